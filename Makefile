@@ -1,0 +1,31 @@
+# Two commands: `make demo` and `make test`. Both set the project up first.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+
+.PHONY: setup demo test check examples clean
+
+setup: $(VENV)/.ready
+
+$(VENV)/.ready: pyproject.toml constraints.txt deploy/setup.sh
+	PYTHON="$(PYTHON)" VENV="$(VENV)" TORCH_INDEX="$(TORCH_INDEX)" bash deploy/setup.sh
+	touch $@
+
+demo: setup
+	$(BIN)/dg4d make examples/newt.png -o out/demo
+
+test: setup check
+	$(BIN)/python -m pytest -n 2 --dist loadscope --jaxtyping-packages=dg4d_lib,beartype.beartype\(conf=beartype.BeartypeConf\(is_pep484_tower=True\)\)
+
+check: setup
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-cache
+
+examples: setup
+	$(BIN)/python -m examples.make_examples
+
+clean:
+	rm -rf $(VENV) out

@@ -1,0 +1,32 @@
+#!/usr/bin/env bash
+# Makes the virtual environment: pinned packages, the CPU build of torch, the `dg4d` command, and the two system
+# libraries that pymeshlab needs.
+set -euo pipefail
+: "${PYTHON:=python3}" "${VENV:=.venv}" "${TORCH_INDEX:=https://download.pytorch.org/whl/cpu}"
+
+"$PYTHON" - <<'PY' || exit 1
+import sys
+if not (3, 11) <= sys.version_info[:2] < (3, 13):
+    sys.exit(f"dg4d needs Python 3.11 or 3.12; this is {sys.version.split()[0]}. Name another: make setup PYTHON=python3.11")
+PY
+[ -x "$VENV/bin/python" ] || "$PYTHON" -m venv "$VENV" || {
+    echo "Could not make a virtual environment. On Debian: apt-get install python3-venv" >&2; exit 1; }
+pip() { "$VENV/bin/python" -m pip --disable-pip-version-check "$@"; }
+
+# The CPU build by its full version: from a configured package source if one has it, else from PyTorch's own index.
+torch=$(grep '^torch==' constraints.txt)
+pip install --quiet "$torch+cpu" -c constraints.txt 2>/dev/null ||
+    pip install --quiet "$torch+cpu" -c constraints.txt --extra-index-url "$TORCH_INDEX"
+pip install --quiet --upgrade 'pip>=25.1' -c constraints.txt
+pip install --quiet -c constraints.txt --editable . --group dev
+
+# pymeshlab imports without these but then lacks its filters.
+filters() { "$VENV/bin/python" -c 'import pymeshlab; print(len(pymeshlab.filter_list()))' 2>/dev/null || echo 0; }
+if [ "$(filters)" -lt 281 ]; then
+    if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
+        apt-get update -qq && apt-get install -y -qq --no-install-recommends libgl1 libopengl0 >/dev/null
+    fi
+    [ "$(filters)" -ge 281 ] || {
+        echo "pymeshlab cannot load its filters: the system libraries libGL.so.1 and libOpenGL.so.0 are missing." >&2
+        echo "On Debian or Ubuntu: sudo apt-get install libgl1 libopengl0" >&2; exit 1; }
+fi

@@ -1,0 +1,69 @@
+"""A camera that looks at the origin from a sphere around it.
+
+World: right-handed, y up, the object's front looks along +z. Azimuth 0 is on +z, 90 on +x; positive elevation is above.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+FOV_Y_DEG = 49.1  # field of view of the method's camera on both axes
+RADIUS = 2.0  # world units
+
+
+@dataclass(frozen=True)
+class OrbitCamera:
+    """Where it stands, how wide it sees, how many pixels it has.
+
+    Attributes:
+        elevation_deg: above the horizon, -90 to 90.
+        azimuth_deg: counter-clockwise seen from above, 0 on +z, 90 on +x.
+        radius: distance from the origin, world units.
+        fov_y_deg: vertical field of view.
+        width: pixels.
+        height: pixels.
+    """
+
+    elevation_deg: float = 0.0
+    azimuth_deg: float = 0.0
+    radius: float = RADIUS
+    fov_y_deg: float = FOV_Y_DEG
+    width: int = 256
+    height: int = 256
+
+    @property
+    def focal(self) -> float:
+        """Focal length in pixels, the same on both axes."""
+        return 0.5 * self.height / math.tan(math.radians(self.fov_y_deg) / 2)
+
+    @property
+    def tan_half_fov(self) -> tuple[float, float]:
+        """Tangents of half the horizontal and half the vertical field of view."""
+        return 0.5 * self.width / self.focal, 0.5 * self.height / self.focal
+
+    def position(self) -> Float[Tensor, " 3"]:
+        """The camera's place in the world, float64."""
+        e, a = math.radians(self.elevation_deg), math.radians(self.azimuth_deg)
+        direction = (math.cos(e) * math.sin(a), math.sin(e), math.cos(e) * math.cos(a))
+        return self.radius * torch.tensor(direction, dtype=torch.float64)
+
+    def world_to_camera(self) -> Float[Tensor, "4 4"]:
+        """World to camera, OpenCV axes (+x right, +y down, +z forward), float64."""
+        e, a = math.radians(self.elevation_deg), math.radians(self.azimuth_deg)
+        sin_e, cos_e, sin_a, cos_a = math.sin(e), math.cos(e), math.sin(a), math.cos(a)
+        matrix = torch.zeros(4, 4, dtype=torch.float64)
+        matrix[0, :3] = torch.tensor((cos_a, 0.0, -sin_a), dtype=torch.float64)
+        matrix[1, :3] = torch.tensor((sin_e * sin_a, -cos_e, sin_e * cos_a), dtype=torch.float64)
+        matrix[2, :3] = torch.tensor((-cos_e * sin_a, -sin_e, -cos_e * cos_a), dtype=torch.float64)
+        matrix[2, 3] = self.radius
+        matrix[3, 3] = 1.0
+        return matrix
+
+
+def world_to_camera(cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b 4 4"]:
+    """The matrices of several cameras, float64."""
+    return torch.stack([camera.world_to_camera() for camera in cameras])

@@ -1,0 +1,1 @@
+"""The two optimizations: static Gaussians and their motion."""

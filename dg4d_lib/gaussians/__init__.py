@@ -1,0 +1,1 @@
+"""Clouds of 3D Gaussians: the value, how it starts, how it grows, how it is stored."""

@@ -1,0 +1,70 @@
+"""The value at the center of the method: a cloud of 3D Gaussians (Kerbl et al. 2023)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dg4d_lib.geometry.harmonics import color_of_harmonics
+from dg4d_lib.geometry.quaternion import rotation_matrix
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """Free parameters as fields, physical quantities as properties.
+
+    `means`, `log_scales` and `quats` may carry a leading batch (one state of the same cloud per frame or view); opacity
+    and color never do, since they do not move (paper, section on deformation).
+
+    Attributes:
+        means: world units.
+        log_scales: natural logarithm of the standard deviations along the Gaussian's own axes.
+        quats: wxyz, any non-zero norm.
+        opacity_logits: logit of the opacity at the center.
+        harmonics: spherical-harmonics coefficients of the color, degree 0 first.
+    """
+
+    means: Float[Tensor, "*b n 3"]
+    log_scales: Float[Tensor, "*b n 3"]
+    quats: Float[Tensor, "*b n 4"]
+    opacity_logits: Float[Tensor, " n"]
+    harmonics: Float[Tensor, "n k 3"]
+
+    def __len__(self) -> int:
+        return self.opacity_logits.shape[0]
+
+    @property
+    def scales(self) -> Float[Tensor, "*b n 3"]:
+        """Standard deviations, world units."""
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> Float[Tensor, " n"]:
+        """Opacity at the center, in (0, 1)."""
+        return self.opacity_logits.sigmoid()
+
+    @property
+    def colors(self) -> Float[Tensor, "n 3"]:
+        """Colors in [0, 1]."""
+        return color_of_harmonics(self.harmonics)
+
+    @property
+    def covariances(self) -> Float[Tensor, "*b n 3 3"]:
+        """R S S^T R^T, world units squared."""
+        half = rotation_matrix(self.quats) * self.scales[..., None, :]
+        return half @ half.mT
+
+    def detach(self) -> "Gaussians":
+        """The same cloud, cut off from the graph."""
+        return Gaussians(**{name: value.detach() for name, value in vars(self).items()})
+
+    def to(self, target: torch.dtype | torch.device) -> "Gaussians":
+        """The same cloud in another precision or on another device."""
+        return Gaussians(**{name: value.to(target) for name, value in vars(self).items()})
+
+    def at(self, frame: int) -> "Gaussians":
+        """One state of a batch."""
+        return Gaussians(
+            self.means[frame], self.log_scales[frame], self.quats[frame], self.opacity_logits, self.harmonics
+        )

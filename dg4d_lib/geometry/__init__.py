@@ -1,0 +1,1 @@
+"""Rotations, color harmonics and grids."""

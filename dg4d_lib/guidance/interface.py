@@ -1,0 +1,56 @@
+"""What judges pictures that nobody took."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+
+
+@dataclass(frozen=True)
+class View:
+    """Where and when a picture is judged.
+
+    Attributes:
+        camera: the pose and the size of the picture.
+        frame: which frame of the driving video, 0 for the static stage.
+    """
+
+    camera: OrbitCamera
+    frame: int = 0
+
+
+@runtime_checkable
+class GuidancePrior(Protocol):
+    """One number to lower.
+
+    Attributes:
+        viewpoints: the only cameras it can judge (their pixels do not matter); None is all of them.
+        frames: the only frames it can judge; None is all of them.
+    """
+
+    viewpoints: tuple[OrbitCamera, ...] | None
+    frames: tuple[int, ...] | None
+
+    def loss(
+        self,
+        images: Float[Tensor, "b h w 3"],
+        coverage: Float[Tensor, "b h w 1"],
+        views: Sequence[View],
+        progress: float,
+        generator: torch.Generator,
+    ) -> Float[Tensor, ""]:
+        """How unlikely these renders are, divided by their number.
+
+        Args:
+            images: renders over white, in [0, 1].
+            coverage: their alpha; priors that only know pictures ignore it.
+            views: one per image.
+            progress: share of the optimization that is done, in [0, 1].
+            generator: the source of all randomness.
+        """
+        ...

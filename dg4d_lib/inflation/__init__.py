@@ -1,0 +1,1 @@
+"""A closed, colored surface guessed from one cut-out picture; needs no weights."""

@@ -1,0 +1,1 @@
+"""Which triangle a camera sees in every pixel, and where in it."""

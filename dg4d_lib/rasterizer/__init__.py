@@ -1,0 +1,1 @@
+"""Differentiable splatting: one call, several backends."""

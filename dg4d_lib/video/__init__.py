@@ -1,0 +1,1 @@
+"""Subjects, driving videos and what generates them."""

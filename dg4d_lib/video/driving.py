@@ -1,0 +1,34 @@
+"""The driving video: what the subject looks like over time from the input view."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class DrivingVideo:
+    """Cut-out frames.
+
+    Attributes:
+        frames: straight color in [0, 1] (undefined where coverage is 0).
+        coverage: alpha in [0, 1].
+        fps: frames per second.
+    """
+
+    frames: Float[Tensor, "t h w 3"]
+    coverage: Float[Tensor, "t h w 1"]
+    fps: float
+
+    def __len__(self) -> int:
+        return self.frames.shape[0]
+
+    @property
+    def times(self) -> Float[Tensor, " t"]:
+        """0 is the first frame, 1 the last, both included (METHOD section 1)."""
+        return torch.linspace(0, 1, len(self))
+
+    def over(self, background: Float[Tensor, " 3"]) -> Float[Tensor, "t h w 3"]:
+        """The frames composited over one color."""
+        return self.frames * self.coverage + (1 - self.coverage) * background

@@ -1,0 +1,97 @@
+"""Every step by name; imports no step and no torch.
+
+Artifacts between steps:
+  frames      a stored zip of NNN.png (RGBA, straight alpha, square) and video.json {"fps": ...}
+  gaussians   a standard 3DGS PLY (float32)
+  motion      safetensors; metadata says the kind of deformation, its settings and the number of frames
+  tracked     safetensors of a tracked mesh: vertices, faces, uvs, texture (uint8), offsets; metadata fps
+  meshes      a stored zip of NNN.safetensors, a textured mesh per frame
+  curves      JSON {"title": ..., "x": [...], "series": {name: [...]}, "notes": [...]}
+"""
+
+from steps.contract import Port, StepSpec
+
+PNG = Port(media_type="image/png", suffix=".png")
+FRAMES = Port(media_type="application/vnd.dg4d.frames+zip", suffix=".zip")
+PLY = Port(media_type="application/vnd.dg4d.gaussians+ply", suffix=".ply")
+MOTION = Port(media_type="application/vnd.dg4d.motion+safetensors", suffix=".safetensors")
+TRACKED = Port(media_type="application/vnd.dg4d.tracked+safetensors", suffix=".safetensors")
+MESHES = Port(media_type="application/vnd.dg4d.meshes+zip", suffix=".zip")
+CURVES = Port(media_type="application/vnd.dg4d.curves+json", suffix=".json")
+PACKAGE = Port(media_type="application/vnd.dg4d.package+zip", suffix=".zip")
+SOURCE = Port(media_type="application/octet-stream", suffix="")
+BANK = Port(media_type="application/vnd.dg4d.bank+zip", suffix=".zip")
+
+
+def _optional(port: Port) -> Port:
+    return port.model_copy(update={"optional": True})
+
+
+STEPS: dict[str, StepSpec] = {
+    spec.name: spec
+    for spec in (
+        StepSpec(
+            name="prepare_subject",
+            version="1",
+            entry="steps.prepare_subject:run",
+            settings="dg4d_lib.settings:SubjectSettings",
+            inputs={"source": SOURCE},
+            outputs={"subject": PNG, "footage": _optional(FRAMES)},
+        ),
+        StepSpec(
+            name="drive_video",
+            version="1",
+            entry="steps.drive_video:run",
+            settings="steps.profiles:DriveVideoSettings",
+            inputs={"subject": PNG, "footage": _optional(FRAMES)},
+            outputs={"driving_video": FRAMES},
+        ),
+        StepSpec(
+            name="fit_gaussians",
+            version="1",
+            entry="steps.fit_gaussians:run",
+            settings="steps.profiles:FitGaussiansSettings",
+            inputs={"subject": PNG, "bank": _optional(BANK)},
+            outputs={"gaussians": PLY, "curves": CURVES, "picture": PNG},
+        ),
+        StepSpec(
+            name="fit_motion",
+            version="1",
+            entry="steps.fit_motion:run",
+            settings="steps.profiles:FitMotionSettings",
+            inputs={"gaussians": PLY, "driving_video": FRAMES, "bank": _optional(BANK)},
+            outputs={"motion": MOTION, "curves": CURVES, "picture": PNG},
+        ),
+        StepSpec(
+            name="extract_mesh",
+            version="1",
+            entry="steps.extract_mesh:run",
+            settings="steps.profiles:ExtractMeshSettings",
+            inputs={"gaussians": PLY, "motion": MOTION},
+            outputs={"tracked": _optional(TRACKED), "meshes": _optional(MESHES), "picture": PNG},
+        ),
+        StepSpec(
+            name="refine_texture",
+            version="1",
+            entry="steps.refine_texture:run",
+            settings="dg4d_lib.settings:RefinerSettings",
+            inputs={"tracked": _optional(TRACKED), "meshes": _optional(MESHES), "driving_video": FRAMES},
+            outputs={"tracked": _optional(TRACKED), "meshes": _optional(MESHES)},
+        ),
+        StepSpec(
+            name="pack_asset",
+            version="1",
+            entry="steps.pack_asset:run",
+            settings="steps.profiles:PackAssetSettings",
+            inputs={
+                "subject": PNG,
+                "driving_video": FRAMES,
+                "gaussians": PLY,
+                "motion": MOTION,
+                "tracked": _optional(TRACKED),
+                "meshes": _optional(MESHES),
+            },
+            outputs={"package": PACKAGE, "sheet": PNG},
+        ),
+    )
+}

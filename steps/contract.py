@@ -1,0 +1,122 @@
+"""What crosses the boundary of a step: references, requests, results, records. Plain JSON; imports no torch."""
+
+import hashlib
+import json
+import re
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+CONTRACT_VERSION = 1
+
+EXIT_DONE = 0
+EXIT_BAD_INPUT = 65  # the same again will fail again
+EXIT_MISSING = 69  # something needed is not here
+EXIT_OUT_OF_MEMORY = 137
+
+Digest = Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")]
+
+
+class Frozen(BaseModel):
+    """Frozen and closed."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ArtifactRef(Frozen):
+    """A file named by its content; it never moves and never changes."""
+
+    digest: Digest
+    media_type: str
+    size_bytes: int = Field(ge=0)
+
+
+class Port(Frozen):
+    """One input or output of a step."""
+
+    media_type: str
+    suffix: str = Field(description="of the file while a step works on it, for example .png")
+    optional: bool = False
+
+
+class StepSpec(Frozen):
+    """What a step is called and what it eats; the code is not imported."""
+
+    name: str
+    version: str = Field(description="raised when the same request should give another result")
+    entry: str = Field(pattern=r"^[\w.]+:\w+$")
+    settings: str = Field(pattern=r"^[\w.]+:\w+$", description="module:class of its settings")
+    inputs: dict[str, Port]
+    outputs: dict[str, Port]
+    image: Literal["cpu", "cuda"] = "cpu"
+    timeout_s: float = Field(3600, gt=0)
+
+
+class StepRequest(Frozen):
+    """Everything a step may depend on; its digest is the cache key."""
+
+    step: str
+    version: str
+    inputs: dict[str, ArtifactRef]
+    settings: dict[str, Any]
+    seed: int = Field(ge=0, lt=2**63)
+
+    def digest(self) -> str:
+        """sha256 of the canonical JSON; names of files and order of keys do not matter."""
+        return digest_of({"contract": CONTRACT_VERSION, **self.model_dump(mode="json")})
+
+
+class ProvenanceRecord(Frozen):
+    """Enough to make the outputs again, and to say why they differ.
+
+    `duration_s` and `peak_memory_mb` are facts about one run and not part of `digest`.
+    """
+
+    step: str
+    code_version: str
+    request_digest: Digest
+    inputs: dict[str, Digest]
+    outputs: dict[str, Digest]
+    settings: dict[str, Any]
+    seed: int
+    backend: str
+    weights: dict[str, Digest] = {}
+    licences: dict[str, str] = {}
+    notes: tuple[str, ...] = ()
+    duration_s: float = Field(ge=0)
+    peak_memory_mb: float = Field(ge=0)
+
+    def digest(self) -> str:
+        """sha256 of the record without what belongs to one run only."""
+        return digest_of(self.model_dump(mode="json", exclude={"duration_s", "peak_memory_mb"}))
+
+
+class StepResult(Frozen):
+    """Where the outputs are, and the record."""
+
+    outputs: dict[str, ArtifactRef]
+    provenance: ProvenanceRecord
+
+
+class StepFailure(Frozen):
+    """Why a step did not finish; written where the result would be."""
+
+    step: str
+    kind: Literal["bad_input", "missing", "diverged", "out_of_memory", "crashed"]
+    message: str
+    pictures: dict[str, ArtifactRef] = {}
+
+
+def canonical(value: Any) -> str:
+    """JSON with sorted keys and no spaces; refuses what JSON does not know, and numbers that are not finite."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+
+
+def digest_of(value: Any) -> str:
+    """The name of a JSON value by its content."""
+    return "sha256:" + hashlib.sha256(canonical(value).encode()).hexdigest()
+
+
+def is_digest(text: str) -> bool:
+    """Whether this is a full sha256 name."""
+    return re.fullmatch(r"sha256:[0-9a-f]{64}", text) is not None
