@@ -2,7 +2,7 @@
 
 import json
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -43,9 +43,11 @@ def read_png(path: Path) -> Float[Tensor, "h w c"]:
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
     file = oiio.ImageInput.open(str(path), config)
-    pixels = file.read_image("float") if file is not None else None
+    if file is None:
+        raise BadInput(f"{path.name} cannot be read as a picture: {oiio.geterror()}")
+    pixels = file.read_image("float")
     if pixels is None:
-        raise BadInput(f"{path.name} cannot be read as a picture: {file.geterror() if file else oiio.geterror()}")
+        raise BadInput(f"{path.name} cannot be read as a picture: {file.geterror()}")
     file.close()
     return torch.from_numpy(np.ascontiguousarray(pixels))
 
@@ -85,7 +87,7 @@ def read_frames(path: Path, scratch: Path) -> DrivingVideo:
 
 
 def write_curves(
-    path: Path, title: str, x: Sequence[int], series: dict[str, Sequence[float]], notes: Sequence[str] = ()
+    path: Path, title: str, x: Sequence[int], series: Mapping[str, Sequence[float]], notes: Sequence[str] = ()
 ) -> None:
     """Losses over iterations as JSON, thinned."""
     step = max(1, len(x) // CURVES_POINTS)

@@ -75,6 +75,7 @@ class PackAssetSettings(Settings):
 
     rasterizer: str
     pack: PackSettings
+    notes: tuple[str, ...] = Field((), description="sentences that travel in the files, say that no model was used")
 
 
 def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSettings:

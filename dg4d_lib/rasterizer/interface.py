@@ -1,8 +1,8 @@
 """What every splatting backend promises: the call, the picture it gives, and the constants they share (gsplat classic).
 
-Pixel centers at +0.5; 2D covariance + BLUR on the diagonal, also for the gradients; alpha = min(MAX_ALPHA, o e^-s); a pair
-counts iff alpha >= MIN_ALPHA; a pixel stops before the Gaussian that would take its transmittance to MIN_TRANSMITTANCE
-or below; color + transmittance * background; depth is the weighted sum of camera z.
+Pixel centers at +0.5; 2D covariance + BLUR on the diagonal, also for the gradients; alpha = min(MAX_ALPHA, o e^-s); a
+pair counts iff alpha >= MIN_ALPHA; a pixel stops before the Gaussian that would take its transmittance to
+MIN_TRANSMITTANCE or below; color + transmittance * background; depth is the weighted sum of camera z.
 """
 
 from collections.abc import Sequence
@@ -99,3 +99,18 @@ def shared_size(cameras: Sequence[OrbitCamera]) -> tuple[int, int]:
     if len(sizes) != 1:
         raise BadInput(f"cameras of one rendering must have one size; given {sorted(sizes) or 'no camera'}")
     return sizes.pop()
+
+
+def state_per_camera(gaussians: Gaussians, cameras: Sequence[OrbitCamera]) -> bool:
+    """Whether the cloud has a state of its own for every camera, rather than one for all.
+
+    Raises:
+        BadInput: it has several states, but not as many as there are cameras.
+    """
+    shape = gaussians.means.shape
+    if shape[:-2] not in ((), (len(cameras),)):
+        raise BadInput(
+            f"{len(cameras)} cameras need Gaussians of one state (n 3) or of {len(cameras)} states; "
+            f"given means of shape {tuple(shape)}"
+        )
+    return len(shape) == 3

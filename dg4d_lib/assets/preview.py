@@ -1,0 +1,124 @@
+"""A short film of an asset: it moves while the camera goes round it once."""
+
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from math import ceil
+from pathlib import Path
+from typing import cast
+
+import av
+import torch
+from av.video.reformatter import ColorRange, Colorspace
+from jaxtyping import Float
+from torch import Tensor
+
+from dg4d_lib.assets.animated import moved
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.cameras.viewpoints import turntable
+from dg4d_lib.deformation.interface import Deformation
+from dg4d_lib.errors import BackendUnavailable
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.rasterizer.interface import Rasterizer
+from dg4d_lib.settings import PackSettings
+
+SMOOTH_FPS = 20  # slower motions are sampled between their frames, so that the turn looks smooth
+ELEVATION_DEG = 10.0  # of the camera: a little from above
+BATCH = 8  # pictures of one rasterizer call, bounds the memory
+CODECS = {"libx264": {"crf": "18", "preset": "medium"}, "mpeg4": {"qscale": "3"}}  # best first
+BT709 = 1  # color primaries, transfer and matrix, as numbered in H.273
+CENTER, CORNER = (0.975, 0.975, 0.98), (0.84, 0.85, 0.87)  # of the background
+
+
+def write_preview(
+    path: Path,
+    gaussians: Gaussians,
+    deformation: Deformation,
+    frames: int,
+    fps: float,
+    rasterizer: Rasterizer,
+    settings: PackSettings,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[str, ...]:
+    """Write a silent MP4 (H.264, yuv420p) in which the motion loops `preview_turns` times during one turn.
+
+    Equal arguments give equal bytes.
+
+    Args:
+        path: of the file, ending in .mp4.
+        gaussians: at rest.
+        deformation: their motion.
+        frames: of the motion.
+        fps: frames per second of the motion.
+        rasterizer: draws the pictures.
+        settings: size and number of loops.
+        progress: called with pictures done and their number.
+
+    Returns:
+        Sentences for the report: empty, or which codec had to stand in.
+
+    Raises:
+        BackendUnavailable: this build of FFmpeg can write no MP4 codec we know.
+        OSError: the file could not be written.
+    """
+    repeats = ceil(SMOOTH_FPS / fps)
+    positions = torch.arange(frames * repeats).repeat(settings.preview_turns) / repeats
+    camera = OrbitCamera(ELEVATION_DEG, width=settings.preview_size, height=settings.preview_size)
+    cameras = turntable(len(positions), camera)
+    background = studio(settings.preview_size)
+    codec = next((name for name in CODECS if name in av.codecs_available), None)
+    if codec is None:
+        raise BackendUnavailable(f"this FFmpeg has none of {', '.join(CODECS)}; run `pip install --force-reinstall av`")
+    with Film(path, codec, fps * repeats, settings.preview_size) as film:
+        for start in range(0, len(positions), BATCH):
+            part = slice(start, start + BATCH)
+            states = moved(gaussians, deformation, frames, positions[part])
+            film.add(pictures_over(background, states, cameras[part], rasterizer))
+            progress(min(start + BATCH, len(positions)), len(positions))
+    return () if codec == "libx264" else (f"preview.mp4 is written with {codec}, since libx264 is not in this FFmpeg",)
+
+
+def pictures_over(
+    background: Float[Tensor, "h w 3"], states: Gaussians, cameras: Sequence[OrbitCamera], rasterizer: Rasterizer
+) -> Float[Tensor, "b h w 3"]:
+    """Every state from its camera, over a background picture, without gradients."""
+    with torch.no_grad():
+        drawn = rasterizer(states, cameras, states.means.new_zeros(3))
+        return (drawn.color + (1 - drawn.alpha) * background.to(drawn.color)).clamp(0, 1)
+
+
+def studio(size: int) -> Float[Tensor, "h w 3"]:
+    """A soft light background, brightest in the middle."""
+    line = torch.linspace(-1, 1, size)
+    distance = (line[:, None].square() + line.square()).div(2).clamp(max=1)[..., None]
+    return torch.lerp(torch.tensor(CENTER), torch.tensor(CORNER), distance)
+
+
+class Film:
+    """An MP4 that is being written; nothing in it depends on time, host or number of cores."""
+
+    def __init__(self, path: Path, codec: str, fps: float, size: int) -> None:
+        self._container = av.open(str(path), "w", options={"movflags": "+faststart", "fflags": "+bitexact"})
+        rate = Fraction(fps).limit_denominator(1001)
+        self._stream = cast(av.VideoStream, self._container.add_stream(codec, rate, dict(CODECS[codec])))
+        context = self._stream.codec_context
+        self._stream.width = self._stream.height = size
+        self._stream.pix_fmt = "yuv420p"
+        context.thread_count = 1
+        context.flags |= av.codec.context.Flags.bitexact
+        context.color_range = ColorRange.MPEG
+        context.colorspace = context.color_primaries = context.color_trc = BT709
+
+    def __enter__(self) -> "Film":
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        if failure[0] is None:
+            self._container.mux(self._stream.encode(None))
+        self._container.close()
+
+    def add(self, pictures: Float[Tensor, "b h w 3"]) -> None:
+        """Append pictures in [0, 1]."""
+        for pixels in (pictures.detach().cpu() * 255).round().to(torch.uint8).numpy():
+            frame = av.VideoFrame.from_ndarray(pixels, "rgb24")
+            frame = frame.reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG)
+            self._container.mux(self._stream.encode(frame))

@@ -1,0 +1,46 @@
+"""Moving splats as one standard PLY per frame."""
+
+from pathlib import Path
+
+import torch
+
+from dg4d_lib.errors import BadInput
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.ply import read_ply, write_ply
+
+
+def write_splats(folder: Path, states: Gaussians) -> list[Path]:
+    """Write every state of a batch as FOLDER/NNN.ply, which must exist.
+
+    Raises:
+        OSError: a file could not be written.
+    """
+    paths = [folder / f"{frame:03d}.ply" for frame in range(len(states.means))]
+    for frame, path in enumerate(paths):
+        write_ply(path, states.at(frame))
+    return paths
+
+
+def read_splats(folder: Path) -> Gaussians:
+    """Read what `write_splats` wrote, as a batch with one state per frame.
+
+    Raises:
+        BadInput: no frames, a gap in the numbering, a broken file, or frames that are not states of one cloud.
+    """
+    paths = sorted(folder.glob("*.ply"))
+    if not paths or [path.name for path in paths] != [f"{frame:03d}.ply" for frame in range(len(paths))]:
+        given = f"{paths[0].name} to {paths[-1].name}, {len(paths)} files" if paths else "none"
+        raise BadInput(f"{folder.name}/ must hold 000.ply, 001.ply, ... without gaps; given {given}")
+    clouds = [read_ply(path) for path in paths]
+    first = clouds[0]
+    for path, cloud in zip(paths, clouds, strict=True):
+        same = torch.equal(cloud.opacity_logits, first.opacity_logits) and torch.equal(cloud.harmonics, first.harmonics)
+        if not same:
+            raise BadInput(f"{path.name} is no state of the cloud in {paths[0].name}: opacity or color differ")
+    return Gaussians(
+        torch.stack([cloud.means for cloud in clouds]),
+        torch.stack([cloud.log_scales for cloud in clouds]),
+        torch.stack([cloud.quats for cloud in clouds]),
+        first.opacity_logits,
+        first.harmonics,
+    )

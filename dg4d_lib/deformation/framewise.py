@@ -1,0 +1,50 @@
+"""Ablation: every frame has its own free displacement (paper, ablation of the deformation field)."""
+
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from dg4d_lib.deformation.interface import Displacement
+from dg4d_lib.errors import BadInput
+
+
+class Framewise(nn.Module):
+    """A table of displacements; linear between frames.
+
+    Args:
+        frames: t.
+        count: Gaussians, n.
+    """
+
+    def __init__(self, frames: int, count: int) -> None:
+        super().__init__()
+        self.table = nn.Parameter(torch.zeros(frames, count, 10))
+
+    def displace(self, means: Float[Tensor, "n 3"], times: Float[Tensor, " t"]) -> Displacement:
+        """What to add at every time in [0, 1]; the means only have to be as many as the table's.
+
+        Raises:
+            BadInput: another number of Gaussians than the table was made for.
+        """
+        if len(means) != self.table.shape[1]:
+            raise BadInput(f"a frame-wise motion of {self.table.shape[1]} Gaussians cannot move {len(means)}")
+        last = self.table.shape[0] - 1
+        place = times.clamp(0, 1) * last
+        left = place.floor().clamp(0, max(last - 1, 0)).long()
+        share = (place - left)[:, None, None]
+        rows = self.table[left] * (1 - share) + self.table[(left + 1).clamp(max=last)] * share
+        return Displacement(rows[..., :3], rows[..., 3:6], rows[..., 6:])
+
+    def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:
+        """The table."""
+        return super().parameters(recurse)
+
+    def planes(self) -> list[nn.Parameter]:
+        """The parameters that learn at the rate of planes: all."""
+        return [self.table]
+
+    def roughness(self) -> Float[Tensor, ""]:
+        """A table has no regularizer: zero."""
+        return self.table.new_zeros(())

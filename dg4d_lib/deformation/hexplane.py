@@ -1,0 +1,131 @@
+"""HexPlane: six planes over space and time, and a small network that reads them (Cao and Johnson 2023; paper 3.2).
+
+Zero initialization with residual heads makes the motion exactly zero at the start; at the first step only the last
+matrices of the heads receive gradient.
+"""
+
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dg4d_lib.deformation.interface import Displacement
+from dg4d_lib.settings import HexPlaneSettings
+
+PLANE_AXES = ((0, 1), (0, 2), (1, 2))  # xy, xz, yz; the time planes are xt, yt, zt
+
+
+class ResidualHead(nn.Module):
+    """h = relu(x); y = h + A h + a; out = B y + b, with A, a, B, b zero at the start."""
+
+    def __init__(self, hidden: int, outputs: int) -> None:
+        super().__init__()
+        self.inner, self.outer = nn.Linear(hidden, hidden), nn.Linear(hidden, outputs)
+        for parameter in self.parameters():
+            nn.init.zeros_(parameter)
+
+    def forward(self, activated: Float[Tensor, "*b hidden"]) -> Float[Tensor, "*b outputs"]:
+        """`activated` is relu(x), shared by all heads."""
+        return self.outer(activated + self.inner(activated))
+
+
+class Heads(nn.Module):
+    """What turns the features of a Gaussian at a time into its displacement."""
+
+    def __init__(self, hidden: int) -> None:
+        super().__init__()
+        self.means, self.log_scales, self.quats = (ResidualHead(hidden, outputs) for outputs in (3, 3, 4))
+
+    def forward(self, hidden: Float[Tensor, "t n hidden"]) -> Displacement:
+        """One displacement per time."""
+        activated = functional.relu(hidden)
+        return Displacement(self.means(activated), self.log_scales(activated), self.quats(activated))
+
+
+class HexPlane(nn.Module):
+    """The paper's deformation model.
+
+    Args:
+        settings: sizes and regularizers.
+        bounds: lower and upper corner of the box that the planes cover, world units.
+        generator: for the start of the planes and the trunk.
+    """
+
+    bounds: Tensor
+
+    def __init__(
+        self, settings: HexPlaneSettings, bounds: Float[Tensor, "2 3"], generator: torch.Generator | None = None
+    ) -> None:
+        super().__init__()
+        self.settings = settings
+        self.register_buffer("bounds", bounds)
+        c, t = settings.features, settings.temporal
+        sizes = [max(2, round(settings.spatial * scale)) for scale in settings.scales]
+        self.space = nn.ParameterList(torch.empty(3, c, r, r).uniform_(0.1, 0.5, generator=generator) for r in sizes)
+        self.time = nn.ParameterList(torch.ones(3, c, t, r) for r in sizes)
+        self.trunk = nn.Linear(c * len(sizes), settings.hidden)
+        nn.init.xavier_uniform_(self.trunk.weight, generator=generator)
+        nn.init.zeros_(self.trunk.bias)
+        self.heads = Heads(settings.hidden)
+
+    def displace(self, means: Float[Tensor, "n 3"], times: Float[Tensor, " t"]) -> Displacement:
+        """What to add at every time in [0, 1]; means outside the box read its border."""
+        low, high = self.bounds
+        coordinates = ((means - low) / (high - low) * 2 - 1).clamp(-1, 1)
+        features = [
+            plane_features(coordinates, space, time_lines(time, times))
+            for space, time in zip(self.space, self.time, strict=True)
+        ]
+        displacement: Displacement = self.heads(self.trunk(torch.cat(features, -1)))
+        return displacement
+
+    def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:
+        """Planes first, then the network."""
+        return super().parameters(recurse)
+
+    def planes(self) -> list[nn.Parameter]:
+        """The parameters that learn at the rate of planes."""
+        return [*self.space, *self.time]
+
+    def roughness(self) -> Float[Tensor, ""]:
+        """Variation in space, second differences in time, distance of time planes from one; all off by default."""
+        s = self.settings
+        total = self.bounds.new_zeros(())
+        for space, time in zip(self.space, self.time, strict=True):
+            if s.variation_weight:
+                total = total + s.variation_weight * (
+                    space.diff(dim=-1).square().mean() + space.diff(dim=-2).square().mean()
+                )
+            if s.smoothness_weight:
+                total = total + s.smoothness_weight * time.diff(n=2, dim=-2).square().mean()
+            if s.sparsity_weight:
+                total = total + s.sparsity_weight * (time - 1).abs().mean()
+        return total
+
+
+def time_lines(planes: Float[Tensor, "3 c steps r"], times: Float[Tensor, " t"]) -> Float[Tensor, "3 t c r"]:
+    """The rows of the time planes at these times: linear between the steps, both ends included."""
+    steps = planes.shape[2]
+    place = times.clamp(0, 1) * (steps - 1)
+    hat = (1 - (place[:, None] - torch.arange(steps, dtype=planes.dtype, device=planes.device)).abs()).clamp(min=0)
+    return torch.einsum("ts,acsr->atcr", hat, planes)
+
+
+def plane_features(
+    coordinates: Float[Tensor, "n 3"], planes: Float[Tensor, "3 c r r"], lines: Float[Tensor, "3 t c r"]
+) -> Float[Tensor, "t n c"]:
+    """Product of the six bilinear samples; coordinates in [-1, 1], corners aligned. Plain torch."""
+    pairs = torch.stack([coordinates[:, list(axes)] for axes in PLANE_AXES])
+    space = functional.grid_sample(planes, pairs[:, None], align_corners=True, padding_mode="border")[:, :, 0].prod(0)
+    last = lines.shape[-1] - 1
+    place = (coordinates + 1) / 2 * last
+    left = place.floor().clamp(0, last - 1)
+    share = (place - left).to(lines.dtype)
+    left = left.long()
+    features = space.T
+    for axis in range(3):
+        i, f = left[:, axis], share[:, axis]
+        features = features * (lines[axis][..., i] * (1 - f) + lines[axis][..., i + 1] * f).transpose(-1, -2)
+    return features

@@ -1,0 +1,129 @@
+"""The dynamic stage: a deformation fitted to the driving video and to a prior at every moment (paper section 3.2)."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
+from dg4d_lib.cameras.viewpoints import random_orbit
+from dg4d_lib.deformation.interface import Deformation
+from dg4d_lib.deformation.rigidity import neighborhoods, rigidity
+from dg4d_lib.fitting.losses import WHITE, Diverged, reference_loss, resized
+from dg4d_lib.fitting.schedules import size_of
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.guidance.interface import GuidancePrior, View
+from dg4d_lib.rasterizer.interface import Rasterizer
+from dg4d_lib.settings import MotionSettings
+from dg4d_lib.video.driving import DrivingVideo
+
+Report = Callable[[int, dict[str, float]], None]
+
+
+def fit_motion(
+    gaussians: Gaussians,
+    deformation: Deformation,
+    video: DrivingVideo,
+    prior: GuidancePrior,
+    rasterize: Rasterizer,
+    settings: MotionSettings,
+    generator: torch.Generator,
+    report: Report = lambda iteration, values: None,
+    input_camera: OrbitCamera | None = None,
+) -> None:
+    """Fit `deformation` in place; the static Gaussians stay frozen.
+
+    Args:
+        gaussians: the canonical cloud.
+        deformation: what is fitted, the identity at the start.
+        video: what the input camera sees.
+        prior: judges every frame from random views.
+        rasterize: draws.
+        settings: every number of the stage.
+        generator: the source of all randomness.
+        report: called after every iteration with (iterations done, named losses).
+        input_camera: where the video was taken from; the default is azimuth and elevation 0.
+
+    Raises:
+        FitDiverged: the loss became non-finite.
+    """
+    camera = replace(input_camera or OrbitCamera(), width=settings.reference_size, height=settings.reference_size)
+    color, alpha = resized(torch.cat([video.frames, video.coverage], -1), settings.reference_size)
+    white = torch.tensor(WHITE)
+    gaussians = gaussians.detach()
+    adam = torch.optim.Adam(_groups(deformation, settings), betas=(0.9, 0.999), eps=1e-15, fused=True)
+    neighbors = neighborhoods(gaussians.means) if settings.rigidity_weight else None
+    for step in range(1, settings.iterations + 1):
+        progress = step / settings.iterations
+        frames = choose_frames(len(video), settings.frames_per_iteration, generator)
+        moved = deformation.displace(gaussians.means, video.times[frames]).apply(gaussians)
+
+        rendering = rasterize(moved, [camera] * len(frames), white)
+        reference = reference_loss(
+            rendering, color[frames], alpha[frames], settings.color_weight, settings.alpha_weight
+        )
+        loss = progress * reference + deformation.roughness()
+        guidance = torch.zeros(())
+        if settings.views and settings.guidance_weight:
+            views, rows = moments(prior, frames, settings, size_of(settings.ladder, progress), generator)
+            if views:
+                states = replace(
+                    moved, **{name: getattr(moved, name)[rows] for name in ("means", "log_scales", "quats")}
+                )
+                rendering = rasterize(states, [view.camera for view in views], white)
+                guidance = prior.loss(rendering.color, rendering.alpha, views, progress, generator)
+                loss = loss + settings.guidance_weight * guidance
+        if neighbors is not None:
+            loss = loss + settings.rigidity_weight * rigidity(moved, *neighbors)
+        if not torch.isfinite(loss):
+            raise Diverged(
+                f"fit_motion: the loss became {loss.item()} at iteration {step} of {settings.iterations}; "
+                "lower motion.network_rate and motion.plane_rate or the weights",
+                gaussians,
+            )
+        adam.zero_grad(set_to_none=True)
+        loss.backward()
+        adam.step()
+        report(step, {"loss": loss.item(), "reference": reference.item(), "guidance": guidance.item()})
+
+
+def choose_frames(total: int, count: int, generator: torch.Generator) -> Int[Tensor, " k"]:
+    """The frames of one iteration in order: all, or `count` different ones, one from each equal stretch of time."""
+    if not count or count >= total:
+        return torch.arange(total)
+    edges = torch.linspace(0, total, count + 1, dtype=torch.float64)
+    inside = torch.rand(count, generator=generator, dtype=torch.float64)
+    return (edges[:-1] + inside * edges.diff()).floor().long().clamp(max=total - 1).unique()
+
+
+def moments(
+    prior: GuidancePrior, frames: Int[Tensor, " k"], settings: MotionSettings, size: int, generator: torch.Generator
+) -> tuple[list[View], Int[Tensor, " m"]]:
+    """Random views of every frame that the prior can judge, and the row of `frames` each belongs to."""
+    rows = [row for row, f in enumerate(frames.tolist()) if prior.frames is None or f in prior.frames]
+    rows = [row for row in rows for _ in range(settings.views)]
+    if prior.viewpoints is None:
+        elevation = (-settings.elevation_deg, settings.elevation_deg)
+        cameras = random_orbit(len(rows), size, elevation_deg=elevation, radius=(RADIUS, RADIUS), generator=generator)
+    else:
+        choice = torch.randint(len(prior.viewpoints), (len(rows),), generator=generator).tolist()
+        cameras = [replace(prior.viewpoints[i], width=size, height=size) for i in choice]
+    views = [View(camera, int(frames[row])) for camera, row in zip(cameras, rows, strict=True)]
+    return views, torch.tensor(rows, dtype=torch.long)
+
+
+def bounds_of(gaussians: Gaussians, margin: float = 0.1) -> Float[Tensor, "2 3"]:
+    """The box of the centers, widened by a share of its longest side: where the planes of a deformation lie."""
+    low, high = gaussians.means.detach().amin(0), gaussians.means.detach().amax(0)
+    slack = margin * (high - low).max().clamp(min=1e-3)
+    return torch.stack([low - slack, high + slack])
+
+
+def _groups(deformation: Deformation, settings: MotionSettings) -> list[dict[str, object]]:
+    planes = deformation.planes()
+    fast = {id(parameter) for parameter in planes}
+    network = [parameter for parameter in deformation.parameters() if id(parameter) not in fast]
+    groups = [{"params": planes, "lr": settings.plane_rate}, {"params": network, "lr": settings.network_rate}]
+    return [group for group in groups if group["params"]]

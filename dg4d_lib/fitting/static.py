@@ -1,0 +1,177 @@
+"""The static stage: DreamGaussianHD (paper section 3.1)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
+from dg4d_lib.cameras.viewpoints import random_orbit
+from dg4d_lib.fitting.losses import WHITE, Diverged, reference_loss, resized
+from dg4d_lib.fitting.schedules import log_linear, size_of
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.growth import Grown, ScreenGradients, grow, prune, reset_opacity
+from dg4d_lib.guidance.interface import GuidancePrior, View
+from dg4d_lib.rasterizer.interface import Rasterizer
+from dg4d_lib.settings import StaticSettings
+
+Report = Callable[[int, dict[str, float]], None]
+FEWEST = 8  # Gaussians; with fewer there is no object left
+
+
+@dataclass
+class _Cloud:
+    """Gaussians under optimization: one Adam group per kind of parameter."""
+
+    parameters: dict[str, nn.Parameter]
+    adam: torch.optim.Adam
+
+    @staticmethod
+    def of(gaussians: Gaussians, rates: dict[str, float]) -> "_Cloud":
+        parameters = {name: nn.Parameter(value.detach().clone()) for name, value in vars(gaussians).items()}
+        groups = [{"params": [parameters[name]], "lr": rate, "name": name} for name, rate in rates.items()]
+        return _Cloud(parameters, torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15, fused=True))
+
+    @property
+    def gaussians(self) -> Gaussians:
+        return Gaussians(**self.parameters)
+
+    def replace(self, grown: Grown) -> None:
+        """Take over a changed cloud; survivors keep their momentum, fresh Gaussians start without."""
+        for group in self.adam.param_groups:
+            name = group["name"]
+            state = self.adam.state.pop(self.parameters[name], None)
+            fresh = nn.Parameter(getattr(grown.gaussians, name).detach().clone())
+            if state is not None:
+                for key in ("exp_avg", "exp_avg_sq"):
+                    momentum = state[key][grown.source]
+                    momentum[grown.fresh] = 0
+                    state[key] = momentum
+                self.adam.state[fresh] = state
+            group["params"] = [fresh]
+            self.parameters[name] = fresh
+
+
+def fit_gaussians(
+    start: Gaussians,
+    subject: Float[Tensor, "h w 4"],
+    prior: GuidancePrior,
+    rasterize: Rasterizer,
+    settings: StaticSettings,
+    generator: torch.Generator,
+    report: Report = lambda iteration, values: None,
+    input_camera: OrbitCamera | None = None,
+) -> Gaussians:
+    """Fit a cloud to one picture, with a prior for the sides nobody sees.
+
+    Args:
+        start: the cloud at iteration 0.
+        subject: the picture, straight alpha.
+        prior: judges random views.
+        rasterize: draws.
+        settings: every number of the stage.
+        generator: the source of all randomness.
+        report: called after every iteration with (iterations done, named losses).
+        input_camera: where the picture was taken from; the default is azimuth and elevation 0.
+
+    Raises:
+        FitDiverged: the loss became non-finite, or (almost) no Gaussian is left.
+    """
+    camera = replace(input_camera or OrbitCamera(), width=settings.reference_size, height=settings.reference_size)
+    color, alpha = resized(subject[None], settings.reference_size)
+    white = torch.tensor(WHITE)
+    cloud = _Cloud.of(start, rates(settings))
+    gradients = ScreenGradients.none(len(start))
+    for step in range(1, settings.iterations + 1):
+        progress = step / settings.iterations
+        cloud.adam.param_groups[0]["lr"] = log_linear(settings.mean_rate, settings.mean_rate_end, progress)
+        gaussians = cloud.gaussians
+
+        offsets = [torch.zeros(1, len(gaussians), 2, requires_grad=True)]
+        rendering = rasterize(gaussians, [camera], white, offsets[0])
+        seen = [(rendering.visible, settings.reference_size)]
+        reference = reference_loss(rendering, color, alpha, settings.color_weight, settings.alpha_weight)
+        loss = progress * reference
+        guidance = torch.zeros(())
+        if settings.views and settings.guidance_weight:
+            size = size_of(settings.ladder, progress)
+            views = [View(c) for c in viewpoints(prior, settings, size, generator)]
+            offsets.append(torch.zeros(len(views), len(gaussians), 2, requires_grad=True))
+            rendering = rasterize(gaussians, [view.camera for view in views], white, offsets[1])
+            seen.append((rendering.visible, size))
+            guidance = prior.loss(rendering.color, rendering.alpha, views, progress, generator)
+            loss = loss + settings.guidance_weight * guidance
+        if not torch.isfinite(loss):
+            raise Diverged(
+                f"fit_gaussians: the loss became {loss.item()} at iteration {step} of {settings.iterations}; "
+                "lower the learning rates (static.*_rate) or the weights",
+                gaussians.detach(),
+            )
+        cloud.adam.zero_grad(set_to_none=True)
+        loss.backward()
+        for offset, (visible, size) in zip(offsets, seen, strict=True):
+            if offset.grad is not None:
+                gradients.add(offset.grad, visible, size)
+        cloud.adam.step()
+        if step % settings.densify_every == 0 and step < settings.iterations:
+            control_density(cloud, gradients, settings, generator)
+            gradients = ScreenGradients.none(len(cloud.gaussians))
+            if len(cloud.gaussians) < FEWEST:
+                raise Diverged(
+                    f"fit_gaussians: {len(cloud.gaussians)} Gaussians are left at iteration {step} of "
+                    f"{settings.iterations}; lower static.prune_opacity or raise static.prune_scale",
+                    gaussians.detach(),
+                )
+        if step % settings.reset_opacity_every == 0 and step < settings.iterations:
+            cloud.parameters["opacity_logits"].data.copy_(reset_opacity(cloud.gaussians).opacity_logits)
+        report(
+            step,
+            {
+                "loss": loss.item(),
+                "reference": reference.item(),
+                "guidance": guidance.item(),
+                "Gaussians": len(cloud.gaussians),
+            },
+        )
+    return cloud.gaussians.detach()
+
+
+def rates(settings: StaticSettings) -> dict[str, float]:
+    """Learning rate of every field of the cloud at the start; the means come first."""
+    return {
+        "means": settings.mean_rate,
+        "harmonics": settings.color_rate,
+        "opacity_logits": settings.opacity_rate,
+        "log_scales": settings.scale_rate,
+        "quats": settings.rotation_rate,
+    }
+
+
+def viewpoints(
+    prior: GuidancePrior, settings: StaticSettings, size: int, generator: torch.Generator
+) -> list[OrbitCamera]:
+    """The random views of one iteration: all around, or out of those the prior knows."""
+    if prior.viewpoints is None:
+        return random_orbit(
+            settings.views,
+            size,
+            elevation_deg=(-settings.elevation_deg, settings.elevation_deg),
+            radius=(RADIUS - settings.radius_jitter, RADIUS + settings.radius_jitter),
+            generator=generator,
+        )
+    choice = torch.randint(len(prior.viewpoints), (settings.views,), generator=generator).tolist()
+    return [replace(prior.viewpoints[i], width=size, height=size) for i in choice]
+
+
+def control_density(
+    cloud: _Cloud, gradients: ScreenGradients, settings: StaticSettings, generator: torch.Generator
+) -> None:
+    """Grow where the views pull, then remove what is faint or too large."""
+    with torch.no_grad():
+        room = settings.max_points - len(cloud.gaussians)
+        pull = gradients.mean
+        grown = grow(cloud.gaussians, pull, settings.densify_gradient, settings.densify_scale, room, generator)
+        cloud.replace(grown)
+        cloud.replace(prune(cloud.gaussians, settings.prune_opacity, settings.prune_scale))

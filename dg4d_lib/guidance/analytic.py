@@ -1,0 +1,69 @@
+"""The exact denoiser of a picture that is known: the prior without weights.
+
+If the clean picture z0 of a view is known, the noise in x_t is (x_t - sqrt(alphabar) z0) / sqrt(1 - alphabar); the same
+score distillation then converges to z0. In pixel space, over white, with the alpha as a fourth channel.
+"""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.guidance.distillation import alphabars, annealed_timestep, score_distillation
+from dg4d_lib.guidance.interface import View
+
+LATENT_NUMBERS = 4 * 32 * 32  # of Zero-1-to-3; a pixel picture is weighted as if it had as many
+
+CleanPictures = Callable[[Sequence[View]], tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]]
+
+
+class AnalyticPrior:
+    """Score distillation towards known pictures.
+
+    Args:
+        clean: color over white and coverage of every view, at its camera's size.
+        noise_start: where the annealing begins, share of the schedule.
+        coverage_weight: of alpha against color.
+        viewpoints: the only cameras `clean` knows; None is all.
+        frames: the only frames `clean` knows; None is all.
+    """
+
+    def __init__(
+        self,
+        clean: CleanPictures,
+        noise_start: float,
+        coverage_weight: float,
+        viewpoints: tuple[OrbitCamera, ...] | None = None,
+        frames: tuple[int, ...] | None = None,
+    ) -> None:
+        self.clean, self.noise_start, self.coverage_weight = clean, noise_start, coverage_weight
+        self.viewpoints, self.frames = viewpoints, frames
+
+    def loss(
+        self,
+        images: Float[Tensor, "b h w 3"],
+        coverage: Float[Tensor, "b h w 1"],
+        views: Sequence[View],
+        progress: float,
+        generator: torch.Generator,
+    ) -> Float[Tensor, ""]:
+        """How far the renders are from the known pictures, weighted as at this moment of the annealing."""
+        timestep = annealed_timestep(progress, self.noise_start)
+        alphabar = float(alphabars()[timestep])
+        clean = self._encode(*self.clean(views))
+
+        def predict_noise(noisy: Float[Tensor, "b c h w"], _timestep: int) -> Float[Tensor, "b c h w"]:
+            return (noisy - alphabar**0.5 * clean) / (1 - alphabar) ** 0.5
+
+        pixels = 3 * images.shape[1] * images.shape[2]
+        loss = score_distillation(self._encode(images, coverage), predict_noise, timestep, generator)
+        return loss * (LATENT_NUMBERS / pixels)
+
+    def _encode(self, images: Float[Tensor, "b h w 3"], coverage: Float[Tensor, "b h w 1"]) -> Float[Tensor, "b c h w"]:
+        """Pixels as they are diffused: color and weighted alpha in [-1, 1]."""
+        channels = [2 * images - 1]
+        if self.coverage_weight:
+            channels.append(self.coverage_weight**0.5 * (2 * coverage - 1))
+        return torch.cat([channel.permute(0, 3, 1, 2) for channel in channels], 1)

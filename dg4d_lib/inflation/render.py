@@ -1,0 +1,88 @@
+"""Pictures of inflated surfaces."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numba import njit
+from torch import Tensor
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.errors import BadInput
+from dg4d_lib.inflation.surface import InflatedSurface
+from dg4d_lib.mesh_rasterizer.zbuffer import in_threads, rasterize_mesh
+
+
+def render_surface(
+    surfaces: InflatedSurface | Sequence[InflatedSurface], cameras: Sequence[OrbitCamera], supersample: int = 2
+) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
+    """What b cameras of one size see.
+
+    Args:
+        surfaces: one for all cameras, or one per camera.
+        cameras: where from.
+        supersample: samples per pixel and axis.
+
+    Returns:
+        Straight color in [0, 1] (0 where nothing is) and coverage in [0, 1].
+
+    Raises:
+        BadInput: cameras of different sizes, none, or another number of surfaces than cameras.
+    """
+    each = [surfaces] * len(cameras) if isinstance(surfaces, InflatedSurface) else list(surfaces)
+    sizes = {(camera.height, camera.width) for camera in cameras}
+    if len(sizes) != 1 or len(each) != len(cameras):
+        raise BadInput(
+            f"{len(each)} surfaces and {len(cameras)} cameras of sizes {sorted(sizes)}: one size is needed, "
+            "and one surface or as many as cameras"
+        )
+    height, width = sizes.pop()
+    color = np.empty((len(cameras), height, width, 3), np.float32)
+    coverage = np.empty((len(cameras), height, width, 1), np.float32)
+
+    def draw(view: int) -> None:
+        surface, camera = each[view], cameras[view]
+        fine = replace(camera, width=width * supersample, height=height * supersample)
+        fragments = rasterize_mesh(surface.vertices, surface.faces, [fine])
+        _shade(
+            fragments.faces[0].cpu().numpy(),
+            fragments.barycentrics[0].cpu().numpy(),
+            surface.faces.cpu().numpy(),
+            surface.colors.cpu().numpy(),
+            supersample,
+            color[view],
+            coverage[view],
+        )
+
+    in_threads(draw, len(cameras))
+    device = each[0].vertices.device
+    return torch.from_numpy(color).to(device), torch.from_numpy(coverage).to(device)
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def _shade(ids, weights, faces, colors, supersample, color, coverage):
+    """Interpolate the corners' colors and average the samples of every pixel."""
+    for row in range(color.shape[0]):
+        for column in range(color.shape[1]):
+            red = green = blue = 0.0
+            hits = 0
+            for y in range(row * supersample, (row + 1) * supersample):
+                for x in range(column * supersample, (column + 1) * supersample):
+                    face = ids[y, x]
+                    if face < 0:
+                        continue
+                    hits += 1
+                    for corner in range(3):
+                        weight, vertex = weights[y, x, corner], faces[face, corner]
+                        red += weight * colors[vertex, 0]
+                        green += weight * colors[vertex, 1]
+                        blue += weight * colors[vertex, 2]
+            share = 1.0 / max(hits, 1)
+            color[row, column, 0] = red * share
+            color[row, column, 1] = green * share
+            color[row, column, 2] = blue * share
+            coverage[row, column, 0] = hits / supersample**2

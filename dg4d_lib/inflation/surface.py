@@ -1,0 +1,156 @@
+"""From a cut-out picture to a closed, colored surface.
+
+Two sheets over one triangulation of the silhouette, welded along the outline: the front one carries the picture, the
+back one a guess. Both slide inwards along the rays of the input camera as they leave the plane z = 0, so the input view
+shows the picture exactly, the opposite view exactly its mirrored outline.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int
+from torch import Tensor
+from torch.nn.functional import interpolate, normalize
+
+from dg4d_lib.cameras.orbit import FOV_Y_DEG, RADIUS
+from dg4d_lib.errors import BadInput
+from dg4d_lib.inflation.colors import back_colors, front_colors
+from dg4d_lib.inflation.heights import heights
+from dg4d_lib.inflation.mask import subject_mask
+from dg4d_lib.inflation.sheet import Sheet, triangulate
+
+FARTHEST = 1.0  # world units: a turned plane leaves z = 0 by no more
+CELLS = 1 << 10  # of a space-filling curve, per axis
+
+
+@dataclass(frozen=True)
+class InflatedSurface:
+    """A closed triangle mesh with a color at every vertex.
+
+    Attributes:
+        vertices: world units.
+        faces: indices into `vertices`, counter-clockwise seen from outside.
+        colors: in [0, 1].
+        seen: whether the picture shows this vertex; the others are a guess.
+    """
+
+    vertices: Float[Tensor, "v 3"]
+    faces: Int[Tensor, "f 3"]
+    colors: Float[Tensor, "v 3"]
+    seen: Bool[Tensor, " v"]
+
+
+def inflate(cutout: Float[Tensor, "h w 4"], size: int, turn_deg: float = 0.0) -> InflatedSurface:
+    """A plausible shape for the subject of a picture taken by the input camera (azimuth and elevation 0, radius 2).
+
+    An opaque picture has no silhouette and becomes a slab.
+
+    Args:
+        cutout: square; straight alpha, color and alpha in [0, 1].
+        size: pixels of a side at which the surface is built.
+        turn_deg: how far the subject's plane is turned about the vertical; positive brings the right side of the
+            picture nearer to the camera. Between -60 and 60.
+
+    Raises:
+        BadInput: the picture is not square, or shows no subject.
+    """
+    if cutout.shape[0] != cutout.shape[1]:
+        raise BadInput(f"a picture to inflate must be square; given {cutout.shape[1]} x {cutout.shape[0]} pixels")
+    picture = resample(cutout, size).double().cpu().numpy()
+    mask, alpha = subject_mask(picture[..., 3])
+    pixel = 2 * RADIUS * math.tan(math.radians(FOV_Y_DEG) / 2) / size
+    across = (np.arange(size) + 0.5 - size / 2) * pixel
+    plane = np.clip(math.tan(math.radians(turn_deg)) * across, -FARTHEST, FARTHEST)
+    front = front_colors(picture[..., :3], alpha, mask)
+    sheet = triangulate(mask, alpha)
+    return _two_sheets(
+        sheet,
+        sheet.at(heights(mask, pixel)) * sheet.inside,
+        sheet.at(np.broadcast_to(plane, mask.shape)),
+        sheet.at(front),
+        sheet.at(back_colors(front, mask)),
+        pixel,
+    )
+
+
+def sample_surface(
+    surface: InflatedSurface, count: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n 3"], float]:
+    """Points spread evenly over the area.
+
+    The triangles are lined up along a space-filling curve and the line is cut into `count` pieces of equal area, each
+    of which gets one point.
+
+    Args:
+        surface: what to sample.
+        count: number of points n.
+        generator: where in its piece a point lies.
+
+    Returns:
+        Points (world units), outward unit normals, colors in [0, 1], and the surface's area (world units squared).
+    """
+    corners = surface.vertices.double()[surface.faces]
+    order = _curve_order(corners.mean(1))
+    corners, colors = corners[order], surface.colors[surface.faces[order]]
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    ends = torch.cumsum(normals.norm(dim=-1), 0)
+    along, u, v = torch.rand(3, count, generator=generator, dtype=torch.float64)
+    target = (torch.arange(count) + along) / count * ends[-1]
+    face = torch.searchsorted(ends, target, right=True).clamp(max=len(ends) - 1)
+    root = u.sqrt()
+    weights = torch.stack([1 - root, root * (1 - v), root * v], -1)[..., None]
+    return (
+        (weights * corners[face]).sum(1).to(surface.vertices),
+        normalize(normals[face], dim=-1).to(surface.vertices),
+        (weights * colors[face]).sum(1).to(surface.colors),
+        0.5 * ends[-1].item(),
+    )
+
+
+def resample(cutout: Float[Tensor, "h w 4"], size: int) -> Float[Tensor, "{size} {size} 4"]:
+    """The picture at another size; the colors of transparent pixels do not bleed in."""
+    if cutout.shape[0] == cutout.shape[1] == size:
+        return cutout
+    alpha = cutout[..., 3:]
+    planes = torch.cat([cutout[..., :3] * alpha, alpha], -1).permute(2, 0, 1)[None]
+    planes = interpolate(planes, (size, size), mode="bicubic", antialias=True)[0].permute(1, 2, 0)
+    return torch.cat([planes[..., :3] / planes[..., 3:].clamp(min=1e-4), planes[..., 3:]], -1).clamp(0, 1)
+
+
+def _two_sheets(
+    sheet: Sheet,
+    bulge: Float64[np.ndarray, " k"],
+    plane: Float64[np.ndarray, " k"],
+    front: Float64[np.ndarray, "k 3"],
+    back: Float64[np.ndarray, "k 3"],
+    pixel: float,
+) -> InflatedSurface:
+    """Lift the sheet by `bulge` (world units, 0 on the outline) to both sides of `plane` and weld it at the outline."""
+    ray = sheet.points * np.array([pixel, -pixel]) / RADIUS  # x and y per unit of distance from the camera's plane
+    place = ray * (RADIUS - plane - bulge)[:, None]
+    behind = np.flatnonzero(sheet.inside)
+    twin = np.arange(len(place))
+    twin[behind] = len(place) + np.arange(len(behind))
+    vertices = np.concatenate(
+        [np.column_stack([place, plane + bulge]), np.column_stack([place, plane - bulge])[behind]]
+    )
+    faces = np.concatenate([sheet.triangles[:, ::-1], twin[sheet.triangles]])
+    return InflatedSurface(
+        vertices=torch.from_numpy(vertices).float(),
+        faces=torch.from_numpy(faces),
+        colors=torch.from_numpy(np.concatenate([front, back[behind]])).float(),
+        seen=torch.arange(len(vertices)) < len(place),
+    )
+
+
+def _curve_order(points: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:
+    """The order of points along Morton's curve: near in the order is near in space."""
+    low = points.amin(0)
+    cell = ((points - low) / (points - low).amax().clamp(min=1e-9) * (CELLS - 1)).long()
+    code = torch.zeros(len(points), dtype=torch.long, device=points.device)
+    for bit in range(CELLS.bit_length() - 1):
+        for axis in range(3):
+            code |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
+    return torch.argsort(code, stable=True)

@@ -1,0 +1,160 @@
+"""A mesh that other programs like: one piece, manifold, even triangles, not too many (METHOD section 8).
+
+The work is pymeshlab's. It is GPL-3 and crashes when two threads of a process use it, so it runs in a process of its own,
+`python -m dg4d_lib.mesh.clean IN.npz OUT.npz`, and is imported nowhere else.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
+from dg4d_lib.settings import MeshSettings
+
+EXIT_MISSING = 69  # of the child: pymeshlab or its plugins are not here
+MERGE = 1e-4  # box units: vertices closer than this become one
+SMOOTHING = 10  # Taubin steps that take away the stairs of marching cubes and keep the volume
+REMESHING = 3  # rounds of isotropic remeshing
+MAX_HOLE = 100  # edges of a hole that is closed
+FILTERS = (
+    "meshing_merge_close_vertices",
+    "meshing_remove_duplicate_faces",
+    "meshing_remove_null_faces",
+    "apply_coord_taubin_smoothing",
+    "meshing_isotropic_explicit_remeshing",
+    "meshing_decimation_quadric_edge_collapse",
+    "meshing_repair_non_manifold_edges",
+    "meshing_repair_non_manifold_vertices",
+    "meshing_close_holes",
+    "meshing_re_orient_faces_coherently",
+    "meshing_remove_unreferenced_vertices",
+)
+
+
+def clean(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], settings: MeshSettings, unit: float = 1.0
+) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
+    """Merge, drop specks, smooth the stairs away, remesh evenly, repair, close holes, thin out; always the same result.
+
+    The edges become `settings.edge_length` long, or longer where that would give more than `settings.max_faces` faces.
+
+    Args:
+        vertices: world units.
+        faces: counter-clockwise seen from outside, as the result's.
+        settings: of the mesh.
+        unit: world length of one unit of the normalized box, in which `edge_length` is given.
+
+    Raises:
+        BadInput: there are no faces.
+        BackendUnavailable: pymeshlab, or a system library that its filters need, is missing.
+        DG4DError: the cleaning process died or left nothing.
+    """
+    if len(faces) == 0:
+        raise BadInput("a mesh without faces cannot be cleaned; lower mesh.density_threshold")
+    vertices, faces = drop_small_components(vertices, faces, settings.min_component)
+    length = max(settings.edge_length, _edge_length_of(vertices / unit, faces, settings.max_faces))
+    with tempfile.TemporaryDirectory(prefix="dg4d-clean-") as folder:
+        given, cleaned = Path(folder) / "given.npz", Path(folder) / "cleaned.npz"
+        np.savez(
+            given,
+            vertices=np.asarray(vertices, np.float64) / unit,
+            faces=np.asarray(faces, np.int32),
+            edge_length=length,
+            max_faces=settings.max_faces,
+        )
+        command = [sys.executable, "-m", "dg4d_lib.mesh.clean", str(given), str(cleaned)]
+        child = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+        if child.returncode == EXIT_MISSING:
+            raise BackendUnavailable(child.stderr.strip())
+        if child.returncode != 0 or not cleaned.exists():
+            raise DG4DError(_obituary(child))
+        with np.load(cleaned) as arrays:
+            vertices, faces = arrays["vertices"], arrays["faces"]
+    vertices, faces = drop_small_components(vertices, faces, settings.min_component)
+    if len(faces) == 0:
+        raise DG4DError("mesh cleaning left no faces; raise mesh.grid or lower mesh.edge_length")
+    return (vertices * unit).astype(np.float32), faces.astype(np.int32)
+
+
+def drop_small_components(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], share: float
+) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
+    """Only the connected pieces with at least this share of the faces, and always the largest one."""
+    if len(faces) == 0:
+        return vertices[:0], faces
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]]).T
+    graph = coo_array((np.ones(ends.shape[1], bool), tuple(ends)), shape=(len(vertices),) * 2)
+    piece = connected_components(graph, directed=False)[1][faces[:, 0]]
+    sizes = np.bincount(piece)
+    kept = faces[(sizes >= min(share * len(faces), sizes.max()))[piece]]
+    used, renumbered = np.unique(kept, return_inverse=True)
+    return vertices[used], renumbered.reshape(kept.shape).astype(faces.dtype)
+
+
+def _edge_length_of(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], count: int) -> float:
+    """The edge of equilateral triangles of which a tenth less than `count` cover the surface."""
+    a, b, c = (vertices[faces[:, i]].astype(np.float64) for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+    return float(np.sqrt(area / (0.9 * count) * 4 / np.sqrt(3)))
+
+
+def _obituary(child: subprocess.CompletedProcess[str]) -> str:
+    code = child.returncode
+    how = f"was stopped by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
+    last = "; ".join(child.stderr.strip().splitlines()[-3:]) or "it said nothing"
+    return f"the process that cleans the mesh {how} ({last}); run it again, or lower mesh.grid or mesh.max_faces"
+
+
+def _clean_here(given: Path, cleaned: Path) -> None:
+    """What the child does, in units of the normalized box."""
+    try:
+        import pymeshlab  # noqa: PLC0415  (only the child may have it)
+    except ImportError as error:
+        _give_up(f"pymeshlab cannot be imported ({error})")
+    missing = sorted(set(FILTERS) - set(pymeshlab.filter_list()))
+    if missing:
+        _give_up(f"pymeshlab has no filter {missing[0]} and {len(missing) - 1} others that are needed")
+    with np.load(given) as arrays:
+        mesh = pymeshlab.Mesh(arrays["vertices"], arrays["faces"])
+        length, max_faces = float(arrays["edge_length"]), int(arrays["max_faces"])
+    ms = pymeshlab.MeshSet(verbose=False)
+    ms.add_mesh(mesh)
+    ms.meshing_merge_close_vertices(threshold=pymeshlab.PureValue(MERGE))
+    ms.meshing_remove_duplicate_faces()
+    ms.meshing_remove_null_faces()
+    ms.apply_coord_taubin_smoothing(stepsmoothnum=SMOOTHING, selected=False)
+    ms.meshing_isotropic_explicit_remeshing(
+        iterations=REMESHING, targetlen=pymeshlab.PureValue(length), selectedonly=False, checksurfdist=False
+    )
+    if ms.current_mesh().face_number() > max_faces:
+        ms.meshing_decimation_quadric_edge_collapse(
+            targetfacenum=max_faces, preservenormal=True, preservetopology=True, selected=False
+        )
+    ms.meshing_repair_non_manifold_edges(method="Remove Faces")
+    ms.meshing_repair_non_manifold_vertices()
+    ms.meshing_close_holes(maxholesize=MAX_HOLE, newfaceselected=False, selfintersection=False, selected=False)
+    ms.meshing_re_orient_faces_coherently()
+    ms.meshing_remove_unreferenced_vertices()
+    result = ms.current_mesh()
+    np.savez(cleaned, vertices=result.vertex_matrix(), faces=result.face_matrix().astype(np.int32))
+
+
+def _give_up(reason: str) -> None:
+    sys.stderr.write(
+        f"mesh cleaning cannot run here: {reason}; install pymeshlab and the system libraries its filters load, "
+        "on Debian: apt-get install libgl1 libopengl0\n"
+    )
+    sys.stderr.flush()
+    os._exit(EXIT_MISSING)
+
+
+if __name__ == "__main__":
+    _clean_here(Path(sys.argv[1]), Path(sys.argv[2]))

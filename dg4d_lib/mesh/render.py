@@ -1,0 +1,61 @@
+"""Pictures of a textured mesh: unlit, the texture as it is."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, grid_sample
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.mesh_rasterizer.zbuffer import Fragments, interpolate, rasterize_mesh
+
+SUPERSAMPLING = 2  # samples of a pixel along each axis
+
+
+def render_mesh(
+    mesh: TexturedMesh, cameras: Sequence[OrbitCamera], offsets: Float[Tensor, "*b v 3"] | None = None
+) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
+    """Color and coverage of a mesh, four samples a pixel.
+
+    Args:
+        mesh: at rest.
+        cameras: b cameras of one width and height.
+        offsets: added to the vertices, world units; the same for all cameras ("v 3") or one state per camera ("b v 3").
+
+    Returns:
+        Straight color in [0, 1] (0 where nothing is) and coverage in {0, 1/4, 1/2, 3/4, 1}.
+
+    Raises:
+        BadInput: no cameras, cameras of different sizes, or another number of states than cameras.
+    """
+    fine = [
+        replace(camera, width=SUPERSAMPLING * camera.width, height=SUPERSAMPLING * camera.height) for camera in cameras
+    ]
+    vertices = mesh.vertices if offsets is None else mesh.vertices + offsets
+    fragments = rasterize_mesh(vertices, mesh.faces, fine)
+    covered = (fragments.faces >= 0)[..., None].to(mesh.texture)
+    color = _pooled(sample_texture(mesh, fragments))
+    coverage = _pooled(covered)
+    return color / coverage.clamp_min(0.5 / SUPERSAMPLING**2), coverage
+
+
+def sample_texture(mesh: TexturedMesh, fragments: Fragments) -> Float[Tensor, "b h w 3"]:
+    """The texture under every pixel, bilinear; zeros where no triangle is. Differentiable in the texture."""
+    places = interpolate(fragments, mesh.faces, mesh.uvs)
+    covered = fragments.faces >= 0
+    color = mesh.texture.new_zeros((*covered.shape, 3))
+    color[covered] = sample(mesh.texture, places[covered])
+    return color
+
+
+def sample(picture: Float[Tensor, "h w c"], places: Float[Tensor, "n 2"]) -> Float[Tensor, "n c"]:
+    """Bilinear samples of a picture at places in [0, 1], u right and v down; its border goes on outside."""
+    grid = (2 * places - 1).to(picture)[None, None]
+    return grid_sample(picture.movedim(-1, 0)[None], grid, align_corners=False, padding_mode="border")[0, :, 0].T
+
+
+def _pooled(values: Float[Tensor, "b h w c"]) -> Float[Tensor, "b i j c"]:
+    return avg_pool2d(values.movedim(-1, 1), SUPERSAMPLING).movedim(1, -1)

@@ -1,0 +1,265 @@
+"""The rasterizer for processors: Numba kernels with explicit vectors, hand-written gradients, float32.
+
+Per view: project (`cpu_project`), sort by depth and list per tile (`cpu_bins`), blend the tiles (`cpu_tiles`); backward
+runs through the lists from the back. Threads take whole views, or tiles when there are fewer views than threads; every
+sum has one fixed order, so the bytes of the result depend on neither the threads' number nor their timing.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.errors import BadInput
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.rasterizer.cpu_bins import TILE, bin_by_tile
+from dg4d_lib.rasterizer.cpu_blend import PLANE
+from dg4d_lib.rasterizer.cpu_project import CAMERA, RECORD, project, unproject
+from dg4d_lib.rasterizer.cpu_tiles import blend, blend_backward, gather
+from dg4d_lib.rasterizer.cpu_workers import Scratch, ranges, run
+from dg4d_lib.rasterizer.interface import FRUSTUM_MARGIN, Rendering, shared_size, state_per_camera
+
+Array = NDArray[Any]
+
+_ALIGNED = 4096  # ranges of Gaussians begin at multiples, so that the compiler's loop remainders fall on the same ones
+
+
+def rasterize(
+    gaussians: Gaussians,
+    cameras: Sequence[OrbitCamera],
+    background: Float[Tensor, " 3"],
+    screen_offsets: Float[Tensor, "b n 2"] | None = None,
+) -> Rendering:
+    """Render every camera's picture; differentiable once, in the Gaussians and `screen_offsets` (taken to be zero).
+
+    Computed in float32; pictures and gradients come back in the precision of the Gaussians. Gaussians with a non-finite
+    place or shape are not drawn. For the arguments see `Rasterizer`.
+
+    Raises:
+        BadInput: no cameras, cameras of different sizes, a number of states other than the number of cameras, or
+            tensors that are not in the processor's memory.
+    """
+    height, width = shared_size(cameras)
+    state_per_camera(gaussians, cameras)
+    if gaussians.means.device.type != "cpu":
+        raise BadInput(f"rasterizer 'cpu' needs tensors on the cpu; given {gaussians.means.device}; move them there")
+    inputs = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
+    color, alpha, depth, visible = _Rasterize.apply(
+        *(value.float() for value in inputs),
+        None if screen_offsets is None else screen_offsets.float(),
+        torch.stack([_packed(camera) for camera in cameras]),
+        background.detach().float(),
+        (height, width),
+    )
+    color, alpha, depth = (plane.permute(0, 2, 3, 1).to(gaussians.means.dtype) for plane in (color, alpha, depth))
+    return Rendering(color, alpha, depth, visible)
+
+
+def _packed(camera: OrbitCamera) -> Float[Tensor, " c"]:
+    """A camera as the kernels read it."""
+    pose = camera.world_to_camera()
+    tan_x, tan_y = camera.tan_half_fov
+    lens = (camera.focal, camera.width / 2, camera.height / 2, FRUSTUM_MARGIN * tan_x, FRUSTUM_MARGIN * tan_y)
+    packed = torch.cat((pose[:3, :3].flatten(), pose[:3, 3], pose.new_tensor(lens))).float()
+    assert len(packed) == CAMERA
+    return packed
+
+
+@dataclass
+class _Clouds:
+    """The inputs as arrays; means, quats and scales have one state, or one per view."""
+
+    means: Array
+    quats: Array
+    scales: Array
+    opacities: Array
+    colors: Array
+
+    def __len__(self) -> int:
+        return len(self.opacities)
+
+    def state(self, view: int) -> tuple[Array, Array, Array]:
+        """Means, quats and scales of a view."""
+        if self.means.ndim == 2:
+            return self.means, self.quats, self.scales
+        return self.means[view], self.quats[view], self.scales[view]
+
+
+@dataclass
+class _Pictures:
+    """What forward draws with, kept for backward."""
+
+    cameras: Array
+    background: Array
+    size: tuple[int, int]
+    count: int  # Gaussians
+    scratch: Scratch = field(default_factory=Scratch)
+
+    def __post_init__(self) -> None:
+        (height, width), views = self.size, len(self.cameras)
+        self.across, self.down = -(-width // TILE), -(-height // TILE)
+        tiles = self.across * self.down
+        self.records = self.scratch.empty((views, self.count, RECORD))
+        self.keys = self.scratch.empty((views, self.count))
+        self.transmittance = self.scratch.empty((views, height, width))
+        self.stops = self.scratch.empty((views, tiles, PLANE))
+        self.stopped = self.scratch.empty((views, tiles), np.bool_)
+        self.bins: list[tuple[Array, Array]] = [(np.zeros(1, np.int64), np.zeros(0, np.uint32))] * views
+
+    @property
+    def views(self) -> range:
+        """Indices of the views."""
+        return range(len(self.cameras))
+
+    @property
+    def tiles(self) -> int:
+        """Number of tiles of a view."""
+        return self.across * self.down
+
+    @property
+    def by_view(self) -> bool:
+        """Whether threads take whole views; else they share the tiles of each."""
+        return len(self.cameras) >= torch.get_num_threads()
+
+    def draw(self, clouds: _Clouds) -> list[Tensor]:
+        """Color, alpha and depth by planes; they are not kept here, for they will hold the graph that holds this."""
+        pictures = [torch.empty(len(self.cameras), planes, *self.size) for planes in (3, 1, 1)]
+        planes = [picture.numpy() for picture in pictures]
+        if self.by_view:
+            run([partial(self._draw_view, clouds, planes, view) for view in self.views])
+        else:
+            threads = torch.get_num_threads()
+            parts = ranges(len(clouds), threads, _ALIGNED)
+            run([partial(self._project, clouds, view, *part) for view in self.views for part in parts])
+            run([partial(self._bin, view) for view in self.views])
+            parts = ranges(self.tiles, 4 * threads)
+            run([partial(self._blend, planes, view, *part) for view in self.views for part in parts])
+        return pictures
+
+    def _draw_view(self, clouds: _Clouds, planes: list[Array], view: int) -> None:
+        self._project(clouds, view, 0, len(clouds))
+        self._bin(view)
+        self._blend(planes, view, 0, self.tiles)
+
+    def _project(self, clouds: _Clouds, view: int, start: int, stop: int) -> None:
+        means, quats, scales = clouds.state(view)
+        records, keys = self.records[view], self.keys[view]
+        opacities, colors, camera = clouds.opacities, clouds.colors, self.cameras[view]
+        project(means, quats, scales, opacities, colors, camera, *self.size, records, keys, start, stop)
+
+    def _bin(self, view: int) -> None:
+        self.bins[view] = bin_by_tile(self.records[view], self.keys[view], self.across, self.down)
+
+    def _blend(self, planes: list[Array], view: int, first: int, last: int) -> None:
+        color, alpha, depth = (plane[view] for plane in planes)
+        kept = (self.transmittance[view], self.stops[view], self.stopped[view])
+        blend(self.records[view], *self.bins[view], self.background, color, alpha[0], depth[0], *kept, first, last)
+
+
+@dataclass
+class _Gradients:
+    """What backward makes."""
+
+    clouds: _Clouds
+    pictures: _Pictures
+    color: Array
+    alpha: Array
+    depth: Array
+
+    def __post_init__(self) -> None:
+        clouds = self.clouds
+        self.means, self.quats, self.scales, self.opacities, self.colors = (
+            np.zeros_like(value)
+            for value in (clouds.means, clouds.quats, clouds.scales, clouds.opacities, clouds.colors)
+        )
+        self.centers = np.zeros((len(self.pictures.cameras), len(clouds), 2), np.float32)
+
+    def collect(self) -> None:
+        """Fill the gradients, some views at a time to bound the memory; the views are summed in their order."""
+        pictures, threads = self.pictures, torch.get_num_threads()
+        together = 2 * threads
+        scratch = Scratch()
+        moments = scratch.empty((min(together, len(pictures.cameras)), len(self.clouds), RECORD))
+        for first in pictures.views[::together]:
+            group = pictures.views[first : first + together]
+            if pictures.by_view:
+                run([partial(self._blend_view, view, moments[view - first]) for view in group])
+            else:
+                self._blend_tiles(group, moments)
+            parts = ranges(len(self.clouds), threads, _ALIGNED)
+            run([partial(self._unproject, group, moments, *part) for part in parts])
+
+    def _blend_view(self, view: int, moments: Array) -> None:
+        moments[:] = 0
+        _, entries = self.pictures.bins[view]
+        self._blend(view, entries, moments, 0, self.pictures.tiles)
+
+    def _blend_tiles(self, group: range, moments: Array) -> None:
+        """Every entry of the tiles' lists gets a row of its own, so that tiles can run at once."""
+        pictures, scratch = self.pictures, Scratch()
+        jobs, sums = [], []
+        for view in group:
+            _, entries = pictures.bins[view]
+            slots = np.arange(len(entries), dtype=np.uint32)
+            rows = scratch.empty((len(entries), RECORD))
+            rows[:] = 0
+            parts = ranges(pictures.tiles, 4 * torch.get_num_threads())
+            jobs += [partial(self._blend, view, slots, rows, *part) for part in parts]
+            sums.append(partial(_sum_rows, entries, rows, moments[view - group.start]))
+        run(jobs)
+        run(sums)
+
+    def _blend(self, view: int, slots: Array, moments: Array, first: int, last: int) -> None:
+        pictures = self.pictures
+        kept = (pictures.transmittance[view], pictures.stops[view], pictures.stopped[view])
+        incoming = (pictures.background, self.color[view], self.alpha[view, 0], self.depth[view, 0])
+        blend_backward(pictures.records[view], *pictures.bins[view], *incoming, *kept, slots, moments, first, last)
+
+    def _unproject(self, group: range, moments: Array, start: int, stop: int) -> None:
+        clouds, pictures = self.clouds, self.pictures
+        for view in group:
+            means, quats, scales = clouds.state(view)
+            shared = clouds.means.ndim == 2
+            own = [grad if shared else grad[view] for grad in (self.means, self.quats, self.scales)]
+            unproject(
+                means, quats, scales, clouds.opacities, pictures.cameras[view], pictures.keys[view],
+                moments[view - group.start], *own, self.opacities, self.colors, self.centers[view], start, stop,
+            )  # fmt: skip
+
+
+def _sum_rows(entries: Array, rows: Array, moments: Array) -> None:
+    moments[:] = 0
+    gather(entries, rows, moments)
+
+
+class _Rasterize(torch.autograd.Function):
+    """The bridge to autograd."""
+
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        *tensors, offsets, cameras, background, size = inputs
+        clouds = _Clouds(*(tensor.detach().contiguous().numpy() for tensor in tensors))
+        pictures = _Pictures(cameras.numpy(), background.contiguous().numpy(), size, len(clouds))
+        color, alpha, depth = pictures.draw(clouds)
+        visible = torch.from_numpy(pictures.keys > 0)
+        ctx.mark_non_differentiable(visible)
+        ctx.clouds, ctx.pictures, ctx.offsets = clouds, pictures, offsets is not None
+        return color, alpha, depth, visible
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *incoming: Tensor) -> tuple[Any, ...]:
+        planes = [gradient.contiguous().numpy() for gradient in incoming[:3]]
+        found = _Gradients(ctx.clouds, ctx.pictures, *planes)
+        found.collect()
+        gradients = (found.means, found.quats, found.scales, found.opacities, found.colors)
+        centers = torch.from_numpy(found.centers) if ctx.offsets else None
+        return (*(torch.from_numpy(gradient) for gradient in gradients), centers, None, None, None)

@@ -1,0 +1,166 @@
+"""Sixteen float lanes inside Numba: LLVM vector instructions, built as expressions.
+
+Numba does not vectorize the blending loops by itself (branches, reductions, possible aliasing), so they are emitted as
+LLVM vectors; LLVM lowers them to what the machine has: one AVX-512 register, two of AVX2, four of SSE or NEON.
+
+Numba's cache on disk looks at the file of a kernel only: after a change in a file that kernels import from, delete the
+`*.nbi` files beside them.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils
+
+Value: TypeAlias = Any  # an llvmlite value; that library's types do not know their attributes
+
+LANES = 16
+FLOAT, INT, LONG = ir.FloatType(), ir.IntType(32), ir.IntType(64)
+FLOATS, INTS = ir.VectorType(FLOAT, LANES), ir.VectorType(INT, LANES)
+FAST = ("nsz", "arcp", "contract", "reassoc")  # not nnan and ninf: comparisons must refuse what is not finite
+KERNEL = {"fastmath": {*FAST, "afn"}, "nogil": True, "cache": True, "error_model": "numpy"}  # options of njit
+INLINE = {**KERNEL, "forceinline": True}
+_EXP2 = (1.3333558e-3, 9.6181291e-3, 5.5504109e-2, 2.4022651e-1, 6.9314718e-1, 1.0)  # of 2^f, |f| <= 1/2
+
+
+class Vectors:
+    """Expressions on vectors of `LANES` floats at the builder's place.
+
+    `fma` is llvm.fmuladd: fused where the machine can, two instructions elsewhere (llvm.fma would call libm there).
+    """
+
+    def __init__(self, builder: ir.IRBuilder) -> None:
+        self.builder = builder
+
+    def constant(self, values: float | Sequence[float]) -> Value:
+        """The same float in all lanes, or one per lane."""
+        lanes = np.broadcast_to(np.asarray(values, np.float32), LANES)
+        return ir.Constant(FLOATS, [float(value) for value in lanes])
+
+    def integers(self, values: int | Sequence[int]) -> Value:
+        """The same int32 in all lanes, or one per lane."""
+        return ir.Constant(INTS, [int(value) for value in np.broadcast_to(values, LANES)])
+
+    def splat(self, scalar: Value, lanes: int = LANES) -> Value:
+        """A vector with a scalar in all lanes."""
+        undefined = ir.Constant(ir.VectorType(scalar.type, lanes), ir.Undefined)
+        first = self.builder.insert_element(undefined, scalar, ir.Constant(INT, 0))
+        return self.builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(INT, lanes), [0] * lanes))
+
+    def add(self, a: Value, b: Value) -> Value:
+        """a + b."""
+        return self.builder.fadd(a, b, flags=FAST)
+
+    def subtract(self, a: Value, b: Value) -> Value:
+        """a - b."""
+        return self.builder.fsub(a, b, flags=FAST)
+
+    def multiply(self, a: Value, b: Value) -> Value:
+        """a * b."""
+        return self.builder.fmul(a, b, flags=FAST)
+
+    def reciprocal(self, a: Value) -> Value:
+        """1 / a."""
+        return self.builder.fdiv(self.constant(1), a, flags=FAST)
+
+    def negate(self, a: Value) -> Value:
+        """-a."""
+        return self.builder.fneg(a)
+
+    def fma(self, a: Value, b: Value, c: Value) -> Value:
+        """a * b + c."""
+        return self.call("fmuladd", a, b, c)
+
+    def less(self, a: Value, b: Value) -> Value:
+        """A mask of a < b."""
+        return self.builder.fcmp_ordered("<", a, b)
+
+    def at_most(self, a: Value, b: Value) -> Value:
+        """A mask of a <= b."""
+        return self.builder.fcmp_ordered("<=", a, b)
+
+    def select(self, mask: Value, a: Value, b: Value) -> Value:
+        """A where the mask is set, else b."""
+        return self.builder.select(mask, a, b)
+
+    def minimum(self, a: Value, b: Value) -> Value:
+        """The lesser; scalars too."""
+        return self.select(self.less(a, b), a, b)
+
+    def maximum(self, a: Value, b: Value) -> Value:
+        """The greater; scalars too."""
+        return self.select(self.less(b, a), a, b)
+
+    def call(self, name: str, *arguments: Value) -> Value:
+        """An LLVM intrinsic on vectors: sqrt, ceil, floor, rint, fmuladd."""
+        signature = ir.FunctionType(FLOATS, [FLOATS] * len(arguments))
+        function = cgutils.get_or_insert_function(self.builder.module, signature, f"llvm.{name}.v{LANES}f32")
+        return self.builder.call(function, arguments)
+
+    def exp2(self, a: Value) -> Value:
+        """2^a for a <= 127; below -126 it stays at 2^-126. Relative error 2e-7."""
+        a = self.maximum(a, self.constant(-126))
+        whole = self.call("rint", a)
+        fraction = self.subtract(a, whole)
+        power = self.constant(_EXP2[0])
+        for coefficient in _EXP2[1:]:
+            power = self.fma(power, fraction, self.constant(coefficient))
+        exponent = self.builder.shl(self.builder.fptosi(whole, INTS), self.integers(23))
+        return self.builder.bitcast(self.builder.add(self.builder.bitcast(power, INTS), exponent), FLOATS)
+
+    def sum(self, a: Value) -> Value:
+        """The sum of the lanes, a scalar."""
+        signature = ir.FunctionType(FLOAT, [FLOAT, FLOATS])
+        name = f"llvm.vector.reduce.fadd.v{LANES}f32"
+        function = cgutils.get_or_insert_function(self.builder.module, signature, name)
+        return self.builder.call(function, [ir.Constant(FLOAT, 0.0), a], fastmath=FAST)
+
+    def load(self, pointer: Value, index: Value, kind: ir.Type = FLOATS) -> Value:
+        """A vector or a scalar that begins at an element of a float or int32 array; no alignment needed."""
+        return self.builder.load(self._place(pointer, index, kind), align=4, typ=kind)
+
+    def store(self, pointer: Value, index: Value, value: Value) -> None:
+        """Write a vector or a scalar from an element of a float or int32 array on."""
+        self.builder.store(value, self._place(pointer, index, value.type), align=4)
+
+    def _place(self, pointer: Value, index: Value, kind: ir.Type) -> Value:
+        return self.builder.bitcast(self.builder.gep(pointer, [index], source_etype=FLOAT), kind.as_pointer())
+
+    def loop(
+        self,
+        start: Value,
+        stop: Value,
+        carried: Sequence[Value],
+        body: Callable[[Value, list[Value]], Sequence[Value]],
+        step: int = 1,
+    ) -> list[Value]:
+        """A counted loop; `body` gets the index and the carried values and gives their next ones.
+
+        Returns:
+            The carried values after the last turn.
+        """
+        builder = self.builder
+        before, inside, after = (
+            builder.basic_block,
+            builder.append_basic_block("loop"),
+            builder.append_basic_block("done"),
+        )
+        builder.cbranch(builder.icmp_signed("<", start, stop), inside, after)
+        builder.position_at_end(inside)
+        current = [builder.phi(value.type) for value in (start, *carried)]
+        for phi, value in zip(current, (start, *carried), strict=True):
+            phi.add_incoming(value, before)
+        results = body(current[0], current[1:])
+        index = builder.add(current[0], ir.Constant(start.type, step))
+        end = builder.basic_block
+        for phi, value in zip(current, (index, *results), strict=True):
+            phi.add_incoming(value, end)
+        builder.cbranch(builder.icmp_signed("<", index, stop), inside, after)
+        builder.position_at_end(after)
+        final = [builder.phi(value.type) for value in carried]
+        for phi, first, last in zip(final, carried, results, strict=True):
+            phi.add_incoming(first, before)
+            phi.add_incoming(last, end)
+        return final

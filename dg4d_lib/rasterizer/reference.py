@@ -1,0 +1,136 @@
+"""The rasterizer that defines the others: plain torch, every pixel against every Gaussian, gradients by autograd.
+
+Notation of Kerbl et al. 2023, section 4 (name here -> symbol there): `half` -> J W R S, `jacobian` -> J,
+`covariances` -> Sigma', `sigma` -> the exponent s of alpha = o e^-s, `transmittance` -> T.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import log
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.geometry.quaternion import rotation_matrix
+from dg4d_lib.rasterizer.interface import (
+    BLUR,
+    FRUSTUM_MARGIN,
+    MAX_ALPHA,
+    MAX_SIGMA,
+    MIN_ALPHA,
+    MIN_TRANSMITTANCE,
+    NEAR,
+    Rendering,
+    shared_size,
+    state_per_camera,
+)
+
+_PAIRS_AT_ONCE = 1 << 22  # pixels times Gaussians of one chunk, bounds the memory
+
+
+def rasterize(
+    gaussians: Gaussians,
+    cameras: Sequence[OrbitCamera],
+    background: Float[Tensor, " 3"],
+    screen_offsets: Float[Tensor, "b n 2"] | None = None,
+) -> Rendering:
+    """Render every camera's picture in the precision of the Gaussians, float32 or float64.
+
+    Gaussians with a non-finite place or shape are not drawn. For the arguments see `Rasterizer`.
+
+    Raises:
+        BadInput: no cameras, cameras of different sizes, or a number of states other than the number of cameras.
+    """
+    height, width = shared_size(cameras)
+    moving = state_per_camera(gaussians, cameras)
+    background = background.to(gaussians.means)
+    views = []
+    for view, camera in enumerate(cameras):
+        splats = _project(gaussians.at(view) if moving else gaussians, camera)
+        if screen_offsets is not None:
+            splats.centers = splats.centers + screen_offsets[view].to(splats.centers)
+        views.append(_picture(splats, background, height, width))
+    color, alpha, depth, visible = (torch.stack(parts) for parts in zip(*views, strict=True))
+    return Rendering(color, alpha, depth, visible)
+
+
+@dataclass
+class _Splats:
+    """Gaussians on the screen of one camera, pixels."""
+
+    centers: Float[Tensor, "n 2"]
+    covariances: Float[Tensor, "n 2 2"]
+    depths: Float[Tensor, " n"]
+    opacities: Float[Tensor, " n"]
+    colors: Float[Tensor, "n 3"]
+
+    def __getitem__(self, index: Int[Tensor, " m"]) -> "_Splats":
+        return _Splats(*(value[index] for value in vars(self).values()))
+
+
+def _project(gaussians: Gaussians, camera: OrbitCamera) -> _Splats:
+    pose = camera.world_to_camera().to(gaussians.means)
+    rotation, translation = pose[:3, :3], pose[:3, 3]
+    x, y, z = (gaussians.means @ rotation.T + translation).unbind(-1)
+    focal, (tan_x, tan_y) = camera.focal, camera.tan_half_fov
+    centers = torch.stack((focal * x / z + 0.5 * camera.width, focal * y / z + 0.5 * camera.height), -1)
+    clamped_x = z * (x / z).clamp(-FRUSTUM_MARGIN * tan_x, FRUSTUM_MARGIN * tan_x)
+    clamped_y = z * (y / z).clamp(-FRUSTUM_MARGIN * tan_y, FRUSTUM_MARGIN * tan_y)
+    zero = torch.zeros_like(z)
+    jacobian = focal * torch.stack(
+        (1 / z, zero, -clamped_x / z**2, zero, 1 / z, -clamped_y / z**2), -1
+    ).unflatten(-1, (2, 3))  # fmt: skip
+    half = jacobian @ rotation @ (rotation_matrix(gaussians.quats) * gaussians.scales[:, None, :])
+    covariances = half @ half.mT + BLUR * torch.eye(2).to(half)
+    return _Splats(centers, covariances, z, gaussians.opacities, gaussians.colors)
+
+
+def _picture(
+    splats: _Splats, background: Float[Tensor, " 3"], height: int, width: int
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"], Float[Tensor, "h w 1"], Bool[Tensor, " n"]]:
+    visible = _visible(splats, height, width)
+    order = torch.argsort(splats.depths.detach(), stable=True)
+    drawn = splats[order[visible[order]]]
+    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    pixels = torch.stack((columns, rows), -1).reshape(-1, 2).to(background)
+    if drawn.depths.numel() == 0:
+        blank = torch.zeros(height, width, 1).to(background)
+        return background.expand(height, width, 3).clone(), blank, blank.clone(), visible
+    chunk = max(1, _PAIRS_AT_ONCE // drawn.depths.numel())
+    parts = [checkpoint(_blend, part, drawn, background, use_reentrant=False) for part in pixels.split(chunk)]
+    color, alpha, depth = torch.cat(parts).reshape(height, width, 5).split((3, 1, 1), -1)
+    return color, alpha, depth, visible
+
+
+@torch.no_grad()
+def _visible(splats: _Splats, height: int, width: int) -> Bool[Tensor, " n"]:
+    """In front of the camera, opaque enough, and with a bounding box that holds a pixel center."""
+    opaque = splats.opacities > MIN_ALPHA
+    reach = (2 * (splats.opacities.clamp(min=MIN_ALPHA).log() - log(MIN_ALPHA))).sqrt().clamp(max=MAX_SIGMA)
+    extent = reach[:, None] * splats.covariances.diagonal(dim1=-2, dim2=-1).sqrt()
+    size = torch.tensor((width, height)).to(splats.centers)
+    on_screen = ((splats.centers + extent > 0.5) & (splats.centers - extent < size - 0.5)).all(-1)
+    finite = splats.centers.isfinite().all(-1) & torch.linalg.det(splats.covariances).isfinite()
+    return opaque & on_screen & finite & (splats.depths > NEAR)
+
+
+def _blend(pixels: Float[Tensor, "p 2"], splats: _Splats, background: Float[Tensor, " 3"]) -> Float[Tensor, "p 5"]:
+    """Color, alpha and depth at these places, from Gaussians in order of depth."""
+    (xx, xy), (_, yy) = splats.covariances.permute(1, 2, 0)
+    determinant = xx * yy - xy * xy
+    dx, dy = (pixels[:, None] - splats.centers).unbind(-1)
+    sigma = (0.5 * (yy * dx * dx + xx * dy * dy) - xy * dx * dy) / determinant
+    alpha = (splats.opacities * (-sigma).exp()).clamp(max=MAX_ALPHA)
+    alpha = torch.where(alpha >= MIN_ALPHA, alpha, 0)
+    with torch.no_grad():  # once at the limit always at the limit: the product of all never grows
+        blended = (1 - alpha).cumprod(-1) > MIN_TRANSMITTANCE
+    alpha = torch.where(blended, alpha, 0)
+    after = (1 - alpha).cumprod(-1)
+    before = torch.cat((torch.ones_like(after[:, :1]), after[:, :-1]), -1)
+    weights, transmittance = alpha * before, after[:, -1:]
+    color = weights @ splats.colors + transmittance * background
+    return torch.cat((color, 1 - transmittance, weights @ splats.depths[:, None]), -1)

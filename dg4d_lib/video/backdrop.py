@@ -1,0 +1,154 @@
+"""Subjects before a plain backdrop: one smooth model of the backdrop for all frames, and a flood from the border.
+
+The backdrop's color is a low polynomial in x and y, fitted robustly to the border, so gradients and vignettes are plain
+too and a subject may touch the border. What the flood reaches from the border is backdrop; soft shadows on it are too.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from scipy import ndimage
+
+BORDER = 0.02  # of the longest side: width of the ring on which the backdrop is learned
+BORDER_DEGREE = 2  # of the polynomial that the border can support
+FLOODED_DEGREE = 4  # and the whole backdrop
+PLAIN_SHARE = 0.6  # of the ring that must agree with the model
+PLAIN_SPREAD = 6.0  # Lab units: above it the ring is no plain backdrop
+TOLERANCE = (5.0, 14.0)  # Lab units: least and most difference that is still backdrop
+SPREADS = 4.0  # tolerance in spreads of the ring
+SHADOW_DROP = 35.0  # lightness by which a shadow may darken the backdrop
+SHADOW_SLOPE = 1.6  # lightness per pixel: shadows fade, outlines do not
+SHADOW_MOST = 0.4  # of the subject that may turn out to be shadow; more is a pale subject
+HOLE = 0.004  # of the subject: a smaller hole in it is a highlight or the white of an eye
+SAMPLES = 20000  # pixels that a fit looks at
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """A smooth color over the frame.
+
+    Attributes:
+        weights: of the monomials x^i y^j, i + j <= degree, per Lab channel; x and y run over [-1, 1].
+        degree: of the polynomial.
+        spread: robust standard deviation of what it was fitted to, Lab units.
+        share: of the border that agrees with it.
+    """
+
+    weights: Float[ndarray, "k 3"]
+    degree: int
+    spread: float
+    share: float
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the border is explained well enough to call everything like it backdrop."""
+        return self.share >= PLAIN_SHARE and self.spread <= PLAIN_SPREAD
+
+    @property
+    def tolerance(self) -> float:
+        """Difference in Lab below which a pixel is backdrop."""
+        return float(np.clip(SPREADS * self.spread, *TOLERANCE))
+
+    def color(self, height: int, width: int) -> Float[ndarray, "h w 3"]:
+        """The backdrop without a subject, Lab."""
+        rows, columns = np.mgrid[:height, :width]
+        return (_monomials(rows, columns, height, width, self.degree) @ self.weights).reshape(height, width, 3)
+
+
+def fit_backdrop(lab: Float[ndarray, "t h w 3"]) -> Backdrop:
+    """The backdrop that the borders of all frames have in common."""
+    ring = border_ring(*lab.shape[1:3])
+    border = np.broadcast_to(ring, lab.shape[:3])
+    first = _fit(lab, border, BORDER_DEGREE, border)
+    if not first.is_plain:
+        return first
+    flooded = np.stack([_flood(frame, first) for frame in lab])
+    if flooded.mean() < 0.3:
+        return first
+    refined = _fit(lab, flooded, FLOODED_DEGREE, border)
+    return refined if refined.is_plain and refined.share >= first.share - 0.05 else first
+
+
+def cut_out(lab: Float[ndarray, "h w 3"], backdrop: Backdrop) -> Bool[ndarray, "h w"]:
+    """Everything the flood does not reach, without shadows and with its small holes filled."""
+    tight = ~_flood(lab, backdrop)
+    loose = ~_flood(lab, backdrop, shadows=True)
+    subject = loose if loose.sum() > (1 - SHADOW_MOST) * tight.sum() else tight
+    inner = ndimage.binary_fill_holes(subject) & ~subject
+    like_backdrop = np.linalg.norm(lab - backdrop.color(*lab.shape[:2]), axis=-1) < backdrop.tolerance
+    enclosed, count = ndimage.label((ndimage.binary_fill_holes(subject) & like_backdrop) | inner)
+    if count:
+        areas = ndimage.sum_labels(np.ones_like(enclosed), enclosed, np.arange(1, count + 1))
+        open_holes = np.isin(enclosed, 1 + np.flatnonzero(areas >= HOLE * subject.sum()))
+    else:
+        open_holes = np.zeros_like(subject)
+    filled: Bool[ndarray, "h w"] = ndimage.binary_fill_holes(subject) & ~open_holes
+    return filled
+
+
+def border_ring(height: int, width: int) -> Bool[ndarray, "h w"]:
+    """The pixels along the edge of a frame."""
+    margin = max(2, round(BORDER * max(height, width)))
+    ring = np.ones((height, width), bool)
+    ring[margin : height - margin, margin : width - margin] = False
+    return ring
+
+
+def _flood(lab: Float[ndarray, "h w 3"], backdrop: Backdrop, shadows: bool = False) -> Bool[ndarray, "h w"]:
+    """What is like the backdrop and reached from the border through gaps of three pixels or more."""
+    difference = lab - backdrop.color(*lab.shape[:2])
+    like = np.linalg.norm(difference, axis=-1) < backdrop.tolerance
+    if shadows:
+        slope = ndimage.gaussian_gradient_magnitude(lab[..., 0], 1.0)
+        chroma = np.linalg.norm(difference[..., 1:], axis=-1)
+        drop = -difference[..., 0]
+        like |= (chroma < 0.8 * backdrop.tolerance) & (drop > 0) & (drop < SHADOW_DROP) & (slope < SHADOW_SLOPE)
+    square = np.ones((3, 3), bool)
+    core = ndimage.binary_erosion(like, square, border_value=1)
+    labels, _ = ndimage.label(core)
+    edge = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+    reached: Bool[ndarray, "h w"] = ndimage.binary_dilation(np.isin(labels, np.unique(edge[edge > 0])), square) & like
+    return reached
+
+
+def _fit(
+    lab: Float[ndarray, "t h w 3"], where: Bool[ndarray, "t h w"], degree: int, border: Bool[ndarray, "t h w"]
+) -> Backdrop:
+    """Reweighted least squares with Cauchy weights, growing from a constant so that outliers cannot lead."""
+    height, width = lab.shape[1:3]
+    colors, design = _sample(lab, where, degree)
+    weights = np.zeros((design.shape[1], 3))
+    weights[0] = np.median(colors, axis=0)
+    spread = 0.0
+    for order in (0, 1, *(degree,) * 8):
+        terms = (order + 1) * (order + 2) // 2
+        residual = np.linalg.norm(colors - design @ weights, axis=1)
+        spread = max(0.5, 1.4826 * float(np.median(residual)) / 1.5382)  # of a norm of three: its median is 1.5382 sigma
+        trust = 1 / (1 + (residual / (2 * spread)) ** 2)
+        weights = np.zeros_like(weights)
+        weighted = design[:, :terms] * trust[:, None]
+        normal = weighted.T @ design[:, :terms] + 1e-6 * len(colors) * np.eye(terms)
+        weights[:terms] = np.linalg.solve(normal, weighted.T @ colors)
+    ring_colors, ring_design = _sample(lab, border, degree)
+    residual = np.linalg.norm(ring_colors - ring_design @ weights, axis=1)
+    share = float((residual < max(TOLERANCE[0], 3 * spread)).mean())
+    return Backdrop(weights, degree, spread, share)
+
+
+def _sample(
+    lab: Float[ndarray, "t h w 3"], where: Bool[ndarray, "t h w"], degree: int
+) -> tuple[Float[ndarray, "s 3"], Float[ndarray, "s k"]]:
+    """Colors and monomials at an even choice of the marked pixels."""
+    height, width = lab.shape[1:3]
+    times, rows, columns = np.nonzero(where)
+    choice = np.arange(0, len(times), max(1, len(times) // SAMPLES))
+    times, rows, columns = times[choice], rows[choice], columns[choice]
+    return lab[times, rows, columns].astype(np.float64), _monomials(rows, columns, height, width, degree)
+
+
+def _monomials(rows: ndarray, columns: ndarray, height: int, width: int, degree: int) -> Float[ndarray, "p k"]:
+    """1, x, y, x^2, xy, y^2 and so on, lower degrees first."""
+    x, y = 2 * columns.ravel() / (width - 1) - 1, 2 * rows.ravel() / (height - 1) - 1
+    return np.stack([x ** (order - j) * y**j for order in range(degree + 1) for j in range(order + 1)], 1)

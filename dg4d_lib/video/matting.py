@@ -1,0 +1,155 @@
+"""From opaque pictures to cut-outs without learned weights: which pixels, how much of them, and what color they have."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from scipy import ndimage
+from skimage.color import rgb2lab
+from torch import Tensor
+from torch.nn import functional
+
+from dg4d_lib.errors import BadInput
+from dg4d_lib.video.backdrop import border_ring, cut_out, fit_backdrop
+from dg4d_lib.video.saliency import segment
+
+PLAIN_SIDE = 640  # pixels of the longest side at which plain backdrops are told
+PHOTO_SIDE = 192  # and photographs
+LEAST = 0.005  # of the frame that a subject must cover in the first frame
+MOST = 0.95  # and may cover
+MOST_BORDER = 0.85  # of the border that it may touch
+LEAST_SEPARATION = 0.75  # of color models; see saliency.Segmentation
+PART = 0.02  # of the largest part: smaller ones are dropped
+STILL = 0.04  # change of color, in [0, 1], below which a pixel does not move between two frames
+ADVICE = "give a PNG with a transparent background, or a picture of one subject before a plain backdrop"
+
+
+@dataclass(frozen=True)
+class Matte:
+    """Cut-outs and how they came about.
+
+    Attributes:
+        frames: straight alpha; colors are freed from what shone through from behind.
+        method: which of the two ways told the subject.
+    """
+
+    frames: Float[Tensor, "t h w 4"]
+    method: Literal["backdrop", "color models"]
+
+
+def matte(frames: Float[Tensor, "t h w 3"]) -> Matte:
+    """Cut the subject out of opaque frames; all of them share one model of the background.
+
+    Raises:
+        BadInput: no subject can be told apart.
+    """
+    height, width = frames.shape[1:3]
+    lab = _lab(frames, PLAIN_SIDE)
+    backdrop = fit_backdrop(lab)
+    if backdrop.is_plain:
+        masks, radius = np.stack([_parts(cut_out(frame, backdrop)) for frame in lab]), 2
+    else:
+        lab = _lab(frames, PHOTO_SIDE)
+        found = segment(lab)
+        if found.separation < LEAST_SEPARATION:
+            raise BadInput(f"no subject found: its colors cannot be told from the background's; {ADVICE}")
+        masks = np.stack([_parts(ndimage.binary_fill_holes(frame > 0.5)) for frame in found.likelihood])
+        radius = 2
+    _check(masks[0])
+    scale = max(height, width) / max(masks.shape[1:])
+    band = max(2, round(radius * max(1.0, scale)))
+    cutouts = torch.stack(
+        [_soften(frame, mask, band) for frame, mask in zip(frames, _enlarge(masks, height, width), strict=True)]
+    )
+    return Matte(_steady(cutouts, frames), "backdrop" if backdrop.is_plain else "color models")
+
+
+def _lab(frames: Float[Tensor, "t h w 3"], longest: int) -> Float[ndarray, "t h2 w2 3"]:
+    """Frames in CIE Lab, shrunk to a longest side, with the noise of single pixels taken off."""
+    scale = longest / max(frames.shape[1:3])
+    small = frames.permute(0, 3, 1, 2)
+    if scale < 1:
+        size = [max(8, round(side * scale)) for side in frames.shape[1:3]]
+        small = functional.interpolate(small, size, mode="bilinear", antialias=True, align_corners=False)
+    pixels = small.permute(0, 2, 3, 1).cpu().numpy()
+    lab = np.stack([rgb2lab(frame) for frame in pixels])
+    return ndimage.gaussian_filter(lab, (0, 0.6, 0.6, 0)).astype(np.float32)
+
+
+def _parts(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
+    """The large parts of a mask; specks go."""
+    labels, count = ndimage.label(mask, np.ones((3, 3)))
+    if count == 0:
+        return mask
+    areas = ndimage.sum_labels(mask, labels, np.arange(1, count + 1))
+    return np.isin(labels, 1 + np.flatnonzero(areas >= max(4, PART * areas.max())))
+
+
+def _check(mask: Bool[ndarray, "h w"]) -> None:
+    share = float(mask.mean())
+    if share < LEAST:
+        found = "the picture is the same everywhere" if share == 0 else f"what stands out covers {share:.2%} of it"
+        raise BadInput(f"no subject found: {found}, a subject must cover at least {LEAST:.1%}; {ADVICE}")
+    touched = float(mask[border_ring(*mask.shape)].mean())
+    if share > MOST or touched > MOST_BORDER:
+        raise BadInput(
+            f"no subject found: what stands out covers {share:.0%} of the picture and {touched:.0%} of its border; {ADVICE}"
+        )
+
+
+def _enlarge(masks: Bool[ndarray, "t h w"], height: int, width: int) -> Bool[ndarray, "t h2 w2"]:
+    if masks.shape[1:] == (height, width):
+        return masks
+    soft = torch.from_numpy(masks).float()[:, None]
+    large = functional.interpolate(soft, (height, width), mode="bicubic", align_corners=False)
+    return (large[:, 0] > 0.5).numpy()
+
+
+def _soften(picture: Float[Tensor, "h w 3"], mask: Bool[ndarray, "h w"], band: int) -> Float[Tensor, "h w 4"]:
+    """Alpha and true color of the pixels near the outline.
+
+    There a pixel is a mixture of the nearby subject and the nearby background: alpha is its place on the line between
+    these two colors, and the subject's color is what remains without the background.
+    """
+    image = picture.cpu().numpy().astype(np.float64)
+    inside, outside = ndimage.distance_transform_edt(mask), ndimage.distance_transform_edt(~mask)
+    core = mask & (inside > np.minimum(band, 0.75 * ndimage.maximum_filter(inside, 2 * band + 1)))
+    away = outside > band
+    if not core.any() or not away.any():
+        return torch.cat([picture, torch.from_numpy(mask).to(picture)[..., None]], -1)
+    front, back = _spread(image, core, band), _spread(image, away, band)
+    line = front - back
+    length = (line**2).sum(-1)
+    mixed = ((image - back) * line).sum(-1) / np.maximum(length, 1e-6)
+    geometric = ndimage.gaussian_filter(mask.astype(np.float64), 0.5 * band)
+    trust = np.clip(length / 0.04, 0, 1)  # colors 0.2 apart in the unit cube tell alpha reliably
+    alpha = np.clip((trust * mixed + (1 - trust) * geometric - 0.04) / 0.92, 0, 1)
+    alpha = np.where(core, 1.0, np.where(away, 0.0, alpha))
+    pure = (image - (1 - alpha[..., None]) * back) / np.maximum(alpha[..., None], 1e-3)
+    color = np.where(core[..., None], image, front + alpha[..., None] * (np.clip(pure, 0, 1) - front))
+    return torch.from_numpy(np.dstack([color, alpha]).clip(0, 1)).to(picture)
+
+
+def _spread(image: Float[ndarray, "h w 3"], source: Bool[ndarray, "h w"], band: int) -> Float[ndarray, "h w 3"]:
+    """The sources' colors everywhere: a local mean near them, the nearest one farther away."""
+    weight = ndimage.gaussian_filter(source.astype(np.float64), band)
+    mean = ndimage.gaussian_filter(image * source[..., None], (band, band, 0)) / np.maximum(weight, 1e-9)[..., None]
+    nearest = ndimage.distance_transform_edt(~source, return_distances=False, return_indices=True)
+    return np.where((weight > 1e-3)[..., None], mean, image[nearest[0], nearest[1]])
+
+
+def _steady(cutouts: Float[Tensor, "t h w 4"], frames: Float[Tensor, "t h w 3"]) -> Float[Tensor, "t h w 4"]:
+    """The median of three frames' alpha wherever the picture itself stands still; what moves is left alone."""
+    if len(cutouts) < 3:
+        return cutouts
+    alpha = cutouts[..., 3]
+    still = (frames[1:] - frames[:-1]).abs().amax(-1) < STILL
+    before, after = torch.cat([still[:1], still]), torch.cat([still, still[-1:]])
+    earlier = torch.cat([alpha[:1], alpha[:-1]])
+    later = torch.cat([alpha[1:], alpha[-1:]])
+    middle = torch.stack([earlier, alpha, later]).median(0).values
+    steady = torch.where(before & after, middle, alpha)
+    return torch.cat([cutouts[..., :3], steady[..., None]], -1)

@@ -1,0 +1,239 @@
+"""How a step runs: in a process of its own, or in this one. `$DG4D_EXECUTOR` chooses by name.
+
+An executor is a function `(spec, request, on_progress) -> StepResult` that raises one of the errors below.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from steps.contract import (
+    EXIT_BAD_INPUT,
+    EXIT_MISSING,
+    EXIT_OUT_OF_MEMORY,
+    ArtifactRef,
+    StepFailure,
+    StepRequest,
+    StepResult,
+    StepSpec,
+)
+from steps.job import Progress
+from steps.main import EXIT_DIVERGED, perform
+from steps.store import ArtifactStore, home, remove_tree
+
+Execute = Callable[[StepSpec, StepRequest, Progress], StepResult]
+
+TAIL_BYTES = 4000  # of standard error, for the message of a crash
+KILL_GRACE_S = 5.0  # between asking a step to end and ending it
+
+
+class StepError(Exception):
+    """A step did not give a result.
+
+    Attributes:
+        step: its name.
+        message: why, for the user.
+        pictures: that explain it, in the store.
+    """
+
+    def __init__(self, step: str, message: str, pictures: dict[str, ArtifactRef] | None = None) -> None:
+        super().__init__(f"{step}: {message}")
+        self.step, self.message, self.pictures = step, message, pictures or {}
+
+
+class StepBadInput(StepError):
+    """What was given cannot be used; the same again will fail again."""
+
+
+class StepMissing(StepError):
+    """Something needed is not here: a library, a device, weights, an artifact."""
+
+
+class StepDiverged(StepError):
+    """An optimization left the finite numbers; `pictures` show the last good state."""
+
+
+class StepOutOfMemory(StepError):
+    """There was not enough memory; there may be when other work has ended."""
+
+
+class StepTimedOut(StepError):
+    """It took longer than its spec allows, and was killed."""
+
+
+class StepCrashed(StepError):
+    """Anything else."""
+
+
+_ERRORS: dict[str, type[StepError]] = {
+    "bad_input": StepBadInput,
+    "missing": StepMissing,
+    "diverged": StepDiverged,
+    "out_of_memory": StepOutOfMemory,
+    "crashed": StepCrashed,
+}
+_ERRORS_BY_STATUS: dict[int, type[StepError]] = {
+    EXIT_BAD_INPUT: StepBadInput,
+    EXIT_MISSING: StepMissing,
+    EXIT_DIVERGED: StepDiverged,
+    EXIT_OUT_OF_MEMORY: StepOutOfMemory,
+    -signal.SIGKILL: StepOutOfMemory,  # nobody else kills a step but the kernel's memory guard
+}
+
+
+def in_process(spec: StepSpec, request: StepRequest, on_progress: Progress) -> StepResult:
+    """Run a step here; for tests and debuggers. Neither its time nor its memory is bounded."""
+    outcome, error = perform(request, ArtifactStore(home() / "store"), on_progress)
+    if isinstance(outcome, StepFailure):
+        raise _ERRORS[outcome.kind](spec.name, outcome.message, outcome.pictures) from error
+    return outcome
+
+
+def in_subprocess(spec: StepSpec, request: StepRequest, on_progress: Progress) -> StepResult:
+    """Run a step in a process of its own, which ends with this one and is killed after `spec.timeout_s`."""
+    with _scratch() as folder:
+        (folder / "request.json").write_text(request.model_dump_json(), encoding="utf-8")
+        with (folder / "stderr").open("wb") as stderr:
+            process = subprocess.Popen(
+                _command(folder, parent=os.getpid()),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=stderr,
+                env={**os.environ, "TMPDIR": str(folder)},
+                start_new_session=True,
+                text=True,
+            )
+        status, timed_out = _watched(process, spec.timeout_s, on_progress)
+        if timed_out:
+            raise StepTimedOut(spec.name, f"no result after {spec.timeout_s:g} s, so it was stopped")
+        outcome = _outcome(folder / "result.json")
+        if status == 0 and isinstance(outcome, StepResult):
+            return outcome
+        if isinstance(outcome, StepFailure):
+            raise _ERRORS[outcome.kind](spec.name, outcome.message, outcome.pictures)
+        tail = _tail(folder / "stderr")
+        if status in _ERRORS_BY_STATUS:
+            raise _ERRORS_BY_STATUS[status](spec.name, tail or f"the process ended with status {status}")
+        reason = f"killed by signal {-status}" if status < 0 else f"ended with status {status}"
+        raise StepCrashed(spec.name, f"{reason} and no result" + (f": {tail}" if tail else ""))
+
+
+EXECUTORS: dict[str, Execute] = {"subprocess": in_subprocess, "in_process": in_process}
+
+
+def chosen() -> Execute:
+    """The executor that `$DG4D_EXECUTOR` names; `subprocess` without it.
+
+    Raises:
+        StepMissing: there is none of that name.
+    """
+    name = os.environ.get("DG4D_EXECUTOR", "subprocess")
+    if name not in EXECUTORS:
+        raise StepMissing("executor", f"$DG4D_EXECUTOR is {name!r}; choose one of: {', '.join(EXECUTORS)}")
+    return EXECUTORS[name]
+
+
+_running: set[subprocess.Popen[str]] = set()
+
+
+def stop_all() -> None:
+    """End every step that runs for this process, at once; its callers get an error."""
+    for process in tuple(_running):
+        _kill(process)
+
+
+def _command(folder: Path, parent: int) -> list[str]:
+    files = [str(folder / "request.json"), str(folder / "result.json")]
+    return [sys.executable, "-m", "steps.main", *files, "--store", str(home() / "store"), "--parent", str(parent)]
+
+
+def _watched(process: subprocess.Popen[str], timeout_s: float, on_progress: Progress) -> tuple[int, bool]:
+    """Follow a step to its end: its exit status, and whether it was killed for its time."""
+    timed_out = threading.Event()
+
+    def end() -> None:
+        timed_out.set()
+        _kill(process)
+
+    alarm = threading.Timer(timeout_s, end)
+    alarm.daemon = True
+    alarm.start()
+    _running.add(process)
+    try:
+        assert process.stdout is not None  # it is a pipe
+        for line in process.stdout:
+            _relay(line, on_progress)
+        status = process.wait()
+        return status, timed_out.is_set()
+    finally:
+        alarm.cancel()
+        _running.discard(process)
+        _kill(process)
+        process.wait(KILL_GRACE_S)
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+def _relay(line: str, on_progress: Progress) -> None:
+    try:
+        report = json.loads(line)
+        done, total, values = int(report["done"]), int(report["total"]), dict(report["values"])
+    except (ValueError, KeyError, TypeError):
+        return
+    on_progress(done, total, values)
+
+
+def _kill(process: subprocess.Popen[str]) -> None:
+    if process.poll() is None:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+def _outcome(path: Path) -> StepResult | StepFailure | None:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return None
+    for kind in (StepResult, StepFailure):
+        with suppress(ValidationError):
+            return kind.model_validate_json(text)
+    return None
+
+
+def _tail(path: Path) -> str:
+    content = path.read_bytes()[-TAIL_BYTES:].decode(errors="replace").strip()
+    return "\n".join(content.splitlines()[-12:])
+
+
+@contextmanager
+def _scratch() -> Iterator[Path]:
+    """A folder for one step; it also removes those of commands that were killed."""
+    scratch = home() / "scratch"
+    scratch.mkdir(parents=True, exist_ok=True)
+    for old in scratch.iterdir():
+        if not _alive(old.name.partition("-")[0]):
+            remove_tree(old)
+    folder = Path(tempfile.mkdtemp(prefix=f"{os.getpid()}-", dir=scratch))
+    try:
+        yield folder
+    finally:
+        remove_tree(folder)
+
+
+def _alive(pid: str) -> bool:
+    try:
+        os.kill(int(pid), 0)
+    except (ValueError, ProcessLookupError):
+        return False
+    except PermissionError:
+        return True
+    return True

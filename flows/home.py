@@ -1,0 +1,48 @@
+"""The places under `$DG4D_HOME`, and the environment in which Prefect is imported."""
+
+import os
+from pathlib import Path
+
+from flows.server import SETTINGS, Server
+from steps.store import ArtifactStore, home
+
+CLIENT_SETTINGS = {
+    "DO_NOT_TRACK": "1",
+    "PREFECT_CLIENT_SERVER_VERSION_CHECK_ENABLED": "false",
+    "PREFECT_TELEMETRY_ENABLE_RESOURCE_METRICS": "false",
+    "PREFECT_SERVER_ANALYTICS_ENABLED": SETTINGS["PREFECT_SERVER_ANALYTICS_ENABLED"],
+    "PREFECT_CLI_PROMPT": "false",
+    "PREFECT_CLIENT_MAX_RETRIES": "10",  # the one database file may be busy for a moment
+    "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "CRITICAL",  # the command says what matters; the rest goes to the server
+}
+
+
+def store() -> ArtifactStore:
+    """Every artifact of this user."""
+    return ArtifactStore(home() / "store")
+
+
+def records() -> Path:
+    """The folder that says what each request gave."""
+    return home() / "results"
+
+
+def locks() -> Path:
+    """The folder of the locks of requests."""
+    return home() / "locks"
+
+
+def failures() -> Path:
+    """The folder of pictures that explain why a step did not finish."""
+    return home() / "failures"
+
+
+def background_server() -> Server:
+    """The server that commands share unless PREFECT_API_URL names another."""
+    return Server(home() / "server", home() / "prefect")
+
+
+def set_environment(api_url: str) -> None:
+    """What Prefect reads when it is imported: its server, its own folder, no telemetry. What the user set stays."""
+    for name, value in {**CLIENT_SETTINGS, "PREFECT_HOME": str(home() / "prefect"), "PREFECT_API_URL": api_url}.items():
+        os.environ.setdefault(name, value)

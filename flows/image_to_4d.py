@@ -1,0 +1,103 @@
+"""A picture becomes an animated 3D asset."""
+
+from typing import Any
+
+from prefect import flow
+from prefect.artifacts import create_markdown_artifact
+from prefect.runtime import flow_run
+from prefect.task_runners import ThreadPoolTaskRunner
+
+from flows import home, pages
+from flows.merging import frames_in, merged
+from flows.tasks import Made, Steps
+from steps.contract import ArtifactRef
+from steps.profiles import (
+    DriveVideoSettings,
+    ExtractMeshSettings,
+    FitGaussiansSettings,
+    FitMotionSettings,
+    PackAssetSettings,
+    PipelineSettings,
+)
+
+# a part uses every core most of the time; two fill the gaps
+RUNNER: Any = ThreadPoolTaskRunner(max_workers=2)
+
+
+@flow(
+    name="image_to_4d",
+    flow_run_name="{item}",
+    task_runner=RUNNER,
+    persist_result=False,
+)
+def image_to_4d(
+    source: ArtifactRef,
+    settings: PipelineSettings,
+    seed: int = 0,
+    item: str = "asset",
+    bank: ArtifactRef | None = None,
+) -> Made:
+    """Prepare the subject, set it in motion, fit Gaussians and their motion, extract a mesh, refine and pack it.
+
+    Raises:
+        StepError: a step did not finish; says which and why.
+    """
+    steps = Steps(item, seed)
+    prepared = steps.run("prepare_subject", {"source": source}, settings.subject)
+    return finish(steps, prepared, settings, bank)
+
+
+def finish(
+    steps: Steps, prepared: dict[str, ArtifactRef], settings: PipelineSettings, bank: ArtifactRef | None
+) -> Made:
+    """From the cut-out subject, and its footage if there is any, to the package."""
+    subject, footage = prepared["subject"], prepared.get("footage")
+    driving = steps.run("drive_video", {"subject": subject, "footage": footage}, _drive(settings))["driving_video"]
+    gaussians = steps.run("fit_gaussians", {"subject": subject, "bank": bank}, _fit(settings))["gaussians"]
+    motion = steps.run(
+        "fit_motion", {"gaussians": gaussians, "driving_video": driving, "bank": bank}, _fit_motion(settings)
+    )["motion"]
+    mesh = extract(steps, gaussians, motion, frames_in(driving, home.store()), settings)
+    refined = steps.run("refine_texture", {**mesh, "driving_video": driving}, settings.refiner)
+    surface = {name: refined.get(name) for name in ("tracked", "meshes")}
+    packed = steps.run(
+        "pack_asset",
+        {"subject": subject, "driving_video": driving, "gaussians": gaussians, "motion": motion, **surface},
+        PackAssetSettings(rasterizer=settings.rasterizer, pack=settings.pack),
+    )
+    rows = [(done.label, done.cached, done.seconds) for done in steps.finished]
+    create_markdown_artifact(
+        key=pages.key("asset", steps.item), markdown=pages.asset_page(steps.item, rows, packed, home.store())
+    )
+    return Made(package=packed["package"], steps=steps.finished, flow_run=str(flow_run.id or ""))
+
+
+def extract(
+    steps: Steps, gaussians: ArtifactRef, motion: ArtifactRef, frames: int, settings: PipelineSettings
+) -> dict[str, ArtifactRef | None]:
+    """One mesh that moves; or a mesh per frame, in parts of a few frames each."""
+    inputs: dict[str, ArtifactRef | None] = {"gaussians": gaussians, "motion": motion}
+    whole = ExtractMeshSettings(rasterizer=settings.rasterizer, mesh=settings.mesh)
+    if settings.mesh.mode == "tracked":
+        return {"tracked": steps.run("extract_mesh", inputs, whole)["tracked"]}
+    count = settings.mesh.frames_per_task
+    parts = [
+        whole.model_copy(update={"first_frame": first, "end_frame": min(first + count, frames)})
+        for first in range(0, frames, count)
+    ]
+    done = steps.run_parts("extract_mesh", inputs, parts)
+    return {"meshes": merged([outputs["meshes"] for outputs in done], home.store())}
+
+
+def _drive(settings: PipelineSettings) -> DriveVideoSettings:
+    return DriveVideoSettings(driving=settings.driving, prior=settings.prior)
+
+
+def _fit(settings: PipelineSettings) -> FitGaussiansSettings:
+    return FitGaussiansSettings(rasterizer=settings.rasterizer, prior=settings.prior, static=settings.static)
+
+
+def _fit_motion(settings: PipelineSettings) -> FitMotionSettings:
+    return FitMotionSettings(
+        rasterizer=settings.rasterizer, prior=settings.prior, deformation=settings.deformation, motion=settings.motion
+    )

@@ -1,0 +1,124 @@
+"""What the Prefect UI shows of a step: Markdown with small pictures inside, tables of numbers."""
+
+import base64
+import hashlib
+import json
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import OpenImageIO as oiio
+
+from flows.executors import StepError
+from steps.contract import ArtifactRef, StepResult
+from steps.store import ArtifactMissing, ArtifactStore
+
+THUMBNAIL_SIZE = 320  # pixels of the longer side
+THUMBNAIL_BYTES = 50_000  # the server keeps pages in its database
+ROWS_OF_A_CURVE = 8
+
+
+def key(label: str, item: str) -> str:
+    """A key as Prefect wants it: lower case, digits and dashes; different names give different keys."""
+    slug = re.sub(r"[^a-z0-9]+", "-", f"{label} {item}".lower()).strip("-")[:80]
+    return f"{slug}-{hashlib.sha256(f'{label}/{item}'.encode()).hexdigest()[:6]}"
+
+
+def step_page(label: str, item: str, result: StepResult, store: ArtifactStore) -> str:
+    """Picture, notes, curves and facts of one finished step."""
+    record = result.provenance
+    lines = [f"# {label}: {item}", ""]
+    lines += [f"{image}\n" for image in pictures_of(result.outputs, store)]
+    lines += [f"> {note}\n" for note in record.notes]
+    for ref in result.outputs.values():
+        if ref.media_type.endswith("curves+json"):
+            lines += curve_table(json.loads(store.path(ref).read_text(encoding="utf-8")))
+    rows = {
+        "seconds": f"{record.duration_s:.1f}",
+        "peak memory": f"{record.peak_memory_mb:.0f} MiB",
+        "backend": record.backend,
+        "seed": record.seed,
+        "code": record.code_version,
+        "request": f"`{record.request_digest[:19]}`",
+        "record": f"`{record.digest()[:19]}`",
+    }
+    lines += ["| fact | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items()), ""]
+    lines += ["| output | kind | size |", "|---|---|---|"]
+    lines += [
+        f"| {name} `{ref.digest[7:19]}` | {ref.media_type} | {megabytes(ref.size_bytes)} |"
+        for name, ref in result.outputs.items()
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def asset_page(
+    item: str, rows: list[tuple[str, bool, float]], outputs: dict[str, ArtifactRef], store: ArtifactStore
+) -> str:
+    """The finished asset: its contact sheet and what each step took."""
+    lines = [f"# {item}", "", *(f"{image}\n" for image in pictures_of(outputs, store))]
+    lines += ["| step | state | seconds |", "|---|---|---|"]
+    lines += [f"| {label} | {'cached' if cached else 'computed'} | {seconds:.1f} |" for label, cached, seconds in rows]
+    return "\n".join(lines) + "\n"
+
+
+def show_failure(item: str, label: str, error: StepError, store: ArtifactStore, create: Callable[..., Any]) -> None:
+    """A page with the message and the pictures that explain it."""
+    lines = [f"# {label}: {item}", "", f"**{type(error).__name__}**", "", error.message, ""]
+    lines += [f"{image}\n" for image in pictures_of(error.pictures, store)]
+    create(key=key(label, item), markdown="\n".join(lines), description=f"{label} of {item} failed")
+
+
+def pictures_of(outputs: dict[str, ArtifactRef], store: ArtifactStore) -> list[str]:
+    """Every PNG among the outputs, small and inside the Markdown."""
+    images = []
+    for name, ref in outputs.items():
+        if ref.media_type == "image/png" and (small := thumbnail(ref, store)) is not None:
+            images.append(f"![{name}](data:image/webp;base64,{base64.b64encode(small).decode()})")
+    return images
+
+
+def thumbnail(ref: ArtifactRef, store: ArtifactStore) -> bytes | None:
+    """A picture as a small WebP; None if it cannot be made, for a page is not worth a failed step."""
+    try:
+        picture = oiio.ImageBuf(str(store.path(ref)))
+    except ArtifactMissing:
+        return None
+    if picture.has_error or not picture.spec().width:
+        return None
+    width, height, channels = picture.spec().width, picture.spec().height, picture.nchannels
+    scale = min(1.0, THUMBNAIL_SIZE / max(width, height))
+    region = oiio.ROI(0, max(1, round(width * scale)), 0, max(1, round(height * scale)), 0, 1, 0, channels)
+    small = oiio.ImageBufAlgo.resize(picture, roi=region)
+    with tempfile.TemporaryDirectory(prefix="dg4d-page-") as folder:
+        path = Path(folder) / "small.webp"
+        for quality in (80, 50, 20):
+            small.specmod().attribute("Compression", f"webp:{quality}")
+            if not small.write(str(path)):
+                return None
+            if path.stat().st_size <= THUMBNAIL_BYTES:
+                return path.read_bytes()
+    return None
+
+
+def curve_table(curves: dict[str, Any]) -> list[str]:
+    """A few rows of a loss curve, from first to last."""
+    names, x = list(curves["series"]), curves["x"]
+    if not x:
+        return []
+    picks = sorted({round(i * (len(x) - 1) / (ROWS_OF_A_CURVE - 1)) for i in range(ROWS_OF_A_CURVE)})
+    head = [f"**{curves['title']}**", "", f"| iteration | {' | '.join(names)} |", "|" + "---|" * (len(names) + 1)]
+    rows = [
+        f"| {x[i]} | " + " | ".join(f"{_at(curves['series'][name], i):.5g}" for name in names) + " |" for i in picks
+    ]
+    return [*head, *rows, ""]
+
+
+def megabytes(size: int) -> str:
+    """A size for people."""
+    return f"{size / 1e6:.1f} MB" if size >= 100_000 else f"{size / 1e3:.1f} kB"
+
+
+def _at(values: list[float], index: int) -> float:
+    return values[min(index, len(values) - 1)] if values else float("nan")

@@ -1,0 +1,240 @@
+"""What goes with a package: `report.json` and `report.html` for people, `provenance.json` for checking it."""
+
+import html
+import json
+import math
+from typing import Any
+
+from flows.orders import Order
+from flows.pages import megabytes
+from flows.publish import RECORD, Files
+from flows.tasks import Finished, Made
+from steps.contract import canonical
+from steps.store import ArtifactStore
+
+FORMAT = 1
+BESIDE = ("report.json", "report.html")
+PLOT_WIDTH, PLOT_HEIGHT = 420, 150  # pixels of a curve
+INKS = ("#2563eb", "#dc2626", "#059669", "#d97706", "#7c3aed", "#0891b2", "#be185d", "#4d7c0f")
+
+
+def texts(order: Order, made: Made, files: Files, store: ArtifactStore) -> dict[str, str]:
+    """The texts that go with a package, by name of file."""
+    report = report_of(order, made, files, store)
+    return {
+        "report.json": json.dumps(report, indent=1, ensure_ascii=False) + "\n",
+        "report.html": page(report),
+        RECORD: json.dumps(provenance(order, made, files), indent=1, ensure_ascii=False, sort_keys=True) + "\n",
+    }
+
+
+def provenance(order: Order, made: Made, files: Files) -> dict[str, Any]:
+    """Every step's record and every file's digest; what belongs to one run only stands under `run`."""
+    records = [done.result.provenance for done in made.steps]
+    return {
+        "format": FORMAT,
+        "order": order.digest(),
+        "source": order.source.digest,
+        "seed": order.seed,
+        "package": made.package.digest,
+        "files": files,
+        "beside": list(BESIDE),
+        "steps": [
+            {"digest": record.digest(), **record.model_dump(mode="json", exclude={"duration_s", "peak_memory_mb"})}
+            for record in records
+        ],
+        "run": {
+            "flow_run": made.flow_run,
+            "steps": [
+                {
+                    "step": done.label,
+                    "cached": done.cached,
+                    "duration_s": done.result.provenance.duration_s,
+                    "peak_memory_mb": done.result.provenance.peak_memory_mb,
+                }
+                for done in made.steps
+            ],
+        },
+    }
+
+
+def report_of(order: Order, made: Made, files: Files, store: ArtifactStore) -> dict[str, Any]:
+    """Stages, times, curves, notes and settings as JSON."""
+    return {
+        "item": order.item,
+        "source": order.source_name,
+        "profile": order.profile,
+        "seed": order.seed,
+        "banner": banner(order, made),
+        "notes": notes(order, made),
+        "seconds": round(sum(done.seconds for done in made.steps), 1),
+        "peak_memory_mb": max(done.result.provenance.peak_memory_mb for done in made.steps),
+        "steps": [_stage(done, store) for done in made.steps],
+        "licences": {k: v for done in made.steps for k, v in done.result.provenance.licences.items()},
+        "files": {name: fact["size_bytes"] for name, fact in files.items()},
+        "settings": order.settings.model_dump(mode="json"),
+    }
+
+
+def banner(order: Order, made: Made) -> str:
+    """One honest sentence: what of this asset was seen and what was guessed."""
+    given = any("footage" in done.result.outputs for done in made.steps)
+    motion = "the motion follows the video" if given else "the motion was made up"
+    if order.settings.prior.kind == "oracle":
+        return f"Test of the optimization: the true views were known; {motion}."
+    weights = any(done.result.provenance.weights for done in made.steps)
+    shape = "guessed by a model" if weights else "guessed without a model, from the outline of one picture"
+    return f"{order.profile.capitalize()}: {motion}; shape and the sides nobody saw were {shape}."
+
+
+def notes(order: Order, made: Made) -> list[str]:
+    """What the user should know, each sentence once."""
+    own = []
+    if order.picture_name:
+        own.append(f"The subject is the first frame of {order.source_name}; {order.picture_name} only names the asset.")
+    theirs = (note for done in made.steps for note in done.result.provenance.notes)
+    return list(dict.fromkeys([*own, *theirs]))
+
+
+def page(report: dict[str, Any]) -> str:
+    """The report as one page; the pictures are the package's own, beside it."""
+    files = report["files"]
+    parts = [
+        f"<h1>{_text(report['item'])}</h1>",
+        f"<p class=banner>{_text(report['banner'])}</p>",
+        _pictures(files),
+        "".join(f"<p class=note>{_text(note)}</p>" for note in report["notes"]),
+        "<h2>Stages</h2>",
+        _stages(report),
+        "".join(_curves(stage) for stage in report["steps"] if stage["curves"]),
+        "<h2>Files</h2>",
+        _files(files),
+        "<h2>Settings</h2>",
+        f"<p>profile <b>{_text(report['profile'])}</b>, seed <b>{report['seed']}</b>, source "
+        f"<b>{_text(report['source'])}</b></p>",
+        f"<details><summary>every knob</summary><pre>{_text(json.dumps(report['settings'], indent=1))}</pre></details>",
+        "<p class=small>The digest of every file and the record of every step are in "
+        '<a href="provenance.json">provenance.json</a>; the numbers of this page in '
+        '<a href="report.json">report.json</a>.</p>',
+    ]
+    return _PAGE.format(title=_text(report["item"]), body="\n".join(parts))
+
+
+def curve(curves: dict[str, Any]) -> str:
+    """Losses over iterations as inline SVG, on a logarithmic scale where all values are positive."""
+    series = {name: values for name, values in curves["series"].items() if len(values) > 1}
+    values = [v for points in series.values() for v in points if math.isfinite(v)]
+    if not values:
+        return ""
+    logarithmic = min(values) > 0 and max(values) / min(values) > 10
+    scale = math.log10 if logarithmic else float
+    low, high = scale(min(values)), scale(max(values))
+    first, last = curves["x"][0], curves["x"][-1]
+    lines, legend = [], []
+    for ink, (name, points) in zip(INKS * len(series), series.items(), strict=False):
+        places = " ".join(
+            f"{PLOT_WIDTH * (x - first) / ((last - first) or 1):.1f},"
+            f"{PLOT_HEIGHT * (1 - (scale(y) - low) / ((high - low) or 1)):.1f}"
+            for x, y in zip(curves["x"], points, strict=False)
+            if math.isfinite(y)
+        )
+        lines.append(f'<polyline points="{places}" stroke="{ink}"/>')
+        legend.append(f'<span style="color:{ink}">&#9632; {_text(name)} {points[-1]:.4g}</span>')
+    return (
+        f"<figure><figcaption>{_text(curves['title'])}</figcaption>"
+        f'<svg viewBox="-4 -4 {PLOT_WIDTH + 8} {PLOT_HEIGHT + 8}" role="img">{"".join(lines)}</svg>'
+        f"<p class=small>{max(values):.3g} to {min(values):.3g}{', logarithmic' if logarithmic else ''}; "
+        f"iterations {first} to {last}</p><p class=small>{' '.join(legend)}</p></figure>"
+    )
+
+
+def _stage(done: Finished, store: ArtifactStore) -> dict[str, Any]:
+    record = done.result.provenance
+    curves = [
+        json.loads(store.path(ref).read_text(encoding="utf-8"))
+        for ref in done.result.outputs.values()
+        if ref.media_type.endswith("curves+json") and store.has(ref)
+    ]
+    return {
+        "step": done.label,
+        "cached": done.cached,
+        "seconds": done.seconds,
+        "computed_in_s": record.duration_s,
+        "peak_memory_mb": record.peak_memory_mb,
+        "backend": record.backend,
+        "notes": list(record.notes),
+        "curves": curves,
+    }
+
+
+def _pictures(files: dict[str, int]) -> str:
+    shown = []
+    if "preview.mp4" in files:
+        shown.append('<video src="preview.mp4" autoplay loop muted playsinline controls></video>')
+    if "contact_sheet.png" in files:
+        shown.append('<img src="contact_sheet.png" alt="columns: moments; rows: angles">')
+    return f"<div class=pictures>{''.join(shown)}</div>"
+
+
+def _stages(report: dict[str, Any]) -> str:
+    longest = max((stage["computed_in_s"] for stage in report["steps"]), default=0) or 1
+    rows = "".join(
+        f"<tr><td>{_text(stage['step'])}<td class=number>{stage['computed_in_s']:.1f} s"
+        f"<td><div class=bar style='width:{120 * stage['computed_in_s'] / longest:.0f}px'></div>"
+        f"<td class=number>{stage['peak_memory_mb']:.0f} MiB<td>{_text(stage['backend'])}"
+        f"<td>{'taken from before' if stage['cached'] else ''}"
+        for stage in report["steps"]
+    )
+    return (
+        "<table><tr><th>stage<th>computed in<th><th>peak memory<th>backend<th>"
+        f"{rows}</table><p class=small>{report['seconds']:.1f} s for this run.</p>"
+    )
+
+
+def _curves(stage: dict[str, Any]) -> str:
+    return "".join(curve(curves) for curves in stage["curves"])
+
+
+def _files(files: dict[str, int]) -> str:
+    rows, folders = [], dict[str, list[int]]()
+    for name, size in files.items():
+        folder, slash, _ = name.partition("/")
+        if slash:
+            folders.setdefault(folder, []).append(size)
+        else:
+            rows.append(f'<tr><td><a href="{_text(name)}">{_text(name)}</a><td class=number>{megabytes(size)}')
+    rows += [
+        f'<tr><td><a href="{_text(name)}/">{_text(name)}/</a> ({len(sizes)} files)<td class=number>'
+        f"{megabytes(sum(sizes))}"
+        for name, sizes in folders.items()
+    ]
+    return f"<table>{''.join(rows)}</table>"
+
+
+def _text(value: object) -> str:
+    return html.escape(value if isinstance(value, str) else canonical(value))
+
+
+_PAGE = """<!doctype html>
+<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>
+:root {{ color-scheme: light dark; --line: #8884; --soft: #8881; }}
+body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 980px; margin: 2rem auto; padding: 0 1rem; }}
+h1 {{ margin: 0 0 .5rem; font-size: 1.6rem; }} h2 {{ margin: 2rem 0 .5rem; font-size: 1.1rem; }}
+.banner {{ border-left: 4px solid #d97706; background: #d9770618; padding: .6rem .9rem; border-radius: 4px; }}
+.note {{ border-left: 4px solid var(--line); padding: 0 .9rem; margin: .4rem 0; }}
+.pictures {{ display: flex; gap: 1rem; flex-wrap: wrap; align-items: flex-start; }}
+.pictures > * {{ flex: 1 1 320px; max-width: 100%; min-width: 0; border: 1px solid var(--line); border-radius: 6px;
+  background: repeating-conic-gradient(#fff 0 25%, #eee 0 50%) 0 0 / 20px 20px; }}
+table {{ border-collapse: collapse; }} td, th {{ padding: .2rem .8rem .2rem 0; text-align: left; }}
+td {{ border-top: 1px solid var(--line); }} .number {{ text-align: right; font-variant-numeric: tabular-nums; }}
+.bar {{ height: .7rem; background: #2563eb; border-radius: 2px; }} .small {{ font-size: .85rem; opacity: .75; margin: .2rem 0; }}
+figure {{ display: inline-block; width: min(440px, 100%); margin: 1rem 1rem 0 0; vertical-align: top; }}
+figcaption {{ font-weight: 600; }}
+svg {{ width: 100%; background: var(--soft); border-radius: 4px; }} polyline {{ fill: none; stroke-width: 1.5; }}
+pre {{ overflow: auto; background: var(--soft); padding: .8rem; border-radius: 4px; }}
+</style>
+{body}
+</html>
+"""

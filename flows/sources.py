@@ -1,0 +1,105 @@
+"""What users hand in, checked at the door and put into the store: pictures, videos, folders of frames, banks."""
+
+import tempfile
+import zipfile
+from pathlib import Path
+
+from dg4d_lib.errors import BadInput
+from flows.merging import add
+from steps.catalog import BANK, SOURCE
+from steps.contract import ArtifactRef
+from steps.store import ArtifactStore, room_for
+
+PICTURES = frozenset(
+    [".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".exr", ".hdr", ".jxl", ".jp2", ".psd", ".ppm", ".pgm"]
+)  # suffixes; what a file is, its content says
+VIDEOS = frozenset([".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif"])
+ALWAYS_MOVING = VIDEOS - {".gif"}  # a GIF may be one picture
+
+
+def check_file(path: Path) -> None:
+    """Refuse what cannot be a picture or a video, before any work.
+
+    Raises:
+        BadInput: says what it is and what to give.
+    """
+    if not path.exists():
+        raise BadInput(f"{path} does not exist; give a picture or a video")
+    if path.is_dir():
+        raise BadInput(
+            f"{path} is a folder; give one file, or `dg4d batch {path} -o DIR` for everything in it, "
+            f"or `--video {path}` if it holds the frames of a video"
+        )
+    if not path.is_file():
+        raise BadInput(f"{path} is not a regular file; give a picture or a video")
+    if path.stat().st_size == 0:
+        raise BadInput(f"{path} is empty (0 bytes); give a picture or a video")
+    _check_readable(path)
+
+
+def check_video(path: Path) -> None:
+    """Refuse what cannot be a video: a file as above, or a folder with at least two pictures.
+
+    Raises:
+        BadInput: says what it is and what to give.
+    """
+    if not path.is_dir():
+        check_file(path)
+    elif len(frames := frames_of(path)) < 2:
+        raise BadInput(
+            f"{path} holds {len(frames) or 'no'} picture{'s' * (len(frames) != 1)}; a folder of frames needs two or "
+            "more, numbered in the order in which they play"
+        )
+
+
+def check_bank(path: Path) -> None:
+    """Refuse a folder without `bank.json`.
+
+    Raises:
+        BadInput: says what is missing.
+    """
+    if not (path / "bank.json").is_file():
+        raise BadInput(f"{path} is not a bank of true views: it has no file bank.json")
+
+
+def frames_of(folder: Path) -> list[Path]:
+    """The pictures directly in a folder, by name."""
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in PICTURES and p.is_file() and p.name[0] != ".")
+
+
+def put_source(path: Path, store: ArtifactStore) -> ArtifactRef:
+    """Keep a checked picture, video, or folder of frames.
+
+    Raises:
+        DiskFull: there is no room.
+    """
+    if path.is_dir():
+        return _put_files(frames_of(path), path, SOURCE.media_type, store)
+    return store.put(path, SOURCE.media_type)
+
+
+def put_bank(path: Path, store: ArtifactStore) -> ArtifactRef:
+    """Keep a checked bank as a stored zip.
+
+    Raises:
+        DiskFull: there is no room.
+    """
+    return _put_files(sorted(p for p in path.rglob("*") if p.is_file()), path, BANK.media_type, store)
+
+
+def _put_files(files: list[Path], folder: Path, media_type: str, store: ArtifactStore) -> ArtifactRef:
+    """Equal files under equal names give equal bytes."""
+    with tempfile.TemporaryDirectory(prefix="dg4d-source-") as scratch, room_for(Path(scratch)):
+        path = Path(scratch) / "files.zip"
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
+            for file in files:
+                add(archive, file.relative_to(folder).as_posix(), file.read_bytes())
+        return store.put(path, media_type)
+
+
+def _check_readable(path: Path) -> None:
+    try:
+        with path.open("rb") as file:
+            file.read(1)
+    except OSError as error:
+        raise BadInput(f"{path} cannot be read: {error.strerror}") from error

@@ -1,0 +1,170 @@
+"""How a run looks on a terminal, and in a log file where there is none."""
+
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.live import Live
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from flows.events import StepEvent, listening
+
+LINE_EVERY_S = 10.0  # between two lines about one step, where there is no terminal
+COUNTED = 1  # totals up to this say nothing as a fraction
+
+
+def console() -> Console:
+    """Where people read; results of commands go to standard output."""
+    return Console(stderr=False, highlight=False, soft_wrap=not sys.stdout.isatty())
+
+
+@contextmanager
+def steps_shown(out: Console) -> Iterator[None]:
+    """Show every step while the block runs: bars on a terminal, lines elsewhere."""
+    if out.is_terminal:
+        bars = StepBars(out)
+        with bars.progress, listening(bars):
+            yield
+    else:
+        with listening(StepLines(out)):
+            yield
+
+
+class StepBars:
+    """A bar per step: how far, the current numbers, the time."""
+
+    def __init__(self, out: Console) -> None:
+        self.progress = Progress(
+            SpinnerColumn(finished_text="[green]✓"),
+            TextColumn("{task.description:<22}"),
+            BarColumn(bar_width=28),
+            TimeElapsedColumn(),
+            TextColumn("[dim]{task.fields[numbers]}"),
+            console=out,
+        )
+        self._bars: dict[str, TaskID] = {}
+
+    def __call__(self, event: StepEvent) -> None:
+        """Show an event."""
+        if event.step not in self._bars:
+            self._bars[event.step] = self.progress.add_task(event.step, total=None, numbers="")
+        bar = self._bars[event.step]
+        match event.kind:
+            case "progress":
+                self.progress.update(bar, completed=event.done, total=max(event.total, 1), numbers=numbers(event))
+            case "finished":
+                self.progress.update(bar, total=1, completed=1, numbers="cached" if event.cached else "")
+            case "failed":
+                self.progress.update(bar, description=f"[red]{event.step}", numbers="failed")
+                self.progress.stop_task(bar)
+            case _:
+                pass
+
+
+class StepLines:
+    """A line when a step starts, every few seconds, and when it ends."""
+
+    def __init__(self, out: Console, with_item: bool = False) -> None:
+        self._out, self._with_item = out, with_item
+        self._last: dict[tuple[str, str], float] = {}
+        self._lock = threading.Lock()
+
+    def __call__(self, event: StepEvent) -> None:
+        """Print an event, unless there was a line a moment ago."""
+        with self._lock:
+            key = event.item, event.step
+            now = time.monotonic()
+            if event.kind == "progress" and now - self._last.get(key, now - LINE_EVERY_S) < LINE_EVERY_S:
+                return
+            self._last[key] = now
+            match event.kind:
+                case "started":
+                    what = "started"
+                case "progress":
+                    what = numbers(event)
+                case "finished":
+                    what = "cached" if event.cached else f"done in {event.seconds:.1f} s"
+                case "failed":
+                    what = f"failed after {event.seconds:.1f} s"
+            name = f"{event.item}: {event.step}" if self._with_item else event.step
+            self._out.print(f"{name}: {what}", markup=False)
+
+
+class BatchTable:
+    """A table with a row per item, alive while the batch runs."""
+
+    def __init__(self, items: list[str]) -> None:
+        self.status: dict[str, str] = dict.fromkeys(items, "waiting")
+        self._doing: dict[str, str] = {}
+        self._since: dict[str, float] = {}
+        self._took: dict[str, float] = {}
+
+    def __call__(self, event: StepEvent) -> None:
+        """Note what an item is doing."""
+        if event.item not in self.status:
+            return
+        self._since.setdefault(event.item, time.monotonic())
+        self.status[event.item] = "running"
+        detail = numbers(event) if event.kind == "progress" else event.kind
+        self._doing[event.item] = f"{event.step}: {detail}"
+
+    def settle(self, item: str, status: str, message: str) -> None:
+        """An item ended."""
+        self.status[item], self._doing[item] = status, message
+        self._took[item] = time.monotonic() - self._since.get(item, time.monotonic())
+
+    def __rich__(self) -> Table:
+        """The table as it is; long batches show what is running and what failed."""
+        done = sum(status in INK and status not in {"waiting", "running"} for status in self.status.values())
+        table = Table(title=f"{done} of {len(self.status)}", title_justify="left", expand=False)
+        for heading in ("item", "status", "time", "what"):
+            table.add_column(heading, overflow="ellipsis", no_wrap=True, max_width=72)
+        shown = [
+            item for item, status in self.status.items() if len(self.status) <= 30 or status in {"running", "failed"}
+        ]
+        for item in shown:
+            status = self.status[item]
+            took = self._took.get(item, time.monotonic() - self._since[item] if item in self._since else 0.0)
+            table.add_row(item, f"[{INK[status]}]{status}", f"{took:.0f} s" if took else "", self._doing.get(item, ""))
+        return table
+
+
+INK = {"waiting": "dim", "running": "cyan", "done": "green", "unchanged": "blue", "failed": "red"}
+
+
+@contextmanager
+def batch_shown(out: Console, items: list[str]) -> Iterator[BatchTable]:
+    """Show a batch while the block runs: a live table on a terminal, lines elsewhere."""
+    table = BatchTable(items)
+    if out.is_terminal:
+        with Live(table, console=out, refresh_per_second=4), listening(table):
+            yield table
+    else:
+        with listening(StepLines(out, with_item=True)):
+            yield table
+
+
+def numbers(event: StepEvent) -> str:
+    """How far a step is, and its current values."""
+    parts = [f"{event.done}/{event.total}"] if event.total > COUNTED else []
+    return "  ".join([*parts, *(f"{name} {value:.4g}" for name, value in event.values.items())])
+
+
+def tell_where(out: Console, folder: Path, sizes: dict[str, int]) -> None:
+    """Everything in a package with its size."""
+    table = Table(title=str(folder), title_justify="left", show_header=False, box=None, title_style="bold")
+    table.add_column()
+    table.add_column(justify="right")
+    groups: dict[str, tuple[int, int]] = {}
+    for name, size in sizes.items():
+        group = f"{name.partition('/')[0]}/" if "/" in name else name
+        count, total = groups.get(group, (0, 0))
+        groups[group] = count + 1, total + size
+    for group, (count, total) in groups.items():
+        table.add_row(group + (f" ({count} files)" if group.endswith("/") else ""), f"{total / 1e6:.2f} MB")
+    out.print(table)

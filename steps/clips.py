@@ -1,0 +1,119 @@
+"""Moving pictures of users, through PyAV: counted first, then only the frames that are wanted are kept, already small."""
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import av
+import numpy as np
+import torch
+from av.error import FFmpegError
+from jaxtyping import Float
+from torch import Tensor
+
+from dg4d_lib.errors import BadInput
+from dg4d_lib.video.framing import shrink
+from steps.stills import check_size
+
+LARGEST_SIDE = 1024  # pixels of a frame that is worked on
+MOST_WORK = 32 * LARGEST_SIDE**2  # pixels of all frames together: half a gigabyte as float32 RGBA; more frames, smaller ones
+MOST_FRAMES = 9000  # five minutes at 30 per second; every one must be decoded
+USUAL_FPS = 24.0  # assumed when a file does not tell
+SAME_RATE = 0.02  # relative difference up to which the rate in the header is believed over the time stamps
+ALPHA_DECODERS = {"vp9": "libvpx-vp9", "vp8": "libvpx"}  # the default ones drop the alpha plane of WebM
+
+
+def evenly_spaced(count: int, most: int) -> list[int]:
+    """At most `most` of the indices below `count`, first and last included, as even as integers allow."""
+    if count <= most:
+        return list(range(count))
+    return [round(i * (count - 1) / (most - 1)) for i in range(most)]
+
+
+def thinned_rate(fps: float, count: int, kept: int) -> float:
+    """The frame rate at which `kept` of `count` frames last as long as all of them did."""
+    return fps * (kept - 1) / (count - 1) if count > 1 else fps
+
+
+def work_side(count: int) -> int:
+    """Longest side, in pixels, that so many frames may have."""
+    return min(LARGEST_SIDE, math.isqrt(MOST_WORK // max(1, count)))
+
+
+class Clip:
+    """One video file.
+
+    Attributes:
+        count: frames that can be decoded.
+        announced: frames that the header promises; 0 where it does not tell.
+        fps: frames per second.
+    """
+
+    def __init__(self, path: Path, container: str, what: str = "the video") -> None:
+        self._path, self._container, self._what = path, container, what
+        times = []
+        for frame in self._frames():
+            if not times:
+                check_size(frame.width, frame.height, what)
+            times.append(frame.time)
+            if len(times) > MOST_FRAMES:
+                raise BadInput(
+                    f"{what} has more than {MOST_FRAMES} frames; cut it to the part that should become an animation"
+                )
+        self.count = len(times)
+        self.fps = self._rate(times)
+
+    def read(self, indices: Sequence[int]) -> tuple[Float[Tensor, "t h w 4"], bool]:
+        """The frames of these ascending indices, and whether the codec carries alpha."""
+        wanted, side = set(indices), work_side(len(indices))
+        frames, has_alpha = [], False
+        for i, frame in enumerate(self._frames()):
+            if i in wanted:
+                has_alpha = has_alpha or any(part.is_alpha for part in frame.format.components)
+                frames.append(_picture(frame, side, has_alpha))
+        if any(frame.shape != frames[0].shape for frame in frames):
+            raise BadInput(f"{self._what} changes its size on the way; export it again at one size")
+        return torch.stack(frames), has_alpha
+
+    def _frames(self) -> Iterator[av.VideoFrame]:
+        try:
+            with av.open(str(self._path), format=self._container) as container:
+                if not container.streams.video:
+                    raise BadInput(f"{self._what} holds no pictures, only other tracks; give one that shows something")
+                stream = container.streams.video[0]
+                context = stream.codec_context
+                if context is None:
+                    raise BadInput(f"{self._what} uses a codec that is not known here; export it as H.264 mp4")
+                if context.width and context.height:
+                    check_size(context.width, context.height, self._what)
+                self.announced = stream.frames
+                self._header_rate = float(stream.average_rate or 0)
+                name = ALPHA_DECODERS.get(context.name, "") if stream.metadata.get("alpha_mode") == "1" else ""
+                decoder = av.CodecContext.create(name, "r") if name else context
+                for packet in container.demux(stream):
+                    for frame in decoder.decode(packet):
+                        if isinstance(frame, av.VideoFrame):
+                            yield frame
+        except FFmpegError as error:
+            raise BadInput(
+                f"{self._what} is cut off or broken ({error.strerror}); copy it again, or export it as H.264 mp4"
+            ) from error
+
+    def _rate(self, times: Sequence[float | None]) -> float:
+        known = [time for time in times if time is not None]
+        span = known[-1] - known[0] if len(known) > 1 else 0.0
+        measured = (len(known) - 1) / span if span > 0 else 0.0
+        if measured and abs(self._header_rate - measured) > SAME_RATE * measured:
+            return measured
+        return self._header_rate or measured or USUAL_FPS
+
+
+def _picture(frame: av.VideoFrame, side: int, has_alpha: bool) -> Float[Tensor, "h w 4"]:
+    """A frame as straight RGBA, upright, no side longer than `side`."""
+    width, height = frame.width, frame.height
+    if not has_alpha and max(width, height) > side:  # the scaler does not know that alpha weighs colors
+        scale = side / max(width, height)
+        width, height = max(1, round(width * scale)), max(1, round(height * scale))
+    pixels = frame.reformat(width=width, height=height, format="rgba", interpolation="AREA").to_ndarray()
+    upright = np.ascontiguousarray(np.rot90(pixels, round(frame.rotation / 90)))
+    return shrink(torch.from_numpy(upright)[None].float() / 255, side)[0]

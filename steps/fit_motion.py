@@ -1,0 +1,48 @@
+"""From static Gaussians and a driving video to a deformation."""
+
+import torch
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.fitting.losses import Diverged
+from dg4d_lib.fitting.motion import fit_motion
+from dg4d_lib.gaussians.ply import read_ply
+from dg4d_lib.rasterizer.interface import choose_rasterizer
+from steps.fit_gaussians import PICTURE_SIZE, Curves, picture_of
+from steps.job import Facts, Job
+from steps.media import read_frames, write_png
+from steps.motions import new_deformation, write_motion
+from steps.priors import make_prior
+from steps.profiles import FitMotionSettings
+
+PICTURE_FRAMES = 6
+PICTURE_AZIMUTHS_DEG = (0.0, 90.0)
+
+
+def run(job: Job) -> Facts:
+    """Fit, and show six moments from the front and from the side."""
+    settings: FitMotionSettings = job.settings
+    gaussians = read_ply(job.inputs["gaussians"])
+    video = read_frames(job.inputs["driving_video"], job.pictures)
+    generator = torch.Generator().manual_seed(job.seed)
+    rasterize = choose_rasterizer(settings.rasterizer)
+    cutouts = list(torch.cat([video.frames, video.coverage], -1))
+    bank = job.inputs.get("bank")
+    prior, note = make_prior(settings.prior, cutouts, settings.motion.noise_start, bank, job.pictures)
+    deformation = new_deformation(settings.deformation, gaussians, len(video), generator)
+    curves = Curves(settings.motion.iterations, job.progress)
+    try:
+        fit_motion(gaussians, deformation, video, prior, rasterize, settings.motion, generator, curves.add)
+    except Diverged as error:
+        write_png(job.pictures / "last_good_state.png", picture_of(error.gaussians, rasterize))
+        raise
+    write_motion(job.outputs["motion"], deformation, settings.deformation, len(video), len(gaussians))
+    curves.write(job.outputs["curves"], "motion fit", [note])
+    with torch.no_grad():
+        moments = torch.linspace(0, 1, min(PICTURE_FRAMES, len(video)))
+        moved = deformation.displace(gaussians.means, moments).apply(gaussians)
+        rows = []
+        for azimuth in PICTURE_AZIMUTHS_DEG:
+            camera = OrbitCamera(0, azimuth, width=PICTURE_SIZE, height=PICTURE_SIZE)
+            rows.append(torch.cat(list(rasterize(moved, [camera] * len(moments), torch.ones(3)).color), 1))
+    write_png(job.outputs["picture"], torch.cat(rows))
+    return Facts(backend=f"{settings.rasterizer} rasterizer", notes=(note,))

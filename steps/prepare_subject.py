@@ -1,0 +1,31 @@
+"""A user's picture or video becomes cut-outs in one square frame."""
+
+from tempfile import TemporaryDirectory
+from pathlib import Path
+
+from dg4d_lib.settings import SubjectSettings
+from dg4d_lib.video.driving import DrivingVideo
+from dg4d_lib.video.subject import prepare
+from steps.job import Facts, Job
+from steps.media import write_frames, write_png
+from steps.sources import read_source
+
+
+def run(job: Job) -> Facts:
+    """Decode `source`, cut out and frame the subject; `footage` is written when the source moves.
+
+    Raises:
+        BadInput: the file cannot be used; says why and what to do.
+    """
+    settings: SubjectSettings = job.settings
+    with TemporaryDirectory() as scratch:
+        source = read_source(job.inputs["source"], Path(scratch), settings.max_frames)
+    job.progress(1, 3, {})
+    cutouts, notes = prepare(source.frames, source.has_alpha, settings)
+    job.progress(2, 3, {})
+    write_png(job.outputs["subject"], cutouts[0])
+    if source.kind == "video":
+        footage = DrivingVideo(cutouts[..., :3].contiguous(), cutouts[..., 3:].contiguous(), source.fps)
+        write_frames(job.outputs["footage"], footage)
+    job.progress(3, 3, {})
+    return Facts(notes=(*source.notes, *notes))

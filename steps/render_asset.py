@@ -1,0 +1,149 @@
+"""Pictures of a finished package, from any side at any moment; behind `dg4d render`."""
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dg4d_lib.assets.animated import between, moved
+from dg4d_lib.assets.glb import read_glb, read_mesh_glb
+from dg4d_lib.assets.splats import read_splats
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.errors import BadInput
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.ply import read_ply
+from dg4d_lib.mesh.render import render_mesh
+from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
+from steps.media import write_png
+from steps.motions import read_motion
+from steps.packages import ASSET, GAUSSIANS, MESHES, MOTION, SPLATS, Manifest, read_manifest
+
+BATCH = 8  # pictures drawn at once, bounds the memory
+SIZES = (16, 4096)  # pixels
+
+Draw = Callable[[Float[Tensor, " b"], Sequence[OrbitCamera]], Float[Tensor, "b h w 4"]]
+
+
+def render_package(
+    folder: Path,
+    azimuths_deg: Sequence[float],
+    elevation_deg: float,
+    size: int,
+    frames: int | None,
+    mesh: bool,
+    out: Path,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    rasterizer: str = "auto",
+) -> list[Path]:
+    """Write OUT/view_<azimuth>/NNN.png, RGBA with straight alpha, for every azimuth and moment.
+
+    Args:
+        folder: an unpacked package.
+        azimuths_deg: of the cameras.
+        elevation_deg: of the cameras, -90 to 90.
+        size: pixels of a side, 16 to 4096.
+        frames: moments, evenly spread from the first to the last frame; None is every frame.
+        mesh: the textured mesh instead of the splats.
+        out: made if it is not there; pictures of the same name are written over.
+        progress: called with pictures done and their number.
+        rasterizer: draws the splats.
+
+    Returns:
+        The folders, one per azimuth.
+
+    Raises:
+        BadInput: the folder is no package or a broken one, or a number is out of range.
+        BackendUnavailable: the rasterizer cannot run here.
+        OSError: a picture could not be written.
+    """
+    manifest = read_manifest(folder)
+    _check(azimuths_deg, elevation_deg, size, frames)
+    draw = _mesh(folder, manifest) if mesh else _splats(folder, manifest, choose_rasterizer(rasterizer))
+    count = manifest.frames if frames is None else frames
+    positions = torch.arange(count, dtype=torch.float64) * (manifest.frames - 1) / max(1, count - 1)
+    views = [out / f"view_{azimuth_deg + 0.0:g}" for azimuth_deg in azimuths_deg]
+    for number, (view, azimuth_deg) in enumerate(zip(views, azimuths_deg, strict=True)):
+        view.mkdir(parents=True, exist_ok=True)
+        camera = OrbitCamera(elevation_deg, azimuth_deg, width=size, height=size)
+        for start in range(0, count, BATCH):
+            part = positions[start : start + BATCH]
+            for frame, picture in enumerate(draw(part, [camera] * len(part)), start):
+                write_png(view / f"{frame:03d}.png", picture)
+            progress(number * count + start + len(part), len(views) * count)
+    return views
+
+
+def _check(azimuths_deg: Sequence[float], elevation_deg: float, size: int, frames: int | None) -> None:
+    if not azimuths_deg or not all(map(math.isfinite, azimuths_deg)):
+        raise BadInput(f"azimuths must be one or more angles in degrees, for example 0,-75,15; given {azimuths_deg}")
+    if not -90 <= elevation_deg <= 90:
+        raise BadInput(f"the elevation must lie between -90 and 90 degrees; given {elevation_deg}")
+    if not SIZES[0] <= size <= SIZES[1]:
+        raise BadInput(f"the size must lie between {SIZES[0]} and {SIZES[1]} pixels; given {size}")
+    if frames is not None and frames < 1:
+        raise BadInput(f"there must be at least one frame to render; given {frames}")
+
+
+def _splats(folder: Path, manifest: Manifest, rasterizer: Rasterizer) -> Draw:
+    """Draws the stored states, or those of the fitted motion where the package holds no splats."""
+    if (folder / SPLATS).is_dir():
+        stored = read_splats(folder / SPLATS)
+        _check_frames(SPLATS, len(stored.means), manifest)
+        states = partial(_between_states, stored)
+    else:
+        deformation, frames = read_motion(folder / MOTION)
+        _check_frames(MOTION, frames, manifest)
+        states = partial(moved, read_ply(folder / GAUSSIANS), deformation, frames)
+
+    def draw(positions: Float[Tensor, " b"], cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b h w 4"]:
+        with torch.no_grad():
+            drawn = rasterizer(states(positions), cameras, torch.zeros(3))
+        straight = drawn.color / drawn.alpha.clamp_min(torch.finfo(drawn.alpha.dtype).tiny)
+        return torch.cat([straight, drawn.alpha], -1).clamp(0, 1)
+
+    return draw
+
+
+def _between_states(states: Gaussians, positions: Float[Tensor, " b"]) -> Gaussians:
+    return Gaussians(
+        between(states.means, positions),
+        between(states.log_scales, positions),
+        between(states.quats, positions),
+        states.opacity_logits,
+        states.harmonics,
+    )
+
+
+def _mesh(folder: Path, manifest: Manifest) -> Draw:
+    """Draws the moved mesh as a player shows it: linear between frames, or each frame's own mesh until the next."""
+    if manifest.mode == "per_frame":
+        meshes = [read_mesh_glb(_content(folder, f"{MESHES}/{i:03d}.glb")) for i in range(manifest.frames)]
+
+        def draw_frames(positions: Float[Tensor, " b"], cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b h w 4"]:
+            shown = zip(positions.floor().long().tolist(), cameras, strict=True)
+            return torch.cat([torch.cat(render_mesh(meshes[frame], [camera]), -1) for frame, camera in shown])
+
+        return draw_frames
+    asset = read_glb(_content(folder, ASSET))
+    _check_frames(ASSET, len(asset.offsets), manifest)
+
+    def draw(positions: Float[Tensor, " b"], cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b h w 4"]:
+        return torch.cat(render_mesh(asset.mesh, cameras, between(asset.offsets, positions)), -1)
+
+    return draw
+
+
+def _content(folder: Path, name: str) -> bytes:
+    try:
+        return (folder / name).read_bytes()
+    except OSError as error:
+        raise BadInput(f"{folder} is not complete: {name} cannot be read ({error.strerror}); make it again") from error
+
+
+def _check_frames(name: str, given: int, manifest: Manifest) -> None:
+    if given != manifest.frames:
+        raise BadInput(f"{name} has {given} frames, the package {manifest.frames}; make it again")

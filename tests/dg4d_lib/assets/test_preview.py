@@ -1,0 +1,105 @@
+"""The preview film: it plays, it shows the object where it is, and equal assets give equal films."""
+
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import torch
+
+from dg4d_lib.assets import preview
+from dg4d_lib.assets.preview import studio, write_preview
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.deformation.framewise import Framewise
+from dg4d_lib.errors import BackendUnavailable
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.rasterizer.reference import rasterize
+from dg4d_lib.settings import PackSettings
+
+SETTINGS = PackSettings(preview_size=64, preview_turns=2)
+FRAMES, FPS = 3, 7.0  # sampled three times per frame: 21 fps
+
+
+def film(path: Path) -> tuple[np.ndarray, Fraction]:
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
+        assert stream.average_rate is not None
+        return np.stack(pictures) / 255, stream.average_rate
+
+
+@pytest.fixture
+def written(tmp_path: Path, red_dot: Gaussians, slide: Framewise) -> Path:
+    path = tmp_path / "preview.mp4"
+    assert write_preview(path, red_dot, slide, FRAMES, FPS, rasterize, SETTINGS) == ()
+    return path
+
+
+def test_the_film_has_every_position_of_every_loop_at_a_smooth_rate(written: Path) -> None:
+    pictures, rate = film(written)
+    assert pictures.shape == (FRAMES * 3 * 2, 64, 64, 3)
+    assert rate == 21
+
+
+def test_colors_survive_the_encoding(written: Path) -> None:
+    first = film(written)[0][0]
+    np.testing.assert_allclose(first[:4, :4], studio(64)[:4, :4].numpy(), atol=4 / 255)
+    assert first[32, 32, 0] > 0.85
+    assert first[32, 32, 1:].max() < 0.25
+
+
+def test_the_object_is_drawn_where_it_is(written: Path) -> None:
+    """It stands at the center in the first picture, and to the right of it in the last frame of the first loop."""
+    redness = (film(written)[0][..., 0] - film(written)[0][..., 1]).clip(0)
+    columns = (redness.sum(1) * np.arange(64)).sum(-1) / redness.sum((1, 2))
+    camera = OrbitCamera(preview.ELEVATION_DEG, 360 * 6 / 18, width=64, height=64)
+    view = camera.world_to_camera() @ torch.tensor([0.5, 0, 0, 1], dtype=torch.float64)
+    expected = 32 + camera.focal * float(view[0] / view[2]) - 0.5
+    assert columns[0] == pytest.approx(31.5, abs=0.5)
+    assert columns[6] == pytest.approx(expected, abs=1)
+    assert abs(expected - 31.5) > 3
+
+
+def test_equal_assets_give_equal_films(written: Path, tmp_path: Path, red_dot: Gaussians, slide: Framewise) -> None:
+    write_preview(tmp_path / "again.mp4", red_dot, slide, FRAMES, FPS, rasterize, SETTINGS)
+    assert (tmp_path / "again.mp4").read_bytes() == written.read_bytes()
+
+
+def test_progress_ends_at_the_number_of_pictures(tmp_path: Path, red_dot: Gaussians, slide: Framewise) -> None:
+    heard: list[tuple[int, int]] = []
+    report = lambda done, total: heard.append((done, total))  # noqa: E731
+    write_preview(tmp_path / "a.mp4", red_dot, slide, 2, 30.0, rasterize, SETTINGS, report)
+    assert heard == [(4, 4)]
+
+
+def test_without_x264_another_codec_stands_in_and_the_report_says_so(
+    tmp_path: Path,
+    red_dot: Gaussians,
+    slide: Framewise,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(av, "codecs_available", av.codecs_available - {"libx264"})
+    (note,) = write_preview(tmp_path / "a.mp4", red_dot, slide, 2, 30.0, rasterize, SETTINGS)
+    assert "mpeg4" in note
+    assert len(film(tmp_path / "a.mp4")[0]) == 4
+
+
+def test_without_any_codec_the_backend_is_missing(
+    tmp_path: Path,
+    red_dot: Gaussians,
+    slide: Framewise,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(av, "codecs_available", set())
+    with pytest.raises(BackendUnavailable, match="pip install"):
+        write_preview(tmp_path / "a.mp4", red_dot, slide, 2, 30.0, rasterize, SETTINGS)
+
+
+def test_a_failure_while_drawing_is_not_hidden(tmp_path: Path, red_dot: Gaussians, slide: Framewise) -> None:
+    def broken(gaussians: Gaussians, cameras: Sequence[OrbitCamera], background, screen_offsets=None):
+        raise ArithmeticError("no picture")
+
+    with pytest.raises(ArithmeticError, match="no picture"):
+        write_preview(tmp_path / "a.mp4", red_dot, slide, 2, 30.0, broken, SETTINGS)

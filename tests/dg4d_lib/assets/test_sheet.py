@@ -1,0 +1,85 @@
+"""The contact sheet: tiles in their places, the footage on top, captions that can be read."""
+
+import pytest
+import torch
+
+from dg4d_lib.assets.sheet import PANEL, contact_sheet
+from dg4d_lib.deformation.framewise import Framewise
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.rasterizer.reference import rasterize
+from dg4d_lib.settings import PackSettings
+from dg4d_lib.video.driving import DrivingVideo
+
+SIZE = 48
+GAP = 2
+SETTINGS = PackSettings(sheet_size=SIZE, sheet_frames=3, sheet_azimuths_deg=(0.0, 180.0))
+
+
+def footage(frames: int) -> DrivingVideo:
+    """A green square."""
+    coverage = torch.zeros(frames, 64, 64, 1)
+    coverage[:, 16:48, 16:48] = 1
+    return DrivingVideo(torch.tensor((0.0, 1.0, 0.0)).expand(frames, 64, 64, 3), coverage, 10.0)
+
+
+@pytest.fixture
+def sheet(red_dot: Gaussians, slide: Framewise) -> torch.Tensor:
+    return contact_sheet(red_dot, slide, footage(5), rasterize, SETTINGS)
+
+
+def tile(sheet: torch.Tensor, row: int, column: int, rows: int = 3, columns: int = 3) -> torch.Tensor:
+    """Tiles end one gap before the lower right corner."""
+    bottom = sheet.shape[0] - GAP - (rows - 1 - row) * (SIZE + GAP)
+    right = sheet.shape[1] - GAP - (columns - 1 - column) * (SIZE + GAP)
+    return sheet[bottom - SIZE : bottom, right - SIZE : right]
+
+
+def test_the_first_row_is_the_footage(sheet: torch.Tensor) -> None:
+    for column in range(3):
+        picture = tile(sheet, 0, column)
+        torch.testing.assert_close(picture[24, 24], torch.tensor([0.0, 1.0, 0.0]))
+        torch.testing.assert_close(picture[0, 0], torch.tensor(PANEL), atol=1 / 255, rtol=0)
+
+
+def test_columns_are_the_first_the_middle_and_the_last_frame(sheet: torch.Tensor) -> None:
+    """The dot slides along +x: to the right seen from the front, to the left seen from behind."""
+    columns = torch.arange(SIZE) - (SIZE - 1) / 2
+    for row, sign in ((1, 1), (2, -1)):
+        places = []
+        for column in range(3):
+            redness = (tile(sheet, row, column)[..., 0] - tile(sheet, row, column)[..., 1]).clamp_min(0).sum(0)
+            places.append(float((redness * columns).sum() / redness.sum()))
+        focal = SIZE / 2 / 0.4568  # tan(49.1 / 2 degrees)
+        assert places == pytest.approx([0, sign * focal * 0.25 / 2, sign * focal * 0.5 / 2], abs=0.6)
+
+
+def test_margins_hold_captions_and_gaps_are_white(sheet: torch.Tensor) -> None:
+    left = sheet.shape[1] - 3 * (SIZE + GAP)
+    top = sheet.shape[0] - 3 * (SIZE + GAP)
+    assert sheet[:top, left:].min() < 0.6
+    for row in range(3):
+        first = top + row * (SIZE + GAP)
+        assert sheet[first : first + SIZE, : left - GAP].min() < 0.6
+    assert sheet[top:, left + SIZE : left + SIZE + GAP].min() == 1
+    assert sheet[-GAP:].min() == 1
+
+
+def test_long_captions_are_not_cut_off(red_dot: Gaussians, slide: Framewise) -> None:
+    short = contact_sheet(red_dot, slide, footage(2), rasterize, PackSettings(sheet_size=32, sheet_azimuths_deg=(0,)))
+    long = contact_sheet(
+        red_dot, slide, footage(2), rasterize, PackSettings(sheet_size=32, sheet_azimuths_deg=(-123.456,))
+    )
+    assert long.shape[1] > short.shape[1]
+    for page in (short, long):
+        assert page[:, 0].min() == 1
+        assert page[0].min() == 1
+
+
+def test_a_short_video_has_a_column_per_frame(red_dot: Gaussians, slide: Framewise) -> None:
+    two = contact_sheet(red_dot, slide, footage(2), rasterize, SETTINGS)
+    three = contact_sheet(red_dot, slide, footage(3), rasterize, SETTINGS)
+    assert three.shape[1] - two.shape[1] == SIZE + GAP
+
+
+def test_equal_assets_give_equal_sheets(sheet: torch.Tensor, red_dot: Gaussians, slide: Framewise) -> None:
+    assert torch.equal(contact_sheet(red_dot, slide, footage(5), rasterize, SETTINGS), sheet)

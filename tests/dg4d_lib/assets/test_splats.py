@@ -1,0 +1,50 @@
+"""Splat sequences: every frame is a standard PLY, and the sequence comes back."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from dg4d_lib.assets.animated import moved
+from dg4d_lib.assets.splats import read_splats, write_splats
+from dg4d_lib.deformation.framewise import Framewise
+from dg4d_lib.errors import BadInput
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.ply import read_ply, write_ply
+
+
+@pytest.fixture
+def states(red_dot: Gaussians, slide: Framewise) -> Gaussians:
+    return moved(red_dot, slide, 3, torch.arange(3.0))
+
+
+def test_a_sequence_comes_back_exactly(tmp_path: Path, states: Gaussians) -> None:
+    assert [path.name for path in write_splats(tmp_path, states)] == ["000.ply", "001.ply", "002.ply"]
+    back = read_splats(tmp_path)
+    assert all(torch.equal(getattr(back, name), value) for name, value in vars(states).items())
+
+
+def test_every_file_is_the_cloud_at_its_frame(tmp_path: Path, states: Gaussians) -> None:
+    write_splats(tmp_path, states)
+    assert torch.equal(read_ply(tmp_path / "002.ply").means, states.means[2])
+
+
+def test_a_gap_in_the_numbers_is_refused(tmp_path: Path, states: Gaussians) -> None:
+    write_splats(tmp_path, states)
+    (tmp_path / "001.ply").unlink()
+    with pytest.raises(BadInput, match=r"without gaps; given 000\.ply to 002\.ply, 2 files"):
+        read_splats(tmp_path)
+
+
+def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="given none"):
+        read_splats(tmp_path)
+
+
+def test_a_foreign_frame_is_refused(tmp_path: Path, states: Gaussians) -> None:
+    write_splats(tmp_path, states)
+    first = states.at(0)
+    stranger = Gaussians(first.means, first.log_scales, first.quats, first.opacity_logits + 1, first.harmonics)
+    write_ply(tmp_path / "001.ply", stranger)
+    with pytest.raises(BadInput, match=r"001\.ply is no state"):
+        read_splats(tmp_path)

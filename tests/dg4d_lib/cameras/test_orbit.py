@@ -1,0 +1,48 @@
+import math
+
+import pytest
+import torch
+
+from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
+
+
+def seen(camera: OrbitCamera, point: tuple[float, float, float]) -> torch.Tensor:
+    return (camera.world_to_camera() @ torch.tensor([*point, 1.0], dtype=torch.float64))[:3]
+
+
+@pytest.mark.parametrize("elevation", [-80.0, -30.0, 0.0, 45.0, 89.9])
+@pytest.mark.parametrize("azimuth", [-170.0, 0.0, 40.0, 90.0])
+def test_it_looks_at_the_origin_from_its_position(elevation: float, azimuth: float):
+    camera = OrbitCamera(elevation, azimuth, 1.7)
+    zero = torch.zeros(3, dtype=torch.float64)
+    torch.testing.assert_close(seen(camera, tuple(camera.position().tolist())), zero, atol=1e-12, rtol=0)
+    torch.testing.assert_close(seen(camera, (0, 0, 0)), torch.tensor([0, 0, 1.7], dtype=torch.float64))
+
+
+def test_up_in_the_world_is_up_in_the_picture():
+    assert seen(OrbitCamera(20, 130), (0, 0.5, 0))[1] < 0
+
+
+def test_azimuth_zero_stands_on_z_and_ninety_on_x():
+    torch.testing.assert_close(OrbitCamera(0, 0).position(), torch.tensor([0, 0, 2], dtype=torch.float64))
+    expected = torch.tensor([2, 0, 0], dtype=torch.float64)
+    torch.testing.assert_close(OrbitCamera(0, 90).position(), expected, atol=1e-12, rtol=0)
+
+
+def test_positive_elevation_is_above():
+    assert OrbitCamera(30, 40).position()[1] > 0
+    golden = torch.tensor([1.1133, -1.0, 1.3268], dtype=torch.float64)  # METHOD's golden value, 30 below
+    torch.testing.assert_close(OrbitCamera(-30, 40).position(), golden, atol=5e-5, rtol=0)
+
+
+def test_rotations_are_proper():
+    matrices = world_to_camera([OrbitCamera(e, a) for e in (-40, 0, 70) for a in (0, 33, 200)])[:, :3, :3]
+    torch.testing.assert_close(matrices @ matrices.mT, torch.eye(3, dtype=torch.float64).expand(9, 3, 3))
+    assert (torch.linalg.det(matrices) > 0).all()
+
+
+def test_focal_length_of_the_method():
+    assert OrbitCamera(width=256, height=256).focal == pytest.approx(280.222, abs=1e-3)
+    assert OrbitCamera(width=512, height=256).tan_half_fov == pytest.approx(
+        (2 * math.tan(math.radians(49.1) / 2), math.tan(math.radians(49.1) / 2))
+    )

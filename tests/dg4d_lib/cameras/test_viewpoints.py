@@ -1,0 +1,29 @@
+import torch
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.cameras.viewpoints import baking_views, random_orbit, turntable
+
+
+def test_random_views_stay_in_their_ranges_and_go_all_around():
+    cameras = random_orbit(
+        500, 64, elevation_deg=(-30, 30), radius=(1.5, 2.5), generator=torch.Generator().manual_seed(0)
+    )
+    assert all(-30 <= c.elevation_deg < 30 and -180 <= c.azimuth_deg < 180 and 1.5 <= c.radius < 2.5 for c in cameras)
+    assert {int((c.azimuth_deg + 180) // 45) for c in cameras} == set(range(8))
+
+
+def test_the_same_seed_gives_the_same_views():
+    def draw() -> list[OrbitCamera]:
+        return random_orbit(3, 8, elevation_deg=(0, 1), radius=(1, 2), generator=torch.Generator().manual_seed(5))
+
+    assert draw() == draw()
+
+
+def test_baking_sees_three_rings_and_both_poles():
+    cameras = baking_views(64)
+    assert len(cameras) == 26
+    assert {c.elevation_deg for c in cameras} == {0.0, -45.0, 45.0, 89.9, -89.9}
+
+
+def test_a_turntable_goes_round_once():
+    assert [c.azimuth_deg for c in turntable(4, OrbitCamera(0, 10))] == [10, 100, 190, 280]

@@ -1,0 +1,102 @@
+"""What every deformation must do, whichever it is."""
+
+import pytest
+import torch
+
+from dg4d_lib.deformation.framewise import Framewise
+from dg4d_lib.deformation.hexplane import HexPlane, plane_features, time_lines
+from dg4d_lib.deformation.interface import Deformation
+from dg4d_lib.deformation.mlp import Mlp
+from dg4d_lib.errors import BadInput
+from dg4d_lib.gaussians.initialize import blob
+from dg4d_lib.settings import HexPlaneSettings, MlpSettings
+
+COUNT, FRAMES = 60, 5
+BOX = torch.tensor([[-0.6, -0.6, -0.6], [0.6, 0.6, 0.6]])
+SMALL = HexPlaneSettings(spatial=8, temporal=6, features=8, hidden=16)
+
+
+def make(kind: str) -> Deformation:
+    generator = torch.Generator().manual_seed(0)
+    match kind:
+        case "hexplane":
+            return HexPlane(SMALL, BOX, generator)
+        case "two scales":
+            return HexPlane(SMALL.model_copy(update={"scales": (1, 2)}), BOX, generator)
+        case "mlp":
+            return Mlp(MlpSettings(frequencies=3, hidden=16), BOX, generator)
+        case _:
+            return Framewise(FRAMES, COUNT)
+
+
+KINDS = ["hexplane", "two scales", "mlp", "framewise"]
+
+
+@pytest.fixture
+def cloud():
+    return blob(COUNT, 0.5, torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_is_the_identity_at_the_start(kind: str, cloud):
+    moved = make(kind).displace(cloud.means, torch.linspace(0, 1, FRAMES)).apply(cloud)
+    assert moved.means.shape == (FRAMES, COUNT, 3)
+    for name in ("means", "log_scales", "quats"):
+        assert torch.equal(getattr(moved, name), getattr(cloud, name).expand_as(getattr(moved, name)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_recovers_a_slide_along_x(kind: str, cloud):
+    deformation, times = make(kind), torch.linspace(0, 1, FRAMES)
+    slide = torch.stack([0.3 * times, torch.zeros(FRAMES), torch.zeros(FRAMES)], -1)[:, None]
+    adam = torch.optim.Adam(deformation.parameters(), lr=0.01)
+    for _ in range(300):
+        adam.zero_grad()
+        (deformation.displace(cloud.means, times).means - slide).square().mean().backward()
+        adam.step()
+    assert (deformation.displace(cloud.means, times).means - slide).abs().max() < 0.02
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_planes_are_some_of_the_parameters(kind: str):
+    deformation = make(kind)
+    everything = {id(parameter) for parameter in deformation.parameters()}
+    assert {id(parameter) for parameter in deformation.planes()} <= everything
+
+
+def test_only_the_last_matrices_learn_at_the_first_step(cloud):
+    deformation = HexPlane(SMALL, BOX, torch.Generator().manual_seed(0))
+    deformation.displace(cloud.means, torch.tensor([0.5])).means.sum().backward()
+    moved = {name for name, p in deformation.named_parameters() if p.grad is not None and p.grad.abs().max() > 0}
+    assert moved == {"heads.means.outer.weight", "heads.means.outer.bias"}
+
+
+def test_time_lines_are_exact_on_the_steps_and_linear_between():
+    planes = torch.arange(6.0).reshape(1, 1, 3, 2).expand(3, 1, 3, 2)
+    lines = time_lines(planes, torch.tensor([0.0, 0.25, 1.0]))
+    assert lines[0, :, 0].tolist() == [[0.0, 1.0], [1.0, 2.0], [4.0, 5.0]]
+
+
+def test_features_are_the_product_of_six_samples():
+    generator = torch.Generator().manual_seed(0)
+    planes = torch.rand(3, 4, 5, 5, generator=generator)
+    lines = torch.rand(3, 2, 4, 5, generator=generator)
+    corner = torch.tensor([[-1.0, 1.0, -1.0]])  # first cell in x and z, last in y
+    expected = planes[0, :, 4, 0] * planes[1, :, 0, 0] * planes[2, :, 0, 4]
+    expected = expected * lines[0, :, :, 0] * lines[1, :, :, 4] * lines[2, :, :, 0]
+    torch.testing.assert_close(plane_features(corner, planes, lines)[:, 0], expected)
+
+
+def test_regularizers_count_only_when_switched_on():
+    assert HexPlane(SMALL, BOX, torch.Generator().manual_seed(0)).roughness() == 0
+    weights = {"variation_weight": 1.0, "smoothness_weight": 1.0, "sparsity_weight": 1.0}
+    rough = HexPlane(SMALL.model_copy(update=weights), BOX, torch.Generator().manual_seed(0))
+    assert rough.roughness() > 0  # random spatial planes
+    for plane in rough.space:
+        plane.data.fill_(0.3)
+    assert rough.roughness() == 0  # constant planes, time planes at one
+
+
+def test_a_framewise_table_refuses_another_cloud():
+    with pytest.raises(BadInput, match="60 Gaussians cannot move 3"):
+        Framewise(FRAMES, COUNT).displace(torch.zeros(3, 3), torch.tensor([0.0]))

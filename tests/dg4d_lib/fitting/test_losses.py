@@ -1,0 +1,22 @@
+import torch
+
+from dg4d_lib.fitting.losses import reference_loss, resized
+from dg4d_lib.rasterizer.interface import Rendering
+
+
+def test_resizing_is_over_white_and_does_not_bleed_hidden_color():
+    cutout = torch.zeros(1, 8, 8, 4)
+    cutout[..., :3] = torch.tensor([0.0, 1.0, 0.0])  # green everywhere, also where it is transparent
+    cutout[:, :, :4, 3] = 1.0
+    color, alpha = resized(cutout, 4)
+    torch.testing.assert_close(alpha[0, :, 0], torch.ones(4, 1))
+    torch.testing.assert_close(color[0, :, 3], torch.ones(4, 3))
+    torch.testing.assert_close(color[0, :, 0], torch.tensor([[0.0, 1.0, 0.0]]).expand(4, 3))
+
+
+def test_the_reference_loss_is_its_two_weighted_means():
+    rendering = Rendering(
+        torch.full((2, 4, 4, 3), 0.5), torch.full((2, 4, 4, 1), 0.5), torch.zeros(2, 4, 4, 1), torch.ones(2, 1).bool()
+    )
+    loss = reference_loss(rendering, torch.zeros(2, 4, 4, 3), torch.ones(2, 4, 4, 1), 8.0, 4.0)
+    torch.testing.assert_close(loss, torch.tensor(8 * 0.25 + 4 * 0.25))

@@ -1,0 +1,61 @@
+import pytest
+import torch
+
+from dg4d_lib.deformation.framewise import Framewise
+from dg4d_lib.deformation.hexplane import HexPlane
+from dg4d_lib.deformation.mlp import Mlp
+from dg4d_lib.errors import FitDiverged
+from dg4d_lib.fitting.motion import bounds_of, choose_frames, fit_motion, moments
+from dg4d_lib.settings import HexPlaneSettings, MlpSettings
+
+FRAMES, SLIDE = 4, 0.3
+
+
+def seed(number: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(number)
+
+
+def make(kind: str, known):
+    box = bounds_of(known.gaussians)
+    match kind:
+        case "hexplane":
+            return HexPlane(HexPlaneSettings(spatial=4, temporal=4, features=8, hidden=16), box, seed())
+        case "mlp":
+            return Mlp(MlpSettings(frequencies=2, hidden=16), box, seed())
+        case _:
+            return Framewise(FRAMES, len(known.gaussians))
+
+
+@pytest.mark.parametrize("kind", ["hexplane", "mlp", "framewise"])
+def test_a_slide_along_x_is_recovered(kind: str, known, motion_settings):
+    deformation = make(kind, known)
+    video = known.video()
+    fit_motion(known.gaussians, deformation, video, known.prior(0.5), known.rasterize, motion_settings, seed())
+    slid = deformation.displace(known.gaussians.means, video.times).means.median(1).values
+    expected = torch.stack([SLIDE * video.times, torch.zeros(FRAMES), torch.zeros(FRAMES)], -1)
+    assert (slid - expected).abs().max() < 0.03
+
+
+def test_frames_of_an_iteration_are_spread_over_time():
+    for number in range(20):
+        frames = choose_frames(32, 8, seed(number))
+        assert [int(f) // 4 for f in frames] == list(range(8))
+    assert choose_frames(5, 0, seed()).tolist() == [0, 1, 2, 3, 4]
+    assert choose_frames(5, 9, seed()).tolist() == [0, 1, 2, 3, 4]
+
+
+def test_a_prior_is_only_asked_what_it_can_judge(known, motion_settings):
+    prior = known.prior(0.5)
+    prior.frames = (0, 2)
+    views, rows = moments(prior, torch.tensor([1, 2, 3]), motion_settings.model_copy(update={"views": 2}), 16, seed())
+    assert [view.frame for view in views] == [2, 2]
+    assert rows.tolist() == [1, 1]
+
+
+def test_a_loss_that_is_no_number_stops_the_fit(known, motion_settings):
+    video = known.video()
+    video.frames[2] = torch.nan
+    with pytest.raises(FitDiverged, match="fit_motion: the loss became nan at iteration 1 of 120"):
+        fit_motion(
+            known.gaussians, make("framewise", known), video, known.prior(0.5), known.rasterize, motion_settings, seed()
+        )

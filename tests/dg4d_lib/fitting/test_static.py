@@ -1,0 +1,82 @@
+import pytest
+import torch
+
+from dg4d_lib.cameras.viewpoints import random_orbit
+from dg4d_lib.errors import FitDiverged
+from dg4d_lib.fitting.losses import Diverged
+from dg4d_lib.fitting.static import fit_gaussians
+from dg4d_lib.gaussians.initialize import blob
+from dg4d_lib.guidance.interface import View
+
+
+def seed(number: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(number)
+
+
+def psnr_from_unseen_sides(known, gaussians) -> float:
+    views = [View(c) for c in random_orbit(8, 32, elevation_deg=(-30, 30), radius=(2, 2), generator=seed(99))]
+    with torch.no_grad():
+        color = known.rasterize(gaussians, [view.camera for view in views], torch.ones(3)).color
+    return float(-10 * (color - known.clean(views)[0]).square().mean().log10())
+
+
+def test_score_distillation_with_the_true_views_recovers_the_object(known, static_settings):
+    start = blob(static_settings.points, 0.5, seed())
+    seen = []
+    fitted = fit_gaussians(
+        start,
+        known.subject(),
+        known.prior(0.98),
+        known.rasterize,
+        static_settings,
+        seed(),
+        lambda i, v: seen.append((i, v)),
+    )
+    assert psnr_from_unseen_sides(known, fitted) > psnr_from_unseen_sides(known, start) + 8
+    assert [i for i, _ in seen] == list(range(1, static_settings.iterations + 1))
+    assert not fitted.means.requires_grad
+
+
+def test_the_same_seed_gives_the_same_bytes(known, static_settings):
+    short = static_settings.model_copy(
+        update={"iterations": 12, "densify_every": 5, "densify_gradient": 1e-6, "prune_scale": 1.0}
+    )
+    start = blob(100, 0.5, seed())
+    first, second = (
+        fit_gaussians(start, known.subject(), known.prior(0.98), known.rasterize, short, seed(3)) for _ in range(2)
+    )
+    assert all(torch.equal(a, b) for a, b in zip(vars(first).values(), vars(second).values(), strict=True))
+
+
+def test_the_cloud_grows_where_the_picture_pulls_and_keeps_its_limit(known, static_settings):
+    eager = static_settings.model_copy(
+        update={
+            "iterations": 12,
+            "densify_every": 5,
+            "densify_gradient": 1e-9,
+            "max_points": 130,
+            "prune_opacity": 1e-6,
+            "prune_scale": 1.0,
+        }
+    )
+    grown = fit_gaussians(blob(100, 0.3, seed()), known.subject(), known.prior(0.98), known.rasterize, eager, seed())
+    assert 100 < len(grown) <= 130
+
+
+def test_a_loss_that_is_no_number_stops_with_step_iteration_and_the_last_good_state(known, static_settings):
+    class Broken:
+        viewpoints, frames = None, None
+
+        def loss(self, images, coverage, views, progress, generator):
+            return images.sum() * (torch.nan if progress > 0.02 else 1.0)
+
+    with pytest.raises(FitDiverged, match="fit_gaussians: the loss became nan at iteration 4 of 150") as caught:
+        fit_gaussians(blob(50, 0.5, seed()), known.subject(), Broken(), known.rasterize, static_settings, seed())
+    assert isinstance(caught.value, Diverged)
+    assert torch.isfinite(caught.value.gaussians.means).all()
+
+
+def test_a_cloud_that_vanishes_is_an_error_not_an_empty_asset(known, static_settings):
+    greedy = static_settings.model_copy(update={"densify_every": 2, "prune_opacity": 0.999})
+    with pytest.raises(FitDiverged, match=r"0 Gaussians are left at iteration 2 of 150; lower static\.prune_opacity"):
+        fit_gaussians(blob(50, 0.5, seed()), known.subject(), known.prior(0.98), known.rasterize, greedy, seed())

@@ -1,0 +1,26 @@
+import torch
+
+from dg4d_lib.gaussians.initialize import blob, on_surface
+
+
+def test_a_blob_fills_its_ball_with_grey():
+    cloud = blob(5000, 0.5, torch.Generator().manual_seed(0))
+    radii = cloud.means.norm(dim=-1)
+    assert radii.max() <= 0.5
+    assert abs((radii < 0.25).float().mean() - 1 / 8) < 0.02  # volume goes with the cube
+    torch.testing.assert_close(cloud.colors, torch.full((5000, 3), 0.5))
+    torch.testing.assert_close(cloud.opacities, torch.full((5000,), 0.1))
+    assert abs(float(cloud.scales.mean()) - 0.035) < 0.003  # the size METHOD names for 5,000 points
+
+
+def test_surface_points_cover_their_area():
+    points = torch.rand(100, 3, generator=torch.Generator().manual_seed(0))
+    cloud = on_surface(points, points, area=4.0)
+    torch.testing.assert_close(cloud.scales, torch.full((100, 3), 0.2))
+    torch.testing.assert_close(cloud.colors, points)
+    torch.testing.assert_close(cloud.means, points)
+
+
+def test_coincident_points_still_have_a_size():
+    cloud = on_surface(torch.zeros(5, 3), torch.zeros(5, 3), area=0.0)
+    assert torch.isfinite(cloud.log_scales).all()

@@ -1,0 +1,55 @@
+import pytest
+import torch
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.guidance.analytic import LATENT_NUMBERS, AnalyticPrior
+from dg4d_lib.guidance.distillation import alphabars, annealed_timestep
+from dg4d_lib.guidance.interface import GuidancePrior, View
+
+SIZE = 12
+VIEWS = [View(OrbitCamera(width=SIZE, height=SIZE))] * 3
+
+
+def known_pictures() -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    return torch.rand(3, SIZE, SIZE, 3, generator=generator), torch.rand(3, SIZE, SIZE, 1, generator=generator)
+
+
+def prior(coverage_weight: float = 1.0) -> AnalyticPrior:
+    return AnalyticPrior(lambda views: known_pictures(), 0.98, coverage_weight)
+
+
+def test_it_is_a_guidance_prior():
+    assert isinstance(prior(), GuidancePrior)
+
+
+@pytest.mark.parametrize("progress", [0.0, 0.4, 1.0])
+def test_the_gradient_is_the_closed_form_and_the_noise_cancels(progress: float):
+    images = torch.full((3, SIZE, SIZE, 3), 0.5, requires_grad=True)
+    coverage = torch.full((3, SIZE, SIZE, 1), 0.5, requires_grad=True)
+    prior(0.5).loss(images, coverage, VIEWS, progress, torch.Generator().manual_seed(0)).backward()
+    color, alpha = known_pictures()
+    a = float(alphabars()[annealed_timestep(progress, 0.98)])
+    scale = (a * (1 - a)) ** 0.5 * LATENT_NUMBERS / (3 * SIZE * SIZE) / 3
+    torch.testing.assert_close(images.grad, scale * 4 * (images.detach() - color), atol=2e-4, rtol=1e-3)
+    torch.testing.assert_close(coverage.grad, 0.5 * scale * 4 * (coverage.detach() - alpha), atol=2e-4, rtol=1e-3)
+
+
+def test_free_pixels_converge_to_the_known_picture():
+    images = torch.full((3, SIZE, SIZE, 3), 0.5, requires_grad=True)
+    coverage = torch.full((3, SIZE, SIZE, 1), 0.5, requires_grad=True)
+    adam = torch.optim.Adam([images, coverage], lr=0.02)
+    generator = torch.Generator().manual_seed(0)
+    for step in range(300):
+        adam.zero_grad()
+        prior().loss(images, coverage, VIEWS, step / 300, generator).backward()
+        adam.step()
+    color, alpha = known_pictures()
+    assert (images - color).abs().max() < 0.01
+    assert (coverage - alpha).abs().max() < 0.01
+
+
+def test_coverage_can_be_left_out():
+    images, coverage = (x.requires_grad_() for x in known_pictures())
+    prior(0.0).loss(images, coverage, VIEWS, 0.5, torch.Generator().manual_seed(0)).backward()
+    assert coverage.grad is None
