@@ -7,7 +7,7 @@ import numpy as np
 from numpy import ndarray
 from scipy.spatial.distance import cdist
 
-from examples.shapes import Bones, Chain, Field, Skin, ellipsoid, skin, smooth_chain, step, turn_about_z, union
+from examples.shapes import Bones, Chain, Field, Skin, ellipsoid, mix, skin, smooth_chain, step, turn_about_z, union
 
 SPINE = (  # x, y, z, radius from the snout to the tip of the tail
     (0.665, 0.175, 0, 0.085),
@@ -181,15 +181,15 @@ class Newt:
     def color(self, p: ndarray, features: ndarray) -> ndarray:
         """Paint at points of the skin at rest, "p 3"."""
         share, height, beyond, leg, spot, speck, middle = features.T
-        paint = _mix(BACK, FLANK, step(0.42, 0.7, 0.35 - height))
-        paint = _mix(paint, BELLY, step(0.42, 0.22, -height))
-        paint = _mix(paint, 0.85 * FLANK + 0.15 * CREST, step(-0.10, 0.08, -p[:, 1]) * step(-0.05, 0.05, -leg))
-        paint = _mix(paint, BELLY, step(0.315, 0.04, -p[:, 1]))
-        paint = _mix(paint, SPOT, 0.92 * step(0, 0.012, -spot))
-        paint = _mix(paint, SPECK, step(0, 0.008, -speck))
+        paint = mix(BACK, FLANK, step(0.42, 0.7, 0.35 - height))
+        paint = mix(paint, BELLY, step(0.42, 0.22, -height))
+        paint = mix(paint, 0.85 * FLANK + 0.15 * CREST, step(-0.10, 0.08, -p[:, 1]) * step(-0.05, 0.05, -leg))
+        paint = mix(paint, BELLY, step(0.315, 0.04, -p[:, 1]))
+        paint = mix(paint, SPOT, 0.92 * step(0, 0.012, -spot))
+        paint = mix(paint, SPECK, step(0, 0.008, -speck))
         stripes = step(0.5, 0.35, 0.5 + 0.5 * np.cos(2 * np.pi * 22 * share))
         on_crest = step(0.028, 0.016, beyond) * step(0.25, 0.04, share) * step(0.5, 0.2, height) * middle
-        paint = _mix(paint, _mix(CREST, CREST_EDGE, stripes), on_crest)
+        paint = mix(paint, mix(CREST, CREST_EDGE, stripes), on_crest)
         return self._face(p, paint)
 
     def _face(self, p: ndarray, paint: ndarray) -> ndarray:
@@ -198,19 +198,19 @@ class Newt:
         smile = 0.118 + 0.55 * (q[:, 0] - 0.60) ** 2 + 0.22 * np.maximum(0.50 - q[:, 0], 0)
         mouth = step(-0.0075, 0.006, -np.abs(q[:, 1] - smile)) * step(0.455, 0.02, q[:, 0])
         chin = step(0.0, 0.012, smile - 0.012 - q[:, 1]) * step(0.40, 0.16, q[:, 0])
-        paint = _mix(paint, BELLY, chin * (1 - mouth))
-        paint = _mix(paint, SPOT, 0.9 * mouth)
-        paint = _mix(paint, SPOT, step(-0.013, 0.006, -np.linalg.norm(q - NOSTRIL, axis=1)))
+        paint = mix(paint, BELLY, chin * (1 - mouth))
+        paint = mix(paint, SPOT, 0.9 * mouth)
+        paint = mix(paint, SPOT, step(-0.013, 0.006, -np.linalg.norm(q - NOSTRIL, axis=1)))
         offset = q - EYE
         distance = np.linalg.norm(offset, axis=1)
         facing = 0.6 * offset[:, 1] + offset[:, 2]
         ball = step(-EYE_RADIUS - 0.004, 0.004, -distance) * step(-0.01, 0.01, facing)
         direction = offset / np.maximum(distance, 1e-9)[:, None]
         look, glint = (np.arccos(np.clip(direction @ towards, -1, 1)) for towards in (LOOK, GLINT))
-        iris = _mix(np.array((0.99, 0.80, 0.16)), np.array((0.74, 0.60, 0.12)), step(0.75, 0.3, look))
-        iris = _mix(iris, np.array((0.02, 0.03, 0.05)), step(-0.56, 0.08, -look))
-        iris = _mix(iris, np.array((0.05, 0.12, 0.14)), step(1.12, 0.10, look))
-        return _mix(paint, _mix(iris, np.ones(3), step(-0.20, 0.06, -glint)), ball)
+        iris = mix(np.array((0.99, 0.80, 0.16)), np.array((0.74, 0.60, 0.12)), step(0.75, 0.3, look))
+        iris = mix(iris, np.array((0.02, 0.03, 0.05)), step(-0.56, 0.08, -look))
+        iris = mix(iris, np.array((0.05, 0.12, 0.14)), step(1.12, 0.10, look))
+        return mix(paint, mix(iris, np.ones(3), step(-0.20, 0.06, -glint)), ball)
 
     def _around(self, p: ndarray) -> tuple[ndarray, ndarray, ndarray]:
         """Share of the spine, height between belly (-1) and back (1), and distance beyond the body's tube."""
@@ -226,8 +226,3 @@ class Newt:
 def _nearest(points: ndarray, centers: ndarray, radii: ndarray) -> ndarray:
     """Distance to the nearest of some balls, negative inside."""
     return (cdist(points, centers) - radii).min(1)
-
-
-def _mix(under: ndarray, over: ndarray, amount: ndarray) -> ndarray:
-    """From one paint to another, "p 3" or one color each."""
-    return under + (over - under) * amount[:, None]

@@ -157,3 +157,8 @@ def step(edge: float, width: float, x: ndarray) -> ndarray:
     """0 below the edge, 1 above, smooth over `width`."""
     t = np.clip((x - edge) / width + 0.5, 0, 1)
     return t * t * (3 - 2 * t)
+
+
+def mix(under: ndarray, over: ndarray, amount: ndarray) -> ndarray:
+    """From one paint to another; each is "p 3" or a single color."""
+    return under + (over - under) * amount[:, None]

@@ -86,8 +86,10 @@ _ERRORS_BY_STATUS: dict[int, type[StepError]] = {
     EXIT_MISSING: StepMissing,
     EXIT_DIVERGED: StepDiverged,
     EXIT_OUT_OF_MEMORY: StepOutOfMemory,
-    -signal.SIGKILL: StepOutOfMemory,  # nobody else kills a step but the kernel's memory guard
 }
+KILLED = (  # nobody else kills a step without a word
+    "it was killed, most likely because memory ran out: end other programs, or choose smaller settings"
+)
 
 
 def in_process(spec: StepSpec, request: StepRequest, on_progress: Progress) -> StepResult:
@@ -120,6 +122,8 @@ def in_subprocess(spec: StepSpec, request: StepRequest, on_progress: Progress) -
             return outcome
         if isinstance(outcome, StepFailure):
             raise _ERRORS[outcome.kind](spec.name, outcome.message, outcome.pictures)
+        if status == -signal.SIGKILL:
+            raise StepOutOfMemory(spec.name, KILLED)
         tail = _tail(folder / "stderr")
         if status in _ERRORS_BY_STATUS:
             raise _ERRORS_BY_STATUS[status](spec.name, tail or f"the process ended with status {status}")

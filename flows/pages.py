@@ -12,6 +12,7 @@ from typing import Any
 import OpenImageIO as oiio
 
 from flows.executors import StepError
+from flows.publish import readable
 from steps.contract import ArtifactRef, StepResult
 from steps.store import ArtifactMissing, ArtifactStore
 
@@ -47,7 +48,7 @@ def step_page(label: str, item: str, result: StepResult, store: ArtifactStore) -
     lines += ["| fact | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items()), ""]
     lines += ["| output | kind | size |", "|---|---|---|"]
     lines += [
-        f"| {name} `{ref.digest[7:19]}` | {ref.media_type} | {megabytes(ref.size_bytes)} |"
+        f"| {name} `{ref.digest[7:19]}` | {ref.media_type} | {readable(ref.size_bytes)} |"
         for name, ref in result.outputs.items()
     ]
     return "\n".join(lines) + "\n"
@@ -85,7 +86,8 @@ def thumbnail(ref: ArtifactRef, store: ArtifactStore) -> bytes | None:
         picture = oiio.ImageBuf(str(store.path(ref)))
     except ArtifactMissing:
         return None
-    if picture.has_error or not picture.spec().width:
+    if not picture.read() or not picture.spec().width:
+        picture.geterror()  # it was taken note of
         return None
     width, height, channels = picture.spec().width, picture.spec().height, picture.nchannels
     scale = min(1.0, THUMBNAIL_SIZE / max(width, height))
@@ -113,11 +115,6 @@ def curve_table(curves: dict[str, Any]) -> list[str]:
         f"| {x[i]} | " + " | ".join(f"{_at(curves['series'][name], i):.5g}" for name in names) + " |" for i in picks
     ]
     return [*head, *rows, ""]
-
-
-def megabytes(size: int) -> str:
-    """A size for people."""
-    return f"{size / 1e6:.1f} MB" if size >= 100_000 else f"{size / 1e3:.1f} kB"
 
 
 def _at(values: list[float], index: int) -> float:

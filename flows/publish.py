@@ -109,6 +109,11 @@ def publish(package: Path, folder: Path, describe: Callable[[Files], dict[str, s
         raise
 
 
+def readable(size_bytes: int) -> str:
+    """A size for people."""
+    return f"{size_bytes / 1e6:.1f} MB" if size_bytes >= 100_000 else f"{size_bytes / 1e3:.1f} kB"
+
+
 def _publish(package: Path, folder: Path, describe: Callable[[Files], dict[str, str]], in_place: bool = False) -> Files:
     place = folder if in_place else folder.parent
     place.mkdir(parents=True, exist_ok=True)

@@ -6,8 +6,7 @@ import math
 from typing import Any
 
 from flows.orders import Order
-from flows.pages import megabytes
-from flows.publish import RECORD, Files
+from flows.publish import RECORD, Files, readable
 from flows.tasks import Finished, Made
 from steps.contract import canonical
 from steps.store import ArtifactStore
@@ -202,10 +201,10 @@ def _files(files: dict[str, int]) -> str:
         if slash:
             folders.setdefault(folder, []).append(size)
         else:
-            rows.append(f'<tr><td><a href="{_text(name)}">{_text(name)}</a><td class=number>{megabytes(size)}')
+            rows.append(f'<tr><td><a href="{_text(name)}">{_text(name)}</a><td class=number>{readable(size)}')
     rows += [
         f'<tr><td><a href="{_text(name)}/">{_text(name)}/</a> ({len(sizes)} files)<td class=number>'
-        f"{megabytes(sum(sizes))}"
+        f"{readable(sum(sizes))}"
         for name, sizes in folders.items()
     ]
     return f"<table>{''.join(rows)}</table>"
@@ -229,7 +228,8 @@ h1 {{ margin: 0 0 .5rem; font-size: 1.6rem; }} h2 {{ margin: 2rem 0 .5rem; font-
   background: repeating-conic-gradient(#fff 0 25%, #eee 0 50%) 0 0 / 20px 20px; }}
 table {{ border-collapse: collapse; }} td, th {{ padding: .2rem .8rem .2rem 0; text-align: left; }}
 td {{ border-top: 1px solid var(--line); }} .number {{ text-align: right; font-variant-numeric: tabular-nums; }}
-.bar {{ height: .7rem; background: #2563eb; border-radius: 2px; }} .small {{ font-size: .85rem; opacity: .75; margin: .2rem 0; }}
+.bar {{ height: .7rem; background: #2563eb; border-radius: 2px; }}
+.small {{ font-size: .85rem; opacity: .75; margin: .2rem 0; }}
 figure {{ display: inline-block; width: min(440px, 100%); margin: 1rem 1rem 0 0; vertical-align: top; }}
 figcaption {{ font-weight: 600; }}
 svg {{ width: 100%; background: var(--soft); border-radius: 4px; }} polyline {{ fill: none; stroke-width: 1.5; }}

@@ -1,6 +1,7 @@
 """One Prefect server in the background, for every command of this user; it ends when nobody has used it for a while.
 
-`python -m flows.server FOLDER` is the guard: it starts the server, says where it is in FOLDER/server.json and watches.
+`python -m flows.server FOLDER PREFECT_HOME` leaves a guard behind: it starts the server, says where it is in
+FOLDER/server.json, and watches.
 Commands hold a shared lock on FOLDER/in-use while they run; the kernel frees it when they end, however they end.
 """
 
@@ -22,6 +23,8 @@ from typing import IO
 
 HOST = "127.0.0.1"  # the server asks nobody who they are, so nobody else may reach it
 START_TIMEOUT_S = 120.0
+STARTS = 3  # before giving up on a server that ends
+GUARD_START_S = 20.0  # a bare interpreter
 IDLE_S = 1800.0  # without a command before the server ends; $DG4D_SERVER_IDLE_S
 LOOK_S = 1.0  # between two looks of the guard
 
@@ -69,21 +72,35 @@ class Server:
         return self.folder / "server.log"
 
     def start(self) -> None:
-        """Start it unless it runs; returns at once. From here on this command counts as a user."""
+        """Start it unless it runs, without waiting for it. From here on this command counts as a user."""
         self.folder.mkdir(parents=True, exist_ok=True)
         if self._in_use is None:
             self._in_use = (self.folder / "in-use").open("a")
             fcntl.flock(self._in_use, fcntl.LOCK_SH)  # waits for a guard that is just ending its server
         if not self._guarded():
             with self.log.open("ab") as log:
-                subprocess.Popen(
+                subprocess.run(
                     [sys.executable, "-m", "flows.server", str(self.folder), str(self.prefect_home)],
                     stdin=subprocess.DEVNULL,
                     stdout=log,
                     stderr=log,
                     cwd=self.folder,
                     start_new_session=True,
+                    check=False,
                 )
+
+    def wait_for_address(self) -> str:
+        """Where it will be; known before it answers.
+
+        Raises:
+            ServerUnavailable: its guard did not start.
+        """
+        deadline = time.monotonic() + GUARD_START_S
+        while time.monotonic() < deadline:
+            if (address := self.address()) is not None:
+                return address
+            time.sleep(0.02)
+        raise ServerUnavailable(f"the guard of the Prefect server did not start; what it said is in {self.log}")
 
     def wait(self, timeout_s: float = START_TIMEOUT_S) -> str:
         """Wait until it answers; the address of its API.
@@ -283,4 +300,6 @@ def _locked(path: Path, *, shared: bool = False, patience_s: float = 0.0) -> Ite
 
 
 if __name__ == "__main__":
+    if os.fork():
+        os._exit(0)  # whoever started the guard does not wait for it
     sys.exit(guard(Path(sys.argv[1]), Path(sys.argv[2])))

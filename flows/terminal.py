@@ -13,6 +13,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 from rich.table import Table
 
 from flows.events import StepEvent, listening
+from flows.publish import readable
 
 LINE_EVERY_S = 10.0  # between two lines about one step, where there is no terminal
 COUNTED = 1  # totals up to this say nothing as a fraction
@@ -166,5 +167,5 @@ def tell_where(out: Console, folder: Path, sizes: dict[str, int]) -> None:
         count, total = groups.get(group, (0, 0))
         groups[group] = count + 1, total + size
     for group, (count, total) in groups.items():
-        table.add_row(group + (f" ({count} files)" if group.endswith("/") else ""), f"{total / 1e6:.2f} MB")
+        table.add_row(group + (f" ({count} files)" if group.endswith("/") else ""), readable(total))
     out.print(table)

@@ -1,13 +1,15 @@
-"""Moving pictures of users, through PyAV: counted first, then only the frames that are wanted are kept, already small."""
+"""Moving pictures of users, through PyAV: counted first, then only the wanted frames are kept, already small."""
 
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import cast
 
 import av
 import numpy as np
 import torch
 from av.error import FFmpegError
+from av.video.codeccontext import VideoCodecContext
 from jaxtyping import Float
 from torch import Tensor
 
@@ -16,7 +18,9 @@ from dg4d_lib.video.framing import shrink
 from steps.stills import check_size
 
 LARGEST_SIDE = 1024  # pixels of a frame that is worked on
-MOST_WORK = 32 * LARGEST_SIDE**2  # pixels of all frames together: half a gigabyte as float32 RGBA; more frames, smaller ones
+MOST_WORK = (
+    32 * LARGEST_SIDE**2
+)  # pixels of all frames together: half a gigabyte as float32 RGBA; more frames, smaller ones
 MOST_FRAMES = 9000  # five minutes at 30 per second; every one must be decoded
 USUAL_FPS = 24.0  # assumed when a file does not tell
 SAME_RATE = 0.02  # relative difference up to which the rate in the header is believed over the time stamps
@@ -51,7 +55,7 @@ class Clip:
 
     def __init__(self, path: Path, container: str, what: str = "the video") -> None:
         self._path, self._container, self._what = path, container, what
-        times = []
+        times: list[float | None] = []
         for frame in self._frames():
             if not times:
                 check_size(frame.width, frame.height, what)
@@ -61,6 +65,10 @@ class Clip:
                     f"{what} has more than {MOST_FRAMES} frames; cut it to the part that should become an animation"
                 )
         self.count = len(times)
+        if self.announced > 0 and self.count == 0:
+            raise BadInput(
+                f"{what} is cut off or broken: none of its {self.announced} frames can be read; copy it again"
+            )
         self.fps = self._rate(times)
 
     def read(self, indices: Sequence[int]) -> tuple[Float[Tensor, "t h w 4"], bool]:
@@ -79,7 +87,8 @@ class Clip:
         try:
             with av.open(str(self._path), format=self._container) as container:
                 if not container.streams.video:
-                    raise BadInput(f"{self._what} holds no pictures, only other tracks; give one that shows something")
+                    found = "holds only sound or other tracks" if len(container.streams) else "is cut off or broken"
+                    raise BadInput(f"{self._what} {found}: there are no pictures in it; give another file")
                 stream = container.streams.video[0]
                 context = stream.codec_context
                 if context is None:
@@ -89,11 +98,9 @@ class Clip:
                 self.announced = stream.frames
                 self._header_rate = float(stream.average_rate or 0)
                 name = ALPHA_DECODERS.get(context.name, "") if stream.metadata.get("alpha_mode") == "1" else ""
-                decoder = av.CodecContext.create(name, "r") if name else context
+                decoder = cast(VideoCodecContext, av.CodecContext.create(name, "r")) if name else context
                 for packet in container.demux(stream):
-                    for frame in decoder.decode(packet):
-                        if isinstance(frame, av.VideoFrame):
-                            yield frame
+                    yield from decoder.decode(packet)
         except FFmpegError as error:
             raise BadInput(
                 f"{self._what} is cut off or broken ({error.strerror}); copy it again, or export it as H.264 mp4"

@@ -7,7 +7,6 @@ from tempfile import TemporaryDirectory
 import torch
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.video.generator import VideoGenerator
 from dg4d_lib.video.warp import Warp
 from steps.job import Facts, Job
 from steps.media import read_frames, read_png, write_frames
@@ -32,8 +31,8 @@ def run(job: Job) -> Facts:
             raise BadInput(f"the footage is {sizes[0]} pixels and the subject {sizes[1]}; prepare both together")
         copyfile(job.inputs["footage"], job.outputs["driving_video"])
         return Facts(backend="none: the footage is used as it is")
-    generator: VideoGenerator = Warp(settings.driving)
+    generator = Warp(settings.driving)
     video = generator.generate(subject, torch.Generator().manual_seed(job.seed))
     write_frames(job.outputs["driving_video"], video)
     note = f"The motion is made up by a warp of the picture ({settings.driving.motion}), without a learned model."
-    return Facts(notes=(note,))
+    return Facts(notes=(note, *generator.notes))

@@ -12,6 +12,7 @@ when `--store` is not given.
 
 import argparse
 import ctypes
+import functools
 import hashlib
 import importlib
 import importlib.metadata
@@ -24,7 +25,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, TextIO
 
@@ -69,12 +70,7 @@ def catalog() -> dict[str, StepSpec]:
 
 def code_version(spec: StepSpec) -> str:
     """Twelve digits that change with any source file of the library, of the steps, or of the step's own module."""
-    content = hashlib.sha256()
-    for package in ("dg4d_lib", "steps"):
-        folder = Path(str(importlib.import_module(package).__file__)).parent
-        for file in sorted(p for p in folder.rglob("*") if p.suffix not in {".pyc", ".md"} and p.is_file()):
-            content.update(f"{package}/{file.relative_to(folder).as_posix()}\0".encode())
-            content.update(file.read_bytes())
+    content = hashlib.sha256(_source_digest(tuple(_source_files())).encode())
     module = spec.entry.partition(":")[0]
     if module.partition(".")[0] not in {"dg4d_lib", "steps"}:
         found = importlib.util.find_spec(module)
@@ -169,6 +165,24 @@ def progress_lines(file: TextIO) -> Progress:
             file.flush()
 
     return report
+
+
+def _source_files() -> Iterator[tuple[str, Path, int, int]]:
+    """Every file of the library and the steps: its name, where it is, when it changed, its size."""
+    for package in ("dg4d_lib", "steps"):
+        folder = Path(str(importlib.import_module(package).__file__)).parent
+        for path in sorted(folder.rglob("*")):
+            if path.suffix not in {".pyc", ".md"} and path.is_file():
+                facts = path.stat()
+                yield f"{package}/{path.relative_to(folder).as_posix()}", path, facts.st_mtime_ns, facts.st_size
+
+
+@functools.lru_cache(maxsize=1)
+def _source_digest(files: tuple[tuple[str, Path, int, int], ...]) -> str:
+    content = hashlib.sha256()
+    for name, path, _, _ in files:
+        content.update(f"{name}\0".encode() + path.read_bytes())
+    return content.hexdigest()
 
 
 def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scratch: Path) -> StepResult:

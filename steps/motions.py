@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 from pydantic import TypeAdapter
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
@@ -46,11 +46,12 @@ def read_motion(path: Path) -> tuple[Deformation, int]:
     Raises:
         BadInput: the file is no motion.
     """
-    with safe_open(path, "pt") as file:
-        about = json.loads((file.metadata() or {}).get("motion", "null"))
-        tensors: Mapping[str, Tensor] = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no dict)
-    if about is None:
-        raise BadInput(f"{path.name} is a safetensors file but no motion; give the `motion` output of fit_motion")
+    try:
+        with safe_open(path, "pt") as file:
+            about = json.loads((file.metadata() or {})["motion"])
+            tensors: Mapping[str, Tensor] = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no dict)
+    except (SafetensorError, KeyError) as error:
+        raise BadInput(f"{path.name} is no motion ({error}); give the `motion` output of fit_motion") from error
     settings: DeformationSettings = TypeAdapter(DeformationSettings).validate_python(about["settings"])
     deformation: HexPlane | Mlp | Framewise
     match settings:

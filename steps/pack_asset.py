@@ -49,7 +49,7 @@ def run(job: Job) -> Facts:
     deformation, frames = read_motion(job.inputs["motion"])
     with TemporaryDirectory() as scratch:
         video = read_frames(job.inputs["driving_video"], Path(scratch))
-        surface = _surface(job, video.fps)
+        surface = _surface(job)
         _check_frames(len(video), {"motion": frames, "mesh": _frames_of(surface)})
         entries = list(_meshes(surface, video.fps, _extras(settings)))
         if settings.pack.splats:
@@ -90,15 +90,12 @@ def run(job: Job) -> Facts:
     return Facts(backend=f"{settings.rasterizer} rasterizer", notes=notes)
 
 
-def _surface(job: Job, fps: float) -> Asset4D | list[TexturedMesh]:
+def _surface(job: Job) -> Asset4D | list[TexturedMesh]:
     """The tracked mesh, or a mesh per frame: whichever was given."""
     given = [port for port in ("tracked", "meshes") if port in job.inputs]
     match given:
         case ["tracked"]:
-            asset = read_tracked(job.inputs["tracked"])
-            if asset.fps != fps:
-                raise BadInput(f"the tracked mesh runs at {asset.fps} frames per second, the driving video at {fps}")
-            return asset
+            return read_tracked(job.inputs["tracked"])
         case ["meshes"]:
             return read_meshes(job.inputs["meshes"])
     raise BadInput(f"a package needs one kind of mesh, `tracked` or `meshes`; given {given or 'neither'}")

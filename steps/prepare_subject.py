@@ -1,7 +1,7 @@
 """A user's picture or video becomes cut-outs in one square frame."""
 
-from tempfile import TemporaryDirectory
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from dg4d_lib.settings import SubjectSettings
 from dg4d_lib.video.driving import DrivingVideo

@@ -1,4 +1,4 @@
-"""What users hand in, whatever it is: a picture, a video, or a zip of numbered pictures; told apart by content, not by name."""
+"""What users hand in: a picture, a video, or a zip of numbered pictures; told apart by content, never by name."""
 
 import re
 import struct
@@ -119,9 +119,7 @@ def _video(
     kept = frames.shape[0]
     if kept < count:
         notes = (*notes, f"{kept} of the video's {count} frames are used, evenly spaced; it lasts as long as before.")
-    return Source(
-        frames, has_alpha and _says_something(frames), thinned_rate(fps, count, kept), "video", notes
-    )
+    return Source(frames, has_alpha and _says_something(frames), thinned_rate(fps, count, kept), "video", notes)
 
 
 def _says_something(frames: Float[Tensor, "t h w 4"]) -> bool:
@@ -135,7 +133,9 @@ def _read_clip(path: Path, container: str, max_frames: int) -> Source:
         return _picture(*clip.read([0]))
     _need_two(clip.count, "the video")
     frames, has_alpha = clip.read(evenly_spaced(clip.count, max_frames))
-    return _video(frames, has_alpha, clip.fps, clip.count)
+    lost = clip.announced - clip.count
+    notes = (f"The video promises {clip.announced} frames; {clip.count} can be read.",) if lost > 1 else ()
+    return _video(frames, has_alpha, clip.fps, clip.count, notes)
 
 
 def _read_webp(path: Path, scratch: Path, max_frames: int) -> Source:
@@ -197,7 +197,9 @@ def _numbered(entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo]:
         return sorted(entries, key=lambda info: info.filename)
     without = sorted(name for name, number in found.items() if number is None)
     if without:
-        raise BadInput(f"the frame {without[0]} has no number at the end of its name while others do; rename or remove it")
+        raise BadInput(
+            f"the frame {without[0]} has no number at the end of its name while others do; rename or remove it"
+        )
     by_number: dict[int, zipfile.ZipInfo] = {}
     for info in entries:
         match = found[info.filename]
@@ -209,11 +211,12 @@ def _numbered(entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo]:
         by_number[number] = info
     first, last = min(by_number), max(by_number)
     if last - first + 1 != len(by_number):
-        width = len(Path(by_number[first].filename).stem) and len(str(last))
         gaps = [number for number in range(first, min(last, first + 10**6)) if number not in by_number]
-        listed = ", ".join(f"{number:0{width}d}" for number in gaps[:NAMED_AT_MOST])
+        listed = ", ".join(f"{number}" for number in gaps[:NAMED_AT_MOST])
         more = f" and {len(gaps) - NAMED_AT_MOST} more" if len(gaps) > NAMED_AT_MOST else ""
-        raise BadInput(f"frames are missing between {first} and {last}: {listed}{more}; add them, or number without gaps")
+        raise BadInput(
+            f"frames are missing between {first} and {last}: {listed}{more}; add them, or number without gaps"
+        )
     return [by_number[number] for number in sorted(by_number)]
 
 
@@ -256,7 +259,7 @@ def _suffix(head: bytes) -> str:
 
 
 def _container(head: bytes) -> str:
-    """FFmpeg's name of the container these bytes begin, or nothing. Guessing is never left to FFmpeg: it knows playlists."""
+    """FFmpeg's name of the container these bytes begin, or nothing; FFmpeg itself would also guess playlists."""
     if head[4:8] == b"ftyp" and head[8:12] in UNREADABLE_BRANDS:
         name = UNREADABLE_BRANDS[head[8:12]]
         raise BadInput(f"{name} pictures cannot be read here; export the picture as PNG or JPEG")

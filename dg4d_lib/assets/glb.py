@@ -23,6 +23,7 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.textured import TexturedMesh
 
 LINEAR, LINEAR_MIPMAP_LINEAR, CLAMP_TO_EDGE = 9729, 9987, 33071
+PNG_LEVEL = 4  # of 9; twice as fast as the default 6, files a few percent larger
 MAX_SHORT_INDEX = 65534  # 65535 restarts primitives on some devices and is forbidden
 TRANSFORMS = {"matrix", "translation", "rotation", "scale"}
 _FOREIGN = (KeyError, IndexError, TypeError, ValueError, ArithmeticError, OSError)  # what another form runs into
@@ -166,7 +167,7 @@ def _add_primitive(document: Document, mesh: TexturedMesh, name: str) -> dict[st
     return {
         "attributes": {
             "POSITION": document.add_accessor(f"{name} positions", vertices, VERTEX_DATA),
-            "NORMAL": document.add_accessor(f"{name} normals", vertex_normals(vertices, faces), VERTEX_DATA),
+            "NORMAL": document.add_accessor(f"{name} normals", seamless_normals(vertices, faces), VERTEX_DATA),
             "TEXCOORD_0": document.add_accessor(f"{name} texture coordinates", _array(mesh.uvs), VERTEX_DATA),
         },
         "indices": document.add_accessor(f"{name} triangles", indices, INDEX_DATA),
@@ -178,7 +179,7 @@ def _add_primitive(document: Document, mesh: TexturedMesh, name: str) -> dict[st
 def _add_material(document: Document, texture: Float[Tensor, "h w 3"], name: str) -> int:
     pixels = (texture.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     file = io.BytesIO()
-    Image.fromarray(pixels).save(file, "PNG")
+    Image.fromarray(pixels).save(file, "PNG", compress_level=PNG_LEVEL)
     view = document.add_view(f"{name} color", file.getvalue())
     image = document.add("images", name=f"{name} color", mimeType="image/png", bufferView=view)
     sampler = document.add(
@@ -226,7 +227,7 @@ def _read_primitive(parsed: Parsed) -> tuple[TexturedMesh, dict[str, Any]]:
     return mesh, primitive
 
 
-def vertex_normals(vertices: NDArray[Any], faces: NDArray[Any]) -> NDArray[Any]:
+def seamless_normals(vertices: NDArray[Any], faces: NDArray[Any]) -> NDArray[Any]:
     """Unit normals, weighted by area, equal at vertices that lie at the same place (the copies along texture seams).
 
     A vertex of no triangle, or of triangles without area, gets +y.

@@ -22,6 +22,7 @@ from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import PackSettings
 
 SMOOTH_FPS = 20  # slower motions are sampled between their frames, so that the turn looks smooth
+MOST_PICTURES = 600  # sampling between frames stops here; a long video still has all its own frames
 ELEVATION_DEG = 10.0  # of the camera: a little from above
 BATCH = 8  # pictures of one rasterizer call, bounds the memory
 CODECS = {"libx264": {"crf": "18", "preset": "medium"}, "mpeg4": {"qscale": "3"}}  # best first
@@ -60,7 +61,7 @@ def write_preview(
         BackendUnavailable: this build of FFmpeg can write no MP4 codec we know.
         OSError: the file could not be written.
     """
-    repeats = ceil(SMOOTH_FPS / fps)
+    repeats = max(1, min(ceil(SMOOTH_FPS / fps), MOST_PICTURES // (frames * settings.preview_turns)))
     positions = torch.arange(frames * repeats).repeat(settings.preview_turns) / repeats
     camera = OrbitCamera(ELEVATION_DEG, width=settings.preview_size, height=settings.preview_size)
     cameras = turntable(len(positions), camera)

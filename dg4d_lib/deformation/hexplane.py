@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dg4d_lib.deformation.hexplane_kernel import hexplane_features
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.settings import HexPlaneSettings
 
@@ -74,8 +75,10 @@ class HexPlane(nn.Module):
         """What to add at every time in [0, 1]; means outside the box read its border."""
         low, high = self.bounds
         coordinates = ((means - low) / (high - low) * 2 - 1).clamp(-1, 1)
+        on_cpu = means.device.type == "cpu" and means.dtype == torch.float32 and not coordinates.requires_grad
+        read = hexplane_features if on_cpu else plane_features
         features = [
-            plane_features(coordinates, space, time_lines(time, times))
+            read(coordinates, space, time_lines(time, times))
             for space, time in zip(self.space, self.time, strict=True)
         ]
         displacement: Displacement = self.heads(self.trunk(torch.cat(features, -1)))
@@ -116,7 +119,10 @@ def time_lines(planes: Float[Tensor, "3 c steps r"], times: Float[Tensor, " t"])
 def plane_features(
     coordinates: Float[Tensor, "n 3"], planes: Float[Tensor, "3 c r r"], lines: Float[Tensor, "3 t c r"]
 ) -> Float[Tensor, "t n c"]:
-    """Product of the six bilinear samples; coordinates in [-1, 1], corners aligned. Plain torch."""
+    """Product of the six bilinear samples; coordinates in [-1, 1], corners aligned.
+
+    Plain torch: the definition of `hexplane_features`, and what runs on other devices and precisions.
+    """
     pairs = torch.stack([coordinates[:, list(axes)] for axes in PLANE_AXES])
     space = functional.grid_sample(planes, pairs[:, None], align_corners=True, padding_mode="border")[:, :, 0].prod(0)
     last = lines.shape[-1] - 1

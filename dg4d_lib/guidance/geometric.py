@@ -11,6 +11,8 @@ from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import InflatedSurface, inflate
 from dg4d_lib.settings import GeometricPriorSettings
 
+LARGE = 2  # times the surface's own resolution: larger pictures take one sample per pixel
+
 
 class InflatedSurfaces:
     """A surface per frame, each built when it is first asked for."""
@@ -46,7 +48,14 @@ class InflatedSurfaces:
 
         Returns:
             Colors over white and coverage, in [0, 1].
+
+        Raises:
+            BadInput: no views, views of different sizes, or a frame that is not there.
         """
+        if not views:
+            raise BadInput("the prior was asked for no view at all; ask for at least one")
         surfaces = [self.surface(view.frame) for view in views]
-        color, coverage = render_surface(surfaces, [view.camera for view in views])
+        cameras = [view.camera for view in views]
+        fine = max(camera.height for camera in cameras) > LARGE * self._settings.size
+        color, coverage = render_surface(surfaces, cameras, supersample=1 if fine else 2)
         return color * coverage + (1 - coverage), coverage

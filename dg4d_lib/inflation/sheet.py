@@ -15,16 +15,24 @@ class Sheet:
         pixels: row and column of the pixel whose values the node carries.
         inside: whether it is a pixel (1) or a crossing (0); pixels come first.
         triangles: clockwise in the picture.
+        mask: the silhouette.
     """
 
     points: Float64[np.ndarray, "k 2"]
     pixels: Int64[np.ndarray, "k 2"]
     inside: Bool[np.ndarray, " k"]
     triangles: Int64[np.ndarray, "f 3"]
+    mask: Bool[np.ndarray, "h w"]
 
     def at(self, values: Float64[np.ndarray, "h w *c"]) -> Float64[np.ndarray, "k *c"]:
         """A picture's values at the nodes."""
         return values[self.pixels[:, 0], self.pixels[:, 1]]
+
+    def covers(self, points: Float64[np.ndarray, "m 2"]) -> Bool[np.ndarray, " m"]:
+        """Whether the pixels under these points belong to the silhouette."""
+        size = np.array(self.mask.shape[::-1])
+        columns, rows = np.clip(np.floor(points + size / 2).astype(np.int64), 0, size - 1).T
+        return self.mask[rows, columns]
 
 
 def triangulate(mask: Bool[np.ndarray, "h w"], alpha: Float64[np.ndarray, "h w"]) -> Sheet:
@@ -66,6 +74,7 @@ def triangulate(mask: Bool[np.ndarray, "h w"], alpha: Float64[np.ndarray, "h w"]
         pixels=np.clip(np.concatenate(pixels) - 1, 0, None),
         inside=np.arange(count) < len(rows),
         triangles=np.concatenate(triangles),
+        mask=mask,
     )
 
 

@@ -1,8 +1,9 @@
 """From a cut-out picture to a closed, colored surface.
 
 Two sheets over one triangulation of the silhouette, welded along the outline: the front one carries the picture, the
-back one a guess. Both slide inwards along the rays of the input camera as they leave the plane z = 0, so the input view
-shows the picture exactly, the opposite view exactly its mirrored outline.
+back one a guess. Both slide inwards along the rays of the input camera as they leave the plane z = 0: the front sheet
+covers the picture exactly in the input view, and the back sheet its mirror image in the opposite view, unless it would
+then show through a hole or a notch in the input view, where it slides inwards less.
 """
 
 import math
@@ -22,6 +23,7 @@ from dg4d_lib.inflation.mask import subject_mask
 from dg4d_lib.inflation.sheet import Sheet, triangulate
 
 FARTHEST = 1.0  # world units: a turned plane leaves z = 0 by no more
+SLIDES = (0.75, 0.5, 0.25, 0.0)  # places tried for the back sheet, outmost first
 CELLS = 1 << 10  # of a space-filling curve, per axis
 
 
@@ -131,10 +133,11 @@ def _two_sheets(
     ray = sheet.points * np.array([pixel, -pixel]) / RADIUS  # x and y per unit of distance from the camera's plane
     place = ray * (RADIUS - plane - bulge)[:, None]
     behind = np.flatnonzero(sheet.inside)
+    far_place = ray * (RADIUS - plane + (2 * _hidden_share(sheet, plane, bulge) - 1) * bulge)[:, None]
     twin = np.arange(len(place))
     twin[behind] = len(place) + np.arange(len(behind))
     vertices = np.concatenate(
-        [np.column_stack([place, plane + bulge]), np.column_stack([place, plane - bulge])[behind]]
+        [np.column_stack([place, plane + bulge]), np.column_stack([far_place, plane - bulge])[behind]]
     )
     faces = np.concatenate([sheet.triangles[:, ::-1], twin[sheet.triangles]])
     return InflatedSurface(
@@ -143,6 +146,18 @@ def _two_sheets(
         colors=torch.from_numpy(np.concatenate([front, back[behind]])).float(),
         seen=torch.arange(len(vertices)) < len(place),
     )
+
+
+def _hidden_share(
+    sheet: Sheet, plane: Float64[np.ndarray, " k"], bulge: Float64[np.ndarray, " k"]
+) -> Float64[np.ndarray, " k"]:
+    """How far out the back sheet must stay to be hidden: 0 is as far in as the front sheet, 1 on the front's ray."""
+    share, hidden = np.ones(len(bulge)), np.ones(len(bulge), bool)
+    for step in SLIDES:
+        reach = (RADIUS - plane + (2 * step - 1) * bulge) / (RADIUS - plane + bulge)  # where the input view sees it
+        hidden &= sheet.covers(sheet.points * reach[:, None])
+        share[hidden] = step
+    return share
 
 
 def _curve_order(points: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:

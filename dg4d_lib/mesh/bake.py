@@ -1,17 +1,20 @@
 """The colors of Gaussians, projected back onto a surface (METHOD section 8; Tang et al. 2024, section 3.2).
 
-Every texel looks at pictures of the Gaussians from 26 sides and from the input view, and keeps a mean of the colors it sees,
-heavily in favor of the view that looks straight at it. Pictures are un-premultiplied and their soft outlines left out, so
-nothing of a background gets into the texture.
+Every texel looks at pictures of the Gaussians from 26 sides and from the input view, and keeps a mean of the colors it
+sees, heavily in favor of the view that looks straight at it. Pictures are un-premultiplied and their soft outlines left
+out, so nothing of a background gets into the texture.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from numba import njit
+from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -20,7 +23,7 @@ from torch.nn.functional import max_pool2d, normalize
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import baking_views
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.mesh.render import sample
+from dg4d_lib.kernels.workers import run
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
@@ -31,9 +34,10 @@ SOLID = 0.5  # alpha below which a pixel is background
 OUTLINE = 2  # pixels: the band along outlines and along nearer surfaces that is not trusted
 LAST_RESORT = 1e-4  # weight of views that are too flat or on an outline: they count where nothing better is
 FLATTEST = 0.05  # cosine below which a view does not count at all
-DEPTH_SLACK = 3.0  # pixel footprints by which a texel may lie behind the z-buffer, over the cosine
+DEPTH_SLACK = 1.5  # pixel footprints by which a texel may lie behind the z-buffer, over the cosine; of it at least 0.2
 NEIGHBORS = 4  # seen texels whose colors an unseen one takes
 VIEWS_AT_ONCE = 9
+TEXELS_AT_ONCE = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -80,18 +84,17 @@ def bake(
     size = settings.texture_size
     if len(texels.rows) == 0:  # all triangles are smaller than a texel
         return torch.full((size, size, 3), 0.5)
-    total = torch.zeros(len(texels.rows), 3)
-    weight = torch.zeros(len(texels.rows), 1)
-    cameras = [OrbitCamera(width=settings.render_size, height=settings.render_size), *baking_views(settings.render_size)]
-    boosts = [INPUT_WEIGHT] + [1.0] * (len(cameras) - 1)
+    total = np.zeros((len(texels.rows), 4), np.float32)  # sum of weight times color, and of weight
+    side = settings.render_size
+    cameras = [OrbitCamera(width=side, height=side), *baking_views(side)]
     for start in range(0, len(cameras), VIEWS_AT_ONCE):
         batch = cameras[start : start + VIEWS_AT_ONCE]
-        for view, boost in zip(_views(batch, vertices, faces, gaussians, rasterize), boosts[start:], strict=False):
-            color, trust = _look(view, texels, settings.min_cosine)
-            total += boost * trust * color
-            weight += boost * trust
+        pictures = _look(batch, vertices, faces, gaussians, rasterize)
+        boosts = [INPUT_WEIGHT if start + view == 0 else 1.0 for view in range(len(batch))]
+        run([partial(_add, texels, batch, pictures, boosts, settings, part, total) for part in _parts(len(total))])
+    weight = torch.from_numpy(total[:, 3:])
     seen = weight[:, 0] > 0
-    colors = torch.where(seen[:, None], total / weight.clamp_min(1e-30), torch.full_like(total, 0.5))
+    colors = torch.where(seen[:, None], torch.from_numpy(total[:, :3]) / weight.clamp_min(1e-30), 0.5)
     colors = _spread(colors, seen, texels.positions)
     return _padded(colors, texels, size)
 
@@ -114,70 +117,66 @@ def texels_of(
     """Where the texels of a square texture lie on the surface; a texel's center is at (index + 0.5) / size."""
     ids, weights = np.full((size, size), -1, np.int32), np.zeros((size, size, 3), np.float32)
     _map(uvs.double().numpy() * size, faces.to(torch.int32).numpy(), ids, weights)
-    rows, columns = np.nonzero(ids >= 0)
-    corners = faces.long()[torch.from_numpy(ids[rows, columns].astype(np.int64))]
-    share = torch.from_numpy(weights[rows, columns])[..., None]
+    found = torch.from_numpy(ids)
+    rows, columns = torch.nonzero(found >= 0, as_tuple=True)
+    corners = faces.long()[found[rows, columns].long()]
+    share = torch.from_numpy(weights)[rows, columns][..., None]
     return Texels(
-        torch.from_numpy(rows),
-        torch.from_numpy(columns),
+        rows,
+        columns,
         (share * vertices[corners]).sum(1),
         normalize((share * normals[corners]).sum(1), dim=-1),
     )
 
 
-@dataclass(frozen=True)
-class _View:
-    """What one camera shows: straight color, where it is to be trusted, and how far the mesh is."""
-
-    camera: OrbitCamera
-    color: Float[Tensor, "h w 3"]
-    solid: Bool[Tensor, "h w"]
-    inner: Bool[Tensor, "h w"]
-    depth: Float[Tensor, "h w"]
-    front: Float[Tensor, "h w"]
+def _parts(count: int) -> list[slice]:
+    return [slice(start, start + TEXELS_AT_ONCE) for start in range(0, count, TEXELS_AT_ONCE)]
 
 
-def _views(
+def _add(
+    texels: Texels,
+    cameras: Sequence[OrbitCamera],
+    pictures: Sequence[Tensor],
+    boosts: Sequence[float],
+    settings: MeshSettings,
+    part: slice,
+    total: NDArray[np.float32],
+) -> None:
+    """Add what some of the texels see from all cameras to their sums."""
+    places, normals = texels.positions[part].numpy(), texels.normals[part].numpy()
+    for view, (camera, boost) in enumerate(zip(cameras, boosts, strict=True)):
+        pose = camera.world_to_camera().numpy(), camera.position().numpy(), camera.focal
+        shown = (picture[view].numpy() for picture in pictures)
+        _gather(places, normals, *pose, *shown, settings.min_cosine, boost, total[part])
+
+
+def _look(
     cameras: Sequence[OrbitCamera],
     vertices: Float[Tensor, "v 3"],
     faces: Int[Tensor, "f 3"],
     gaussians: Gaussians,
     rasterize: Rasterizer,
-) -> list[_View]:
+) -> tuple[Float[Tensor, "b h w 3"], UInt8[Tensor, "b h w"], Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
+    """Pictures of the Gaussians and of the mesh.
+
+    Returns:
+        Straight color; 0 where there is background, 1 on outlines, 2 inside of them; the mesh's camera z; and the least
+        z around a pixel. The z of nothing is infinite.
+    """
     with torch.no_grad():
         picture = rasterize(gaussians, cameras, torch.zeros(3))
     straight = (picture.color / picture.alpha.clamp_min(1e-6)).clamp(0, 1)
     alpha = picture.alpha[..., 0]
     depth = rasterize_mesh(vertices, faces, cameras).depth
     depth = torch.where(depth > 0, depth, torch.full_like(depth, torch.inf))
-    inner, front = _lowest(alpha) > SOLID, _lowest(depth)
-    parts = zip(cameras, straight, alpha > SOLID, inner, depth, front, strict=True)
-    return [_View(*part) for part in parts]
+    grade = (alpha > SOLID).to(torch.uint8) + (_lowest(alpha) > SOLID).to(torch.uint8)
+    return straight, grade, depth, _lowest(depth)
 
 
 def _lowest(values: Float[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
     """The least value within `OUTLINE` pixels."""
-    return -max_pool2d(-values, 2 * OUTLINE + 1, stride=1, padding=OUTLINE)
-
-
-def _look(view: _View, texels: Texels, min_cosine: float) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 1"]]:
-    """What the texels see in one picture, and how much that counts (0: nothing)."""
-    camera = view.camera
-    pose = camera.world_to_camera().float()
-    local = texels.positions @ pose[:3, :3].T + pose[:3, 3]
-    cosine = ((camera.position().float() - texels.positions) * texels.normals).sum(-1) / local.norm(dim=-1)
-    pixels = local[:, :2] / local[:, 2:] * camera.focal + torch.tensor([camera.width / 2, camera.height / 2])
-    column, row = pixels.floor().long().unbind(-1)
-    kept = (cosine > FLATTEST) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    row, column = row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)
-    behind = local[:, 2] - DEPTH_SLACK * local[:, 2] / camera.focal / cosine.clamp_min(FLATTEST)
-    kept &= (behind <= view.depth[row, column]) & view.solid[row, column]
-    good = (cosine > min_cosine) & view.inner[row, column] & (behind <= view.front[row, column])
-    trust = torch.where(good, 1.0, LAST_RESORT) * cosine.clamp_min(0) ** SHARPNESS * kept
-    color = torch.zeros_like(texels.positions)
-    size = torch.tensor([camera.width, camera.height])
-    color[kept] = sample(view.color, pixels[kept] / size)
-    return color, trust[:, None]
+    rows = max_pool2d(-values, (2 * OUTLINE + 1, 1), stride=1, padding=(OUTLINE, 0))
+    return -max_pool2d(rows, (1, 2 * OUTLINE + 1), stride=1, padding=(0, OUTLINE))
 
 
 def _spread(
@@ -187,9 +186,9 @@ def _spread(
     if bool(seen.all()) or not bool(seen.any()):
         return colors
     count = min(NEIGHBORS, int(seen.sum()))
-    distance, nearest = cKDTree(positions[seen].numpy()).query(positions[~seen].numpy(), k=range(1, count + 1))
-    share = 1 / (torch.from_numpy(distance).float() + 1e-6)
-    taken = colors[seen][torch.from_numpy(nearest)]
+    found = cKDTree(positions[seen].numpy()).query(positions[~seen].numpy(), k=range(1, count + 1))
+    distance, nearest = (torch.from_numpy(np.asarray(a)) for a in found)
+    share, taken = 1 / (distance.float() + 1e-6), colors[seen][nearest]
     colors = colors.clone()
     colors[~seen] = (share[..., None] * taken).sum(1) / share.sum(1, keepdim=True)
     return colors
@@ -205,7 +204,8 @@ def _padded(colors: Float[Tensor, "p 3"], texels: Texels, size: int) -> Float[Te
 
 
 @njit(cache=True, nogil=True)
-def _map(corners, faces, ids, weights):  # type: ignore[no-untyped-def]
+@no_type_check
+def _map(corners, faces, ids, weights):
     """Which triangle lies over which texel's center, and the weights of its corners; all lengths in texels."""
     height, width = ids.shape
     for f in range(faces.shape[0]):
@@ -225,3 +225,39 @@ def _map(corners, faces, ids, weights):  # type: ignore[no-untyped-def]
                 if a >= 0 and b >= 0 and c >= 0:
                     ids[row, column] = f
                     weights[row, column, 0], weights[row, column, 1], weights[row, column, 2] = a, b, c
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _gather(positions, normals, pose, eye, focal, color, grade, depth, front, min_cosine, boost, total):
+    """Add what the texels see in one picture to their sums; all arrays of one view."""
+    height, width = grade.shape
+    for i in range(positions.shape[0]):
+        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
+        tx, ty, tz = eye[0] - x, eye[1] - y, eye[2] - z
+        cosine = tx * normals[i, 0] + ty * normals[i, 1] + tz * normals[i, 2]
+        cosine /= np.sqrt(tx * tx + ty * ty + tz * tz)
+        if not cosine > FLATTEST:
+            continue
+        far = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+        if far <= 0:
+            continue
+        u = focal * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / far + 0.5 * width
+        v = focal * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / far + 0.5 * height
+        if not (0 <= u < width and 0 <= v < height):
+            continue
+        row, column = int(v), int(u)
+        near = far - DEPTH_SLACK * far / focal / max(cosine, 0.2)
+        if grade[row, column] == 0 or near > depth[row, column]:
+            continue
+        good = cosine > min_cosine and grade[row, column] == 2 and near <= front[row, column]
+        weight = boost * cosine**SHARPNESS * (1.0 if good else LAST_RESORT)
+        left, top = min(max(u - 0.5, 0.0), width - 1.0), min(max(v - 0.5, 0.0), height - 1.0)
+        c0, r0 = int(left), int(top)
+        c1, r1 = min(c0 + 1, width - 1), min(r0 + 1, height - 1)
+        a, b = left - c0, top - r0
+        for k in range(3):
+            upper = (1 - a) * color[r0, c0, k] + a * color[r0, c1, k]
+            lower = (1 - a) * color[r1, c0, k] + a * color[r1, c1, k]
+            total[i, k] += weight * ((1 - b) * upper + b * lower)
+        total[i, 3] += weight

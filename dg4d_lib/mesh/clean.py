@@ -1,7 +1,7 @@
 """A mesh that other programs like: one piece, manifold, even triangles, not too many (METHOD section 8).
 
-The work is pymeshlab's. It is GPL-3 and crashes when two threads of a process use it, so it runs in a process of its own,
-`python -m dg4d_lib.mesh.clean IN.npz OUT.npz`, and is imported nowhere else.
+The work is pymeshlab's. It is GPL-3 and crashes when two threads of a process use it, so it runs in a process of its
+own, `python -m dg4d_lib.mesh.clean IN.npz OUT.npz`, and is imported nowhere else.
 """
 
 import os
@@ -9,7 +9,9 @@ import signal
 import subprocess
 import sys
 import tempfile
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -116,7 +118,8 @@ def _obituary(child: subprocess.CompletedProcess[str]) -> str:
 def _clean_here(given: Path, cleaned: Path) -> None:
     """What the child does, in units of the normalized box."""
     try:
-        import pymeshlab  # noqa: PLC0415  (only the child may have it)
+        # only the child may have it; its names come from a star import that type checkers cannot follow
+        pymeshlab: Any = import_module("pymeshlab")
     except ImportError as error:
         _give_up(f"pymeshlab cannot be imported ({error})")
     missing = sorted(set(FILTERS) - set(pymeshlab.filter_list()))

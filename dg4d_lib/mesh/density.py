@@ -1,9 +1,10 @@
 """How much matter Gaussians put where: the scalar field whose level set is the surface.
 
-density(p) = sum_i opacity_i exp(-0.5 d^T Sigma_i^-1 d), d = p - mean_i (METHOD section 8; Tang et al. 2024, section 3.2).
+density(p) = sum_i opacity_i exp(-0.5 d^T Sigma_i^-1 d), d = p - mean_i (METHOD section 8; Tang et al. 2024, 3.2).
 """
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 import torch
@@ -16,7 +17,8 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import rotation_matrix
 from dg4d_lib.settings import MeshSettings
 
-LONGEST_SIDE = 1.8  # of the cloud inside the box [-1, 1]
+LONGEST_SIDE = 1.8  # of the box around the means, inside the box [-1, 1] of the field
+MARGIN = 2.0  # standard deviations around every mean that lie in the field too, however large they are
 REACH = 4.0  # standard deviations at which a Gaussian ends; what is left out is below opacity * exp(-8) = 3.4e-4 each
 THINNEST = 0.7  # cells: a standard deviation below this is raised to it, else a flat Gaussian falls between the samples
 
@@ -41,8 +43,8 @@ class DensityField:
 def density_field(gaussians: Gaussians, settings: MeshSettings) -> DensityField:
     """Sample the density of one cloud on `settings.grid` cells per axis.
 
-    The box is centered on the cloud (means and one standard deviation around them); the cloud's longest side is 1.8 of
-    its 2 units. Standard deviations below 0.7 cells are raised to that and the opacity is kept, so that a flat Gaussian
+    The box is centered on the means, whose longest side takes 1.8 of its 2 units; less where large Gaussians need room.
+    Standard deviations below 0.7 cells are raised to that and the opacity is kept, so that a flat Gaussian
     keeps its peak; it moves a level set outwards by less than one cell. A Gaussian ends at four standard deviations:
     a sample misses less than 3.4e-4 times the opacities it cannot see.
 
@@ -51,7 +53,9 @@ def density_field(gaussians: Gaussians, settings: MeshSettings) -> DensityField:
         FitDiverged: parameters are not finite, or no Gaussian is more opaque than `settings.min_opacity`.
     """
     if gaussians.means.dim() != 2:
-        raise BadInput(f"density needs one state of a cloud, given a batch of shape {tuple(gaussians.means.shape[:-2])}")
+        raise BadInput(
+            f"density needs one state of a cloud, given a batch of shape {tuple(gaussians.means.shape[:-2])}"
+        )
     opacities = gaussians.opacities.double()
     shown = opacities > settings.min_opacity
     means, scales = gaussians.means.double()[shown], gaussians.scales.double()[shown]
@@ -64,11 +68,12 @@ def density_field(gaussians: Gaussians, settings: MeshSettings) -> DensityField:
     if not all(bool(t.isfinite().all()) for t in (means, scales, axes)):
         raise FitDiverged("no surface: some Gaussians are not finite; fit the model again")
 
-    spread = (axes * scales[:, None, :]).norm(dim=-1)
-    low, high = (means - spread).amin(0), (means + spread).amax(0)
-    unit = float((high - low).amax()) / LONGEST_SIDE
+    low, high = means.amin(0), means.amax(0)
+    center = (low + high) / 2
+    far = (means - center).abs() + MARGIN * (axes * scales[:, None, :]).norm(dim=-1)
+    unit = max(float((high - low).amax()) / LONGEST_SIDE, float(far.amax()))
     cell = 2 * unit / settings.grid
-    origin = (low + high) / 2 - unit + cell / 2
+    origin = center - unit + cell / 2
 
     scales = scales.clamp_min(THINNEST * cell)
     half_inverse = (axes / scales[:, None, :]).mT  # d^T Sigma^-1 d is the squared length of this times d
@@ -85,7 +90,8 @@ def density_field(gaussians: Gaussians, settings: MeshSettings) -> DensityField:
 
 
 @njit(cache=True, nogil=True)
-def _splat(means, half_inverse, reach, opacities, values):  # type: ignore[no-untyped-def]
+@no_type_check
+def _splat(means, half_inverse, reach, opacities, values):
     """Add every Gaussian to the samples inside its ellipsoid; all lengths in cells."""
     size = values.shape[0]
     first, last = np.zeros(3, np.int64), np.zeros(3, np.int64)

@@ -1,14 +1,17 @@
 """One surface for all times: vertices ride the Gaussians around them.
 
-A vertex moves with the rigid motion that fits its neighborhood best (moving least squares with rotations: Schaefer et al. 2006,
-section 3; Muller et al. 2005). Both the centers of the Gaussians and their own rotations say how the neighborhood turns
-(oriented particles: Muller and Chentanez 2011); either alone is noisier.
+A vertex moves with the rigid motion that fits its neighborhood best (moving least squares with rotations: Schaefer et
+al. 2006, section 3; Mueller et al. 2005). Both the centers of the Gaussians and their own rotations say how the
+neighborhood turns (oriented particles: Mueller and Chentanez 2011).
 """
+
+from functools import partial
+from typing import no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from scipy.sparse import csr_array
+from jaxtyping import Float, Int
+from numba import njit
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -16,17 +19,17 @@ from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import rotation_matrix
+from dg4d_lib.kernels.workers import run
 
 NEIGHBORS = 24  # Gaussians that carry a vertex
 FAINT = 0.005  # less opaque Gaussians carry nothing, their motion is not seen
 FALLBACK = 0.01  # weight of mere nearness against that of density
 THINNEST = 0.25  # of the neighborhood's size: flat Gaussians carry what is near, not only what lies in their plane
 OWN_ROTATION = 0.5  # weight of the Gaussians' own rotations, per squared size of the neighborhood
+SWEEPS = 6  # of Jacobi; four by four needs five for full precision
 
 
-def ride(
-    vertices: Float[Tensor, "v 3"], gaussians: Gaussians, displacement: Displacement
-) -> Float[Tensor, "t v 3"]:
+def ride(vertices: Float[Tensor, "v 3"], gaussians: Gaussians, displacement: Displacement) -> Float[Tensor, "t v 3"]:
     """How far every vertex has gone at every time.
 
     Args:
@@ -44,31 +47,29 @@ def ride(
         raise BadInput(f"vertices ride one state of a cloud that is not empty; given {tuple(gaussians.means.shape)}")
     points = vertices.double().cpu()
     rest = gaussians.to(torch.device("cpu")).to(torch.float64)
-    weights = _weights(points, rest)
-    center = _mean(weights, rest.means)
-    size2 = (_mean(weights, rest.means.square()) - center.square()).sum(-1).clamp_min(0)
-    own = OWN_ROTATION * size2[:, None, None] + 1e-12
+    carriers, weights = _carriers(points, rest)
     back = rotation_matrix(rest.quats).mT
+    offsets = np.empty((displacement.means.shape[0], len(points), 3))
 
-    offsets = torch.empty(displacement.means.shape[0], len(points), 3, dtype=torch.float64)
-    for time, (means, quats) in enumerate(zip(displacement.means, displacement.quats, strict=True)):
-        moved = rest.means + means.double().cpu()
-        turns = rotation_matrix(rest.quats + quats.double().cpu()) @ back
-        there = _mean(weights, moved)
-        moments = _mean(weights, moved[:, :, None] * rest.means[:, None, :]) - there[:, :, None] * center[:, None, :]
-        rotation = _nearest_rotation(moments + own * _mean(weights, turns))
-        offsets[time] = there + (rotation @ (points - center)[..., None])[..., 0] - points
-    return offsets.to(vertices)
+    def move(time: int) -> None:
+        moved = rest.means + displacement.means[time].double().cpu()
+        turns = rotation_matrix(rest.quats + displacement.quats[time].double().cpu()) @ back
+        places = (points, rest.means, moved, turns)
+        _move(carriers.numpy(), weights.numpy(), *(place.numpy() for place in places), offsets[time])
+
+    run([partial(move, time) for time in range(len(offsets))])
+    return torch.from_numpy(offsets).to(vertices)
 
 
-def _weights(points: Float[Tensor, "v 3"], rest: Gaussians) -> csr_array:
-    """How much of a vertex (row) every Gaussian (column) carries: its share of the density there. Rows sum to 1."""
+def _carriers(points: Float[Tensor, "v 3"], rest: Gaussians) -> tuple[Int[Tensor, "v k"], Float[Tensor, "v k"]]:
+    """The Gaussians that carry every vertex, and their weights with sum 1: their shares of the density there."""
     shown = torch.nonzero(rest.opacities > FAINT)[:, 0]
     if len(shown) == 0:
         shown = torch.arange(len(rest))
     count = min(NEIGHBORS, len(shown))
-    distance, nearest = cKDTree(rest.means[shown].numpy()).query(points.numpy(), k=range(1, count + 1))
-    carriers, distance = shown[torch.from_numpy(nearest)], torch.from_numpy(distance)
+    found = cKDTree(rest.means[shown].numpy()).query(points.numpy(), k=range(1, count + 1))
+    distance, nearest = (torch.from_numpy(np.asarray(a)) for a in found)
+    carriers = shown[nearest]
     reach = distance[:, -1:].clamp_min(1e-9)
     axes = rotation_matrix(rest.quats)[carriers]
     scales = rest.scales[carriers].maximum(THINNEST * reach[..., None])
@@ -77,19 +78,80 @@ def _weights(points: Float[Tensor, "v 3"], rest: Gaussians) -> csr_array:
     density = torch.exp(-0.5 * local.square().sum(-1))
     nearness = torch.exp(-4.5 * (distance / reach).square())  # three standard deviations at the last neighbor
     weights = rest.opacities[carriers] * (density + FALLBACK * nearness)
-    weights = weights / weights.sum(-1, keepdim=True)
-    rows = np.arange(0, carriers.numel() + 1, count)
-    return csr_array((weights.flatten().numpy(), carriers.flatten().numpy(), rows), shape=(len(points), len(rest)))
+    return carriers, weights / weights.sum(-1, keepdim=True)
 
 
-def _mean(weights: csr_array, values: Float[Tensor, "n *c"]) -> Float[Tensor, "v *c"]:
-    """The weighted means of what the Gaussians have, for every vertex."""
-    return torch.from_numpy(weights @ values.flatten(1).numpy()).unflatten(1, values.shape[1:])
+@njit(cache=True, nogil=True)
+@no_type_check
+def _move(carriers, weights, points, rest, moved, turns, offsets):
+    """Offsets of all vertices at one time."""
+    center, there, arm = np.zeros(3), np.zeros(3), np.zeros(3)
+    moments, turn, rotation = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    for v in range(points.shape[0]):
+        center[:], there[:], moments[:], turn[:] = 0, 0, 0, 0
+        for k in range(carriers.shape[1]):
+            i, w = carriers[v, k], weights[v, k]
+            for a in range(3):
+                center[a] += w * rest[i, a]
+                there[a] += w * moved[i, a]
+        size2 = 0.0
+        for k in range(carriers.shape[1]):
+            i, w = carriers[v, k], weights[v, k]
+            for b in range(3):
+                arm[b] = rest[i, b] - center[b]
+                size2 += w * arm[b] * arm[b]
+            for a in range(3):
+                there_arm = w * (moved[i, a] - there[a])
+                for b in range(3):
+                    moments[a, b] += there_arm * arm[b]
+                    turn[a, b] += w * turns[i, a, b]
+        own = OWN_ROTATION * size2 + 1e-12
+        for a in range(3):
+            for b in range(3):
+                moments[a, b] += own * turn[a, b]
+        _nearest_rotation(moments, rotation)
+        for a in range(3):
+            offsets[v, a] = there[a] - points[v, a]
+            for b in range(3):
+                offsets[v, a] += rotation[a, b] * (points[v, b] - center[b])
 
 
-def _nearest_rotation(matrices: Float[Tensor, "v 3 3"]) -> Float[Tensor, "v 3 3"]:
-    """The proper rotations nearest to the matrices (Kabsch 1976; Umeyama 1991)."""
-    left, _, right = torch.linalg.svd(matrices)
-    flip = torch.ones_like(matrices[:, 0])
-    flip[:, 2] = torch.linalg.det(left @ right).sign()
-    return left @ (flip[..., None] * right)
+@njit(cache=True, nogil=True)
+@no_type_check
+def _nearest_rotation(m, rotation):
+    """The proper rotation nearest to a matrix: an eigenvector (Horn 1987), found by Jacobi sweeps."""
+    n = np.zeros((4, 4))
+    n[0, 0], n[1, 1] = m[0, 0] + m[1, 1] + m[2, 2], m[0, 0] - m[1, 1] - m[2, 2]
+    n[2, 2], n[3, 3] = m[1, 1] - m[0, 0] - m[2, 2], m[2, 2] - m[0, 0] - m[1, 1]
+    n[0, 1], n[0, 2], n[0, 3] = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    n[1, 2], n[1, 3], n[2, 3] = m[1, 0] + m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2]
+    vectors = np.eye(4)
+    for _ in range(SWEEPS):
+        for p in range(3):
+            for q in range(p + 1, 4):
+                if abs(n[p, q]) < 1e-300:
+                    continue
+                tau = (n[q, q] - n[p, p]) / (2 * n[p, q])
+                t = (1.0 if tau >= 0 else -1.0) / (abs(tau) + np.sqrt(1 + tau * tau))
+                c = 1 / np.sqrt(1 + t * t)
+                s = t * c
+                n[p, p] -= t * n[p, q]
+                n[q, q] += t * n[p, q]
+                n[p, q] = 0.0
+                for r in range(4):
+                    if r not in (p, q):
+                        pr, qr = (min(p, r), max(p, r)), (min(q, r), max(q, r))
+                        x, y = n[pr], n[qr]
+                        n[pr], n[qr] = c * x - s * y, s * x + c * y
+                    x, y = vectors[r, p], vectors[r, q]
+                    vectors[r, p], vectors[r, q] = c * x - s * y, s * x + c * y
+    best = 0
+    for p in range(1, 4):
+        if n[p, p] > n[best, best]:
+            best = p
+    w, x, y, z = vectors[0, best], vectors[1, best], vectors[2, best], vectors[3, best]
+    rotation[0, 0], rotation[1, 1] = 1 - 2 * (y * y + z * z), 1 - 2 * (x * x + z * z)
+    rotation[2, 2] = 1 - 2 * (x * x + y * y)
+    rotation[0, 1], rotation[1, 0] = 2 * (x * y - w * z), 2 * (x * y + w * z)
+    rotation[0, 2], rotation[2, 0] = 2 * (x * z + w * y), 2 * (x * z - w * y)
+    rotation[1, 2], rotation[2, 1] = 2 * (y * z - w * x), 2 * (y * z + w * x)

@@ -20,11 +20,11 @@ from torch.autograd.function import once_differentiable
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.kernels.workers import Scratch, ranges, run
 from dg4d_lib.rasterizer.cpu_bins import TILE, bin_by_tile
 from dg4d_lib.rasterizer.cpu_blend import PLANE
 from dg4d_lib.rasterizer.cpu_project import CAMERA, RECORD, project, unproject
 from dg4d_lib.rasterizer.cpu_tiles import blend, blend_backward, gather
-from dg4d_lib.rasterizer.cpu_workers import Scratch, ranges, run
 from dg4d_lib.rasterizer.interface import FRUSTUM_MARGIN, Rendering, shared_size, state_per_camera
 
 Array = NDArray[Any]
@@ -51,7 +51,7 @@ def rasterize(
     state_per_camera(gaussians, cameras)
     if gaussians.means.device.type != "cpu":
         raise BadInput(f"rasterizer 'cpu' needs tensors on the cpu; given {gaussians.means.device}; move them there")
-    inputs = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
+    inputs = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacity_logits, gaussians.colors)
     color, alpha, depth, visible = _Rasterize.apply(
         *(value.float() for value in inputs),
         None if screen_offsets is None else screen_offsets.float(),
@@ -176,7 +176,7 @@ class _Gradients:
 
     def __post_init__(self) -> None:
         clouds = self.clouds
-        self.means, self.quats, self.scales, self.opacities, self.colors = (
+        self.means, self.quats, self.log_scales, self.log_opacities, self.colors = (
             np.zeros_like(value)
             for value in (clouds.means, clouds.quats, clouds.scales, clouds.opacities, clouds.colors)
         )
@@ -227,12 +227,11 @@ class _Gradients:
         clouds, pictures = self.clouds, self.pictures
         for view in group:
             means, quats, scales = clouds.state(view)
-            shared = clouds.means.ndim == 2
-            own = [grad if shared else grad[view] for grad in (self.means, self.quats, self.scales)]
-            unproject(
-                means, quats, scales, clouds.opacities, pictures.cameras[view], pictures.keys[view],
-                moments[view - group.start], *own, self.opacities, self.colors, self.centers[view], start, stop,
-            )  # fmt: skip
+            gradients = (self.means, self.quats, self.log_scales)
+            own = gradients if clouds.means.ndim == 2 else [gradient[view] for gradient in gradients]
+            shared = (self.log_opacities, self.colors, self.centers[view])
+            seen = (pictures.cameras[view], pictures.keys[view], moments[view - group.start])
+            unproject(means, quats, scales, *seen, *own, *shared, start, stop)
 
 
 def _sum_rows(entries: Array, rows: Array, moments: Array) -> None:
@@ -245,13 +244,14 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        *tensors, offsets, cameras, background, size = inputs
+        means, quats, log_scales, logits, colors, offsets, cameras, background, size = inputs
+        tensors = (means, quats, log_scales.exp(), logits.sigmoid(), colors)
         clouds = _Clouds(*(tensor.detach().contiguous().numpy() for tensor in tensors))
         pictures = _Pictures(cameras.numpy(), background.contiguous().numpy(), size, len(clouds))
         color, alpha, depth = pictures.draw(clouds)
         visible = torch.from_numpy(pictures.keys > 0)
         ctx.mark_non_differentiable(visible)
-        ctx.clouds, ctx.pictures, ctx.offsets = clouds, pictures, offsets is not None
+        ctx.clouds, ctx.pictures, ctx.logits, ctx.offsets = clouds, pictures, logits.detach(), offsets is not None
         return color, alpha, depth, visible
 
     @staticmethod
@@ -260,6 +260,11 @@ class _Rasterize(torch.autograd.Function):
         planes = [gradient.contiguous().numpy() for gradient in incoming[:3]]
         found = _Gradients(ctx.clouds, ctx.pictures, *planes)
         found.collect()
-        gradients = (found.means, found.quats, found.scales, found.opacities, found.colors)
-        centers = torch.from_numpy(found.centers) if ctx.offsets else None
-        return (*(torch.from_numpy(gradient) for gradient in gradients), centers, None, None, None)
+        means, quats, log_scales, log_opacities, colors, centers = (
+            torch.from_numpy(gradient)
+            for gradient in (
+                found.means, found.quats, found.log_scales, found.log_opacities, found.colors, found.centers
+            )
+        )  # fmt: skip
+        logits = log_opacities * (-ctx.logits).sigmoid()  # d log o / d logit = 1 - o, exact for o near one too
+        return means, quats, log_scales, logits, colors, centers if ctx.offsets else None, None, None, None

@@ -5,8 +5,8 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
+from dg4d_lib.kernels.vectors import INLINE, KERNEL
 from dg4d_lib.rasterizer.cpu_project import CENTER_X, CENTER_Y, EXTENT_X, EXTENT_Y
-from dg4d_lib.rasterizer.cpu_vectors import INLINE, KERNEL
 
 TILE = 64  # pixels of a side; the picture does not depend on it
 _DIGIT = 11  # bits of one pass of the radix sort

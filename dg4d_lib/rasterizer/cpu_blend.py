@@ -12,6 +12,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from dg4d_lib.kernels.vectors import FLOAT, FLOATS, INT, INTS, LANES, LONG, Value, Vectors, pointers
 from dg4d_lib.rasterizer.cpu_bins import TILE
 from dg4d_lib.rasterizer.cpu_project import (
     BLUE,
@@ -36,7 +37,6 @@ from dg4d_lib.rasterizer.cpu_project import (
     WHITEN_B,
     WHITEN_C,
 )
-from dg4d_lib.rasterizer.cpu_vectors import FLOAT, FLOATS, INT, INTS, LANES, LONG, Value, Vectors
 from dg4d_lib.rasterizer.interface import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
 COLUMNS = LANES // 2  # of a vector
@@ -64,7 +64,7 @@ def cover(typing_context, records, g, left, top, places, us, vs, length):  # noq
 
     def generate(context, builder, signature, arguments):
         e = Vectors(builder)
-        data = _pointers(context, builder, signature, arguments)
+        data = pointers(context, builder, signature, arguments)
         record, base = data[0], builder.mul(arguments[1], _long(RECORD))
 
         def scalar(field):
@@ -147,7 +147,7 @@ def blend_list(typing_context, state, places, us, vs, masks, start, end, records
 
     def generate(context, builder, signature, arguments):
         e = Vectors(builder)
-        data = _pointers(context, builder, signature, arguments)
+        data = pointers(context, builder, signature, arguments)
         pixels, splat = data[0], _Splat(e, data[7], arguments[8])
 
         def body(j, carried):
@@ -193,7 +193,7 @@ def blend_list_backward(typing_context, state, places, us, vs, start, end, recor
 
     def generate(context, builder, signature, arguments):
         e = Vectors(builder)
-        data = _pointers(context, builder, signature, arguments)
+        data = pointers(context, builder, signature, arguments)
         pixels, splat, own_place = data[0], _Splat(e, data[6], arguments[7]), e.splat(arguments[9])
 
         def body(j, sums):
@@ -272,22 +272,13 @@ def prefetch(typing_context, array, index):
 
     def generate(context, builder, signature, arguments):
         byte = ir.IntType(8).as_pointer()
-        place = builder.gep(_pointers(context, builder, signature, arguments)[0], [arguments[1]], source_etype=FLOAT)
+        place = builder.gep(pointers(context, builder, signature, arguments)[0], [arguments[1]], source_etype=FLOAT)
         kind = ir.FunctionType(ir.VoidType(), [byte, INT, INT, INT])
         prefetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
         builder.call(prefetch, [builder.bitcast(place, byte), _int(0), _int(3), _int(1)])  # read, keep, data
         return context.get_dummy_value()
 
     return types.void(array, types.int64), generate
-
-
-@no_type_check
-def _pointers(context, builder, signature, arguments):
-    """The data of array arguments; None for scalars."""
-    return [
-        context.make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else None
-        for kind, value in zip(signature.args, arguments, strict=True)
-    ]
 
 
 def _int(value: int) -> ir.Constant:

@@ -12,7 +12,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from dg4d_lib.rasterizer.cpu_vectors import INLINE, KERNEL
+from dg4d_lib.kernels.vectors import INLINE, KERNEL
 from dg4d_lib.rasterizer.interface import BLUR, MIN_ALPHA, NEAR
 
 # A record is what blending needs of one Gaussian: 16 floats, one cache line.
@@ -87,8 +87,8 @@ def project(means, quats, scales, opacities, colors, camera, height, width, reco
 @njit(**KERNEL)
 @no_type_check
 def unproject(
-    means, quats, scales, opacities, camera, keys, moments,
-    grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_centers, start, stop,
+    means, quats, scales, camera, keys, moments,
+    grad_means, grad_quats, grad_log_scales, grad_log_opacities, grad_colors, grad_centers, start, stop,
 ):  # fmt: skip
     """Add what Gaussians start..stop get from the gradients of their records in one view."""
     rotation, translation, focal, _, _, limit_x, limit_y = _lens(camera)
@@ -101,14 +101,16 @@ def unproject(
         slant = _slant(x, y, z, focal, limit_x, limit_y)
         jacobian = _jacobian(slant, rotation)
         half = _half(jacobian, stretch)
-        whitening = _whitening(*_covariance(half))
+        xx, xy, yy, determinant = _covariance(half)
+        whitening = _whitening(xx, xy, yy, determinant)
         d_center_x, d_center_y = _center_gradient(whitening, moments[i, MOMENT_U], moments[i, MOMENT_V])
-        d_half = _half_gradient(half, whitening, moments[i, MOMENT_UU], moments[i, MOMENT_UV], moments[i, MOMENT_VV])
+        whitened = _whitened(half, whitening, yy)
+        d_whitened = _whitened_gradient(whitened, moments[i, MOMENT_UU], moments[i, MOMENT_UV], moments[i, MOMENT_VV])
+        d_half = _half_gradient(whitening, d_whitened)
         d_slant = _slant_gradient(d_half, stretch, rotation)
         d_x, d_y, d_z = _place_gradient(x, y, z, focal, limit_x, limit_y, slant, d_slant, d_center_x, d_center_y)
         d_z += moments[i, DEPTH]
         d_stretch = _stretch_gradient(jacobian, d_half)
-        d_s0, d_s1, d_s2 = _scale_gradient(turn, d_stretch)
         d_qw, d_qx, d_qy, d_qz = _quat_gradient(
             unit, inverse_norm, _stretch(d_stretch, scales[i, 0], scales[i, 1], scales[i, 2])
         )
@@ -120,10 +122,11 @@ def unproject(
         grad_quats[i, 1] += d_qx
         grad_quats[i, 2] += d_qy
         grad_quats[i, 3] += d_qz
-        grad_scales[i, 0] += d_s0
-        grad_scales[i, 1] += d_s1
-        grad_scales[i, 2] += d_s2
-        grad_opacities[i] += moments[i, MOMENT] / opacities[i]
+        # dL/d log s_k = (column k of P) . (column k of dL/dP), taken in the whitened frame
+        grad_log_scales[i, 0] += whitened[0] * d_whitened[0] + whitened[3] * d_whitened[3]
+        grad_log_scales[i, 1] += whitened[1] * d_whitened[1] + whitened[4] * d_whitened[4]
+        grad_log_scales[i, 2] += whitened[2] * d_whitened[2] + whitened[5] * d_whitened[5]
+        grad_log_opacities[i] += moments[i, MOMENT]
         grad_colors[i, 0] += moments[i, RED]
         grad_colors[i, 1] += moments[i, GREEN]
         grad_colors[i, 2] += moments[i, BLUE]
@@ -208,12 +211,25 @@ def _half(jacobian, stretch):
 @njit(**INLINE)
 @no_type_check
 def _covariance(half):
-    """xx, xy, yy and the determinant of the covariance on the screen, blur included, pixels squared."""
+    """xx, xy, yy and the determinant of the covariance on the screen, blur included, pixels squared.
+
+    det(P P^T + blur) as a sum of positive terms, the first by Cauchy-Binet: xx yy - xy^2 would cancel for needles.
+    """
     p00, p01, p02, p10, p11, p12 = half
-    xx = p00 * p00 + p01 * p01 + p02 * p02 + _BLUR
-    yy = p10 * p10 + p11 * p11 + p12 * p12 + _BLUR
-    xy = p00 * p10 + p01 * p11 + p02 * p12
-    return xx, xy, yy, xx * yy - xy * xy
+    sharp_xx = p00 * p00 + p01 * p01 + p02 * p02
+    sharp_yy = p10 * p10 + p11 * p11 + p12 * p12
+    minor0, minor1, minor2 = _minors(half)
+    minors = minor0 * minor0 + minor1 * minor1 + minor2 * minor2
+    determinant = minors + _BLUR * (sharp_xx + sharp_yy) + _BLUR * _BLUR
+    return sharp_xx + _BLUR, p00 * p10 + p01 * p11 + p02 * p12, sharp_yy + _BLUR, determinant
+
+
+@njit(**INLINE)
+@no_type_check
+def _minors(half):
+    """The cross product of the two rows."""
+    p00, p01, p02, p10, p11, p12 = half
+    return p01 * p12 - p02 * p11, p02 * p10 - p00 * p12, p00 * p11 - p01 * p10
 
 
 @njit(**INLINE)
@@ -234,18 +250,41 @@ def _center_gradient(whitening, mu, mv):
 
 @njit(**INLINE)
 @no_type_check
-def _half_gradient(half, whitening, muu, muv, mvv):
-    """dL/dP of Sigma' = P P^T + blur, two rows."""
-    a, b, c = whitening
+def _whitened(half, whitening, yy):
+    """W P, two rows: the Gaussian's own axes in the whitened frame, again without cancellation.
+
+    a (p0 - xy / yy p1) = a / yy (p1 x (p0 x p1) + blur p0), rows p0 and p1 of P.
+    """
+    a, _, c = whitening
     p00, p01, p02, p10, p11, p12 = half
-    k = _TWO * _LN_2 * _LN_2
-    xx = _TWO * k * a * a * muu
-    xy = _TWO * k * a * (b * muu + c * muv)
-    yy = _TWO * k * (b * (b * muu + _TWO * c * muv) + c * c * mvv)
+    n0, n1, n2 = _minors(half)
+    k = a / yy
     return (
-        xx * p00 + xy * p10, xx * p01 + xy * p11, xx * p02 + xy * p12,
-        yy * p10 + xy * p00, yy * p11 + xy * p01, yy * p12 + xy * p02,
+        k * (p11 * n2 - p12 * n1 + _BLUR * p00), k * (p12 * n0 - p10 * n2 + _BLUR * p01),
+        k * (p10 * n1 - p11 * n0 + _BLUR * p02), c * p10, c * p11, c * p12,
     )  # fmt: skip
+
+
+@njit(**INLINE)
+@no_type_check
+def _whitened_gradient(whitened, muu, muv, mvv):
+    """4 ln2^2 M_2 W P, two rows."""
+    u0, u1, u2, v0, v1, v2 = whitened
+    k = _TWO * _TWO * _LN_2 * _LN_2
+    muu, muv, mvv = k * muu, k * muv, k * mvv
+    return (
+        muu * u0 + muv * v0, muu * u1 + muv * v1, muu * u2 + muv * v2,
+        muv * u0 + mvv * v0, muv * u1 + mvv * v1, muv * u2 + mvv * v2,
+    )  # fmt: skip
+
+
+@njit(**INLINE)
+@no_type_check
+def _half_gradient(whitening, d_whitened):
+    """dL/dP = 2 dL/dSigma' P = W^T (4 ln2^2 M_2 W P), two rows."""
+    a, b, c = whitening
+    d0, d1, d2, e0, e1, e2 = d_whitened
+    return a * d0, a * d1, a * d2, b * d0 + c * e0, b * d1 + c * e1, b * d2 + c * e2
 
 
 @njit(**INLINE)
@@ -292,14 +331,6 @@ def _stretch_gradient(jacobian, d_half):
         j01 * d00 + j11 * d10, j01 * d01 + j11 * d11, j01 * d02 + j11 * d12,
         j02 * d00 + j12 * d10, j02 * d01 + j12 * d11, j02 * d02 + j12 * d12,
     )  # fmt: skip
-
-
-@njit(**INLINE)
-@no_type_check
-def _scale_gradient(turn, d_stretch):
-    t00, t01, t02, t10, t11, t12, t20, t21, t22 = turn
-    n00, n01, n02, n10, n11, n12, n20, n21, n22 = d_stretch
-    return n00 * t00 + n10 * t10 + n20 * t20, n01 * t01 + n11 * t11 + n21 * t21, n02 * t02 + n12 * t12 + n22 * t22
 
 
 @njit(**INLINE)

@@ -9,6 +9,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
+from dg4d_lib.kernels.vectors import KERNEL, LANES
 from dg4d_lib.rasterizer.cpu_bins import TILE
 from dg4d_lib.rasterizer.cpu_blend import (
     BACKWARD_PLANES,
@@ -23,7 +24,6 @@ from dg4d_lib.rasterizer.cpu_blend import (
     prefetch,
 )
 from dg4d_lib.rasterizer.cpu_project import RECORD
-from dg4d_lib.rasterizer.cpu_vectors import KERNEL, LANES
 
 NEVER = np.float32(3e9)  # the place in the list where a pixel stopped that did not
 

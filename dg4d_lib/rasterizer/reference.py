@@ -29,7 +29,7 @@ from dg4d_lib.rasterizer.interface import (
     state_per_camera,
 )
 
-_PAIRS_AT_ONCE = 1 << 22  # pixels times Gaussians of one chunk, bounds the memory
+_PAIRS_AT_ONCE = 1 << 18  # pixels times Gaussians of one chunk: what stays in the cache
 
 
 def rasterize(

@@ -21,7 +21,7 @@ SPREADS = 4.0  # tolerance in spreads of the ring
 SHADOW_DROP = 35.0  # lightness by which a shadow may darken the backdrop
 SHADOW_SLOPE = 1.6  # lightness per pixel: shadows fade, outlines do not
 SHADOW_MOST = 0.4  # of the subject that may turn out to be shadow; more is a pale subject
-HOLE = 0.004  # of the subject: a smaller hole in it is a highlight or the white of an eye
+HOLE = 0.0006  # of the subject: a smaller spot of the backdrop's color in it is a highlight, not a gap between limbs
 SAMPLES = 20000  # pixels that a fit looks at
 
 
@@ -53,8 +53,12 @@ class Backdrop:
 
     def color(self, height: int, width: int) -> Float[ndarray, "h w 3"]:
         """The backdrop without a subject, Lab."""
-        rows, columns = np.mgrid[:height, :width]
-        return (_monomials(rows, columns, height, width, self.degree) @ self.weights).reshape(height, width, 3)
+        powers = np.arange(self.degree + 1)
+        x, y = (np.linspace(-1, 1, side)[:, None] ** powers for side in (width, height))
+        terms = np.zeros((self.degree + 1, self.degree + 1, 3))  # power of y, power of x
+        for weight, (i, j) in zip(self.weights, _exponents(self.degree), strict=True):
+            terms[j, i] = weight
+        return np.einsum("hj,wi,jic->hwc", y, x, terms, optimize=True).astype(np.float32)
 
 
 def fit_backdrop(lab: Float[ndarray, "t h w 3"]) -> Backdrop:
@@ -64,28 +68,17 @@ def fit_backdrop(lab: Float[ndarray, "t h w 3"]) -> Backdrop:
     first = _fit(lab, border, BORDER_DEGREE, border)
     if not first.is_plain:
         return first
-    flooded = np.stack([_flood(frame, first) for frame in lab])
+    flooded = np.stack([_flood(difference, first) for difference in lab - first.color(*lab.shape[1:3])])
     if flooded.mean() < 0.3:
         return first
     refined = _fit(lab, flooded, FLOODED_DEGREE, border)
     return refined if refined.is_plain and refined.share >= first.share - 0.05 else first
 
 
-def cut_out(lab: Float[ndarray, "h w 3"], backdrop: Backdrop) -> Bool[ndarray, "h w"]:
+def cut_out(lab: Float[ndarray, "t h w 3"], backdrop: Backdrop) -> Bool[ndarray, "t h w"]:
     """Everything the flood does not reach, without shadows and with its small holes filled."""
-    tight = ~_flood(lab, backdrop)
-    loose = ~_flood(lab, backdrop, shadows=True)
-    subject = loose if loose.sum() > (1 - SHADOW_MOST) * tight.sum() else tight
-    inner = ndimage.binary_fill_holes(subject) & ~subject
-    like_backdrop = np.linalg.norm(lab - backdrop.color(*lab.shape[:2]), axis=-1) < backdrop.tolerance
-    enclosed, count = ndimage.label((ndimage.binary_fill_holes(subject) & like_backdrop) | inner)
-    if count:
-        areas = ndimage.sum_labels(np.ones_like(enclosed), enclosed, np.arange(1, count + 1))
-        open_holes = np.isin(enclosed, 1 + np.flatnonzero(areas >= HOLE * subject.sum()))
-    else:
-        open_holes = np.zeros_like(subject)
-    filled: Bool[ndarray, "h w"] = ndimage.binary_fill_holes(subject) & ~open_holes
-    return filled
+    differences = lab - backdrop.color(*lab.shape[1:3])
+    return np.stack([_subject(difference, backdrop) for difference in differences])
 
 
 def border_ring(height: int, width: int) -> Bool[ndarray, "h w"]:
@@ -96,28 +89,37 @@ def border_ring(height: int, width: int) -> Bool[ndarray, "h w"]:
     return ring
 
 
-def _flood(lab: Float[ndarray, "h w 3"], backdrop: Backdrop, shadows: bool = False) -> Bool[ndarray, "h w"]:
+def _subject(difference: Float[ndarray, "h w 3"], backdrop: Backdrop) -> Bool[ndarray, "h w"]:
+    tight = ~_flood(difference, backdrop)
+    loose = ~_flood(difference, backdrop, shadows=True)
+    subject = loose if loose.sum() > (1 - SHADOW_MOST) * tight.sum() else tight
+    filled = ndimage.binary_fill_holes(subject)
+    like_backdrop = np.linalg.norm(difference, axis=-1) < 0.7 * backdrop.tolerance
+    enclosed, count = ndimage.label(filled & (like_backdrop | ~subject))
+    areas = ndimage.sum_labels(np.ones_like(enclosed), enclosed, np.arange(1, count + 1))
+    holes = 1 + np.flatnonzero(areas >= HOLE * subject.sum())
+    return np.asarray(filled & ~np.isin(enclosed, holes))
+
+
+def _flood(difference: Float[ndarray, "h w 3"], backdrop: Backdrop, shadows: bool = False) -> Bool[ndarray, "h w"]:
     """What is like the backdrop and reached from the border through gaps of three pixels or more."""
-    difference = lab - backdrop.color(*lab.shape[:2])
     like = np.linalg.norm(difference, axis=-1) < backdrop.tolerance
     if shadows:
-        slope = ndimage.gaussian_gradient_magnitude(lab[..., 0], 1.0)
+        slope = ndimage.gaussian_gradient_magnitude(difference[..., 0], 1.0)
         chroma = np.linalg.norm(difference[..., 1:], axis=-1)
         drop = -difference[..., 0]
         like |= (chroma < 0.8 * backdrop.tolerance) & (drop > 0) & (drop < SHADOW_DROP) & (slope < SHADOW_SLOPE)
     square = np.ones((3, 3), bool)
-    core = ndimage.binary_erosion(like, square, border_value=1)
-    labels, _ = ndimage.label(core)
+    labels, _ = ndimage.label(ndimage.binary_erosion(like, square, border_value=1))
     edge = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
-    reached: Bool[ndarray, "h w"] = ndimage.binary_dilation(np.isin(labels, np.unique(edge[edge > 0])), square) & like
-    return reached
+    reached = np.isin(labels, np.unique(edge[edge > 0]))
+    return np.asarray(ndimage.binary_dilation(reached, square) & like)
 
 
 def _fit(
     lab: Float[ndarray, "t h w 3"], where: Bool[ndarray, "t h w"], degree: int, border: Bool[ndarray, "t h w"]
 ) -> Backdrop:
     """Reweighted least squares with Cauchy weights, growing from a constant so that outliers cannot lead."""
-    height, width = lab.shape[1:3]
     colors, design = _sample(lab, where, degree)
     weights = np.zeros((design.shape[1], 3))
     weights[0] = np.median(colors, axis=0)
@@ -125,7 +127,9 @@ def _fit(
     for order in (0, 1, *(degree,) * 8):
         terms = (order + 1) * (order + 2) // 2
         residual = np.linalg.norm(colors - design @ weights, axis=1)
-        spread = max(0.5, 1.4826 * float(np.median(residual)) / 1.5382)  # of a norm of three: its median is 1.5382 sigma
+        spread = max(
+            0.5, 1.4826 * float(np.median(residual)) / 1.5382
+        )  # of a norm of three: its median is 1.5382 sigma
         trust = 1 / (1 + (residual / (2 * spread)) ** 2)
         weights = np.zeros_like(weights)
         weighted = design[:, :terms] * trust[:, None]
@@ -149,6 +153,11 @@ def _sample(
 
 
 def _monomials(rows: ndarray, columns: ndarray, height: int, width: int, degree: int) -> Float[ndarray, "p k"]:
-    """1, x, y, x^2, xy, y^2 and so on, lower degrees first."""
-    x, y = 2 * columns.ravel() / (width - 1) - 1, 2 * rows.ravel() / (height - 1) - 1
-    return np.stack([x ** (order - j) * y**j for order in range(degree + 1) for j in range(order + 1)], 1)
+    """1, x, y, x^2, xy, y^2 and so on, lower degrees first; x and y run over [-1, 1]."""
+    x, y = 2 * columns / (width - 1) - 1, 2 * rows / (height - 1) - 1
+    return np.stack([x**i * y**j for i, j in _exponents(degree)], 1)
+
+
+def _exponents(degree: int) -> list[tuple[int, int]]:
+    """Powers of x and y of every monomial, lower degrees first."""
+    return [(order - j, j) for order in range(degree + 1) for j in range(order + 1)]

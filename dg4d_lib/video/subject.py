@@ -5,9 +5,10 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import SubjectSettings
-from dg4d_lib.video.framing import VISIBLE, around_subject, extent, lies_well, reframe, whole_frame
+from dg4d_lib.video.framing import VISIBLE, around_subject, extent, lies_well, reframe, shrink, whole_frame
 from dg4d_lib.video.matting import matte
 
+OVERSAMPLING = 2  # times the size of the square: larger opaque frames are shrunk before they are cut out
 SMALLEST_SUBJECT = 16  # pixels of its longest side; below there is nothing to reconstruct
 NOTES = {
     "backdrop": "The background was removed by its plain color; a PNG with transparency is cut more exactly.",
@@ -37,9 +38,12 @@ def prepare(
     notes: tuple[str, ...] = ()
     given = has_alpha
     if not has_alpha:
-        found = matte(frames[..., :3])
+        found = matte(shrink(frames, OVERSAMPLING * settings.size)[..., :3])
         frames, notes = found.frames, (NOTES[found.method],)
     alpha = frames[..., 3]
+    extent(alpha)  # refuses what shows nothing at all
+    if not (alpha[0] > VISIBLE).any():
+        raise BadInput("the first frame shows no subject; cut the video so that it begins when the subject is there")
     left, top, right, bottom = extent(alpha[:1])
     if max(right - left, bottom - top) < SMALLEST_SUBJECT:
         raise BadInput(

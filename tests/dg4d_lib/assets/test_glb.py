@@ -17,7 +17,7 @@ from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.glb import (
     read_glb,
     read_mesh_glb,
-    vertex_normals,
+    seamless_normals,
     write_frames_glb,
     write_glb,
     write_mesh_glb,
@@ -166,7 +166,7 @@ def test_the_first_row_of_the_texture_is_the_top_of_the_embedded_picture() -> No
 
 def test_normals_are_smooth_across_seams() -> None:
     sphere = ball(subdivisions=2)
-    normals = vertex_normals(sphere.vertices.numpy(), sphere.faces.numpy())
+    normals = seamless_normals(sphere.vertices.numpy(), sphere.faces.numpy())
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
     radial = sphere.vertices.numpy() / 0.5
     assert (normals * radial).sum(1).min() > 0.995
@@ -174,7 +174,7 @@ def test_normals_are_smooth_across_seams() -> None:
 
 def test_a_vertex_without_area_still_has_a_unit_normal() -> None:
     vertices = np.zeros((4, 3), np.float32)
-    normals = vertex_normals(vertices, np.array([[0, 1, 2]]))
+    normals = seamless_normals(vertices, np.array([[0, 1, 2]]))
     assert np.array_equal(normals, np.tile((0, 1, 0), (4, 1)))
 
 

@@ -43,6 +43,15 @@ def test_the_film_has_every_position_of_every_loop_at_a_smooth_rate(written: Pat
     assert rate == 21
 
 
+def test_a_slow_motion_is_not_sampled_without_end(
+    tmp_path: Path, red_dot: Gaussians, slide: Framewise, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(preview, "MOST_PICTURES", 25)
+    write_preview(tmp_path / "a.mp4", red_dot, slide, FRAMES, 0.5, rasterize, SETTINGS)
+    pictures, rate = film(tmp_path / "a.mp4")
+    assert (len(pictures), rate) == (24, 2)
+
+
 def test_colors_survive_the_encoding(written: Path) -> None:
     first = film(written)[0][0]
     np.testing.assert_allclose(first[:4, :4], studio(64)[:4, :4].numpy(), atol=4 / 255)

@@ -49,13 +49,14 @@ def random_cloud() -> Callable[..., Gaussians]:
             return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
         batch = (states,) if states else ()
-        return Gaussians(
+        cloud = Gaussians(
             place * normal(*batch, count, 3),
             spread * normal(*batch, count, 3) + torch.tensor(scale).double().log(),
             normal(*batch, count, 4),
             normal(count) + opacity,
             normal(count, 1, 3),
         )
+        return cloud.to(torch.float32).to(torch.float64)  # rounded once, so that both precisions see the same cloud
 
     return make
 

@@ -9,7 +9,6 @@ import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.rasterizer.cpu_workers import ranges
 from dg4d_lib.rasterizer.interface import choose_rasterizer
 
 WHITE = torch.ones(3)
@@ -120,12 +119,6 @@ def test_zero_everywhere_is_the_gradient_where_nothing_is_seen(blobs, forward_an
         choose_rasterizer("cpu"), blobs([(0, 0, 5), (9, 0, 0)]), [OrbitCamera(width=32, height=32)], torch.float32
     )
     assert all(gradient.eq(0).all() for gradient in gradients.values())
-
-
-def test_ranges_make_up_the_whole_at_multiples():
-    assert ranges(10, 3) == [(0, 4), (4, 8), (8, 10)]
-    assert ranges(10000, 2, 4096) == [(0, 8192), (8192, 10000)]
-    assert ranges(0, 4) == []
 
 
 def test_importing_the_interface_compiles_nothing():

@@ -43,11 +43,11 @@ def _call(job: Callable[[], None]) -> None:
 @cache
 def _pool(process: int, threads: int) -> ThreadPoolExecutor:
     """One pool per process (threads do not survive a fork) and number of threads."""
-    return ThreadPoolExecutor(threads, thread_name_prefix="rasterizer")
+    return ThreadPoolExecutor(threads, thread_name_prefix="kernels")
 
 
 class Scratch:
-    """Arrays for one rendering; their memory goes back to a common store when this object is no longer used."""
+    """Arrays for one call; their memory goes back to a common store when this object is no longer used."""
 
     def __init__(self) -> None:
         self._taken: list[NDArray[np.uint8]] = []

@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from llvmlite import ir
+from numba import types
 from numba.core import cgutils
 
 Value: TypeAlias = Any  # an llvmlite value; that library's types do not know their attributes
@@ -164,3 +165,11 @@ class Vectors:
             phi.add_incoming(first, before)
             phi.add_incoming(last, end)
         return final
+
+
+def pointers(context: Any, builder: Any, signature: Any, arguments: Sequence[Value]) -> list[Value]:
+    """The data of an intrinsic's array arguments; None for scalars."""
+    return [
+        context.make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else None
+        for kind, value in zip(signature.args, arguments, strict=True)
+    ]

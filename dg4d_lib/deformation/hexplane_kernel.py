@@ -1,0 +1,238 @@
+"""HexPlane features and their gradient in one pass over the points, sixteen channels at a time.
+
+The spatial planes are read once per point, not once per point and time, and nothing is written but the features.
+Buffers have the channels last: planes as [plane, row, column, channel], lines as [axis, cell, time, channel].
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn import functional
+
+from dg4d_lib.kernels.vectors import FLOAT, INT, KERNEL, LANES, LONG, Value, Vectors, pointers
+from dg4d_lib.kernels.workers import ranges, run
+
+
+def hexplane_features(
+    coordinates: Float[Tensor, "n 3"], planes: Float[Tensor, "3 c r r"], lines: Float[Tensor, "3 t c r"]
+) -> Float[Tensor, "t n c"]:
+    """Product of six samples for every point and time; differentiable once, in planes and lines.
+
+    Args:
+        coordinates: in [-1, 1], from the centers of the first to those of the last cells; outside reads the border.
+            They get no gradient.
+        planes: xy, xz and yz; rows are the second axis, columns the first; read bilinearly.
+        lines: xt, yt and zt at the times asked for; read linearly.
+
+    Returns:
+        Features in the precision of the planes, computed in float32.
+
+    Raises:
+        ValueError: the coordinates want a gradient.
+    """
+    features: Tensor = _Features.apply(coordinates, planes.float(), lines.float())
+    return features.to(planes.dtype)
+
+
+class _Features(torch.autograd.Function):
+    """The bridge to autograd; channels are padded to whole vectors."""
+
+    @staticmethod
+    def forward(ctx: Any, coordinates: Tensor, planes: Tensor, lines: Tensor) -> Tensor:
+        if ctx.needs_input_grad[0]:
+            raise ValueError("HexPlane features have no gradient in the coordinates; detach them")
+        channels = planes.shape[1]
+        plane_buffer = _padded(planes.permute(0, 2, 3, 1))
+        line_buffer = _padded(lines.permute(0, 3, 1, 2))
+        cells, shares = _places(coordinates, planes.shape[-1])
+        features = torch.empty(lines.shape[1], len(coordinates), plane_buffer.shape[-1])
+        arrays = [tensor.numpy() for tensor in (cells, shares, plane_buffer, line_buffer)]
+        parts = ranges(len(coordinates), torch.get_num_threads())
+        run([partial(_read, *arrays, features.numpy(), *part) for part in parts])
+        ctx.arrays, ctx.channels = arrays, channels
+        return features[..., :channels]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, incoming: Tensor) -> tuple[None, Tensor, Tensor]:
+        """Threads take channels, so that each sum runs over the points in their order."""
+        gradient = _padded(incoming).numpy()
+        found = [np.zeros_like(buffer) for buffer in ctx.arrays[2:]]
+        parts = ranges(gradient.shape[-1], torch.get_num_threads(), LANES)
+        run([partial(_write_back, *ctx.arrays, gradient, *found, *part) for part in parts])
+        planes, lines = (torch.from_numpy(buffer)[..., : ctx.channels] for buffer in found)
+        return None, planes.permute(0, 3, 1, 2), lines.permute(0, 2, 3, 1)
+
+
+def _padded(tensor: Tensor) -> Tensor:
+    """Contiguous, the last axis filled up with zeros to whole vectors."""
+    missing = -tensor.shape[-1] % LANES
+    return (functional.pad(tensor, (0, missing)) if missing else tensor).contiguous()
+
+
+def _places(coordinates: Tensor, size: int) -> tuple[Int[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """The cell to the left on each axis, and the share of its right neighbor."""
+    place = ((coordinates.detach() + 1) / 2 * (size - 1)).clamp(0, size - 1)
+    cells = place.floor().to(torch.int32).clamp(0, size - 2)
+    return cells.contiguous(), (place - cells).float().contiguous()
+
+
+@njit(**KERNEL)
+@no_type_check
+def _read(cells, shares, planes, lines, features, start, stop):
+    size, times, channels = planes.shape[1], lines.shape[2], planes.shape[3]
+    points = features.shape[1]
+    for point in range(start, stop):
+        for channel in range(0, channels, LANES):
+            _read_point(cells, shares, planes, lines, features, point, channel, size, times, channels, points)
+
+
+@njit(**KERNEL)
+@no_type_check
+def _write_back(cells, shares, planes, lines, gradient, grad_planes, grad_lines, start, stop):
+    size, times, channels = planes.shape[1], lines.shape[2], planes.shape[3]
+    points = gradient.shape[1]
+    for point in range(len(cells)):
+        for channel in range(start, stop, LANES):
+            _write_back_point(
+                cells, shares, planes, lines, gradient, grad_planes, grad_lines,
+                point, channel, size, times, channels, points,
+            )  # fmt: skip
+
+
+@intrinsic
+@no_type_check
+def _read_point(typing_context, cells, shares, planes, lines, features, point, channel, size, times, channels, points):
+    """Features of one point and sixteen channels at all times."""
+    scalars = [types.int64] * 6
+    signature = types.void(cells, shares, planes, lines, features, *scalars)
+
+    def generate(context, builder, signature, arguments):
+        e = Vectors(builder)
+        data = pointers(context, builder, signature, arguments)
+        corner = _Corner(e, data, arguments[5:])
+        first, second, third = corner.spatial()
+        product = e.multiply(e.multiply(first, second), third)
+
+        def at_time(time, carried):
+            x, y, z = corner.temporal(time)
+            e.store(data[4], corner.feature(time), e.multiply(e.multiply(product, x), e.multiply(y, z)))
+            return []
+
+        e.loop(_long(0), arguments[8], [], at_time)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@intrinsic
+@no_type_check
+def _write_back_point(
+    typing_context, cells, shares, planes, lines, gradient, grad_planes, grad_lines,
+    point, channel, size, times, channels, points,
+):  # fmt: skip
+    """Add the gradient of one point and sixteen channels to those of the planes and lines that it read."""
+    scalars = [types.int64] * 6
+    signature = types.void(cells, shares, planes, lines, gradient, grad_planes, grad_lines, *scalars)
+
+    def generate(context, builder, signature, arguments):
+        e = Vectors(builder)
+        data = pointers(context, builder, signature, arguments)
+        corner = _Corner(e, data, arguments[7:])
+        first, second, third = corner.spatial()
+        product = e.multiply(e.multiply(first, second), third)
+
+        def add(array, index, weight, value):
+            e.store(array, index, e.fma(weight, value, e.load(array, index)))
+
+        def at_time(time, carried):
+            x, y, z = corner.temporal(time)
+            incoming = e.load(data[4], corner.feature(time))
+            scaled = e.multiply(incoming, product)
+            xy = e.multiply(x, y)
+            parts = (e.multiply(e.multiply(scaled, y), z), e.multiply(e.multiply(scaled, x), z), e.multiply(scaled, xy))
+            for axis, part in enumerate(parts):
+                for index, weight in corner.ends(axis, time):
+                    add(data[6], index, weight, part)
+            return [e.fma(incoming, e.multiply(xy, z), carried[0])]
+
+        (total,) = e.loop(_long(0), arguments[10], [e.constant(0)], at_time)
+        others = (e.multiply(second, third), e.multiply(first, third), e.multiply(first, second))
+        for plane, other in enumerate(others):
+            part = e.multiply(total, other)
+            for index, weight in corner.corners(plane):
+                add(data[5], index, weight, part)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+class _Corner:
+    """Where one point reads, and with which weights."""
+
+    def __init__(self, e: Vectors, data: Sequence[Value], scalars: Sequence[Value]) -> None:
+        self.e, self.planes, self.lines = e, data[2], data[3]
+        self.point, self.channel, self.size, self.times, self.channels, self.points = scalars
+        builder = e.builder
+        base = builder.mul(self.point, _long(3))
+        indices = [builder.add(base, _long(axis)) for axis in range(3)]
+        self.cells = [builder.sext(e.load(data[0], index, INT), LONG) for index in indices]
+        self.right = [e.splat(e.load(data[1], index, FLOAT)) for index in indices]
+        self.left = [e.subtract(e.constant(1), share) for share in self.right]
+
+    def corners(self, plane: int) -> list[tuple[Value, Value]]:
+        """Place and weight of the four cells of a spatial plane."""
+        builder = self.e.builder
+        column, row = ((0, 1), (0, 2), (1, 2))[plane]
+        found = []
+        for down, row_weight in enumerate((self.left[row], self.right[row])):
+            line = builder.add(builder.mul(self.size, _long(plane)), builder.add(self.cells[row], _long(down)))
+            for along, column_weight in enumerate((self.left[column], self.right[column])):
+                cell = builder.add(builder.add(builder.mul(line, self.size), self.cells[column]), _long(along))
+                index = builder.add(builder.mul(cell, self.channels), self.channel)
+                found.append((index, self.e.multiply(row_weight, column_weight)))
+        return found
+
+    def ends(self, axis: int, time: Value) -> list[tuple[Value, Value]]:
+        """Place and weight of the two cells of a line."""
+        builder = self.e.builder
+        found = []
+        for along, weight in enumerate((self.left[axis], self.right[axis])):
+            cell = builder.add(builder.mul(self.size, _long(axis)), builder.add(self.cells[axis], _long(along)))
+            row = builder.add(builder.mul(cell, self.times), time)
+            found.append((builder.add(builder.mul(row, self.channels), self.channel), weight))
+        return found
+
+    def feature(self, time: Value) -> Value:
+        """Place of the point's features at a time."""
+        builder = self.e.builder
+        row = builder.add(builder.mul(time, self.points), self.point)
+        return builder.add(builder.mul(row, self.channels), self.channel)
+
+    def spatial(self) -> list[Value]:
+        """Samples of the three spatial planes."""
+        return [self._sample(self.planes, self.corners(plane)) for plane in range(3)]
+
+    def temporal(self, time: Value) -> list[Value]:
+        """Samples of the three lines at a time."""
+        return [self._sample(self.lines, self.ends(axis, time)) for axis in range(3)]
+
+    def _sample(self, array: Value, terms: list[tuple[Value, Value]]) -> Value:
+        (index, weight), *others = terms
+        total = self.e.multiply(weight, self.e.load(array, index))
+        for index, weight in others:
+            total = self.e.fma(weight, self.e.load(array, index), total)
+        return total
+
+
+def _long(value: int) -> Value:
+    return ir.Constant(LONG, value)

@@ -1,0 +1,1 @@
+"""What compiled kernels share: vector instructions, threads and memory."""

@@ -1,0 +1,68 @@
+"""Many orders in one parent run: a few at a time, each in a flow run of its own; a bad one stops no other."""
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from prefect import flow, task
+from prefect.artifacts import create_table_artifact
+from prefect.cache_policies import NO_CACHE
+from prefect.task_runners import ThreadPoolTaskRunner
+
+from dg4d_lib.errors import DG4DError
+from flows.executors import StepError
+from flows.make import make, save_pictures
+from flows.orders import Order
+from flows.summary import Row
+
+Settle = Callable[[Row], None]
+
+
+@flow(name="catalog", flow_run_name="{title}", persist_result=False)
+def catalog(orders: list[Order], out: str, title: str) -> list[dict[str, Any]]:
+    """Make every order into `out`/<item>; a row of the summary for each, whatever happened to it."""
+    futures = [convert.submit(order, out) for order in orders]
+    rows = [future.result() for future in futures]
+    create_table_artifact(table=rows, key="catalog", description=title)
+    return rows
+
+
+@task(name="convert", task_run_name="convert {order.item}", cache_policy=NO_CACHE, persist_result=False)
+def convert(order: Order, out: str) -> dict[str, Any]:
+    """Make one order; a failure is a row too."""
+    start = time.monotonic()
+    row = _converted(order, Path(out) / order.item)
+    row = row.model_copy(update={"seconds": round(time.monotonic() - start, 1)})
+    with _one_at_a_time:
+        for settle in _settlers:
+            settle(row)
+    return row.model_dump(mode="json")
+
+
+def convert_all(orders: list[Order], out: Path, workers: int, title: str, settle: Settle) -> None:
+    """Run the batch, `workers` items at a time, and hand every finished item to `settle`."""
+    _settlers.append(settle)
+    try:
+        runner: Any = ThreadPoolTaskRunner(max_workers=workers)
+        catalog.with_options(task_runner=runner)(orders, str(out), title)
+    finally:
+        _settlers.remove(settle)
+
+
+_settlers: list[Settle] = []
+_one_at_a_time = threading.Lock()
+
+
+def _converted(order: Order, folder: Path) -> Row:
+    row = Row(item=order.item, source=order.source_name, status="failed")
+    try:
+        _, cached = make(order, folder)
+    except (StepError, DG4DError) as error:
+        pictures = [str(path) for path in save_pictures(order, error)]
+        message = error.message if isinstance(error, StepError) else str(error)
+        return row.model_copy(update={"message": message, "kind": type(error).__name__, "pictures": pictures})
+    except Exception as error:  # whatever it is, it is this item's own
+        return row.model_copy(update={"message": f"{type(error).__name__}: {error}", "kind": "Crashed"})
+    return row.model_copy(update={"status": "done", "message": "every step was already done" if cached else ""})

@@ -1,0 +1,87 @@
+"""One order becomes one folder: connect to a server, run the flow, publish what it made."""
+
+import os
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+from flows import home
+from flows.orders import Order
+from flows.publish import Files, publish
+from flows.server import ServerUnavailable
+from steps.store import ArtifactMissing
+
+ANSWER_S = 10.0  # for a server of the user's own
+
+
+def connect() -> None:
+    """Have a Prefect server, and import Prefect while it starts.
+
+    Raises:
+        ServerUnavailable: there is none; says what to do.
+    """
+    own = os.environ.get("PREFECT_API_URL")
+    if own:
+        home.set_environment(own)
+        _check(own)
+    else:
+        server = home.background_server()
+        server.start()
+        home.set_environment(f"{server.wait_for_address()}/api")
+        import prefect.main  # noqa: F401 - takes seconds, and so does the server
+
+        server.wait()
+    from flows.orphans import settle_orphans
+
+    settle_orphans()
+
+
+def make(order: Order, folder: Path) -> tuple[Files, bool]:
+    """Run the flow of an order and put the package into `folder`.
+
+    Returns:
+        The files of the package, and whether every step had been done before.
+
+    Raises:
+        StepError: a step did not finish; `folder` is as it was.
+        BadInput: the folder cannot be written, or the disk is full; it is as it was.
+    """
+    from prefect import tags
+    from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
+
+    from flows import report
+    from flows.image_to_4d import image_to_4d
+    from flows.orphans import process_tag
+    from flows.video_to_4d import video_to_4d
+
+    flow = video_to_4d if order.moving else image_to_4d
+    quick = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # a sync flow waits a second for its heart to stop
+    with temporary_settings(quick), tags(process_tag(), f"profile:{order.profile}"):
+        made = flow(order.source, order.settings, order.seed, order.item, order.bank)
+    store = home.store()
+    files = publish(store.path(made.package), folder, lambda files: report.texts(order, made, files, store))
+    return files, all(done.cached for done in made.steps)
+
+
+def save_pictures(order: Order, error: Exception) -> list[Path]:
+    """Keep the pictures that explain a failure where the user can look at them."""
+    saved = []
+    for name, ref in getattr(error, "pictures", {}).items():
+        path = home.failures() / f"{order.item.replace('/', '-')}-{getattr(error, 'step', 'step')}-{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            home.store().get(ref, path)
+        except (OSError, ArtifactMissing):
+            continue
+        saved.append(path)
+    return saved
+
+
+def _check(api_url: str) -> None:
+    try:
+        urllib.request.urlopen(f"{api_url.rstrip('/')}/health", timeout=ANSWER_S).close()
+    except (urllib.error.URLError, OSError, ValueError) as error:
+        raise ServerUnavailable(
+            f"PREFECT_API_URL is {api_url} and nothing answers there ({error}); "
+            "start that server, or unset the variable to have one started"
+        ) from error

@@ -1,0 +1,118 @@
+"""From Gaussians and their motion to textured triangles: one mesh that moves, or a mesh per frame."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.deformation.interface import Displacement
+from dg4d_lib.errors import BadInput
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.ply import read_ply
+from dg4d_lib.mesh.bake import bake, vertex_normals
+from dg4d_lib.mesh.clean import clean
+from dg4d_lib.mesh.density import density_field
+from dg4d_lib.mesh.extract import best_level, surface, usable_level
+from dg4d_lib.mesh.render import render_mesh
+from dg4d_lib.mesh.ride import ride
+from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.mesh.unwrap import unwrap
+from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
+from dg4d_lib.settings import MeshSettings
+from steps.job import Facts, Job
+from steps.media import write_png
+from steps.meshfiles import write_meshes, write_tracked
+from steps.motions import read_motion
+from steps.profiles import ExtractMeshSettings
+
+PICTURE_SIZE = 256  # pixels of one view
+PICTURE_AZIMUTHS_DEG = (0.0, 75.0, 180.0, 285.0)
+FPS_UNKNOWN = 1.0  # frames per second: motion has no clock; refine_texture, which sees the driving video, sets it
+
+
+def run(job: Job) -> Facts:
+    """Extract; the level of the surface is the one that agrees best with the outlines of the Gaussians at time 0.
+
+    Raises:
+        BadInput: frames that the motion does not have.
+    """
+    settings: ExtractMeshSettings = job.settings
+    rasterize = choose_rasterizer(settings.rasterizer)
+    gaussians = read_ply(job.inputs["gaussians"])
+    deformation, frames = read_motion(job.inputs["motion"])
+    with torch.no_grad():
+        displacement = deformation.displace(gaussians.means, torch.linspace(0, 1, frames))
+    states = displacement.apply(gaussians)
+    rest = states.at(0)
+    level, agreement = best_level(density_field(rest, settings.mesh), rest, rasterize, settings.mesh.density_threshold)
+    notes = [f"surface at density {level:.3g}; its outlines agree with the Gaussians' to {agreement:.1%} (IoU)"]
+
+    if settings.mesh.mode == "tracked":
+        job.progress(1, 3, {})
+        mesh, offsets = _tracked(rest, _from_start(displacement), level, rasterize, settings.mesh)
+        job.progress(2, 3, {})
+        write_tracked(job.outputs["tracked"], Asset4D(mesh, offsets, FPS_UNKNOWN))
+        picture = _picture(mesh)
+        notes.append(f"one mesh for {frames} frames: {len(mesh.vertices)} vertices, {len(mesh.faces)} triangles")
+    else:
+        end = settings.end_frame or frames
+        if not settings.first_frame < end <= frames:
+            raise BadInput(f"frames {settings.first_frame} to {end} were asked for; the motion has {frames}")
+        meshes = {}
+        for frame in range(settings.first_frame, end):
+            meshes[frame] = textured(states.at(frame), level, rasterize, settings.mesh)
+            job.progress(frame - settings.first_frame + 1, end - settings.first_frame, {})
+        write_meshes(job.outputs["meshes"], meshes)
+        picture = _picture(meshes[settings.first_frame])
+    write_png(job.outputs["picture"], picture)
+    return Facts(backend=f"{settings.rasterizer} rasterizer, pymeshlab, xatlas", notes=tuple(notes))
+
+
+def textured(gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings) -> TexturedMesh:
+    """The surface of one state of the cloud at a density, with its colors."""
+    vertices, faces = _cleaned_surface(gaussians, level, settings)
+    return _colored(vertices, faces, gaussians, rasterize, settings)[0]
+
+
+def _tracked(
+    rest: Gaussians, displacement: Displacement, level: float, rasterize: Rasterizer, settings: MeshSettings
+) -> tuple[TexturedMesh, Float[Tensor, "t v 3"]]:
+    """The mesh of the cloud at rest, and what to add to its vertices at every time."""
+    vertices, faces = _cleaned_surface(rest, level, settings)
+    mesh, copied = _colored(vertices, faces, rest, rasterize, settings)
+    return mesh, ride(vertices, rest, displacement)[:, copied]
+
+
+def _from_start(displacement: Displacement) -> Displacement:
+    """The same motion, told from where it begins."""
+    return Displacement(**{name: value - value[:1] for name, value in vars(displacement).items()})
+
+
+def _cleaned_surface(
+    gaussians: Gaussians, level: float, settings: MeshSettings
+) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
+    field = density_field(gaussians, settings)
+    vertices, faces = clean(*surface(field, usable_level(field, level)), settings, field.unit)
+    return torch.from_numpy(vertices), torch.from_numpy(faces)
+
+
+def _colored(
+    vertices: Float[Tensor, "v 3"],
+    faces: Int[Tensor, "f 3"],
+    gaussians: Gaussians,
+    rasterize: Rasterizer,
+    settings: MeshSettings,
+) -> tuple[TexturedMesh, Int[Tensor, " w"]]:
+    """Unwrapped and baked; and the old vertex of every new one."""
+    copied, corners, uvs = (torch.from_numpy(a) for a in unwrap(vertices.numpy(), faces.numpy(), settings.texture_size))
+    normals = vertex_normals(vertices, faces)[copied]
+    texture = bake(vertices[copied], normals, corners, uvs, gaussians, rasterize, settings)
+    return TexturedMesh(vertices[copied], corners, uvs, texture), copied
+
+
+def _picture(mesh: TexturedMesh) -> Float[Tensor, "h w 3"]:
+    """Four views in a row, over white."""
+    cameras = [OrbitCamera(0, azimuth, width=PICTURE_SIZE, height=PICTURE_SIZE) for azimuth in PICTURE_AZIMUTHS_DEG]
+    color, coverage = render_mesh(mesh, cameras)
+    return torch.cat(list(color * coverage + 1 - coverage), 1)

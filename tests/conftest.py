@@ -1,0 +1,20 @@
+"""Every test run has a home of its own, and nothing of the user's environment."""
+
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+_HOME = Path(tempfile.mkdtemp(prefix="dg4d-tests-"))
+for _name in tuple(os.environ):
+    if _name.startswith(("PREFECT_", "DG4D_")):
+        del os.environ[_name]
+os.environ["DG4D_HOME"] = str(_HOME)  # before anything imports Prefect, which reads its settings then
+os.environ["PREFECT_HOME"] = str(_HOME / "prefect")
+os.environ["DO_NOT_TRACK"] = "1"
+os.environ["PREFECT_SERVER_ANALYTICS_ENABLED"] = "false"
+os.environ["PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL"] = "CRITICAL"
+
+
+def pytest_unconfigure() -> None:
+    shutil.rmtree(_HOME, ignore_errors=True)

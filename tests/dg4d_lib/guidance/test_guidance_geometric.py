@@ -1,0 +1,74 @@
+import pytest
+import torch
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.errors import BadInput
+from dg4d_lib.guidance.geometric import InflatedSurfaces
+from dg4d_lib.guidance.interface import View
+from dg4d_lib.settings import GeometricPriorSettings
+
+SIZE = 48
+
+
+def disc(x: float) -> torch.Tensor:
+    rows, columns = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
+    alpha = ((columns - x) ** 2 + (rows - 24) ** 2 < 100).float()[..., None]
+    return torch.cat([torch.tensor([0.9, 0.3, 0.1]).expand(SIZE, SIZE, 3), alpha], -1)
+
+
+SETTINGS = GeometricPriorSettings(size=SIZE)
+CAMERA = OrbitCamera(width=SIZE, height=SIZE)
+
+
+def test_the_input_view_of_a_frame_shows_that_frame_over_white():
+    surfaces = InflatedSurfaces([disc(16), disc(32)], SETTINGS)
+    color, coverage = surfaces.clean([View(CAMERA, 1), View(CAMERA, 0)])
+    for view, x in enumerate((32, 16)):
+        picture = disc(x)
+        share = (coverage[view] - picture[..., 3:]).abs().mean()
+        assert share < 0.02
+        inside = (picture[..., 3] == 1) & (coverage[view, ..., 0] == 1)
+        torch.testing.assert_close(color[view][inside], picture[inside][:, :3])
+        assert (color[view][coverage[view, ..., 0] == 0] == 1).all()
+
+
+def test_views_do_not_depend_on_their_neighbors():
+    views = [View(OrbitCamera(elevation, 70 * elevation, width=32, height=32), elevation % 2) for elevation in range(5)]
+    surfaces = InflatedSurfaces([disc(16), disc(32)], SETTINGS)
+    color, coverage = surfaces.clean(views)
+    for i, view in enumerate(views):
+        alone, cover = InflatedSurfaces([disc(16), disc(32)], SETTINGS).clean([view])
+        assert torch.equal(alone[0], color[i]) and torch.equal(cover[0], coverage[i])
+
+
+def test_only_the_frames_that_are_asked_for_are_built_and_only_once():
+    surfaces = InflatedSurfaces([disc(16), torch.zeros(SIZE, SIZE, 4)], SETTINGS)
+    assert surfaces.surface(0) is surfaces.surface(0)
+    with pytest.raises(BadInput, match="no subject"):
+        surfaces.surface(1)
+
+
+def test_the_turn_of_the_settings_is_used():
+    color, _ = InflatedSurfaces([disc(24)], SETTINGS).clean([View(OrbitCamera(0, 50, width=SIZE, height=SIZE))])
+    settings = GeometricPriorSettings(size=SIZE, turn_deg=40)
+    turned, _ = InflatedSurfaces([disc(24)], settings).clean([View(OrbitCamera(0, 50, width=SIZE, height=SIZE))])
+    assert (color - turned).abs().mean() > 0.01
+
+
+@pytest.mark.parametrize("frame", [-1, 1])
+def test_a_frame_that_is_not_there_is_refused(frame):
+    with pytest.raises(BadInput, match="there are 1"):
+        InflatedSurfaces([disc(24)], SETTINGS).clean([View(CAMERA, frame)])
+
+
+def test_no_view_at_all_is_refused():
+    with pytest.raises(BadInput, match="at least one"):
+        InflatedSurfaces([disc(24)], SETTINGS).clean([])
+
+
+def test_large_pictures_show_the_same_surface():
+    surfaces = InflatedSurfaces([disc(20)], SETTINGS)
+    small, large = (surfaces.clean([View(OrbitCamera(10, 40, width=s, height=s))])[1] for s in (SIZE, 3 * SIZE))
+    shrunk = torch.nn.functional.avg_pool2d(large.permute(0, 3, 1, 2), 3).permute(0, 2, 3, 1)
+    torch.testing.assert_close(shrunk, small, atol=0.4, rtol=0)
+    assert (shrunk - small).abs().mean() < 0.01

@@ -1,0 +1,37 @@
+"""Threads and memory of kernels."""
+
+import numpy as np
+import pytest
+import torch
+
+from dg4d_lib.kernels.workers import Scratch, ranges, run
+
+
+def test_ranges_make_up_the_whole_at_multiples():
+    assert ranges(10, 3) == [(0, 4), (4, 8), (8, 10)]
+    assert ranges(10000, 2, 4096) == [(0, 8192), (8192, 10000)]
+    assert ranges(0, 4) == []
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_every_job_runs_and_a_failure_is_raised(threads):
+    before, done = torch.get_num_threads(), []
+    torch.set_num_threads(threads)
+    try:
+        run([lambda i=i: done.append(i) for i in range(7)])
+        with pytest.raises(ZeroDivisionError):
+            run([lambda: 1 / 0, lambda: None])
+    finally:
+        torch.set_num_threads(before)
+    assert sorted(done) == list(range(7))
+
+
+def test_memory_is_used_again_but_never_while_in_use():
+    first, second = Scratch(), Scratch()
+    a, b = first.empty((1000, 3)), second.empty((3000,))
+    assert not np.shares_memory(a, b)
+    address = a.ctypes.data
+    del a, first
+    again = Scratch()
+    assert again.empty((2999,)).ctypes.data == address
+    assert again.empty((2, 2), np.bool_).dtype == np.bool_

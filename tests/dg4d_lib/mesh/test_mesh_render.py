@@ -1,0 +1,59 @@
+import math
+
+import pytest
+import torch
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.mesh.render import render_mesh
+from dg4d_lib.mesh.textured import TexturedMesh
+
+SIZE = 32
+CAMERA = OrbitCamera(width=SIZE, height=SIZE)
+HALF = 2 * math.tan(math.radians(CAMERA.fov_y_deg) / 2)  # half the picture's height in the plane of the origin
+
+
+@pytest.fixture
+def board() -> TexturedMesh:
+    """A square that faces the input camera and covers the middle half of its picture; the texture has four colors."""
+    corners = torch.tensor([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+    uvs = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    quarters = torch.tensor([[[1.0, 0, 0], [0, 1, 0]], [[0, 0, 1], [1, 1, 0]]])
+    texture = quarters.repeat_interleave(16, 0).repeat_interleave(16, 1)
+    return TexturedMesh(0.5 * HALF * corners, torch.tensor([[0, 3, 2], [0, 2, 1]]), uvs, texture)
+
+
+def test_the_top_left_of_the_texture_is_the_top_left_of_the_picture(board: TexturedMesh) -> None:
+    color, coverage = render_mesh(board, [CAMERA])
+    for (row, column), expected in {(9, 9): (1, 0, 0), (9, 22): (0, 1, 0), (22, 9): (0, 0, 1)}.items():
+        torch.testing.assert_close(color[0, row, column], torch.tensor(expected, dtype=torch.float32))
+    assert coverage[0, 8:24, 8:24].min() == 1
+    assert coverage.sum() == 16 * 16
+
+
+def test_half_covered_pixels_keep_their_color(board: TexturedMesh) -> None:
+    pixel = 2 * HALF / SIZE
+    shifted = board.vertices.new_tensor([0.5 * pixel, 0, 0]).expand_as(board.vertices)
+    color, coverage = render_mesh(board, [CAMERA], shifted)
+    assert coverage[0, 10, 8, 0] == 0.5
+    torch.testing.assert_close(color[0, 10, 8], torch.tensor([1.0, 0, 0]))
+
+
+def test_every_camera_can_have_a_state_of_its_own(board: TexturedMesh) -> None:
+    away = torch.zeros(2, 4, 3)
+    away[1] += 10
+    _, coverage = render_mesh(board, [CAMERA, CAMERA], away)
+    assert coverage[0].sum() > 0
+    assert coverage[1].sum() == 0
+
+
+def test_what_is_not_covered_is_zero_and_finite(board: TexturedMesh) -> None:
+    color, coverage = render_mesh(board, [CAMERA])
+    assert (color[coverage[..., 0] == 0] == 0).all()
+
+
+def test_the_picture_is_differentiable_in_the_texture(board: TexturedMesh) -> None:
+    texture = board.texture.clone().requires_grad_()
+    color, _ = render_mesh(TexturedMesh(board.vertices, board.faces, board.uvs, texture), [CAMERA])
+    color.sum().backward()
+    assert texture.grad is not None
+    assert texture.grad.sum() == pytest.approx(3 * 16 * 16, rel=1e-4)

@@ -1,0 +1,102 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dg4d_lib.deformation.interface import Displacement
+from dg4d_lib.errors import BadInput
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.geometry.quaternion import multiply, rotation_matrix
+from dg4d_lib.mesh.ride import ride
+
+
+def still(gaussians: Gaussians, times: int) -> Displacement:
+    count = len(gaussians)
+    return Displacement(torch.zeros(times, count, 3), torch.zeros(times, count, 3), torch.zeros(times, count, 4))
+
+
+@pytest.fixture
+def gaussians() -> Gaussians:
+    generator = torch.Generator().manual_seed(3)
+    means, quats = torch.rand(300, 3, generator=generator) - 0.5, torch.randn(300, 4, generator=generator)
+    log_scales = torch.log(0.02 + 0.05 * torch.rand(300, 3, generator=generator))
+    return Gaussians(means, log_scales, quats, torch.randn(300, generator=generator), torch.zeros(300, 1, 3))
+
+
+@pytest.fixture
+def vertices() -> torch.Tensor:
+    return torch.rand(200, 3, generator=torch.Generator().manual_seed(4)) - 0.5
+
+
+def turned(gaussians: Gaussians, quat: torch.Tensor) -> Displacement:
+    """All Gaussians turned together about the origin, as one displacement."""
+    means = gaussians.means @ rotation_matrix(quat).T - gaussians.means
+    quats = multiply(quat.expand_as(gaussians.quats), gaussians.quats) - gaussians.quats
+    return replace(still(gaussians, 1), means=means[None], quats=quats[None])
+
+
+def test_a_shift_of_all_gaussians_shifts_every_vertex(gaussians: Gaussians, vertices: torch.Tensor) -> None:
+    shift = torch.tensor([[0.1, -0.2, 0.3], [0.0, 0.5, 0.0]])
+    displacement = replace(still(gaussians, 2), means=shift[:, None].expand(2, 300, 3))
+    offsets = ride(vertices, gaussians, displacement)
+    torch.testing.assert_close(offsets, shift[:, None].expand(2, 200, 3), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("degrees", [5.0, 90.0, 170.0])
+def test_a_turn_of_all_gaussians_turns_every_vertex(
+    gaussians: Gaussians, vertices: torch.Tensor, degrees: float
+) -> None:
+    half = math.radians(degrees) / 2
+    quat = torch.tensor([math.cos(half), 0.6 * math.sin(half), 0.0, 0.8 * math.sin(half)])
+    offsets = ride(vertices, gaussians, turned(gaussians, quat))
+    torch.testing.assert_close(vertices + offsets[0], vertices @ rotation_matrix(quat).T, atol=1e-5, rtol=0)
+
+
+def test_nothing_moves_where_no_gaussian_does(gaussians: Gaussians, vertices: torch.Tensor) -> None:
+    assert ride(vertices, gaussians, still(gaussians, 3)).abs().max() < 1e-7
+
+
+def test_a_single_gaussian_carries_with_its_own_rotation(gaussians: Gaussians, vertices: torch.Tensor) -> None:
+    one = Gaussians(**{name: value[:1] for name, value in vars(gaussians).items()})
+    quat = torch.tensor([math.cos(0.4), 0.0, math.sin(0.4), 0.0])
+    offsets = ride(vertices, one, turned(one, quat))
+    torch.testing.assert_close(vertices + offsets[0], vertices @ rotation_matrix(quat).T, atol=1e-5, rtol=0)
+
+
+def test_a_smooth_bend_is_followed(gaussians: Gaussians, vertices: torch.Tensor) -> None:
+    def bent(points: torch.Tensor) -> torch.Tensor:
+        angle = 0.8 * points[:, 1]
+        x = points[:, 0] * angle.cos() + 0.5 * (1 - angle.cos())
+        return torch.stack([x, points[:, 1], points[:, 2] + points[:, 0] * angle.sin()], -1)
+
+    displacement = replace(still(gaussians, 1), means=(bent(gaussians.means) - gaussians.means)[None])
+    vertices = 0.7 * vertices  # inside of the cloud
+    moved = bent(vertices) - vertices
+    error = (ride(vertices, gaussians, displacement)[0] - moved).norm(dim=-1)
+    nearest = torch.cdist(vertices, gaussians.means).argmin(-1)
+    error_of_the_nearest = (displacement.means[0, nearest] - moved).norm(dim=-1)
+    assert error.mean() < 0.6 * error_of_the_nearest.mean()
+
+
+def test_invisible_gaussians_carry_nothing(gaussians: Gaussians, vertices: torch.Tensor) -> None:
+    logits = torch.where(torch.arange(300) < 150, 2.0, -9.0)
+    means = torch.where(torch.arange(300)[:, None] < 150, 0.0, 5.0)
+    faint = replace(gaussians, opacity_logits=logits)
+    displacement = replace(still(gaussians, 1), means=means.expand(300, 3)[None])
+    assert ride(vertices, faint, displacement).abs().max() < 1e-6
+
+
+def test_order_of_the_gaussians_does_not_matter(gaussians: Gaussians, vertices: torch.Tensor) -> None:
+    generator = torch.Generator().manual_seed(5)
+    displacement = replace(still(gaussians, 1), means=0.1 * torch.randn(1, 300, 3, generator=generator))
+    order = torch.randperm(300, generator=generator)
+    other = Gaussians(**{name: value[order] for name, value in vars(gaussians).items()})
+    mixed = Displacement(**{name: value[:, order] for name, value in vars(displacement).items()})
+    torch.testing.assert_close(ride(vertices, gaussians, displacement), ride(vertices, other, mixed), atol=1e-6, rtol=0)
+
+
+def test_an_empty_cloud_is_refused(gaussians: Gaussians, vertices: torch.Tensor) -> None:
+    empty = Gaussians(**{name: value[:0] for name, value in vars(gaussians).items()})
+    with pytest.raises(BadInput, match="not empty"):
+        ride(vertices, empty, still(empty, 1))

@@ -1,0 +1,87 @@
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from dg4d_lib.mesh.unwrap import taubin_smooth, unwrap
+
+Mesh = tuple[np.ndarray, np.ndarray]
+SIZE = 256
+
+
+def charts(faces: np.ndarray) -> np.ndarray:
+    """Which connected piece of the flat map a face belongs to."""
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]]).T
+    graph = coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(faces.max() + 1,) * 2)
+    return connected_components(graph, directed=False)[1][faces[:, 0]]
+
+
+def drawn(faces: np.ndarray, uvs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How many triangles hold a texel's center well inside, and the last one's chart."""
+    count, chart = np.zeros((SIZE, SIZE), int), np.full((SIZE, SIZE), -1)
+    places, names = uvs.astype(np.float64) * SIZE - 0.5, charts(faces)
+    for face, name in zip(faces, names, strict=True):
+        corners = places[face]
+        low, high = np.ceil(corners.min(0)).astype(int), np.floor(corners.max(0)).astype(int)
+        columns, rows = np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1))
+        edges = np.stack([corners[1] - corners[0], corners[2] - corners[0]], 1)
+        if columns.size == 0 or abs(np.linalg.det(edges)) < 1e-9:
+            continue
+        b, c = np.linalg.solve(edges, np.stack([columns.ravel() - corners[0, 0], rows.ravel() - corners[0, 1]]))
+        inside = (b > 1e-4) & (c > 1e-4) & (b + c < 1 - 1e-4)
+        count[rows.ravel()[inside], columns.ravel()[inside]] += 1
+        chart[rows.ravel()[inside], columns.ravel()[inside]] = name
+    return count, chart
+
+
+@pytest.fixture(scope="module")
+def torus() -> Mesh:
+    mesh = trimesh.creation.torus(0.5, 0.2, major_sections=48, minor_sections=24)
+    return mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32)
+
+
+@pytest.fixture(scope="module")
+def flat(torus: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return unwrap(*torus, SIZE)
+
+
+def test_every_triangle_stays_where_it_was(torus: Mesh, flat: tuple[np.ndarray, ...]) -> None:
+    copied, faces, _ = flat
+    np.testing.assert_array_equal(copied[faces], torus[1])
+
+
+def test_places_lie_in_the_texture_and_fill_it(flat: tuple[np.ndarray, ...]) -> None:
+    uvs = flat[2]
+    assert uvs.min() >= 0
+    assert uvs.max() <= 1
+    assert (uvs.max(0) > 0.95).all(), "the rectangle of the atlas is stretched to the square"
+
+
+def test_no_two_triangles_share_a_texel(flat: tuple[np.ndarray, ...]) -> None:
+    count, _ = drawn(*flat[1:])
+    assert count.max() == 1
+    assert (count > 0).mean() > 0.35
+
+
+def test_charts_keep_two_texels_apart(flat: tuple[np.ndarray, ...]) -> None:
+    _, chart = drawn(*flat[1:])
+    assert chart.max() > 0
+    for rows, columns in ((1, 0), (0, 1), (1, 1), (1, -1)):
+        other = np.roll(chart, (rows, columns), (0, 1))[1:-1, 1:-1]
+        mine = chart[1:-1, 1:-1]
+        assert not ((mine >= 0) & (other >= 0) & (mine != other)).any()
+
+
+def test_the_same_mesh_is_unwrapped_the_same(torus: Mesh, flat: tuple[np.ndarray, ...]) -> None:
+    for first, second in zip(flat, unwrap(*torus, SIZE), strict=True):
+        assert first.tobytes() == second.tobytes()
+
+
+def test_smoothing_takes_noise_away_and_keeps_the_size(sphere: Mesh) -> None:
+    vertices, faces = sphere
+    noise = 0.01 * torch.randn(vertices.shape, generator=torch.Generator().manual_seed(0)).numpy()
+    radii = np.linalg.norm(taubin_smooth(vertices + noise, faces), axis=1)
+    assert radii.std() < 0.4 * np.linalg.norm(vertices + noise, axis=1).std()
+    assert radii.mean() == pytest.approx(0.5, rel=0.01)

@@ -1,0 +1,143 @@
+"""Steps that do next to nothing, under the names of the real ones; what happens is said in the source file.
+
+The source is text: words that name a step and what it should do there, for example "fit_motion=sleep:5".
+Every run of a step is noted in the file $FAKE_LOG.
+"""
+
+import json
+import os
+import signal
+import time
+import zipfile
+import zlib
+from pathlib import Path
+
+from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
+from steps.catalog import STEPS as REAL
+from steps.job import Facts, Job
+
+
+def _png() -> bytes:
+    def chunk(name: bytes, body: bytes) -> bytes:
+        return len(body).to_bytes(4, "big") + name + body + zlib.crc32(name + body).to_bytes(4, "big")
+
+    rows = b"".join(b"\0" + bytes([40 * y, 200, 90] * 8) for y in range(6))
+    head = b"\0\0\0\x08\0\0\0\x06\x08\x02\0\0\0"
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+
+
+PNG = _png()  # 8 x 6 pixels
+STEPS = {
+    name: spec.model_copy(update={"entry": f"fake_steps:{name}", "timeout_s": 60.0}) for name, spec in REAL.items()
+}
+
+
+def prepare_subject(job: Job) -> Facts:
+    words = _begin("prepare_subject", job, job.inputs["source"].read_bytes())
+    job.outputs["subject"].write_bytes(PNG + words)  # what follows a picture is ignored by those who look at it
+    if b"moving" in words:
+        job.outputs["footage"].write_bytes(words)
+    return Facts(notes=("This asset is a fake.",))
+
+
+def drive_video(job: Job) -> Facts:
+    words = _begin("drive_video", job, job.inputs["subject"].read_bytes()[len(PNG) :])
+    with zipfile.ZipFile(job.outputs["driving_video"], "w") as archive:
+        for i in range(5):
+            archive.writestr(zipfile.ZipInfo(f"{i:03d}.png"), words)
+    return Facts()
+
+
+def fit_gaussians(job: Job) -> Facts:
+    words = _begin("fit_gaussians", job, job.inputs["subject"].read_bytes()[len(PNG) :])
+    for i in range(10):
+        job.progress(i + 1, 10, {"loss": 1 / (i + 1)})
+    job.outputs["gaussians"].write_bytes(words)
+    _curves(job)
+    return Facts()
+
+
+def fit_motion(job: Job) -> Facts:
+    words = _begin("fit_motion", job, job.inputs["gaussians"].read_bytes())
+    job.outputs["motion"].write_bytes(words)
+    _curves(job)
+    return Facts()
+
+
+def extract_mesh(job: Job) -> Facts:
+    words = _begin("extract_mesh", job, job.inputs["motion"].read_bytes())
+    settings = job.settings
+    if settings.mesh.mode == "tracked":
+        job.outputs["tracked"].write_bytes(words)
+    else:
+        with zipfile.ZipFile(job.outputs["meshes"], "w") as archive:
+            for i in range(settings.first_frame, settings.end_frame):
+                archive.writestr(zipfile.ZipInfo(f"{i:03d}.safetensors"), f"frame {i}".encode())
+    job.outputs["picture"].write_bytes(PNG)
+    return Facts()
+
+
+def refine_texture(job: Job) -> Facts:
+    name = "tracked" if "tracked" in job.inputs else "meshes"
+    _begin("refine_texture", job, b"")
+    job.outputs[name].write_bytes(job.inputs[name].read_bytes())
+    return Facts()
+
+
+def pack_asset(job: Job) -> Facts:
+    words = _begin("pack_asset", job, job.inputs["subject"].read_bytes()[len(PNG) :])
+    name = "tracked" if "tracked" in job.inputs else "meshes"
+    with zipfile.ZipFile(job.outputs["package"], "w") as archive:
+        archive.writestr(zipfile.ZipInfo("asset.glb"), job.inputs[name].read_bytes())
+        archive.writestr(zipfile.ZipInfo("contact_sheet.png"), PNG + words)
+        archive.writestr(zipfile.ZipInfo("splats/000.ply"), b"0")
+        archive.writestr(zipfile.ZipInfo("splats/001.ply"), str(job.seed).encode())
+    job.outputs["sheet"].write_bytes(PNG)
+    return Facts()
+
+
+def _begin(step: str, job: Job, words: bytes) -> bytes:
+    """Note the run, then do what the words say for this step."""
+    log = Path(os.environ["FAKE_LOG"])
+    with log.open("a") as file:
+        file.write(f"{step}\n")
+    for word in words.decode(errors="replace").split():
+        name, _, command = word.partition("=")
+        if name == step:
+            _obey(command, job, step)
+    return words
+
+
+def _obey(command: str, job: Job, step: str) -> None:
+    verb, _, value = command.partition(":")
+    once = Path(os.environ["FAKE_LOG"]).with_suffix(f".{step}")
+    match verb:
+        case "bad":
+            raise BadInput(f"the picture is {value}")
+        case "missing":
+            raise BackendUnavailable("no cuda here")
+        case "diverge":
+            (job.pictures / "last_good.png").write_bytes(PNG)
+            raise FitDiverged(f"{step} diverged at iteration 7: the loss is nan")
+        case "crash":
+            raise ZeroDivisionError("division by zero")
+        case "memory":
+            raise MemoryError("not enough")
+        case "memory-once" if not once.exists():
+            once.touch()
+            raise MemoryError("not enough")
+        case "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+        case "sleep":
+            time.sleep(float(value))
+        case "sleep-once" if not once.exists():
+            once.touch()
+            time.sleep(float(value))
+        case "full":
+            raise OSError(28, "No space left on device")
+
+
+def _curves(job: Job) -> None:
+    curves = {"title": "fake", "x": [0, 1, 2], "series": {"loss": [1.0, 0.1, 0.01]}, "notes": []}
+    job.outputs["curves"].write_text(json.dumps(curves))
+    job.outputs["picture"].write_bytes(PNG)

@@ -1,0 +1,280 @@
+"""The flows with a real server and steps that do next to nothing; one module, for every server costs seconds."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prefect.client.orchestration import get_client
+from prefect.settings import PREFECT_API_URL, temporary_settings
+
+from flows import home, tasks
+from flows.executors import StepBadInput, StepCrashed, StepDiverged, StepError, StepMissing, StepOutOfMemory
+from flows.make import make, save_pictures
+from flows.orders import Order, Wish
+from flows.orphans import settle_orphans
+from flows.server import Server, ServerUnavailable
+from steps.profiles import PREVIEW, revise
+
+EVERY_STEP = [
+    "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "extract_mesh", "refine_texture", "pack_asset",
+]  # fmt: skip
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """A server of the product's own, which ends with the module."""
+    place = tmp_path_factory.mktemp("home")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DG4D_HOME", str(place))
+        patch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
+        patch.setenv("PYTHONPATH", str(Path(__file__).parent))
+        running = home.background_server()
+        running.start()
+        address = running.wait()
+        with temporary_settings({PREFECT_API_URL: address}):
+            yield running
+        running.release()
+        running.stop()
+
+
+@pytest.fixture
+def log(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where fake steps say that they ran; steps run in this process, and nobody waits before trying again."""
+    monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
+    monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
+    monkeypatch.setattr(tasks, "RETRY_DELAY_S", 0.01)
+    return tmp_path / "ran"
+
+
+def ran(log: Path) -> list[str]:
+    steps = log.read_text().split() if log.exists() else []
+    log.unlink(missing_ok=True)
+    return steps
+
+
+def order(words: str, folder: Path, *, name: str = "fake.png", **changes: object) -> Order:
+    (folder / name).write_text(words)
+    return Wish(item="fake", picture=folder / name, settings=revise(PREVIEW, dict(changes))).order(home.store())
+
+
+def tree(folder: Path, *but: str) -> dict[str, bytes]:
+    files = (p for p in sorted(folder.rglob("*")) if p.is_file() and p.name not in but)
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in files}
+
+
+def test_a_flow_runs_every_step_once_and_then_none(log: Path, tmp_path: Path) -> None:
+    wanted = order("twice", tmp_path)
+    _, cached = make(wanted, tmp_path / "one")
+    assert ran(log) == EVERY_STEP
+    assert not cached
+    _, cached = make(wanted, tmp_path / "two")
+    assert ran(log) == []
+    assert cached
+    assert tree(tmp_path / "one", "report.json", "report.html", "provenance.json") == tree(
+        tmp_path / "two", "report.json", "report.html", "provenance.json"
+    )
+    one, two = (json.loads((tmp_path / name / "provenance.json").read_text()) for name in ("one", "two"))
+    assert one.pop("run") != two.pop("run")
+    assert one == two
+    assert len(one["steps"]) == len(EVERY_STEP)
+
+
+def test_a_changed_knob_runs_its_step_and_what_follows(log: Path, tmp_path: Path) -> None:
+    make(order("knob", tmp_path), tmp_path / "out")
+    ran(log)
+    make(order("knob", tmp_path, **{"mesh.grid": 64}), tmp_path / "out")
+    assert ran(log) == ["extract_mesh"]  # its output did not change, so what follows was there already
+
+
+def test_a_lost_artifact_is_made_again(log: Path, tmp_path: Path) -> None:
+    wanted = order("lost", tmp_path)
+    make(wanted, tmp_path / "out")
+    ran(log)
+    record = json.loads((tmp_path / "out" / "provenance.json").read_text())
+    motion = next(step for step in record["steps"] if step["step"] == "fit_motion")["outputs"]["motion"]
+    (blob,) = (home.store().root / "sha256").rglob(motion.removeprefix("sha256:"))
+    blob.unlink()
+    make(wanted, tmp_path / "out")
+    assert set(ran(log)) >= {"fit_motion"}
+    assert blob.exists()
+
+
+def test_a_video_moves_the_asset_and_a_picture_is_no_video(log: Path, tmp_path: Path) -> None:
+    make(order("moving film", tmp_path, name="film.mp4"), tmp_path / "out")
+    assert "the motion follows the video" in (tmp_path / "out" / "report.json").read_text()
+    with pytest.raises(StepBadInput, match="single picture"):
+        make(order("still", tmp_path, name="still.mp4"), tmp_path / "still")
+    assert not (tmp_path / "still").exists()
+
+
+def test_a_mesh_per_frame_is_made_in_parts_and_joined(log: Path, tmp_path: Path) -> None:
+    knobs = {"mesh.mode": "per_frame", "mesh.frames_per_task": 2}
+    make(order("parts", tmp_path, **knobs), tmp_path / "two")
+    assert ran(log).count("extract_mesh") == 3  # five frames, two at a time
+    make(order("parts", tmp_path, **{**knobs, "mesh.frames_per_task": 5}), tmp_path / "five")
+    assert ran(log).count("extract_mesh") == 1
+    assert (tmp_path / "two" / "asset.glb").read_bytes() == (tmp_path / "five" / "asset.glb").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("word", "error", "attempts"),
+    [
+        ("bad:ugly", StepBadInput, 1),
+        ("missing", StepMissing, 1),
+        ("diverge", StepDiverged, 1),
+        ("crash", StepCrashed, 2),
+        ("memory", StepOutOfMemory, 3),
+    ],
+)
+def test_only_what_may_heal_is_tried_again(
+    log: Path, tmp_path: Path, word: str, error: type[StepError], attempts: int
+) -> None:
+    wanted = order(f"fit_motion={word}", tmp_path)
+    with pytest.raises(error) as caught:
+        make(wanted, tmp_path / "out")
+    assert ran(log).count("fit_motion") == attempts
+    assert not (tmp_path / "out").exists()
+    pictures = save_pictures(wanted, caught.value)
+    assert [p.name for p in pictures] == (["fake-fit_motion-last_good.png"] if word == "diverge" else [])
+
+
+def test_memory_that_is_free_again_is_enough(log: Path, tmp_path: Path) -> None:
+    make(order("fit_motion=memory-once", tmp_path), tmp_path / "out")
+    assert ran(log).count("fit_motion") == 2
+
+
+def test_every_step_leaves_a_page_with_its_picture_on_the_server(log: Path, tmp_path: Path) -> None:
+    make(order("pages", tmp_path), tmp_path / "out")
+    with get_client(sync_client=True) as client:
+        pages: list[Any] = client.request("POST", "/artifacts/latest/filter", json={"limit": 200}).json()
+    markdown = {page["key"]: page["data"] for page in pages if page["type"] == "markdown"}
+    ours = {key: data for key, data in markdown.items() if "-fake-" in key}
+    assert len(ours) == len(EVERY_STEP) + 1
+    motion = next(data for key, data in ours.items() if key.startswith("fit-motion"))
+    assert "data:image/webp;base64," in motion
+    assert "| 2 | 0.01 |" in motion
+    progress = next(
+        page for page in pages if page["type"] == "progress" and page["key"].startswith("progress-fit-gauss")
+    )
+    assert progress["data"] == 100
+
+
+@pytest.fixture
+def dg4d(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """The command in a process of its own, with steps in theirs."""
+    monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(_command(*arguments), capture_output=True, text=True, check=False)
+
+    return run
+
+
+def _command(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "flows.cli", *arguments]
+
+
+def test_a_killed_command_goes_on_where_it_was_and_gives_the_same_bytes(dg4d: Run, tmp_path: Path, log: Path) -> None:
+    settle_orphans()
+    (tmp_path / "x.png").write_text("kill fit_motion=sleep-once:60")
+    command = subprocess.Popen(_command("make", "x.png", "-o", "out"), stdout=subprocess.DEVNULL, env=_subprocesses())
+    wait_until(lambda: log.exists() and "fit_motion" in log.read_text())
+    command.send_signal(signal.SIGKILL)
+    command.wait()
+    assert ran(log) == EVERY_STEP[:4]
+    assert not (tmp_path / "out").exists()
+    done = subprocess.run(
+        _command("make", "x.png", "-o", "out"), capture_output=True, text=True, env=_subprocesses(), check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert ran(log) == EVERY_STEP[3:]
+    assert "prepare_subject: cached" in done.stdout
+    assert settle_orphans() == 0  # the second command had marked the killed run
+    again = subprocess.run(
+        _command("make", "x.png", "-o", "out"), capture_output=True, text=True, env=_subprocesses(), check=False
+    )
+    assert "nothing to do" in again.stdout
+    make(Wish(item="undisturbed", picture=tmp_path / "x.png", settings=PREVIEW).order(home.store()), tmp_path / "other")
+    assert ran(log) == []
+
+
+def test_two_commands_at_once_do_the_work_once(dg4d: Run, tmp_path: Path, log: Path) -> None:
+    (tmp_path / "x.png").write_text("both fit_gaussians=sleep:1")
+    both = [subprocess.Popen(_command("make", "x.png", "-o", out), stdout=subprocess.DEVNULL) for out in ("a", "b")]
+    assert [command.wait() for command in both] == [0, 0]
+    assert sorted(ran(log)) == sorted(EVERY_STEP)
+    assert tree(tmp_path / "a", "report.json", "report.html", "provenance.json") == tree(
+        tmp_path / "b", "report.json", "report.html", "provenance.json"
+    )
+
+
+def test_bad_input_that_a_step_finds_is_one_message(dg4d: Run, tmp_path: Path) -> None:
+    (tmp_path / "x.png").write_text("prepare_subject=bad:ugly")
+    done = dg4d("make", "x.png", "-o", "out")
+    assert done.returncode == 65
+    assert done.stderr == "dg4d: the picture is ugly\n"
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_batch_makes_what_it_can_and_leaves_alone_what_is_made(dg4d: Run, tmp_path: Path, log: Path) -> None:
+    (tmp_path / "in" / "deep").mkdir(parents=True)
+    for name, words in {"a": "one", "deep/b": "two", "bad": "prepare_subject=bad:ugly"}.items():
+        (tmp_path / "in" / f"{name}.png").write_text(words)
+    done = dg4d("batch", "in", "-o", "out", "--workers", "2")
+    assert done.returncode == 1, done.stderr
+    status = {row["item"]: row["status"] for row in json.loads((tmp_path / "out/summary.json").read_text())["items"]}
+    assert status == {"a": "done", "bad": "failed", "deep/b": "done"}
+    assert (tmp_path / "out/deep/b/asset.glb").exists()
+    assert not (tmp_path / "out/bad").exists()
+    ran(log)
+    (tmp_path / "in" / "bad.png").write_text("good")
+    (tmp_path / "in" / "a.png").write_text("one changed")
+    assert dg4d("batch", "in", "-o", "out").returncode == 0
+    assert sorted(ran(log)) == sorted(EVERY_STEP * 2)
+    again = dg4d("batch", "in", "-o", "out")
+    assert again.returncode == 0
+    assert "nothing to do" in again.stdout
+    assert ran(log) == []
+
+
+def test_the_server_is_shared_and_ends_when_nobody_uses_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DG4D_SERVER_IDLE_S", "1")
+    one, two = (Server(tmp_path / "server", tmp_path / "prefect") for _ in range(2))
+    one.start()
+    two.start()
+    assert one.wait() == two.wait()
+    one.release()
+    time.sleep(3)
+    assert two.address() is not None  # somebody uses it still
+    two.release()
+    wait_until(lambda: two.address() is None)
+    assert not (tmp_path / "server" / "server.json").exists()
+    assert not two.stop()
+
+
+def test_a_server_that_cannot_start_is_unavailable(tmp_path: Path) -> None:
+    (tmp_path / "prefect").write_text("a file where a folder should be")
+    broken = Server(tmp_path / "server", tmp_path / "prefect")
+    broken.start()
+    with pytest.raises(ServerUnavailable, match=r"server\.log"):
+        broken.wait(timeout_s=15)
+
+
+def _subprocesses() -> dict[str, str]:
+    return {**os.environ, "DG4D_EXECUTOR": "subprocess"}
+
+
+def wait_until(condition: Callable[[], bool], timeout_s: float = 60) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen"
+        time.sleep(0.05)

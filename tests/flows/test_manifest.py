@@ -1,0 +1,108 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from dg4d_lib.errors import BadInput
+from flows.manifest import Item, distinct, items_of, parse_changes
+
+
+def touch(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"x")
+
+
+def items(inputs: Path, out: str = "out", **changes: object) -> list[Item]:
+    return items_of(inputs, Path(out), "preview", changes, 3)
+
+
+def test_a_folder_gives_its_pictures_and_videos_with_their_places(tmp_path: Path) -> None:
+    touch(tmp_path, "b.png", "deep/er/c.mp4", "a.JPG", "notes.txt", ".hidden.png", ".git/d.png")
+    assert [item.name for item in items(tmp_path)] == ["a", "b", "deep/er/c"]
+
+
+def test_packages_and_the_output_folder_are_no_inputs(tmp_path: Path) -> None:
+    touch(tmp_path, "a.png", "out/a/contact_sheet.png", "made/contact_sheet.png")
+    (tmp_path / "made" / "provenance.json").write_text(json.dumps({"files": {}}))
+    assert [item.name for item in items(tmp_path, str(tmp_path / "out"))] == ["a"]
+
+
+def test_no_two_items_share_a_folder_and_none_lies_within_another(tmp_path: Path) -> None:
+    touch(tmp_path, "a.png", "A.mp4", "b.png", "b/c.png", "d.png")
+    assert [item.name for item in items(tmp_path)] == ["A-mp4", "a-png", "b/c", "b-png", "d"]
+    assert distinct([("x", ""), ("x", ""), ("x-2", "")]) == ["x", "x-2", "x-2-2"]
+
+
+def test_a_csv_has_a_row_per_item_with_knobs_of_its_own(tmp_path: Path) -> None:
+    (tmp_path / "m.csv").write_text(
+        "path,video,name,seed,set,mesh.grid\n"
+        "p/cat.png,,,,,\n"
+        "p/dog.png,p/run.mp4,hero,7,motion.views=2; pack.splats=false,64\n"
+    )
+    cat, dog = items(tmp_path / "m.csv", **{"static.iterations": 9})
+    assert cat.wish is not None
+    assert dog.wish is not None
+    assert (cat.name, cat.wish.picture, cat.wish.seed, cat.wish.video) == ("cat", tmp_path / "p/cat.png", 3, None)
+    assert (dog.name, dog.wish.video, dog.wish.seed) == ("hero", tmp_path / "p/run.mp4", 7)
+    settings = dog.wish.settings
+    assert (settings.motion.views, settings.pack.splats, settings.mesh.grid) == (2, False, 64)
+    assert cat.wish.settings.mesh.grid != 64
+    assert settings.static.iterations == cat.wish.settings.static.iterations == 9
+
+
+def test_a_json_manifest_says_the_same(tmp_path: Path) -> None:
+    rows = [{"path": "/abs/cat.png", "set": {"mesh.grid": 32}, "name": "../../cat"}]
+    (tmp_path / "m.json").write_text(json.dumps(rows))
+    (cat,) = items(tmp_path / "m.json")
+    assert cat.wish is not None
+    assert (cat.name, cat.wish.picture, cat.wish.settings.mesh.grid) == ("cat", Path("/abs/cat.png"), 32)
+
+
+def test_a_bad_row_is_a_bad_item_and_no_more(tmp_path: Path) -> None:
+    rows = [
+        {"path": "a.png", "mesh.grit": 1},
+        {"path": "b.png", "seed": "x"},
+        {"path": "c.png"},
+        {"path": "d", "seed": -1},
+    ]
+    (tmp_path / "m.json").write_text(json.dumps(rows))
+    found = items(tmp_path / "m.json")
+    assert [bool(item.wish) for item in found] == [False, False, True, False]
+    assert "mesh.grit" in found[0].error
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("m.csv", "file\nx.png\n", "unknown column 'file'"),
+        ("m.csv", "path,seed\n,1\n", "row 1: no path"),
+        ("m.json", "{", "cannot be read"),
+        ("m.json", '{"path": 1}', "list of rows"),
+        ("m.txt", "x", "neither a folder nor a manifest"),
+        ("m.csv", "path\n", "holds no pictures"),
+    ],
+)
+def test_a_manifest_that_is_wrong_as_a_whole_is_refused(tmp_path: Path, name: str, content: str, says: str) -> None:
+    (tmp_path / name).write_text(content)
+    with pytest.raises(BadInput, match=says):
+        items(tmp_path / name)
+
+
+def test_an_empty_or_missing_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="no pictures"):
+        items(tmp_path)
+    with pytest.raises(BadInput, match="does not exist"):
+        items(tmp_path / "nothing")
+
+
+def test_values_are_json_where_they_can_be_and_kinds_come_first() -> None:
+    changes = parse_changes(
+        ["prior.size=64", "a.b=[1, 2]", "pack.splats=false", "mesh.mode=per_frame", "prior.kind=geometric"]
+    )
+    assert changes == {
+        "prior.kind": "geometric", "prior.size": 64, "a.b": [1, 2], "pack.splats": False, "mesh.mode": "per_frame",
+    }  # fmt: skip
+    assert next(iter(changes)) == "prior.kind"
+    with pytest.raises(BadInput, match="knob=value"):
+        parse_changes(["motion.iterations"])

@@ -1,0 +1,146 @@
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows import report
+from flows.orders import Order
+from flows.summary import Row, write_summary
+from flows.tasks import Finished, Made
+from steps.contract import ArtifactRef, ProvenanceRecord, StepResult
+from steps.profiles import PREVIEW, revise
+from steps.store import ArtifactStore
+
+FILES = {
+    name: {"digest": "sha256:" + "a" * 64, "size_bytes": size}
+    for name, size in {
+        "asset.glb": 5_400_000,
+        "contact_sheet.png": 99_000,
+        "preview.mp4": 1,
+        "splats/000.ply": 7,
+    }.items()
+}
+CURVES = {"title": "static <fit>", "x": [0, 10, 20], "series": {"loss": [100.0, 1.0, 0.01]}, "notes": []}
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> ArtifactStore:
+    return ArtifactStore(tmp_path / "store")
+
+
+def finished(step: str, store: ArtifactStore, seconds: float, **outputs: ArtifactRef) -> Finished:
+    record = ProvenanceRecord(
+        step=step,
+        code_version="1",
+        request_digest="sha256:" + "b" * 64,
+        inputs={},
+        outputs={name: ref.digest for name, ref in outputs.items()},
+        settings={},
+        seed=0,
+        backend="cpu",
+        notes=("Twice said.", "<b>bold</b>"),
+        duration_s=seconds,
+        peak_memory_mb=seconds * 10,
+    )
+    result = StepResult(outputs=outputs, provenance=record)
+    return Finished(label=step, cached=seconds > 5, seconds=seconds, result=result)
+
+
+def made(store: ArtifactStore, seconds: float = 2.0) -> tuple[Order, Made]:
+    source = store.put_bytes(b"s", "application/octet-stream")
+    curves = store.put_bytes(json.dumps(CURVES).encode(), "application/vnd.dg4d.curves+json")
+    order = Order(
+        item="<fox>", source=source, moving=False, profile="preview", settings=PREVIEW, seed=0, source_name="fox.png"
+    )
+    steps = [finished("fit_gaussians", store, seconds, curves=curves), finished("pack_asset", store, seconds + 1)]
+    return order, Made(package=source, steps=steps, flow_run=f"run {seconds}")
+
+
+class Links(HTMLParser):
+    """Every tag and every address of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.addresses: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.addresses += [value for name, value in attrs if name in {"src", "href"} and value]
+
+
+def test_the_page_is_self_contained_and_escapes_what_it_is_given(store: ArtifactStore) -> None:
+    order, what = made(store)
+    page = report.texts(order, what, FILES, store)["report.html"]
+    links = Links(page)
+    assert "script" not in links.tags
+    assert "fox" not in links.tags
+    assert "b" in links.tags
+    assert "<b>bold</b>" not in page
+    assert not [address for address in links.addresses if re.match(r"\w+:|//", address)]
+    assert {"preview.mp4", "contact_sheet.png", "asset.glb", "splats/", "provenance.json"} <= set(links.addresses)
+    assert links.tags.count("polyline") == 1
+    assert "5.4 MB" in page
+
+
+def test_the_banner_is_honest(store: ArtifactStore) -> None:
+    order, what = made(store)
+    assert "the motion was made up" in report.banner(order, what)
+    assert "guessed without a model" in report.banner(order, what)
+    moving = what.model_copy(update={"steps": [finished("prepare_subject", store, 1, footage=order.source)]})
+    assert "the motion follows the video" in report.banner(order, moving)
+    oracle = order.model_copy(update={"settings": revise(PREVIEW, {"prior.kind": "oracle"})})
+    assert "true views were known" in report.banner(oracle, what)
+
+
+def test_notes_are_said_once_and_a_picture_that_only_names_is_mentioned(store: ArtifactStore) -> None:
+    order, what = made(store)
+    order = order.model_copy(update={"picture_name": "fox.jpg", "source_name": "run.mp4"})
+    notes = report.notes(order, what)
+    assert notes[1:] == ["Twice said.", "<b>bold</b>"]
+    assert "run.mp4" in notes[0]
+    assert "fox.jpg only names" in notes[0]
+
+
+def test_provenance_differs_between_runs_only_under_run(store: ArtifactStore) -> None:
+    one = json.loads(report.texts(*made(store, 1.0), FILES, store)["provenance.json"])
+    two = json.loads(report.texts(*made(store, 9.0), FILES, store)["provenance.json"])
+    assert one != two
+    assert one.pop("run") != two.pop("run")
+    assert one == two
+    assert one["files"] == FILES
+
+
+def test_a_curve_goes_from_top_left_to_bottom_right_on_a_logarithmic_scale() -> None:
+    svg = report.curve(CURVES)
+    (points,) = re.findall(r'points="([^"]*)"', svg)
+    places = [tuple(map(float, pair.split(","))) for pair in points.split()]
+    assert places == [(0, 0), (report.PLOT_WIDTH / 2, report.PLOT_HEIGHT / 2), (report.PLOT_WIDTH, report.PLOT_HEIGHT)]
+    assert "logarithmic" in svg
+
+
+@pytest.mark.parametrize("values", [[], [1.0], [float("nan"), float("nan")], [0.0, 0.0], [-1.0, 2.0]])
+def test_odd_curves_break_no_page(values: list[float]) -> None:
+    curves: dict[str, Any] = {"title": "t", "x": list(range(len(values))), "series": {"a": values}, "notes": []}
+    assert "nan" not in report.curve(curves)
+
+
+def test_a_summary_counts_and_the_overview_links_what_is_there(tmp_path: Path) -> None:
+    (tmp_path / "a b").mkdir()
+    (tmp_path / "a b" / "preview.mp4").touch()
+    rows = [
+        Row(item="a b", status="done", seconds=3),
+        Row(item="z/y", status="failed", message="<ugly>"),
+        Row(item="c", status="unchanged"),
+    ]
+    write_summary(tmp_path, rows)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["counts"] == {"done": 1, "unchanged": 1, "failed": 1}
+    page = (tmp_path / "index.html").read_text()
+    assert Links(page).addresses.count("a%20b/preview.mp4") == 1
+    assert "&lt;ugly&gt;" in page
+    assert page.index("z/y") < page.index("a b")

@@ -1,0 +1,126 @@
+"""The two fitting steps: files in, files out, and what they do when a loss is no number."""
+
+import json
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.errors import BadInput, FitDiverged
+from dg4d_lib.gaussians.ply import read_ply
+from dg4d_lib.guidance.interface import View
+from dg4d_lib.video.driving import DrivingVideo
+from steps import fit_gaussians, fit_motion
+from steps.job import Job
+from steps.media import read_png, write_frames, write_png
+from steps.motions import read_motion
+from steps.priors import read_bank
+from steps.profiles import PREVIEW, FitGaussiansSettings, FitMotionSettings, revise
+
+SMALL = revise(
+    PREVIEW,
+    {
+        "static.iterations": 3,
+        "static.views": 2,
+        "static.points": 200,
+        "static.reference_size": 32,
+        "static.prune_scale": 1.0,
+        "motion.iterations": 2,
+        "motion.reference_size": 32,
+        "motion.frames_per_iteration": 0,
+        "static.ladder": [{"until": 1.0, "size": 32}],
+        "motion.ladder": [{"until": 1.0, "size": 32}],
+        "prior.size": 32,
+    },
+)
+
+
+def disc(shift: int = 0) -> torch.Tensor:
+    rows, columns = torch.meshgrid(torch.arange(48), torch.arange(48), indexing="ij")
+    inside = ((rows - 24) ** 2 + (columns - 24 - shift) ** 2 < 14**2).float()
+    return torch.stack([inside, columns / 48 * inside, 0 * inside, inside], -1)
+
+
+def job(tmp_path: Path, settings, inputs: dict[str, Path], outputs: list[str]) -> Job:
+    (tmp_path / "pictures").mkdir(exist_ok=True)
+    reported = tmp_path / "progress.txt"
+
+    def progress(done: int, total: int, values: dict[str, float]) -> None:
+        reported.write_text(f"{done}/{total} {sorted(values)}")
+
+    suffixes = {"picture": ".png"}
+    files = {name: tmp_path / f"out_{name}{suffixes.get(name, '')}" for name in outputs}
+    return Job(inputs, files, settings, seed=1, progress=progress, pictures=tmp_path / "pictures")
+
+
+@pytest.fixture
+def subject(tmp_path: Path) -> Path:
+    write_png(tmp_path / "subject.png", disc())
+    return tmp_path / "subject.png"
+
+
+def fit_settings(settings=SMALL) -> FitGaussiansSettings:
+    return FitGaussiansSettings(rasterizer="auto", prior=settings.prior, static=settings.static)
+
+
+def fitted(tmp_path: Path, subject: Path) -> Job:
+    work = job(tmp_path, fit_settings(), {"subject": subject}, ["gaussians", "curves", "picture"])
+    fit_gaussians.run(work)
+    return work
+
+
+def test_static_gaussians_come_out_with_curves_and_a_picture(tmp_path: Path, subject: Path):
+    work = fitted(tmp_path, subject)
+    assert len(read_ply(work.outputs["gaussians"])) > 100
+    curves = json.loads(work.outputs["curves"].read_text())
+    assert curves["x"] == [1, 2, 3]
+    assert set(curves["series"]) == {"loss", "reference", "guidance", "Gaussians"}
+    assert read_png(work.outputs["picture"]).shape == (192, 6 * 192, 3)
+    assert (tmp_path / "progress.txt").read_text().startswith("3/3")
+
+
+def test_a_motion_comes_out_of_gaussians_and_a_video(tmp_path: Path, subject: Path):
+    gaussians = fitted(tmp_path, subject).outputs["gaussians"]
+    frames = torch.stack([disc(), disc(2), disc(4)])
+    write_frames(tmp_path / "video.zip", DrivingVideo(frames[..., :3], frames[..., 3:], 5.0))
+    settings = FitMotionSettings(
+        rasterizer="auto", prior=SMALL.prior, deformation=SMALL.deformation, motion=SMALL.motion
+    )
+    inputs = {"gaussians": gaussians, "driving_video": tmp_path / "video.zip"}
+    work = job(tmp_path, settings, inputs, ["motion", "curves", "picture"])
+    facts = fit_motion.run(work)
+    _, frames_fitted = read_motion(work.outputs["motion"])
+    assert frames_fitted == 3
+    assert "no model" in facts.notes[0]
+
+
+def test_a_loss_that_is_no_number_leaves_a_picture_of_the_last_good_state(tmp_path: Path, subject: Path):
+    wild = revise(SMALL, {"static.color_weight": 1e45})
+    work = job(tmp_path, fit_settings(wild), {"subject": subject}, ["gaussians", "curves", "picture"])
+    with pytest.raises(FitDiverged, match="the loss became inf at iteration 1 of 3"):
+        fit_gaussians.run(work)
+    assert read_png(work.pictures / "last_good_state.png").shape[2] == 3
+    assert not work.outputs["gaussians"].exists()
+
+
+def test_the_oracle_without_a_bank_is_refused(tmp_path: Path, subject: Path):
+    settings = fit_settings(revise(SMALL, {"prior.kind": "oracle"}))
+    with pytest.raises(BadInput, match="--bank"):
+        fit_gaussians.run(job(tmp_path, settings, {"subject": subject}, ["gaussians", "curves", "picture"]))
+
+
+def test_a_bank_is_read_tile_by_tile(tmp_path: Path):
+    sheet = torch.zeros(16, 16, 4)
+    sheet[..., 3] = 1
+    sheet[:8, 8:, 0] = 1.0  # the second tile is red
+    write_png(tmp_path / "view.png", sheet)
+    about = {"frames": [0, 4], "tile": [2, 2], "tile_size": 8}
+    about["views"] = [{"file": "view.png", "azimuth": 22.5, "elevation": -20, "radius": 2.0}]
+    with zipfile.ZipFile(tmp_path / "bank.zip", "w") as archive:
+        archive.write(tmp_path / "view.png", "view.png")
+        archive.writestr("bank.json", json.dumps(about))
+    bank = read_bank(tmp_path / "bank.zip", tmp_path)
+    color, _ = bank.clean([View(OrbitCamera(-20, 22.5, width=8, height=8), frame) for frame in (0, 4)])
+    assert color[:, 0, 0, 0].tolist() == [0.0, 1.0]

@@ -1,0 +1,66 @@
+from pathlib import Path
+
+import pytest
+import torch
+from media_files import disc, opaque, save, save_clip, walk
+
+from dg4d_lib.errors import BadInput
+from dg4d_lib.settings import SubjectSettings
+from dg4d_lib.video.framing import extent
+from steps.job import Facts, Job
+from steps.media import read_frames, read_png
+from steps.prepare_subject import run
+
+
+def prepare(source: Path, out: Path, **settings: object) -> Facts:
+    out.mkdir()
+    outputs = {"subject": out / "subject.png", "footage": out / "footage.zip"}
+    return run(Job({"source": source}, outputs, SubjectSettings(size=64, **settings), 0, lambda *_: None, out))
+
+
+def test_a_picture_becomes_a_square_cutout_and_no_footage(tmp_path):
+    prepare(save(tmp_path / "a.png", opaque(disc())), tmp_path / "out")
+    subject = read_png(tmp_path / "out" / "subject.png")
+    left, top, right, bottom = extent(subject[None, ..., 3])
+    assert subject.shape == (64, 64, 4)
+    assert (right - left, bottom - top) == (pytest.approx(51, abs=3), pytest.approx(51, abs=3))
+    assert not (tmp_path / "out" / "footage.zip").exists()
+
+
+def test_a_video_becomes_footage_whose_first_frame_is_the_subject(tmp_path):
+    facts = prepare(save_clip(tmp_path / "a.mkv", walk(9), "ffv1", "bgra"), tmp_path / "out", max_frames=5)
+    footage = read_frames(tmp_path / "out" / "footage.zip", tmp_path)
+    subject = read_png(tmp_path / "out" / "subject.png")
+    assert len(footage) == 5 and footage.fps == pytest.approx(5)
+    assert torch.equal(torch.cat([footage.frames[0], footage.coverage[0]], -1), subject)
+    assert any("5 of the video's 9 frames" in note for note in facts.notes)
+
+
+def test_the_same_file_gives_the_same_bytes(tmp_path):
+    source = save_clip(tmp_path / "a.mp4", walk(4), "libx264", "yuv420p")
+    for name in ("one", "two"):
+        prepare(source, tmp_path / name)
+    for name in ("subject.png", "footage.zip"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
+def test_the_settings_are_read(tmp_path):
+    source = save(tmp_path / "a.png", disc())
+    prepare(source, tmp_path / "wide", framing="center", border=0.5)
+    prepare(source, tmp_path / "kept", framing="keep")
+    wide, kept = (read_png(tmp_path / name / "subject.png") for name in ("wide", "kept"))
+    left, _, right, _ = extent(wide[None, ..., 3])
+    assert right - left == pytest.approx(32, abs=2)
+    assert extent(kept[None, ..., 3])[0] == 13
+
+
+def test_nothing_is_written_for_a_picture_that_is_refused(tmp_path):
+    blank = save(tmp_path / "a.png", opaque(disc()) * 0 + 128)
+    with pytest.raises(BadInput, match="no subject found"):
+        prepare(blank, tmp_path / "out")
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_a_fully_transparent_file_is_refused(tmp_path):
+    with pytest.raises(BadInput, match="fully transparent"):
+        prepare(save(tmp_path / "a.png", disc() * 0), tmp_path / "out")

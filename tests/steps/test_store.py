@@ -1,0 +1,107 @@
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from steps import store as module
+from steps.contract import ArtifactRef
+from steps.store import ArtifactMissing, ArtifactStore, DiskFull, home, write_atomically
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> ArtifactStore:
+    return ArtifactStore(tmp_path / "store")
+
+
+def files_in(store: ArtifactStore) -> list[Path]:
+    return sorted(p for p in store.root.rglob("*") if p.is_file())
+
+
+def test_what_was_put_comes_back(store: ArtifactStore, tmp_path: Path) -> None:
+    content = bytes(range(256)) * 10_000
+    (tmp_path / "a").write_bytes(content)
+    ref = store.put(tmp_path / "a", "x/y")
+    store.get(ref, tmp_path / "b")
+    assert (tmp_path / "b").read_bytes() == content
+    assert ref.size_bytes == len(content)
+    assert ref == store.put_bytes(content, "x/y")
+
+
+def test_a_name_is_the_sha256_of_the_content(store: ArtifactStore) -> None:
+    ref = store.put_bytes(b"abc", "text/plain")  # FIPS 180-2, appendix B.1
+    assert ref.digest == "sha256:ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def test_equal_content_is_kept_once(store: ArtifactStore) -> None:
+    store.put_bytes(b"same", "a/b")
+    store.put_bytes(b"same", "c/d")
+    assert len(files_in(store)) == 1
+
+
+def test_changing_a_fetched_file_leaves_the_store_as_it_was(store: ArtifactStore, tmp_path: Path) -> None:
+    ref = store.put_bytes(b"precious", "a/b")
+    store.get(ref, tmp_path / "mine")
+    (tmp_path / "mine").write_bytes(b"scribble")
+    assert store.path(ref).read_bytes() == b"precious"
+    assert store.path(ref).stat().st_mode & 0o222 == 0
+
+
+def test_a_truncated_artifact_is_missing_and_putting_it_again_heals_it(store: ArtifactStore) -> None:
+    ref = store.put_bytes(b"0123456789", "a/b")
+    store.path(ref).chmod(0o644)
+    os.truncate(store.path(ref), 4)
+    assert not store.has(ref)
+    with pytest.raises(ArtifactMissing, match="run the same command again"):
+        store.path(ref)
+    store.put_bytes(b"0123456789", "a/b")
+    assert store.path(ref).read_bytes() == b"0123456789"
+
+
+def test_a_damaged_artifact_is_refused_and_dropped(store: ArtifactStore, tmp_path: Path) -> None:
+    ref = store.put_bytes(b"0123456789", "a/b")
+    store.path(ref).chmod(0o644)
+    store.path(ref).write_bytes(b"0123X56789")  # the size is right
+    with pytest.raises(ArtifactMissing, match="damaged"):
+        store.get(ref, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    assert not store.has(ref)
+
+
+def test_a_reference_to_nothing_is_missing(store: ArtifactStore) -> None:
+    ref = ArtifactRef(digest="sha256:" + "0" * 64, media_type="a/b", size_bytes=1)
+    assert not store.has(ref)
+    with pytest.raises(ArtifactMissing):
+        store.path(ref)
+
+
+def test_a_full_disk_is_one_clear_error_and_leaves_nothing(
+    store: ArtifactStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = store.put_bytes(b"kept", "a/b")
+
+    def full(handle: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(module.os, "fsync", full)
+    with pytest.raises(DiskFull, match="free some space"):
+        store.put_bytes(b"too much", "a/b")
+    assert [p.name for p in files_in(store)] == [kept.digest[7:]]
+    (tmp_path / "state").write_text("old")
+    with pytest.raises(DiskFull):
+        write_atomically(tmp_path / "state", "new")
+    assert (tmp_path / "state").read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir() if p.is_file()] == ["state"]
+
+
+def test_another_trouble_with_a_file_is_not_called_a_full_disk(store: ArtifactStore, tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        store.put(tmp_path / "nothing", "a/b")
+
+
+def test_home_is_where_the_environment_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path / "h"))
+    assert home() == tmp_path / "h"
+    monkeypatch.delenv("DG4D_HOME")
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "x"))
+    assert home() == tmp_path / "x" / "dg4d"
