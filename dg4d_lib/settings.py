@@ -15,7 +15,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 class Settings(BaseModel):
     """Frozen and closed: an unknown key is refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Rung(Settings):
@@ -61,6 +61,13 @@ class GeometricPriorSettings(Settings):
     size: int = Field(128, ge=32, le=512, description="pixels at which the surface is built")
     turn_deg: float = Field(
         0.0, ge=-60, le=60, description="how far the subject's plane is turned away from the camera; a user's hint"
+    )
+    depth_sigma: float = Field(
+        0.03,
+        ge=0,
+        le=0.5,
+        description="how uncertain the guessed depth is, world units, one standard deviation: a view from the side is the "
+        "average over it, so it is soft along the direction in which depth shows",
     )
     coverage_weight: NotNegative = Field(1.0, description="weight of alpha against color in the clean picture, ours")
 
@@ -193,6 +200,6 @@ class PackSettings(Settings):
     preview_turns: int = Field(3, ge=1, le=20, description="times the motion loops while the camera goes round once")
     sheet_size: int = Field(192, ge=32, le=1024, description="pixels of a tile of the contact sheet")
     sheet_frames: int = Field(6, ge=1, le=32, description="columns: moments")
-    sheet_azimuths_deg: tuple[float, ...] = Field(
+    sheet_azimuths_deg: tuple[Annotated[float, Field(ge=-360, le=360)], ...] = Field(
         (0.0, -75.0, 15.0, 105.0, 195.0), min_length=1, description="rows: angles"
     )

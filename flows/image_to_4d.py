@@ -7,6 +7,7 @@ from prefect.artifacts import create_markdown_artifact
 from prefect.runtime import flow_run
 from prefect.task_runners import ThreadPoolTaskRunner
 
+from dg4d_lib.settings import GeometricPriorSettings
 from flows import home, pages
 from flows.merging import frames_in, merged
 from flows.tasks import Made, Steps
@@ -63,7 +64,7 @@ def finish(
     packed = steps.run(
         "pack_asset",
         {"subject": subject, "driving_video": driving, "gaussians": gaussians, "motion": motion, **surface},
-        PackAssetSettings(rasterizer=settings.rasterizer, pack=settings.pack),
+        PackAssetSettings(rasterizer=settings.rasterizer, pack=settings.pack, notes=steps.notes()),
     )
     rows = [(done.label, done.cached, done.seconds) for done in steps.finished]
     create_markdown_artifact(
@@ -90,7 +91,8 @@ def extract(
 
 
 def _drive(settings: PipelineSettings) -> DriveVideoSettings:
-    return DriveVideoSettings(driving=settings.driving, prior=settings.prior)
+    turn_deg = settings.prior.turn_deg if isinstance(settings.prior, GeometricPriorSettings) else 0.0
+    return DriveVideoSettings(driving=settings.driving, turn_deg=turn_deg)
 
 
 def _fit(settings: PipelineSettings) -> FitGaussiansSettings:

@@ -69,7 +69,7 @@ def report_of(order: Order, made: Made, files: Files, store: ArtifactStore) -> d
         "seconds": round(sum(done.seconds for done in made.steps), 1),
         "peak_memory_mb": max(done.result.provenance.peak_memory_mb for done in made.steps),
         "steps": [_stage(done, store) for done in made.steps],
-        "licences": {k: v for done in made.steps for k, v in done.result.provenance.licences.items()},
+        "licenses": {k: v for done in made.steps for k, v in done.result.provenance.licenses.items()},
         "files": {name: fact["size_bytes"] for name, fact in files.items()},
         "settings": order.settings.model_dump(mode="json"),
     }
@@ -203,8 +203,8 @@ def _files(files: dict[str, int]) -> str:
         else:
             rows.append(f'<tr><td><a href="{_text(name)}">{_text(name)}</a><td class=number>{readable(size)}')
     rows += [
-        f'<tr><td><a href="{_text(name)}/">{_text(name)}/</a> ({len(sizes)} files)<td class=number>'
-        f"{readable(sum(sizes))}"
+        f'<tr><td><a href="{_text(name)}/">{_text(name)}/</a> ({len(sizes)} file{"s" * (len(sizes) != 1)})'
+        f"<td class=number>{readable(sum(sizes))}"
         for name, sizes in folders.items()
     ]
     return f"<table>{''.join(rows)}</table>"

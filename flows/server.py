@@ -100,6 +100,7 @@ class Server:
             if (address := self.address()) is not None:
                 return address
             time.sleep(0.02)
+        self.release()
         raise ServerUnavailable(f"the guard of the Prefect server did not start; what it said is in {self.log}")
 
     def wait(self, timeout_s: float = START_TIMEOUT_S) -> str:
@@ -114,11 +115,12 @@ class Server:
             if (address := self.address()) is not None and answers(address, timeout_s=5.0):
                 return f"{address}/api"
             if not self._guarded():
-                if starts == 3:
+                if starts == STARTS:
                     break
                 starts += 1
                 self.start()
             time.sleep(0.1)
+        self.release()
         raise ServerUnavailable(
             f"the Prefect server did not answer within {timeout_s:g} s; what it said is in {self.log}. "
             "Set PREFECT_API_URL to use a server of your own."

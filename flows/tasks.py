@@ -134,6 +134,10 @@ class Steps:
             future.wait()
         return [self._note(label, future.state, start) for label, future in futures]
 
+    def notes(self) -> tuple[str, ...]:
+        """What the steps so far have to say about the asset, each sentence once."""
+        return tuple(dict.fromkeys(note for done in self.finished for note in done.result.provenance.notes))
+
     def _request(self, step: str, inputs: dict[str, ArtifactRef | None], settings: BaseModel) -> StepRequest:
         return StepRequest(
             step=step,

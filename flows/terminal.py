@@ -167,5 +167,9 @@ def tell_where(out: Console, folder: Path, sizes: dict[str, int]) -> None:
         count, total = groups.get(group, (0, 0))
         groups[group] = count + 1, total + size
     for group, (count, total) in groups.items():
-        table.add_row(group + (f" ({count} files)" if group.endswith("/") else ""), readable(total))
+        table.add_row(group + (f" ({_files(count)})" if group.endswith("/") else ""), readable(total))
     out.print(table)
+
+
+def _files(count: int) -> str:
+    return "1 file" if count == 1 else f"{count} files"

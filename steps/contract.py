@@ -81,7 +81,7 @@ class ProvenanceRecord(Frozen):
     seed: int
     backend: str
     weights: dict[str, Digest] = {}
-    licences: dict[str, str] = {}
+    licenses: dict[str, str] = {}
     notes: tuple[str, ...] = ()
     duration_s: float = Field(ge=0)
     peak_memory_mb: float = Field(ge=0)

@@ -31,7 +31,7 @@ def run(job: Job) -> Facts:
             raise BadInput(f"the footage is {sizes[0]} pixels and the subject {sizes[1]}; prepare both together")
         copyfile(job.inputs["footage"], job.outputs["driving_video"])
         return Facts(backend="none: the footage is used as it is")
-    generator = Warp(settings.driving)
+    generator = Warp(settings.driving, settings.turn_deg)
     video = generator.generate(subject, torch.Generator().manual_seed(job.seed))
     write_frames(job.outputs["driving_video"], video)
     note = f"The motion is made up by a warp of the picture ({settings.driving.motion}), without a learned model."

@@ -14,7 +14,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import blob, on_surface
 from dg4d_lib.gaussians.ply import write_ply
 from dg4d_lib.inflation.surface import inflate, sample_surface
-from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
+from dg4d_lib.rasterizer.interface import Rasterizer, backend_name, choose_rasterizer
 from dg4d_lib.settings import GeometricPriorSettings, PriorSettings, StaticSettings
 from steps.job import Facts, Job
 from steps.media import read_png, write_curves, write_png
@@ -43,7 +43,7 @@ def run(job: Job) -> Facts:
     write_ply(job.outputs["gaussians"], gaussians)
     curves.write(job.outputs["curves"], "static fit", [note])
     write_png(job.outputs["picture"], picture_of(gaussians, rasterize))
-    return Facts(backend=f"{settings.rasterizer} rasterizer", notes=(note,))
+    return Facts(backend=f"{backend_name(settings.rasterizer)} rasterizer", notes=(note,))
 
 
 def starting_cloud(

@@ -6,7 +6,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.losses import Diverged
 from dg4d_lib.fitting.motion import fit_motion
 from dg4d_lib.gaussians.ply import read_ply
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import backend_name, choose_rasterizer
 from steps.fit_gaussians import PICTURE_SIZE, Curves, picture_of
 from steps.job import Facts, Job
 from steps.media import read_frames, write_png
@@ -45,4 +45,4 @@ def run(job: Job) -> Facts:
             camera = OrbitCamera(0, azimuth, width=PICTURE_SIZE, height=PICTURE_SIZE)
             rows.append(torch.cat(list(rasterize(moved, [camera] * len(moments), torch.ones(3)).color), 1))
     write_png(job.outputs["picture"], torch.cat(rows))
-    return Facts(backend=f"{settings.rasterizer} rasterizer", notes=(note,))
+    return Facts(backend=f"{backend_name(settings.rasterizer)} rasterizer", notes=(note,))

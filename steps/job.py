@@ -36,11 +36,11 @@ class Facts:
     Attributes:
         backend: what computed, for example "cpu (numba)".
         weights: digest of every weights file, by name; empty where none were used.
-        licences: licence of everything whose licence follows the asset, by name.
+        licenses: license of everything whose license follows the asset, by name.
         notes: sentences the user should read in the report.
     """
 
     backend: str = "cpu"
     weights: dict[str, str] = field(default_factory=dict)
-    licences: dict[str, str] = field(default_factory=dict)
+    licenses: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()

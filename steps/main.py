@@ -7,7 +7,7 @@ Exit status: 0 done · 65 bad input or settings, or no room: the same again will
 missing · 70 the optimization diverged · 137 out of memory · 1 anything else, which may be tried again.
 
 `$DG4D_CATALOG` ("module:name") names another catalog than `steps.catalog:STEPS`; `$DG4D_HOME` says where the store is
-when `--store` is not given.
+when `--store` is not given; `$DG4D_CODE_VERSION` stands for the digest of the source.
 """
 
 import argparse
@@ -69,7 +69,12 @@ def catalog() -> dict[str, StepSpec]:
 
 
 def code_version(spec: StepSpec) -> str:
-    """Twelve digits that change with any source file of the library, of the steps, or of the step's own module."""
+    """Twelve digits that change with any source file of the library, of the steps, or of the step's own module.
+
+    An image in which the code cannot change may say `$DG4D_CODE_VERSION` instead, for example its own digest.
+    """
+    if fixed := os.environ.get("DG4D_CODE_VERSION"):
+        return fixed
     content = hashlib.sha256(_source_digest(tuple(_source_files())).encode())
     module = spec.entry.partition(":")[0]
     if module.partition(".")[0] not in {"dg4d_lib", "steps"}:
@@ -216,7 +221,7 @@ def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scr
         seed=request.seed,
         backend=facts.backend,
         weights=facts.weights,
-        licences=facts.licences,
+        licenses=facts.licenses,
         notes=facts.notes,
         duration_s=round(time.perf_counter() - start, 3),
         peak_memory_mb=round(peak_memory_mb(), 1),

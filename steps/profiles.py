@@ -41,7 +41,7 @@ class DriveVideoSettings(Settings):
     """What `drive_video` reads."""
 
     driving: DrivingSettings
-    prior: PriorSettings
+    turn_deg: float = Field(0.0, ge=-60, le=60, description="how far the subject is turned; the geometric prior's hint")
 
 
 class FitGaussiansSettings(Settings):

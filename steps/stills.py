@@ -103,7 +103,7 @@ def decode_still(path: Path, what: str, limits: bool = True) -> tuple[Float[Tens
 
 
 def _as_rgba(pixels: np.ndarray, spec: oiio.ImageSpec) -> tuple[np.ndarray, bool]:
-    """Red, green, blue and alpha out of whatever channels a file has; grey is repeated, depth and the like dropped."""
+    """Red, green, blue and alpha out of whatever channels a file has; gray is repeated, depth and the like dropped."""
     names = [name.lower() for name in spec.channelnames]
     alpha = spec.alpha_channel if spec.alpha_channel >= 0 else names.index("a") if "a" in names else -1
     if all(name in names for name in "rgb"):

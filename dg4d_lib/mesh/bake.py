@@ -28,13 +28,14 @@ from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
 
-SHARPNESS = 4  # power of the cosine in a view's weight; 1 blurs, a large one leaves visible borders between views
-INPUT_WEIGHT = 8.0  # of the input view against another one: only there the colors come from a picture
+SHARPNESS = 2  # power in a view's weight of how far the cosine is above the least; views fade in and out without seams
+INPUT_WEIGHT = 200.0  # of the input view against another one: only there the colors come from a picture
+INPUT_FLATTER = 0.6  # of `min_cosine` in the input view: a stretched true color is better than a guessed one
 SOLID = 0.5  # alpha below which a pixel is background
 OUTLINE = 2  # pixels: the band along outlines and along nearer surfaces that is not trusted
 LAST_RESORT = 1e-4  # weight of views that are too flat or on an outline: they count where nothing better is
 FLATTEST = 0.05  # cosine below which a view does not count at all
-DEPTH_SLACK = 1.5  # pixel footprints by which a texel may lie behind the z-buffer, over the cosine; of it at least 0.2
+DEPTH_SLACK = 1.5  # pixels by which a texel's place in a picture is uncertain when its depth is compared
 NEIGHBORS = 4  # seen texels whose colors an unseen one takes
 VIEWS_AT_ONCE = 9
 TEXELS_AT_ONCE = 1 << 16
@@ -90,8 +91,10 @@ def bake(
     for start in range(0, len(cameras), VIEWS_AT_ONCE):
         batch = cameras[start : start + VIEWS_AT_ONCE]
         pictures = _look(batch, vertices, faces, gaussians, rasterize)
-        boosts = [INPUT_WEIGHT if start + view == 0 else 1.0 for view in range(len(batch))]
-        run([partial(_add, texels, batch, pictures, boosts, settings, part, total) for part in _parts(len(total))])
+        rules = [(settings.min_cosine, 1.0)] * len(batch)
+        if start == 0:
+            rules[0] = (INPUT_FLATTER * settings.min_cosine, INPUT_WEIGHT)
+        run([partial(_add, texels, batch, pictures, rules, part, total) for part in _parts(len(total))])
     weight = torch.from_numpy(total[:, 3:])
     seen = weight[:, 0] > 0
     colors = torch.where(seen[:, None], torch.from_numpy(total[:, :3]) / weight.clamp_min(1e-30), 0.5)
@@ -137,17 +140,16 @@ def _add(
     texels: Texels,
     cameras: Sequence[OrbitCamera],
     pictures: Sequence[Tensor],
-    boosts: Sequence[float],
-    settings: MeshSettings,
+    rules: Sequence[tuple[float, float]],
     part: slice,
     total: NDArray[np.float32],
 ) -> None:
-    """Add what some of the texels see from all cameras to their sums."""
+    """Add what some of the texels see to their sums; for every camera its least cosine and its weight."""
     places, normals = texels.positions[part].numpy(), texels.normals[part].numpy()
-    for view, (camera, boost) in enumerate(zip(cameras, boosts, strict=True)):
+    for view, (camera, rule) in enumerate(zip(cameras, rules, strict=True)):
         pose = camera.world_to_camera().numpy(), camera.position().numpy(), camera.focal
         shown = (picture[view].numpy() for picture in pictures)
-        _gather(places, normals, *pose, *shown, settings.min_cosine, boost, total[part])
+        _gather(places, normals, *pose, *shown, *rule, total[part])
 
 
 def _look(
@@ -247,11 +249,12 @@ def _gather(positions, normals, pose, eye, focal, color, grade, depth, front, mi
         if not (0 <= u < width and 0 <= v < height):
             continue
         row, column = int(v), int(u)
-        near = far - DEPTH_SLACK * far / focal / max(cosine, 0.2)
-        if grade[row, column] == 0 or near > depth[row, column]:
+        slope = far / focal / max(cosine, 0.2)  # how much deeper a tilted surface gets within a pixel, at most
+        if grade[row, column] == 0 or far - DEPTH_SLACK * slope > depth[row, column]:
             continue
-        good = cosine > min_cosine and grade[row, column] == 2 and near <= front[row, column]
-        weight = boost * cosine**SHARPNESS * (1.0 if good else LAST_RESORT)
+        beside = far - (DEPTH_SLACK + 1.5 * OUTLINE) * slope <= front[row, column]  # no edge of something nearer
+        facing = (cosine - min_cosine) / (1 - min_cosine) if beside and grade[row, column] == 2 else 0.0
+        weight = boost * max(facing, 0.0) ** SHARPNESS + LAST_RESORT * cosine
         left, top = min(max(u - 0.5, 0.0), width - 1.0), min(max(v - 0.5, 0.0), height - 1.0)
         c0, r0 = int(left), int(top)
         c1, r1 = min(c0 + 1, width - 1), min(r0 + 1, height - 1)

@@ -1,16 +1,10 @@
 """A mesh that other programs like: one piece, manifold, even triangles, not too many (METHOD section 8).
 
 The work is pymeshlab's. It is GPL-3 and crashes when two threads of a process use it, so it runs in a process of its
-own, `python -m dg4d_lib.mesh.clean IN.npz OUT.npz`, and is imported nowhere else.
+own, `python -m dg4d_lib.mesh.clean`, and is imported nowhere else.
 """
 
-import os
-import signal
-import subprocess
-import sys
-import tempfile
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,9 +13,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
+from dg4d_lib.mesh.apart import Arrays, run_apart, serve
 from dg4d_lib.settings import MeshSettings
 
-EXIT_MISSING = 69  # of the child: pymeshlab or its plugins are not here
 MERGE = 1e-4  # box units: vertices closer than this become one
 SMOOTHING = 10  # Taubin steps that take away the stairs of marching cubes and keep the volume
 REMESHING = 3  # rounds of isotropic remeshing
@@ -63,24 +57,14 @@ def clean(
         raise BadInput("a mesh without faces cannot be cleaned; lower mesh.density_threshold")
     vertices, faces = drop_small_components(vertices, faces, settings.min_component)
     length = max(settings.edge_length, _edge_length_of(vertices / unit, faces, settings.max_faces))
-    with tempfile.TemporaryDirectory(prefix="dg4d-clean-") as folder:
-        given, cleaned = Path(folder) / "given.npz", Path(folder) / "cleaned.npz"
-        np.savez(
-            given,
-            vertices=np.asarray(vertices, np.float64) / unit,
-            faces=np.asarray(faces, np.int32),
-            edge_length=length,
-            max_faces=settings.max_faces,
-        )
-        command = [sys.executable, "-m", "dg4d_lib.mesh.clean", str(given), str(cleaned)]
-        child = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
-        if child.returncode == EXIT_MISSING:
-            raise BackendUnavailable(child.stderr.strip())
-        if child.returncode != 0 or not cleaned.exists():
-            raise DG4DError(_obituary(child))
-        with np.load(cleaned) as arrays:
-            vertices, faces = arrays["vertices"], arrays["faces"]
-    vertices, faces = drop_small_components(vertices, faces, settings.min_component)
+    arrays = {
+        "vertices": np.asarray(vertices, np.float64) / unit,
+        "faces": np.asarray(faces, np.int32),
+        "edge_length": np.array(length),
+        "max_faces": np.array(settings.max_faces),
+    }
+    cleaned = run_apart("dg4d_lib.mesh.clean", "clean the mesh", arrays)
+    vertices, faces = drop_small_components(cleaned["vertices"], cleaned["faces"], settings.min_component)
     if len(faces) == 0:
         raise DG4DError("mesh cleaning left no faces; raise mesh.grid or lower mesh.edge_length")
     return (vertices * unit).astype(np.float32), faces.astype(np.int32)
@@ -108,28 +92,19 @@ def _edge_length_of(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "
     return float(np.sqrt(area / (0.9 * count) * 4 / np.sqrt(3)))
 
 
-def _obituary(child: subprocess.CompletedProcess[str]) -> str:
-    code = child.returncode
-    how = f"was stopped by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
-    last = "; ".join(child.stderr.strip().splitlines()[-3:]) or "it said nothing"
-    return f"the process that cleans the mesh {how} ({last}); run it again, or lower mesh.grid or mesh.max_faces"
-
-
-def _clean_here(given: Path, cleaned: Path) -> None:
+def _clean_here(arrays: Arrays) -> Arrays:
     """What the child does, in units of the normalized box."""
     try:
         # only the child may have it; its names come from a star import that type checkers cannot follow
         pymeshlab: Any = import_module("pymeshlab")
     except ImportError as error:
-        _give_up(f"pymeshlab cannot be imported ({error})")
+        raise _unavailable(f"pymeshlab cannot be imported ({error})") from error
     missing = sorted(set(FILTERS) - set(pymeshlab.filter_list()))
     if missing:
-        _give_up(f"pymeshlab has no filter {missing[0]} and {len(missing) - 1} others that are needed")
-    with np.load(given) as arrays:
-        mesh = pymeshlab.Mesh(arrays["vertices"], arrays["faces"])
-        length, max_faces = float(arrays["edge_length"]), int(arrays["max_faces"])
+        raise _unavailable(f"pymeshlab has no filter {missing[0]} and {len(missing) - 1} others that are needed")
+    length, max_faces = float(arrays["edge_length"]), int(arrays["max_faces"])
     ms = pymeshlab.MeshSet(verbose=False)
-    ms.add_mesh(mesh)
+    ms.add_mesh(pymeshlab.Mesh(arrays["vertices"], arrays["faces"]))
     ms.meshing_merge_close_vertices(threshold=pymeshlab.PureValue(MERGE))
     ms.meshing_remove_duplicate_faces()
     ms.meshing_remove_null_faces()
@@ -147,17 +122,15 @@ def _clean_here(given: Path, cleaned: Path) -> None:
     ms.meshing_re_orient_faces_coherently()
     ms.meshing_remove_unreferenced_vertices()
     result = ms.current_mesh()
-    np.savez(cleaned, vertices=result.vertex_matrix(), faces=result.face_matrix().astype(np.int32))
+    return {"vertices": result.vertex_matrix(), "faces": result.face_matrix().astype(np.int32)}
 
 
-def _give_up(reason: str) -> None:
-    sys.stderr.write(
+def _unavailable(reason: str) -> BackendUnavailable:
+    return BackendUnavailable(
         f"mesh cleaning cannot run here: {reason}; install pymeshlab and the system libraries its filters load, "
-        "on Debian: apt-get install libgl1 libopengl0\n"
+        "on Debian: apt-get install libgl1 libopengl0"
     )
-    sys.stderr.flush()
-    os._exit(EXIT_MISSING)
 
 
 if __name__ == "__main__":
-    _clean_here(Path(sys.argv[1]), Path(sys.argv[2]))
+    serve(_clean_here)

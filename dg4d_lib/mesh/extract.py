@@ -42,7 +42,7 @@ def surface(field: DensityField, level: float) -> tuple[Float[np.ndarray, "v 3"]
 
 
 def best_level(field: DensityField, gaussians: Gaussians, rasterize: Rasterizer, level: float) -> tuple[float, float]:
-    """The level whose surface has the outlines of the Gaussians themselves, searched by factors of the root of 2, and of its root.
+    """The level whose surface has the outlines of the Gaussians themselves, to a factor of the fourth root of 2.
 
     How dense opaque matter is depends on how a fit spreads it over Gaussians; the outline (alpha above one half) does
     not.
@@ -54,8 +54,8 @@ def best_level(field: DensityField, gaussians: Gaussians, rasterize: Rasterizer,
         level: where the search begins.
 
     Returns:
-        The best level, within a factor of five of the given one, and the intersection over union of its outlines with the
-        Gaussians' over all views, in [0, 1].
+        The best level, within a factor of five of the given one, and the intersection over union of its outlines with
+        the Gaussians' over all views, in [0, 1].
 
     Raises:
         FitDiverged: the field is zero everywhere.

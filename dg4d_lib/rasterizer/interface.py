@@ -72,14 +72,19 @@ class Rasterizer(Protocol):
 _BACKENDS = {"reference": "dg4d_lib.rasterizer.reference", "cpu": "dg4d_lib.rasterizer.cpu"}
 
 
+def backend_name(name: str) -> str:
+    """The backend that `choose_rasterizer` takes for this name: `auto` is the fastest one that runs here."""
+    return "cpu" if name == "auto" else name
+
+
 def choose_rasterizer(name: str) -> Rasterizer:
-    """The backend of this name; `auto` is the fastest one that runs here.
+    """The backend of this name, or the one that `auto` stands for.
 
     Raises:
         BadInput: the name is not known.
         BackendUnavailable: it is known but cannot run here.
     """
-    name = "cpu" if name == "auto" else name
+    name = backend_name(name)
     if name not in _BACKENDS:
         raise BadInput(f"rasterizer {name!r} is not known; choose one of auto, {', '.join(_BACKENDS)}")
     try:

@@ -37,7 +37,10 @@ def refine_texture(
     wanted = refiner.refine(video)[covered]
     texture = mesh.texture
     for _ in range(ITERATIONS):
-        texture = texture + _mean_on_texels(texture, places, wanted - sample(texture, places))
+        error = wanted - sample(texture, places)
+        if not error.any():
+            break
+        texture = texture + _mean_on_texels(texture, places, error)
     return texture.clamp(0, 1)
 
 

@@ -33,9 +33,9 @@ class Warp:
         notes: what the last video does otherwise than asked, in sentences for the user.
     """
 
-    def __init__(self, settings: DrivingSettings) -> None:
-        """Choose the motion, its strength, and how many frames at which rate."""
-        self.settings = settings
+    def __init__(self, settings: DrivingSettings, turn_deg: float = 0.0) -> None:
+        """Choose the motion, its strength, how many frames at which rate, and how the subject is turned (`turn`)."""
+        self.settings, self.turn_deg = settings, turn_deg
         self.notes: tuple[str, ...] = ()
 
     def generate(self, subject: Float[Tensor, "h w 4"], generator: torch.Generator) -> DrivingVideo:
@@ -84,7 +84,7 @@ class Warp:
 
     def _turn(self, subject: Float[Tensor, "h w 4"]) -> DrivingVideo:
         height, width = subject.shape[:2]
-        surface = inflate(subject, min(height, TURN_SIZE))
+        surface = inflate(subject, min(height, TURN_SIZE), self.turn_deg)
         angles = [TURN_DEG * self.settings.strength * math.sin(2 * math.pi * phase) for phase in self._phases()]
         cameras = [OrbitCamera(azimuth_deg=angle, width=width, height=height) for angle in angles]
         color, coverage = render_surface(surface, cameras)

@@ -59,7 +59,7 @@ def fit_gaussians(job: Job) -> Facts:
 
 def fit_motion(job: Job) -> Facts:
     words = _begin("fit_motion", job, job.inputs["gaussians"].read_bytes())
-    job.outputs["motion"].write_bytes(words)
+    job.outputs["motion"].write_bytes(b"motion of " + words)
     _curves(job)
     return Facts()
 

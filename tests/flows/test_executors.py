@@ -31,6 +31,7 @@ HERE = str(Path(__file__).parent)
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("DG4D_HOME", str(tmp_path / "home"))
     monkeypatch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
+    monkeypatch.setenv("DG4D_CODE_VERSION", "test")
     monkeypatch.setenv("PYTHONPATH", HERE)
     monkeypatch.setenv("FAKE_LOG", str(tmp_path / "log"))
     return tmp_path

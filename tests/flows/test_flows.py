@@ -13,19 +13,21 @@ from typing import Any
 import pytest
 from prefect.client.orchestration import get_client
 from prefect.settings import PREFECT_API_URL, temporary_settings
+from typer.testing import CliRunner, Result
 
-from flows import home, tasks
+from flows import cli, home, tasks
 from flows.executors import StepBadInput, StepCrashed, StepDiverged, StepError, StepMissing, StepOutOfMemory
 from flows.make import make, save_pictures
 from flows.orders import Order, Wish
 from flows.orphans import settle_orphans
-from flows.server import Server, ServerUnavailable
+from flows.server import Server
 from steps.profiles import PREVIEW, revise
 
 EVERY_STEP = [
     "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "extract_mesh", "refine_texture", "pack_asset",
 ]  # fmt: skip
-Run = Callable[..., subprocess.CompletedProcess[str]]
+RUN_FACTS = ("report.json", "report.html", "provenance.json")  # these say when and how long
+Run = Callable[..., Result]
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +37,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DG4D_HOME", str(place))
         patch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
+        patch.setenv("DG4D_CODE_VERSION", "test")
         patch.setenv("PYTHONPATH", str(Path(__file__).parent))
         running = home.background_server()
         running.start()
@@ -60,9 +63,9 @@ def ran(log: Path) -> list[str]:
     return steps
 
 
-def order(words: str, folder: Path, *, name: str = "fake.png", **changes: object) -> Order:
+def order(words: str, folder: Path, *, name: str = "fake.png", item: str = "fake", **changes: object) -> Order:
     (folder / name).write_text(words)
-    return Wish(item="fake", picture=folder / name, settings=revise(PREVIEW, dict(changes))).order(home.store())
+    return Wish(item=item, picture=folder / name, settings=revise(PREVIEW, dict(changes))).order(home.store())
 
 
 def tree(folder: Path, *but: str) -> dict[str, bytes]:
@@ -78,9 +81,7 @@ def test_a_flow_runs_every_step_once_and_then_none(log: Path, tmp_path: Path) ->
     _, cached = make(wanted, tmp_path / "two")
     assert ran(log) == []
     assert cached
-    assert tree(tmp_path / "one", "report.json", "report.html", "provenance.json") == tree(
-        tmp_path / "two", "report.json", "report.html", "provenance.json"
-    )
+    assert tree(tmp_path / "one", *RUN_FACTS) == tree(tmp_path / "two", *RUN_FACTS)
     one, two = (json.loads((tmp_path / name / "provenance.json").read_text()) for name in ("one", "two"))
     assert one.pop("run") != two.pop("run")
     assert one == two
@@ -152,11 +153,11 @@ def test_memory_that_is_free_again_is_enough(log: Path, tmp_path: Path) -> None:
 
 
 def test_every_step_leaves_a_page_with_its_picture_on_the_server(log: Path, tmp_path: Path) -> None:
-    make(order("pages", tmp_path), tmp_path / "out")
+    make(order("pages", tmp_path, item="paged"), tmp_path / "out")
     with get_client(sync_client=True) as client:
         pages: list[Any] = client.request("POST", "/artifacts/latest/filter", json={"limit": 200}).json()
     markdown = {page["key"]: page["data"] for page in pages if page["type"] == "markdown"}
-    ours = {key: data for key, data in markdown.items() if "-fake-" in key}
+    ours = {key: data for key, data in markdown.items() if "-paged-" in key}
     assert len(ours) == len(EVERY_STEP) + 1
     motion = next(data for key, data in ours.items() if key.startswith("fit-motion"))
     assert "data:image/webp;base64," in motion
@@ -168,60 +169,89 @@ def test_every_step_leaves_a_page_with_its_picture_on_the_server(log: Path, tmp_
 
 
 @pytest.fixture
-def dg4d(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
-    """The command in a process of its own, with steps in theirs."""
-    monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
+def dg4d(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """The command in this process, which is connected already."""
     monkeypatch.chdir(tmp_path)
-
-    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(_command(*arguments), capture_output=True, text=True, check=False)
-
-    return run
+    monkeypatch.setattr("flows.make.connect", lambda: None)
+    return lambda *arguments: CliRunner().invoke(cli.app, arguments)
 
 
-def _command(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", "flows.cli", *arguments]
+def _start(*arguments: str) -> "subprocess.Popen[str]":
+    """The command in a process of its own, with steps in theirs."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "flows.cli", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "DG4D_EXECUTOR": "subprocess"},
+    )
 
 
-def test_a_killed_command_goes_on_where_it_was_and_gives_the_same_bytes(dg4d: Run, tmp_path: Path, log: Path) -> None:
-    settle_orphans()
+def test_a_killed_command_goes_on_where_it_was_and_gives_the_same_bytes(log: Path, tmp_path: Path) -> None:
     (tmp_path / "x.png").write_text("kill fit_motion=sleep-once:60")
-    command = subprocess.Popen(_command("make", "x.png", "-o", "out"), stdout=subprocess.DEVNULL, env=_subprocesses())
+    command = _start("make", str(tmp_path / "x.png"), "-o", str(tmp_path / "out"))
     wait_until(lambda: log.exists() and "fit_motion" in log.read_text())
     command.send_signal(signal.SIGKILL)
-    command.wait()
+    command.communicate()
     assert ran(log) == EVERY_STEP[:4]
     assert not (tmp_path / "out").exists()
-    done = subprocess.run(
-        _command("make", "x.png", "-o", "out"), capture_output=True, text=True, env=_subprocesses(), check=False
-    )
-    assert done.returncode == 0, done.stderr
+    assert settle_orphans() == 1
+    assert settle_orphans() == 0
+    command = _start("make", str(tmp_path / "x.png"), "-o", str(tmp_path / "out"))
+    said, trouble = command.communicate()
+    assert command.returncode == 0, trouble
     assert ran(log) == EVERY_STEP[3:]
-    assert "prepare_subject: cached" in done.stdout
-    assert settle_orphans() == 0  # the second command had marked the killed run
-    again = subprocess.run(
-        _command("make", "x.png", "-o", "out"), capture_output=True, text=True, env=_subprocesses(), check=False
-    )
-    assert "nothing to do" in again.stdout
-    make(Wish(item="undisturbed", picture=tmp_path / "x.png", settings=PREVIEW).order(home.store()), tmp_path / "other")
-    assert ran(log) == []
+    assert "prepare_subject: cached" in said
+    make(order("undisturbed", tmp_path), tmp_path / "other")
+    assert set(tree(tmp_path / "out")) == set(tree(tmp_path / "other"))
 
 
-def test_two_commands_at_once_do_the_work_once(dg4d: Run, tmp_path: Path, log: Path) -> None:
+def test_two_commands_at_once_do_the_work_once(log: Path, tmp_path: Path) -> None:
     (tmp_path / "x.png").write_text("both fit_gaussians=sleep:1")
-    both = [subprocess.Popen(_command("make", "x.png", "-o", out), stdout=subprocess.DEVNULL) for out in ("a", "b")]
-    assert [command.wait() for command in both] == [0, 0]
+    both = [_start("make", str(tmp_path / "x.png"), "-o", str(tmp_path / out)) for out in ("a", "b")]
+    for command in both:
+        _, trouble = command.communicate()
+        assert command.returncode == 0, trouble
     assert sorted(ran(log)) == sorted(EVERY_STEP)
-    assert tree(tmp_path / "a", "report.json", "report.html", "provenance.json") == tree(
-        tmp_path / "b", "report.json", "report.html", "provenance.json"
-    )
+    assert tree(tmp_path / "a", *RUN_FACTS) == tree(tmp_path / "b", *RUN_FACTS)
+
+
+def test_a_command_with_nothing_to_do_says_so(dg4d: Run, log: Path, tmp_path: Path) -> None:
+    (tmp_path / "x.png").write_text("nothing")
+    assert "nothing to do" not in dg4d("make", "x.png").output
+    ran(log)
+    before = tree(tmp_path / "out" / "x")
+    for out in ("out/x", "out/y"):
+        done = dg4d("make", "x.png", "-o", out)
+        assert done.exit_code == 0
+        assert "nothing to do: every step was already done" in done.stdout
+    assert ran(log) == []
+    assert tree(tmp_path / "out" / "x") == before
+    assert tree(tmp_path / "out" / "y", *RUN_FACTS) == {k: v for k, v in before.items() if k not in RUN_FACTS}
 
 
 def test_bad_input_that_a_step_finds_is_one_message(dg4d: Run, tmp_path: Path) -> None:
     (tmp_path / "x.png").write_text("prepare_subject=bad:ugly")
     done = dg4d("make", "x.png", "-o", "out")
-    assert done.returncode == 65
+    assert done.exit_code == 65
     assert done.stderr == "dg4d: the picture is ugly\n"
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_fit_that_diverged_says_where_and_shows_the_last_good_state(dg4d: Run, tmp_path: Path) -> None:
+    (tmp_path / "x.png").write_text("fit_motion=diverge")
+    done = dg4d("make", "x.png", "-o", "out")
+    assert done.exit_code == 65
+    assert "iteration 7" in done.stderr
+    (picture,) = (word for word in done.stderr.split() if word.endswith(".png"))
+    assert Path(picture).is_file()
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("word", "status"), [("missing", 69), ("full", 65), ("crash", 1)])
+def test_the_exit_status_of_the_command_follows_the_step(dg4d: Run, tmp_path: Path, word: str, status: int) -> None:
+    (tmp_path / "x.png").write_text(f"prepare_subject={word}")
+    assert dg4d("make", "x.png", "-o", "out").exit_code == status
     assert not (tmp_path / "out").exists()
 
 
@@ -230,7 +260,7 @@ def test_a_batch_makes_what_it_can_and_leaves_alone_what_is_made(dg4d: Run, tmp_
     for name, words in {"a": "one", "deep/b": "two", "bad": "prepare_subject=bad:ugly"}.items():
         (tmp_path / "in" / f"{name}.png").write_text(words)
     done = dg4d("batch", "in", "-o", "out", "--workers", "2")
-    assert done.returncode == 1, done.stderr
+    assert done.exit_code == 1, done.output
     status = {row["item"]: row["status"] for row in json.loads((tmp_path / "out/summary.json").read_text())["items"]}
     assert status == {"a": "done", "bad": "failed", "deep/b": "done"}
     assert (tmp_path / "out/deep/b/asset.glb").exists()
@@ -238,39 +268,19 @@ def test_a_batch_makes_what_it_can_and_leaves_alone_what_is_made(dg4d: Run, tmp_
     ran(log)
     (tmp_path / "in" / "bad.png").write_text("good")
     (tmp_path / "in" / "a.png").write_text("one changed")
-    assert dg4d("batch", "in", "-o", "out").returncode == 0
+    assert dg4d("batch", "in", "-o", "out").exit_code == 0
     assert sorted(ran(log)) == sorted(EVERY_STEP * 2)
     again = dg4d("batch", "in", "-o", "out")
-    assert again.returncode == 0
+    assert again.exit_code == 0
     assert "nothing to do" in again.stdout
     assert ran(log) == []
 
 
-def test_the_server_is_shared_and_ends_when_nobody_uses_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("DG4D_SERVER_IDLE_S", "1")
-    one, two = (Server(tmp_path / "server", tmp_path / "prefect") for _ in range(2))
-    one.start()
-    two.start()
-    assert one.wait() == two.wait()
-    one.release()
-    time.sleep(3)
-    assert two.address() is not None  # somebody uses it still
-    two.release()
-    wait_until(lambda: two.address() is None)
-    assert not (tmp_path / "server" / "server.json").exists()
-    assert not two.stop()
-
-
-def test_a_server_that_cannot_start_is_unavailable(tmp_path: Path) -> None:
-    (tmp_path / "prefect").write_text("a file where a folder should be")
-    broken = Server(tmp_path / "server", tmp_path / "prefect")
-    broken.start()
-    with pytest.raises(ServerUnavailable, match=r"server\.log"):
-        broken.wait(timeout_s=15)
-
-
-def _subprocesses() -> dict[str, str]:
-    return {**os.environ, "DG4D_EXECUTOR": "subprocess"}
+def test_there_is_one_server(server: Server) -> None:
+    other = home.background_server()
+    other.start()
+    assert other.wait() == server.wait() == f"{server.address()}/api"
+    other.release()
 
 
 def wait_until(condition: Callable[[], bool], timeout_s: float = 60) -> None:

@@ -13,6 +13,11 @@ def store(tmp_path: Path) -> ArtifactStore:
     return ArtifactStore(tmp_path / "store")
 
 
+@pytest.fixture(autouse=True)
+def code(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DG4D_CODE_VERSION", "test")
+
+
 def wish(picture: Path, video: Path | None = None, bank: Path | None = None, **changes: object) -> Wish:
     return Wish(item="x", picture=picture, video=video, bank=bank, settings=revise(PREVIEW, dict(changes)))
 
@@ -44,6 +49,14 @@ def test_names_do_not_count_but_content_settings_and_seed_do(tmp_path: Path, sto
         first.model_copy(update={"moving": True}),
     ]
     assert len({first.digest(), *(other.digest() for other in others)}) == 5
+
+
+def test_other_code_is_another_order(tmp_path: Path, store: ArtifactStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.png").write_bytes(b"picture")
+    one = order(wish(tmp_path / "a.png"), store)
+    before = one.digest()
+    monkeypatch.setenv("DG4D_CODE_VERSION", "other")
+    assert one.digest() != before
 
 
 def test_a_folder_of_frames_is_a_video_and_equal_frames_are_equal_sources(tmp_path: Path, store: ArtifactStore) -> None:

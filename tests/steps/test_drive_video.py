@@ -5,7 +5,7 @@ import torch
 from media_files import disc
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.settings import DrivingSettings, GeometricPriorSettings
+from dg4d_lib.settings import DrivingSettings
 from dg4d_lib.video.driving import DrivingVideo
 from steps.drive_video import run
 from steps.job import Facts, Job
@@ -14,7 +14,7 @@ from steps.profiles import DriveVideoSettings
 
 
 def drive(folder: Path, inputs: dict[str, Path], **driving: object) -> Facts:
-    settings = DriveVideoSettings(driving=DrivingSettings(**driving), prior=GeometricPriorSettings())
+    settings = DriveVideoSettings(driving=DrivingSettings(**driving))
     return run(Job(inputs, {"driving_video": folder / "driving.zip"}, settings, 0, lambda *_: None, folder))
 
 

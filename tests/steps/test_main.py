@@ -50,7 +50,7 @@ def shout(job: Job) -> Facts:
     os.write(1, b"so does native code\n")
     if job.settings.trouble != "forgets":
         job.outputs["loud"].write_text(job.inputs["quiet"].read_text().upper() * job.settings.times)
-    return Facts(backend="voice", notes=("It was loud.",), licences={"voice": "free"})
+    return Facts(backend="voice", notes=("It was loud.",), licenses={"voice": "free"})
 
 
 CATALOG = {
@@ -99,7 +99,7 @@ def test_a_request_becomes_outputs_and_a_record(store: ArtifactStore) -> None:
     assert record.request_digest == request.digest()
     assert record.inputs["quiet"] == request.inputs["quiet"].digest
     assert record.outputs["loud"] == outcome.outputs["loud"].digest
-    assert (record.seed, record.backend, record.notes, record.licences) == (
+    assert (record.seed, record.backend, record.notes, record.licenses) == (
         4,
         "voice",
         ("It was loud.",),
@@ -168,6 +168,13 @@ def test_the_version_of_a_request_follows_the_source() -> None:
     assert len(version) == 2 + 12
     other = CATALOG["shout"].model_copy(update={"entry": "test_store:anything"})
     assert host.code_version(other) != host.code_version(CATALOG["shout"])
+
+
+def test_an_image_may_fix_the_version_of_its_code(store: ArtifactStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DG4D_CODE_VERSION", "image-7")
+    outcome, _ = host.perform(request_for(store).model_copy(update={"version": "3+image-7"}), store)
+    assert isinstance(outcome, StepResult)
+    assert outcome.provenance.code_version.endswith("+image-7")
 
 
 def run_alone(tmp_path: Path, request: str, *arguments: str) -> tuple[subprocess.CompletedProcess[str], Any]:

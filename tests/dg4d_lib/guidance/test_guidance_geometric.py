@@ -3,7 +3,7 @@ import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
-from dg4d_lib.guidance.geometric import InflatedSurfaces
+from dg4d_lib.guidance.geometric import InflatedSurfaces, averaged_over_depth
 from dg4d_lib.guidance.interface import View
 from dg4d_lib.settings import GeometricPriorSettings
 
@@ -72,3 +72,24 @@ def test_large_pictures_show_the_same_surface():
     shrunk = torch.nn.functional.avg_pool2d(large.permute(0, 3, 1, 2), 3).permute(0, 2, 3, 1)
     torch.testing.assert_close(shrunk, small, atol=0.4, rtol=0)
     assert (shrunk - small).abs().mean() < 0.01
+
+
+def spread(image: torch.Tensor, axis: int) -> float:
+    weights = image.sum(1 - axis)
+    places = torch.arange(len(weights), dtype=weights.dtype)
+    mean = (weights * places).sum() / weights.sum()
+    return float((weights * (places - mean) ** 2).sum() / weights.sum()) ** 0.5
+
+
+@pytest.mark.parametrize(
+    ("elevation", "azimuth", "down", "across"), [(0, 0, 0, 0), (0, 90, 0, 1), (90, 0, 1, 0), (0, 30, 0, 0.5)]
+)
+def test_depth_blurs_along_the_direction_in_which_it_shows(elevation, azimuth, down, across):
+    camera = OrbitCamera(elevation, azimuth, width=65, height=65)
+    point = torch.zeros(1, 65, 65, 1)
+    point[0, 32, 32] = 1
+    blurred = averaged_over_depth(point, [camera], 0.1)[0, ..., 0]
+    sigma = 0.1 * camera.focal / camera.radius
+    assert spread(blurred, 0) == pytest.approx(down * sigma, abs=0.02)
+    assert spread(blurred, 1) == pytest.approx(across * sigma, abs=0.02)
+    assert blurred.sum() == pytest.approx(1, abs=1e-4)

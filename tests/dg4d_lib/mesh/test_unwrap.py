@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -5,6 +8,7 @@ import trimesh
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from dg4d_lib.errors import DG4DError
 from dg4d_lib.mesh.unwrap import taubin_smooth, unwrap
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -77,6 +81,24 @@ def test_charts_keep_two_texels_apart(flat: tuple[np.ndarray, ...]) -> None:
 def test_the_same_mesh_is_unwrapped_the_same(torus: Mesh, flat: tuple[np.ndarray, ...]) -> None:
     for first, second in zip(flat, unwrap(*torus, SIZE), strict=True):
         assert first.tobytes() == second.tobytes()
+
+
+def test_a_texture_without_room_is_refused(torus: Mesh) -> None:
+    with pytest.raises(DG4DError, match=r"no room .* 2 texels a side; raise mesh\.texture_size"):
+        unwrap(*torus, 2)
+
+
+def test_xatlas_stays_out_of_the_calling_process() -> None:
+    code = """if True:
+        import sys
+        import numpy as np
+        from dg4d_lib.errors import DG4DError
+from dg4d_lib.mesh.unwrap import unwrap
+        corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+        unwrap(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32), 64)
+        sys.exit("xatlas" in sys.modules)
+    """
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_smoothing_takes_noise_away_and_keeps_the_size(sphere: Mesh) -> None:

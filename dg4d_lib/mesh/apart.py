@@ -1,0 +1,75 @@
+"""Work that must not share a process with ours: arrays go out to a module that runs as a program, arrays come back."""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dg4d_lib.errors import BackendUnavailable, DG4DError
+
+Arrays = dict[str, NDArray[Any]]
+
+EXIT_MISSING = 69  # of the child: something it needs is not here
+EXIT_REFUSED = 65  # of the child: the task has no solution
+
+
+def run_apart(module: str, task: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
+    """What `python -m MODULE`, which ends in `serve`, makes of the arrays.
+
+    Args:
+        module: full name.
+        task: what it does, for messages: "clean the mesh".
+        arrays: by name.
+
+    Raises:
+        BackendUnavailable: the child said that something is missing.
+        DG4DError: it said that the task cannot be done, or died.
+    """
+    with tempfile.TemporaryDirectory(prefix="dg4d-mesh-") as folder:
+        given, made = Path(folder) / "given.npz", Path(folder) / "made.npz"
+        np.savez(given, **arrays)
+        command = [sys.executable, "-m", module, str(given), str(made)]
+        child = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+        if child.returncode == EXIT_MISSING:
+            raise BackendUnavailable(child.stderr.strip())
+        if child.returncode == EXIT_REFUSED:
+            raise DG4DError(child.stderr.strip())
+        if child.returncode != 0 or not made.exists():
+            raise DG4DError(_obituary(child, task))
+        with np.load(made) as results:
+            return dict(results)
+
+
+def serve(work: Callable[[Arrays], Arrays]) -> None:
+    """Be the child: read the arrays, do the work, write the results, and leave without tidying up.
+
+    Destructors of the libraries that run here are not to be trusted (see `unwrap`), so none is called.
+    """
+    given, made = sys.argv[1:]
+    status, message = 0, ""
+    with np.load(given) as arrays:
+        content = dict(arrays)
+    try:
+        np.savez(made, **work(content))
+    except BackendUnavailable as error:
+        status, message = EXIT_MISSING, str(error)
+    except DG4DError as error:
+        status, message = EXIT_REFUSED, str(error)
+    sys.stderr.write(message)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
+
+
+def _obituary(child: subprocess.CompletedProcess[str], task: str) -> str:
+    code = child.returncode
+    how = f"was stopped by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
+    last = "; ".join(child.stderr.strip().splitlines()[-3:]) or "it said nothing"
+    return f"the process to {task} {how} ({last}); run it again, or lower mesh.grid or mesh.max_faces"

@@ -1,0 +1,154 @@
+"""What the documents say is so: the tree, the commands, the files of a package, the version."""
+
+import re
+import tomllib
+from pathlib import PurePosixPath
+
+import pytest
+import repository
+
+import flows.cli
+from flows.manifest import parse_changes
+from flows.publish import RECORD
+from flows.report import BESIDE
+from steps import packages
+from steps.profiles import PROFILES, profile, revise
+
+README = repository.text("README.md")
+DOCUMENTS = [path for path in repository.files() if path.endswith(".md")]
+FOLDED = ("tests",)  # folders whose one line stands for everything in them
+LINE = re.compile(r"( *)(\S+)(?: {2,}(\S.*))?")
+
+
+def named_in(block: str) -> dict[str, str]:
+    """The paths of a drawn tree, folders with a slash at the end, and what it says about each."""
+    paths: dict[str, str] = {}
+    above: list[str] = []
+    for line in filter(None, block.splitlines()):
+        match = LINE.fullmatch(line)
+        assert match and len(match[1]) % 2 == 0, f"not a line of a tree: {line!r}"
+        depth = len(match[1]) // 2
+        assert depth <= len(above), f"indented below nothing: {line!r}"
+        del above[depth:]
+        paths["".join(above) + match[2]] = match[3] or ""
+        if match[2].endswith("/"):
+            above.append(match[2])
+    return paths
+
+
+def lost(named: dict[str, str], files: tuple[str, ...]) -> list[str]:
+    """The lines that name nothing on disk."""
+    folders = {f"{parent}/" for path in files for parent in PurePosixPath(path).parents}
+    return sorted(set(named) - set(files) - folders)
+
+
+def uncovered(named: dict[str, str], files: tuple[str, ...]) -> list[str]:
+    """The files without a line: `__init__.py` is covered by its folder's, and so is all that is folded."""
+
+    def covered(path: str) -> bool:
+        folder = f"{PurePosixPath(path).parent}/"
+        folded = path.split("/", maxsplit=1)[0] in FOLDED and f"{path.split('/', maxsplit=1)[0]}/" in named
+        return path in named or folded or (path.endswith("__init__.py") and folder in named)
+
+    return [path for path in files if not covered(path)]
+
+
+TREE = named_in(repository.fenced(README, "## The tree"))
+
+
+def test_every_line_of_the_tree_names_something_on_disk() -> None:
+    assert not lost(TREE, repository.files())
+
+
+def test_everything_on_disk_has_a_line_in_the_tree() -> None:
+    assert not uncovered(TREE, repository.files())
+
+
+def test_every_line_of_the_tree_says_something() -> None:
+    assert not [path for path, meaning in TREE.items() if not meaning]
+
+
+def test_a_tree_that_is_not_true_would_be_noticed() -> None:
+    named = named_in("a/  folder\n  b.py  file\ntests/  folded\nlost.py  gone\n")
+    files = ("a/__init__.py", "a/b.py", "a/new.py", "c.py", "tests/x/test_y.py")
+    assert lost(named, files) == ["lost.py"]
+    assert uncovered(named, files) == ["a/new.py", "c.py"]
+
+
+def test_the_two_commands_are_in_the_makefile() -> None:
+    targets = set(re.findall(r"^([\w-]+):", repository.text("Makefile"), re.MULTILINE))
+    commands = re.findall(r"^make (\w+)", repository.fenced(README, "## Two commands"), re.MULTILINE)
+    assert commands == ["demo", "test"]
+    mentioned = set(re.findall(r"`make ([\w-]+)", "".join(repository.text(path) for path in DOCUMENTS)))
+    assert {*commands, *mentioned} <= targets
+
+
+def test_ci_runs_the_readmes_test_command_and_nothing_else() -> None:
+    lines = [
+        line for line in repository.text(".ci/run").splitlines() if line and not line.startswith(("#", "set ", "cd "))
+    ]
+    assert lines == ["exec make test"]
+
+
+def test_the_changelog_has_this_version() -> None:
+    version = tomllib.loads(repository.text("pyproject.toml"))["project"]["version"]
+    assert re.search(
+        rf"^## \[?{re.escape(version)}\]? - \d{{4}}-\d\d-\d\d$", repository.text("CHANGELOG.md"), re.MULTILINE
+    )
+
+
+def test_every_command_has_an_example_and_every_example_is_a_command() -> None:
+    commands = {command.callback.__name__ for command in flows.cli.app.registered_commands if command.callback}
+    mentioned = set(re.findall(r"(?:^|[` ])dg4d ([a-z]+)", README, re.MULTILINE))
+    assert mentioned == commands
+
+
+@pytest.mark.parametrize("path", DOCUMENTS)
+def test_every_setting_in_a_document_can_be_set(path: str) -> None:
+    pairs = re.findall(r"--set ([^\s`]+=[^\s`]+)", repository.text(path))
+    for pair in pairs:
+        revise(profile("preview"), parse_changes([pair]))
+
+
+def test_every_profile_is_explained() -> None:
+    assert not [name for name in PROFILES if f"`{name}`" not in README]
+
+
+def test_the_exit_codes_are_those_of_the_command() -> None:
+    codes = {value for name, value in vars(flows.cli).items() if name.startswith("EXIT_")}
+    section = README.split("\n## Exit codes\n", 1)[1].split("\n## ", 1)[0]
+    assert set(map(int, re.findall(r"^\| (\d+) \|", section, re.MULTILINE))) == {0, 2, *codes}
+
+
+def test_every_file_of_a_package_is_explained() -> None:
+    names = [value for name, value in vars(packages).items() if name.isupper() and isinstance(value, str)]
+    assert len(names) > 5
+    assert not [name for name in (*names, RECORD, *BESIDE) if f"`{name}" not in README]
+
+
+def test_every_environment_variable_is_explained() -> None:
+    code = "".join(repository.text(path) for path in repository.modules(*repository.PACKAGES))
+    documents = "".join(repository.text(path) for path in DOCUMENTS)
+    assert set(re.findall(r"\bDG4D_[A-Z_]+", code)) == set(re.findall(r"\bDG4D_[A-Z_]+", documents))
+
+
+@pytest.mark.parametrize("path", DOCUMENTS)
+def test_every_link_leads_somewhere(path: str) -> None:
+    folder = (repository.ROOT / path).parent
+    links = [link for link in re.findall(r"\]\(([^)#\s]+)", repository.text(path)) if "://" not in link]
+    assert not [link for link in links if not (folder / link).exists()]
+
+
+def test_decisions_are_numbered_and_complete() -> None:
+    entries = repository.text("DECISIONS.md").split("\n## ")[1:]
+    assert [int(entry.split(".")[0]) for entry in entries] == list(range(1, len(entries) + 1))
+    for entry in entries:
+        words = re.findall(r"^(Choice|Reason|Price|Would change our mind): \S", entry, re.MULTILINE)
+        assert words == ["Choice", "Reason", "Price", "Would change our mind"], entry.splitlines()[0]
+
+
+def test_the_license_is_the_one_that_pyproject_names() -> None:
+    assert tomllib.loads(repository.text("pyproject.toml"))["project"]["license"] == "Apache-2.0"
+    license_text = repository.text("LICENSE")
+    assert "Apache License" in license_text and "Version 2.0, January 2004" in license_text
+    assert "Copyright 2026 the dg4d authors" in license_text
