@@ -84,7 +84,8 @@ def averaged_over_depth(
     pixels = torch.tensor([depth_sigma * camera.focal / camera.radius for camera in cameras], dtype=torch.float64)
     shift = world_to_camera(cameras)[:, :2, 2].abs() * pixels[:, None]
     across, down = (_gaussian(shift[:, i], size).to(images) for i, size in ((0, images.shape[2]), (1, images.shape[1])))
-    return torch.einsum("bij,bkl,bjlc->bikc", down, across, images)
+    rows = torch.einsum("bij,bjlc->bilc", down, images)
+    return torch.einsum("bkl,bilc->bikc", across, rows)
 
 
 def _gaussian(sigmas: Float[Tensor, " b"], size: int) -> Float[Tensor, "b size size"]:

@@ -34,7 +34,7 @@ def run_apart(module: str, task: str, arrays: Mapping[str, NDArray[Any]]) -> Arr
     """
     with tempfile.TemporaryDirectory(prefix="dg4d-mesh-") as folder:
         given, made = Path(folder) / "given.npz", Path(folder) / "made.npz"
-        np.savez(given, **arrays)
+        _write(given, arrays)
         command = [sys.executable, "-m", module, str(given), str(made)]
         child = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
         if child.returncode == EXIT_MISSING:
@@ -57,7 +57,7 @@ def serve(work: Callable[[Arrays], Arrays]) -> None:
     with np.load(given) as arrays:
         content = dict(arrays)
     try:
-        np.savez(made, **work(content))
+        _write(Path(made), work(content))
     except BackendUnavailable as error:
         status, message = EXIT_MISSING, str(error)
     except DG4DError as error:
@@ -66,6 +66,10 @@ def serve(work: Callable[[Arrays], Arrays]) -> None:
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(status)
+
+
+def _write(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    np.savez(path, allow_pickle=False, **dict(arrays))
 
 
 def _obituary(child: subprocess.CompletedProcess[str], task: str) -> str:

@@ -57,7 +57,7 @@ def clean(
         raise BadInput("a mesh without faces cannot be cleaned; lower mesh.density_threshold")
     vertices, faces = drop_small_components(vertices, faces, settings.min_component)
     length = max(settings.edge_length, _edge_length_of(vertices / unit, faces, settings.max_faces))
-    arrays = {
+    arrays: Arrays = {
         "vertices": np.asarray(vertices, np.float64) / unit,
         "faces": np.asarray(faces, np.int32),
         "edge_length": np.array(length),

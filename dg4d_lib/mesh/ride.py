@@ -2,7 +2,8 @@
 
 A vertex moves with the rigid motion that fits its neighborhood best (moving least squares with rotations: Schaefer et
 al. 2006, section 3; Mueller et al. 2005). Both the centers of the Gaussians and their own rotations say how the
-neighborhood turns (oriented particles: Mueller and Chentanez 2011).
+neighborhood turns (oriented particles: Mueller and Chentanez 2011). Neighbors that leave the company of the one that
+carries most, as one leg leaves the other, carry little.
 """
 
 from functools import partial
@@ -25,6 +26,7 @@ NEIGHBORS = 24  # Gaussians that carry a vertex
 FAINT = 0.005  # less opaque Gaussians carry nothing, their motion is not seen
 FALLBACK = 0.01  # weight of mere nearness against that of density
 THINNEST = 0.25  # of the neighborhood's size: flat Gaussians carry what is near, not only what lies in their plane
+PARTING = 0.5  # of the neighborhood's radius: standard deviation of how a carrier's distance to the main one may change
 OWN_ROTATION = 0.5  # weight of the Gaussians' own rotations, per squared size of the neighborhood
 SWEEPS = 6  # of Jacobi; four by four needs five for full precision
 
@@ -47,15 +49,15 @@ def ride(vertices: Float[Tensor, "v 3"], gaussians: Gaussians, displacement: Dis
         raise BadInput(f"vertices ride one state of a cloud that is not empty; given {tuple(gaussians.means.shape)}")
     points = vertices.double().cpu()
     rest = gaussians.to(torch.device("cpu")).to(torch.float64)
-    carriers, weights = _carriers(points, rest)
+    moved = (rest.means + displacement.means.double().cpu()).numpy()
+    carriers, weights = (part.numpy() for part in _carriers(points, rest))
+    _keep_company(carriers, weights, points.numpy(), rest.means.numpy(), moved)
     back = rotation_matrix(rest.quats).mT
-    offsets = np.empty((displacement.means.shape[0], len(points), 3))
+    offsets = np.empty((len(moved), len(points), 3))
 
     def move(time: int) -> None:
-        moved = rest.means + displacement.means[time].double().cpu()
         turns = rotation_matrix(rest.quats + displacement.quats[time].double().cpu()) @ back
-        places = (points, rest.means, moved, turns)
-        _move(carriers.numpy(), weights.numpy(), *(place.numpy() for place in places), offsets[time])
+        _move(carriers, weights, points.numpy(), rest.means.numpy(), moved[time], turns.numpy(), offsets[time])
 
     run([partial(move, time) for time in range(len(offsets))])
     return torch.from_numpy(offsets).to(vertices)
@@ -79,6 +81,27 @@ def _carriers(points: Float[Tensor, "v 3"], rest: Gaussians) -> tuple[Int[Tensor
     nearness = torch.exp(-4.5 * (distance / reach).square())  # three standard deviations at the last neighbor
     weights = rest.opacities[carriers] * (density + FALLBACK * nearness)
     return carriers, weights / weights.sum(-1, keepdim=True)
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _keep_company(carriers, weights, points, rest, moved):
+    """Lower the weights of carriers whose distance to the main one changes over time; rows sum to 1 again."""
+    for v in range(carriers.shape[0]):
+        main = carriers[v, np.argmax(weights[v])]
+        reach2 = 1e-18
+        for i in carriers[v]:
+            reach2 = max(reach2, np.square(rest[i] - points[v]).sum())
+        for k in range(carriers.shape[1]):
+            i, change = carriers[v, k], 0.0
+            before = np.sqrt(np.square(rest[i] - rest[main]).sum())
+            for t in range(moved.shape[0]):
+                after = 0.0
+                for a in range(3):
+                    after += (moved[t, i, a] - moved[t, main, a]) ** 2
+                change = max(change, abs(np.sqrt(after) - before))
+            weights[v, k] *= np.exp(-0.5 * change * change / (PARTING * PARTING * reach2))
+        weights[v] /= weights[v].sum()
 
 
 @njit(cache=True, nogil=True)

@@ -17,7 +17,9 @@ from dg4d_lib.mesh.apart import Arrays, run_apart, serve
 
 PADDING = 2  # texels between charts, at least
 SMOOTHING = 20  # Taubin steps; xatlas' time grows with roughness, so the charts are cut on a smooth copy
-ATTEMPTS = 4  # packings with growing padding until it survives the fit into the square
+MOST_PADDING = (
+    1 / 8
+)  # of the side of the atlas: its padding grows, up to this, until it survives the fit into the square
 
 _KEPT: list[Any] = []  # atlases of the child, which must not be destroyed
 
@@ -73,7 +75,7 @@ def _unwrap_here(arrays: Arrays) -> Arrays:
     vertices, faces, size = arrays["vertices"], arrays["faces"], int(arrays["size"])
     chart, pack = xatlas.ChartOptions(), xatlas.PackOptions()
     pack.resolution, pack.padding, pack.bilinear = size, 2 * PADDING, True
-    for _ in range(ATTEMPTS):
+    while pack.padding <= size * MOST_PADDING:
         atlas = xatlas.Atlas()
         _KEPT.append(atlas)
         atlas.add_mesh(vertices, faces)
@@ -83,7 +85,7 @@ def _unwrap_here(arrays: Arrays) -> Arrays:
             copied, corners, uvs = atlas.get_mesh(0)
             uvs = np.clip(uvs, 0, 1).astype(np.float32)
             return {"copied": copied.astype(np.int32), "corners": corners.astype(np.int32), "uvs": uvs}
-        pack.padding = int(np.ceil(1.5 * PADDING * max(atlas.width, atlas.height) / size))
+        pack.padding = max(pack.padding + 1, int(np.ceil(1.2 * PADDING * max(atlas.width, atlas.height) / size)))
     raise DG4DError(
         f"the texture has no room for the charts of {len(faces)} faces: {size} texels a side; "
         "raise mesh.texture_size or lower mesh.max_faces"

@@ -79,6 +79,26 @@ def test_a_smooth_bend_is_followed(gaussians: Gaussians, vertices: torch.Tensor)
     assert error.mean() < 0.6 * error_of_the_nearest.mean()
 
 
+def test_two_parts_that_touch_and_part_take_their_own_surface_along() -> None:
+    generator = torch.Generator().manual_seed(6)
+    means = 0.4 * torch.rand(400, 3, generator=generator) - 0.2
+    left = means[:, 0] < 0
+    cloud = Gaussians(
+        means,
+        torch.full((400, 3), math.log(0.03)),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(400, 1),
+        torch.full((400,), 2.0),
+        torch.zeros(400, 1, 3),
+    )
+    apart = replace(still(cloud, 2), means=torch.stack([0 * means, torch.where(left[:, None], -0.5, 0.5) + 0 * means]))
+    vertices = 0.3 * torch.rand(300, 3, generator=generator) - 0.15
+    offsets = ride(vertices, cloud, apart)[1]
+    torch.testing.assert_close(offsets.abs(), torch.full_like(offsets, 0.5), atol=0.02, rtol=0)
+    clearly_left, clearly_right = vertices[:, 0] < -0.05, vertices[:, 0] > 0.05
+    assert (offsets[clearly_left] < 0).all()
+    assert (offsets[clearly_right] > 0).all()
+
+
 def test_invisible_gaussians_carry_nothing(gaussians: Gaussians, vertices: torch.Tensor) -> None:
     logits = torch.where(torch.arange(300) < 150, 2.0, -9.0)
     means = torch.where(torch.arange(300)[:, None] < 150, 0.0, 5.0)
