@@ -66,8 +66,8 @@ class GeometricPriorSettings(Settings):
         0.03,
         ge=0,
         le=0.5,
-        description="how uncertain the guessed depth is, world units, one standard deviation: a view from the side is the "
-        "average over it, so it is soft along the direction in which depth shows",
+        description="standard deviation of the guessed depth, world units: a view from the side is the average over it, "
+        "soft along the direction in which depth shows",
     )
     coverage_weight: NotNegative = Field(1.0, description="weight of alpha against color in the clean picture, ours")
 
@@ -123,7 +123,7 @@ class HexPlaneSettings(Settings):
     temporal: int = Field(32, ge=2, le=512, description="cells of the time axis")
     features: int = Field(32, ge=1, le=128)
     hidden: int = Field(64, ge=1, le=512)
-    scales: tuple[int, ...] = Field(
+    scales: tuple[Annotated[int, Field(ge=1, le=16)], ...] = Field(
         (1,), min_length=1, description="multi-resolution: factors on `spatial`, concatenated"
     )
     variation_weight: NotNegative = Field(0.0, description="total variation of the spatial planes (1e-4 when used)")

@@ -9,6 +9,8 @@ _HOME = Path(tempfile.mkdtemp(prefix="dg4d-tests-"))
 for _name in tuple(os.environ):
     if _name.startswith(("PREFECT_", "DG4D_")):
         del os.environ[_name]
+os.environ["OMP_NUM_THREADS"] = "1"  # tests run side by side; spinning threads would slow each other down
+os.environ["OMP_WAIT_POLICY"] = "passive"
 os.environ["DG4D_HOME"] = str(_HOME)  # before anything imports Prefect, which reads its settings then
 os.environ["PREFECT_HOME"] = str(_HOME / "prefect")
 os.environ["DO_NOT_TRACK"] = "1"
