@@ -66,8 +66,8 @@ class GeometricPriorSettings(Settings):
         0.03,
         ge=0,
         le=0.5,
-        description="standard deviation of the guessed depth, world units: a view from the side is the average over it, "
-        "soft along the direction in which depth shows",
+        description="standard deviation of the guessed depth, world units: a view from the side is the average over it,"
+        " soft along the direction in which depth shows",
     )
     coverage_weight: NotNegative = Field(1.0, description="weight of alpha against color in the clean picture, ours")
 

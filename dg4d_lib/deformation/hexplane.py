@@ -78,8 +78,7 @@ class HexPlane(nn.Module):
         on_cpu = means.device.type == "cpu" and means.dtype == torch.float32 and not coordinates.requires_grad
         read = hexplane_features if on_cpu else plane_features
         features = [
-            read(coordinates, space, time_lines(time, times))
-            for space, time in zip(self.space, self.time, strict=True)
+            read(coordinates, space, time_lines(time, times)) for space, time in zip(self.space, self.time, strict=True)
         ]
         displacement: Displacement = self.heads(self.trunk(torch.cat(features, -1)))
         return displacement

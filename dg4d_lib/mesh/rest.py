@@ -1,0 +1,89 @@
+"""The moment from which one mesh can follow the whole motion best.
+
+Parts that touch at the moment of extraction share a surface and tear when they part; what is hidden or folded then has
+no surface to unfold. So a few moments are tried on a coarse grid, and the outlines over the whole motion decide.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.deformation.interface import Displacement
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.mesh.density import density_field
+from dg4d_lib.mesh.extract import best_level, surface
+from dg4d_lib.mesh.ride import ride
+from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
+from dg4d_lib.rasterizer.interface import Rasterizer
+from dg4d_lib.settings import MeshSettings
+
+CANDIDATES = 6  # moments that are tried
+MOMENTS = 8  # at which outlines are compared
+GRID = 64  # cells of the trial's density field
+SIZE = 128  # pixels of an outline
+AZIMUTHS_DEG = (0.0, 0.0, 75.0)  # the input view, where an eye compares, counts twice
+GAIN = 0.005  # of intersection over union: less is no reason to leave the first frame
+
+
+def since(displacement: Displacement, frame: int) -> Displacement:
+    """The same motion, told from where the cloud is at this frame."""
+    return Displacement(**{name: value - value[frame] for name, value in vars(displacement).items()})
+
+
+def best_rest(
+    states: Gaussians, displacement: Displacement, rasterize: Rasterizer, settings: MeshSettings
+) -> tuple[int, float]:
+    """The frame whose surface, carried along, agrees best with the outlines of the Gaussians at all times.
+
+    Args:
+        states: the cloud at every frame (fields "t n 3").
+        displacement: of the canonical cloud at every frame.
+        rasterize: the splatting backend.
+        settings: of the mesh.
+
+    Returns:
+        The frame, and its mean intersection over union over moments and views, in [0, 1].
+
+    Raises:
+        FitDiverged: the cloud is empty.
+    """
+    frames = len(states.means)
+    moments = evenly(frames, MOMENTS)
+    truth = [_splat_outlines(states, moments, azimuth, rasterize) for azimuth in AZIMUTHS_DEG]
+    scores = {}
+    for frame in evenly(frames, CANDIDATES):
+        rest = states.at(frame)
+        field = density_field(rest, settings.model_copy(update={"grid": min(GRID, settings.grid)}))
+        level, _ = best_level(field, rest, rasterize, settings.density_threshold)
+        vertices, faces = (torch.from_numpy(array) for array in surface(field, level))
+        motion = since(displacement, frame)
+        some = Displacement(**{name: value[moments] for name, value in vars(motion).items()})
+        moved = vertices + ride(vertices, rest, some)
+        agreements = []
+        for azimuth, outline in zip(AZIMUTHS_DEG, truth, strict=True):
+            camera = OrbitCamera(0, azimuth, width=SIZE, height=SIZE)
+            drawn = rasterize_mesh(moved, faces, [camera] * len(moments)).faces >= 0
+            shared, either = ((mask).flatten(1).sum(1) for mask in (drawn & outline, drawn | outline))
+            agreements.append((shared / either.clamp(min=1)).mean())
+        scores[frame] = float(torch.stack(agreements).mean())
+    best = max(scores, key=lambda frame: scores[frame])
+    chosen = best if scores[best] > scores[0] + GAIN else 0
+    return chosen, scores[chosen]
+
+
+def evenly(total: int, count: int) -> list[int]:
+    """Up to `count` different numbers below `total`, the first and the last included."""
+    return sorted({round(i * (total - 1) / max(min(count, total) - 1, 1)) for i in range(min(count, total))})
+
+
+def _splat_outlines(
+    states: Gaussians, moments: Sequence[int], azimuth_deg: float, rasterize: Rasterizer
+) -> Bool[Tensor, "m h w"]:
+    some = replace(states, **{name: getattr(states, name)[moments] for name in ("means", "log_scales", "quats")})
+    camera = OrbitCamera(0, azimuth_deg, width=SIZE, height=SIZE)
+    with torch.no_grad():
+        return rasterize(some, [camera] * len(moments), torch.zeros(3)).alpha[..., 0] > 0.5
