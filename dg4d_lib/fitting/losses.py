@@ -1,5 +1,7 @@
 """The reference-view loss of both stages, and the check that a loss is a number."""
 
+from collections.abc import Iterable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -34,6 +36,30 @@ def reference_loss(
     return color_weight * functional.mse_loss(rendering.color, color) + alpha_weight * functional.mse_loss(
         rendering.alpha, alpha
     )
+
+
+def check_finite(
+    stage: str, quantity: str, values: Iterable[Tensor | None], moment: str, advice: str, gaussians: Gaussians
+) -> None:
+    """Stop a fit whose numbers are none.
+
+    A Gaussian that is no number is not drawn and its loss stays finite, so gradients are checked too.
+
+    Args:
+        stage: name of the fit.
+        quantity: what is checked, "loss" or "gradient".
+        values: the tensors; None is left out.
+        moment: "iteration 3 of 200".
+        advice: what the user can do.
+        gaussians: the last good cloud.
+
+    Raises:
+        Diverged: one of the values is not finite.
+    """
+    for value in values:
+        if value is not None and not torch.isfinite(value).all():
+            bad = value.detach()[~torch.isfinite(value.detach())].flatten()[0].item()
+            raise Diverged(f"{stage}: the {quantity} became {bad} at {moment}; {advice}", gaussians.detach())
 
 
 class Diverged(FitDiverged):

@@ -11,7 +11,7 @@ from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.cameras.viewpoints import random_orbit
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.deformation.rigidity import neighborhoods, rigidity
-from dg4d_lib.fitting.losses import WHITE, Diverged, reference_loss, resized
+from dg4d_lib.fitting.losses import WHITE, check_finite, reference_loss, resized
 from dg4d_lib.fitting.schedules import size_of
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.interface import GuidancePrior, View
@@ -19,6 +19,7 @@ from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MotionSettings
 from dg4d_lib.video.driving import DrivingVideo
 
+ADVICE = "lower motion.network_rate and motion.plane_rate or the weights"
 Report = Callable[[int, dict[str, float]], None]
 
 
@@ -77,14 +78,12 @@ def fit_motion(
                 loss = loss + settings.guidance_weight * guidance
         if neighbors is not None:
             loss = loss + settings.rigidity_weight * rigidity(moved, *neighbors)
-        if not torch.isfinite(loss):
-            raise Diverged(
-                f"fit_motion: the loss became {loss.item()} at iteration {step} of {settings.iterations}; "
-                "lower motion.network_rate and motion.plane_rate or the weights",
-                gaussians,
-            )
+        moment = f"iteration {step} of {settings.iterations}"
+        check_finite("fit_motion", "loss", [loss], moment, ADVICE, gaussians)
         adam.zero_grad(set_to_none=True)
         loss.backward()
+        slopes = [parameter.grad for parameter in deformation.parameters()]
+        check_finite("fit_motion", "gradient", slopes, moment, ADVICE, gaussians)
         adam.step()
         report(step, {"loss": loss.item(), "reference": reference.item(), "guidance": guidance.item()})
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.cameras.viewpoints import random_orbit
-from dg4d_lib.fitting.losses import WHITE, Diverged, reference_loss, resized
+from dg4d_lib.fitting.losses import WHITE, Diverged, check_finite, reference_loss, resized
 from dg4d_lib.fitting.schedules import log_linear, size_of
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.growth import Grown, ScreenGradients, grow, prune, reset_opacity
@@ -18,6 +18,7 @@ from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import StaticSettings
 
 Report = Callable[[int, dict[str, float]], None]
+ADVICE = "lower the learning rates (static.*_rate) or the weights"
 FEWEST = 8  # Gaussians; with fewer there is no object left
 
 
@@ -103,14 +104,12 @@ def fit_gaussians(
             seen.append((rendering.visible, size))
             guidance = prior.loss(rendering.color, rendering.alpha, views, progress, generator)
             loss = loss + settings.guidance_weight * guidance
-        if not torch.isfinite(loss):
-            raise Diverged(
-                f"fit_gaussians: the loss became {loss.item()} at iteration {step} of {settings.iterations}; "
-                "lower the learning rates (static.*_rate) or the weights",
-                gaussians.detach(),
-            )
+        moment = f"iteration {step} of {settings.iterations}"
+        check_finite("fit_gaussians", "loss", [loss], moment, ADVICE, gaussians)
         cloud.adam.zero_grad(set_to_none=True)
         loss.backward()
+        slopes = [parameter.grad for parameter in cloud.parameters.values()]
+        check_finite("fit_gaussians", "gradient", slopes, moment, ADVICE, gaussians)
         for offset, (visible, size) in zip(offsets, seen, strict=True):
             if offset.grad is not None:
                 gradients.add(offset.grad, visible, size)

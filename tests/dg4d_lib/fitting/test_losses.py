@@ -1,6 +1,9 @@
+import pytest
 import torch
 
-from dg4d_lib.fitting.losses import reference_loss, resized
+from dg4d_lib.errors import FitDiverged
+from dg4d_lib.fitting.losses import Diverged, check_finite, reference_loss, resized
+from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.rasterizer.interface import Rendering
 
 
@@ -20,3 +23,13 @@ def test_the_reference_loss_is_its_two_weighted_means():
     )
     loss = reference_loss(rendering, torch.zeros(2, 4, 4, 3), torch.ones(2, 4, 4, 1), 8.0, 4.0)
     torch.testing.assert_close(loss, torch.tensor(8 * 0.25 + 4 * 0.25))
+
+
+def test_a_gradient_that_is_no_number_stops_the_fit():
+    cloud = blob(9, 0.5, torch.Generator().manual_seed(0))
+    check_finite("fit", "gradient", [None, torch.zeros(3)], "iteration 1 of 2", "rest", cloud)
+    broken = torch.tensor([1.0, torch.inf])
+    with pytest.raises(FitDiverged, match="fit: the gradient became inf at iteration 1 of 2; rest") as caught:
+        check_finite("fit", "gradient", [None, broken], "iteration 1 of 2", "rest", cloud)
+    assert isinstance(caught.value, Diverged)
+    assert len(caught.value.gaussians) == 9
