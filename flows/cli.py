@@ -198,6 +198,7 @@ def main() -> None:
 def _made(order: "Order", folder: Path, console: "Console") -> dict[str, dict[str, int]]:
     """Run the flow of an order with its steps on the terminal; the files of the package."""
     from flows import terminal
+    from flows.executors import StepBadInput
     from flows.make import connect, make, save_pictures
 
     with console.status("starting") if console.is_terminal else nullcontext():
@@ -206,6 +207,8 @@ def _made(order: "Order", folder: Path, console: "Console") -> dict[str, dict[st
     try:
         with terminal.steps_shown(console):
             files, cached = make(order, folder)
+    except StepBadInput as error:  # a step knows files by their content, the user by their names
+        raise StepBadInput(error.step, f"{order.source_name}: {error.message}", error.pictures) from error
     except Exception as error:
         for path in save_pictures(order, error):
             typer.echo(f"the last good state: {path}", err=True)

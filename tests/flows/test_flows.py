@@ -234,7 +234,7 @@ def test_bad_input_that_a_step_finds_is_one_message(dg4d: Run, tmp_path: Path) -
     (tmp_path / "x.png").write_text("prepare_subject=bad:ugly")
     done = dg4d("make", "x.png", "-o", "out")
     assert done.exit_code == 65
-    assert done.stderr == "dg4d: the picture is ugly\n"
+    assert done.stderr == "dg4d: x.png: the picture is ugly\n"
     assert not (tmp_path / "out").exists()
 
 
