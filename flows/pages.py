@@ -13,18 +13,38 @@ import OpenImageIO as oiio
 
 from flows.executors import StepError
 from flows.publish import readable
-from steps.contract import ArtifactRef, StepResult
+from steps.contract import ArtifactRef, StepResult, StepSpec
 from steps.store import ArtifactMissing, ArtifactStore
 
 THUMBNAIL_SIZE = 320  # pixels of the longer side
 THUMBNAIL_BYTES = 50_000  # the server keeps pages in its database
 ROWS_OF_A_CURVE = 8
+ARTIFACT_ADDRESS = "/dg4d/artifacts/"  # of the background server
 
 
 def key(label: str, item: str) -> str:
     """A key as Prefect wants it: lower case, digits and dashes; different names give different keys."""
     slug = re.sub(r"[^a-z0-9]+", "-", f"{label} {item}".lower()).strip("-")[:80]
     return f"{slug}-{hashlib.sha256(f'{label}/{item}'.encode()).hexdigest()[:6]}"
+
+
+def address(name: str, ref: ArtifactRef, suffix: str) -> str:
+    """Where the background server has a file of the store; relative to the server."""
+    return f"{ARTIFACT_ADDRESS}{ref.digest.removeprefix('sha256:')}/{ref.size_bytes}/{name}{suffix}"
+
+
+def output_rows(result: StepResult, spec: StepSpec) -> list[dict[str, str]]:
+    """A table of a step's outputs, each with the address of its file."""
+    return [
+        {
+            "output": name,
+            "kind": ref.media_type,
+            "size": readable(ref.size_bytes),
+            "digest": ref.digest[7:19],
+            "file": f"[{name}{spec.outputs[name].suffix}]({address(name, ref, spec.outputs[name].suffix)})",
+        }
+        for name, ref in result.outputs.items()
+    ]
 
 
 def step_page(label: str, item: str, result: StepResult, store: ArtifactStore) -> str:

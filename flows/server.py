@@ -231,7 +231,7 @@ def _serve(port: int, prefect_home: Path) -> subprocess.Popen[bytes]:
     prefect_home.mkdir(parents=True, exist_ok=True)
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
     environment |= SETTINGS | {"PREFECT_HOME": str(prefect_home), "PREFECT__SERVER_FINAL": "1"}
-    application = ["--factory", "prefect.server.api.server:create_app"]
+    application = ["--factory", "flows.server_app:create_app"]
     return subprocess.Popen(
         [sys.executable, "-m", "uvicorn", *application, "--host", HOST, "--port", str(port), "--log-level", "warning"],
         env=environment,

@@ -6,7 +6,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from prefect import task
-from prefect.artifacts import create_markdown_artifact, create_progress_artifact, update_progress_artifact
+from prefect.artifacts import (
+    create_link_artifact,
+    create_markdown_artifact,
+    create_progress_artifact,
+    create_table_artifact,
+    update_progress_artifact,
+)
 from prefect.cache_policies import CachePolicy
 from prefect.client.schemas.objects import State, TaskRun
 from prefect.futures import PrefectFuture
@@ -75,6 +81,18 @@ def run_step(request: StepRequest, item: str, label: str) -> dict[str, Any]:
         key=pages.key(label, item),
         markdown=pages.step_page(label, item, result, home.store()),
         description=f"{label} of {item}",
+    )
+    create_table_artifact(
+        key=pages.key(f"outputs {label}", item),
+        table=pages.output_rows(result, spec),
+        description=f"Files that {label} of {item} made",
+    )
+    name, ref = next(iter(result.outputs.items()))
+    create_link_artifact(
+        key=pages.key(f"file {label}", item),
+        link=pages.address(name, ref, spec.outputs[name].suffix),
+        link_text=f"{name}{spec.outputs[name].suffix}",
+        description=f"What {label} of {item} made",
     )
     return result.model_dump(mode="json")
 

@@ -2,10 +2,12 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -66,6 +68,10 @@ def ran(log: Path) -> list[str]:
 def order(words: str, folder: Path, *, name: str = "fake.png", item: str = "fake", **changes: object) -> Order:
     (folder / name).write_text(words)
     return Wish(item=item, picture=folder / name, settings=revise(PREVIEW, dict(changes))).order(home.store())
+
+
+def server_address() -> str:
+    return str(PREFECT_API_URL.value()).removesuffix("/api")
 
 
 def tree(folder: Path, *but: str) -> dict[str, bytes]:
@@ -157,11 +163,20 @@ def test_every_step_leaves_a_page_with_its_picture_on_the_server(log: Path, tmp_
     with get_client(sync_client=True) as client:
         pages: list[Any] = client.request("POST", "/artifacts/latest/filter", json={"limit": 200}).json()
     markdown = {page["key"]: page["data"] for page in pages if page["type"] == "markdown"}
-    ours = {key: data for key, data in markdown.items() if "-paged-" in key}
+    paged = {key: data for key, data in markdown.items() if "-paged-" in key}
+    files = {key: data for key, data in paged.items() if key.startswith("file-")}  # links are Markdown to Prefect
+    ours = {key: data for key, data in paged.items() if key not in files}
     assert len(ours) == len(EVERY_STEP) + 1
     motion = next(data for key, data in ours.items() if key.startswith("fit-motion"))
     assert "data:image/webp;base64," in motion
     assert "| 2 | 0.01 |" in motion
+    assert len(files) == len(EVERY_STEP)
+    subject = next(data for key, data in files.items() if key.startswith("file-prepare-subject"))
+    with urllib.request.urlopen(server_address() + re.findall(r"/dg4d/[^)\s\]]+", subject)[0]) as answer:
+        assert answer.headers["content-type"] == "image/png"
+        assert answer.read().startswith(b"\x89PNG")
+    tables = [page for page in pages if page["type"] == "table" and "-paged-" in page["key"]]
+    assert len(tables) == len(EVERY_STEP)
     progress = next(
         page for page in pages if page["type"] == "progress" and page["key"].startswith("progress-fit-gauss")
     )
