@@ -21,7 +21,7 @@ from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
 
-CANDIDATES = 6  # moments that are tried
+CANDIDATES = 12  # moments that are tried
 MOMENTS = 8  # at which outlines are compared
 GRID = 64  # cells of the trial's density field
 SIZE = 128  # pixels of an outline

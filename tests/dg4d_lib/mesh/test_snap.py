@@ -31,8 +31,8 @@ def test_vertices_that_stayed_behind_reach_the_surface_of_their_moment():
     vertices, faces = (torch.from_numpy(a) for a in surface(density_field(rest, SETTINGS), LEVEL))
     nothing = torch.zeros(2, len(vertices), 3)
     snapped = vertices + snap(vertices, nothing, faces, states, LEVEL, SETTINGS)
-    assert (snapped[0] - vertices).norm(dim=-1).max() < 0.01  # it was on the surface
-    grown_by = snapped[1].norm(dim=-1).mean() / vertices.norm(dim=-1).mean()
+    assert (snapped[0] - vertices).norm(dim=-1).max() < 0.02  # it was on the surface, and is drawn in a little
+    grown_by = snapped[1].norm(dim=-1).mean() / snapped[0].norm(dim=-1).mean()
     assert abs(grown_by - 1.06) < 0.01
     assert trimesh.Trimesh(snapped[1].numpy(), faces.numpy(), process=False).is_watertight
 
