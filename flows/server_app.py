@@ -2,12 +2,10 @@
 
 from pathlib import PurePath
 
+from fastapi import FastAPI, Response
+from fastapi.responses import FileResponse, PlainTextResponse
 from prefect.server.api.server import create_app as prefect_app
 from pydantic import ValidationError
-from starlette.applications import Starlette
-from starlette.requests import Request
-from starlette.responses import FileResponse, PlainTextResponse, Response
-from starlette.routing import Route
 
 from flows import home
 from flows.pages import ARTIFACT_ADDRESS
@@ -16,22 +14,19 @@ from steps.contract import ArtifactRef
 SHOWN = {".png": "image/png", ".json": "application/json"}  # what a browser shows; the rest is saved to disk
 
 
-def create_app() -> Starlette:
+def create_app() -> FastAPI:
     """Prefect's application with the artifacts in front; needs DG4D_HOME in the environment."""
-    application: Starlette = prefect_app()
-    application.router.routes.insert(0, Route(ARTIFACT_ADDRESS + "{digest}/{size:int}/{name}", artifact))
+    application = prefect_app()
+    application.add_api_route(ARTIFACT_ADDRESS + "{digest}/{size}/{name}", artifact, response_class=Response)
+    routes = application.router.routes
+    routes.insert(0, routes.pop())  # before the user interface, which answers to every address
     return application
 
 
-def artifact(request: Request) -> Response:
+def artifact(digest: str, size: int, name: str) -> Response:
     """One file of the store, by the address that `pages.address` gives."""
-    name = request.path_params["name"]
     try:
-        ref = ArtifactRef(
-            digest=f"sha256:{request.path_params['digest']}",
-            media_type="application/octet-stream",
-            size_bytes=request.path_params["size"],
-        )
+        ref = ArtifactRef(digest=f"sha256:{digest}", media_type="application/octet-stream", size_bytes=size)
     except ValidationError:
         return PlainTextResponse("no such artifact", 404)
     store = home.store()

@@ -173,13 +173,12 @@ def progress_lines(file: TextIO) -> Progress:
 
 
 def _source_files() -> Iterator[tuple[str, Path, int, int]]:
-    """Every file of the library and the steps: its name, where it is, when it changed, its size."""
+    """Every source file of the library and the steps: its name, where it is, when it changed, its size."""
     for package in ("dg4d_lib", "steps"):
         folder = Path(str(importlib.import_module(package).__file__)).parent
-        for path in sorted(folder.rglob("*")):
-            if path.suffix not in {".pyc", ".md"} and path.is_file():
-                facts = path.stat()
-                yield f"{package}/{path.relative_to(folder).as_posix()}", path, facts.st_mtime_ns, facts.st_size
+        for path in sorted(folder.rglob("*.py")):  # not what compilers leave beside them
+            facts = path.stat()
+            yield f"{package}/{path.relative_to(folder).as_posix()}", path, facts.st_mtime_ns, facts.st_size
 
 
 @functools.lru_cache(maxsize=1)

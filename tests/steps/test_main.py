@@ -170,6 +170,13 @@ def test_the_version_of_a_request_follows_the_source() -> None:
     assert host.code_version(other) != host.code_version(CATALOG["shout"])
 
 
+def test_only_source_files_count_for_the_version_of_the_code() -> None:
+    """Kernels that are compiled during a run lie beside the source and must not make another request of the next."""
+    names = [name for name, *_ in host._source_files()]
+    assert "dg4d_lib/settings.py" in names
+    assert all(name.endswith(".py") for name in names)
+
+
 def test_an_image_may_fix_the_version_of_its_code(store: ArtifactStore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DG4D_CODE_VERSION", "image-7")
     outcome, _ = host.perform(request_for(store).model_copy(update={"version": "3+image-7"}), store)
