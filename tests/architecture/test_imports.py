@@ -132,7 +132,7 @@ def test_what_is_imported_is_declared() -> None:
 
 
 def test_what_is_declared_is_imported() -> None:
-    assert declared() - used() == {"fastapi"}  # bounded for Prefect, which does not start its server with newer ones
+    assert declared() - used() == set()
 
 
 def test_every_declared_distribution_is_pinned() -> None:
