@@ -16,6 +16,7 @@ from flows.events import StepEvent, listening
 from flows.publish import readable
 
 LINE_EVERY_S = 10.0  # between two lines about one step, where there is no terminal
+WIDE = 130  # columns, from which all values of a step fit beside its bar
 COUNTED = 1  # totals up to this say nothing as a fraction
 
 
@@ -43,12 +44,13 @@ class StepBars:
         self.progress = Progress(
             SpinnerColumn(finished_text="[green]✓"),
             TextColumn("{task.description:<22}"),
-            BarColumn(bar_width=28),
+            BarColumn(bar_width=28 if out.width >= WIDE else 14),
             TimeElapsedColumn(),
             TextColumn("[dim]{task.fields[numbers]}"),
             console=out,
         )
         self._bars: dict[str, TaskID] = {}
+        self._values = None if out.width >= WIDE else 1  # a narrow terminal has room for the loss
 
     def __call__(self, event: StepEvent) -> None:
         """Show an event."""
@@ -57,7 +59,8 @@ class StepBars:
         bar = self._bars[event.step]
         match event.kind:
             case "progress":
-                self.progress.update(bar, completed=event.done, total=max(event.total, 1), numbers=numbers(event))
+                text = numbers(event, self._values)
+                self.progress.update(bar, completed=event.done, total=max(event.total, 1), numbers=text)
             case "finished":
                 self.progress.update(bar, total=1, completed=1, numbers="cached" if event.cached else "")
             case "failed":
@@ -150,10 +153,10 @@ def batch_shown(out: Console, items: list[str]) -> Iterator[BatchTable]:
             yield table
 
 
-def numbers(event: StepEvent) -> str:
-    """How far a step is, and its current values."""
+def numbers(event: StepEvent, most: int | None = None) -> str:
+    """How far a step is, and its current values, at most the first `most` of them."""
     parts = [f"{event.done}/{event.total}"] if event.total > COUNTED else []
-    return "  ".join([*parts, *(f"{name} {value:.4g}" for name, value in event.values.items())])
+    return "  ".join([*parts, *(f"{name} {value:.4g}" for name, value in list(event.values.items())[:most])])
 
 
 def tell_where(out: Console, folder: Path, sizes: dict[str, int]) -> None:

@@ -1,0 +1,29 @@
+import io
+
+import pytest
+from rich.console import Console
+
+from flows.events import StepEvent
+from flows.terminal import StepBars, numbers
+
+EVENT = StepEvent("newt", "fit_gaussians", "progress", done=114, total=250, values={"loss": 9.437, "reference": 12.57})
+
+
+def test_numbers_say_how_far_and_how_good():
+    assert numbers(EVENT) == "114/250  loss 9.437  reference 12.57"
+    assert numbers(EVENT, 1) == "114/250  loss 9.437"
+
+
+@pytest.mark.parametrize(
+    ("width", "shown", "hidden"), [(80, "loss 9.437", "reference"), (160, "reference 12.57", None)]
+)
+def test_the_loss_of_a_step_fits_on_a_terminal_of_any_width(width: int, shown: str, hidden: str | None):
+    screen = io.StringIO()
+    bars = StepBars(Console(file=screen, width=width, force_terminal=True, color_system=None))
+    with bars.progress:
+        bars(EVENT)
+    text = screen.getvalue()
+    assert "fit_gaussians" in text
+    assert "…" not in text
+    assert shown in text
+    assert hidden is None or hidden not in text
