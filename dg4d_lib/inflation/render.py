@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import no_type_check
 
 import numpy as np
@@ -13,7 +14,8 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.inflation.surface import InflatedSurface
-from dg4d_lib.mesh_rasterizer.zbuffer import in_threads, rasterize_mesh
+from dg4d_lib.kernels.workers import run
+from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
 
 def render_surface(
@@ -57,7 +59,8 @@ def render_surface(
             coverage[view],
         )
 
-    in_threads(draw, len(cameras))
+    # one camera in each job: the z-buffer inside does not wait for the same threads
+    run([partial(draw, index) for index in range(len(cameras))])
     device = each[0].vertices.device
     return torch.from_numpy(color).to(device), torch.from_numpy(coverage).to(device)
 

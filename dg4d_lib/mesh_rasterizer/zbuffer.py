@@ -4,9 +4,9 @@ A pixel belongs to the triangle that holds its center (column + 0.5, row + 0.5),
 of equally near ones the one that stands first in `faces`. Edges belong to both neighbors: a closed mesh has no cracks.
 """
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import no_type_check
 
 import numpy as np
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
+from dg4d_lib.kernels.workers import run
 
 NEAR = 0.2  # world units of camera z; a triangle with a nearer corner is not drawn
 EDGE = 1e-9  # how far outside of a triangle still counts as its edge, in barycentric coordinates: float64 noise
@@ -72,7 +73,7 @@ def rasterize_mesh(
         _draw(screen, triangles, ids[view], np.zeros((height, width)))
         _resolve(screen, triangles, ids[view], weights[view], depth[view])
 
-    in_threads(draw, count)
+    run([partial(draw, index) for index in range(count)])
     fragments = Fragments(torch.from_numpy(ids), torch.from_numpy(weights), torch.from_numpy(depth))
     return Fragments(**{name: value.to(vertices.device) for name, value in vars(fragments).items()})
 
@@ -101,17 +102,6 @@ def interpolate(
     result = attributes.new_zeros((*covered.shape, attributes.shape[-1]))
     result[covered] = (weights[..., None] * values).sum(-2)
     return result
-
-
-def in_threads(work: Callable[[int], None], count: int) -> None:
-    """Do `work(0)` to `work(count - 1)` on as many threads as torch uses."""
-    threads = min(count, torch.get_num_threads())
-    if threads <= 1:
-        for index in range(count):
-            work(index)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(work, range(count)))
 
 
 def _project(vertices: Float64[np.ndarray, "v 3"], camera: OrbitCamera) -> Float64[np.ndarray, "v 3"]:
