@@ -20,7 +20,7 @@ from dg4d_lib.mesh.ride import ride
 from dg4d_lib.mesh.snap import snap
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.unwrap import unwrap
-from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
+from dg4d_lib.rasterizer.interface import Rasterizer, backend_name, choose_rasterizer
 from dg4d_lib.settings import MeshSettings
 from steps.job import Facts, Job
 from steps.media import write_png
@@ -35,7 +35,7 @@ FPS_UNKNOWN = 1.0  # frames per second: motion has no clock; refine_texture, whi
 
 
 def run(job: Job) -> Facts:
-    """Extract; the level of the surface is the one that agrees best with the outlines of the Gaussians at time 0.
+    """Extract; the level of the surface is the one that agrees best with the outlines of the Gaussians at rest.
 
     Raises:
         BadInput: frames that the motion does not have.
@@ -73,7 +73,7 @@ def run(job: Job) -> Facts:
         write_meshes(job.outputs["meshes"], meshes)
         picture = _picture(meshes[settings.first_frame])
     write_png(job.outputs["picture"], picture)
-    return Facts(backend=f"{settings.rasterizer} rasterizer, pymeshlab, xatlas", notes=tuple(notes))
+    return Facts(backend=f"{backend_name(settings.rasterizer)} rasterizer, pymeshlab, xatlas", notes=tuple(notes))
 
 
 def _tracks(settings: ExtractMeshSettings) -> bool:

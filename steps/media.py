@@ -73,17 +73,22 @@ def write_frames(path: Path, video: DrivingVideo) -> None:
     write_zip(path, entries)
 
 
+def frame_rate(path: Path) -> float:
+    """Frames per second of what `write_frames` wrote, without decoding it."""
+    with zipfile.ZipFile(path) as archive:
+        return float(json.loads(archive.read("video.json"))["fps"])
+
+
 def read_frames(path: Path, scratch: Path) -> DrivingVideo:
     """Read what `write_frames` wrote; `scratch` is a folder for the unpacked pictures."""
     with zipfile.ZipFile(path) as archive:
         names = sorted(name for name in archive.namelist() if name.endswith(".png"))
-        fps = float(json.loads(archive.read("video.json"))["fps"])
         cutouts = []
         for name in names:
             archive.extract(name, scratch)
             cutouts.append(read_png(scratch / name))
     stack = torch.stack(cutouts)
-    return DrivingVideo(stack[..., :3].contiguous(), stack[..., 3:].contiguous(), fps)
+    return DrivingVideo(stack[..., :3].contiguous(), stack[..., 3:].contiguous(), frame_rate(path))
 
 
 def write_curves(

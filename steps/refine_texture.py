@@ -8,14 +8,14 @@ from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.texture.refine import refine_texture
 from dg4d_lib.texture.refiner import Identity
 from steps.job import Facts, Job
-from steps.media import read_frames
+from steps.media import frame_rate
 from steps.meshfiles import read_meshes, read_tracked, write_meshes, write_tracked
 
 
 def run(job: Job) -> Facts:
     """Refine the mesh that moves, or every frame's own."""
     refiner = Identity()  # the only kind of RefinerSettings
-    fps = read_frames(job.inputs["driving_video"], job.pictures).fps
+    fps = frame_rate(job.inputs["driving_video"])
     if "tracked" in job.inputs:
         asset = read_tracked(job.inputs["tracked"])
         texture = refine_texture(asset.mesh, asset.offsets, refiner)

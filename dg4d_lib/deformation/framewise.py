@@ -1,7 +1,5 @@
 """Ablation: every frame has its own free displacement (paper, ablation of the deformation field)."""
 
-from collections.abc import Iterator
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -36,10 +34,6 @@ class Framewise(nn.Module):
         share = (place - left)[:, None, None]
         rows = self.table[left] * (1 - share) + self.table[(left + 1).clamp(max=last)] * share
         return Displacement(rows[..., :3], rows[..., 3:6], rows[..., 6:])
-
-    def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:
-        """The table."""
-        return super().parameters(recurse)
 
     def planes(self) -> list[nn.Parameter]:
         """The parameters that learn at the rate of planes: all."""

@@ -4,8 +4,6 @@ Zero initialization with residual heads makes the motion exactly zero at the sta
 matrices of the heads receive gradient.
 """
 
-from collections.abc import Iterator
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -82,10 +80,6 @@ class HexPlane(nn.Module):
         ]
         displacement: Displacement = self.heads(self.trunk(torch.cat(features, -1)))
         return displacement
-
-    def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:
-        """Planes first, then the network."""
-        return super().parameters(recurse)
 
     def planes(self) -> list[nn.Parameter]:
         """The parameters that learn at the rate of planes."""

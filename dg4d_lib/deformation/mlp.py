@@ -1,7 +1,5 @@
 """Ablation: one network over place and time instead of planes (paper, ablation of the deformation field)."""
 
-from collections.abc import Iterator
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -46,10 +44,6 @@ class Mlp(nn.Module):
         )
         displacement: Displacement = self.heads(hidden)
         return displacement
-
-    def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:
-        """All layers."""
-        return super().parameters(recurse)
 
     def planes(self) -> list[nn.Parameter]:
         """None: everything is network."""

@@ -70,9 +70,7 @@ def fit_motion(
         if settings.views and settings.guidance_weight:
             views, rows = moments(prior, frames, settings, size_of(settings.ladder, progress), generator)
             if views:
-                states = replace(
-                    moved, **{name: getattr(moved, name)[rows] for name in ("means", "log_scales", "quats")}
-                )
+                states = moved.states(rows)
                 rendering = rasterize(states, [view.camera for view in views], white)
                 guidance = prior.loss(rendering.color, rendering.alpha, views, progress, generator)
                 loss = loss + settings.guidance_weight * guidance

@@ -1,9 +1,10 @@
 """The value at the center of the method: a cloud of 3D Gaussians (Kerbl et al. 2023)."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from dg4d_lib.geometry.harmonics import color_of_harmonics
@@ -62,6 +63,10 @@ class Gaussians:
     def to(self, target: torch.dtype | torch.device) -> "Gaussians":
         """The same cloud in another precision or on another device."""
         return Gaussians(**{name: value.to(target) for name, value in vars(self).items()})
+
+    def states(self, rows: Sequence[int] | Int[Tensor, " m"]) -> "Gaussians":
+        """Some states of a batch, in this order."""
+        return replace(self, means=self.means[rows], log_scales=self.log_scales[rows], quats=self.quats[rows])
 
     def at(self, frame: int) -> "Gaussians":
         """One state of a batch."""

@@ -5,7 +5,6 @@ no surface to unfold. So a few moments are tried on a coarse grid, and the outli
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from jaxtyping import Bool
@@ -25,7 +24,7 @@ CANDIDATES = 12  # moments that are tried
 MOMENTS = 8  # at which outlines are compared
 GRID = 64  # cells of the trial's density field
 SIZE = 128  # pixels of an outline
-AZIMUTHS_DEG = (0.0, 0.0, 75.0)  # the input view, where an eye compares, counts twice
+VIEWS = ((0.0, 2.0), (75.0, 1.0))  # azimuth in degrees and weight: an eye compares at the input view
 GAIN = 0.005  # of intersection over union: less is no reason to leave the first frame
 
 
@@ -53,7 +52,7 @@ def best_rest(
     """
     frames = len(states.means)
     moments = evenly(frames, MOMENTS)
-    truth = [_splat_outlines(states, moments, azimuth, rasterize) for azimuth in AZIMUTHS_DEG]
+    truth = [_splat_outlines(states, moments, azimuth, rasterize) for azimuth, _ in VIEWS]
     scores = {}
     for frame in evenly(frames, CANDIDATES):
         rest = states.at(frame)
@@ -63,13 +62,13 @@ def best_rest(
         motion = since(displacement, frame)
         some = Displacement(**{name: value[moments] for name, value in vars(motion).items()})
         moved = vertices + ride(vertices, rest, some)
-        agreements = []
-        for azimuth, outline in zip(AZIMUTHS_DEG, truth, strict=True):
+        total = 0.0
+        for (azimuth, weight), outline in zip(VIEWS, truth, strict=True):
             camera = OrbitCamera(0, azimuth, width=SIZE, height=SIZE)
             drawn = rasterize_mesh(moved, faces, [camera] * len(moments)).faces >= 0
-            shared, either = ((mask).flatten(1).sum(1) for mask in (drawn & outline, drawn | outline))
-            agreements.append((shared / either.clamp(min=1)).mean())
-        scores[frame] = float(torch.stack(agreements).mean())
+            shared, either = (mask.flatten(1).sum(1) for mask in (drawn & outline, drawn | outline))
+            total += weight * float((shared / either.clamp(min=1)).mean())
+        scores[frame] = total / sum(weight for _, weight in VIEWS)
     best = max(scores, key=lambda frame: scores[frame])
     chosen = best if scores[best] > scores[0] + GAIN else 0
     return chosen, scores[chosen]
@@ -83,7 +82,6 @@ def evenly(total: int, count: int) -> list[int]:
 def _splat_outlines(
     states: Gaussians, moments: Sequence[int], azimuth_deg: float, rasterize: Rasterizer
 ) -> Bool[Tensor, "m h w"]:
-    some = replace(states, **{name: getattr(states, name)[moments] for name in ("means", "log_scales", "quats")})
     camera = OrbitCamera(0, azimuth_deg, width=SIZE, height=SIZE)
     with torch.no_grad():
-        return rasterize(some, [camera] * len(moments), torch.zeros(3)).alpha[..., 0] > 0.5
+        return rasterize(states.states(moments), [camera] * len(moments), torch.zeros(3)).alpha[..., 0] > 0.5
