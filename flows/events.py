@@ -13,18 +13,20 @@ class StepEvent:
     Attributes:
         item: name of the asset.
         step: name of the step, with the part of the work it does where it was divided.
-        kind: what happened; `finished` has `cached` and `seconds`, `progress` has `done`, `total` and `values`.
+        kind: what happened; `finished` has `cached` and `seconds`, `progress` has `done`, `total` and `values`,
+            `note` has `text`.
         cached: whether the result was there already.
     """
 
     item: str
     step: str
-    kind: Literal["started", "progress", "finished", "failed"]
+    kind: Literal["started", "progress", "note", "finished", "failed"]
     done: int = 0
     total: int = 0
     values: dict[str, float] = field(default_factory=dict)
     seconds: float = 0.0
     cached: bool = False
+    text: str = ""
 
 
 Listener = Callable[[StepEvent], None]

@@ -27,10 +27,11 @@ from steps.contract import (
     StepSpec,
 )
 from steps.job import Progress
-from steps.main import EXIT_DIVERGED, perform
+from steps.main import EXIT_DIVERGED, notes_to, perform
 from steps.store import ArtifactStore, home, remove_tree
 
-Execute = Callable[[StepSpec, StepRequest, Progress], StepResult]
+Say = Callable[[str], None]
+Execute = Callable[[StepSpec, StepRequest, Progress, Say], StepResult]
 
 TAIL_BYTES = 4000  # of standard error, for the message of a crash
 KILL_GRACE_S = 5.0  # between asking a step to end and ending it
@@ -92,15 +93,18 @@ KILLED = (  # nobody else kills a step without a word
 )
 
 
-def in_process(spec: StepSpec, request: StepRequest, on_progress: Progress) -> StepResult:
+def in_process(spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say = lambda text: None) -> StepResult:
     """Run a step here; for tests and debuggers. Neither its time nor its memory is bounded."""
-    outcome, error = perform(request, ArtifactStore(home() / "store"), on_progress)
+    with notes_to(say):
+        outcome, error = perform(request, ArtifactStore(home() / "store"), on_progress)
     if isinstance(outcome, StepFailure):
         raise _ERRORS[outcome.kind](spec.name, outcome.message, outcome.pictures) from error
     return outcome
 
 
-def in_subprocess(spec: StepSpec, request: StepRequest, on_progress: Progress) -> StepResult:
+def in_subprocess(
+    spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say = lambda text: None
+) -> StepResult:
     """Run a step in a process of its own, which ends with this one and is killed after `spec.timeout_s`."""
     with _scratch() as folder:
         (folder / "request.json").write_text(request.model_dump_json(), encoding="utf-8")
@@ -114,7 +118,7 @@ def in_subprocess(spec: StepSpec, request: StepRequest, on_progress: Progress) -
                 start_new_session=True,
                 text=True,
             )
-        status, timed_out = _watched(process, spec.timeout_s, on_progress)
+        status, timed_out = _watched(process, spec.timeout_s, on_progress, say)
         if timed_out:
             raise StepTimedOut(spec.name, f"no result after {spec.timeout_s:g} s, so it was stopped")
         outcome = _outcome(folder / "result.json")
@@ -160,7 +164,7 @@ def _command(folder: Path, parent: int) -> list[str]:
     return [sys.executable, "-m", "steps.main", *files, "--store", str(home() / "store"), "--parent", str(parent)]
 
 
-def _watched(process: subprocess.Popen[str], timeout_s: float, on_progress: Progress) -> tuple[int, bool]:
+def _watched(process: subprocess.Popen[str], timeout_s: float, on_progress: Progress, say: Say) -> tuple[int, bool]:
     """Follow a step to its end: its exit status, and whether it was killed for its time."""
     timed_out = threading.Event()
 
@@ -175,7 +179,7 @@ def _watched(process: subprocess.Popen[str], timeout_s: float, on_progress: Prog
     try:
         assert process.stdout is not None  # it is a pipe
         for line in process.stdout:
-            _relay(line, on_progress)
+            _relay(line, on_progress, say)
         status = process.wait()
         return status, timed_out.is_set()
     finally:
@@ -187,9 +191,12 @@ def _watched(process: subprocess.Popen[str], timeout_s: float, on_progress: Prog
             process.stdout.close()
 
 
-def _relay(line: str, on_progress: Progress) -> None:
+def _relay(line: str, on_progress: Progress, say: Say) -> None:
     try:
         report = json.loads(line)
+        if "note" in report:
+            say(str(report["note"]))
+            return
         done, total, values = int(report["done"]), int(report["total"]), dict(report["values"])
     except (ValueError, KeyError, TypeError):
         return

@@ -61,6 +61,8 @@ class StepBars:
             case "progress":
                 text = numbers(event, self._values)
                 self.progress.update(bar, completed=event.done, total=max(event.total, 1), numbers=text)
+            case "note":
+                self.progress.update(bar, numbers=event.text)
             case "finished":
                 self.progress.update(bar, total=1, completed=1, numbers="cached" if event.cached else "")
             case "failed":
@@ -91,6 +93,8 @@ class StepLines:
                     what = "started"
                 case "progress":
                     what = numbers(event)
+                case "note":
+                    what = event.text
                 case "finished":
                     what = "cached" if event.cached else f"done in {event.seconds:.1f} s"
                 case "failed":
@@ -114,7 +118,7 @@ class BatchTable:
             return
         self._since.setdefault(event.item, time.monotonic())
         self.status[event.item] = "running"
-        detail = numbers(event) if event.kind == "progress" else event.kind
+        detail = numbers(event) if event.kind == "progress" else event.text or event.kind
         self._doing[event.item] = f"{event.step}: {detail}"
 
     def settle(self, item: str, status: str, message: str) -> None:

@@ -55,13 +55,13 @@ class OrbitCamera:
         """World to camera, OpenCV axes (+x right, +y down, +z forward), float64."""
         e, a = math.radians(self.elevation_deg), math.radians(self.azimuth_deg)
         sin_e, cos_e, sin_a, cos_a = math.sin(e), math.cos(e), math.sin(a), math.cos(a)
-        matrix = torch.zeros(4, 4, dtype=torch.float64)
-        matrix[0, :3] = torch.tensor((cos_a, 0.0, -sin_a), dtype=torch.float64)
-        matrix[1, :3] = torch.tensor((sin_e * sin_a, -cos_e, sin_e * cos_a), dtype=torch.float64)
-        matrix[2, :3] = torch.tensor((-cos_e * sin_a, -sin_e, -cos_e * cos_a), dtype=torch.float64)
-        matrix[2, 3] = self.radius
-        matrix[3, 3] = 1.0
-        return matrix
+        rows = (
+            (cos_a, 0.0, -sin_a, 0.0),
+            (sin_e * sin_a, -cos_e, sin_e * cos_a, 0.0),
+            (-cos_e * sin_a, -sin_e, -cos_e * cos_a, self.radius),
+            (0.0, 0.0, 0.0, 1.0),
+        )
+        return torch.tensor(rows, dtype=torch.float64)
 
 
 def world_to_camera(cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b 4 4"]:

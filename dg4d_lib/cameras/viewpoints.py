@@ -1,5 +1,6 @@
 """Sets of viewpoints: random ones for score distillation, fixed ones for baking and inspection."""
 
+import math
 from dataclasses import replace
 
 import torch
@@ -17,14 +18,19 @@ def random_orbit(
     elevation_deg: tuple[float, float],
     radius: tuple[float, float],
     generator: torch.Generator,
+    ring: int = 1,
 ) -> list[OrbitCamera]:
-    """Cameras all around: azimuth uniform in [-180, 180), elevation and radius uniform in the given ranges."""
-    u = torch.rand(count, 3, generator=generator, dtype=torch.float64).tolist()
+    """Cameras all around: azimuth uniform in [-180, 180), elevation and radius uniform in the given ranges.
+
+    With `ring` above 1, that many cameras at a time differ only in azimuth, by equal steps around the object.
+    """
+    u = torch.rand(math.ceil(count / ring), 3, generator=generator, dtype=torch.float64).tolist()
     (low_e, high_e), (low_r, high_r) = elevation_deg, radius
-    return [
+    firsts = [
         OrbitCamera(low_e + (high_e - low_e) * e, -180 + 360 * a, low_r + (high_r - low_r) * r, width=size, height=size)
         for e, a, r in u
     ]
+    return [camera for first in firsts for camera in turntable(ring, first)][:count]
 
 
 def turntable(count: int, camera: OrbitCamera) -> list[OrbitCamera]:

@@ -21,6 +21,9 @@ from torch.nn import functional
 from dg4d_lib.kernels.vectors import FLOAT, INT, KERNEL, LANES, LONG, Value, Vectors, pointers
 from dg4d_lib.kernels.workers import ranges, run
 
+BLOCKS = 4  # of points, each with sums of its own in backward
+BLOCK_BYTES = 1 << 26  # of the sums at most; fewer blocks where they would be larger
+
 
 def hexplane_features(
     coordinates: Float[Tensor, "n 3"], planes: Float[Tensor, "3 c r r"], lines: Float[Tensor, "3 t c r"]
@@ -64,12 +67,21 @@ class _Features(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, incoming: Tensor) -> tuple[None, Tensor, Tensor]:
-        """Threads take channels, so that each sum runs over the points in their order."""
+        """Threads take blocks of points and sixteen channels; neither blocks nor sums depend on the threads."""
+        buffers = ctx.arrays[2:]
         gradient = _padded(incoming).numpy()
-        found = [np.zeros_like(buffer) for buffer in ctx.arrays[2:]]
-        parts = ranges(gradient.shape[-1], torch.get_num_threads(), LANES)
-        run([partial(_write_back, *ctx.arrays, gradient, *found, *part) for part in parts])
-        planes, lines = (torch.from_numpy(buffer)[..., : ctx.channels] for buffer in found)
+        blocks = max(1, min(BLOCKS, BLOCK_BYTES // sum(buffer.nbytes for buffer in buffers)))
+        parts = ranges(gradient.shape[1], blocks)
+        found = [np.zeros((len(parts), *buffer.shape), np.float32) for buffer in buffers]
+        run(
+            [
+                partial(_write_back, *ctx.arrays, gradient, *(array[i] for array in found), *part, channel)
+                for i, part in enumerate(parts)
+                for channel in range(0, gradient.shape[2], LANES)
+            ]
+        )
+        sums = (torch.from_numpy(array.sum(0)) for array in found)
+        planes, lines = (total[..., : ctx.channels] for total in sums)
         return None, planes.permute(0, 3, 1, 2), lines.permute(0, 2, 3, 1)
 
 
@@ -98,15 +110,14 @@ def _read(cells, shares, planes, lines, features, start, stop):
 
 @njit(**KERNEL)
 @no_type_check
-def _write_back(cells, shares, planes, lines, gradient, grad_planes, grad_lines, start, stop):
+def _write_back(cells, shares, planes, lines, gradient, grad_planes, grad_lines, start, stop, channel):
     size, times, channels = planes.shape[1], lines.shape[2], planes.shape[3]
     points = gradient.shape[1]
-    for point in range(len(cells)):
-        for channel in range(start, stop, LANES):
-            _write_back_point(
-                cells, shares, planes, lines, gradient, grad_planes, grad_lines,
-                point, channel, size, times, channels, points,
-            )  # fmt: skip
+    for point in range(start, stop):
+        _write_back_point(
+            cells, shares, planes, lines, gradient, grad_planes, grad_lines,
+            point, channel, size, times, channels, points,
+        )  # fmt: skip
 
 
 @intrinsic

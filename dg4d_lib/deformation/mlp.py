@@ -39,10 +39,8 @@ class Mlp(nn.Module):
         low, high = self.bounds
         place = ((means - low) / (high - low) * 2 - 1).expand(len(times), -1, -1)
         time = (2 * times - 1)[:, None, None].expand(-1, len(means), 1)
-        hidden = self.second(
-            functional.relu(self.first(encode(torch.cat([place, time], -1), self.settings.frequencies)))
-        )
-        displacement: Displacement = self.heads(hidden)
+        encoded = encode(torch.cat([place, time], -1), self.settings.frequencies)
+        displacement: Displacement = self.heads(self.second, functional.relu(self.first(encoded)))
         return displacement
 
     def planes(self) -> list[nn.Parameter]:
@@ -56,5 +54,6 @@ class Mlp(nn.Module):
 
 def encode(values: Float[Tensor, "*b d"], frequencies: int) -> Float[Tensor, "*b e"]:
     """The values, and sines and cosines of pi times 1, 2, 4, ... of them (Mildenhall et al. 2020)."""
-    angles = values[..., None, :] * (torch.pi * 2.0 ** torch.arange(frequencies, dtype=values.dtype))[:, None]
+    octaves = 2.0 ** torch.arange(frequencies, dtype=values.dtype, device=values.device)
+    angles = values[..., None, :] * (torch.pi * octaves)[:, None]
     return torch.cat([values, angles.sin().flatten(-2), angles.cos().flatten(-2)], -1)

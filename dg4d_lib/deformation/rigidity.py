@@ -19,7 +19,7 @@ def neighborhoods(
     count = min(count, len(means) - 1)
     places = means.detach().cpu().numpy()
     distances, indices = map(torch.as_tensor, cKDTree(places).query(places, k=count + 1))
-    return indices[:, 1:].long(), torch.exp(-FALLOFF * distances[:, 1:].to(means).square())
+    return indices[:, 1:].long().to(means.device), torch.exp(-FALLOFF * distances[:, 1:].to(means).square())
 
 
 def rigidity(moved: Gaussians, indices: Int[Tensor, "n k"], weights: Float[Tensor, "n k"]) -> Float[Tensor, ""]:

@@ -9,20 +9,23 @@ from torch.nn import functional
 
 from dg4d_lib.errors import FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.metrics.ssim import ssim
 from dg4d_lib.rasterizer.interface import Rendering
 
 WHITE = (1.0, 1.0, 1.0)
 
 
 def resized(cutouts: Float[Tensor, "t h w 4"], size: int) -> tuple[Float[Tensor, "t s s 3"], Float[Tensor, "t s s 1"]]:
-    """Color over white and alpha of cut-outs at another size, resampled with premultiplied alpha, antialiased."""
+    """Color over white and alpha of cut-outs at another size, resampled with premultiplied alpha, antialiased.
+
+    In memory they lie plane by plane, as renderings do: what compares the two reads both in one order.
+    """
     alpha = cutouts[..., 3:]
-    both = torch.cat([cutouts[..., :3] * alpha, alpha], -1).permute(0, 3, 1, 2)
+    both = torch.cat([cutouts[..., :3] * alpha, alpha], -1).permute(0, 3, 1, 2).contiguous()
     if both.shape[-1] != size or both.shape[-2] != size:
         both = functional.interpolate(both, (size, size), mode="bilinear", antialias=True, align_corners=False)
-    both = both.permute(0, 2, 3, 1)
-    alpha = both[..., 3:].contiguous()
-    return (both[..., :3] + 1 - alpha).contiguous(), alpha
+    color, alpha = both[:, :3] + 1 - both[:, 3:], both[:, 3:].contiguous()
+    return color.permute(0, 2, 3, 1), alpha.permute(0, 2, 3, 1)
 
 
 def reference_loss(
@@ -31,11 +34,15 @@ def reference_loss(
     alpha: Float[Tensor, "b h w 1"],
     color_weight: float,
     alpha_weight: float,
+    ssim_weight: float = 0.0,
 ) -> Float[Tensor, ""]:
-    """Weighted mean squared errors of color and alpha, means over images, pixels and channels (METHOD section 3)."""
-    return color_weight * functional.mse_loss(rendering.color, color) + alpha_weight * functional.mse_loss(
-        rendering.alpha, alpha
-    )
+    """Weighted mean squared errors of color and alpha, means over images, pixels and channels (METHOD section 3).
+
+    With `ssim_weight` also how far the colors' structural similarity is from 1 (3DGS; the paper has none).
+    """
+    loss = color_weight * functional.mse_loss(rendering.color, color)
+    loss = loss + alpha_weight * functional.mse_loss(rendering.alpha, alpha)
+    return loss + ssim_weight * (1 - ssim(rendering.color, color).mean()) if ssim_weight else loss
 
 
 def check_finite(

@@ -14,7 +14,7 @@ from dg4d_lib.deformation.rigidity import neighborhoods, rigidity
 from dg4d_lib.fitting.losses import WHITE, check_finite, reference_loss, resized
 from dg4d_lib.fitting.schedules import size_of
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.guidance.interface import GuidancePrior, View
+from dg4d_lib.guidance.interface import GuidancePrior, View, ring_of
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MotionSettings
 from dg4d_lib.video.driving import DrivingVideo
@@ -37,8 +37,8 @@ def fit_motion(
     """Fit `deformation` in place; the static Gaussians stay frozen.
 
     Args:
-        gaussians: the canonical cloud.
-        deformation: what is fitted, the identity at the start.
+        gaussians: the canonical cloud; the fit runs on its device.
+        deformation: what is fitted, the identity at the start; on the same device.
         video: what the input camera sees.
         prior: judges every frame from random views.
         rasterize: draws.
@@ -51,19 +51,26 @@ def fit_motion(
         FitDiverged: the loss became non-finite.
     """
     camera = replace(input_camera or OrbitCamera(), width=settings.reference_size, height=settings.reference_size)
-    color, alpha = resized(torch.cat([video.frames, video.coverage], -1), settings.reference_size)
-    white = torch.tensor(WHITE)
+    device = gaussians.means.device
+    color, alpha = resized(torch.cat([video.frames, video.coverage], -1).to(device), settings.reference_size)
+    times = video.times.to(device)
+    white = torch.tensor(WHITE, device=device)
     gaussians = gaussians.detach()
     adam = torch.optim.Adam(_groups(deformation, settings), betas=(0.9, 0.999), eps=1e-15, fused=True)
     neighbors = neighborhoods(gaussians.means) if settings.rigidity_weight else None
     for step in range(1, settings.iterations + 1):
         progress = step / settings.iterations
         frames = choose_frames(len(video), settings.frames_per_iteration, generator)
-        moved = deformation.displace(gaussians.means, video.times[frames]).apply(gaussians)
+        moved = deformation.displace(gaussians.means, times[frames]).apply(gaussians)
 
         rendering = rasterize(moved, [camera] * len(frames), white)
         reference = reference_loss(
-            rendering, color[frames], alpha[frames], settings.color_weight, settings.alpha_weight
+            rendering,
+            color[frames],
+            alpha[frames],
+            settings.color_weight,
+            settings.alpha_weight,
+            settings.ssim_weight,
         )
         loss = progress * reference + deformation.roughness()
         guidance = torch.zeros(())
@@ -103,7 +110,14 @@ def moments(
     rows = [row for row in rows for _ in range(settings.views)]
     if prior.viewpoints is None:
         elevation = (-settings.elevation_deg, settings.elevation_deg)
-        cameras = random_orbit(len(rows), size, elevation_deg=elevation, radius=(RADIUS, RADIUS), generator=generator)
+        cameras = random_orbit(
+            len(rows),
+            size,
+            elevation_deg=elevation,
+            radius=(RADIUS, RADIUS),
+            generator=generator,
+            ring=ring_of(prior),
+        )
     else:
         choice = torch.randint(len(prior.viewpoints), (len(rows),), generator=generator).tolist()
         cameras = [replace(prior.viewpoints[i], width=size, height=size) for i in choice]

@@ -13,7 +13,7 @@ from dg4d_lib.fitting.losses import WHITE, Diverged, check_finite, reference_los
 from dg4d_lib.fitting.schedules import log_linear, size_of
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.growth import Grown, ScreenGradients, grow, prune, reset_opacity
-from dg4d_lib.guidance.interface import GuidancePrior, View
+from dg4d_lib.guidance.interface import GuidancePrior, View, ring_of
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import StaticSettings
 
@@ -68,7 +68,7 @@ def fit_gaussians(
     """Fit a cloud to one picture, with a prior for the sides nobody sees.
 
     Args:
-        start: the cloud at iteration 0.
+        start: the cloud at iteration 0; the fit runs on its device.
         subject: the picture, straight alpha.
         prior: judges random views.
         rasterize: draws.
@@ -81,25 +81,28 @@ def fit_gaussians(
         FitDiverged: the loss became non-finite, or (almost) no Gaussian is left.
     """
     camera = replace(input_camera or OrbitCamera(), width=settings.reference_size, height=settings.reference_size)
-    color, alpha = resized(subject[None], settings.reference_size)
-    white = torch.tensor(WHITE)
+    device = start.means.device
+    color, alpha = resized(subject[None].to(device), settings.reference_size)
+    white = torch.tensor(WHITE, device=device)
     cloud = _Cloud.of(start, rates(settings))
-    gradients = ScreenGradients.none(len(start))
+    gradients = ScreenGradients.none(len(start), device)
     for step in range(1, settings.iterations + 1):
         progress = step / settings.iterations
         cloud.adam.param_groups[0]["lr"] = log_linear(settings.mean_rate, settings.mean_rate_end, progress)
         gaussians = cloud.gaussians
 
-        offsets = [torch.zeros(1, len(gaussians), 2, requires_grad=True)]
+        offsets = [torch.zeros(1, len(gaussians), 2, device=device, requires_grad=True)]
         rendering = rasterize(gaussians, [camera], white, offsets[0])
         seen = [(rendering.visible, settings.reference_size)]
-        reference = reference_loss(rendering, color, alpha, settings.color_weight, settings.alpha_weight)
+        reference = reference_loss(
+            rendering, color, alpha, settings.color_weight, settings.alpha_weight, settings.ssim_weight
+        )
         loss = progress * reference
         guidance = torch.zeros(())
         if settings.views and settings.guidance_weight:
             size = size_of(settings.ladder, progress)
             views = [View(c) for c in viewpoints(prior, settings, size, generator)]
-            offsets.append(torch.zeros(len(views), len(gaussians), 2, requires_grad=True))
+            offsets.append(torch.zeros(len(views), len(gaussians), 2, device=device, requires_grad=True))
             rendering = rasterize(gaussians, [view.camera for view in views], white, offsets[1])
             seen.append((rendering.visible, size))
             guidance = prior.loss(rendering.color, rendering.alpha, views, progress, generator)
@@ -116,7 +119,7 @@ def fit_gaussians(
         cloud.adam.step()
         if step % settings.densify_every == 0 and step < settings.iterations:
             control_density(cloud, gradients, settings, generator)
-            gradients = ScreenGradients.none(len(cloud.gaussians))
+            gradients = ScreenGradients.none(len(cloud.gaussians), device)
             if len(cloud.gaussians) < FEWEST:
                 raise Diverged(
                     f"fit_gaussians: {len(cloud.gaussians)} Gaussians are left at iteration {step} of "
@@ -159,6 +162,7 @@ def viewpoints(
             elevation_deg=(-settings.elevation_deg, settings.elevation_deg),
             radius=(RADIUS - settings.radius_jitter, RADIUS + settings.radius_jitter),
             generator=generator,
+            ring=ring_of(prior),
         )
     choice = torch.randint(len(prior.viewpoints), (settings.views,), generator=generator).tolist()
     return [replace(prior.viewpoints[i], width=size, height=size) for i in choice]

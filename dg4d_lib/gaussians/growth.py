@@ -3,6 +3,7 @@
 Functions on values (Kerbl et al. 2023, section 5; thresholds of DreamGaussianHD).
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -29,9 +30,9 @@ class ScreenGradients:
     views: Float[Tensor, " n"]
 
     @staticmethod
-    def none(count: int) -> "ScreenGradients":
+    def none(count: int, device: torch.device | None = None) -> "ScreenGradients":
         """Nothing seen yet."""
-        return ScreenGradients(torch.zeros(count), torch.zeros(count))
+        return ScreenGradients(torch.zeros(count, device=device), torch.zeros(count, device=device))
 
     def add(self, pixel_gradients: Float[Tensor, "b n 2"], visible: Bool[Tensor, "b n"], size: int) -> None:
         """Gather the views of one rendering; gradients per pixel become per NDC by half the size."""
@@ -83,16 +84,16 @@ def grow(
         strongest[pull.argsort(descending=True, stable=True)[: max(room, 0)]] = True
         wanted &= strongest
     large = gaussians.scales.amax(-1) > max_scale
-    everything = torch.arange(len(gaussians))
+    everything = torch.arange(len(gaussians), device=pull.device)
     kept, cloned, split = everything[~(wanted & large)], everything[wanted & ~large], everything[wanted & large]
     halves = split.repeat(SPLIT_INTO)
     source = torch.cat([kept, cloned, halves])
-    fresh = torch.arange(len(source)) >= len(kept)
+    fresh = torch.arange(len(source), device=pull.device) >= len(kept)
     means, log_scales = gaussians.means[source].clone(), gaussians.log_scales[source].clone()
     if len(halves):
-        local = torch.randn(len(halves), 3, generator=generator) * gaussians.scales[halves]
+        local = torch.randn(len(halves), 3, generator=generator).to(means) * gaussians.scales[halves]
         means[-len(halves) :] += (rotation_matrix(gaussians.quats[halves]) @ local[..., None])[..., 0]
-        log_scales[-len(halves) :] -= torch.log(torch.tensor(SPLIT_SHRINK))
+        log_scales[-len(halves) :] -= math.log(SPLIT_SHRINK)
     grown = Gaussians(
         means, log_scales, gaussians.quats[source], gaussians.opacity_logits[source], gaussians.harmonics[source]
     )
@@ -103,7 +104,7 @@ def prune(gaussians: Gaussians, min_opacity: float, max_scale: float) -> Grown:
     """Remove what is almost invisible or too large."""
     source = ((gaussians.opacities >= min_opacity) & (gaussians.scales.amax(-1) <= max_scale)).nonzero()[:, 0]
     kept = Gaussians(**{name: value[source] for name, value in vars(gaussians).items()})
-    return Grown(kept, source, torch.zeros(len(source), dtype=torch.bool))
+    return Grown(kept, source, torch.zeros_like(source, dtype=torch.bool))
 
 
 def reset_opacity(gaussians: Gaussians, ceiling: float = 0.01) -> Gaussians:

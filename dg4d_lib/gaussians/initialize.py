@@ -41,7 +41,7 @@ def on_surface(points: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"], area:
         area: of the surface, world units squared.
     """
     scale = max(math.sqrt(area / len(points)), SMALLEST)
-    return isotropic(points, torch.full((len(points),), scale), colors, SURFACE_OPACITY)
+    return isotropic(points, points.new_full((len(points),), scale), colors, SURFACE_OPACITY)
 
 
 def isotropic(
@@ -52,7 +52,7 @@ def isotropic(
     return Gaussians(
         means.clone(),
         scales.log()[:, None].repeat(1, 3),
-        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        torch.full((count,), math.log(opacity / (1 - opacity))),
+        means.new_tensor((1.0, 0.0, 0.0, 0.0)).repeat(count, 1),
+        means.new_full((count,), math.log(opacity / (1 - opacity))),
         harmonics_of_color(colors),
     )

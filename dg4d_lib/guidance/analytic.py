@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.guidance.distillation import alphabars, annealed_timestep, score_distillation
+from dg4d_lib.guidance.distillation import Annealing, alphabars, score_distillation
 from dg4d_lib.guidance.interface import View
 
 LATENT_NUMBERS = 4 * 32 * 32  # of Zero-1-to-3; a pixel picture is weighted as if it had as many
@@ -24,7 +24,7 @@ class AnalyticPrior:
 
     Args:
         clean: color over white and coverage of every view, at its camera's size.
-        noise_start: where the annealing begins, share of the schedule.
+        noise: which timestep an iteration uses.
         coverage_weight: of alpha against color.
         viewpoints: the only cameras `clean` knows; None is all.
         frames: the only frames `clean` knows; None is all.
@@ -33,12 +33,12 @@ class AnalyticPrior:
     def __init__(
         self,
         clean: CleanPictures,
-        noise_start: float,
+        noise: Annealing,
         coverage_weight: float,
         viewpoints: tuple[OrbitCamera, ...] | None = None,
         frames: tuple[int, ...] | None = None,
     ) -> None:
-        self.clean, self.noise_start, self.coverage_weight = clean, noise_start, coverage_weight
+        self.clean, self.noise, self.coverage_weight = clean, noise, coverage_weight
         self.viewpoints, self.frames = viewpoints, frames
 
     def loss(
@@ -50,9 +50,9 @@ class AnalyticPrior:
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:
         """How far the renders are from the known pictures, weighted as at this moment of the annealing."""
-        timestep = annealed_timestep(progress, self.noise_start)
+        timestep = self.noise.timestep(progress, generator)
         alphabar = float(alphabars()[timestep])
-        clean = self._encode(*self.clean(views))
+        clean = self._encode(*self.clean(views)).to(images.device)
 
         def predict_noise(noisy: Float[Tensor, "b c h w"], _timestep: int) -> Float[Tensor, "b c h w"]:
             return (noisy - alphabar**0.5 * clean) / (1 - alphabar) ** 0.5

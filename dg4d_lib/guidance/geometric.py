@@ -4,10 +4,15 @@ The outline says nothing sure about depth. The best single picture of a view is 
 view is blurred along the direction in which depth shows: not at all from the input camera, most from the side.
 """
 
+import math
 from collections.abc import Sequence
+from functools import partial
+from typing import no_type_check
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
+from numba import njit
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
@@ -15,6 +20,8 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.interface import View
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import InflatedSurface, inflate
+from dg4d_lib.kernels.vectors import INLINE, KERNEL
+from dg4d_lib.kernels.workers import run
 from dg4d_lib.settings import GeometricPriorSettings
 
 SHARPEST = 0.05  # pixels: narrower Gaussians are the identity in float32
@@ -65,7 +72,8 @@ class InflatedSurfaces:
         cameras = [view.camera for view in views]
         fine = max(camera.height for camera in cameras) > LARGE * self._settings.size
         color, coverage = render_surface(surfaces, cameras, supersample=1 if fine else 2)
-        both = torch.cat([color * coverage + (1 - coverage), coverage], -1)
+        over_white = color * coverage + (1 - coverage)
+        both = torch.cat([over_white.movedim(-1, 1), coverage.movedim(-1, 1)], 1).movedim(1, -1)  # plane by plane
         if self._settings.depth_sigma:
             both = averaged_over_depth(both, cameras, self._settings.depth_sigma)
         return both[..., :3], both[..., 3:]
@@ -81,16 +89,52 @@ def averaged_over_depth(
         cameras: where they were taken; the shift is that of a point at the origin.
         depth_sigma: standard deviation of the shift, world units.
     """
-    pixels = torch.tensor([depth_sigma * camera.focal / camera.radius for camera in cameras], dtype=torch.float64)
-    shift = world_to_camera(cameras)[:, :2, 2].abs() * pixels[:, None]
-    across, down = (_gaussian(shift[:, i], size).to(images) for i, size in ((0, images.shape[2]), (1, images.shape[1])))
-    rows = torch.einsum("bij,bjlc->bilc", down, images)
-    return torch.einsum("bkl,bilc->bikc", across, rows)
+    sigma = torch.tensor([depth_sigma * camera.focal / camera.radius for camera in cameras], dtype=torch.float64)
+    shifts = (world_to_camera(cameras)[:, :2, 2].abs() * sigma[:, None]).tolist()
+    planes = images.movedim(-1, 1).to("cpu", torch.float32).contiguous().numpy()
+    blurred = np.empty_like(planes)
+    weights = [[_gaussian(shift) for shift in pair] for pair in shifts]
+    run([partial(_blur, *view) for view in zip(planes, *zip(*weights, strict=True), blurred, strict=True)])
+    return torch.from_numpy(blurred).movedim(1, -1).to(images)
 
 
-def _gaussian(sigmas: Float[Tensor, " b"], size: int) -> Float[Tensor, "b size size"]:
-    """Rows of normalized weights; a sigma of zero is the identity."""
-    places = torch.arange(size, dtype=sigmas.dtype)
-    reach = (places[:, None] - places).square() / (2 * sigmas.clamp(min=SHARPEST)[:, None, None].square())
-    weights = (-reach).exp()
-    return weights / weights.sum(-1, keepdim=True)
+def _gaussian(sigma: float) -> Float32[np.ndarray, " taps"]:
+    """Weights of the neighbors within five sigma, with sum 1; a sigma of zero is the identity."""
+    sigma = max(sigma, SHARPEST)
+    places = np.arange(-math.ceil(5 * sigma), math.ceil(5 * sigma) + 1)
+    weights = np.exp(-np.square(places) / (2 * sigma**2))
+    return (weights / weights.sum()).astype(np.float32)
+
+
+@njit(**KERNEL)
+@no_type_check
+def _blur(planes, across, down, blurred):
+    """Filter planes along both axes; where the filter leaves the picture, the weights inside count as all."""
+    channels, height, width = planes.shape
+    margin, reach = len(across) // 2, len(down) // 2
+    line = np.zeros(width + 2 * margin, planes.dtype)
+    middle = line[margin : margin + width]
+    inside = np.zeros(width, planes.dtype)
+    middle[:] = 1
+    for place in range(len(across)):
+        _add(across[place], line[place:], inside)
+    for channel in range(channels):
+        for row in range(height):
+            middle[:] = 0
+            whole = planes.dtype.type(0)
+            for place in range(max(0, reach - row), min(len(down), height + reach - row)):
+                _add(down[place], planes[channel, row + place - reach], middle)
+                whole += down[place]
+            found = blurred[channel, row]
+            found[:] = 0
+            for place in range(len(across)):
+                _add(across[place], line[place:], found)
+            for column in range(width):
+                found[column] /= whole * inside[column]
+
+
+@njit(**INLINE)
+@no_type_check
+def _add(weight, values, total):
+    for i in range(len(total)):
+        total[i] += weight * values[i]

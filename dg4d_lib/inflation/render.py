@@ -42,8 +42,7 @@ def render_surface(
             "and one surface or as many as cameras"
         )
     height, width = sizes.pop()
-    color = np.empty((len(cameras), height, width, 3), np.float32)
-    coverage = np.empty((len(cameras), height, width, 1), np.float32)
+    planes = np.empty((len(cameras), 4, height, width), np.float32)
 
     def draw(view: int) -> None:
         surface, camera = each[view], cameras[view]
@@ -55,22 +54,21 @@ def render_surface(
             surface.faces.cpu().numpy(),
             surface.colors.cpu().numpy(),
             supersample,
-            color[view],
-            coverage[view],
+            planes[view],
         )
 
     # one camera in each job: the z-buffer inside does not wait for the same threads
     run([partial(draw, index) for index in range(len(cameras))])
-    device = each[0].vertices.device
-    return torch.from_numpy(color).to(device), torch.from_numpy(coverage).to(device)
+    pictures = torch.from_numpy(planes).to(each[0].vertices.device).movedim(1, -1)
+    return pictures[..., :3], pictures[..., 3:]
 
 
 @njit(nogil=True, cache=True)
 @no_type_check
-def _shade(ids, weights, faces, colors, supersample, color, coverage):
-    """Interpolate the corners' colors and average the samples of every pixel."""
-    for row in range(color.shape[0]):
-        for column in range(color.shape[1]):
+def _shade(ids, weights, faces, colors, supersample, planes):
+    """Interpolate the corners' colors and average the samples of every pixel; the last plane is coverage."""
+    for row in range(planes.shape[1]):
+        for column in range(planes.shape[2]):
             red = green = blue = 0.0
             hits = 0
             for y in range(row * supersample, (row + 1) * supersample):
@@ -85,7 +83,7 @@ def _shade(ids, weights, faces, colors, supersample, color, coverage):
                         green += weight * colors[vertex, 1]
                         blue += weight * colors[vertex, 2]
             share = 1.0 / max(hits, 1)
-            color[row, column, 0] = red * share
-            color[row, column, 1] = green * share
-            color[row, column, 2] = blue * share
-            coverage[row, column, 0] = hits / supersample**2
+            planes[0, row, column] = red * share
+            planes[1, row, column] = green * share
+            planes[2, row, column] = blue * share
+            planes[3, row, column] = hits / supersample**2

@@ -2,9 +2,6 @@
 
 Numba does not vectorize the blending loops by itself (branches, reductions, possible aliasing), so they are emitted as
 LLVM vectors; LLVM lowers them to what the machine has: one AVX-512 register, two of AVX2, four of SSE or NEON.
-
-Numba's cache on disk looks at the file of a kernel only: after a change in a file that kernels import from, delete the
-`*.nbi` files beside them.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,14 +12,19 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
+from dg4d_lib.kernels.compiling import prepare
+
+prepare()
+
 Value: TypeAlias = Any  # an llvmlite value; that library's types do not know their attributes
 
 LANES = 16
 FLOAT, INT, LONG = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 FLOATS, INTS = ir.VectorType(FLOAT, LANES), ir.VectorType(INT, LANES)
-FAST = ("nsz", "arcp", "contract", "reassoc")  # not nnan and ninf: comparisons must refuse what is not finite
-KERNEL = {"fastmath": {*FAST, "afn"}, "nogil": True, "cache": True, "error_model": "numpy"}  # options of njit
-INLINE = {**KERNEL, "forceinline": True}
+# arcp and afn would cost needles their digits; with nnan and ninf, comparisons would not refuse what is not finite
+FAST = ("nsz", "contract", "reassoc")
+KERNEL = {"fastmath": set(FAST), "nogil": True, "cache": True, "error_model": "numpy"}  # options of njit
+INLINE = {**KERNEL, "inline": "always"}
 _EXP2 = (1.3333558e-3, 9.6181291e-3, 5.5504109e-2, 2.4022651e-1, 6.9314718e-1, 1.0)  # of 2^f, |f| <= 1/2
 
 
@@ -117,6 +119,29 @@ class Vectors:
         name = f"llvm.vector.reduce.fadd.v{LANES}f32"
         function = cgutils.get_or_insert_function(self.builder.module, signature, name)
         return self.builder.call(function, [ir.Constant(FLOAT, 0.0), a], fastmath=FAST)
+
+    def sums(self, terms: Sequence[Value]) -> Value:
+        """The sums of the lanes of up to `LANES` vectors, one per lane of the result; zeros in the lanes left over.
+
+        Neighbors are added crosswise, so that every turn halves both the vectors and what is left to add in each: two
+        shuffles a pair rather than the log2(LANES) that every vector would take alone.
+        """
+        lanes, remaining, step = range(LANES), list(terms), 1
+        while step < LANES:
+            remaining += [self.constant(0)] * (len(remaining) % 2)
+            remaining = [
+                self.add(
+                    self._pick(a, b, [lane + LANES * bool(lane & step) for lane in lanes]),
+                    self._pick(a, b, [(lane ^ step) + LANES * bool(lane & step) for lane in lanes]),
+                )
+                for a, b in zip(remaining[::2], remaining[1::2], strict=True)
+            ]
+            step *= 2
+        return remaining[0]
+
+    def _pick(self, a: Value, b: Value, lanes: Sequence[int]) -> Value:
+        """Lanes of two vectors; those of the second are counted from `LANES` on."""
+        return self.builder.shuffle_vector(a, b, ir.Constant(INTS, list(lanes)))
 
     def load(self, pointer: Value, index: Value, kind: ir.Type = FLOATS) -> Value:
         """A vector or a scalar that begins at an element of a float or int32 array; no alignment needed."""

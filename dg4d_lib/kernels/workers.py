@@ -21,13 +21,21 @@ _IDLE_BYTES = 1 << 29  # of it at most
 
 
 def run(jobs: Sequence[Callable[[], None]]) -> None:
-    """Run independent jobs and wait for all; raises what the first failing one raised."""
-    threads = torch.get_num_threads()
-    if min(threads, len(jobs)) <= 1:
-        for job in jobs:
+    """Run independent jobs, here and on other threads, and wait for all; raises what a failing one raised."""
+    waiting = iter(jobs)  # that threads take from it in turn needs no lock: its step is one of the interpreter's
+
+    def work() -> None:
+        for job in waiting:
             job()
-    else:
-        list(_pool(os.getpid(), threads).map(_call, jobs))
+
+    helpers = min(torch.get_num_threads(), len(jobs)) - 1
+    helping = [_pool(os.getpid(), helpers).submit(work) for _ in range(helpers)]
+    try:
+        work()
+    finally:
+        for helper in helping:
+            if not helper.cancel():  # one that did not start has nothing left to do
+                helper.result()
 
 
 def ranges(count: int, parts: int, multiple: int = 1) -> list[tuple[int, int]]:
@@ -36,13 +44,9 @@ def ranges(count: int, parts: int, multiple: int = 1) -> list[tuple[int, int]]:
     return [(start, min(start + step, count)) for start in range(0, count, step)]
 
 
-def _call(job: Callable[[], None]) -> None:
-    job()
-
-
 @cache
 def _pool(process: int, threads: int) -> ThreadPoolExecutor:
-    """One pool per process (threads do not survive a fork) and number of threads."""
+    """One pool per process (threads do not survive a fork) and number of helpers."""
     return ThreadPoolExecutor(threads, thread_name_prefix="kernels")
 
 

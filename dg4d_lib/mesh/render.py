@@ -5,11 +5,12 @@ from dataclasses import replace
 
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample
+from torch.nn.functional import avg_pool2d
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.mesh_rasterizer.zbuffer import Fragments, interpolate, rasterize_mesh
+from dg4d_lib.mesh_rasterizer.texture import look_up, read
+from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
 SUPERSAMPLING = 2  # samples of a pixel along each axis
 
@@ -17,7 +18,7 @@ SUPERSAMPLING = 2  # samples of a pixel along each axis
 def render_mesh(
     mesh: TexturedMesh, cameras: Sequence[OrbitCamera], offsets: Float[Tensor, "*b v 3"] | None = None
 ) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
-    """Color and coverage of a mesh, four samples a pixel.
+    """Color and coverage of a mesh, four samples a pixel; differentiable in the texture.
 
     Args:
         mesh: at rest.
@@ -35,25 +36,11 @@ def render_mesh(
     ]
     vertices = mesh.vertices if offsets is None else mesh.vertices + offsets
     fragments = rasterize_mesh(vertices, mesh.faces, fine)
-    covered = (fragments.faces >= 0)[..., None].to(mesh.texture)
-    color = _pooled(sample_texture(mesh, fragments))
-    coverage = _pooled(covered)
+    lookup = look_up(vertices, mesh.faces, mesh.uvs, mesh.texture.shape[:2], fine, fragments)
+    samples = mesh.texture.new_zeros((*lookup.covered.shape, 3))
+    samples[lookup.covered] = read(mesh.texture, lookup)
+    color, coverage = _pooled(samples), _pooled(lookup.covered[..., None].to(samples))
     return color / coverage.clamp_min(0.5 / SUPERSAMPLING**2), coverage
-
-
-def sample_texture(mesh: TexturedMesh, fragments: Fragments) -> Float[Tensor, "b h w 3"]:
-    """The texture under every pixel, bilinear; zeros where no triangle is. Differentiable in the texture."""
-    places = interpolate(fragments, mesh.faces, mesh.uvs)
-    covered = fragments.faces >= 0
-    color = mesh.texture.new_zeros((*covered.shape, 3))
-    color[covered] = sample(mesh.texture, places[covered])
-    return color
-
-
-def sample(picture: Float[Tensor, "h w c"], places: Float[Tensor, "n 2"]) -> Float[Tensor, "n c"]:
-    """Bilinear samples of a picture at places in [0, 1], u right and v down; its border goes on outside."""
-    grid = (2 * places - 1).to(picture)[None, None]
-    return grid_sample(picture.movedim(-1, 0)[None], grid, align_corners=False, padding_mode="border")[0, :, 0].T
 
 
 def _pooled(values: Float[Tensor, "b h w c"]) -> Float[Tensor, "b i j c"]:

@@ -19,6 +19,7 @@ from dg4d_lib.settings import MeshSettings
 DRAWN_IN = 1.4  # times the level of the surface: a mesh that joins what parts is too fat over the whole motion
 REACH = 3.0  # cells of the density field: how far a vertex may go
 STEPS = 13  # places that are looked at, from inside to outside
+PASSES = 3  # the surface is looked for again from where the last pass came out
 SMOOTHING = 3  # rounds in which a vertex's way takes half of its neighbors'
 
 
@@ -43,14 +44,15 @@ def snap(
     mesh = trimesh.Trimesh(vertices.numpy(), faces.numpy(), process=False)
     mean_of_neighbors = trimesh.smoothing.laplacian_calculation(mesh)
     corrected = offsets.clone()
-    for frame, offset in enumerate(offsets):
+    for frame in range(len(offsets)):
         field = density_field(states.at(frame), settings)
-        moved = vertices + offset
-        normals = vertex_normals(moved, faces)
-        ways = _ways(field, moved.numpy(), normals.numpy(), DRAWN_IN * level)
-        for _ in range(SMOOTHING):
-            ways = 0.5 * ways + 0.5 * (mean_of_neighbors @ ways)
-        corrected[frame] += torch.from_numpy(ways.astype(np.float32))[:, None] * normals
+        for _ in range(PASSES):
+            moved = vertices + corrected[frame]
+            normals = vertex_normals(moved, faces)
+            ways = _ways(field, moved.numpy(), normals.numpy(), DRAWN_IN * level)
+            for _ in range(SMOOTHING):
+                ways = 0.5 * ways + 0.5 * (mean_of_neighbors @ ways)
+            corrected[frame] += torch.from_numpy(ways.astype(np.float32))[:, None] * normals
     return corrected
 
 

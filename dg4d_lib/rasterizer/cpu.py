@@ -8,6 +8,7 @@ sum has one fixed order, so the bytes of the result depend on neither the thread
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from math import log
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn.functional import logsigmoid
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
@@ -24,12 +26,10 @@ from dg4d_lib.kernels.workers import Scratch, ranges, run
 from dg4d_lib.rasterizer.cpu_bins import TILE, bin_by_tile
 from dg4d_lib.rasterizer.cpu_blend import PLANE
 from dg4d_lib.rasterizer.cpu_project import CAMERA, RECORD, project, unproject
-from dg4d_lib.rasterizer.cpu_tiles import blend, blend_backward, gather
-from dg4d_lib.rasterizer.interface import FRUSTUM_MARGIN, Rendering, shared_size, state_per_camera
+from dg4d_lib.rasterizer.cpu_tiles import blend, blend_backward, gather, own_rows
+from dg4d_lib.rasterizer.interface import FRUSTUM_MARGIN, Rendering, require_finite, shared_size, state_per_camera
 
 Array = NDArray[Any]
-
-_ALIGNED = 4096  # ranges of Gaussians begin at multiples, so that the compiler's loop remainders fall on the same ones
 
 
 def rasterize(
@@ -40,22 +40,23 @@ def rasterize(
 ) -> Rendering:
     """Render every camera's picture; differentiable once, in the Gaussians and `screen_offsets` (taken to be zero).
 
-    Computed in float32; pictures and gradients come back in the precision of the Gaussians. Gaussians with a non-finite
-    place or shape are not drawn. For the arguments see `Rasterizer`.
+    Computed in float32; pictures and gradients come back in the precision of the Gaussians. Gaussians whose size
+    overflows are not drawn. For the arguments see `Rasterizer`.
 
     Raises:
-        BadInput: no cameras, cameras of different sizes, a number of states other than the number of cameras, or
-            tensors that are not in the processor's memory.
+        BadInput: no cameras, cameras of different sizes, a number of states other than the number of cameras, Gaussians
+            with numbers that are not finite, or tensors that are not in the processor's memory.
     """
     height, width = shared_size(cameras)
     state_per_camera(gaussians, cameras)
+    require_finite(gaussians)
     if gaussians.means.device.type != "cpu":
         raise BadInput(f"rasterizer 'cpu' needs tensors on the cpu; given {gaussians.means.device}; move them there")
     inputs = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacity_logits, gaussians.colors)
     color, alpha, depth, visible = _Rasterize.apply(
         *(value.float() for value in inputs),
         None if screen_offsets is None else screen_offsets.float(),
-        torch.stack([_packed(camera) for camera in cameras]),
+        torch.stack([packed(camera) for camera in cameras]),
         background.detach().float(),
         (height, width),
     )
@@ -63,7 +64,7 @@ def rasterize(
     return Rendering(color, alpha, depth, visible)
 
 
-def _packed(camera: OrbitCamera) -> Float[Tensor, " c"]:
+def packed(camera: OrbitCamera) -> Float[Tensor, " c"]:
     """A camera as the kernels read it."""
     pose = camera.world_to_camera()
     tan_x, tan_y = camera.tan_half_fov
@@ -80,11 +81,11 @@ class _Clouds:
     means: Array
     quats: Array
     scales: Array
-    opacities: Array
+    log_opacities: Array  # to base 2
     colors: Array
 
     def __len__(self) -> int:
-        return len(self.opacities)
+        return len(self.colors)
 
     def state(self, view: int) -> tuple[Array, Array, Array]:
         """Means, quats and scales of a view."""
@@ -107,11 +108,13 @@ class _Pictures:
         (height, width), views = self.size, len(self.cameras)
         self.across, self.down = -(-width // TILE), -(-height // TILE)
         tiles = self.across * self.down
-        self.records = self.scratch.empty((views, self.count, RECORD))
-        self.keys = self.scratch.empty((views, self.count))
-        self.transmittance = self.scratch.empty((views, height, width))
-        self.stops = self.scratch.empty((views, tiles, PLANE))
-        self.stopped = self.scratch.empty((views, tiles), np.bool_)
+        empty = self.scratch.empty
+        self.keys = empty((views, self.count))
+        self.stopped = empty((views, tiles), np.bool_)
+        # view by view, for memory is kept in pieces up to a limit
+        self.records = [empty((self.count, RECORD)) for _ in self.views]
+        self.transmittance = [empty((height, width)) for _ in self.views]
+        self.stops = [empty((tiles, PLANE)) for _ in self.views]
         self.bins: list[tuple[Array, Array]] = [(np.zeros(1, np.int64), np.zeros(0, np.uint32))] * views
 
     @property
@@ -137,7 +140,7 @@ class _Pictures:
             run([partial(self._draw_view, clouds, planes, view) for view in self.views])
         else:
             threads = torch.get_num_threads()
-            parts = ranges(len(clouds), threads, _ALIGNED)
+            parts = ranges(len(clouds), threads)
             run([partial(self._project, clouds, view, *part) for view in self.views for part in parts])
             run([partial(self._bin, view) for view in self.views])
             parts = ranges(self.tiles, 4 * threads)
@@ -152,11 +155,11 @@ class _Pictures:
     def _project(self, clouds: _Clouds, view: int, start: int, stop: int) -> None:
         means, quats, scales = clouds.state(view)
         records, keys = self.records[view], self.keys[view]
-        opacities, colors, camera = clouds.opacities, clouds.colors, self.cameras[view]
+        opacities, colors, camera = clouds.log_opacities, clouds.colors, self.cameras[view]
         project(means, quats, scales, opacities, colors, camera, *self.size, records, keys, start, stop)
 
     def _bin(self, view: int) -> None:
-        self.bins[view] = bin_by_tile(self.records[view], self.keys[view], self.across, self.down)
+        self.bins[view] = bin_by_tile(self.records[view], self.keys[view], self.across, self.down, self.scratch)
 
     def _blend(self, planes: list[Array], view: int, first: int, last: int) -> None:
         color, alpha, depth = (plane[view] for plane in planes)
@@ -178,44 +181,38 @@ class _Gradients:
         clouds = self.clouds
         self.means, self.quats, self.log_scales, self.log_opacities, self.colors = (
             np.zeros_like(value)
-            for value in (clouds.means, clouds.quats, clouds.scales, clouds.opacities, clouds.colors)
+            for value in (clouds.means, clouds.quats, clouds.scales, clouds.log_opacities, clouds.colors)
         )
         self.centers = np.zeros((len(self.pictures.cameras), len(clouds), 2), np.float32)
 
     def collect(self) -> None:
         """Fill the gradients, some views at a time to bound the memory; the views are summed in their order."""
         pictures, threads = self.pictures, torch.get_num_threads()
-        together = 2 * threads
-        scratch = Scratch()
-        moments = scratch.empty((min(together, len(pictures.cameras)), len(self.clouds), RECORD))
-        for first in pictures.views[::together]:
-            group = pictures.views[first : first + together]
-            if pictures.by_view:
-                run([partial(self._blend_view, view, moments[view - first]) for view in group])
-            else:
-                self._blend_tiles(group, moments)
-            parts = ranges(len(self.clouds), threads, _ALIGNED)
+        for first in pictures.views[:: 2 * threads]:
+            group, scratch = pictures.views[first : first + 2 * threads], Scratch()
+            moments = self._blend_group(group, scratch)
+            parts = ranges(len(self.clouds), threads)
             run([partial(self._unproject, group, moments, *part) for part in parts])
 
-    def _blend_view(self, view: int, moments: Array) -> None:
-        moments[:] = 0
-        _, entries = self.pictures.bins[view]
-        self._blend(view, entries, moments, 0, self.pictures.tiles)
+    def _blend_group(self, group: range, scratch: Scratch) -> list[Array]:
+        """Moments of the Gaussians, for each view.
 
-    def _blend_tiles(self, group: range, moments: Array) -> None:
-        """Every entry of the tiles' lists gets a row of its own, so that tiles can run at once."""
-        pictures, scratch = self.pictures, Scratch()
-        jobs, sums = [], []
+        Every entry of the tiles' lists has a row, so that tiles can be blended at once; those of one Gaussian are added
+        in the order of the tiles.
+        """
+        pictures, count = self.pictures, len(self.clouds)
+        moments, blends, sums = [], [], []
         for view in group:
             _, entries = pictures.bins[view]
-            slots = np.arange(len(entries), dtype=np.uint32)
-            rows = scratch.empty((len(entries), RECORD))
-            rows[:] = 0
-            parts = ranges(pictures.tiles, 4 * torch.get_num_threads())
-            jobs += [partial(self._blend, view, slots, rows, *part) for part in parts]
-            sums.append(partial(_sum_rows, entries, rows, moments[view - group.start]))
-        run(jobs)
+            slots = scratch.empty(entries.shape, np.uint32)
+            rows = scratch.empty((own_rows(entries, count, slots), RECORD))
+            parts = ranges(pictures.tiles, 1 if pictures.by_view else 4 * torch.get_num_threads())
+            blends += [partial(self._blend, view, slots, rows, *part) for part in parts]
+            sums.append(partial(gather, entries, slots, count, rows))
+            moments.append(rows)
+        run(blends)
         run(sums)
+        return moments
 
     def _blend(self, view: int, slots: Array, moments: Array, first: int, last: int) -> None:
         pictures = self.pictures
@@ -223,20 +220,15 @@ class _Gradients:
         incoming = (pictures.background, self.color[view], self.alpha[view, 0], self.depth[view, 0])
         blend_backward(pictures.records[view], *pictures.bins[view], *incoming, *kept, slots, moments, first, last)
 
-    def _unproject(self, group: range, moments: Array, start: int, stop: int) -> None:
+    def _unproject(self, group: range, moments: list[Array], start: int, stop: int) -> None:
         clouds, pictures = self.clouds, self.pictures
-        for view in group:
+        for view, sums in zip(group, moments, strict=True):
             means, quats, scales = clouds.state(view)
             gradients = (self.means, self.quats, self.log_scales)
             own = gradients if clouds.means.ndim == 2 else [gradient[view] for gradient in gradients]
             shared = (self.log_opacities, self.colors, self.centers[view])
-            seen = (pictures.cameras[view], pictures.keys[view], moments[view - group.start])
+            seen = (pictures.cameras[view], pictures.keys[view], sums)
             unproject(means, quats, scales, *seen, *own, *shared, start, stop)
-
-
-def _sum_rows(entries: Array, rows: Array, moments: Array) -> None:
-    moments[:] = 0
-    gather(entries, rows, moments)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -245,7 +237,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         means, quats, log_scales, logits, colors, offsets, cameras, background, size = inputs
-        tensors = (means, quats, log_scales.exp(), logits.sigmoid(), colors)
+        tensors = (means, quats, log_scales.exp(), logsigmoid(logits) / log(2), colors)
         clouds = _Clouds(*(tensor.detach().contiguous().numpy() for tensor in tensors))
         pictures = _Pictures(cameras.numpy(), background.contiguous().numpy(), size, len(clouds))
         color, alpha, depth = pictures.draw(clouds)

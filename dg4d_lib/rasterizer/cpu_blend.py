@@ -22,12 +22,7 @@ from dg4d_lib.rasterizer.cpu_project import (
     EXTENT_Y,
     GREEN,
     LOG_OPACITY,
-    MOMENT,
-    MOMENT_U,
-    MOMENT_UU,
-    MOMENT_UV,
-    MOMENT_V,
-    MOMENT_VV,
+    MOMENTS,
     RECORD,
     RED,
     ROW_LOSS,
@@ -40,7 +35,8 @@ from dg4d_lib.rasterizer.cpu_project import (
 from dg4d_lib.rasterizer.interface import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
 COLUMNS = LANES // 2  # of a vector
-STRIDE = 2 * (TILE + COLUMNS)  # floats of a pair of rows; a vector may reach past the tile's right edge
+PLANE_SHAPE = (TILE // 2, TILE + COLUMNS, 2)  # pairs of rows; a vector may reach past the tile's right edge
+STRIDE = 2 * (TILE + COLUMNS)  # floats of a pair of rows
 PLANE = STRIDE * TILE // 2
 FORWARD_PLANES = 5  # transmittance (negative once stopped), red, green, blue, depth
 BACKWARD_PLANES = 6  # transmittance, what lies behind, gradients of red, green, blue, depth
@@ -175,7 +171,7 @@ def blend_list(typing_context, state, places, us, vs, masks, start, end, records
 @intrinsic
 @no_type_check
 def blend_list_backward(typing_context, state, places, us, vs, start, end, records, g, stops, place, moments, slot):
-    """Take Gaussian g off vectors start..end again, and add the gradient of its record to moments[slot]."""
+    """Take Gaussian g off vectors start..end again, and write the gradient of its record to moments[slot]."""
     signature = types.void(
         state,
         places,
@@ -226,12 +222,9 @@ def blend_list_backward(typing_context, state, places, us, vs, start, end, recor
                 *(e.fma(a, b, total) for total, (a, b) in zip(sums[3:], terms, strict=True)),
             ]
 
-        fields = (MOMENT, MOMENT_U, MOMENT_V, MOMENT_UU, MOMENT_UV, MOMENT_VV, RED, GREEN, BLUE, DEPTH)
-        sums = e.loop(arguments[4], arguments[5], [e.constant(0) for _ in fields], body)
-        base = builder.mul(arguments[11], _long(RECORD))
-        for field, total in zip(fields, sums, strict=True):
-            index = builder.add(base, _long(field))
-            e.store(data[10], index, builder.fadd(e.load(data[10], index, FLOAT), e.sum(total)))
+        sums = e.loop(arguments[4], arguments[5], [e.constant(0)] * MOMENTS, body)
+        row = builder.mul(arguments[11], _long(RECORD))
+        e.store(data[10], row, e.sums(sums))
         return context.get_dummy_value()
 
     return signature, generate

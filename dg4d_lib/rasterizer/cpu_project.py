@@ -21,17 +21,18 @@ CENTER_X, CENTER_Y = 0, 1  # pixels
 WHITEN_A, WHITEN_B, WHITEN_C = 2, 3, 4
 LOG_OPACITY = 5  # to base 2
 RED, GREEN, BLUE, DEPTH = 6, 7, 8, 9
-ROW_SLOPE, ROW_REACH, ROW_LOSS = (
-    10,
-    11,
-    12,
-)  # half a row's span is sqrt(reach - loss dy^2), its middle moves by slope dy
+ROW_SLOPE, ROW_REACH, ROW_LOSS = 10, 11, 12  # half a row's span is sqrt(reach - loss dy^2), its middle slope dy
 EXTENT_X, EXTENT_Y = 13, 14  # pixels, half the bounding box
+KEY = 15  # camera z or HIDDEN
 # Its gradient: moments of s over the whitened frame, then dL/dcolor and dL/ddepth.
 MOMENT, MOMENT_U, MOMENT_V, MOMENT_UU, MOMENT_UV, MOMENT_VV = 0, 1, 2, 3, 4, 5
+MOMENTS = DEPTH + 1
 
 CAMERA = 17  # floats: rotation by rows, translation, focal, center x and y, limit of |x/z| and of |y/z|
-HIDDEN = np.float32(-1)  # depth key of a Gaussian that touches no pixel
+HIDDEN = np.float32(-1)  # key of a Gaussian that touches no pixel
+
+_STATE = 10  # floats that move a Gaussian: place, quaternion, scale
+_BLOCK = 64  # Gaussians computed together, always as many: their fields lie side by side, so the compiler makes vectors
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _LOG2_E, _LN_2 = np.float32(1 / log(2)), np.float32(log(2))
@@ -42,46 +43,53 @@ _LARGEST = np.float32(1e30)  # a determinant beyond is an overflow
 
 @njit(**KERNEL)
 @no_type_check
-def project(means, quats, scales, opacities, colors, camera, height, width, records, keys, start, stop):
-    """Fill records, and keys with camera z or HIDDEN, of Gaussians start..stop.
+def project(means, quats, scales, log_opacities, colors, camera, height, width, records, keys, start, stop):
+    """Fill records, and keys with camera z or HIDDEN, of Gaussians start..stop; opacities are logarithms to base 2.
 
     The bound where alpha falls to MIN_ALPHA lies within MAX_SIGMA for every opacity up to one, so it alone counts.
     """
     rotation, translation, focal, center_x, center_y, limit_x, limit_y = _lens(camera)
     right, bottom = np.float32(width) - _HALF, np.float32(height) - _HALF
-    for i in range(start, stop):
-        x, y, z = _to_camera(rotation, translation, means[i, 0], means[i, 1], means[i, 2])
-        turn, _, _ = _turn(quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3])
-        stretch = _stretch(turn, scales[i, 0], scales[i, 1], scales[i, 2])
-        half = _half(_jacobian(_slant(x, y, z, focal, limit_x, limit_y), rotation), stretch)
-        xx, xy, yy, determinant = _covariance(half)
-        a, b, c = _whitening(xx, xy, yy, determinant)
-        log_opacity = np.log(opacities[i]) * _LOG2_E
-        reach = log_opacity - _LEAST_LOG_ALPHA
-        spread = max(reach, _ZERO) * _TWO * _LN_2
-        extent_x, extent_y = np.sqrt(spread * xx), np.sqrt(spread * yy)
-        u, v = focal * x / z + center_x, focal * y / z + center_y
-        inverse_a2 = _ONE / (a * a)
-        records[i, CENTER_X] = u
-        records[i, CENTER_Y] = v
-        records[i, WHITEN_A] = a
-        records[i, WHITEN_B] = b
-        records[i, WHITEN_C] = c
-        records[i, LOG_OPACITY] = log_opacity
-        records[i, RED] = colors[i, 0]
-        records[i, GREEN] = colors[i, 1]
-        records[i, BLUE] = colors[i, 2]
-        records[i, DEPTH] = z
-        records[i, ROW_SLOPE] = xy / yy
-        records[i, ROW_REACH] = reach * inverse_a2
-        records[i, ROW_LOSS] = c * c * inverse_a2
-        records[i, EXTENT_X] = extent_x
-        records[i, EXTENT_Y] = extent_y
-        records[i, RECORD - 1] = _ZERO
-        shown = (z > _NEAR) & (reach > _ZERO) & (determinant > _ZERO) & (determinant < _LARGEST)
-        shown &= (u + extent_x > _HALF) & (u - extent_x < right)
-        shown &= (v + extent_y > _HALF) & (v - extent_y < bottom)
-        keys[i] = z if shown else HIDDEN
+    state, record = np.empty((_STATE, _BLOCK), np.float32), np.empty((RECORD, _BLOCK), np.float32)
+    for first in range(start, stop, _BLOCK):
+        count = min(_BLOCK, stop - first)
+        _gather(means, quats, scales, first, count, state)
+        for k in range(count):
+            record[LOG_OPACITY, k] = log_opacities[first + k]
+            record[RED, k] = colors[first + k, 0]
+            record[GREEN, k] = colors[first + k, 1]
+            record[BLUE, k] = colors[first + k, 2]
+        for k in range(_BLOCK):
+            x, y, z = _to_camera(rotation, translation, state[0, k], state[1, k], state[2, k])
+            turn, _, _ = _turn(state[3, k], state[4, k], state[5, k], state[6, k])
+            stretch = _stretch(turn, state[7, k], state[8, k], state[9, k])
+            half = _half(_jacobian(_slant(x, y, z, focal, limit_x, limit_y), rotation), stretch)
+            xx, xy, yy, determinant = _covariance(half)
+            a, b, c = _whitening(xx, xy, yy, determinant)
+            reach = record[LOG_OPACITY, k] - _LEAST_LOG_ALPHA
+            spread = max(reach, _ZERO) * _TWO * _LN_2
+            extent_x, extent_y = np.sqrt(spread * xx), np.sqrt(spread * yy)
+            u, v = focal * x / z + center_x, focal * y / z + center_y
+            inverse_a2 = _ONE / (a * a)
+            shown = (z > _NEAR) & (reach > _ZERO) & (determinant > _ZERO) & (determinant < _LARGEST)
+            shown &= (u + extent_x > _HALF) & (u - extent_x < right)
+            shown &= (v + extent_y > _HALF) & (v - extent_y < bottom)
+            record[CENTER_X, k] = u
+            record[CENTER_Y, k] = v
+            record[WHITEN_A, k] = a
+            record[WHITEN_B, k] = b
+            record[WHITEN_C, k] = c
+            record[DEPTH, k] = z
+            record[ROW_SLOPE, k] = xy / yy
+            record[ROW_REACH, k] = reach * inverse_a2
+            record[ROW_LOSS, k] = c * c * inverse_a2
+            record[EXTENT_X, k] = extent_x
+            record[EXTENT_Y, k] = extent_y
+            record[KEY, k] = z if shown else HIDDEN
+        for k in range(count):
+            for field in range(RECORD):
+                records[first + k, field] = record[field, k]
+            keys[first + k] = record[KEY, k]
 
 
 @njit(**KERNEL)
@@ -92,46 +100,71 @@ def unproject(
 ):  # fmt: skip
     """Add what Gaussians start..stop get from the gradients of their records in one view."""
     rotation, translation, focal, _, _, limit_x, limit_y = _lens(camera)
-    for i in range(start, stop):
-        if not keys[i] > _ZERO:
-            continue
-        x, y, z = _to_camera(rotation, translation, means[i, 0], means[i, 1], means[i, 2])
-        turn, unit, inverse_norm = _turn(quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3])
-        stretch = _stretch(turn, scales[i, 0], scales[i, 1], scales[i, 2])
-        slant = _slant(x, y, z, focal, limit_x, limit_y)
-        jacobian = _jacobian(slant, rotation)
-        half = _half(jacobian, stretch)
-        xx, xy, yy, determinant = _covariance(half)
-        whitening = _whitening(xx, xy, yy, determinant)
-        d_center_x, d_center_y = _center_gradient(whitening, moments[i, MOMENT_U], moments[i, MOMENT_V])
-        whitened = _whitened(half, whitening, yy)
-        d_whitened = _whitened_gradient(whitened, moments[i, MOMENT_UU], moments[i, MOMENT_UV], moments[i, MOMENT_VV])
-        d_half = _half_gradient(whitening, d_whitened)
-        d_slant = _slant_gradient(d_half, stretch, rotation)
-        d_x, d_y, d_z = _place_gradient(x, y, z, focal, limit_x, limit_y, slant, d_slant, d_center_x, d_center_y)
-        d_z += moments[i, DEPTH]
-        d_stretch = _stretch_gradient(jacobian, d_half)
-        d_qw, d_qx, d_qy, d_qz = _quat_gradient(
-            unit, inverse_norm, _stretch(d_stretch, scales[i, 0], scales[i, 1], scales[i, 2])
-        )
-        r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation
-        grad_means[i, 0] += r00 * d_x + r10 * d_y + r20 * d_z
-        grad_means[i, 1] += r01 * d_x + r11 * d_y + r21 * d_z
-        grad_means[i, 2] += r02 * d_x + r12 * d_y + r22 * d_z
-        grad_quats[i, 0] += d_qw
-        grad_quats[i, 1] += d_qx
-        grad_quats[i, 2] += d_qy
-        grad_quats[i, 3] += d_qz
-        # dL/d log s_k = (column k of P) . (column k of dL/dP), taken in the whitened frame
-        grad_log_scales[i, 0] += whitened[0] * d_whitened[0] + whitened[3] * d_whitened[3]
-        grad_log_scales[i, 1] += whitened[1] * d_whitened[1] + whitened[4] * d_whitened[4]
-        grad_log_scales[i, 2] += whitened[2] * d_whitened[2] + whitened[5] * d_whitened[5]
-        grad_log_opacities[i] += moments[i, MOMENT]
-        grad_colors[i, 0] += moments[i, RED]
-        grad_colors[i, 1] += moments[i, GREEN]
-        grad_colors[i, 2] += moments[i, BLUE]
-        grad_centers[i, 0] += d_center_x
-        grad_centers[i, 1] += d_center_y
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation
+    state, moment = np.empty((_STATE, _BLOCK), np.float32), np.empty((MOMENTS, _BLOCK), np.float32)
+    center, gradient = np.empty((2, _BLOCK), np.float32), np.empty((_STATE, _BLOCK), np.float32)
+    for first in range(start, stop, _BLOCK):
+        count = min(_BLOCK, stop - first)
+        _gather(means, quats, scales, first, count, state)
+        for k in range(count):
+            for field in range(MOMENTS):
+                moment[field, k] = moments[first + k, field]
+        for k in range(_BLOCK):
+            s0, s1, s2 = state[7, k], state[8, k], state[9, k]
+            x, y, z = _to_camera(rotation, translation, state[0, k], state[1, k], state[2, k])
+            turn, unit, inverse_norm = _turn(state[3, k], state[4, k], state[5, k], state[6, k])
+            stretch = _stretch(turn, s0, s1, s2)
+            slant = _slant(x, y, z, focal, limit_x, limit_y)
+            jacobian = _jacobian(slant, rotation)
+            half = _half(jacobian, stretch)
+            xx, xy, yy, determinant = _covariance(half)
+            whitening = _whitening(xx, xy, yy, determinant)
+            d_center_x, d_center_y = _center_gradient(whitening, moment[MOMENT_U, k], moment[MOMENT_V, k])
+            whitened = _whitened(half, whitening, yy)
+            d_whitened = _whitened_gradient(whitened, moment[MOMENT_UU, k], moment[MOMENT_UV, k], moment[MOMENT_VV, k])
+            d_half = _half_gradient(whitening, d_whitened)
+            d_slant = _slant_gradient(d_half, stretch, rotation)
+            d_x, d_y, d_z = _place_gradient(x, y, z, focal, limit_x, limit_y, slant, d_slant, d_center_x, d_center_y)
+            d_z += moment[DEPTH, k]
+            d_turn = _stretch(_stretch_gradient(jacobian, d_half), s0, s1, s2)
+            d_qw, d_qx, d_qy, d_qz = _quat_gradient(unit, inverse_norm, d_turn)
+            center[0, k] = d_center_x
+            center[1, k] = d_center_y
+            gradient[0, k] = r00 * d_x + r10 * d_y + r20 * d_z
+            gradient[1, k] = r01 * d_x + r11 * d_y + r21 * d_z
+            gradient[2, k] = r02 * d_x + r12 * d_y + r22 * d_z
+            gradient[3, k] = d_qw
+            gradient[4, k] = d_qx
+            gradient[5, k] = d_qy
+            gradient[6, k] = d_qz
+            # dL/d log s_k = (column k of P) . (column k of dL/dP), taken in the whitened frame
+            gradient[7, k] = whitened[0] * d_whitened[0] + whitened[3] * d_whitened[3]
+            gradient[8, k] = whitened[1] * d_whitened[1] + whitened[4] * d_whitened[4]
+            gradient[9, k] = whitened[2] * d_whitened[2] + whitened[5] * d_whitened[5]
+        for k in range(count):
+            i = first + k
+            if keys[i] > _ZERO:
+                for axis in range(3):
+                    grad_means[i, axis] += gradient[axis, k]
+                    grad_log_scales[i, axis] += gradient[7 + axis, k]
+                    grad_colors[i, axis] += moment[RED + axis, k]
+                for axis in range(4):
+                    grad_quats[i, axis] += gradient[3 + axis, k]
+                for axis in range(2):
+                    grad_centers[i, axis] += center[axis, k]
+                grad_log_opacities[i] += moment[MOMENT, k]
+
+
+@njit(**INLINE)
+@no_type_check
+def _gather(means, quats, scales, first, count, state):
+    """Place, quaternion and scale of some Gaussians, by fields."""
+    for k in range(count):
+        for axis in range(3):
+            state[axis, k] = means[first + k, axis]
+            state[7 + axis, k] = scales[first + k, axis]
+        for axis in range(4):
+            state[3 + axis, k] = quats[first + k, axis]
 
 
 @njit(**INLINE)

@@ -9,7 +9,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from dg4d_lib.kernels.vectors import KERNEL, LANES
+from dg4d_lib.kernels.vectors import INLINE, KERNEL, LANES
 from dg4d_lib.rasterizer.cpu_bins import TILE
 from dg4d_lib.rasterizer.cpu_blend import (
     BACKWARD_PLANES,
@@ -17,7 +17,7 @@ from dg4d_lib.rasterizer.cpu_blend import (
     MOST_VECTORS,
     OVERRUN,
     PLANE,
-    STRIDE,
+    PLANE_SHAPE,
     blend_list,
     blend_list_backward,
     cover,
@@ -45,7 +45,7 @@ def blend(
     """
     height, width = alpha.shape
     across = (width + TILE - 1) // TILE
-    state = np.empty(FORWARD_PLANES * PLANE, np.float32)
+    state = np.empty((FORWARD_PLANES, *PLANE_SHAPE), np.float32)
     places, us, vs = np.empty(_LIST, np.int32), np.empty(_LIST, np.float32), np.empty(_LIST, np.float32)
     masks, ends = np.empty(_LIST, np.int32), np.empty(_AHEAD, np.int64)
     for tile in range(first, last):
@@ -82,10 +82,10 @@ def blend_backward(
     records, offsets, entries, background, grad_color, grad_alpha, grad_depth, transmittance, stops, stopped,
     slots, moments, first, last,
 ):  # fmt: skip
-    """Add the gradients of the records of tiles first..last to `moments`, row slots[i] for entry i of the lists."""
+    """Fill the rows slots[i] of `moments` with the gradients of the records of entries i of tiles first..last."""
     height, width = grad_alpha.shape
     across = (width + TILE - 1) // TILE
-    state = np.zeros(BACKWARD_PLANES * PLANE, np.float32)
+    state = np.zeros((BACKWARD_PLANES, *PLANE_SHAPE), np.float32)
     places, us, vs = np.empty(_LIST, np.int32), np.empty(_LIST, np.float32), np.empty(_LIST, np.float32)
     ends = np.empty(_AHEAD, np.int64)
     never = np.full(PLANE, NEVER, np.float32)
@@ -110,35 +110,50 @@ def blend_backward(
             start = 0
             for i in range(count):
                 entry = end - i - 1
-                if ends[i] > start:
-                    g, slot, place = np.int64(entries[entry]), np.int64(slots[entry]), np.float32(entry - begin)
-                    blend_list_backward(
-                        state, places, us, vs, start, ends[i], records, g, limits, place, moments, slot
-                    )  # fmt: skip
+                g, slot, place = np.int64(entries[entry]), np.int64(slots[entry]), np.float32(entry - begin)
+                blend_list_backward(state, places, us, vs, start, ends[i], records, g, limits, place, moments, slot)
                 start = ends[i]
             end -= count
 
 
 @njit(**KERNEL)
 @no_type_check
-def gather(entries, parts, moments):
-    """Add gradients of single entries to those of their Gaussians, in order of the lists."""
+def own_rows(entries, count, slots):
+    """Rows of moments that no two entries share; gives their number, for which `count + len(entries)` is enough.
+
+    The first entry of Gaussian g has row g, those of other tiles have rows of their own behind all `count`.
+    """
+    seen = np.zeros(count, np.bool_)
+    rows = count
     for i in range(len(entries)):
         g = entries[i]
-        for field in range(RECORD):
-            moments[g, field] += parts[i, field]
+        slots[i] = rows if seen[g] else g
+        rows += seen[g]
+        seen[g] = True
+    return rows
 
 
 @njit(**KERNEL)
 @no_type_check
+def gather(entries, slots, count, moments):
+    """Add the rows of single entries to those of their Gaussians, in order of the lists."""
+    for i in range(len(entries)):
+        if slots[i] >= count:
+            for field in range(RECORD):
+                moments[entries[i], field] += moments[slots[i], field]
+
+
+@njit(**INLINE)
+@no_type_check
 def _clear(state, columns, rows):
     """Full transmittance inside the picture, stopped from the start outside."""
-    state[:PLANE] = -_ONE
-    state[PLANE:] = _ZERO
-    for y in range(rows):
-        base = (y >> 1) * STRIDE + (y & 1)
+    state[0] = -_ONE
+    state[1:] = _ZERO
+    for pair in range(rows >> 1):
         for x in range(columns):
-            state[base + 2 * x] = _ONE
+            state[0, pair, x, 0] = state[0, pair, x, 1] = _ONE
+    if rows & 1:
+        state[0, rows >> 1, :columns, 0] = _ONE
 
 
 @njit(**KERNEL)
@@ -153,39 +168,60 @@ def _note_stops(masks, places, start, end, place, stops):
     return count
 
 
-@njit(**KERNEL)
+@njit(**INLINE)
 @no_type_check
 def _write(state, background, color, alpha, depth, transmittance, left, top, columns, rows):
-    for y in range(rows):
-        base, row = (y >> 1) * STRIDE + (y & 1), top + y
+    """Copy a tile into the picture."""
+    spare = np.empty(TILE, np.float32)
+    for pair in range((rows + 1) >> 1):
+        upper, lower = _pair_of_rows(transmittance, top + 2 * pair, left, columns, spare)
         for x in range(columns):
-            rest = abs(state[base + 2 * x])
-            transmittance[row, left + x] = rest
-            alpha[row, left + x] = _ONE - rest
+            upper[x], lower[x] = abs(state[0, pair, x, 0]), abs(state[0, pair, x, 1])
+        upper, lower = _pair_of_rows(alpha, top + 2 * pair, left, columns, spare)
         for x in range(columns):
-            depth[row, left + x] = state[base + 2 * x + 4 * PLANE]
+            upper[x], lower[x] = _ONE - abs(state[0, pair, x, 0]), _ONE - abs(state[0, pair, x, 1])
+        upper, lower = _pair_of_rows(depth, top + 2 * pair, left, columns, spare)
+        for x in range(columns):
+            upper[x], lower[x] = state[4, pair, x, 0], state[4, pair, x, 1]
         for channel in range(3):
+            upper, lower = _pair_of_rows(color[channel], top + 2 * pair, left, columns, spare)
             behind = background[channel]
-            plane = base + (channel + 1) * PLANE
             for x in range(columns):
-                color[channel, row, left + x] = state[plane + 2 * x] + abs(state[base + 2 * x]) * behind
+                upper[x] = state[channel + 1, pair, x, 0] + abs(state[0, pair, x, 0]) * behind
+                lower[x] = state[channel + 1, pair, x, 1] + abs(state[0, pair, x, 1]) * behind
 
 
-@njit(**KERNEL)
+@njit(**INLINE)
 @no_type_check
 def _read(state, background, grad_color, grad_alpha, grad_depth, transmittance, left, top, columns, rows):
+    """Fill a tile with what backward starts from: the state behind all Gaussians."""
     if columns < TILE or rows < TILE:
         state[:] = _ZERO
-    red, green, blue = background[0], background[1], background[2]
-    for y in range(rows):
-        base, row = (y >> 1) * STRIDE + (y & 1), top + y
+    spare = np.zeros(TILE, np.float32)
+    for pair in range((rows + 1) >> 1):
+        upper, lower = _pair_of_rows(grad_alpha, top + 2 * pair, left, columns, spare)
         for x in range(columns):
-            i, column = base + 2 * x, left + x
-            d_red, d_green, d_blue = grad_color[0, row, column], grad_color[1, row, column], grad_color[2, row, column]
-            rest = transmittance[row, column]
-            state[i] = rest
-            state[i + PLANE] = rest * (d_red * red + d_green * green + d_blue * blue - grad_alpha[row, column])
-            state[i + 2 * PLANE] = d_red
-            state[i + 3 * PLANE] = d_green
-            state[i + 4 * PLANE] = d_blue
-            state[i + 5 * PLANE] = grad_depth[row, column]
+            state[1, pair, x, 0], state[1, pair, x, 1] = -upper[x], -lower[x]
+        for channel in range(3):
+            upper, lower = _pair_of_rows(grad_color[channel], top + 2 * pair, left, columns, spare)
+            behind = background[channel]
+            for x in range(columns):
+                state[channel + 2, pair, x, 0], state[channel + 2, pair, x, 1] = upper[x], lower[x]
+                state[1, pair, x, 0] += upper[x] * behind
+                state[1, pair, x, 1] += lower[x] * behind
+        upper, lower = _pair_of_rows(grad_depth, top + 2 * pair, left, columns, spare)
+        for x in range(columns):
+            state[5, pair, x, 0], state[5, pair, x, 1] = upper[x], lower[x]
+        upper, lower = _pair_of_rows(transmittance, top + 2 * pair, left, columns, spare)
+        for x in range(columns):
+            state[0, pair, x, 0], state[0, pair, x, 1] = upper[x], lower[x]
+            state[1, pair, x, 0] *= upper[x]
+            state[1, pair, x, 1] *= lower[x]
+
+
+@njit(**INLINE)
+@no_type_check
+def _pair_of_rows(picture, row, left, columns, spare):
+    """A row of a picture inside a tile and the one below, for which `spare` stands below the picture."""
+    right = left + columns
+    return picture[row, left:right], picture[row + 1, left:right] if row + 1 < len(picture) else spare[:columns]

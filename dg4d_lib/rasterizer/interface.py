@@ -10,12 +10,14 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.rasterizer.choice import CUDA, backend_name, require_backend
 
 BLUR = 0.3  # pixels squared, the low-pass filter
 MAX_ALPHA = 0.999
@@ -64,21 +66,21 @@ class Rasterizer(Protocol):
                 control reads (METHOD section 2). Backends may assume that they are zero.
 
         Raises:
-            BadInput: no cameras, or cameras of different sizes.
+            BadInput: no cameras, cameras of different sizes, another number of states than of cameras, or Gaussians
+                with numbers that are not finite.
         """
         ...
 
 
-_BACKENDS = {"reference": "dg4d_lib.rasterizer.reference", "cpu": "dg4d_lib.rasterizer.cpu"}
-
-
-def backend_name(name: str) -> str:
-    """The backend that `choose_rasterizer` takes for this name: `auto` is the fastest one that runs here."""
-    return "cpu" if name == "auto" else name
+_BACKENDS = {
+    "reference": "dg4d_lib.rasterizer.reference",
+    "cpu": "dg4d_lib.rasterizer.cpu",
+    "cuda_gsplat": "dg4d_lib.rasterizer.cuda_gsplat",
+}
 
 
 def choose_rasterizer(name: str) -> Rasterizer:
-    """The backend of this name, or the one that `auto` stands for.
+    """The backend of this name, or the one that `auto` stands for here.
 
     Raises:
         BadInput: the name is not known.
@@ -87,11 +89,22 @@ def choose_rasterizer(name: str) -> Rasterizer:
     name = backend_name(name)
     if name not in _BACKENDS:
         raise BadInput(f"rasterizer {name!r} is not known; choose one of auto, {', '.join(_BACKENDS)}")
+    require_backend(name)
+    if name == CUDA and not torch.cuda.is_available():
+        raise BackendUnavailable(
+            f"rasterizer {name!r} cannot run here: torch {torch.__version__} cannot use the GPU (often the driver is "
+            "too old; python -c 'import torch; torch.cuda.init()' says what is wrong); or choose rasterizer=cpu"
+        )
     try:
         backend: Rasterizer = import_module(_BACKENDS[name]).rasterize
     except ImportError as error:
         raise BackendUnavailable(f"rasterizer {name!r} cannot run here: {error}") from error
     return backend
+
+
+def device_of(name: str) -> torch.device:
+    """Where Gaussians should lie that this backend draws often; elsewhere they are moved for every call, or refused."""
+    return torch.device("cuda" if backend_name(name) == CUDA else "cpu")
 
 
 def shared_size(cameras: Sequence[OrbitCamera]) -> tuple[int, int]:
@@ -119,3 +132,23 @@ def state_per_camera(gaussians: Gaussians, cameras: Sequence[OrbitCamera]) -> bo
             f"given means of shape {tuple(shape)}"
         )
     return len(shape) == 3
+
+
+def require_finite(gaussians: Gaussians) -> None:
+    """Refuse a cloud with numbers that are none.
+
+    One sum per field instead of a test per number: a sum is finite unless a number is not, or all are beyond use.
+
+    Raises:
+        BadInput: says which fields hold how many.
+    """
+    fields = {name: value.detach() for name, value in vars(gaussians).items()}
+    if torch.stack([value.sum() for value in fields.values()]).isfinite().all():
+        return
+    bad = {name: int((~value.isfinite()).sum()) for name, value in fields.items()}
+    counts = ", ".join(f"{count} in {name}" for name, count in bad.items() if count)
+    if counts:
+        raise BadInput(
+            f"{len(gaussians)} Gaussians with numbers that are not finite ({counts}) cannot be drawn; remove the "
+            "broken ones, or look for what made them"
+        )

@@ -25,6 +25,7 @@ from dg4d_lib.rasterizer.interface import (
     MIN_TRANSMITTANCE,
     NEAR,
     Rendering,
+    require_finite,
     shared_size,
     state_per_camera,
 )
@@ -40,13 +41,15 @@ def rasterize(
 ) -> Rendering:
     """Render every camera's picture in the precision of the Gaussians, float32 or float64.
 
-    Gaussians with a non-finite place or shape are not drawn. For the arguments see `Rasterizer`.
+    Gaussians whose size overflows are not drawn. For the arguments see `Rasterizer`.
 
     Raises:
-        BadInput: no cameras, cameras of different sizes, or a number of states other than the number of cameras.
+        BadInput: no cameras, cameras of different sizes, a number of states other than the number of cameras, or
+            Gaussians with numbers that are not finite.
     """
     height, width = shared_size(cameras)
     moving = state_per_camera(gaussians, cameras)
+    require_finite(gaussians)
     background = background.to(gaussians.means)
     views = []
     for view, camera in enumerate(cameras):
@@ -97,10 +100,7 @@ def _picture(
     drawn = splats[order[visible[order]]]
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     pixels = torch.stack((columns, rows), -1).reshape(-1, 2).to(background)
-    if drawn.depths.numel() == 0:
-        blank = torch.zeros(height, width, 1).to(background)
-        return background.expand(height, width, 3).clone(), blank, blank.clone(), visible
-    chunk = max(1, _PAIRS_AT_ONCE // drawn.depths.numel())
+    chunk = max(1, _PAIRS_AT_ONCE // max(1, drawn.depths.numel()))
     parts = [checkpoint(_blend, part, drawn, background, use_reentrant=False) for part in pixels.split(chunk)]
     color, alpha, depth = torch.cat(parts).reshape(height, width, 5).split((3, 1, 1), -1)
     return color, alpha, depth, visible
@@ -129,8 +129,7 @@ def _blend(pixels: Float[Tensor, "p 2"], splats: _Splats, background: Float[Tens
     with torch.no_grad():  # once at the limit always at the limit: the product of all never grows
         blended = (1 - alpha).cumprod(-1) > MIN_TRANSMITTANCE
     alpha = torch.where(blended, alpha, 0)
-    after = (1 - alpha).cumprod(-1)
-    before = torch.cat((torch.ones_like(after[:, :1]), after[:, :-1]), -1)
-    weights, transmittance = alpha * before, after[:, -1:]
+    passed = torch.cat((pixels.new_ones(len(pixels), 1), (1 - alpha).cumprod(-1)), -1)
+    weights, transmittance = alpha * passed[:, :-1], passed[:, -1:]
     color = weights @ splats.colors + transmittance * background
     return torch.cat((color, 1 - transmittance, weights @ splats.depths[:, None]), -1)

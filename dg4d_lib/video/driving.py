@@ -27,7 +27,7 @@ class DrivingVideo:
     @property
     def times(self) -> Float[Tensor, " t"]:
         """0 is the first frame, 1 the last, both included (METHOD section 1)."""
-        return torch.linspace(0, 1, len(self))
+        return torch.linspace(0, 1, len(self), device=self.frames.device)
 
     def over(self, background: Float[Tensor, " 3"]) -> Float[Tensor, "t h w 3"]:
         """The frames composited over one color."""

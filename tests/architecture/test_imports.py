@@ -114,9 +114,10 @@ def test_prefect_is_imported_by_flows_only() -> None:
 
 
 def declared() -> set[str]:
-    """The distributions that the product needs, as pyproject says."""
+    """The distributions that the product needs or can use, as pyproject says."""
     project = tomllib.loads(repository.text("pyproject.toml"))["project"]
-    return {canonicalize_name(Requirement(line).name) for line in project["dependencies"]}
+    extras = [line for lines in project.get("optional-dependencies", {}).values() for line in lines]
+    return {canonicalize_name(Requirement(line).name) for line in (*project["dependencies"], *extras)}
 
 
 def used() -> set[str]:

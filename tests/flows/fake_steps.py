@@ -5,6 +5,7 @@ Every run of a step is noted in the file $FAKE_LOG.
 """
 
 import json
+import logging
 import os
 import signal
 import time
@@ -112,6 +113,8 @@ def _obey(command: str, job: Job, step: str) -> None:
     verb, _, value = command.partition(":")
     once = Path(os.environ["FAKE_LOG"]).with_suffix(f".{step}")
     match verb:
+        case "log":
+            logging.getLogger("dg4d_lib.fake").info(value)
         case "bad":
             raise BadInput(f"the picture is {value}")
         case "missing":

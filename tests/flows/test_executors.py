@@ -9,6 +9,7 @@ import fake_steps
 import pytest
 
 from flows.executors import (
+    Execute,
     StepBadInput,
     StepCrashed,
     StepDiverged,
@@ -54,6 +55,13 @@ def test_a_process_of_its_own_gives_the_same_digests_as_this_one(place: Path) ->
     here, there = in_process(spec, request, ignore), in_subprocess(spec, request, ignore)
     assert here.outputs == there.outputs
     assert here.provenance.digest() == there.provenance.digest()
+
+
+@pytest.mark.parametrize("execute", [in_process, in_subprocess])
+def test_what_the_library_logs_is_handed_on(place: Path, execute: Execute) -> None:
+    said: list[str] = []
+    execute(*ask(place, "prepare_subject=log:compiling"), ignore, said.append)
+    assert said == ["compiling"]
 
 
 @pytest.mark.parametrize(

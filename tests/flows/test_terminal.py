@@ -3,8 +3,8 @@ import io
 import pytest
 from rich.console import Console
 
-from flows.events import StepEvent
-from flows.terminal import StepBars, numbers
+from flows.events import StepEvent, tell
+from flows.terminal import StepBars, numbers, steps_shown
 
 EVENT = StepEvent("newt", "fit_gaussians", "progress", done=114, total=250, values={"loss": 9.437, "reference": 12.57})
 
@@ -27,3 +27,12 @@ def test_the_loss_of_a_step_fits_on_a_terminal_of_any_width(width: int, shown: s
     assert "…" not in text
     assert shown in text
     assert hidden is None or hidden not in text
+
+
+def test_what_the_library_has_to_say_is_shown():
+    note = StepEvent("newt", "fit_gaussians", "note", text="compiling kernels")
+    for interactive in (True, False):
+        screen = io.StringIO()
+        with steps_shown(Console(file=screen, width=100, force_terminal=interactive, color_system=None)):
+            tell(note)
+        assert "compiling kernels" in screen.getvalue()

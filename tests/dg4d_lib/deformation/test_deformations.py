@@ -1,8 +1,11 @@
 """What every deformation must do, whichever it is."""
 
+from copy import deepcopy
+
 import pytest
 import torch
 
+from dg4d_lib.deformation import hexplane
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.deformation.hexplane import HexPlane, plane_features, time_lines
 from dg4d_lib.deformation.interface import Deformation
@@ -69,6 +72,31 @@ def test_only_the_last_matrices_learn_at_the_first_step(cloud):
     deformation.displace(cloud.means, torch.tensor([0.5])).means.sum().backward()
     moved = {name for name, p in deformation.named_parameters() if p.grad is not None and p.grad.abs().max() > 0}
     assert moved == {"heads.means.outer.weight", "heads.means.outer.bias"}
+
+
+def test_displacements_and_gradients_are_those_of_three_residual_heads(cloud, monkeypatch):
+    monkeypatch.setattr(hexplane, "ROWS", 37)  # parts that end within a moment
+    deformation = HexPlane(SMALL, BOX, torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(3)
+    for parameter in deformation.heads.parameters():
+        torch.nn.init.normal_(parameter, std=0.3, generator=generator)
+    times, cotangents = torch.linspace(0, 1, 4), [torch.randn(4, COUNT, k, generator=generator) for k in (3, 3, 4)]
+    moved = deformation.displace(cloud.means, times)
+    found = torch.autograd.grad(
+        [moved.means, moved.log_scales, moved.quats], list(deformation.parameters()), cotangents
+    )
+
+    exact = deepcopy(deformation).double()
+    place = (cloud.means.double() - exact.bounds[0]) / (exact.bounds[1] - exact.bounds[0]) * 2 - 1
+    features = plane_features(place.clamp(-1, 1), exact.space[0], time_lines(exact.time[0], times.double()))
+    hidden = exact.trunk(features).relu()
+    heads = (exact.heads.means, exact.heads.log_scales, exact.heads.quats)
+    outputs = [head.outer(hidden + head.inner(hidden)) for head in heads]
+    for output, name in zip(outputs, ("means", "log_scales", "quats"), strict=True):
+        torch.testing.assert_close(getattr(moved, name).double(), output, rtol=1e-5, atol=1e-6)
+    truth = torch.autograd.grad(outputs, list(exact.parameters()), [value.double() for value in cotangents])
+    for gradient, true_gradient in zip(found, truth, strict=True):
+        assert (gradient - true_gradient).norm() / true_gradient.norm() < 1e-5
 
 
 def test_time_lines_are_exact_on_the_steps_and_linear_between():

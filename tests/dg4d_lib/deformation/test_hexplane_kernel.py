@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch.nn import functional
 
+from dg4d_lib.deformation import hexplane_kernel
 from dg4d_lib.deformation.hexplane_kernel import hexplane_features
 
 AXES = ((0, 1), (0, 2), (1, 2))
@@ -65,6 +66,22 @@ def test_the_number_of_threads_does_not_change_a_byte():
     finally:
         torch.set_num_threads(before)
     assert all(a.equal(b) for result in results[1:] for a, b in zip(result, results[0], strict=True))
+
+
+def test_large_planes_are_summed_in_fewer_blocks(monkeypatch):
+    coordinates, planes, lines = inputs(100, 3, 16, 8)
+    found = torch.autograd.grad(hexplane_features(coordinates, planes, lines).sum(), (planes, lines))
+    monkeypatch.setattr(hexplane_kernel, "BLOCK_BYTES", 1)
+    again = torch.autograd.grad(hexplane_features(coordinates, planes, lines).sum(), (planes, lines))
+    for gradient, other in zip(found, again, strict=True):
+        torch.testing.assert_close(gradient, other, rtol=1e-5, atol=1e-5)
+
+
+def test_no_points_have_no_gradient():
+    coordinates, planes, lines = inputs(0, 3, 16, 8)
+    features = hexplane_features(coordinates, planes, lines)
+    assert features.shape == (3, 0, 16)
+    assert all((gradient == 0).all() for gradient in torch.autograd.grad(features.sum(), (planes, lines)))
 
 
 def test_a_gradient_in_the_coordinates_is_refused():

@@ -9,6 +9,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import isotropic
 from dg4d_lib.guidance.analytic import AnalyticPrior
+from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.interface import View
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
 from dg4d_lib.settings import MotionSettings, Rung, StaticSettings
@@ -45,7 +46,7 @@ class KnownObject:
         return picture.color, picture.alpha
 
     def prior(self, noise_start: float) -> AnalyticPrior:
-        return AnalyticPrior(self.clean, noise_start, coverage_weight=1.0)
+        return AnalyticPrior(self.clean, Annealing(noise_start), coverage_weight=1.0)
 
     def video(self) -> DrivingVideo:
         camera = OrbitCamera(width=SIZE, height=SIZE)

@@ -25,6 +25,17 @@ def test_the_reference_loss_is_its_two_weighted_means():
     torch.testing.assert_close(loss, torch.tensor(8 * 0.25 + 4 * 0.25))
 
 
+def test_structural_similarity_counts_when_it_has_a_weight():
+    color = torch.rand(2, 12, 12, 3, generator=torch.Generator().manual_seed(0))
+    nothing = torch.zeros(2, 12, 12, 1)
+    rendering = Rendering(color.clone().requires_grad_(), nothing, nothing, torch.ones(2, 1).bool())
+    torch.testing.assert_close(reference_loss(rendering, color, nothing, 1.0, 1.0, 5.0), torch.tensor(0.0))
+    loss = reference_loss(rendering, 1 - color, nothing, 0.0, 0.0, 5.0)
+    assert 5 < loss < 10  # opposite pictures: similarity below zero
+    loss.backward()
+    assert rendering.color.grad is not None and rendering.color.grad.abs().sum() > 0
+
+
 def test_a_gradient_that_is_no_number_stops_the_fit():
     cloud = blob(9, 0.5, torch.Generator().manual_seed(0))
     check_finite("fit", "gradient", [None, torch.zeros(3)], "iteration 1 of 2", "rest", cloud)

@@ -57,3 +57,11 @@ def test_the_picture_is_differentiable_in_the_texture(board: TexturedMesh) -> No
     color.sum().backward()
     assert texture.grad is not None
     assert texture.grad.sum() == pytest.approx(3 * 16 * 16, rel=1e-4)
+
+
+def test_fine_textures_come_out_as_their_mean(board: TexturedMesh) -> None:
+    """Eight texels a sample; single texels would be off by a third."""
+    noise = torch.rand(256, 256, 3, generator=torch.Generator().manual_seed(0))
+    color, _ = render_mesh(TexturedMesh(board.vertices, board.faces, board.uvs, noise), [CAMERA])
+    mean = noise.reshape(16, 16, 16, 16, 3).mean((1, 3))
+    assert (color[0, 8:24, 8:24] - mean).square().mean().sqrt() < 0.02

@@ -1,11 +1,15 @@
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy.ndimage import binary_fill_holes
+from scipy.spatial import ConvexHull
 
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.errors import BadInput
-from dg4d_lib.mesh_rasterizer.zbuffer import NEAR, interpolate, rasterize_mesh
+from dg4d_lib.mesh_rasterizer.scanlines import NEAR
+from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
 
 SQUARE_FACES = torch.tensor([[0, 1, 2], [0, 2, 3]])
 
@@ -49,9 +53,8 @@ def test_pixels_see_what_their_rays_hit(camera):
     vertices, faces = soup(3)
     fragments = rasterize_mesh(vertices, faces, [camera])
     face, weights, depth = shoot(vertices, faces, camera)
-    same = fragments.faces[0] == face
-    assert same.float().mean() > 0.998  # a center on an edge may fall to either side
-    seen = same & (face >= 0)
+    assert torch.equal(fragments.faces[0].long(), face)
+    seen = face >= 0
     assert 0.15 < seen.float().mean() < 0.95
     torch.testing.assert_close(fragments.barycentrics[0][seen].double(), weights[seen], atol=1e-5, rtol=0)
     torch.testing.assert_close(fragments.depth[0][seen].double(), depth[seen], atol=1e-5, rtol=0)
@@ -129,6 +132,74 @@ def test_a_fan_has_no_cracks():
     center = (torch.arange(101) - 50) * RADIUS / camera.focal
     inside = center[:, None] ** 2 + center[None] ** 2 < (0.6 * math.cos(math.pi / 37)) ** 2 - 1e-6
     assert covered[inside].all()
+
+
+@pytest.mark.parametrize("size", [48, 49])  # the middle lines of the grid run between centers, or through them
+def test_the_triangles_of_a_square_share_its_pixels_without_remainder(size):
+    camera, count = OrbitCamera(width=size, height=size), 8
+    ticks = torch.linspace(-1, 1, count + 1) * 16.2 * RADIUS / camera.focal  # 16.2 pixels to each side
+    vertices = torch.stack([*torch.meshgrid(ticks, ticks, indexing="xy"), torch.zeros(count + 1, count + 1)], -1)
+    index = torch.arange((count + 1) ** 2).reshape(count + 1, count + 1)
+    a, b, c, d = (corner.flatten() for corner in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
+    faces = torch.cat([torch.stack([a, b, c], -1), torch.stack([b, d, c], -1)])
+    covered = [rasterize_mesh(vertices.reshape(-1, 3), face[None], [camera]).faces >= 0 for face in faces]
+    times = torch.cat(covered).sum(0)
+    assert times.max() == 1
+    assert times.sum() == (32 if size == 48 else 33) ** 2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_every_pixel_of_a_closed_surface_has_one_triangle_on_each_side(seed):
+    vertices = torch.randn(60, 3, generator=torch.Generator().manual_seed(seed)).double()
+    vertices = (0.7 * vertices / vertices.norm(dim=-1, keepdim=True)).mul(64).round().div(64)  # centers on edges
+    faces = torch.from_numpy(ConvexHull(vertices.numpy()).simplices).long()
+    cameras = [OrbitCamera(e, a, width=49, height=49) for e in (-90, -45, 0, 30, 90) for a in (0, 30, 45, 90, 171)]
+    whole = rasterize_mesh(vertices, faces, cameras)
+    for view, camera in enumerate(cameras):
+        corners = vertices[faces]
+        normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        outwards = normals * (normals * corners.mean(1)).sum(-1, keepdim=True).sign()
+        facing = ((camera.position() - corners[:, 0]) * outwards).sum(-1) > 0
+        for side in (faces[facing], faces[~facing]):
+            once, again = (rasterize_mesh(vertices, order, [camera]).faces[0] for order in (side, side.flip(0)))
+            assert torch.equal(once >= 0, whole.faces[view] >= 0)
+            assert torch.equal(once, torch.where(again >= 0, len(side) - 1 - again, -1))  # no choice of two
+        covered = whole.faces[view].numpy() >= 0
+        assert covered.sum() > 500
+        assert np.array_equal(covered, binary_fill_holes(covered))
+
+
+def test_attributes_on_a_slanted_plane_are_where_the_rays_meet_it():
+    camera = OrbitCamera(width=40, height=40)
+    corners = torch.tensor([[-1.0, -0.8], [1.0, -0.8], [1.0, 0.8], [-1.0, 0.8]], dtype=torch.float64)
+    vertices = torch.cat([corners, 0.9 * corners[:, :1] - 0.7 * corners[:, 1:]], 1)  # z = 0.9 x - 0.7 y
+    fragments = rasterize_mesh(vertices, SQUARE_FACES, [camera])
+    y, x = torch.meshgrid(*[(torch.arange(40) + 0.5 - 20).double() / camera.focal] * 2, indexing="ij")
+    depth = RADIUS / (1 + 0.9 * x + 0.7 * y)  # of the point (x, -y) depth on the plane, RADIUS - z
+    expected = torch.stack([x, -y], -1) * depth[..., None]
+    seen = fragments.faces[0] >= 0
+    assert 300 < seen.sum() < 1600
+    places = interpolate(fragments, SQUARE_FACES, corners)[0]
+    torch.testing.assert_close(places[seen], expected[seen], atol=1e-6, rtol=0)
+    torch.testing.assert_close(fragments.depth[0][seen].double(), depth[seen], atol=1e-6, rtol=0)
+
+
+def test_in_the_thinnest_triangles_weights_are_weights():
+    generator = torch.Generator().manual_seed(2)
+    ends = torch.rand(400, 2, 3, generator=generator).double() - 0.5
+    share = torch.rand(400, 1, generator=generator).double()
+    thin = 10.0 ** (-16 * torch.rand(400, 1, generator=generator).double())
+    third = (share * ends[:, 0] + (1 - share) * ends[:, 1]) + thin * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    vertices = torch.cat([ends, third[:, None]], 1).reshape(-1, 3)
+    fragments = rasterize_mesh(
+        vertices, torch.arange(1200).reshape(-1, 3), [OrbitCamera(20, 50, width=256, height=256)]
+    )
+    seen = fragments.faces >= 0
+    assert seen.sum() > 100
+    weights = fragments.barycentrics[seen]
+    assert (weights >= 0).all() and (weights <= 1).all()
+    torch.testing.assert_close(weights.sum(-1), torch.ones(len(weights)))
+    assert (fragments.depth[seen] > RADIUS - 1).all() and (fragments.depth[seen] < RADIUS + 1).all()
 
 
 def test_interpolation_recovers_a_linear_function_of_space():

@@ -1,16 +1,34 @@
-"""Clouds and cotangents that the rasterizer tests share."""
+"""Clouds, backends and cotangents that the rasterizer tests share."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.harmonics import harmonics_of_color
-from dg4d_lib.rasterizer.interface import Rasterizer, Rendering
+from dg4d_lib.rasterizer.interface import Rasterizer, Rendering, choose_rasterizer
+
+COLORFUL = torch.tensor([0.9, 0.1, 0.4])
+
+
+@pytest.fixture(params=["reference", "cpu", pytest.param("cuda_gsplat", marks=pytest.mark.gpu)])
+def backend(request: pytest.FixtureRequest) -> str:
+    """The name of every backend that can run here."""
+    try:
+        choose_rasterizer(request.param)
+    except BackendUnavailable as missing:
+        pytest.skip(str(missing))
+    return request.param
+
+
+@pytest.fixture
+def rasterize(backend: str) -> Rasterizer:
+    """Every backend that can run here."""
+    return choose_rasterizer(backend)
 
 
 @pytest.fixture
@@ -62,23 +80,59 @@ def random_cloud() -> Callable[..., Gaussians]:
 
 
 @pytest.fixture
-def forward_and_backward() -> Callable[..., tuple[Rendering, dict[str, Tensor]]]:
-    """A rendering, and the gradients under random cotangents for color, alpha and depth."""
+def cotangents() -> Callable[[Rendering], tuple[Tensor, Tensor, Tensor]]:
+    """Random weights of color, alpha and depth, the same for renderings of one shape."""
+
+    def make(rendering: Rendering) -> tuple[Tensor, Tensor, Tensor]:
+        generator = torch.Generator().manual_seed(11)
+        shapes = (rendering.color.shape, rendering.alpha.shape, rendering.depth.shape)
+        color, alpha, depth = (torch.randn(shape, generator=generator) for shape in shapes)
+        return color, alpha, depth
+
+    return make
+
+
+@pytest.fixture
+def drawn() -> Callable[..., tuple[Rendering, dict[str, Tensor]]]:
+    """A rendering of a cloud in a precision, and the leaves whose gradients are of interest, by name."""
+
+    def draw(
+        rasterize: Rasterizer,
+        cloud: Gaussians,
+        cameras: Sequence[OrbitCamera],
+        dtype: torch.dtype,
+        background: Tensor = COLORFUL,
+    ) -> tuple[Rendering, dict[str, Tensor]]:
+        leaves = {name: value.detach().to(dtype).requires_grad_() for name, value in vars(cloud).items()}
+        offsets = cloud.means.new_zeros(len(cameras), len(cloud), 2, dtype=dtype).requires_grad_()
+        return rasterize(Gaussians(**leaves), cameras, background, offsets), {**leaves, "screen_offsets": offsets}
+
+    return draw
+
+
+@pytest.fixture
+def gradients(cotangents) -> Callable[..., dict[str, Tensor]]:
+    """Gradients of the leaves under the cotangents, at the pixels of a mask."""
+
+    def differentiate(rendering: Rendering, leaves: dict[str, Tensor], mask: Tensor | None = None) -> dict[str, Tensor]:
+        pictures = (rendering.color, rendering.alpha, rendering.depth)
+        weights = [weight.to(rendering.color) for weight in cotangents(rendering)]
+        if mask is not None:
+            weights = [weight * mask.to(weight) for weight in weights]
+        found = torch.autograd.grad(pictures, list(leaves.values()), weights)
+        return dict(zip(leaves, found, strict=True))
+
+    return differentiate
+
+
+@pytest.fixture
+def forward_and_backward(drawn, gradients) -> Callable[..., tuple[Rendering, dict[str, Tensor]]]:
+    """A rendering, and its gradients under the cotangents at every pixel."""
 
     def run(
-        rasterizer: Rasterizer, gaussians: Gaussians, cameras: Sequence[OrbitCamera], dtype: torch.dtype, **options: Any
+        rasterize: Rasterizer, cloud: Gaussians, cameras: Sequence[OrbitCamera], dtype: torch.dtype
     ) -> tuple[Rendering, dict[str, Tensor]]:
-        leaves = {name: value.detach().to(dtype).requires_grad_() for name, value in vars(gaussians).items()}
-        offsets = torch.zeros(len(cameras), len(gaussians), 2, dtype=dtype, requires_grad=True)
-        background = options.get("background", torch.tensor([0.9, 0.1, 0.4]))
-        rendering = rasterizer(Gaussians(**leaves), cameras, background, offsets)
-        generator = torch.Generator().manual_seed(11)
-        loss = torch.zeros((), dtype=dtype)
-        for picture in (rendering.color, rendering.alpha, rendering.depth):
-            cotangent = torch.randn(picture.shape, generator=generator, dtype=torch.float64).to(dtype)
-            loss = loss + (cotangent * picture).sum()
-        loss.backward()
-        gradients = {name: value.grad for name, value in {**leaves, "screen_offsets": offsets}.items()}
-        return rendering, {name: value for name, value in gradients.items() if value is not None}
+        rendering, leaves = drawn(rasterize, cloud, cameras, dtype)
+        return rendering, gradients(rendering, leaves)
 
     return run

@@ -1,0 +1,59 @@
+"""Timing functions side by side, so that what else the machine does weighs on all of them.
+
+CPU time (user and system, all threads of the process) is what to compare: wall time says more about the neighbors.
+"""
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # torch's idle threads would count as CPU time
+
+
+@dataclass(frozen=True)
+class Times:
+    """Medians over the rounds, milliseconds per call."""
+
+    cpu_ms: float
+    wall_ms: float
+
+    def per(self, parts: float) -> "Times":
+        """The same for one of so many equal parts of a call."""
+        return Times(self.cpu_ms / parts, self.wall_ms / parts)
+
+
+def interleaved(functions: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, Times]:
+    """Call every function once untimed, then all in turn `rounds` times; gives the medians of each.
+
+    The order turns round from one round to the next, so that none always follows the same one.
+    """
+    for function in functions.values():
+        function()
+    taken: dict[str, list[tuple[float, float]]] = {name: [] for name in functions}
+    for turn in range(rounds):
+        names = list(functions) if turn % 2 == 0 else list(functions)[::-1]
+        for name in names:
+            wall, cpu = time.perf_counter(), time.process_time()
+            functions[name]()
+            taken[name].append((time.process_time() - cpu, time.perf_counter() - wall))
+    return {
+        name: Times(median(cpu for cpu, _ in pairs) * 1e3, median(wall for _, wall in pairs) * 1e3)
+        for name, pairs in taken.items()
+    }
+
+
+def machine() -> str:
+    """The processor, its cores and how busy they are: a line that belongs above every table of times."""
+    lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "processor")
+    return f"{model}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"
+
+
+def write_rows(path: Path, rows: Iterable[Any]) -> None:
+    """Dataclasses of numbers as `{"rows": [...]}`."""
+    path.write_text(json.dumps({"rows": [asdict(row) for row in rows]}, indent=1) + "\n", encoding="utf-8")

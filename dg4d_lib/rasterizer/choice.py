@@ -1,0 +1,53 @@
+"""Which backend `auto` is on this machine; told without torch, so that a request can name its backend."""
+
+import ctypes
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+
+from dg4d_lib.errors import BackendUnavailable
+
+PROCESSOR, CUDA = "cpu", "cuda_gsplat"
+CUDA_DRIVER = "libcuda.so.1"
+
+
+def backend_name(name: str) -> str:
+    """The backend that this name stands for here: `auto` is gsplat where nothing keeps it from drawing, else `cpu`."""
+    if name != "auto":
+        return name
+    return PROCESSOR if what_gsplat_lacks() else CUDA
+
+
+def require_backend(name: str) -> None:
+    """Refuse a backend that cannot draw here.
+
+    Raises:
+        BackendUnavailable: says what is missing and what gets it.
+    """
+    if backend_name(name) == CUDA and (lack := what_gsplat_lacks()):
+        raise BackendUnavailable(f"rasterizer {CUDA!r} cannot run here: {lack}; or choose rasterizer={PROCESSOR}")
+
+
+def what_gsplat_lacks() -> str:
+    """What keeps gsplat from drawing here, and what mends it; empty where nothing is known to."""
+    if find_spec("gsplat") is None:
+        return "gsplat is not installed (pip install 'gsplat>=1.5.3')"
+    try:
+        build = version("torch").partition("+")[2]
+    except PackageNotFoundError:
+        return "torch is not installed"
+    if build == "cpu":
+        return "torch is its build for processors (install the one for CUDA, see https://pytorch.org/get-started)"
+    if not cuda_devices():
+        return "the CUDA driver shows no device (it takes an NVIDIA GPU, its driver, and no empty CUDA_VISIBLE_DEVICES)"
+    return ""
+
+
+def cuda_devices() -> int:
+    """How many GPUs the CUDA driver shows to this process; 0 where there is no driver."""
+    try:
+        driver = ctypes.CDLL(CUDA_DRIVER)
+    except OSError:
+        return 0
+    count = ctypes.c_int()
+    started = driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0
+    return count.value if started else 0

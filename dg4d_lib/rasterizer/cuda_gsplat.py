@@ -1,0 +1,103 @@
+"""The rasterizer for CUDA: gsplat's kernels (https://docs.gsplat.studio) behind the semantics of `interface`, float32.
+
+gsplat 1.5.3 has the same blur, least and greatest alpha, exclusive stop, bounds, margin of the frustum, order and
+depth; all but the blur and the near plane are compiled in. What differs:
+- Gradients: the last transmittance of a pixel is 1 - alpha, which loses digits where little light is left; sums are
+  atomic, so two runs differ in the last digits; exponentials and divisions are CUDA's fast ones.
+- A pair whose exponent rounds below zero is left out (needles near their center).
+- `visible` rounds the bounding box up to whole pixels: it may count a Gaussian that ends just outside of the picture.
+- A scale whose square overflows float32, or a quaternion of norm zero, has no defined picture.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from gsplat import rasterization
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
+from dg4d_lib.errors import BackendUnavailable
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.rasterizer import reference
+from dg4d_lib.rasterizer.interface import BLUR, NEAR, Rendering, require_finite, shared_size, state_per_camera
+
+DEVICE = torch.device("cuda")
+
+
+def rasterize(
+    gaussians: Gaussians,
+    cameras: Sequence[OrbitCamera],
+    background: Float[Tensor, " 3"],
+    screen_offsets: Float[Tensor, "b n 2"] | None = None,
+) -> Rendering:
+    """Render every camera's picture in one call of gsplat; differentiable once; `screen_offsets` are taken to be zero.
+
+    Drawn on the GPU; pictures and gradients come back where the Gaussians are, in their precision. For the arguments
+    see `Rasterizer`.
+
+    Raises:
+        BadInput: no cameras, cameras of different sizes, a number of states other than the number of cameras, or
+            Gaussians with numbers that are not finite.
+        BackendUnavailable: gsplat could not compile its kernels.
+    """
+    height, width = shared_size(cameras)
+    moving = state_per_camera(gaussians, cameras)
+    require_finite(gaussians)
+    if len(gaussians) == 0:  # gsplat divides by their number
+        return reference.rasterize(gaussians, cameras, background, screen_offsets)
+    fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
+    means, quats, scales, opacities, colors = (value.to(DEVICE, torch.float32) for value in fields)
+    caught: list[Tensor] = []
+    if screen_offsets is not None:
+        means = _ScreenGradient.apply(means, screen_offsets, caught)
+    poses, lenses = world_to_camera(cameras).to(DEVICE, torch.float32), _lenses(cameras).to(DEVICE)
+    backgrounds = background.detach().to(DEVICE, torch.float32).expand(len(cameras), 3)
+    if moving:  # a batch of clouds with one camera each
+        opacities, colors = opacities.expand(len(cameras), -1), colors.expand(len(cameras), -1, -1)
+        poses, lenses, backgrounds = poses[:, None], lenses[:, None], backgrounds[:, None]
+    try:
+        pictures, alpha, info = rasterization(
+            means, quats, scales, opacities, colors, poses, lenses, width, height,
+            near_plane=NEAR, eps2d=BLUR, backgrounds=backgrounds, render_mode="RGB+D", packed=False,
+        )  # fmt: skip
+    except AttributeError as error:  # gsplat's kernels are None where there was nothing to compile them with
+        raise BackendUnavailable(
+            "gsplat has no kernels here: install the CUDA toolkit (nvcc) of torch's CUDA version, or a wheel of gsplat "
+            "that holds them (https://docs.gsplat.studio/whl); or choose rasterizer=cpu"
+        ) from error
+    if screen_offsets is not None and info["means2d"].requires_grad:
+        info["means2d"].register_hook(caught.append)
+    views = (len(cameras), height, width)
+    color, depth = pictures.reshape(*views, 4).to(gaussians.means).split((3, 1), -1)
+    visible = (info["radii"] > 0).all(-1).reshape(len(cameras), len(gaussians)).to(gaussians.means.device)
+    return Rendering(color, alpha.reshape(*views, 1).to(gaussians.means), depth, visible)
+
+
+def _lenses(cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b 3 3"]:
+    """Intrinsics: focal lengths and the principal point, pixels."""
+    return torch.tensor(
+        [
+            ((camera.focal, 0, camera.width / 2), (0, camera.focal, camera.height / 2), (0, 0, 1))
+            for camera in cameras
+        ]
+    )  # fmt: skip
+
+
+class _ScreenGradient(torch.autograd.Function):
+    """The identity on the means; gives `screen_offsets` the gradient that was caught at the projected centers.
+
+    These exist inside of gsplat only. In backward they come before the means, so their gradient is there by then.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, means: Tensor, offsets: Tensor, caught: list[Tensor]) -> Tensor:
+        ctx.caught, ctx.offsets = caught, offsets.detach()
+        return means.view_as(means)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
+        return gradient, ctx.caught.pop().reshape(ctx.offsets.shape).to(ctx.offsets), None

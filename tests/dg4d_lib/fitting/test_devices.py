@@ -1,0 +1,127 @@
+"""Fits run where their cloud lies.
+
+Without a GPU: on torch's `meta` device tensors have shapes and no numbers, and an operation on tensors of two devices
+is refused, so what makes a tensor on the processor by accident is caught. With one: the fits themselves.
+"""
+
+import pytest
+import torch
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.deformation.framewise import Framewise
+from dg4d_lib.deformation.hexplane import HexPlane
+from dg4d_lib.deformation.mlp import Mlp
+from dg4d_lib.deformation.rigidity import neighborhoods, rigidity
+from dg4d_lib.errors import BackendUnavailable
+from dg4d_lib.fitting.losses import reference_loss, resized
+from dg4d_lib.fitting.motion import bounds_of, fit_motion
+from dg4d_lib.fitting.static import fit_gaussians
+from dg4d_lib.gaussians.growth import ScreenGradients, reset_opacity
+from dg4d_lib.gaussians.initialize import blob, isotropic, on_surface
+from dg4d_lib.guidance.interface import View
+from dg4d_lib.rasterizer.interface import Rendering, choose_rasterizer
+from dg4d_lib.settings import HexPlaneSettings, MlpSettings
+from dg4d_lib.video.driving import DrivingVideo
+
+META, CUDA = torch.device("meta"), torch.device("cuda")
+COUNT, FRAMES = 30, 4
+DEFORMATIONS = {
+    "hexplane": lambda box: HexPlane(HexPlaneSettings(spatial=4, temporal=4, features=8, hidden=16), box, seed()),
+    "mlp": lambda box: Mlp(MlpSettings(frequencies=2, hidden=16), box, seed()),
+    "framewise": lambda box: Framewise(FRAMES, COUNT),
+}
+
+
+def seed() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def meta_rendering() -> Rendering:
+    color, alpha = torch.zeros(2, 8, 8, 3, device=META), torch.zeros(2, 8, 8, 1, device=META)
+    return Rendering(color.requires_grad_(), alpha.requires_grad_(), alpha, torch.ones(2, COUNT, device=META).bool())
+
+
+def test_tensors_of_two_devices_would_be_noticed():
+    with pytest.raises(RuntimeError, match="expected device meta"):
+        torch.zeros(3, device=META) + torch.zeros(3)
+
+
+@pytest.mark.parametrize("kind", DEFORMATIONS)
+def test_motions_stay_on_the_device_of_their_cloud(kind):
+    cloud = blob(COUNT, 0.5, seed()).to(META)
+    video = DrivingVideo(torch.zeros(FRAMES, 8, 8, 3, device=META), torch.zeros(FRAMES, 8, 8, 1, device=META), 8.0)
+    deformation = DEFORMATIONS[kind](bounds_of(cloud)).to(META)
+    moved = deformation.displace(cloud.means, video.times).apply(cloud)
+    assert moved.means.device == deformation.roughness().device == META
+    assert moved.states([0, 0, 1]).means.device == META
+
+
+def test_rigidity_stays_on_the_device_of_the_cloud():
+    cloud, times = blob(COUNT, 0.5, seed()).to(META), torch.zeros(FRAMES, device=META)
+    moved = Framewise(FRAMES, COUNT).to(META).displace(cloud.means, times).apply(cloud)
+    neighbors, weights = neighborhoods(blob(COUNT, 0.5, seed()).means)
+    assert rigidity(moved, neighbors, weights.to(META)).device == META
+
+
+def test_losses_stay_on_the_device_of_the_pictures(known):
+    color, alpha = resized(torch.zeros(2, 16, 16, 4, device=META), 8)
+    assert reference_loss(meta_rendering(), color, alpha, 1.0, 1.0).device == META
+    views = [View(OrbitCamera(azimuth_deg=90.0 * i, width=8, height=8)) for i in range(2)]
+    rendering = meta_rendering()
+    loss = known.prior(0.98).loss(rendering.color, rendering.alpha, views, 0.5, seed())  # its pictures are elsewhere
+    assert loss.device == META
+    loss.backward()
+    assert rendering.color.grad is not None
+
+
+def test_clouds_stay_on_the_device_of_their_points():
+    points = torch.zeros(COUNT, 3, device=META)
+    for cloud in (on_surface(points, points, 1.0), isotropic(points, points[:, 0], points, 0.5)):
+        assert {value.device for value in vars(cloud).values()} == {META}
+        assert {value.device for value in vars(reset_opacity(cloud)).values()} == {META}
+    gradients = ScreenGradients.none(COUNT, META)
+    gradients.add(torch.zeros(2, COUNT, 2, device=META), meta_rendering().visible, 8)
+    assert gradients.mean.device == META
+
+
+@pytest.fixture
+def gsplat():
+    try:
+        return choose_rasterizer("cuda_gsplat")
+    except BackendUnavailable as missing:
+        pytest.skip(str(missing))
+
+
+@pytest.mark.gpu
+def test_the_static_fit_on_a_gpu_ends_where_the_processor_ends(known, static_settings, gsplat):
+    """Density is controlled on the way; the sums of a GPU have no fixed order, so the losses agree, not the bytes."""
+    settings = static_settings.model_copy(update={"iterations": 60, "densify_every": 25, "densify_gradient": 1e-4})
+    start, ends = blob(settings.points, 0.5, seed()), {}
+    for device, rasterize in ((torch.device("cpu"), known.rasterize), (CUDA, gsplat)):
+        losses: list[float] = []
+        fitted = fit_gaussians(
+            start.to(device), known.subject(), known.prior(0.98), rasterize, settings, seed(),
+            lambda _, values, losses=losses: losses.append(values["reference"]),
+        )  # fmt: skip
+        assert fitted.means.device.type == device.type
+        ends[device.type] = sum(losses[-10:]) / 10
+        assert ends[device.type] < 0.5 * losses[0]
+    assert ends["cuda"] == pytest.approx(ends["cpu"], rel=0.2)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("kind", DEFORMATIONS)
+def test_the_motion_fit_on_a_gpu_ends_where_the_processor_ends(kind, known, motion_settings, gsplat):
+    settings = motion_settings.model_copy(update={"iterations": 60, "rigidity_weight": 0.1})
+    ends = {}
+    for device, rasterize in ((torch.device("cpu"), known.rasterize), (CUDA, gsplat)):
+        make = DEFORMATIONS[kind] if kind != "framewise" else lambda box: Framewise(FRAMES, len(known.gaussians))
+        deformation = make(bounds_of(known.gaussians)).to(device)
+        losses: list[float] = []
+        fit_motion(
+            known.gaussians.to(device), deformation, known.video(), known.prior(0.5), rasterize, settings, seed(),
+            lambda _, values, losses=losses: losses.append(values["reference"]),
+        )  # fmt: skip
+        ends[device.type] = sum(losses[-10:]) / 10
+        assert ends[device.type] < 0.5 * losses[0]
+    assert ends["cuda"] == pytest.approx(ends["cpu"], rel=0.2)

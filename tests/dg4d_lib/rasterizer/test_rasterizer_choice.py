@@ -1,0 +1,97 @@
+"""Which backend a name stands for, and what is said where it cannot run."""
+
+import ctypes
+import importlib.util
+
+import pytest
+import torch
+
+from dg4d_lib.errors import BackendUnavailable, BadInput
+from dg4d_lib.rasterizer import choice
+from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
+
+
+class Driver:
+    """A CUDA driver with some devices."""
+
+    def __init__(self, devices: int, status: int = 0) -> None:
+        self.devices, self.status = devices, status
+
+    def cuInit(self, _flags: int) -> int:
+        return self.status
+
+    def cuDeviceGetCount(self, count) -> int:
+        count._obj.value = self.devices
+        return 0
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """A machine with or without gsplat, a build of torch, a driver."""
+
+    def make(gsplat: bool = True, torch_version: str = "2.13.0", driver: Driver | None = None) -> None:
+        monkeypatch.setattr(choice, "find_spec", lambda name: object() if gsplat else None)
+        monkeypatch.setattr(choice, "version", lambda name: torch_version)
+
+        def load(name: str) -> Driver:
+            if driver is None:
+                raise OSError(f"{name}: cannot open shared object file")
+            return driver
+
+        monkeypatch.setattr(ctypes, "CDLL", load)
+
+    return make
+
+
+def test_auto_is_gsplat_where_everything_is_there(machine):
+    machine(driver=Driver(1))
+    assert choice.backend_name("auto") == "cuda_gsplat"
+    assert device_of("auto") == device_of("cuda_gsplat") == torch.device("cuda")
+    choice.require_backend("auto")
+    choice.require_backend("cuda_gsplat")
+
+
+@pytest.mark.parametrize(
+    ("here", "lack"),
+    [
+        ({"gsplat": False, "driver": Driver(1)}, "pip install 'gsplat>=1.5.3'"),
+        ({"torch_version": "2.13.0+cpu", "driver": Driver(1)}, "build for processors"),
+        ({}, "shows no device"),
+        ({"driver": Driver(0)}, "shows no device"),
+        ({"driver": Driver(1, status=100)}, "shows no device"),
+    ],
+)
+def test_auto_is_the_processor_elsewhere_and_gsplat_is_refused_with_the_reason(here, lack, machine):
+    machine(**here)
+    assert choice.backend_name("auto") == "cpu"
+    assert device_of("auto") == torch.device("cpu")
+    choice.require_backend("auto")
+    with pytest.raises(BackendUnavailable, match="rasterizer 'cuda_gsplat' cannot run here") as caught:
+        choose_rasterizer("cuda_gsplat")
+    assert lack in str(caught.value)
+    assert "or choose rasterizer=cpu" in str(caught.value)
+
+
+def test_a_gpu_that_torch_cannot_use_is_no_import_error(machine, monkeypatch):
+    machine(driver=Driver(1))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(BackendUnavailable, match=r"torch .* cannot use the GPU"):
+        choose_rasterizer("auto")
+
+
+def test_other_names_stand_for_themselves():
+    assert [choice.backend_name(name) for name in ("reference", "cpu", "cuda_gsplat")] == [
+        "reference",
+        "cpu",
+        "cuda_gsplat",
+    ]
+
+
+def test_here_auto_is_what_torch_says():
+    here = importlib.util.find_spec("gsplat") is not None and torch.cuda.is_available()
+    assert choice.backend_name("auto") == ("cuda_gsplat" if here else "cpu")
+
+
+def test_an_unknown_rasterizer_is_refused():
+    with pytest.raises(BadInput, match="auto, reference, cpu, cuda_gsplat"):
+        choose_rasterizer("magic")
