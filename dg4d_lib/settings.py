@@ -3,13 +3,15 @@
 The defaults are the paper's; profiles differ by name (steps/profiles.py). "Ours" marks a choice of this project.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
+Precision = Literal["fp16", "bf16", "fp32"]
+NoiseDraw = Literal["annealed", "uniform"]  # the timestep of an iteration: T_max itself, or drawn evenly below it
 
 
 class Settings(BaseModel):
@@ -28,6 +30,21 @@ class Rung(Settings):
 LADDER = (Rung(until=0.3, size=128), Rung(until=0.6, size=256), Rung(until=1.0, size=512))
 
 
+class TextSettings(Settings):
+    """A picture drawn from words by any text-to-image pipeline of diffusers; only for orders that begin with words."""
+
+    weights: str = Field("", description="an id of the Hugging Face hub, or a folder in diffusers' layout; empty: none")
+    size: int = Field(512, ge=32, le=2048, multiple_of=8, description="pixels of the square picture")
+    steps: int = Field(30, ge=1, le=1000, description="of denoising")
+    guidance: float = Field(7.5, ge=0, le=100, description="classifier-free guidance")
+    suffix: str = Field(
+        ", the whole of it in the middle of the picture, plain white background",
+        max_length=1000,
+        description="added to the words, so that the subject can be cut out",
+    )
+    precision: Precision = Field("fp16", description="of the networks; without a GPU always fp32")
+
+
 class SubjectSettings(Settings):
     """From any picture or video to cut-outs in one square frame."""
 
@@ -43,15 +60,65 @@ class SubjectSettings(Settings):
     max_frames: int = Field(32, ge=2, le=512, description="frames taken from a video; longer ones are sampled evenly")
 
 
-class DrivingSettings(Settings):
-    """Where the driving video comes from when the user has none."""
+class VideoModelSettings(Settings):
+    """Stable Video Diffusion, wherever it is used (Blattmann et al. 2023)."""
 
-    motion: Literal["sway", "bend", "breathe", "bounce", "wave", "turn"] = Field(
-        "sway", description="weights-free motion, ours"
+    weights: str = Field(
+        "svd", min_length=1, description="a name of `dg4d weights list`, or a folder in the diffusers layout"
+    )
+    precision: Precision = Field("fp16", description="of the networks; without a GPU always fp32")
+    low_memory: bool = Field(False, description="only the network that is at work is on the GPU; slower")
+    steps: int = Field(25, ge=2, le=200, description="noise levels of the whole schedule")
+    guidance_start: float = Field(1.0, ge=0, le=20, description="classifier-free guidance of the first frame")
+    guidance_end: float = Field(3.0, ge=0, le=20, description="and of the last, linear between")
+    fps_id: int = Field(6, ge=0, le=30, description="what the network is told; 6 is playback at 7 frames per second")
+    motion_bucket: int = Field(127, ge=0, le=255, description="what the network is told: how much moves")
+    noise_augmentation: float = Field(
+        0.02, ge=0, le=1, description="noise on the picture that is animated, pictures in [-1, 1]"
+    )
+    videos_at_once: int = Field(
+        2, ge=1, le=64, description="videos in the network at a time; each counts twice, with and without the picture"
+    )
+    frames_at_once: int = Field(14, ge=1, le=128, description="frames that are encoded or decoded at a time")
+
+
+Candidates = Annotated[
+    int, Field(ge=1, le=16, description="motions made, scored and shown; the best one is taken unless `pick` says")
+]
+Pick = Annotated[int, Field(ge=0, le=16, description="candidate that is made, and no other; 0 is the best of all")]
+
+
+Motion = Literal["sway", "bend", "breathe", "bounce", "wave", "turn"]
+
+
+class WarpSettings(Settings):
+    """The picture itself, warped in a loop; no weights."""
+
+    kind: Literal["warp"] = "warp"
+    candidates: Candidates = 1
+    pick: Pick = 0
+    motion: Motion = Field(
+        "sway", description="weights-free motion, ours; of the first candidate, the others take the others"
     )
     strength: float = Field(1.0, gt=0, le=3, description="times the motion's own amplitude")
     frames: int = Field(14, ge=2, le=128, description="frames of a generated video (paper: 14)")
     fps: float = Field(7.0, gt=0, le=120, description="frames per second of a generated video (paper: 7)")
+
+
+class SvdSettings(Settings):
+    """Stable Video Diffusion animates the picture; candidate k has the seed of the order plus k - 1."""
+
+    kind: Literal["svd"] = "svd"
+    candidates: Candidates = 1
+    pick: Pick = 0
+    model: VideoModelSettings = VideoModelSettings()
+    frames: int = Field(14, ge=2, le=64, description="of the video; svd was trained on 14, svd-xt on 25")
+    fps: float = Field(7.0, gt=0, le=120, description="frames per second of playback (paper: 7)")
+    height: int = Field(512, ge=64, le=2048, multiple_of=64, description="pixels (public code: 512; trained on 576)")
+    width: int = Field(512, ge=64, le=2048, multiple_of=64, description="pixels (public code: 512; trained on 1024)")
+
+
+DrivingSettings = Annotated[WarpSettings | SvdSettings, Field(discriminator="kind")]
 
 
 class GeometricPriorSettings(Settings):
@@ -72,6 +139,53 @@ class GeometricPriorSettings(Settings):
     coverage_weight: NotNegative = Field(1.0, description="weight of alpha against color in the clean picture, ours")
 
 
+class Zero123PriorSettings(Settings):
+    """Zero-1-to-3, a diffusion model of how a picture looks from another camera (Liu et al. 2023)."""
+
+    kind: Literal["zero123"] = "zero123"
+    weights: str = Field(
+        "zero123-xl",
+        min_length=1,
+        description="a name from `dg4d weights list`, an id of the Hugging Face hub, or a folder in diffusers' layout",
+    )
+    variant: Literal["xl", "stable"] = Field(
+        "xl",
+        description="the last number that the model is told of a camera: xl: its radius less the input's;"
+        " stable (Stable-Zero123): the input's angle from the pole",
+    )
+    input_elevation_deg: float = Field(
+        0.0, ge=-80, le=80, description="how far above the subject its picture was taken; variant stable is told"
+    )
+    guidance_scale: float = Field(5.0, ge=0, le=100, description="classifier-free guidance (paper's code: 5)")
+    precision: Precision = Field("fp16", description="of the networks; without a GPU always fp32")
+    memory_gb: float = Field(
+        24.0,
+        ge=6,
+        le=1024,
+        description="GiB of memory to plan for, say 12, 24 or 80: how many views are judged at once",
+    )
+    compiled: bool = Field(False, description="let torch compile the networks: minutes at the start, then faster")
+
+
+class ImageDreamPriorSettings(Settings):
+    """ImageDream, a diffusion model of how a picture looks from four sides at once (Wang and Shi 2023)."""
+
+    kind: Literal["imagedream"] = "imagedream"
+    weights: str = Field(
+        "imagedream",
+        min_length=1,
+        description="a name from `dg4d weights list`, an id of the Hugging Face hub, or a folder in diffusers' layout",
+    )
+    guidance_scale: float = Field(5.0, ge=0, le=100, description="classifier-free guidance (public code: 5)")
+    precision: Precision = Field("fp16", description="of the networks, on a GPU (public code: fp16)")
+    memory_gb: float = Field(
+        24.0,
+        ge=8,
+        le=1024,
+        description="GiB of memory to plan for, say 12, 24 or 80: how many rings of four views are judged at once",
+    )
+
+
 class OraclePriorSettings(Settings):
     """Knows the true views; for tests and benchmarks."""
 
@@ -79,27 +193,48 @@ class OraclePriorSettings(Settings):
     coverage_weight: NotNegative = Field(1.0, description="weight of alpha against color in the clean picture, ours")
 
 
-PriorSettings = Annotated[GeometricPriorSettings | OraclePriorSettings, Field(discriminator="kind")]
+PriorSettings = Annotated[
+    GeometricPriorSettings | Zero123PriorSettings | ImageDreamPriorSettings | OraclePriorSettings,
+    Field(discriminator="kind"),
+]
+
+
+class LgmSettings(Settings):
+    """LGM makes Gaussians out of four views, which ImageDream makes out of the picture (public code)."""
+
+    weights: str = Field("lgm", min_length=1, description="a name from `dg4d weights list`, a folder, or the file")
+    views_weights: str = Field(
+        "imagedream", min_length=1, description="of ImageDream: a name from `dg4d weights list`, a hub id, or a folder"
+    )
+    precision: Precision = Field("fp16", description="of the networks, on a GPU (public code: fp16)")
+    steps: int = Field(30, ge=1, le=500, description="of ImageDream's sampler (public code: 30)")
+    guidance_scale: float = Field(5.0, ge=0, le=100, description="classifier-free, of ImageDream (public code: 5)")
 
 
 class StaticSettings(Settings):
     """The DreamGaussianHD loop."""
 
-    iterations: int = Field(500, ge=1, le=20000)
+    iterations: int = Field(500, ge=0, le=20000, description="0 leaves the start as it is (public code, after LGM)")
     views: int = Field(16, ge=0, le=64, description="random views per iteration (paper: 16)")
     ladder: tuple[Rung, ...] = Field(LADDER, min_length=1)
     reference_size: int = Field(256, ge=32, le=1024, description="pixels of the reference view")
-    start: Literal["blob", "surface"] = Field(
-        "blob", description="blob: a random ball; surface: points on the prior's surface (ours)"
+    start: Literal["blob", "surface", "lgm"] = Field(
+        "blob",
+        description="blob: a random ball; surface: points on the prior's surface (ours); lgm: what LGM reconstructs, "
+        "whose means then move a tenth as fast (public code)",
     )
+    lgm: LgmSettings | None = Field(None, description="there where start is lgm, and only there")
     points: int = Field(5000, ge=16, le=500000, description="Gaussians at the start")
     blob_radius: Positive = Field(0.5, description="world units")
     elevation_deg: float = Field(30.0, ge=0, le=80, description="random views lie within plus and minus this")
     radius_jitter: float = Field(0.5, ge=0, lt=1.5, description="random radius 2 +- this, world units")
     color_weight: NotNegative = Field(10000.0, description="reference view, times progress, mean squared error")
     alpha_weight: NotNegative = Field(1000.0, description="reference view, times progress, mean squared error")
+    ssim_weight: NotNegative = Field(0.0, description="reference view, times progress, 1 - SSIM; not in the paper")
     guidance_weight: NotNegative = 1.0
     noise_start: float = Field(0.98, gt=0.02, le=1, description="T_max at the start of the annealing")
+    noise_end: Share = Field(0.02, description="and at its end (paper; the public code goes from 1 to 0, cut at 0.02)")
+    noise_draw: NoiseDraw = "annealed"
     mean_rate: Positive = Field(0.01, description="learning rate of the means at the start")
     mean_rate_end: Positive = Field(0.0002, description="and at the end, log-linear")
     color_rate: Positive = 0.01
@@ -113,6 +248,14 @@ class StaticSettings(Settings):
     prune_scale: Positive = Field(0.05, description="world units; larger ones are removed after a split")
     max_points: int = Field(100000, ge=16, description="growth stops here")
     reset_opacity_every: int = Field(700, ge=1, description="iterations (never reached within 500)")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _lgm_where_it_is_used(cls, given: Any) -> Any:
+        """Weights that nobody uses are not asked for."""
+        if not isinstance(given, dict):
+            return given
+        return {**given, "lgm": (given.get("lgm") or {}) if given.get("start") == "lgm" else None}
 
 
 class HexPlaneSettings(Settings):
@@ -161,8 +304,11 @@ class MotionSettings(Settings):
     elevation_deg: float = Field(30.0, ge=0, le=80, description="random views lie within plus and minus this")
     color_weight: NotNegative = Field(10000.0, description="reference views, times progress, mean squared error")
     alpha_weight: NotNegative = Field(1000.0, description="reference views, times progress, mean squared error")
+    ssim_weight: NotNegative = Field(0.0, description="reference views, times progress, 1 - SSIM; not in the paper")
     guidance_weight: NotNegative = 1.0
     noise_start: float = Field(0.5, gt=0.02, le=1, description="T_max at the start of the annealing (paper: 0.5)")
+    noise_end: Share = Field(0.02, description="and at its end (paper; the public code goes from 1 to 0, cut at 0.02)")
+    noise_draw: NoiseDraw = "annealed"
     network_rate: Positive = Field(6.4e-4, description="learning rate of networks")
     plane_rate: Positive = Field(6.4e-3, description="learning rate of planes and frame-wise displacements")
     rigidity_weight: NotNegative = Field(0.0, description="local rigidity over time (Luiten et al. 2024)")
@@ -186,10 +332,50 @@ class MeshSettings(Settings):
     frames_per_task: int = Field(4, ge=1, le=128, description="mode per_frame: frames that one task extracts")
 
 
-class RefinerSettings(Settings):
-    """Texture refinement; `identity` hands the texture through."""
+class IdentitySettings(Settings):
+    """The texture stays as it is."""
 
     kind: Literal["identity"] = "identity"
+
+
+class TextureSettings(Settings):
+    """A texture follows better pictures (paper section 3.4)."""
+
+    iterations: int = Field(50, ge=1, le=2000)
+    rate: Positive = Field(0.2, description="Adam's learning rate of the logits of the colors")
+    size: int = Field(512, ge=64, le=1024, multiple_of=64, description="pixels of the pictures")
+    min_cosine: Share = Field(0.5, description="the reference view says nothing where the surface is flatter")
+    azimuth_step_deg: float = Field(
+        10.0, ge=-180, le=180, description="by which the camera goes on from frame to frame, from a random start"
+    )
+    refresh_every: int = Field(
+        1, ge=1, le=2000, description="iterations between new trajectories and new targets (paper: 1)"
+    )
+
+
+class VideoToVideoSettings(Settings):
+    """A video of the moving mesh, noised and denoised by Stable Video Diffusion (paper section 3.4)."""
+
+    kind: Literal["video_to_video"] = "video_to_video"
+    texture: TextureSettings = TextureSettings()
+    model: VideoModelSettings = VideoModelSettings()
+    skipped: float = Field(
+        0.7, ge=0, lt=1, description="share of the noise levels that is skipped: 0.7 of 25 starts at sigma 1.273"
+    )
+
+
+class ImageToImageSettings(Settings):
+    """Every picture on its own, noised and denoised by Zero-1-to-3 (Tang et al. 2024, section 3.3); the ablation."""
+
+    kind: Literal["image_to_image"] = "image_to_image"
+    texture: TextureSettings = TextureSettings()
+    prior: Zero123PriorSettings = Zero123PriorSettings()
+    steps: int = Field(50, ge=2, le=500, description="noise levels of the whole schedule, DDIM")
+    skipped_start: float = Field(0.5, ge=0, lt=1, description="share of them that is skipped in the first iteration")
+    skipped_end: float = Field(0.95, ge=0, lt=1, description="and in the last, linear between")
+
+
+RefinerSettings = Annotated[IdentitySettings | VideoToVideoSettings | ImageToImageSettings, Field(discriminator="kind")]
 
 
 class PackSettings(Settings):

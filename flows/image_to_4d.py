@@ -19,6 +19,7 @@ from steps.profiles import (
     FitMotionSettings,
     PackAssetSettings,
     PipelineSettings,
+    RefineTextureSettings,
 )
 
 # a part uses every core most of the time; two fill the gaps
@@ -53,13 +54,15 @@ def finish(
 ) -> Made:
     """From the cut-out subject, and its footage if there is any, to the package."""
     subject, footage = prepared["subject"], prepared.get("footage")
-    driving = steps.run("drive_video", {"subject": subject, "footage": footage}, _drive(settings))["driving_video"]
+    driving = steps.run("drive_video", {"subject": subject, "footage": footage}, drive(settings))["driving_video"]
     gaussians = steps.run("fit_gaussians", {"subject": subject, "bank": bank}, _fit(settings))["gaussians"]
     motion = steps.run(
         "fit_motion", {"gaussians": gaussians, "driving_video": driving, "bank": bank}, _fit_motion(settings)
     )["motion"]
     mesh = extract(steps, gaussians, motion, frames_in(driving, home.store()), settings)
-    refined = steps.run("refine_texture", {**mesh, "driving_video": driving}, settings.refiner)
+    refined = steps.run(
+        "refine_texture", {**mesh, "driving_video": driving}, RefineTextureSettings(refiner=settings.refiner)
+    )
     surface = {name: refined.get(name) for name in ("tracked", "meshes")}
     packed = steps.run(
         "pack_asset",
@@ -90,7 +93,8 @@ def extract(
     return {"meshes": merged([outputs["meshes"] for outputs in done], home.store())}
 
 
-def _drive(settings: PipelineSettings) -> DriveVideoSettings:
+def drive(settings: PipelineSettings) -> DriveVideoSettings:
+    """What `drive_video` is asked for."""
     turn_deg = settings.prior.turn_deg if isinstance(settings.prior, GeometricPriorSettings) else 0.0
     return DriveVideoSettings(driving=settings.driving, turn_deg=turn_deg)
 

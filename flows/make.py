@@ -3,7 +3,10 @@
 import os
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from flows import home
 from flows.orders import Order
@@ -52,15 +55,42 @@ def make(order: Order, folder: Path) -> tuple[Files, bool]:
     from flows import report
     from flows.image_to_4d import image_to_4d
     from flows.orphans import process_tag
+    from flows.text_to_4d import text_to_4d
     from flows.video_to_4d import video_to_4d
 
-    flow = video_to_4d if order.moving else image_to_4d
+    flow = text_to_4d if order.drawn else video_to_4d if order.moving else image_to_4d
     quick = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # a sync flow waits a second for its heart to stop
     with temporary_settings(quick), tags(process_tag(), f"profile:{order.profile}"):
         made = flow(order.source, order.settings, order.seed, order.item, order.bank)
     store = home.store()
     files = publish(store.path(made.package), folder, lambda files: report.texts(order, made, files, store))
     return files, all(done.cached for done in made.steps)
+
+
+def make_motions(order: Order, folder: Path) -> dict[str, Any]:
+    """Hold the tournament of an order's motions and put sheet, ranking and films into `folder`; the ranking.
+
+    Raises:
+        StepError: a step did not finish.
+    """
+    from flows.motions import motions, unpack
+
+    with _surroundings(order):
+        made = motions(order.source, order.settings, order.seed, order.item)
+    return unpack(made, folder)
+
+
+@contextmanager
+def _surroundings(order: Order) -> Iterator[None]:
+    """What a flow of an order runs in."""
+    from prefect import tags
+    from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
+
+    from flows.orphans import process_tag
+
+    quick = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # a sync flow waits a second for its heart to stop
+    with temporary_settings(quick), tags(process_tag(), f"profile:{order.profile}"):
+        yield
 
 
 def save_pictures(order: Order, error: Exception) -> list[Path]:

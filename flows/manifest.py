@@ -46,6 +46,21 @@ def items_of(inputs: Path, out: Path, profile_name: str, changes: Mapping[str, A
     return items
 
 
+def only_commercial(items: list[Item]) -> list[Item]:
+    """The same items, each asking for weights that allow commercial use.
+
+    Raises:
+        BadInput: the settings of one name others.
+    """
+    strict = []
+    for item in items:
+        wish = item.wish.model_copy(update={"commercial_only": True}) if item.wish else None
+        if wish is not None:
+            wish.check_licenses()
+        strict.append(item.model_copy(update={"wish": wish}))
+    return strict
+
+
 def parse_changes(pairs: list[str]) -> dict[str, Any]:
     """Turn `knob=value` pairs into changes; values are JSON where they can be, else text.
 

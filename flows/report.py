@@ -35,6 +35,8 @@ def provenance(order: Order, made: Made, files: Files) -> dict[str, Any]:
         "order": order.digest(),
         "source": order.source.digest,
         "seed": order.seed,
+        "commercial_only": order.commercial_only,
+        "licenses": licenses(made),
         "package": made.package.digest,
         "files": files,
         "beside": list(BESIDE),
@@ -64,12 +66,13 @@ def report_of(order: Order, made: Made, files: Files, store: ArtifactStore) -> d
         "source": order.source_name,
         "profile": order.profile,
         "seed": order.seed,
+        "commercial_only": order.commercial_only,
         "banner": banner(order, made),
         "notes": notes(order, made),
         "seconds": round(sum(done.seconds for done in made.steps), 1),
         "peak_memory_mb": max(done.result.provenance.peak_memory_mb for done in made.steps),
         "steps": [_stage(done, store) for done in made.steps],
-        "licenses": {k: v for done in made.steps for k, v in done.result.provenance.licenses.items()},
+        "licenses": licenses(made),
         "files": {name: fact["size_bytes"] for name, fact in files.items()},
         "settings": order.settings.model_dump(mode="json"),
     }
@@ -78,12 +81,19 @@ def report_of(order: Order, made: Made, files: Files, store: ArtifactStore) -> d
 def banner(order: Order, made: Made) -> str:
     """One honest sentence: what of this asset was seen and what was guessed."""
     given = any("footage" in done.result.outputs for done in made.steps)
-    motion = "the motion follows the video" if given else "the motion was made up"
+    imagined = "the motion was made up by a model" if _used_weights(made, "drive_video") else "the motion was made up"
+    motion = "the motion follows the video" if given else imagined
     if order.settings.prior.kind == "oracle":
         return f"Test of the optimization: the true views were known; {motion}."
-    weights = any(done.result.provenance.weights for done in made.steps)
+    drawn = "the picture was drawn by a model; " if order.drawn else ""
+    weights = _used_weights(made, "fit_gaussians", "fit_motion")
     shape = "guessed by a model" if weights else "guessed without a model, from the outline of one picture"
-    return f"{order.profile.capitalize()}: {motion}; shape and the sides nobody saw were {shape}."
+    return f"{order.profile.capitalize()}: {drawn}{motion}; shape and the sides nobody saw were {shape}."
+
+
+def licenses(made: Made) -> dict[str, str]:
+    """The licenses that follow the asset, by what they are of; empty where no weights were used."""
+    return {name: terms for done in made.steps for name, terms in done.result.provenance.licenses.items()}
 
 
 def notes(order: Order, made: Made) -> list[str]:
@@ -108,6 +118,8 @@ def page(report: dict[str, Any]) -> str:
         "".join(_curves(stage) for stage in report["steps"] if stage["curves"]),
         "<h2>Files</h2>",
         _files(files),
+        "<h2>Licenses</h2>",
+        _licenses(report["licenses"]),
         "<h2>Settings</h2>",
         f"<p>profile <b>{_text(report['profile'])}</b>, seed <b>{report['seed']}</b>, source "
         f"<b>{_text(report['source'])}</b></p>",
@@ -145,6 +157,11 @@ def curve(curves: dict[str, Any]) -> str:
         f"<p class=small>{max(values):.3g} to {min(values):.3g}{', logarithmic' if logarithmic else ''}; "
         f"iterations {first} to {last}</p><p class=small>{' '.join(legend)}</p></figure>"
     )
+
+
+def _used_weights(made: Made, *steps: str) -> bool:
+    records = [done.result.provenance for done in made.steps]
+    return any(record.weights for record in records if record.step in steps)
 
 
 def _stage(done: Finished, store: ArtifactStore) -> dict[str, Any]:
@@ -208,6 +225,13 @@ def _files(files: dict[str, int]) -> str:
         for name, sizes in folders.items()
     ]
     return f"<table>{''.join(rows)}</table>"
+
+
+def _licenses(terms: dict[str, str]) -> str:
+    if not terms:
+        return "<p>No weights were used: no license of a model follows this asset.</p>"
+    rows = "".join(f"<tr><td>{_text(name)}<td>{_text(its)}" for name, its in terms.items())
+    return f"<p>Weights were used; their licenses follow this asset.</p><table>{rows}</table>"
 
 
 def _text(value: object) -> str:

@@ -1,4 +1,4 @@
-"""What users hand in, checked at the door and put into the store: pictures, videos, folders of frames, banks."""
+"""What users hand in, checked at the door and put into the store: pictures, videos, frames, words, banks."""
 
 import tempfile
 import zipfile
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from dg4d_lib.errors import BadInput
 from flows.merging import add
-from steps.catalog import BANK, SOURCE
+from steps.catalog import BANK, SOURCE, TEXT
 from steps.contract import ArtifactRef
 from steps.store import ArtifactStore, room_for
 
@@ -15,6 +15,7 @@ PICTURES = frozenset(
 )  # suffixes; what a file is, its content says
 VIDEOS = frozenset([".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif"])
 ALWAYS_MOVING = VIDEOS - {".gif"}  # a GIF may be one picture
+LONGEST_TEXT = 1000  # characters
 
 
 def check_file(path: Path) -> None:
@@ -62,6 +63,18 @@ def check_bank(path: Path) -> None:
         raise BadInput(f"{path} is not a bank of true views: it has no file bank.json")
 
 
+def check_text(text: str) -> None:
+    """Refuse words that say nothing, or too many.
+
+    Raises:
+        BadInput: says what to give.
+    """
+    if not text.strip():
+        raise BadInput('--text is empty; say what to make, for example --text "a red dragon"')
+    if len(text) > LONGEST_TEXT:
+        raise BadInput(f"--text has {len(text)} characters; give at most {LONGEST_TEXT}, models read about 60 words")
+
+
 def frames_of(folder: Path) -> list[Path]:
     """The pictures directly in a folder, by name."""
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in PICTURES and p.is_file() and p.name[0] != ".")
@@ -76,6 +89,15 @@ def put_source(path: Path, store: ArtifactStore) -> ArtifactRef:
     if path.is_dir():
         return _put_files(frames_of(path), path, SOURCE.media_type, store)
     return store.put(path, SOURCE.media_type)
+
+
+def put_text(text: str, store: ArtifactStore) -> ArtifactRef:
+    """Keep words, with single spaces between them.
+
+    Raises:
+        DiskFull: there is no room.
+    """
+    return store.put_bytes(" ".join(text.split()).encode(), TEXT.media_type)
 
 
 def put_bank(path: Path, store: ArtifactStore) -> ArtifactRef:

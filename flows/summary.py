@@ -23,14 +23,15 @@ class Row(BaseModel):
     pictures: list[str] = []
 
 
-def write_summary(out: Path, rows: list[Row]) -> None:
-    """Write `summary.json` and `index.html`.
+def write_summary(out: Path, rows: list[Row], commercial_only: bool = False) -> None:
+    """Write `summary.json` and `index.html`; the summary says whether weights had to allow commercial use.
 
     Raises:
         DiskFull: there is no room; what was there stays.
     """
     counts = {status: sum(row.status == status for row in rows) for status in ("done", "unchanged", "failed")}
-    summary = {"counts": counts, "items": [row.model_dump(mode="json") for row in rows]}
+    items = [row.model_dump(mode="json") for row in rows]
+    summary = {"counts": counts, "commercial_only": commercial_only, "items": items}
     write_atomically(out / "summary.json", json.dumps(summary, indent=1, ensure_ascii=False) + "\n")
     write_atomically(out / "index.html", index(out, rows, counts))
 

@@ -27,6 +27,7 @@ from flows.events import StepEvent, tell
 from flows.executors import StepCrashed, StepError, StepOutOfMemory, chosen
 from steps.contract import ArtifactRef, StepRequest, StepResult
 from steps.main import catalog, request_version
+from steps.weights import identities, weights_in
 
 PROGRESS_PAGE_EVERY_S = 3.0
 RETRIES = 2
@@ -69,8 +70,11 @@ def run_step(request: StepRequest, item: str, label: str) -> dict[str, Any]:
         tell(StepEvent(item, label, "progress", done=done, total=total, values=values))
         page.update(done, total, values)
 
+    def say(text: str) -> None:
+        tell(StepEvent(item, label, "note", text=text))
+
     try:
-        result = chosen()(spec, request, on_progress)
+        result = chosen()(spec, request, on_progress, say)
     except StepError as error:
         pages.show_failure(item, label, error, home.store(), create_markdown_artifact)
         raise
@@ -157,12 +161,14 @@ class Steps:
         return tuple(dict.fromkeys(note for done in self.finished for note in done.result.provenance.notes))
 
     def _request(self, step: str, inputs: dict[str, ArtifactRef | None], settings: BaseModel) -> StepRequest:
+        tree = settings.model_dump(mode="json")
         return StepRequest(
             step=step,
             version=request_version(catalog()[step]),
             inputs={name: ref for name, ref in inputs.items() if ref is not None},
-            settings=settings.model_dump(mode="json"),
+            settings=tree,
             seed=self.seed,
+            weights=identities(weights_in(tree)),
         )
 
     def _before(self, request: StepRequest) -> list[State[Any]]:

@@ -6,6 +6,8 @@ Artifacts between steps:
   motion      safetensors; metadata says the kind of deformation, its settings and the number of frames
   tracked     safetensors of a tracked mesh: vertices, faces, uvs, texture (uint8), offsets; metadata fps
   meshes      a stored zip of NNN.safetensors, a textured mesh per frame
+  ranking     JSON {"weights": {...}, "candidates": [{"number": ..., "name": ..., "total": ..., ...}]}, best first
+  films       a stored zip of N.mp4, one per candidate
   curves      JSON {"title": ..., "x": [...], "series": {name: [...]}, "notes": [...]}
 """
 
@@ -18,7 +20,10 @@ MOTION = Port(media_type="application/vnd.dg4d.motion+safetensors", suffix=".saf
 TRACKED = Port(media_type="application/vnd.dg4d.tracked+safetensors", suffix=".safetensors")
 MESHES = Port(media_type="application/vnd.dg4d.meshes+zip", suffix=".zip")
 CURVES = Port(media_type="application/vnd.dg4d.curves+json", suffix=".json")
+RANKING = Port(media_type="application/vnd.dg4d.ranking+json", suffix=".json")
+FILMS = Port(media_type="application/vnd.dg4d.films+zip", suffix=".zip")
 PACKAGE = Port(media_type="application/vnd.dg4d.package+zip", suffix=".zip")
+TEXT = Port(media_type="text/plain", suffix=".txt")
 SOURCE = Port(media_type="application/octet-stream", suffix="")
 BANK = Port(media_type="application/vnd.dg4d.bank+zip", suffix=".zip")
 
@@ -30,6 +35,14 @@ def _optional(port: Port) -> Port:
 STEPS: dict[str, StepSpec] = {
     spec.name: spec
     for spec in (
+        StepSpec(
+            name="draw_picture",
+            version="1",
+            entry="steps.draw_picture:run",
+            settings="dg4d_lib.settings:TextSettings",
+            inputs={"text": TEXT},
+            outputs={"picture": PNG},
+        ),
         StepSpec(
             name="prepare_subject",
             version="1",
@@ -44,7 +57,12 @@ STEPS: dict[str, StepSpec] = {
             entry="steps.drive_video:run",
             settings="steps.profiles:DriveVideoSettings",
             inputs={"subject": PNG, "footage": _optional(FRAMES)},
-            outputs={"driving_video": FRAMES},
+            outputs={
+                "driving_video": FRAMES,
+                "candidates": _optional(PNG),
+                "ranking": _optional(RANKING),
+                "films": _optional(FILMS),
+            },
         ),
         StepSpec(
             name="fit_gaussians",
@@ -74,7 +92,7 @@ STEPS: dict[str, StepSpec] = {
             name="refine_texture",
             version="1",
             entry="steps.refine_texture:run",
-            settings="dg4d_lib.settings:RefinerSettings",
+            settings="steps.profiles:RefineTextureSettings",
             inputs={"tracked": _optional(TRACKED), "meshes": _optional(MESHES), "driving_video": FRAMES},
             outputs={"tracked": _optional(TRACKED), "meshes": _optional(MESHES)},
         ),

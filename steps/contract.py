@@ -60,6 +60,7 @@ class StepRequest(Frozen):
     inputs: dict[str, ArtifactRef]
     settings: dict[str, Any]
     seed: int = Field(ge=0, lt=2**63)
+    weights: dict[str, Digest] = Field({}, description="identity of the weights that the settings name, by name")
 
     def digest(self) -> str:
         """sha256 of the canonical JSON; names of files and order of keys do not matter."""

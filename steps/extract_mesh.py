@@ -20,7 +20,7 @@ from dg4d_lib.mesh.ride import ride
 from dg4d_lib.mesh.snap import snap
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.unwrap import unwrap
-from dg4d_lib.rasterizer.interface import Rasterizer, backend_name, choose_rasterizer
+from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
 from dg4d_lib.settings import MeshSettings
 from steps.job import Facts, Job
 from steps.media import write_png
@@ -73,7 +73,7 @@ def run(job: Job) -> Facts:
         write_meshes(job.outputs["meshes"], meshes)
         picture = _picture(meshes[settings.first_frame])
     write_png(job.outputs["picture"], picture)
-    return Facts(backend=f"{backend_name(settings.rasterizer)} rasterizer, pymeshlab, xatlas", notes=tuple(notes))
+    return Facts(backend=f"{settings.rasterizer} rasterizer, pymeshlab, xatlas", notes=tuple(notes))
 
 
 def _tracks(settings: ExtractMeshSettings) -> bool:

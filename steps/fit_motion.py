@@ -6,7 +6,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.losses import Diverged
 from dg4d_lib.fitting.motion import fit_motion
 from dg4d_lib.gaussians.ply import read_ply
-from dg4d_lib.rasterizer.interface import backend_name, choose_rasterizer
+from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
 from steps.fit_gaussians import PICTURE_SIZE, Curves, picture_of
 from steps.job import Facts, Job
 from steps.media import read_frames, write_png
@@ -27,16 +27,21 @@ def run(job: Job) -> Facts:
     rasterize = choose_rasterizer(settings.rasterizer)
     cutouts = list(torch.cat([video.frames, video.coverage], -1))
     bank = job.inputs.get("bank")
-    prior, note = make_prior(settings.prior, cutouts, settings.motion.noise_start, bank, job.pictures)
+    chosen = make_prior(settings.prior, cutouts, settings.motion, bank, job.pictures)
     deformation = new_deformation(settings.deformation, gaussians, len(video), generator)
+    device = device_of(settings.rasterizer)
+    deformation.to(device)
     curves = Curves(settings.motion.iterations, job.progress)
     try:
-        fit_motion(gaussians, deformation, video, prior, rasterize, settings.motion, generator, curves.add)
+        fit_motion(
+            gaussians.to(device), deformation, video, chosen.prior, rasterize, settings.motion, generator, curves.add
+        )
     except Diverged as error:
         write_png(job.pictures / "last_good_state.png", picture_of(error.gaussians, rasterize))
         raise
+    deformation.cpu()
     write_motion(job.outputs["motion"], deformation, settings.deformation, len(video), len(gaussians))
-    curves.write(job.outputs["curves"], "motion fit", [note])
+    curves.write(job.outputs["curves"], "motion fit", [chosen.note])
     with torch.no_grad():
         moments = torch.linspace(0, 1, min(PICTURE_FRAMES, len(video)))
         moved = deformation.displace(gaussians.means, moments).apply(gaussians)
@@ -45,4 +50,4 @@ def run(job: Job) -> Facts:
             camera = OrbitCamera(0, azimuth, width=PICTURE_SIZE, height=PICTURE_SIZE)
             rows.append(torch.cat(list(rasterize(moved, [camera] * len(moments), torch.ones(3)).color), 1))
     write_png(job.outputs["picture"], torch.cat(rows))
-    return Facts(backend=f"{backend_name(settings.rasterizer)} rasterizer", notes=(note,))
+    return chosen.facts(f"{settings.rasterizer} rasterizer")

@@ -1,7 +1,8 @@
 """The entry point of every step: `python -m steps.main REQUEST.json RESULT.json [--store DIR] [--progress FILE]`.
 
 Reads a StepRequest, writes a StepResult, or a StepFailure in its place. Progress goes to standard output as JSON lines,
-{"done": 3, "total": 10, "values": {"loss": 0.1}}; everything else that is printed goes to standard error.
+{"done": 3, "total": 10, "values": {"loss": 0.1}}, and so does what the library has to say on its way, {"note": "..."};
+everything else that is printed goes to standard error.
 
 Exit status: 0 done · 65 bad input or settings, or no room: the same again will fail again · 69 something needed is
 missing · 70 the optimization diverged · 137 out of memory · 1 anything else, which may be tried again.
@@ -18,6 +19,7 @@ import importlib
 import importlib.metadata
 import importlib.util
 import json
+import logging
 import os
 import resource
 import signal
@@ -26,6 +28,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, TextIO
 
@@ -46,6 +49,7 @@ from steps.contract import (
 )
 from steps.job import Facts, Job, Progress
 from steps.store import NO_SPACE, ArtifactMissing, ArtifactStore, home, write_atomically
+from steps.weights import require_same
 
 EXIT_CRASHED = 1
 EXIT_DIVERGED = 70
@@ -152,8 +156,32 @@ def main(arguments: list[str] | None = None) -> int:
         except (OSError, UnicodeDecodeError, ValidationError) as trouble:
             failure = StepFailure(step="", kind="bad_input", message=f"{given.request} is not a StepRequest: {trouble}")
             return _finish(failure, None, given.result)
-        outcome, error = perform(request, ArtifactStore(given.store or home() / "store"), progress_lines(file))
+        with notes_to(note_lines(file)):
+            outcome, error = perform(request, ArtifactStore(given.store or home() / "store"), progress_lines(file))
         return _finish(outcome, error, given.result)
+
+
+@contextmanager
+def notes_to(say: Callable[[str], None]) -> Iterator[None]:
+    """Hand on what the library logs while the block runs, such as that kernels are being compiled."""
+    handler = _Notes(logging.INFO)
+    handler.say = say
+    logger = logging.getLogger("dg4d_lib")
+    level = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+
+
+class _Notes(logging.Handler):
+    say: Callable[[str], None]
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.say(record.getMessage())
 
 
 def progress_lines(file: TextIO) -> Progress:
@@ -170,6 +198,16 @@ def progress_lines(file: TextIO) -> Progress:
             file.flush()
 
     return report
+
+
+def note_lines(file: TextIO) -> Callable[[str], None]:
+    """Writes notes as JSON lines."""
+
+    def say(text: str) -> None:
+        file.write(json.dumps({"note": text}) + "\n")
+        file.flush()
+
+    return say
 
 
 def _source_files() -> Iterator[tuple[str, Path, int, int]]:
@@ -198,6 +236,7 @@ def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scr
             f"this request was made for version {request.version} of {spec.name} and the code here is "
             f"{spec.version}+{code}: the code changed in between; run the same command again"
         )
+    require_same(request.weights)
     job = Job(
         inputs=_fetched_inputs(request, spec, store, scratch),
         outputs={name: scratch / "out" / f"{name}{port.suffix}" for name, port in spec.outputs.items()},

@@ -17,7 +17,7 @@ from dg4d_lib.assets.splats import write_splats
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.rasterizer.interface import backend_name, choose_rasterizer
+from dg4d_lib.rasterizer.interface import choose_rasterizer
 from steps.job import Facts, Job
 from steps.media import read_frames, write_png, write_zip
 from steps.meshfiles import read_meshes, read_tracked
@@ -87,7 +87,7 @@ def run(job: Job) -> Facts:
     )
     text = json.dumps(manifest.model_dump(mode="json"), indent=2, ensure_ascii=False) + "\n"
     write_zip(job.outputs["package"], [(MANIFEST, text.encode()), *entries])
-    return Facts(backend=f"{backend_name(settings.rasterizer)} rasterizer", notes=notes)
+    return Facts(backend=f"{settings.rasterizer} rasterizer", notes=notes)
 
 
 def _surface(job: Job) -> Asset4D | list[TexturedMesh]:

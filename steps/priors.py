@@ -3,6 +3,7 @@
 import json
 import zipfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -10,47 +11,120 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.analytic import AnalyticPrior
+from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.geometric import InflatedSurfaces
+from dg4d_lib.guidance.imagedream import ImageDream, ImageDreamPrior
 from dg4d_lib.guidance.interface import GuidancePrior
 from dg4d_lib.guidance.oracle import Bank
-from dg4d_lib.settings import GeometricPriorSettings, OraclePriorSettings, PriorSettings
+from dg4d_lib.guidance.zero123 import Zero123
+from dg4d_lib.settings import (
+    GeometricPriorSettings,
+    ImageDreamPriorSettings,
+    MotionSettings,
+    OraclePriorSettings,
+    PriorSettings,
+    StaticSettings,
+    Zero123PriorSettings,
+)
+from dg4d_lib.weights.registry import weights_called
+from steps.job import Facts
 from steps.media import read_png
+from steps.weights import Opened, open_weights
 
 GEOMETRIC_NOTE = "prior: inflation of the silhouette (no model); sides the picture does not show are guesses"
 ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
 
 
+@dataclass(frozen=True)
+class ChosenPrior:
+    """A prior, and what the record says about it.
+
+    Attributes:
+        prior: judges renders.
+        note: the sentence about it that the report shows.
+        opened: the weights it came from; None where there are none.
+        batches: what of it may run out of memory.
+    """
+
+    prior: GuidancePrior
+    note: str
+    opened: Opened | None = None
+    batches: MicroBatches | None = None
+
+    def facts(self, backend: str) -> Facts:
+        """What a step that used it can say of itself, after it did."""
+        notes = (self.note, *(self.batches.notes() if self.batches else ()))
+        if self.opened is None:
+            return Facts(backend, notes=notes)
+        return Facts(backend, self.opened.digests, self.opened.licenses, notes)
+
+
 def make_prior(
     settings: PriorSettings,
     cutouts: Sequence[Float[Tensor, "h w 4"]],
-    noise_start: float,
+    stage: StaticSettings | MotionSettings,
     bank: Path | None,
     scratch: Path,
-) -> tuple[GuidancePrior, str]:
-    """The prior, and the sentence about it that the report shows.
+) -> ChosenPrior:
+    """The prior of a stage.
 
     Args:
         settings: which one.
         cutouts: the subject at every frame (one in the static stage).
-        noise_start: where the stage's annealing begins.
+        stage: says which timesteps its iterations use.
         bank: file of true views, for the oracle.
         scratch: a folder for unpacking.
 
     Raises:
-        BadInput: the oracle without a bank.
+        BadInput: the oracle without a bank; weights that are damaged, or not those of this prior.
+        BackendUnavailable: weights or packages that are not here.
     """
+    noise = Annealing(stage.noise_start, stage.noise_end, uniform=stage.noise_draw == "uniform")
     match settings:
         case GeometricPriorSettings():
             surfaces = InflatedSurfaces(cutouts, settings)
-            return AnalyticPrior(surfaces.clean, noise_start, settings.coverage_weight), GEOMETRIC_NOTE
+            return ChosenPrior(AnalyticPrior(surfaces.clean, noise, settings.coverage_weight), GEOMETRIC_NOTE)
         case OraclePriorSettings():
             if bank is None:
                 raise BadInput("prior.kind = oracle needs true views: give --bank FOLDER (with a bank.json)")
             views = read_bank(bank, scratch)
-            prior = AnalyticPrior(views.clean, noise_start, settings.coverage_weight, views.cameras, views.frames)
-            return prior, ORACLE_NOTE
+            prior = AnalyticPrior(views.clean, noise, settings.coverage_weight, views.cameras, views.frames)
+            return ChosenPrior(prior, ORACLE_NOTE)
+        case Zero123PriorSettings():
+            check_variant(settings)
+            opened = open_weights(settings.weights)
+            known = Zero123.load(opened.folder, settings, _device()).conditioned_on(_over_white(cutouts), noise)
+            return ChosenPrior(known, f"prior: Zero-1-to-3, weights {settings.weights}", opened, known.batches)
+        case ImageDreamPriorSettings():
+            opened = open_weights(settings.weights)
+            model = ImageDream.load(opened.folder, settings.precision, _device())
+            dream = ImageDreamPrior(model, model.conditioned_on(_over_white(cutouts)), noise, settings)
+            return ChosenPrior(dream, f"prior: ImageDream, weights {settings.weights}", opened, dream.batches)
+
+
+def _device() -> torch.device:
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def _over_white(cutouts: Sequence[Float[Tensor, "h w 4"]]) -> Float[Tensor, "t h w 3"]:
+    return torch.stack([cutout[..., :3] * cutout[..., 3:] + 1 - cutout[..., 3:] for cutout in cutouts])
+
+
+def check_variant(settings: Zero123PriorSettings) -> None:
+    """Refuse weights that the registry knows to be of the other variant.
+
+    Raises:
+        BadInput: says how to set it right.
+    """
+    known = {"zero123-xl": "xl", "stable-zero123": "stable"}
+    name = weights_called(settings.weights).name
+    if known.get(name, settings.variant) != settings.variant:
+        raise BadInput(
+            f"prior.variant = {settings.variant} does not fit the weights {name}; set prior.variant={known[name]}"
+        )
 
 
 def read_bank(path: Path, scratch: Path) -> Bank:

@@ -1,15 +1,17 @@
 """The settings of a whole pipeline, the named profiles, and the one way to change a knob."""
 
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError
 
 from dg4d_lib.errors import BadInput
+from dg4d_lib.rasterizer.choice import backend_name
 from dg4d_lib.settings import (
     DeformationSettings,
     DrivingSettings,
     GeometricPriorSettings,
     HexPlaneSettings,
+    IdentitySettings,
     MeshSettings,
     MotionSettings,
     PackSettings,
@@ -19,21 +21,27 @@ from dg4d_lib.settings import (
     Settings,
     StaticSettings,
     SubjectSettings,
+    TextSettings,
+    WarpSettings,
 )
+
+RasterizerName = Literal["auto", "reference", "cpu", "cuda_gsplat"]
+Backend = Annotated[RasterizerName, AfterValidator(backend_name)]  # never `auto`: a request says what will draw
 
 
 class PipelineSettings(Settings):
     """Every knob of every stage; the command line's `--set stage.knob=value`."""
 
-    rasterizer: str = Field("auto", description="auto, reference or cpu")
+    rasterizer: RasterizerName = Field("auto", description="auto: cuda_gsplat where that can run, else cpu")
+    text: TextSettings = TextSettings()
     subject: SubjectSettings = SubjectSettings()
-    driving: DrivingSettings = DrivingSettings()
+    driving: DrivingSettings = WarpSettings()
     prior: PriorSettings = GeometricPriorSettings()
     static: StaticSettings = StaticSettings()
     deformation: DeformationSettings = HexPlaneSettings()
     motion: MotionSettings = MotionSettings()
     mesh: MeshSettings = MeshSettings()
-    refiner: RefinerSettings = RefinerSettings()
+    refiner: RefinerSettings = IdentitySettings()
     pack: PackSettings = PackSettings()
 
 
@@ -47,7 +55,7 @@ class DriveVideoSettings(Settings):
 class FitGaussiansSettings(Settings):
     """What `fit_gaussians` reads."""
 
-    rasterizer: str
+    rasterizer: Backend
     prior: PriorSettings
     static: StaticSettings
 
@@ -55,7 +63,7 @@ class FitGaussiansSettings(Settings):
 class FitMotionSettings(Settings):
     """What `fit_motion` reads."""
 
-    rasterizer: str
+    rasterizer: Backend
     prior: PriorSettings
     deformation: DeformationSettings
     motion: MotionSettings
@@ -64,16 +72,22 @@ class FitMotionSettings(Settings):
 class ExtractMeshSettings(Settings):
     """What `extract_mesh` reads."""
 
-    rasterizer: str
+    rasterizer: Backend
     mesh: MeshSettings
     first_frame: int = Field(0, ge=0, description="mode per_frame: first frame of this task")
     end_frame: int = Field(0, ge=0, description="mode per_frame: one past the last; 0 is all frames")
 
 
+class RefineTextureSettings(Settings):
+    """What `refine_texture` reads."""
+
+    refiner: RefinerSettings
+
+
 class PackAssetSettings(Settings):
     """What `pack_asset` reads."""
 
-    rasterizer: str
+    rasterizer: Backend
     pack: PackSettings
     notes: tuple[str, ...] = Field((), description="sentences that travel in the files, say that no model was used")
 
@@ -81,11 +95,13 @@ class PackAssetSettings(Settings):
 def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSettings:
     """The same settings with some dotted keys changed, validated again.
 
+    Another `kind` starts from its own defaults, and is chosen before anything else is set.
+
     Raises:
         BadInput: a key that does not exist, or a value out of range; says which and what is allowed.
     """
     tree = settings.model_dump(mode="json")
-    for key, value in changes.items():
+    for key, value in sorted(changes.items(), key=lambda change: not change[0].endswith(".kind")):
         *path, last = key.split(".")
         branch: Any = tree
         for i, name in enumerate([*path, last]):
@@ -94,14 +110,23 @@ def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSetti
                 raise BadInput(f"unknown setting {key!r}: {'.'.join(key.split('.')[:i]) or 'the pipeline'} has {known}")
             if i < len(path):
                 branch = branch[name]
+        if last == "kind" and branch[last] != value:
+            branch.clear()
         branch[last] = value
-        if last == "kind" and len(path) == 1:  # another member of a union starts from its own defaults
-            tree[path[0]] = {"kind": value}
+        tree = _with_defaults(tree)
     try:
         return PipelineSettings.model_validate(tree)
     except ValidationError as error:
         lines = [f"{'.'.join(map(str, e['loc']))} = {e['input']!r}: {e['msg']}" for e in error.errors()]
         raise BadInput("settings refused: " + "; ".join(lines)) from error
+
+
+def _with_defaults(tree: dict[str, Any]) -> dict[str, Any]:
+    """The tree with what a changed choice brings; where it is not valid (yet), the tree as it is."""
+    try:
+        return PipelineSettings.model_validate(tree).model_dump(mode="json")
+    except ValidationError:
+        return tree
 
 
 PREVIEW_LADDER = [Rung(until=1.0, size=128).model_dump()]
@@ -127,7 +152,51 @@ PREVIEW = revise(
     },
 )
 
-PROFILES: dict[str, PipelineSettings] = {"preview": PREVIEW}
+PAPER = revise(
+    PipelineSettings(),
+    {
+        "driving.kind": "svd",
+        "prior.kind": "zero123",
+        "mesh.mode": "per_frame",
+        "refiner.kind": "video_to_video",
+    },
+)
+VIDEO = revise(PAPER, {"subject.max_frames": 32, "motion.iterations": 500})
+VIDEO_FAST = revise(VIDEO, {"subject.max_frames": 16, "motion.views": 1})
+
+REFERENCE = revise(
+    PAPER,
+    {
+        "prior.weights": "stable-zero123",
+        "prior.variant": "stable",
+        "static.start": "lgm",
+        "static.noise_start": 1.0,
+        "static.noise_end": 0.0,
+        "deformation.temporal": 12,
+        "motion.iterations": 500,
+        "motion.noise_start": 1.0,
+        "motion.noise_end": 0.0,
+    },
+)
+
+QUALITY = revise(
+    PAPER,
+    {
+        "driving.candidates": 4,
+        "motion.iterations": 500,
+        "mesh.mode": "tracked",
+        "mesh.texture_size": 2048,
+    },
+)
+
+PROFILES: dict[str, PipelineSettings] = {
+    "preview": PREVIEW,
+    "paper": PAPER,
+    "video": VIDEO,
+    "video-fast": VIDEO_FAST,
+    "reference": REFERENCE,
+    "quality": QUALITY,
+}
 
 
 def profile(name: str) -> PipelineSettings:

@@ -1,29 +1,86 @@
 """Refine the texture, and give the mesh the clock of the driving video."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.texture.refine import refine_texture
-from dg4d_lib.texture.refiner import Identity
+from dg4d_lib.diffusion.video_model import VideoModel
+from dg4d_lib.guidance.distillation import Annealing
+from dg4d_lib.guidance.zero123 import Zero123
+from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.settings import IdentitySettings, ImageToImageSettings, VideoToVideoSettings
+from dg4d_lib.texture.refine import Stretch, refine_textures
+from dg4d_lib.texture.refiner import ImageToImage, Refiner, VideoToVideo
+from dg4d_lib.video.driving import DrivingVideo
 from steps.job import Facts, Job
-from steps.media import frame_rate
+from steps.media import frame_rate, read_frames
 from steps.meshfiles import read_meshes, read_tracked, write_meshes, write_tracked
+from steps.profiles import RefineTextureSettings
+from steps.weights import open_weights
 
 
 def run(job: Job) -> Facts:
-    """Refine the mesh that moves, or every frame's own."""
-    refiner = Identity()  # the only kind of RefinerSettings
+    """Refine the mesh that moves, or every frame's own; all frames are seen as one video.
+
+    Raises:
+        BadInput: meshes and driving video have different numbers of frames.
+        BackendUnavailable: weights, or what loads them, are not here.
+        FitDiverged: the loss left the finite numbers.
+    """
+    facts = Facts()
     fps = frame_rate(job.inputs["driving_video"])
     if "tracked" in job.inputs:
         asset = read_tracked(job.inputs["tracked"])
-        texture = refine_texture(asset.mesh, asset.offsets, refiner)
+        (texture,), facts = _refined(job, [Stretch(asset.mesh, asset.offsets)])
         refined = replace(asset.mesh, texture=texture)
         write_tracked(job.outputs["tracked"], Asset4D(refined, asset.offsets, fps, asset.extras))
     if "meshes" in job.inputs:
-        still = [(mesh, torch.zeros(1, *mesh.vertices.shape)) for mesh in read_meshes(job.inputs["meshes"])]
-        textures = [refine_texture(mesh, rest, refiner) for mesh, rest in still]
-        meshes = [replace(mesh, texture=texture) for (mesh, _), texture in zip(still, textures, strict=True)]
-        write_meshes(job.outputs["meshes"], dict(enumerate(meshes)))
-    return Facts()
+        meshes = read_meshes(job.inputs["meshes"])
+        textures, facts = _refined(job, [Stretch(mesh, torch.zeros(1, *mesh.vertices.shape)) for mesh in meshes])
+        better = [replace(mesh, texture=texture) for mesh, texture in zip(meshes, textures, strict=True)]
+        write_meshes(job.outputs["meshes"], dict(enumerate(better)))
+    return facts
+
+
+def _refined(job: Job, stretches: Sequence[Stretch]) -> tuple[list[Float[Tensor, "h w 3"]], Facts]:
+    """The textures of a motion, and how they were made."""
+    settings: RefineTextureSettings = job.settings
+    kind = settings.refiner
+    if isinstance(kind, IdentitySettings):
+        return [stretch.mesh.texture for stretch in stretches], Facts()
+    with TemporaryDirectory() as scratch:
+        driving = read_frames(job.inputs["driving_video"], Path(scratch))
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    driving = DrivingVideo(driving.frames.to(device), driving.coverage.to(device), driving.fps)
+    pictures = driving.over(driving.frames.new_ones(3))
+    refiner: Refiner
+    match kind:
+        case VideoToVideoSettings():
+            opened = open_weights(kind.model.weights)
+            model = VideoModel.load(opened.folder, kind.model, device)
+            refiner, notes = VideoToVideo(kind, model, pictures[0]), model.notes
+            how = f"by video diffusion from sigma {refiner.sigmas[0]:.3f} on, {len(refiner.sigmas) - 1} steps"
+        case ImageToImageSettings():
+            opened = open_weights(kind.prior.weights)
+            loaded = Zero123.load(opened.folder, kind.prior, device)
+            prior = loaded.conditioned_on(pictures, Annealing(1.0))
+            refiner, notes = ImageToImage(kind, prior), prior.batches.notes
+            how = "picture by picture, by image diffusion"
+    generator = torch.Generator().manual_seed(job.seed)
+    there = [Stretch(_on(device, stretch.mesh), stretch.offsets.to(device)) for stretch in stretches]
+    textures = refine_textures(there, driving, refiner, kind.texture, generator, job.progress)
+    often = "every iteration" if kind.texture.refresh_every == 1 else f"every {kind.texture.refresh_every} iterations"
+    said = (f"Textures were refined {how}; {kind.texture.iterations} iterations, new targets {often}.", *notes())
+    return [texture.cpu() for texture in textures], Facts(
+        f"{device.type} (diffusers)", opened.digests, opened.licenses, said
+    )
+
+
+def _on(device: torch.device, mesh: TexturedMesh) -> TexturedMesh:
+    return TexturedMesh(mesh.vertices.to(device), mesh.faces.to(device), mesh.uvs.to(device), mesh.texture.to(device))

@@ -66,9 +66,7 @@ def write_preview(
     camera = OrbitCamera(ELEVATION_DEG, width=settings.preview_size, height=settings.preview_size)
     cameras = turntable(len(positions), camera)
     background = studio(settings.preview_size)
-    codec = next((name for name in CODECS if name in av.codecs_available), None)
-    if codec is None:
-        raise BackendUnavailable(f"this FFmpeg has none of {', '.join(CODECS)}; run `pip install --force-reinstall av`")
+    codec = _codec()
     with Film(path, codec, fps * repeats, settings.preview_size) as film:
         for start in range(0, len(positions), BATCH):
             part = slice(start, start + BATCH)
@@ -76,6 +74,24 @@ def write_preview(
             film.add(pictures_over(background, states, cameras[part], rasterizer))
             progress(min(start + BATCH, len(positions)), len(positions))
     return () if codec == "libx264" else (f"preview.mp4 is written with {codec}, since libx264 is not in this FFmpeg",)
+
+
+def write_film(path: Path, pictures: Float[Tensor, "t s s 3"], fps: float) -> None:
+    """Write pictures in [0, 1] with an even number of pixels a side as a silent MP4.
+
+    Raises:
+        BackendUnavailable: this build of FFmpeg can write no MP4 codec we know.
+        OSError: the file could not be written.
+    """
+    with Film(path, _codec(), fps, pictures.shape[1]) as film:
+        film.add(pictures)
+
+
+def _codec() -> str:
+    codec = next((name for name in CODECS if name in av.codecs_available), None)
+    if codec is None:
+        raise BackendUnavailable(f"this FFmpeg has none of {', '.join(CODECS)}; run `pip install --force-reinstall av`")
+    return codec
 
 
 def pictures_over(

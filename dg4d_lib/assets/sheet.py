@@ -1,5 +1,6 @@
 """A contact sheet: what an asset looks like from several sides at several moments, on one page."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -56,8 +57,27 @@ def contact_sheet(
         ]
         rows.append(torch.cat(tiles))
     names = ["input", *(f"{azimuth_deg:g}°" for azimuth_deg in settings.sheet_azimuths_deg)]
-    moments = [f"{frame / video.fps:.2f} s" for frame in frames.tolist()]
-    return _page(torch.stack(rows), names, moments)
+    return _page(torch.stack(rows), names, _moments(frames, video.fps))
+
+
+def videos_sheet(
+    videos: Sequence[DrivingVideo], names: Sequence[str], size: int, columns: int
+) -> Float[Tensor, "h w 3"]:
+    """Several videos below each other as a picture in [0, 1]; columns are moments, from the first frame to the last.
+
+    Args:
+        videos: all of one length and rate.
+        names: of the rows.
+        size: pixels of a tile.
+        columns: moments, at most.
+    """
+    frames = torch.linspace(0, len(videos[0]) - 1, min(columns, len(videos[0]))).round().long()
+    rows = torch.stack([_footage(video, frames, size) for video in videos])
+    return _page(rows, list(names), _moments(frames, videos[0].fps))
+
+
+def _moments(frames: Tensor, fps: float) -> list[str]:
+    return [f"{frame / fps:.2f} s" for frame in frames.tolist()]
 
 
 def _part(states: Gaussians, wanted: Tensor) -> Gaussians:

@@ -5,15 +5,20 @@ x_t = sqrt(alphabar) z + sqrt(1 - alphabar) e;  grad = (1 - alphabar) (e_predict
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dg4d_lib.diffusion.batching import MicroBatches
+
 TRAIN_STEPS = 1000
 BETA_START, BETA_END = 0.00085, 0.012  # scaled-linear
-NOISE_END = 0.02  # share of the schedule at which the annealing ends
+NOISE_END = 0.02  # share of the schedule at which the paper's annealing ends
+LOWEST, HIGHEST = 20, 980  # timesteps
 
 PredictNoise = Callable[[Float[Tensor, "b c h w"], int], Float[Tensor, "b c h w"]]
 
@@ -25,15 +30,38 @@ def alphabars() -> Float[Tensor, " steps"]:
     return (1 - betas).cumprod(0)
 
 
-def annealed_timestep(progress: float, noise_start: float) -> int:
-    """The one timestep of an iteration: linear from `noise_start` down to 0.02 of the schedule.
+@dataclass(frozen=True)
+class Annealing:
+    """Which timestep an iteration uses: one for its whole batch.
+
+    Attributes:
+        start: T_max at the beginning, share of the schedule; the paper's is 0.98, and 0.5 in the dynamic stage.
+        end: where it is going; the paper's is 0.02. The public code's schedule is from 1 to 0 in both stages.
+        uniform: draw the timestep evenly from 0.02 to T_max, rather than take T_max itself.
+    """
+
+    start: float
+    end: float = NOISE_END
+    uniform: bool = False
+
+    def timestep(self, progress: float, generator: torch.Generator) -> int:
+        """The timestep at a progress in [0, 1]; the generator is touched only by uniform draws."""
+        highest = annealed_timestep(progress, self.start, self.end)
+        if not self.uniform:
+            return highest
+        return int(torch.randint(LOWEST, highest + 1, (), generator=generator))
+
+
+def annealed_timestep(progress: float, noise_start: float, noise_end: float = NOISE_END) -> int:
+    """Linear from `noise_start` to `noise_end` of the schedule, and never outside of 20 to 980.
 
     Args:
         progress: share of the optimization that is done, in [0, 1].
-        noise_start: 0.98 in the static stage, 0.5 in the dynamic stage (paper).
+        noise_start: share of the schedule at progress 0.
+        noise_end: and at progress 1.
     """
-    share = noise_start + (NOISE_END - noise_start) * progress
-    return min(max(round(TRAIN_STEPS * share), round(TRAIN_STEPS * NOISE_END)), round(TRAIN_STEPS * 0.98))
+    share = noise_start + (noise_end - noise_start) * progress
+    return min(max(round(TRAIN_STEPS * share), LOWEST), HIGHEST)
 
 
 def weight(timestep: int) -> float:
@@ -44,18 +72,76 @@ def weight(timestep: int) -> float:
 def score_distillation(
     latents: Float[Tensor, "b c h w"], predict_noise: PredictNoise, timestep: int, generator: torch.Generator
 ) -> Float[Tensor, ""]:
+    """The distillation loss with noise from a generator; see `distillation_loss`."""
+    noise = torch.randn(latents.shape, dtype=latents.dtype, generator=generator).to(latents.device)
+    return distillation_loss(latents, predict_noise, timestep, noise)
+
+
+def distillation_loss(
+    latents: Float[Tensor, "b c h w"], predict_noise: PredictNoise, timestep: int, noise: Float[Tensor, "b c h w"]
+) -> Float[Tensor, ""]:
     """The distillation loss, divided by the number of images.
 
     Args:
         latents: z, with gradient.
         predict_noise: (x_t, t) -> the noise it believes in; called without gradient.
         timestep: t, one for the batch.
-        generator: the source of e.
+        noise: e.
     """
     alphabar = float(alphabars()[timestep])
     with torch.no_grad():
-        noise = torch.empty_like(latents, memory_format=torch.contiguous_format).normal_(generator=generator)
         noisy = alphabar**0.5 * latents + (1 - alphabar) ** 0.5 * noise
         gradient = torch.nan_to_num(weight(timestep) * (predict_noise(noisy, timestep) - noise))
         target = latents - gradient
     return 0.5 * (latents - target).square().sum() / len(latents)
+
+
+def distill_in_pieces(
+    images: Float[Tensor, "b h w 3"],
+    encode: Callable[[Float[Tensor, "p h w 3"]], Float[Tensor, "p c u v"]],
+    predict_noise: Callable[[Float[Tensor, "p c u v"], int, slice], Float[Tensor, "p c u v"]],
+    timestep: int,
+    noise: Float[Tensor, "b c u v"],
+    batches: MicroBatches,
+) -> Float[Tensor, ""]:
+    """`distillation_loss` of encoded images, in micro-batches, whatever their size the same loss and gradient.
+
+    The gradient of an image depends on no other image. So each piece is encoded, judged and differentiated at once:
+    only one piece's activations of the encoder are held at a time, and no forward pass is done twice (checkpoints, or
+    a second pass through the encoder after the loss, would repeat a third of the work). Backward only hands on the
+    gradient that is already there.
+
+    Args:
+        images: renders in [0, 1]; where they lie, the loss and the gradient lie.
+        encode: pictures to latents, with gradient.
+        predict_noise: (x_t, t, which of the images) -> the noise it believes in.
+        timestep: t, one for the batch.
+        noise: e.
+        batches: how many images go through at once.
+    """
+
+    def judge(piece: slice) -> tuple[Tensor, Tensor]:
+        pixels = images[piece].detach().requires_grad_()
+        with torch.enable_grad():
+            latents = encode(pixels)
+            noises = noise[piece].to(latents.device)
+            mean = distillation_loss(latents, lambda noisy, t: predict_noise(noisy, t, piece), timestep, noises)
+            loss = mean * len(pixels)  # divided by their number at the end, where half precision cannot lose digits
+        return loss.detach().to(images.device), torch.autograd.grad(loss, pixels)[0]
+
+    losses, gradients = zip(*batches.run(judge, len(images)), strict=True)
+    return _Differentiated.apply(images, torch.stack(losses).sum() / len(images), torch.cat(gradients) / len(images))
+
+
+class _Differentiated(torch.autograd.Function):
+    """A number whose gradient with respect to some images is known."""
+
+    @staticmethod
+    def forward(context: Any, images: Tensor, loss: Tensor, gradient: Tensor) -> Tensor:
+        context.save_for_backward(gradient)
+        return loss.clone()
+
+    @staticmethod
+    def backward(context: Any, *upstream: Tensor) -> tuple[Tensor, None, None]:
+        (gradient,) = context.saved_tensors
+        return upstream[0] * gradient, None, None

@@ -26,15 +26,15 @@ class View:
 
 @runtime_checkable
 class GuidancePrior(Protocol):
-    """One number to lower.
+    """One number to lower."""
 
-    Attributes:
-        viewpoints: the only cameras it can judge (their pixels do not matter); None is all of them.
-        frames: the only frames it can judge; None is all of them.
-    """
+    @property
+    def viewpoints(self) -> tuple[OrbitCamera, ...] | None:
+        """The only cameras it can judge (their pixels do not matter); None is all of them."""
 
-    viewpoints: tuple[OrbitCamera, ...] | None
-    frames: tuple[int, ...] | None
+    @property
+    def frames(self) -> tuple[int, ...] | None:
+        """The only frames it can judge; None is all of them."""
 
     def loss(
         self,
@@ -54,3 +54,22 @@ class GuidancePrior(Protocol):
             generator: the source of all randomness.
         """
         ...
+
+
+@runtime_checkable
+class JudgesRings(Protocol):
+    """What a prior has beside `GuidancePrior` if it judges several cameras of a moment together.
+
+    Attributes:
+        ring: how many; consecutive views, at equal steps of azimuth all around.
+    """
+
+    @property
+    def ring(self) -> int:
+        """At least 1."""
+        ...
+
+
+def ring_of(prior: GuidancePrior) -> int:
+    """How many consecutive views the prior judges together; 1 if it judges each for itself."""
+    return prior.ring if isinstance(prior, JudgesRings) else 1

@@ -1,23 +1,131 @@
-"""What makes the pictures of a moving textured mesh better; the texture then follows them."""
+"""What makes the pictures of a moving textured mesh better; the texture then follows them (METHOD section 9)."""
 
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import interpolate
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.diffusion.video_model import VideoModel, karras_sigmas, start_index
+from dg4d_lib.guidance.distillation import TRAIN_STEPS, alphabars
+from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.zero123 import ConditionedZero123, encoded
+from dg4d_lib.settings import ImageToImageSettings, VideoToVideoSettings
 
 
 @runtime_checkable
 class Refiner(Protocol):
-    """A video in, a better video out."""
+    """Pictures in, better pictures out."""
 
-    def refine(self, video: Float[Tensor, "t h w 3"]) -> Float[Tensor, "t h w 3"]:
-        """The same moments from the same viewpoints, in [0, 1]."""
+    def refine(
+        self,
+        video: Float[Tensor, "t h w 3"],
+        cameras: Sequence[OrbitCamera],
+        progress: float,
+        generator: torch.Generator,
+    ) -> Float[Tensor, "t h w 3"]:
+        """The same moments from the same viewpoints.
+
+        Args:
+            video: the mesh over white, in [0, 1], a picture per frame of the driving video.
+            cameras: of every picture.
+            progress: of the refinement, 0 in its first iteration and 1 in its last.
+            generator: of noise.
+        """
         ...
 
 
-class Identity:
-    """Leaves the video as it is; a texture refined towards it does not change."""
+class VideoToVideo:
+    """Noises the video and denoises it with Stable Video Diffusion, which knows the input picture."""
 
-    def refine(self, video: Float[Tensor, "t h w 3"]) -> Float[Tensor, "t h w 3"]:
-        """The video itself."""
-        return video
+    def __init__(self, settings: VideoToVideoSettings, model: VideoModel, picture: Float[Tensor, "h w 3"]) -> None:
+        """Choose how much noise.
+
+        Args:
+            settings: share of the schedule that is skipped.
+            model: read from weights.
+            picture: the input over white, in [0, 1].
+        """
+        self.model = model
+        self.sigmas = karras_sigmas(settings.model.steps)[start_index(settings.model.steps, settings.skipped) :]
+        self._picture = picture
+
+    def refine(
+        self,
+        video: Float[Tensor, "t h w 3"],
+        cameras: Sequence[OrbitCamera],
+        progress: float,
+        generator: torch.Generator,
+    ) -> Float[Tensor, "t h w 3"]:
+        """The denoised video; viewpoints and progress do not matter."""
+        condition = self.model.look_at(_resized(self._picture[None], *video.shape[1:3])[0], [generator])
+        latents = self.model.encode(video)[None]
+        noisy = latents + self.sigmas[0] * self.model.noise(latents.shape, [generator])
+        return self.model.decode(self.model.denoise(noisy, condition, self.sigmas)[0]).to(video)
+
+
+class ImageToImage:
+    """Noises every picture on its own and denoises it with Zero-1-to-3, which knows its frame and its camera.
+
+    Less noise from iteration to iteration, as in DreamGaussian (Tang et al. 2024).
+    """
+
+    def __init__(self, settings: ImageToImageSettings, prior: ConditionedZero123) -> None:
+        """Choose the schedule; `prior` is conditioned on the frames of the driving video."""
+        self.settings, self.prior = settings, prior
+
+    @torch.no_grad()
+    def refine(
+        self,
+        video: Float[Tensor, "t h w 3"],
+        cameras: Sequence[OrbitCamera],
+        progress: float,
+        generator: torch.Generator,
+    ) -> Float[Tensor, "t h w 3"]:
+        """The denoised pictures; they have the 256 pixels of Zero-1-to-3 and are enlarged."""
+        settings, prior, scale = self.settings, self.prior, float(self.prior.vae.config.scaling_factor)
+        skipped = settings.skipped_start + progress * (settings.skipped_end - settings.skipped_start)
+        timesteps = ddim_timesteps(settings.steps)[start_index(settings.steps, skipped) :]
+        tokens = prior.tokens([View(camera, frame) for frame, camera in enumerate(cameras)])
+        images = video.to(prior.vae.device)
+
+        def denoised(piece: slice) -> Float[Tensor, "p h w 3"]:
+            latents = scale * encoded(prior.vae, images[piece])
+            latents = _diffused(latents, noise[piece].to(latents), timesteps[0])
+            for timestep, following in pairwise((*timesteps, 0)):
+                believed = prior.believed_noise(latents, timestep, prior.latents[piece], tokens[piece])
+                latents = _ddim_step(latents, believed, timestep, following)
+            decoded = prior.vae.decode((latents / scale).to(prior.vae.dtype)).sample.to(latents)
+            return _resized((decoded.movedim(1, -1) / 2 + 0.5).clamp(0, 1), *video.shape[1:3])
+
+        noise = torch.randn((len(video), *prior.latents.shape[1:]), dtype=video.dtype, generator=generator)
+        return torch.cat(prior.batches.run(denoised, len(images))).to(video)
+
+
+def ddim_timesteps(steps: int) -> tuple[int, ...]:
+    """From the noisiest to the cleanest, evenly spaced: 981, 961, ..., 1 for 50 steps."""
+    stride = TRAIN_STEPS // steps
+    return tuple(stride * i + 1 for i in reversed(range(steps)))
+
+
+def _diffused(latents: Float[Tensor, "b c i j"], noise: Float[Tensor, "b c i j"], timestep: int) -> Tensor:
+    alphabar = float(alphabars()[timestep])
+    return alphabar**0.5 * latents + (1 - alphabar) ** 0.5 * noise
+
+
+def _ddim_step(
+    noisy: Float[Tensor, "b c i j"], believed: Float[Tensor, "b c i j"], timestep: int, following: int
+) -> Float[Tensor, "b c i j"]:
+    """From one timestep to the next without new noise (Song et al. 2021)."""
+    alphabar = float(alphabars()[timestep])
+    latents = (noisy - (1 - alphabar) ** 0.5 * believed) / alphabar**0.5
+    return _diffused(latents, believed, following)
+
+
+def _resized(pictures: Float[Tensor, "b h w 3"], height: int, width: int) -> Float[Tensor, "b i j 3"]:
+    planes = pictures.movedim(-1, 1)
+    return interpolate(planes, (height, width), mode="bilinear", antialias=True, align_corners=False).movedim(1, -1)

@@ -11,7 +11,7 @@ from dg4d_lib.video.driving import DrivingVideo
 
 @runtime_checkable
 class VideoGenerator(Protocol):
-    """A source of motion: procedural warps, later video diffusion."""
+    """A source of motion: procedural warps, or video diffusion."""
 
     def generate(self, subject: Float[Tensor, "h w 4"], generator: torch.Generator) -> DrivingVideo:
         """A video whose first frame shows the subject (straight alpha, in [0, 1])."""

@@ -25,6 +25,7 @@ LEAST_SEPARATION = 0.75  # of color models; see saliency.Segmentation
 PART = 0.02  # of the largest part: smaller ones are dropped
 PHOTO_PART = 0.3  # the same in photographs, where parts are more often mistakes
 STILL = 0.04  # change of color, in [0, 1], below which a pixel does not move between two frames
+KEPT = 0.8  # of a still pixel's alpha that comes from the frame before
 ADVICE = "give a PNG with a transparent background, or a picture of one subject before a plain backdrop"
 
 
@@ -66,6 +67,31 @@ def matte(frames: Float[Tensor, "t h w 3"]) -> Matte:
         [_soften(frame, mask, band) for frame, mask in zip(frames, _enlarge(masks, height, width), strict=True)]
     )
     return Matte(_steady(cutouts, frames), "backdrop" if backdrop.is_plain else "color models")
+
+
+def matte_after(frames: Float[Tensor, "t h w 3"], first: Float[Tensor, "h w"]) -> Float[Tensor, "t h w 4"]:
+    """Cut out frames of which the alpha of the first is known, so that alpha does not flicker.
+
+    Mattes of single frames are uncertain along the outline. Where a pixel keeps its color from one frame to the next,
+    it keeps most of its alpha too; so what is known of the first frame is handed on, and noise is averaged out. What
+    moves is left alone.
+
+    Args:
+        frames: opaque, in [0, 1]; the subject in the first is where `first` says.
+        first: alpha of the first frame.
+
+    Returns:
+        Straight alpha.
+
+    Raises:
+        BadInput: no subject can be told apart.
+    """
+    cutouts = matte(frames).frames.clone()
+    cutouts[0] = torch.cat([frames[0], first[..., None]], -1)
+    kept = KEPT * torch.exp(-((frames[1:] - frames[:-1]).abs().amax(-1) / STILL).square())
+    for now, share in enumerate(kept, 1):
+        cutouts[now, ..., 3] = torch.lerp(cutouts[now, ..., 3], cutouts[now - 1, ..., 3], share)
+    return cutouts
 
 
 def _lab(frames: Float[Tensor, "t h w 3"], longest: int) -> Float[ndarray, "t h2 w2 3"]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import inflate
-from dg4d_lib.settings import DrivingSettings
+from dg4d_lib.settings import Motion, WarpSettings
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.limbs import WAVE_DEG, Waver, waving_limbs
 from dg4d_lib.video.motions import BEND_DEG, JUMP, SWAY_DEG, bounce, breathe, jump_height, lean
@@ -20,7 +20,21 @@ from dg4d_lib.video.puppet import Puppet
 TURN_DEG = 20.0
 TURN_SIZE = 256  # pixels at which the surface that turns is built, at most
 FOR_BUSTS = ("sway", "breathe", "turn")  # motions that leave a cropped lower border where it is
+MOTIONS: tuple[Motion, ...] = ("sway", "bend", "breathe", "bounce", "wave", "turn")
+WEAKER = 0.6  # times the strength: candidates beyond the number of motions
 SMALL_JUMP = 0.5  # of the wanted height: below, the user is told
+
+
+def candidate(settings: WarpSettings, number: int) -> WarpSettings:
+    """The settings of one of several motions: the first is the chosen one, then come the others, then weaker ones.
+
+    Args:
+        settings: what the user chose.
+        number: from 1.
+    """
+    place = (MOTIONS.index(settings.motion) + number - 1) % len(MOTIONS)
+    rounds = (number - 1) // len(MOTIONS)
+    return settings.model_copy(update={"motion": MOTIONS[place], "strength": settings.strength * WEAKER**rounds})
 
 
 class Warp:
@@ -33,7 +47,7 @@ class Warp:
         notes: what the last video does otherwise than asked, in sentences for the user.
     """
 
-    def __init__(self, settings: DrivingSettings, turn_deg: float = 0.0) -> None:
+    def __init__(self, settings: WarpSettings, turn_deg: float = 0.0) -> None:
         """Choose the motion, its strength, how many frames at which rate, and how the subject is turned (`turn`)."""
         self.settings, self.turn_deg = settings, turn_deg
         self.notes: tuple[str, ...] = ()

@@ -8,6 +8,7 @@ import pytest
 import repository
 
 import flows.cli
+import flows.endings
 from flows.manifest import parse_changes
 from flows.publish import RECORD
 from flows.report import BESIDE
@@ -99,6 +100,9 @@ def test_the_changelog_has_this_version() -> None:
 
 def test_every_command_has_an_example_and_every_example_is_a_command() -> None:
     commands = {command.callback.__name__ for command in flows.cli.app.registered_commands if command.callback}
+    commands |= {
+        str(group.typer_instance.info.name) for group in flows.cli.app.registered_groups if group.typer_instance
+    }
     mentioned = set(re.findall(r"(?:^|[` ])dg4d ([a-z]+)", README, re.MULTILINE))
     assert mentioned == commands
 
@@ -115,7 +119,7 @@ def test_every_profile_is_explained() -> None:
 
 
 def test_the_exit_codes_are_those_of_the_command() -> None:
-    codes = {value for name, value in vars(flows.cli).items() if name.startswith("EXIT_")}
+    codes = {value for name, value in vars(flows.endings).items() if name.startswith("EXIT_")}
     section = README.split("\n## Exit codes\n", 1)[1].split("\n## ", 1)[0]
     assert set(map(int, re.findall(r"^\| (\d+) \|", section, re.MULTILINE))) == {0, 2, *codes}
 

@@ -33,6 +33,13 @@ STEPS = {
 }
 
 
+def draw_picture(job: Job) -> Facts:
+    words = _begin("draw_picture", job, job.inputs["text"].read_bytes())
+    job.outputs["picture"].write_bytes(PNG + words)
+    weights = {"fake/unet.safetensors": "sha256:" + "e" * 64}
+    return Facts(weights=weights, licenses={"fake": "fake license: <free>"})
+
+
 def prepare_subject(job: Job) -> Facts:
     words = _begin("prepare_subject", job, job.inputs["source"].read_bytes())
     job.outputs["subject"].write_bytes(PNG + words)  # what follows a picture is ignored by those who look at it
@@ -46,6 +53,14 @@ def drive_video(job: Job) -> Facts:
     with zipfile.ZipFile(job.outputs["driving_video"], "w") as archive:
         for i in range(5):
             archive.writestr(zipfile.ZipInfo(f"{i:03d}.png"), words)
+    driving = job.settings.driving
+    if driving.candidates > 1 and not driving.pick:
+        rows = [{"number": i, "total": 1 / i, "name": "still", "remarks": []} for i in range(1, driving.candidates + 1)]
+        job.outputs["candidates"].write_bytes(PNG)
+        job.outputs["ranking"].write_text(json.dumps({"taken": 1, "candidates": rows}))
+        with zipfile.ZipFile(job.outputs["films"], "w") as archive:
+            for row in rows:
+                archive.writestr(zipfile.ZipInfo(f"{row['number']}.mp4"), b"film")
     return Facts()
 
 

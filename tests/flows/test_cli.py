@@ -108,6 +108,10 @@ def test_a_bank_without_the_oracle_and_the_oracle_without_a_bank() -> None:
     refused(dg4d("make", "cat.png", "--set", "prior.kind=oracle", "-o", "out"), "--bank DIR")
 
 
+def test_a_pick_where_a_video_is_followed() -> None:
+    refused(dg4d("make", "cat.png", "--video", "cat.png", "--pick", "2", "-o", "out"), "--pick")
+
+
 def test_wrong_usage() -> None:
     assert dg4d("make").exit_code == 2
     assert dg4d("make", "cat.png", "--speed", "9").exit_code == 2

@@ -122,6 +122,22 @@ def test_a_video_moves_the_asset_and_a_picture_is_no_video(log: Path, tmp_path: 
     assert not (tmp_path / "still").exists()
 
 
+def test_words_become_a_picture_first(log: Path, tmp_path: Path) -> None:
+    settings = revise(PREVIEW, {"text.weights": "somebody/pictures"})
+    wish = Wish(item="words", text="a  red\ndragon", settings=settings)
+    make(wish.order(home.store()), tmp_path / "out")
+    assert ran(log) == ["draw_picture", *EVERY_STEP]
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["banner"].startswith("Preview: the picture was drawn by a model; the motion was made up;")
+    assert report["licenses"] == {"fake": "fake license: <free>"}
+    assert "fake license: &lt;free&gt;" in (tmp_path / "out" / "report.html").read_text()
+    record = json.loads((tmp_path / "out" / "provenance.json").read_text())
+    assert record["licenses"] == report["licenses"]
+    assert record["steps"][0]["weights"] == {"fake/unet.safetensors": "sha256:" + "e" * 64}
+    make(wish.model_copy(update={"text": "a red dragon"}).order(home.store()), tmp_path / "again")
+    assert ran(log) == []
+
+
 def test_a_mesh_per_frame_is_made_in_parts_and_joined(log: Path, tmp_path: Path) -> None:
     knobs = {"mesh.mode": "per_frame", "mesh.frames_per_task": 2}
     make(order("parts", tmp_path, **knobs), tmp_path / "two")
@@ -243,6 +259,35 @@ def test_a_command_with_nothing_to_do_says_so(dg4d: Run, log: Path, tmp_path: Pa
     assert ran(log) == []
     assert tree(tmp_path / "out" / "x") == before
     assert tree(tmp_path / "out" / "y", *RUN_FACTS) == {k: v for k, v in before.items() if k not in RUN_FACTS}
+
+
+def test_motions_are_shown_without_an_asset_being_made(dg4d: Run, log: Path, tmp_path: Path) -> None:
+    (tmp_path / "x.png").write_text("choose")
+    done = dg4d("motions", "x.png", "--candidates", "3")
+    assert done.exit_code == 0, done.output
+    assert ran(log) == EVERY_STEP[:2]
+    files = tree(tmp_path / "out" / "x-motions")
+    assert set(files) == {"motions.png", "motions.json", "1.mp4", "2.mp4", "3.mp4"}
+    assert [line.split()[0] for line in done.stdout.splitlines() if "still" in line] == ["1", "2", "3"]
+    assert "motions.png" in done.stdout
+
+
+def test_a_video_has_its_motion_already(dg4d: Run, tmp_path: Path) -> None:
+    (tmp_path / "x.png").write_text("moving")
+    done = dg4d("motions", "x.png")
+    assert done.exit_code == 65 and "x.png" in done.stderr and "motion already" in done.stderr
+
+
+def test_a_pick_is_a_knob_of_the_driving_video(dg4d: Run, log: Path, tmp_path: Path) -> None:
+    (tmp_path / "x.png").write_text("pick")
+    assert dg4d("make", "x.png", "--pick", "3", "-o", "picked").exit_code == 0
+    ran(log)
+    record = json.loads((tmp_path / "picked" / "provenance.json").read_text())
+    drive = next(step for step in record["steps"] if step["step"] == "drive_video")
+    assert drive["settings"]["driving"]["pick"] == 3
+    done = dg4d("make", "x.png", "--set", "driving.pick=3", "-o", "picked")
+    assert done.exit_code == 0 and "nothing to do" in done.stdout
+    assert dg4d("make", "x.png", "--pick", "0").exit_code == 2
 
 
 def test_bad_input_that_a_step_finds_is_one_message(dg4d: Run, tmp_path: Path) -> None:

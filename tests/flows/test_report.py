@@ -97,6 +97,38 @@ def test_the_banner_is_honest(store: ArtifactStore) -> None:
     assert "true views were known" in report.banner(oracle, what)
 
 
+def with_weights(step: Finished, licenses: dict[str, str]) -> Finished:
+    record = step.result.provenance.model_copy(
+        update={"weights": {f"{name}/unet": "sha256:" + "c" * 64 for name in licenses}, "licenses": licenses}
+    )
+    return step.model_copy(update={"result": step.result.model_copy(update={"provenance": record})})
+
+
+def test_the_banner_says_what_models_did(store: ArtifactStore) -> None:
+    order, what = made(store)
+    fit, drive = finished("fit_gaussians", store, 1), finished("drive_video", store, 1)
+    by_prior = what.model_copy(update={"steps": [with_weights(fit, {"zero123-xl": "x"}), drive]})
+    assert "the motion was made up; shape and the sides nobody saw were guessed by a model" in report.banner(
+        order, by_prior
+    )
+    by_video = what.model_copy(update={"steps": [fit, with_weights(drive, {"svd": "x"})]})
+    assert "the motion was made up by a model; " in report.banner(order, by_video)
+    assert "guessed without a model" in report.banner(order, by_video)
+
+
+def test_licenses_follow_the_asset_only_where_weights_were_used(store: ArtifactStore) -> None:
+    order, what = made(store)
+    texts = report.texts(order, what, FILES, store)
+    assert "No weights were used" in texts["report.html"]
+    assert json.loads(texts["provenance.json"])["licenses"] == {}
+    used = what.model_copy(update={"steps": [with_weights(step, {"svd": "S & Co"}) for step in what.steps]})
+    texts = report.texts(order, used, FILES, store)
+    assert "No weights were used" not in texts["report.html"]
+    assert "S &amp; Co" in texts["report.html"]
+    assert json.loads(texts["provenance.json"])["licenses"] == {"svd": "S & Co"}
+    assert json.loads(texts["report.json"])["licenses"] == {"svd": "S & Co"}
+
+
 def test_notes_are_said_once_and_a_picture_that_only_names_is_mentioned(store: ArtifactStore) -> None:
     order, what = made(store)
     order = order.model_copy(update={"picture_name": "fox.jpg", "source_name": "run.mp4"})
@@ -140,6 +172,7 @@ def test_a_summary_counts_and_the_overview_links_what_is_there(tmp_path: Path) -
     write_summary(tmp_path, rows)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["counts"] == {"done": 1, "unchanged": 1, "failed": 1}
+    assert summary["commercial_only"] is False
     page = (tmp_path / "index.html").read_text()
     assert Links(page).addresses.count("a%20b/preview.mp4") == 1
     assert "&lt;ugly&gt;" in page

@@ -9,14 +9,14 @@ from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import write_ply
 from dg4d_lib.geometry.harmonics import harmonics_of_color
-from dg4d_lib.settings import FramewiseSettings, MeshSettings, RefinerSettings
+from dg4d_lib.settings import FramewiseSettings, IdentitySettings, MeshSettings
 from dg4d_lib.video.driving import DrivingVideo
 from steps.extract_mesh import run
 from steps.job import Facts, Job
 from steps.media import read_png, write_frames
 from steps.meshfiles import read_meshes, read_tracked, write_meshes, write_tracked
 from steps.motions import write_motion
-from steps.profiles import ExtractMeshSettings
+from steps.profiles import ExtractMeshSettings, RefineTextureSettings
 from steps.refine_texture import run as refine
 
 FRAMES = 3
@@ -65,7 +65,9 @@ def test_the_mesh_is_that_of_the_first_frame_and_moves_with_the_cloud(tracked: t
     assert radii.mean() == pytest.approx(0.5, abs=0.04)  # half-transparent two standard deviations of 0.06 outside
     assert radii.std() < 0.03
     expected = torch.arange(FRAMES)[:, None, None] * SHIFT
-    assert asset.offsets[0].norm(dim=-1).max() < 0.03  # cleaning smoothed it, the surface of the moment is elsewhere
+    drawn_in = asset.offsets[0].norm(dim=-1)  # cleaning smoothed the bumps, and the surface of a moment is denser
+    assert drawn_in.mean() < 0.02
+    assert drawn_in.max() < 0.06
     ways = asset.offsets - asset.offsets[:1]
     torch.testing.assert_close(ways, expected.expand_as(ways), atol=1e-4, rtol=0)
 
@@ -118,7 +120,7 @@ def test_refining_with_the_identity_keeps_the_mesh_and_sets_the_clock(
     job = Job(
         inputs={mode: tmp_path / f"given_{mode}", "driving_video": tmp_path / "video"},
         outputs={"tracked": tmp_path / "tracked", "meshes": tmp_path / "meshes"},
-        settings=RefinerSettings(),
+        settings=RefineTextureSettings(refiner=IdentitySettings()),
         seed=0,
         progress=lambda done, total, values: None,
         pictures=tmp_path,

@@ -5,6 +5,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import tiny_weights
 import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
@@ -94,6 +95,27 @@ def test_a_motion_comes_out_of_gaussians_and_a_video(tmp_path: Path, subject: Pa
     _, frames_fitted = read_motion(work.outputs["motion"])
     assert frames_fitted == 3
     assert "no model" in facts.notes[0]
+
+
+def test_both_fits_run_with_a_trained_prior_and_say_so(tmp_path: Path, subject: Path):
+    model = tiny_weights.write_zero123(tmp_path / "tiny")
+    trained = revise(SMALL, {"prior.kind": "zero123", "prior.weights": str(model), "motion.views": 1})
+    statics = job(tmp_path, fit_settings(trained), {"subject": subject}, ["gaussians", "curves", "picture"])
+    of_the_cloud = fit_gaussians.run(statics)
+    frames = torch.stack([disc(), disc(2)])
+    write_frames(tmp_path / "video.zip", DrivingVideo(frames[..., :3], frames[..., 3:], 5.0))
+    settings = FitMotionSettings(
+        rasterizer="auto", prior=trained.prior, deformation=trained.deformation, motion=trained.motion
+    )
+    inputs = {"gaussians": statics.outputs["gaussians"], "driving_video": tmp_path / "video.zip"}
+    work = job(tmp_path, settings, inputs, ["motion", "curves", "picture"])
+    of_the_motion = fit_motion.run(work)
+    for facts in (of_the_cloud, of_the_motion):
+        assert any(name.endswith("unet/diffusion_pytorch_model.safetensors") for name in facts.weights)
+        assert "Zero-1-to-3" in facts.notes[0] and facts.licenses
+    for done in (statics, work):
+        curves = json.loads(done.outputs["curves"].read_text())
+        assert all(value > 0 for value in curves["series"]["guidance"])
 
 
 def test_a_loss_that_is_no_number_leaves_a_picture_of_the_last_good_state(tmp_path: Path, subject: Path):

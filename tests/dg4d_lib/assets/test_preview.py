@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from dg4d_lib.assets import preview
-from dg4d_lib.assets.preview import studio, write_preview
+from dg4d_lib.assets.preview import studio, write_film, write_preview
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.errors import BackendUnavailable
@@ -112,3 +112,11 @@ def test_a_failure_while_drawing_is_not_hidden(tmp_path: Path, red_dot: Gaussian
 
     with pytest.raises(ArithmeticError, match="no picture"):
         write_preview(tmp_path / "a.mp4", red_dot, slide, 2, 30.0, broken, SETTINGS)
+
+
+def test_pictures_become_a_film_of_their_rate_and_colors(tmp_path: Path) -> None:
+    shades = torch.linspace(0.1, 0.9, 4)[:, None, None, None].expand(4, 32, 32, 3)
+    write_film(tmp_path / "film.mp4", shades, 7.0)
+    pictures, rate = film(tmp_path / "film.mp4")
+    assert rate == 7
+    np.testing.assert_allclose(pictures, shades.numpy(), atol=4 / 255)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dg4d_lib.assets.sheet import PANEL, contact_sheet
+from dg4d_lib.assets.sheet import PANEL, contact_sheet, videos_sheet
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer.reference import rasterize
@@ -83,3 +83,12 @@ def test_a_short_video_has_a_column_per_frame(red_dot: Gaussians, slide: Framewi
 
 def test_equal_assets_give_equal_sheets(sheet: torch.Tensor, red_dot: Gaussians, slide: Framewise) -> None:
     assert torch.equal(contact_sheet(red_dot, slide, footage(5), rasterize, SETTINGS), sheet)
+
+
+def test_several_videos_are_rows_in_the_given_order() -> None:
+    second = footage(5)
+    blue = DrivingVideo(torch.tensor((0.0, 0.0, 1.0)).expand(5, 64, 64, 3), second.coverage, 10.0)
+    page = videos_sheet([footage(5), blue], ["1 sway: 0.90", "2 bend: 0.50"], SIZE, 3)
+    for column in range(3):
+        torch.testing.assert_close(tile(page, 0, column, rows=2)[24, 24], torch.tensor([0.0, 1.0, 0.0]))
+        torch.testing.assert_close(tile(page, 1, column, rows=2)[24, 24], torch.tensor([0.0, 0.0, 1.0]))

@@ -1,3 +1,4 @@
+import pytest
 import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
@@ -27,3 +28,13 @@ def test_baking_sees_three_rings_and_both_poles():
 
 def test_a_turntable_goes_round_once():
     assert [c.azimuth_deg for c in turntable(4, OrbitCamera(0, 10))] == [10, 100, 190, 280]
+
+
+def test_random_cameras_come_in_rings_where_they_are_asked_to():
+    generator = torch.Generator().manual_seed(3)
+    cameras = random_orbit(8, 48, elevation_deg=(-30, 30), radius=(1.5, 2.5), generator=generator, ring=4)
+    for four in (cameras[:4], cameras[4:]):
+        assert len({(camera.elevation_deg, camera.radius) for camera in four}) == 1
+        turns = [camera.azimuth_deg - four[0].azimuth_deg for camera in four]
+        assert turns == pytest.approx([0, 90, 180, 270])
+    assert cameras[0] != cameras[4]

@@ -3,7 +3,7 @@ import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.guidance.analytic import LATENT_NUMBERS, AnalyticPrior
-from dg4d_lib.guidance.distillation import alphabars, annealed_timestep
+from dg4d_lib.guidance.distillation import Annealing, alphabars, annealed_timestep
 from dg4d_lib.guidance.interface import GuidancePrior, View
 
 SIZE = 12
@@ -16,7 +16,7 @@ def known_pictures() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def prior(coverage_weight: float = 1.0) -> AnalyticPrior:
-    return AnalyticPrior(lambda views: known_pictures(), 0.98, coverage_weight)
+    return AnalyticPrior(lambda views: known_pictures(), Annealing(0.98), coverage_weight)
 
 
 def test_it_is_a_guidance_prior():

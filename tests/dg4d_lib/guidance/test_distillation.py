@@ -1,7 +1,16 @@
 import pytest
 import torch
 
-from dg4d_lib.guidance.distillation import alphabars, annealed_timestep, score_distillation, weight
+from dg4d_lib.diffusion.batching import MicroBatches
+from dg4d_lib.guidance.distillation import (
+    Annealing,
+    alphabars,
+    annealed_timestep,
+    distill_in_pieces,
+    distillation_loss,
+    score_distillation,
+    weight,
+)
 
 
 @pytest.mark.parametrize(("timestep", "expected"), [(20, 0.0187), (250, 0.326), (500, 0.724), (980, 0.994)])
@@ -14,6 +23,66 @@ def test_the_annealing_goes_from_its_start_to_two_percent():
     assert annealed_timestep(0.5, 0.98) == 500
     assert annealed_timestep(1.0, 0.98) == 20
     assert annealed_timestep(0.0, 0.5) == 500
+
+
+@pytest.mark.parametrize(("timestep", "expected"), [(20, 0.0187), (250, 0.326), (500, 0.724), (980, 0.994)])
+def test_weights_to_the_digits_that_are_written_down(timestep: int, expected: float):
+    digits = len(str(expected)) - 2
+    assert round(weight(timestep), digits) == expected
+
+
+@pytest.mark.parametrize(("start", "iterations"), [(0.98, 500), (0.5, 200)])
+def test_the_papers_timesteps(start: float, iterations: int):
+    generator = torch.Generator()
+    for i in range(1, iterations + 1):
+        s = i / iterations
+        expected = round(1000 * (start + (0.02 - start) * s))
+        assert Annealing(start).timestep(s, generator) == expected
+
+
+def test_the_timesteps_of_the_public_code():
+    generator = torch.Generator()
+    found = [Annealing(1.0, 0.0).timestep(i / 500, generator) for i in range(1, 501)]
+    assert found == [min(max(round(1000 * (1 - i / 500)), 20), 980) for i in range(1, 501)]
+    assert set(found[:10]) == {980} and found[10] == 978
+    assert found[488] == 22 and set(found[489:]) == {20}
+
+
+def test_a_schedule_without_draws_leaves_the_generator_alone():
+    generator = torch.Generator().manual_seed(1)
+    Annealing(0.98).timestep(0.3, generator)
+    assert torch.equal(generator.get_state(), torch.Generator().manual_seed(1).get_state())
+
+
+def test_uniform_timesteps_fill_the_stretch_below_the_highest():
+    generator = torch.Generator().manual_seed(0)
+    draws = [Annealing(0.98, uniform=True).timestep(0.9, generator) for _ in range(4000)]
+    highest = annealed_timestep(0.9, 0.98)
+    assert (min(draws), max(draws)) == (20, highest)
+    assert sum(draws) / len(draws) == pytest.approx((20 + highest) / 2, rel=0.02)
+    assert [Annealing(0.98, uniform=True).timestep(1.0, generator) for _ in range(5)] == [20] * 5
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 8])
+def test_pieces_have_the_loss_and_the_gradient_of_the_whole(size: int):
+    generator = torch.Generator().manual_seed(0)
+    images = torch.rand(5, 16, 16, 3, generator=generator, dtype=torch.float64)
+    noise = torch.randn(5, 3, 8, 8, generator=generator, dtype=torch.float64)
+    offsets = torch.randn(5, 3, 8, 8, generator=generator, dtype=torch.float64)
+
+    def encode(pixels: torch.Tensor) -> torch.Tensor:
+        return torch.nn.functional.avg_pool2d(pixels.permute(0, 3, 1, 2), 2).sin()
+
+    def predict(noisy: torch.Tensor, t: int, piece: slice = slice(None)) -> torch.Tensor:
+        return noisy.tanh() * t / 1000 + offsets[piece]
+
+    whole, pieces = images.clone().requires_grad_(), images.clone().requires_grad_()
+    expected = distillation_loss(encode(whole), predict, 300, noise)
+    found = distill_in_pieces(pieces, encode, predict, 300, noise, MicroBatches("images", size))
+    (3 * expected).backward()
+    (3 * found).backward()
+    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(pieces.grad, whole.grad)
 
 
 @pytest.mark.parametrize("timestep", [20, 500, 980])

@@ -93,3 +93,17 @@ def test_depth_blurs_along_the_direction_in_which_it_shows(elevation, azimuth, d
     assert spread(blurred, 0) == pytest.approx(down * sigma, abs=0.02)
     assert spread(blurred, 1) == pytest.approx(across * sigma, abs=0.02)
     assert blurred.sum() == pytest.approx(1, abs=1e-4)
+
+
+def test_the_blur_is_the_normalized_gaussian_of_the_places_inside():
+    cameras = [
+        OrbitCamera(elevation, azimuth, width=30, height=30) for elevation, azimuth in ((0, 0), (20, 90), (80, 40))
+    ]
+    images = torch.rand(3, 30, 30, 2, generator=torch.Generator().manual_seed(0))
+    places = torch.arange(30.0, dtype=torch.float64)
+    for camera, image, found in zip(cameras, images, averaged_over_depth(images, cameras, 0.15), strict=True):
+        depth = camera.world_to_camera()[:2, 2].abs() * 0.15 * camera.focal / camera.radius
+        weights = [(-((places[:, None] - places) ** 2) / (2 * max(float(d), 1e-3) ** 2)).exp() for d in depth]
+        across, down = (each / each.sum(1, keepdim=True) for each in weights)
+        expected = torch.einsum("ij,jlc,kl->ikc", down, image.double(), across)
+        torch.testing.assert_close(found.double(), expected, rtol=0, atol=3e-6)  # tails beyond five sigma

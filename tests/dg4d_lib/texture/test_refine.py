@@ -1,47 +1,206 @@
 import math
+from collections.abc import Sequence
+from itertools import pairwise
 
 import pytest
 import torch
+from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.mesh.render import sample
+from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.texture.refine import refine_texture
-from dg4d_lib.texture.refiner import Identity
+from dg4d_lib.mesh_rasterizer.texture import bilinear, look_up, read
+from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
+from dg4d_lib.settings import TextureSettings
+from dg4d_lib.texture.refine import Stretch, refine_textures
+from dg4d_lib.video.driving import DrivingVideo
 
-HALF = 2 * math.tan(math.radians(OrbitCamera().fov_y_deg) / 2)
-STILL = torch.zeros(2, 4, 3)
-
-
-class Negative:
-    """Shows every color's opposite."""
-
-    def refine(self, video: torch.Tensor) -> torch.Tensor:
-        return 1 - video
+SIZE, FRAMES = 64, 3
+SETTINGS = TextureSettings(iterations=50, size=SIZE, azimuth_step_deg=40.0)
+FACES = torch.tensor([[0, 1, 2], [0, 2, 3]])
 
 
-@pytest.fixture
-def board() -> TexturedMesh:
-    """A square that covers the middle half of the input view with the left half of a smooth texture."""
-    corners = torch.tensor([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
-    uvs = torch.tensor([[0.0, 0.0], [0.5, 0.0], [0.5, 1.0], [0.0, 1.0]])
-    ramp = torch.linspace(0, 1, 16)
-    texture = torch.stack(torch.broadcast_tensors(ramp[:, None], ramp, torch.tensor(0.2)), -1)
-    return TexturedMesh(0.5 * HALF * corners, torch.tensor([[0, 3, 2], [0, 2, 1]]), uvs, texture)
+def box(texture: Tensor) -> TexturedMesh:
+    """Four upright sides around the axis, each with a quarter of the texture, seen from all azimuths."""
+    vertices, uvs, faces = [], [], []
+    for side in range(4):
+        angle = math.radians(90 * side)
+        for x, y, u, v in ((-1, -1, 0, 1), (1, -1, 1, 1), (1, 1, 1, 0), (-1, 1, 0, 0)):
+            place = (x * math.cos(angle) + math.sin(angle), y, -x * math.sin(angle) + math.cos(angle))
+            vertices.append([0.4 * c for c in place])
+            uvs.append([(side + 0.05 + 0.9 * u) / 4, 0.05 + 0.9 * v])
+        faces.append(FACES + 4 * side)
+    return TexturedMesh(torch.tensor(vertices), torch.cat(faces), torch.tensor(uvs), texture)
 
 
-def test_where_the_refiner_changes_nothing_the_texture_stays_bit_for_bit(board: TexturedMesh) -> None:
-    assert torch.equal(refine_texture(board, STILL, Identity(), 64), board.texture)
+def painted(seed: float = 0.0) -> Tensor:
+    """Smooth colors that differ everywhere."""
+    y, x = torch.meshgrid(torch.linspace(0, 1, 32), torch.linspace(0, 1, 128), indexing="ij")
+    waves = (7 * x + seed, 5 * y + 3 * x + seed, 9 * x - 4 * y + seed)
+    return torch.stack([0.5 + 0.35 * torch.sin(wave) for wave in waves], -1)
 
 
-def test_the_texture_follows_what_the_refiner_shows(board: TexturedMesh) -> None:
-    texture = refine_texture(board, STILL, Negative(), 64)
-    grid = torch.linspace(0.05, 0.45, 9)
-    places = torch.stack(torch.meshgrid(grid, 2 * grid, indexing="ij"), -1).reshape(-1, 2)
-    wanted = 1 - sample(board.texture, places)
-    torch.testing.assert_close(sample(texture, places), wanted, atol=0.03, rtol=0)
+def shown(meshes: Sequence[TexturedMesh], cameras: Sequence[OrbitCamera]) -> Tensor:
+    """Each mesh over white from its camera."""
+    pictures = []
+    for mesh, camera in zip(meshes, cameras, strict=True):
+        fragments = rasterize_mesh(mesh.vertices, mesh.faces, [camera])
+        lookup = look_up(mesh.vertices, mesh.faces, mesh.uvs, mesh.texture.shape[:2], [camera], fragments)
+        picture = torch.ones(*lookup.covered.shape, 3)
+        picture[lookup.covered] = read(mesh.texture, lookup)
+        pictures.append(picture[0])
+    return torch.stack(pictures)
 
 
-def test_texels_that_the_input_view_does_not_show_stay(board: TexturedMesh) -> None:
-    texture = refine_texture(board, STILL, Negative(), 64)
-    assert torch.equal(texture[:, 10:], board.texture[:, 10:])
+class Oracle:
+    """Returns the true pictures, and remembers what it was asked."""
+
+    def __init__(self, truth: Sequence[TexturedMesh]) -> None:
+        self.truth = truth
+        self.cameras: list[Sequence[OrbitCamera]] = []
+        self.progress: list[float] = []
+
+    def refine(
+        self, video: Tensor, cameras: Sequence[OrbitCamera], progress: float, generator: torch.Generator
+    ) -> Tensor:
+        self.cameras.append(cameras)
+        self.progress.append(progress)
+        return shown(self.truth, cameras)
+
+
+class Satisfied:
+    """Finds every video good."""
+
+    def refine(
+        self, video: Tensor, cameras: Sequence[OrbitCamera], progress: float, generator: torch.Generator
+    ) -> Tensor:
+        return video
+
+
+def moved(mesh: TexturedMesh, frame: int) -> TexturedMesh:
+    return TexturedMesh(mesh.vertices + shift(mesh, frame), mesh.faces, mesh.uvs, mesh.texture)
+
+
+def shift(mesh: TexturedMesh, frame: int) -> Tensor:
+    return torch.tensor([0.05 * frame, 0.0, 0.0]).expand_as(mesh.vertices)
+
+
+def driving_of(meshes: Sequence[TexturedMesh]) -> DrivingVideo:
+    frames = shown(meshes, [OrbitCamera(width=SIZE, height=SIZE)] * len(meshes))
+    return DrivingVideo(frames, torch.ones_like(frames[..., :1]), 7.0)
+
+
+def rng(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def error(texture: Tensor, truth: Tensor) -> float:
+    """Mean over the texels that the sides show."""
+    inside = torch.linspace(0.1, 0.9, 20)
+    places = torch.stack([torch.stack([(side + u) / 4, v]) for side in range(4) for u in inside for v in inside])
+    return float((bilinear(texture, places) - bilinear(truth, places)).abs().mean())
+
+
+def tracked(texture: Tensor) -> list[Stretch]:
+    mesh = box(texture)
+    return [Stretch(mesh, torch.stack([shift(mesh, frame) for frame in range(FRAMES)]))]
+
+
+def test_a_refiner_that_knows_the_truth_gives_a_tracked_mesh_its_texture() -> None:
+    truth, start = painted(), torch.full((32, 128, 3), 0.5)
+    meshes = [moved(box(truth), frame) for frame in range(FRAMES)]
+    (texture,) = refine_textures(tracked(start), driving_of(meshes), Oracle(meshes), SETTINGS, rng())
+    assert error(start, truth) > 0.2
+    assert error(texture, truth) < 0.02
+
+
+def test_it_gives_every_frame_of_its_own_mesh_its_own_texture() -> None:
+    truths = [painted(frame) for frame in range(FRAMES)]
+    meshes = [moved(box(truth), frame) for frame, truth in enumerate(truths)]
+    start = torch.full((32, 128, 3), 0.5)
+    stretches = [Stretch(moved(box(start), frame), torch.zeros(1, 16, 3)) for frame in range(FRAMES)]
+    textures = refine_textures(stretches, driving_of(meshes), Oracle(meshes), SETTINGS, rng())
+    for texture, truth in zip(textures, truths, strict=True):
+        assert error(texture, truth) < 0.05  # each is seen by one camera per iteration
+    assert error(textures[0], truths[2]) > 0.1
+
+
+def test_the_camera_goes_round_at_constant_speed_from_random_starts() -> None:
+    meshes = [moved(box(painted()), frame) for frame in range(FRAMES)]
+    oracle, settings = Oracle(meshes), SETTINGS.model_copy(update={"iterations": 5, "azimuth_step_deg": 10.0})
+    refine_textures(tracked(painted()), driving_of(meshes), oracle, settings, rng())
+    starts = []
+    for cameras in oracle.cameras:
+        azimuths = [camera.azimuth_deg for camera in cameras]
+        assert [b - a for a, b in pairwise(azimuths)] == pytest.approx([10.0, 10.0])
+        assert all(camera.elevation_deg == 0 and camera.width == SIZE for camera in cameras)
+        starts.append(azimuths[0])
+    assert len(set(starts)) == 5 and max(starts) - min(starts) > 90
+    assert oracle.progress == [0, 0.25, 0.5, 0.75, 1]
+
+
+def test_targets_are_kept_for_as_many_iterations_as_wanted() -> None:
+    meshes = [moved(box(painted()), frame) for frame in range(FRAMES)]
+    oracle, settings = Oracle(meshes), SETTINGS.model_copy(update={"iterations": 7, "refresh_every": 3})
+    refine_textures(tracked(painted()), driving_of(meshes), oracle, settings, rng())
+    assert len(oracle.cameras) == 3
+
+
+def test_texels_that_nothing_shows_stay_bit_for_bit() -> None:
+    """Only the front is shown, and only its right half is painted anew; the lower half of the texture is on no side."""
+    start = torch.cat([painted(), painted(1.0)])
+    mesh = box(start)
+    front = TexturedMesh(mesh.vertices[:4], mesh.faces[:2], mesh.uvs[:4] * torch.tensor([1.0, 0.4]), start)
+    truth = TexturedMesh(front.vertices, front.faces, front.uvs, 1 - start)
+    settings = SETTINGS.model_copy(update={"iterations": 3, "azimuth_step_deg": 0.0})
+    (texture,) = refine_textures(
+        [Stretch(front, torch.zeros(1, 4, 3))], driving_of([truth]), Satisfied(), settings, rng()
+    )
+    assert torch.equal(texture[32:], start[32:])
+    assert (texture[4:20, 4:28] - start[4:20, 4:28]).abs().mean() > 0.05
+
+
+def test_the_input_view_does_not_color_what_it_sees_from_the_side() -> None:
+    """The driving video is all red; the sides of a turned box are flatter than the least cosine, its front is not."""
+    start = torch.full((32, 128, 3), 0.5)
+    mesh = box(start)
+    angle = math.radians(25)
+    turn = torch.tensor([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
+    turned = TexturedMesh(mesh.vertices @ turn.T, mesh.faces, mesh.uvs, start)
+    red = DrivingVideo(torch.tensor([1.0, 0, 0]).expand(1, SIZE, SIZE, 3), torch.ones(1, SIZE, SIZE, 1), 7.0)
+    stretches = [Stretch(turned, torch.zeros(1, 16, 3))]
+    settings = SETTINGS.model_copy(update={"iterations": 3, "min_cosine": 0.6})
+    (texture,) = refine_textures(stretches, red, Satisfied(), settings, rng())
+    change = (texture - start).abs().mean(-1).mean(0).reshape(4, 32).mean(1)
+    assert change[0] > 0.1
+    assert change[1:].max() < 0.01
+    (texture,) = refine_textures(stretches, red, Satisfied(), settings.model_copy(update={"min_cosine": 0.0}), rng())
+    assert (texture - start).abs().mean(-1).mean(0).reshape(4, 32).mean(1)[1:].max() > 0.1
+
+
+def test_equal_seeds_give_equal_bits() -> None:
+    meshes = [moved(box(painted()), frame) for frame in range(FRAMES)]
+    settings = SETTINGS.model_copy(update={"iterations": 3})
+    once, again, other = (
+        refine_textures(tracked(painted(1.0)), driving_of(meshes), Oracle(meshes), settings, rng(seed))[0]
+        for seed in (0, 0, 1)
+    )
+    assert torch.equal(once, again) and not torch.equal(once, other)
+
+
+def test_another_number_of_frames_is_refused() -> None:
+    meshes = [box(painted())] * 2
+    with pytest.raises(BadInput, match="3 frames and the driving video 2"):
+        refine_textures(tracked(painted()), driving_of(meshes), Satisfied(), SETTINGS, rng())
+
+
+def test_a_refiner_that_breaks_is_noticed() -> None:
+    class Broken:
+        def refine(
+            self, video: Tensor, cameras: Sequence[OrbitCamera], progress: float, generator: torch.Generator
+        ) -> Tensor:
+            return torch.full_like(video, math.nan)
+
+    meshes = [moved(box(painted()), frame) for frame in range(FRAMES)]
+    with pytest.raises(FitDiverged, match="iteration 0"):
+        refine_textures(tracked(painted()), driving_of(meshes), Broken(), SETTINGS, rng())

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.settings import DrivingSettings
+from dg4d_lib.settings import WarpSettings
 from dg4d_lib.video.generator import VideoGenerator
 from dg4d_lib.video.limbs import waving_limbs
 from dg4d_lib.video.motions import bounce, breathe, lean, squash
@@ -46,7 +46,7 @@ BUST = picture(torch.maximum(14 - ((X - 48) ** 2 + (Y - 40) ** 2).sqrt(), capsul
 
 
 def video(subject: torch.Tensor, motion: str, strength: float = 1.0, frames: int = 8):
-    warp = Warp(DrivingSettings(motion=motion, frames=frames, strength=strength))
+    warp = Warp(WarpSettings(motion=motion, frames=frames, strength=strength))
     return warp.generate(subject, torch.Generator()), warp.notes
 
 
@@ -212,7 +212,7 @@ def test_the_same_request_gives_the_same_bytes():
 
 
 def test_it_is_a_video_generator():
-    assert isinstance(Warp(DrivingSettings()), VideoGenerator)
+    assert isinstance(Warp(WarpSettings()), VideoGenerator)
 
 
 def test_a_rigid_sheet_follows_a_rotation_exactly():

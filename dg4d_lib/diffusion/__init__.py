@@ -1,0 +1,1 @@
+"""What users of pretrained diffusion models share: loading their parts, and fitting batches into memory."""

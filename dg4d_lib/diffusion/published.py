@@ -1,0 +1,39 @@
+"""Networks of this project filled with published tensors, whose names they carry."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from dg4d_lib.diffusion.parts import Placement, frozen, read_tensors
+from dg4d_lib.errors import BadInput
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+def load_network(build: Callable[[dict[str, Tensor]], Network], file: Path, placement: Placement) -> Network:
+    """The network that `build` makes, with the tensors of a file, frozen; tensors it does not know are left out.
+
+    Args:
+        build: makes it for these tensors; called where new tensors take no memory.
+        file: a safetensors file, or a pickle of tensors.
+        placement: where and how it lies.
+
+    Raises:
+        BadInput: the file cannot be read, or tensors are missing or of another shape.
+    """
+    tensors = read_tensors(file)
+    with torch.device("meta"):
+        network = build(tensors)
+    wanted = {name: value.shape for name, value in network.state_dict().items()}
+    wrong = [name for name, shape in wanted.items() if name not in tensors or tensors[name].shape != shape]
+    if wrong:
+        raise BadInput(
+            f"{file} does not fit this {type(network).__name__}: {len(wrong)} of its {len(wanted)} tensors are missing "
+            f"or of another shape, the first is {wrong[0]}"
+        )
+    network.load_state_dict({name: tensors[name].to(placement.dtype) for name in wanted}, assign=True)
+    loaded: Network = frozen(network, placement)
+    return loaded

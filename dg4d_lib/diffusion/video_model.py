@@ -1,0 +1,243 @@
+"""Stable Video Diffusion in its parts: look at a picture, encode, denoise and decode videos (METHOD sections 6 and 9).
+
+The schedule is Karras et al. 2022; the network predicts v (Salimans and Ho 2022) of x = x0 + sigma e:
+x0 = x / (1 + sigma^2) - v sigma / sqrt(1 + sigma^2), and its input is x / sqrt(1 + sigma^2) at the time ln(sigma) / 4.
+Between noise levels goes one step of Euler's method. Latents are kept in float32 or better between the steps.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import conv2d, interpolate, pad
+
+from dg4d_lib.diffusion.batching import MicroBatches
+from dg4d_lib.diffusion.parts import DTYPES, Placement, load_image_encoder, load_temporal_unet, load_temporal_vae
+from dg4d_lib.settings import VideoModelSettings
+
+SIGMA_MAX, SIGMA_MIN, RHO = 700.0, 0.002, 7.0
+CLIP_SIZE = 224  # pixels of the picture that the image encoder sees
+CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+
+
+def karras_sigmas(steps: int) -> tuple[float, ...]:
+    """Noise levels from 700 down to 0.002 whose 1/7th powers are evenly spaced, and 0 after them: `steps` + 1."""
+    top, bottom = SIGMA_MAX ** (1 / RHO), SIGMA_MIN ** (1 / RHO)
+    return (*((top + i / (steps - 1) * (bottom - top)) ** RHO for i in range(steps)), 0.0)
+
+
+def start_index(steps: int, skipped: float) -> int:
+    """The first noise level that is used if a share of them is skipped: 0.7 of 25 gives 17, whose sigma is 1.2732."""
+    return min(int(steps * skipped + 1e-9), steps - 1)
+
+
+def clean(noisy: Float[Tensor, "*b"], velocity: Float[Tensor, "*b"], sigma: float) -> Float[Tensor, "*b"]:
+    """x0 out of x and the network's v."""
+    return noisy / (1 + sigma**2) - velocity * sigma / math.sqrt(1 + sigma**2)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What the network is told about b videos.
+
+    Attributes:
+        embedding: of the picture, by the image encoder.
+        latents: of the picture with a little noise, by the VAE, not scaled; every frame gets them.
+        ids: fps id, motion bucket and strength of that noise.
+    """
+
+    embedding: Float[Tensor, "b 1 d"]
+    latents: Float[Tensor, "b c i j"]
+    ids: Float[Tensor, "b 3"]
+
+
+class VideoModel:
+    """The three networks, frozen.
+
+    Attributes:
+        unet: predicts v.
+        vae: pictures to latents and back.
+        image_encoder: CLIP.
+    """
+
+    def __init__(
+        self, unet: Any, vae: Any, image_encoder: Any, settings: VideoModelSettings, device: torch.device
+    ) -> None:
+        """Take networks; with `settings.low_memory` each is on the device only while it works."""
+        self.unet, self.vae, self.image_encoder = unet, vae, image_encoder
+        self.settings, self.device = settings, device
+        self._videos = MicroBatches("videos of the video model", settings.videos_at_once)
+        self._frames = MicroBatches("frames of the video model", settings.frames_at_once)
+        if not settings.low_memory:
+            for part in (unet, vae, image_encoder):
+                part.to(device)
+
+    @classmethod
+    def load(cls, folder: Path, settings: VideoModelSettings, device: torch.device) -> "VideoModel":
+        """Read the networks from a folder in the diffusers layout.
+
+        Raises:
+            BadInput: a file is missing, damaged, or holds other tensors than its config says.
+            BackendUnavailable: diffusers or transformers is not installed.
+        """
+        dtype = torch.float32 if device.type == "cpu" else DTYPES[settings.precision]
+        place = Placement(torch.device("cpu") if settings.low_memory else device, dtype)
+        parts = load_temporal_unet(folder, place), load_temporal_vae(folder, place), load_image_encoder(folder, place)
+        return cls(*parts, settings, device)
+
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for the report: where memory ran out."""
+        return (*self._videos.notes(), *self._frames.notes())
+
+    @property
+    def shrinkage(self) -> int:
+        """Pixels of a side of a latent: 8."""
+        return int(2 ** (len(self.vae.config.block_out_channels) - 1))
+
+    @property
+    def trained_frames(self) -> int:
+        """Frames of the videos that the network was trained on: 14 or 25."""
+        return int(self.unet.config.num_frames)
+
+    def blank(self, videos: int, frames: int, height: int, width: int) -> tuple[int, int, int, int, int]:
+        """The shape of the latents of videos of this many pixels: "b t c i j"."""
+        channels = int(self.vae.config.latent_channels)
+        return videos, frames, channels, height // self.shrinkage, width // self.shrinkage
+
+    @torch.no_grad()
+    def look_at(self, picture: Float[Tensor, "h w 3"], generators: Sequence[torch.Generator]) -> Condition:
+        """What the network is told about videos of this picture, one per generator.
+
+        Args:
+            picture: in [0, 1]; sides are multiples of `shrinkage`.
+            generators: of the noise on the picture.
+        """
+        settings, count = self.settings, len(generators)
+        scaled = 2 * picture.movedim(-1, 0)[None] - 1
+        with self._awake(self.image_encoder) as encoder:
+            eye = _for_clip(scaled.to(self.device, _wide(encoder.dtype)))
+            embedding = encoder(eye.to(encoder.dtype)).image_embeds[:, None]
+        noise = torch.cat([_normal(scaled.shape, generator, scaled.dtype) for generator in generators])
+        latents = self._mode(scaled + settings.noise_augmentation * noise.to(scaled))
+        ids = torch.tensor(
+            [settings.fps_id, settings.motion_bucket, settings.noise_augmentation], dtype=self.unet.dtype
+        )
+        return Condition(embedding.expand(count, -1, -1), latents, ids.to(self.device).expand(count, -1))
+
+    @torch.no_grad()
+    def encode(self, video: Float[Tensor, "t h w 3"]) -> Float[Tensor, "t c i j"]:
+        """The scaled latents of pictures in [0, 1]: modes, no samples."""
+        return self._mode(2 * video.movedim(-1, 1) - 1) * float(self.vae.config.scaling_factor)
+
+    @torch.no_grad()
+    def decode(self, latents: Float[Tensor, "t c i j"]) -> Float[Tensor, "t h w 3"]:
+        """The pictures of scaled latents, in [0, 1], a few frames at a time."""
+        with self._awake(self.vae) as vae:
+            inside = (latents / vae.config.scaling_factor).to(self.device, vae.dtype)
+            pictures = self._frames.run(
+                lambda part: vae.decode(inside[part], num_frames=len(inside[part])).sample, len(inside)
+            )
+        decoded = torch.cat(pictures)
+        return (decoded.to(_wide(decoded.dtype)).movedim(1, -1) / 2 + 0.5).clamp(0, 1)
+
+    @torch.no_grad()
+    def denoise(
+        self, latents: Float[Tensor, "b t c i j"], condition: Condition, sigmas: Sequence[float]
+    ) -> Float[Tensor, "b t c i j"]:
+        """Latents at the first noise level, taken to the last by Euler's method.
+
+        Guidance goes from `guidance_start` in the first frame to `guidance_end` in the last; what it is guided away
+        from knows no picture.
+        """
+        with self._awake(self.unet) as unet:
+            for sigma, following in pairwise(sigmas):
+                slope = (latents - clean(latents, self._guided(unet, latents, condition, sigma), sigma)) / sigma
+                latents = latents + (following - sigma) * slope
+        return latents
+
+    def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Float[Tensor, "b t c i j"]:
+        """Noise of standard deviation 1 for the latents of several videos, one generator each."""
+        dtype = _wide(self.unet.dtype)
+        return torch.cat([_normal((1, *shape[1:]), generator, dtype) for generator in generators]).to(self.device)
+
+    def _guided(
+        self, unet: Any, latents: Float[Tensor, "b t c i j"], condition: Condition, sigma: float
+    ) -> Float[Tensor, "b t c i j"]:
+        """The network's v, guided towards the picture."""
+        frames = latents.shape[1]
+        time = torch.tensor(0.25 * math.log(sigma), dtype=_wide(unet.dtype), device=self.device)
+        embedding = torch.cat([torch.zeros_like(condition.embedding), condition.embedding])
+        pictures = torch.cat([torch.zeros_like(condition.latents), condition.latents])
+        ids = torch.cat([condition.ids, condition.ids])
+        noisy = (torch.cat([latents, latents]) / math.sqrt(1 + sigma**2)).to(unet.dtype)
+        seen = torch.cat([noisy, pictures[:, None].expand(-1, frames, -1, -1, -1).to(unet.dtype)], 2)
+        velocities = self._videos.run(
+            lambda part: unet(seen[part], time, embedding[part], ids[part], return_dict=False)[0], len(seen)
+        )
+        without, informed = torch.cat(velocities).to(latents).chunk(2)
+        guidance = torch.linspace(self.settings.guidance_start, self.settings.guidance_end, frames)
+        return without + guidance.to(latents)[:, None, None, None] * (informed - without)
+
+    def _mode(self, pictures: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c i j"]:
+        """Latents of pictures in [-1, 1]; in float32 where half precision overflows."""
+        with self._awake(self.vae) as vae:
+            dtype = vae.dtype
+            careful = dtype == torch.float16 and vae.config.force_upcast
+            if careful:
+                vae.to(torch.float32)
+            seen = pictures.to(self.device, vae.dtype)
+            latents = self._frames.run(lambda part: vae.encode(seen[part]).latent_dist.mode(), len(seen))
+            if careful:
+                vae.to(dtype)
+        return torch.cat(latents).to(_wide(dtype))
+
+    @contextmanager
+    def _awake(self, part: Any) -> Iterator[Any]:
+        if not self.settings.low_memory:
+            yield part
+            return
+        part.to(self.device)
+        try:
+            yield part
+        finally:
+            part.to("cpu")
+
+
+def _wide(dtype: torch.dtype) -> torch.dtype:
+    return torch.promote_types(dtype, torch.float32)
+
+
+def _normal(shape: Sequence[int], generator: torch.Generator, dtype: torch.dtype) -> Tensor:
+    """Drawn where the generator is, so that devices agree."""
+    return torch.randn(tuple(shape), generator=generator, dtype=dtype, device=generator.device)
+
+
+def _for_clip(pictures: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 s s"]:
+    """Pictures in [-1, 1] as the image encoder was trained to see them: blurred, 224 pixels a side, normalized.
+
+    The blur's deviation is half of the shrinkage less one, cut off at about two deviations; resampling is bicubic and
+    keeps the centers of the corner pixels.
+    """
+    for axis in (3, 2):
+        pictures = _blur(pictures, axis)
+    small = interpolate(pictures, (CLIP_SIZE, CLIP_SIZE), mode="bicubic", align_corners=True)
+    mean, deviation = (small.new_tensor(values)[:, None, None] for values in (CLIP_MEAN, CLIP_STD))
+    return (small / 2 + 0.5 - mean) / deviation
+
+
+def _blur(pictures: Float[Tensor, "b 3 h w"], axis: int) -> Float[Tensor, "b 3 h w"]:
+    sigma = max((pictures.shape[axis] / CLIP_SIZE - 1) / 2, 0.001)
+    length = max(int(4 * sigma), 3) | 1
+    places = torch.arange(length, device=pictures.device, dtype=pictures.dtype) - length // 2
+    weights = torch.exp(-places.square() / (2 * sigma**2))
+    weights = (weights / weights.sum()).view((1, 1, -1, 1) if axis == 2 else (1, 1, 1, -1)).expand(3, 1, -1, -1)
+    margin = length // 2
+    around = (0, 0, margin, margin) if axis == 2 else (margin, margin, 0, 0)
+    return conv2d(pad(pictures, around, mode="reflect"), weights, groups=3)

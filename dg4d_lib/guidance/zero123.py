@@ -1,0 +1,260 @@
+"""Zero-1-to-3: a diffusion model that knows a picture, and how it should look from another camera (Liu et al. 2023).
+
+Loading is slow and done once; conditioning on frames is quick and gives a new frozen prior. Layout of the folder:
+`dg4d_lib/diffusion/parts.py`, and clip_camera_projection/ with the linear layer proj from [CLIP embedding, camera] to
+the one token of the UNet's cross-attention.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.diffusion.batching import MicroBatches
+from dg4d_lib.diffusion.parts import (
+    BetaSchedule,
+    Placement,
+    dtype_on,
+    load_image_encoder,
+    load_unet,
+    load_vae,
+    read_linear,
+    require_schedule,
+)
+from dg4d_lib.errors import BadInput
+from dg4d_lib.guidance.distillation import BETA_END, BETA_START, TRAIN_STEPS, Annealing, distill_in_pieces
+from dg4d_lib.guidance.interface import View
+from dg4d_lib.settings import Precision, Zero123PriorSettings
+
+SIZE, LATENT_SIZE, LATENT_CHANNELS = 256, 32, 4  # pixels; latents of the VAE
+CLIP_SIZE = 224  # pixels
+CLIP_MEAN, CLIP_DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+CAMERA_NUMBERS = 4
+SCHEDULE = BetaSchedule(BETA_START, BETA_END, "scaled_linear", TRAIN_STEPS, "epsilon")
+
+RESIDENT_GB = {"fp16": 5.0, "bf16": 5.0, "fp32": 8.0}  # weights (2.7 or 5.4), renders and what CUDA takes
+VIEW_GB = {"fp16": 0.5, "bf16": 0.5, "fp32": 1.0}  # what the VAE keeps for its gradient (.37 or .74), and workspace
+
+
+@dataclass(frozen=True)
+class Zero123:
+    """The frozen networks.
+
+    Attributes:
+        vae: AutoencoderKL.
+        unet: UNet2DConditionModel: noisy latent and the input's latent in, noise out.
+        image_encoder: CLIPVisionModelWithProjection.
+        camera_projection: CLIP embedding and camera to one token.
+        settings: of the prior.
+    """
+
+    vae: Any
+    unet: Any
+    image_encoder: Any
+    camera_projection: nn.Linear
+    settings: Zero123PriorSettings
+
+    @classmethod
+    def load(cls, model: Path, settings: Zero123PriorSettings, device: torch.device) -> "Zero123":
+        """Read the networks from a folder.
+
+        Args:
+            model: in diffusers' layout.
+            settings: precision, memory and guidance.
+            device: where they will run; on a processor in fp32 whatever the settings say.
+
+        Raises:
+            BadInput: a file is missing or damaged, or the parts are not those of Zero-1-to-3.
+            BackendUnavailable: diffusers is not installed.
+        """
+        placement = Placement(device, dtype_on(device, settings.precision), channels_last=device.type == "cuda")
+        require_schedule(model, SCHEDULE)
+        projection = read_linear(model / "clip_camera_projection", "proj", placement)
+        encoder = load_image_encoder(model, placement)
+        vae, unet = load_vae(model, placement), load_unet(model, placement)
+        found = {
+            "inputs of the UNet": (unet.config.in_channels, 2 * LATENT_CHANNELS),
+            "outputs of the UNet": (unet.config.out_channels, LATENT_CHANNELS),
+            "channels of the VAE": (vae.config.latent_channels, LATENT_CHANNELS),
+            "shrinking by the VAE": (2 ** (len(vae.config.block_out_channels) - 1), SIZE // LATENT_SIZE),
+            "inputs of the projection": (projection.in_features, encoder.config.projection_dim + CAMERA_NUMBERS),
+            "outputs of the projection": (projection.out_features, unet.config.cross_attention_dim),
+        }
+        if wrong := [f"{name}: {have} instead of {want}" for name, (have, want) in found.items() if have != want]:
+            raise BadInput(f"{model} is no Zero-1-to-3 ({'; '.join(wrong)}); give weights of Zero-1-to-3")
+        if settings.compiled:
+            unet.compile()
+            vae.encoder.compile()
+        return cls(vae, unet, encoder, projection, settings)
+
+    @torch.no_grad()
+    def conditioned_on(
+        self, frames: Float[Tensor, "t h w 3"], noise: Annealing, input_camera: OrbitCamera | None = None
+    ) -> "ConditionedZero123":
+        """A prior that knows these frames; the image encoder is not part of it and may be freed.
+
+        Args:
+            frames: what the input camera sees, over white, in [0, 1].
+            noise: which timestep an iteration uses.
+            input_camera: where the frames were taken from; the default is azimuth and elevation 0.
+        """
+        precision: Precision = self.settings.precision
+        batches = MicroBatches.within(
+            "views for the prior", self.settings.memory_gb, RESIDENT_GB[precision], VIEW_GB[precision]
+        )
+
+        def embed(piece: slice) -> tuple[Tensor, Tensor]:
+            pictures = frames[piece].to(self.vae.device)
+            clip = clip_pixels(pictures).to(self.image_encoder.dtype)
+            return self.image_encoder(clip).image_embeds, encoded(self.vae, pictures).to(self.unet.dtype)
+
+        embeddings, latents = (torch.cat(parts) for parts in zip(*batches.run(embed, len(frames)), strict=True))
+        return ConditionedZero123(
+            vae=self.vae,
+            unet=self.unet,
+            camera_projection=self.camera_projection,
+            settings=self.settings,
+            embeddings=embeddings,
+            latents=latents,
+            noise=noise,
+            input_camera=input_camera or OrbitCamera(),
+            batches=batches,
+        )
+
+
+@dataclass(frozen=True)
+class ConditionedZero123:
+    """A guidance prior: every render is judged as another view of its frame.
+
+    Attributes:
+        vae: as in `Zero123`.
+        unet: as in `Zero123`.
+        camera_projection: as in `Zero123`.
+        settings: of the prior.
+        embeddings: CLIP's, of every frame.
+        latents: the VAE's, of every frame, not scaled.
+        noise: which timestep an iteration uses.
+        input_camera: where the frames were taken from.
+        batches: how many views are judged at once.
+    """
+
+    vae: Any
+    unet: Any
+    camera_projection: nn.Linear
+    settings: Zero123PriorSettings
+    embeddings: Float[Tensor, "t e"]
+    latents: Float[Tensor, "t 4 32 32"]
+    noise: Annealing
+    input_camera: OrbitCamera
+    batches: MicroBatches
+    viewpoints: tuple[OrbitCamera, ...] | None = field(default=None, init=False)
+    frames: tuple[int, ...] | None = field(default=None, init=False)
+
+    def loss(
+        self,
+        images: Float[Tensor, "b h w 3"],
+        coverage: Float[Tensor, "b h w 1"],
+        views: Sequence[View],
+        progress: float,
+        generator: torch.Generator,
+    ) -> Float[Tensor, ""]:
+        """The distillation loss of the renders; coverage is ignored.
+
+        Raises:
+            BadInput: a view of a frame that it does not know.
+            BackendUnavailable: there is no memory for a single view.
+        """
+        rows = torch.tensor([self._known(view.frame) for view in views], device=self.vae.device)
+        timestep = self.noise.timestep(progress, generator)
+        shape = (len(images), LATENT_CHANNELS, LATENT_SIZE, LATENT_SIZE)
+        noise = torch.randn(shape, dtype=images.dtype, generator=generator)
+        tokens, pictures = self.tokens(views), self.latents[rows]
+
+        def encode(pixels: Float[Tensor, "p h w 3"]) -> Float[Tensor, "p 4 32 32"]:
+            return self.vae.config.scaling_factor * encoded(self.vae, pixels.to(self.vae.device))
+
+        def predict_noise(noisy: Float[Tensor, "p 4 32 32"], timestep: int, piece: slice) -> Float[Tensor, "p 4 32 32"]:
+            return self.believed_noise(noisy, timestep, pictures[piece], tokens[piece])
+
+        return distill_in_pieces(images, encode, predict_noise, timestep, noise, self.batches)
+
+    def believed_noise(
+        self,
+        noisy: Float[Tensor, "b 4 32 32"],
+        timestep: int,
+        pictures: Float[Tensor, "b 4 32 32"],
+        tokens: Float[Tensor, "b 1 c"],
+    ) -> Float[Tensor, "b 4 32 32"]:
+        """The UNet's noise with classifier-free guidance, in the precision of `noisy`.
+
+        Args:
+            noisy: x_t.
+            timestep: t.
+            pictures: latents of the frames; zero in the unconditional half.
+            tokens: of the cameras; zero in the unconditional half.
+        """
+        context = torch.cat([torch.zeros_like(tokens), tokens])
+        condition = torch.cat([torch.zeros_like(pictures), pictures])
+        inputs = torch.cat([torch.cat([noisy, noisy]).to(condition.dtype), condition], 1)
+        timesteps = torch.full((len(inputs),), timestep, device=inputs.device)
+        free, conditional = self.unet(inputs, timesteps, context).sample.to(noisy.dtype).chunk(2)
+        return free + self.settings.guidance_scale * (conditional - free)
+
+    def tokens(self, views: Sequence[View]) -> Float[Tensor, "b 1 c"]:
+        """What the cross-attention of the UNet reads: one token per view, out of its frame and its camera."""
+        told = self.settings.input_elevation_deg if self.settings.variant == "stable" else None
+        cameras = torch.stack([camera_numbers(view.camera, self.input_camera, told) for view in views])
+        embeddings = self.embeddings[[self._known(view.frame) for view in views]]
+        with torch.no_grad():
+            return self.camera_projection(torch.cat([embeddings, cameras.to(embeddings)], -1))[:, None]
+
+    def _known(self, frame: int) -> int:
+        if not 0 <= frame < len(self.embeddings):
+            raise BadInput(f"frame {frame} was asked for; there are {len(self.embeddings)}, counted from 0")
+        return frame
+
+
+def camera_numbers(
+    camera: OrbitCamera, input_camera: OrbitCamera, input_elevation_deg: float | None = None
+) -> Float[Tensor, " 4"]:
+    """A camera as Zero-1-to-3 was trained to read it, relative to the input's: the one place of its conventions.
+
+    It counts the polar angle from the pole above, so that a camera that moved up, for us a greater elevation, has a
+    negative difference; azimuths grow in the same direction as ours.
+
+    Args:
+        camera: where the new picture is taken from.
+        input_camera: where the known one was taken from.
+        input_elevation_deg: for Stable-Zero123, whose last number is the known picture's polar angle; otherwise it is
+            the difference of the radii, world units.
+
+    Returns:
+        [polar difference in radians, sine and cosine of the azimuth difference, last number], float64.
+    """
+    polar = math.radians(input_camera.elevation_deg - camera.elevation_deg)
+    azimuth = math.radians(camera.azimuth_deg - input_camera.azimuth_deg)
+    last = camera.radius - input_camera.radius
+    if input_elevation_deg is not None:
+        last = math.radians(90 - input_elevation_deg)
+    return torch.tensor([polar, math.sin(azimuth), math.cos(azimuth), last], dtype=torch.float64)
+
+
+def encoded(vae: Any, images: Float[Tensor, "b h w 3"]) -> Float[Tensor, "b 4 32 32"]:
+    """The mode of the VAE's latents of pictures in [0, 1], not scaled, in their precision; differentiable."""
+    planes = functional.interpolate(images.permute(0, 3, 1, 2), (SIZE, SIZE), mode="bilinear", antialias=True)
+    return vae.encode((2 * planes - 1).to(vae.dtype)).latent_dist.mode().to(images.dtype)
+
+
+def clip_pixels(images: Float[Tensor, "b h w 3"]) -> Float[Tensor, "b 3 224 224"]:
+    """Pictures in [0, 1] as CLIP reads them."""
+    planes = images.permute(0, 3, 1, 2)
+    planes = functional.interpolate(planes, (CLIP_SIZE, CLIP_SIZE), mode="bicubic", antialias=True).clamp(0, 1)
+    mean, deviation = (planes.new_tensor(values)[:, None, None] for values in (CLIP_MEAN, CLIP_DEVIATION))
+    return (planes - mean) / deviation

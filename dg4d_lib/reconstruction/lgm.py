@@ -1,0 +1,153 @@
+"""LGM: four views of an object to 65,536 Gaussians in one pass (Tang et al. 2024; METHOD section 10).
+
+LGM's world is ours (right-handed, y up, the first camera on +z, azimuth counter-clockwise from above, quaternions
+wxyz), except that its cameras stand at radius 1.5. Everything is scaled by 2 / 1.5 once, in `gaussians_of`: a picture
+taken from radius 2 then equals LGM's own from 1.5, because sizes and distances grow by the same factor.
+"""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
+from dg4d_lib.cameras.viewpoints import turntable
+from dg4d_lib.diffusion.parts import Placement
+from dg4d_lib.diffusion.published import load_network
+from dg4d_lib.errors import BadInput
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.rasterizer.interface import Rasterizer
+from dg4d_lib.reconstruction.alignment import best_azimuth
+from dg4d_lib.reconstruction.unet import VIEWS, Unet, UnetShape
+
+WEIGHTS_FILE = "model_fp16_fixrot.safetensors"
+LGM_RADIUS = 1.5  # of LGM's cameras
+WORLD_SCALE = RADIUS / LGM_RADIUS
+INPUTS = 9  # color and ray
+OUTPUTS = 14  # position 3, opacity 1, scale 3, rotation 4, color 3
+FAINTEST = 0.005  # opacity of the faintest Gaussian that is kept
+SMALLEST = 1e-8  # LGM's units; a logarithm needs a scale above zero
+COLOR_MEAN, COLOR_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet
+
+
+class Lgm(nn.Module):
+    """The network with the names of its published weights.
+
+    Args:
+        shape: of the U-Net.
+    """
+
+    def __init__(self, shape: UnetShape) -> None:
+        super().__init__()
+        self.unet = Unet(INPUTS, OUTPUTS, shape)
+        self.conv = nn.Conv2d(OUTPUTS, OUTPUTS, 1)
+
+    @torch.no_grad()
+    def forward(self, pictures: Float[Tensor, "4 h w 3"]) -> Float[Tensor, "n 14"]:
+        """One row per pixel of the output of every view, before activations, where and as precise as the pictures are.
+
+        Args:
+            pictures: from azimuth 0, 90, 180, 270 at elevation 0, over white, in [0, 1], square.
+        """
+        parameter = next(self.parameters())
+        size = pictures.shape[1]
+        cameras = turntable(VIEWS, OrbitCamera(radius=LGM_RADIUS, width=size, height=size))
+        mean, deviation = pictures.new_tensor(COLOR_MEAN), pictures.new_tensor(COLOR_DEVIATION)
+        colors = ((pictures - mean) / deviation).permute(0, 3, 1, 2)
+        features = torch.cat([colors.to(parameter), ray_embedding(cameras).to(parameter)], 1)
+        return self.conv(self.unet(features)).permute(0, 2, 3, 1).reshape(-1, OUTPUTS).to(pictures)
+
+
+def ray_embedding(cameras: list[OrbitCamera]) -> Float[Tensor, "v 6 h w"]:
+    """Pluecker coordinates of every pixel's ray: o x d, then the unit direction d; float64, world axes.
+
+    Args:
+        cameras: of one size.
+    """
+    width, height = cameras[0].width, cameras[0].height
+    rows, columns = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    right, down = (columns + 0.5 - width / 2) / cameras[0].focal, (rows + 0.5 - height / 2) / cameras[0].focal
+    seen = functional.normalize(torch.stack([right, down, torch.ones_like(right)], -1), dim=-1)
+    embeddings = []
+    for camera in cameras:
+        directions = seen @ camera.world_to_camera()[:3, :3]  # the transpose of a rotation takes the camera's axes back
+        origins = camera.position().expand_as(directions)
+        embeddings.append(torch.cat([torch.linalg.cross(origins, directions), directions], -1))
+    return torch.stack(embeddings).permute(0, 3, 1, 2)
+
+
+def gaussians_of(raw: Float[Tensor, "n 14"]) -> Gaussians:
+    """LGM's activations, in our world: positions within +-4/3, scale 0.1 softplus, color 0.5 tanh + 0.5."""
+    means, opacity_logits, scales, quats, colors = raw.split((3, 1, 3, 4, 3), -1)
+    return Gaussians(
+        means.clamp(-1, 1) * WORLD_SCALE,
+        (0.1 * functional.softplus(scales)).clamp(min=SMALLEST).log() + math.log(WORLD_SCALE),
+        functional.normalize(quats, dim=-1),
+        opacity_logits[:, 0],
+        harmonics_of_color(0.5 * colors.tanh() + 0.5),
+    )
+
+
+def reconstruct(
+    model: Lgm, views: Float[Tensor, "4 h w 3"], picture: Float[Tensor, "s t 3"], rasterize: Rasterizer
+) -> Gaussians:
+    """Gaussians that look like the picture from azimuth 0.
+
+    A multi-view model may turn the object away from its input. The first pass is therefore looked at from all around,
+    and what it shows from the azimuth that resembles the picture most, and from 90, 180 and 270 degrees on, is
+    reconstructed again.
+
+    Args:
+        model: the network.
+        views: four pictures of the object, 90 degrees of azimuth apart, over white; the result lies where they are.
+        picture: the subject over white, in the same crop as the rest of the pipeline sees it.
+        rasterize: draws Gaussians that lie there.
+    """
+    size = views.shape[1]
+    first = visible(gaussians_of(model(views)))
+    camera = OrbitCamera(azimuth_deg=best_azimuth(first, picture, rasterize), width=size, height=size)
+    aligned = rasterize(first, turntable(VIEWS, camera), torch.ones(3, device=first.means.device)).color
+    return visible(gaussians_of(model(aligned)))
+
+
+def visible(gaussians: Gaussians) -> Gaussians:
+    """Those that are not too faint to be seen (opacity of at least 0.005)."""
+    keep = gaussians.opacities >= FAINTEST
+    return Gaussians(**{name: value[keep] for name, value in vars(gaussians).items()})
+
+
+def load_lgm(path: Path, placement: Placement) -> Lgm:
+    """The network with published weights, frozen; its size is that of the weights.
+
+    Args:
+        path: the file, or the folder that holds `model_fp16_fixrot.safetensors`.
+        placement: where and how it lies; the weights are published in float16.
+
+    Raises:
+        BadInput: no such file, a damaged one, or one with other tensors.
+    """
+    file = path / WEIGHTS_FILE if path.is_dir() else path
+    return load_network(lambda tensors: Lgm(shape_of(tensors)), file, placement)
+
+
+def shape_of(tensors: Mapping[str, Tensor]) -> UnetShape:
+    """The size of the network that these tensors belong to.
+
+    Raises:
+        BadInput: they belong to none.
+    """
+    channels: dict[str, tuple[int, ...]] = {}
+    attention: dict[str, tuple[bool, ...]] = {}
+    for way in ("down", "up"):
+        levels = [f"unet.{way}_blocks.{i}" for i in range(len(tensors))]
+        levels = [level for level in levels if f"{level}.nets.0.conv1.weight" in tensors]
+        channels[way] = tuple(len(tensors[f"{level}.nets.0.conv1.weight"]) for level in levels)
+        attention[way] = tuple(f"{level}.attns.0.norm.weight" in tensors for level in levels)
+    if not 1 <= len(channels["up"]) < len(channels["down"]):
+        raise BadInput(f"these are no weights of LGM: levels down {channels['down']}, up {channels['up']}")
+    return UnetShape(channels["down"], attention["down"], channels["up"], attention["up"])

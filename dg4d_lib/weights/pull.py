@@ -1,0 +1,115 @@
+"""Getting weights from the Hugging Face hub into the folder of all weights, and remembering what came."""
+
+import errno
+from collections import defaultdict
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
+
+from dg4d_lib.errors import BackendUnavailable
+from dg4d_lib.weights.locate import MEMORY, READ, TENSORS, digests, folder_name, troubles
+from dg4d_lib.weights.lock import Locked, LockedFile, read_lock, write_lock
+from dg4d_lib.weights.registry import Weights
+
+HALF = ".fp16"  # in the names of files in half precision
+FORMATS = ((True, ".safetensors"), (False, ".safetensors"), (True, ".bin"), (False, ".bin"))  # wanted most first
+
+
+def pull(weights: Weights, home: Path) -> Locked:
+    """Download what is needed of some weights; goes on where it was stopped, and leaves alone what is here already.
+
+    The revision is the lock's, else the registry's, else the newest.
+
+    Returns:
+        What the lock now says.
+
+    Raises:
+        BackendUnavailable: the hub cannot be reached or does not give them, or what came is not what the hub lists.
+        OSError: the disk is full.
+    """
+    try:
+        import huggingface_hub as hub  # noqa: PLC0415 - part of an extra
+    except ModuleNotFoundError as error:
+        raise BackendUnavailable(
+            "downloading weights needs the package huggingface_hub: pip install 'dg4d[diffusion]'"
+        ) from error
+    before = read_lock(home).get(weights.name)
+    folder = home / folder_name(weights)
+    for name in troubles(folder, weights, before, home / MEMORY) if before else ():
+        (folder / name).unlink(missing_ok=True)  # the download alone may take it for whole
+    try:
+        info = hub.HfApi().model_info(
+            weights.hub_id, revision=before.revision if before else weights.revision, files_metadata=True
+        )
+        listed = info.siblings or []
+        published = {file.rfilename: file.lfs.sha256 for file in listed if file.lfs is not None}
+        chosen = needed([file.rfilename for file in listed], weights.parts)
+        folder.mkdir(parents=True, exist_ok=True)
+        hub.snapshot_download(weights.hub_id, revision=info.sha, local_dir=folder, allow_patterns=chosen)
+    except Exception as error:  # whatever a network, a proxy or a server may answer
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        raise BackendUnavailable(_refusal(weights, error)) from error
+    have = {name: digest for name, digest in digests(folder, memory=home / MEMORY).items() if name in chosen}
+    wrong = {name: "did not come" for name in chosen if name not in have} | troubles(folder, weights)
+    for name in [name for name, digest in have.items() if published.get(name, digest) != digest]:
+        wrong[name] = "is damaged"
+        (folder / name).unlink()
+    if wrong:
+        raise BackendUnavailable(
+            f"weights {weights.name} did not come whole from {weights.hub_id}: "
+            f"{'; '.join(map(' '.join, wrong.items()))}; run `dg4d weights pull {weights.name}` again"
+        )
+    files = {name: LockedFile(sha256=have[name], size=(folder / name).stat().st_size) for name in chosen}
+    card = str(getattr(info.card_data, "license", None) or "")
+    locked = Locked(hub_id=weights.hub_id, revision=info.sha or "", license=card, files=files)
+    write_lock(home, weights.name, locked)
+    return locked
+
+
+def needed(names: Iterable[str], parts: tuple[str, ...] = ()) -> list[str]:
+    """Of all files of a repository, those to download: texts, and the tensors of each folder in one format.
+
+    Half precision is preferred to full, safetensors to pickles; checkpoints beside `model_index.json`, which hold all
+    parts once more, are left out.
+    """
+    everything = sorted(names)
+    folders: dict[PurePosixPath, list[str]] = defaultdict(list)
+    for name in everything:
+        path = PurePosixPath(name)
+        hidden = any(part.startswith(".") for part in path.parts)
+        whole = "model_index.json" in everything and len(path.parts) == 1 and path.suffix in TENSORS
+        other = ".non_ema." in name or path.name.startswith("openvino")
+        wanted = path.parts[0] in parts or path.name == "model_index.json" if parts else not whole
+        if wanted and path.suffix in READ and not hidden and not other:
+            folders[path.parent].append(name)
+    return sorted(name for files in folders.values() for name in _one_format(files))
+
+
+def _one_format(files: list[str]) -> list[str]:
+    """The files of a folder that hold no tensors, and those that do in the format that is wanted most."""
+
+    def fits(name: str, half: bool, suffix: str) -> bool:
+        return suffix in name and (HALF in name) == half
+
+    tensors = [name for name in files if PurePosixPath(name).suffix in TENSORS]
+    for half, suffix in FORMATS:
+        if any(fits(name, half, suffix) for name in tensors):
+            held = {name for name in files if name in tensors or ".index." in name}  # an index lists the shards
+            return [name for name in files if name not in held or fits(name, half, suffix)]
+    return files
+
+
+def _refusal(weights: Weights, error: Exception) -> str:
+    kind = type(error).__name__
+    where = f"https://huggingface.co/{weights.hub_id}"
+    if kind in ("GatedRepoError", "RepositoryNotFoundError"):
+        mend = f"look at {where}: accept its license there and log in with `hf auth login`, or correct the id"
+    elif kind == "RevisionNotFoundError":
+        mend = f"the revision is gone; see {where}"
+    else:
+        mend = (
+            "connect this machine to the network and run the command again, or copy the folder from a machine that has "
+            "it and name the folder instead"
+        )
+    reason = str(error).strip().splitlines()[0] if str(error).strip() else "no reason given"
+    return f"weights {weights.name} could not be downloaded from {where} ({kind}: {reason}); {mend}"

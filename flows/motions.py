@@ -1,0 +1,43 @@
+"""The motions that a picture could make, judged and shown, so that a person can choose."""
+
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+from prefect import flow
+
+from flows import home
+from flows.executors import StepBadInput
+from flows.image_to_4d import drive
+from flows.tasks import Steps
+from steps.contract import ArtifactRef
+from steps.profiles import PipelineSettings
+
+
+@flow(name="motions", flow_run_name="{item}", persist_result=False)
+def motions(
+    source: ArtifactRef, settings: PipelineSettings, seed: int = 0, item: str = "asset"
+) -> dict[str, ArtifactRef]:
+    """Prepare the subject and hold the tournament of `drive_video`; its outputs by name.
+
+    Raises:
+        StepError: a step did not finish; says which and why.
+    """
+    steps = Steps(item, seed)
+    prepared = steps.run("prepare_subject", {"source": source}, settings.subject)
+    if "footage" in prepared:
+        raise StepBadInput("prepare_subject", "this is a video and has its motion already; give a picture")
+    return steps.run("drive_video", {"subject": prepared["subject"]}, drive(settings))
+
+
+def unpack(made: dict[str, ArtifactRef], folder: Path) -> dict[str, Any]:
+    """Put the sheet, the ranking and a film per candidate into a folder; the ranking."""
+    store = home.store()
+    folder.mkdir(parents=True, exist_ok=True)
+    store.get(made["candidates"], folder / "motions.png")
+    store.get(made["ranking"], folder / "motions.json")
+    with zipfile.ZipFile(store.path(made["films"])) as films:
+        films.extractall(folder)
+    ranking: dict[str, Any] = json.loads((folder / "motions.json").read_text(encoding="utf-8"))
+    return ranking

@@ -1,0 +1,36 @@
+"""Words become a picture, by a text-to-image pipeline that the user names."""
+
+import torch
+
+from dg4d_lib.diffusion.text_to_image import draw_picture
+from dg4d_lib.errors import BadInput
+from dg4d_lib.settings import TextSettings
+from steps.job import Facts, Job
+from steps.media import write_png
+from steps.weights import open_weights
+
+
+def run(job: Job) -> Facts:
+    """Draw the words in `text`.
+
+    Raises:
+        BadInput: no pipeline was named, or it cannot draw.
+        BackendUnavailable: its weights, or the packages that run it, are not here.
+    """
+    settings: TextSettings = job.settings
+    if not settings.weights:
+        raise BadInput("no text-to-image pipeline was named: --set text.weights=FOLDER, or an id of the hub")
+    words = job.inputs["text"].read_text(encoding="utf-8")
+    opened = open_weights(settings.weights)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    picture = draw_picture(
+        opened.folder,
+        words,
+        settings,
+        torch.Generator().manual_seed(job.seed),
+        device,
+        lambda done, total: job.progress(done, total, {}),
+    )
+    write_png(job.outputs["picture"], picture)
+    note = f"The picture was drawn by a model ({settings.weights}) from the words: {words}{settings.suffix}"
+    return Facts(backend=f"{device.type} (diffusers)", weights=opened.digests, licenses=opened.licenses, notes=(note,))

@@ -1,0 +1,90 @@
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_text_to_image import save_pipeline
+
+from dg4d_lib.diffusion.text_to_image import draw_picture
+from dg4d_lib.errors import BackendUnavailable, BadInput
+from dg4d_lib.settings import TextSettings
+
+CPU = torch.device("cpu")
+QUICK = TextSettings(size=48, steps=3)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_pipeline(tmp_path_factory.mktemp("models") / "tiny")
+
+
+def draw(model: Path, text: str = "a red dragon", seed: int = 0, **changes: object) -> torch.Tensor:
+    settings = TextSettings.model_validate({**QUICK.model_dump(), **changes})
+    return draw_picture(model, text, settings, torch.Generator().manual_seed(seed), CPU)
+
+
+def test_equal_words_and_seeds_give_equal_pictures_and_others_do_not(model: Path) -> None:
+    picture = draw(model)
+    assert picture.shape == (48, 48, 3)
+    assert picture.dtype == torch.float32
+    assert 0 <= picture.min() < picture.max() <= 1
+    assert torch.equal(picture, draw(model))
+    for other in (
+        draw(model, seed=1),
+        draw(model, "a blue newt"),
+        draw(model, suffix=" in the red"),
+        draw(model, steps=2),
+        draw(model, guidance=1.0),
+    ):
+        assert not torch.equal(picture, other)
+
+
+def test_the_suffix_is_part_of_the_words(model: Path) -> None:
+    assert torch.equal(draw(model, "a red", suffix=" dragon"), draw(model, "a red dragon", suffix=""))
+
+
+def test_every_step_is_told(model: Path) -> None:
+    told: list[tuple[int, int]] = []
+    generator = torch.Generator().manual_seed(0)
+    draw_picture(model, "a newt", QUICK, generator, CPU, lambda done, total: told.append((done, total)))
+    assert told == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_files_in_half_precision_are_read_and_draw_the_same_up_to_their_rounding(model: Path, tmp_path: Path) -> None:
+    from diffusers import StableDiffusionPipeline
+
+    half = StableDiffusionPipeline.from_pretrained(model, dtype=torch.float16)
+    half.save_pretrained(tmp_path / "half", variant="fp16")
+    assert list(tmp_path.rglob("*.fp16.safetensors"))
+    difference = (draw(tmp_path / "half") - draw(model)).abs()
+    assert 0 < difference.max() < 0.02  # half precision keeps 11 bits
+
+
+def test_a_picture_that_is_no_numbers_is_refused(model: Path, tmp_path: Path) -> None:
+    from safetensors.torch import load_file, save_file
+
+    broken = shutil.copytree(model, tmp_path / "broken")
+    file = broken / "vae" / "diffusion_pytorch_model.safetensors"
+    save_file({name: value * torch.nan for name, value in load_file(file).items()}, file)
+    with pytest.raises(BadInput, match=r"text\.precision=fp32"):
+        draw(broken)
+
+
+def test_what_is_no_pipeline_of_pictures_is_refused(model: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match=r"no model_index\.json"):
+        draw(tmp_path)
+    damaged = shutil.copytree(model, tmp_path / "damaged")
+    (damaged / "unet" / "diffusion_pytorch_model.safetensors").write_bytes(b"not tensors")
+    with pytest.raises(BadInput, match="cannot be read"):
+        draw(damaged)
+    other = shutil.copytree(model, tmp_path / "other")
+    index = other / "model_index.json"
+    index.write_text(index.read_text().replace('"StableDiffusionPipeline"', '"StableDiffusionImg2ImgPipeline"'))
+    with pytest.raises(BadInput, match=r"StableDiffusionImg2ImgPipeline .* does not make pictures out of words alone"):
+        draw(other)
+
+
+def test_without_diffusers_the_extra_is_named(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "diffusers", None)
+    with pytest.raises(BackendUnavailable, match=r"pip install 'dg4d\[diffusion\]'"):
+        draw(model)

@@ -1,0 +1,145 @@
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+from tiny_svd import SCHEDULE, save_tiny_svd, tiny_svd
+
+from dg4d_lib.diffusion import batching
+from dg4d_lib.diffusion.video_model import VideoModel, clean, karras_sigmas, start_index
+from dg4d_lib.errors import BadInput
+from dg4d_lib.settings import VideoModelSettings
+
+CPU = torch.device("cpu")
+STEPS, FRAMES, SIDE = 3, 3, 32
+SCHEDULERS_OWN = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
+SETTINGS = VideoModelSettings(steps=STEPS, frames_at_once=2)
+
+
+def rng(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_tiny_svd(tmp_path_factory.mktemp("svd"))
+
+
+@pytest.fixture(scope="module")
+def model(folder: Path) -> VideoModel:
+    return VideoModel.load(folder, SETTINGS, CPU)
+
+
+@pytest.fixture(scope="module")
+def pixels() -> torch.Tensor:
+    return (256 * torch.rand(SIDE, SIDE, 3, generator=rng(1))).byte()
+
+
+def generated(model: VideoModel, picture: torch.Tensor, *seeds: int) -> torch.Tensor:
+    generators = [rng(seed) for seed in seeds]
+    condition = model.look_at(picture, generators)
+    start = math.sqrt(700**2 + 1) * model.noise(model.blank(len(seeds), FRAMES, SIDE, SIDE), generators)
+    videos = model.denoise(start, condition, karras_sigmas(model.settings.steps))
+    return torch.stack([model.decode(latents) for latents in videos])
+
+
+@SCHEDULERS_OWN
+def test_the_noise_levels_are_those_of_the_real_scheduler() -> None:
+    from diffusers import EulerDiscreteScheduler
+
+    scheduler = EulerDiscreteScheduler(**SCHEDULE)
+    scheduler.set_timesteps(25)
+    torch.testing.assert_close(torch.tensor(karras_sigmas(25)), scheduler.sigmas, rtol=1e-5, atol=0)
+    times = torch.tensor([0.25 * math.log(sigma) for sigma in karras_sigmas(25)[:-1]])
+    torch.testing.assert_close(times, scheduler.timesteps, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("skipped", "index", "sigma"), [(0.6, 15, 3.870), (0.7, 17, 1.2732), (0.75, 18, 0.678), (0.8, 20, 0.157)]
+)
+def test_the_skipped_share_gives_the_known_start(skipped: float, index: int, sigma: float) -> None:
+    assert start_index(25, skipped) == index
+    assert karras_sigmas(25)[index] == pytest.approx(sigma, abs=5.1e-4)
+
+
+def test_eight_steps_are_left_of_25_when_seven_tenths_are_skipped() -> None:
+    sigmas = karras_sigmas(25)
+    assert sigmas[0] == pytest.approx(700) and sigmas[24] == pytest.approx(0.002) and sigmas[25] == 0
+    assert len(sigmas[start_index(25, 0.7) :]) - 1 == 8
+
+
+@pytest.mark.parametrize("sigma", [0.01, 1.0, 500.0])
+def test_the_clean_video_comes_out_of_the_true_velocity(sigma: float) -> None:
+    """v of (x0, e) at the angle arctan(sigma) is cos e - sin x0 (Salimans and Ho 2022)."""
+    x0, noise = torch.randn(2, 5, generator=rng(0), dtype=torch.float64)
+    angle = math.atan(sigma)
+    velocity = math.cos(angle) * noise - math.sin(angle) * x0
+    torch.testing.assert_close(clean(x0 + sigma * noise, velocity, sigma), x0, rtol=1e-9, atol=1e-9)
+
+
+@SCHEDULERS_OWN
+def test_a_video_is_what_diffusers_makes_of_the_same_noise(model: VideoModel, pixels: torch.Tensor) -> None:
+    pipeline = tiny_svd()
+    pipeline.set_progress_bar_config(disable=True)
+    theirs = pipeline(
+        Image.fromarray(pixels.numpy()),
+        height=SIDE,
+        width=SIDE,
+        num_frames=FRAMES,
+        num_inference_steps=STEPS,
+        fps=7,
+        decode_chunk_size=SETTINGS.frames_at_once,
+        generator=rng(5),
+        output_type="pt",
+    ).frames[0]
+    ours = generated(model, pixels / 255, 5)[0]
+    assert ours.std() > 0.05  # otherwise equality would say little
+    torch.testing.assert_close(ours, theirs.movedim(1, -1), rtol=0, atol=2e-5)
+
+
+def test_several_seeds_at_once_are_the_same_seeds_one_by_one(model: VideoModel, pixels: torch.Tensor) -> None:
+    both = generated(model, pixels / 255, 5, 6)
+    torch.testing.assert_close(both[1], generated(model, pixels / 255, 6)[0], rtol=0, atol=2e-5)
+    assert (both[0] - both[1]).abs().max() > 0.1
+
+
+def test_equal_seeds_give_equal_bits_and_low_memory_changes_none(
+    folder: Path, model: VideoModel, pixels: torch.Tensor
+) -> None:
+    frugal = VideoModel.load(folder, SETTINGS.model_copy(update={"low_memory": True}), CPU)
+    assert torch.equal(generated(model, pixels / 255, 5), generated(frugal, pixels / 255, 5))
+
+
+def test_where_memory_runs_out_less_is_done_at_once_and_said(
+    folder: Path, model: VideoModel, pixels: torch.Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tight = VideoModel.load(folder, SETTINGS, CPU)
+    whole = tight.unet.forward
+
+    def forward(sample: torch.Tensor, *others: object, **named: object) -> object:
+        if len(sample) > 1:
+            raise torch.OutOfMemoryError("no room")
+        return whole(sample, *others, **named)
+
+    monkeypatch.setattr(tight.unet, "forward", forward)
+    video = generated(tight, pixels / 255, 5)
+    torch.testing.assert_close(video, generated(model, pixels / 255, 5), rtol=0, atol=2e-5)
+    assert any("memory ran out with 2 videos" in note for note in tight.notes())
+    assert not model.notes()
+    assert batching.is_out_of_memory(torch.OutOfMemoryError("no room"))
+
+
+def test_half_precision_does_not_leave_the_encoder_in_another_one(pixels: torch.Tensor, folder: Path) -> None:
+    pipeline = tiny_svd().to(torch.float16)
+    half = VideoModel(pipeline.unet, pipeline.vae, pipeline.image_encoder, SETTINGS, CPU)
+    latents = half.encode(pixels[None] / 255)
+    assert latents.dtype == torch.float32 and half.vae.dtype == torch.float16
+    exact = VideoModel.load(folder, SETTINGS, CPU).encode(pixels[None] / 255)
+    torch.testing.assert_close(latents, exact, rtol=0, atol=5e-3)
+
+
+def test_a_missing_part_is_named(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "unet").symlink_to(folder / "unet")
+    with pytest.raises(BadInput, match="vae"):
+        VideoModel.load(tmp_path, SETTINGS, CPU)

@@ -1,0 +1,31 @@
+import pytest
+
+from dg4d_lib.weights.registry import KNOWN, weights_called
+
+
+def test_a_name_and_its_hub_id_mean_the_same() -> None:
+    for weights in KNOWN.values():
+        assert weights_called(weights.name) is weights
+        assert weights_called(weights.hub_id) is weights
+        assert weights_called(weights.hub_id.upper()) is weights
+
+
+def test_what_is_not_verified_is_not_commercial() -> None:
+    allowed = {name for name, weights in KNOWN.items() if weights.license.allows_commercial_use}
+    assert allowed == {"svd", "svd-xt"}
+    assert weights_called("stable-zero123").license.commercial == "no"
+    assert not weights_called("somebody/something").license.allows_commercial_use
+
+
+@pytest.mark.parametrize(
+    ("card", "commercial"),
+    [("mit", "yes"), ("openrail++", "conditions"), ("cc-by-nc-4.0", "no"), ("other", "unverified"), ("", "unverified")],
+)
+def test_a_model_card_counts_for_weights_that_are_not_known(card: str, commercial: str) -> None:
+    its = weights_called("somebody/something", card).license
+    assert its.commercial == commercial
+    assert (card or "unknown") in str(its)
+
+
+def test_a_model_card_does_not_change_what_is_known() -> None:
+    assert weights_called("stable-zero123", "mit").license.commercial == "no"

@@ -1,0 +1,155 @@
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import huggingface_hub
+import pytest
+from typer.testing import CliRunner, Result
+
+from dg4d_lib.weights.locate import digests
+from dg4d_lib.weights.lock import Locked, LockedFile, write_lock
+from dg4d_lib.weights.registry import KNOWN
+from flows import cli
+
+LGM = "model_fp16_fixrot.safetensors"
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "home" / "weights"
+
+
+def dg4d(*arguments: str) -> Result:
+    return CliRunner().invoke(cli.app, [*arguments])
+
+
+def pulled(home: Path) -> Path:
+    folder = home / "lgm"
+    folder.mkdir(parents=True)
+    (folder / LGM).write_bytes(b"tensors" * 1000)
+    files = {
+        name: LockedFile(sha256=digest, size=(folder / name).stat().st_size) for name, digest in digests(folder).items()
+    }
+    write_lock(home, "lgm", Locked(hub_id="ashawkey/LGM", revision="c0ffee" + "0" * 34, files=files))
+    return folder / LGM
+
+
+def line_of(name: str, listing: str) -> str:
+    return next(line for line in listing.splitlines() if line.startswith(f"{name} "))
+
+
+def test_the_list_names_all_weights_their_licenses_and_what_is_here(home: Path) -> None:
+    before = dg4d("weights", "list")
+    assert before.exit_code == 0, before.output
+    for name, weights in KNOWN.items():
+        assert line_of(name, before.stdout).split()[1] == "no"
+        folded = "".join(before.stdout.split())
+        assert weights.hub_id in folded
+        assert "".join(weights.license.name.split()) in folded
+    file = pulled(home)
+    listing = dg4d("weights", "list").stdout
+    assert line_of("lgm", listing).split()[1:4] == ["yes", "0.00", "c0ffee0000"]
+    file.write_bytes(b"cut")
+    assert line_of("lgm", dg4d("weights", "list").stdout).split()[1] == "damaged"
+    write_lock(home, "me/pictures", Locked(hub_id="me/pictures", revision="", license="cc-by-nc-4.0", files={}))
+    assert "cc-by-nc-4.0" in line_of("me/pictures", dg4d("weights", "list").stdout)
+
+
+def test_the_list_imports_no_torch() -> None:
+
+    program = (
+        "import sys; sys.argv = ['dg4d', 'weights', 'list']\nfrom flows.cli import main\n"
+        "try: main()\nexcept SystemExit: pass\n"
+        "print([m for m in ('torch', 'numpy', 'prefect', 'diffusers', 'transformers') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_check_reads_every_file_again(home: Path) -> None:
+    assert "nothing" in dg4d("weights", "check").stdout
+    file = pulled(home)
+    good = dg4d("weights", "check", "lgm")
+    assert good.exit_code == 0, good.output
+    assert "lgm: whole, 1 file," in good.stdout
+    times = file.stat().st_atime_ns, file.stat().st_mtime_ns
+    file.write_bytes(b"tensorz" * 1000)
+    os.utime(file, ns=times)  # as a disk that forgets does
+    bad = dg4d("weights", "check")
+    assert bad.exit_code == 69
+    assert f"lgm: {LGM} is not the file that was pulled" in bad.stdout
+    assert "`dg4d weights pull lgm`" in bad.stderr
+
+
+def test_check_names_what_is_missing(home: Path) -> None:
+    missing = dg4d("weights", "check", "svd")
+    assert missing.exit_code == 69
+    assert "`dg4d weights pull svd`" in missing.stderr
+    assert dg4d("weights", "check", "svt").exit_code == 65
+
+
+def test_weights_that_were_copied_are_complete_but_not_compared(home: Path) -> None:
+    (home / "lgm").mkdir(parents=True)
+    (home / "lgm" / LGM).touch()
+    copied = dg4d("weights", "check")
+    assert copied.exit_code == 0
+    assert "nothing to compare it with" in copied.stdout
+
+
+def test_pull_without_a_network_is_one_message(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def offline(*_: object, **__: object) -> None:
+        raise OSError("Name or service not known")
+
+    monkeypatch.setattr(huggingface_hub.HfApi, "model_info", offline)
+    result = dg4d("weights", "pull", "svd")
+    assert result.exit_code == 69
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert "connect this machine to the network" in result.stderr
+    assert not (home / "svd").exists()
+
+
+def test_pull_wants_names() -> None:
+    assert dg4d("weights", "pull").exit_code == 2
+    Path("folder").mkdir()
+    result = dg4d("weights", "pull", "./folder")
+    assert result.exit_code == 65
+    assert "is a folder on this machine" in result.stderr
+
+
+def test_make_refuses_weights_that_forbid_commercial_use_before_it_looks_for_them(home: Path) -> None:
+    Path("cat.png").write_text("a cat")
+    arguments = ["make", "cat.png", "--set", "prior.kind=zero123", "-o", "out"]
+    missing = dg4d(*arguments)
+    assert missing.exit_code == 69
+    assert "`dg4d weights pull zero123-xl`" in missing.stderr
+    refused = dg4d(*arguments, "--commercial-only")
+    assert refused.exit_code == 65
+    assert "zero123-xl" in refused.stderr
+    assert not Path("out").exists()
+
+
+def test_a_batch_is_refused_as_a_whole_where_one_item_names_such_weights(home: Path) -> None:
+    Path("cat.png").write_text("a cat")
+    rows = [{"path": "cat.png"}, {"path": "cat.png", "prior.kind": "zero123"}]
+    Path("items.json").write_text(json.dumps(rows))
+    refused = dg4d("batch", "items.json", "-o", "out", "--commercial-only")
+    assert refused.exit_code == 65
+    assert "zero123-xl" in refused.stderr
+    assert not Path("out").exists()
+
+
+def test_words_and_a_picture_are_one_too_many_and_neither_is_one_too_few(home: Path) -> None:
+    Path("cat.png").write_text("a cat")
+    both = dg4d("make", "cat.png", "--text", "a cat", "--set", "text.weights=me/pictures")
+    assert both.exit_code == 65
+    assert "not both" in both.stderr
+    assert dg4d("make").exit_code == 2
+    nothing = dg4d("make", "--text", "a cat")
+    assert nothing.exit_code == 65
+    assert "--set text.weights" in nothing.stderr

@@ -1,0 +1,104 @@
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_svd import save_tiny_svd
+from tiny_weights import write_zero123
+
+from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.errors import BadInput
+from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.settings import ImageToImageSettings, RefinerSettings, VideoToVideoSettings
+from dg4d_lib.video.driving import DrivingVideo
+from steps.job import Facts, Job
+from steps.media import write_frames
+from steps.meshfiles import read_meshes, read_tracked, write_meshes, write_tracked
+from steps.profiles import RefineTextureSettings
+from steps.refine_texture import run
+
+FRAMES = 3
+TEXTURE = {"iterations": 2, "size": 64}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Inputs of the step: a board that moves, tracked and per frame, and its video."""
+    corners = torch.tensor([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
+    uvs = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    texture = torch.full((16, 16, 3), 128 / 255)
+    mesh = TexturedMesh(corners, torch.tensor([[0, 3, 2], [0, 2, 1]], dtype=torch.int32), uvs, texture)
+    offsets = torch.stack([torch.full((4, 3), 0.05 * frame) for frame in range(FRAMES)])
+    write_tracked(tmp_path / "tracked.in", Asset4D(mesh, offsets, 1.0, {}))
+    write_meshes(
+        tmp_path / "meshes.in", {i: replace(mesh, vertices=corners + offset) for i, offset in enumerate(offsets)}
+    )
+    red = torch.tensor([0.9, 0.1, 0.1]).expand(FRAMES, 64, 64, 3)
+    write_frames(tmp_path / "video", DrivingVideo(red, torch.ones(FRAMES, 64, 64, 1), 24.0))
+    return tmp_path
+
+
+def refine(folder: Path, mode: str, refiner: RefinerSettings) -> Facts:
+    return run(
+        Job(
+            inputs={mode: folder / f"{mode}.in", "driving_video": folder / "video"},
+            outputs={"tracked": folder / "tracked", "meshes": folder / "meshes"},
+            settings=RefineTextureSettings(refiner=refiner),
+            seed=0,
+            progress=lambda done, total, values: None,
+            pictures=folder,
+        )
+    )
+
+
+def video_to_video(folder: Path, **changes: object) -> VideoToVideoSettings:
+    weights = save_tiny_svd(folder / "svd")
+    return VideoToVideoSettings(texture={**TEXTURE, **changes}, model={"weights": str(weights), "steps": 4})
+
+
+@pytest.mark.parametrize("mode", ["tracked", "meshes"])
+def test_video_diffusion_sees_all_frames_as_one_video(folder: Path, mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from dg4d_lib.texture.refiner import VideoToVideo
+
+    seen = []
+    refined = VideoToVideo.refine
+    monkeypatch.setattr(
+        VideoToVideo, "refine", lambda self, video, *rest: seen.append(len(video)) or refined(self, video, *rest)
+    )
+    facts = refine(folder, mode, video_to_video(folder, refresh_every=2))
+    assert seen == [FRAMES]
+    if mode == "tracked":
+        asset = read_tracked(folder / "tracked")
+        textures = [asset.mesh.texture]
+        assert asset.fps == 24
+    else:
+        textures = [mesh.texture for mesh in read_meshes(folder / "meshes")]
+        assert len(textures) == FRAMES
+    for texture in textures:  # towards the driving video, which is red
+        red, green, _ = texture[4:12, 4:12].mean((0, 1))
+        assert red > 0.53 and green < 0.47
+    assert facts.backend == "cpu (diffusers)" and any("unet" in name for name in facts.weights) and facts.licenses
+    assert "every 2 iterations" in facts.notes[0] and "2 steps" in facts.notes[0]
+
+
+def test_image_diffusion_is_the_alternative(folder: Path) -> None:
+    prior = {"weights": str(write_zero123(folder / "zero123")), "precision": "fp32"}
+    settings = ImageToImageSettings(texture=TEXTURE, prior=prior, steps=4)
+    facts = refine(folder, "tracked", settings)
+    assert "picture by picture" in facts.notes[0] and any("unet" in name for name in facts.weights)
+    red, green, _ = read_tracked(folder / "tracked").mesh.texture[4:12, 4:12].mean((0, 1))
+    assert red > 0.53 and green < 0.47
+
+
+def test_a_video_of_another_length_is_refused(folder: Path) -> None:
+    write_frames(folder / "video", DrivingVideo(torch.rand(5, 64, 64, 3), torch.ones(5, 64, 64, 1), 24.0))
+    with pytest.raises(BadInput, match="3 frames and the driving video 5"):
+        refine(folder, "tracked", video_to_video(folder))
+
+
+def test_the_same_seed_gives_the_same_bytes(folder: Path) -> None:
+    settings = video_to_video(folder, iterations=1)
+    refine(folder, "tracked", settings)
+    once = (folder / "tracked").read_bytes()
+    refine(folder, "tracked", settings)
+    assert (folder / "tracked").read_bytes() == once
