@@ -179,8 +179,20 @@ def _stage(done: Finished, store: ArtifactStore) -> dict[str, Any]:
         "peak_memory_mb": record.peak_memory_mb,
         "backend": record.backend,
         "notes": list(record.notes),
+        "flops": record.flops,
         "curves": curves,
     }
+
+
+def arithmetic(flops: dict[str, int]) -> str:
+    """What each network did, for people: "UNet2DConditionModel 15.3 TFLOP"."""
+    return ", ".join(f"{name} {_scaled(count)}FLOP" for name, count in flops.items())
+
+
+def _scaled(count: float) -> str:
+    """With the prefix of the unit."""
+    power = min(max(int(math.log10(max(count, 1))) // 3, 2), 5)
+    return f"{count / 1000**power:,.1f} {'..MGTP'[power]}"
 
 
 def _pictures(files: dict[str, int]) -> str:
@@ -198,11 +210,12 @@ def _stages(report: dict[str, Any]) -> str:
         f"<tr><td>{_text(stage['step'])}<td class=number>{stage['computed_in_s']:.1f} s"
         f"<td><div class=bar style='width:{120 * stage['computed_in_s'] / longest:.0f}px'></div>"
         f"<td class=number>{stage['peak_memory_mb']:.0f} MiB<td>{_text(stage['backend'])}"
+        f"<td>{_text(arithmetic(stage['flops']))}"
         f"<td>{'taken from before' if stage['cached'] else ''}"
         for stage in report["steps"]
     )
     return (
-        "<table><tr><th>stage<th>computed in<th><th>peak memory<th>backend<th>"
+        "<table><tr><th>stage<th>computed in<th><th>peak memory<th>backend<th>networks<th>"
         f"{rows}</table><p class=small>{report['seconds']:.1f} s for this run.</p>"
     )
 

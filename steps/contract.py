@@ -84,6 +84,7 @@ class ProvenanceRecord(Frozen):
     weights: dict[str, Digest] = {}
     licenses: dict[str, str] = {}
     notes: tuple[str, ...] = ()
+    flops: dict[str, int] = Field({}, description="floating-point operations of networks, by the name of their class")
     duration_s: float = Field(ge=0)
     peak_memory_mb: float = Field(ge=0)
 

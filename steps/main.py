@@ -34,6 +34,7 @@ from typing import Any, Literal, TextIO
 
 from pydantic import BaseModel, ValidationError
 
+from dg4d_lib.diffusion.ledger import counting_flops
 from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
 from steps.contract import (
     EXIT_BAD_INPUT,
@@ -247,7 +248,8 @@ def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scr
     )
     (scratch / "out").mkdir()
     run: Callable[[Job], Facts] = _named(spec.entry)
-    facts = run(job)
+    with counting_flops() as flops:
+        facts = run(job)
     outputs = _stored_outputs(job, spec, store)
     record = ProvenanceRecord(
         step=spec.name,
@@ -261,6 +263,7 @@ def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scr
         weights=facts.weights,
         licenses=facts.licenses,
         notes=facts.notes,
+        flops=flops,
         duration_s=round(time.perf_counter() - start, 3),
         peak_memory_mb=round(peak_memory_mb(), 1),
     )

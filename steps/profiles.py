@@ -170,6 +170,7 @@ REFERENCE = revise(
         "prior.weights": "stable-zero123",
         "prior.variant": "stable",
         "static.start": "lgm",
+        "static.iterations": 0,
         "static.noise_start": 1.0,
         "static.noise_end": 0.0,
         "deformation.temporal": 12,

@@ -21,6 +21,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from dg4d_lib.diffusion.ledger import counted
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.settings import Precision
 
@@ -131,7 +132,7 @@ def load_part(kind: Any, folder: Path, placement: Placement, names: tuple[str, .
             f"{file} does not fit its config.json: {len(lacking)} tensors are missing or of another shape, "
             f"the first is {lacking[0]}"
         )
-    return frozen(part, placement)
+    return counted(frozen(part, placement))
 
 
 def weights_file(folder: Path, names: tuple[str, ...] = (DIFFUSERS_FILE,), half: bool = False) -> Path:

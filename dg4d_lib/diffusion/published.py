@@ -7,6 +7,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 
+from dg4d_lib.diffusion.ledger import counted
 from dg4d_lib.diffusion.parts import Placement, frozen, read_tensors
 from dg4d_lib.errors import BadInput
 
@@ -35,5 +36,5 @@ def load_network(build: Callable[[dict[str, Tensor]], Network], file: Path, plac
             f"or of another shape, the first is {wrong[0]}"
         )
     network.load_state_dict({name: tensors[name].to(placement.dtype) for name in wanted}, assign=True)
-    loaded: Network = frozen(network, placement)
+    loaded: Network = counted(frozen(network, placement))
     return loaded

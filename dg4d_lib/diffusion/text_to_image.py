@@ -7,8 +7,9 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
+from dg4d_lib.diffusion.ledger import counted
 from dg4d_lib.diffusion.parts import DTYPES, HALF
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.settings import TextSettings
@@ -41,6 +42,9 @@ def draw_picture(
     """
     dtype = torch.float32 if device.type == "cpu" else DTYPES[settings.precision]
     pipeline = _load(model, dtype).to(device)
+    for part in pipeline.components.values():
+        if isinstance(part, nn.Module):
+            counted(part)
     pipeline.set_progress_bar_config(disable=True)
     options = {
         "num_inference_steps": settings.steps,

@@ -1,0 +1,189 @@
+"""Every trained profile with the steps' own code on a processor: tiny random weights in the real formats, few iterations."""
+
+import json
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+from media_files import save, save_zip, walk
+from pydantic import BaseModel
+from tiny_imagedream import write_imagedream, write_lgm
+from tiny_svd import save_tiny_svd
+from tiny_weights import write_zero123
+
+from dg4d_lib.weights.registry import KNOWN, weights_called
+from steps.catalog import STEPS
+from steps.contract import ArtifactRef, ProvenanceRecord, StepRequest, StepResult
+from steps.main import perform, request_version
+from steps.packages import ASSET, GAUSSIANS, MANIFEST, MESHES, MOTION, PREVIEW, SHEET, SPLATS, SUBJECT
+from steps.profiles import (
+    PROFILES,
+    DriveVideoSettings,
+    ExtractMeshSettings,
+    FitGaussiansSettings,
+    FitMotionSettings,
+    PackAssetSettings,
+    PipelineSettings,
+    RefineTextureSettings,
+    profile,
+    revise,
+)
+from steps.store import ArtifactStore
+from steps.weights import identities, license_of, weights_in
+
+FRAMES = 3
+LADDER = [{"until": 1.0, "size": 32}]
+TINY: dict[str, Any] = {
+    "subject.size": 64,
+    "subject.max_frames": FRAMES,
+    "static.iterations": 2,
+    "static.views": 1,
+    "static.points": 300,
+    "static.reference_size": 32,
+    "static.ladder": LADDER,
+    "motion.iterations": 2,
+    "motion.views": 1,
+    "motion.reference_size": 32,
+    "motion.ladder": LADDER,
+    "mesh.grid": 32,
+    "mesh.edge_length": 0.06,
+    "mesh.texture_size": 64,
+    "mesh.render_size": 64,
+    "driving.frames": FRAMES,
+    "driving.height": 64,
+    "driving.width": 64,
+    "driving.model.steps": 2,
+    "refiner.texture.iterations": 2,
+    "refiner.texture.size": 64,
+    "refiner.model.steps": 4,
+    "pack.preview_size": 64,
+    "pack.preview_turns": 1,
+    "pack.sheet_size": 32,
+    "pack.sheet_frames": 2,
+}
+WRITERS = {
+    "zero123-xl": write_zero123,
+    "stable-zero123": write_zero123,
+    "svd": save_tiny_svd,
+    "imagedream": write_imagedream,
+    "lgm": write_lgm,
+}
+ALWAYS = {MANIFEST, ASSET, GAUSSIANS, MOTION, SUBJECT, PREVIEW, SHEET}
+
+
+@dataclass
+class Run:
+    """One order, step by step in this process."""
+
+    profile: str
+    store: ArtifactStore
+    settings: PipelineSettings = field(init=False)
+    records: list[ProvenanceRecord] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        started_by_model = profile(self.profile).static.start == "lgm"
+        self.settings = revise(profile(self.profile), {**TINY, **({"static.lgm.steps": 2} if started_by_model else {})})
+
+    def step(self, name: str, inputs: Mapping[str, ArtifactRef | None], settings: BaseModel) -> dict[str, ArtifactRef]:
+        tree = settings.model_dump(mode="json")
+        request = StepRequest(
+            step=name,
+            version=request_version(STEPS[name]),
+            inputs={port: ref for port, ref in inputs.items() if ref is not None},
+            settings=tree,
+            seed=0,
+            weights=identities(weights_in(tree)),
+        )
+        outcome, error = perform(request, self.store)
+        assert isinstance(outcome, StepResult), error
+        self.records.append(outcome.provenance)
+        return outcome.outputs
+
+    def notes(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(note for record in self.records for note in record.notes))
+
+    def make(self, source: ArtifactRef) -> Path:
+        """The package of a source."""
+        settings, draws = self.settings, {"rasterizer": self.settings.rasterizer}
+        prepared = self.step("prepare_subject", {"source": source}, settings.subject)
+        subject, footage = prepared["subject"], prepared.get("footage")
+        driven = self.step(
+            "drive_video", {"subject": subject, "footage": footage}, DriveVideoSettings(driving=settings.driving)
+        )
+        video = driven["driving_video"]
+        static = FitGaussiansSettings(prior=settings.prior, static=settings.static, **draws)
+        gaussians = self.step("fit_gaussians", {"subject": subject}, static)["gaussians"]
+        dynamic = FitMotionSettings(
+            prior=settings.prior, deformation=settings.deformation, motion=settings.motion, **draws
+        )
+        motion = self.step("fit_motion", {"gaussians": gaussians, "driving_video": video}, dynamic)["motion"]
+        cloud = {"gaussians": gaussians, "motion": motion}
+        extracted = self.step("extract_mesh", cloud, ExtractMeshSettings(mesh=settings.mesh, **draws))
+        surface = {port: extracted.get(port) for port in ("tracked", "meshes")}
+        refined = self.step(
+            "refine_texture", {**surface, "driving_video": video}, RefineTextureSettings(refiner=settings.refiner)
+        )
+        assert refined != {port: ref for port, ref in surface.items() if ref}
+        surface = {port: refined.get(port) for port in ("tracked", "meshes")}
+        packed = self.step(
+            "pack_asset",
+            {"subject": subject, "driving_video": video, **cloud, **surface},
+            PackAssetSettings(pack=settings.pack, notes=self.notes(), **draws),
+        )
+        return self.store.path(packed["package"])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """A tiny stand-in for everything that a profile names, where pulled weights would lie."""
+    home = tmp_path_factory.mktemp("weights")
+    for name, write in WRITERS.items():
+        write(home / name)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DG4D_WEIGHTS", str(home))
+        yield home
+
+
+def source_of(folder: Path, store: ArtifactStore, moving: bool) -> ArtifactRef:
+    pictures = {f"{i}.png": picture for i, picture in enumerate(walk(FRAMES))}
+    path = save_zip(folder / "walk.zip", pictures, folder) if moving else save(folder / "disc.png", pictures["0.png"])
+    return store.put(path, "application/octet-stream")
+
+
+@pytest.mark.parametrize(
+    ("name", "moving", "used"),
+    [
+        ("paper", False, {"fit_gaussians": {"zero123-xl"}, "drive_video": {"svd"}}),
+        ("video", True, {"fit_gaussians": {"zero123-xl"}}),
+        ("reference", False, {"fit_gaussians": {"stable-zero123", "imagedream", "lgm"}, "drive_video": {"svd"}}),
+        ("quality", False, {"fit_gaussians": {"zero123-xl"}, "drive_video": {"svd"}}),
+    ],
+)
+def test_a_profile_goes_from_a_file_to_a_package_with_the_models_it_names_and_no_others(
+    name: str, moving: bool, used: dict[str, set[str]], tmp_path: Path
+) -> None:
+    run = Run(name, ArtifactStore(tmp_path / "store"))
+    package = run.make(source_of(tmp_path, run.store, moving))
+
+    prior = used["fit_gaussians"] - {"imagedream", "lgm"}
+    expected = {"refine_texture": {"svd"}, "fit_motion": prior, **used}
+    for record in run.records:
+        named = expected.get(record.step, set())
+        assert set(record.licenses.items()) == {(each, str(license_of(each))) for each in named}
+        assert {file.partition("/")[0] for file in record.weights} == named
+        assert bool(record.flops) == bool(named), record.step
+    print(name, [(r.step, r.duration_s, r.flops) for r in run.records], run.notes())
+
+    with zipfile.ZipFile(package) as files:
+        manifest = json.loads(files.read(MANIFEST))
+        names = set(files.namelist())
+    per_frame = run.settings.mesh.mode == "per_frame"
+    assert names == (
+        ALWAYS
+        | {f"{SPLATS}/{frame:03d}.ply" for frame in range(FRAMES)}
+        | {f"{MESHES}/{frame:03d}.glb" for frame in range(FRAMES) if per_frame}
+    )
+    assert manifest["frames"] == FRAMES and set(manifest["files"]) == names - {MANIFEST}
