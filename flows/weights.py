@@ -94,7 +94,8 @@ def check(
                     f"{name}: complete; it was not pulled by this command, so there is nothing to compare it with"
                 )
             else:
-                typer.echo(f"{name}: whole, {len(locked.files)} file{'s' * (len(locked.files) != 1)}, {_size(locked)} GB")
+                count = f"{len(locked.files)} file{'s' * (len(locked.files) != 1)}"
+                typer.echo(f"{name}: whole, {count}, {_size(locked)} GB")
         if broken:
             raise BackendUnavailable(f"not whole; `dg4d weights pull {' '.join(broken)}` gets it again")
 

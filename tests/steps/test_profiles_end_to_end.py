@@ -1,4 +1,4 @@
-"""Every trained profile with the steps' own code on a processor: tiny random weights in the real formats, few iterations."""
+"""Every trained profile by the steps' own code on a processor: tiny random weights in the real formats, small numbers."""
 
 import json
 import zipfile
@@ -14,7 +14,7 @@ from tiny_imagedream import write_imagedream, write_lgm
 from tiny_svd import save_tiny_svd
 from tiny_weights import write_zero123
 
-from dg4d_lib.weights.registry import KNOWN, weights_called
+from dg4d_lib.weights.registry import KNOWN
 from steps.catalog import STEPS
 from steps.contract import ArtifactRef, ProvenanceRecord, StepRequest, StepResult
 from steps.main import perform, request_version
@@ -32,7 +32,7 @@ from steps.profiles import (
     revise,
 )
 from steps.store import ArtifactStore
-from steps.weights import identities, license_of, weights_in
+from steps.weights import identities, weights_in
 
 FRAMES = 3
 LADDER = [{"until": 1.0, "size": 32}]
@@ -144,6 +144,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Any:
         write(home / name)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DG4D_WEIGHTS", str(home))
+        patch.setenv("DG4D_CODE_VERSION", "unchanging")
         yield home
 
 
@@ -156,34 +157,48 @@ def source_of(folder: Path, store: ArtifactStore, moving: bool) -> ArtifactRef:
 @pytest.mark.parametrize(
     ("name", "moving", "used"),
     [
-        ("paper", False, {"fit_gaussians": {"zero123-xl"}, "drive_video": {"svd"}}),
-        ("video", True, {"fit_gaussians": {"zero123-xl"}}),
-        ("reference", False, {"fit_gaussians": {"stable-zero123", "imagedream", "lgm"}, "drive_video": {"svd"}}),
-        ("quality", False, {"fit_gaussians": {"zero123-xl"}, "drive_video": {"svd"}}),
+        ("paper", False, {"drive_video": {"svd"}}),
+        ("video", True, {}),
+        ("video-fast", True, {}),
+        ("reference", False, {"drive_video": {"svd"}, "fit_gaussians": {"stable-zero123", "imagedream", "lgm"}}),
+        ("quality", False, {"drive_video": {"svd"}}),
     ],
 )
-def test_a_profile_goes_from_a_file_to_a_package_with_the_models_it_names_and_no_others(
+def test_a_file_becomes_a_package_by_the_models_that_its_profile_names_and_no_others(
     name: str, moving: bool, used: dict[str, set[str]], tmp_path: Path
 ) -> None:
     run = Run(name, ArtifactStore(tmp_path / "store"))
     package = run.make(source_of(tmp_path, run.store, moving))
 
-    prior = used["fit_gaussians"] - {"imagedream", "lgm"}
-    expected = {"refine_texture": {"svd"}, "fit_motion": prior, **used}
+    prior = "stable-zero123" if name == "reference" else "zero123-xl"
+    expected = {"fit_gaussians": {prior}, "fit_motion": {prior}, "refine_texture": {"svd"}, **used}
     for record in run.records:
         named = expected.get(record.step, set())
-        assert set(record.licenses.items()) == {(each, str(license_of(each))) for each in named}
-        assert {file.partition("/")[0] for file in record.weights} == named
-        assert bool(record.flops) == bool(named), record.step
-    print(name, [(r.step, r.duration_s, r.flops) for r in run.records], run.notes())
+        assert record.licenses == {each: str(KNOWN[each].license) for each in named}, record.step
+        assert {file.partition("/")[0] for file in record.weights} == named, record.step
+        assert bool(record.flops) == bool(named) and all(count > 1e6 for count in record.flops.values()), record.step
+
+    said = run.notes()
+    assert f"prior: Zero-1-to-3, weights {prior}" in said
+    assert any("LGM" in note for note in said) == (name == "reference")
+    assert any("best of 4" in note for note in said) == (name == "quality")
+    assert not [note for note in said if "no model" in note or "without a" in note]
 
     with zipfile.ZipFile(package) as files:
-        manifest = json.loads(files.read(MANIFEST))
-        names = set(files.namelist())
-    per_frame = run.settings.mesh.mode == "per_frame"
-    assert names == (
-        ALWAYS
-        | {f"{SPLATS}/{frame:03d}.ply" for frame in range(FRAMES)}
-        | {f"{MESHES}/{frame:03d}.glb" for frame in range(FRAMES) if per_frame}
-    )
-    assert manifest["frames"] == FRAMES and set(manifest["files"]) == names - {MANIFEST}
+        names, manifest = set(files.namelist()), json.loads(files.read(MANIFEST))
+        assert files.read(ASSET).startswith(b"glTF")
+    per_frame = name != "quality"
+    assert names == {
+        *ALWAYS,
+        *(f"{SPLATS}/{frame:03d}.ply" for frame in range(FRAMES)),
+        *(f"{MESHES}/{frame:03d}.glb" for frame in range(FRAMES * per_frame)),
+    }
+    assert manifest["frames"] == FRAMES and set(said) <= set(manifest["notes"])
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_a_profile_names_weights_of_the_registry_and_the_preview_none(name: str) -> None:
+    named = set(weights_in(profile(name).model_dump(mode="json")))
+    assert named <= set(KNOWN)
+    assert bool(named) == (name != "preview")
+    assert named <= set(WRITERS)  # so the test above leaves none out

@@ -1,0 +1,357 @@
+"""How long the paper's schedule takes with full-size networks of random weights, against the floor that arithmetic sets.
+
+Run with `python -m benchmarks.paper_schedule` on a machine with a CUDA device (`--json FILE` keeps the rows); nothing is
+downloaded. `--quick` runs the same code with tiny networks and numbers anywhere, as a smoke test: its times say nothing.
+
+Columns: seconds of the stage, first calls included, loading not; operations of all networks as the ledger counts them;
+what that is per second; the floor, which is the planned operations at 790 TFLOP/s (bf16, one H100); the highest GPU
+memory, weights included; and the share of the time that no network was at work: drawing, losses, optimizers.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial, wraps
+from pathlib import Path
+from typing import Any
+
+from benchmarks.measure import machine, write_rows  # before torch: how its threads wait
+
+import torch  # isort: skip
+from diffusers import (
+    AutoencoderKL,
+    AutoencoderKLTemporalDecoder,
+    UNet2DConditionModel,
+    UNetSpatioTemporalConditionModel,
+)
+from rich.console import Console
+from rich.table import Table
+from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
+
+from dg4d_lib.diffusion.ledger import counted, counting_flops
+from dg4d_lib.diffusion.parts import Placement, dtype_on, frozen
+from dg4d_lib.diffusion.video_model import VideoModel
+from dg4d_lib.fitting.motion import fit_motion
+from dg4d_lib.fitting.static import fit_gaussians
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.initialize import blob
+from dg4d_lib.guidance.distillation import Annealing
+from dg4d_lib.guidance.interface import GuidancePrior
+from dg4d_lib.guidance.zero123 import CAMERA_NUMBERS, LATENT_CHANNELS, Zero123
+from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
+from dg4d_lib.settings import MotionSettings, Precision, StaticSettings
+from dg4d_lib.texture.refine import Stretch, refine_textures
+from dg4d_lib.texture.refiner import VideoToVideo
+from dg4d_lib.video.driving import DrivingVideo
+from dg4d_lib.video.svd import StableVideo
+from steps.motions import new_deformation
+from steps.profiles import PipelineSettings, profile, revise
+
+FLOORS_S = {"video": 3.0, "static": 9.1, "dynamic": 12.8, "refinement": 21.7}
+GIB = 2**30
+LADDER = [{"until": 1.0, "size": 32}]
+QUICK = {
+    "driving.frames": 2,
+    "driving.height": 64,
+    "driving.width": 64,
+    "driving.model.steps": 2,
+    "static.iterations": 2,
+    "static.views": 2,
+    "static.points": 200,
+    "static.reference_size": 32,
+    "static.ladder": LADDER,
+    "motion.iterations": 2,
+    "motion.views": 1,
+    "motion.reference_size": 32,
+    "motion.ladder": LADDER,
+    "mesh.texture_size": 64,
+    "refiner.texture.iterations": 1,
+    "refiner.texture.size": 64,
+    "refiner.model.steps": 4,
+}
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Sizes of a CLIP image encoder."""
+
+    width: int = 64
+    layers: int = 2
+    heads: int = 4
+    embedding: int = 32
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Of the networks: channels of the first level of every U-Net and VAE, and the image encoders."""
+
+    unet: int = 32
+    vae: int = 32
+    clip: Clip = Clip()  # Zero-1-to-3's: ViT-L/14
+    eye: Clip = Clip()  # the video model's: ViT-H/14
+
+
+FULL = Sizes(320, 128, Clip(1024, 24, 16, 768), Clip(1280, 32, 16, 1024))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One stage; without a GPU there is no memory to tell, and tiny networks have no floor."""
+
+    stage: str
+    seconds: float
+    pflop: float
+    tflop_per_s: float
+    floor_s: float | None
+    over_floor: float | None
+    peak_gib: float | None
+    outside_networks: float
+
+
+@dataclass
+class Clock:
+    """How long networks were at work."""
+
+    device: torch.device
+    seconds: float = 0.0
+
+    def watch(self, owner: object, *methods: str) -> None:
+        """Count the time within these methods."""
+        for method in methods:
+            object.__setattr__(owner, method, self._timed(getattr(owner, method)))  # some owners are frozen
+
+    def now(self) -> float:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+        return time.perf_counter()
+
+    def _timed(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(method)
+        def timed(*positional: Any, **named: Any) -> Any:
+            start = self.now()
+            made = method(*positional, **named)
+            self.seconds += self.now() - start
+            return made
+
+        return timed
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The paper's settings, and networks of a size.
+
+    Attributes:
+        settings: of the whole pipeline.
+        sizes: of the networks.
+        device: where they run.
+    """
+
+    settings: PipelineSettings
+    sizes: Sizes
+    device: torch.device
+
+    def rows(self) -> Iterator[Row]:
+        """Every stage after the other, each with what the one before made."""
+        subject, clock = disc(self.settings.subject.size), Clock(self.device)
+        motion = self.video_model(self.settings.driving.model, clock)
+        row, video = self.measured("video", clock, lambda: self.drive(motion, subject))
+        yield row
+        del motion
+        prior = self.zero123()
+        row, gaussians = self.measured("static", clock, lambda: self.fit(prior, subject, clock))
+        yield row
+        row, _ = self.measured("dynamic", clock, lambda: self.fit_motion(prior, gaussians, video, clock))
+        yield row
+        del prior
+        textures = self.video_model(self.settings.refiner.model, clock)
+        yield self.measured("refinement", clock, lambda: self.refine(textures, video))[0]
+
+    def measured(self, stage: str, clock: Clock, work: Callable[[], Any]) -> tuple[Row, Any]:
+        on_gpu = self.device.type == "cuda"
+        if on_gpu:
+            torch.cuda.empty_cache()
+            torch.cuda.reset_peak_memory_stats(self.device)
+        clock.seconds, start = 0.0, clock.now()
+        with counting_flops() as flops:
+            made = work()
+        seconds, floor = clock.now() - start, FLOORS_S[stage] if self.sizes == FULL else None
+        row = Row(
+            stage=stage,
+            seconds=seconds,
+            pflop=sum(flops.values()) / 1e15,
+            tflop_per_s=sum(flops.values()) / 1e12 / seconds,
+            floor_s=floor,
+            over_floor=seconds / floor if floor else None,
+            peak_gib=torch.cuda.max_memory_allocated(self.device) / GIB if on_gpu else None,
+            outside_networks=1 - clock.seconds / seconds,
+        )
+        return row, made
+
+    def drive(self, model: VideoModel, subject: torch.Tensor) -> DrivingVideo:
+        return StableVideo(self.settings.driving, model).generate(subject, seeded())
+
+    def fit(self, model: Zero123, subject: torch.Tensor, clock: Clock) -> Gaussians:
+        static = self.settings.static
+        start = blob(static.points, static.blob_radius, seeded()).to(device_of("auto"))
+        prior = conditioned(model, subject[None], static, clock)
+        return fit_gaussians(start, subject, prior, choose_rasterizer("auto"), static, seeded())
+
+    def fit_motion(self, model: Zero123, gaussians: Gaussians, video: DrivingVideo, clock: Clock) -> None:
+        dynamic = self.settings.motion
+        deformation = new_deformation(self.settings.deformation, gaussians.to("cpu"), len(video), seeded())
+        deformation.to(gaussians.means.device)
+        prior = conditioned(model, torch.cat([video.frames, video.coverage], -1), dynamic, clock)
+        fit_motion(gaussians, deformation, video, prior, choose_rasterizer("auto"), dynamic, seeded())
+
+    def refine(self, model: VideoModel, video: DrivingVideo) -> None:
+        there = DrivingVideo(video.frames.to(self.device), video.coverage.to(self.device), video.fps)
+        refiner = VideoToVideo(self.settings.refiner, model, there.over(there.frames.new_ones(3))[0])
+        mesh = ball(self.settings.mesh.texture_size, self.device)
+        stretches = [Stretch(mesh, torch.zeros_like(mesh.vertices)[None])] * len(video)
+        refine_textures(stretches, there, refiner, self.settings.refiner.texture, seeded())
+
+    def zero123(self) -> Zero123:
+        settings, sizes = self.settings.prior, self.sizes
+        tokens = sizes.clip.embedding
+        make = partial(self.network, settings.precision, channels_last=self.device.type == "cuda")
+        return Zero123(
+            vae=make(lambda: AutoencoderKL(up_block_types=("UpDecoderBlock2D",) * 4, **vae(sizes))),
+            unet=make(
+                lambda: UNet2DConditionModel(
+                    in_channels=2 * LATENT_CHANNELS, block_out_channels=levels(sizes.unet), cross_attention_dim=tokens
+                )
+            ),
+            image_encoder=make(lambda: image_encoder(sizes.clip)),
+            camera_projection=make(lambda: torch.nn.Linear(tokens + CAMERA_NUMBERS, tokens)),
+            settings=settings,
+        )
+
+    def video_model(self, settings: Any, clock: Clock) -> VideoModel:
+        make, sizes = partial(self.network, settings.precision), self.sizes
+        unet = make(
+            lambda: UNetSpatioTemporalConditionModel(
+                block_out_channels=levels(sizes.unet),
+                num_attention_heads=tuple(max(1, channels // 64) for channels in levels(sizes.unet)),
+                cross_attention_dim=sizes.eye.embedding,
+                num_frames=14,
+            )
+        )
+        decoder = make(lambda: AutoencoderKLTemporalDecoder(**vae(sizes)))
+        model = VideoModel(unet, decoder, make(lambda: image_encoder(sizes.eye)), settings, self.device)
+        clock.watch(model, "look_at", "encode", "decode", "denoise")
+        return model
+
+    def network(self, precision: Precision, build: Callable[[], Any], channels_last: bool = False) -> Any:
+        placement = Placement(self.device, dtype_on(self.device, precision), channels_last)
+        with self.device:
+            return counted(frozen(build().to(placement.dtype), placement))
+
+
+def conditioned(
+    model: Zero123, cutouts: torch.Tensor, stage: StaticSettings | MotionSettings, clock: Clock
+) -> GuidancePrior:
+    """The prior that knows some frames, watched by the clock."""
+    over_white = cutouts[..., :3] * cutouts[..., 3:] + 1 - cutouts[..., 3:]
+    clock.watch(prior := model.conditioned_on(over_white, Annealing(stage.noise_start, stage.noise_end)), "loss")
+    return prior
+
+
+def levels(width: int) -> tuple[int, ...]:
+    return (width, 2 * width, 4 * width, 4 * width)
+
+
+def vae(sizes: Sizes) -> dict[str, Any]:
+    return {
+        "block_out_channels": levels(sizes.vae),
+        "down_block_types": ("DownEncoderBlock2D",) * 4,
+        "layers_per_block": 2,
+        "latent_channels": LATENT_CHANNELS,
+    }
+
+
+def image_encoder(sizes: Clip) -> CLIPVisionModelWithProjection:
+    config = CLIPVisionConfig(
+        hidden_size=sizes.width,
+        intermediate_size=4 * sizes.width,
+        num_hidden_layers=sizes.layers,
+        num_attention_heads=sizes.heads,
+        projection_dim=sizes.embedding,
+        image_size=224,
+        patch_size=14,
+    )
+    return CLIPVisionModelWithProjection(config)
+
+
+def seeded() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def disc(size: int) -> torch.Tensor:
+    """A cut-out of a colored disc."""
+    rows, columns = torch.meshgrid(*[torch.linspace(-1, 1, size)] * 2, indexing="ij")
+    inside = (rows.square() + columns.square() < 0.36).float()
+    return torch.stack([(rows + 1) / 2, (columns + 1) / 2, 0.4 * inside, inside], -1)
+
+
+def ball(texture: int, device: torch.device, rows: int = 100, columns: int = 200) -> TexturedMesh:
+    """About as many triangles as an extracted mesh has, gray."""
+    down, around = torch.linspace(0, 1, rows), torch.linspace(0, 1, columns)
+    v, u = (place.flatten() for place in torch.meshgrid(down, around, indexing="ij"))
+    polar, azimuth = torch.pi * v, 2 * torch.pi * u
+    vertices = torch.stack([polar.sin() * azimuth.sin(), polar.cos(), polar.sin() * azimuth.cos()], -1)
+    corner = (torch.arange(rows - 1)[:, None] * columns + torch.arange(columns - 1)).flatten()
+    below = corner + columns
+    faces = torch.cat([torch.stack([corner, below, below + 1], -1), torch.stack([corner, below + 1, corner + 1], -1)])
+    gray = torch.full((texture, texture, 3), 0.5)
+    mesh = TexturedMesh(0.5 * vertices, faces, torch.stack([u, v], -1), gray)
+    return replace(mesh, **{name: value.to(device) for name, value in vars(mesh).items()})
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="tiny networks, small numbers, any device")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
+    options = parser.parse_args()
+    found = torch.cuda.is_available()
+    if not found and not options.quick:
+        parser.error("there is no CUDA device here; --quick runs tiny networks without one")
+    device = torch.device("cuda" if found else "cpu")
+    console = Console()
+    name = machine()
+    settings = revise(profile("paper"), QUICK if options.quick else {})
+    if found:
+        about = torch.cuda.get_device_properties(device)
+        settings = revise(settings, {"prior.memory_gb": max(6, about.total_memory // GIB)})
+        name = f"{about.name}, {about.total_memory / GIB:.0f} GiB"
+    console.print(
+        f"{name}; torch {torch.__version__}; {'tiny' if options.quick else 'full-size'} networks, random weights"
+    )
+    rows = []
+    for row in Schedule(settings, Sizes() if options.quick else FULL, device).rows():
+        console.print(f"{row.stage}: {row.seconds:.1f} s")
+        rows.append(row)
+    console.print(table(rows))
+    if options.json:
+        write_rows(options.json, rows)
+
+
+def table(rows: list[Row]) -> Table:
+    """Rows as they are printed."""
+    result = Table("stage", "s", "PFLOP", "TFLOP/s", "floor, s", "times floor", "peak, GiB", "outside networks")
+    for row in rows:
+        limits = (row.floor_s, row.over_floor, row.peak_gib)
+        result.add_row(
+            row.stage,
+            f"{row.seconds:.1f}",
+            f"{row.pflop:.4g}",
+            f"{row.tflop_per_s:.3g}",
+            *("-" if value is None else f"{value:.1f}" for value in limits),
+            f"{row.outside_networks:.0%}",
+        )
+    return result
+
+
+if __name__ == "__main__":
+    main()
