@@ -56,7 +56,7 @@ def _counting(name: str, forward: Callable[..., Any]) -> Callable[..., Any]:
         tensors = [value for value in (*positional, *named.values()) if isinstance(value, torch.Tensor)]
         shapes = tuple(value.shape for value in tensors)
         if shapes not in of_one_call:  # a call of its own: the counter does not bear gradients
-            apart = {name: _detached(value) for name, value in named.items()}
+            apart = {key: _detached(value) for key, value in named.items()}
             with torch.no_grad(), FlopCounterMode(display=False) as counter:
                 forward(*map(_detached, positional), **apart)
             of_one_call[shapes] = counter.get_total_flops()

@@ -116,6 +116,19 @@ def test_the_banner_says_what_models_did(store: ArtifactStore) -> None:
     assert "guessed without a model" in report.banner(order, by_video)
 
 
+def test_what_networks_did_is_said_for_every_step(store: ArtifactStore) -> None:
+    order, what = made(store)
+    fit, pack = what.steps
+    record = fit.result.provenance.model_copy(update={"flops": {"Unet": 15_250_000_000_000, "Vae": 3_000_000}})
+    fit = fit.model_copy(update={"result": fit.result.model_copy(update={"provenance": record})})
+    texts = report.texts(order, what.model_copy(update={"steps": [fit, pack]}), FILES, store)
+    stages = json.loads(texts["report.json"])["steps"]
+    assert [stage["flops"] for stage in stages] == [record.flops, {}]
+    assert texts["report.html"].count("FLOP") == 2
+    assert "Unet 15.2 TFLOP, Vae 3.0 MFLOP" in texts["report.html"]
+    assert json.loads(texts["provenance.json"])["steps"][0]["flops"] == record.flops
+
+
 def test_licenses_follow_the_asset_only_where_weights_were_used(store: ArtifactStore) -> None:
     order, what = made(store)
     texts = report.texts(order, what, FILES, store)

@@ -40,7 +40,7 @@ DIFFERENCES = {
     "reference": {"motion.iterations": 500, "static.noise_start": 1.0, "static.noise_end": 0.0,
                   "motion.noise_start": 1.0, "motion.noise_end": 0.0, "deformation.temporal": 12,
                   "prior.weights": "stable-zero123", "prior.variant": "stable",
-                  "static.start": "lgm"},
+                  "static.start": "lgm", "static.iterations": 0},
 }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Every trained profile by the steps' own code on a processor: tiny random weights in the real formats, small numbers."""
+"""Every trained profile by the real steps on a processor: tiny random weights in the real formats, small numbers."""
 
 import json
 import zipfile
@@ -154,6 +154,7 @@ def source_of(folder: Path, store: ArtifactStore, moving: bool) -> ArtifactRef:
     return store.put(path, "application/octet-stream")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "moving", "used"),
     [
