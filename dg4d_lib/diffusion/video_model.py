@@ -1,4 +1,4 @@
-"""Stable Video Diffusion in its parts: look at a picture, encode, denoise and decode videos (METHOD sections 6 and 9).
+"""Stable Video Diffusion in its parts: look at a picture, encode, denoise and decode videos.
 
 The schedule is Karras et al. 2022; the network predicts v (Salimans and Ho 2022) of x = x0 + sigma e:
 x0 = x / (1 + sigma^2) - v sigma / sqrt(1 + sigma^2), and its input is x / sqrt(1 + sigma^2) at the time ln(sigma) / 4.

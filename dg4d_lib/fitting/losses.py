@@ -36,7 +36,7 @@ def reference_loss(
     alpha_weight: float,
     ssim_weight: float = 0.0,
 ) -> Float[Tensor, ""]:
-    """Weighted mean squared errors of color and alpha, means over images, pixels and channels (METHOD section 3).
+    """Weighted mean squared errors of color and alpha, means over images, pixels and channels.
 
     With `ssim_weight` also how far the colors' structural similarity is from 1 (3DGS; the paper has none).
     """

@@ -17,7 +17,7 @@ SMALLEST = 1e-4  # world units; coincident points still get a size
 
 
 def blob(count: int, radius: float, generator: torch.Generator) -> Gaussians:
-    """Gray points uniform in a ball, as large as their three nearest neighbors are far (METHOD: RMS distance).
+    """Gray points uniform in a ball, as large as their three nearest neighbors are far (root mean square).
 
     Args:
         count: Gaussians.

@@ -1,6 +1,6 @@
 """ImageDream: how an object looks from four sides at once, given a picture of its front (Wang and Shi 2023).
 
-It makes the views that LGM reconstructs (METHOD section 10), and can judge renders as a prior. Its conventions end
+It makes the views that LGM reconstructs, and can judge renders as a prior. Its conventions end
 here: a world with z up, an object whose front is seen from azimuth 90, cameras on the unit sphere.
 """
 

@@ -1,4 +1,4 @@
-"""The colors of Gaussians, projected back onto a surface (METHOD section 8; Tang et al. 2024, section 3.2).
+"""The colors of Gaussians, projected back onto a surface (Tang et al. 2024, section 3.2).
 
 Every texel looks at pictures of the Gaussians from 26 sides and from the input view, and keeps a mean of the colors it
 sees, heavily in favor of the view that looks straight at it. Pictures are un-premultiplied and their soft outlines left

@@ -1,4 +1,4 @@
-"""A mesh that other programs like: one piece, manifold, even triangles, not too many (METHOD section 8).
+"""A mesh that other programs like: one piece, manifold, even triangles, not too many.
 
 The work is pymeshlab's. It is GPL-3 and crashes when two threads of a process use it, so it runs in a process of its
 own, `python -m dg4d_lib.mesh.clean`, and is imported nowhere else.

@@ -1,6 +1,6 @@
 """How much matter Gaussians put where: the scalar field whose level set is the surface.
 
-density(p) = sum_i opacity_i exp(-0.5 d^T Sigma_i^-1 d), d = p - mean_i (METHOD section 8; Tang et al. 2024, 3.2).
+density(p) = sum_i opacity_i exp(-0.5 d^T Sigma_i^-1 d), d = p - mean_i (Tang et al. 2024, 3.2).
 """
 
 from dataclasses import dataclass

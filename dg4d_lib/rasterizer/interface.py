@@ -64,7 +64,7 @@ class Rasterizer(Protocol):
             cameras: b cameras of one width and height.
             background: color behind everything.
             screen_offsets: zeros that are added to the projected centers, in pixels; their gradient is what density
-                control reads (METHOD section 2). Backends may assume that they are zero.
+                control reads. Backends may assume that they are zero.
 
         Raises:
             BadInput: no cameras, cameras of different sizes, another number of states than of cameras, or Gaussians

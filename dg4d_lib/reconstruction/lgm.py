@@ -1,4 +1,4 @@
-"""LGM: four views of an object to 65,536 Gaussians in one pass (Tang et al. 2024; METHOD section 10).
+"""LGM: four views of an object to 65,536 Gaussians in one pass (Tang et al. 2024).
 
 LGM's world is ours (right-handed, y up, the first camera on +z, azimuth counter-clockwise from above, quaternions
 wxyz), except that its cameras stand at radius 1.5. Everything is scaled by 2 / 1.5 once, in `gaussians_of`: a picture

@@ -1,4 +1,4 @@
-"""Textures follow better pictures of a moving mesh (METHOD section 9; paper section 3.4).
+"""Textures follow better pictures of a moving mesh (paper section 3.4).
 
 Every iteration looks at all frames twice: from the input view, where the driving video says how they look, and from a
 camera that goes round at constant speed, where a refiner says it. Colors are optimized as logits, the shape stays.

@@ -1,4 +1,4 @@
-"""What makes the pictures of a moving textured mesh better; the texture then follows them (METHOD section 9)."""
+"""What makes the pictures of a moving textured mesh better; the texture then follows them."""
 
 from collections.abc import Sequence
 from itertools import pairwise

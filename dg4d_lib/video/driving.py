@@ -26,7 +26,7 @@ class DrivingVideo:
 
     @property
     def times(self) -> Float[Tensor, " t"]:
-        """0 is the first frame, 1 the last, both included (METHOD section 1)."""
+        """0 is the first frame, 1 the last, both included."""
         return torch.linspace(0, 1, len(self), device=self.frames.device)
 
     def over(self, background: Float[Tensor, " 3"]) -> Float[Tensor, "t h w 3"]:

@@ -1,4 +1,4 @@
-"""From any frames to cut-outs of the subject in one square frame (METHOD sections 1 and 6)."""
+"""From any frames to cut-outs of the subject in one square frame."""
 
 from jaxtyping import Float
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""Driving videos by Stable Video Diffusion (METHOD section 6; Blattmann et al. 2023)."""
+"""Driving videos by Stable Video Diffusion (Blattmann et al. 2023)."""
 
 import math
 from collections.abc import Iterator, Sequence

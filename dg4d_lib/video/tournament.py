@@ -1,4 +1,4 @@
-"""Which of several driving videos is worth being made 3D, without a person looking (METHOD sections 6 and 13).
+"""Which of several driving videos is worth being made 3D, without a person looking.
 
 Five questions, each answered by a number in [0, 1]:
   alive      share of the frames that show the subject and are not frozen

@@ -31,7 +31,7 @@ def test_azimuth_zero_stands_on_z_and_ninety_on_x():
 
 def test_positive_elevation_is_above():
     assert OrbitCamera(30, 40).position()[1] > 0
-    golden = torch.tensor([1.1133, -1.0, 1.3268], dtype=torch.float64)  # METHOD's golden value, 30 below
+    golden = torch.tensor([1.1133, -1.0, 1.3268], dtype=torch.float64)  # of the public code, 30 below
     torch.testing.assert_close(OrbitCamera(-30, 40).position(), golden, atol=5e-5, rtol=0)
 
 

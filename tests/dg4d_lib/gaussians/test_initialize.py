@@ -10,7 +10,7 @@ def test_a_blob_fills_its_ball_with_grey():
     assert abs((radii < 0.25).float().mean() - 1 / 8) < 0.02  # volume goes with the cube
     torch.testing.assert_close(cloud.colors, torch.full((5000, 3), 0.5))
     torch.testing.assert_close(cloud.opacities, torch.full((5000,), 0.1))
-    assert abs(float(cloud.scales.mean()) - 0.035) < 0.003  # the size METHOD names for 5,000 points
+    assert abs(float(cloud.scales.mean()) - 0.035) < 0.003  # the size that the public code gets for 5,000 points
 
 
 def test_surface_points_cover_their_area():

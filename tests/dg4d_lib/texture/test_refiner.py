@@ -33,7 +33,7 @@ def video(seed: int = 1) -> Tensor:
 def by_the_formulas(
     parts: object, pictures: Tensor, picture: Tensor, sigmas: Tensor, generator: torch.Generator
 ) -> Tensor:
-    """METHOD section 9 in the preconditioning of Karras et al. (2022), float64, written out frame by frame."""
+    """The refinement in the preconditioning of Karras et al. (2022), float64, written out frame by frame."""
     unet, vae, eye = parts.unet, parts.vae, parts.image_encoder
     seen = 2 * picture.permute(2, 0, 1)[None] - 1
     clip = interpolate(seen, (224, 224), mode="bicubic", align_corners=True)  # enlarged: the blur is none
