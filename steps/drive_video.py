@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from shutil import copyfile
 from tempfile import TemporaryDirectory
@@ -14,6 +14,7 @@ from torch.nn.functional import interpolate
 
 from dg4d_lib.assets.preview import write_film
 from dg4d_lib.assets.sheet import videos_sheet
+from dg4d_lib.diffusion.parts import device_here
 from dg4d_lib.diffusion.video_model import VideoModel
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import SvdSettings, WarpSettings
@@ -63,12 +64,8 @@ def run(job: Job) -> Facts:
             origin = "Stable Video Diffusion ({})"
     taken, verdict = _tournament(job, subject, motions) if len(motions) > 1 else (motions[0], ())
     write_frames(job.outputs["driving_video"], taken.video)
-    return Facts(
-        backend=facts.backend,
-        weights=facts.weights,
-        licenses=facts.licenses,
-        notes=(f"The motion is made up by {origin.format(taken.name)}.", *verdict, *taken.notes, *facts.notes),
-    )
+    made_up = f"The motion is made up by {origin.format(taken.name)}."
+    return replace(facts, notes=(made_up, *verdict, *taken.notes, *facts.notes))
 
 
 def _follow(job: Job, subject: Float[Tensor, "h w 4"]) -> Facts:
@@ -102,7 +99,7 @@ def _stable_videos(
 ) -> tuple[list[_Motion], Facts]:
     """Candidate k of a seed is candidate 1 of the seed plus k - 1."""
     opened = open_weights(settings.model.weights)
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = device_here()
     maker = StableVideo(settings, VideoModel.load(opened.folder, settings.model, device))
     seeds = [seed + number - 1 for number in numbers]
     videos = maker.generate_all(subject, [torch.Generator().manual_seed(each) for each in seeds])

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.batching import MicroBatches
+from dg4d_lib.diffusion.parts import device_here
 from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.analytic import AnalyticPrior
 from dg4d_lib.guidance.distillation import Annealing
@@ -29,6 +30,7 @@ from dg4d_lib.settings import (
     StaticSettings,
     Zero123PriorSettings,
 )
+from dg4d_lib.video.driving import over_white
 from dg4d_lib.weights.registry import weights_called
 from steps.job import Facts
 from steps.media import read_png
@@ -96,21 +98,17 @@ def make_prior(
         case Zero123PriorSettings():
             check_variant(settings)
             opened = open_weights(settings.weights)
-            known = Zero123.load(opened.folder, settings, _device()).conditioned_on(_over_white(cutouts), noise)
+            known = Zero123.load(opened.folder, settings, device_here()).conditioned_on(_pictures(cutouts), noise)
             return ChosenPrior(known, f"prior: Zero-1-to-3, weights {settings.weights}", opened, known.batches)
         case ImageDreamPriorSettings():
             opened = open_weights(settings.weights)
-            model = ImageDream.load(opened.folder, settings.precision, _device())
-            dream = ImageDreamPrior(model, model.conditioned_on(_over_white(cutouts)), noise, settings)
+            model = ImageDream.load(opened.folder, settings.precision, device_here())
+            dream = ImageDreamPrior(model, model.conditioned_on(_pictures(cutouts)), noise, settings)
             return ChosenPrior(dream, f"prior: ImageDream, weights {settings.weights}", opened, dream.batches)
 
 
-def _device() -> torch.device:
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-
-
-def _over_white(cutouts: Sequence[Float[Tensor, "h w 4"]]) -> Float[Tensor, "t h w 3"]:
-    return torch.stack([cutout[..., :3] * cutout[..., 3:] + 1 - cutout[..., 3:] for cutout in cutouts])
+def _pictures(cutouts: Sequence[Float[Tensor, "h w 4"]]) -> Float[Tensor, "t h w 3"]:
+    return over_white(torch.stack(list(cutouts)))
 
 
 def check_variant(settings: Zero123PriorSettings) -> None:

@@ -6,12 +6,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dg4d_lib.diffusion.parts import Placement, dtype_on
+from dg4d_lib.diffusion.parts import Placement, device_here, dtype_on
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.imagedream import ImageDream
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.reconstruction.lgm import load_lgm, reconstruct
 from dg4d_lib.settings import LgmSettings
+from dg4d_lib.video.driving import over_white
 from steps.job import Facts
 from steps.weights import Opened, open_weights
 
@@ -55,8 +56,8 @@ def reconstruct_subject(
         BackendUnavailable: weights or packages that are not here.
     """
     opened = open_weights(settings.views_weights), open_weights(settings.weights)
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    picture = subject[..., :3] * subject[..., 3:] + 1 - subject[..., 3:]
+    device = device_here()
+    picture = over_white(subject)
     model = ImageDream.load(opened[0].folder, settings.precision, device)
     condition = model.conditioned_on(picture[None])
     views = model.views(condition, generator, settings.steps, settings.guidance_scale).to(picture)

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.diffusion.parts import device_here
 from dg4d_lib.diffusion.video_model import VideoModel
 from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.zero123 import Zero123
@@ -56,7 +57,7 @@ def _refined(job: Job, stretches: Sequence[Stretch]) -> tuple[list[Float[Tensor,
         return [stretch.mesh.texture for stretch in stretches], Facts()
     with TemporaryDirectory() as scratch:
         driving = read_frames(job.inputs["driving_video"], Path(scratch))
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = device_here()
     driving = DrivingVideo(driving.frames.to(device), driving.coverage.to(device), driving.fps)
     pictures = driving.over(driving.frames.new_ones(3))
     refiner: Refiner

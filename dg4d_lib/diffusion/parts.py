@@ -17,6 +17,7 @@ from pickle import UnpicklingError
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
@@ -28,6 +29,8 @@ from dg4d_lib.settings import Precision
 DTYPES: dict[Precision, torch.dtype] = {"fp16": torch.float16, "bf16": torch.bfloat16, "fp32": torch.float32}
 
 DIFFUSERS_FILE, TRANSFORMERS_FILES = "diffusion_pytorch_model", ("model", "pytorch_model")
+CLIP_SIZE = 224  # pixels of the pictures that image encoders see
+CLIP_MEAN, CLIP_DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 HALF = "fp16"  # the variant of a file whose tensors are stored in half precision
 UNREADABLE = (OSError, EOFError, ValueError, KeyError, TypeError, RuntimeError, SafetensorError, UnpicklingError)
 
@@ -63,6 +66,17 @@ def dtype_on(device: torch.device, precision: Precision) -> torch.dtype:
     return torch.float32 if device.type == "cpu" else DTYPES[precision]
 
 
+def device_here() -> torch.device:
+    """Where networks run: the first CUDA device, or the processor."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def normalized_for_clip(planes: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+    """Colors in [0, 1] by the mean and deviation of CLIP's training pictures."""
+    mean, deviation = (planes.new_tensor(values)[:, None, None] for values in (CLIP_MEAN, CLIP_DEVIATION))
+    return (planes - mean) / deviation
+
+
 def load_vae(model: Path, placement: Placement) -> Any:
     """The AutoencoderKL of `model`/vae.
 
@@ -94,7 +108,7 @@ def load_image_encoder(model: Path, placement: Placement) -> Any:
         from transformers import CLIPVisionModelWithProjection  # noqa: PLC0415 - takes seconds
         from transformers.utils.logging import disable_progress_bar  # noqa: PLC0415
     except ImportError as error:
-        raise _missing_packages(error) from error
+        raise missing_packages(error) from error
     disable_progress_bar()
     return load_part(CLIPVisionModelWithProjection, model / "image_encoder", placement, TRANSFORMERS_FILES)
 
@@ -226,6 +240,13 @@ def require_schedule(model: Path, expected: BetaSchedule) -> None:
         raise BadInput(f"the scheduler of {model} is {given}; this model has to have {expected}")
 
 
+def missing_packages(error: ImportError) -> BackendUnavailable:
+    """What to raise where diffusers or transformers cannot be imported."""
+    return BackendUnavailable(
+        f"diffusion models need packages that are not here ({error}): pip install 'dg4d[diffusion]'"
+    )
+
+
 def frozen(part: Any, placement: Placement) -> Any:
     """The part in evaluation mode, without weight gradients, at its place."""
     part = part.eval().requires_grad_(False).to(placement.device)
@@ -236,14 +257,8 @@ def _diffusers() -> Any:
     try:
         import diffusers  # noqa: PLC0415 - takes seconds
     except ImportError as error:
-        raise _missing_packages(error) from error
+        raise missing_packages(error) from error
     return diffusers
-
-
-def _missing_packages(error: ImportError) -> BackendUnavailable:
-    return BackendUnavailable(
-        f"diffusion models need packages that are not here ({error}): pip install 'dg4d[diffusion]'"
-    )
 
 
 def _first_line(error: BaseException) -> str:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from dg4d_lib.diffusion.ledger import counted
-from dg4d_lib.diffusion.parts import DTYPES, HALF
+from dg4d_lib.diffusion.parts import HALF, dtype_on, missing_packages
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.settings import TextSettings
 
@@ -40,7 +40,7 @@ def draw_picture(
         BadInput: the folder holds no such pipeline, or what came out is no picture.
         BackendUnavailable: diffusers or transformers is not installed.
     """
-    dtype = torch.float32 if device.type == "cpu" else DTYPES[settings.precision]
+    dtype = dtype_on(device, settings.precision)
     pipeline = _load(model, dtype).to(device)
     for part in pipeline.components.values():
         if isinstance(part, nn.Module):
@@ -76,9 +76,7 @@ def _load(model: Path, dtype: torch.dtype) -> Any:
     try:
         from diffusers import DiffusionPipeline  # noqa: PLC0415 - takes seconds
     except ImportError as error:
-        raise BackendUnavailable(
-            f"diffusion models need packages that are not here ({error}): pip install 'dg4d[diffusion]'"
-        ) from error
+        raise missing_packages(error) from error
     if not (model / "model_index.json").is_file():
         raise BadInput(f"{model} has no model_index.json; give a text-to-image pipeline in the layout of diffusers")
     half = any(model.glob(f"*/*.{HALF}*"))

@@ -19,12 +19,18 @@ from torch import Tensor
 from torch.nn.functional import conv2d, interpolate, pad
 
 from dg4d_lib.diffusion.batching import MicroBatches
-from dg4d_lib.diffusion.parts import DTYPES, Placement, load_image_encoder, load_temporal_unet, load_temporal_vae
+from dg4d_lib.diffusion.parts import (
+    CLIP_SIZE,
+    Placement,
+    dtype_on,
+    load_image_encoder,
+    load_temporal_unet,
+    load_temporal_vae,
+    normalized_for_clip,
+)
 from dg4d_lib.settings import VideoModelSettings
 
 SIGMA_MAX, SIGMA_MIN, RHO = 700.0, 0.002, 7.0
-CLIP_SIZE = 224  # pixels of the picture that the image encoder sees
-CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 
 
 def karras_sigmas(steps: int) -> tuple[float, ...]:
@@ -87,7 +93,7 @@ class VideoModel:
             BadInput: a file is missing, damaged, or holds other tensors than its config says.
             BackendUnavailable: diffusers or transformers is not installed.
         """
-        dtype = torch.float32 if device.type == "cpu" else DTYPES[settings.precision]
+        dtype = dtype_on(device, settings.precision)
         place = Placement(torch.device("cpu") if settings.low_memory else device, dtype)
         parts = load_temporal_unet(folder, place), load_temporal_vae(folder, place), load_image_encoder(folder, place)
         return cls(*parts, settings, device)
@@ -228,8 +234,7 @@ def _for_clip(pictures: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 s s"]:
     for axis in (3, 2):
         pictures = _blur(pictures, axis)
     small = interpolate(pictures, (CLIP_SIZE, CLIP_SIZE), mode="bicubic", align_corners=True)
-    mean, deviation = (small.new_tensor(values)[:, None, None] for values in (CLIP_MEAN, CLIP_STD))
-    return (small / 2 + 0.5 - mean) / deviation
+    return normalized_for_clip(small / 2 + 0.5)
 
 
 def _blur(pictures: Float[Tensor, "b 3 h w"], axis: int) -> Float[Tensor, "b 3 h w"]:

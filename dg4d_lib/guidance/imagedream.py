@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,8 @@ from dg4d_lib.diffusion.parts import (
 )
 from dg4d_lib.diffusion.published import load_network
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.guidance.distillation import TRAIN_STEPS, Annealing, alphabars, distill_in_pieces
+from dg4d_lib.guidance.ddim import ddim_step, ddim_timesteps
+from dg4d_lib.guidance.distillation import Annealing, distill_in_pieces
 from dg4d_lib.guidance.interface import View
 from dg4d_lib.guidance.zero123 import LATENT_CHANNELS, LATENT_SIZE, SCHEDULE, clip_pixels, encoded
 from dg4d_lib.settings import ImageDreamPriorSettings, Precision
@@ -149,11 +151,9 @@ class ImageDream:
         cameras = turntable(RING, OrbitCamera(elevation_deg))
         shape = (1, RING, LATENT_CHANNELS, LATENT_SIZE, LATENT_SIZE)
         latents = torch.randn(shape, generator=generator, dtype=condition.latents.dtype).to(condition.latents.device)
-        for timestep, following in ddim_timesteps(steps):
+        for timestep, following in pairwise((*ddim_timesteps(steps), 0)):
             noise = self.predict_noise(latents, timestep, [cameras], condition, guidance)
-            now, then = float(alphabars()[timestep]), float(alphabars()[max(following, 0)])
-            clean = (latents - (1 - now) ** 0.5 * noise) / now**0.5
-            latents = then**0.5 * clean + (1 - then) ** 0.5 * noise
+            latents = ddim_step(latents, noise, timestep, following)
         pictures = self.vae.decode(latents[0].to(self.vae.dtype) / self.vae.config.scaling_factor).sample
         return (_wide(pictures) / 2 + 0.5).clamp(0, 1).permute(0, 2, 3, 1)
 
@@ -277,12 +277,6 @@ def camera_numbers(camera: OrbitCamera) -> Float[Tensor, "16"]:
     pose = turned.world_to_camera().inverse() @ torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64).diag()
     right, up, front, last = pose
     return torch.cat([right, -front, up, last])
-
-
-def ddim_timesteps(steps: int) -> list[tuple[int, int]]:
-    """Each timestep of the sampler ("leading" spacing, offset 1), and the one after, which is below 0 at the end."""
-    stride = TRAIN_STEPS // steps
-    return [(stride * i + 1, stride * (i - 1) + 1) for i in reversed(range(steps))]
 
 
 def _is_ring(views: Sequence[View]) -> bool:

@@ -19,12 +19,14 @@ from torch.nn import functional
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.diffusion.parts import (
+    CLIP_SIZE,
     BetaSchedule,
     Placement,
     dtype_on,
     load_image_encoder,
     load_unet,
     load_vae,
+    normalized_for_clip,
     read_linear,
     require_schedule,
 )
@@ -34,8 +36,6 @@ from dg4d_lib.guidance.interface import View
 from dg4d_lib.settings import Precision, Zero123PriorSettings
 
 SIZE, LATENT_SIZE, LATENT_CHANNELS = 256, 32, 4  # pixels; latents of the VAE
-CLIP_SIZE = 224  # pixels
-CLIP_MEAN, CLIP_DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 CAMERA_NUMBERS = 4
 SCHEDULE = BetaSchedule(BETA_START, BETA_END, "scaled_linear", TRAIN_STEPS, "epsilon")
 
@@ -256,5 +256,4 @@ def clip_pixels(images: Float[Tensor, "b h w 3"]) -> Float[Tensor, "b 3 224 224"
     """Pictures in [0, 1] as CLIP reads them."""
     planes = images.permute(0, 3, 1, 2)
     planes = functional.interpolate(planes, (CLIP_SIZE, CLIP_SIZE), mode="bicubic", antialias=True).clamp(0, 1)
-    mean, deviation = (planes.new_tensor(values)[:, None, None] for values in (CLIP_MEAN, CLIP_DEVIATION))
-    return (planes - mean) / deviation
+    return normalized_for_clip(planes)

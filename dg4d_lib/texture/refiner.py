@@ -11,7 +11,7 @@ from torch.nn.functional import interpolate
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.video_model import VideoModel, karras_sigmas, start_index
-from dg4d_lib.guidance.distillation import TRAIN_STEPS, alphabars
+from dg4d_lib.guidance.ddim import ddim_step, ddim_timesteps, diffused
 from dg4d_lib.guidance.interface import View
 from dg4d_lib.guidance.zero123 import ConditionedZero123, encoded
 from dg4d_lib.settings import ImageToImageSettings, VideoToVideoSettings
@@ -95,35 +95,15 @@ class ImageToImage:
 
         def denoised(piece: slice) -> Float[Tensor, "p h w 3"]:
             latents = scale * encoded(prior.vae, images[piece])
-            latents = _diffused(latents, noise[piece].to(latents), timesteps[0])
+            latents = diffused(latents, noise[piece].to(latents), timesteps[0])
             for timestep, following in pairwise((*timesteps, 0)):
                 believed = prior.believed_noise(latents, timestep, prior.latents[piece], tokens[piece])
-                latents = _ddim_step(latents, believed, timestep, following)
+                latents = ddim_step(latents, believed, timestep, following)
             decoded = prior.vae.decode((latents / scale).to(prior.vae.dtype)).sample.to(latents)
             return _resized((decoded.movedim(1, -1) / 2 + 0.5).clamp(0, 1), *video.shape[1:3])
 
         noise = torch.randn((len(video), *prior.latents.shape[1:]), dtype=video.dtype, generator=generator)
         return torch.cat(prior.batches.run(denoised, len(images))).to(video)
-
-
-def ddim_timesteps(steps: int) -> tuple[int, ...]:
-    """From the noisiest to the cleanest, evenly spaced: 981, 961, ..., 1 for 50 steps."""
-    stride = TRAIN_STEPS // steps
-    return tuple(stride * i + 1 for i in reversed(range(steps)))
-
-
-def _diffused(latents: Float[Tensor, "b c i j"], noise: Float[Tensor, "b c i j"], timestep: int) -> Tensor:
-    alphabar = float(alphabars()[timestep])
-    return alphabar**0.5 * latents + (1 - alphabar) ** 0.5 * noise
-
-
-def _ddim_step(
-    noisy: Float[Tensor, "b c i j"], believed: Float[Tensor, "b c i j"], timestep: int, following: int
-) -> Float[Tensor, "b c i j"]:
-    """From one timestep to the next without new noise (Song et al. 2021)."""
-    alphabar = float(alphabars()[timestep])
-    latents = (noisy - (1 - alphabar) ** 0.5 * believed) / alphabar**0.5
-    return _diffused(latents, believed, following)
 
 
 def _resized(pictures: Float[Tensor, "b h w 3"], height: int, width: int) -> Float[Tensor, "b i j 3"]:

@@ -32,3 +32,8 @@ class DrivingVideo:
     def over(self, background: Float[Tensor, " 3"]) -> Float[Tensor, "t h w 3"]:
         """The frames composited over one color."""
         return self.frames * self.coverage + (1 - self.coverage) * background
+
+
+def over_white(cutouts: Float[Tensor, "*b h w 4"]) -> Float[Tensor, "*b h w 3"]:
+    """Straight cut-outs, composited over white."""
+    return cutouts[..., :3] * cutouts[..., 3:] + 1 - cutouts[..., 3:]

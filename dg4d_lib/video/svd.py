@@ -10,7 +10,7 @@ from torch import Tensor
 from dg4d_lib.diffusion.video_model import SIGMA_MAX, VideoModel, karras_sigmas
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import SvdSettings
-from dg4d_lib.video.driving import DrivingVideo
+from dg4d_lib.video.driving import DrivingVideo, over_white
 from dg4d_lib.video.framing import resample
 from dg4d_lib.video.matting import matte_after
 
@@ -56,7 +56,7 @@ class StableVideo:
         top, left = (height - rows) // 2, (width - columns) // 2
         place = slice(top, top + rows), slice(left, left + columns)
         canvas = subject.new_ones((height, width, 3))
-        canvas[place] = small[..., :3] * small[..., 3:] + 1 - small[..., 3:]
+        canvas[place] = over_white(small)
         return canvas, place
 
     def _sample(

@@ -14,8 +14,9 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import random_orbit, turntable
 from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.errors import BadInput
+from dg4d_lib.guidance.ddim import ddim_timesteps
 from dg4d_lib.guidance.distillation import Annealing, alphabars
-from dg4d_lib.guidance.imagedream import Condition, ImageDream, ImageDreamPrior, camera_numbers, ddim_timesteps
+from dg4d_lib.guidance.imagedream import Condition, ImageDream, ImageDreamPrior, camera_numbers
 from dg4d_lib.guidance.interface import GuidancePrior, View, ring_of
 from dg4d_lib.settings import ImageDreamPriorSettings
 
@@ -99,7 +100,7 @@ def test_timesteps_are_those_of_the_usual_sampler(folder: Path) -> None:
     sampler = DDIMScheduler.from_pretrained(folder / "scheduler")
     for steps in (30, 50, 7):
         sampler.set_timesteps(steps)
-        assert [now for now, _ in ddim_timesteps(steps)] == sampler.timesteps.tolist()
+        assert list(ddim_timesteps(steps)) == sampler.timesteps.tolist()
 
 
 def test_views_are_what_the_usual_sampler_makes_of_the_same_noise(

@@ -11,11 +11,12 @@ from torch.nn.functional import interpolate
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.video_model import VideoModel
+from dg4d_lib.guidance.ddim import ddim_timesteps
 from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.interface import View
 from dg4d_lib.guidance.zero123 import Zero123, encoded
 from dg4d_lib.settings import ImageToImageSettings, VideoModelSettings, VideoToVideoSettings, Zero123PriorSettings
-from dg4d_lib.texture.refiner import ImageToImage, Refiner, VideoToVideo, ddim_timesteps
+from dg4d_lib.texture.refiner import ImageToImage, Refiner, VideoToVideo
 
 CPU = torch.device("cpu")
 FRAMES, SIDE = 3, 32
