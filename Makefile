@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
-.PHONY: setup demo test check examples clean
+.PHONY: setup clients demo test check examples clean
 
 setup: $(VENV)/.ready
 
@@ -15,7 +15,11 @@ $(VENV)/.ready: pyproject.toml constraints.txt deploy/setup.sh
 demo: setup
 	$(BIN)/dg4d make examples/newt.png -o out/demo
 
-test: setup check
+# other people's readers of our files, for tests; without node or Chromium those tests are skipped, with the reason
+clients: setup
+	bash deploy/clients.sh
+
+test: setup clients check
 	$(BIN)/python -m pytest -n 2 --dist loadscope --jaxtyping-packages=dg4d_lib,beartype.beartype\(conf=beartype.BeartypeConf\(is_pep484_tower=True\)\)
 
 check: setup

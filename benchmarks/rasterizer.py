@@ -147,9 +147,9 @@ def phases(count: int, size: int, rounds: int) -> tuple[dict[str, float], float]
     """Milliseconds of one thread in every phase of one view, the least of all rounds; and its millions of pairs."""
     cloud, camera = bumpy_ball(count), ring(size, 1)[0]
     state = [value.detach().numpy() for value in (cloud.means, cloud.quats, cloud.log_scales.exp())]
-    logits, colors = cloud.opacity_logits.detach(), cloud.colors.detach().numpy()
-    log_opacities = (torch.nn.functional.logsigmoid(logits) / np.log(2)).numpy()
-    lens = packed(camera).numpy()
+    coefficients = cloud.harmonics.detach()[:, 0].numpy()
+    log_opacities = torch.nn.functional.logsigmoid(cloud.opacity_logits.detach()).numpy()
+    lens = packed(camera)
     across = -(-size // TILE)
     records, keys = np.empty((count, RECORD), np.float32), np.empty(count, np.float32)
     gradients = [np.zeros_like(value) for value in state]
@@ -164,7 +164,7 @@ def phases(count: int, size: int, rounds: int) -> tuple[dict[str, float], float]
     for _ in range(rounds):
         scratch = Scratch()
         marks = [time.thread_time()]
-        project(*state, log_opacities, colors, lens, size, size, records, keys, 0, count)
+        project(*state, log_opacities, coefficients, lens, size, size, records, keys, 0, count)
         marks.append(time.thread_time())
         offsets, entries = bin_by_tile(records, keys, across, across, scratch)
         marks.append(time.thread_time())
@@ -175,13 +175,13 @@ def phases(count: int, size: int, rounds: int) -> tuple[dict[str, float], float]
         blend_backward(records, offsets, entries, white, *planes, *kept, slots, moments, 0, across * across)
         gather(entries, slots, count, moments)
         marks.append(time.thread_time())
-        unproject(*state, lens, keys, moments, *gradients, *more, 0, count)
+        unproject(*state, coefficients, lens, keys, moments, *gradients, *more, 0, count)
         marks.append(time.thread_time())
         taken = zip(PHASES, marks[:-1], marks[1:], strict=True)
         least = {name: min(least[name], (after - before) * 1e3) for name, before, after in taken}
     a, b, c = (records[:, field] for field in (WHITEN_A, WHITEN_B, WHITEN_C))
     conics = 2 * np.float32(np.log(2)) * np.stack((a * a, a * b, b * b + c * c), -1)
-    pixels, _ = blended_pairs(records[:, :2], keys, conics, np.exp2(log_opacities), size, size)
+    pixels, _ = blended_pairs(records[:, :2], keys, conics, np.exp(log_opacities), size, size)
     return least, len(pixels) / 1e6
 
 
@@ -223,15 +223,20 @@ def compare(counts: Sequence[int], sizes: Sequence[int], views: Sequence[int], r
     """Times of everything, and the rows of the file."""
     several, rows = str(views[1]), []
     ours = [*(str(n) for n in views), OWN_STATES]
-    table = Table("Gaussians", "pixels", *(f"V={name}" for name in ours), f"wall, V={several}", *PEERS)
+    headings = [*(f"V={name}" for name in ours), f"wall, V={several}", "one", "own"]
+    table = Table("Gaussians", "pixels", *headings, *PEERS)
     for count, size in product(counts, sizes):
         taken, missing = cell(count, size, views, rounds)
         rows += rows_of(count, size, views, taken)
         own = [f"{taken[name].cpu_ms:.2f}" for name in ours] + [f"{taken[several].wall_ms:.2f}"]
-        peers = (f"{taken[p].cpu_ms:.0f} ({taken[p].cpu_ms / taken[several].cpu_ms:.0f}x)" for p in PEERS if p in taken)
-        table.add_row(str(count), str(size), *own, *peers)
+        ratios = [f"{taken[name].cpu_ms / taken[several].cpu_ms:.2f}" for name in (str(views[0]), OWN_STATES)]
+        peers = [
+            f"{taken[p].cpu_ms:.0f} ({taken[p].cpu_ms / taken[several].cpu_ms:.0f}x)" if p in taken else ""
+            for p in PEERS
+        ]
+        table.add_row(str(count), str(size), *own, *ratios, *peers)
     table.title = f"Milliseconds per view, forward and backward; own states and ratios are of V={several}"
-    table.caption = "; ".join(f"missing: {name}" for name in missing)
+    table.caption = f"one, own: V={views[0]} and own states over V={several}" + "".join(f"; no {m}" for m in missing)
     return table, rows
 
 

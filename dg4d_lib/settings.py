@@ -43,6 +43,7 @@ class TextSettings(Settings):
         description="added to the words, so that the subject can be cut out",
     )
     precision: Precision = Field("fp16", description="of the networks; without a GPU always fp32")
+    low_memory: bool = Field(False, description="only the network that is at work is on the GPU; slower")
 
 
 class SubjectSettings(Settings):
@@ -191,6 +192,19 @@ class OraclePriorSettings(Settings):
 
     kind: Literal["oracle"] = "oracle"
     coverage_weight: NotNegative = Field(1.0, description="weight of alpha against color in the clean picture, ours")
+    blur: float = Field(0.0, ge=0, le=64, description="imperfection: standard deviation of a blur, pixels of the bank")
+    color_gain: float = Field(
+        0.0, ge=0, le=2, description="imperfection: standard deviation of the logarithm of a gain per view and frame"
+    )
+    pose_deg: float = Field(
+        0.0, ge=0, le=45, description="imperfection: standard deviation of an error of every view's angles"
+    )
+    shift: float = Field(
+        0.0,
+        ge=0,
+        le=64,
+        description="imperfection: standard deviation of a shift per view and frame, bank pixels",
+    )
 
 
 PriorSettings = Annotated[
@@ -216,6 +230,9 @@ class StaticSettings(Settings):
 
     iterations: int = Field(500, ge=0, le=20000, description="0 leaves the start as it is (public code, after LGM)")
     views: int = Field(16, ge=0, le=64, description="random views per iteration (paper: 16)")
+    background: Literal["white", "random"] = Field(
+        "white", description="behind random views; random: black in half of the iterations (DreamGaussian)"
+    )
     ladder: tuple[Rung, ...] = Field(LADDER, min_length=1)
     reference_size: int = Field(256, ge=32, le=1024, description="pixels of the reference view")
     start: Literal["blob", "surface", "lgm"] = Field(
@@ -258,6 +275,12 @@ class StaticSettings(Settings):
         return {**given, "lgm": (given.get("lgm") or {}) if given.get("start") == "lgm" else None}
 
 
+Endpoint = Annotated[
+    bool,
+    Field(description="frame k of T lies at k/(T-1) of the time axis, its end included; else at k/T (public code)"),
+]
+
+
 class HexPlaneSettings(Settings):
     """Six planes and a small network (Cao and Johnson 2023; paper section 3.2)."""
 
@@ -266,6 +289,15 @@ class HexPlaneSettings(Settings):
     temporal: int = Field(32, ge=2, le=512, description="cells of the time axis")
     features: int = Field(32, ge=1, le=128)
     hidden: int = Field(64, ge=1, le=512)
+    half_side: NotNegative = Field(
+        0.0,
+        description="of the box that the planes cover around the origin, world units (public code: 1.6); "
+        "0: the box of the Gaussians and a tenth more",
+    )
+    endpoint: Endpoint = True
+    zero_start: bool = Field(
+        True, description="the heads are zero at the start and so is the motion (paper); else Xavier-uniform (ablation)"
+    )
     scales: tuple[Annotated[int, Field(ge=1, le=16)], ...] = Field(
         (1,), min_length=1, description="multi-resolution: factors on `spatial`, concatenated"
     )
@@ -280,12 +312,18 @@ class MlpSettings(Settings):
     kind: Literal["mlp"] = "mlp"
     frequencies: int = Field(6, ge=1, le=16)
     hidden: int = Field(64, ge=1, le=512)
+    endpoint: Endpoint = True
 
 
 class FramewiseSettings(Settings):
     """Ablation: a free displacement per frame."""
 
     kind: Literal["framewise"] = "framewise"
+    start: Literal["static", "scattered"] = Field(
+        "static",
+        description="of every frame; scattered: each Gaussian up to the object's radius away, so that the static stage "
+        "says nothing of places",
+    )
 
 
 DeformationSettings = Annotated[HexPlaneSettings | MlpSettings | FramewiseSettings, Field(discriminator="kind")]
@@ -312,6 +350,16 @@ class MotionSettings(Settings):
     network_rate: Positive = Field(6.4e-4, description="learning rate of networks")
     plane_rate: Positive = Field(6.4e-3, description="learning rate of planes and frame-wise displacements")
     rigidity_weight: NotNegative = Field(0.0, description="local rigidity over time (Luiten et al. 2024)")
+    fine_tune: bool = Field(
+        False,
+        description="the Gaussians at rest are optimized too, at the rates below (paper: frozen; public code: so)",
+    )
+    mean_rate: Positive = Field(0.001, description="learning rate of the means at rest, at the start (public code)")
+    mean_rate_end: Positive = Field(2e-5, description="and at the end, log-linear (public code)")
+    color_rate: Positive = 0.01
+    opacity_rate: Positive = 0.05
+    scale_rate: Positive = 0.005
+    rotation_rate: Positive = 0.005
 
 
 class MeshSettings(Settings):
@@ -324,7 +372,7 @@ class MeshSettings(Settings):
     min_opacity: float = Field(0.005, ge=0, lt=1, description="fainter Gaussians do not count")
     density_threshold: Positive = Field(0.5, description="level of the surface (1.0 for plain statics)")
     edge_length: Positive = Field(0.015, description="of the isotropic remeshing, in units of the normalized box")
-    max_faces: int = Field(100000, ge=100)
+    max_faces: int = Field(100000, ge=100, description="triangles of a mesh, never more")
     min_component: Share = Field(0.02, description="components with a smaller share of the faces are dropped")
     texture_size: int = Field(1024, ge=64, le=8192, description="texels of a side")
     render_size: int = Field(512, ge=64, le=2048, description="pixels of the renders that are projected back")
@@ -351,6 +399,16 @@ class TextureSettings(Settings):
     refresh_every: int = Field(
         1, ge=1, le=2000, description="iterations between new trajectories and new targets (paper: 1)"
     )
+    frame_size: int = Field(
+        0,
+        ge=0,
+        le=1024,
+        description="of a tracked mesh: texels of a side of what every frame adds to the shared texture, and of the "
+        "textures per frame that come out; 0: one texture for all frames (ours)",
+    )
+    frame_weight: NotNegative = Field(
+        0.01, description="of the squares of what frames add, and of its changes from frame to frame"
+    )
 
 
 class VideoToVideoSettings(Settings):
@@ -376,16 +434,3 @@ class ImageToImageSettings(Settings):
 
 
 RefinerSettings = Annotated[IdentitySettings | VideoToVideoSettings | ImageToImageSettings, Field(discriminator="kind")]
-
-
-class PackSettings(Settings):
-    """What the package holds."""
-
-    splats: bool = Field(True, description="one standard PLY per frame")
-    preview_size: int = Field(384, ge=64, le=2048, description="pixels of preview.mp4 (even)", multiple_of=2)
-    preview_turns: int = Field(3, ge=1, le=20, description="times the motion loops while the camera goes round once")
-    sheet_size: int = Field(192, ge=32, le=1024, description="pixels of a tile of the contact sheet")
-    sheet_frames: int = Field(6, ge=1, le=32, description="columns: moments")
-    sheet_azimuths_deg: tuple[Annotated[float, Field(ge=-360, le=360)], ...] = Field(
-        (0.0, -75.0, 15.0, 105.0, 195.0), min_length=1, description="rows: angles"
-    )

@@ -11,6 +11,7 @@ import json
 import os
 import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,9 @@ from prefect.cache_policies import CachePolicy
 from prefect.context import TaskRunContext
 from pydantic import ValidationError
 
+from steps.bucket import open_store
 from steps.contract import StepRequest, StepResult
-from steps.store import ArtifactStore
+from steps.store import ArtifactStore, StoreUnreachable
 
 POLL_S = 0.1  # between two looks at a lock that another process holds
 
@@ -31,12 +33,16 @@ def record_key(request: StepRequest) -> str:
 
 
 def recorded(path: Path, store: ArtifactStore) -> StepResult | None:
-    """The result in a record that Prefect wrote, if it can be read and all its artifacts exist."""
+    """The result in a record that Prefect wrote, if it can be read and all its artifacts are there and sound.
+
+    Raises:
+        StoreUnreachable: the store does not answer.
+    """
     try:
         result = StepResult.model_validate(json.loads(json.loads(path.read_text(encoding="utf-8"))["result"]))
     except (OSError, ValueError, KeyError, TypeError, ValidationError):
         return None
-    return result if all(store.has(ref) for ref in result.outputs.values()) else None
+    return result if all(store.is_sound(ref) for ref in result.outputs.values()) else None
 
 
 @dataclass
@@ -44,7 +50,7 @@ class RequestPolicy(CachePolicy):
     """The key of a task that is called with `request=StepRequest(...)`; drops its record when that is broken."""
 
     records: Path = Path()
-    store: Path = Path()
+    store: str = ""
 
     def compute_key(
         self, task_ctx: TaskRunContext, inputs: dict[str, Any], flow_parameters: dict[str, Any], **_: Any
@@ -52,8 +58,9 @@ class RequestPolicy(CachePolicy):
         """The name of the request's record."""
         key = record_key(inputs["request"])
         record = self.records / key
-        if record.exists() and recorded(record, ArtifactStore(self.store)) is None:
-            self._drop(record, key)
+        with suppress(StoreUnreachable):  # the record is good until the contrary is known
+            if record.exists() and recorded(record, open_store(self.store)) is None:
+                self._drop(record, key)
         return key
 
     def _drop(self, record: Path, key: str) -> None:
@@ -64,7 +71,7 @@ class RequestPolicy(CachePolicy):
             record.unlink(missing_ok=True)
         elif lock.try_lock(key, holder):
             try:
-                if recorded(record, ArtifactStore(self.store)) is None:
+                if recorded(record, open_store(self.store)) is None:
                     record.unlink(missing_ok=True)
             finally:
                 lock.release_lock(key, holder)

@@ -8,11 +8,12 @@ import os
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
 from flows.endings import EXIT_FAILED, clear_ending
+from flows.store import store
 from flows.weights import weights
 
 if TYPE_CHECKING:
@@ -20,7 +21,9 @@ if TYPE_CHECKING:
 
     from flows.manifest import Item
     from flows.orders import Order
+    from flows.rebuild import Rebuilt
     from flows.summary import Row
+    from flows.verify import Verdict
     from steps.store import ArtifactStore
 
 Result = TypeVar("Result")
@@ -34,6 +37,7 @@ app = typer.Typer(
 )
 
 app.add_typer(weights)
+app.add_typer(store)
 
 Profile = Annotated[str, typer.Option(help="named settings to start from")]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="KNOB=VALUE", help="change a knob; may be repeated")]
@@ -41,6 +45,9 @@ Commercial = Annotated[
     bool, typer.Option("--commercial-only", help="refuse weights whose license forbids commercial use")
 ]
 Seed = Annotated[int, typer.Option(min=0, help="of everything random; equal seeds give equal bytes")]
+Triangles = Annotated[int | None, typer.Option(help="of the mesh, at most; short for --set mesh.max_faces=")]
+Texture = Annotated[int | None, typer.Option("--texture", help="texels of a side; short for --set mesh.texture_size=")]
+Rate = Annotated[float | None, typer.Option("--fps", help="frames per second of the files; short for --set pack.fps=")]
 
 
 @app.command()
@@ -54,6 +61,9 @@ def make(
     ] = None,
     profile: Profile = "preview",
     changes: Set = None,
+    triangles: Triangles = None,
+    texture: Texture = None,
+    fps: Rate = None,
     seed: Seed = 0,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="folder of the package  [default: out/<name>]")
@@ -79,7 +89,8 @@ def make(
         console = terminal.console()
         if pick and video:
             raise BadInput("--pick takes one of the motions that are made up; with --video the video is followed")
-        settings = revise(named(profile), parse_changes(changes or []) | ({"driving.pick": pick} if pick else {}))
+        short = _short(triangles, texture, fps) | ({"driving.pick": pick} if pick else {})
+        settings = revise(named(profile), parse_changes(changes or []) | short)
         item = picture.stem if picture else name_of(text)
         wish = Wish(
             item=item,
@@ -156,23 +167,30 @@ def batch(
     out: Annotated[Path, typer.Option("-o", "--out", help="DIR/<item>/ is a package each")],
     profile: Profile = "preview",
     changes: Set = None,
+    triangles: Triangles = None,
+    texture: Texture = None,
+    fps: Rate = None,
     seed: Seed = 0,
     workers: Annotated[int, typer.Option(min=1, max=64, help="items at a time")] = 1,
     commercial_only: Commercial = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="an asset that a gate does not let pass is a failure, and ends the batch")
+    ] = False,
 ) -> None:
     """Make many assets; those that are made already are left alone, and a bad one stops no other.
 
-    A manifest has a row per item: path, and if you like video, name, profile, seed, bank, set ("a.b=c; d.e=f"), or any
-    knob as a column of its own.
+    A manifest has a row per item: path or text, and if you like video, name, profile, seed, bank,
+    set ("a.b=c; d.e=f"), or any knob as a column of its own.
     """
     with clear_ending():
         from flows import home, terminal
         from flows.manifest import items_of, only_commercial, parse_changes
         from flows.publish import check_writable
-        from flows.summary import write_summary
+        from flows.summary import NOT_ACCEPTED, write_summary
 
         console = terminal.console()
-        items = items_of(inputs, out, profile, parse_changes(changes or []), seed)
+        wanted = parse_changes(changes or []) | _short(triangles, texture, fps)
+        items = items_of(inputs, out, profile, wanted, seed)
         items = only_commercial(items) if commercial_only else items
         check_writable(out)
         out.mkdir(parents=True, exist_ok=True)
@@ -186,18 +204,23 @@ def batch(
                     console.print(f"{row.item}: {row.status} {row.message}", markup=False)
                 write_summary(out, list(rows.values()), commercial_only)
 
-            orders = [order for item in items if (order := _ready(item, out, home.store(), settle)) is not None]
+            ready = (_ready(item, out, home.store(), settle, strict) for item in items)
+            orders = [order for order in ready if order is not None]
             if orders:
                 from flows.make import connect
 
                 connect()
                 from flows.catalog import convert_all
 
-                convert_all(orders, out, workers, f"{inputs.name}: {len(items)} items", settle)
+                refused = [row.item for row in rows.values() if row.kind == NOT_ACCEPTED]
+                convert_all(orders, out, workers, f"{inputs.name}: {len(items)} items", settle, strict, refused)
         write_summary(out, [rows[item.name] for item in items], commercial_only)
         failed = [row for row in rows.values() if row.status == "failed"]
         for row in failed:
             console.print(f"failed: {row.item}: {row.message}", markup=False, style="red")
+        doubtful = [row for row in rows.values() if row.failing and row.status != "failed"]
+        for row in doubtful:
+            console.print(f"not accepted: {row.item}: {', '.join(row.failing or ())}", markup=False, style="yellow")
         if not orders and not failed:
             console.print("nothing to do: every item was already done")
         console.print(f"{len(rows) - len(failed)} of {len(rows)} items are in {out}", markup=False)
@@ -233,6 +256,131 @@ def render(
 
 
 @app.command()
+def view(
+    package: Annotated[Path, typer.Argument(help="the folder of a package")],
+    show: Annotated[bool, typer.Option("--open/--no-open", help="open the page in a browser")] = True,
+) -> None:
+    """Check a package and show the page that plays it; prints where the page is."""
+    with clear_ending():
+        from flows.view import view as check_and_show
+
+        typer.echo(check_and_show(package, show))
+
+
+@app.command()
+def compose(
+    out: Annotated[Path, typer.Option("-o", "--out", help="the scene, a file ending in .glb or .usdz")],
+    packages: Annotated[
+        list[Path] | None, typer.Argument(help="folders of packages, from left to right", show_default=False)
+    ] = None,
+    scene: Annotated[
+        Path | None, typer.Option(help="a scene file (JSON): which packages stand where, and when")
+    ] = None,
+    spacing: Annotated[float, typer.Option(min=0, max=1000, help="world units between neighbors in a row")] = 0.25,
+    preview: Annotated[bool, typer.Option("--preview", help="also a film, beside the scene")] = False,
+) -> None:
+    """Put several assets into one animated scene: side by side, or as a scene file says."""
+    with clear_ending():
+        os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+        from flows.compose import compose as compose_scene
+
+        for note in compose_scene(packages or [], out, scene, spacing, preview):
+            typer.echo(note, err=True)
+        typer.echo(out)
+
+
+@app.command()
+def score(
+    asset: Annotated[Path, typer.Argument(help="the folder of a package")],
+    truth: Annotated[Path, typer.Option(help="pictures from known sides, meshes if there are; or one picture")],
+    mesh: Annotated[bool, typer.Option("--mesh", help="the textured mesh instead of the splats")] = False,
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", metavar="score.KNOB=VALUE", help="change a knob; may be repeated")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="also write the results here, as JSON")] = None,
+) -> None:
+    """Judge an asset against the truth, beside what costs nothing: the input repeated, the first frame held."""
+    with clear_ending():
+        from flows import terminal
+        from flows.benchmark import score as judge_one
+        from flows.scores import markdown
+
+        console = terminal.console()
+        results = judge_one(asset, truth, console, mesh, changes, out)
+        console.print(markdown(results), markup=False)
+
+
+@app.command()
+def bench(
+    dataset: Annotated[Path, typer.Argument(help="a folder per object, with pictures from known sides")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="results, films, and packages in DIR/assets")],
+    profile: Profile = "preview",
+    changes: Set = None,
+    seed: Seed = 0,
+    mesh: Annotated[bool, typer.Option("--mesh", help="judge the textured meshes instead of the splats")] = False,
+    bank: Annotated[bool, typer.Option("--bank", help="every object's true views are its prior")] = False,
+    limit: Annotated[int | None, typer.Option(min=1, help="only so many objects, the first by name")] = None,
+    workers: Annotated[int, typer.Option(min=1, max=64, help="objects at a time")] = 1,
+) -> None:
+    """Make an asset of every object of a data set and judge it: the paper's table, as JSON, CSV and a page."""
+    with clear_ending():
+        from flows import terminal
+        from flows.benchmark import bench as judge_all
+        from flows.scores import markdown
+
+        console = terminal.console()
+        results = judge_all(dataset, out, console, profile, changes, seed, mesh, bank, limit, workers)
+        console.print(markdown(results), markup=False)
+        console.print(f"overview: {out / 'index.html'}", markup=False)
+
+
+@app.command()
+def verify(
+    package: Annotated[Path, typer.Argument(help="the folder of a package")],
+    trust: Annotated[
+        Path | None,
+        typer.Option(help="certificates (PEM) of who vouches for signers; then all must be signed"),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="for machines")] = False,
+) -> None:
+    """Check every digest and signature of a package; says what was altered, is missing or was added."""
+    with clear_ending():
+        from flows.verify import verify as check
+
+        _tell(check(package, trust), as_json)
+
+
+@app.command()
+def rebuild(
+    package: Annotated[Path, typer.Argument(help="the folder of a package")],
+    source: Annotated[
+        Path | None, typer.Option(help="the picture, video or folder of frames, where the store does not have it")
+    ] = None,
+    bank: Annotated[Path | None, typer.Option(help="the folder of true views, likewise")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="keep the new package here")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="for machines")] = False,
+) -> None:
+    """Make a package again from its record, every step anew, and compare step by step."""
+    with clear_ending():
+        from flows import home, terminal
+        from flows.orders import order_again
+        from flows.publish import check_folder, whole
+
+        record = whole(package)
+        if out is not None:
+            check_folder(out)
+        order = order_again(record, home.store(), source, bank)
+        console = terminal.console()
+
+        def work() -> "Rebuilt":
+            from flows.rebuild import rebuild as do_again
+
+            return do_again(package, record, order, out)
+
+        _tell(_run(order, console, work), as_json)
+
+
+@app.command()
 def up() -> None:
     """Start the server that shows every run, and keep it until `dg4d down`; prints its address."""
     with clear_ending():
@@ -256,6 +404,24 @@ def down() -> None:
 def main() -> None:
     """The entry point of `dg4d`."""
     app()
+
+
+def _tell(found: "Verdict | Rebuilt", as_json: bool) -> None:
+    """What was found, as JSON or as a table, and the exit status that says so."""
+    from flows import terminal
+
+    if as_json:
+        typer.echo(found.model_dump_json(indent=1))
+    else:
+        terminal.tell_rows(terminal.console(), found.rows())
+    if found.exit_code:
+        raise typer.Exit(found.exit_code)
+
+
+def _short(triangles: int | None, texture: int | None, fps: float | None) -> dict[str, Any]:
+    """The knobs behind options that are short for them."""
+    given = {"mesh.max_faces": triangles, "mesh.texture_size": texture, "pack.fps": fps}
+    return {knob: value for knob, value in given.items() if value is not None}
 
 
 def _made(order: "Order", folder: Path, console: "Console") -> dict[str, dict[str, int]]:
@@ -288,11 +454,13 @@ def _run(order: "Order", console: "Console", work: Callable[[], Result]) -> Resu
         raise
 
 
-def _ready(item: "Item", out: Path, store: "ArtifactStore", settle: Callable[["Row"], None]) -> "Order | None":
+def _ready(
+    item: "Item", out: Path, store: "ArtifactStore", settle: Callable[["Row"], None], strict: bool
+) -> "Order | None":
     """The order of an item; None if it is settled already."""
     from dg4d_lib.errors import DG4DError
     from flows.publish import check_folder, is_current
-    from flows.summary import Row
+    from flows.summary import Row, judged
 
     failed = Row(item=item.name, status="failed", kind="BadInput", message=item.error)
     if item.wish is None:
@@ -307,7 +475,7 @@ def _ready(item: "Item", out: Path, store: "ArtifactStore", settle: Callable[["R
         settle(failed.model_copy(update={"message": str(error), "source": source}))
         return None
     if is_current(out / item.name, order.digest()):
-        settle(Row(item=item.name, source=source, status="unchanged"))
+        settle(judged(Row(item=item.name, source=source, status="unchanged"), out / item.name, strict))
         return None
     return order
 

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from flows.home import store
 from steps.contract import (
     EXIT_BAD_INPUT,
     EXIT_MISSING,
@@ -28,7 +29,7 @@ from steps.contract import (
 )
 from steps.job import Progress
 from steps.main import EXIT_DIVERGED, notes_to, perform
-from steps.store import ArtifactStore, home, remove_tree
+from steps.store import home, remove_tree
 
 Say = Callable[[str], None]
 Execute = Callable[[StepSpec, StepRequest, Progress, Say], StepResult]
@@ -59,6 +60,14 @@ class StepMissing(StepError):
     """Something needed is not here: a library, a device, weights, an artifact."""
 
 
+class StepLost(StepMissing):
+    """An artifact that it needs is gone or damaged; what made it will make it again."""
+
+
+class StepUnreachable(StepMissing):
+    """The store does not answer at the moment."""
+
+
 class StepDiverged(StepError):
     """An optimization left the finite numbers; `pictures` show the last good state."""
 
@@ -78,6 +87,8 @@ class StepCrashed(StepError):
 _ERRORS: dict[str, type[StepError]] = {
     "bad_input": StepBadInput,
     "missing": StepMissing,
+    "lost": StepLost,
+    "unreachable": StepUnreachable,
     "diverged": StepDiverged,
     "out_of_memory": StepOutOfMemory,
     "crashed": StepCrashed,
@@ -96,7 +107,7 @@ KILLED = (  # nobody else kills a step without a word
 def in_process(spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say = lambda text: None) -> StepResult:
     """Run a step here; for tests and debuggers. Neither its time nor its memory is bounded."""
     with notes_to(say):
-        outcome, error = perform(request, ArtifactStore(home() / "store"), on_progress)
+        outcome, error = perform(request, store(), on_progress)
     if isinstance(outcome, StepFailure):
         raise _ERRORS[outcome.kind](spec.name, outcome.message, outcome.pictures) from error
     return outcome
@@ -161,7 +172,7 @@ def stop_all() -> None:
 
 def _command(folder: Path, parent: int) -> list[str]:
     files = [str(folder / "request.json"), str(folder / "result.json")]
-    return [sys.executable, "-m", "steps.main", *files, "--store", str(home() / "store"), "--parent", str(parent)]
+    return [sys.executable, "-m", "steps.main", *files, "--store", store().address, "--parent", str(parent)]
 
 
 def _watched(process: subprocess.Popen[str], timeout_s: float, on_progress: Progress, say: Say) -> tuple[int, bool]:

@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 from flows.server import SETTINGS, Server
+from steps.bucket import open_store
 from steps.store import ArtifactStore, home
 
 CLIENT_SETTINGS = {
@@ -18,8 +19,12 @@ CLIENT_SETTINGS = {
 
 
 def store() -> ArtifactStore:
-    """Every artifact of this user."""
-    return ArtifactStore(home() / "store")
+    """Every artifact of this user: the folder `store` here, or what `$DG4D_STORE` names.
+
+    Raises:
+        BadInput: that is no address of a store.
+    """
+    return open_store()
 
 
 def records() -> Path:

@@ -13,6 +13,7 @@ from flows.merging import frames_in, merged
 from flows.tasks import Made, Steps
 from steps.contract import ArtifactRef
 from steps.profiles import (
+    CheckAssetSettings,
     DriveVideoSettings,
     ExtractMeshSettings,
     FitGaussiansSettings,
@@ -56,9 +57,10 @@ def finish(
     subject, footage = prepared["subject"], prepared.get("footage")
     driving = steps.run("drive_video", {"subject": subject, "footage": footage}, drive(settings))["driving_video"]
     gaussians = steps.run("fit_gaussians", {"subject": subject, "bank": bank}, _fit(settings))["gaussians"]
-    motion = steps.run(
+    fitted = steps.run(
         "fit_motion", {"gaussians": gaussians, "driving_video": driving, "bank": bank}, _fit_motion(settings)
-    )["motion"]
+    )
+    gaussians, motion = fitted.get("gaussians", gaussians), fitted["motion"]
     mesh = extract(steps, gaussians, motion, frames_in(driving, home.store()), settings)
     refined = steps.run(
         "refine_texture", {**mesh, "driving_video": driving}, RefineTextureSettings(refiner=settings.refiner)
@@ -69,10 +71,14 @@ def finish(
         {"subject": subject, "driving_video": driving, "gaussians": gaussians, "motion": motion, **surface},
         PackAssetSettings(rasterizer=settings.rasterizer, pack=settings.pack, notes=steps.notes()),
     )
-    rows = [(done.label, done.cached, done.seconds) for done in steps.finished]
-    create_markdown_artifact(
-        key=pages.key("asset", steps.item), markdown=pages.asset_page(steps.item, rows, packed, home.store())
+    checked = steps.run(
+        "check_asset",
+        {"package": packed["package"], "driving_video": driving, "subject": subject},
+        CheckAssetSettings(rasterizer=settings.rasterizer, gates=settings.gates),
     )
+    rows = [(done.label, done.cached, done.seconds) for done in steps.finished]
+    page = pages.asset_page(steps.item, rows, {**packed, **checked}, home.store())
+    create_markdown_artifact(key=pages.key("asset", steps.item), markdown=page)
     return Made(package=packed["package"], steps=steps.finished, flow_run=str(flow_run.id or ""))
 
 

@@ -6,13 +6,17 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from flows import home
+from flows.credentials import Signer, configured
 from flows.orders import Order
 from flows.publish import Files, publish
 from flows.server import ServerUnavailable
 from steps.store import ArtifactMissing
+
+if TYPE_CHECKING:
+    from flows.tasks import Made
 
 ANSWER_S = 10.0  # for a server of the user's own
 
@@ -40,31 +44,69 @@ def connect() -> None:
 
 
 def make(order: Order, folder: Path) -> tuple[Files, bool]:
-    """Run the flow of an order and put the package into `folder`.
+    """Run the flow of an order and put the package into `folder`, signed if a key is configured; keep it as a version.
+
+    What turns out to be damaged or gone on the way is made again.
 
     Returns:
         The files of the package, and whether every step had been done before.
 
     Raises:
         StepError: a step did not finish; `folder` is as it was.
-        BadInput: the folder cannot be written, or the disk is full; it is as it was.
+        BadInput: the folder cannot be written, the disk is full, or the key cannot sign; it is as it was.
+        BackendUnavailable: a key is configured, and signing is not installed.
     """
-    from prefect import tags
-    from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
+    from flows.executors import StepLost
 
-    from flows import report
+    signer = configured()
+    try:
+        return _make(order, folder, signer)
+    except (ArtifactMissing, StepLost):  # it was dropped when it was found, and so was the result that named it
+        return _make(order, folder, signer)
+
+
+def run(order: Order, refresh: bool = False) -> "Made":
+    """Run the flow of an order.
+
+    Args:
+        order: what to make.
+        refresh: do every step, also those whose result is there already.
+
+    Raises:
+        StepError: a step did not finish.
+    """
+    from prefect.settings import PREFECT_TASKS_REFRESH_CACHE, temporary_settings
+
     from flows.image_to_4d import image_to_4d
-    from flows.orphans import process_tag
     from flows.text_to_4d import text_to_4d
     from flows.video_to_4d import video_to_4d
 
     flow = text_to_4d if order.drawn else video_to_4d if order.moving else image_to_4d
-    quick = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # a sync flow waits a second for its heart to stop
-    with temporary_settings(quick), tags(process_tag(), f"profile:{order.profile}"):
-        made = flow(order.source, order.settings, order.seed, order.item, order.bank)
+    with temporary_settings({PREFECT_TASKS_REFRESH_CACHE: refresh}), _surroundings(order):
+        return flow(order.source, order.settings, order.seed, order.item, order.bank)
+
+
+def deliver(order: Order, made: "Made", folder: Path, signer: Signer | None) -> Files:
+    """Put what a flow made into a folder; raises as `make` does."""
+    from flows.report import complete
+
     store = home.store()
-    files = publish(store.path(made.package), folder, lambda files: report.texts(order, made, files, store))
-    return files, all(done.cached for done in made.steps)
+    return publish(
+        store.path(made.package),
+        folder,
+        lambda staging, files: complete(staging, files, order, made, store, signer),
+    )
+
+
+def _make(order: Order, folder: Path, signer: Signer | None) -> tuple[Files, bool]:
+    from flows.leases import running
+    from flows.versions import keep_version
+
+    store = home.store()
+    with running(store, order.item):
+        made = run(order)
+        keep_version(store, order, made)
+        return deliver(order, made, folder, signer), all(done.cached for done in made.steps)
 
 
 def make_motions(order: Order, folder: Path) -> dict[str, Any]:

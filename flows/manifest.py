@@ -9,12 +9,12 @@ from typing import Any
 
 from dg4d_lib.errors import BadInput
 from flows import sources
-from flows.orders import Wish
+from flows.orders import Wish, name_of
 from flows.publish import record_of
 from steps.contract import Frozen
 from steps.profiles import PipelineSettings, profile, revise
 
-COLUMNS = ("path", "video", "name", "profile", "seed", "bank", "set")  # and any dotted knob, for example mesh.grid
+COLUMNS = ("path", "text", "video", "name", "profile", "seed", "bank", "set")  # and any dotted knob, as mesh.grid
 MANIFESTS = (".csv", ".json")
 
 
@@ -127,10 +127,10 @@ def _of_manifest(file: Path, profile_name: str, changes: Mapping[str, Any], seed
 
 def _wanted(row: dict[str, Any]) -> tuple[str, str]:
     """The name that a row asks for, within the output folder; and its suffix, in case another asks for it too."""
-    path = PurePosixPath(str(row["path"]))
-    name = PurePosixPath(str(row.get("name") or path.stem))
-    parts = [part for part in name.parts if part not in {"/", ".."}]
-    return "/".join(parts) or path.stem, "" if row.get("name") else path.suffix.lower().lstrip(".")
+    path = PurePosixPath(str(row.get("path", "")))
+    own = path.stem or name_of(str(row.get("text", "")))
+    parts = [part for part in PurePosixPath(str(row.get("name") or own)).parts if part not in {"/", ".."}]
+    return "/".join(parts) or own, "" if row.get("name") else path.suffix.lower().lstrip(".")
 
 
 def _wish_of(
@@ -149,7 +149,8 @@ def _wish_of(
         raise BadInput(f"seed {number} is negative; use 0 or more")
     return Wish(
         item=name,
-        picture=folder / str(row["path"]),
+        picture=folder / str(row["path"]) if row.get("path") else None,
+        text=str(row.get("text", "")),
         video=folder / str(row["video"]) if row.get("video") else None,
         bank=folder / str(row["bank"]) if row.get("bank") else None,
         profile=chosen,
@@ -173,15 +174,15 @@ def _rows(file: Path) -> list[dict[str, Any]]:
     except (OSError, ValueError, csv.Error) as error:
         raise BadInput(f"{file} cannot be read as a manifest: {error}") from error
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise BadInput(f"{file} should hold a list of rows, each with at least a path")
+        raise BadInput(f"{file} should hold a list of rows, each with at least a path or a text")
     for number, row in enumerate(rows, 1):
         if unknown := sorted(key for key in row if key not in COLUMNS and ("." not in key)):
             raise BadInput(
                 f"{file}, row {number}: unknown column {unknown[0]!r}; there are: {', '.join(COLUMNS)}, "
                 "and any knob such as motion.iterations"
             )
-        if not row.get("path"):
-            raise BadInput(f"{file}, row {number}: no path")
+        if not row.get("path") and not row.get("text"):
+            raise BadInput(f"{file}, row {number}: neither a path nor a text")
     return [{key: value for key, value in row.items() if value not in (None, "")} for row in rows]
 
 

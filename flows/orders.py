@@ -1,11 +1,17 @@
 """What a user asks for, with the files already in the store: enough to make an asset, and to know if it is made."""
 
 import re
+from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
-from dg4d_lib.errors import BadInput
+from pydantic import ValidationError
+
+from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.rasterizer.choice import backend_name, require_backend
 from flows import sources
+from flows.credentials import certificate
 from steps.contract import ArtifactRef, Frozen, digest_of
 from steps.main import catalog, request_version
 from steps.profiles import PipelineSettings
@@ -13,6 +19,7 @@ from steps.store import ArtifactStore
 from steps.weights import identities, license_of, open_weights, weights_in, without_paths
 
 LONGEST_NAME = 60  # characters of a name made out of words
+NAMES = {"item", "profile", "source_name", "picture_name"}  # of an order: for people, no part of its digest
 
 
 class Wish(Frozen):
@@ -51,6 +58,8 @@ class Wish(Frozen):
             BackendUnavailable: the rasterizer that was asked for cannot run here, or weights are missing.
         """
         require_backend(self.settings.rasterizer)
+        if (self.settings.pack.lods or self.settings.pack.gltf.meshopt) and not find_spec("meshoptimizer"):
+            raise BackendUnavailable("pack.lods and pack.gltf.meshopt need meshoptimizer: pip install 'dg4d[meshopt]'")
         self._check_source()
         if self.bank is not None:
             sources.check_bank(self.bank)
@@ -86,7 +95,7 @@ class Wish(Frozen):
             return Order(
                 item=self.item,
                 source=sources.put_source(footage, store) if footage else sources.put_text(self.text, store),
-                drawn=bool(self.text),
+                text=sources.plain(self.text),
                 moving=self._suffix() in sources.ALWAYS_MOVING or self.video is not None,
                 bank=sources.put_bank(self.bank, store) if self.bank is not None else None,
                 profile=self.profile,
@@ -139,12 +148,13 @@ class Order(Frozen):
 
     Attributes:
         source: a picture, a video, the frames of one; words if `drawn`.
+        text: those words.
         moving: whether `source` is a video for certain.
     """
 
     item: str
     source: ArtifactRef
-    drawn: bool = False
+    text: str = ""
     moving: bool = False
     bank: ArtifactRef | None = None
     profile: str
@@ -154,22 +164,71 @@ class Order(Frozen):
     source_name: str = ""
     picture_name: str = ""
 
+    @property
+    def drawn(self) -> bool:
+        """Whether a model draws the picture out of words."""
+        return bool(self.text)
+
+    def recipe(self) -> dict[str, Any]:
+        """Everything that the same code needs to make the same package, as JSON; names for people are left out."""
+        recipe = self.model_dump(mode="json", exclude=NAMES)
+        return recipe | {"settings": {**recipe["settings"], "rasterizer": backend_name(self.settings.rasterizer)}}
+
     def digest(self) -> str:
-        """Equal for orders that give the same package with the code that is installed here."""
-        tree = self.settings.model_dump(mode="json")
+        """Equal for orders that give the same package with the code and the signing key that are here."""
+        recipe = self.recipe()
         return digest_of(
             {
-                "source": self.source.digest,
-                "drawn": self.drawn,
-                "moving": self.moving,
-                "bank": self.bank.digest if self.bank else None,
-                "settings": tree,
-                "weights": identities(weights_in(tree)),
-                "rasterizer": backend_name(self.settings.rasterizer),
-                "seed": self.seed,
-                "commercial_only": self.commercial_only,
+                **recipe,
+                "weights": identities(weights_in(recipe["settings"])),
                 "steps": {name: request_version(spec) for name, spec in catalog().items()},
+                "certificate": certificate(),
             }
+        )
+
+
+def order_again(
+    record: Mapping[str, Any], store: ArtifactStore, source: Path | None = None, bank: Path | None = None
+) -> Order:
+    """The order that a package was made from.
+
+    Args:
+        record: the provenance of the package.
+        store: where the source is, or goes.
+        source: the picture, the video or the folder of frames; needed where the store does not have it.
+        bank: the folder of true views; likewise.
+
+    Raises:
+        BadInput: the record is of another version, something is needed, or what was given is something else; says what.
+    """
+    try:
+        names = {name: record[name] for name in NAMES & set(record)}
+        order = Order.model_validate({**record["recipe"], **record["run"].get("names", {}), **names})
+    except (KeyError, ValidationError) as error:
+        raise BadInput(
+            f"the record of this package was written by another version of dg4d ({type(error).__name__}: {error}); "
+            "make the asset again from its source"
+        ) from error
+    require_backend(order.settings.rasterizer)
+    if order.text:
+        sources.put_text(order.text, store)
+    if source is not None:
+        sources.check_video(source)
+        _require_same(source, sources.put_source(source, store), order.source)
+    if bank is not None and order.bank is not None:
+        sources.check_bank(bank)
+        _require_same(bank, sources.put_bank(bank, store), order.bank)
+    for option, ref in (("--source", order.source), ("--bank", order.bank)):
+        if ref is not None and not store.has(ref):
+            raise BadInput(f"what this package was made from ({ref.digest}) is not in the store: give it with {option}")
+    return order
+
+
+def _require_same(path: Path, given: ArtifactRef, recorded: ArtifactRef) -> None:
+    if given.digest != recorded.digest:
+        raise BadInput(
+            f"{path} is not what this package was made from: its digest is {given.digest}, "
+            f"that in the record {recorded.digest}"
         )
 
 

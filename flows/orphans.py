@@ -2,12 +2,13 @@
 
 import os
 import socket
-from pathlib import Path
 
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterState, FlowRunFilterStateType
 from prefect.client.schemas.objects import StateType
 from prefect.states import Crashed
+
+from flows.processes import start_of
 
 
 def process_tag() -> str:
@@ -30,13 +31,4 @@ def settle_orphans() -> int:
 
 
 def _tag(pid: int) -> str:
-    return f"process:{socket.gethostname()}:{pid}:{_start_of(pid)}"
-
-
-def _start_of(pid: int) -> str:
-    """When a process began, in the kernel's ticks; empty if there is none."""
-    try:
-        stat = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
-    except OSError:
-        return ""
-    return stat.rpartition(")")[2].split()[19]
+    return f"process:{socket.gethostname()}:{pid}:{start_of(pid)}"

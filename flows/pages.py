@@ -11,6 +11,7 @@ from typing import Any
 
 import OpenImageIO as oiio
 
+from flows import acceptance
 from flows.executors import StepError
 from flows.publish import readable
 from steps.contract import ArtifactRef, StepResult, StepSpec
@@ -52,10 +53,12 @@ def step_page(label: str, item: str, result: StepResult, store: ArtifactStore) -
     record = result.provenance
     lines = [f"# {label}: {item}", ""]
     lines += [f"{image}\n" for image in pictures_of(result.outputs, store)]
-    lines += [f"> {note}\n" for note in record.notes]
+    lines += [f"> {note}\n" for note in (*record.notes, *record.run_notes)]
     for ref in result.outputs.values():
         if ref.media_type.endswith("curves+json"):
             lines += curve_table(json.loads(store.path(ref).read_text(encoding="utf-8")))
+        if ref.media_type.endswith("gates+json"):
+            lines += acceptance.markdown(json.loads(store.path(ref).read_text(encoding="utf-8")))
     rows = {
         "seconds": f"{record.duration_s:.1f}",
         "peak memory": f"{record.peak_memory_mb:.0f} MiB",

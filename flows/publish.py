@@ -19,6 +19,7 @@ RECORD = "provenance.json"
 CANNOT_SWAP = {errno.EBUSY, errno.EXDEV, errno.EACCES, errno.EPERM, errno.EROFS, errno.EINVAL}
 
 Files = dict[str, dict[str, Any]]  # path within the package -> {"digest", "size_bytes"}
+Finish = Callable[[Path, Files], Files]
 
 
 def check_folder(folder: Path) -> None:
@@ -58,34 +59,59 @@ def check_writable(folder: Path) -> None:
 
 
 def record_of(folder: Path) -> dict[str, Any] | None:
-    """The provenance of the package in a folder; None if there is no package."""
+    """The provenance of the package in a folder; None if there is no package, or names of it lead out of the folder."""
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-        return record if isinstance(record["files"], dict) else None
+        sound = isinstance(record["files"], dict) and all(map(_within, [*record["files"], *record.get("beside", ())]))
+        return record if sound else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
 
 def is_current(folder: Path, order: str) -> bool:
-    """Whether a folder holds the package of an order (its digest), with every byte as it was written."""
+    """Whether a folder holds the package of an order (its digest), with every byte as it was written.
+
+    What lies beside the package, the reports for example, must be there, as whatever it is.
+    """
     record = record_of(folder)
     if record is None or record.get("order") != order:
         return False
     try:
-        return all(_fact(folder / name) == fact for name, fact in record["files"].items())
+        unchanged = all(fact_of(folder / name) == fact for name, fact in record["files"].items())
     except OSError:
         return False
+    return unchanged and all((folder / name).is_file() for name in record.get("beside", ()))
 
 
-def publish(package: Path, folder: Path, describe: Callable[[Files], dict[str, str]]) -> Files:
-    """Unpack a package beside `folder`, describe it, and put it in the place of what is there.
+def whole(folder: Path) -> dict[str, Any]:
+    """The provenance of the package in a folder, whose files are all there with every byte as it was written.
+
+    Raises:
+        BadInput: there is no package, or files of it are missing or altered; says which.
+    """
+    record = record_of(folder)
+    if record is None:
+        raise BadInput(f"{folder} is no asset: it has no {RECORD}; give a folder that `dg4d make` wrote")
+    faults = [f"{name} {fault}" for name, fact in record["files"].items() if (fault := _fault(folder / name, fact))]
+    if faults:
+        more = f" and {len(faults) - 3} more" if len(faults) > 3 else ""
+        raise BadInput(f"{folder} is not as it was made: {', '.join(faults[:3])}{more}; make it again")
+    return record
+
+
+def publish(package: Path, folder: Path, finish: Finish) -> Files:
+    """Unpack a package beside `folder`, finish it, and put it in the place of what is there.
 
     Files in `folder` that no package brought stay. If anything fails, `folder` is as it was.
 
     Args:
         package: the zip that `pack_asset` made.
         folder: where the user wants it.
-        describe: gives the texts of the files that go with the package, by name; one of them is the record.
+        finish: is given the unpacked folder and the facts of its files; adds what goes with the package, the record
+            above all, and gives the facts of the package's files as they are then.
+
+    Returns:
+        What `finish` gave.
 
     Raises:
         DiskFull: there is no room.
@@ -96,11 +122,11 @@ def publish(package: Path, folder: Path, describe: Callable[[Files], dict[str, s
     try:
         with room_for(folder):
             try:
-                return _publish(package, folder, describe)
+                return _publish(package, folder, finish)
             except OSError as error:
                 if error.errno not in CANNOT_SWAP or not folder.is_dir():
                     raise
-                return _publish(package, folder, describe, in_place=True)
+                return _publish(package, folder, finish, in_place=True)
     except OSError as error:
         _tidy(missing)
         raise BadInput(f"the output folder {folder} cannot be written: {error.strerror or error}") from error
@@ -109,12 +135,48 @@ def publish(package: Path, folder: Path, describe: Callable[[Files], dict[str, s
         raise
 
 
+def unpacked(package: Path, folder: Path) -> Files:
+    """Unpack a package into a folder; the facts of its files.
+
+    Raises:
+        BadInput: an entry leads out of the folder.
+    """
+    files: Files = {}
+    with zipfile.ZipFile(package) as archive:
+        for entry in sorted(archive.infolist(), key=lambda e: e.filename):
+            name = PurePosixPath(entry.filename)
+            if entry.is_dir():
+                continue
+            if not _within(entry.filename):
+                raise BadInput(f"the package has an entry outside itself: {entry.filename}")
+            target = folder / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with archive.open(entry) as source, target.open("wb") as file:
+                shutil.copyfileobj(source, file)
+            files[name.as_posix()] = fact_of(target)
+    return files
+
+
+def fact_of(path: Path) -> dict[str, Any]:
+    """The digest and the size of a file."""
+    with path.open("rb") as file:
+        return {
+            "digest": f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}",
+            "size_bytes": path.stat().st_size,
+        }
+
+
+def fact_of_bytes(content: bytes) -> dict[str, Any]:
+    """As `fact_of`, of what a file will hold."""
+    return {"digest": f"sha256:{hashlib.sha256(content).hexdigest()}", "size_bytes": len(content)}
+
+
 def readable(size_bytes: int) -> str:
     """A size for people."""
     return f"{size_bytes / 1e6:.1f} MB" if size_bytes >= 100_000 else f"{size_bytes / 1e3:.1f} kB"
 
 
-def _publish(package: Path, folder: Path, describe: Callable[[Files], dict[str, str]], in_place: bool = False) -> Files:
+def _publish(package: Path, folder: Path, finish: Finish, in_place: bool = False) -> Files:
     place = folder if in_place else folder.parent
     place.mkdir(parents=True, exist_ok=True)
     _recover(folder, place)
@@ -122,9 +184,7 @@ def _publish(package: Path, folder: Path, describe: Callable[[Files], dict[str, 
     remove_tree(staging)
     try:
         staging.mkdir()
-        files = _unpacked(package, staging)
-        for name, text in describe(files).items():
-            (staging / name).write_text(text, encoding="utf-8")
+        files = finish(staging, unpacked(package, staging))
         if in_place or _contains(folder, Path.cwd()):
             _move_in(staging, folder)
         else:
@@ -134,29 +194,14 @@ def _publish(package: Path, folder: Path, describe: Callable[[Files], dict[str, 
         remove_tree(staging)
 
 
-def _unpacked(package: Path, folder: Path) -> Files:
-    files: Files = {}
-    with zipfile.ZipFile(package) as archive:
-        for entry in sorted(archive.infolist(), key=lambda e: e.filename):
-            name = PurePosixPath(entry.filename)
-            if entry.is_dir():
-                continue
-            if name.is_absolute() or ".." in name.parts:
-                raise BadInput(f"the package has an entry outside itself: {entry.filename}")
-            target = folder / name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with archive.open(entry) as source, target.open("wb") as file:
-                shutil.copyfileobj(source, file)
-            files[name.as_posix()] = _fact(target)
-    return files
-
-
-def _fact(path: Path) -> dict[str, Any]:
-    with path.open("rb") as file:
-        return {
-            "digest": f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}",
-            "size_bytes": path.stat().st_size,
-        }
+def _fault(path: Path, fact: dict[str, Any]) -> str:
+    """What is wrong with a file; empty if nothing is."""
+    try:
+        return "" if fact_of(path) == fact else "was altered"
+    except FileNotFoundError:
+        return "is missing"
+    except OSError as error:
+        return f"cannot be read ({error.strerror})"
 
 
 def _swap(staging: Path, folder: Path) -> None:
@@ -200,21 +245,26 @@ def _recover(folder: Path, place: Path) -> None:
 
 def _move_in(staging: Path, folder: Path) -> None:
     """File by file, where the folder itself cannot be renamed; the record last, so that a half is known as one."""
-    before = set((record_of(folder) or {"files": {}})["files"])
+    before = _ours(folder)
     fresh = sorted(p.relative_to(staging) for p in staging.rglob("*") if p.is_file())
     for name in sorted(fresh, key=lambda n: n == Path(RECORD)):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (staging / name).replace(folder / name)
-    for name in before - {f.as_posix() for f in fresh}:
-        (folder / name).unlink(missing_ok=True)
+    for left in before - {f.as_posix() for f in fresh}:
+        (folder / left).unlink(missing_ok=True)
 
 
 def _foreign(folder: Path) -> list[Path]:
     """Files that no package brought, relative to the folder."""
-    record = record_of(folder)
-    ours = set() if record is None else {*record["files"], *record.get("beside", ()), RECORD}
+    ours = _ours(folder)
     files = (p.relative_to(folder) for p in folder.rglob("*") if p.is_file() or p.is_symlink())
     return sorted(f for f in files if f.as_posix() not in ours)
+
+
+def _ours(folder: Path) -> set[str]:
+    """The files that the package in a folder brought."""
+    record = record_of(folder)
+    return set() if record is None else {*record["files"], *record.get("beside", ()), RECORD}
 
 
 def _first_missing(folder: Path) -> Path | None:
@@ -232,6 +282,12 @@ def _tidy(made: Path | None) -> None:
     for folder in [*sorted((p for p in made.rglob("*") if p.is_dir()), reverse=True), made]:
         with suppress(OSError):
             folder.rmdir()
+
+
+def _within(name: str) -> bool:
+    """Whether a name in a package stays inside of it."""
+    path = PurePosixPath(name)
+    return not path.is_absolute() and ".." not in path.parts
 
 
 def _contains(folder: Path, other: Path) -> bool:

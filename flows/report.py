@@ -3,55 +3,98 @@
 import html
 import json
 import math
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
+from flows.acceptance import picture_of, section, verdict_of
+from flows.crate import CRATE, crate_text
+from flows.credentials import Claim, Signer, certificate, sidecar_of
 from flows.orders import Order
-from flows.publish import RECORD, Files, readable
+from flows.publish import RECORD, Files, fact_of_bytes, readable
 from flows.tasks import Finished, Made
-from steps.contract import canonical
+from flows.view import VIEWER, page_of
+from steps.contract import RUN_ONLY, StepResult, canonical
 from steps.store import ArtifactStore
 
-FORMAT = 1
-BESIDE = ("report.json", "report.html")
+FORMAT = 2
+BESIDE = ("report.json", "report.html", VIEWER, CRATE)
+GENERATIVE = ("draw_picture", "drive_video", "fit_gaussians", "fit_motion", "refine_texture")  # where they use weights
+UNSIGNED: Mapping[str, Any] = MappingProxyType({})
 PLOT_WIDTH, PLOT_HEIGHT = 420, 150  # pixels of a curve
 INKS = ("#2563eb", "#dc2626", "#059669", "#d97706", "#7c3aed", "#0891b2", "#be185d", "#4d7c0f")
 
 
-def texts(order: Order, made: Made, files: Files, store: ArtifactStore) -> dict[str, str]:
+def complete(
+    folder: Path, files: Files, order: Order, made: Made, store: ArtifactStore, signer: Signer | None
+) -> Files:
+    """Sign the files of a package if there is a signer, and write what goes with them; their facts as they are then."""
+    signatures = UNSIGNED
+    claim = Claim(_used_weights(made, *GENERATIVE), f"{banner(order, made)} Package {made.package.digest}.")
+    if signer is not None:
+        files, signed = signer.sign_package(folder, files, claim)
+        signatures = {"certificate": certificate(), "subject": signer.subject, "files": signed}
+    for name, text in texts(order, made, files, store, signatures).items():
+        (folder / name).write_text(text, encoding="utf-8")
+    if signer is not None:
+        signer.sign_beside(folder / CRATE, claim)  # it holds the digest of every other file
+    return files
+
+
+def texts(
+    order: Order, made: Made, files: Files, store: ArtifactStore, signatures: Mapping[str, Any] = UNSIGNED
+) -> dict[str, str]:
     """The texts that go with a package, by name of file."""
     report = report_of(order, made, files, store)
-    return {
+    record = provenance(order, made, files, signatures)
+    with zipfile.ZipFile(store.path(made.package)) as package:
+        viewer = page_of(record, package.read)
+    beside = {
+        VIEWER: viewer,
         "report.json": json.dumps(report, indent=1, ensure_ascii=False) + "\n",
-        "report.html": page(report),
-        RECORD: json.dumps(provenance(order, made, files), indent=1, ensure_ascii=False, sort_keys=True) + "\n",
+        "report.html": page(report, picture_of(_results(made), store)),
+        RECORD: json.dumps(record, indent=1, ensure_ascii=False, sort_keys=True) + "\n",
     }
+    facts = {name: fact_of_bytes(text.encode()) for name, text in beside.items()}
+    return {**beside, CRATE: crate_text(record, facts, banner(order, made))}
 
 
-def provenance(order: Order, made: Made, files: Files) -> dict[str, Any]:
-    """Every step's record and every file's digest; what belongs to one run only stands under `run`."""
+def provenance(order: Order, made: Made, files: Files, signatures: Mapping[str, Any] = UNSIGNED) -> dict[str, Any]:
+    """Every step's record, every file's digest, and the recipe; what belongs to one run only stands under `run`.
+
+    Signatures never come out twice the same: where there are any, `files` and `signatures` belong to one run as well.
+    """
     records = [done.result.provenance for done in made.steps]
+    outputs = [ref for done in made.steps for ref in done.result.outputs.values()]
+    artifacts = [ref for ref in (order.source, order.bank, *outputs) if ref is not None]
     return {
         "format": FORMAT,
         "order": order.digest(),
+        "item": order.item,
+        "profile": order.profile,
         "source": order.source.digest,
         "seed": order.seed,
         "commercial_only": order.commercial_only,
+        "recipe": order.recipe(),
         "licenses": licenses(made),
         "package": made.package.digest,
+        "artifacts": {ref.digest: ref.model_dump(mode="json", exclude={"digest"}) for ref in artifacts},
         "files": files,
-        "beside": list(BESIDE),
+        "signatures": dict(signatures),
+        "beside": [*BESIDE, *([sidecar_of(CRATE)] if signatures else [])],
         "steps": [
-            {"digest": record.digest(), **record.model_dump(mode="json", exclude={"duration_s", "peak_memory_mb"})}
-            for record in records
+            {"digest": record.digest(), **record.model_dump(mode="json", exclude=set(RUN_ONLY))} for record in records
         ],
         "run": {
             "flow_run": made.flow_run,
+            "names": {"source_name": order.source_name, "picture_name": order.picture_name},
             "steps": [
                 {
                     "step": done.label,
                     "cached": done.cached,
-                    "duration_s": done.result.provenance.duration_s,
-                    "peak_memory_mb": done.result.provenance.peak_memory_mb,
+                    **done.result.provenance.model_dump(mode="json", include=set(RUN_ONLY)),
                 }
                 for done in made.steps
             ],
@@ -71,6 +114,7 @@ def report_of(order: Order, made: Made, files: Files, store: ArtifactStore) -> d
         "notes": notes(order, made),
         "seconds": round(sum(done.seconds for done in made.steps), 1),
         "peak_memory_mb": max(done.result.provenance.peak_memory_mb for done in made.steps),
+        "acceptance": verdict_of(_results(made), store),
         "steps": [_stage(done, store) for done in made.steps],
         "licenses": licenses(made),
         "files": {name: fact["size_bytes"] for name, fact in files.items()},
@@ -101,18 +145,21 @@ def notes(order: Order, made: Made) -> list[str]:
     own = []
     if order.picture_name:
         own.append(f"The subject is the first frame of {order.source_name}; {order.picture_name} only names the asset.")
-    theirs = (note for done in made.steps for note in done.result.provenance.notes)
+    records = [done.result.provenance for done in made.steps]
+    theirs = (note for record in records for note in (*record.notes, *record.run_notes))
     return list(dict.fromkeys([*own, *theirs]))
 
 
-def page(report: dict[str, Any]) -> str:
-    """The report as one page; the pictures are the package's own, beside it."""
+def page(report: dict[str, Any], shortcomings: bytes | None = None) -> str:
+    """The report as one page; the pictures are the package's own, beside it, but for that of its shortcomings (PNG)."""
     files = report["files"]
     parts = [
         f"<h1>{_text(report['item'])}</h1>",
         f"<p class=banner>{_text(report['banner'])}</p>",
+        f'<p><a href="{VIEWER}">look at it from all sides</a></p>',
         _pictures(files),
         "".join(f"<p class=note>{_text(note)}</p>" for note in report["notes"]),
+        *(["<h2>Acceptance</h2>", section(report["acceptance"], shortcomings)] if report["acceptance"] else []),
         "<h2>Stages</h2>",
         _stages(report),
         "".join(_curves(stage) for stage in report["steps"] if stage["curves"]),
@@ -159,6 +206,10 @@ def curve(curves: dict[str, Any]) -> str:
     )
 
 
+def _results(made: Made) -> list[StepResult]:
+    return [done.result for done in made.steps]
+
+
 def _used_weights(made: Made, *steps: str) -> bool:
     records = [done.result.provenance for done in made.steps]
     return any(record.weights for record in records if record.step in steps)
@@ -178,7 +229,7 @@ def _stage(done: Finished, store: ArtifactStore) -> dict[str, Any]:
         "computed_in_s": record.duration_s,
         "peak_memory_mb": record.peak_memory_mb,
         "backend": record.backend,
-        "notes": list(record.notes),
+        "notes": [*record.notes, *record.run_notes],
         "flops": record.flops,
         "curves": curves,
     }
@@ -266,6 +317,9 @@ h1 {{ margin: 0 0 .5rem; font-size: 1.6rem; }} h2 {{ margin: 2rem 0 .5rem; font-
 table {{ border-collapse: collapse; }} td, th {{ padding: .2rem .8rem .2rem 0; text-align: left; }}
 td {{ border-top: 1px solid var(--line); }} .number {{ text-align: right; font-variant-numeric: tabular-nums; }}
 .bar {{ height: .7rem; background: #2563eb; border-radius: 2px; }}
+.verdict {{ font-weight: 600; }}
+.passed td:first-child {{ color: #059669; }} .missed td:first-child {{ color: #dc2626; }}
+.gates td {{ vertical-align: top; }} .gates td:nth-child(3), .gates td:nth-child(4) {{ white-space: nowrap; }}
 .small {{ font-size: .85rem; opacity: .75; margin: .2rem 0; }}
 figure {{ display: inline-block; width: min(440px, 100%); margin: 1rem 1rem 0 0; vertical-align: top; }}
 figcaption {{ font-weight: 600; }}

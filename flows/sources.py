@@ -92,12 +92,17 @@ def put_source(path: Path, store: ArtifactStore) -> ArtifactRef:
 
 
 def put_text(text: str, store: ArtifactStore) -> ArtifactRef:
-    """Keep words, with single spaces between them.
+    """Keep words, as `plain` gives them.
 
     Raises:
         DiskFull: there is no room.
     """
-    return store.put_bytes(" ".join(text.split()).encode(), TEXT.media_type)
+    return store.put_bytes(plain(text).encode(), TEXT.media_type)
+
+
+def plain(text: str) -> str:
+    """Words with single spaces between them."""
+    return " ".join(text.split())
 
 
 def put_bank(path: Path, store: ArtifactStore) -> ArtifactRef:

@@ -24,9 +24,11 @@ from pydantic import BaseModel
 from flows import home, pages
 from flows.caching import FileLocks, RequestPolicy
 from flows.events import StepEvent, tell
-from flows.executors import StepCrashed, StepError, StepOutOfMemory, chosen
+from flows.executors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable, chosen
+from flows.leases import hold
 from steps.contract import ArtifactRef, StepRequest, StepResult
 from steps.main import catalog, request_version
+from steps.store import StoreUnreachable
 from steps.weights import identities, weights_in
 
 PROGRESS_PAGE_EVERY_S = 3.0
@@ -79,7 +81,7 @@ def run_step(request: StepRequest, item: str, label: str) -> dict[str, Any]:
         pages.show_failure(item, label, error, home.store(), create_markdown_artifact)
         raise
     page.update(1, 1, {})
-    for note in result.provenance.notes:
+    for note in (*result.provenance.notes, *result.provenance.run_notes):
         get_run_logger().info(note)
     create_markdown_artifact(
         key=pages.key(label, item),
@@ -102,9 +104,9 @@ def run_step(request: StepRequest, item: str, label: str) -> dict[str, Any]:
 
 
 def may_help(_task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
-    """Whether to try again: memory may be free again, a crash gets one more chance, bad input stays bad."""
+    """Whether to try again: memory may be free, the store back; a crash gets one more chance, bad input stays bad."""
     error = state.result(raise_on_failure=False)
-    if isinstance(error, StepOutOfMemory):
+    if isinstance(error, StepOutOfMemory | StepUnreachable | StoreUnreachable):
         return True
     return isinstance(error, StepCrashed | OSError) and run.run_count <= 1
 
@@ -157,7 +159,7 @@ class Steps:
         return [self._note(label, future.state, start) for label, future in futures]
 
     def notes(self) -> tuple[str, ...]:
-        """What the steps so far have to say about the asset, each sentence once."""
+        """What the steps so far have to say about the asset, and not about their run; each sentence once."""
         return tuple(dict.fromkeys(note for done in self.finished for note in done.result.provenance.notes))
 
     def _request(self, step: str, inputs: dict[str, ArtifactRef | None], settings: BaseModel) -> StepRequest:
@@ -184,6 +186,8 @@ class Steps:
             raise error if isinstance(error, BaseException) else StepCrashed(label, str(state.message))
         result = StepResult.model_validate(state.result())
         cached = state.name == "Cached"
+        if cached:
+            hold(home.store(), self.item, (ref.digest for ref in result.outputs.values()))
         self.finished.append(Finished(label=label, cached=cached, seconds=round(seconds, 3), result=result))
         for ref in result.outputs.values():
             self._makers[ref.digest] = state
@@ -197,7 +201,7 @@ _locks: dict[str, FileLocks] = {}
 def _task(step: str, item: str, label: str) -> Task[..., Any]:
     """The task under the step's own name, with its records where `$DG4D_HOME` is."""
     locks = _locks.setdefault(str(home.locks()), FileLocks(home.locks()))
-    policy: CachePolicy = RequestPolicy(records=home.records(), store=home.store().root)
+    policy: CachePolicy = RequestPolicy(records=home.records(), store=home.store().address)
     home.records().mkdir(parents=True, exist_ok=True)
     return run_step.with_options(
         name=step,

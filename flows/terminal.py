@@ -3,7 +3,7 @@
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -142,7 +142,7 @@ class BatchTable:
         return table
 
 
-INK = {"waiting": "dim", "running": "cyan", "done": "green", "unchanged": "blue", "failed": "red"}
+INK = {"waiting": "dim", "skipped": "dim", "running": "cyan", "done": "green", "unchanged": "blue", "failed": "red"}
 
 
 @contextmanager
@@ -176,6 +176,14 @@ def tell_where(out: Console, folder: Path, sizes: dict[str, int]) -> None:
     for group, (count, total) in groups.items():
         table.add_row(group + (f" ({_files(count)})" if group.endswith("/") else ""), readable(total))
     out.print(table)
+
+
+def tell_rows(out: Console, rows: Iterable[tuple[str, str, str]]) -> None:
+    """What, how it is, and why, a line each, in columns."""
+    lines = list(rows)
+    widths = [max((len(line[column]) for line in lines), default=0) for column in (0, 1)]
+    for what, state, why in lines:
+        out.print(f"{what:<{widths[0]}}  {state:<{widths[1]}}  {why}".rstrip(), markup=False)
 
 
 def _files(count: int) -> str:

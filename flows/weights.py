@@ -21,7 +21,9 @@ Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="a name of t
 
 
 @weights.command("list")
-def show() -> None:
+def show(
+    files: Annotated[bool, typer.Option("--files", help="and every file that was pulled: sha256, bytes, name")] = False,
+) -> None:
     """Show all weights that profiles name, and those that were pulled besides: license, size, whether they are here."""
     with clear_ending():
         from rich.table import Column, Table
@@ -41,6 +43,9 @@ def show() -> None:
         out.print(table)
         out.print(f"kept in {weights_home()}; a setting may name a folder instead", markup=False)
         out.print("revision and digests are written down by the first pull, and compared from then on")
+        for name, locked in locks.items() if files else ():
+            for path, file in locked.files.items():
+                typer.echo(f"{file.sha256}  {file.size:>12}  {name}/{path}")
 
 
 @weights.command()

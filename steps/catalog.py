@@ -8,6 +8,10 @@ Artifacts between steps:
   meshes      a stored zip of NNN.safetensors, a textured mesh per frame
   ranking     JSON {"weights": {...}, "candidates": [{"number": ..., "name": ..., "total": ..., ...}]}, best first
   films       a stored zip of N.mp4, one per candidate
+  gates       JSON {"accepted": ..., "failing": [...], "gates": [{"name", "passed", "value", "least", "most", ...}]}
+  truth       a stored zip of input/NNN.png, view_<azimuth>/NNN.png and, where it is known, mesh.npz
+  scores      JSON {"frames": ..., "size": ..., "rows": {name: {"input", "views", "mean", "geometry"}}, "clips": ...,
+              "missing": {metric: what gets it}, "notes": [...]}
   curves      JSON {"title": ..., "x": [...], "series": {name: [...]}, "notes": [...]}
 """
 
@@ -22,6 +26,9 @@ MESHES = Port(media_type="application/vnd.dg4d.meshes+zip", suffix=".zip")
 CURVES = Port(media_type="application/vnd.dg4d.curves+json", suffix=".json")
 RANKING = Port(media_type="application/vnd.dg4d.ranking+json", suffix=".json")
 FILMS = Port(media_type="application/vnd.dg4d.films+zip", suffix=".zip")
+TRUTH = Port(media_type="application/vnd.dg4d.truth+zip", suffix=".zip")
+GATES = Port(media_type="application/vnd.dg4d.gates+json", suffix=".json")
+SCORES = Port(media_type="application/vnd.dg4d.scores+json", suffix=".json")
 PACKAGE = Port(media_type="application/vnd.dg4d.package+zip", suffix=".zip")
 TEXT = Port(media_type="text/plain", suffix=".txt")
 SOURCE = Port(media_type="application/octet-stream", suffix="")
@@ -78,7 +85,7 @@ STEPS: dict[str, StepSpec] = {
             entry="steps.fit_motion:run",
             settings="steps.profiles:FitMotionSettings",
             inputs={"gaussians": PLY, "driving_video": FRAMES, "bank": _optional(BANK)},
-            outputs={"motion": MOTION, "curves": CURVES, "picture": PNG},
+            outputs={"motion": MOTION, "gaussians": _optional(PLY), "curves": CURVES, "picture": PNG},
         ),
         StepSpec(
             name="extract_mesh",
@@ -110,6 +117,22 @@ STEPS: dict[str, StepSpec] = {
                 "meshes": _optional(MESHES),
             },
             outputs={"package": PACKAGE, "sheet": PNG},
+        ),
+        StepSpec(
+            name="check_asset",
+            version="1",
+            entry="steps.check_asset:run",
+            settings="steps.profiles:CheckAssetSettings",
+            inputs={"package": PACKAGE, "driving_video": FRAMES, "subject": PNG},
+            outputs={"gates": GATES, "picture": PNG},
+        ),
+        StepSpec(
+            name="score_asset",
+            version="1",
+            entry="steps.score_asset:run",
+            settings="steps.profiles:ScoreAssetSettings",
+            inputs={"package": _optional(PACKAGE), "truth": TRUTH},
+            outputs={"scores": SCORES, "films": FILMS},
         ),
     )
 }

@@ -14,6 +14,10 @@ EXIT_BAD_INPUT = 65  # the same again will fail again
 EXIT_MISSING = 69  # something needed is not here
 EXIT_OUT_OF_MEMORY = 137
 
+RUN_ONLY = frozenset(  # fields of a record that are no part of its digest
+    ["started", "duration_s", "peak_memory_mb", "flops", "run_notes", "machine"]
+)
+
 Digest = Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")]
 
 
@@ -70,7 +74,7 @@ class StepRequest(Frozen):
 class ProvenanceRecord(Frozen):
     """Enough to make the outputs again, and to say why they differ.
 
-    `duration_s` and `peak_memory_mb` are facts about one run and not part of `digest`.
+    The fields in `RUN_ONLY` are facts about one run, which machines with less memory or speed do in another way.
     """
 
     step: str
@@ -84,13 +88,16 @@ class ProvenanceRecord(Frozen):
     weights: dict[str, Digest] = {}
     licenses: dict[str, str] = {}
     notes: tuple[str, ...] = ()
+    run_notes: tuple[str, ...] = ()
     flops: dict[str, int] = Field({}, description="floating-point operations of networks, by the name of their class")
+    started: str = Field("", description="when, in UTC, as ISO 8601")
     duration_s: float = Field(ge=0)
     peak_memory_mb: float = Field(ge=0)
+    machine: dict[str, str] = Field({}, description="what computed it (steps/machine.py)")
 
     def digest(self) -> str:
         """sha256 of the record without what belongs to one run only."""
-        return digest_of(self.model_dump(mode="json", exclude={"duration_s", "peak_memory_mb"}))
+        return digest_of(self.model_dump(mode="json", exclude=set(RUN_ONLY)))
 
 
 class StepResult(Frozen):
@@ -104,7 +111,7 @@ class StepFailure(Frozen):
     """Why a step did not finish; written where the result would be."""
 
     step: str
-    kind: Literal["bad_input", "missing", "diverged", "out_of_memory", "crashed"]
+    kind: Literal["bad_input", "missing", "lost", "unreachable", "diverged", "out_of_memory", "crashed"]
     message: str
     pictures: dict[str, ArtifactRef] = {}
 

@@ -105,7 +105,7 @@ def _stable_videos(
     videos = maker.generate_all(subject, [torch.Generator().manual_seed(each) for each in seeds])
     motions = [_Motion(*made, ()) for made in zip(numbers, (f"seed {each}" for each in seeds), videos, strict=True)]
     return motions, Facts(
-        f"{device.type} (diffusers)", opened.digests, opened.licenses, (*maker.notes, *maker.model.notes())
+        f"{device.type} (diffusers)", opened.digests, opened.licenses, maker.notes, maker.model.notes()
     )
 
 

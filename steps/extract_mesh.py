@@ -11,6 +11,7 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.mesh.bake import bake, vertex_normals
+from dg4d_lib.mesh.check import MeshFacts, checked, welded
 from dg4d_lib.mesh.clean import clean
 from dg4d_lib.mesh.density import density_field
 from dg4d_lib.mesh.extract import best_level, surface, usable_level
@@ -56,9 +57,10 @@ def run(job: Job) -> Facts:
         job.progress(1, 3, {})
         mesh, offsets = _tracked(states, displacement, frame, level, rasterize, settings.mesh)
         job.progress(2, 3, {})
-        write_tracked(job.outputs["tracked"], Asset4D(mesh, offsets, FPS_UNKNOWN))
+        write_tracked(job.outputs["tracked"], Asset4D(mesh, offsets, FPS_UNKNOWN, rest=frame))
         picture = _picture(mesh)
         notes.append(f"one mesh for {frames} frames: {len(mesh.vertices)} vertices, {len(mesh.faces)} triangles")
+        notes.append(f"at rest it is {_facts(mesh)}")
         notes.append(f"it is the surface of frame {frame}, which follows the motion best ({followed:.1%} IoU on trial)")
         if followed < FOLLOWS:
             notes.append("one mesh follows this motion poorly: --set mesh.mode=per_frame gives a mesh per frame")
@@ -71,6 +73,7 @@ def run(job: Job) -> Facts:
             meshes[frame] = textured(states.at(frame), level, rasterize, settings.mesh)
             job.progress(frame - settings.first_frame + 1, end - settings.first_frame, {})
         write_meshes(job.outputs["meshes"], meshes)
+        notes += _soundness(meshes)
         picture = _picture(meshes[settings.first_frame])
     write_png(job.outputs["picture"], picture)
     return Facts(backend=f"{settings.rasterizer} rasterizer, pymeshlab, xatlas", notes=tuple(notes))
@@ -122,6 +125,16 @@ def _colored(
     normals = vertex_normals(vertices, faces)[copied]
     texture = bake(vertices[copied], normals, corners, uvs, gaussians, rasterize, settings)
     return TexturedMesh(vertices[copied], corners, uvs, texture), copied
+
+
+def _soundness(meshes: dict[int, TexturedMesh]) -> list[str]:
+    facts = {frame: _facts(mesh) for frame, mesh in meshes.items()}
+    flawed = [f"the mesh of frame {frame} is {its}" for frame, its in facts.items() if not its.sound]
+    return [f"{len(facts) - len(flawed)} of {len(facts)} meshes from frame {min(facts)} on bound solids", *flawed]
+
+
+def _facts(mesh: TexturedMesh) -> MeshFacts:
+    return checked(*welded(mesh.vertices.numpy(), mesh.faces.numpy()))
 
 
 def _picture(mesh: TexturedMesh) -> Float[Tensor, "h w 3"]:

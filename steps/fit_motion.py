@@ -1,11 +1,13 @@
 """From static Gaussians and a driving video to a deformation."""
 
+from dataclasses import replace
+
 import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.losses import Diverged
 from dg4d_lib.fitting.motion import fit_motion
-from dg4d_lib.gaussians.ply import read_ply
+from dg4d_lib.gaussians.ply import read_ply, write_ply
 from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
 from steps.fit_gaussians import PICTURE_SIZE, Curves, picture_of
 from steps.job import Facts, Job
@@ -14,12 +16,13 @@ from steps.motions import new_deformation, write_motion
 from steps.priors import make_prior
 from steps.profiles import FitMotionSettings
 
+FINE_TUNED = "The Gaussians at rest were fitted to the whole video together with their motion."
 PICTURE_FRAMES = 6
 PICTURE_AZIMUTHS_DEG = (0.0, 90.0)
 
 
 def run(job: Job) -> Facts:
-    """Fit, and show six moments from the front and from the side."""
+    """Fit, and show six moments from the front and from the side; `gaussians` come out where they were fine-tuned."""
     settings: FitMotionSettings = job.settings
     gaussians = read_ply(job.inputs["gaussians"])
     video = read_frames(job.inputs["driving_video"], job.pictures)
@@ -33,13 +36,16 @@ def run(job: Job) -> Facts:
     deformation.to(device)
     curves = Curves(settings.motion.iterations, job.progress)
     try:
-        fit_motion(
+        fitted = fit_motion(
             gaussians.to(device), deformation, video, chosen.prior, rasterize, settings.motion, generator, curves.add
         )
     except Diverged as error:
         write_png(job.pictures / "last_good_state.png", picture_of(error.gaussians, rasterize))
         raise
     deformation.cpu()
+    gaussians = fitted.to(torch.device("cpu"))
+    if settings.motion.fine_tune:
+        write_ply(job.outputs["gaussians"], gaussians)
     write_motion(job.outputs["motion"], deformation, settings.deformation, len(video), len(gaussians))
     curves.write(job.outputs["curves"], "motion fit", [chosen.note])
     with torch.no_grad():
@@ -50,4 +56,5 @@ def run(job: Job) -> Facts:
             camera = OrbitCamera(0, azimuth, width=PICTURE_SIZE, height=PICTURE_SIZE)
             rows.append(torch.cat(list(rasterize(moved, [camera] * len(moments), torch.ones(3)).color), 1))
     write_png(job.outputs["picture"], torch.cat(rows))
-    return chosen.facts(f"{settings.rasterizer} rasterizer")
+    facts = chosen.facts(f"{settings.rasterizer} rasterizer")
+    return replace(facts, notes=(*facts.notes, FINE_TUNED)) if settings.motion.fine_tune else facts

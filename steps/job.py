@@ -38,9 +38,11 @@ class Facts:
         weights: digest of every weights file, by name; empty where none were used.
         licenses: license of everything whose license follows the asset, by name.
         notes: sentences the user should read in the report.
+        run_notes: such sentences about this run alone, for example that memory ran out and batches were halved.
     """
 
     backend: str = "cpu"
     weights: dict[str, str] = field(default_factory=dict)
     licenses: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    run_notes: tuple[str, ...] = ()

@@ -1,14 +1,15 @@
-"""The entry point of every step: `python -m steps.main REQUEST.json RESULT.json [--store DIR] [--progress FILE]`.
+"""The entry point of every step: `python -m steps.main REQUEST.json RESULT.json [--store STORE] [--progress FILE]`.
 
 Reads a StepRequest, writes a StepResult, or a StepFailure in its place. Progress goes to standard output as JSON lines,
 {"done": 3, "total": 10, "values": {"loss": 0.1}}, and so does what the library has to say on its way, {"note": "..."};
 everything else that is printed goes to standard error.
 
 Exit status: 0 done · 65 bad input or settings, or no room: the same again will fail again · 69 something needed is
-missing · 70 the optimization diverged · 137 out of memory · 1 anything else, which may be tried again.
+missing · 70 the optimization diverged · 75 the store does not answer at the moment · 137 out of memory · 1 anything
+else, which may be tried again.
 
-`$DG4D_CATALOG` ("module:name") names another catalog than `steps.catalog:STEPS`; `$DG4D_HOME` says where the store is
-when `--store` is not given; `$DG4D_CODE_VERSION` stands for the digest of the source.
+`$DG4D_CATALOG` ("module:name") names another catalog than `steps.catalog:STEPS`; `$DG4D_STORE` and `$DG4D_HOME` say
+where the store is when `--store` is not given; `$DG4D_CODE_VERSION` stands for the digest of the source.
 """
 
 import argparse
@@ -29,6 +30,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, TextIO
 
@@ -36,6 +38,7 @@ from pydantic import BaseModel, ValidationError
 
 from dg4d_lib.diffusion.ledger import counting_flops
 from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
+from steps.bucket import open_store
 from steps.contract import (
     EXIT_BAD_INPUT,
     EXIT_DONE,
@@ -49,14 +52,18 @@ from steps.contract import (
     StepSpec,
 )
 from steps.job import Facts, Job, Progress
-from steps.store import NO_SPACE, ArtifactMissing, ArtifactStore, home, write_atomically
+from steps.machine import machine
+from steps.store import NO_SPACE, ArtifactMissing, ArtifactStore, StoreUnreachable, write_atomically
 from steps.weights import require_same
 
 EXIT_CRASHED = 1
 EXIT_DIVERGED = 70
+EXIT_UNREACHABLE = 75
 EXIT_STATUS = {
     "bad_input": EXIT_BAD_INPUT,
     "missing": EXIT_MISSING,
+    "lost": EXIT_MISSING,
+    "unreachable": EXIT_UNREACHABLE,
     "diverged": EXIT_DIVERGED,
     "out_of_memory": EXIT_OUT_OF_MEMORY,
     "crashed": EXIT_CRASHED,
@@ -65,7 +72,7 @@ PROGRESS_EVERY_S = 0.2
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_MAX = -1, -2, -4  # names of glibc's mallopt
 PR_SET_PDEATHSIG = 1  # name of Linux's prctl
 
-Kind = Literal["bad_input", "missing", "diverged", "out_of_memory", "crashed"]
+Kind = Literal["bad_input", "missing", "lost", "unreachable", "diverged", "out_of_memory", "crashed"]
 
 
 def catalog() -> dict[str, StepSpec]:
@@ -128,7 +135,11 @@ def kind_of(error: BaseException) -> Kind:
             kind = "bad_input"
         case OSError() if error.errno in NO_SPACE:
             kind = "bad_input"
-        case BackendUnavailable() | ArtifactMissing():
+        case StoreUnreachable():
+            kind = "unreachable"
+        case ArtifactMissing():
+            kind = "lost"
+        case BackendUnavailable():
             kind = "missing"
         case FitDiverged():
             kind = "diverged"
@@ -144,7 +155,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m steps.main", description="Run one step: files in, files out.")
     parser.add_argument("request", type=Path, help="a StepRequest as JSON")
     parser.add_argument("result", type=Path, help="where to write the StepResult or StepFailure")
-    parser.add_argument("--store", type=Path, help="folder of the artifacts (default: $DG4D_HOME/store)")
+    parser.add_argument(
+        "--store", help="of the artifacts: a folder or s3://BUCKET/PREFIX (default: $DG4D_STORE, else $DG4D_HOME/store)"
+    )
     parser.add_argument("--progress", type=Path, help="write progress here instead of to standard output")
     parser.add_argument("--parent", type=int, help="process without which this one should not live")
     given = parser.parse_args(arguments)
@@ -158,7 +171,7 @@ def main(arguments: list[str] | None = None) -> int:
             failure = StepFailure(step="", kind="bad_input", message=f"{given.request} is not a StepRequest: {trouble}")
             return _finish(failure, None, given.result)
         with notes_to(note_lines(file)):
-            outcome, error = perform(request, ArtifactStore(given.store or home() / "store"), progress_lines(file))
+            outcome, error = perform(request, open_store(given.store), progress_lines(file))
         return _finish(outcome, error, given.result)
 
 
@@ -229,7 +242,7 @@ def _source_digest(files: tuple[tuple[str, Path, int, int], ...]) -> str:
 
 
 def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scratch: Path) -> StepResult:
-    start = time.perf_counter()
+    started, start = datetime.now(UTC).isoformat(timespec="milliseconds"), time.perf_counter()
     spec = _checked_spec(request)
     code = code_version(spec)
     if request.version not in {spec.version, f"{spec.version}+{code}"}:
@@ -263,9 +276,12 @@ def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scr
         weights=facts.weights,
         licenses=facts.licenses,
         notes=facts.notes,
+        run_notes=facts.run_notes,
         flops=flops,
+        started=started,
         duration_s=round(time.perf_counter() - start, 3),
         peak_memory_mb=round(peak_memory_mb(), 1),
+        machine=machine(),
     )
     return StepResult(outputs=outputs, provenance=record)
 
@@ -318,7 +334,7 @@ def _kept(pictures: Path, store: ArtifactStore) -> dict[str, ArtifactRef]:
     try:
         for file in sorted(pictures.glob("*.png")):
             kept[file.stem] = store.put(file, "image/png")
-    except (OSError, BadInput):
+    except (OSError, BadInput, StoreUnreachable):
         return kept
     return kept
 

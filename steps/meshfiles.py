@@ -17,9 +17,11 @@ from steps.media import write_zip
 
 
 def write_tracked(path: Path, asset: Asset4D) -> None:
-    """Write a tracked mesh; the texture is rounded to 8 bits."""
+    """Write a tracked mesh; textures are rounded to 8 bits."""
     tensors = {**_tensors(asset.mesh), "offsets": asset.offsets.float().cpu().contiguous()}
-    about = json.dumps({"fps": asset.fps, "extras": asset.extras}, sort_keys=True)
+    if asset.textures is not None:
+        tensors["textures"] = _rounded(asset.textures)
+    about = json.dumps({"fps": asset.fps, "extras": asset.extras, "rest": asset.rest}, sort_keys=True)
     path.write_bytes(save(tensors, {"tracked": about}))
 
 
@@ -33,7 +35,9 @@ def read_tracked(path: Path) -> Asset4D:
         with safe_open(path, "pt") as file:
             about = json.loads((file.metadata() or {})["tracked"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no dict)
-        return Asset4D(_mesh(tensors), tensors["offsets"], float(about["fps"]), about["extras"])
+        textures = tensors["textures"].float() / 255 if "textures" in tensors else None
+        mesh, fps, rest = _mesh(tensors), float(about["fps"]), float(about["rest"])
+        return Asset4D(mesh, tensors["offsets"], fps, about["extras"], textures, rest)
     except (SafetensorError, KeyError) as error:
         raise BadInput(
             f"{path.name} is no tracked mesh ({error}); give the `tracked` output of extract_mesh"
@@ -64,15 +68,18 @@ def read_meshes(path: Path) -> list[TexturedMesh]:
 
 
 def _tensors(mesh: TexturedMesh) -> dict[str, Tensor]:
-    texture = (mesh.texture.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8)
     tensors = {
         "vertices": mesh.vertices.detach().cpu().float(),
         "faces": mesh.faces.cpu().to(torch.int32),
         "uvs": mesh.uvs.detach().cpu().float(),
-        "texture": texture,
+        "texture": _rounded(mesh.texture),
     }
     return {name: value.contiguous() for name, value in tensors.items()}
 
 
 def _mesh(tensors: Mapping[str, Tensor]) -> TexturedMesh:
     return TexturedMesh(tensors["vertices"], tensors["faces"], tensors["uvs"], tensors["texture"].float() / 255)
+
+
+def _rounded(colors: Tensor) -> Tensor:
+    return (colors.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).contiguous()

@@ -2,46 +2,62 @@
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from pydantic import TypeAdapter
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
-from torch import Tensor, nn
+from torch import Tensor
 
-from dg4d_lib.deformation.framewise import Framewise
-from dg4d_lib.deformation.hexplane import HexPlane
+from dg4d_lib.deformation import kinds
 from dg4d_lib.deformation.interface import Deformation
-from dg4d_lib.deformation.mlp import Mlp
+from dg4d_lib.deformation.kinds import AnyDeformation, restored, tensors_of
 from dg4d_lib.errors import BadInput
 from dg4d_lib.fitting.motion import bounds_of
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.settings import DeformationSettings, FramewiseSettings, HexPlaneSettings, MlpSettings
+from dg4d_lib.settings import DeformationSettings
 
 
 def new_deformation(
     settings: DeformationSettings, gaussians: Gaussians, frames: int, generator: torch.Generator | None
-) -> HexPlane | Mlp | Framewise:
-    """A deformation of this kind, the identity at the start."""
-    match settings:
-        case HexPlaneSettings():
-            return HexPlane(settings, bounds_of(gaussians), generator)
-        case MlpSettings():
-            return Mlp(settings, bounds_of(gaussians), generator)
-        case FramewiseSettings():
-            return Framewise(frames, len(gaussians))
+) -> AnyDeformation:
+    """A deformation of this kind for these Gaussians, the identity at the start."""
+    return kinds.new_deformation(settings, bounds_of(gaussians), frames, len(gaussians), generator)
 
 
-def write_motion(path: Path, deformation: nn.Module, settings: DeformationSettings, frames: int, count: int) -> None:
+def write_motion(
+    path: Path, deformation: AnyDeformation, settings: DeformationSettings, frames: int, count: int
+) -> None:
     """Write a deformation of `count` Gaussians over `frames` frames."""
-    tensors = {name: value.detach().contiguous() for name, value in sorted(deformation.state_dict().items())}
     about = {"settings": settings.model_dump(mode="json"), "frames": frames, "gaussians": count}
-    path.write_bytes(save(tensors, {"motion": json.dumps(about, sort_keys=True)}))
+    path.write_bytes(save(tensors_of(deformation), {"motion": json.dumps(about, sort_keys=True)}))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted motion.
+
+    Attributes:
+        deformation: without gradients.
+        settings: its kind and sizes.
+        frames: of the video it was fitted to.
+    """
+
+    deformation: AnyDeformation
+    settings: DeformationSettings
+    frames: int
 
 
 def read_motion(path: Path) -> tuple[Deformation, int]:
-    """The deformation, and the number of frames of the video it was fitted to.
+    """The deformation, and the number of frames of the video it was fitted to; raises as `read_fit` does."""
+    fit = read_fit(path)
+    return fit.deformation, fit.frames
+
+
+def read_fit(path: Path) -> Fit:
+    """Read what `write_motion` wrote.
 
     Raises:
         BadInput: the file is no motion.
@@ -53,14 +69,4 @@ def read_motion(path: Path) -> tuple[Deformation, int]:
     except (SafetensorError, KeyError) as error:
         raise BadInput(f"{path.name} is no motion ({error}); give the `motion` output of fit_motion") from error
     settings: DeformationSettings = TypeAdapter(DeformationSettings).validate_python(about["settings"])
-    deformation: HexPlane | Mlp | Framewise
-    match settings:
-        case HexPlaneSettings():
-            deformation = HexPlane(settings, tensors["bounds"])
-        case MlpSettings():
-            deformation = Mlp(settings, tensors["bounds"])
-        case FramewiseSettings():
-            deformation = Framewise(about["frames"], about["gaussians"])
-    deformation.load_state_dict(dict(tensors))
-    deformation.requires_grad_(False)
-    return deformation, about["frames"]
+    return Fit(restored(settings, tensors, about["frames"], about["gaussians"]), settings, about["frames"])

@@ -1,7 +1,8 @@
 """Everything that leaves the house, in one package."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -9,32 +10,180 @@ from typing import Any
 
 import torch
 
-from dg4d_lib.assets.animated import Asset4D, moved
+from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.assets.compact import Compact, write_compact
 from dg4d_lib.assets.glb import write_frames_glb, write_glb, write_mesh_glb
-from dg4d_lib.assets.preview import write_preview
+from dg4d_lib.assets.preview import write_film, write_preview, write_turntable
+from dg4d_lib.assets.resample import moments, resampled, states
+from dg4d_lib.assets.rigged import rig_of, write_rigged_glb
 from dg4d_lib.assets.sheet import contact_sheet
-from dg4d_lib.assets.splats import write_splats
+from dg4d_lib.assets.splats import write_splat_glb_frames, write_splats, write_spz_frames
+from dg4d_lib.assets.usd import write_usdz
+from dg4d_lib.assets.webp import write_webp
+from dg4d_lib.assets.websplats import write_web_splats
+from dg4d_lib.deformation.kinds import AnyDeformation
 from dg4d_lib.errors import BadInput
+from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply
+from dg4d_lib.mesh.simplify import simplified
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
+from dg4d_lib.settings import DeformationSettings
+from dg4d_lib.video.driving import DrivingVideo
+from steps import packages
 from steps.job import Facts, Job
 from steps.media import read_frames, write_png, write_zip
 from steps.meshfiles import read_meshes, read_tracked
-from steps.motions import read_motion
-from steps.packages import (
-    ASSET,
-    GAUSSIANS,
-    MANIFEST,
-    MESHES,
-    MOTION,
-    PREVIEW,
-    SHEET,
-    SPLATS,
-    SUBJECT,
-    Manifest,
-)
+from steps.motions import read_fit
+from steps.packages import MANIFEST, Manifest
 from steps.profiles import PackAssetSettings
+
+Surface = Asset4D | list[TexturedMesh]
+Notes = Sequence[str]
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What is written, and where; its methods write, and give notes for the report.
+
+    Attributes:
+        folder: of the package.
+        settings: of the step.
+        surface: the tracked mesh, or a mesh per state.
+        gaussians: at rest.
+        deformation: their motion.
+        fitted: the settings of the deformation.
+        video: what the motion was fitted to.
+        states: the cloud at every moment that is written.
+        fps: how many of these a second has.
+        rasterizer: draws the films.
+        inputs: the files that go in unchanged, by port.
+    """
+
+    folder: Path
+    settings: PackAssetSettings
+    surface: Surface
+    gaussians: Gaussians
+    deformation: AnyDeformation
+    fitted: DeformationSettings
+    video: DrivingVideo
+    states: Gaussians
+    fps: float
+    rasterizer: Rasterizer
+    inputs: dict[str, Path]
+
+    @property
+    def meshes(self) -> list[TexturedMesh]:
+        """The mesh at rest, or one per state."""
+        return [self.surface.mesh] if isinstance(self.surface, Asset4D) else self.surface
+
+    @property
+    def extras(self) -> dict[str, Any]:
+        """What the files say about themselves."""
+        return {"generator": _generator(), "notes": list(self.settings.notes)}
+
+    def place(self, name: str) -> Path:
+        """Where a file of the package goes; its folder is made."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def write_meshes(self) -> Notes:
+        """The animated mesh, and in the mode per_frame every frame's mesh beside it."""
+        gltf, surface = self.settings.pack.gltf, self.surface
+        if isinstance(surface, Asset4D):
+            named = replace(surface, extras={**surface.extras, **self.extras})
+            self.place(packages.ASSET).write_bytes(write_glb(named, gltf))
+            return ()
+        self.place(packages.ASSET).write_bytes(write_frames_glb(surface, self.fps, self.extras, gltf))
+        for frame, mesh in enumerate(surface):
+            self.place(f"{packages.MESHES}/{frame:03d}.glb").write_bytes(write_mesh_glb(mesh, gltf))
+        return ()
+
+    def write_levels(self) -> Notes:
+        """The tracked mesh with fewer triangles."""
+        surface, notes = self.surface, []
+        if not isinstance(surface, Asset4D):
+            return ()
+        for level, share in enumerate(self.settings.pack.lods, 1):
+            mesh, offsets = simplified(surface.mesh, surface.offsets, max(1, round(share * len(surface.mesh.faces))))
+            name = f"{packages.LEVELS}/{level}.glb"
+            less = replace(surface, mesh=mesh, offsets=offsets, extras={**surface.extras, **self.extras})
+            self.place(name).write_bytes(write_glb(less, self.settings.pack.gltf))
+            notes.append(f"{name} has {len(mesh.faces)} of {len(surface.mesh.faces)} triangles")
+        return notes
+
+    def write_rig(self) -> Notes:
+        """The tracked mesh on a skeleton, where one follows it."""
+        pack, surface = self.settings.pack, self.surface
+        if not pack.rig or not isinstance(surface, Asset4D):
+            return ()
+        rig, note = rig_of(surface, pack.rig_bones, pack.rig_error)
+        if rig is not None:
+            named = replace(surface, extras={**surface.extras, **self.extras})
+            self.place(packages.RIGGED).write_bytes(write_rigged_glb(named, rig, pack.gltf))
+        return (note,)
+
+    def write_usd(self) -> Notes:
+        """Mesh and splats in one USDZ."""
+        if self.settings.pack.usd:
+            path = self.place(packages.USD)
+            write_usdz(path, self.surface, self.fps, self.states, self.extras, self.settings.pack.gltf)
+        return ()
+
+    def write_splats(self) -> Notes:
+        """The cloud at every moment, in the formats that are asked for, and what plays in a browser."""
+        pack, states = self.settings.pack, self.states
+        self.place(packages.WEB_SPLATS).write_bytes(write_web_splats(states, self.fps))
+        folder = self.place(packages.WEB_SPLATS).parent
+        if pack.splats:
+            write_splats(folder, states)
+        if pack.spz:
+            write_spz_frames(folder, states)
+        if pack.splat_gltf != "none":
+            write_splat_glb_frames(folder, states, pack.splat_gltf)
+        return ()
+
+    def write_canonical(self) -> Notes:
+        """What everything else was made from."""
+        for name, port in (
+            (packages.GAUSSIANS, "gaussians"),
+            (packages.MOTION, "motion"),
+            (packages.SUBJECT, "subject"),
+        ):
+            self.place(name).write_bytes(self.inputs[port].read_bytes())
+        video = self.video
+        exact = Compact(self.gaussians, self.deformation, self.fitted, len(video), video.fps)
+        write_compact(self.place(packages.COMPACT), exact)
+        even = video.frames.shape[1] // 2 * 2  # pixels; films of odd sizes do not play everywhere
+        write_film(self.place(packages.DRIVING), video.over(torch.ones(3))[:, :even, :even], video.fps)
+        return ()
+
+    def write_previews(self) -> Notes:
+        """Films, a moving picture, and the contact sheet."""
+        pack, video = self.settings.pack, self.video
+        told = write_preview(
+            self.place(packages.PREVIEW),
+            self.gaussians,
+            self.deformation,
+            len(video),
+            video.fps,
+            self.rasterizer,
+            pack,
+        )
+        write_turntable(self.place(packages.TURNTABLE), self.states.at(0), self.rasterizer, pack)
+        write_webp(
+            self.place(packages.MOVING_PICTURE),
+            self.gaussians,
+            self.deformation,
+            len(video),
+            video.fps,
+            self.rasterizer,
+            pack,
+        )
+        sheet = contact_sheet(self.gaussians, self.deformation, video, self.rasterizer, pack)
+        write_png(self.place(packages.SHEET), sheet)
+        return told
 
 
 def run(job: Job) -> Facts:
@@ -42,55 +191,76 @@ def run(job: Job) -> Facts:
 
     Raises:
         BadInput: inputs that do not belong together: other numbers of frames, neither or both kinds of mesh.
+        BackendUnavailable: a setting asks for a library that is not here.
     """
-    settings: PackAssetSettings = job.settings
-    rasterizer = choose_rasterizer(settings.rasterizer)
-    gaussians = read_ply(job.inputs["gaussians"])
-    deformation, frames = read_motion(job.inputs["motion"])
     with TemporaryDirectory() as scratch:
-        video = read_frames(job.inputs["driving_video"], Path(scratch))
-        surface = _surface(job)
-        _check_frames(len(video), {"motion": frames, "mesh": _frames_of(surface)})
-        entries = list(_meshes(surface, video.fps, _extras(settings)))
-        if settings.pack.splats:
-            states = moved(gaussians, deformation, frames, torch.arange(float(frames)))
-            paths = write_splats(Path(scratch), states)
-            entries += [(f"{SPLATS}/{path.name}", path.read_bytes()) for path in paths]
-        film = Path(scratch) / PREVIEW
-        notes = write_preview(
-            film,
-            gaussians,
-            deformation,
-            frames,
-            video.fps,
-            rasterizer,
-            settings.pack,
-            lambda done, total: job.progress(done, total, {}),
+        contents = _contents(job, Path(scratch))
+        notes: list[str] = []
+        writers = (
+            contents.write_meshes,
+            contents.write_levels,
+            contents.write_rig,
+            contents.write_usd,
+            contents.write_splats,
+            contents.write_canonical,
+            contents.write_previews,
         )
-        entries.append((PREVIEW, film.read_bytes()))
-    write_png(job.outputs["sheet"], contact_sheet(gaussians, deformation, video, rasterizer, settings.pack))
-    entries.append((SHEET, job.outputs["sheet"].read_bytes()))
-    for name, port in ((GAUSSIANS, "gaussians"), (MOTION, "motion"), (SUBJECT, "subject")):
-        entries.append((name, job.inputs[port].read_bytes()))
-    meshes = [surface.mesh] if isinstance(surface, Asset4D) else surface
-    manifest = Manifest(
-        generator=_generator(),
-        mode="tracked" if isinstance(surface, Asset4D) else "per_frame",
-        fps=video.fps,
-        frames=frames,
-        duration_s=frames / video.fps,
-        gaussians=len(gaussians),
-        vertices=tuple(len(mesh.vertices) for mesh in meshes),
-        triangles=tuple(len(mesh.faces) for mesh in meshes),
-        files={name: _about(name) for name, _ in entries},
-        notes=(*settings.notes, *notes),
+        for done, write in enumerate(writers, 1):
+            notes += write()
+            job.progress(done, len(writers), {})
+        job.outputs["sheet"].write_bytes((contents.folder / packages.SHEET).read_bytes())
+        names = sorted(path.relative_to(contents.folder).as_posix() for path in contents.folder.rglob("*.*"))
+        manifest = Manifest(
+            generator=_generator(),
+            mode="tracked" if isinstance(contents.surface, Asset4D) else "per_frame",
+            fps=contents.fps,
+            frames=len(contents.states.means),
+            duration_s=len(contents.states.means) / contents.fps,
+            gaussians=len(contents.gaussians),
+            vertices=tuple(len(mesh.vertices) for mesh in contents.meshes),
+            triangles=tuple(len(mesh.faces) for mesh in contents.meshes),
+            files={name: packages.about(name) for name in names},
+            notes=(*contents.settings.notes, *notes),
+        )
+        text = json.dumps(manifest.model_dump(mode="json"), indent=2, ensure_ascii=False) + "\n"
+        files = [(name, (contents.folder / name).read_bytes()) for name in names]
+        write_zip(job.outputs["package"], [(MANIFEST, text.encode()), *files])
+    return Facts(backend=f"{contents.settings.rasterizer} rasterizer", notes=tuple(notes))
+
+
+def _contents(job: Job, scratch: Path) -> Contents:
+    """Read the inputs, at the frame rate that is asked for."""
+    settings: PackAssetSettings = job.settings
+    gaussians = read_ply(job.inputs["gaussians"])
+    fit = read_fit(job.inputs["motion"])
+    video = read_frames(job.inputs["driving_video"], scratch)
+    surface = _surface(job)
+    frames = len(surface.offsets) if isinstance(surface, Asset4D) else len(surface)
+    _check_frames(len(video), {"motion": fit.frames, "mesh": frames})
+    fps = settings.pack.fps or video.fps
+    if isinstance(surface, Asset4D):
+        surface = resampled(replace(surface, fps=video.fps), gaussians, fit.deformation, fit.frames, fps)
+    elif fps != video.fps:
+        raise BadInput(
+            f"a mesh per frame has the frames of the driving video, {video.fps:g} a second; {fps:g} are asked for: "
+            "leave pack.fps at 0, or choose mesh.mode=tracked"
+        )
+    return Contents(
+        folder=scratch / "package",
+        settings=settings,
+        surface=surface,
+        gaussians=gaussians,
+        deformation=fit.deformation,
+        fitted=fit.settings,
+        video=video,
+        states=states(gaussians, fit.deformation, fit.frames, moments(fit.frames, video.fps, fps)),
+        fps=fps,
+        rasterizer=choose_rasterizer(settings.rasterizer),
+        inputs=dict(job.inputs),
     )
-    text = json.dumps(manifest.model_dump(mode="json"), indent=2, ensure_ascii=False) + "\n"
-    write_zip(job.outputs["package"], [(MANIFEST, text.encode()), *entries])
-    return Facts(backend=f"{settings.rasterizer} rasterizer", notes=notes)
 
 
-def _surface(job: Job) -> Asset4D | list[TexturedMesh]:
+def _surface(job: Job) -> Surface:
     """The tracked mesh, or a mesh per frame: whichever was given."""
     given = [port for port in ("tracked", "meshes") if port in job.inputs]
     match given:
@@ -101,44 +271,11 @@ def _surface(job: Job) -> Asset4D | list[TexturedMesh]:
     raise BadInput(f"a package needs one kind of mesh, `tracked` or `meshes`; given {given or 'neither'}")
 
 
-def _frames_of(surface: Asset4D | list[TexturedMesh]) -> int:
-    return len(surface.offsets) if isinstance(surface, Asset4D) else len(surface)
-
-
 def _check_frames(expected: int, given: dict[str, int]) -> None:
     wrong = [f"{name} {count}" for name, count in given.items() if count != expected]
     if wrong:
         raise BadInput(f"the driving video has {expected} frames, but: {', '.join(wrong)}; run the steps before again")
 
 
-def _meshes(surface: Asset4D | list[TexturedMesh], fps: float, extras: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
-    """The animated mesh, and in the mode per_frame every frame's mesh beside it."""
-    if isinstance(surface, Asset4D):
-        yield ASSET, write_glb(Asset4D(surface.mesh, surface.offsets, fps, {**surface.extras, **extras}))
-        return
-    yield ASSET, write_frames_glb(surface, fps, extras)
-    for frame, mesh in enumerate(surface):
-        yield f"{MESHES}/{frame:03d}.glb", write_mesh_glb(mesh)
-
-
 def _generator() -> str:
     return f"dg4d {version('dg4d')}"
-
-
-def _extras(settings: PackAssetSettings) -> dict[str, Any]:
-    """What the GLB says about itself."""
-    return {"generator": _generator(), "notes": list(settings.notes)}
-
-
-def _about(name: str) -> str:
-    """One line on a file of the package."""
-    single = {
-        ASSET: "animated textured mesh, core glTF 2.0",
-        GAUSSIANS: "Gaussians at rest, 3DGS PLY",
-        MOTION: "their deformation over time, safetensors",
-        SUBJECT: "the cut-out input",
-        PREVIEW: "turntable film",
-        SHEET: "moments by angles",
-    }
-    folders = {SPLATS: "Gaussians of one frame, 3DGS PLY", MESHES: "textured mesh of one frame, core glTF 2.0"}
-    return single.get(name) or folders[name.partition("/")[0]]

@@ -1,6 +1,6 @@
 """What lies where in a package, and the manifest that says so (`asset.json`)."""
 
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from pydantic import Field, ValidationError
@@ -11,13 +11,44 @@ from steps.contract import Frozen
 
 MANIFEST = "asset.json"
 ASSET = "asset.glb"
+RIGGED = "asset_rigged.glb"
+USD = "asset.usdz"
 SPLATS = "splats"
+WEB_SPLATS = "splats/moving.websplats"
 MESHES = "meshes"
+LEVELS = "lod"
 GAUSSIANS = "canonical/gaussians.ply"
 MOTION = "canonical/motion.safetensors"
+COMPACT = "canonical/asset4d.safetensors"
 SUBJECT = "input/subject.png"
+DRIVING = "input/driving.mp4"
 PREVIEW = "preview.mp4"
+TURNTABLE = "turntable.mp4"
+MOVING_PICTURE = "preview.webp"
 SHEET = "contact_sheet.png"
+
+ABOUT = {
+    ASSET: "animated textured mesh, glTF 2.0",
+    RIGGED: "the same mesh on a skeleton, glTF 2.0",
+    USD: "animated mesh, and as a variant moving splats, USDZ",
+    WEB_SPLATS: "moving splats for the viewer",
+    GAUSSIANS: "Gaussians at rest, 3DGS PLY",
+    MOTION: "their deformation over time, safetensors",
+    COMPACT: "Gaussians and deformation in one file, safetensors",
+    SUBJECT: "the cut-out input",
+    DRIVING: "what the motion follows, MP4",
+    PREVIEW: "it moves while the camera goes round, MP4",
+    TURNTABLE: "the first moment, turned once, MP4",
+    MOVING_PICTURE: "it moves, animated WebP",
+    SHEET: "moments by angles",
+}
+ABOUT_FOLDERS = {
+    (SPLATS, ".ply"): "Gaussians of one moment, 3DGS PLY",
+    (SPLATS, ".spz"): "Gaussians of one moment, SPZ",
+    (SPLATS, ".glb"): "Gaussians of one moment, glTF with KHR_gaussian_splatting",
+    (MESHES, ".glb"): "textured mesh of one frame, glTF 2.0",
+    (LEVELS, ".glb"): "the animated mesh with fewer triangles, glTF 2.0",
+}
 
 
 class Camera(Frozen):
@@ -34,7 +65,10 @@ class Camera(Frozen):
 
 
 class Manifest(Frozen):
-    """What a package holds. Frame i is shown at i / fps seconds; after the last frame comes the first again."""
+    """What a package holds. Frame i is shown at i / fps seconds; after the last frame comes the first again.
+
+    Frames are those that are written: another number than the driving video's where `pack.fps` asks for another rate.
+    """
 
     format: Literal["dg4d-asset"] = "dg4d-asset"
     version: Literal[1] = 1
@@ -49,6 +83,12 @@ class Manifest(Frozen):
     camera: Camera = Camera()
     files: dict[str, str] = Field(description="what every file is, by its name in the package")
     notes: tuple[str, ...] = ()
+
+
+def about(name: str) -> str:
+    """One line on a file of a package, by its name there."""
+    path = PurePosixPath(name)
+    return ABOUT.get(name) or ABOUT_FOLDERS[path.parts[0], path.suffix]
 
 
 def read_manifest(folder: Path) -> Manifest:

@@ -19,7 +19,7 @@ from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.geometric import InflatedSurfaces
 from dg4d_lib.guidance.imagedream import ImageDream, ImageDreamPrior
 from dg4d_lib.guidance.interface import GuidancePrior
-from dg4d_lib.guidance.oracle import Bank
+from dg4d_lib.guidance.oracle import Bank, imperfect
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.settings import (
     GeometricPriorSettings,
@@ -58,10 +58,9 @@ class ChosenPrior:
 
     def facts(self, backend: str) -> Facts:
         """What a step that used it can say of itself, after it did."""
-        notes = (self.note, *(self.batches.notes() if self.batches else ()))
-        if self.opened is None:
-            return Facts(backend, notes=notes)
-        return Facts(backend, self.opened.digests, self.opened.licenses, notes)
+        halved = self.batches.notes() if self.batches else ()
+        weights, licenses = (self.opened.digests, self.opened.licenses) if self.opened else ({}, {})
+        return Facts(backend, weights, licenses, notes=(self.note,), run_notes=halved)
 
 
 def make_prior(
@@ -92,9 +91,7 @@ def make_prior(
         case OraclePriorSettings():
             if bank is None:
                 raise BadInput("prior.kind = oracle needs true views: give --bank FOLDER (with a bank.json)")
-            views = read_bank(bank, scratch)
-            prior = AnalyticPrior(views.clean, noise, settings.coverage_weight, views.cameras, views.frames)
-            return ChosenPrior(prior, ORACLE_NOTE)
+            return ChosenPrior(oracle_prior(read_bank(bank, scratch), settings, noise), ORACLE_NOTE)
         case Zero123PriorSettings():
             check_variant(settings)
             opened = open_weights(settings.weights)
@@ -105,6 +102,12 @@ def make_prior(
             model = ImageDream.load(opened.folder, settings.precision, device_here())
             dream = ImageDreamPrior(model, model.conditioned_on(_pictures(cutouts)), noise, settings)
             return ChosenPrior(dream, f"prior: ImageDream, weights {settings.weights}", opened, dream.batches)
+
+
+def oracle_prior(bank: Bank, settings: OraclePriorSettings, noise: Annealing) -> AnalyticPrior:
+    """A prior that knows the bank, or with imperfections something like it, always the same."""
+    known = imperfect(bank, settings, torch.Generator().manual_seed(0))
+    return AnalyticPrior(known.clean, noise, settings.coverage_weight, known.cameras, known.frames)
 
 
 def _pictures(cutouts: Sequence[Float[Tensor, "h w 4"]]) -> Float[Tensor, "t h w 3"]:
@@ -126,10 +129,7 @@ def check_variant(settings: Zero123PriorSettings) -> None:
 
 
 def read_bank(path: Path, scratch: Path) -> Bank:
-    """A zip of bank.json and one sheet of tiles per view.
-
-    bank.json: {"frames": [...], "tile": [rows, columns], "tile_size": px, "views": [{"file", "azimuth", "elevation",
-    "radius"}]}, angles in degrees, positive elevation above.
+    """The bank in a zip; see `read_bank_folder`.
 
     Raises:
         BadInput: no bank.json in it.
@@ -138,12 +138,21 @@ def read_bank(path: Path, scratch: Path) -> Bank:
         if "bank.json" not in archive.namelist():
             raise BadInput("the bank has no bank.json")
         archive.extractall(scratch)
-    about = json.loads((scratch / "bank.json").read_text())
+    return read_bank_folder(scratch)
+
+
+def read_bank_folder(folder: Path) -> Bank:
+    """The bank in a folder: bank.json and one sheet of tiles per view.
+
+    bank.json: {"frames": [...], "tile": [rows, columns], "tile_size": px, "views": [{"file", "azimuth", "elevation",
+    "radius"}]}, angles in degrees, positive elevation above.
+    """
+    about = json.loads((folder / "bank.json").read_text())
     (rows, columns), size, frames = about["tile"], about["tile_size"], about["frames"]
     cameras, sheets = [], []
     for view in about["views"]:
         cameras.append(OrbitCamera(view["elevation"], view["azimuth"], view["radius"], width=size, height=size))
-        sheet = (read_png(scratch / view["file"]) * 255).round().to(torch.uint8)
+        sheet = (read_png(folder / view["file"]) * 255).round().to(torch.uint8)
         tiles = sheet.reshape(rows, size, columns, size, 4).transpose(1, 2).reshape(rows * columns, size, size, 4)
         sheets.append(tiles[: len(frames)])
     return Bank(tuple(cameras), tuple(frames), torch.stack(sheets))

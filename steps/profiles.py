@@ -4,6 +4,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError
 
+from dg4d_lib.asset_settings import GateSettings, PackSettings, ScoreSettings
 from dg4d_lib.errors import BadInput
 from dg4d_lib.rasterizer.choice import backend_name
 from dg4d_lib.settings import (
@@ -14,7 +15,6 @@ from dg4d_lib.settings import (
     IdentitySettings,
     MeshSettings,
     MotionSettings,
-    PackSettings,
     PriorSettings,
     RefinerSettings,
     Rung,
@@ -43,6 +43,7 @@ class PipelineSettings(Settings):
     mesh: MeshSettings = MeshSettings()
     refiner: RefinerSettings = IdentitySettings()
     pack: PackSettings = PackSettings()
+    gates: GateSettings = GateSettings()
 
 
 class DriveVideoSettings(Settings):
@@ -90,6 +91,21 @@ class PackAssetSettings(Settings):
     rasterizer: Backend
     pack: PackSettings
     notes: tuple[str, ...] = Field((), description="sentences that travel in the files, say that no model was used")
+
+
+class CheckAssetSettings(Settings):
+    """What `check_asset` reads."""
+
+    rasterizer: Backend
+    gates: GateSettings
+
+
+class ScoreAssetSettings(Settings):
+    """What `score_asset` reads."""
+
+    rasterizer: Backend
+    mesh: bool = Field(False, description="the textured mesh is judged instead of the splats")
+    score: ScoreSettings = ScoreSettings()
 
 
 def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSettings:
@@ -174,9 +190,12 @@ REFERENCE = revise(
         "static.noise_start": 1.0,
         "static.noise_end": 0.0,
         "deformation.temporal": 12,
+        "deformation.half_side": 1.6,
+        "deformation.endpoint": False,
         "motion.iterations": 500,
         "motion.noise_start": 1.0,
         "motion.noise_end": 0.0,
+        "motion.fine_tune": True,
     },
 )
 

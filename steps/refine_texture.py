@@ -6,17 +6,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.diffusion.parts import device_here
 from dg4d_lib.diffusion.video_model import VideoModel
 from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.settings import IdentitySettings, ImageToImageSettings, VideoToVideoSettings
-from dg4d_lib.texture.refine import Stretch, refine_textures
+from dg4d_lib.texture.refine import Refined, Stretch, refine_textures
 from dg4d_lib.texture.refiner import ImageToImage, Refiner, VideoToVideo
 from dg4d_lib.video.driving import DrivingVideo
 from steps.job import Facts, Job
@@ -38,23 +35,23 @@ def run(job: Job) -> Facts:
     fps = frame_rate(job.inputs["driving_video"])
     if "tracked" in job.inputs:
         asset = read_tracked(job.inputs["tracked"])
-        (texture,), facts = _refined(job, [Stretch(asset.mesh, asset.offsets)])
-        refined = replace(asset.mesh, texture=texture)
-        write_tracked(job.outputs["tracked"], Asset4D(refined, asset.offsets, fps, asset.extras))
+        (its,), facts = _refined(job, [Stretch(asset.mesh, asset.offsets)])
+        mesh = replace(asset.mesh, texture=its.texture)
+        write_tracked(job.outputs["tracked"], replace(asset, mesh=mesh, fps=fps, textures=its.frames))
     if "meshes" in job.inputs:
         meshes = read_meshes(job.inputs["meshes"])
-        textures, facts = _refined(job, [Stretch(mesh, torch.zeros(1, *mesh.vertices.shape)) for mesh in meshes])
-        better = [replace(mesh, texture=texture) for mesh, texture in zip(meshes, textures, strict=True)]
+        refined, facts = _refined(job, [Stretch(mesh, torch.zeros(1, *mesh.vertices.shape)) for mesh in meshes])
+        better = [replace(mesh, texture=its.texture) for mesh, its in zip(meshes, refined, strict=True)]
         write_meshes(job.outputs["meshes"], dict(enumerate(better)))
     return facts
 
 
-def _refined(job: Job, stretches: Sequence[Stretch]) -> tuple[list[Float[Tensor, "h w 3"]], Facts]:
+def _refined(job: Job, stretches: Sequence[Stretch]) -> tuple[list[Refined], Facts]:
     """The textures of a motion, and how they were made."""
     settings: RefineTextureSettings = job.settings
     kind = settings.refiner
     if isinstance(kind, IdentitySettings):
-        return [stretch.mesh.texture for stretch in stretches], Facts()
+        return [Refined(stretch.mesh.texture) for stretch in stretches], Facts()
     with TemporaryDirectory() as scratch:
         driving = read_frames(job.inputs["driving_video"], Path(scratch))
     device = device_here()
@@ -65,22 +62,23 @@ def _refined(job: Job, stretches: Sequence[Stretch]) -> tuple[list[Float[Tensor,
         case VideoToVideoSettings():
             opened = open_weights(kind.model.weights)
             model = VideoModel.load(opened.folder, kind.model, device)
-            refiner, notes = VideoToVideo(kind, model, pictures[0]), model.notes
+            refiner, halved = VideoToVideo(kind, model, pictures[0]), model.notes
             how = f"by video diffusion from sigma {refiner.sigmas[0]:.3f} on, {len(refiner.sigmas) - 1} steps"
         case ImageToImageSettings():
             opened = open_weights(kind.prior.weights)
             loaded = Zero123.load(opened.folder, kind.prior, device)
             prior = loaded.conditioned_on(pictures, Annealing(1.0))
-            refiner, notes = ImageToImage(kind, prior), prior.batches.notes
+            refiner, halved = ImageToImage(kind, prior), prior.batches.notes
             how = "picture by picture, by image diffusion"
     generator = torch.Generator().manual_seed(job.seed)
     there = [Stretch(_on(device, stretch.mesh), stretch.offsets.to(device)) for stretch in stretches]
-    textures = refine_textures(there, driving, refiner, kind.texture, generator, job.progress)
+    refined = refine_textures(there, driving, refiner, kind.texture, generator, job.progress)
     often = "every iteration" if kind.texture.refresh_every == 1 else f"every {kind.texture.refresh_every} iterations"
-    said = (f"Textures were refined {how}; {kind.texture.iterations} iterations, new targets {often}.", *notes())
-    return [texture.cpu() for texture in textures], Facts(
-        f"{device.type} (diffusers)", opened.digests, opened.licenses, said
-    )
+    said = [f"Textures were refined {how}; {kind.texture.iterations} iterations, new targets {often}."]
+    if any(its.frames is not None for its in refined):
+        said.append("The texture changes from frame to frame: every frame adds colors of its own to the shared one.")
+    facts = Facts(f"{device.type} (diffusers)", opened.digests, opened.licenses, tuple(said), halved())
+    return [Refined(its.texture.cpu(), None if its.frames is None else its.frames.cpu()) for its in refined], facts
 
 
 def _on(device: torch.device, mesh: TexturedMesh) -> TexturedMesh:

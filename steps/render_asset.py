@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dg4d_lib.assets.animated import between, moved
+from dg4d_lib.assets.animated import Asset4D, between, moved
 from dg4d_lib.assets.glb import read_glb, read_mesh_glb
 from dg4d_lib.assets.splats import read_splats
 from dg4d_lib.cameras.orbit import OrbitCamera
@@ -17,6 +18,7 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.mesh.render import render_mesh
+from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
 from steps.media import write_png
 from steps.motions import read_motion
@@ -25,6 +27,8 @@ from steps.packages import ASSET, GAUSSIANS, MESHES, MOTION, SPLATS, Manifest, r
 BATCH = 8  # pictures drawn at once, bounds the memory
 SIZES = (16, 4096)  # pixels
 
+States = Callable[[Float[Tensor, " b"]], Gaussians]  # the cloud at positions of the animation
+Surface = Asset4D | list[TexturedMesh]  # one mesh that moves, or a mesh per frame
 Draw = Callable[[Float[Tensor, " b"], Sequence[OrbitCamera]], Float[Tensor, "b h w 4"]]
 
 
@@ -62,7 +66,10 @@ def render_package(
     """
     manifest = read_manifest(folder)
     _check(azimuths_deg, elevation_deg, size, frames)
-    draw = _mesh(folder, manifest) if mesh else _splats(folder, manifest, choose_rasterizer(rasterizer))
+    if mesh:
+        draw = drawn_mesh(read_surface(folder, manifest))
+    else:
+        draw = _drawn_splats(read_states(folder, manifest), choose_rasterizer(rasterizer))
     count = manifest.frames if frames is None else frames
     positions = torch.arange(count, dtype=torch.float64) * (manifest.frames - 1) / max(1, count - 1)
     views = [out / f"view_{azimuth_deg + 0.0:g}" for azimuth_deg in azimuths_deg]
@@ -77,6 +84,69 @@ def render_package(
     return views
 
 
+def read_states(folder: Path, manifest: Manifest) -> States:
+    """The stored states of the cloud, or those of the fitted motion where an unpacked package holds no splats.
+
+    Raises:
+        BadInput: files are missing or broken, or have another number of frames than the package.
+    """
+    if any((folder / SPLATS).glob("*.ply")):
+        stored = read_splats(folder / SPLATS)
+        _check_frames(SPLATS, len(stored.means), manifest)
+        return partial(states_between, stored)
+    gaussians, (deformation, frames) = read_ply(folder / GAUSSIANS), read_motion(folder / MOTION)
+    return lambda positions: moved(gaussians, deformation, frames, positions * frames / manifest.frames)
+
+
+def states_between(states: Gaussians, positions: Float[Tensor, " b"]) -> Gaussians:
+    """States of a cloud given per frame, linear between frames."""
+    return Gaussians(
+        between(states.means, positions),
+        between(states.log_scales, positions),
+        between(states.quats, positions),
+        states.opacity_logits,
+        states.harmonics,
+    )
+
+
+def read_surface(folder: Path, manifest: Manifest) -> Surface:
+    """The mesh that moves, or the mesh of every frame, of an unpacked package.
+
+    Raises:
+        BadInput: files are missing or broken, or have another number of frames than the package.
+    """
+    if manifest.mode == "per_frame":
+        return [read_mesh_glb(_content(folder, f"{MESHES}/{i:03d}.glb")) for i in range(manifest.frames)]
+    asset = read_glb(_content(folder, ASSET))
+    _check_frames(ASSET, len(asset.offsets), manifest)
+    return asset
+
+
+def drawn_mesh(surface: Surface) -> Draw:
+    """Draws the moved mesh as a player shows it: linear between frames, or each frame's own mesh until the next."""
+    if isinstance(surface, Asset4D) and surface.textures is None:
+        return lambda positions, cameras: torch.cat(
+            render_mesh(surface.mesh, cameras, between(surface.offsets, positions)), -1
+        )
+
+    def draw(positions: Float[Tensor, " b"], cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b h w 4"]:
+        shown = zip(positions, cameras, strict=True)
+        return torch.cat([torch.cat(render_mesh(mesh_at(surface, there), [camera]), -1) for there, camera in shown])
+
+    return draw
+
+
+def mesh_at(surface: Surface, position: Float[Tensor, ""]) -> TexturedMesh:
+    """The mesh of a moment, with the texture of its frame where textures change."""
+    frame = int(position)
+    if not isinstance(surface, Asset4D):
+        return surface[frame]
+    texture = surface.mesh.texture if surface.textures is None else surface.textures[frame % len(surface.textures)]
+    return replace(
+        surface.mesh, vertices=surface.mesh.vertices + between(surface.offsets, position[None])[0], texture=texture
+    )
+
+
 def _check(azimuths_deg: Sequence[float], elevation_deg: float, size: int, frames: int | None) -> None:
     if not azimuths_deg or not all(map(math.isfinite, azimuths_deg)):
         raise BadInput(f"azimuths must be one or more angles in degrees, for example 0,-75,15; given {azimuths_deg}")
@@ -88,51 +158,12 @@ def _check(azimuths_deg: Sequence[float], elevation_deg: float, size: int, frame
         raise BadInput(f"there must be at least one frame to render; given {frames}")
 
 
-def _splats(folder: Path, manifest: Manifest, rasterizer: Rasterizer) -> Draw:
-    """Draws the stored states, or those of the fitted motion where the package holds no splats."""
-    if (folder / SPLATS).is_dir():
-        stored = read_splats(folder / SPLATS)
-        _check_frames(SPLATS, len(stored.means), manifest)
-        states = partial(_between_states, stored)
-    else:
-        deformation, frames = read_motion(folder / MOTION)
-        _check_frames(MOTION, frames, manifest)
-        states = partial(moved, read_ply(folder / GAUSSIANS), deformation, frames)
-
+def _drawn_splats(states: States, rasterizer: Rasterizer) -> Draw:
     def draw(positions: Float[Tensor, " b"], cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b h w 4"]:
         with torch.no_grad():
             drawn = rasterizer(states(positions), cameras, torch.zeros(3))
         straight = drawn.color / drawn.alpha.clamp_min(torch.finfo(drawn.alpha.dtype).tiny)
         return torch.cat([straight, drawn.alpha], -1).clamp(0, 1)
-
-    return draw
-
-
-def _between_states(states: Gaussians, positions: Float[Tensor, " b"]) -> Gaussians:
-    return Gaussians(
-        between(states.means, positions),
-        between(states.log_scales, positions),
-        between(states.quats, positions),
-        states.opacity_logits,
-        states.harmonics,
-    )
-
-
-def _mesh(folder: Path, manifest: Manifest) -> Draw:
-    """Draws the moved mesh as a player shows it: linear between frames, or each frame's own mesh until the next."""
-    if manifest.mode == "per_frame":
-        meshes = [read_mesh_glb(_content(folder, f"{MESHES}/{i:03d}.glb")) for i in range(manifest.frames)]
-
-        def draw_frames(positions: Float[Tensor, " b"], cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b h w 4"]:
-            shown = zip(positions.floor().long().tolist(), cameras, strict=True)
-            return torch.cat([torch.cat(render_mesh(meshes[frame], [camera]), -1) for frame, camera in shown])
-
-        return draw_frames
-    asset = read_glb(_content(folder, ASSET))
-    _check_frames(ASSET, len(asset.offsets), manifest)
-
-    def draw(positions: Float[Tensor, " b"], cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b h w 4"]:
-        return torch.cat(render_mesh(asset.mesh, cameras, between(asset.offsets, positions)), -1)
 
     return draw
 

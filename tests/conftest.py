@@ -7,7 +7,7 @@ from pathlib import Path
 
 _HOME = Path(tempfile.mkdtemp(prefix="dg4d-tests-"))
 for _name in tuple(os.environ):
-    if _name.startswith(("PREFECT_", "DG4D_")):
+    if _name.startswith(("PREFECT_", "DG4D_")) and not _name.startswith("DG4D_TEST_"):
         del os.environ[_name]
 os.environ["OMP_NUM_THREADS"] = "1"  # tests run side by side; spinning threads would slow each other down
 os.environ["OMP_WAIT_POLICY"] = "passive"

@@ -25,12 +25,16 @@ class Asset4D:
         offsets: what to add to the vertices at every frame, world units.
         fps: frames per second.
         extras: JSON that goes into the GLB untouched.
+        textures: the colors of every frame in [0, 1], where they change; None: always the mesh's own.
+        rest: the position at which the moved mesh is the mesh at rest, but for what was corrected afterwards.
     """
 
     mesh: TexturedMesh
     offsets: Float[Tensor, "t v 3"]
     fps: float
     extras: dict[str, Any] = field(default_factory=dict)
+    textures: Float[Tensor, "t h w 3"] | None = None
+    rest: float = 0.0
 
 
 def moved(gaussians: Gaussians, deformation: Deformation, frames: int, positions: Float[Tensor, " m"]) -> Gaussians:

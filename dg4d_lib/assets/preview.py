@@ -1,4 +1,4 @@
-"""A short film of an asset: it moves while the camera goes round it once."""
+"""Short films of an asset: it moves while the camera goes round it once, or holds still and is turned."""
 
 from collections.abc import Callable, Sequence
 from fractions import Fraction
@@ -12,6 +12,7 @@ from av.video.reformatter import ColorRange, Colorspace
 from jaxtyping import Float
 from torch import Tensor
 
+from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.animated import moved
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import turntable
@@ -19,13 +20,16 @@ from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer.interface import Rasterizer
-from dg4d_lib.settings import PackSettings
 
 SMOOTH_FPS = 20  # slower motions are sampled between their frames, so that the turn looks smooth
 MOST_PICTURES = 600  # sampling between frames stops here; a long video still has all its own frames
 ELEVATION_DEG = 10.0  # of the camera: a little from above
+TURN_S = 5  # seconds in which a subject that holds still is turned once
 BATCH = 8  # pictures of one rasterizer call, bounds the memory
-CODECS = {"libx264": {"crf": "18", "preset": "medium"}, "mpeg4": {"qscale": "3"}}  # best first
+CODECS = {  # best first; without `cpu-independent`, x264's look ahead gave other bytes in one of ten equal films
+    "libx264": {"crf": "18", "preset": "medium", "x264-params": "cpu-independent=1"},
+    "mpeg4": {"qscale": "3"},
+}
 BT709 = 1  # color primaries, transfer and matrix, as numbered in H.273
 CENTER, CORNER = (0.975, 0.975, 0.98), (0.84, 0.85, 0.87)  # of the background
 
@@ -63,17 +67,60 @@ def write_preview(
     """
     repeats = max(1, min(ceil(SMOOTH_FPS / fps), MOST_PICTURES // (frames * settings.preview_turns)))
     positions = torch.arange(frames * repeats).repeat(settings.preview_turns) / repeats
-    camera = OrbitCamera(ELEVATION_DEG, width=settings.preview_size, height=settings.preview_size)
-    cameras = turntable(len(positions), camera)
+
+    def states(part: slice) -> Gaussians:
+        return moved(gaussians, deformation, frames, positions[part])
+
+    return _round(path, states, len(positions), fps * repeats, rasterizer, settings, progress)
+
+
+def write_turntable(
+    path: Path,
+    gaussians: Gaussians,
+    rasterizer: Rasterizer,
+    settings: PackSettings,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[str, ...]:
+    """Write a silent MP4 (H.264, yuv420p) of one state of an asset, turned once; it begins with the input view's side.
+
+    Equal arguments give equal bytes.
+
+    Args:
+        path: of the file, ending in .mp4.
+        gaussians: one state.
+        rasterizer: draws the pictures.
+        settings: size.
+        progress: called with pictures done and their number.
+
+    Returns:
+        Sentences for the report: empty, or which codec had to stand in.
+
+    Raises:
+        BackendUnavailable: this build of FFmpeg can write no MP4 codec we know.
+        OSError: the file could not be written.
+    """
+    return _round(path, lambda part: gaussians, TURN_S * SMOOTH_FPS, SMOOTH_FPS, rasterizer, settings, progress)
+
+
+def _round(
+    path: Path,
+    states: Callable[[slice], Gaussians],
+    count: int,
+    fps: float,
+    rasterizer: Rasterizer,
+    settings: PackSettings,
+    progress: Callable[[int, int], None],
+) -> tuple[str, ...]:
+    """Write a film in which the camera goes round once; `states` are those of a range of its pictures."""
+    cameras = turntable(count, OrbitCamera(ELEVATION_DEG, width=settings.preview_size, height=settings.preview_size))
     background = studio(settings.preview_size)
     codec = _codec()
-    with Film(path, codec, fps * repeats, settings.preview_size) as film:
-        for start in range(0, len(positions), BATCH):
+    with Film(path, codec, fps, settings.preview_size) as film:
+        for start in range(0, count, BATCH):
             part = slice(start, start + BATCH)
-            states = moved(gaussians, deformation, frames, positions[part])
-            film.add(pictures_over(background, states, cameras[part], rasterizer))
-            progress(min(start + BATCH, len(positions)), len(positions))
-    return () if codec == "libx264" else (f"preview.mp4 is written with {codec}, since libx264 is not in this FFmpeg",)
+            film.add(pictures_over(background, states(part), cameras[part], rasterizer))
+            progress(min(start + BATCH, count), count)
+    return () if codec == "libx264" else (f"{path.name} is written with {codec}, since libx264 is not in this FFmpeg",)
 
 
 def write_film(path: Path, pictures: Float[Tensor, "t s s 3"], fps: float) -> None:

@@ -10,13 +10,13 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.animated import moved
 from dg4d_lib.assets.preview import BATCH, pictures_over
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer.interface import Rasterizer
-from dg4d_lib.settings import PackSettings
 from dg4d_lib.video.driving import DrivingVideo
 
 PAGE, PANEL, INK = (255, 255, 255), (0.945, 0.948, 0.955), (70, 74, 82)
@@ -57,7 +57,7 @@ def contact_sheet(
         ]
         rows.append(torch.cat(tiles))
     names = ["input", *(f"{azimuth_deg:g}°" for azimuth_deg in settings.sheet_azimuths_deg)]
-    return _page(torch.stack(rows), names, _moments(frames, video.fps))
+    return page(torch.stack(rows), names, _moments(frames, video.fps))
 
 
 def videos_sheet(
@@ -73,7 +73,27 @@ def videos_sheet(
     """
     frames = torch.linspace(0, len(videos[0]) - 1, min(columns, len(videos[0]))).round().long()
     rows = torch.stack([_footage(video, frames, size) for video in videos])
-    return _page(rows, list(names), _moments(frames, videos[0].fps))
+    return page(rows, names, _moments(frames, videos[0].fps))
+
+
+def page(tiles: Float[Tensor, "r m s s 3"], names: Sequence[str], headings: Sequence[str]) -> Float[Tensor, "h w 3"]:
+    """Tiles in [0, 1] on a white page, rows named on the left, columns above."""
+    size = tiles.shape[2]
+    gap = max(2, round(size * GAP))
+    font = ImageFont.load_default(max(SMALLEST_FONT, round(size * FONT)))
+    probe = ImageDraw.Draw(Image.new("RGB", (1, 1)))
+    left = 2 * gap + max(round(probe.textlength(name, font)) for name in names)
+    top = 2 * gap + round(probe.textbbox((0, 0), "0.00 s", font)[3])
+    sheet = Image.new("RGB", (left + len(headings) * (size + gap), top + len(names) * (size + gap)), PAGE)
+    draw = ImageDraw.Draw(sheet)
+    for column, heading in enumerate(headings):
+        draw.text((left + column * (size + gap) + size // 2, top - gap), heading, INK, font, anchor="ms")
+    for row, name in enumerate(names):
+        draw.text((left - gap, top + row * (size + gap) + size // 2), name, INK, font, anchor="rm")
+        for column in range(len(headings)):
+            pixels = (tiles[row, column].detach().cpu() * 255).round().to(torch.uint8).numpy()
+            sheet.paste(Image.fromarray(pixels), (left + column * (size + gap), top + row * (size + gap)))
+    return torch.from_numpy(np.array(sheet)).float() / 255
 
 
 def _moments(frames: Tensor, fps: float) -> list[str]:
@@ -89,23 +109,3 @@ def _footage(video: DrivingVideo, frames: Tensor, size: int) -> Float[Tensor, "m
     over = DrivingVideo(video.frames[frames], video.coverage[frames], video.fps).over(torch.tensor(PANEL))
     small = interpolate(over.movedim(-1, 1), size=(size, size), mode="bilinear", antialias=True, align_corners=False)
     return small.movedim(1, -1).clamp(0, 1)
-
-
-def _page(tiles: Float[Tensor, "r m s s 3"], names: list[str], moments: list[str]) -> Float[Tensor, "h w 3"]:
-    """The tiles on a white page, rows named on the left, columns above."""
-    size = tiles.shape[2]
-    gap = max(2, round(size * GAP))
-    font = ImageFont.load_default(max(SMALLEST_FONT, round(size * FONT)))
-    probe = ImageDraw.Draw(Image.new("RGB", (1, 1)))
-    left = 2 * gap + max(round(probe.textlength(name, font)) for name in names)
-    top = 2 * gap + round(probe.textbbox((0, 0), "0.00 s", font)[3])
-    page = Image.new("RGB", (left + len(moments) * (size + gap), top + len(names) * (size + gap)), PAGE)
-    draw = ImageDraw.Draw(page)
-    for column, moment in enumerate(moments):
-        draw.text((left + column * (size + gap) + size // 2, top - gap), moment, INK, font, anchor="ms")
-    for row, name in enumerate(names):
-        draw.text((left - gap, top + row * (size + gap) + size // 2), name, INK, font, anchor="rm")
-        for column in range(len(moments)):
-            pixels = (tiles[row, column].detach().cpu() * 255).round().to(torch.uint8).numpy()
-            page.paste(Image.fromarray(pixels), (left + column * (size + gap), top + row * (size + gap)))
-    return torch.from_numpy(np.array(page)).float() / 255

@@ -1,24 +1,45 @@
-"""Moving splats as one standard PLY per frame."""
+"""Moving splats as one file per frame: standard PLY, SPZ, or glTF."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
 
+from dg4d_lib.assets.splat_glb import SplatGlbVersion, write_splat_glb
+from dg4d_lib.assets.spz import write_spz
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply, write_ply
 
 
 def write_splats(folder: Path, states: Gaussians) -> list[Path]:
-    """Write every state of a batch as FOLDER/NNN.ply, which must exist.
+    """Write every state of a batch as FOLDER/NNN.ply; the folder must exist.
 
     Raises:
+        BadInput: numbers that are not finite.
         OSError: a file could not be written.
     """
-    paths = [folder / f"{frame:03d}.ply" for frame in range(len(states.means))]
-    for frame, path in enumerate(paths):
-        write_ply(path, states.at(frame))
-    return paths
+    return _write(folder, states, "ply", write_ply)
+
+
+def write_spz_frames(folder: Path, states: Gaussians) -> list[Path]:
+    """Write every state of a batch as FOLDER/NNN.spz; the folder must exist.
+
+    Raises:
+        BadInput: numbers that are not finite, or centers thousands of units away.
+        OSError: a file could not be written.
+    """
+    return _write(folder, states, "spz", write_spz)
+
+
+def write_splat_glb_frames(folder: Path, states: Gaussians, version: SplatGlbVersion = "ratified") -> list[Path]:
+    """Write every state of a batch as FOLDER/NNN.glb, which holds splats; the folder must exist.
+
+    Raises:
+        BadInput: no Gaussians, or numbers that are not finite.
+        OSError: a file could not be written.
+    """
+    return _write(folder, states, "glb", lambda path, state: path.write_bytes(write_splat_glb(state, version)))
 
 
 def read_splats(folder: Path) -> Gaussians:
@@ -44,3 +65,10 @@ def read_splats(folder: Path) -> Gaussians:
         first.opacity_logits,
         first.harmonics,
     )
+
+
+def _write(folder: Path, states: Gaussians, suffix: str, write: Callable[[Path, Gaussians], object]) -> list[Path]:
+    paths = [folder / f"{frame:03d}.{suffix}" for frame in range(len(states.means))]
+    for frame, path in enumerate(paths):
+        write(path, states.at(frame))
+    return paths

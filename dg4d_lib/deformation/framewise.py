@@ -3,6 +3,7 @@
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.errors import BadInput
@@ -14,11 +15,18 @@ class Framewise(nn.Module):
     Args:
         frames: t.
         count: Gaussians, n.
+        scatter: how far from its place at rest a Gaussian may begin, at random and in every frame anew, world units.
+        generator: of these beginnings.
     """
 
-    def __init__(self, frames: int, count: int) -> None:
+    def __init__(self, frames: int, count: int, scatter: float = 0.0, generator: torch.Generator | None = None) -> None:
         super().__init__()
-        self.table = nn.Parameter(torch.zeros(frames, count, 10))
+        table = torch.zeros(frames, count, 10)
+        if scatter:
+            directions = functional.normalize(torch.randn(frames, count, 3, generator=generator), dim=-1)
+            shares = torch.rand(frames, count, 1, generator=generator) ** (1 / 3)  # evenly over the ball
+            table[..., :3] = scatter * shares * directions
+        self.table = nn.Parameter(table)
 
     def displace(self, means: Float[Tensor, "n 3"], times: Float[Tensor, " t"]) -> Displacement:
         """What to add at every time in [0, 1]; the means only have to be as many as the table's.

@@ -61,15 +61,20 @@ class HexPlane(nn.Module):
         settings: sizes and regularizers.
         bounds: lower and upper corner of the box that the planes cover, world units.
         generator: for the start of the planes and the trunk.
+        last: where the last frame lies on the time axis of the planes, which ends at 1.
     """
 
     bounds: Tensor
 
     def __init__(
-        self, settings: HexPlaneSettings, bounds: Float[Tensor, "2 3"], generator: torch.Generator | None = None
+        self,
+        settings: HexPlaneSettings,
+        bounds: Float[Tensor, "2 3"],
+        generator: torch.Generator | None = None,
+        last: float = 1.0,
     ) -> None:
         super().__init__()
-        self.settings = settings
+        self.settings, self.last = settings, last
         self.register_buffer("bounds", bounds)
         c, t = settings.features, settings.temporal
         sizes = [max(2, round(settings.spatial * scale)) for scale in settings.scales]
@@ -79,6 +84,9 @@ class HexPlane(nn.Module):
         nn.init.xavier_uniform_(self.trunk.weight, generator=generator)
         nn.init.zeros_(self.trunk.bias)
         self.heads = Heads(settings.hidden)
+        if not settings.zero_start:
+            for matrix in (parameter for parameter in self.heads.parameters() if parameter.ndim == 2):
+                nn.init.xavier_uniform_(matrix, generator=generator)
 
     def displace(self, means: Float[Tensor, "n 3"], times: Float[Tensor, " t"]) -> Displacement:
         """What to add at every time in [0, 1]; means outside the box read its border."""
@@ -86,8 +94,10 @@ class HexPlane(nn.Module):
         coordinates = ((means - low) / (high - low) * 2 - 1).clamp(-1, 1)
         on_cpu = means.device.type == "cpu" and means.dtype == torch.float32 and not coordinates.requires_grad
         read = hexplane_features if on_cpu else plane_features
+        moments = self.last * times
         features = [
-            read(coordinates, space, time_lines(time, times)) for space, time in zip(self.space, self.time, strict=True)
+            read(coordinates, space, time_lines(time, moments))
+            for space, time in zip(self.space, self.time, strict=True)
         ]
         displacement: Displacement = self.heads(self.trunk, torch.cat(features, -1))
         return displacement

@@ -17,15 +17,20 @@ class Mlp(nn.Module):
         settings: sizes.
         bounds: lower and upper corner of the box that maps to [-1, 1], world units.
         generator: for the start of the layers.
+        last: where the last frame lies on the network's axis of time, which ends at 1.
     """
 
     bounds: Tensor
 
     def __init__(
-        self, settings: MlpSettings, bounds: Float[Tensor, "2 3"], generator: torch.Generator | None = None
+        self,
+        settings: MlpSettings,
+        bounds: Float[Tensor, "2 3"],
+        generator: torch.Generator | None = None,
+        last: float = 1.0,
     ) -> None:
         super().__init__()
-        self.settings = settings
+        self.settings, self.last = settings, last
         self.register_buffer("bounds", bounds)
         self.first = nn.Linear(4 * (1 + 2 * settings.frequencies), settings.hidden)
         self.second = nn.Linear(settings.hidden, settings.hidden)
@@ -38,7 +43,7 @@ class Mlp(nn.Module):
         """What to add at every time in [0, 1]."""
         low, high = self.bounds
         place = ((means - low) / (high - low) * 2 - 1).expand(len(times), -1, -1)
-        time = (2 * times - 1)[:, None, None].expand(-1, len(means), 1)
+        time = (2 * self.last * times - 1)[:, None, None].expand(-1, len(means), 1)
         encoded = encode(torch.cat([place, time], -1), self.settings.frequencies)
         displacement: Displacement = self.heads(self.second, functional.relu(self.first(encoded)))
         return displacement

@@ -30,7 +30,7 @@ def draw_picture(
         text: what to draw; `settings.suffix` is added.
         settings: how.
         generator: of the noise, on the processor: then devices agree.
-        device: where the networks lie; on a processor they are fp32 whatever the settings say.
+        device: where the networks work; on a processor they are fp32 whatever the settings say.
         progress: told how many denoising steps are done.
 
     Returns:
@@ -40,11 +40,14 @@ def draw_picture(
         BadInput: the folder holds no such pipeline, or what came out is no picture.
         BackendUnavailable: diffusers or transformers is not installed.
     """
-    dtype = dtype_on(device, settings.precision)
-    pipeline = _load(model, dtype).to(device)
+    pipeline = _load(model, dtype_on(device, settings.precision))
     for part in pipeline.components.values():
         if isinstance(part, nn.Module):
             counted(part)
+    if settings.low_memory and device.type != "cpu":
+        pipeline.enable_model_cpu_offload(device=device)
+    else:
+        pipeline.to(device)
     pipeline.set_progress_bar_config(disable=True)
     options = {
         "num_inference_steps": settings.steps,

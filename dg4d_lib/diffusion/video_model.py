@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import conv2d, interpolate, pad
 
 from dg4d_lib.diffusion.batching import MicroBatches
@@ -76,7 +76,13 @@ class VideoModel:
     def __init__(
         self, unet: Any, vae: Any, image_encoder: Any, settings: VideoModelSettings, device: torch.device
     ) -> None:
-        """Take networks; with `settings.low_memory` each is on the device only while it works."""
+        """Take networks; with `settings.low_memory` each is on the device only while it works.
+
+        An encoder that overflows in half precision becomes float32 once and for all; the decoder stays as it is.
+        """
+        if vae.config.force_upcast and vae.dtype == torch.float16:
+            for part in (vae.encoder, vae.quant_conv):
+                part.to(torch.float32)
         self.unet, self.vae, self.image_encoder = unet, vae, image_encoder
         self.settings, self.device = settings, device
         self._videos = MicroBatches("videos of the video model", settings.videos_at_once)
@@ -146,7 +152,7 @@ class VideoModel:
     def decode(self, latents: Float[Tensor, "t c i j"]) -> Float[Tensor, "t h w 3"]:
         """The pictures of scaled latents, in [0, 1], a few frames at a time."""
         with self._awake(self.vae) as vae:
-            inside = (latents / vae.config.scaling_factor).to(self.device, vae.dtype)
+            inside = (latents / vae.config.scaling_factor).to(self.device, _dtype(vae.decoder))
             pictures = self._frames.run(
                 lambda part: vae.decode(inside[part], num_frames=len(inside[part])).sample, len(inside)
             )
@@ -192,17 +198,11 @@ class VideoModel:
         return without + guidance.to(latents)[:, None, None, None] * (informed - without)
 
     def _mode(self, pictures: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c i j"]:
-        """Latents of pictures in [-1, 1]; in float32 where half precision overflows."""
+        """Latents of pictures in [-1, 1]."""
         with self._awake(self.vae) as vae:
-            dtype = vae.dtype
-            careful = dtype == torch.float16 and vae.config.force_upcast
-            if careful:
-                vae.to(torch.float32)
-            seen = pictures.to(self.device, vae.dtype)
-            latents = self._frames.run(lambda part: vae.encode(seen[part]).latent_dist.mode(), len(seen))
-            if careful:
-                vae.to(dtype)
-        return torch.cat(latents).to(_wide(dtype))
+            seen = pictures.to(self.device, _dtype(vae.encoder))
+            latents = torch.cat(self._frames.run(lambda part: vae.encode(seen[part]).latent_dist.mode(), len(seen)))
+        return latents.to(_wide(latents.dtype))
 
     @contextmanager
     def _awake(self, part: Any) -> Iterator[Any]:
@@ -214,6 +214,11 @@ class VideoModel:
             yield part
         finally:
             part.to("cpu")
+
+
+def _dtype(part: nn.Module) -> torch.dtype:
+    """What a part of a network computes in."""
+    return next(part.parameters()).dtype
 
 
 def _wide(dtype: torch.dtype) -> torch.dtype:

@@ -5,21 +5,22 @@ from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.cameras.viewpoints import random_orbit
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.deformation.rigidity import neighborhoods, rigidity
 from dg4d_lib.fitting.losses import WHITE, check_finite, reference_loss, resized
-from dg4d_lib.fitting.schedules import size_of
+from dg4d_lib.fitting.schedules import log_linear, size_of
+from dg4d_lib.fitting.static import rates
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.interface import GuidancePrior, View, ring_of
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MotionSettings
 from dg4d_lib.video.driving import DrivingVideo
 
-ADVICE = "lower motion.network_rate and motion.plane_rate or the weights"
+ADVICE = "lower the learning rates (motion.*_rate) or the weights"
 Report = Callable[[int, dict[str, float]], None]
 
 
@@ -33,11 +34,11 @@ def fit_motion(
     generator: torch.Generator,
     report: Report = lambda iteration, values: None,
     input_camera: OrbitCamera | None = None,
-) -> None:
-    """Fit `deformation` in place; the static Gaussians stay frozen.
+) -> Gaussians:
+    """Fit `deformation` in place, and with `settings.fine_tune` the Gaussians at rest with it.
 
     Args:
-        gaussians: the canonical cloud; the fit runs on its device.
+        gaussians: the canonical cloud; the fit runs on its device. Neither it nor its density changes.
         deformation: what is fitted, the identity at the start; on the same device.
         video: what the input camera sees.
         prior: judges every frame from random views.
@@ -47,27 +48,37 @@ def fit_motion(
         report: called after every iteration with (iterations done, named losses).
         input_camera: where the video was taken from; the default is azimuth and elevation 0.
 
+    Returns:
+        The cloud that `deformation` moves: the one that was given, or with `settings.fine_tune` a better one.
+
     Raises:
         FitDiverged: the loss became non-finite.
     """
     camera = replace(input_camera or OrbitCamera(), width=settings.reference_size, height=settings.reference_size)
     device = gaussians.means.device
-    color, alpha = resized(torch.cat([video.frames, video.coverage], -1).to(device), settings.reference_size)
+    pictures = resized(torch.cat([video.frames, video.coverage], -1).to(device), settings.reference_size)
+    color, alpha = (picture.permute(0, 3, 1, 2) for picture in pictures)  # so that chosen ones lie plane by plane too
     times = video.times.to(device)
     white = torch.tensor(WHITE, device=device)
-    gaussians = gaussians.detach()
-    adam = torch.optim.Adam(_groups(deformation, settings), betas=(0.9, 0.999), eps=1e-15, fused=True)
+    gaussians, groups = gaussians.detach(), _groups(deformation, settings)
+    if settings.fine_tune:
+        gaussians = Gaussians(**{name: nn.Parameter(value.clone()) for name, value in vars(gaussians).items()})
+        of_cloud = [{"params": getattr(gaussians, name), "lr": rate} for name, rate in rates(settings).items()]
+        groups = [*of_cloud, *groups]
+    adam = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15, fused=True)
     neighbors = neighborhoods(gaussians.means) if settings.rigidity_weight else None
     for step in range(1, settings.iterations + 1):
         progress = step / settings.iterations
+        if settings.fine_tune:
+            adam.param_groups[0]["lr"] = log_linear(settings.mean_rate, settings.mean_rate_end, progress)
         frames = choose_frames(len(video), settings.frames_per_iteration, generator)
         moved = deformation.displace(gaussians.means, times[frames]).apply(gaussians)
 
         rendering = rasterize(moved, [camera] * len(frames), white)
         reference = reference_loss(
             rendering,
-            color[frames],
-            alpha[frames],
+            color[frames].permute(0, 2, 3, 1),
+            alpha[frames].permute(0, 2, 3, 1),
             settings.color_weight,
             settings.alpha_weight,
             settings.ssim_weight,
@@ -87,10 +98,11 @@ def fit_motion(
         check_finite("fit_motion", "loss", [loss], moment, ADVICE, gaussians)
         adam.zero_grad(set_to_none=True)
         loss.backward()
-        slopes = [parameter.grad for parameter in deformation.parameters()]
+        slopes = [parameter.grad for group in adam.param_groups for parameter in group["params"]]
         check_finite("fit_motion", "gradient", slopes, moment, ADVICE, gaussians)
         adam.step()
         report(step, {"loss": loss.item(), "reference": reference.item(), "guidance": guidance.item()})
+    return gaussians.detach()
 
 
 def choose_frames(total: int, count: int, generator: torch.Generator) -> Int[Tensor, " k"]:

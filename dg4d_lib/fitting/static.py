@@ -15,7 +15,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.growth import Grown, ScreenGradients, grow, prune, reset_opacity
 from dg4d_lib.guidance.interface import GuidancePrior, View, ring_of
 from dg4d_lib.rasterizer.interface import Rasterizer
-from dg4d_lib.settings import StaticSettings
+from dg4d_lib.settings import MotionSettings, StaticSettings
 
 Report = Callable[[int, dict[str, float]], None]
 ADVICE = "lower the learning rates (static.*_rate) or the weights"
@@ -103,7 +103,8 @@ def fit_gaussians(
             size = size_of(settings.ladder, progress)
             views = [View(c) for c in viewpoints(prior, settings, size, generator)]
             offsets.append(torch.zeros(len(views), len(gaussians), 2, device=device, requires_grad=True))
-            rendering = rasterize(gaussians, [view.camera for view in views], white, offsets[1])
+            behind = background(settings, generator).to(device)
+            rendering = rasterize(gaussians, [view.camera for view in views], behind, offsets[1])
             seen.append((rendering.visible, size))
             guidance = prior.loss(rendering.color, rendering.alpha, views, progress, generator)
             loss = loss + settings.guidance_weight * guidance
@@ -140,8 +141,14 @@ def fit_gaussians(
     return cloud.gaussians.detach()
 
 
-def rates(settings: StaticSettings) -> dict[str, float]:
-    """Learning rate of every field of the cloud at the start; the means come first."""
+def background(settings: StaticSettings, generator: torch.Generator) -> Float[Tensor, " 3"]:
+    """What is behind the random views of one iteration; the generator is touched only where it is random."""
+    black = settings.background == "random" and float(torch.rand((), generator=generator)) < 0.5
+    return torch.zeros(3) if black else torch.tensor(WHITE)
+
+
+def rates(settings: StaticSettings | MotionSettings) -> dict[str, float]:
+    """Learning rate of every field of the cloud at the start of a stage; the means come first."""
     return {
         "means": settings.mean_rate,
         "harmonics": settings.color_rate,

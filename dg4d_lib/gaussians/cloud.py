@@ -65,7 +65,9 @@ class Gaussians:
         return Gaussians(**{name: value.to(target) for name, value in vars(self).items()})
 
     def states(self, rows: Sequence[int] | Int[Tensor, " m"]) -> "Gaussians":
-        """Some states of a batch, in this order."""
+        """Some states of a batch, in this order; not copied if they are all, each in its place."""
+        if torch.as_tensor(rows).tolist() == list(range(len(self.means))):
+            return self
         return replace(self, means=self.means[rows], log_scales=self.log_scales[rows], quats=self.quats[rows])
 
     def at(self, frame: int) -> "Gaussians":

@@ -29,12 +29,11 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
     """Write one cloud (no leading batch, color of degree 0); equal clouds give equal bytes.
 
     Raises:
-        BadInput: the cloud carries a batch or color of a higher degree, which this layout would lose.
+        BadInput: the cloud carries a batch or color of a higher degree, which this layout would lose, or numbers that
+            are not finite.
         OSError: the file could not be written.
     """
-    if gaussians.means.dim() != 2 or gaussians.harmonics.shape[1] != 1:
-        shapes = f"means {tuple(gaussians.means.shape)}, harmonics {tuple(gaussians.harmonics.shape)}"
-        raise BadInput(f"a PLY holds one state with one harmonics base: means n 3, harmonics n 1 3; given {shapes}")
+    check_storable(gaussians, "a PLY")
     columns = (
         gaussians.means,
         torch.zeros_like(gaussians.means),
@@ -79,6 +78,24 @@ def read_ply(path: Path) -> Gaussians:
         raise BadInput(f"{path.name} holds numbers that are not finite; make it again")
     means, log_scales, quats, opacity, colors = parts
     return Gaussians(means, log_scales, quats, opacity[:, 0], colors[:, None])
+
+
+def check_storable(gaussians: Gaussians, form: str) -> None:
+    """Whether a file of one state and constant colors can hold this cloud.
+
+    Args:
+        gaussians: what is to be written.
+        form: what the file is called in the message.
+
+    Raises:
+        BadInput: the cloud carries a batch, color of a higher degree, or numbers that are not finite.
+    """
+    if gaussians.means.dim() != 2 or gaussians.harmonics.shape[1] != 1:
+        shapes = f"means {tuple(gaussians.means.shape)}, harmonics {tuple(gaussians.harmonics.shape)}"
+        raise BadInput(f"{form} holds one state with one harmonics base: means n 3, harmonics n 1 3; given {shapes}")
+    broken = [name for name, values in vars(gaussians).items() if not bool(values.isfinite().all())]
+    if broken:
+        raise BadInput(f"{form} holds finite numbers; given others in {', '.join(broken)}; fit the Gaussians again")
 
 
 def _header(name: str, beginning: bytes) -> tuple[int, np.dtype[np.void], int]:

@@ -1,16 +1,19 @@
-"""A bank of true pictures: what an ideal prior would say. For tests and benchmarks."""
+"""A bank of true pictures: what an ideal prior would say, and what an imperfect one. For tests and benchmarks."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from scipy.ndimage import gaussian_filter, shift
 from torch import Tensor
 from torch.nn import functional
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.interface import View
+from dg4d_lib.settings import OraclePriorSettings
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,47 @@ class Bank:
             both = functional.interpolate(both, size, mode="bilinear", antialias=True, align_corners=False)
         both = both.permute(0, 2, 3, 1)
         return both[..., :3], both[..., 3:]
+
+
+def imperfect(bank: Bank, settings: OraclePriorSettings, generator: torch.Generator) -> Bank:
+    """What a prior says that knows less: blurred, a little beside the view, and in every frame otherwise.
+
+    Everything is drawn once, so that the same question always has the same answer.
+
+    Args:
+        bank: the truth.
+        settings: how imperfect; with zeros the truth comes back.
+        generator: of gains, shifts and errors.
+    """
+    pictures, cameras = bank.pictures, bank.cameras
+    if settings.blur or settings.shift:
+        shifts = settings.shift * torch.randn(*pictures.shape[:2], 2, generator=generator)
+        moved = [_misplaced(view, settings.blur, shift) for view, shift in zip(pictures, shifts, strict=True)]
+        pictures = torch.stack(moved)
+    if settings.color_gain:
+        gains = torch.exp(settings.color_gain * torch.randn(*pictures.shape[:2], 1, 1, 3, generator=generator))
+        tinted = [(view[..., :3] * gain).clamp(0, 255).round() for view, gain in zip(pictures, gains, strict=True)]
+        pictures = torch.cat([torch.stack(tinted).to(torch.uint8), pictures[..., 3:]], -1)
+    if settings.pose_deg:
+        errors = (settings.pose_deg * torch.randn(len(cameras), 2, generator=generator)).tolist()
+        cameras = tuple(
+            replace(camera, elevation_deg=camera.elevation_deg + up, azimuth_deg=camera.azimuth_deg + around)
+            for camera, (up, around) in zip(cameras, errors, strict=True)
+        )
+    return Bank(cameras, bank.frames, pictures)
+
+
+def _misplaced(
+    pictures: UInt8[Tensor, "t h w 4"], sigma: float, shifts: Float[Tensor, "t 2"]
+) -> UInt8[Tensor, "t h w 4"]:
+    """Cut-outs out of focus and out of place; nothing of the color behind them comes in."""
+    straight = pictures.float() / 255
+    planes = torch.cat([straight[..., :3] * straight[..., 3:], straight[..., 3:]], -1).numpy()
+    planes = gaussian_filter(planes, (0, sigma, sigma, 0), mode="constant")
+    placed = [shift(plane, (*by, 0), order=1) for plane, by in zip(planes, shifts.tolist(), strict=True)]
+    soft = torch.from_numpy(np.stack(placed))
+    color = soft[..., :3] / soft[..., 3:].clamp(min=1e-6)
+    return (torch.cat([color, soft[..., 3:]], -1).clamp(0, 1) * 255).round().to(torch.uint8)
 
 
 def _pose(camera: OrbitCamera) -> tuple[float, float, float]:

@@ -10,6 +10,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -59,14 +60,30 @@ class Scratch:
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray[Any]:
         """An array with arbitrary content."""
-        bytes_needed = int(np.prod(shape)) * np.dtype(dtype).itemsize
-        size = 1 << max(12, (bytes_needed - 1).bit_length())
-        try:
-            memory = _IDLE[size].pop()
-        except IndexError:
-            memory = np.empty(size, np.uint8)
+        memory, array = _take(shape, dtype)
         self._taken.append(memory)
-        return memory[:bytes_needed].view(dtype).reshape(shape)
+        return array
+
+
+def recycled(shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """An array with arbitrary content; its memory goes back when neither it nor a tensor made of it is used any more.
+
+    Its views do not count: they have to go first.
+    """
+    memory, array = _take(shape, np.float32)
+    weakref.finalize(array, _give_back, [memory]).atexit = False
+    return array
+
+
+def _take(shape: tuple[int, ...], dtype: DTypeLike) -> tuple[NDArray[np.uint8], NDArray[Any]]:
+    """Memory from the store, and an array in it."""
+    bytes_needed = prod(shape) * np.dtype(dtype).itemsize
+    size = 1 << max(12, (bytes_needed - 1).bit_length())
+    try:
+        memory = _IDLE[size].pop()
+    except IndexError:
+        memory = np.empty(size, np.uint8)
+    return memory, memory[:bytes_needed].view(dtype).reshape(shape)
 
 
 def _give_back(taken: list[NDArray[np.uint8]]) -> None:

@@ -11,6 +11,7 @@ from functools import partial
 from typing import no_type_check
 
 import numpy as np
+import OpenImageIO as oiio
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from numba import njit
@@ -22,6 +23,7 @@ from torch.nn.functional import max_pool2d, normalize
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import baking_views
+from dg4d_lib.errors import DG4DError
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.kernels.workers import run
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
@@ -37,6 +39,7 @@ LAST_RESORT = 1e-4  # weight of views that are too flat or on an outline: they c
 FLATTEST = 0.05  # cosine below which a view does not count at all
 DEPTH_SLACK = 1.5  # pixels by which a texel's place in a picture is uncertain when its depth is compared
 NEIGHBORS = 4  # seen texels whose colors an unseen one takes
+GUTTER = 2  # texels around charts that repeat their rim: what bilinear reading needs, and the next mip level
 VIEWS_AT_ONCE = 9
 TEXELS_AT_ONCE = 1 << 16
 
@@ -79,7 +82,7 @@ def bake(
         settings: of the mesh.
 
     Returns:
-        Colors in [0, 1] of every texel; texels outside of all charts repeat the nearest one inside.
+        Colors in [0, 1] of every texel; texels outside of all charts go on from those beside them.
     """
     texels = texels_of(vertices, normals, faces, uvs, settings.texture_size)
     size = settings.texture_size
@@ -197,12 +200,21 @@ def _spread(
 
 
 def _padded(colors: Float[Tensor, "p 3"], texels: Texels, size: int) -> Float[Tensor, "h w 3"]:
-    """The texture, every empty texel a copy of the nearest full one."""
-    texture, empty = np.zeros((size, size, 3), np.float32), np.ones((size, size), bool)
-    texture[texels.rows, texels.columns] = colors.numpy()
+    """The texture without holes.
+
+    Empty texels within the gutter of a chart repeat its nearest one, so that nothing bleeds over a seam. Those further
+    away blend what lies around them by push and pull (Gortler et al. 1996, section 3.4): smooth pictures pack well.
+    """
+    texture, empty = np.zeros((size, size, 4), np.float32), np.ones((size, size), bool)
+    texture[texels.rows, texels.columns] = np.pad(colors.numpy(), ((0, 0), (0, 1)), constant_values=1)
     empty[texels.rows, texels.columns] = False
-    rows, columns = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
-    return torch.from_numpy(texture[rows, columns])
+    distance, (rows, columns) = ndimage.distance_transform_edt(empty, return_indices=True)
+    texture = np.where((distance <= GUTTER)[..., None], texture[rows, columns], 0)
+    filled = oiio.ImageBufAlgo.fillholes_pushpull(oiio.ImageBuf(texture))
+    if filled.has_error:
+        raise DG4DError(f"the texture could not be filled: {filled.geterror()}; lower mesh.texture_size")
+    pixels = np.asarray(filled.get_pixels(oiio.FLOAT))
+    return torch.from_numpy((pixels[..., :3] / pixels[..., 3:]).clip(0, 1))
 
 
 @njit(cache=True, nogil=True)

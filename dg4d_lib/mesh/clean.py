@@ -14,18 +14,22 @@ from scipy.sparse.csgraph import connected_components
 
 from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
 from dg4d_lib.mesh.apart import Arrays, run_apart, serve
+from dg4d_lib.mesh.check import outward
 from dg4d_lib.settings import MeshSettings
 
 MERGE = 1e-4  # box units: vertices closer than this become one
 SMOOTHING = 10  # Taubin steps that take away the stairs of marching cubes and keep the volume
 REMESHING = 3  # rounds of isotropic remeshing
 MAX_HOLE = 100  # edges of a hole that is closed
+FIRST_CELL = 0.5  # edges: what is finer is lost where too many handles keep a mesh from being thinned out
+CELL_GROWTH = 1.25  # until there are few enough faces
 FILTERS = (
     "meshing_merge_close_vertices",
     "meshing_remove_duplicate_faces",
     "meshing_remove_null_faces",
     "apply_coord_taubin_smoothing",
     "meshing_isotropic_explicit_remeshing",
+    "generate_resampled_uniform_mesh",
     "meshing_decimation_quadric_edge_collapse",
     "meshing_repair_non_manifold_edges",
     "meshing_repair_non_manifold_vertices",
@@ -41,6 +45,7 @@ def clean(
     """Merge, drop specks, smooth the stairs away, remesh evenly, repair, close holes, thin out; always the same result.
 
     The edges become `settings.edge_length` long, or longer where that would give more than `settings.max_faces` faces.
+    There are never more than that; where handles are in the way, the surface is sampled again, more and more coarsely.
 
     Args:
         vertices: world units.
@@ -67,7 +72,7 @@ def clean(
     vertices, faces = drop_small_components(cleaned["vertices"], cleaned["faces"], settings.min_component)
     if len(faces) == 0:
         raise DG4DError("mesh cleaning left no faces; raise mesh.grid or lower mesh.edge_length")
-    return (vertices * unit).astype(np.float32), faces.astype(np.int32)
+    return (vertices * unit).astype(np.float32), outward(vertices, faces).astype(np.int32)
 
 
 def drop_small_components(
@@ -112,6 +117,21 @@ def _clean_here(arrays: Arrays) -> Arrays:
     ms.meshing_isotropic_explicit_remeshing(
         iterations=REMESHING, targetlen=pymeshlab.PureValue(length), selectedonly=False, checksurfdist=False
     )
+    whole, cell = ms.current_mesh_id(), FIRST_CELL * length
+    _thin_out(ms, max_faces)
+    while ms.current_mesh().face_number() > max_faces:
+        ms.set_current_mesh(whole)
+        ms.generate_resampled_uniform_mesh(cellsize=pymeshlab.PureValue(cell), offset=pymeshlab.PureValue(0))
+        _thin_out(ms, max_faces)
+        cell *= CELL_GROWTH
+    ms.meshing_re_orient_faces_coherently()
+    ms.meshing_remove_unreferenced_vertices()
+    result = ms.current_mesh()
+    return {"vertices": result.vertex_matrix(), "faces": result.face_matrix().astype(np.int32)}
+
+
+def _thin_out(ms: Any, max_faces: int) -> None:
+    """Fewer faces, as far as the topology allows, and no flaws that come of it."""
     if ms.current_mesh().face_number() > max_faces:
         ms.meshing_decimation_quadric_edge_collapse(
             targetfacenum=max_faces, preservenormal=True, preservetopology=True, selected=False
@@ -119,10 +139,6 @@ def _clean_here(arrays: Arrays) -> Arrays:
     ms.meshing_repair_non_manifold_edges(method="Remove Faces")
     ms.meshing_repair_non_manifold_vertices()
     ms.meshing_close_holes(maxholesize=MAX_HOLE, newfaceselected=False, selfintersection=False, selected=False)
-    ms.meshing_re_orient_faces_coherently()
-    ms.meshing_remove_unreferenced_vertices()
-    result = ms.current_mesh()
-    return {"vertices": result.vertex_matrix(), "faces": result.face_matrix().astype(np.int32)}
 
 
 def _unavailable(reason: str) -> BackendUnavailable:

@@ -86,21 +86,35 @@ def _carriers(points: Float[Tensor, "v 3"], rest: Gaussians) -> tuple[Int[Tensor
 @njit(cache=True, nogil=True)
 @no_type_check
 def _keep_company(carriers, weights, points, rest, moved):
-    """Lower the weights of carriers whose distance to the main one changes over time; rows sum to 1 again."""
+    """Keep to the largest company: carriers whose distance to its middle one changes over time carry less.
+
+    The middle one is the carrier that most weight goes along with. Rows of weights sum to 1 again.
+    """
+    count = carriers.shape[1]
+    agree = np.empty((count, count))
     for v in range(carriers.shape[0]):
-        main = carriers[v, np.argmax(weights[v])]
         reach2 = 1e-18
         for i in carriers[v]:
             reach2 = max(reach2, np.square(rest[i] - points[v]).sum())
-        for k in range(carriers.shape[1]):
-            i, change = carriers[v, k], 0.0
-            before = np.sqrt(np.square(rest[i] - rest[main]).sum())
-            for t in range(moved.shape[0]):
-                after = 0.0
-                for a in range(3):
-                    after += (moved[t, i, a] - moved[t, main, a]) ** 2
-                change = max(change, abs(np.sqrt(after) - before))
-            weights[v, k] *= np.exp(-0.5 * change * change / (PARTING * PARTING * reach2))
+        agree[:] = 1.0
+        for k in range(count):
+            for m in range(k):
+                i, j, change = carriers[v, k], carriers[v, m], 0.0
+                before = np.sqrt(np.square(rest[i] - rest[j]).sum())
+                for t in range(moved.shape[0]):
+                    after = 0.0
+                    for a in range(3):
+                        after += (moved[t, i, a] - moved[t, j, a]) ** 2
+                    change = max(change, abs(np.sqrt(after) - before))
+                agree[k, m] = agree[m, k] = np.exp(-0.5 * change * change / (PARTING * PARTING * reach2))
+        most, middle = -1.0, 0
+        for m in range(count):
+            company = 0.0
+            for k in range(count):
+                company += weights[v, k] * agree[m, k]
+            if company > most:
+                most, middle = company, m
+        weights[v] *= agree[middle]
         weights[v] /= weights[v].sum()
 
 

@@ -33,3 +33,11 @@ def iou(
     ours, theirs = coverage > threshold, truth > threshold
     both, either = (ours & theirs).sum((1, 2, 3)), (ours | theirs).sum((1, 2, 3))
     return torch.where(either > 0, both / either.clamp_min(1), 1.0).to(coverage)
+
+
+def resized(images: Float[Tensor, "b h w c"], size: int) -> Float[Tensor, "b size size c"]:
+    """Square pictures at another size, bicubic and without aliasing, within [0, 1]: as Pillow's `resize` does it."""
+    planes = torch.nn.functional.interpolate(
+        images.movedim(-1, 1), (size, size), mode="bicubic", antialias=True, align_corners=False
+    )
+    return planes.clamp(0, 1).movedim(1, -1)

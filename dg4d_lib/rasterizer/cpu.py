@@ -8,7 +8,6 @@ sum has one fixed order, so the bytes of the result depend on neither the thread
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from math import log
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from torch.nn.functional import logsigmoid
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.kernels.workers import Scratch, ranges, run
+from dg4d_lib.kernels.workers import Scratch, ranges, recycled, run
 from dg4d_lib.rasterizer.cpu_bins import TILE, bin_by_tile
 from dg4d_lib.rasterizer.cpu_blend import PLANE
 from dg4d_lib.rasterizer.cpu_project import CAMERA, RECORD, project, unproject
@@ -52,24 +51,25 @@ def rasterize(
     require_finite(gaussians)
     if gaussians.means.device.type != "cpu":
         raise BadInput(f"rasterizer 'cpu' needs tensors on the cpu; given {gaussians.means.device}; move them there")
-    inputs = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacity_logits, gaussians.colors)
+    log_opacities = logsigmoid(gaussians.opacity_logits)
+    inputs = (gaussians.means, gaussians.quats, gaussians.log_scales, log_opacities, gaussians.harmonics)
     color, alpha, depth, visible = _Rasterize.apply(
         *(value.float() for value in inputs),
         None if screen_offsets is None else screen_offsets.float(),
-        torch.stack([packed(camera) for camera in cameras]),
-        background.detach().float(),
+        np.stack([packed(camera) for camera in cameras]),
+        background.detach().float().contiguous().numpy(),
         (height, width),
     )
-    color, alpha, depth = (plane.permute(0, 2, 3, 1).to(gaussians.means.dtype) for plane in (color, alpha, depth))
+    color, alpha, depth = (picture.to(gaussians.means.dtype) for picture in (color, alpha, depth))
     return Rendering(color, alpha, depth, visible)
 
 
-def packed(camera: OrbitCamera) -> Float[Tensor, " c"]:
+def packed(camera: OrbitCamera) -> Float[Array, " c"]:
     """A camera as the kernels read it."""
-    pose = camera.world_to_camera()
+    pose = camera.world_to_camera().numpy()
     tan_x, tan_y = camera.tan_half_fov
     lens = (camera.focal, camera.width / 2, camera.height / 2, FRUSTUM_MARGIN * tan_x, FRUSTUM_MARGIN * tan_y)
-    packed = torch.cat((pose[:3, :3].flatten(), pose[:3, 3], pose.new_tensor(lens))).float()
+    packed = np.array([*pose[:3, :3].flat, *pose[:3, 3], *lens], np.float32)
     assert len(packed) == CAMERA
     return packed
 
@@ -81,11 +81,11 @@ class _Clouds:
     means: Array
     quats: Array
     scales: Array
-    log_opacities: Array  # to base 2
-    colors: Array
+    log_opacities: Array
+    harmonics: Array
 
     def __len__(self) -> int:
-        return len(self.colors)
+        return len(self.harmonics)
 
     def state(self, view: int) -> tuple[Array, Array, Array]:
         """Means, quats and scales of a view."""
@@ -155,8 +155,8 @@ class _Pictures:
     def _project(self, clouds: _Clouds, view: int, start: int, stop: int) -> None:
         means, quats, scales = clouds.state(view)
         records, keys = self.records[view], self.keys[view]
-        opacities, colors, camera = clouds.log_opacities, clouds.colors, self.cameras[view]
-        project(means, quats, scales, opacities, colors, camera, *self.size, records, keys, start, stop)
+        shared = (clouds.log_opacities, clouds.harmonics[:, 0], self.cameras[view])
+        project(means, quats, scales, *shared, *self.size, records, keys, start, stop)
 
     def _bin(self, view: int) -> None:
         self.bins[view] = bin_by_tile(self.records[view], self.keys[view], self.across, self.down, self.scratch)
@@ -179,11 +179,11 @@ class _Gradients:
 
     def __post_init__(self) -> None:
         clouds = self.clouds
-        self.means, self.quats, self.log_scales, self.log_opacities, self.colors = (
-            np.zeros_like(value)
-            for value in (clouds.means, clouds.quats, clouds.scales, clouds.log_opacities, clouds.colors)
+        self.means, self.quats, self.log_scales, self.log_opacities, self.harmonics = (
+            recycled(value.shape)
+            for value in (clouds.means, clouds.quats, clouds.scales, clouds.log_opacities, clouds.harmonics)
         )
-        self.centers = np.zeros((len(self.pictures.cameras), len(clouds), 2), np.float32)
+        self.centers = recycled((len(self.pictures.cameras), len(clouds), 2))
 
     def collect(self) -> None:
         """Fill the gradients, some views at a time to bound the memory; the views are summed in their order."""
@@ -223,12 +223,15 @@ class _Gradients:
     def _unproject(self, group: range, moments: list[Array], start: int, stop: int) -> None:
         clouds, pictures = self.clouds, self.pictures
         for view, sums in zip(group, moments, strict=True):
-            means, quats, scales = clouds.state(view)
-            gradients = (self.means, self.quats, self.log_scales)
-            own = gradients if clouds.means.ndim == 2 else [gradient[view] for gradient in gradients]
-            shared = (self.log_opacities, self.colors, self.centers[view])
-            seen = (pictures.cameras[view], pictures.keys[view], sums)
-            unproject(means, quats, scales, *seen, *own, *shared, start, stop)
+            own = clouds.means.ndim == 3
+            state = [gradient[view] if own else gradient for gradient in (self.means, self.quats, self.log_scales)]
+            unwritten = [self.centers[view], *(state if own or view == 0 else ())]
+            unwritten += [self.log_opacities, self.harmonics] if view == 0 else []
+            for gradient in unwritten:  # cleared here, where they are about to be added to, not all at once
+                gradient[start:stop] = 0
+            shared = (self.log_opacities, self.harmonics[:, 0], self.centers[view])
+            seen = (clouds.harmonics[:, 0], pictures.cameras[view], pictures.keys[view], sums)
+            unproject(*clouds.state(view), *seen, *state, *shared, start, stop)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -236,27 +239,27 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        means, quats, log_scales, logits, colors, offsets, cameras, background, size = inputs
-        tensors = (means, quats, log_scales.exp(), logsigmoid(logits) / log(2), colors)
-        clouds = _Clouds(*(tensor.detach().contiguous().numpy() for tensor in tensors))
-        pictures = _Pictures(cameras.numpy(), background.contiguous().numpy(), size, len(clouds))
-        color, alpha, depth = pictures.draw(clouds)
+        *parameters, offsets, cameras, background, size = inputs
+        means, quats, log_scales, log_opacities, harmonics = (
+            parameter.detach().contiguous().numpy() for parameter in parameters
+        )
+        pictures = _Pictures(cameras, background, size, len(harmonics))
+        scales = pictures.scratch.empty(log_scales.shape)
+        with np.errstate(over="ignore"):  # by NumPy, for torch would wake its threads for so few numbers
+            np.exp(log_scales, out=scales)
+        clouds = _Clouds(means, quats, scales, log_opacities, harmonics)
+        color, alpha, depth = (picture.permute(0, 2, 3, 1) for picture in pictures.draw(clouds))
         visible = torch.from_numpy(pictures.keys > 0)
         ctx.mark_non_differentiable(visible)
-        ctx.clouds, ctx.pictures, ctx.logits, ctx.offsets = clouds, pictures, logits.detach(), offsets is not None
+        ctx.clouds, ctx.pictures, ctx.offsets = clouds, pictures, offsets is not None
         return color, alpha, depth, visible
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *incoming: Tensor) -> tuple[Any, ...]:
-        planes = [gradient.contiguous().numpy() for gradient in incoming[:3]]
+        planes = [gradient.permute(0, 3, 1, 2).contiguous().numpy() for gradient in incoming[:3]]
         found = _Gradients(ctx.clouds, ctx.pictures, *planes)
         found.collect()
-        means, quats, log_scales, log_opacities, colors, centers = (
-            torch.from_numpy(gradient)
-            for gradient in (
-                found.means, found.quats, found.log_scales, found.log_opacities, found.colors, found.centers
-            )
-        )  # fmt: skip
-        logits = log_opacities * (-ctx.logits).sigmoid()  # d log o / d logit = 1 - o, exact for o near one too
-        return means, quats, log_scales, logits, colors, centers if ctx.offsets else None, None, None, None
+        arrays = (found.means, found.quats, found.log_scales, found.log_opacities, found.harmonics, found.centers)
+        *parameters, centers = (torch.from_numpy(array) for array in arrays)
+        return *parameters, centers if ctx.offsets else None, None, None, None

@@ -12,6 +12,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
+from dg4d_lib.geometry.harmonics import C0
 from dg4d_lib.kernels.vectors import INLINE, KERNEL
 from dg4d_lib.rasterizer.interface import BLUR, MIN_ALPHA, NEAR
 
@@ -31,20 +32,22 @@ MOMENTS = DEPTH + 1
 CAMERA = 17  # floats: rotation by rows, translation, focal, center x and y, limit of |x/z| and of |y/z|
 HIDDEN = np.float32(-1)  # key of a Gaussian that touches no pixel
 
-_STATE = 10  # floats that move a Gaussian: place, quaternion, scale
+_STATE = 13  # floats of a Gaussian: place, quaternion, scale, the coefficients of its constant color
 _BLOCK = 64  # Gaussians computed together, always as many: their fields lie side by side, so the compiler makes vectors
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _LOG2_E, _LN_2 = np.float32(1 / log(2)), np.float32(log(2))
 _LEAST_LOG_ALPHA = np.float32(log(MIN_ALPHA) / log(2))
 _BLUR, _NEAR = np.float32(BLUR), np.float32(NEAR)
+_C0 = np.float32(C0)
+_ROUNDING = np.float32(1e-6)  # of colors: what lies so close to a bound of the clamp counts as inside
 _LARGEST = np.float32(1e30)  # a determinant beyond is an overflow
 
 
 @njit(**KERNEL)
 @no_type_check
-def project(means, quats, scales, log_opacities, colors, camera, height, width, records, keys, start, stop):
-    """Fill records, and keys with camera z or HIDDEN, of Gaussians start..stop; opacities are logarithms to base 2.
+def project(means, quats, scales, log_opacities, coefficients, camera, height, width, records, keys, start, stop):
+    """Fill records, and keys with camera z or HIDDEN, of Gaussians start..stop; coefficients are of the constant color.
 
     The bound where alpha falls to MIN_ALPHA lies within MAX_SIGMA for every opacity up to one, so it alone counts.
     """
@@ -53,12 +56,9 @@ def project(means, quats, scales, log_opacities, colors, camera, height, width, 
     state, record = np.empty((_STATE, _BLOCK), np.float32), np.empty((RECORD, _BLOCK), np.float32)
     for first in range(start, stop, _BLOCK):
         count = min(_BLOCK, stop - first)
-        _gather(means, quats, scales, first, count, state)
+        _gather(means, quats, scales, coefficients, first, count, state)
         for k in range(count):
-            record[LOG_OPACITY, k] = log_opacities[first + k]
-            record[RED, k] = colors[first + k, 0]
-            record[GREEN, k] = colors[first + k, 1]
-            record[BLUE, k] = colors[first + k, 2]
+            record[LOG_OPACITY, k] = _LOG2_E * log_opacities[first + k]
         for k in range(_BLOCK):
             x, y, z = _to_camera(rotation, translation, state[0, k], state[1, k], state[2, k])
             turn, _, _ = _turn(state[3, k], state[4, k], state[5, k], state[6, k])
@@ -79,6 +79,9 @@ def project(means, quats, scales, log_opacities, colors, camera, height, width, 
             record[WHITEN_A, k] = a
             record[WHITEN_B, k] = b
             record[WHITEN_C, k] = c
+            record[RED, k] = min(max(_color(state[10, k]), _ZERO), _ONE)
+            record[GREEN, k] = min(max(_color(state[11, k]), _ZERO), _ONE)
+            record[BLUE, k] = min(max(_color(state[12, k]), _ZERO), _ONE)
             record[DEPTH, k] = z
             record[ROW_SLOPE, k] = xy / yy
             record[ROW_REACH, k] = reach * inverse_a2
@@ -95,8 +98,8 @@ def project(means, quats, scales, log_opacities, colors, camera, height, width, 
 @njit(**KERNEL)
 @no_type_check
 def unproject(
-    means, quats, scales, camera, keys, moments,
-    grad_means, grad_quats, grad_log_scales, grad_log_opacities, grad_colors, grad_centers, start, stop,
+    means, quats, scales, coefficients, camera, keys, moments,
+    grad_means, grad_quats, grad_log_scales, grad_log_opacities, grad_coefficients, grad_centers, start, stop,
 ):  # fmt: skip
     """Add what Gaussians start..stop get from the gradients of their records in one view."""
     rotation, translation, focal, _, _, limit_x, limit_y = _lens(camera)
@@ -105,7 +108,7 @@ def unproject(
     center, gradient = np.empty((2, _BLOCK), np.float32), np.empty((_STATE, _BLOCK), np.float32)
     for first in range(start, stop, _BLOCK):
         count = min(_BLOCK, stop - first)
-        _gather(means, quats, scales, first, count, state)
+        _gather(means, quats, scales, coefficients, first, count, state)
         for k in range(count):
             for field in range(MOMENTS):
                 moment[field, k] = moments[first + k, field]
@@ -141,13 +144,16 @@ def unproject(
             gradient[7, k] = whitened[0] * d_whitened[0] + whitened[3] * d_whitened[3]
             gradient[8, k] = whitened[1] * d_whitened[1] + whitened[4] * d_whitened[4]
             gradient[9, k] = whitened[2] * d_whitened[2] + whitened[5] * d_whitened[5]
+            gradient[10, k] = _color_gradient(state[10, k], moment[RED, k])
+            gradient[11, k] = _color_gradient(state[11, k], moment[GREEN, k])
+            gradient[12, k] = _color_gradient(state[12, k], moment[BLUE, k])
         for k in range(count):
             i = first + k
             if keys[i] > _ZERO:
                 for axis in range(3):
                     grad_means[i, axis] += gradient[axis, k]
                     grad_log_scales[i, axis] += gradient[7 + axis, k]
-                    grad_colors[i, axis] += moment[RED + axis, k]
+                    grad_coefficients[i, axis] += gradient[10 + axis, k]
                 for axis in range(4):
                     grad_quats[i, axis] += gradient[3 + axis, k]
                 for axis in range(2):
@@ -157,14 +163,29 @@ def unproject(
 
 @njit(**INLINE)
 @no_type_check
-def _gather(means, quats, scales, first, count, state):
-    """Place, quaternion and scale of some Gaussians, by fields."""
+def _gather(means, quats, scales, coefficients, first, count, state):
+    """Place, quaternion, scale and coefficients of some Gaussians, by fields."""
     for k in range(count):
         for axis in range(3):
             state[axis, k] = means[first + k, axis]
             state[7 + axis, k] = scales[first + k, axis]
+            state[10 + axis, k] = coefficients[first + k, axis]
         for axis in range(4):
             state[3 + axis, k] = quats[first + k, axis]
+
+
+@njit(**INLINE)
+@no_type_check
+def _color(coefficient):
+    """The constant basis, before it is clamped to [0, 1]."""
+    return _C0 * coefficient + _HALF
+
+
+@njit(**INLINE)
+@no_type_check
+def _color_gradient(coefficient, d_color):
+    """Through the clamp, which holds nothing back at its bounds."""
+    return _C0 * d_color if abs(_color(coefficient) - _HALF) <= _HALF + _ROUNDING else _ZERO
 
 
 @njit(**INLINE)

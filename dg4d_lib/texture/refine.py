@@ -2,11 +2,15 @@
 
 Every iteration looks at all frames twice: from the input view, where the driving video says how they look, and from a
 camera that goes round at constant speed, where a refiner says it. Colors are optimized as logits, the shape stays.
+
+A mesh that is tracked through many frames may get a texture per frame: what a frame adds to the shared texture is
+optimized with it, as color and not as logit. Pictures are linear in colors, so the sum is read part by part, each with
+its own number of texels, and no frame ever needs a texture of full size.
 """
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,13 +22,14 @@ from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.mesh.bake import vertex_normals
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh_rasterizer.texture import Lookup, look_up, read
+from dg4d_lib.mesh_rasterizer.zbuffer import Fragments, rasterize_mesh
 from dg4d_lib.mesh_rasterizer.zbuffer import interpolate as spread
-from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.settings import TextureSettings
 from dg4d_lib.texture.refiner import Refiner
 from dg4d_lib.video.driving import DrivingVideo
 
 DARKEST = 1 / 512  # colors are kept this far from 0 and 1, whose logits are infinite
+STEEPEST = 1 / 4  # slope of a color over its logit, at most: colors learn at so much of the logits' rate
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,19 @@ class Stretch:
     offsets: Float[Tensor, "t v 3"]
 
 
+@dataclass(frozen=True)
+class Refined:
+    """The colors of a stretch, in [0, 1].
+
+    Attributes:
+        texture: for all of its frames; texels that no picture shows are as they were.
+        frames: for each of its frames, where they differ (`TextureSettings.frame_size`); smaller than `texture`.
+    """
+
+    texture: Float[Tensor, "h w 3"]
+    frames: Float[Tensor, "t i j 3"] | None = None
+
+
 def refine_textures(
     stretches: Sequence[Stretch],
     driving: DrivingVideo,
@@ -47,8 +65,8 @@ def refine_textures(
     settings: TextureSettings,
     generator: torch.Generator,
     progress: Callable[[int, int, dict[str, float]], None] = lambda done, total, values: None,
-) -> list[Float[Tensor, "h w 3"]]:
-    """The texture of every stretch after the refinement.
+) -> list[Refined]:
+    """The textures of every stretch after the refinement.
 
     Args:
         stretches: the whole motion, in the order of time.
@@ -58,9 +76,6 @@ def refine_textures(
         generator: of the trajectories and of the refiner's noise, on the processor.
         progress: called with iterations done, their number, and the loss.
 
-    Returns:
-        Colors in [0, 1]; texels that no picture shows keep theirs.
-
     Raises:
         BadInput: another number of frames than the driving video has.
         FitDiverged: the loss left the finite numbers.
@@ -69,24 +84,27 @@ def refine_textures(
     if frames != len(driving):
         raise BadInput(f"the mesh has {frames} frames and the driving video {len(driving)}; make them from one video")
     front = OrbitCamera(width=settings.size, height=settings.size)
-    reference, facing = _look(stretches, [front] * frames, settings.min_cosine)
-    wanted = _resized(driving.over(driving.frames.new_ones(3)), settings.size)
+    added = [_nothing_added(stretch, settings.frame_size) for stretch in stretches]
+    reference, facing = _look(stretches, added, [front] * frames, settings.min_cosine)
+    wanted = _resized(driving.over(driving.frames.new_ones(3)), (settings.size, settings.size))
     textures = [stretch.mesh.texture for stretch in stretches]
     starts = [texture.clamp(DARKEST, 1 - DARKEST).logit() for texture in textures]
     logits = [start.clone().requires_grad_() for start in starts]
-    adam = torch.optim.Adam(logits, lr=settings.rate)
+    own = [colors for colors in added if colors is not None]
+    groups = [{"params": logits, "lr": settings.rate}, {"params": own, "lr": STEEPEST * settings.rate}]
+    adam = torch.optim.Adam(groups if own else groups[:1])
     for iteration in range(settings.iterations):
         colors = [logit.sigmoid() for logit in logits]
         if iteration % settings.refresh_every == 0:
             cameras = _trajectory(frames, settings, generator)
-            lookups, _ = _look(stretches, cameras)
-            seen = _draw(colors, lookups)
+            looks, _ = _look(stretches, added, cameras)
+            seen = _draw(colors, added, looks)
             done = iteration / max(1, settings.iterations - 1)
-            better = refiner.refine(seen.detach(), cameras, done, generator)
+            better = refiner.refine(seen.detach().clamp(0, 1), cameras, done, generator)
         else:
-            seen = _draw(colors, lookups)
-        known = ((_draw(colors, reference) - wanted) * facing).square().mean((1, 2, 3)).sum()
-        loss = known + (seen - better).square().mean()
+            seen = _draw(colors, added, looks)
+        known = ((_draw(colors, added, reference) - wanted) * facing).square().mean((1, 2, 3)).sum()
+        loss = known + (seen - better).square().mean() + settings.frame_weight * sum(map(_restlessness, own))
         value = loss.item()
         if not math.isfinite(value):
             raise FitDiverged(f"textures: the loss is {value} in iteration {iteration}; lower refiner.texture.rate")
@@ -95,7 +113,31 @@ def refine_textures(
         adam.step()
         progress(iteration + 1, settings.iterations, {"loss": value})
     ends = zip(textures, starts, (logit.detach() for logit in logits), strict=True)
-    return [torch.where(logit == start, texture, logit.sigmoid()) for texture, start, logit in ends]
+    shared = [torch.where(logit == start, texture, logit.sigmoid()) for texture, start, logit in ends]
+    return [Refined(texture, _summed(texture, colors)) for texture, colors in zip(shared, added, strict=True)]
+
+
+def _nothing_added(stretch: Stretch, size: int) -> Float[Tensor, "t i j 3"] | None:
+    """Where what every frame adds is kept: black, no larger than the texture; None where there is nothing to add."""
+    frames, texture = len(stretch.offsets), stretch.mesh.texture
+    if not size or frames == 1:
+        return None
+    shrunk = min(1.0, size / max(texture.shape[:2]))
+    height, width = (max(1, round(side * shrunk)) for side in texture.shape[:2])
+    return texture.new_zeros((frames, height, width, 3)).requires_grad_()
+
+
+def _restlessness(added: Float[Tensor, "t i j 3"]) -> Float[Tensor, ""]:
+    """How much frames add and how much that changes: mean squares, summed over frames as the pictures' errors are."""
+    size, change = added.square(), added.diff(dim=0).square()
+    return size.mean((1, 2, 3)).sum() + change.mean((1, 2, 3)).sum()
+
+
+def _summed(texture: Float[Tensor, "h w 3"], added: Float[Tensor, "t i j 3"] | None) -> Float[Tensor, "t i j 3"] | None:
+    """The texture of every frame."""
+    if added is None:
+        return None
+    return (_resized(texture[None], added.shape[1:3]) + added.detach()).clamp(0, 1)
 
 
 def _trajectory(frames: int, settings: TextureSettings, generator: torch.Generator) -> list[OrbitCamera]:
@@ -107,35 +149,66 @@ def _trajectory(frames: int, settings: TextureSettings, generator: torch.Generat
     ]
 
 
+@dataclass(frozen=True)
+class _Look:
+    """Where the pixels of a stretch look: into the shared texture, and frame by frame into what its frames add."""
+
+    shared: Lookup
+    own: tuple[Lookup, ...]
+
+
 def _look(
-    stretches: Sequence[Stretch], cameras: Sequence[OrbitCamera], min_cosine: float = -1.0
-) -> tuple[list[Lookup], Bool[Tensor, "t h w 1"]]:
-    """Where the pixels of every frame look into its texture, and which see the surface at a better cosine."""
-    lookups, facing, first = [], [], 0
-    for stretch in stretches:
+    stretches: Sequence[Stretch],
+    added: Sequence[Float[Tensor, "_ _ _ 3"] | None],
+    cameras: Sequence[OrbitCamera],
+    min_cosine: float = -1.0,
+) -> tuple[list[_Look], Bool[Tensor, "t h w 1"]]:
+    """Where the pixels of every frame look, and which see the surface at a better cosine."""
+    looks, facing, first = [], [], 0
+    for stretch, colors in zip(stretches, added, strict=True):
         mesh, moved = stretch.mesh, stretch.mesh.vertices + stretch.offsets
         mine = cameras[first : first + len(moved)]
         first += len(moved)
         fragments = rasterize_mesh(moved, mesh.faces, mine)
-        lookups.append(look_up(moved, mesh.faces, mesh.uvs, mesh.texture.shape[:2], mine, fragments))
+        shared = look_up(moved, mesh.faces, mesh.uvs, mesh.texture.shape[:2], mine, fragments)
+        own = (
+            []
+            if colors is None
+            else [
+                look_up(moved[i], mesh.faces, mesh.uvs, colors.shape[1:3], mine[i : i + 1], _of_view(fragments, i))
+                for i in range(len(moved))
+            ]
+        )
+        looks.append(_Look(shared, tuple(own)))
         normals = torch.stack([vertex_normals(state, mesh.faces) for state in moved])
         places = torch.stack([camera.position().to(moved) for camera in mine])[:, None, None]
         rays = normalize(places - spread(fragments, mesh.faces, moved), dim=-1)
         cosines = (rays * normalize(spread(fragments, mesh.faces, normals), dim=-1)).sum(-1, keepdim=True)
         facing.append((fragments.faces >= 0)[..., None] & (cosines > min_cosine))
-    return lookups, torch.cat(facing)
+    return looks, torch.cat(facing)
 
 
-def _draw(textures: Sequence[Float[Tensor, "i j 3"]], lookups: Sequence[Lookup]) -> Float[Tensor, "t h w 3"]:
-    """All frames over white; differentiable in the textures."""
+def _of_view(fragments: Fragments, view: int) -> Fragments:
+    return Fragments(*(getattr(fragments, field.name)[view : view + 1] for field in fields(fragments)))
+
+
+def _draw(
+    textures: Sequence[Float[Tensor, "_ _ 3"]],
+    added: Sequence[Float[Tensor, "_ _ _ 3"] | None],
+    looks: Sequence[_Look],
+) -> Float[Tensor, "t h w 3"]:
+    """All frames over white; differentiable in the textures and in what is added to them."""
     pictures = []
-    for texture, lookup in zip(textures, lookups, strict=True):
-        picture = texture.new_ones((*lookup.covered.shape, 3))
-        picture[lookup.covered] = read(texture, lookup)
+    for texture, colors, look in zip(textures, added, looks, strict=True):
+        covered, seen = look.shared.covered, read(texture, look.shared)
+        if colors is not None:
+            seen = seen + torch.cat([read(frame, own) for frame, own in zip(colors, look.own, strict=True)])
+        picture = texture.new_ones((*covered.shape, 3))
+        picture[covered] = seen
         pictures.append(picture)
     return torch.cat(pictures)
 
 
-def _resized(pictures: Float[Tensor, "t h w 3"], size: int) -> Float[Tensor, "t s s 3"]:
+def _resized(pictures: Float[Tensor, "t h w 3"], size: Sequence[int]) -> Float[Tensor, "t i j 3"]:
     planes = pictures.movedim(-1, 1)
-    return interpolate(planes, (size, size), mode="bilinear", antialias=True, align_corners=False).movedim(1, -1)
+    return interpolate(planes, tuple(size), mode="bilinear", antialias=True, align_corners=False).movedim(1, -1)

@@ -11,9 +11,9 @@ from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.weights.lock import Locked, read_lock, write_json
 from dg4d_lib.weights.registry import KNOWN, Weights, weights_called
 
-READ = frozenset([".json", ".txt", ".model", ".safetensors", ".bin"])  # suffixes of what loading reads
-TENSORS = frozenset([".safetensors", ".bin"])
-NO_TENSORS = "has no tensors (.safetensors, .bin)"
+TENSORS = frozenset([".safetensors", ".bin", ".pth", ".pt"])  # suffixes
+READ = TENSORS | {".json", ".txt", ".model"}  # suffixes of what loading reads
+NO_TENSORS = f"has no tensors ({', '.join(sorted(TENSORS))})"
 MEMORY = "digests.json"  # digests of large files, so that they are read once and not at every run
 BY_CONTENT = "@"  # between a folder's name and the first digits of its identity
 CHUNK = 1 << 22  # bytes read at a time

@@ -1,4 +1,4 @@
-"""The weights that the profiles name: where they come from, what of them is needed, and what their license allows.
+"""The weights that profiles and scores name: where they come from, what of them is needed, what their license allows.
 
 Revisions and digests are not written here: the first `dg4d weights pull` records what it got (trust on first use, see
 lock.py), and every later use is compared with that. `revision` pins a commit of the hub where one must not change.
@@ -119,6 +119,34 @@ KNOWN: dict[str, Weights] = {
             license=License("license of LGM", "unverified", UNVERIFIED),
             parts=("model_fp16_fixrot.safetensors",),
             about_gb=0.83,
+        ),
+        Weights(
+            name="vgg16",
+            hub_id="timm/vgg16.tv_in1k",
+            purpose="scores: the network of LPIPS (torchvision's VGG16)",
+            license=License("BSD-3-Clause", "yes", "commercial use is allowed; trained on ImageNet"),
+            parts=("model.safetensors",),
+            about_gb=0.55,
+        ),
+        Weights(
+            name="lpips-vgg",
+            hub_id="chaofengc/IQA-PyTorch-Weights",
+            purpose="scores: LPIPS on top of vgg16 (7 kB)",
+            license=License("BSD-2-Clause", "yes", "commercial use is allowed; vgg.pth of the package lpips"),
+            parts=("LPIPS_v0.1_vgg-a78928a0.pth",),
+        ),
+        Weights(
+            name="clip-vit-b-32",
+            hub_id="openai/clip-vit-base-patch32",
+            purpose="scores: CLIP similarity",
+            license=License("license of CLIP's weights", "unverified", UNVERIFIED),
+        ),
+        Weights(
+            name="i3d",
+            hub_id="flateon/FVD-I3D-torchscript",
+            purpose="scores: FVD",
+            license=License("license of I3D's weights", "unverified", UNVERIFIED),
+            parts=("i3d_torchscript.pt",),
         ),
     )
 }

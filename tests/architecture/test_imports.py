@@ -19,11 +19,11 @@ from packaging.utils import canonicalize_name
 HEAVY = {
     "torch", "diffusers", "transformers", "huggingface_hub",
     "gsplat", "prefect", "numpy", "scipy", "numba", "llvmlite", "skimage", "trimesh", "xatlas",
-    "pymeshlab", "av", "OpenImageIO", "PIL", "safetensors", "jaxtyping", "rich",
+    "pymeshlab", "av", "OpenImageIO", "PIL", "safetensors", "jaxtyping", "rich", "pxr",
 }  # fmt: skip
 LIGHT_MODULES = (
     "dg4d_lib", "dg4d_lib.settings", "dg4d_lib.weights.locate", "dg4d_lib.weights.pull",
-    "steps.contract", "steps.catalog", "steps.profiles", "steps.job", "steps.weights",
+    "dg4d_lib.assets.viewer_page", "steps.contract", "steps.catalog", "steps.profiles", "steps.job", "steps.weights",
 )  # fmt: skip
 HELP_CPU_S = 1.0  # measured 0.25; the first start after an installation also compiles
 ATTEMPTS = 3  # a busy machine makes processor time longer, never shorter: the least of a few is the program's own

@@ -13,13 +13,14 @@ import repository
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
+import dg4d_lib.asset_settings
 import dg4d_lib.settings
 import steps.profiles
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import Settings
 from steps.profiles import PROFILES, PipelineSettings, profile, revise
 
-DEFINITIONS = {"dg4d_lib/settings.py", "steps/profiles.py"}
+DEFINITIONS = {"dg4d_lib/settings.py", "dg4d_lib/asset_settings.py", "steps/profiles.py"}
 EVIDENT = {  # numbers whose names say everything
     "iterations", "features", "hidden", "frequencies", "max_faces", "prune_opacity",
     "guidance_weight", "color_rate", "opacity_rate", "scale_rate", "rotation_rate",
@@ -30,7 +31,7 @@ Classes = Mapping[str, tuple[type[BaseModel], ...]]
 
 
 def settings_classes() -> list[type[Settings]]:
-    modules = (dg4d_lib.settings, steps.profiles)
+    modules = (dg4d_lib.settings, dg4d_lib.asset_settings, steps.profiles)
     found = [value for module in modules for _, value in inspect.getmembers(module, inspect.isclass)]
     return sorted({c for c in found if issubclass(c, Settings) and c is not Settings}, key=lambda c: c.__name__)
 

@@ -18,17 +18,20 @@ from prefect.settings import PREFECT_API_URL, temporary_settings
 from typer.testing import CliRunner, Result
 
 from flows import cli, home, tasks
+from flows.catalog import convert_all
 from flows.executors import StepBadInput, StepCrashed, StepDiverged, StepError, StepMissing, StepOutOfMemory
 from flows.make import make, save_pictures
 from flows.orders import Order, Wish
 from flows.orphans import settle_orphans
 from flows.server import Server
+from flows.summary import Row
 from steps.profiles import PREVIEW, revise
 
 EVERY_STEP = [
     "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "extract_mesh", "refine_texture", "pack_asset",
+    "check_asset",
 ]  # fmt: skip
-RUN_FACTS = ("report.json", "report.html", "provenance.json")  # these say when and how long
+RUN_FACTS = ("report.json", "report.html", "provenance.json", "ro-crate-metadata.json")  # these say when and how long
 Run = Callable[..., Result]
 
 
@@ -99,6 +102,15 @@ def test_a_changed_knob_runs_its_step_and_what_follows(log: Path, tmp_path: Path
     ran(log)
     make(order("knob", tmp_path, **{"mesh.grid": 64}), tmp_path / "out")
     assert ran(log) == ["extract_mesh"]  # its output did not change, so what follows was there already
+
+
+def test_gaussians_that_were_fine_tuned_take_the_place_of_the_others(log: Path, tmp_path: Path) -> None:
+    make(order("tuned", tmp_path, **{"motion.fine_tune": True}), tmp_path / "out")
+    record = json.loads((tmp_path / "out" / "provenance.json").read_text())
+    steps = {step["step"]: step for step in record["steps"]}
+    better = steps["fit_motion"]["outputs"]["gaussians"]
+    assert better != steps["fit_gaussians"]["outputs"]["gaussians"] == steps["fit_motion"]["inputs"]["gaussians"]
+    assert steps["extract_mesh"]["inputs"]["gaussians"] == steps["pack_asset"]["inputs"]["gaussians"] == better
 
 
 def test_a_lost_artifact_is_made_again(log: Path, tmp_path: Path) -> None:
@@ -348,3 +360,31 @@ def wait_until(condition: Callable[[], bool], timeout_s: float = 60) -> None:
     while not condition():
         assert time.monotonic() < deadline, "it did not happen"
         time.sleep(0.05)
+
+
+def test_a_strict_batch_begins_nothing_after_an_item_that_is_not_accepted(log: Path, tmp_path: Path) -> None:
+    names = ("first", "torn", "last")
+    orders = [order(f"strict {name}", tmp_path, name=f"{name}.png", item=name) for name in names]
+    rows: list[Row] = []
+    convert_all(orders, tmp_path / "out", 1, "strict", rows.append, strict=True)
+    assert [(row.item, row.status, row.failing) for row in rows] == [
+        ("first", "done", []),
+        ("torn", "failed", ["silhouette"]),
+        ("last", "skipped", None),
+    ]
+    assert "torn was not accepted" in rows[2].message
+    assert (tmp_path / "out" / "torn" / "report.html").exists()
+    assert not (tmp_path / "out" / "last").exists()
+    rows.clear()
+    convert_all(orders[2:], tmp_path / "out", 1, "refused before", rows.append, strict=True, refused=["torn"])
+    assert [row.status for row in rows] == ["skipped"]
+    rows.clear()
+    convert_all(orders, tmp_path / "out", 1, "lenient", rows.append)
+    assert [(row.status, row.failing) for row in rows] == [("done", []), ("done", ["silhouette"]), ("done", [])]
+
+
+def test_the_report_says_what_the_gates_say(log: Path, tmp_path: Path) -> None:
+    make(order("torn thing", tmp_path), tmp_path / "out")
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["acceptance"]["failing"] == ["silhouette"]
+    assert "fit it &lt;again&gt;" in (tmp_path / "out" / "report.html").read_text()

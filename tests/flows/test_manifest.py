@@ -1,9 +1,11 @@
+import csv
 import json
+import re
 from pathlib import Path
 
 import pytest
 
-from dg4d_lib.errors import BadInput
+from dg4d_lib.errors import BadInput, DG4DError
 from flows.manifest import Item, distinct, items_of, parse_changes
 
 
@@ -59,6 +61,52 @@ def test_a_json_manifest_says_the_same(tmp_path: Path) -> None:
     assert (cat.name, cat.wish.picture, cat.wish.settings.mesh.grid) == ("cat", Path("/abs/cat.png"), 32)
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".json"])
+def test_words_may_stand_in_place_of_a_path(tmp_path: Path, suffix: str) -> None:
+    rows = [
+        {"text": "A red, red dragon!", "text.weights": "some/pictures", "seed": "7"},
+        {"text": "a RED red dragon", "name": "deep/second"},
+        {"text": "a red red dragon"},
+        {"path": "a.png"},
+    ]
+    file = tmp_path / f"m{suffix}"
+    if suffix == ".json":
+        file.write_text(json.dumps(rows))
+    else:
+        with file.open("w", newline="") as lines:
+            table = csv.DictWriter(lines, ["path", "text", "name", "seed", "text.weights"])
+            table.writeheader()
+            table.writerows(rows)
+    found = items(file)
+    assert [item.name for item in found] == ["a-red-red-dragon", "deep/second", "a-red-red-dragon-2", "a"]
+    first, _, _, picture = (item.wish for item in found)
+    assert first is not None and picture is not None
+    assert (first.picture, first.text, first.seed) == (None, "A red, red dragon!", 7)
+    assert first.settings.text.weights == "some/pictures"
+    assert (picture.picture, picture.text) == (tmp_path / "a.png", "")
+
+
+@pytest.mark.parametrize(
+    ("row", "says"),
+    [
+        ({"text": "a fox"}, "text.weights=FOLDER"),
+        ({"text": "a fox", "path": "fox.png", "text.weights": "some/pictures"}, "not both"),
+        ({"text": "a fox", "video": "fox.mp4", "text.weights": "some/pictures"}, "not both"),
+        ({"text": "  ", "text.weights": "some/pictures"}, "is empty"),
+        ({"text": "a fox", "text.weights": "some/pictures"}, "dg4d weights pull some/pictures"),
+    ],
+)
+def test_words_that_nothing_can_be_made_of_are_refused_before_any_work(
+    tmp_path: Path, row: dict[str, str], says: str
+) -> None:
+    touch(tmp_path, "fox.png", "fox.mp4")
+    (tmp_path / "m.json").write_text(json.dumps([row]))
+    (item,) = items(tmp_path / "m.json")
+    assert item.wish is not None
+    with pytest.raises(DG4DError, match=re.escape(says)):
+        item.wish.check()
+
+
 def test_a_bad_row_is_a_bad_item_and_no_more(tmp_path: Path) -> None:
     rows = [
         {"path": "a.png", "mesh.grit": 1},
@@ -76,7 +124,7 @@ def test_a_bad_row_is_a_bad_item_and_no_more(tmp_path: Path) -> None:
     ("name", "content", "says"),
     [
         ("m.csv", "file\nx.png\n", "unknown column 'file'"),
-        ("m.csv", "path,seed\n,1\n", "row 1: no path"),
+        ("m.csv", "path,seed\n,1\n", "row 1: neither a path nor a text"),
         ("m.json", "{", "cannot be read"),
         ("m.json", '{"path": 1}', "list of rows"),
         ("m.txt", "x", "neither a folder nor a manifest"),

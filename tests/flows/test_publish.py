@@ -19,11 +19,10 @@ def zipped(path: Path, **entries: str) -> Path:
     return path
 
 
-def describe(files: Files) -> dict[str, str]:
-    return {
-        "provenance.json": json.dumps({"order": "o1", "files": files, "beside": ["report.html"]}),
-        "report.html": "r",
-    }
+def finish(folder: Path, files: Files) -> Files:
+    (folder / "provenance.json").write_text(json.dumps({"order": "o1", "files": files, "beside": ["report.html"]}))
+    (folder / "report.html").write_text("r")
+    return files
 
 
 def tree(folder: Path) -> dict[str, str]:
@@ -40,7 +39,7 @@ def package(tmp_path: Path) -> Path:
 
 
 def test_a_package_appears_with_what_goes_with_it(package: Path, tmp_path: Path) -> None:
-    files = publish(package, tmp_path / "deep" / "out", describe)
+    files = publish(package, tmp_path / "deep" / "out", finish)
     assert set(files) == {"asset.glb", "splats/000.ply"}
     assert set(tree(tmp_path / "deep" / "out")) == {*files, "provenance.json", "report.html"}
     assert is_current(tmp_path / "deep" / "out", "o1")
@@ -50,19 +49,37 @@ def test_a_package_appears_with_what_goes_with_it(package: Path, tmp_path: Path)
 
 def test_a_new_package_replaces_the_old_and_keeps_files_of_the_user(package: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    publish(package, out, describe)
+    publish(package, out, finish)
     (out / "renders").mkdir()
     (out / "renders" / "mine.png").write_text("mine")
-    publish(zipped(tmp_path / "other.zip", asset_dot_glb="new"), out, describe)
+    publish(zipped(tmp_path / "other.zip", asset_dot_glb="new"), out, finish)
     assert tree(out)["asset.glb"] == "new"
     assert tree(out)["renders/mine.png"] == "mine"
     assert "splats/000.ply" not in tree(out)
     assert is_current(out, "o1")
 
 
+def test_a_package_without_its_report_is_not_current(package: Path, tmp_path: Path) -> None:
+    publish(package, tmp_path / "out", finish)
+    (tmp_path / "out" / "report.html").unlink()
+    assert not is_current(tmp_path / "out", "o1")
+
+
+@pytest.mark.parametrize("where", ["files", "beside"])
+def test_a_record_whose_names_lead_outside_is_none(package: Path, tmp_path: Path, where: str) -> None:
+    out = tmp_path / "out"
+    publish(package, out, finish)
+    record = json.loads((out / "provenance.json").read_text())
+    record[where] = {"../mine.txt": {}}
+    (out / "provenance.json").write_text(json.dumps(record))
+    assert record_of(out) is None
+    with pytest.raises(BadInput, match="holds other files"):
+        check_folder(out)
+
+
 @pytest.mark.parametrize("damage", ["change", "delete", "truncate"])
 def test_a_damaged_package_is_not_current(package: Path, tmp_path: Path, damage: str) -> None:
-    publish(package, tmp_path / "out", describe)
+    publish(package, tmp_path / "out", finish)
     file = tmp_path / "out" / "asset.glb"
     {"change": lambda: file.write_text("MESH"), "delete": file.unlink, "truncate": lambda: os.truncate(file, 1)}[
         damage
@@ -73,7 +90,7 @@ def test_a_damaged_package_is_not_current(package: Path, tmp_path: Path, damage:
 def test_a_full_disk_leaves_the_old_package_whole_and_nothing_else(
     package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    publish(package, tmp_path / "out", describe)
+    publish(package, tmp_path / "out", finish)
     before = tree(tmp_path)
 
     def full(source: object, target: object) -> None:
@@ -81,9 +98,9 @@ def test_a_full_disk_leaves_the_old_package_whole_and_nothing_else(
 
     monkeypatch.setattr(module.shutil, "copyfileobj", full)
     with pytest.raises(DiskFull, match="free some space"):
-        publish(package, tmp_path / "out", describe)
+        publish(package, tmp_path / "out", finish)
     with pytest.raises(DiskFull):
-        publish(package, tmp_path / "new" / "out", describe)
+        publish(package, tmp_path / "new" / "out", finish)
     assert tree(tmp_path) == before
     assert not (tmp_path / "new").exists()
 
@@ -92,10 +109,10 @@ def test_a_folder_that_cannot_be_renamed_is_filled_in_place(
     package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
-    publish(package, out, describe)
+    publish(package, out, finish)
     monkeypatch.chdir(out)  # a user who stands in the folder must not find it gone
     inode = out.stat().st_ino
-    publish(zipped(tmp_path / "other.zip", asset_dot_glb="new"), out, describe)
+    publish(zipped(tmp_path / "other.zip", asset_dot_glb="new"), out, finish)
     assert out.stat().st_ino == inode
     assert set(tree(out)) == {"asset.glb", "provenance.json", "report.html"}
     assert is_current(out, "o1")
@@ -103,12 +120,12 @@ def test_a_folder_that_cannot_be_renamed_is_filled_in_place(
 
 def test_what_a_killed_command_left_is_cleared_up_or_put_back(package: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    publish(package, out, describe)
+    publish(package, out, finish)
     (out / "notes.txt").write_text("mine")
     dead = 2**22 + 1  # above the largest number a process can have
     out.rename(tmp_path / f".out.outgoing-{dead}")  # killed between the two renames
     (tmp_path / f".out.incoming-{dead}").mkdir()
-    publish(package, out, describe)
+    publish(package, out, finish)
     assert tree(out)["notes.txt"] == "mine"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "package.zip"]
 
@@ -117,7 +134,7 @@ def test_an_entry_outside_the_package_is_refused(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "evil.zip", "w") as archive:
         archive.writestr("../evil.txt", "x")
     with pytest.raises(BadInput, match="outside"):
-        publish(tmp_path / "evil.zip", tmp_path / "out", describe)
+        publish(tmp_path / "evil.zip", tmp_path / "out", finish)
     assert not (tmp_path / "evil.txt").exists()
     assert not (tmp_path / "out").exists()
 

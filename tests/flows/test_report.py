@@ -1,5 +1,7 @@
+import io
 import json
 import re
+import zipfile
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -42,6 +44,8 @@ def finished(step: str, store: ArtifactStore, seconds: float, **outputs: Artifac
         seed=0,
         backend="cpu",
         notes=("Twice said.", "<b>bold</b>"),
+        run_notes=("memory ran out",) if seconds > 5 else (),
+        flops={"Unet": 7} if seconds > 5 else {},
         duration_s=seconds,
         peak_memory_mb=seconds * 10,
     )
@@ -51,12 +55,16 @@ def finished(step: str, store: ArtifactStore, seconds: float, **outputs: Artifac
 
 def made(store: ArtifactStore, seconds: float = 2.0) -> tuple[Order, Made]:
     source = store.put_bytes(b"s", "application/octet-stream")
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.writestr(zipfile.ZipInfo("asset.glb"), b"a mesh")
+    package = store.put_bytes(packed.getvalue(), "application/zip")
     curves = store.put_bytes(json.dumps(CURVES).encode(), "application/vnd.dg4d.curves+json")
     order = Order(
         item="<fox>", source=source, moving=False, profile="preview", settings=PREVIEW, seed=0, source_name="fox.png"
     )
     steps = [finished("fit_gaussians", store, seconds, curves=curves), finished("pack_asset", store, seconds + 1)]
-    return order, Made(package=source, steps=steps, flow_run=f"run {seconds}")
+    return order, Made(package=package, steps=steps, flow_run=f"run {seconds}")
 
 
 class Links(HTMLParser):
@@ -126,7 +134,7 @@ def test_what_networks_did_is_said_for_every_step(store: ArtifactStore) -> None:
     assert [stage["flops"] for stage in stages] == [record.flops, {}]
     assert texts["report.html"].count("FLOP") == 2
     assert "Unet 15.2 TFLOP, Vae 3.0 MFLOP" in texts["report.html"]
-    assert json.loads(texts["provenance.json"])["steps"][0]["flops"] == record.flops
+    assert json.loads(texts["provenance.json"])["run"]["steps"][0]["flops"] == record.flops
 
 
 def test_licenses_follow_the_asset_only_where_weights_were_used(store: ArtifactStore) -> None:
@@ -147,6 +155,7 @@ def test_notes_are_said_once_and_a_picture_that_only_names_is_mentioned(store: A
     order = order.model_copy(update={"picture_name": "fox.jpg", "source_name": "run.mp4"})
     notes = report.notes(order, what)
     assert notes[1:] == ["Twice said.", "<b>bold</b>"]
+    assert report.notes(*made(store, 9.0)) == ["Twice said.", "<b>bold</b>", "memory ran out"]
     assert "run.mp4" in notes[0]
     assert "fox.jpg only names" in notes[0]
 
@@ -155,7 +164,10 @@ def test_provenance_differs_between_runs_only_under_run(store: ArtifactStore) ->
     one = json.loads(report.texts(*made(store, 1.0), FILES, store)["provenance.json"])
     two = json.loads(report.texts(*made(store, 9.0), FILES, store)["provenance.json"])
     assert one != two
-    assert one.pop("run") != two.pop("run")
+    runs = [record.pop("run")["steps"][0] for record in (one, two)]
+    for fact in ("duration_s", "peak_memory_mb", "flops", "run_notes"):
+        assert runs[0][fact] != runs[1][fact]
+    assert runs[1]["run_notes"] == ["memory ran out"]
     assert one == two
     assert one["files"] == FILES
 
@@ -184,7 +196,7 @@ def test_a_summary_counts_and_the_overview_links_what_is_there(tmp_path: Path) -
     ]
     write_summary(tmp_path, rows)
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["counts"] == {"done": 1, "unchanged": 1, "failed": 1}
+    assert summary["counts"] == {"done": 1, "unchanged": 1, "failed": 1, "skipped": 0}
     assert summary["commercial_only"] is False
     page = (tmp_path / "index.html").read_text()
     assert Links(page).addresses.count("a%20b/preview.mp4") == 1

@@ -4,7 +4,7 @@ import pytest
 from rich.console import Console
 
 from flows.events import StepEvent, tell
-from flows.terminal import StepBars, numbers, steps_shown
+from flows.terminal import StepBars, numbers, steps_shown, tell_rows
 
 EVENT = StepEvent("newt", "fit_gaussians", "progress", done=114, total=250, values={"loss": 9.437, "reference": 12.57})
 
@@ -36,3 +36,9 @@ def test_what_the_library_has_to_say_is_shown():
         with steps_shown(Console(file=screen, width=100, force_terminal=interactive, color_system=None)):
             tell(note)
         assert "compiling kernels" in screen.getvalue()
+
+
+def test_rows_stand_in_columns_and_words_in_brackets_stay():
+    screen = io.StringIO()
+    tell_rows(Console(file=screen, width=200), [("a", "whole", ""), ("asset.glb", "altered", "[why]")])
+    assert screen.getvalue() == "a          whole\nasset.glb  altered  [why]\n"

@@ -1,3 +1,4 @@
+import hashlib
 import json
 import os
 import subprocess
@@ -55,6 +56,9 @@ def test_the_list_names_all_weights_their_licenses_and_what_is_here(home: Path) 
     file = pulled(home)
     listing = dg4d("weights", "list").stdout
     assert line_of("lgm", listing).split()[1:4] == ["yes", "0.00", "c0ffee0000"]
+    of_the_file = [hashlib.sha256(file.read_bytes()).hexdigest(), "7000", f"lgm/{LGM}"]
+    assert dg4d("weights", "list", "--files").stdout.splitlines()[-1].split() == of_the_file
+    assert LGM not in listing
     file.write_bytes(b"cut")
     assert line_of("lgm", dg4d("weights", "list").stdout).split()[1] == "damaged"
     write_lock(home, "me/pictures", Locked(hub_id="me/pictures", revision="", license="cc-by-nc-4.0", files={}))

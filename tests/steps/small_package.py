@@ -2,17 +2,19 @@
 
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import torch
 import trimesh
 
+from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import write_ply
 from dg4d_lib.geometry.harmonics import harmonics_of_color
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.settings import FramewiseSettings, PackSettings
+from dg4d_lib.settings import FramewiseSettings
 from dg4d_lib.video.driving import DrivingVideo
 from steps.job import Job
 from steps.media import write_frames, write_png
@@ -78,9 +80,9 @@ def inputs(folder: Path, mode: str = "tracked") -> dict[str, Path]:
     return paths
 
 
-def job(given: dict[str, Path], out: Path, splats: bool = True) -> Job:
+def job(given: dict[str, Path], out: Path, **wanted: Any) -> Job:
     out.mkdir(parents=True, exist_ok=True)
-    pack = PackSettings(splats=splats, preview_size=64, preview_turns=1, sheet_size=32, sheet_frames=2)
+    pack = PackSettings(preview_size=64, preview_turns=1, sheet_size=32, sheet_frames=2, **wanted)
     return Job(
         inputs=given,
         outputs={"package": out / "package.zip", "sheet": out / "sheet.png"},
@@ -91,9 +93,9 @@ def job(given: dict[str, Path], out: Path, splats: bool = True) -> Job:
     )
 
 
-def packed(folder: Path, mode: str = "tracked", splats: bool = True) -> Path:
-    """An unpacked package."""
-    given = job(inputs(folder / "inputs", mode), folder / "out", splats)
+def packed(folder: Path, mode: str = "tracked", **wanted: Any) -> Path:
+    """An unpacked package, with these settings of what it holds."""
+    given = job(inputs(folder / "inputs", mode), folder / "out", **wanted)
     run(given)
     with zipfile.ZipFile(given.outputs["package"]) as archive:
         archive.extractall(folder / "asset")

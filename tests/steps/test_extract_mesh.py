@@ -11,6 +11,7 @@ from dg4d_lib.gaussians.ply import write_ply
 from dg4d_lib.geometry.harmonics import harmonics_of_color
 from dg4d_lib.settings import FramewiseSettings, IdentitySettings, MeshSettings
 from dg4d_lib.video.driving import DrivingVideo
+from steps import extract_mesh
 from steps.extract_mesh import run
 from steps.job import Facts, Job
 from steps.media import read_png, write_frames
@@ -85,6 +86,18 @@ def test_the_picture_shows_it_and_the_notes_say_how_well_it_fits(tracked: tuple[
     assert not (tracked[0] / "meshes").exists()
 
 
+def test_the_notes_say_what_kind_of_surface_it_is(tracked: tuple[Path, Facts]) -> None:
+    assert "at rest it is watertight, 1 component, 0 inverted" in tracked[1].notes
+
+
+def test_the_frame_whose_surface_it_is_stays_with_the_mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(extract_mesh, "best_rest", lambda *arguments: (2, 1.0))
+    extract(tmp_path, ball())
+    asset = read_tracked(tmp_path / "tracked")
+    assert asset.rest == 2
+    torch.testing.assert_close(asset.mesh.vertices.mean(0), 3 * SHIFT, atol=0.02, rtol=0)
+
+
 def test_the_same_job_gives_the_same_bytes(tracked: tuple[Path, Facts], tmp_path: Path) -> None:
     extract(tmp_path, ball())
     for name in ("tracked", "picture.png"):
@@ -92,7 +105,8 @@ def test_the_same_job_gives_the_same_bytes(tracked: tuple[Path, Facts], tmp_path
 
 
 def test_a_mesh_per_frame_stands_where_the_cloud_is_then(tmp_path: Path) -> None:
-    extract(tmp_path, ball(), MESH.model_copy(update={"mode": "per_frame"}), first_frame=1, end_frame=3)
+    _, facts = extract(tmp_path, ball(), MESH.model_copy(update={"mode": "per_frame"}), first_frame=1, end_frame=3)
+    assert facts.notes[1:] == ("2 of 2 meshes from frame 1 on bound solids",)
     meshes = read_meshes(tmp_path / "meshes")
     centers = torch.stack([(mesh.vertices.amax(0) + mesh.vertices.amin(0)) / 2 for mesh in meshes])
     torch.testing.assert_close(centers, torch.tensor([[2.0], [3.0]]) * SHIFT, atol=0.03, rtol=0)

@@ -90,11 +90,20 @@ def test_a_motion_comes_out_of_gaussians_and_a_video(tmp_path: Path, subject: Pa
         rasterizer="auto", prior=SMALL.prior, deformation=SMALL.deformation, motion=SMALL.motion
     )
     inputs = {"gaussians": gaussians, "driving_video": tmp_path / "video.zip"}
-    work = job(tmp_path, settings, inputs, ["motion", "curves", "picture"])
+    (tmp_path / "moving").mkdir()
+    work = job(tmp_path / "moving", settings, inputs, ["motion", "gaussians", "curves", "picture"])
     facts = fit_motion.run(work)
     _, frames_fitted = read_motion(work.outputs["motion"])
     assert frames_fitted == 3
     assert "no model" in facts.notes[0]
+    assert not work.outputs["gaussians"].exists()
+
+    tuned = settings.model_copy(update={"motion": SMALL.motion.model_copy(update={"fine_tune": True})})
+    work = job(tmp_path / "moving", tuned, inputs, ["motion", "gaussians", "curves", "picture"])
+    facts = fit_motion.run(work)
+    before, after = read_ply(gaussians), read_ply(work.outputs["gaussians"])
+    assert len(before) == len(after) and not torch.equal(before.harmonics, after.harmonics)
+    assert "together with their motion" in facts.notes[-1]
 
 
 def test_both_fits_run_with_a_trained_prior_and_say_so(tmp_path: Path, subject: Path):

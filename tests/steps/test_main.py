@@ -114,7 +114,7 @@ def test_a_request_becomes_outputs_and_a_record(store: ArtifactStore) -> None:
     [
         ("bad", "bad_input"),
         ("missing", "missing"),
-        ("gone", "missing"),
+        ("gone", "lost"),
         ("diverged", "diverged"),
         ("memory", "out_of_memory"),
         ("torch memory", "out_of_memory"),
@@ -159,7 +159,7 @@ def test_an_input_the_step_does_not_have_is_refused(store: ArtifactStore) -> Non
 
 def test_an_artifact_that_is_gone_is_missing(store: ArtifactStore) -> None:
     gone = ArtifactRef(digest="sha256:" + "1" * 64, media_type="text/plain", size_bytes=3)
-    assert failure(request_for(store).model_copy(update={"inputs": {"quiet": gone}}), store).kind == "missing"
+    assert failure(request_for(store).model_copy(update={"inputs": {"quiet": gone}}), store).kind == "lost"
 
 
 def test_the_version_of_a_request_follows_the_source() -> None:

@@ -27,12 +27,20 @@ def assert_same(first: TexturedMesh, second: TexturedMesh) -> None:
 
 
 def test_a_tracked_mesh_comes_back_as_it_was(tmp_path: Path) -> None:
-    asset = Asset4D(some_mesh(), torch.randn(3, 5, 3), 12.5, {"notes": ["a"], "n": 1})
+    asset = Asset4D(some_mesh(), torch.randn(3, 5, 3), 12.5, {"notes": ["a"], "n": 1}, rest=2)
     write_tracked(tmp_path / "a.safetensors", asset)
     back = read_tracked(tmp_path / "a.safetensors")
     assert_same(back.mesh, asset.mesh)
     assert torch.equal(back.offsets, asset.offsets)
-    assert (back.fps, back.extras) == (asset.fps, asset.extras)
+    assert (back.fps, back.extras, back.textures, back.rest) == (asset.fps, asset.extras, None, 2)
+
+
+def test_a_texture_per_frame_comes_back_in_eight_bits(tmp_path: Path) -> None:
+    textures = torch.stack([some_mesh(seed).texture for seed in range(3)])
+    write_tracked(tmp_path / "a", Asset4D(some_mesh(), torch.randn(3, 5, 3), 12.5, {}, textures))
+    back = read_tracked(tmp_path / "a").textures
+    assert back is not None and torch.equal(back, textures)
+    assert (tmp_path / "a").stat().st_size < 4 * textures.numel()  # a byte per number
 
 
 def test_equal_meshes_give_equal_bytes(tmp_path: Path) -> None:

@@ -11,6 +11,10 @@ from steps.motions import new_deformation, read_motion, write_motion
 SETTINGS = [HexPlaneSettings(spatial=4, temporal=3, features=2, hidden=4), MlpSettings(hidden=4), FramewiseSettings()]
 
 
+def seed(number: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(number)
+
+
 @pytest.mark.parametrize("settings", SETTINGS, ids=lambda s: s.kind)
 def test_a_motion_survives_the_round_trip(settings, tmp_path: Path):
     cloud = blob(30, 0.5, torch.Generator().manual_seed(0))
@@ -25,6 +29,31 @@ def test_a_motion_survives_the_round_trip(settings, tmp_path: Path):
     assert all(torch.equal(vars(before)[name], vars(after)[name]) for name in vars(before))
     write_motion(tmp_path / "n", deformation, settings, 5, 30)
     assert (tmp_path / "m").read_bytes() == (tmp_path / "n").read_bytes()
+
+
+@pytest.mark.parametrize("settings", SETTINGS[:2], ids=lambda s: s.kind)
+def test_without_the_endpoint_frame_k_of_t_lies_at_k_over_t(settings, tmp_path: Path):
+    """The same numbers on both clocks: five frames of one are the first five of six of the other."""
+    cloud, open_ended = blob(30, 0.5, seed()), settings.model_copy(update={"endpoint": False})
+    deformations = {}
+    for name, kind, frames in (("k/T", open_ended, 5), ("k/(T-1)", settings, 6)):
+        made = new_deformation(kind, cloud, frames, seed(1))
+        for i, parameter in enumerate(made.parameters()):
+            parameter.data.normal_(generator=seed(i))
+        write_motion(tmp_path / "m", made, kind, frames, 30)
+        again, _ = read_motion(tmp_path / "m")
+        times = torch.arange(5) / (5 - 1 if name == "k/T" else 6 - 1)
+        before, deformations[name] = made.displace(cloud.means, times), again.displace(cloud.means, times)
+        assert torch.equal(before.means, deformations[name].means)
+    assert deformations["k/T"].means.diff(dim=0).abs().max() > 0.01
+    torch.testing.assert_close(deformations["k/T"].means, deformations["k/(T-1)"].means)
+
+
+def test_the_planes_cover_the_cloud_or_the_box_that_was_asked_for():
+    cloud = blob(30, 0.5, seed())
+    assert new_deformation(SETTINGS[0], cloud, 5, None).bounds.abs().max() < 0.7
+    wide = new_deformation(SETTINGS[0].model_copy(update={"half_side": 1.6}), cloud, 5, None)
+    assert torch.equal(wide.bounds, torch.tensor([[-1.6] * 3, [1.6] * 3]))
 
 
 def test_another_file_is_no_motion(tmp_path: Path):

@@ -18,10 +18,12 @@ from steps.pack_asset import run
 from steps.packages import read_manifest
 
 COMMON = {
-    "asset.json", "asset.glb", "preview.mp4", "contact_sheet.png",
-    "canonical/gaussians.ply", "canonical/motion.safetensors", "input/subject.png",
+    "asset.json", "asset.glb", "asset.usdz", "preview.mp4", "preview.webp", "turntable.mp4", "contact_sheet.png",
+    "canonical/gaussians.ply", "canonical/motion.safetensors", "canonical/asset4d.safetensors",
+    "input/subject.png", "input/driving.mp4", "splats/moving.websplats",
 }  # fmt: skip
-SPLATS = {f"splats/{i:03d}.ply" for i in range(FRAMES)}
+SPLATS = {f"splats/{i:03d}.{form}" for i in range(FRAMES) for form in ("ply", "spz")}
+RIGGED = {"asset_rigged.glb"}
 MESHES = {f"meshes/{i:03d}.glb" for i in range(FRAMES)}
 
 
@@ -32,7 +34,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def per_frame(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return packed(tmp_path_factory.mktemp("per_frame"), "per_frame", splats=False)
+    return packed(tmp_path_factory.mktemp("per_frame"), "per_frame", splats=False, spz=False)
 
 
 def files(folder: Path) -> set[str]:
@@ -40,7 +42,7 @@ def files(folder: Path) -> set[str]:
 
 
 def test_a_tracked_package_is_complete(package: Path) -> None:
-    assert files(package) == COMMON | SPLATS
+    assert files(package) == COMMON | SPLATS | RIGGED
 
 
 def test_a_package_of_a_mesh_per_frame_is_complete(per_frame: Path) -> None:
@@ -55,7 +57,8 @@ def test_the_manifest_says_what_is_there(package: Path, per_frame: Path) -> None
         assert manifest.vertices == (len(gem().vertices),) * meshes
         assert manifest.triangles == (len(gem().faces),) * meshes
         assert set(manifest.files) == files(folder) - {"asset.json"}
-        assert manifest.notes == (NOTE,)
+        assert manifest.notes[0] == NOTE
+    assert any(note.startswith("rig: 1 bone ") for note in read_manifest(package).notes)
 
 
 def test_the_glb_moves_as_the_tracked_mesh_and_says_how_it_was_made(package: Path) -> None:
@@ -64,6 +67,39 @@ def test_the_glb_moves_as_the_tracked_mesh_and_says_how_it_was_made(package: Pat
     assert asset.fps == FPS
     assert asset.extras["notes"] == [NOTE]
     assert asset.extras["generator"].startswith("dg4d ")
+
+
+def test_another_frame_rate_keeps_the_length_and_the_frames(tmp_path: Path) -> None:
+    folder = packed(tmp_path, fps=2 * FPS)
+    manifest, asset, states = (
+        read_manifest(folder),
+        read_glb((folder / "asset.glb").read_bytes()),
+        read_splats(folder / "splats"),
+    )
+    assert (manifest.frames, manifest.fps) == (len(asset.offsets), asset.fps) == (2 * FRAMES, 2 * FPS)
+    assert manifest.duration_s == pytest.approx(FRAMES / FPS)
+    assert len(states.means) == 2 * FRAMES
+    torch.testing.assert_close(asset.offsets[::2], tracked().offsets, atol=1e-6, rtol=0)
+    torch.testing.assert_close(states.means[::2, 0, 0], torch.linspace(0, REACH, FRAMES))
+    assert states.means[1, 0, 0].item() == pytest.approx(REACH / 4)
+
+
+def test_a_mesh_per_frame_keeps_the_rate_of_the_driving_video(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match=r"48 are asked for.*mesh\.mode=tracked"):
+        packed(tmp_path, "per_frame", fps=2 * FPS)
+
+
+def test_levels_of_detail_have_their_share_of_the_triangles(tmp_path: Path) -> None:
+    pytest.importorskip("meshoptimizer", reason="meshoptimizer is not installed: make clients")
+    folder = packed(tmp_path, lods=(0.5,))
+    level = read_glb((folder / "lod/1.glb").read_bytes())
+    assert len(level.mesh.faces) <= len(gem().faces) / 2
+    assert len(level.offsets) == FRAMES
+
+
+def test_what_is_not_wanted_is_not_written(tmp_path: Path) -> None:
+    folder = packed(tmp_path, usd=False, spz=False, rig=False, splats=False, splat_gltf="ratified")
+    assert files(folder) == COMMON - {"asset.usdz"} | {f"splats/{i:03d}.glb" for i in range(FRAMES)}
 
 
 def test_the_splats_move_as_the_motion_says(package: Path) -> None:

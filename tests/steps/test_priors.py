@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 
 import pytest
@@ -6,9 +7,17 @@ import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BackendUnavailable, BadInput
+from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.interface import View
-from dg4d_lib.settings import GeometricPriorSettings, MotionSettings, StaticSettings, Zero123PriorSettings
-from steps.priors import ChosenPrior, make_prior
+from dg4d_lib.settings import (
+    GeometricPriorSettings,
+    MotionSettings,
+    OraclePriorSettings,
+    StaticSettings,
+    Zero123PriorSettings,
+)
+from steps.media import write_png, write_zip
+from steps.priors import ChosenPrior, make_prior, oracle_prior, read_bank, read_bank_folder
 
 CUTOUTS = [torch.rand(64, 64, 4, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1)]
 
@@ -58,9 +67,10 @@ def test_frames_are_told_apart(model: Path) -> None:
     assert judged(choice, 0) != judged(choice, 1)
 
 
-def test_memory_that_ran_out_is_in_the_notes(model: Path) -> None:
+def test_that_memory_ran_out_is_said_of_the_run_and_of_nothing_else(model: Path) -> None:
     choice = chosen(model, StaticSettings(), CUTOUTS[:1])
-    assert len(choice.facts("cpu").notes) == 1
+    plenty = choice.facts("cpu")
+    assert len(plenty.notes) == 1 and not plenty.run_notes
 
     def tight(piece: slice) -> None:
         if piece.stop - piece.start > 3:
@@ -68,7 +78,8 @@ def test_memory_that_ran_out_is_in_the_notes(model: Path) -> None:
 
     assert choice.batches is not None
     choice.batches.run(tight, 16)
-    assert "memory ran out with 16 views" in choice.facts("cpu").notes[1]
+    assert choice.facts("cpu").notes == plenty.notes
+    assert "memory ran out with 16 views" in choice.facts("cpu").run_notes[0]
 
 
 @pytest.mark.parametrize(
@@ -90,3 +101,33 @@ def test_the_prior_without_weights_has_none_in_its_facts(tmp_path: Path) -> None
     settings = GeometricPriorSettings(size=32)
     facts = make_prior(settings, CUTOUTS[:1], StaticSettings(), None, tmp_path).facts("cpu")
     assert facts.weights == {} and facts.licenses == {} and len(facts.notes) == 1
+
+
+def bank_folder(folder: Path) -> Path:
+    """Two views of two frames, each of one color."""
+    folder.mkdir()
+    views = []
+    for row, azimuth in enumerate((0.0, 90.0)):
+        sheet = torch.ones(8, 16, 4)
+        sheet[:, :8, 0], sheet[:, 8:, 0] = 0.2 * row, 0.2 * row + 0.4
+        write_png(folder / f"{row}.png", sheet)
+        views.append({"file": f"{row}.png", "azimuth": azimuth, "elevation": 0.0, "radius": 2.0})
+    about = {"frames": [0, 2], "tile": [1, 2], "tile_size": 8, "views": views}
+    (folder / "bank.json").write_text(json.dumps(about))
+    return folder
+
+
+def test_a_bank_is_the_same_from_a_folder_and_from_a_zip(tmp_path: Path) -> None:
+    folder = bank_folder(tmp_path / "bank")
+    write_zip(tmp_path / "bank.zip", [(path.name, path.read_bytes()) for path in sorted(folder.iterdir())])
+    packed, plain = read_bank(tmp_path / "bank.zip", tmp_path / "scratch"), read_bank_folder(folder)
+    assert torch.equal(packed.pictures, plain.pictures) and packed.cameras == plain.cameras
+    assert packed.pictures[:, :, 0, 0, 0].tolist() == [[0, 102], [51, 153]] and packed.frames == (0, 2)
+
+
+def test_an_imperfect_oracle_has_the_same_flaws_in_both_stages(tmp_path: Path) -> None:
+    bank = read_bank_folder(bank_folder(tmp_path / "bank"))
+    flawed = OraclePriorSettings(pose_deg=3.0)
+    first, second = (oracle_prior(bank, flawed, Annealing(start)) for start in (0.98, 0.5))
+    assert first.viewpoints == second.viewpoints
+    assert first.viewpoints != oracle_prior(bank, OraclePriorSettings(), Annealing(0.5)).viewpoints == bank.cameras

@@ -29,7 +29,8 @@ def test_a_request_says_what_will_draw(lack: str, backend: str, monkeypatch: pyt
 PAPER = {"static.iterations": 500, "static.views": 16, "static.noise_start": 0.98, "static.noise_end": 0.02,
          "motion.iterations": 200, "motion.views": 4, "motion.noise_start": 0.5, "motion.noise_end": 0.02,
          "motion.frames_per_iteration": 0, "static.points": 5000, "deformation.temporal": 32, "deformation.spatial": 32,
-         "deformation.features": 32, "prior.weights": "zero123-xl", "prior.variant": "xl", "prior.guidance_scale": 5.0,
+         "deformation.features": 32, "deformation.endpoint": True, "motion.fine_tune": False,
+         "prior.weights": "zero123-xl", "prior.variant": "xl", "prior.guidance_scale": 5.0,
          "driving.kind": "svd", "driving.frames": 14,
          "refiner.kind": "video_to_video", "refiner.skipped": 0.7, "static.start": "blob",
          "mesh.mode": "per_frame", "mesh.grid": 128, "mesh.texture_size": 1024}  # fmt: skip
@@ -39,6 +40,7 @@ DIFFERENCES = {
     "video-fast": {"subject.max_frames": 16, "motion.iterations": 500, "motion.views": 1},
     "reference": {"motion.iterations": 500, "static.noise_start": 1.0, "static.noise_end": 0.0,
                   "motion.noise_start": 1.0, "motion.noise_end": 0.0, "deformation.temporal": 12,
+                  "motion.fine_tune": True, "deformation.endpoint": False, "deformation.half_side": 1.6,
                   "prior.weights": "stable-zero123", "prior.variant": "stable",
                   "static.start": "lgm", "static.iterations": 0},
 }  # fmt: skip

@@ -18,7 +18,7 @@ from dg4d_lib.weights.registry import KNOWN
 from steps.catalog import STEPS
 from steps.contract import ArtifactRef, ProvenanceRecord, StepRequest, StepResult
 from steps.main import perform, request_version
-from steps.packages import ASSET, GAUSSIANS, MANIFEST, MESHES, MOTION, PREVIEW, SHEET, SPLATS, SUBJECT
+from steps.packages import ABOUT, ASSET, MANIFEST, MESHES, RIGGED, SPLATS
 from steps.profiles import (
     PROFILES,
     DriveVideoSettings,
@@ -71,7 +71,7 @@ WRITERS = {
     "imagedream": write_imagedream,
     "lgm": write_lgm,
 }
-ALWAYS = {MANIFEST, ASSET, GAUSSIANS, MOTION, SUBJECT, PREVIEW, SHEET}
+ALWAYS = {MANIFEST, *ABOUT} - {RIGGED}
 
 
 @dataclass
@@ -119,8 +119,9 @@ class Run:
         dynamic = FitMotionSettings(
             prior=settings.prior, deformation=settings.deformation, motion=settings.motion, **draws
         )
-        motion = self.step("fit_motion", {"gaussians": gaussians, "driving_video": video}, dynamic)["motion"]
-        cloud = {"gaussians": gaussians, "motion": motion}
+        fitted = self.step("fit_motion", {"gaussians": gaussians, "driving_video": video}, dynamic)
+        assert ("gaussians" in fitted) == settings.motion.fine_tune
+        cloud = {"gaussians": fitted.get("gaussians", gaussians), "motion": fitted["motion"]}
         extracted = self.step("extract_mesh", cloud, ExtractMeshSettings(mesh=settings.mesh, **draws))
         surface = {port: extracted.get(port) for port in ("tracked", "meshes")}
         refined = self.step(
@@ -189,9 +190,9 @@ def test_a_file_becomes_a_package_by_the_models_that_its_profile_names_and_no_ot
         names, manifest = set(files.namelist()), json.loads(files.read(MANIFEST))
         assert files.read(ASSET).startswith(b"glTF")
     per_frame = name != "quality"
-    assert names == {
+    assert names - {RIGGED} == {
         *ALWAYS,
-        *(f"{SPLATS}/{frame:03d}.ply" for frame in range(FRAMES)),
+        *(f"{SPLATS}/{frame:03d}.{form}" for frame in range(FRAMES) for form in ("ply", "spz")),
         *(f"{MESHES}/{frame:03d}.glb" for frame in range(FRAMES * per_frame)),
     }
     assert manifest["frames"] == FRAMES and set(said) <= set(manifest["notes"])

@@ -81,6 +81,16 @@ def test_video_diffusion_sees_all_frames_as_one_video(folder: Path, mode: str, m
     assert "every 2 iterations" in facts.notes[0] and "2 steps" in facts.notes[0]
 
 
+def test_every_frame_of_a_tracked_mesh_may_add_its_own(folder: Path) -> None:
+    facts = refine(folder, "tracked", video_to_video(folder, frame_size=8))
+    asset = read_tracked(folder / "tracked")
+    assert asset.textures is not None and asset.textures.shape == (FRAMES, 8, 8, 3)
+    assert asset.mesh.texture.shape == (16, 16, 3) and asset.fps == 24
+    assert "from frame to frame" in facts.notes[1]
+    facts = refine(folder, "meshes", video_to_video(folder, frame_size=8))  # there every frame has its own anyway
+    assert len(facts.notes) == 1
+
+
 def test_image_diffusion_is_the_alternative(folder: Path) -> None:
     prior = {"weights": str(write_zero123(folder / "zero123")), "precision": "fp32"}
     settings = ImageToImageSettings(texture=TEXTURE, prior=prior, steps=4)

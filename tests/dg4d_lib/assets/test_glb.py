@@ -13,19 +13,14 @@ import torch
 import trimesh
 from PIL import Image
 
+from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.assets.glb import (
-    read_glb,
-    read_mesh_glb,
-    seamless_normals,
-    write_frames_glb,
-    write_glb,
-    write_mesh_glb,
-)
+from dg4d_lib.assets.glb import read_glb, read_mesh_glb, write_frames_glb, write_glb, write_mesh_glb
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.textured import TexturedMesh
 
 FRAMES, FPS = 5, 7.0
+PNG = GltfSettings(image="png")
 COMPONENTS = {5126: "<f4", 5125: "<u4", 5123: "<u2"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
 
@@ -62,10 +57,11 @@ def rows(tree: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
 
 
 WRITTEN = {
-    "tracked": lambda: write_glb(moving_ball()),
+    "tracked": lambda: write_glb(moving_ball(), PNG),
     "one frame": lambda: write_glb(moving_ball(frames=1)),
+    "many frames": lambda: write_glb(moving_ball(frames=300)),
     "per frame": lambda: write_frames_glb([ball(0), ball(1), ball(0)], FPS),
-    "still": lambda: write_mesh_glb(ball()),
+    "still": lambda: write_mesh_glb(ball(), PNG),
 }
 
 
@@ -109,7 +105,7 @@ def test_other_readers_load_it(kind: str) -> None:
 
 def test_a_tracked_mesh_comes_back() -> None:
     given = moving_ball()
-    back = read_glb(write_glb(given))
+    back = read_glb(write_glb(given, PNG))
     for name in ("vertices", "faces", "uvs"):
         assert torch.equal(getattr(back.mesh, name), getattr(given.mesh, name))
     torch.testing.assert_close(back.mesh.texture, given.mesh.texture, atol=1e-7, rtol=0)
@@ -141,41 +137,58 @@ def test_each_key_shows_one_frame_and_the_last_key_shows_the_first() -> None:
 def test_a_mesh_per_frame_is_shown_alone_at_its_time() -> None:
     tree, binary = unpack(write_frames_glb([ball(0), ball(1), ball(0)], FPS))
     (animation,) = tree["animations"]
-    scales = []
     for node, (channel, sampler) in enumerate(zip(animation["channels"], animation["samplers"], strict=True)):
         assert channel["target"] == {"node": node, "path": "scale"}
         assert sampler["interpolation"] == "STEP"
-        scales.append(rows(tree, binary, sampler["output"]))
-    assert np.array_equal(np.stack(scales)[..., 0], [[1, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0]])
-    assert [node["scale"] for node in tree["nodes"]] == [[1.0] * 3, [0.0] * 3, [0.0] * 3]
+        keys = (rows(tree, binary, sampler["input"])[:, 0] * FPS).round().astype(int).tolist()
+        scales = rows(tree, binary, sampler["output"])
+        assert (scales == scales[:, :1]).all()
+        held = [scales[max(i for i, key in enumerate(keys) if key <= frame), 0] for frame in range(4)]
+        assert held == [node == frame % 3 for frame in range(4)]
+    assert [node.get("scale") for node in tree["nodes"]] == [[1.0] * 3, [0.0] * 3, [0.0] * 3, None]
+    assert tree["nodes"][tree["scenes"][0]["nodes"][0]] == {"name": "subject", "children": [0, 1, 2]}
+
+
+def test_a_thousand_frames_come_back_and_no_node_holds_more_than_a_player_can() -> None:
+    given = moving_ball(frames=1000)
+    content = write_glb(given, PNG)
+    assert torch.equal(read_glb(content).offsets, given.offsets)
+    assert max(len(mesh["weights"]) for mesh in unpack(content)[0]["meshes"]) <= 129
+    assert len(content) < 1000 * len(given.mesh.vertices) * 24 * 1.3  # what nodes share is written once
+
+
+def test_nodes_of_a_long_animation_follow_each_other_without_a_gap() -> None:
+    tree, binary = unpack(write_glb(moving_ball(frames=300)))
+    (animation,) = tree["animations"]
+    seconds = np.arange(301 * 4) / 4 / FPS
+    shown, weighted = np.zeros((3, len(seconds))), []
+    for channel, sampler in zip(animation["channels"], animation["samplers"], strict=True):
+        times, output = rows(tree, binary, sampler["input"])[:, 0], rows(tree, binary, sampler["output"])
+        node = channel["target"]["node"]
+        if channel["target"]["path"] == "scale":
+            shown[node] = output[np.searchsorted(times, seconds, side="right") - 1, 0]
+        else:
+            weighted.append((node, times[0], times[-1]))
+    assert (shown.sum(0) == 1).all()
+    for node, first, last in weighted:
+        there = seconds[shown[node] == 1]
+        assert first <= there[there < 300 / FPS - 1e-3].max()
+        assert node == 0 or first <= there.min() + 1e-5
+        assert last >= there[there < 300 / FPS - 1e-3].max()
 
 
 def test_a_still_mesh_comes_back() -> None:
-    back = read_mesh_glb(write_mesh_glb(ball()))
+    back = read_mesh_glb(write_mesh_glb(ball(), PNG))
     assert torch.equal(back.vertices, ball().vertices)
     torch.testing.assert_close(back.texture, ball().texture, atol=1e-7, rtol=0)
 
 
 def test_the_first_row_of_the_texture_is_the_top_of_the_embedded_picture() -> None:
-    tree, binary = unpack(write_mesh_glb(ball()))
+    tree, binary = unpack(write_mesh_glb(ball(), PNG))
     view = tree["bufferViews"][tree["images"][0]["bufferView"]]
     content = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
     picture = np.array(Image.open(io.BytesIO(content)))
     assert np.array_equal(picture, (ball().texture * 255).round().byte().numpy())
-
-
-def test_normals_are_smooth_across_seams() -> None:
-    sphere = ball(subdivisions=2)
-    normals = seamless_normals(sphere.vertices.numpy(), sphere.faces.numpy())
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
-    radial = sphere.vertices.numpy() / 0.5
-    assert (normals * radial).sum(1).min() > 0.995
-
-
-def test_a_vertex_without_area_still_has_a_unit_normal() -> None:
-    vertices = np.zeros((4, 3), np.float32)
-    normals = seamless_normals(vertices, np.array([[0, 1, 2]]))
-    assert np.array_equal(normals, np.tile((0, 1, 0), (4, 1)))
 
 
 def test_many_vertices_get_wide_indices() -> None:
@@ -197,11 +210,36 @@ def test_equal_assets_give_equal_bytes() -> None:
         (replace(moving_ball(), offsets=moving_ball().offsets * float("nan")), "not finite"),
         (replace(moving_ball(), mesh=replace(ball(), faces=torch.zeros(0, 3, dtype=torch.long))), "without triangles"),
         (replace(moving_ball(), mesh=replace(ball(), vertices=ball().vertices * float("inf"))), "not finite"),
+        (replace(moving_ball(), mesh=replace(ball(), vertices=ball().vertices * float("nan"))), "not finite"),
+        (replace(moving_ball(), mesh=replace(ball(), texture=torch.zeros(0, 4, 3))), "needs a texture"),
+        (replace(moving_ball(), mesh=replace(ball(), faces=ball().faces + 1)), "beyond"),
+        (replace(moving_ball(), offsets=torch.zeros(2, 3, 3)), "offsets for 3"),
+        (replace(moving_ball(), fps=float("nan")), "positive"),
+        (replace(moving_ball(), textures=torch.full((FRAMES, 4, 4, 3), float("nan"))), "not finite"),
     ],
 )
 def test_an_unusable_asset_is_refused(asset: Asset4D, says: str) -> None:
     with pytest.raises(BadInput, match=says):
         write_glb(asset)
+
+
+@pytest.mark.parametrize("side", [1, 3])
+def test_tiny_textures_come_back(side: int) -> None:
+    mesh = replace(ball(), texture=torch.full((side, side, 3), 0.2))
+    torch.testing.assert_close(read_mesh_glb(write_mesh_glb(mesh)).texture, mesh.texture, atol=2 / 255, rtol=0)
+
+
+def test_a_texture_of_8192_pixels_is_written_whole() -> None:
+    mesh = replace(ball(), texture=torch.full((1, 1, 3), 0.5).expand(8192, 8192, 3))
+    tree, binary = unpack(write_mesh_glb(mesh))
+    view = tree["bufferViews"][tree["images"][0]["bufferView"]]
+    with Image.open(io.BytesIO(binary[view["byteOffset"] :])) as picture:
+        assert picture.size == (8192, 8192)
+
+
+def test_text_of_any_script_stays_in_the_extras() -> None:
+    extras = {"name": 'süßer Fuchs 🦊 " \\ \n', "名前": ["きつね"]}
+    assert read_glb(write_glb(replace(moving_ball(), extras=extras))).extras == extras
 
 
 def test_no_meshes_are_refused() -> None:

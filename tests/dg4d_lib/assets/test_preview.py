@@ -1,6 +1,8 @@
-"""The preview film: it plays, it shows the object where it is, and equal assets give equal films."""
+"""The films: they play, they show the object where it is, and equal assets give equal films."""
 
+import struct
 from collections.abc import Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -9,14 +11,14 @@ import numpy as np
 import pytest
 import torch
 
+from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets import preview
-from dg4d_lib.assets.preview import studio, write_film, write_preview
+from dg4d_lib.assets.preview import studio, write_film, write_preview, write_turntable
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer.reference import rasterize
-from dg4d_lib.settings import PackSettings
 
 SETTINGS = PackSettings(preview_size=64, preview_turns=2)
 FRAMES, FPS = 3, 7.0  # sampled three times per frame: 21 fps
@@ -41,6 +43,27 @@ def test_the_film_has_every_position_of_every_loop_at_a_smooth_rate(written: Pat
     pictures, rate = film(written)
     assert pictures.shape == (FRAMES * 3 * 2, 64, 64, 3)
     assert rate == 21
+
+
+def boxes(content: bytes) -> list[str]:
+    """The names of the boxes of an MP4, in their order."""
+    names, start = [], 0
+    while start < len(content):
+        size, name = struct.unpack_from(">I4s", content, start)
+        names.append(name.decode())
+        start += size
+    return names
+
+
+def test_browsers_can_play_it_and_begin_before_all_is_loaded(written: Path) -> None:
+    """They want H.264 in 4:2:0, and the index before the pictures."""
+    with av.open(str(written)) as container:
+        assert [stream.type for stream in container.streams] == ["video"]
+        context = container.streams.video[0].codec_context
+        assert (context.name, context.pix_fmt) == ("h264", "yuv420p")
+    names = boxes(written.read_bytes())
+    assert names[0] == "ftyp"
+    assert names.index("moov") < names.index("mdat")
 
 
 def test_a_slow_motion_is_not_sampled_without_end(
@@ -81,6 +104,27 @@ def test_progress_ends_at_the_number_of_pictures(tmp_path: Path, red_dot: Gaussi
     report = lambda done, total: heard.append((done, total))  # noqa: E731
     write_preview(tmp_path / "a.mp4", red_dot, slide, 2, 30.0, rasterize, SETTINGS, report)
     assert heard == [(4, 4)]
+
+
+def test_the_turntable_turns_once_and_nothing_else_moves(tmp_path: Path, red_dot: Gaussians) -> None:
+    """A ball beside the axis goes round: right, behind, left, front."""
+    beside = replace(red_dot, means=torch.tensor([[0.5, 0.0, 0.0]]))
+    assert write_turntable(tmp_path / "turntable.mp4", beside, rasterize, SETTINGS) == ()
+    pictures, rate = film(tmp_path / "turntable.mp4")
+    assert len(pictures) / rate == preview.TURN_S
+    redness = (pictures[..., 0] - pictures[..., 1] - 0.2).clip(0)  # of the ball, not of what encoding adds
+    columns = (redness.sum(1) * np.arange(64)).sum(-1) / redness.sum((1, 2)) - 31.5
+    focal = OrbitCamera(width=64, height=64).focal
+    turn = np.arange(len(pictures)) / len(pictures) * 2 * np.pi
+    tilt = np.cos(np.radians(preview.ELEVATION_DEG))
+    expected = focal * 0.5 * np.cos(turn) / (2 - tilt * 0.5 * np.sin(turn))
+    np.testing.assert_allclose(columns, expected, atol=1)
+
+
+def test_equal_states_give_equal_turntables(tmp_path: Path, red_dot: Gaussians) -> None:
+    for name in "ab":
+        write_turntable(tmp_path / f"{name}.mp4", red_dot, rasterize, SETTINGS)
+    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
 
 
 def test_without_x264_another_codec_stands_in_and_the_report_says_so(

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
+from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.sheet import PANEL, contact_sheet, videos_sheet
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer.reference import rasterize
-from dg4d_lib.settings import PackSettings
 from dg4d_lib.video.driving import DrivingVideo
 
 SIZE = 48

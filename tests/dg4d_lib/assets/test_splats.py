@@ -2,11 +2,14 @@
 
 from pathlib import Path
 
+import gsply
+import numpy as np
 import pytest
 import torch
 
 from dg4d_lib.assets.animated import moved
-from dg4d_lib.assets.splats import read_splats, write_splats
+from dg4d_lib.assets.splat_glb import read_splat_glb
+from dg4d_lib.assets.splats import read_splats, write_splat_glb_frames, write_splats, write_spz_frames
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -27,6 +30,20 @@ def test_a_sequence_comes_back_exactly(tmp_path: Path, states: Gaussians) -> Non
 def test_every_file_is_the_cloud_at_its_frame(tmp_path: Path, states: Gaussians) -> None:
     write_splats(tmp_path, states)
     assert torch.equal(read_ply(tmp_path / "002.ply").means, states.means[2])
+
+
+def test_every_spz_is_the_cloud_at_its_frame(tmp_path: Path, states: Gaussians) -> None:
+    paths = write_spz_frames(tmp_path, states)
+    assert [path.name for path in paths] == ["000.spz", "001.spz", "002.spz"]
+    for path, means in zip(paths, states.means.numpy(), strict=True):
+        np.testing.assert_allclose(gsply.read_spz(str(path)).means, means, atol=1 / 8192)
+
+
+def test_every_splat_glb_is_the_cloud_at_its_frame(tmp_path: Path, states: Gaussians) -> None:
+    paths = write_splat_glb_frames(tmp_path, states)
+    assert [path.name for path in paths] == ["000.glb", "001.glb", "002.glb"]
+    for path, means in zip(paths, states.means, strict=True):
+        assert torch.equal(read_splat_glb(path.read_bytes()).means, means)
 
 
 def test_a_gap_in_the_numbers_is_refused(tmp_path: Path, states: Gaussians) -> None:

@@ -9,10 +9,11 @@ from dg4d_lib.deformation import hexplane
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.deformation.hexplane import HexPlane, plane_features, time_lines
 from dg4d_lib.deformation.interface import Deformation
+from dg4d_lib.deformation.kinds import new_deformation
 from dg4d_lib.deformation.mlp import Mlp
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.initialize import blob
-from dg4d_lib.settings import HexPlaneSettings, MlpSettings
+from dg4d_lib.settings import FramewiseSettings, HexPlaneSettings, MlpSettings
 
 COUNT, FRAMES = 60, 5
 BOX = torch.tensor([[-0.6, -0.6, -0.6], [0.6, 0.6, 0.6]])
@@ -123,6 +124,27 @@ def test_regularizers_count_only_when_switched_on():
     for plane in rough.space:
         plane.data.fill_(0.3)
     assert rough.roughness() == 0  # constant planes, time planes at one
+
+
+def test_random_heads_move_the_cloud_before_the_first_step(cloud):
+    random = HexPlane(SMALL.model_copy(update={"zero_start": False}), BOX, torch.Generator().manual_seed(0))
+    moved = random.displace(cloud.means, torch.linspace(0, 1, FRAMES))
+    assert all((part != 0).any(-1).all() for part in (moved.means, moved.log_scales, moved.quats))
+    random.displace(cloud.means, torch.tensor([0.5])).means.sum().backward()
+    assert random.space[0].grad.abs().max() > 0  # everything learns at once
+
+
+def test_scattered_gaussians_begin_anywhere_within_the_radius_and_elsewhere_in_every_frame():
+    box = torch.tensor([[-0.6, -0.2, -0.2], [0.6, 0.2, 0.2]])
+    scattered = new_deformation(
+        FramewiseSettings(start="scattered"), box, FRAMES, 2000, torch.Generator().manual_seed(0)
+    )
+    start = scattered.displace(torch.zeros(2000, 3), torch.linspace(0, 1, FRAMES))
+    distances = start.means.norm(dim=-1)
+    assert 0.59 < distances.max() < 0.6 + 1e-6
+    assert distances.mean().item() == pytest.approx(0.75 * 0.6, rel=0.02)  # evenly over the ball
+    assert torch.corrcoef(start.means[:2, :, 0])[0, 1].abs() < 0.1
+    assert not start.log_scales.any() and not start.quats.any()
 
 
 def test_a_framewise_table_refuses_another_cloud():

@@ -50,6 +50,28 @@ def test_every_step_is_told(model: Path) -> None:
     assert told == [(1, 3), (2, 3), (3, 3)]
 
 
+def test_with_little_memory_networks_wait_beside_the_gpu_and_draw_the_same(
+    model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The processor stands for the GPU: networks get diffusers' real hooks, which send them to it one by one."""
+    from diffusers import DiffusionPipeline
+
+    offload, asked = DiffusionPipeline.enable_model_cpu_offload, []
+
+    def to_the_processor(pipeline: DiffusionPipeline, device: torch.device) -> None:
+        asked.append(str(device))
+        offload(pipeline, device="cpu")
+        assert len(pipeline._all_hooks) == 3  # of words, of noise, of pixels
+
+    monkeypatch.setattr(DiffusionPipeline, "enable_model_cpu_offload", to_the_processor)
+    settings = QUICK.model_copy(update={"low_memory": True, "precision": "fp32"})
+    generator = torch.Generator().manual_seed(0)
+    picture = draw_picture(model, "a red dragon", settings, generator, torch.device("cuda"))
+    assert asked.pop(0) == "cuda" and asked == ["cpu:0"]  # the pipeline itself sends away the last network
+    assert torch.equal(picture, draw(model))
+    assert torch.equal(picture, draw(model, low_memory=True)) and len(asked) == 1  # without a GPU there is no other way
+
+
 def test_files_in_half_precision_are_read_and_draw_the_same_up_to_their_rounding(model: Path, tmp_path: Path) -> None:
     from diffusers import StableDiffusionPipeline
 

@@ -130,11 +130,17 @@ def test_where_memory_runs_out_less_is_done_at_once_and_said(
     assert batching.is_out_of_memory(torch.OutOfMemoryError("no room"))
 
 
-def test_half_precision_does_not_leave_the_encoder_in_another_one(pixels: torch.Tensor, folder: Path) -> None:
+def test_in_half_precision_the_encoder_alone_is_wider_and_its_weights_are_never_copied(
+    pixels: torch.Tensor, folder: Path
+) -> None:
     pipeline = tiny_svd().to(torch.float16)
     half = VideoModel(pipeline.unet, pipeline.vae, pipeline.image_encoder, SETTINGS, CPU)
+    lie = [parameter.data_ptr() for parameter in half.vae.parameters()]
     latents = half.encode(pixels[None] / 255)
-    assert latents.dtype == torch.float32 and half.vae.dtype == torch.float16
+    assert half.decode(latents).shape == (1, SIDE, SIDE, 3)
+    assert [parameter.data_ptr() for parameter in half.vae.parameters()] == lie
+    assert {parameter.dtype for parameter in half.vae.decoder.parameters()} == {torch.float16}
+    assert {parameter.dtype for parameter in half.vae.encoder.parameters()} == {torch.float32} == {latents.dtype}
     exact = VideoModel.load(folder, SETTINGS, CPU).encode(pixels[None] / 255)
     torch.testing.assert_close(latents, exact, rtol=0, atol=5e-3)
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -34,6 +36,40 @@ def test_a_slide_along_x_is_recovered(kind: str, known, motion_settings):
     slid = deformation.displace(known.gaussians.means, video.times).means.median(1).values
     expected = torch.stack([SLIDE * video.times, torch.zeros(FRAMES), torch.zeros(FRAMES)], -1)
     assert (slid - expected).abs().max() < 0.03
+
+
+def test_fine_tuning_mends_colors_and_a_frozen_cloud_keeps_its_bits(known, motion_settings):
+    truth, gray = known.gaussians, replace(known.gaussians, harmonics=torch.zeros(40, 1, 3))
+    wrong = (gray.colors - truth.colors).abs().mean()
+    for fine_tune in (False, True):
+        settings = motion_settings.model_copy(update={"fine_tune": fine_tune, "color_rate": 0.1, "iterations": 60})
+        losses: list[float] = []
+        fitted = fit_motion(
+            gray, make("hexplane", known), known.video(), known.prior(0.5), known.rasterize, settings, seed(),
+            lambda _, values, losses=losses: losses.append(values["reference"]),
+        )  # fmt: skip
+        assert (gray.harmonics == 0).all()  # what was given is left alone
+        left = (fitted.colors - truth.colors).abs().mean()
+        if fine_tune:
+            assert left < 0.3 * wrong and losses[-1] < 0.05 * losses[0]
+        else:
+            assert losses[-1] > 0.2 * losses[0]
+            assert all(torch.equal(value, getattr(gray, name)) for name, value in vars(fitted).items())
+
+
+def test_fine_tuning_learns_at_the_rates_of_the_public_code(known, motion_settings):
+    """The first step of Adam is the rate, whatever the gradient; in the only iteration the means' is their last."""
+    turned = replace(known.gaussians, log_scales=known.gaussians.log_scales + torch.tensor([0.0, 0.3, -0.3]))
+    settings = motion_settings.model_copy(update={"fine_tune": True, "iterations": 1})
+    fitted = fit_motion(
+        turned, make("hexplane", known), known.video(), known.prior(0.5), known.rasterize, settings, seed()
+    )
+    rates = {"means": 2e-5, "harmonics": 0.01, "opacity_logits": 0.05, "log_scales": 0.005, "quats": 0.005}
+    for name, rate in rates.items():
+        change = (getattr(fitted, name) - getattr(turned, name)).abs()
+        assert change.median().item() == pytest.approx(rate, rel=0.01), name
+        assert change.max() < 1.02 * rate, name
+    assert (settings.mean_rate, settings.mean_rate_end) == (1e-3, 2e-5)
 
 
 def test_frames_of_an_iteration_are_spread_over_time():

@@ -4,7 +4,7 @@ import torch
 from dg4d_lib.cameras.viewpoints import random_orbit
 from dg4d_lib.errors import FitDiverged
 from dg4d_lib.fitting.losses import Diverged
-from dg4d_lib.fitting.static import fit_gaussians
+from dg4d_lib.fitting.static import background, fit_gaussians
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.guidance.interface import View
 
@@ -80,3 +80,24 @@ def test_a_cloud_that_vanishes_is_an_error_not_an_empty_asset(known, static_sett
     greedy = static_settings.model_copy(update={"densify_every": 2, "prune_opacity": 0.999})
     with pytest.raises(FitDiverged, match=r"0 Gaussians are left at iteration 2 of 150; lower static\.prune_opacity"):
         fit_gaussians(blob(50, 0.5, seed()), known.subject(), known.prior(0.98), known.rasterize, greedy, seed())
+
+
+def test_a_random_background_is_black_every_other_time_and_only_behind_random_views(known, static_settings):
+    seen = {}
+
+    def watching(gaussians, cameras, color, offsets=None):
+        seen.setdefault(len(cameras), []).append(color.unique().item())
+        return known.rasterize(gaussians, cameras, color, offsets)
+
+    settings = static_settings.model_copy(update={"iterations": 60, "densify_every": 100, "background": "random"})
+    start = blob(50, 0.5, seed())
+    fit_gaussians(start, known.subject(), known.prior(0.98), watching, settings, seed())
+    assert set(seen[1]) == {1.0} and set(seen[4]) == {0.0, 1.0}
+    assert 18 <= seen[4].count(0.0) <= 42  # three standard deviations around a half
+
+
+def test_a_white_background_draws_no_lots(static_settings):
+    generator = seed()
+    before = generator.get_state()
+    assert (background(static_settings, generator) == 1).all()
+    assert torch.equal(generator.get_state(), before)

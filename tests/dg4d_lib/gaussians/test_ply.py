@@ -1,5 +1,6 @@
 """The splat PLY: exact, equal bytes, readable by others, clear about broken files."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import gsply
@@ -33,6 +34,12 @@ def test_equal_clouds_give_equal_bytes(tmp_path: Path) -> None:
     for name in ("a.ply", "b.ply"):
         write_ply(tmp_path / name, cloud())
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_numbers_that_are_not_finite_are_refused_by_name(tmp_path: Path) -> None:
+    given = cloud()
+    with pytest.raises(BadInput, match="a PLY holds finite numbers; given others in log_scales;"):
+        write_ply(tmp_path / "a.ply", replace(given, log_scales=given.log_scales / 0))
 
 
 def test_rows_stand_in_the_order_viewers_expect(tmp_path: Path) -> None:

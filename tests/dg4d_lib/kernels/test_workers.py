@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from dg4d_lib.kernels.workers import Scratch, ranges, run
+from dg4d_lib.kernels.workers import Scratch, ranges, recycled, run
 
 
 def test_ranges_make_up_the_whole_at_multiples():
@@ -35,3 +35,15 @@ def test_memory_is_used_again_but_never_while_in_use():
     again = Scratch()
     assert again.empty((2999,)).ctypes.data == address
     assert again.empty((2, 2), np.bool_).dtype == np.bool_
+
+
+def test_memory_of_a_recycled_array_waits_for_the_tensor_made_of_it():
+    array = recycled((1000, 3))
+    array[:] = 1
+    address, tensor = array.ctypes.data, torch.from_numpy(array)
+    part = tensor[5:]
+    del array, tensor
+    assert recycled((1000, 3)).ctypes.data != address
+    assert part.eq(1).all()
+    del part
+    assert recycled((1000, 3)).ctypes.data == address

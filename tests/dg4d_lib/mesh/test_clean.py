@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from skimage.measure import marching_cubes
 
 from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
+from dg4d_lib.mesh.check import checked
 from dg4d_lib.mesh.clean import clean, drop_small_components
 from dg4d_lib.settings import MeshSettings
 
@@ -43,6 +45,27 @@ def test_the_edge_length_is_in_units_of_the_box(sphere: Mesh) -> None:
 def test_there_are_no_more_faces_than_allowed(sphere: Mesh) -> None:
     _, faces = clean(*sphere, MeshSettings(edge_length=0.02, max_faces=500))
     assert 350 < len(faces) <= 500
+
+
+def test_handles_do_not_stand_in_the_way_of_the_limit() -> None:
+    """A sponge of more than a hundred handles, each of which needs some triangles, and too few of them."""
+    axis = np.linspace(-1, 1, 40)
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    sponge = np.maximum(np.abs(x), np.maximum(np.abs(y), np.abs(z))) < 0.9
+    waves = np.cos(12 * x) + np.cos(12 * y) + np.cos(12 * z) + 0.5
+    vertices, faces, _, _ = marching_cubes(np.where(sponge, waves, -1.0), 0.0)
+    mesh = trimesh.Trimesh(vertices / 20 - 1, faces[:, ::-1])
+    assert mesh.euler_number < -200
+    cleaned = clean(mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32), MeshSettings(max_faces=400))
+    assert 100 < len(cleaned[1]) <= 400
+    assert checked(*cleaned).watertight
+
+
+def test_what_is_inside_out_is_turned(sphere: Mesh) -> None:
+    inverted = sphere[0] + 1.5, sphere[1][:, ::-1]
+    cleaned = clean(*both(sphere, inverted), COARSE)
+    facts = checked(*cleaned)
+    assert (facts.components, facts.inverted, facts.watertight) == (2, 0, True)
 
 
 def test_specks_go_and_a_hole_is_closed(sphere: Mesh) -> None:
@@ -88,7 +111,7 @@ def fake_pymeshlab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_missing_filters_name_the_system_libraries(sphere: Mesh, fake_pymeshlab: Path) -> None:
     fake_pymeshlab.write_text("def filter_list(): return ['meshing_close_holes']")
-    with pytest.raises(BackendUnavailable, match=r"no filter .* and 9 others.*libgl1 libopengl0"):
+    with pytest.raises(BackendUnavailable, match=r"no filter .* and 10 others.*libgl1 libopengl0"):
         clean(*sphere, COARSE)
 
 

@@ -2,10 +2,12 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from dg4d_lib.metrics.image import iou, psnr
+from dg4d_lib.metrics.image import iou, psnr, resized
 
 
 def noise(seed: int, *shape: int) -> torch.Tensor:
@@ -51,3 +53,13 @@ def test_a_batch_is_judged_picture_by_picture() -> None:
     x, y = noise(3, 3, 16, 16, 3), noise(4, 3, 16, 16, 3)
     alone = torch.cat([psnr(x[i : i + 1], y[i : i + 1]) for i in range(3)])
     torch.testing.assert_close(psnr(x, y), alone)
+
+
+def test_resizing_is_pillows() -> None:
+    coarse = torch.rand(1, 3, 5, 5, generator=torch.Generator().manual_seed(0))
+    smooth = torch.nn.functional.interpolate(coarse, (40, 40), mode="bilinear").movedim(1, -1)
+    levels = (smooth * 255).round().to(torch.uint8)
+    for size in (16, 96):
+        expected = np.asarray(Image.fromarray(levels[0].numpy()).resize((size, size), Image.BICUBIC)) / 255
+        difference = resized(levels / 255, size)[0].numpy() - expected
+        assert np.abs(difference).max() < 2 / 255  # Pillow rounds after either axis

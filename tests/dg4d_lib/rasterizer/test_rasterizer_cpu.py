@@ -70,3 +70,26 @@ def test_layout_of_the_inputs_and_of_the_cotangent_does_not_matter(random_cloud)
         picture = cpu(gaussians, [camera], WHITE).color
         gradients.append(torch.autograd.grad(picture.sum(), means)[0])
     assert gradients[0].equal(gradients[1])
+
+
+def test_a_gaussian_whose_size_overflows_is_not_drawn_and_changes_nothing(blobs):
+    cpu, camera = choose_rasterizer("cpu"), OrbitCamera(width=40, height=30)
+    cloud = blobs([(0, 0, 0), (0.2, 0, 0.1)]).to(torch.float32)
+    alone = cpu(replace(cloud, opacity_logits=cloud.opacity_logits - torch.tensor([0.0, 1e9])), [camera], WHITE)
+    cloud.log_scales[1] = 100
+    both = cpu(cloud, [camera], WHITE)
+    assert both.visible.tolist() == [[True, False]]
+    assert both.color.equal(alone.color)
+
+
+def test_colors_at_the_bounds_of_the_clamp_can_be_learned_and_those_beyond_cannot(blobs):
+    cpu, camera = choose_rasterizer("cpu"), OrbitCamera(width=40, height=30)
+    cloud = blobs([(0, 0, 0)], colors=[(0, 1, 0.5)]).to(torch.float32)
+    harmonics = cloud.harmonics.requires_grad_()
+    gradients = [
+        torch.autograd.grad(cpu(replace(cloud, harmonics=harmonics + shift), [camera], WHITE).color.sum(), harmonics)[0]
+        for shift in torch.tensor([[0.0, 0.0, 0.0], [-0.01, 0.01, 0.0]])
+    ]
+    red, green, blue = gradients[0].flatten()
+    assert red == green == blue > 0
+    assert gradients[1].flatten().tolist() == [0, 0, blue]

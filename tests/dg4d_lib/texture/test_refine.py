@@ -18,6 +18,7 @@ from dg4d_lib.video.driving import DrivingVideo
 SIZE, FRAMES = 64, 3
 SETTINGS = TextureSettings(iterations=50, size=SIZE, azimuth_step_deg=40.0)
 FACES = torch.tensor([[0, 1, 2], [0, 2, 3]])
+GRAY = torch.full((8, 8, 3), 0.5)
 
 
 def box(texture: Tensor) -> TexturedMesh:
@@ -109,9 +110,10 @@ def tracked(texture: Tensor) -> list[Stretch]:
 def test_a_refiner_that_knows_the_truth_gives_a_tracked_mesh_its_texture() -> None:
     truth, start = painted(), torch.full((32, 128, 3), 0.5)
     meshes = [moved(box(truth), frame) for frame in range(FRAMES)]
-    (texture,) = refine_textures(tracked(start), driving_of(meshes), Oracle(meshes), SETTINGS, rng())
+    (refined,) = refine_textures(tracked(start), driving_of(meshes), Oracle(meshes), SETTINGS, rng())
     assert error(start, truth) > 0.2
-    assert error(texture, truth) < 0.02
+    assert error(refined.texture, truth) < 0.02
+    assert refined.frames is None
 
 
 def test_it_gives_every_frame_of_its_own_mesh_its_own_texture() -> None:
@@ -119,10 +121,62 @@ def test_it_gives_every_frame_of_its_own_mesh_its_own_texture() -> None:
     meshes = [moved(box(truth), frame) for frame, truth in enumerate(truths)]
     start = torch.full((32, 128, 3), 0.5)
     stretches = [Stretch(moved(box(start), frame), torch.zeros(1, 16, 3)) for frame in range(FRAMES)]
-    textures = refine_textures(stretches, driving_of(meshes), Oracle(meshes), SETTINGS, rng())
+    refined = refine_textures(stretches, driving_of(meshes), Oracle(meshes), SETTINGS, rng())
+    textures = [each.texture for each in refined]
     for texture, truth in zip(textures, truths, strict=True):
         assert error(texture, truth) < 0.05  # each is seen by one camera per iteration
     assert error(textures[0], truths[2]) > 0.1
+
+
+def test_a_texture_that_changes_over_time_takes_what_every_frame_adds() -> None:
+    truths = [painted(0.6 * frame) for frame in range(FRAMES)]
+    meshes = [moved(box(truth), frame) for frame, truth in enumerate(truths)]
+    errors = {}
+    for size in (0, 64):
+        settings = SETTINGS.model_copy(update={"frame_size": size})
+        (refined,) = refine_textures(tracked(painted()), driving_of(meshes), Oracle(meshes), settings, rng())
+        shown_at = [refined.texture] * FRAMES if refined.frames is None else list(refined.frames)
+        assert (refined.frames is None) == (size == 0)
+        errors[size] = max(error(texture, truth) for texture, truth in zip(shown_at, truths, strict=True))
+    assert shown_at[0].shape == (16, 64, 3)  # as the texture, half as large
+    assert errors[0] > 0.1
+    assert errors[64] < 0.3 * errors[0]
+
+
+def test_where_nothing_changes_frames_add_next_to_nothing() -> None:
+    meshes = [moved(box(painted()), frame) for frame in range(FRAMES)]
+    settings = SETTINGS.model_copy(update={"frame_size": 128})
+    start = torch.full((32, 128, 3), 0.5)
+    (refined,) = refine_textures(tracked(start), driving_of(meshes), Oracle(meshes), settings, rng())
+    assert refined.frames is not None and refined.frames.shape == (FRAMES, 32, 128, 3)
+    for texture in refined.frames:
+        assert error(texture, painted()) < 0.03
+    assert max(error(one, other) for one in refined.frames for other in refined.frames) < 0.03
+
+
+def test_what_frames_add_is_what_its_weight_leaves_of_it() -> None:
+    """A board in one color per frame: a(b + r - c)^2 + w r^2 + w (change of r)^2 per texel, a line of equations."""
+    board = TexturedMesh(box(painted()).vertices[:4], FACES, torch.tensor([[0.0, 1], [1, 1], [1, 0], [0, 0]]), GRAY)
+    colors, weight = torch.tensor([0.3, 0.4, 0.8]), 0.2
+    frames = colors[:, None, None, None].expand(FRAMES, SIZE, SIZE, 3)
+    video = DrivingVideo(frames, torch.ones(FRAMES, SIZE, SIZE, 1), 7.0)
+    settings = SETTINGS.model_copy(update={"iterations": 150, "frame_size": 8, "frame_weight": weight})
+    (refined,) = refine_textures([Stretch(board, torch.zeros(FRAMES, 4, 3))], video, Satisfied(), settings, rng())
+
+    drawn = rasterize_mesh(board.vertices, board.faces, [OrbitCamera(width=SIZE, height=SIZE)])
+    seen = float((drawn.faces >= 0).double().mean())
+    steps = torch.eye(FRAMES, dtype=torch.float64).diff(dim=0)
+    # unknowns: b, r1, r2, r3
+    equations = torch.zeros(FRAMES + 1, FRAMES + 1, dtype=torch.float64)
+    equations[0, 0], equations[0, 1:], equations[1:, 0] = FRAMES, 1, 1
+    equations[1:, 1:] = (1 + weight / seen) * torch.eye(FRAMES) + weight / seen * steps.T @ steps
+    base, *added = torch.linalg.solve(equations, torch.cat([colors.double().sum()[None], colors.double()])).tolist()
+    inside = refined.texture[2:-2, 2:-2]
+    assert float(inside.mean()) == pytest.approx(base, abs=0.01)
+    assert refined.frames is not None
+    for texture, more in zip(refined.frames, added, strict=True):
+        assert float(texture[2:-2, 2:-2].mean()) == pytest.approx(base + more, abs=0.01)
+    assert max(added) < 0.8 * float(colors.max() - colors.mean())  # so that the weight is felt
 
 
 def test_the_camera_goes_round_at_constant_speed_from_random_starts() -> None:
@@ -153,11 +207,11 @@ def test_texels_that_nothing_shows_stay_bit_for_bit() -> None:
     front = TexturedMesh(mesh.vertices[:4], mesh.faces[:2], mesh.uvs[:4] * torch.tensor([1.0, 0.4]), start)
     truth = TexturedMesh(front.vertices, front.faces, front.uvs, 1 - start)
     settings = SETTINGS.model_copy(update={"iterations": 3, "azimuth_step_deg": 0.0})
-    (texture,) = refine_textures(
+    (refined,) = refine_textures(
         [Stretch(front, torch.zeros(1, 4, 3))], driving_of([truth]), Satisfied(), settings, rng()
     )
-    assert torch.equal(texture[32:], start[32:])
-    assert (texture[4:20, 4:28] - start[4:20, 4:28]).abs().mean() > 0.05
+    assert torch.equal(refined.texture[32:], start[32:])
+    assert (refined.texture[4:20, 4:28] - start[4:20, 4:28]).abs().mean() > 0.05
 
 
 def test_the_input_view_does_not_color_what_it_sees_from_the_side() -> None:
@@ -170,19 +224,19 @@ def test_the_input_view_does_not_color_what_it_sees_from_the_side() -> None:
     red = DrivingVideo(torch.tensor([1.0, 0, 0]).expand(1, SIZE, SIZE, 3), torch.ones(1, SIZE, SIZE, 1), 7.0)
     stretches = [Stretch(turned, torch.zeros(1, 16, 3))]
     settings = SETTINGS.model_copy(update={"iterations": 3, "min_cosine": 0.6})
-    (texture,) = refine_textures(stretches, red, Satisfied(), settings, rng())
-    change = (texture - start).abs().mean(-1).mean(0).reshape(4, 32).mean(1)
+    (refined,) = refine_textures(stretches, red, Satisfied(), settings, rng())
+    change = (refined.texture - start).abs().mean(-1).mean(0).reshape(4, 32).mean(1)
     assert change[0] > 0.1
     assert change[1:].max() < 0.01
-    (texture,) = refine_textures(stretches, red, Satisfied(), settings.model_copy(update={"min_cosine": 0.0}), rng())
-    assert (texture - start).abs().mean(-1).mean(0).reshape(4, 32).mean(1)[1:].max() > 0.1
+    (refined,) = refine_textures(stretches, red, Satisfied(), settings.model_copy(update={"min_cosine": 0.0}), rng())
+    assert (refined.texture - start).abs().mean(-1).mean(0).reshape(4, 32).mean(1)[1:].max() > 0.1
 
 
 def test_equal_seeds_give_equal_bits() -> None:
     meshes = [moved(box(painted()), frame) for frame in range(FRAMES)]
     settings = SETTINGS.model_copy(update={"iterations": 3})
     once, again, other = (
-        refine_textures(tracked(painted(1.0)), driving_of(meshes), Oracle(meshes), settings, rng(seed))[0]
+        refine_textures(tracked(painted(1.0)), driving_of(meshes), Oracle(meshes), settings, rng(seed))[0].texture
         for seed in (0, 0, 1)
     )
     assert torch.equal(once, again) and not torch.equal(once, other)

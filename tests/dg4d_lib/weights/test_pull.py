@@ -8,7 +8,7 @@ import pytest
 from huggingface_hub.errors import OfflineModeIsEnabled
 
 from dg4d_lib.errors import BackendUnavailable
-from dg4d_lib.weights.locate import find_weights
+from dg4d_lib.weights.locate import digests, find_weights
 from dg4d_lib.weights.lock import read_lock
 from dg4d_lib.weights.pull import needed, pull
 from dg4d_lib.weights.registry import KNOWN, weights_called
@@ -219,3 +219,22 @@ def test_tensors_come_in_one_format(files: list[str], chosen: list[str]) -> None
 def test_a_part_may_be_a_single_file() -> None:
     files = ["model.safetensors", "model_fp16_fixrot.safetensors", "model_fp16.safetensors", "README.md"]
     assert needed(files, KNOWN["lgm"].parts) == ["model_fp16_fixrot.safetensors"]
+
+
+@pytest.mark.parametrize("name", ["vgg16", "lpips-vgg", "i3d"])
+def test_of_the_judges_repositories_one_file_is_needed(name: str) -> None:
+    (file,) = KNOWN[name].parts
+    repository = [file, "README.md", "config.json", "LPIPS_v0.1_alex-df73285e.pth", "pytorch_model.bin", "other.pt"]
+    assert needed(repository, KNOWN[name].parts) == [file]
+
+
+@pytest.mark.parametrize("name", ["lpips-vgg", "i3d"])
+def test_files_of_torch_are_found_and_told_apart_by_their_content(name: str, tmp_path: Path) -> None:
+    (file,) = KNOWN[name].parts
+    (tmp_path / name).mkdir()
+    (tmp_path / name / file).write_bytes(b"tensors")
+    assert find_weights(name, tmp_path) == tmp_path / name
+    before = digests(tmp_path / name, KNOWN[name].parts)
+    assert list(before) == [file]
+    (tmp_path / name / file).write_bytes(b"other tensors")
+    assert digests(tmp_path / name) != before

@@ -12,7 +12,7 @@ def test_a_name_and_its_hub_id_mean_the_same() -> None:
 
 def test_what_is_not_verified_is_not_commercial() -> None:
     allowed = {name for name, weights in KNOWN.items() if weights.license.allows_commercial_use}
-    assert allowed == {"svd", "svd-xt"}
+    assert allowed == {"svd", "svd-xt", "vgg16", "lpips-vgg"}
     assert weights_called("stable-zero123").license.commercial == "no"
     assert not weights_called("somebody/something").license.allows_commercial_use
 

@@ -1,0 +1,364 @@
+"""The paper's ablations on objects whose truth is known: `python -m benchmarks.ablations NAME ...`.
+
+Every variant is a set of the pipeline's own settings. The prior is the oracle, which knows true views (never those that
+are scored); with `--imperfect` they are blurred, beside the view, and shifted and tinted otherwise in every frame.
+Objects are our own, or those of a data set with banks (`--data DIR`). The table has means over objects and seeds and,
+behind a +-, the standard deviation over them; the sentence below compares pairs: the same object, the same seed.
+`--quick` is a smoke test.
+
+An oracle is no diffusion model: it never disagrees with itself from one iteration to the next. What of the paper rests
+on that cannot be seen here, and is said so.
+"""
+
+import argparse
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import mean, stdev
+from typing import Any
+
+from rich.console import Console
+from rich.table import Column, Table
+
+from benchmarks.fits import Figures, fits_per_frame, moving_fit, score, static_fit
+from benchmarks.measure import write_rows
+from benchmarks.objects.specimens import OBJECTS, Specimen, made, read
+from dg4d_lib.gaussians.cloud import Gaussians
+from flows.manifest import parse_changes
+from steps.profiles import PipelineSettings, revise
+from steps.truth import find_truths
+
+DIGITS = {"psnr": 2, "psnr_obj": 2, "iou": 3, "terr": 3}
+LESS_IS_BETTER = {"terr"}
+SIGNIFICANT = 2.0  # standard errors of the mean of the differences
+
+SMALL: dict[str, Any] = {  # the paper's schedule, scaled to seconds on a processor: fewer iterations, larger steps
+    "prior.kind": "oracle",
+    "static.iterations": 150,
+    "static.views": 8,
+    "static.points": 2000,
+    "motion.iterations": 100,
+    "motion.views": 2,
+    "motion.plane_rate": 0.0128,
+    "motion.network_rate": 0.00128,
+}
+QUICK: dict[str, Any] = {"static.iterations": 30, "static.points": 500, "motion.iterations": 10}
+IMPERFECT: dict[str, Any] = {"prior.blur": 1.0, "prior.color_gain": 0.2, "prior.pose_deg": 4.0, "prior.shift": 1.5}
+FINE: dict[str, Any] = {"deformation.scales": [1, 4]}
+TUNED: dict[str, Any] = {"motion.fine_tune": True}
+LONGER: dict[str, Any] = {"motion.iterations": 200}
+SMOOTH: dict[str, Any] = {"deformation.smoothness_weight": 0.01}
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One row of a table.
+
+    Attributes:
+        changes: of the settings, dotted.
+        per_frame: every frame is fitted for itself, from a blob.
+    """
+
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    per_frame: bool = False
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One variant is better than another by a figure, or (`alike`) not significantly."""
+
+    better: str
+    other: str
+    figure: str
+    alike: bool = False
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """What is compared.
+
+    Attributes:
+        says: the paper's claim in our words.
+        variants: by name, in the order of the table.
+        claims: what has to hold for it.
+        still: only the static stage.
+        caveat: why the oracle cannot decide all of it.
+    """
+
+    says: str
+    variants: Mapping[str, Variant]
+    claims: tuple[Claim, ...]
+    still: bool = False
+    caveat: str = ""
+
+
+ABLATIONS: dict[str, Ablation] = {
+    "static": Ablation(
+        "16 views before white (DreamGaussianHD) give a better static object than 1 view before black or white",
+        {
+            "1 view, random": Variant({"static.views": 1, "static.background": "random"}),
+            "1 view, white": Variant({"static.views": 1}),
+            "16 views, random": Variant({"static.views": 16, "static.background": "random"}),
+            "16 views, white": Variant({"static.views": 16}),
+        },
+        (
+            Claim("16 views, white", "1 view, white", "psnr"),
+            Claim("16 views, white", "16 views, random", "psnr"),
+            Claim("16 views, white", "1 view, random", "psnr"),
+        ),
+        still=True,
+        caveat="the oracle's pictures are before white, as Zero-1-to-3's are: who renders before black learns a white "
+        "shell, which `psnr_obj` cannot see",
+    ),
+    "representation": Ablation(
+        "HexPlane moves better than an MLP and than a fit per frame, and a static start helps the latter",
+        {
+            "HexPlane": Variant(),
+            "MLP": Variant({"deformation.kind": "mlp"}),
+            "frame-wise, static start": Variant({"deformation.kind": "framewise"}),
+            "frame-wise, scattered": Variant({"deformation.kind": "framewise", "deformation.start": "scattered"}),
+            "every frame from a blob": Variant(per_frame=True),
+        },
+        (
+            Claim("HexPlane", "MLP", "psnr_obj"),
+            Claim("HexPlane", "MLP", "terr"),
+            Claim("HexPlane", "frame-wise, static start", "psnr_obj"),
+            Claim("HexPlane", "frame-wise, static start", "terr"),
+            Claim("HexPlane", "every frame from a blob", "terr"),
+            Claim("frame-wise, static start", "frame-wise, scattered", "psnr_obj"),
+        ),
+        caveat="a perfect oracle says the same of every frame, which leaves no flicker to regularize: see --imperfect",
+    ),
+    "resolution": Ablation(
+        "32 cells of space and of time are best",
+        {
+            "S 32, T 32": Variant(),
+            "S 8, T 32": Variant({"deformation.spatial": 8}),
+            "S 16, T 32": Variant({"deformation.spatial": 16}),
+            "S 64, T 32": Variant({"deformation.spatial": 64}),
+            "S 128, T 32": Variant({"deformation.spatial": 128}),
+            "S 32, T 4": Variant({"deformation.temporal": 4}),
+            "S 32, T 8": Variant({"deformation.temporal": 8}),
+            "S 32, T 16": Variant({"deformation.temporal": 16}),
+            "S 32, T 64": Variant({"deformation.temporal": 64}),
+        },
+        tuple(
+            Claim("S 32, T 32", other, "psnr_obj") for other in ("S 8, T 32", "S 128, T 32", "S 32, T 4", "S 32, T 64")
+        ),
+        caveat="planes finer than the motion cost nothing where the prior is consistent over time",
+    ),
+    "zero-start": Ablation(
+        "heads that start at zero lead to a better motion than random ones",
+        {"zero": Variant(), "random": Variant({"deformation.zero_start": False})},
+        (Claim("zero", "random", "psnr_obj"),),
+        caveat="the oracle has one answer, so that no start can lead to another; zero heads only learn a little later",
+    ),
+    "noise": Ablation(
+        "in the dynamic stage T_max = 0.5 is better than 0.98",
+        {"T_max .5": Variant({"motion.noise_start": 0.5}), "T_max .98": Variant({"motion.noise_start": 0.98})},
+        (Claim("T_max .5", "T_max .98", "psnr_obj"),),
+        caveat="a denoiser that knows the picture does so at every timestep: T_max only weighs its gradient",
+    ),
+    "fine-tuning": Ablation(
+        "freezing the static Gaussians in the dynamic stage, the paper's default, costs nothing",
+        {"frozen": Variant(), "fine-tuned": Variant({"motion.fine_tune": True})},
+        (Claim("fine-tuned", "frozen", "psnr_obj", alike=True),),
+    ),
+    "rigidity": Ablation(
+        "a loss of local rigidity over time brings no significant improvement",
+        {
+            "off": Variant(),
+            "weight 3000": Variant({"motion.rigidity_weight": 3000.0}),
+            "weight 100000": Variant({"motion.rigidity_weight": 100000.0}),
+        },
+        tuple(
+            Claim(weight, "off", figure, alike=True)
+            for weight in ("weight 3000", "weight 100000")
+            for figure in ("psnr_obj", "terr")
+        ),
+    ),
+    "fast": Ablation(
+        "all frames with four views each (Ours) beat half of them with one view (Ours-Fast)",
+        {
+            "Ours": Variant({"motion.views": 4, **SMOOTH}),
+            "Ours-Fast": Variant({"motion.views": 1, "subject.max_frames": 0.5, **SMOOTH}),
+        },
+        (Claim("Ours", "Ours-Fast", "psnr_obj"), Claim("Ours", "Ours-Fast", "terr")),
+    ),
+    "regularizers": Ablation(
+        "ours, not the paper's: between the frames that were fitted, planes finer than these frames need smoothness",
+        {
+            "off": Variant({"subject.max_frames": 0.5}),
+            "smoothness .01": Variant({"subject.max_frames": 0.5, **SMOOTH}),
+            "smoothness 100": Variant({"subject.max_frames": 0.5, "deformation.smoothness_weight": 100.0}),
+            "variation .0001": Variant({"subject.max_frames": 0.5, "deformation.variation_weight": 1e-4}),
+            "sparsity .0001": Variant({"subject.max_frames": 0.5, "deformation.sparsity_weight": 1e-4}),
+            "T as the frames": Variant({"subject.max_frames": 0.5, "deformation.temporal": 6}),
+        },
+        (Claim("smoothness .01", "off", "terr"), Claim("smoothness .01", "off", "psnr_obj")),
+        caveat="half of the frames were fitted, all are scored",
+    ),
+    "recipe": Ablation(
+        "ours, not the paper's: finer planes, fine-tuned Gaussians and longer fits are worth their time",
+        {
+            "paper": Variant(),
+            "S 96": Variant({"deformation.spatial": 96}),
+            "scales 1, 4": Variant(FINE),
+            "fine-tuned": Variant(TUNED),
+            "scales 1, 4, fine-tuned": Variant({**FINE, **TUNED}),
+            "and twice as long": Variant({**FINE, **TUNED, **LONGER}),
+            "and a longer static stage": Variant({**FINE, **TUNED, **LONGER, "static.iterations": 300}),
+        },
+        (
+            Claim("and a longer static stage", "paper", "psnr_obj"),
+            Claim("and a longer static stage", "paper", "terr"),
+            Claim("scales 1, 4", "S 96", "psnr_obj"),
+        ),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One fit."""
+
+    ablation: str
+    variant: str
+    specimen: str
+    seed: int
+    figures: Figures
+
+
+def settings_of(changes: Mapping[str, Any], size: int, frames: int) -> PipelineSettings:
+    """The small schedule with changes; a fraction as `subject.max_frames` is one of the frames there are."""
+    ladder = [{"until": 1.0, "size": size}]
+    sizes = {
+        f"{stage}.{name}": value
+        for stage in ("static", "motion")
+        for name, value in (("ladder", ladder), ("reference_size", size))
+    }
+    share = changes.get("subject.max_frames", 1.0)
+    return revise(
+        PipelineSettings(), {**SMALL, **sizes, **changes, "subject.max_frames": max(2, round(share * frames))}
+    )
+
+
+class Laboratory:
+    """Fits, and remembers what several variants share: static clouds, and figures of equal settings."""
+
+    def __init__(self, base: Mapping[str, Any], size: int) -> None:
+        self.base, self.size = base, size
+        self._rest: dict[tuple[str, int, str], Gaussians] = {}
+        self._figures: dict[tuple[str, int, bool, bool, str], Figures] = {}
+
+    def figures(self, specimen: Specimen, variant: Variant, seed: int, still: bool) -> Figures:
+        """What a variant reaches."""
+        settings = settings_of({**self.base, **variant.changes}, self.size, len(specimen.cutouts))
+        key = (specimen.name, seed, still, variant.per_frame, settings.model_dump_json())
+        if key not in self._figures:
+            self._figures[key] = score(specimen, self._states(specimen, variant.per_frame, settings, seed, still))
+        return self._figures[key]
+
+    def _states(
+        self, specimen: Specimen, per_frame: bool, settings: PipelineSettings, seed: int, still: bool
+    ) -> list[Gaussians]:
+        if per_frame:
+            return fits_per_frame(specimen, settings, seed)
+        key = (specimen.name, seed, settings.static.model_dump_json() + settings.prior.model_dump_json())
+        if key not in self._rest:
+            self._rest[key] = static_fit(specimen, settings, seed)
+        rest = self._rest[key]
+        return [rest] if still else moving_fit(specimen, rest, settings, seed)
+
+
+def verdict(ablation: Ablation, rows: Sequence[Row]) -> str:
+    """One sentence: whether the claim holds here, and by how much."""
+    found = {(row.variant, row.specimen, row.seed): row.figures for row in rows}
+    pairs = sorted({(row.specimen, row.seed) for row in rows})
+    parts, outcomes = [], []
+    for claim in ablation.claims:
+        sign = -1 if claim.figure in LESS_IS_BETTER else 1
+        gains = [
+            sign
+            * (getattr(found[claim.better, *pair], claim.figure) - getattr(found[claim.other, *pair], claim.figure))
+            for pair in pairs
+        ]
+        gain, error = mean(gains), stdev(gains) / math.sqrt(len(gains)) if len(gains) > 1 else math.inf
+        ahead, behind = gain > SIGNIFICANT * error, gain < -SIGNIFICANT * error
+        outcomes.append("no" if (ahead if claim.alike else behind) else "yes" if claim.alike or ahead else "open")
+        digits = DIGITS[claim.figure]
+        parts.append(f"{claim.better} against {claim.other}: {gain:+.{digits}f} +- {error:.{digits}f} {claim.figure}")
+    word = {"yes": "Reproduced", "open": "Not decided", "no": "Not reproduced"}
+    outcome = word["no" if "no" in outcomes else "open" if "open" in outcomes else "yes"]
+    caveat = f" (but {ablation.caveat})" if ablation.caveat else ""
+    return f"{outcome}{caveat}: {ablation.says}; gains: {'; '.join(parts)}."
+
+
+def table(title: str, rows: Sequence[Row]) -> Table:
+    """Means and spread over objects and seeds."""
+    result = Table(Column("variant", no_wrap=True), *DIGITS, title=title)
+    for variant in dict.fromkeys(row.variant for row in rows):
+        result.add_row(
+            variant, *(_cell([row.figures for row in rows if row.variant == variant], name) for name in DIGITS)
+        )
+    return result
+
+
+def _cell(figures: Sequence[Figures], name: str) -> str:
+    values = [value for one in figures if (value := getattr(one, name)) is not None]
+    if not values:
+        return ""
+    spread = stdev(values) if len(values) > 1 else 0.0
+    return f"{mean(values):.{DIGITS[name]}f} +- {spread:.{DIGITS[name]}f}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("names", nargs="+", choices=list(ABLATIONS), metavar="NAME", help=", ".join(ABLATIONS))
+    parser.add_argument(
+        "--objects", nargs="+", metavar="NAME", help=f"of {', '.join(OBJECTS)}, or of DIR; default: all"
+    )
+    parser.add_argument("--data", type=Path, metavar="DIR", help="a data set with banks, instead of our own objects")
+    parser.add_argument("--seeds", type=int, default=2, help="fits of every variant and object")
+    parser.add_argument("--frames", type=int, default=16, help="of the video, at most")
+    parser.add_argument("--size", type=int, default=96, help="pixels of what is fitted, and of our own objects' views")
+    parser.add_argument("--imperfect", action="store_true", help="an oracle with the flaws of a model")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of every variant")
+    parser.add_argument("--quick", action="store_true", help="one seed, four frames, a few iterations")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
+    options = parser.parse_args()
+    if options.quick:
+        options.seeds, options.frames, options.size = 1, 4, 48
+    base = {
+        **(QUICK if options.quick else {}),
+        **(IMPERFECT if options.imperfect else {}),
+        **parse_changes(options.set),
+    }
+    laboratory, console, rows = Laboratory(base, options.size), Console(), list[Row]()
+    specimens = find_specimens(options.data, options.objects, options.frames, options.size)
+    scale = f"{options.seeds} seeds, {len(specimens[0].cutouts)} frames, {options.size} px"
+    about = f"{', '.join(specimen.name for specimen in specimens)}; {scale}"
+    for name in options.names:
+        ablation, mine = ABLATIONS[name], list[Row]()
+        for specimen in specimens:
+            for seed in range(options.seeds):
+                for title, variant in ablation.variants.items():
+                    figures = laboratory.figures(specimen, variant, seed, ablation.still)
+                    mine.append(Row(name, title, specimen.name, seed, figures))
+        console.print(table(f"{name}: {about}", mine))
+        console.print(verdict(ablation, mine), soft_wrap=True)
+        rows += mine
+        if options.json:
+            write_rows(options.json, rows)
+
+
+def find_specimens(data: Path | None, names: Sequence[str] | None, frames: int, size: int) -> list[Specimen]:
+    """Our own objects, or those of a data set."""
+    if data is None:
+        return [made(name, frames, size) for name in names or OBJECTS]
+    return [read(truth, frames) for truth in find_truths(data) if not names or truth.name in names]
+
+
+if __name__ == "__main__":
+    main()

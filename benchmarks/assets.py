@@ -1,0 +1,224 @@
+"""How large the files of an asset are, and what writing them costs: 14 frames, 20,000 vertices, a texture of 1024^2.
+
+Run with `python -m benchmarks.assets` (a minute; `--quick`: a small asset, some seconds; `--json FILE` keeps the rows).
+The asset is made up: a ball on which waves run, colored by noise at all scales, and splats on it that a HexPlane moves.
+Rows without splats do not depend on them. `.4dgs`, a container of moving splats, is a peer; `pip install --target DIR
+fourdgs` and `PYTHONPATH=DIR` add it, and it is given the PLY files. Goals are sizes, and 5 seconds for one file of
+every kind.
+"""
+
+import argparse
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from benchmarks.measure import interleaved, machine, write_rows  # before torch: how its threads wait
+
+import torch  # isort: skip
+from rich.console import Console
+from rich.table import Column, Table
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from dg4d_lib.asset_settings import GltfSettings, PackSettings
+from dg4d_lib.assets.animated import Asset4D, moved
+from dg4d_lib.assets.compact import Compact, write_compact
+from dg4d_lib.assets.glb import write_glb
+from dg4d_lib.assets.preview import write_preview
+from dg4d_lib.assets.splats import write_splat_glb_frames, write_splats, write_spz_frames
+from dg4d_lib.assets.usd import write_usdz
+from dg4d_lib.assets.viewer_page import viewer_page
+from dg4d_lib.assets.websplats import write_web_splats
+from dg4d_lib.deformation.kinds import new_deformation
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.settings import HexPlaneSettings
+
+FRAMES, FPS = 14, 12.0
+MEGABYTE = 1e6
+GLTF = {
+    "default": GltfSettings(),
+    "png": GltfSettings(image="png"),
+    "webp": GltfSettings(image="webp"),
+    "still normals": GltfSettings(moving_normals=False),
+    "quantized": GltfSettings(quantized=True),
+    "quantized, meshopt": GltfSettings(quantized=True, meshopt=True),
+}
+GOALS_MB = {"asset.glb, default": 8.0, "web splats": 0.4, "viewer page, empty": 1.0}  # with 5,000 splats
+GOAL_S = 5.0  # on two cores
+EVERY_KIND = (
+    "asset.glb, default", "viewer page, empty", "splats, PLY", "splats, SPZ", "web splats", "compact, exact",
+    "asset.usdz, mesh and splats", "preview.mp4",
+)  # fmt: skip
+
+Write = Callable[[Path], object]  # into this empty folder
+
+
+@dataclass(frozen=True)
+class Row:
+    """One writer; splats is None where they do not matter."""
+
+    writer: str
+    splats: int | None
+    megabytes: float
+    cpu_s: float
+    wall_s: float
+
+
+def waving_ball(rows: int, texels: int) -> Asset4D:
+    """A sphere by latitude and longitude with `2 rows^2` vertices, about."""
+    v, u = torch.meshgrid(torch.linspace(0, 1, rows + 1), torch.linspace(0, 1, 2 * rows + 1), indexing="ij")
+    rest = on_ball(torch.stack([u, v], -1).reshape(-1, 2))
+    index = torch.arange(len(rest)).reshape(u.shape)
+    a, b, c, d = (part.flatten() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
+    upper, lower = torch.stack([a, c, b], -1), torch.stack([b, c, d], -1)
+    faces = torch.cat([upper[2 * rows :], lower[: -2 * rows]])  # without those that the poles leave no area
+    mesh = TexturedMesh(rest, faces, torch.stack([u, v], -1).reshape(-1, 2), noise_picture(texels))
+    moments = torch.arange(FRAMES)[:, None, None] / FRAMES
+    return Asset4D(mesh, 0.05 * torch.sin(2 * math.pi * (moments + rest[:, [1, 2, 0]])), FPS)
+
+
+def on_ball(places: Tensor) -> Tensor:
+    """World points of texture coordinates."""
+    around, polar = 2 * math.pi * places[:, 0], math.pi * places[:, 1]
+    return 0.7 * torch.stack([polar.sin() * around.sin(), polar.cos(), polar.sin() * around.cos()], -1)
+
+
+def noise_picture(texels: int) -> Tensor:
+    """Colors whose contrast at a scale is proportional to it, as in pictures of things."""
+    generator, picture = torch.Generator().manual_seed(0), torch.full((1, 3, texels, texels), 0.5)
+    for octave in range(2, round(math.log2(texels)) + 1):
+        octave_noise = torch.rand(1, 3, 2**octave, 2**octave, generator=generator) - 0.5
+        picture = picture + 2.0 ** (1 - octave) * interpolate(octave_noise, (texels, texels), mode="bicubic")
+    return picture[0].movedim(0, -1).clamp(0, 1)
+
+
+def waving_splats(count: int) -> Compact:
+    """Flat splats on the ball, and a HexPlane in the sizes of the profile `preview` with waves in its planes."""
+    generator = torch.Generator().manual_seed(0)
+    places = torch.rand(count, 2, generator=generator)
+    places[:, 1] = (1 - 2 * places[:, 1]).acos() / math.pi  # evenly over the ball
+    means = on_ball(places)
+    log_scales = (torch.tensor([0.03, 0.03, 0.01]) * (5_000 / count) ** 0.5).log().repeat(count, 1)
+    log_scales = log_scales + 0.2 * torch.randn(count, 3, generator=generator)
+    picture = noise_picture(256)
+    colors = picture[(places[:, 1] * 255).long(), (places[:, 0] * 255).long()]
+    cloud = Gaussians(
+        means,
+        log_scales,
+        torch.randn(count, 4, generator=generator),
+        3 + torch.randn(count, generator=generator),
+        harmonics_of_color(colors),
+    )
+    settings = HexPlaneSettings(features=16, hidden=32)
+    field = new_deformation(settings, torch.tensor([[-0.8] * 3, [0.8] * 3]), FRAMES, count, generator)
+    phases = 6 * torch.rand(2, 3, settings.features, 1, 1, generator=generator)
+    steps, cells = (torch.linspace(0, 2 * math.pi, size) for size in (settings.temporal, settings.spatial))
+    with torch.no_grad():
+        for parameter in field.heads.parameters():
+            parameter.normal_(std=0.04, generator=generator)
+        field.space[0].copy_(1 + 0.3 * torch.sin(cells[:, None] + cells + phases[0]))
+        field.time[0].copy_(1 + 0.3 * torch.sin(steps[:, None] + cells + phases[1]))
+    return Compact(cloud, field.requires_grad_(False), settings, FRAMES, FPS)
+
+
+def mesh_writers(asset: Asset4D) -> Iterator[tuple[str, Write]]:
+    for name, settings in GLTF.items():
+        yield f"asset.glb, {name}", lambda folder, s=settings: (folder / "a.glb").write_bytes(write_glb(asset, s))
+    yield "asset.usdz, mesh", lambda folder: write_usdz(folder / "a.usdz", asset, FPS)
+    yield (
+        "viewer page, empty",
+        lambda folder: (folder / "a.html").write_text(viewer_page("", b"", None, None, None, {})),
+    )
+
+
+def splat_writers(asset: Asset4D, splats: Compact, pack: PackSettings) -> Iterator[tuple[str, Write]]:
+    cloud, field = splats.gaussians, splats.deformation
+    states = moved(cloud, field, FRAMES, torch.arange(float(FRAMES)))
+    rasterizer = choose_rasterizer("auto")
+    yield "splats, PLY", lambda folder: write_splats(folder, states)
+    yield "splats, SPZ", lambda folder: write_spz_frames(folder, states)
+    yield "splats, glTF", lambda folder: write_splat_glb_frames(folder, states)
+    yield "web splats", lambda folder: (folder / "a.bin").write_bytes(write_web_splats(states, FPS))
+    yield "compact, exact", lambda folder: write_compact(folder / "a.safetensors", splats)
+    yield "asset.usdz, mesh and splats", lambda folder: write_usdz(folder / "a.usdz", asset, FPS, states)
+    yield (
+        "preview.mp4",
+        lambda folder: write_preview(folder / "a.mp4", cloud, field, FRAMES, FPS, rasterizer, pack),
+    )
+
+
+def fourdgs(folder: Path) -> Write:
+    """The peer, given a folder of PLY files.
+
+    Raises:
+        ImportError: it is not installed.
+    """
+    library: Any = import_module("fourdgs")
+    convert = import_module("fourdgs.convert").convert_ply_sequence
+    return lambda out: library.write(str(out / "a.4dgs"), *convert(str(folder), fps=FPS))
+
+
+def measured(writers: dict[str, Write], splats: int | None, rounds: int) -> list[Row]:
+    """Every writer, into a folder of its own that it fills again and again."""
+    with TemporaryDirectory() as scratch:
+        folders = {name: Path(scratch) / str(i) for i, name in enumerate(writers)}
+        for folder in folders.values():
+            folder.mkdir()
+        taken = interleaved({name: partial(write, folders[name]) for name, write in writers.items()}, rounds)
+        rows = []
+        for name, times in taken.items():
+            megabytes = sum(path.stat().st_size for path in folders[name].iterdir()) / MEGABYTE
+            rows.append(Row(name, splats, megabytes, times.cpu_ms / 1e3, times.wall_ms / 1e3))
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="a small asset, one round")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
+    options = parser.parse_args()
+    grid, texels, counts, rounds = (30, 256, (500,), 1) if options.quick else (100, 1024, (5_000, 20_000), 3)
+    pack = PackSettings(preview_size=64) if options.quick else PackSettings()
+    console, asset = Console(), waving_ball(grid, texels)
+    rows = measured(dict(mesh_writers(asset)), None, rounds)
+    for count in counts:
+        splats = waving_splats(count)
+        writers = dict(splat_writers(asset, splats, pack))
+        with TemporaryDirectory() as scratch:
+            writers["splats, PLY"](Path(scratch))
+            try:
+                writers["splats, .4dgs"] = fourdgs(Path(scratch))
+            except ImportError as error:
+                console.print(f"fourdgs is missing: {error}", markup=False, highlight=False)
+            rows += measured(writers, count, rounds)
+    title = f"{machine()}; {FRAMES} frames, {len(asset.mesh.vertices)} vertices, {texels} x {texels} texels"
+    console.print(table(title, rows))
+    whole = [row for row in rows if row.writer in EVERY_KIND and row.splats in (None, counts[0])]
+    cpu_s, wall_s = sum(row.cpu_s for row in whole), sum(row.wall_s for row in whole)
+    console.print(
+        f"one file of every kind, {counts[0]} splats: {cpu_s:.2f} s CPU, {wall_s:.2f} s wall; goal {GOAL_S:.0f} s"
+    )
+    if options.json:
+        write_rows(options.json, rows)
+
+
+def table(title: str, rows: list[Row]) -> Table:
+    """Rows as they are printed."""
+    result = Table(Column("writer", no_wrap=True), "splats", "MB", "goal, MB", "s CPU", "s wall", title=title)
+    for row in rows:
+        goal = str(GOALS_MB.get(row.writer, "")) if row.splats in (None, 5_000) else ""
+        splats = "" if row.splats is None else str(row.splats)
+        result.add_row(row.writer, splats, f"{row.megabytes:.2f}", goal, f"{row.cpu_s:.2f}", f"{row.wall_s:.2f}")
+    return result
+
+
+if __name__ == "__main__":
+    main()

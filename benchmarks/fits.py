@@ -1,0 +1,108 @@
+"""From what is true of an object to the figures of a fit: both stages of the pipeline, with its settings."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import benchmarks.measure  # noqa: F401 (before torch: how its threads wait)
+
+import torch  # isort: skip
+
+from benchmarks.objects.specimens import Specimen
+from dg4d_lib.fitting.motion import fit_motion
+from dg4d_lib.fitting.static import fit_gaussians
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.guidance.analytic import AnalyticPrior
+from dg4d_lib.guidance.distillation import Annealing
+from dg4d_lib.guidance.oracle import Bank
+from dg4d_lib.metrics.image import iou, psnr
+from dg4d_lib.metrics.video import temporal_error
+from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.settings import MotionSettings, OraclePriorSettings, StaticSettings
+from dg4d_lib.video.driving import over_white
+from steps.fit_gaussians import starting_cloud
+from steps.motions import new_deformation
+from steps.priors import oracle_prior
+from steps.profiles import PipelineSettings
+
+RASTERIZE = choose_rasterizer("auto")
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Means over views nobody fitted, and over frames; a still one has no `terr`."""
+
+    psnr: float
+    psnr_obj: float
+    iou: float
+    terr: float | None = None
+
+
+def static_fit(specimen: Specimen, settings: PipelineSettings, seed: int) -> Gaussians:
+    """The static stage, of the first frame."""
+    generator = torch.Generator().manual_seed(seed)
+    subject = specimen.cutouts[0]
+    start = starting_cloud(subject, settings.static, settings.prior, generator)
+    prior = prior_of(specimen.bank, settings, settings.static)
+    return fit_gaussians(start, subject, prior, RASTERIZE, settings.static, generator)
+
+
+def moving_fit(specimen: Specimen, rest: Gaussians, settings: PipelineSettings, seed: int) -> list[Gaussians]:
+    """The dynamic stage: the cloud at every frame, also at those that were not fitted."""
+    generator = torch.Generator().manual_seed(seed)
+    frames = len(specimen.cutouts)
+    seen, stride = thinned(specimen, settings.subject.max_frames)
+    deformation = new_deformation(settings.deformation, rest, len(seen.cutouts), generator)
+    prior = prior_of(seen.bank, settings, settings.motion)
+    fitted = fit_motion(rest, deformation, seen.video, prior, RASTERIZE, settings.motion, generator)
+    times = (torch.arange(frames) / (stride * (len(seen.cutouts) - 1))).clamp(max=1)
+    with torch.no_grad():
+        moved = deformation.displace(fitted.means, times).apply(fitted)
+    return [moved.at(frame) for frame in range(frames)]
+
+
+def fits_per_frame(specimen: Specimen, settings: PipelineSettings, seed: int) -> list[Gaussians]:
+    """The static stage of every frame for itself, as long as the dynamic stage: no motion, no common start."""
+    static = settings.static.model_copy(update={"iterations": settings.motion.iterations})
+    alone = settings.model_copy(update={"static": static})
+    return [static_fit(_moment(specimen, frame), alone, seed) for frame in range(len(specimen.cutouts))]
+
+
+def score(specimen: Specimen, states: Sequence[Gaussians]) -> Figures:
+    """States of the first frames against what the scorer's cameras see of them."""
+    cutouts = specimen.views[:, : len(states)]
+    with torch.no_grad():
+        drawn = [RASTERIZE(state, specimen.cameras, torch.ones(3)) for state in states]
+    films = torch.stack([picture.color.clamp(0, 1) for picture in drawn], 1)
+    coverage = torch.stack([picture.alpha for picture in drawn], 1)
+    rows = []
+    for film, seen, cutout in zip(films, coverage, cutouts, strict=True):
+        wanted, mask = over_white(cutout), cutout[..., 3:]
+        either = ((seen > 0.5) | (mask > 0.5)).float()
+        rows.append([psnr(film, wanted).mean(), psnr(film, wanted, either).mean(), iou(seen, mask).mean()])
+        if len(states) > 1:
+            rows[-1].append(temporal_error(film, wanted))
+    means = [float(sum(column) / len(rows)) for column in zip(*rows, strict=True)]
+    return Figures(*means)
+
+
+def prior_of(bank: Bank, settings: PipelineSettings, stage: StaticSettings | MotionSettings) -> AnalyticPrior:
+    """The oracle, perfect or not, with the timesteps of a stage."""
+    assert isinstance(settings.prior, OraclePriorSettings), "these fits are made with prior.kind = oracle"
+    noise = Annealing(stage.noise_start, stage.noise_end, uniform=stage.noise_draw == "uniform")
+    return oracle_prior(bank, settings.prior, noise)
+
+
+def thinned(specimen: Specimen, most: int) -> tuple[Specimen, int]:
+    """At most so many of the frames, and how far they are apart."""
+    stride = -(-len(specimen.cutouts) // most)
+    kept = [column for column, frame in enumerate(specimen.bank.frames) if frame % stride == 0]
+    moments = tuple(specimen.bank.frames[column] // stride for column in kept)
+    bank = Bank(specimen.bank.cameras, moments, specimen.bank.pictures[:, kept])
+    return replace(specimen, cutouts=specimen.cutouts[::stride], bank=bank, views=specimen.views[:, ::stride]), stride
+
+
+def _moment(specimen: Specimen, frame: int) -> Specimen:
+    """One frame, as if there were no other; the nearest that the bank has."""
+    column = min(range(len(specimen.bank.frames)), key=lambda i: abs(specimen.bank.frames[i] - frame))
+    bank = Bank(specimen.bank.cameras, (0,), specimen.bank.pictures[:, [column]])
+    return replace(specimen, cutouts=specimen.cutouts[[frame]], bank=bank, views=specimen.views[:, [frame]])

@@ -1,0 +1,351 @@
+"""Whether the gates tell good assets from spoiled ones: what every gate measures on both, and its bounds between them.
+
+Run with `python -m benchmarks.gates [PACKAGE ...] [--poor PACKAGE ...]` (minutes; `--json FILE` keeps the rows). A
+package is a folder that `dg4d make` wrote with a tracked mesh, whose steps are still kept in $DG4D_HOME: the driving
+video is taken from there. `--poor` are packages in which a person sees faults: none should be accepted. Three shapes
+of our own, whose splats lie on the surface of their mesh, are always among the good ones.
+
+Every good asset is spoiled in every way below, each meant for one gate. A gate separates if it passes every good asset
+and fails every one that is spoiled for it.
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from benchmarks.measure import machine, write_rows  # before torch: how its threads wait
+
+import numpy as np  # isort: skip
+import torch
+from jaxtyping import Float
+from rich.console import Console
+from rich.table import Column, Table
+from torch import Tensor
+from torch.nn.functional import interpolate
+from trimesh.creation import icosphere
+
+from dg4d_lib.asset_settings import GateSettings
+from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.errors import BadInput
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.geometry.harmonics import color_of_harmonics, harmonics_of_color
+from dg4d_lib.mesh.render import render_mesh
+from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.metrics.gates import Gate, judge
+from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.video.driving import DrivingVideo
+from flows.publish import whole
+from steps.check_asset import Parts, gather
+from steps.contract import ArtifactRef
+from steps.media import read_frames, read_png
+from steps.packages import SUBJECT, read_manifest
+from steps.render_asset import read_states, read_surface, states_between
+from steps.store import ArtifactStore, home
+
+FRAMES, SIZE, FPS = 12, 256, 12.0  # of our own shapes
+SOLID = 3.0  # logit of the opacity of their splats
+SPREAD = 0.6  # standard deviation of such a splat, in edges
+INSET = 0.97  # how far from the middle its center is, in distances of the surface
+WIDTH = 150  # characters of the table
+
+
+@dataclass(frozen=True)
+class Sample:
+    """An asset in memory, with what it was made from.
+
+    Attributes:
+        name: of the object.
+        states: the cloud at every frame.
+        surface: the mesh that moves.
+        video: the driving video.
+        cutout: the input picture.
+    """
+
+    name: str
+    states: Gaussians
+    surface: Asset4D
+    video: DrivingVideo
+    cutout: Float[Tensor, "h w 4"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A way of spoiling, and the gate that it is meant for."""
+
+    spoiled_by: str
+    gate: str
+    least: float | None
+    most: float | None
+    good_min: float
+    good_max: float
+    spoiled_min: float
+    spoiled_max: float
+    good_passed: int
+    spoiled_failed: int
+    assets: int
+    also_fails: str
+
+    @property
+    def separates(self) -> bool:
+        """Whether all good ones pass and all spoiled ones fail."""
+        return self.good_passed == self.spoiled_failed == self.assets
+
+
+Spoil = Callable[[Sample], Sample]
+
+
+def read_package(folder: Path) -> Sample:
+    """A package on disk.
+
+    Raises:
+        BadInput: it is broken, has a mesh per frame, or its driving video is kept no more.
+    """
+    record, manifest, store = whole(folder), read_manifest(folder), ArtifactStore(home() / "store")
+    surface = read_surface(folder, manifest)
+    if not isinstance(surface, Asset4D):
+        raise BadInput(f"{folder} has a mesh per frame; give packages made with mesh.mode=tracked")
+    packing = next(step for step in record["steps"] if step["step"] == "pack_asset")
+    digest = packing["inputs"]["driving_video"]
+    sizes = {entry.name: entry.size_bytes for entry in store.artifacts()}
+    if digest not in sizes:
+        raise BadInput(f"the driving video of {folder} is not in {store.root}; set DG4D_HOME to where it was made")
+    with TemporaryDirectory() as scratch:
+        ref = ArtifactRef(digest=digest, media_type="application/zip", size_bytes=sizes[digest])
+        video = read_frames(store.path(ref), Path(scratch))
+    states = read_states(folder, manifest)(torch.arange(manifest.frames, dtype=torch.float64))
+    return Sample(folder.name, states, surface, video, read_png(folder / SUBJECT))
+
+
+def own(name: str) -> Sample:
+    """A closed shape of our own as if it had been made almost perfectly: as a mesh, and as splats on its surface."""
+    ball = icosphere(subdivisions=5, radius=1.0)
+    ways, faces = torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces, dtype=torch.int64)
+    turns = torch.arange(FRAMES) / FRAMES * 2 * torch.pi
+    shape, motion = SHAPES[name]
+    places = torch.stack([motion(shape(ways)[:, None] * ways, 0.06 * turn.sin()) for turn in turns])
+    colors = 0.5 + 0.4 * torch.sin(7 * ways + torch.tensor([0.0, 2.0, 4.0]) + 3 * ways.roll(1, 1))
+    edge = (places[0][faces] - places[0][faces.roll(1, 1)]).norm(dim=-1).mean()
+    states = Gaussians(
+        means=INSET * places,
+        log_scales=(SPREAD * edge).log().expand(FRAMES, len(ways), 3),
+        quats=torch.tensor([1.0, 0, 0, 0]).expand(FRAMES, len(ways), 4),
+        opacity_logits=torch.full((len(ways),), SOLID),
+        harmonics=harmonics_of_color(colors),
+    )
+    blank = TexturedMesh(places[0], faces, torch.zeros(len(ways), 2), torch.zeros(1, 1, 3))
+    surface = Asset4D(*_painted(blank, places - places[0], colors), FPS)
+    color, coverage = render_mesh(surface.mesh, [OrbitCamera(width=SIZE, height=SIZE)] * FRAMES, surface.offsets)
+    return Sample(name, states, surface, DrivingVideo(color, coverage, FPS), torch.cat([color, coverage], -1)[0])
+
+
+def _bent(places: Tensor, amount: Tensor) -> Tensor:
+    """Sideways, the more the higher."""
+    return places + 2 * amount * places[:, 1:2].square() * torch.tensor([1.0, 0, 0])
+
+
+def _breathing(places: Tensor, amount: Tensor) -> Tensor:
+    return places * (1 + amount * torch.tensor([1.0, -1.0, 1.0]))
+
+
+def _twisted(places: Tensor, amount: Tensor) -> Tensor:
+    """About the upright axis, the more the higher."""
+    angle = 5 * amount * places[:, 1]
+    x, y, z = places.unbind(1)
+    return torch.stack([x * angle.cos() + z * angle.sin(), y, z * angle.cos() - x * angle.sin()], 1)
+
+
+SHAPES: dict[str, tuple[Callable[[Tensor], Tensor], Callable[[Tensor, Tensor], Tensor]]] = {
+    "stone": (lambda ways: 0.6 + 0.06 * torch.sin(4 * ways).prod(1), _breathing),
+    "peanut": (lambda ways: 0.4 + 0.3 * ways[:, 1].square(), _bent),
+    "star": (lambda ways: 0.45 + 0.25 * (ways.pow(4).sum(1) - 0.5), _twisted),
+}
+
+
+def _painted(
+    mesh: TexturedMesh, offsets: Float[Tensor, "t v 3"], colors: Float[Tensor, "v 3"]
+) -> tuple[TexturedMesh, Float[Tensor, "t w 3"]]:
+    """The mesh with a texel of its own for every triangle."""
+    side = int(np.ceil(np.sqrt(len(mesh.faces))))
+    texture = torch.zeros(side * side, 3)
+    texture[: len(mesh.faces)] = colors[mesh.faces].mean(1)
+    texel = torch.arange(len(mesh.faces))
+    uvs = (torch.stack([texel % side, texel // side], -1) + 0.5) / side
+    corners = mesh.faces.flatten()
+    faces = torch.arange(len(corners)).reshape(-1, 3)
+    uvs = uvs.repeat_interleave(3, 0)
+    return TexturedMesh(mesh.vertices[corners], faces, uvs, texture.reshape(side, side, 3)), offsets[:, corners]
+
+
+def _noise(*shape: int) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(0))
+
+
+def _recolored(sample: Sample, change: Callable[[Tensor], Tensor]) -> Sample:
+    """Splats and mesh with other colors."""
+    colors = harmonics_of_color(change(color_of_harmonics(sample.states.harmonics)).clamp(0, 1))
+    states = replace(sample.states, harmonics=colors)
+    return replace(_retextured(sample, change), states=states)
+
+
+def _retextured(sample: Sample, change: Callable[[Tensor], Tensor]) -> Sample:
+    mesh = replace(sample.surface.mesh, texture=change(sample.surface.mesh.texture).clamp(0, 1))
+    return replace(sample, surface=replace(sample.surface, mesh=mesh))
+
+
+def _moved(sample: Sample, change: Callable[[Tensor], Tensor]) -> Sample:
+    """Splats and mesh with a change to the places of all frames "t n 3"."""
+    rest = sample.surface.mesh.vertices
+    offsets = change(rest + sample.surface.offsets) - rest
+    states = replace(sample.states, means=change(sample.states.means))
+    return replace(sample, states=states, surface=replace(sample.surface, offsets=offsets))
+
+
+def _mesh_moved(sample: Sample, change: Callable[[Tensor], Tensor]) -> Sample:
+    return replace(_moved(sample, change), states=sample.states)
+
+
+def _splats_moved(sample: Sample, change: Callable[[Tensor], Tensor]) -> Sample:
+    return replace(_moved(sample, change), surface=sample.surface)
+
+
+def _refaced(sample: Sample, faces: Tensor) -> Sample:
+    return replace(sample, surface=replace(sample.surface, mesh=replace(sample.surface.mesh, faces=faces)))
+
+
+def _blurred(texture: Float[Tensor, "h w 3"], texels: int) -> Float[Tensor, "h w 3"]:
+    """A texture that was saved much too small."""
+    planes = texture.movedim(-1, 0)[None]
+    small = interpolate(planes, (texels, texels), mode="bilinear", antialias=True)
+    return interpolate(small, texture.shape[:2], mode="bilinear")[0].movedim(0, -1)
+
+
+def _deepened(means: Float[Tensor, "t n 3"]) -> Float[Tensor, "t n 3"]:
+    """Scattered along the rays of the input camera: the same from there, a cloud from everywhere else."""
+    eye = torch.tensor([0.0, 0.0, 2.0])
+    rays = torch.nn.functional.normalize(means - eye, dim=-1)
+    return means + 0.1 * _noise(1, means.shape[1], 1) * rays
+
+
+def _scattered(means: Float[Tensor, "t n 3"]) -> Float[Tensor, "t n 3"]:
+    """One of a hundred is anywhere."""
+    generator = torch.Generator().manual_seed(0)
+    away = torch.rand(means.shape[1], 1, generator=generator) < 0.01
+    return torch.where(away, torch.rand(means.shape[1], 3, generator=generator) * 1.6 - 0.8, means)
+
+
+def _torn(places: Float[Tensor, "t n 3"]) -> Float[Tensor, "t n 3"]:
+    """In one frame the right half stands a fifth of the subject higher."""
+    torn = places.clone()
+    middle = places[len(places) // 2]
+    torn[len(places) // 2, :, 1] += 0.3 * (middle[:, 0] > middle[:, 0].median())
+    return torn
+
+
+def _holed(sample: Sample) -> Sample:
+    """Nothing is left around one Gaussian."""
+    means = sample.states.means[0]
+    near = (means - means[len(means) // 2])[:, :2].norm(dim=-1) < 0.25
+    return replace(sample, states=replace(sample.states, opacity_logits=sample.states.opacity_logits - 20.0 * near))
+
+
+SPOILS: dict[str, tuple[str, Spoil]] = {
+    "washed-out colors": ("fidelity", lambda s: _recolored(s, lambda c: (1 + c) / 2)),
+    "a hole in the splats": ("fidelity", _holed),
+    "shifted by a twentieth": ("silhouette", lambda s: _moved(s, lambda p: p + torch.tensor([0.09, 0, 0]))),
+    "enlarged by a tenth": ("silhouette", lambda s: _moved(s, lambda p: 1.1 * p)),
+    "a torn frame of the mesh": ("silhouette", lambda s: _mesh_moved(s, _torn)),
+    "splats scattered in depth": ("consistency", lambda s: _splats_moved(s, _deepened)),
+    "every frame jumps": ("flicker", lambda s: _moved(s, lambda p: p + 0.03 * _noise(len(p), 1, 3).to(p))),
+    "floaters": ("floaters", lambda s: _splats_moved(s, _scattered)),
+    "one in fifty triangles gone": (
+        "flaws",
+        lambda s: _refaced(s, s.surface.mesh.faces[torch.arange(len(s.surface.mesh.faces)) % 50 > 0]),
+    ),
+    "turned inside out": ("flaws", lambda s: _refaced(s, s.surface.mesh.faces.flip(1))),
+    "a mesh too thick": ("agreement", lambda s: _mesh_moved(s, lambda p: 1.15 * p)),
+    "a blurred texture": ("sharpness", lambda s: _retextured(s, partial(_blurred, texels=16))),
+    "noisy colors": ("sharpness", lambda s: _recolored(s, lambda c: c + 0.3 * _noise(*c.shape))),
+    "frozen": ("motion", lambda s: _moved(s, lambda p: p[:1].expand_as(p))),
+    "a frozen mesh": ("motion", lambda s: _mesh_moved(s, lambda p: p[:1].expand_as(p))),
+    "three times the motion": ("motion", lambda s: _moved(s, lambda p: p[:1] + 3 * (p - p[:1]))),
+}
+
+
+def measured(sample: Sample) -> dict[str, Gate]:
+    """Every gate by its name."""
+    parts = Parts(partial(states_between, sample.states), sample.surface, len(sample.surface.offsets))
+    evidence = gather(parts, sample.video, sample.cutout, choose_rasterizer("cpu"))
+    return {gate.name: gate for gate in judge(evidence, GateSettings())}
+
+
+def rows(samples: Sequence[Sample], tell: Callable[[str], None]) -> list[Row]:
+    """A row per way of spoiling."""
+    good = []
+    for sample in samples:
+        good.append(measured(sample))
+        tell(f"{sample.name}: {_verdict(good[-1])}")
+    return [_row(name, gate, good, [measured(spoil(sample)) for sample in samples])
+            for name, (gate, spoil) in SPOILS.items()]  # fmt: skip
+
+
+def _row(name: str, meant: str, good: Sequence[dict[str, Gate]], spoiled: Sequence[dict[str, Gate]]) -> Row:
+    fine, bad = ([gates[meant] for gates in each] for each in (good, spoiled))
+    others = [gate for gate in spoiled[0] if gate != meant and not any(gates[gate].passed for gates in spoiled)]
+    return Row(
+        name,
+        meant,
+        fine[0].least,
+        fine[0].most,
+        min(gate.value for gate in fine),
+        max(gate.value for gate in fine),
+        min(gate.value for gate in bad),
+        max(gate.value for gate in bad),
+        sum(gate.passed for gate in fine),
+        sum(not gate.passed for gate in bad),
+        len(good),
+        ", ".join(others),
+    )
+
+
+def _verdict(gates: dict[str, Gate]) -> str:
+    values = ", ".join(f"{name} {gate.value:.3g}" for name, gate in gates.items())
+    failing = [name for name, gate in gates.items() if not gate.passed]
+    return (f"not accepted ({', '.join(failing)})" if failing else "accepted") + f": {values}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("packages", nargs="*", type=Path, help="folders of good packages")
+    parser.add_argument("--poor", nargs="*", default=[], type=Path, help="folders of packages with faults one can see")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
+    options = parser.parse_args()
+    console = Console(width=WIDTH, soft_wrap=True, highlight=False)
+    found = rows([*map(read_package, options.packages), *map(own, SHAPES)], console.print)
+    for folder in options.poor:
+        console.print(f"{folder.name}, poor: {_verdict(measured(read_package(folder)))}")
+    console.print(table(found))
+    if options.json:
+        write_rows(options.json, found)
+
+
+def table(found: Sequence[Row]) -> Table:
+    """Rows as they are printed."""
+    count = found[0].assets
+    result = Table(
+        Column("spoiled by", no_wrap=True), "gate", "bounds", "good", "spoiled", "separates", "also fails",
+        title=f"{machine()}; {count} assets",
+    )  # fmt: skip
+    for row in found:
+        bounds = f"{'' if row.least is None else f'{row.least:g}'}..{'' if row.most is None else f'{row.most:g}'}"
+        ranges = f"{row.good_min:.3g}..{row.good_max:.3g}", f"{row.spoiled_min:.3g}..{row.spoiled_max:.3g}"
+        answer = "yes" if row.separates else f"{row.good_passed} good pass, {row.spoiled_failed} spoiled fail"
+        result.add_row(row.spoiled_by, row.gate, bounds, *ranges, answer, row.also_fails)
+    return result
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,134 @@
+"""One mesh that moves against a mesh per frame: how far the first is from the second, and how both look.
+
+Run with `python -m benchmarks.mesh_modes PACKAGE ...` on packages with a tracked mesh (some seconds a frame; `--quick`:
+two frames; `--json FILE` keeps the rows). The surface of a frame is extracted from the Gaussians of that frame as the
+mode `per_frame` does it: cleaned, unwrapped and baked anew. Distances to it are in thousandths of a world unit; what it
+has to itself is due to the points with which surfaces are compared. Pictures are compared with the splats of the frame
+over white: PSNR at the pixels where either is seen, and intersection over union of the outlines.
+"""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from benchmarks.measure import machine, write_rows  # before torch: how its threads wait
+
+import torch  # isort: skip
+from rich.console import Console
+from rich.table import Column, Table
+from torch import Tensor
+
+from dg4d_lib.assets.animated import moved
+from dg4d_lib.assets.glb import read_glb
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.ply import read_ply
+from dg4d_lib.mesh.density import density_field
+from dg4d_lib.mesh.extract import best_level
+from dg4d_lib.mesh.render import render_mesh
+from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.metrics.image import iou, psnr
+from dg4d_lib.metrics.surface import chamfer
+from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
+from dg4d_lib.settings import MeshSettings
+from steps.extract_mesh import textured
+from steps.motions import read_motion
+from steps.packages import ASSET, GAUSSIANS, MOTION
+
+AZIMUTHS_DEG = (0.0, 90.0)  # the input view, and the right side
+SIZE = 512  # pixels
+POINTS = 50_000  # on every surface
+SETTINGS = MeshSettings(max_faces=20000)  # as the profile `preview`
+PER_WORLD_UNIT = 1000
+MODES = "tracked", "per_frame"
+FIGURES = "chamfer", "input_psnr", "input_iou", "side_psnr", "side_iou"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A mode on one package, means over the frames; distances in thousandths of a world unit, PSNR in dB."""
+
+    package: str
+    mode: str
+    frames: int
+    chamfer: float
+    input_psnr: float
+    input_iou: float
+    side_psnr: float
+    side_iou: float
+
+
+def of_package(folder: Path, count: int, rasterize: Rasterizer) -> list[Row]:
+    asset = read_glb((folder / ASSET).read_bytes())
+    deformation, frames = read_motion(folder / MOTION)
+    gaussians = read_ply(folder / GAUSSIANS)
+    first = moved(gaussians, deformation, frames, torch.zeros(1)).at(0)
+    level, _ = best_level(density_field(first, SETTINGS), first, rasterize, SETTINGS.density_threshold)
+    chosen = [i * frames // count for i in range(count)]
+    states = moved(gaussians, deformation, frames, torch.tensor(chosen, dtype=torch.float32))
+    rows = []
+    for i, frame in enumerate(chosen):
+        extracted = textured(states.at(i), level, rasterize, SETTINGS)
+        tracked = replace(asset.mesh, vertices=asset.mesh.vertices + asset.offsets[frame])
+        truth, generator = splats(states.at(i), rasterize), torch.Generator().manual_seed(frame)
+        for mode, mesh in (("tracked", tracked), ("per_frame", extracted)):
+            apart = chamfer(mesh.vertices, mesh.faces, extracted.vertices, extracted.faces, POINTS, generator)
+            rows.append(Row(folder.name, mode, 1, PER_WORLD_UNIT * apart, *look(mesh, truth)))
+    return [mean_row(folder.name, [row for row in rows if row.mode == mode]) for mode in MODES]
+
+
+def cameras() -> list[OrbitCamera]:
+    return [OrbitCamera(0.0, azimuth, width=SIZE, height=SIZE) for azimuth in AZIMUTHS_DEG]
+
+
+def splats(state: Gaussians, rasterize: Rasterizer) -> tuple[Tensor, Tensor]:
+    """Color over white, and coverage."""
+    with torch.no_grad():
+        drawn = rasterize(state, cameras(), torch.ones(3))
+    return drawn.color, drawn.alpha
+
+
+def look(mesh: TexturedMesh, truth: tuple[Tensor, Tensor]) -> list[float]:
+    """PSNR and overlap in the first view, then in the second."""
+    color, coverage = render_mesh(mesh, cameras())
+    seen = ((coverage > 0.5) | (truth[1] > 0.5)).float()
+    pairs = torch.stack([psnr(color * coverage + 1 - coverage, truth[0], seen), iou(coverage, truth[1])], 1)
+    return pairs.flatten().tolist()
+
+
+def mean_row(package: str, rows: Sequence[Row]) -> Row:
+    """Of rows with one mode."""
+    means = [sum(getattr(row, name) for row in rows) / len(rows) for name in FIGURES]
+    return Row(package, rows[0].mode, sum(row.frames for row in rows), *means)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("packages", type=Path, nargs="+", metavar="PACKAGE", help="folders that `dg4d make` wrote")
+    parser.add_argument("--frames", type=int, default=4, help="frames per package, evenly spread")
+    parser.add_argument("--quick", action="store_true", help="two frames per package")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
+    options = parser.parse_args()
+    rasterize = choose_rasterizer("auto")
+    count = 2 if options.quick else options.frames
+    rows = [row for folder in options.packages for row in of_package(folder, count, rasterize)]
+    means = [mean_row("mean", [row for row in rows if row.mode == mode]) for mode in MODES]
+    Console().print(table(f"{machine()}; {SIZE} px, {POINTS} points a surface", [*rows, *means]))
+    if options.json:
+        write_rows(options.json, rows)
+
+
+def table(title: str, rows: list[Row]) -> Table:
+    """Rows as they are printed."""
+    heads = "frames", "chamfer", "input PSNR", "input IoU", "side PSNR", "side IoU"
+    result = Table(Column("package", no_wrap=True), Column("mode", no_wrap=True), *heads, title=title)
+    for row in rows:
+        figures = f"{row.chamfer:.2f}", f"{row.input_psnr:.2f}", f"{row.input_iou:.3f}"
+        side = f"{row.side_psnr:.2f}", f"{row.side_iou:.3f}"
+        result.add_row(row.package, row.mode, str(row.frames), *figures, *side)
+    return result
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""What is true of an object: the video of the input camera, the bank of a prior, and views for scoring alone."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from benchmarks.objects.drawing import Painted
+from benchmarks.objects.excavator import Excavator
+from benchmarks.objects.jellyfish import Jellyfish
+from benchmarks.objects.parrot import Parrot
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.errors import BadInput
+from dg4d_lib.guidance.oracle import Bank
+from dg4d_lib.video.driving import DrivingVideo
+from examples.drawing import Creature
+from examples.newt import Newt
+from steps.media import read_png
+from steps.priors import read_bank_folder
+from steps.truth import Truth
+
+OBJECTS: dict[str, Callable[[], Creature]] = {  # a walker, a flier, something soft, something stiff
+    "newt": Newt,
+    "parrot": Parrot,
+    "jellyfish": Jellyfish,
+    "excavator": Excavator,
+}
+SCORED_AZIMUTHS_DEG = (-75, 15, 105, 195)  # of Consistent4D; none of them is in a bank
+BANK_AZIMUTHS = 16  # at equal steps
+BANK_ELEVATIONS_DEG = (-20.0, 0.0, 20.0)
+FPS = 12.0
+
+
+@dataclass(frozen=True)
+class Specimen:
+    """Everything that is true of an object.
+
+    Attributes:
+        name: of the object.
+        cutouts: what the input camera sees, straight alpha.
+        bank: what the prior may know.
+        cameras: where nobody looks but the scorer.
+        views: what is seen from there, straight alpha, one row per camera.
+    """
+
+    name: str
+    cutouts: Float[Tensor, "t h w 4"]
+    bank: Bank
+    cameras: tuple[OrbitCamera, ...]
+    views: Float[Tensor, "v t g x 4"]
+
+    @property
+    def video(self) -> DrivingVideo:
+        """The driving video."""
+        return DrivingVideo(self.cutouts[..., :3], self.cutouts[..., 3:], FPS)
+
+
+def made(name: str, frames: int, size: int) -> Specimen:
+    """One of our own objects: a loop of so many frames, pictures of `size` pixels.
+
+    Raises:
+        KeyError: there is no such object.
+    """
+    painted = Painted(OBJECTS[name]())
+    scored = tuple(OrbitCamera(0, azimuth, width=size, height=size) for azimuth in SCORED_AZIMUTHS_DEG)
+    known = tuple(
+        OrbitCamera(elevation, 360 * i / BANK_AZIMUTHS, width=size, height=size)
+        for elevation in BANK_ELEVATIONS_DEG
+        for i in range(BANK_AZIMUTHS)
+    )
+    everywhere = [OrbitCamera(width=size, height=size), *scored, *known]
+    pictures = torch.stack([painted.draw(frame / frames, everywhere) for frame in range(frames)], 1)
+    first = 1 + len(scored)
+    bank = Bank(known, tuple(range(frames)), (pictures[first:] * 255).round().to(torch.uint8))
+    return Specimen(name, pictures[0], bank, scored, pictures[1:first])
+
+
+def read(truth: Truth, frames: int) -> Specimen:
+    """An object out of a data set.
+
+    Of a longer video every second, third ... frame is taken, whatever gives at most `frames`.
+
+    Raises:
+        BadInput: it has no bank.
+    """
+    if truth.bank is None:
+        raise BadInput(f"{truth.name} has no bank/ of true views, which the oracle prior needs")
+    stride = -(-len(truth.inputs) // frames)
+    whole = read_bank_folder(truth.bank)
+    kept = [column for column, frame in enumerate(whole.frames) if frame % stride == 0]
+    moments = tuple(whole.frames[column] // stride for column in kept)
+    views = torch.stack([_pictures(view.frames[::stride]) for view in truth.views])
+    height, width = views.shape[2:4]
+    cameras = tuple(OrbitCamera(0, view.azimuth_deg, width=width, height=height) for view in truth.views)
+    bank = Bank(whole.cameras, moments, whole.pictures[:, kept])
+    return Specimen(truth.name, _pictures(truth.inputs[::stride]), bank, cameras, views)
+
+
+def _pictures(paths: Sequence[Path]) -> Float[Tensor, "t h w 4"]:
+    return torch.stack([read_png(path) for path in paths])

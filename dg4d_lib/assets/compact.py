@@ -1,0 +1,107 @@
+"""The exact compact form of an asset: the Gaussians at rest and what moves them, in one safetensors file.
+
+Metadata, under the key `asset4d`, is JSON: `format` and `version`; `settings` of the deformation, of which `kind` says
+how it works; `frames`, `fps`, `gaussians`; `last_moment`, where the last frame lies on the deformation's axis of time
+from 0 to 1; `tensors`, which says what each is. Tensors: those of the Gaussians under `gaussians.`, those of the
+deformation under `deformation.`. What a deformation gives is added to means, log scales and quaternions as they are
+stored; after the last frame they go back to the first in a straight line. `examples/load_compact.py` reads it without
+this library.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from dg4d_lib.deformation.kinds import AnyDeformation, last_moment, restored, tensors_of
+from dg4d_lib.errors import BadInput
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.ply import check_storable
+from dg4d_lib.settings import DeformationSettings
+
+KEY = "asset4d"
+FORM = {"format": "dg4d-compact", "version": 1}
+GAUSSIANS, DEFORMATION = "gaussians.", "deformation."
+TENSORS = {
+    "gaussians.means": "n 3; at rest, world units: right-handed, y up, the front looks along +z",
+    "gaussians.log_scales": "n 3; natural logarithms of the standard deviations",
+    "gaussians.quats": "n 4; rotations, wxyz, any length but zero",
+    "gaussians.opacity_logits": "n; logits of the opacities",
+    "gaussians.harmonics": "n 1 3; sRGB color = 0.28209479 * harmonics + 0.5",
+    "deformation.bounds": "2 3; the box that maps to the planes' ends, or to [-1, 1]",
+    "deformation.space.i": "3 c r r; planes xy, xz, yz of level i: the first axis along columns, ends on the box",
+    "deformation.time.i": "3 c t r; planes xt, yt, zt of level i: time along rows, from 0 to 1",
+    "deformation.trunk": "linear, of the products of the six samples of all levels; then relu: h",
+    "deformation.first, deformation.second": "linear, relu after each; in: place, time in [-1, 1]; sines, cosines",
+    "deformation.heads.NAME": "what is added to gaussians.NAME: outer(h + inner(h)), both linear",
+    "deformation.table": "t n 10; what is added at every frame: 3 to means, 3 to log_scales, 4 to quats",
+}
+
+
+@dataclass(frozen=True)
+class Compact:
+    """What a file holds.
+
+    Attributes:
+        gaussians: at rest.
+        deformation: what moves them.
+        settings: its kind and sizes.
+        frames: of the animation.
+        fps: frames per second.
+    """
+
+    gaussians: Gaussians
+    deformation: AnyDeformation
+    settings: DeformationSettings
+    frames: int
+    fps: float
+
+
+def write_compact(path: Path, asset: Compact) -> None:
+    """Write one file; equal assets give equal bytes.
+
+    Raises:
+        BadInput: the Gaussians carry a batch, color of a higher degree, or numbers that are not finite.
+        OSError: the file could not be written.
+    """
+    check_storable(asset.gaussians, "a compact asset")
+    tensors = {GAUSSIANS + name: value.detach().cpu().contiguous() for name, value in vars(asset.gaussians).items()}
+    tensors |= {DEFORMATION + name: value for name, value in tensors_of(asset.deformation).items()}
+    about = {
+        **FORM,
+        "settings": asset.settings.model_dump(mode="json"),
+        "frames": asset.frames,
+        "fps": asset.fps,
+        "gaussians": len(asset.gaussians),
+        "last_moment": last_moment(asset.settings, asset.frames),
+        "tensors": TENSORS,
+    }
+    path.write_bytes(save(tensors, {KEY: json.dumps(about, sort_keys=True)}))
+
+
+def read_compact(path: Path) -> Compact:
+    """Read what `write_compact` wrote: everything comes back exactly.
+
+    Raises:
+        BadInput: the file is missing, broken or of another form.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            about: dict[str, Any] = json.loads((file.metadata() or {})[KEY])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no dict)
+        if {name: about[name] for name in FORM} != FORM:
+            raise BadInput(f"{path.name} is a compact asset of another version; this program reads version 1")
+        settings: DeformationSettings = TypeAdapter(DeformationSettings).validate_python(about["settings"])
+        parts = {
+            prefix: {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+            for prefix in (GAUSSIANS, DEFORMATION)
+        }
+        gaussians = Gaussians(**parts[GAUSSIANS])
+        deformation = restored(settings, parts[DEFORMATION], about["frames"], len(gaussians))
+        return Compact(gaussians, deformation, settings, about["frames"], about["fps"])
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, ValidationError, RuntimeError) as error:
+        raise BadInput(f"{path.name} is no compact asset: {error}") from error

@@ -1,0 +1,73 @@
+"""EXT_meshopt_compression: vertices and triangles packed without loss, by the library that defines the format."""
+
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dg4d_lib.errors import BackendUnavailable, BadInput
+
+EXTENSION = "EXT_meshopt_compression"
+VERTEX_FORMAT, INDEX_FORMAT = 0, 1  # versions that the extension prescribes
+
+
+def pack_vertices(rows: NDArray[Any]) -> bytes:
+    """Pack rows whose bytes are a multiple of four, at most 256.
+
+    Raises:
+        BackendUnavailable: meshoptimizer is missing.
+    """
+    library = _library()
+    library.encode_vertex_version(VERTEX_FORMAT)
+    return library.encode_vertex_buffer(rows, len(rows), rows[0].nbytes)
+
+
+def unpack_vertices(content: bytes, count: int, stride: int) -> bytes:
+    """What `pack_vertices` packed.
+
+    Raises:
+        BackendUnavailable: meshoptimizer is missing.
+        BadInput: the content is broken.
+    """
+    library = _library()
+    try:
+        return library.decode_vertex_buffer(count, stride, content, np.dtype((np.void, stride))).tobytes()
+    except RuntimeError as error:
+        raise BadInput(f"vertices of this GLB cannot be unpacked: {error}") from error
+
+
+def pack_triangles(indices: NDArray[Any]) -> bytes:
+    """Pack three indices per triangle; they may come back turned, (1, 2, 0) for (0, 1, 2).
+
+    Raises:
+        BackendUnavailable: meshoptimizer is missing.
+    """
+    library = _library()
+    library.encode_index_version(INDEX_FORMAT)
+    return library.encode_index_buffer(indices.ravel(), indices.size, int(indices.max()) + 1)
+
+
+def unpack_triangles(content: bytes, count: int, size: int) -> bytes:
+    """What `pack_triangles` packed, as unsigned numbers of 2 or 4 bytes.
+
+    Raises:
+        BackendUnavailable: meshoptimizer is missing.
+        BadInput: the content is broken.
+    """
+    library = _library()
+    try:
+        return library.decode_index_buffer(count, np.uint32().nbytes, content).astype(f"<u{size}").tobytes()
+    except RuntimeError as error:
+        raise BadInput(f"triangles of this GLB cannot be unpacked: {error}") from error
+
+
+def _library() -> ModuleType:
+    try:
+        import meshoptimizer  # noqa: PLC0415 (an optional package)
+    except ImportError as error:
+        raise BackendUnavailable(
+            f"{EXTENSION} needs the package meshoptimizer: pip install 'dg4d[meshopt]', "
+            "or write without pack.gltf.meshopt"
+        ) from error
+    return meshoptimizer

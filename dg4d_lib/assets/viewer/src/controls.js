@@ -1,0 +1,99 @@
+// Buttons, scrub bar and keys.
+import { SPEEDS } from "./player.js";
+
+const VIDEO_DRIFT = 0.12; // seconds that the film may be off before it is set right
+const byId = (id) => document.getElementById(id);
+
+export class Controls {
+  constructor({ player, stage, video, modes, show, draw }) {
+    Object.assign(this, { player, stage, video, modes, show, draw });
+    this.buttons = [...byId("modes").children];
+    for (const button of this.buttons) {
+      button.hidden = !modes.includes(button.dataset.show);
+      button.addEventListener("click", () => show(button.dataset.show));
+    }
+    byId("speed").append(...SPEEDS.map((speed) => new Option(`${speed}×`, speed)));
+    byId("speed").addEventListener("change", ({ target }) => this.change(() => (player.speed = Number(target.value))));
+    byId("scrub").max = player.duration;
+    byId("scrub").addEventListener("input", ({ target }) => this.change(() => this.scrub(Number(target.value))));
+    byId("play").addEventListener("click", () => this.toggle());
+    byId("reset").addEventListener("click", () => stage.reset());
+    byId("background").addEventListener("click", () => this.darken());
+    byId("details").addEventListener("click", () => this.unfold());
+    document.addEventListener("keydown", (event) => this.press(event));
+    this.darken(matchMedia("(prefers-color-scheme: dark)").matches);
+  }
+
+  /** Shows the state of the clock; runs after every picture. */
+  update(mode) {
+    const { player } = this;
+    for (const button of this.buttons) button.setAttribute("aria-pressed", button.dataset.show === mode);
+    byId("scrub").value = player.time;
+    byId("scrub").style.setProperty("--done", `${(100 * player.time) / (player.duration || 1)}%`);
+    byId("speed").value = player.speed;
+    byId("play").dataset.playing = player.playing;
+    const digits = String(player.frames).length;
+    const frame = String(player.frame + 1).padStart(digits, "\u2007");
+    byId("readout").textContent = `${player.time.toFixed(2)} s · frame ${frame}/${player.frames}`;
+    this.follow();
+  }
+
+  /** Keeps the driving video at the moment that is shown. */
+  follow() {
+    const { player, video } = this;
+    if (!video || !(video.duration > 0)) return;
+    const wanted = player.time % video.duration;
+    const off = Math.abs(video.currentTime - wanted);
+    const drift = Math.min(off, video.duration - off);
+    if (drift > (player.playing ? VIDEO_DRIFT * Math.max(1, player.speed) : 0.01) && !video.seeking) video.currentTime = wanted;
+    video.playbackRate = player.speed;
+    if (player.playing && video.paused) video.play().catch(() => {}); // a browser may refuse; it then follows by seeking
+    if (!player.playing && !video.paused) video.pause();
+  }
+
+  change(deed) {
+    deed();
+    this.draw();
+  }
+
+  toggle() {
+    this.change(() => (this.player.playing = !this.player.playing));
+  }
+
+  scrub(seconds) {
+    this.player.playing = false;
+    this.player.seek(Math.min(seconds, this.player.duration * (1 - 1e-6))); // the end of the bar is not the beginning
+  }
+
+  darken(dark = document.documentElement.dataset.theme !== "dark") {
+    document.documentElement.dataset.theme = dark ? "dark" : "light";
+  }
+
+  unfold() {
+    document.body.toggleAttribute("data-folded");
+    byId("panel").scrollIntoView({ behavior: "smooth", block: "nearest" });
+  }
+
+  press(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("select, summary")) return;
+    const { player } = this;
+    const deeds = {
+      " ": () => this.toggle(),
+      ArrowLeft: () => this.change(() => player.step(-1)),
+      ArrowRight: () => this.change(() => player.step(1)),
+      ArrowUp: () => this.change(() => player.shift(1)),
+      ArrowDown: () => this.change(() => player.shift(-1)),
+      Home: () => this.change(() => this.scrub(0)),
+      r: () => this.stage.reset(),
+      b: () => this.darken(),
+      i: () => this.unfold(),
+    };
+    ["mesh", "splats", "wireframe"].forEach((mode, i) => {
+      if (this.modes.includes(mode)) deeds[i + 1] = () => this.show(mode);
+    });
+    const deed = deeds[event.key] ?? deeds[event.key.toLowerCase()];
+    if (!deed) return;
+    event.preventDefault();
+    deed();
+  }
+}

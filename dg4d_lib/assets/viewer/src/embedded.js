@@ -1,0 +1,22 @@
+// What the page was filled with: elements that hold base64 or JSON, by their id.
+
+/** The bytes of a block; null if the page has none of this name. */
+export function bytesOf(name) {
+  const element = document.getElementById(`data-${name}`);
+  if (!element) return null;
+  const text = atob(element.textContent);
+  element.remove(); // the decoded bytes are enough
+  const bytes = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+  return bytes;
+}
+
+/** The provenance: nested objects of strings and numbers. */
+export function facts() {
+  return JSON.parse(document.getElementById("data-facts").textContent);
+}
+
+/** An address under which an element of the page can show bytes. */
+export function addressOf(bytes, type) {
+  return URL.createObjectURL(new Blob([bytes], { type }));
+}

@@ -1,0 +1,105 @@
+// Puts the page together: what it was filled with, the stage, the clock, the controls. `window.dg4d` drives it from code.
+import { bytesOf, facts } from "./embedded.js";
+import { Cloud } from "./cloud.js";
+import { Controls } from "./controls.js";
+import { readMesh } from "./mesh.js";
+import { Player } from "./player.js";
+import { fillPanel } from "./panel.js";
+import { readSplats } from "./splats.js";
+import { Stage, canDraw } from "./stage.js";
+
+const NO_WEBGL =
+  "This browser cannot draw in 3D: it has no WebGL 2, or it is switched off. The films beside this page show the asset without it.";
+
+const stageElement = document.getElementById("stage");
+
+/** What there is to show, by the modes it has. */
+async function read() {
+  const [glb, packed] = [bytesOf("glb"), bytesOf("splats")];
+  const mesh = await readMesh(glb);
+  const splats = packed && (await readSplats(packed));
+  return { mesh, cloud: splats && new Cloud(splats) };
+}
+
+async function start() {
+  const video = fillPanel(facts(), bytesOf("picture"), bytesOf("video"));
+  if (!canDraw()) throw new Error(NO_WEBGL);
+  const { mesh, cloud } = await read();
+  const player = new Player(Math.max(mesh.duration, cloud?.splats.duration ?? 0), cloud?.splats.fps || mesh.fps || 1);
+  const stage = new Stage(stageElement);
+  const modes = ["mesh", ...(cloud ? ["splats"] : []), "wireframe"];
+  const shown = [mesh, cloud].filter(Boolean);
+  stage.scene.add(...shown.map(({ object }) => object));
+  let mode;
+
+  const show = (what) => {
+    if (!modes.includes(what)) throw new Error(`${what} is not here; there are ${modes.join(", ")}`);
+    mode = what;
+    for (const one of shown) one.show(what);
+    draw();
+  };
+  const draw = () => {
+    for (const one of shown) if (one.object.visible) one.seek(player.time);
+    stage.draw((camera, pixels) => mode === "splats" && cloud.look(camera, pixels));
+    controls.update(mode);
+  };
+  const state = () => ({
+    time: player.time,
+    duration: player.duration,
+    frame: player.frame,
+    frames: player.frames,
+    fps: player.fps,
+    playing: player.playing,
+    speed: player.speed,
+    shown: mode,
+    modes,
+    dark: document.documentElement.dataset.theme === "dark",
+  });
+  const controls = new Controls({ player, stage, video, modes, show, draw });
+  show(modes[0]);
+  stageElement.removeAttribute("data-loading");
+  Object.assign(window.dg4d, {
+    state,
+    show,
+    draw,
+    seek(seconds) {
+      player.playing = false;
+      player.seek(seconds);
+      draw();
+    },
+    play() {
+      player.playing = true;
+    },
+  });
+  animate(player, stage, draw);
+}
+
+/** Draws when something changed: the time, the view or the size. */
+function animate(player, stage, draw) {
+  let last = performance.now();
+  const tick = (now) => {
+    requestAnimationFrame(tick);
+    stage.controls.update();
+    if (player.playing) player.advance((now - last) / 1000);
+    last = now;
+    if (player.playing || stage.stale) draw();
+  };
+  requestAnimationFrame(tick);
+}
+
+function refuse(error) {
+  stageElement.removeAttribute("data-loading");
+  document.body.toggleAttribute("data-still", true);
+  document.querySelector("video").controls = true;
+  const notice = document.getElementById("notice");
+  notice.hidden = false;
+  notice.textContent = error.message;
+  if (error.message === NO_WEBGL) return;
+  notice.textContent = `The asset cannot be shown: ${error.message}`;
+  console.error(error);
+}
+
+// `ready` is fulfilled with the first picture, and rejected if there will be none.
+window.dg4d = { ready: null };
+window.dg4d.ready = start();
+window.dg4d.ready.catch(refuse);

@@ -1,0 +1,78 @@
+// Canvas, camera and the hand that turns it. The canvas is transparent: the page's background shows through.
+import { DirectionalLight, HemisphereLight, PerspectiveCamera, Scene, WebGLRenderer } from "three";
+import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+
+// The camera of the input picture: on +z, looking at the origin; as in dg4d_lib/cameras/orbit.py.
+const FOV_DEG = 49.1; // of the shorter side
+const RADIUS = 2;
+const NEAREST = 0.3;
+const FARTHEST = 12;
+const MOST_PIXELS_PER_POINT = 2; // sharper screens would only be slower
+
+/** Whether this browser can draw at all. */
+export function canDraw() {
+  return Boolean(document.createElement("canvas").getContext("webgl2"));
+}
+
+export class Stage {
+  constructor(element) {
+    this.element = element;
+    this.renderer = new WebGLRenderer({ canvas: element.querySelector("canvas"), antialias: true, alpha: true });
+    this.scene = new Scene();
+    this.camera = new PerspectiveCamera(FOV_DEG, 1, 0.02, 100);
+    this.controls = new OrbitControls(this.camera, this.renderer.domElement);
+    Object.assign(this.controls, { enableDamping: true, minDistance: NEAREST, maxDistance: FARTHEST });
+    this.stale = true;
+    this.controls.addEventListener("change", () => (this.stale = true));
+    new ResizeObserver(() => this.resize()).observe(element);
+    this.light();
+    this.reset();
+    this.resize();
+  }
+
+  /** Back to the view of the input picture. */
+  reset() {
+    this.controls.enableDamping = false;
+    this.controls.update(); // ends what is still turning
+    this.controls.enableDamping = true;
+    this.controls.target.set(0, 0, 0);
+    this.camera.position.set(0, 0, RADIUS);
+    this.controls.update();
+    this.stale = true;
+  }
+
+  /** The scene as it is now, drawn at once. */
+  draw(before) {
+    this.camera.updateMatrixWorld();
+    before(this.camera, this.pixels);
+    this.renderer.render(this.scene, this.camera);
+    this.stale = false;
+  }
+
+  /** Width and height of the picture in pixels. */
+  get pixels() {
+    const { width, height } = this.renderer.domElement;
+    return { width, height };
+  }
+
+  resize() {
+    const { clientWidth: width, clientHeight: height } = this.element;
+    if (!width || !height) return;
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, MOST_PIXELS_PER_POINT));
+    this.renderer.setSize(width, height, false);
+    this.camera.aspect = width / height;
+    const half = Math.tan((FOV_DEG * Math.PI) / 360) / Math.min(1, this.camera.aspect);
+    this.camera.fov = (360 / Math.PI) * Math.atan(half);
+    this.camera.updateProjectionMatrix();
+    this.stale = true;
+  }
+
+  /** For the clay under the wireframe; textures are shown as they are. */
+  light() {
+    const lamp = new DirectionalLight(0xffffff, 1.6);
+    lamp.position.set(-1, 1.5, 1);
+    this.camera.add(lamp, lamp.target);
+    lamp.target.position.set(0, 0, -1);
+    this.scene.add(this.camera, new HemisphereLight(0xffffff, 0x8890a0, 1.9));
+  }
+}

@@ -1,0 +1,64 @@
+"""The kinds of deformation: made new, or out of their tensors."""
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dg4d_lib.deformation.framewise import Framewise
+from dg4d_lib.deformation.hexplane import HexPlane
+from dg4d_lib.deformation.mlp import Mlp
+from dg4d_lib.settings import DeformationSettings, FramewiseSettings, HexPlaneSettings, MlpSettings
+
+AnyDeformation = HexPlane | Mlp | Framewise
+
+
+def new_deformation(
+    settings: DeformationSettings,
+    bounds: Float[Tensor, "2 3"],
+    frames: int,
+    count: int,
+    generator: torch.Generator | None = None,
+) -> AnyDeformation:
+    """A deformation of this kind; the identity at the start unless its settings say otherwise.
+
+    Args:
+        settings: its kind and sizes.
+        bounds: lower and upper corner of the box of the Gaussians; what it covers unless the settings name a box.
+        frames: of the video.
+        count: Gaussians.
+        generator: for the start of planes, layers and scattered Gaussians.
+    """
+    match settings:
+        case HexPlaneSettings():
+            wide = torch.tensor([[-settings.half_side] * 3, [settings.half_side] * 3])
+            covered = wide if settings.half_side else bounds
+            return HexPlane(settings, covered, generator, last_moment(settings, frames))
+        case MlpSettings():
+            return Mlp(settings, bounds, generator, last_moment(settings, frames))
+        case FramewiseSettings():
+            radius = float((bounds[1] - bounds[0]).max()) / 2 if settings.start == "scattered" else 0.0
+            return Framewise(frames, count, radius, generator)
+
+
+def tensors_of(deformation: AnyDeformation) -> dict[str, Tensor]:
+    """Everything that makes a fitted deformation, by name."""
+    return {name: value.detach().cpu().contiguous() for name, value in sorted(deformation.state_dict().items())}
+
+
+def restored(settings: DeformationSettings, tensors: Mapping[str, Tensor], frames: int, count: int) -> AnyDeformation:
+    """The deformation that `tensors_of` took apart, without gradients.
+
+    Raises:
+        RuntimeError: a tensor is missing, is of another shape or belongs to nothing.
+    """
+    deformation = new_deformation(settings, torch.zeros(2, 3), frames, count)  # the true box is among the tensors
+    deformation.load_state_dict(dict(tensors))
+    return deformation.requires_grad_(False)
+
+
+def last_moment(settings: DeformationSettings, frames: int) -> float:
+    """Where the last frame lies on the deformation's axis of time, which goes from 0 to 1."""
+    open_ended = not isinstance(settings, FramewiseSettings) and not settings.endpoint
+    return (frames - 1) / frames if open_ended else 1.0

@@ -1,0 +1,118 @@
+"""Finished assets against the truth, one after the other; their means as a table in the Prefect UI."""
+
+import json
+from typing import Any, Literal
+
+from prefect import flow, tags
+from prefect.artifacts import create_table_artifact
+from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
+
+from dg4d_lib.errors import BadInput
+from flows import home, scores
+from flows.executors import StepError
+from flows.orphans import process_tag
+from flows.scores import ObjectScores, Results
+from flows.tasks import Steps
+from steps.contract import ArtifactRef, Frozen
+from steps.profiles import ScoreAssetSettings
+
+STEP = "score_asset"
+FVD = "fvd"
+
+
+class Entry(Frozen):
+    """An object to judge.
+
+    Attributes:
+        name: of the object.
+        truth: what it should look like.
+        package: the asset; None where making it failed.
+        error: why there is no asset.
+        seconds: that it took.
+    """
+
+    name: str
+    truth: ArtifactRef
+    package: ArtifactRef | None = None
+    error: str = ""
+    seconds: float = 0.0
+
+
+class Judged(Frozen):
+    """What the flow gives: the results, and the films of every object: the truth's and the asset's."""
+
+    results: Results
+    films: dict[str, dict[Literal["truth", "ours"], ArtifactRef]]
+
+
+@flow(name="benchmark", flow_run_name="{title}", persist_result=False)
+def benchmark(entries: list[Entry], settings: ScoreAssetSettings, title: str, ours: str, seed: int = 0) -> Judged:
+    """Judge every asset, and the naive guesses beside it; an object that fails stops no other."""
+    objects: list[ObjectScores] = []
+    films: dict[str, dict[Literal["truth", "ours"], ArtifactRef]] = {}
+    missing: dict[str, str] = {}
+    crowds: dict[str, list[list[float]]] = {"truth": [], "ours": []}
+    for entry in entries:
+        one = ObjectScores(object=entry.name, error=entry.error, seconds=entry.seconds)
+        if entry.package is not None:
+            try:
+                guessed, judged = _judge(entry, settings, seed)
+            except StepError as error:
+                one = one.model_copy(update={"error": error.message})
+            else:
+                theirs, mine = (_read(made["scores"]) for made in (guessed, judged))
+                films[entry.name] = {"truth": guessed["films"], "ours": judged["films"]}
+                missing |= mine["missing"]
+                crowds["truth"] += theirs["clips"].values()
+                crowds["ours"] += mine["clips"].values()
+                rows = {**theirs["rows"], ours: mine["rows"]["asset"]}
+                facts = {name: mine[name] for name in ("frames", "size", "notes")}
+                one = one.model_copy(update={"rows": rows, **facts})
+        objects.append(one)
+    mean = scores.averaged(objects, ours)
+    figures, troubles = _fvd(crowds, missing.get("fvd_consistent4d", ""))
+    mean.get(ours, {}).update(figures)
+    results = Results(
+        title=title,
+        ours=ours,
+        drawn="mesh" if settings.mesh else "splats",
+        settings=settings.model_dump(mode="json"),
+        objects=objects,
+        mean=mean,
+        missing=missing | troubles,
+    )
+    create_table_artifact(table=scores.table(results), key="benchmark", description=title)
+    return Judged(results=results, films=films)
+
+
+def judge(entries: list[Entry], settings: ScoreAssetSettings, title: str, ours: str, seed: int = 0) -> Judged:
+    """Run the flow."""
+    quick = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # a sync flow waits a second for its heart to stop
+    with temporary_settings(quick), tags(process_tag()):
+        return benchmark(entries, settings, title, ours, seed)
+
+
+def _judge(
+    entry: Entry, settings: ScoreAssetSettings, seed: int
+) -> tuple[dict[str, ArtifactRef], dict[str, ArtifactRef]]:
+    """What the naive guesses score, and what the asset does."""
+    steps = Steps(entry.name, seed)
+    guessed = steps.run(STEP, {"truth": entry.truth}, settings.model_copy(update={"mesh": False}))
+    return guessed, steps.run(STEP, {"truth": entry.truth, "package": entry.package}, settings)
+
+
+def _read(ref: ArtifactRef) -> dict[str, Any]:
+    report: dict[str, Any] = json.loads(home.store().path(ref).read_text(encoding="utf-8"))
+    return report
+
+
+def _fvd(crowds: dict[str, list[list[float]]], without: str) -> tuple[scores.Figures, dict[str, str]]:
+    """The distance of all films from all true ones, or why there is none; `without` says why no film has outputs."""
+    if not crowds["ours"]:
+        return {}, {FVD: without} if without else {}
+    from dg4d_lib.metrics.fvd import fvd  # noqa: PLC0415 - brings torch
+
+    try:
+        return {FVD: fvd(crowds["ours"], crowds["truth"])}, {}
+    except BadInput as error:
+        return {}, {FVD: str(error)}

@@ -1,0 +1,53 @@
+"""What computed a step: processor, system, installed packages, container image. No name of a host, user or path."""
+
+import functools
+import os
+import platform
+import sys
+from pathlib import Path
+from typing import Any
+
+from steps.contract import digest_of
+
+
+def machine() -> dict[str, str]:
+    """Facts about this process, for the record of a step; what does not exist here is left out."""
+    facts = {
+        "system": platform.platform(),
+        "processor": processor(),
+        "cores": str(_cores()),
+        "gpu": _gpu(),
+        "python": platform.python_version(),
+        "packages": digest_of(packages()),
+        "image": os.environ.get("DG4D_IMAGE", ""),
+    }
+    return {name: value for name, value in facts.items() if value}
+
+
+@functools.cache
+def packages() -> list[str]:
+    """Every installed distribution as "name-version", sorted; told by the names of folders, without reading any."""
+    folders = (Path(entry) for entry in sys.path)
+    return sorted({found.stem for folder in folders if folder.is_dir() for found in folder.glob("*.dist-info")})
+
+
+@functools.cache
+def processor() -> str:
+    """The model of the processor, or at least its architecture."""
+    try:
+        about = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        about = ""
+    models = [line.partition(":")[2].strip() for line in about.splitlines() if line.startswith("model name")]
+    return models[0] if models else platform.processor() or platform.machine()
+
+
+def _cores() -> int:
+    """Those that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _gpu() -> str:
+    """The GPU that was used; asking does not wake one."""
+    torch: Any = sys.modules.get("torch")
+    return str(torch.cuda.get_device_name()) if torch is not None and torch.cuda.is_initialized() else ""

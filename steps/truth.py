@@ -1,0 +1,177 @@
+"""Ground truth on disk: where the frames of every view lie. Imports no torch.
+
+Three layouts are read, an object a folder:
+
+  ours           input/, view_<azimuth>/ ..., mesh.npz and bank/ where there are any
+  Consistent4D   eval_0/ ... eval_3/, and the input in a folder beside them, or directly in the object's folder
+  input only     one picture, or a folder of frames: nothing is known of other sides
+
+Frames are pictures whose names end in their number; RGBA is best, for opaque ones the subject is what is not white.
+"""
+
+import json
+import re
+from pathlib import Path
+
+from dg4d_lib.errors import BadInput
+from steps.contract import Frozen
+
+CONSISTENT4D_AZIMUTHS_DEG = (-75.0, 15.0, 105.0, 195.0)  # of eval_0 to eval_3 (readme.txt of its test data)
+PICTURES = frozenset([".png", ".jpg", ".jpeg", ".webp"])
+OURS, THEIRS = re.compile(r"view_(-?\d+(?:\.\d+)?)"), re.compile(r"eval_(\d+)")
+INPUT, MESH, BANK, CAMERAS = "input", "mesh.npz", "bank", "cameras.json"
+# of every view, as in dg4d_lib/cameras/orbit.py, whose import would bring torch
+CAMERA = {"elevation": 0.0, "radius": 2.0, "fovy": 49.1}  # degrees, world units, degrees
+CLOSE = 0.01  # in the units of the above
+
+
+class View(Frozen):
+    """What is seen from one side, level with the subject.
+
+    Attributes:
+        azimuth_deg: of the camera; 0 is the input's.
+        frames: in the order in which they play.
+    """
+
+    azimuth_deg: float
+    frames: tuple[Path, ...]
+
+    @property
+    def name(self) -> str:
+        """As folders and scores call it, for example "-75"."""
+        return f"{self.azimuth_deg + 0.0:g}"
+
+
+class Truth(Frozen):
+    """What is known of one object.
+
+    Attributes:
+        name: of the object.
+        inputs: the frames of the input; one where only a picture was given.
+        views: what should be seen from other sides; as many frames as the input, if that has more than one.
+        mesh: NumPy archive of `vertices` [t v 3], `faces` [f 3] and perhaps `face_weight` [f]; None: unknown.
+        bank: folder of true views for the oracle prior; None: there is none.
+    """
+
+    name: str
+    inputs: tuple[Path, ...]
+    views: tuple[View, ...] = ()
+    mesh: Path | None = None
+    bank: Path | None = None
+
+
+def find_truth(place: Path) -> Truth:
+    """The ground truth of one object.
+
+    Raises:
+        BadInput: there is none, or it is not complete; says what is missing.
+    """
+    if place.is_file() and place.suffix.lower() in PICTURES:
+        return Truth(name=place.stem, inputs=(place,))
+    if not place.is_dir():
+        raise BadInput(f"{place} is no ground truth: give a folder of an object, or a picture")
+    views = _views(place)
+    truth = Truth(
+        name=place.absolute().name,
+        inputs=_inputs(place),
+        views=views,
+        mesh=place / MESH if (place / MESH).is_file() else None,
+        bank=place / BANK if (place / BANK / "bank.json").is_file() else None,
+    )
+    _check(truth, place)
+    return truth
+
+
+def find_truths(dataset: Path) -> list[Truth]:
+    """The objects of a data set: a folder each, or a picture each; also of a folder that has these in `gt/`.
+
+    Raises:
+        BadInput: there are none, or one of them is not complete.
+    """
+    if not dataset.is_dir():
+        raise BadInput(f"{dataset} is no data set: give a folder that holds a folder per object")
+    root = dataset / "gt" if (dataset / "gt").is_dir() else dataset
+    if _view_folders(root) or (root / INPUT).is_dir():
+        return [find_truth(root)]
+    folders = [path for path in sorted(root.iterdir()) if path.is_dir() and not path.name.startswith(".")]
+    objects = [path for path in folders if _view_folders(path) or (path / INPUT).is_dir()]
+    found = [find_truth(path) for path in objects or _pictures(root)]
+    if not found:
+        raise BadInput(
+            f"{dataset} holds no objects: an object is a folder with input/ and view_<azimuth>/, or, as in "
+            "Consistent4D, with eval_0/ to eval_3/; or a single picture"
+        )
+    return found
+
+
+def _views(folder: Path) -> tuple[View, ...]:
+    views = [View(azimuth_deg=azimuth, frames=tuple(_pictures(path))) for azimuth, path in _view_folders(folder)]
+    return tuple(sorted(views, key=lambda view: view.azimuth_deg))
+
+
+def _view_folders(folder: Path) -> list[tuple[float, Path]]:
+    found = []
+    for path in sorted(folder.iterdir()):
+        ours, theirs = OURS.fullmatch(path.name), THEIRS.fullmatch(path.name)
+        if not path.is_dir() or not (ours or theirs):
+            continue
+        if ours:
+            found.append((float(ours.group(1)), path))
+        elif theirs and int(theirs.group(1)) < len(CONSISTENT4D_AZIMUTHS_DEG):
+            found.append((CONSISTENT4D_AZIMUTHS_DEG[int(theirs.group(1))], path))
+        else:
+            raise BadInput(f"{path}: Consistent4D has the views eval_0 to eval_3; name others view_<azimuth>")
+    return found
+
+
+def _inputs(folder: Path) -> tuple[Path, ...]:
+    """The frames in `input/`; else those directly in the folder; else those of the only other folder with pictures."""
+    if (folder / INPUT).is_dir():
+        return tuple(_pictures(folder / INPUT))
+    if direct := _pictures(folder):
+        return tuple(direct)
+    known = {path for _, path in _view_folders(folder)} | {folder / BANK, folder / "static"}
+    others = [path for path in sorted(folder.iterdir()) if path.is_dir() and path not in known and _pictures(path)]
+    if len(others) != 1:
+        named = f" ({', '.join(path.name for path in others)}: which?)" if others else ""
+        raise BadInput(f"{folder} has no input{named}: put the frames that are given into {folder / INPUT}")
+    return tuple(_pictures(others[0]))
+
+
+def _pictures(folder: Path) -> list[Path]:
+    """The pictures directly in a folder, by the number at the end of their names."""
+    found = [p for p in folder.iterdir() if p.suffix.lower() in PICTURES and p.is_file() and p.name[0] != "."]
+    return sorted(found, key=lambda path: (int((re.findall(r"\d+", path.stem) or ["0"])[-1]), path.name))
+
+
+def _check(truth: Truth, folder: Path) -> None:
+    if not truth.inputs:
+        raise BadInput(f"{folder} has no input frames: put them into {folder / INPUT}")
+    counts = {f"view_{view.name}": len(view.frames) for view in truth.views}
+    if len(truth.inputs) > 1:
+        counts = {INPUT: len(truth.inputs), **counts}
+    if len(set(counts.values())) > 1 or 0 in counts.values():
+        listed = ", ".join(f"{name} {count}" for name, count in counts.items())
+        raise BadInput(f"the views of {folder} must have as many frames as each other; they have: {listed}")
+    if len({view.azimuth_deg for view in truth.views}) < len(truth.views):
+        raise BadInput(f"{folder} has two folders of one view; keep one")
+    if (folder / CAMERAS).is_file():
+        _check_cameras(folder / CAMERAS, truth)
+
+
+def _check_cameras(path: Path, truth: Truth) -> None:
+    """Refuse views that were not taken as ours are."""
+    try:
+        given = json.loads(path.read_text(encoding="utf-8"))
+        cameras = {name: given[name] for name in (INPUT, *(f"view_{view.name}" for view in truth.views))}
+        wrong = [
+            f"{name}: {what} {camera[what]}"
+            for name, camera in cameras.items()
+            for what, value in CAMERA.items()
+            if abs(float(camera[what]) - value) > CLOSE
+        ]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise BadInput(f"{path} does not say how every view was taken: {error!r}") from error
+    if wrong:
+        expected = ", ".join(f"{what} {value:g}" for what, value in CAMERA.items())
+        raise BadInput(f"{path}: views must be taken with {expected}; {'; '.join(wrong)}")

@@ -1,0 +1,34 @@
+"""Spans of frames."""
+
+import numpy as np
+import pytest
+
+from dg4d_lib.assets.tracks import Span, cut
+
+
+@pytest.mark.parametrize(("frames", "longest"), [(1, 1), (5, 1), (5, 2), (6, 3), (300, 128)])
+def test_every_frame_is_in_one_span(frames: int, longest: int) -> None:
+    spans = cut(frames, longest)
+    assert [frame for span in spans for frame in range(span.first, span.end)] == list(range(frames))
+    assert max(span.end - span.first for span in spans) <= longest
+
+
+def test_a_span_ends_with_the_first_pose_of_the_next() -> None:
+    first, second = cut(4, 2)
+    assert (first.keys, first.poses) == ([0, 1, 2], [0, 1, 2])
+    assert (second.keys, second.poses) == ([2, 3, 4], [2, 3, 0])
+
+
+def test_a_whole_animation_comes_back_to_its_first_pose_without_a_pose_more() -> None:
+    (span,) = cut(3, 8)
+    assert span.poses == [0, 1, 2]
+    assert np.array_equal(span.weights(), np.eye(3)[[0, 1, 2, 0]])
+
+
+@pytest.mark.parametrize("span", [Span(0, 1, 1), Span(0, 2, 5), Span(2, 4, 5), Span(3, 5, 5), Span(0, 5, 5)])
+def test_a_node_is_shown_in_its_span_and_in_the_next_round(span: Span) -> None:
+    keys, scales = span.shown()
+    for frame in range(span.of + 1):
+        shown = scales[np.searchsorted(keys, frame, side="right") - 1]
+        assert (shown == float(span.first <= frame % span.of < span.end)).all()
+    assert (keys[0], keys[-1]) == (0, span.of)

@@ -1,0 +1,90 @@
+"""The page around the data: what goes in can be read out again, and does nothing else."""
+
+import base64
+import json
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from typing import Any
+
+import pytest
+
+from dg4d_lib.assets.viewer_page import viewer_page
+
+NASTY = "</script><script>alert(1)</script><!-- @data@ @title@ & \"ümlaut\" 'π'"
+GLB = bytes(range(256))
+
+
+class Blocks(HTMLParser):
+    """Title, heading, and the scripts of a page by id, as a browser cuts them."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.scripts: dict[str | None, str] = {}
+        self.texts: dict[str, str] = {}
+        self.open: list[tuple[str, str | None]] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.open.append((tag, dict(attrs).get("id")))
+
+    def handle_data(self, data: str) -> None:
+        tag, name = self.open[-1] if self.open else ("", None)
+        if tag == "script":
+            self.scripts[name] = self.scripts.get(name, "") + data
+        elif tag in ("title", "h1"):
+            self.texts[tag] = self.texts.get(tag, "") + data
+
+    def handle_endtag(self, tag: str) -> None:
+        while self.open and self.open.pop()[0] != tag:
+            pass
+
+
+def page(title: str = "Fox", facts: dict[str, Any] | None = None) -> str:
+    return viewer_page(title, GLB, b"splats", None, b"film", facts or {})
+
+
+def test_the_data_can_be_read_out_again() -> None:
+    scripts = Blocks(page()).scripts
+    assert set(scripts) == {"data-glb", "data-splats", "data-video", "data-facts", None}
+    assert base64.b64decode(scripts["data-glb"]) == GLB
+    assert base64.b64decode(scripts["data-video"]) == b"film"
+
+
+def test_text_stays_text() -> None:
+    facts = {NASTY: [1, None, {"deep": NASTY}]}
+    read = Blocks(page(NASTY, facts))
+    assert json.loads(read.scripts["data-facts"]) == facts
+    assert read.texts == {"title": NASTY, "h1": NASTY}
+    assert set(read.scripts) == {"data-glb", "data-splats", "data-video", "data-facts", None}
+    assert read.scripts[None] == Blocks(page()).scripts[None]
+
+
+def test_equal_arguments_give_equal_pages() -> None:
+    assert page("Fox", {"a": 1}) == page("Fox", {"a": 1}) != page("Fox", {"a": 2})
+
+
+def test_facts_that_are_no_json_are_refused() -> None:
+    with pytest.raises(ValueError, match="JSON"):
+        page(facts={"loss": float("nan")})
+
+
+def test_the_policy_of_the_page_lets_nothing_in_from_outside() -> None:
+    policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page())
+    assert policy is not None
+    rules = {rule.split()[0]: set(rule.split()[1:]) for rule in policy[1].split(";")}
+    assert rules.pop("default-src") == {"'none'"}
+    inside = {"blob:", "data:", "'unsafe-inline'", "'wasm-unsafe-eval'"}
+    assert set.union(*rules.values()) <= inside
+
+
+def test_the_licenses_of_what_is_bundled_are_in_the_page() -> None:
+    text = page()
+    for words in ("three.js authors", "Arseny Kapoulkine", "The above copyright notice and this permission notice"):
+        assert words in text
+
+
+def test_making_a_page_loads_no_tensors() -> None:
+    code = "import dg4d_lib.assets.viewer_page, sys; sys.exit(bool({'torch', 'numpy'} & sys.modules.keys()))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

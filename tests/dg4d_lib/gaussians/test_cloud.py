@@ -1,0 +1,28 @@
+"""The cloud as a value; what draws it is tested elsewhere."""
+
+import pytest
+import torch
+
+from dg4d_lib.gaussians.cloud import Gaussians
+
+
+def moving(states: int) -> Gaussians:
+    generator = torch.Generator().manual_seed(1)
+    means, log_scales, quats = (torch.randn(states, 5, width, generator=generator) for width in (3, 3, 4))
+    return Gaussians(means, log_scales, quats, torch.zeros(5), torch.zeros(5, 1, 3))
+
+
+@pytest.mark.parametrize("rows", [[2, 0], [0, 1], [1, 1, 1], [0, 2, 1], [0, 1, 2], []])
+@pytest.mark.parametrize("kind", [list, lambda rows: torch.tensor(rows, dtype=torch.long)], ids=["list", "tensor"])
+def test_states_are_picked_in_the_order_asked_for(rows, kind):
+    cloud = moving(3)
+    picked = cloud.states(kind(rows))
+    for name in ("means", "log_scales", "quats"):
+        assert getattr(picked, name).equal(getattr(cloud, name)[torch.tensor(rows, dtype=torch.long)])
+    assert picked.harmonics is cloud.harmonics
+
+
+def test_all_states_in_their_places_are_not_copied():
+    cloud = moving(3)
+    assert cloud.states(torch.arange(3)).means is cloud.means
+    assert cloud.states(torch.arange(2)).means is not cloud.means

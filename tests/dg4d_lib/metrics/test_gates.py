@@ -1,0 +1,229 @@
+import math
+import re
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from dg4d_lib.asset_settings import GateSettings
+from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
+from dg4d_lib.cameras.viewpoints import turntable
+from dg4d_lib.metrics.gates import (
+    MESH,
+    SPLATS,
+    Evidence,
+    Gate,
+    Pictures,
+    Turn,
+    consistency,
+    fidelity,
+    flicker,
+    floaters,
+    judge,
+    motion,
+    sharpness,
+)
+
+SIZE = 64
+
+
+def disk(x: float = 0.0, radius: float = 0.5, gray: float = 0.3) -> Pictures:
+    """A striped disk at x, in halves of the picture."""
+    line = (torch.arange(SIZE) + 0.5) / SIZE * 2 - 1
+    v, u = torch.meshgrid(line, line, indexing="ij")
+    inside = (((u - x) ** 2 + v**2) < radius**2).float()[None, ..., None]
+    stripes = gray + 0.2 * torch.sin(20 * (u - x))[None, ..., None]
+    return Pictures((stripes * inside + 1 - inside).expand(1, SIZE, SIZE, 3).contiguous(), inside)
+
+
+def film(places: list[float]) -> Pictures:
+    disks = [disk(x) for x in places]
+    return Pictures(torch.cat([d.color for d in disks]), torch.cat([d.coverage for d in disks]))
+
+
+def ball_turn(radius: float = 0.5, count: int = 24) -> Turn:
+    """A ball around the origin, whose depth is known in closed form."""
+    cameras = turntable(count, OrbitCamera(width=SIZE, height=SIZE))
+    focal = cameras[0].focal
+    line = (torch.arange(SIZE) + 0.5 - SIZE / 2) / focal
+    y, x = torch.meshgrid(line, line, indexing="ij")
+    a, b, c = x**2 + y**2 + 1, torch.tensor(-2 * 2.0), 4 - radius**2  # |depth * ray - (0, 0, 2)| = radius
+    root = (b**2 - 4 * a * c).clamp(min=0).sqrt()
+    hit = (b**2 - 4 * a * c > 0).float()
+    depth = torch.where(hit > 0, (-b - root) / (2 * a), 0.0)
+    everywhere = (count, SIZE, SIZE, 1)
+    return Turn(
+        hit[None, ..., None].expand(everywhere).contiguous(),
+        depth[None, ..., None].expand(everywhere).contiguous(),
+        world_to_camera(cameras),
+        focal,
+    )
+
+
+def evidence(pictures: Pictures, video: Pictures) -> Evidence:
+    forms = {SPLATS: pictures, MESH: pictures}
+    return Evidence(Pictures(video.color[:1], video.coverage[:1]), video, forms, forms, ball_turn(), 0.0)
+
+
+SWAYING = film([0.1 * math.sin(t) for t in range(8)])
+
+
+def test_the_video_itself_passes_every_gate() -> None:
+    gates = judge(evidence(SWAYING, SWAYING), GateSettings())
+    assert [gate.name for gate in gates if not gate.passed] == []
+    assert {gate.name: gate.value for gate in gates} == {
+        "fidelity": pytest.approx(60, abs=1e-3),
+        "silhouette": 1,
+        "consistency": pytest.approx(1, abs=0.04),  # the rim is a large part of so few pixels
+        "flicker": 0,
+        "floaters": 0,
+        "flaws": 0,
+        "agreement": 1,
+        "sharpness": 1,
+        "motion": 1,
+    }
+
+
+@pytest.mark.parametrize(
+    ("pictures", "failing"),
+    [
+        (film([0.0] * 8), {"motion", "flicker"}),
+        (film([0.4 * math.sin(t) for t in range(8)]), {"motion", "flicker", "silhouette", "fidelity"}),
+        (Pictures((SWAYING.color + 1) / 2, SWAYING.coverage), {"fidelity", "motion", "sharpness"}),
+    ],
+    ids=["frozen", "four times the motion", "washed out"],
+)
+def test_what_is_wrong_is_named(pictures: Pictures, failing: set[str]) -> None:
+    gates = judge(evidence(pictures, SWAYING), GateSettings())
+    assert failing <= {gate.name for gate in gates if not gate.passed}
+    assert {"consistency", "flaws", "agreement", "floaters"} <= {gate.name for gate in gates if gate.passed}
+
+
+def test_one_torn_frame_is_enough_for_the_silhouette() -> None:
+    torn = SWAYING.coverage.clone()
+    torn[3, :, : SIZE // 2] = 0
+    found = {gate.name: gate for gate in judge(evidence(replace(SWAYING, coverage=torn), SWAYING), GateSettings())}
+    assert found["silhouette"].value < 0.6
+    assert found["fidelity"].passed
+
+
+def test_the_worse_form_counts() -> None:
+    still = film([0.0] * 8)
+    mixed = replace(evidence(SWAYING, SWAYING), seen={SPLATS: SWAYING, MESH: still})
+    found = {gate.name: gate for gate in judge(mixed, GateSettings())}
+    assert (found["motion"].form, found["motion"].passed) == (MESH, False)
+    assert found["motion"].values[SPLATS] == 1
+
+
+@pytest.mark.parametrize(
+    ("value", "passed"), [(0.75, True), (0.7499, False), (1.25, True), (1.2501, False), (1.0, True)]
+)
+def test_bounds_belong_to_what_passes(value: float, passed: bool) -> None:
+    assert Gate("sharpness", {"mesh": value}, 0.75, 1.25, "", "", "").passed is passed
+
+
+def test_a_band_is_left_on_either_side() -> None:
+    gate = Gate("motion", {"splats": 0.1, "mesh": 1.1}, 0.6, 1.7, "", "", "")
+    assert (gate.form, gate.value, gate.passed) == ("splats", 0.1, False)
+    assert replace(gate, values={"splats": 0.7, "mesh": 5.0}).form == "mesh"
+
+
+def test_fidelity_looks_at_the_subject_only() -> None:
+    dark = Pictures(disk().color - 0.1 * disk().coverage, disk().coverage)
+    assert fidelity(dark, disk()).item() == pytest.approx(20, abs=1e-3)  # 0.1 off everywhere on the subject
+
+
+def test_where_the_video_stands_still_no_motion_is_right_and_jumps_are_wrong() -> None:
+    still = film([0.0] * 4)
+    jumping = film([0.0, 0.1, 0.0, 0.1])
+    assert motion(still, still) == 1
+    assert flicker(still, still) == 0
+    assert motion(jumping, still) > 10
+    assert flicker(jumping, still) > 10
+
+
+def test_a_single_frame_has_nothing_to_flicker() -> None:
+    assert flicker(disk(), disk(0.2)) == 0
+    assert motion(disk(), disk(0.2)) == 1
+
+
+def test_motion_counts_changes() -> None:
+    video = film([0.0, 0.02])
+    gray = replace(video, color=(1 + video.color) / 2)  # half the contrast, half the change
+    assert motion(gray, video) == pytest.approx(0.5, abs=0.05)
+
+
+def test_floaters_are_what_hangs_apart() -> None:
+    coverage = torch.zeros(3, SIZE, SIZE, 1)
+    coverage[:, 10:20, 10:20] = 1  # 100 pixels
+    coverage[1, 40:45, 40:45] = 1  # 25 apart
+    coverage[2, 20:25, 20:25] = 1  # 25 that touch a corner
+    pictures = Pictures(torch.zeros(3, SIZE, SIZE, 3), coverage)
+    assert floaters(pictures).tolist() == pytest.approx([0, 0.2, 0])
+    assert floaters(Pictures(torch.zeros(1, 8, 8, 3), torch.zeros(1, 8, 8, 1))).tolist() == [0]
+
+
+def test_what_hangs_apart_in_the_video_too_is_no_floater() -> None:
+    coverage = SWAYING.coverage.clone()
+    coverage[:, :6, :6] = 1
+    apart = replace(SWAYING, coverage=coverage)
+    found = {gate.name: gate.value for gate in judge(evidence(apart, apart), GateSettings())}
+    assert found["floaters"] == 0
+    assert judge(evidence(apart, SWAYING), GateSettings())[4].value > 0.02
+
+
+def test_a_solid_ball_is_consistent() -> None:
+    assert consistency(ball_turn()) > 0.965  # but for its rim, where depth changes within a pixel
+
+
+def test_depths_that_do_not_fit_each_other_are_not() -> None:
+    turn = ball_turn()
+    generator = torch.Generator().manual_seed(0)
+    flat = turn.coverage * 2.0  # every side shows a disk through the middle, turned towards it
+    noisy = turn.depth + 0.2 * torch.randn(turn.depth.shape, generator=generator)
+    near = torch.arange(24).reshape(-1, 1, 1, 1) % 2 * 0.3  # every other side shows it nearer
+    for depth in (flat, noisy, turn.depth - near):
+        assert consistency(replace(turn, depth=depth)) < 0.9
+    assert consistency(replace(turn, coverage=torch.zeros_like(turn.coverage))) == 0
+
+
+def test_blur_and_noise_are_told_by_sharpness() -> None:
+    truth = disk(radius=0.8)
+
+    def with_color(color: Tensor) -> float:
+        return sharpness(replace(truth, color=color), truth)
+
+    planes = truth.color.movedim(-1, 1)
+    blurred = torch.nn.functional.avg_pool2d(planes, 9, 1, 4).movedim(1, -1)
+    noise = torch.rand(truth.color.shape, generator=torch.Generator().manual_seed(0))
+    assert with_color(truth.color) == 1
+    assert with_color(blurred) < 0.8
+    assert with_color(truth.color + 0.2 * noise) > 1.3
+
+
+def test_a_plain_subject_is_as_sharp_as_can_be() -> None:
+    plain = Pictures(torch.full((1, SIZE, SIZE, 3), 0.5), disk().coverage)
+    assert sharpness(plain, plain) == 1
+
+
+def test_every_threshold_decides() -> None:
+    found = {gate.name: gate for gate in judge(evidence(SWAYING, SWAYING), GateSettings())}
+    for knob in GateSettings.model_fields:
+        name, _, side = knob.rpartition("_")
+        changed = judge(evidence(SWAYING, SWAYING), GateSettings(**{knob: getattr(GateSettings(), knob) * 0.5}))
+        moved = {gate.name: gate for gate in changed}
+        assert getattr(moved[name], side) == pytest.approx(getattr(found[name], side) / 2)
+        assert all(moved[other] == found[other] for other in found if other != name)
+
+
+def test_every_piece_of_advice_names_knobs_that_exist() -> None:
+    profiles = pytest.importorskip("steps.profiles")
+    tree = profiles.PREVIEW.model_dump()
+    knobs = [
+        knob
+        for gate in judge(evidence(SWAYING, SWAYING), GateSettings())
+        for knob in re.findall(r"\b([a-z]+\.[a-z_]+)\b", gate.advice)
+    ]
+    assert len(knobs) > 9
+    assert [knob for knob in knobs if knob.split(".")[1] not in tree[knob.split(".")[0]]] == []

@@ -1,0 +1,114 @@
+"""Scenes of whole packages, and their films."""
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from pxr import Usd, UsdGeom
+from small_package import FPS, FRAMES, REACH, packed, tracked
+
+from dg4d_lib.assets.compose import Body
+from dg4d_lib.assets.scene import Item, Scene
+from dg4d_lib.assets.usd import write_usdz
+from dg4d_lib.errors import BadInput
+from steps.compose_scene import Cast
+
+SECONDS = FRAMES / FPS
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = packed(tmp_path_factory.mktemp("package"))
+    write_usdz(folder / "asset.usdz", tracked(), FPS)
+    return folder
+
+
+def cast_of(package: Path, *items: Item) -> Cast:
+    return Cast([package] * len(items), items, [item.name for item in items])
+
+
+def item(name: str, **where: object) -> Item:
+    return Item(package="p", name=name, **where)
+
+
+def pictures(film: Path) -> np.ndarray:
+    with av.open(str(film)) as container:
+        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
+
+
+def blue(picture: np.ndarray) -> np.ndarray:
+    """Columns in which the blue cloud is seen."""
+    return np.flatnonzero((picture[..., 2].astype(int) - picture[..., 0] > 60).any(0))
+
+
+def test_a_glb_holds_every_asset_where_it_was_put(package: Path, tmp_path: Path) -> None:
+    cast = cast_of(package, item("left", position=(-1, 0, 0)), item("right", position=(1, 0, 0), scale=2))
+    assert cast.write_glb(tmp_path / "scene.glb", None) == ()
+    scene = Body((tmp_path / "scene.glb").read_bytes())
+    width = REACH + 2 * tracked().mesh.vertices[:, 0].max().item()
+    np.testing.assert_allclose((scene.low[0], scene.high[0]), (-1 - width / 2, 1 + width), atol=1e-5)
+    assert scene.low[1] == pytest.approx(0, abs=1e-6)
+
+
+def test_a_usdz_agrees_with_the_glb(package: Path, tmp_path: Path) -> None:
+    cast = cast_of(
+        package, item("turned", position=(1, 2, 3), rotation_deg=(20, 60, 0), scale=1.5, start_s=0.5, speed=0.5)
+    )
+    cast.write_glb(tmp_path / "scene.glb", None)
+    cast.write_usdz(tmp_path / "scene.usdz", None)
+    stage = Usd.Stage.Open(str(tmp_path / "scene.usdz"))
+    (mesh,) = (UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
+    for seconds, frame in ((0.2, 0), (0.5 + 1 / (0.5 * FPS), 1)):
+        time = seconds * stage.GetTimeCodesPerSecond()
+        matrix = np.array(mesh.ComputeLocalToWorldTransform(time))
+        points = np.array(mesh.GetPointsAttr().Get(time)) @ matrix[:3, :3] + matrix[3, :3]
+        asset, transform = tracked(), cast.actors[0].transform
+        given = (asset.mesh.vertices + asset.offsets[frame]).numpy() @ transform[:3, :3].T + transform[:3, 3]
+        np.testing.assert_allclose(sorted(points[:, 1]), sorted(given[:, 1]), atol=1e-5)
+
+
+def test_a_usdz_says_what_would_loop_in_a_glb(package: Path, tmp_path: Path) -> None:
+    cast = cast_of(package, item("again"), item("once", loop=False))
+    (note,) = cast.write_usdz(tmp_path / "scene.usdz", 3 * SECONDS)
+    assert "again" in note
+    assert "once," not in note
+
+
+def test_a_package_without_usdz_is_named(package: Path, tmp_path: Path) -> None:
+    folder = packed(tmp_path / "older")
+    (folder / "asset.usdz").unlink(missing_ok=True)
+    with pytest.raises(BadInput, match=r"has no asset\.usdz"):
+        Cast([folder], [item("a")], ["a"]).write_usdz(tmp_path / "scene.usdz", None)
+
+
+def test_a_film_shows_every_asset(package: Path, tmp_path: Path) -> None:
+    cast = cast_of(package, item("a"), item("b"), item("c"))
+    cast.in_a_row(1.0)
+    cast.write_preview(tmp_path / "scene.mp4", Scene(items=(item("a"),), fps=12, duration_s=0.5), "reference")
+    film = pictures(tmp_path / "scene.mp4")
+    assert len(film) == 6
+    groups = np.split(blue(film[0]), np.flatnonzero(np.diff(blue(film[0])) > 1) + 1)
+    assert len(groups) == 3
+
+
+def test_a_film_waits_for_an_asset_to_start(package: Path, tmp_path: Path) -> None:
+    cast = cast_of(package, item("late", start_s=0.5, loop=False))
+    plan = Scene(items=(item("late"),), fps=FPS, duration_s=0.5 + SECONDS)
+    cast.write_preview(tmp_path / "scene.mp4", plan, "reference")
+    film = pictures(tmp_path / "scene.mp4")
+    middles = [blue(picture).mean() for picture in film]
+    assert abs(middles[6] - middles[0]) < 6 < abs(middles[-1] - middles[6])  # pixels; the camera swings a little
+
+
+def test_a_film_has_an_end(package: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="pictures"):
+        cast_of(package, item("a")).write_preview(
+            tmp_path / "scene.mp4", Scene(items=(item("a"),), fps=100, duration_s=600), "reference"
+        )
+
+
+def test_a_broken_asset_is_named(tmp_path: Path) -> None:
+    (tmp_path / "asset.glb").write_bytes(b"no GLB")
+    with pytest.raises(BadInput, match=r"asset\.glb: this is no GLB"):
+        Cast([tmp_path], [item("a")], ["a"])
