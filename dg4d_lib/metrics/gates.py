@@ -138,7 +138,7 @@ def judge(evidence: Evidence, settings: GateSettings) -> list[Gate]:
             None,
             "dB",
             "how well it shows the video from the input view: PSNR on the subject, mean over frames",
-            "raise static.iterations, motion.iterations or mesh.render_size; the picture of the worst moments says which",
+            "raise static.iterations, motion.iterations or mesh.render_size; the picture says which",
         ),
         Gate(
             "silhouette",
