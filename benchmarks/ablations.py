@@ -169,13 +169,12 @@ ABLATIONS: dict[str, Ablation] = {
         "a loss of local rigidity over time brings no significant improvement",
         {
             "off": Variant(),
+            "weight 300": Variant({"motion.rigidity_weight": 300.0}),
             "weight 3000": Variant({"motion.rigidity_weight": 3000.0}),
-            "weight 100000": Variant({"motion.rigidity_weight": 100000.0}),
         },
-        tuple(
-            Claim(weight, "off", figure, alike=True)
-            for weight in ("weight 3000", "weight 100000")
-            for figure in ("psnr_obj", "terr")
+        (
+            Claim("weight 300", "off", "psnr_obj", alike=True),
+            Claim("weight 300", "off", "terr", alike=True),
         ),
     ),
     "fast": Ablation(

@@ -18,6 +18,7 @@ from flows.orders import Order, Wish
 from flows.publish import check_folder, check_writable, is_current, whole
 from flows.scores import Results
 from flows.summary import Row
+from steps.archives import unpack
 from steps.catalog import PACKAGE, TRUTH
 from steps.contract import ArtifactRef
 from steps.profiles import ScoreAssetSettings, profile, revise
@@ -251,9 +252,9 @@ def _put_films(judged: "Judged", out: Path) -> dict[str, dict[str, dict[str, str
         for whose, ref in refs.items():
             folder = out / FILMS / name / whose
             folder.mkdir(parents=True, exist_ok=True)
-            with room_for(folder), zipfile.ZipFile(home.store().path(ref)) as archive:
-                archive.extractall(folder)
-                views = {Path(entry).stem: f"{FILMS}/{name}/{whose}/{entry}" for entry in archive.namelist()}
+            with room_for(folder):
+                films = unpack(home.store().path(ref), folder, "the zip of films")
+            views = {Path(film).stem: f"{FILMS}/{name}/{whose}/{film}" for film in films}
             shown.setdefault(name, {})[whose] = views
     return shown
 

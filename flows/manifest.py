@@ -110,7 +110,13 @@ def _of_folder(folder: Path, out: Path, item: Callable[[str, Path], Item]) -> li
     names = distinct(
         [(path.relative_to(folder).with_suffix("").as_posix(), path.suffix.lower().lstrip(".")) for path in found]
     )
-    return [item(name, path) for name, path in zip(names, found, strict=True)]
+    items = []
+    for name, path in zip(names, found, strict=True):
+        try:
+            items.append(item(name, sources.inside(folder, path.relative_to(folder).as_posix(), "the file")))
+        except BadInput as error:
+            items.append(Item(name=name, error=str(error)))
+    return items
 
 
 def _of_manifest(file: Path, profile_name: str, changes: Mapping[str, Any], seed: int) -> list[Item]:
@@ -129,7 +135,8 @@ def _wanted(row: dict[str, Any]) -> tuple[str, str]:
     """The name that a row asks for, within the output folder; and its suffix, in case another asks for it too."""
     path = PurePosixPath(str(row.get("path", "")))
     own = path.stem or name_of(str(row.get("text", "")))
-    parts = [part for part in PurePosixPath(str(row.get("name") or own)).parts if part not in {"/", ".."}]
+    name = "".join(letter for letter in str(row.get("name") or own) if letter.isprintable())
+    parts = [part for part in PurePosixPath(name).parts if part.strip("/") not in {"", ".."}]
     return "/".join(parts) or own, "" if row.get("name") else path.suffix.lower().lstrip(".")
 
 
@@ -149,10 +156,10 @@ def _wish_of(
         raise BadInput(f"seed {number} is negative; use 0 or more")
     return Wish(
         item=name,
-        picture=folder / str(row["path"]) if row.get("path") else None,
+        picture=sources.inside(folder, str(row["path"]), "path") if row.get("path") else None,
         text=str(row.get("text", "")),
-        video=folder / str(row["video"]) if row.get("video") else None,
-        bank=folder / str(row["bank"]) if row.get("bank") else None,
+        video=sources.inside(folder, str(row["video"]), "video") if row.get("video") else None,
+        bank=sources.inside(folder, str(row["bank"]), "bank") if row.get("bank") else None,
         profile=chosen,
         settings=revise(profile(chosen), {**changes, **own, **knobs}),
         seed=number,

@@ -1,7 +1,6 @@
 """The motions that a picture could make, judged and shown, so that a person can choose."""
 
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ from flows import home
 from flows.executors import StepBadInput
 from flows.image_to_4d import drive
 from flows.tasks import Steps
+from steps.archives import unpack as unpack_zip
 from steps.contract import ArtifactRef
 from steps.profiles import PipelineSettings
 
@@ -37,7 +37,6 @@ def unpack(made: dict[str, ArtifactRef], folder: Path) -> dict[str, Any]:
     folder.mkdir(parents=True, exist_ok=True)
     store.get(made["candidates"], folder / "motions.png")
     store.get(made["ranking"], folder / "motions.json")
-    with zipfile.ZipFile(store.path(made["films"])) as films:
-        films.extractall(folder)
+    unpack_zip(store.path(made["films"]), folder, "the zip of films")
     ranking: dict[str, Any] = json.loads((folder / "motions.json").read_text(encoding="utf-8"))
     return ranking

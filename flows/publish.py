@@ -6,13 +6,13 @@ import json
 import os
 import shutil
 import tempfile
-import zipfile
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from dg4d_lib.errors import BadInput
+from steps.archives import stays_inside, unpack
 from steps.store import remove_tree, room_for
 
 RECORD = "provenance.json"
@@ -62,7 +62,7 @@ def record_of(folder: Path) -> dict[str, Any] | None:
     """The provenance of the package in a folder; None if there is no package, or names of it lead out of the folder."""
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-        sound = isinstance(record["files"], dict) and all(map(_within, [*record["files"], *record.get("beside", ())]))
+        sound = isinstance(record["files"], dict) and all(map(stays_inside, [*record["files"], *record.get("beside", ())]))
         return record if sound else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
@@ -139,22 +139,9 @@ def unpacked(package: Path, folder: Path) -> Files:
     """Unpack a package into a folder; the facts of its files.
 
     Raises:
-        BadInput: an entry leads out of the folder.
+        BadInput: an entry leads out of the folder, or the package is broken.
     """
-    files: Files = {}
-    with zipfile.ZipFile(package) as archive:
-        for entry in sorted(archive.infolist(), key=lambda e: e.filename):
-            name = PurePosixPath(entry.filename)
-            if entry.is_dir():
-                continue
-            if not _within(entry.filename):
-                raise BadInput(f"the package has an entry outside itself: {entry.filename}")
-            target = folder / name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with archive.open(entry) as source, target.open("wb") as file:
-                shutil.copyfileobj(source, file)
-            files[name.as_posix()] = fact_of(target)
-    return files
+    return {name: fact_of(folder / name) for name in unpack(package, folder, "the package")}
 
 
 def fact_of(path: Path) -> dict[str, Any]:
@@ -282,12 +269,6 @@ def _tidy(made: Path | None) -> None:
     for folder in [*sorted((p for p in made.rglob("*") if p.is_dir()), reverse=True), made]:
         with suppress(OSError):
             folder.rmdir()
-
-
-def _within(name: str) -> bool:
-    """Whether a name in a package stays inside of it."""
-    path = PurePosixPath(name)
-    return not path.is_absolute() and ".." not in path.parts
 
 
 def _contains(folder: Path, other: Path) -> bool:

@@ -16,6 +16,31 @@ PICTURES = frozenset(
 VIDEOS = frozenset([".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif"])
 ALWAYS_MOVING = VIDEOS - {".gif"}  # a GIF may be one picture
 LONGEST_TEXT = 1000  # characters
+LARGEST_FILE_BYTES = 8 * 2**30  # of a picture or a video, which is copied into the store before it is looked at
+
+
+def inside(folder: Path, name: str, what: str) -> Path:
+    """A file or folder that somebody else's list names, in or below the folder of that list.
+
+    Args:
+        folder: of the list.
+        name: as the list has it.
+        what: how messages call it.
+
+    Raises:
+        BadInput: it leads out of the folder, by "..", as an absolute path, or by a link.
+    """
+    path = folder / name
+    try:
+        stays = "\0" not in name and path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # a circle of links
+        stays = False
+    if not stays:
+        raise BadInput(
+            f"{what} {name!r} leads out of the folder {folder}: what it names must lie there or below, and links may not "
+            "lead out; copy the file there"
+        )
+    return path
 
 
 def check_file(path: Path) -> None:
@@ -35,6 +60,8 @@ def check_file(path: Path) -> None:
         raise BadInput(f"{path} is not a regular file; give a picture or a video")
     if path.stat().st_size == 0:
         raise BadInput(f"{path} is empty (0 bytes); give a picture or a video")
+    if path.stat().st_size > LARGEST_FILE_BYTES:
+        raise BadInput(f"{path} has {path.stat().st_size} bytes; at most {LARGEST_FILE_BYTES} are read: shorten it")
     _check_readable(path)
 
 
@@ -51,6 +78,8 @@ def check_video(path: Path) -> None:
             f"{path} holds {len(frames) or 'no'} picture{'s' * (len(frames) != 1)}; a folder of frames needs two or "
             "more, numbered in the order in which they play"
         )
+    else:
+        _check_files(path, frames)
 
 
 def check_bank(path: Path) -> None:
@@ -61,6 +90,7 @@ def check_bank(path: Path) -> None:
     """
     if not (path / "bank.json").is_file():
         raise BadInput(f"{path} is not a bank of true views: it has no file bank.json")
+    _check_files(path, _files_below(path))
 
 
 def check_text(text: str) -> None:
@@ -111,7 +141,20 @@ def put_bank(path: Path, store: ArtifactStore) -> ArtifactRef:
     Raises:
         DiskFull: there is no room.
     """
-    return _put_files(sorted(p for p in path.rglob("*") if p.is_file()), path, BANK.media_type, store)
+    return _put_files(_files_below(path), path, BANK.media_type, store)
+
+
+def _files_below(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if path.is_file())
+
+
+def _check_files(folder: Path, files: list[Path]) -> None:
+    """Refuse links that lead out of a folder, and more than can be meant."""
+    for file in files:
+        inside(folder, file.relative_to(folder).as_posix(), "the file")
+    size = sum(file.stat().st_size for file in files)
+    if size > LARGEST_FILE_BYTES:
+        raise BadInput(f"the files in {folder} have {size} bytes together; at most {LARGEST_FILE_BYTES} are read")
 
 
 def _put_files(files: list[Path], folder: Path, media_type: str, store: ArtifactStore) -> ArtifactRef:

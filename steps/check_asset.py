@@ -1,7 +1,6 @@
 """Whether a package is good enough to be handed on: every gate, and a picture of where it falls short."""
 
 import json
-import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from dg4d_lib.mesh.check import checked, welded
 from dg4d_lib.metrics.gates import MESH, SPLATS, Evidence, Gate, Pictures, Turn, fidelity, judge
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
+from steps.archives import unpack
 from steps.job import Facts, Job
 from steps.media import read_frames, read_png, write_png
 from steps.packages import ASSET, GAUSSIANS, MANIFEST, MESHES, MOTION, read_manifest
@@ -79,8 +79,7 @@ def read_parts(package: Path, folder: Path) -> Parts:
         BadInput: files are missing or broken.
     """
     wanted = (MANIFEST, ASSET, GAUSSIANS, MOTION, f"{MESHES}/", f"{SPLATS_FOLDER}/")
-    with zipfile.ZipFile(package) as archive:
-        archive.extractall(folder, [name for name in archive.namelist() if name.startswith(wanted)])
+    unpack(package, folder, "the package", lambda name: name.startswith(wanted))
     manifest = read_manifest(folder)
     return Parts(read_states(folder, manifest), read_surface(folder, manifest), manifest.frames)
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.video.driving import DrivingVideo
+from steps.archives import unpack
 
 EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a zip can hold; every entry has it
 CURVES_POINTS = 200  # a curve is thinned to about this many points
@@ -81,13 +82,8 @@ def frame_rate(path: Path) -> float:
 
 def read_frames(path: Path, scratch: Path) -> DrivingVideo:
     """Read what `write_frames` wrote; `scratch` is a folder for the unpacked pictures."""
-    with zipfile.ZipFile(path) as archive:
-        names = sorted(name for name in archive.namelist() if name.endswith(".png"))
-        cutouts = []
-        for name in names:
-            archive.extract(name, scratch)
-            cutouts.append(read_png(scratch / name))
-    stack = torch.stack(cutouts)
+    names = unpack(path, scratch, "the zip of frames", lambda name: name.endswith(".png"))
+    stack = torch.stack([read_png(scratch / name) for name in names])
     return DrivingVideo(stack[..., :3].contiguous(), stack[..., 3:].contiguous(), frame_rate(path))
 
 

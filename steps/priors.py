@@ -1,7 +1,6 @@
 """The prior of a stage, from settings and files."""
 
 import json
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +31,7 @@ from dg4d_lib.settings import (
 )
 from dg4d_lib.video.driving import over_white
 from dg4d_lib.weights.registry import weights_called
+from steps.archives import stays_inside, unpack
 from steps.job import Facts
 from steps.media import read_png
 from steps.weights import Opened, open_weights
@@ -132,12 +132,10 @@ def read_bank(path: Path, scratch: Path) -> Bank:
     """The bank in a zip; see `read_bank_folder`.
 
     Raises:
-        BadInput: no bank.json in it.
+        BadInput: no bank.json in it, or a name that leads out of it.
     """
-    with zipfile.ZipFile(path) as archive:
-        if "bank.json" not in archive.namelist():
-            raise BadInput("the bank has no bank.json")
-        archive.extractall(scratch)
+    if "bank.json" not in unpack(path, scratch, "the bank"):
+        raise BadInput("the bank has no bank.json")
     return read_bank_folder(scratch)
 
 
@@ -151,6 +149,8 @@ def read_bank_folder(folder: Path) -> Bank:
     (rows, columns), size, frames = about["tile"], about["tile_size"], about["frames"]
     cameras, sheets = [], []
     for view in about["views"]:
+        if not stays_inside(view["file"]):
+            raise BadInput(f"bank.json names a sheet outside of the bank: {view['file']}")
         cameras.append(OrbitCamera(view["elevation"], view["azimuth"], view["radius"], width=size, height=size))
         sheet = (read_png(folder / view["file"]) * 255).round().to(torch.uint8)
         tiles = sheet.reshape(rows, size, columns, size, 4).transpose(1, 2).reshape(rows * columns, size, size, 4)

@@ -28,6 +28,7 @@ from dg4d_lib.metrics.lpips import Lpips, load_lpips
 from dg4d_lib.metrics.ssim import ssim
 from dg4d_lib.metrics.surface import aligned, chamfer_of_points, sample_surface
 from dg4d_lib.metrics.video import flicker, motion_amount, temporal_error
+from steps.archives import unpack
 from steps.job import Facts, Job
 from steps.media import read_png, write_zip
 from steps.packages import ASSET, MESHES, read_manifest
@@ -324,8 +325,8 @@ def _write_films(path: Path, films: Mapping[str, Film], scratch: Path) -> None:
 
 
 def _unpacked(archive: Path, folder: Path) -> Path:
-    with zipfile.ZipFile(archive) as content:
-        content.extractall(folder)
+    folder.mkdir(exist_ok=True)
+    unpack(archive, folder, "the zip")
     return folder
 
 
