@@ -4,7 +4,6 @@ import errno
 import hashlib
 import json
 import os
-import shutil
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
@@ -62,7 +61,9 @@ def record_of(folder: Path) -> dict[str, Any] | None:
     """The provenance of the package in a folder; None if there is no package, or names of it lead out of the folder."""
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-        sound = isinstance(record["files"], dict) and all(map(stays_inside, [*record["files"], *record.get("beside", ())]))
+        sound = isinstance(record["files"], dict) and all(
+            map(stays_inside, [*record["files"], *record.get("beside", ())])
+        )
         return record if sound else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

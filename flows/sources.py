@@ -37,8 +37,8 @@ def inside(folder: Path, name: str, what: str) -> Path:
         stays = False
     if not stays:
         raise BadInput(
-            f"{what} {name!r} leads out of the folder {folder}: what it names must lie there or below, and links may not "
-            "lead out; copy the file there"
+            f"{what} {name!r} leads out of the folder {folder}: what it names must lie there or below, and links may "
+            "not lead out; copy the file there"
         )
     return path
 

@@ -154,3 +154,27 @@ def test_values_are_json_where_they_can_be_and_kinds_come_first() -> None:
     assert next(iter(changes)) == "prior.kind"
     with pytest.raises(BadInput, match="knob=value"):
         parse_changes(["motion.iterations"])
+
+
+@pytest.mark.parametrize("column", ["path", "video", "bank"])
+@pytest.mark.parametrize("name", ["../outside.png", "/etc/hostname", "p/link.png", "round", "p/\0.png"])
+def test_what_leads_out_of_the_folder_of_a_list_is_a_bad_item(tmp_path: Path, column: str, name: str) -> None:
+    touch(tmp_path, "outside.png", "list/p/cat.png")
+    (tmp_path / "list/p/link.png").symlink_to(tmp_path / "outside.png")
+    (tmp_path / "list/round").symlink_to(tmp_path / "list/round")
+    row = {"path": "p/cat.png", column: name, "name": "bad"}
+    (tmp_path / "list/m.json").write_text(json.dumps([row, {"path": "p/cat.png", "name": "good"}]))
+    bad, good = items(tmp_path / "list/m.json")
+    assert (bad.wish, good.error) == (None, "")
+    assert re.search(f"{column} .* leads out of the folder", bad.error)
+
+
+def test_a_link_that_leads_out_of_a_folder_is_a_bad_item(tmp_path: Path) -> None:
+    touch(tmp_path, "outside.png", "in/a.png")
+    (tmp_path / "in/b.png").symlink_to(tmp_path / "outside.png")
+    (tmp_path / "in/c.png").symlink_to(tmp_path / "in/a.png")
+    assert [(item.name, bool(item.error)) for item in items(tmp_path / "in")] == [
+        ("a", False),
+        ("b", True),
+        ("c", False),
+    ]

@@ -1,0 +1,73 @@
+"""Zips that somebody else may have written, unpacked so that nothing lands outside, and not without end."""
+
+import re
+import shutil
+import stat
+import zipfile
+from collections.abc import Callable
+from pathlib import Path, PurePosixPath
+
+from dg4d_lib.errors import BadInput
+
+MOST_ENTRIES = 100_000
+MOST_UNPACKED_BYTES = 64 * 2**30  # of all entries together; what they say of themselves is the most that is read
+UNFIT = re.compile(r"[\\\x00-\x1f]|^[A-Za-z]:")  # backslashes, control characters, drives
+
+
+def stays_inside(name: str) -> bool:
+    """Whether a name with slashes leads to a file in or below its folder, on every system."""
+    parts = name.split("/")
+    return bool(name) and not UNFIT.search(name) and not {"", ".", ".."} & set(parts)
+
+
+def checked(archive: zipfile.ZipFile, what: str) -> list[zipfile.ZipInfo]:
+    """The files of a zip, by name.
+
+    Args:
+        archive: the zip.
+        what: how messages call it.
+
+    Raises:
+        BadInput: an entry leads outside or is a link, two have one name, or there is too much in it.
+    """
+    entries = sorted((entry for entry in archive.infolist() if not entry.is_dir()), key=lambda entry: entry.filename)
+    if len(entries) > MOST_ENTRIES:
+        raise BadInput(f"{what} has {len(entries)} entries; at most {MOST_ENTRIES} are unpacked")
+    size = sum(entry.file_size for entry in entries)
+    if size > MOST_UNPACKED_BYTES:
+        raise BadInput(f"{what} unpacks to {size} bytes; at most {MOST_UNPACKED_BYTES} are unpacked")
+    before = ""
+    for entry in entries:
+        if not stays_inside(entry.filename):
+            raise BadInput(f"{what} has an entry outside itself: {entry.filename!r}")
+        if stat.S_ISLNK(entry.external_attr >> 16):
+            raise BadInput(f"{what} has a link in it, {entry.filename!r}; pack the file itself")
+        if entry.filename == before:
+            raise BadInput(f"{what} has two entries {entry.filename!r}")
+        before = entry.filename
+    return entries
+
+
+def unpack(path: Path, folder: Path, what: str, wanted: Callable[[str], bool] = lambda name: True) -> list[str]:
+    """Unpack a zip into an existing folder; the names of its files.
+
+    Args:
+        path: the zip.
+        folder: best a new one: links in it would be followed.
+        what: how messages call the zip.
+        wanted: whether a file of this name is unpacked.
+
+    Raises:
+        BadInput: no zip, or what `checked` refuses; then nothing is unpacked.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = [entry for entry in checked(archive, what) if wanted(entry.filename)]
+            for entry in entries:
+                target = folder / PurePosixPath(entry.filename)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with archive.open(entry) as source, target.open("wb") as file:
+                    shutil.copyfileobj(source, file)
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
+        raise BadInput(f"{what} is broken, encrypted, or no zip: {error}") from error
+    return [entry.filename for entry in entries]
