@@ -9,6 +9,7 @@ from typing import Any
 from prefect import flow, task
 from prefect.artifacts import create_table_artifact
 from prefect.cache_policies import NO_CACHE
+from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
 from prefect.task_runners import ThreadPoolTaskRunner
 
 from dg4d_lib.errors import DG4DError
@@ -70,7 +71,8 @@ def convert_all(
     _refused.extend(refused)
     try:
         runner: Any = ThreadPoolTaskRunner(max_workers=workers)
-        catalog.with_options(task_runner=runner)(orders, str(out), title, strict)
+        with temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):  # a second at the end of every flow
+            catalog.with_options(task_runner=runner)(orders, str(out), title, strict)
     finally:
         _settlers.remove(settle)
         _refused.clear()

@@ -6,13 +6,14 @@ Exit status: 0 done · 1 an item of a batch failed, or something broke · 2 wron
 
 import os
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flows.checking import bench, rebuild, score, verify
 from flows.endings import EXIT_FAILED, clear_ending
+from flows.options import Changes, Commercial, Profile, Rate, Seed, Texture, Triangles
 from flows.store import store
 from flows.weights import weights
 
@@ -21,12 +22,8 @@ if TYPE_CHECKING:
 
     from flows.manifest import Item
     from flows.orders import Order
-    from flows.rebuild import Rebuilt
     from flows.summary import Row
-    from flows.verify import Verdict
     from steps.store import ArtifactStore
-
-Result = TypeVar("Result")
 
 app = typer.Typer(
     name="dg4d",
@@ -39,16 +36,6 @@ app = typer.Typer(
 app.add_typer(weights)
 app.add_typer(store)
 
-Profile = Annotated[str, typer.Option(help="named settings to start from")]
-Set = Annotated[list[str] | None, typer.Option("--set", metavar="KNOB=VALUE", help="change a knob; may be repeated")]
-Commercial = Annotated[
-    bool, typer.Option("--commercial-only", help="refuse weights whose license forbids commercial use")
-]
-Seed = Annotated[int, typer.Option(min=0, help="of everything random; equal seeds give equal bytes")]
-Triangles = Annotated[int | None, typer.Option(help="of the mesh, at most; short for --set mesh.max_faces=")]
-Texture = Annotated[int | None, typer.Option("--texture", help="texels of a side; short for --set mesh.texture_size=")]
-Rate = Annotated[float | None, typer.Option("--fps", help="frames per second of the files; short for --set pack.fps=")]
-
 
 @app.command()
 def make(
@@ -60,7 +47,7 @@ def make(
         Path | None, typer.Option(help="a video or a folder of frames to follow; PICTURE then only names the asset")
     ] = None,
     profile: Profile = "preview",
-    changes: Set = None,
+    changes: Changes = None,
     triangles: Triangles = None,
     texture: Texture = None,
     fps: Rate = None,
@@ -121,7 +108,7 @@ def make(
 def motions(
     picture: Annotated[Path, typer.Argument(help="a picture")],
     profile: Profile = "preview",
-    changes: Set = None,
+    changes: Changes = None,
     seed: Seed = 0,
     commercial_only: Commercial = False,
     candidates: Annotated[int, typer.Option(min=2, max=16, help="how many motions")] = 6,
@@ -154,7 +141,7 @@ def motions(
         folder = out or Path("out") / f"{picture.stem}-motions"
         check_writable(folder)
         order = wish.order(home.store())
-        ranking = _run(order, console, lambda: make_motions(order, folder))
+        ranking = terminal.with_steps(order, console, lambda: make_motions(order, folder))
         for row in ranking["candidates"]:
             remarks = "; ".join(row["remarks"])
             console.print(f"{row['number']:>3}  {row['total']:.2f}  {row['name']}  {remarks}".rstrip(), markup=False)
@@ -166,7 +153,7 @@ def batch(
     inputs: Annotated[Path, typer.Argument(help="a folder of pictures and videos, or a manifest (.csv, .json)")],
     out: Annotated[Path, typer.Option("-o", "--out", help="DIR/<item>/ is a package each")],
     profile: Profile = "preview",
-    changes: Set = None,
+    changes: Changes = None,
     triangles: Triangles = None,
     texture: Texture = None,
     fps: Rate = None,
@@ -289,95 +276,8 @@ def compose(
         typer.echo(out)
 
 
-@app.command()
-def score(
-    asset: Annotated[Path, typer.Argument(help="the folder of a package")],
-    truth: Annotated[Path, typer.Option(help="pictures from known sides, meshes if there are; or one picture")],
-    mesh: Annotated[bool, typer.Option("--mesh", help="the textured mesh instead of the splats")] = False,
-    changes: Annotated[
-        list[str] | None, typer.Option("--set", metavar="score.KNOB=VALUE", help="change a knob; may be repeated")
-    ] = None,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="also write the results here, as JSON")] = None,
-) -> None:
-    """Judge an asset against the truth, beside what costs nothing: the input repeated, the first frame held."""
-    with clear_ending():
-        from flows import terminal
-        from flows.benchmark import score as judge_one
-        from flows.scores import markdown
-
-        console = terminal.console()
-        results = judge_one(asset, truth, console, mesh, changes, out)
-        console.print(markdown(results), markup=False)
-
-
-@app.command()
-def bench(
-    dataset: Annotated[Path, typer.Argument(help="a folder per object, with pictures from known sides")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="results, films, and packages in DIR/assets")],
-    profile: Profile = "preview",
-    changes: Set = None,
-    seed: Seed = 0,
-    mesh: Annotated[bool, typer.Option("--mesh", help="judge the textured meshes instead of the splats")] = False,
-    bank: Annotated[bool, typer.Option("--bank", help="every object's true views are its prior")] = False,
-    limit: Annotated[int | None, typer.Option(min=1, help="only so many objects, the first by name")] = None,
-    workers: Annotated[int, typer.Option(min=1, max=64, help="objects at a time")] = 1,
-) -> None:
-    """Make an asset of every object of a data set and judge it: the paper's table, as JSON, CSV and a page."""
-    with clear_ending():
-        from flows import terminal
-        from flows.benchmark import bench as judge_all
-        from flows.scores import markdown
-
-        console = terminal.console()
-        results = judge_all(dataset, out, console, profile, changes, seed, mesh, bank, limit, workers)
-        console.print(markdown(results), markup=False)
-        console.print(f"overview: {out / 'index.html'}", markup=False)
-
-
-@app.command()
-def verify(
-    package: Annotated[Path, typer.Argument(help="the folder of a package")],
-    trust: Annotated[
-        Path | None,
-        typer.Option(help="certificates (PEM) of who vouches for signers; then all must be signed"),
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="for machines")] = False,
-) -> None:
-    """Check every digest and signature of a package; says what was altered, is missing or was added."""
-    with clear_ending():
-        from flows.verify import verify as check
-
-        _tell(check(package, trust), as_json)
-
-
-@app.command()
-def rebuild(
-    package: Annotated[Path, typer.Argument(help="the folder of a package")],
-    source: Annotated[
-        Path | None, typer.Option(help="the picture, video or folder of frames, where the store does not have it")
-    ] = None,
-    bank: Annotated[Path | None, typer.Option(help="the folder of true views, likewise")] = None,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="keep the new package here")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="for machines")] = False,
-) -> None:
-    """Make a package again from its record, every step anew, and compare step by step."""
-    with clear_ending():
-        from flows import home, terminal
-        from flows.orders import order_again
-        from flows.publish import check_folder, whole
-
-        record = whole(package)
-        if out is not None:
-            check_folder(out)
-        order = order_again(record, home.store(), source, bank)
-        console = terminal.console()
-
-        def work() -> "Rebuilt":
-            from flows.rebuild import rebuild as do_again
-
-            return do_again(package, record, order, out)
-
-        _tell(_run(order, console, work), as_json)
+for command in (score, bench, verify, rebuild):
+    app.command()(command)
 
 
 @app.command()
@@ -406,18 +306,6 @@ def main() -> None:
     app()
 
 
-def _tell(found: "Verdict | Rebuilt", as_json: bool) -> None:
-    """What was found, as JSON or as a table, and the exit status that says so."""
-    from flows import terminal
-
-    if as_json:
-        typer.echo(found.model_dump_json(indent=1))
-    else:
-        terminal.tell_rows(terminal.console(), found.rows())
-    if found.exit_code:
-        raise typer.Exit(found.exit_code)
-
-
 def _short(triangles: int | None, texture: int | None, fps: float | None) -> dict[str, Any]:
     """The knobs behind options that are short for them."""
     given = {"mesh.max_faces": triangles, "mesh.texture_size": texture, "pack.fps": fps}
@@ -426,32 +314,13 @@ def _short(triangles: int | None, texture: int | None, fps: float | None) -> dic
 
 def _made(order: "Order", folder: Path, console: "Console") -> dict[str, dict[str, int]]:
     """Run the flow of an order with its steps on the terminal; the files of the package."""
+    from flows import terminal
     from flows.make import make
 
-    files, cached = _run(order, console, lambda: make(order, folder))
+    files, cached = terminal.with_steps(order, console, lambda: make(order, folder))
     if cached:
         console.print("nothing to do: every step was already done")
     return files
-
-
-def _run(order: "Order", console: "Console", work: Callable[[], Result]) -> Result:
-    """What `work` gives, which runs a flow of this order, with its steps on the terminal."""
-    from flows import terminal
-    from flows.executors import StepBadInput
-    from flows.make import connect, save_pictures
-
-    with console.status("starting") if console.is_terminal else nullcontext():
-        connect()
-        from flows import image_to_4d  # noqa: F401 - takes a second
-    try:
-        with terminal.steps_shown(console):
-            return work()
-    except StepBadInput as error:  # a step knows files by their content, the user by their names
-        raise StepBadInput(error.step, f"{order.source_name}: {error.message}", error.pictures) from error
-    except Exception as error:
-        for path in save_pictures(order, error):
-            typer.echo(f"the last good state: {path}", err=True)
-        raise
 
 
 def _ready(

@@ -3,9 +3,10 @@
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
 from rich.console import Console
 from rich.live import Live
@@ -15,14 +16,39 @@ from rich.table import Table
 from flows.events import StepEvent, listening
 from flows.publish import readable
 
+if TYPE_CHECKING:
+    from flows.orders import Order
+
+Result = TypeVar("Result")
+
 LINE_EVERY_S = 10.0  # between two lines about one step, where there is no terminal
 WIDE = 130  # columns, from which all values of a step fit beside its bar
 COUNTED = 1  # totals up to this say nothing as a fraction
 
 
-def console() -> Console:
-    """Where people read; results of commands go to standard output."""
-    return Console(stderr=False, highlight=False, soft_wrap=not sys.stdout.isatty())
+def console(stderr: bool = False) -> Console:
+    """Where people read: standard output, or standard error where that is for machines."""
+    stream = sys.stderr if stderr else sys.stdout
+    return Console(stderr=stderr, highlight=False, soft_wrap=not stream.isatty())
+
+
+def with_steps(order: "Order", out: Console, work: Callable[[], Result]) -> Result:
+    """What `work` gives, which runs a flow of this order, with its steps on the terminal."""
+    from flows.executors import StepBadInput
+    from flows.make import connect, save_pictures
+
+    with out.status("starting") if out.is_terminal else nullcontext():
+        connect()
+        from flows import image_to_4d  # noqa: F401 - takes a second
+    try:
+        with steps_shown(out):
+            return work()
+    except StepBadInput as error:  # a step knows files by their content, the user by their names
+        raise StepBadInput(error.step, f"{order.source_name}: {error.message}", error.pictures) from error
+    except Exception as error:
+        for path in save_pictures(order, error):
+            sys.stderr.write(f"the last good state: {path}\n")
+        raise
 
 
 @contextmanager

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 from prefect.client.orchestration import get_client
-from prefect.settings import PREFECT_API_URL, temporary_settings
 from rich.console import Console
 
 from dg4d_lib.errors import BadInput
-from flows import home, tasks
+from flows import tasks
 from flows.benchmark import bench, put_truth, score
 from flows.scores import Results
+from flows.server import Server
 from steps.store import ArtifactStore
 from steps.truth import find_truth
 
@@ -22,22 +22,15 @@ VIEWS = ("view_-75", "view_15")
 
 
 @pytest.fixture(scope="module", autouse=True)
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    place = tmp_path_factory.mktemp("home")
+def place(server: Server, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("DG4D_HOME", str(place))
+        patch.setenv("DG4D_HOME", str(tmp_path_factory.mktemp("home")))
         patch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
         patch.setenv("DG4D_CODE_VERSION", "test")
         patch.setenv("DG4D_EXECUTOR", "in_process")
         patch.setattr(tasks, "RETRY_DELAY_S", 0.01)
         patch.setattr("flows.make.connect", lambda: None)  # this process is connected already
-        running = home.background_server()
-        running.start()
-        address = running.wait()
-        with temporary_settings({PREFECT_API_URL: address}):
-            yield
-        running.release()
-        running.stop()
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from prefect.client.orchestration import get_client
-from prefect.settings import PREFECT_API_URL, temporary_settings
+from prefect.settings import PREFECT_API_URL
 from typer.testing import CliRunner, Result
 
 from flows import cli, home, tasks
@@ -36,25 +36,18 @@ Run = Callable[..., Result]
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """A server of the product's own, which ends with the module."""
-    place = tmp_path_factory.mktemp("home")
+def place(server: Server) -> Iterator[None]:
+    """Fake steps under the home folder of the server, for this process and those that it starts."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("DG4D_HOME", str(place))
+        patch.setenv("DG4D_HOME", str(server.folder.parent))
         patch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
         patch.setenv("DG4D_CODE_VERSION", "test")
         patch.setenv("PYTHONPATH", str(Path(__file__).parent))
-        running = home.background_server()
-        running.start()
-        address = running.wait()
-        with temporary_settings({PREFECT_API_URL: address}):
-            yield running
-        running.release()
-        running.stop()
+        yield
 
 
 @pytest.fixture
-def log(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def log(place: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where fake steps say that they ran; steps run in this process, and nobody waits before trying again."""
     monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
     monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
@@ -188,10 +181,10 @@ def test_memory_that_is_free_again_is_enough(log: Path, tmp_path: Path) -> None:
 
 def test_every_step_leaves_a_page_with_its_picture_on_the_server(log: Path, tmp_path: Path) -> None:
     make(order("pages", tmp_path, item="paged"), tmp_path / "out")
+    wanted = {"artifacts": {"key": {"like_": "-paged-"}}, "limit": 200}
     with get_client(sync_client=True) as client:
-        pages: list[Any] = client.request("POST", "/artifacts/latest/filter", json={"limit": 200}).json()
-    markdown = {page["key"]: page["data"] for page in pages if page["type"] == "markdown"}
-    paged = {key: data for key, data in markdown.items() if "-paged-" in key}
+        pages: list[Any] = client.request("POST", "/artifacts/latest/filter", json=wanted).json()
+    paged = {page["key"]: page["data"] for page in pages if page["type"] == "markdown"}
     files = {key: data for key, data in paged.items() if key.startswith("file-")}  # links are Markdown to Prefect
     ours = {key: data for key, data in paged.items() if key not in files}
     assert len(ours) == len(EVERY_STEP) + 1
@@ -203,7 +196,7 @@ def test_every_step_leaves_a_page_with_its_picture_on_the_server(log: Path, tmp_
     with urllib.request.urlopen(server_address() + re.findall(r"/dg4d/[^)\s\]]+", subject)[0]) as answer:
         assert answer.headers["content-type"] == "image/png"
         assert answer.read().startswith(b"\x89PNG")
-    tables = [page for page in pages if page["type"] == "table" and "-paged-" in page["key"]]
+    tables = [page for page in pages if page["type"] == "table"]
     assert len(tables) == len(EVERY_STEP)
     progress = next(
         page for page in pages if page["type"] == "progress" and page["key"].startswith("progress-fit-gauss")
@@ -348,7 +341,7 @@ def test_a_batch_makes_what_it_can_and_leaves_alone_what_is_made(dg4d: Run, tmp_
     assert ran(log) == []
 
 
-def test_there_is_one_server(server: Server) -> None:
+def test_there_is_one_server(place: None, server: Server) -> None:
     other = home.background_server()
     other.start()
     assert other.wait() == server.wait() == f"{server.address()}/api"

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from dg4d_lib.errors import BadInput
-from flows import publish as module
 from flows.publish import Files, check_folder, is_current, publish, record_of
 from steps.store import DiskFull
 
@@ -96,7 +95,7 @@ def test_a_full_disk_leaves_the_old_package_whole_and_nothing_else(
     def full(source: object, target: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(module.shutil, "copyfileobj", full)
+    monkeypatch.setattr("shutil.copyfileobj", full)
     with pytest.raises(DiskFull, match="free some space"):
         publish(package, tmp_path / "out", finish)
     with pytest.raises(DiskFull):

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import fake_steps
@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from made_package import SOURCE, made_package, record_in
 from PIL import Image
-from prefect.settings import PREFECT_API_URL, temporary_settings
 
 from dg4d_lib.errors import BadInput
 from flows import home, tasks
@@ -45,18 +44,6 @@ TINY = {
     "pack.sheet_size": 48,
     "pack.sheet_frames": 2,
 }
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("DG4D_HOME", str(tmp_path_factory.mktemp("home")))
-        running = home.background_server()
-        running.start()
-        with temporary_settings({PREFECT_API_URL: running.wait()}):
-            yield running
-        running.release()
-        running.stop()
 
 
 @pytest.fixture

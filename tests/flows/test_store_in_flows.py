@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from prefect.settings import PREFECT_API_URL, temporary_settings
 from tiny_s3 import BUCKET, TinyS3
 
 from flows import home, tasks
@@ -17,6 +16,7 @@ from flows.executors import StepLost, StepUnreachable
 from flows.make import make
 from flows.orders import Order, Wish
 from flows.publish import whole
+from flows.server import Server
 from flows.versions import Version, faults, versions
 from steps.profiles import PREVIEW, revise
 from steps.store import object_name
@@ -24,25 +24,12 @@ from steps.store import object_name
 RUN_FACTS = ("report.json", "report.html", "provenance.json", "ro-crate-metadata.json")  # these say when and how long
 
 
-@pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("DG4D_HOME", str(tmp_path_factory.mktemp("home")))
-        patch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
-        patch.setenv("DG4D_CODE_VERSION", "test")
-        patch.setenv("PYTHONPATH", str(Path(__file__).parent))
-        running = home.background_server()
-        running.start()
-        with temporary_settings({PREFECT_API_URL: running.wait()}):
-            yield
-        running.release()
-        running.stop()
-
-
 @pytest.fixture
-def log(server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def log(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where fake steps say that they ran; each test has records and a store of its own."""
     monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
+    monkeypatch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
+    monkeypatch.setenv("DG4D_CODE_VERSION", "test")
     monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
     monkeypatch.setenv("DG4D_HOME", str(tmp_path / "home"))
     monkeypatch.setattr(tasks, "RETRY_DELAY_S", 0.01)

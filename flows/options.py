@@ -1,0 +1,17 @@
+"""Options that several commands share."""
+
+from typing import Annotated
+
+import typer
+
+Profile = Annotated[str, typer.Option(help="named settings to start from")]
+Changes = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KNOB=VALUE", help="change a knob; may be repeated")
+]
+Commercial = Annotated[
+    bool, typer.Option("--commercial-only", help="refuse weights whose license forbids commercial use")
+]
+Seed = Annotated[int, typer.Option(min=0, help="of everything random; equal seeds give equal bytes")]
+Triangles = Annotated[int | None, typer.Option(help="of the mesh, at most; short for --set mesh.max_faces=")]
+Texture = Annotated[int | None, typer.Option("--texture", help="texels of a side; short for --set mesh.texture_size=")]
+Rate = Annotated[float | None, typer.Option("--fps", help="frames per second of the files; short for --set pack.fps=")]
