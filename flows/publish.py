@@ -15,6 +15,7 @@ from steps.archives import stays_inside, unpack
 from steps.store import remove_tree, room_for
 
 RECORD = "provenance.json"
+FORMAT = 2  # of the record
 CANNOT_SWAP = {errno.EBUSY, errno.EXDEV, errno.EACCES, errno.EPERM, errno.EROFS, errno.EINVAL}
 
 Files = dict[str, dict[str, Any]]  # path within the package -> {"digest", "size_bytes"}

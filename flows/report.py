@@ -13,13 +13,12 @@ from flows.acceptance import picture_of, section, verdict_of
 from flows.crate import CRATE, crate_text
 from flows.credentials import Claim, Signer, certificate, sidecar_of
 from flows.orders import Order
-from flows.publish import RECORD, Files, fact_of_bytes, readable
+from flows.publish import FORMAT, RECORD, Files, fact_of_bytes, readable
 from flows.tasks import Finished, Made
 from flows.view import VIEWER, page_of
 from steps.contract import RUN_ONLY, StepResult, canonical
 from steps.store import ArtifactStore
 
-FORMAT = 2
 BESIDE = ("report.json", "report.html", VIEWER, CRATE)
 GENERATIVE = ("draw_picture", "drive_video", "fit_gaussians", "fit_motion", "refine_texture")  # where they use weights
 UNSIGNED: Mapping[str, Any] = MappingProxyType({})

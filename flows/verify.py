@@ -9,7 +9,7 @@ from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows.crate import CRATE, files_in, own_digest, rendered
 from flows.credentials import CERTIFICATE, Signature, sidecar_of, signature_of
 from flows.endings import EXIT_BAD_INPUT, EXIT_MISSING
-from flows.publish import RECORD, fact_of, record_of
+from flows.publish import FORMAT, RECORD, fact_of, record_of
 from steps.contract import RUN_ONLY, Frozen, digest_of
 
 State = Literal["whole", "altered", "missing", "extra", "trusted", "untrusted", "invalid", "unsigned", "unchecked"]
@@ -69,11 +69,16 @@ def verify(folder: Path, anchors: Path | None = None) -> Verdict:
             that nobody signed is at fault.
 
     Raises:
-        BadInput: there is no package, or the anchors cannot be read.
+        BadInput: there is no package, its record is of another format, or the anchors cannot be read.
     """
     record = record_of(folder)
     if record is None:
         raise BadInput(f"{folder} is no asset: it has no sound {RECORD}; give a folder that `dg4d make` wrote")
+    if (written := record.get("format")) != FORMAT:
+        raise BadInput(
+            f"{folder} has a {RECORD} of format {written!r}; this version checks format {FORMAT}: "
+            "check it with the version that made it, or make it again"
+        )
     trusted = _text(anchors) if anchors else ""
     try:
         checks = [*_files(folder, record), *_records(record), *_signatures(folder, record, trusted)]

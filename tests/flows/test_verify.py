@@ -1,4 +1,5 @@
 import json
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -53,7 +54,7 @@ def test_a_changed_byte_in_any_file_is_noticed_and_the_file_named(package: Path)
                 verdict = verify(package)
             except BadInput as error:
                 assert name == "provenance.json", place  # broken JSON
-                assert "no sound provenance.json" in str(error)
+                assert re.search("no sound provenance.json|provenance.json of format", str(error))
             else:
                 assert faults(verdict).get(name) == "altered", (name, place)
                 assert verdict.exit_code == 65
@@ -119,6 +120,13 @@ def test_records_that_contradict_each_other_are_named(package: Path) -> None:
 def test_a_record_of_another_form_is_altered_and_breaks_nothing(package: Path, damage: dict[str, object]) -> None:
     with_new_crate(package, lambda record: record.update(damage))
     assert "provenance.json" in faults(verify(package))
+
+
+def test_a_record_of_another_version_is_named_as_that(package: Path) -> None:
+    record = json.loads((package / "provenance.json").read_text())
+    (package / "provenance.json").write_text(json.dumps({**record, "format": 1}))
+    with pytest.raises(BadInput, match="of format 1; this version checks format 2"):
+        verify(package)
 
 
 def test_a_folder_without_a_package_is_refused(tmp_path: Path) -> None:
