@@ -3,7 +3,6 @@
 import html
 import json
 import math
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -35,7 +34,7 @@ def complete(
     if signer is not None:
         files, signed = signer.sign_package(folder, files, claim)
         signatures = {"certificate": certificate(), "subject": signer.subject, "files": signed}
-    for name, text in texts(order, made, files, store, signatures).items():
+    for name, text in texts(order, made, files, store, folder, signatures).items():
         (folder / name).write_text(text, encoding="utf-8")
     if signer is not None:
         signer.sign_beside(folder / CRATE, claim)  # it holds the digest of every other file
@@ -43,18 +42,22 @@ def complete(
 
 
 def texts(
-    order: Order, made: Made, files: Files, store: ArtifactStore, signatures: Mapping[str, Any] = UNSIGNED
+    order: Order,
+    made: Made,
+    files: Files,
+    store: ArtifactStore,
+    folder: Path,
+    signatures: Mapping[str, Any] = UNSIGNED,
 ) -> dict[str, str]:
-    """The texts that go with a package, by name of file."""
+    """The texts that go with the package in a folder, by name of file."""
     report = report_of(order, made, files, store)
     record = provenance(order, made, files, signatures)
-    with zipfile.ZipFile(store.path(made.package)) as package:
-        viewer = page_of(record, package.read)
+    written = json.dumps(record, indent=1, ensure_ascii=False, sort_keys=True) + "\n"
     beside = {
-        VIEWER: viewer,
+        VIEWER: page_of(json.loads(written), lambda name: (folder / name).read_bytes()),  # as `dg4d view` will see it
         "report.json": json.dumps(report, indent=1, ensure_ascii=False) + "\n",
         "report.html": page(report, picture_of(_results(made), store)),
-        RECORD: json.dumps(record, indent=1, ensure_ascii=False, sort_keys=True) + "\n",
+        RECORD: written,
     }
     facts = {name: fact_of_bytes(text.encode()) for name, text in beside.items()}
     return {**beside, CRATE: crate_text(record, facts, banner(order, made))}

@@ -53,6 +53,13 @@ def finished(step: str, store: ArtifactStore, seconds: float, **outputs: Artifac
     return Finished(label=step, cached=seconds > 5, seconds=seconds, result=result)
 
 
+@pytest.fixture
+def unpacked(tmp_path: Path) -> Path:
+    """The files of the package."""
+    (tmp_path / "asset.glb").write_bytes(b"a mesh")
+    return tmp_path
+
+
 def made(store: ArtifactStore, seconds: float = 2.0) -> tuple[Order, Made]:
     source = store.put_bytes(b"s", "application/octet-stream")
     packed = io.BytesIO()
@@ -81,9 +88,9 @@ class Links(HTMLParser):
         self.addresses += [value for name, value in attrs if name in {"src", "href"} and value]
 
 
-def test_the_page_is_self_contained_and_escapes_what_it_is_given(store: ArtifactStore) -> None:
+def test_the_page_is_self_contained_and_escapes_what_it_is_given(store: ArtifactStore, unpacked: Path) -> None:
     order, what = made(store)
-    page = report.texts(order, what, FILES, store)["report.html"]
+    page = report.texts(order, what, FILES, store, unpacked)["report.html"]
     links = Links(page)
     assert "script" not in links.tags
     assert "fox" not in links.tags
@@ -124,12 +131,12 @@ def test_the_banner_says_what_models_did(store: ArtifactStore) -> None:
     assert "guessed without a model" in report.banner(order, by_video)
 
 
-def test_what_networks_did_is_said_for_every_step(store: ArtifactStore) -> None:
+def test_what_networks_did_is_said_for_every_step(store: ArtifactStore, unpacked: Path) -> None:
     order, what = made(store)
     fit, pack = what.steps
     record = fit.result.provenance.model_copy(update={"flops": {"Unet": 15_250_000_000_000, "Vae": 3_000_000}})
     fit = fit.model_copy(update={"result": fit.result.model_copy(update={"provenance": record})})
-    texts = report.texts(order, what.model_copy(update={"steps": [fit, pack]}), FILES, store)
+    texts = report.texts(order, what.model_copy(update={"steps": [fit, pack]}), FILES, store, unpacked)
     stages = json.loads(texts["report.json"])["steps"]
     assert [stage["flops"] for stage in stages] == [record.flops, {}]
     assert texts["report.html"].count("FLOP") == 2
@@ -137,13 +144,13 @@ def test_what_networks_did_is_said_for_every_step(store: ArtifactStore) -> None:
     assert json.loads(texts["provenance.json"])["run"]["steps"][0]["flops"] == record.flops
 
 
-def test_licenses_follow_the_asset_only_where_weights_were_used(store: ArtifactStore) -> None:
+def test_licenses_follow_the_asset_only_where_weights_were_used(store: ArtifactStore, unpacked: Path) -> None:
     order, what = made(store)
-    texts = report.texts(order, what, FILES, store)
+    texts = report.texts(order, what, FILES, store, unpacked)
     assert "No weights were used" in texts["report.html"]
     assert json.loads(texts["provenance.json"])["licenses"] == {}
     used = what.model_copy(update={"steps": [with_weights(step, {"svd": "S & Co"}) for step in what.steps]})
-    texts = report.texts(order, used, FILES, store)
+    texts = report.texts(order, used, FILES, store, unpacked)
     assert "No weights were used" not in texts["report.html"]
     assert "S &amp; Co" in texts["report.html"]
     assert json.loads(texts["provenance.json"])["licenses"] == {"svd": "S & Co"}
@@ -160,9 +167,9 @@ def test_notes_are_said_once_and_a_picture_that_only_names_is_mentioned(store: A
     assert "fox.jpg only names" in notes[0]
 
 
-def test_provenance_differs_between_runs_only_under_run(store: ArtifactStore) -> None:
-    one = json.loads(report.texts(*made(store, 1.0), FILES, store)["provenance.json"])
-    two = json.loads(report.texts(*made(store, 9.0), FILES, store)["provenance.json"])
+def test_provenance_differs_between_runs_only_under_run(store: ArtifactStore, unpacked: Path) -> None:
+    one = json.loads(report.texts(*made(store, 1.0), FILES, store, unpacked)["provenance.json"])
+    two = json.loads(report.texts(*made(store, 9.0), FILES, store, unpacked)["provenance.json"])
     assert one != two
     runs = [record.pop("run")["steps"][0] for record in (one, two)]
     for fact in ("duration_s", "peak_memory_mb", "flops", "run_notes"):

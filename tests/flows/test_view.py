@@ -3,14 +3,18 @@
 import json
 import webbrowser
 import zipfile
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
+from made_package import made_package
+from signing import identity
 
 from dg4d_lib.errors import BadInput
 from flows import view as module
 from flows.publish import RECORD, Files, publish
+from flows.verify import verify
 from flows.view import VIEWER, facts_of, page_of, view
 from steps import packages
 
@@ -65,6 +69,14 @@ def test_the_page_does_not_depend_on_the_run(package: Path) -> None:
     page = page_of(known, CONTENT.__getitem__)
     assert page_of(known | {"run": {"flow_run": "tomorrow"}}, CONTENT.__getitem__) == page
     assert page_of(known | {"seed": 4}, CONTENT.__getitem__) != page
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_looking_at_a_package_does_not_change_it(tmp_path: Path, signed: bool) -> None:
+    with identity(tmp_path).configured() if signed else nullcontext():
+        folder = made_package(tmp_path)
+        view(folder, open_browser=False)
+        assert verify(folder).exit_code == 0
 
 
 def test_every_step_and_every_file_is_among_the_facts(package: Path) -> None:
