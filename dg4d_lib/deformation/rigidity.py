@@ -5,6 +5,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from dg4d_lib.deformation.rigidity_kernel import strain
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import rotation_matrix
 
@@ -30,7 +31,22 @@ def rigidity(moved: Gaussians, indices: Int[Tensor, "n k"], weights: Float[Tenso
         indices: neighbors, from `neighborhoods`.
         weights: theirs.
     """
-    edges = moved.means[:, indices] - moved.means[:, :, None]
+    steps = len(moved.means) - 1
+    if steps < 1:
+        return moved.means.new_zeros(())
     turns = rotation_matrix(moved.quats)
+    on_cpu = moved.means.device.type == "cpu" and moved.means.dtype == torch.float32
+    total = (strain if on_cpu else plain_strain)(moved.means, turns, indices, weights)
+    return total / (steps * indices.numel())
+
+
+def plain_strain(
+    means: Float[Tensor, "t n 3"],
+    turns: Float[Tensor, "t n 3 3"],
+    indices: Int[Tensor, "n k"],
+    weights: Float[Tensor, "n k"],
+) -> Float[Tensor, ""]:
+    """The definition of `strain`, and what runs on other devices and precisions."""
+    edges = means[:, indices] - means[:, :, None]
     local = torch.einsum("tnij,tnki->tnkj", turns, edges)
-    return (weights * (local[1:] - local[:-1]).norm(dim=-1)).mean() if len(local) > 1 else edges.new_zeros(())
+    return (weights * local.diff(dim=0).norm(dim=-1)).sum()

@@ -1,6 +1,8 @@
+import pytest
 import torch
 
-from dg4d_lib.deformation.rigidity import neighborhoods, rigidity
+from dg4d_lib.deformation.rigidity import neighborhoods, plain_strain, rigidity
+from dg4d_lib.deformation.rigidity_kernel import strain
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.geometry.quaternion import multiply, rotation_matrix
@@ -27,3 +29,47 @@ def test_a_rigid_motion_costs_nothing():
 def test_stretching_costs():
     states = two_states(torch.tensor([1.0, 0, 0, 0]), 0.0, stretch=1.5)
     assert rigidity(states, *neighborhoods(states.means[0])) > 1e-3
+
+
+def pairs(times: int) -> tuple[torch.Tensor, ...]:
+    """Random places and turns of 300 Gaussians, and their neighbors, in float64."""
+    generator = torch.Generator().manual_seed(1)
+    means = torch.rand(300, 3, generator=generator, dtype=torch.float64)
+    moved = means + 0.1 * torch.rand(times, 300, 3, generator=generator, dtype=torch.float64)
+    quats = torch.randn(times, 300, 4, generator=generator, dtype=torch.float64)
+    return moved, rotation_matrix(quats), *neighborhoods(means, 7)
+
+
+@pytest.mark.parametrize("times", [2, 3, 16, 17])
+def test_the_kernel_is_its_definition_and_so_are_its_gradients(times: int) -> None:
+    means, turns, indices, weights = pairs(times)
+    means[:, 5] = means[0, 5]
+    means[:, indices[5]] = means[0, indices[5]]
+    turns[:, 5] = turns[0, 5]  # these pairs do not move: there the distance has no slope
+    truth_leaves = [means.clone().requires_grad_(), turns.clone().requires_grad_()]
+    truth = plain_strain(*truth_leaves, indices, weights)
+    truth.backward()
+    leaves = [means.float().requires_grad_(), turns.float().requires_grad_()]
+    found = strain(*leaves, indices, weights.float())
+    (3 * found).backward()
+    assert torch.isclose(found.double(), truth, rtol=1e-5)
+    for leaf, true_leaf in zip(leaves, truth_leaves, strict=True):
+        assert leaf.grad is not None
+        assert true_leaf.grad is not None
+        torch.testing.assert_close(leaf.grad.double(), 3 * true_leaf.grad, rtol=1e-4, atol=2e-4)
+
+
+def test_the_number_of_threads_changes_no_bit_of_the_strain() -> None:
+    means, turns, indices, weights = (tensor.float() if tensor.is_floating_point() else tensor for tensor in pairs(5))
+    gradients = []
+    before = torch.get_num_threads()
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            leaf = means.clone().requires_grad_()
+            strain(leaf, turns, indices, weights).backward()
+            gradients.append(leaf.grad)
+    finally:
+        torch.set_num_threads(before)
+    assert gradients[0] is not None
+    assert all(gradient is not None and gradient.equal(gradients[0]) for gradient in gradients)
