@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
-.PHONY: setup clients demo test check examples clean
+.PHONY: setup clients demo test check audit examples clean
 
 setup: $(VENV)/.ready
 
@@ -27,6 +27,10 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
+
+audit: setup
+	$(BIN)/python -m venv out/audit && out/audit/bin/pip install -q pip-audit
+	out/audit/bin/pip-audit -r constraints.txt --no-deps --disable-pip
 
 examples: setup
 	$(BIN)/python -m examples.make_examples

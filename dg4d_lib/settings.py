@@ -365,8 +365,9 @@ class MotionSettings(Settings):
 class MeshSettings(Settings):
     """From Gaussians to triangles with a texture."""
 
-    mode: Literal["tracked", "per_frame"] = Field(
-        "tracked", description="one mesh that moves (ours), or a mesh per frame (paper)"
+    mode: Literal["tracked", "per_frame", "auto"] = Field(
+        "tracked",
+        description="one mesh that moves (ours), a mesh per frame (paper), or one where it can follow the motion",
     )
     grid: int = Field(128, ge=16, le=512, description="cells of the density field on each axis of [-1, 1]")
     min_opacity: float = Field(0.005, ge=0, lt=1, description="fainter Gaussians do not count")

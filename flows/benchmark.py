@@ -17,7 +17,7 @@ from flows.merging import add
 from flows.orders import Order, Wish
 from flows.publish import check_folder, check_writable, is_current, whole
 from flows.scores import Results
-from flows.summary import Row
+from flows.summary import Row, Tally
 from steps.archives import unpack
 from steps.catalog import PACKAGE, TRUTH
 from steps.contract import ArtifactRef
@@ -211,14 +211,14 @@ def _converted(orders: list[Order], folder: Path, workers: int, console: "Consol
         return rows
     with terminal.batch_shown(console, [order.item for order in waiting]) as table:
 
-        def settle(row: Row) -> None:
-            rows[row.item] = row
+        def show(row: Row) -> None:
             table.settle(row.item, row.status, row.message)
             if not console.is_terminal:
                 console.print(f"{row.item}: {row.status} {row.message}", markup=False)
 
-        convert_all(waiting, folder, workers, f"{name}: {len(waiting)} objects", settle)
-    return rows
+        tally = Tally(len(waiting), show)
+        convert_all(waiting, folder, workers, f"{name}: {len(waiting)} objects", tally)
+    return rows | tally.rows
 
 
 def _entry(truth: Truth, folder: Path, row: Row) -> "Entry":

@@ -20,8 +20,8 @@ from prefect.cache_policies import CachePolicy
 from prefect.context import TaskRunContext
 from pydantic import ValidationError
 
-from steps.bucket import open_store
 from steps.contract import StepRequest, StepResult
+from steps.opening import open_store
 from steps.store import ArtifactStore, StoreUnreachable
 
 POLL_S = 0.1  # between two looks at a lock that another process holds

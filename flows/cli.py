@@ -5,25 +5,22 @@ Exit status: 0 done · 1 an item of a batch failed, or something broke · 2 wron
 """
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from flows.checking import bench, rebuild, score, verify
-from flows.endings import EXIT_FAILED, clear_ending
+from flows.endings import clear_ending
 from flows.options import Changes, Commercial, Profile, Rate, Seed, Texture, Triangles
+from flows.services import down, up, watch
 from flows.store import store
 from flows.weights import weights
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from flows.manifest import Item
     from flows.orders import Order
-    from flows.summary import Row
-    from steps.store import ArtifactStore
 
 app = typer.Typer(
     name="dg4d",
@@ -150,7 +147,13 @@ def motions(
 
 @app.command()
 def batch(
-    inputs: Annotated[Path, typer.Argument(help="a folder of pictures and videos, or a manifest (.csv, .json)")],
+    inputs: Annotated[
+        str,
+        typer.Argument(
+            help="a folder of pictures and videos, a pattern ('photos/**/*.png', in quotes), s3://BUCKET/PREFIX, or a "
+            "manifest (.csv, .json, .jsonl, .parquet)"
+        ),
+    ],
     out: Annotated[Path, typer.Option("-o", "--out", help="DIR/<item>/ is a package each")],
     profile: Profile = "preview",
     changes: Changes = None,
@@ -163,57 +166,37 @@ def batch(
     strict: Annotated[
         bool, typer.Option("--strict", help="an asset that a gate does not let pass is a failure, and ends the batch")
     ] = False,
+    root: Annotated[
+        Path | None, typer.Option(help="where a manifest's files are, and must stay  [default: beside it]")
+    ] = None,
+    gpus: Annotated[
+        int | None, typer.Option(min=0, help="use the first so many, a step on each  [default: all]")
+    ] = None,
+    cpus: Annotated[
+        int | None,
+        typer.Option(min=1, help="steps that compute on the processor at a time  [default: one per 4 cores]"),
+    ] = None,
+    price_per_hour: Annotated[
+        float | None, typer.Option(min=0, envvar="DG4D_PRICE_PER_HOUR", help="of this machine; the summary has costs")
+    ] = None,
 ) -> None:
     """Make many assets; those that are made already are left alone, and a bad one stops no other.
 
-    A manifest has a row per item: path or text, and if you like video, name, profile, seed, bank,
-    set ("a.b=c; d.e=f"), or any knob as a column of its own.
+    A manifest has a row per item: path or text, and if you like video, name, profile, seed, bank, priority (higher
+    first), set ("a.b=c; d.e=f"), or any knob as a column of its own.
     """
     with clear_ending():
-        from flows import home, terminal
-        from flows.manifest import items_of, only_commercial, parse_changes
-        from flows.publish import check_writable
-        from flows.summary import NOT_ACCEPTED, write_summary
+        os.environ.update({name: str(n) for name, n in {"DG4D_GPUS": gpus, "DG4D_CPUS": cpus}.items() if n is not None})
+        from flows import terminal
+        from flows.batch import batch as make_all
+        from flows.batch import tell
+        from flows.manifest import parse_changes
 
         console = terminal.console()
         wanted = parse_changes(changes or []) | _short(triangles, texture, fps)
-        items = items_of(inputs, out, profile, wanted, seed)
-        items = only_commercial(items) if commercial_only else items
-        check_writable(out)
-        out.mkdir(parents=True, exist_ok=True)
-        rows: dict[str, Row] = {}
-        with terminal.batch_shown(console, [item.name for item in items]) as table:
-
-            def settle(row: "Row") -> None:
-                rows[row.item] = row
-                table.settle(row.item, row.status, row.message)
-                if not console.is_terminal:
-                    console.print(f"{row.item}: {row.status} {row.message}", markup=False)
-                write_summary(out, list(rows.values()), commercial_only)
-
-            ready = (_ready(item, out, home.store(), settle, strict) for item in items)
-            orders = [order for order in ready if order is not None]
-            if orders:
-                from flows.make import connect
-
-                connect()
-                from flows.catalog import convert_all
-
-                refused = [row.item for row in rows.values() if row.kind == NOT_ACCEPTED]
-                convert_all(orders, out, workers, f"{inputs.name}: {len(items)} items", settle, strict, refused)
-        write_summary(out, [rows[item.name] for item in items], commercial_only)
-        failed = [row for row in rows.values() if row.status == "failed"]
-        for row in failed:
-            console.print(f"failed: {row.item}: {row.message}", markup=False, style="red")
-        doubtful = [row for row in rows.values() if row.failing and row.status != "failed"]
-        for row in doubtful:
-            console.print(f"not accepted: {row.item}: {', '.join(row.failing or ())}", markup=False, style="yellow")
-        if not orders and not failed:
-            console.print("nothing to do: every item was already done")
-        console.print(f"{len(rows) - len(failed)} of {len(rows)} items are in {out}", markup=False)
-        console.print(f"overview: {out / 'index.html'}", markup=False)
-        if failed:
-            raise typer.Exit(EXIT_FAILED)
+        asked = (profile, wanted, seed, workers, commercial_only, strict, root, price_per_hour)
+        if status := tell(make_all(inputs, out, console, *asked), out, console):
+            raise typer.Exit(status)
 
 
 @app.command()
@@ -276,29 +259,8 @@ def compose(
         typer.echo(out)
 
 
-for command in (score, bench, verify, rebuild):
+for command in (score, bench, verify, rebuild, up, down, watch):
     app.command()(command)
-
-
-@app.command()
-def up() -> None:
-    """Start the server that shows every run, and keep it until `dg4d down`; prints its address."""
-    with clear_ending():
-        from flows import home
-
-        server = home.background_server()
-        server.start()
-        server.keep()
-        typer.echo(server.wait().removesuffix("/api"))
-
-
-@app.command()
-def down() -> None:
-    """Stop the server."""
-    with clear_ending():
-        from flows import home
-
-        typer.echo("the server is stopped" if home.background_server().stop() else "no server was running")
 
 
 def main() -> None:
@@ -321,32 +283,6 @@ def _made(order: "Order", folder: Path, console: "Console") -> dict[str, dict[st
     if cached:
         console.print("nothing to do: every step was already done")
     return files
-
-
-def _ready(
-    item: "Item", out: Path, store: "ArtifactStore", settle: Callable[["Row"], None], strict: bool
-) -> "Order | None":
-    """The order of an item; None if it is settled already."""
-    from dg4d_lib.errors import DG4DError
-    from flows.publish import check_folder, is_current
-    from flows.summary import Row, judged
-
-    failed = Row(item=item.name, status="failed", kind="BadInput", message=item.error)
-    if item.wish is None:
-        settle(failed)
-        return None
-    source = item.wish.source_name
-    try:
-        item.wish.check()
-        check_folder(out / item.name)
-        order = item.wish.order(store)
-    except DG4DError as error:
-        settle(failed.model_copy(update={"message": str(error), "source": source}))
-        return None
-    if is_current(out / item.name, order.digest()):
-        settle(judged(Row(item=item.name, source=source, status="unchanged"), out / item.name, strict))
-        return None
-    return order
 
 
 if __name__ == "__main__":

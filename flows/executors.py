@@ -1,4 +1,4 @@
-"""How a step runs: in a process of its own, or in this one. `$DG4D_EXECUTOR` chooses by name.
+"""How a step runs: in a process of its own, in a container, or in this process. `$DG4D_EXECUTOR` chooses by name.
 
 An executor is a function `(spec, request, on_progress) -> StepResult` that raises one of the errors below.
 """
@@ -12,10 +12,14 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from pydantic import ValidationError
 
+from dg4d_lib.errors import BackendUnavailable
+from flows import resources
+from flows.containers import container
 from flows.home import store
 from steps.contract import (
     EXIT_BAD_INPUT,
@@ -118,35 +122,67 @@ def in_subprocess(
 ) -> StepResult:
     """Run a step in a process of its own, which ends with this one and is killed after `spec.timeout_s`."""
     with _scratch() as folder:
-        (folder / "request.json").write_text(request.model_dump_json(), encoding="utf-8")
-        with (folder / "stderr").open("wb") as stderr:
-            process = subprocess.Popen(
-                _command(folder, parent=os.getpid()),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=stderr,
-                env={**os.environ, "TMPDIR": str(folder)},
-                start_new_session=True,
-                text=True,
-            )
-        status, timed_out = _watched(process, spec.timeout_s, on_progress, say)
-        if timed_out:
-            raise StepTimedOut(spec.name, f"no result after {spec.timeout_s:g} s, so it was stopped")
-        outcome = _outcome(folder / "result.json")
-        if status == 0 and isinstance(outcome, StepResult):
-            return outcome
-        if isinstance(outcome, StepFailure):
-            raise _ERRORS[outcome.kind](spec.name, outcome.message, outcome.pictures)
-        if status == -signal.SIGKILL:
-            raise StepOutOfMemory(spec.name, KILLED)
-        tail = _tail(folder / "stderr")
-        if status in _ERRORS_BY_STATUS:
-            raise _ERRORS_BY_STATUS[status](spec.name, tail or f"the process ended with status {status}")
-        reason = f"killed by signal {-status}" if status < 0 else f"ended with status {status}"
-        raise StepCrashed(spec.name, f"{reason} and no result" + (f": {tail}" if tail else ""))
+        command = [sys.executable, "-m", "steps.main", *_arguments(folder, parent=str(os.getpid()))]
+        program = _Program(command, {**os.environ, "TMPDIR": str(folder)}, end=lambda: None)
+        return _result_of(program, folder, spec, request, on_progress, say)
 
 
-EXECUTORS: dict[str, Execute] = {"subprocess": in_subprocess, "in_process": in_process}
+def in_container(
+    spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say = lambda text: None
+) -> StepResult:
+    """Run a step in a container of its own, which ends with this process and is removed after `spec.timeout_s`."""
+    with _scratch() as folder:
+        try:
+            run, arguments = container(request, folder, store().address), _arguments(folder, parent="-")
+        except BackendUnavailable as error:
+            raise StepMissing(spec.name, str(error)) from error
+        program = _Program([*run.command, *arguments], dict(os.environ), end=run.remove)
+        return _result_of(program, folder, spec, request, on_progress, say)
+
+
+@dataclass(frozen=True)
+class _Program:
+    """What runs a step outside of this process: a command, its environment, and what ends that which it started."""
+
+    command: list[str]
+    environment: dict[str, str]
+    end: Callable[[], None]
+
+
+def _result_of(
+    program: _Program, folder: Path, spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say
+) -> StepResult:
+    """Run a program that reads the request and writes the result in a folder; its result, or the error it means."""
+    (folder / "request.json").write_text(request.model_dump_json(), encoding="utf-8")
+    with (folder / "stderr").open("wb") as stderr:
+        process = subprocess.Popen(
+            program.command,
+            stdin=subprocess.PIPE,  # open for as long as this process lives
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            env={**program.environment, **resources.environment()},
+            pass_fds=resources.handles(),
+            start_new_session=True,
+            text=True,
+        )
+    status, timed_out = _watched(process, program.end, spec.timeout_s, on_progress, say)
+    if timed_out:
+        raise StepTimedOut(spec.name, f"no result after {spec.timeout_s:g} s, so it was stopped")
+    outcome = _outcome(folder / "result.json")
+    if status == 0 and isinstance(outcome, StepResult):
+        return outcome
+    if isinstance(outcome, StepFailure):
+        raise _ERRORS[outcome.kind](spec.name, outcome.message, outcome.pictures)
+    if status in (-signal.SIGKILL, EXIT_OUT_OF_MEMORY):
+        raise StepOutOfMemory(spec.name, KILLED)
+    tail = _tail(folder / "stderr")
+    if status in _ERRORS_BY_STATUS:
+        raise _ERRORS_BY_STATUS[status](spec.name, tail or f"the process ended with status {status}")
+    reason = f"killed by signal {-status}" if status < 0 else f"ended with status {status}"
+    raise StepCrashed(spec.name, f"{reason} and no result" + (f": {tail}" if tail else ""))
+
+
+EXECUTORS: dict[str, Execute] = {"subprocess": in_subprocess, "container": in_container, "in_process": in_process}
 
 
 def chosen() -> Execute:
@@ -161,45 +197,49 @@ def chosen() -> Execute:
     return EXECUTORS[name]
 
 
-_running: set[subprocess.Popen[str]] = set()
+_running: dict[subprocess.Popen[str], Callable[[], None]] = {}
 
 
 def stop_all() -> None:
-    """End every step that runs for this process, at once; its callers get an error."""
-    for process in tuple(_running):
-        _kill(process)
+    """End every step that runs for this process, at once, and begin no other; their callers get an error."""
+    resources.stopping.set()
+    for process, end in tuple(_running.items()):
+        _stop(process, end)
 
 
-def _command(folder: Path, parent: int) -> list[str]:
+def _arguments(folder: Path, parent: str) -> list[str]:
+    """What `steps.main` is told."""
     files = [str(folder / "request.json"), str(folder / "result.json")]
-    return [sys.executable, "-m", "steps.main", *files, "--store", store().address, "--parent", str(parent)]
+    return [*files, "--store", store().address, "--parent", parent]
 
 
-def _watched(process: subprocess.Popen[str], timeout_s: float, on_progress: Progress, say: Say) -> tuple[int, bool]:
-    """Follow a step to its end: its exit status, and whether it was killed for its time."""
+def _watched(
+    process: subprocess.Popen[str], end: Callable[[], None], timeout_s: float, on_progress: Progress, say: Say
+) -> tuple[int, bool]:
+    """Follow a step to its end: its exit status, and whether it was stopped for its time."""
     timed_out = threading.Event()
 
-    def end() -> None:
+    def stop() -> None:
         timed_out.set()
-        _kill(process)
+        _stop(process, end)
 
-    alarm = threading.Timer(timeout_s, end)
+    alarm = threading.Timer(timeout_s, stop)
     alarm.daemon = True
     alarm.start()
-    _running.add(process)
+    _running[process] = end
     try:
-        assert process.stdout is not None  # it is a pipe
+        assert process.stdin is not None and process.stdout is not None  # they are pipes
         for line in process.stdout:
             _relay(line, on_progress, say)
         status = process.wait()
         return status, timed_out.is_set()
     finally:
         alarm.cancel()
-        _running.discard(process)
-        _kill(process)
+        _running.pop(process, None)
+        _stop(process, end)
         process.wait(KILL_GRACE_S)
-        if process.stdout is not None:
-            process.stdout.close()
+        for pipe in filter(None, (process.stdin, process.stdout)):
+            pipe.close()
 
 
 def _relay(line: str, on_progress: Progress, say: Say) -> None:
@@ -214,10 +254,12 @@ def _relay(line: str, on_progress: Progress, say: Say) -> None:
     on_progress(done, total, values)
 
 
-def _kill(process: subprocess.Popen[str]) -> None:
+def _stop(process: subprocess.Popen[str], end: Callable[[], None]) -> None:
+    """Kill a program, with every process that it started here, and what it started elsewhere."""
     if process.poll() is None:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
+        end()
 
 
 def _outcome(path: Path) -> StepResult | StepFailure | None:

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 from flows.server import SETTINGS, Server
-from steps.bucket import open_store
+from steps.opening import open_store
 from steps.store import ArtifactStore, home
 
 CLIENT_SETTINGS = {

@@ -3,12 +3,12 @@
 from typing import Any
 
 from prefect import flow
-from prefect.artifacts import create_markdown_artifact
 from prefect.runtime import flow_run
 from prefect.task_runners import ThreadPoolTaskRunner
 
 from dg4d_lib.settings import GeometricPriorSettings
-from flows import home, pages
+from flows import home
+from flows.asset_page import show_asset
 from flows.merging import frames_in, merged
 from flows.tasks import Made, Steps
 from steps.contract import ArtifactRef
@@ -71,28 +71,29 @@ def finish(
         {"subject": subject, "driving_video": driving, "gaussians": gaussians, "motion": motion, **surface},
         PackAssetSettings(rasterizer=settings.rasterizer, pack=settings.pack, notes=steps.notes()),
     )
-    checked = steps.run(
+    steps.run(
         "check_asset",
         {"package": packed["package"], "driving_video": driving, "subject": subject},
         CheckAssetSettings(rasterizer=settings.rasterizer, gates=settings.gates),
     )
-    rows = [(done.label, done.cached, done.seconds) for done in steps.finished]
-    page = pages.asset_page(steps.item, rows, {**packed, **checked}, home.store())
-    create_markdown_artifact(key=pages.key("asset", steps.item), markdown=page)
+    show_asset(steps.item, steps.finished, packed["package"], home.store())
     return Made(package=packed["package"], steps=steps.finished, flow_run=str(flow_run.id or ""))
 
 
 def extract(
     steps: Steps, gaussians: ArtifactRef, motion: ArtifactRef, frames: int, settings: PipelineSettings
 ) -> dict[str, ArtifactRef | None]:
-    """One mesh that moves; or a mesh per frame, in parts of a few frames each."""
+    """One mesh that moves; or a mesh per frame, in parts of a few frames each, where one is asked for or needed."""
     inputs: dict[str, ArtifactRef | None] = {"gaussians": gaussians, "motion": motion}
     whole = ExtractMeshSettings(rasterizer=settings.rasterizer, mesh=settings.mesh)
-    if settings.mesh.mode == "tracked":
-        return {"tracked": steps.run("extract_mesh", inputs, whole)["tracked"]}
+    if settings.mesh.mode != "per_frame":
+        tracked = steps.run("extract_mesh", inputs, whole).get("tracked")
+        if tracked is not None:
+            return {"tracked": tracked}
     count = settings.mesh.frames_per_task
+    mesh = settings.mesh.model_copy(update={"mode": "per_frame"})
     parts = [
-        whole.model_copy(update={"first_frame": first, "end_frame": min(first + count, frames)})
+        whole.model_copy(update={"mesh": mesh, "first_frame": first, "end_frame": min(first + count, frames)})
         for first in range(0, frames, count)
     ]
     done = steps.run_parts("extract_mesh", inputs, parts)

@@ -1,49 +1,114 @@
-"""The items of a batch: everything in a folder, or the rows of a CSV or JSON file; each with a name of its own."""
+"""The items of a batch: the rows of a manifest, or everything in a folder, a pattern or an object store, by name."""
 
 import csv
 import json
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from dg4d_lib.errors import BadInput
-from flows import sources
+from dg4d_lib.errors import BackendUnavailable, BadInput
+from flows import listing, sources
 from flows.orders import Wish, name_of
-from flows.publish import record_of
 from steps.contract import Frozen
 from steps.profiles import PipelineSettings, profile, revise
 
-COLUMNS = ("path", "text", "video", "name", "profile", "seed", "bank", "set")  # and any dotted knob, as mesh.grid
-MANIFESTS = (".csv", ".json")
+COLUMNS = (
+    "path", "text", "video", "name", "profile", "seed", "bank", "priority", "set",
+)  # and any dotted knob, as mesh.grid  # fmt: skip
+MANIFESTS = (".csv", ".json", ".jsonl", ".parquet")
+WHAT = (
+    "a folder of pictures and videos, a pattern such as 'photos/**/*.png', an object store (s3://BUCKET/PREFIX), or a "
+    f"manifest ({', '.join(MANIFESTS)})"
+)
 
 
 class Item(Frozen):
-    """One line of a batch: what to make, or why that cannot be known."""
+    """One line of a batch: what to make, or why that cannot be known.
+
+    Attributes:
+        name: of the folder of its package, within that of the batch.
+        wish: what to make.
+        error: why that is not known.
+        priority: those with a higher one are made earlier.
+        store: the object store where the source is, as the user gave it; empty where `wish` says where it is.
+        remote: the source in that store.
+    """
 
     name: str
     wish: Wish | None = None
     error: str = ""
+    priority: int = 0
+    store: str = ""
+    remote: str = ""
+
+    @contextmanager
+    def here(self) -> Iterator[Wish]:
+        """The wish with its files on this machine, as long as the block runs; an object is fetched.
+
+        Raises:
+            BadInput: what to make is not known, or the object is gone.
+            BackendUnavailable: the object store does not answer.
+        """
+        if self.wish is None or self.wish.picture is None or not self.remote:
+            if self.wish is None:
+                raise BadInput(self.error)
+            yield self.wish
+            return
+        with listing.fetched(self.store, self.remote, self.wish.picture.name) as path:
+            yield self.wish.model_copy(update={"picture": path})
 
 
-def items_of(inputs: Path, out: Path, profile_name: str, changes: Mapping[str, Any], seed: int) -> list[Item]:
-    """The items of a folder (with its folders, without `out`), or of a manifest.
+def items_of(
+    inputs: str | Path,
+    out: Path,
+    profile_name: str,
+    changes: Mapping[str, Any],
+    seed: int,
+    root: Path | None = None,
+) -> list[Item]:
+    """The items of a folder (with its folders, without `out`), a pattern, an object store or a manifest.
+
+    Those of higher priority come first, equal ones in their order: by name, or as in the manifest.
+
+    Args:
+        inputs: what the user gave.
+        out: the folder of the packages.
+        profile_name: of items that do not name one.
+        changes: of its knobs, for all items.
+        seed: of items that do not have one.
+        root: where a manifest's files are, and must stay; default: the folder of the manifest.
 
     Raises:
         BadInput: there is nothing to do, or the manifest as a whole cannot be read.
+        BackendUnavailable: the object store does not answer, or reading Parquet is not installed.
     """
     settings = revise(profile(profile_name), dict(changes))
-    if inputs.is_dir():
-        items = _of_folder(inputs, out, lambda name, path: _wish(name, path, profile_name, settings, seed))
-    elif inputs.is_file() and inputs.suffix.lower() in MANIFESTS:
-        items = _of_manifest(inputs, profile_name, changes, seed)
-    elif inputs.exists():
-        raise BadInput(f"{inputs} is neither a folder nor a manifest (.csv, .json); for one file use `dg4d make`")
+    path, given = Path(inputs), str(inputs)
+    if path.is_file() and path.suffix.lower() in MANIFESTS:
+        items = _of_manifest(path, root or path.parent, profile_name, changes, seed)
+        return sorted(items, key=lambda item: -item.priority)
+    if root is not None:
+        raise BadInput(f"--root says where the files of a manifest are, and {given} is none")
+    if given.startswith(listing.BUCKET):
+        found = listing.in_bucket(given)
+    elif path.is_dir():
+        found = listing.in_folder(path, out)
+    elif path.exists():
+        raise BadInput(
+            f"{given} is neither a folder nor a manifest ({', '.join(MANIFESTS)}); for one file use `dg4d make`"
+        )
+    elif listing.WILD & set(given):
+        found = listing.by_pattern(given, out)
     else:
-        raise BadInput(f"{inputs} does not exist; give a folder of pictures and videos, or a manifest (.csv, .json)")
-    if not items:
-        raise BadInput(f"{inputs} holds no pictures or videos ({', '.join(sorted(sources.PICTURES | sources.VIDEOS))})")
-    return items
+        raise BadInput(f"{given} does not exist; give {WHAT}")
+    if not found:
+        raise BadInput(f"{given} holds no pictures or videos ({', '.join(sorted(listing.WANTED))})")
+    common = Wish(item="", profile=profile_name, settings=settings, seed=seed)
+    return [_item(name, file, given, common) for name, file in zip(_names(found), found, strict=True)]
 
 
 def only_commercial(items: list[Item]) -> list[Item]:
@@ -91,41 +156,40 @@ def distinct(wanted: list[tuple[str, str]]) -> list[str]:
     return names
 
 
-def _wish(name: str, path: Path, profile_name: str, settings: PipelineSettings, seed: int) -> Item:
-    return Item(name=name, wish=Wish(item=name, picture=path, profile=profile_name, settings=settings, seed=seed))
+def _names(found: list[listing.Found]) -> list[str]:
+    places = [PurePosixPath(file.name) for file in found]
+    return distinct([(place.with_suffix("").as_posix(), place.suffix.lower().lstrip(".")) for place in places])
 
 
-def _of_folder(folder: Path, out: Path, item: Callable[[str, Path], Item]) -> list[Item]:
-    wanted = sources.PICTURES | sources.VIDEOS
-    packages = {record.parent for record in folder.rglob("provenance.json") if record_of(record.parent) is not None}
-    skipped = packages | {out.absolute(), out.resolve()}
-    found = [
-        path
-        for path in sorted(folder.rglob("*"))
-        if path.suffix.lower() in wanted
-        and path.is_file()
-        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-        and not skipped & {*path.parents, *path.absolute().parents}
-    ]
-    names = distinct(
-        [(path.relative_to(folder).with_suffix("").as_posix(), path.suffix.lower().lstrip(".")) for path in found]
-    )
-    items = []
-    for name, path in zip(names, found, strict=True):
-        try:
-            items.append(item(name, sources.inside(folder, path.relative_to(folder).as_posix(), "the file")))
-        except BadInput as error:
-            items.append(Item(name=name, error=str(error)))
-    return items
+def _item(name: str, file: listing.Found, given: str, common: Wish) -> Item:
+    if file.error:
+        return Item(name=_within(name) or "unnamed", error=file.error)
+    wish = common.model_copy(update={"item": name, "picture": file.path})
+    return Item(name=name, wish=wish, store=given if file.remote else "", remote=file.remote)
 
 
-def _of_manifest(file: Path, profile_name: str, changes: Mapping[str, Any], seed: int) -> list[Item]:
+def _of_manifest(file: Path, root: Path, profile_name: str, changes: Mapping[str, Any], seed: int) -> list[Item]:
+    if not root.is_dir():
+        raise BadInput(f"--root {root} is not a folder")
     rows = _rows(file)
+    if not rows:
+        raise BadInput(f"{file} holds no pictures or videos: it has no rows")
     names = distinct([_wanted(row) for row in rows])
+    pipelines: dict[str, PipelineSettings] = {}  # many rows want the same: it is kept, and checked, once
     items = []
     for name, row in zip(names, rows, strict=True):
         try:
-            items.append(Item(name=name, wish=_wish_of(name, row, file.parent, profile_name, changes, seed)))
+            chosen = str(row.get("profile") or profile_name)
+            knobs = {**changes, **_knobs(row)}
+            key = f"{chosen} {json.dumps(knobs, default=str)}"
+            if key not in pipelines:
+                pipelines[key] = revise(profile(chosen), knobs)
+            common = Wish(
+                item=name, profile=chosen, settings=pipelines[key], seed=_whole("seed", row.get("seed", seed), least=0)
+            )
+            items.append(
+                Item(name=name, wish=_wish(row, root, common), priority=_whole("priority", row.get("priority", 0)))
+            )
         except BadInput as error:
             items.append(Item(name=name, error=str(error)))
     return items
@@ -135,35 +199,45 @@ def _wanted(row: dict[str, Any]) -> tuple[str, str]:
     """The name that a row asks for, within the output folder; and its suffix, in case another asks for it too."""
     path = PurePosixPath(str(row.get("path", "")))
     own = path.stem or name_of(str(row.get("text", "")))
-    name = "".join(letter for letter in str(row.get("name") or own) if letter.isprintable())
-    parts = [part for part in PurePosixPath(name).parts if part.strip("/") not in {"", ".."}]
-    return "/".join(parts) or own, "" if row.get("name") else path.suffix.lower().lstrip(".")
+    name = _within(str(row.get("name") or own)) or own
+    return name, "" if row.get("name") else path.suffix.lower().lstrip(".")
 
 
-def _wish_of(
-    name: str, row: dict[str, Any], folder: Path, profile_name: str, changes: Mapping[str, Any], seed: int
-) -> Wish:
+def _within(name: str) -> str:
+    """A name without parts that lead out of a folder."""
+    printable = "".join(letter for letter in name if letter.isprintable())
+    return "/".join(part for part in PurePosixPath(printable).parts if part.strip("/") not in {"", ".."})
+
+
+def _knobs(row: dict[str, Any]) -> dict[str, Any]:
+    """The knobs that a row sets: those in its column `set`, then those with a column of their own."""
     own: Any = row.get("set") or {}
     if isinstance(own, str):
         own = parse_changes([pair for pair in own.split(";") if pair.strip()])
-    knobs = {key: _value(value) if isinstance(value, str) else value for key, value in row.items() if "." in key}
-    chosen = str(row.get("profile") or profile_name)
+    return {
+        **own,
+        **{key: _value(value) if isinstance(value, str) else value for key, value in row.items() if "." in key},
+    }
+
+
+def _whole(what: str, value: Any, least: int | None = None) -> int:
     try:
-        number = int(row.get("seed", seed))
-    except (TypeError, ValueError) as error:
-        raise BadInput(f"seed {row['seed']!r} is not a whole number") from error
-    if number < 0:
-        raise BadInput(f"seed {number} is negative; use 0 or more")
-    return Wish(
-        item=name,
-        picture=sources.inside(folder, str(row["path"]), "path") if row.get("path") else None,
-        text=str(row.get("text", "")),
-        video=sources.inside(folder, str(row["video"]), "video") if row.get("video") else None,
-        bank=sources.inside(folder, str(row["bank"]), "bank") if row.get("bank") else None,
-        profile=chosen,
-        settings=revise(profile(chosen), {**changes, **own, **knobs}),
-        seed=number,
-    )
+        number = int(value)
+        if number != float(value):
+            raise ValueError
+    except (TypeError, ValueError, OverflowError) as error:
+        raise BadInput(f"{what} {value!r} is not a whole number") from error
+    if least is not None and number < least:
+        raise BadInput(f"{what} {number} is too small; use {least} or more")
+    return number
+
+
+def _wish(row: dict[str, Any], root: Path, common: Wish) -> Wish:
+    def file(column: str) -> Path | None:
+        return sources.inside(root, str(row[column]), column) if row.get(column) else None
+
+    files = {"picture": file("path"), "video": file("video"), "bank": file("bank")}
+    return common.model_copy(update={"text": str(row.get("text", "")), **files})
 
 
 def _rows(file: Path) -> list[dict[str, Any]]:
@@ -171,13 +245,10 @@ def _rows(file: Path) -> list[dict[str, Any]]:
 
     Raises:
         BadInput: it is not a table, or has columns that mean nothing.
+        BackendUnavailable: reading Parquet is not installed.
     """
     try:
-        text = file.read_text(encoding="utf-8-sig")
-        if file.suffix.lower() == ".csv":
-            rows: Any = list(csv.DictReader(text.splitlines(), restkey="too many cells"))
-        else:
-            rows = json.loads(text)
+        rows = _table(file)
     except (OSError, ValueError, csv.Error) as error:
         raise BadInput(f"{file} cannot be read as a manifest: {error}") from error
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
@@ -190,7 +261,30 @@ def _rows(file: Path) -> list[dict[str, Any]]:
             )
         if not row.get("path") and not row.get("text"):
             raise BadInput(f"{file}, row {number}: neither a path nor a text")
-    return [{key: value for key, value in row.items() if value not in (None, "")} for row in rows]
+    return [{key: value for key, value in row.items() if not _is_empty(value)} for row in rows]
+
+
+def _table(file: Path) -> Any:
+    kind = file.suffix.lower()
+    if kind == ".parquet":
+        return _parquet(file)
+    text = file.read_text(encoding="utf-8-sig")
+    if kind == ".csv":
+        return list(csv.DictReader(text.splitlines(), restkey="too many cells"))
+    if kind == ".jsonl":
+        return [json.loads(line) for line in text.splitlines() if line.strip()]
+    return json.loads(text)
+
+
+def _parquet(file: Path) -> Any:
+    if find_spec("pyarrow") is None:
+        raise BackendUnavailable(f"{file} is Parquet, which pyarrow reads: pip install 'dg4d[parquet]'; or give a .csv")
+    return import_module("pyarrow.parquet").read_table(file).to_pylist()
+
+
+def _is_empty(value: Any) -> bool:
+    """Nothing in a cell, in the ways in which tables say so; what is not a number is unlike itself."""
+    return value is None or value == "" or value != value  # noqa: PLR0124
 
 
 def _numbered(name: str, taken: list[str], inside: set[str]) -> str:

@@ -5,7 +5,6 @@ import hashlib
 import json
 import re
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +16,11 @@ from flows.publish import readable
 from steps.contract import ArtifactRef, StepResult, StepSpec
 from steps.store import ArtifactMissing, ArtifactStore
 
-THUMBNAIL_SIZE = 320  # pixels of the longer side
+THUMBNAIL_SIZES = (960, 640, 320)  # pixels of the longer side
 THUMBNAIL_BYTES = 50_000  # the server keeps pages in its database
 ROWS_OF_A_CURVE = 8
 ARTIFACT_ADDRESS = "/dg4d/artifacts/"  # of the background server
+VIEWER_ADDRESS = "/dg4d/viewer/"
 
 
 def key(label: str, item: str) -> str:
@@ -29,9 +29,9 @@ def key(label: str, item: str) -> str:
     return f"{slug}-{hashlib.sha256(f'{label}/{item}'.encode()).hexdigest()[:6]}"
 
 
-def address(name: str, ref: ArtifactRef, suffix: str) -> str:
-    """Where the background server has a file of the store; relative to the server."""
-    return f"{ARTIFACT_ADDRESS}{ref.digest.removeprefix('sha256:')}/{ref.size_bytes}/{name}{suffix}"
+def address(name: str, ref: ArtifactRef, suffix: str, place: str = ARTIFACT_ADDRESS) -> str:
+    """Where the background server has a file of the store, or a page made of it; relative to the server."""
+    return f"{place}{ref.digest.removeprefix('sha256:')}/{ref.size_bytes}/{name}{suffix}"
 
 
 def output_rows(result: StepResult, spec: StepSpec) -> list[dict[str, str]]:
@@ -77,34 +77,32 @@ def step_page(label: str, item: str, result: StepResult, store: ArtifactStore) -
     return "\n".join(lines) + "\n"
 
 
-def asset_page(
-    item: str, rows: list[tuple[str, bool, float]], outputs: dict[str, ArtifactRef], store: ArtifactStore
-) -> str:
-    """The finished asset: its contact sheet and what each step took."""
-    lines = [f"# {item}", "", *(f"{image}\n" for image in pictures_of(outputs, store))]
-    lines += ["| step | state | seconds |", "|---|---|---|"]
-    lines += [f"| {label} | {'cached' if cached else 'computed'} | {seconds:.1f} |" for label, cached, seconds in rows]
-    return "\n".join(lines) + "\n"
-
-
-def show_failure(item: str, label: str, error: StepError, store: ArtifactStore, create: Callable[..., Any]) -> None:
-    """A page with the message and the pictures that explain it."""
+def failure_page(label: str, item: str, error: StepError, store: ArtifactStore) -> str:
+    """The message of a step that failed, and the pictures that explain it."""
     lines = [f"# {label}: {item}", "", f"**{type(error).__name__}**", "", error.message, ""]
-    lines += [f"{image}\n" for image in pictures_of(error.pictures, store)]
-    create(key=key(label, item), markdown="\n".join(lines), description=f"{label} of {item} failed")
+    return "\n".join([*lines, *(f"{image}\n" for image in pictures_of(error.pictures, store))])
 
 
 def pictures_of(outputs: dict[str, ArtifactRef], store: ArtifactStore) -> list[str]:
     """Every PNG among the outputs, small and inside the Markdown."""
-    images = []
-    for name, ref in outputs.items():
-        if ref.media_type == "image/png" and (small := thumbnail(ref, store)) is not None:
-            images.append(f"![{name}](data:image/webp;base64,{base64.b64encode(small).decode()})")
-    return images
+    return [
+        embedded(name, "image/webp", small)
+        for name, ref in outputs.items()
+        if ref.media_type == "image/png" and (small := thumbnail(ref, store)) is not None
+    ]
 
 
-def thumbnail(ref: ArtifactRef, store: ArtifactStore) -> bytes | None:
-    """A picture as a small WebP; None if it cannot be made, for a page is not worth a failed step."""
+def embedded(name: str, media_type: str, content: bytes) -> str:
+    """A picture inside the Markdown."""
+    return f"![{name}](data:{media_type};base64,{base64.b64encode(content).decode()})"
+
+
+def thumbnail(ref: ArtifactRef, store: ArtifactStore, most_bytes: int = THUMBNAIL_BYTES) -> bytes | None:
+    """A picture as a WebP of at most so many bytes, as large and as good as fits.
+
+    Returns:
+        None if it cannot be made, for a page is not worth a failed step.
+    """
     try:
         picture = oiio.ImageBuf(str(store.path(ref)))
     except ArtifactMissing:
@@ -112,19 +110,25 @@ def thumbnail(ref: ArtifactRef, store: ArtifactStore) -> bytes | None:
     if not picture.read() or not picture.spec().width:
         picture.geterror()  # it was taken note of
         return None
-    width, height, channels = picture.spec().width, picture.spec().height, picture.nchannels
-    scale = min(1.0, THUMBNAIL_SIZE / max(width, height))
-    region = oiio.ROI(0, max(1, round(width * scale)), 0, max(1, round(height * scale)), 0, 1, 0, channels)
-    small = oiio.ImageBufAlgo.resize(picture, roi=region)
     with tempfile.TemporaryDirectory(prefix="dg4d-page-") as folder:
         path = Path(folder) / "small.webp"
-        for quality in (80, 50, 20):
-            small.specmod().attribute("Compression", f"webp:{quality}")
-            if not small.write(str(path)):
-                return None
-            if path.stat().st_size <= THUMBNAIL_BYTES:
-                return path.read_bytes()
+        for size in THUMBNAIL_SIZES:
+            small = _shrunk(picture, size)
+            for quality in (80, 50, 20):
+                small.specmod().attribute("Compression", f"webp:{quality}")
+                if not small.write(str(path)):
+                    return None
+                if path.stat().st_size <= most_bytes:
+                    return path.read_bytes()
     return None
+
+
+def _shrunk(picture: oiio.ImageBuf, size: int) -> oiio.ImageBuf:
+    """With no side longer than `size` pixels."""
+    width, height, channels = picture.spec().width, picture.spec().height, picture.nchannels
+    scale = min(1.0, size / max(width, height))
+    region = oiio.ROI(0, max(1, round(width * scale)), 0, max(1, round(height * scale)), 0, 1, 0, channels)
+    return oiio.ImageBufAlgo.resize(picture, roi=region)
 
 
 def curve_table(curves: dict[str, Any]) -> list[str]:

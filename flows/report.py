@@ -11,6 +11,7 @@ from typing import Any
 from flows.acceptance import picture_of, section, verdict_of
 from flows.crate import CRATE, crate_text
 from flows.credentials import Claim, Signer, certificate, sidecar_of
+from flows.curves import HEIGHT, WIDTH, drawing, inked, summary
 from flows.orders import Order
 from flows.publish import FORMAT, RECORD, Files, fact_of_bytes, readable
 from flows.tasks import Finished, Made
@@ -21,8 +22,6 @@ from steps.store import ArtifactStore
 BESIDE = ("report.json", "report.html", VIEWER, CRATE)
 GENERATIVE = ("draw_picture", "drive_video", "fit_gaussians", "fit_motion", "refine_texture")  # where they use weights
 UNSIGNED: Mapping[str, Any] = MappingProxyType({})
-PLOT_WIDTH, PLOT_HEIGHT = 420, 150  # pixels of a curve
-INKS = ("#2563eb", "#dc2626", "#059669", "#d97706", "#7c3aed", "#0891b2", "#be185d", "#4d7c0f")
 
 
 def complete(
@@ -181,30 +180,18 @@ def page(report: dict[str, Any], shortcomings: bytes | None = None) -> str:
 
 
 def curve(curves: dict[str, Any]) -> str:
-    """Losses over iterations as inline SVG, on a logarithmic scale where all values are positive."""
-    series = {name: values for name, values in curves["series"].items() if len(values) > 1}
-    values = [v for points in series.values() for v in points if math.isfinite(v)]
-    if not values:
+    """Losses over iterations as inline SVG; empty if there is nothing to draw."""
+    drawn = drawing(curves)
+    if not drawn:
         return ""
-    logarithmic = min(values) > 0 and max(values) / min(values) > 10
-    scale = math.log10 if logarithmic else float
-    low, high = scale(min(values)), scale(max(values))
-    first, last = curves["x"][0], curves["x"][-1]
-    lines, legend = [], []
-    for ink, (name, points) in zip(INKS * len(series), series.items(), strict=False):
-        places = " ".join(
-            f"{PLOT_WIDTH * (x - first) / ((last - first) or 1):.1f},"
-            f"{PLOT_HEIGHT * (1 - (scale(y) - low) / ((high - low) or 1)):.1f}"
-            for x, y in zip(curves["x"], points, strict=False)
-            if math.isfinite(y)
-        )
-        lines.append(f'<polyline points="{places}" stroke="{ink}"/>')
-        legend.append(f'<span style="color:{ink}">&#9632; {_text(name)} {points[-1]:.4g}</span>')
+    legend = [
+        f'<span style="color:{ink}">&#9632; {_text(name)} {points[-1]:.4g}</span>'
+        for ink, name, points in inked(curves)
+    ]
     return (
         f"<figure><figcaption>{_text(curves['title'])}</figcaption>"
-        f'<svg viewBox="-4 -4 {PLOT_WIDTH + 8} {PLOT_HEIGHT + 8}" role="img">{"".join(lines)}</svg>'
-        f"<p class=small>{max(values):.3g} to {min(values):.3g}{', logarithmic' if logarithmic else ''}; "
-        f"iterations {first} to {last}</p><p class=small>{' '.join(legend)}</p></figure>"
+        f'<svg viewBox="-4 -4 {WIDTH + 8} {HEIGHT + 8}" role="img">{drawn}</svg>'
+        f"<p class=small>{summary(curves)}</p><p class=small>{' '.join(legend)}</p></figure>"
     )
 
 
@@ -325,7 +312,7 @@ td {{ border-top: 1px solid var(--line); }} .number {{ text-align: right; font-v
 .small {{ font-size: .85rem; opacity: .75; margin: .2rem 0; }}
 figure {{ display: inline-block; width: min(440px, 100%); margin: 1rem 1rem 0 0; vertical-align: top; }}
 figcaption {{ font-weight: 600; }}
-svg {{ width: 100%; background: var(--soft); border-radius: 4px; }} polyline {{ fill: none; stroke-width: 1.5; }}
+svg {{ width: 100%; background: var(--soft); border-radius: 4px; }}
 pre {{ overflow: auto; background: var(--soft); padding: .8rem; border-radius: 4px; }}
 </style>
 {body}

@@ -40,13 +40,8 @@ SETTINGS = {
     "PREFECT_SERVER_SERVICES_TASK_RUN_RECORDER_FLUSH_INTERVAL": "1",
     "PREFECT_SERVER_SERVICES_EVENT_PERSISTER_BATCH_SIZE": "500",
     "PREFECT_SERVER_SERVICES_EVENT_PERSISTER_READ_BATCH_SIZE": "200",
-    # services for deployments, which nobody makes here: they would only poll
-    "PREFECT_SERVER_SERVICES_SCHEDULER_ENABLED": "false",
-    "PREFECT_SERVER_SERVICES_LATE_RUNS_ENABLED": "false",
-    "PREFECT_SERVER_SERVICES_PAUSE_EXPIRATIONS_ENABLED": "false",
-    "PREFECT_SERVER_SERVICES_CANCELLATION_CLEANUP_ENABLED": "false",
-    "PREFECT_SERVER_SERVICES_FOREMAN_ENABLED": "false",
-    "PREFECT_SERVER_SERVICES_TRIGGERS_ENABLED": "false",
+    # a slot that a killed run held is free again, also after the server was started anew
+    "PREFECT_SERVER_CONCURRENCY_LEASE_STORAGE": "prefect.server.concurrency.lease_storage.filesystem",
 }
 
 
@@ -77,7 +72,7 @@ class Server:
         if self._in_use is None:
             self._in_use = (self.folder / "in-use").open("a")
             fcntl.flock(self._in_use, fcntl.LOCK_SH)  # waits for a guard that is just ending its server
-        if not self._guarded():
+        if not self.is_guarded():
             with self.log.open("ab") as log:
                 subprocess.run(
                     [sys.executable, "-m", "flows.server", str(self.folder), str(self.prefect_home)],
@@ -114,7 +109,7 @@ class Server:
         while time.monotonic() < deadline:
             if (address := self.address()) is not None and answers(address, timeout_s=5.0):
                 return f"{address}/api"
-            if not self._guarded():
+            if not self.is_guarded():
                 if starts == STARTS:
                     break
                 starts += 1
@@ -129,7 +124,7 @@ class Server:
     def address(self) -> str | None:
         """Where it is, or will be when it has started; None when it does not run."""
         state = self._state()
-        return f"http://{HOST}:{state['port']}" if state and self._guarded() else None
+        return f"http://{HOST}:{state['port']}" if state and self.is_guarded() else None
 
     def keep(self) -> None:
         """Do not end it for want of users."""
@@ -143,12 +138,12 @@ class Server:
         """
         (self.folder / "keep").unlink(missing_ok=True)
         state = self._state()
-        if not self._guarded() or state is None:
+        if not self.is_guarded() or state is None:
             return False
         with suppress(ProcessLookupError):
             os.kill(state["guard"], signal.SIGTERM)
         deadline = time.monotonic() + timeout_s
-        while self._guarded():
+        while self.is_guarded():
             if time.monotonic() > deadline:
                 raise ServerUnavailable(f"process {state['guard']} did not end; see {self.log}")
             time.sleep(0.05)
@@ -167,8 +162,9 @@ class Server:
         except (OSError, ValueError, KeyError, TypeError):
             return None
 
-    def _guarded(self) -> bool:
-        with _locked(self.folder / "guard", shared=True) as free:
+    def is_guarded(self) -> bool:
+        """Whether its guard is there: it runs, or starts."""
+        with locked(self.folder / "guard", shared=True) as free:
             return not free
 
 
@@ -187,7 +183,7 @@ def answers(address: str, timeout_s: float) -> bool:
 
 def guard(folder: Path, prefect_home: Path) -> int:
     """Run the server until it is told to stop, ends by itself, or nobody uses it."""
-    with _locked(folder / "guard", patience_s=1.0) as alone:
+    with locked(folder / "guard", patience_s=1.0) as alone:
         if not alone:
             return 0  # another guard was quicker
         state = folder / "server.json"
@@ -196,7 +192,7 @@ def guard(folder: Path, prefect_home: Path) -> int:
         idle_s = float(os.environ.get("DG4D_SERVER_IDLE_S", IDLE_S))
         port = _free_port(state)
         process = _serve(port, prefect_home)
-        signal.signal(signal.SIGTERM, _leave)
+        signal.signal(signal.SIGTERM, leave)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:
             scratch = state.with_suffix(".new")
@@ -205,7 +201,7 @@ def guard(folder: Path, prefect_home: Path) -> int:
             return _watch(process, folder, idle_s)
         finally:
             state.unlink(missing_ok=True)
-            _end(process)
+            end(process)
 
 
 def _watch(process: subprocess.Popen[bytes], folder: Path, idle_s: float) -> int:
@@ -218,12 +214,12 @@ def _watch(process: subprocess.Popen[bytes], folder: Path, idle_s: float) -> int
         if (folder / "keep").exists():
             last_use = time.monotonic()
             continue
-        with _locked(folder / "in-use") as unused:
+        with locked(folder / "in-use") as unused:
             if not unused:
                 last_use = time.monotonic()
             elif time.monotonic() - last_use > idle_s:
                 (folder / "server.json").unlink(missing_ok=True)
-                _end(process)
+                end(process)
                 return 0
 
 
@@ -236,11 +232,12 @@ def _serve(port: int, prefect_home: Path) -> subprocess.Popen[bytes]:
         [sys.executable, "-m", "uvicorn", *application, "--host", HOST, "--port", str(port), "--log-level", "warning"],
         env=environment,
         cwd=prefect_home,
-        preexec_fn=_die_with_parent,  # noqa: PLW1509 - the guard has one thread
+        preexec_fn=die_with_parent,  # noqa: PLW1509 - the guard has one thread
     )
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
+def end(process: subprocess.Popen[bytes]) -> None:
+    """End a process, gently first."""
     process.terminate()
     try:
         process.wait(8.0)
@@ -249,11 +246,13 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         process.wait()
 
 
-def _leave(number: int, frame: FrameType | None) -> None:
+def leave(number: int, frame: FrameType | None) -> None:
+    """What a guard does when it is told to stop."""
     sys.exit(0)
 
 
-def _die_with_parent() -> None:
+def die_with_parent() -> None:
+    """Have the kernel end this process when the one that started it ends, however it does."""
     if sys.platform.startswith("linux"):
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
@@ -277,7 +276,7 @@ def _free_port(state: Path) -> int:
 
 
 @contextmanager
-def _locked(path: Path, *, shared: bool = False, patience_s: float = 0.0) -> Iterator[bool]:
+def locked(path: Path, *, shared: bool = False, patience_s: float = 0.0) -> Iterator[bool]:
     """Hold the lock of a file while the block runs; gives whether it could be had.
 
     Args:

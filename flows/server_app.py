@@ -1,14 +1,16 @@
-"""The application of the background server: Prefect's own, and the artifacts of the store at one more address."""
+"""The application of the background server: Prefect's own, and at two more addresses what the store holds."""
 
-from pathlib import PurePath
+from pathlib import Path, PurePath
 
 from fastapi import FastAPI, Response
-from fastapi.responses import FileResponse, PlainTextResponse
+from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse
 from prefect.server.api.server import create_app as prefect_app
 from pydantic import ValidationError
 
+from dg4d_lib.errors import BadInput
 from flows import home
-from flows.pages import ARTIFACT_ADDRESS
+from flows.pages import ARTIFACT_ADDRESS, VIEWER_ADDRESS
+from flows.view import page_of_package
 from steps.contract import ArtifactRef
 
 SHOWN = {".png": "image/png", ".json": "application/json"}  # what a browser shows; the rest is saved to disk
@@ -17,14 +19,40 @@ SHOWN = {".png": "image/png", ".json": "application/json"}  # what a browser sho
 def create_app() -> FastAPI:
     """Prefect's application with the artifacts in front; needs DG4D_HOME in the environment."""
     application = prefect_app()
-    application.add_api_route(ARTIFACT_ADDRESS + "{digest}/{size}/{name}", artifact, response_class=Response)
     routes = application.router.routes
-    routes.insert(0, routes.pop())  # before the user interface, which answers to every address
+    for place, answer in ((ARTIFACT_ADDRESS, artifact), (VIEWER_ADDRESS, viewer)):
+        application.add_api_route(place + "{digest}/{size}/{name}", answer, response_class=Response)
+        routes.insert(0, routes.pop())  # before the user interface, which answers to every address
     return application
 
 
 def artifact(digest: str, size: int, name: str) -> Response:
     """One file of the store, by the address that `pages.address` gives."""
+    path = _path(digest, size)
+    if isinstance(path, Response):
+        return path
+    kind = SHOWN.get(PurePath(name).suffix)
+    return FileResponse(
+        path,
+        media_type=kind or "application/octet-stream",
+        filename=PurePath(name).name,
+        content_disposition_type="inline" if kind else "attachment",
+    )
+
+
+def viewer(digest: str, size: int, name: str) -> Response:
+    """The page that plays a package of the store."""
+    path = _path(digest, size)
+    if isinstance(path, Response):
+        return path
+    try:
+        return HTMLResponse(page_of_package(path, PurePath(name).stem))
+    except BadInput as error:
+        return PlainTextResponse(str(error), 404)
+
+
+def _path(digest: str, size: int) -> Path | Response:
+    """An artifact's file, or the answer that says why there is none."""
     try:
         ref = ArtifactRef(digest=f"sha256:{digest}", media_type="application/octet-stream", size_bytes=size)
     except ValidationError:
@@ -32,10 +60,4 @@ def artifact(digest: str, size: int, name: str) -> Response:
     store = home.store()
     if not store.has(ref):
         return PlainTextResponse("this artifact is not in the store; run the same command again to renew it", 404)
-    kind = SHOWN.get(PurePath(name).suffix)
-    return FileResponse(
-        store.path(ref),
-        media_type=kind or ref.media_type,
-        filename=PurePath(name).name,
-        content_disposition_type="inline" if kind else "attachment",
-    )
+    return store.path(ref)

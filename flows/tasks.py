@@ -2,9 +2,11 @@
 
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
+import httpx
 from prefect import task
 from prefect.artifacts import (
     create_link_artifact,
@@ -21,11 +23,12 @@ from prefect.tasks import Task, exponential_backoff
 from prefect.transactions import IsolationLevel
 from pydantic import BaseModel
 
-from flows import home, pages
+from flows import home, pages, resources
 from flows.caching import FileLocks, RequestPolicy
 from flows.events import StepEvent, tell
 from flows.executors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable, chosen
 from flows.leases import hold
+from flows.showing import show
 from steps.contract import ArtifactRef, StepRequest, StepResult
 from steps.main import catalog, request_version
 from steps.store import StoreUnreachable
@@ -76,25 +79,34 @@ def run_step(request: StepRequest, item: str, label: str) -> dict[str, Any]:
         tell(StepEvent(item, label, "note", text=text))
 
     try:
-        result = chosen()(spec, request, on_progress, say)
+        with resources.slot(resources.resource_of(request), say):
+            result = chosen()(spec, request, on_progress, say)
     except StepError as error:
-        pages.show_failure(item, label, error, home.store(), create_markdown_artifact)
+        show(
+            create_markdown_artifact,
+            key=pages.key(label, item),
+            markdown=pages.failure_page(label, item, error, home.store()),
+            description=f"{label} of {item} failed",
+        )
         raise
     page.update(1, 1, {})
     for note in (*result.provenance.notes, *result.provenance.run_notes):
         get_run_logger().info(note)
-    create_markdown_artifact(
+    show(
+        create_markdown_artifact,
         key=pages.key(label, item),
         markdown=pages.step_page(label, item, result, home.store()),
         description=f"{label} of {item}",
     )
-    create_table_artifact(
+    show(
+        create_table_artifact,
         key=pages.key(f"outputs {label}", item),
         table=pages.output_rows(result, spec),
         description=f"Files that {label} of {item} made",
     )
     name, ref = next(iter(result.outputs.items()))
-    create_link_artifact(
+    show(
+        create_link_artifact,
         key=pages.key(f"file {label}", item),
         link=pages.address(name, ref, spec.outputs[name].suffix),
         link_text=f"{name}{spec.outputs[name].suffix}",
@@ -104,8 +116,13 @@ def run_step(request: StepRequest, item: str, label: str) -> dict[str, Any]:
 
 
 def may_help(_task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
-    """Whether to try again: memory may be free, the store back; a crash gets one more chance, bad input stays bad."""
+    """Whether to try again: memory may be free, the store back; a crash gets one more chance, bad input stays bad.
+
+    What the user stopped is not begun again.
+    """
     error = state.result(raise_on_failure=False)
+    if resources.stopping.is_set():
+        return False
     if isinstance(error, StepOutOfMemory | StepUnreachable | StoreUnreachable):
         return True
     return isinstance(error, StepCrashed | OSError) and run.run_count <= 1
@@ -206,7 +223,7 @@ def _task(step: str, item: str, label: str) -> Task[..., Any]:
     return run_step.with_options(
         name=step,
         task_run_name=f"{label}: {item}",
-        tags=[f"step:{step}", f"item:{item}"],
+        tags=[f"step:{step}", f"item:{item}", f"resource:{catalog()[step].resource}"],
         cache_policy=policy.configure(isolation_level=IsolationLevel.SERIALIZABLE, lock_manager=locks),
         result_storage=home.records(),
         retries=RETRIES,
@@ -230,7 +247,8 @@ class _ProgressPage:
         self._last = now
         share = PROGRESS_DONE * done / max(total, 1)
         text = ", ".join([f"{self._what}: {done}/{total}", *(f"{name} {value:.4g}" for name, value in values.items())])
-        if self._artifact is None:
-            self._artifact = create_progress_artifact(share, key=self._key, description=text)
-        else:
-            update_progress_artifact(self._artifact, share, description=text)
+        with suppress(httpx.TransportError):  # the step goes on while the server is away
+            if self._artifact is None:
+                self._artifact = create_progress_artifact(share, key=self._key, description=text)
+            else:
+                update_progress_artifact(self._artifact, share, description=text)

@@ -23,6 +23,7 @@ Result = TypeVar("Result")
 
 LINE_EVERY_S = 10.0  # between two lines about one step, where there is no terminal
 WIDE = 130  # columns, from which all values of a step fit beside its bar
+ROWS_SHOWN = 30  # of a batch
 COUNTED = 1  # totals up to this say nothing as a fraction
 
 
@@ -143,6 +144,7 @@ class BatchTable:
         if event.item not in self.status:
             return
         self._since.setdefault(event.item, time.monotonic())
+        self._took.pop(event.item, None)  # it may be tried again
         self.status[event.item] = "running"
         detail = numbers(event) if event.kind == "progress" else event.text or event.kind
         self._doing[event.item] = f"{event.step}: {detail}"
@@ -153,14 +155,16 @@ class BatchTable:
         self._took[item] = time.monotonic() - self._since.get(item, time.monotonic())
 
     def __rich__(self) -> Table:
-        """The table as it is; long batches show what is running and what failed."""
+        """The table as it is; long batches show what is running and what failed last."""
         done = sum(status in INK and status not in {"waiting", "running"} for status in self.status.values())
         table = Table(title=f"{done} of {len(self.status)}", title_justify="left", expand=False)
         for heading in ("item", "status", "time", "what"):
             table.add_column(heading, overflow="ellipsis", no_wrap=True, max_width=72)
-        shown = [
-            item for item, status in self.status.items() if len(self.status) <= 30 or status in {"running", "failed"}
-        ]
+        shown = list(self.status)
+        if len(shown) > ROWS_SHOWN:
+            running = [item for item, status in self.status.items() if status == "running"]
+            failed = [item for item, status in self.status.items() if status == "failed"]
+            shown = [*running, *failed[-max(ROWS_SHOWN - len(running), 1) :]]
         for item in shown:
             status = self.status[item]
             took = self._took.get(item, time.monotonic() - self._since[item] if item in self._since else 0.0)

@@ -3,6 +3,7 @@
 import os
 import sys
 import webbrowser
+import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,24 @@ def page_of(record: Mapping[str, Any], read: Callable[[str], bytes]) -> str:
         read(name) if name in record["files"] else None for name in (WEB_SPLATS, SUBJECT, DRIVING)
     )
     return viewer_page(record.get("item", "asset"), read(ASSET), splats, picture, video, facts_of(record))
+
+
+def page_of_package(package: Path, title: str) -> str:
+    """The page of a package that is still a zip, without the provenance that goes with it when it is delivered.
+
+    Raises:
+        BadInput: it is no package.
+    """
+    try:
+        with zipfile.ZipFile(package) as archive:
+            sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
+            splats, picture, video = (
+                archive.read(name) if name in sizes else None for name in (WEB_SPLATS, SUBJECT, DRIVING)
+            )
+            facts = {"Files": {name: readable(size) for name, size in sizes.items()}}
+            return viewer_page(title, archive.read(ASSET), splats, picture, video, facts)
+    except (zipfile.BadZipFile, KeyError) as error:
+        raise BadInput(f"{title} is no package that can be viewed") from error
 
 
 def facts_of(record: Mapping[str, Any]) -> dict[str, Any]:

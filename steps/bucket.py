@@ -1,8 +1,8 @@
-"""The store in a bucket of an S3-compatible object store, with a folder of copies in front; and opening any store."""
+"""The store in a bucket of an S3-compatible object store, with a folder of copies in front."""
 
-import functools
 import hashlib
 import os
+import shutil
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,21 +15,28 @@ import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError, PermissionDeniedError, UnauthenticatedError
 from obstore.store import S3Store
 
-from dg4d_lib.errors import BackendUnavailable, BadInput
+from dg4d_lib.errors import BackendUnavailable
 from steps.contract import ArtifactRef
-from steps.store import CHUNK, OBJECTS, ArtifactMissing, ArtifactStore, Entry, StoreUnreachable, home, object_name
+from steps.opening import ENDPOINTS, LOOPBACK
+from steps.store import (
+    CHUNK,
+    OBJECTS,
+    ArtifactMissing,
+    ArtifactStore,
+    Entry,
+    StoreUnreachable,
+    object_name,
+    room_for,
+)
 
 if TYPE_CHECKING:
     from obstore.store import ClientConfig, ObjectStore
 
-PATIENCE_S = 120.0  # a request that gets no answer is repeated for so long
 CONNECT_S = 10.0
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 5.0  # between two attempts
 MOST_ATTEMPTS = 10_000  # patience ends them first
 READ_AHEAD = 8 * CHUNK  # bytes of one request for a part of an artifact
 CLOCK = "clock"  # a file that is written to learn the time
-ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
-LOOPBACK = {"localhost", "127.0.0.1", "::1"}
 
 
 class BucketStore(ArtifactStore):
@@ -113,6 +120,18 @@ class BucketStore(ArtifactStore):
                 return bytes(obstore.get(self._bucket, name).bytes())
         except FileNotFoundError:
             return None
+
+    def fetch(self, name: str, path: Path) -> None:
+        """Copy any file of the bucket to `path`, in parts.
+
+        Raises:
+            FileNotFoundError: there is none of that name.
+            DiskFull: there is no room at `path`.
+            StoreUnreachable: the bucket does not answer.
+        """
+        with self._answering(), room_for(path.parent), path.open("wb") as target:
+            reader = obstore.open_reader(self._bucket, name, buffer_size=READ_AHEAD)
+            shutil.copyfileobj(cast(BinaryIO, reader), target, READ_AHEAD)
 
     def write(self, name: str, text: str) -> None:
         """Write a small file, or replace it."""
@@ -205,30 +224,16 @@ class BucketStore(ArtifactStore):
             raise BackendUnavailable(f"{self.address}: there is no such bucket; make it first") from error
 
 
-def open_store(address: str | Path | None = None, patience_s: float | None = None) -> ArtifactStore:
-    """The store at an address: a folder, or `s3://BUCKET/PREFIX` with the usual AWS_* variables.
+def open_bucket(address: str, copies: Path, patience_s: float) -> BucketStore:
+    """The store at `s3://BUCKET/PREFIX`, with the usual AWS_* variables.
 
     Args:
-        address: default: `$DG4D_STORE`, else the folder `store` under the home folder.
-        patience_s: how long requests to an object store are repeated before they fail; `PATIENCE_S` without it.
-
-    Raises:
-        BadInput: an address of something else.
+        address: that.
+        copies: the folder of copies.
+        patience_s: how long requests are repeated before they fail.
     """
-    given = str(address or os.environ.get("DG4D_STORE") or home() / "store")
-    return _opened(given, home() / "copies", PATIENCE_S if patience_s is None else patience_s)
-
-
-@functools.cache
-def _opened(given: str, copies: Path, patience_s: float) -> ArtifactStore:
-    """One store of a kind in a process: it keeps connections, and remembers which files are sound."""
-    if "://" not in given:
-        return ArtifactStore(Path(given).expanduser())
-    parts = urlsplit(given)
-    if parts.scheme != "s3" or not parts.netloc:
-        raise BadInput(f"the store {given!r} is neither a folder nor of the form s3://BUCKET/PREFIX; set $DG4D_STORE")
     bucket = S3Store.from_url(
-        given,
+        address,
         client_options=_client_options(),
         retry_config={
             "max_retries": MOST_ATTEMPTS,
@@ -240,7 +245,7 @@ def _opened(given: str, copies: Path, patience_s: float) -> ArtifactStore:
             },
         },
     )
-    return BucketStore(bucket, copies, given)
+    return BucketStore(bucket, copies, address)
 
 
 def _client_options() -> "ClientConfig":

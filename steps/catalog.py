@@ -49,6 +49,7 @@ STEPS: dict[str, StepSpec] = {
             settings="dg4d_lib.settings:TextSettings",
             inputs={"text": TEXT},
             outputs={"picture": PNG},
+            resource="gpu",
         ),
         StepSpec(
             name="prepare_subject",
@@ -56,7 +57,8 @@ STEPS: dict[str, StepSpec] = {
             entry="steps.prepare_subject:run",
             settings="dg4d_lib.settings:SubjectSettings",
             inputs={"source": SOURCE},
-            outputs={"subject": PNG, "footage": _optional(FRAMES)},
+            outputs={"subject": PNG, "footage": _optional(FRAMES), "picture": PNG},
+            timeout_s=2400,  # a decoder that hangs in one frame cannot be stopped from within
         ),
         StepSpec(
             name="drive_video",
@@ -66,10 +68,12 @@ STEPS: dict[str, StepSpec] = {
             inputs={"subject": PNG, "footage": _optional(FRAMES)},
             outputs={
                 "driving_video": FRAMES,
+                "picture": PNG,
                 "candidates": _optional(PNG),
                 "ranking": _optional(RANKING),
                 "films": _optional(FILMS),
             },
+            resource="gpu",
         ),
         StepSpec(
             name="fit_gaussians",
@@ -78,6 +82,7 @@ STEPS: dict[str, StepSpec] = {
             settings="steps.profiles:FitGaussiansSettings",
             inputs={"subject": PNG, "bank": _optional(BANK)},
             outputs={"gaussians": PLY, "curves": CURVES, "picture": PNG},
+            resource="gpu",
         ),
         StepSpec(
             name="fit_motion",
@@ -86,6 +91,7 @@ STEPS: dict[str, StepSpec] = {
             settings="steps.profiles:FitMotionSettings",
             inputs={"gaussians": PLY, "driving_video": FRAMES, "bank": _optional(BANK)},
             outputs={"motion": MOTION, "gaussians": _optional(PLY), "curves": CURVES, "picture": PNG},
+            resource="gpu",
         ),
         StepSpec(
             name="extract_mesh",
@@ -102,6 +108,7 @@ STEPS: dict[str, StepSpec] = {
             settings="steps.profiles:RefineTextureSettings",
             inputs={"tracked": _optional(TRACKED), "meshes": _optional(MESHES), "driving_video": FRAMES},
             outputs={"tracked": _optional(TRACKED), "meshes": _optional(MESHES)},
+            resource="gpu",
         ),
         StepSpec(
             name="pack_asset",
@@ -133,6 +140,7 @@ STEPS: dict[str, StepSpec] = {
             settings="steps.profiles:ScoreAssetSettings",
             inputs={"package": _optional(PACKAGE), "truth": TRUTH},
             outputs={"scores": SCORES, "films": FILMS},
+            resource="gpu",
         ),
     )
 }

@@ -1,7 +1,8 @@
 """Moving pictures of users, through PyAV: counted first, then only the wanted frames are kept, already small."""
 
 import math
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -15,13 +16,15 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.video.framing import shrink
-from steps.stills import check_size
+from steps.stills import MOST_PIXELS, check_size
 
 LARGEST_SIDE = 1024  # pixels of a frame that is worked on
 MOST_WORK = (
     32 * LARGEST_SIDE**2
 )  # pixels of all frames together: half a gigabyte as float32 RGBA; more frames, smaller ones
 MOST_FRAMES = 9000  # five minutes at 30 per second; every one must be decoded
+MOST_DECODED = 40_000_000_000  # pixels of all frames as they come: nine thousand of 2560 x 1600
+MOST_DECODING_S = 900.0  # for reading a video once; only files that are made to take long need so much
 USUAL_FPS = 24.0  # assumed when a file does not tell
 SAME_RATE = 0.02  # relative difference up to which the rate in the header is believed over the time stamps
 ALPHA_DECODERS = {"vp9": "libvpx-vp9", "vp8": "libvpx"}  # the default ones drop the alpha plane of WebM
@@ -55,15 +58,7 @@ class Clip:
 
     def __init__(self, path: Path, container: str, what: str = "the video") -> None:
         self._path, self._container, self._what = path, container, what
-        times: list[float | None] = []
-        for frame in self._frames():
-            if not times:
-                check_size(frame.width, frame.height, what)
-            times.append(frame.time)
-            if len(times) > MOST_FRAMES:
-                raise BadInput(
-                    f"{what} has more than {MOST_FRAMES} frames; cut it to the part that should become an animation"
-                )
+        times = [frame.time for frame in self._frames()]
         self.count = len(times)
         if self.announced > 0 and self.count == 0:
             raise BadInput(
@@ -99,12 +94,31 @@ class Clip:
                 self._header_rate = float(stream.average_rate or 0)
                 name = ALPHA_DECODERS.get(context.name, "") if stream.metadata.get("alpha_mode") == "1" else ""
                 decoder = cast(VideoCodecContext, av.CodecContext.create(name, "r")) if name else context
-                for packet in container.demux(stream):
-                    yield from decoder.decode(packet)
+                decoder.options = {"max_pixels": str(MOST_PIXELS)}  # frames may be larger than the header says
+                yield from self._bounded(
+                    frame for packet in container.demux(stream) for frame in decoder.decode(packet)
+                )
         except FFmpegError as error:
             raise BadInput(
                 f"{self._what} is cut off or broken ({error.strerror}); copy it again, or export it as H.264 mp4"
             ) from error
+
+    def _bounded(self, frames: Iterable[av.VideoFrame]) -> Iterator[av.VideoFrame]:
+        """The frames of one reading, for as long as number, size and time are within reason."""
+        start, pixels = time.monotonic(), 0
+        for number, frame in enumerate(frames, 1):
+            check_size(frame.width, frame.height, self._what)
+            pixels += frame.width * frame.height
+            if number > MOST_FRAMES or pixels > MOST_DECODED:
+                raise BadInput(
+                    f"{self._what} has more than {MOST_FRAMES} frames, or more than {MOST_DECODED // 10**9} billion "
+                    "pixels in all; cut it to the part that should become an animation, or export it smaller"
+                )
+            if time.monotonic() - start > MOST_DECODING_S:
+                raise BadInput(
+                    f"{self._what} takes more than {MOST_DECODING_S:g} s to read; cut it, or export it smaller"
+                )
+            yield frame
 
     def _rate(self, times: Sequence[float | None]) -> float:
         known = [time for time in times if time is not None]

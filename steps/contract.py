@@ -15,7 +15,7 @@ EXIT_MISSING = 69  # something needed is not here
 EXIT_OUT_OF_MEMORY = 137
 
 RUN_ONLY = frozenset(  # fields of a record that are no part of its digest
-    ["started", "duration_s", "peak_memory_mb", "flops", "run_notes", "machine"]
+    ["started", "duration_s", "cpu_s", "peak_memory_mb", "flops", "run_notes", "machine"]
 )
 
 Digest = Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")]
@@ -52,7 +52,9 @@ class StepSpec(Frozen):
     settings: str = Field(pattern=r"^[\w.]+:\w+$", description="module:class of its settings")
     inputs: dict[str, Port]
     outputs: dict[str, Port]
-    image: Literal["cpu", "cuda"] = "cpu"
+    resource: Literal["cpu", "gpu"] = Field(
+        "cpu", description="gpu: it has a GPU to itself where its settings use one; drawing on one in passing is cpu"
+    )
     timeout_s: float = Field(3600, gt=0)
 
 
@@ -92,6 +94,7 @@ class ProvenanceRecord(Frozen):
     flops: dict[str, int] = Field({}, description="floating-point operations of networks, by the name of their class")
     started: str = Field("", description="when, in UTC, as ISO 8601")
     duration_s: float = Field(ge=0)
+    cpu_s: float = Field(0.0, ge=0, description="seconds of all cores, of the step's process and those it started")
     peak_memory_mb: float = Field(ge=0)
     machine: dict[str, str] = Field({}, description="what computed it (steps/machine.py)")
 

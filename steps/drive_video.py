@@ -27,7 +27,7 @@ from steps.media import read_frames, read_png, write_frames, write_png, write_zi
 from steps.profiles import DriveVideoSettings
 from steps.weights import open_weights
 
-TILE, COLUMNS = 160, 7  # pixels and moments of the sheet of candidates
+TILE, COLUMNS = 160, 7  # pixels and moments of the sheets
 FILM = 256  # pixels of their films
 WHITE = torch.ones(3)
 
@@ -64,6 +64,7 @@ def run(job: Job) -> Facts:
             origin = "Stable Video Diffusion ({})"
     taken, verdict = _tournament(job, subject, motions) if len(motions) > 1 else (motions[0], ())
     write_frames(job.outputs["driving_video"], taken.video)
+    write_png(job.outputs["picture"], videos_sheet([taken.video], [taken.name], TILE, COLUMNS))
     made_up = f"The motion is made up by {origin.format(taken.name)}."
     return replace(facts, notes=(made_up, *verdict, *taken.notes, *facts.notes))
 
@@ -78,6 +79,7 @@ def _follow(job: Job, subject: Float[Tensor, "h w 4"]) -> Facts:
         sizes = [f"{shape[1]} x {shape[0]}" for shape in (footage.frames.shape[1:3], subject.shape[:2])]
         raise BadInput(f"the footage is {sizes[0]} pixels and the subject {sizes[1]}; prepare both together")
     copyfile(job.inputs["footage"], job.outputs["driving_video"])
+    write_png(job.outputs["picture"], videos_sheet([footage], ["footage"], TILE, COLUMNS))
     found = score(footage, subject)
     why = "; ".join(found.remarks) or f"its score is low in {found.weakest}"
     note = f"The footage may be hard to follow (score {found.total:.2f} of 1): {why}."

@@ -1,4 +1,8 @@
-"""From Gaussians and their motion to textured triangles: one mesh that moves, or a mesh per frame."""
+"""From Gaussians and their motion to textured triangles: one mesh that moves, or a mesh per frame.
+
+In the mode `auto` there is no mesh where one cannot follow the motion: the step says so, and meshes per frame are made
+instead.
+"""
 
 import torch
 from jaxtyping import Float, Int
@@ -29,9 +33,8 @@ from steps.meshfiles import write_meshes, write_tracked
 from steps.motions import read_motion
 from steps.profiles import ExtractMeshSettings
 
-PICTURE_SIZE = 256  # pixels of one view
-PICTURE_AZIMUTHS_DEG = (0.0, 75.0, 180.0, 285.0)
-FOLLOWS = 0.85  # intersection over union on trial, below which the user is told of the other mode
+PICTURE_CAMERAS = [OrbitCamera(0, azimuth, width=256, height=256) for azimuth in (0.0, 75.0, 180.0, 285.0)]
+FOLLOWS = 0.85  # intersection over union on trial, below which one mesh does not follow a motion
 FPS_UNKNOWN = 1.0  # frames per second: motion has no clock; refine_texture, which sees the driving video, sets it
 
 
@@ -48,12 +51,17 @@ def run(job: Job) -> Facts:
     with torch.no_grad():
         displacement = deformation.displace(gaussians.means, torch.linspace(0, 1, frames))
     states = displacement.apply(gaussians)
-    frame, followed = best_rest(states, displacement, rasterize, settings.mesh) if _tracks(settings) else (0, 1.0)
+    one = settings.mesh.mode != "per_frame"
+    frame, followed = best_rest(states, displacement, rasterize, settings.mesh) if one else (0, 1.0)
     rest = states.at(frame)
+    if settings.mesh.mode == "auto" and followed < FOLLOWS:
+        write_png(job.outputs["picture"], _picture_of_splats(rest, rasterize))
+        note = f"one mesh does not follow this motion ({followed:.1%} IoU on trial): every frame gets its own"
+        return Facts(backend=f"{settings.rasterizer} rasterizer", notes=(note,))
     level, agreement = best_level(density_field(rest, settings.mesh), rest, rasterize, settings.mesh.density_threshold)
     notes = [f"surface at density {level:.3g}; its outlines agree with the Gaussians' to {agreement:.1%} (IoU)"]
 
-    if _tracks(settings):
+    if one:
         job.progress(1, 3, {})
         mesh, offsets = _tracked(states, displacement, frame, level, rasterize, settings.mesh)
         job.progress(2, 3, {})
@@ -77,10 +85,6 @@ def run(job: Job) -> Facts:
         picture = _picture(meshes[settings.first_frame])
     write_png(job.outputs["picture"], picture)
     return Facts(backend=f"{settings.rasterizer} rasterizer, pymeshlab, xatlas", notes=tuple(notes))
-
-
-def _tracks(settings: ExtractMeshSettings) -> bool:
-    return settings.mesh.mode == "tracked"
 
 
 def textured(gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings) -> TexturedMesh:
@@ -139,6 +143,12 @@ def _facts(mesh: TexturedMesh) -> MeshFacts:
 
 def _picture(mesh: TexturedMesh) -> Float[Tensor, "h w 3"]:
     """Four views in a row, over white."""
-    cameras = [OrbitCamera(0, azimuth, width=PICTURE_SIZE, height=PICTURE_SIZE) for azimuth in PICTURE_AZIMUTHS_DEG]
-    color, coverage = render_mesh(mesh, cameras)
+    color, coverage = render_mesh(mesh, PICTURE_CAMERAS)
     return torch.cat(list(color * coverage + 1 - coverage), 1)
+
+
+def _picture_of_splats(gaussians: Gaussians, rasterize: Rasterizer) -> Float[Tensor, "h w 3"]:
+    """The same views of a cloud."""
+    white = torch.ones(3, device=gaussians.means.device)
+    with torch.no_grad():
+        return torch.cat(list(rasterize(gaussians, PICTURE_CAMERAS, white).color.clamp(0, 1)), 1)

@@ -26,6 +26,7 @@ import resource
 import signal
 import sys
 import tempfile
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -38,7 +39,6 @@ from pydantic import BaseModel, ValidationError
 
 from dg4d_lib.diffusion.ledger import counting_flops
 from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
-from steps.bucket import open_store
 from steps.contract import (
     EXIT_BAD_INPUT,
     EXIT_DONE,
@@ -53,6 +53,7 @@ from steps.contract import (
 )
 from steps.job import Facts, Job, Progress
 from steps.machine import machine
+from steps.opening import open_store
 from steps.store import NO_SPACE, ArtifactMissing, ArtifactStore, StoreUnreachable, write_atomically
 from steps.weights import require_same
 
@@ -83,11 +84,13 @@ def catalog() -> dict[str, StepSpec]:
 def code_version(spec: StepSpec) -> str:
     """Twelve digits that change with any source file of the library, of the steps, or of the step's own module.
 
-    An image in which the code cannot change may say `$DG4D_CODE_VERSION` instead, for example its own digest.
+    A process reads them once, for what it imported stays; a step in a process of its own refuses a request that was
+    made for other code. An image in which the code cannot change may say `$DG4D_CODE_VERSION` instead, for example its
+    own digest.
     """
     if fixed := os.environ.get("DG4D_CODE_VERSION"):
         return fixed
-    content = hashlib.sha256(_source_digest(tuple(_source_files())).encode())
+    content = hashlib.sha256(_source_digest().encode())
     module = spec.entry.partition(":")[0]
     if module.partition(".")[0] not in {"dg4d_lib", "steps"}:
         found = importlib.util.find_spec(module)
@@ -159,7 +162,9 @@ def main(arguments: list[str] | None = None) -> int:
         "--store", help="of the artifacts: a folder or s3://BUCKET/PREFIX (default: $DG4D_STORE, else $DG4D_HOME/store)"
     )
     parser.add_argument("--progress", type=Path, help="write progress here instead of to standard output")
-    parser.add_argument("--parent", type=int, help="process without which this one should not live")
+    parser.add_argument(
+        "--parent", help="process without which this one should not live; -: whoever keeps standard input open"
+    )
     given = parser.parse_args(arguments)
     if given.parent is not None:
         _die_with(given.parent)
@@ -224,25 +229,25 @@ def note_lines(file: TextIO) -> Callable[[str], None]:
     return say
 
 
-def _source_files() -> Iterator[tuple[str, Path, int, int]]:
-    """Every source file of the library and the steps: its name, where it is, when it changed, its size."""
+def _source_files() -> Iterator[tuple[str, Path]]:
+    """Every source file of the library and the steps: its name, and where it is."""
     for package in ("dg4d_lib", "steps"):
         folder = Path(str(importlib.import_module(package).__file__)).parent
         for path in sorted(folder.rglob("*.py")):  # not what compilers leave beside them
-            facts = path.stat()
-            yield f"{package}/{path.relative_to(folder).as_posix()}", path, facts.st_mtime_ns, facts.st_size
+            yield f"{package}/{path.relative_to(folder).as_posix()}", path
 
 
-@functools.lru_cache(maxsize=1)
-def _source_digest(files: tuple[tuple[str, Path, int, int], ...]) -> str:
+@functools.cache
+def _source_digest() -> str:
     content = hashlib.sha256()
-    for name, path, _, _ in files:
+    for name, path in _source_files():
         content.update(f"{name}\0".encode() + path.read_bytes())
     return content.hexdigest()
 
 
 def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scratch: Path) -> StepResult:
     started, start = datetime.now(UTC).isoformat(timespec="milliseconds"), time.perf_counter()
+    busy = _cpu_seconds()
     spec = _checked_spec(request)
     code = code_version(spec)
     if request.version not in {spec.version, f"{spec.version}+{code}"}:
@@ -280,6 +285,7 @@ def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scr
         flops=flops,
         started=started,
         duration_s=round(time.perf_counter() - start, 3),
+        cpu_s=round(_cpu_seconds() - busy, 3),
         peak_memory_mb=round(peak_memory_mb(), 1),
         machine=machine(),
     )
@@ -342,6 +348,9 @@ def _kept(pictures: Path, store: ArtifactStore) -> dict[str, ArtifactRef]:
 def _message(error: BaseException) -> str:
     if isinstance(error, OSError) and error.errno in NO_SPACE:
         return "the disk is full: free some space and run the same command again; finished steps are kept"
+    if kind_of(error) == "out_of_memory":
+        said = f" ({error})" if str(error) else ""
+        return f"memory ran out: end other programs, or choose smaller settings{said}"
     if kind_of(error) == "crashed":
         where = traceback.extract_tb(error.__traceback__)
         place = f" (at {Path(where[-1].filename).name}:{where[-1].lineno})" if where else ""
@@ -375,6 +384,12 @@ def _product_version() -> str:
         return importlib.metadata.version("dg4d")
     except importlib.metadata.PackageNotFoundError:
         return "0"
+
+
+def _cpu_seconds() -> float:
+    """What this process and those that it started, and that ended, have used of all cores."""
+    used = (resource.getrusage(whose) for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(times.ru_utime + times.ru_stime for times in used)
 
 
 def peak_memory_mb() -> float:
@@ -411,12 +426,22 @@ def _prepare_process() -> None:
     mallopt(M_TOP_PAD, 256 * 2**20)
 
 
-def _die_with(parent: int) -> None:
-    """Have the kernel end this process when its parent ends, however it ends."""
+def _die_with(parent: str) -> None:
+    """Have this process end when its parent ends, however it ends."""
+    if parent == "-":
+        threading.Thread(target=_end_with_input, daemon=True).start()
+        return
     if sys.platform.startswith("linux"):
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it ended before we asked
+    if os.getppid() != int(parent):  # it ended before we asked
         sys.exit(EXIT_CRASHED)
+
+
+def _end_with_input() -> None:
+    """The processes of a container end with its first, which is this one; a container's parent is no process in it."""
+    while os.read(0, 1):
+        pass
+    os._exit(EXIT_CRASHED)
 
 
 if __name__ == "__main__":

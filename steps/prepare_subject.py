@@ -3,12 +3,19 @@
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
 from dg4d_lib.settings import SubjectSettings
 from dg4d_lib.video.driving import DrivingVideo
+from dg4d_lib.video.framing import reframe, whole_frame
 from dg4d_lib.video.subject import prepare
 from steps.job import Facts, Job
 from steps.media import write_frames, write_png
 from steps.sources import read_source
+
+TILE = 256  # pixels
 
 
 def run(job: Job) -> Facts:
@@ -27,5 +34,13 @@ def run(job: Job) -> Facts:
     if source.kind == "video":
         footage = DrivingVideo(cutouts[..., :3].contiguous(), cutouts[..., 3:].contiguous(), source.fps)
         write_frames(job.outputs["footage"], footage)
+    write_png(job.outputs["picture"], picture_of(source.frames[0], cutouts[0]))
     job.progress(3, 3, {})
     return Facts(notes=(*source.notes, *notes))
+
+
+def picture_of(source: Float[Tensor, "h w 4"], cutout: Float[Tensor, "s s 4"]) -> Float[Tensor, "t w3 3"]:
+    """The source, its matte and the cut-out side by side, over white."""
+    tiles = [reframe(each[None], whole_frame(*each.shape[:2]), TILE)[0] for each in (source, cutout)]
+    given, cut = (tile[..., :3] * tile[..., 3:] + 1 - tile[..., 3:] for tile in tiles)
+    return torch.cat([given, tiles[1][..., 3:].expand(TILE, TILE, 3), cut], 1)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.video.framing import shrink
-from steps.clips import LARGEST_SIDE, Clip, evenly_spaced, thinned_rate, work_side
+from steps.clips import LARGEST_SIDE, MOST_FRAMES, Clip, evenly_spaced, thinned_rate, work_side
 from steps.stills import decode_still, read_still
 from steps.webp import AnimatedWebp, is_animated
 
@@ -192,6 +192,10 @@ def _is_picture_name(name: str) -> bool:
 def _numbered(entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo]:
     """Entries in the order of the number at the end of their names; of their names where none has a number."""
     _need_two(len(entries), "the folder of frames")
+    if len(entries) > MOST_FRAMES:
+        raise BadInput(
+            f"the folder of frames has {len(entries)} pictures; at most {MOST_FRAMES} are read: leave some out"
+        )
     found = {info.filename: re.search(r"(\d+)$", Path(info.filename).stem) for info in entries}
     if not any(found.values()):
         return sorted(entries, key=lambda info: info.filename)

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
+from steps.clips import MOST_DECODED, MOST_FRAMES
 from steps.stills import check_size, decode_still
 
 HEADER = 12  # bytes of "RIFF", size, "WEBP"
@@ -56,6 +57,10 @@ class AnimatedWebp:
         except (IndexError, struct.error) as error:
             raise BadInput("the WebP animation is cut off or broken; export it again") from error
         check_size(self.width, self.height, "the WebP animation")
+        if len(self._parts) > MOST_FRAMES or len(self._parts) * self.width * self.height > MOST_DECODED:
+            raise BadInput("the WebP animation has too many or too large frames; cut it, or export it smaller")
+        if any(part.left + part.width > self.width or part.top + part.height > self.height for part in self._parts):
+            raise BadInput("a frame of the WebP animation lies outside its canvas; export it again")
         mean_ms = sum(part.duration_ms for part in self._parts) / max(1, len(self._parts))
         self.fps = 1000 / mean_ms if mean_ms > 0 else 10.0
 

@@ -137,7 +137,9 @@ def test_what_is_imported_is_declared() -> None:
 
 
 def test_what_is_declared_is_imported() -> None:
-    assert declared() - used() == {"accelerate"}  # diffusers takes it to load weights without a second copy
+    by_others = {"accelerate"}  # diffusers takes it to load weights without a second copy
+    by_servers = {"prefect-docker", "prefect-kubernetes", "prefect-redis", "distributed"}  # processes of their own
+    assert declared() - used() == by_others | by_servers
 
 
 def test_every_declared_distribution_is_pinned() -> None:

@@ -7,6 +7,7 @@ Every run of a step is noted in the file $FAKE_LOG.
 import json
 import logging
 import os
+import resource
 import signal
 import time
 import zipfile
@@ -43,6 +44,7 @@ def draw_picture(job: Job) -> Facts:
 def prepare_subject(job: Job) -> Facts:
     words = _begin("prepare_subject", job, job.inputs["source"].read_bytes())
     job.outputs["subject"].write_bytes(PNG + words)  # what follows a picture is ignored by those who look at it
+    job.outputs["picture"].write_bytes(PNG)
     if b"moving" in words:
         job.outputs["footage"].write_bytes(words)
     return Facts(notes=("This asset is a fake.",))
@@ -53,6 +55,7 @@ def drive_video(job: Job) -> Facts:
     with zipfile.ZipFile(job.outputs["driving_video"], "w") as archive:
         for i in range(5):
             archive.writestr(zipfile.ZipInfo(f"{i:03d}.png"), words)
+    job.outputs["picture"].write_bytes(PNG)
     driving = job.settings.driving
     if driving.candidates > 1 and not driving.pick:
         rows = [{"number": i, "total": 1 / i, "name": "still", "remarks": []} for i in range(1, driving.candidates + 1)]
@@ -85,19 +88,19 @@ def fit_motion(job: Job) -> Facts:
 def extract_mesh(job: Job) -> Facts:
     words = _begin("extract_mesh", job, job.inputs["motion"].read_bytes())
     settings = job.settings
-    if settings.mesh.mode == "tracked":
-        job.outputs["tracked"].write_bytes(words)
-    else:
+    if settings.mesh.mode == "per_frame":
         with zipfile.ZipFile(job.outputs["meshes"], "w") as archive:
             for i in range(settings.first_frame, settings.end_frame):
                 archive.writestr(zipfile.ZipInfo(f"{i:03d}.safetensors"), f"frame {i}".encode())
+    elif settings.mesh.mode == "tracked" or b"flutters" not in words:
+        job.outputs["tracked"].write_bytes(words)
     job.outputs["picture"].write_bytes(PNG)
     return Facts()
 
 
 def refine_texture(job: Job) -> Facts:
     name = "tracked" if "tracked" in job.inputs else "meshes"
-    _begin("refine_texture", job, b"")
+    _begin("refine_texture", job, job.inputs[name].read_bytes())
     job.outputs[name].write_bytes(job.inputs[name].read_bytes())
     return Facts()
 
@@ -190,6 +193,10 @@ def _obey(command: str, job: Job, step: str) -> None:
         case "sleep-once" if not once.exists():
             once.touch()
             time.sleep(float(value))
+        case "hoard":
+            used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+            resource.setrlimit(resource.RLIMIT_AS, (used + 2**26, resource.getrlimit(resource.RLIMIT_AS)[1]))
+            bytearray(2**30)
         case "full":
             raise OSError(28, "No space left on device")
 

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from flows import acceptance, report
-from flows.summary import NOT_ACCEPTED, Row, judged, write_summary
+from flows.summary import NOT_ACCEPTED, Row, Writer, judged
 from steps.contract import ArtifactRef, ProvenanceRecord, StepResult
 from steps.store import ArtifactStore
 
@@ -125,7 +125,7 @@ def test_the_overview_marks_what_is_not_accepted_and_links_it_all_the_same(tmp_p
         Row(item="worse", status="failed", kind=NOT_ACCEPTED, failing=["motion"]),
         Row(item="later", status="skipped"),
     ]
-    write_summary(tmp_path, rows)
+    Writer(tmp_path).write(rows, 1.0)
     page = (tmp_path / "index.html").read_text()
     cards = {re.search(r"<h2>(\w+)", card)[1]: card for card in page.split("<article")[1:]}  # type: ignore[index]
     assert list(cards) == ["worse", "bad", "fine", "later", "old"]

@@ -72,7 +72,7 @@ def test_an_unknown_profile() -> None:
         ("motion.iterations=0", "greater than or equal to 1"),
         ("motion.iterations=many", "many"),
         ("motion.iterations", "knob=value"),
-        ("mesh.mode=round", "'tracked' or 'per_frame'"),
+        ("mesh.mode=round", "'tracked', 'per_frame' or 'auto'"),
         ("prior.kind=crystal", "crystal"),
     ],
 )
@@ -129,7 +129,7 @@ def test_a_batch_of_nothing() -> None:
 def test_a_batch_of_bad_items_fails_without_a_server_and_says_why(place: Path) -> None:
     Path("m.json").write_text(json.dumps([{"path": "dog.png"}, {"path": "cat.png", "mesh.grid": 1}]))
     result = dg4d("batch", "m.json", "-o", "out")
-    assert result.exit_code == 1
+    assert result.exit_code == 65
     summary = json.loads(Path("out/summary.json").read_text())
     assert [item["status"] for item in summary["items"]] == ["failed", "failed"]
     assert "does not exist" in summary["items"][0]["message"]

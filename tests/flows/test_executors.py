@@ -7,7 +7,9 @@ from pathlib import Path
 
 import fake_steps
 import pytest
+import stand_in_engine
 
+from flows.containers import container
 from flows.executors import (
     Execute,
     StepBadInput,
@@ -18,6 +20,7 @@ from flows.executors import (
     StepOutOfMemory,
     StepTimedOut,
     chosen,
+    in_container,
     in_process,
     in_subprocess,
 )
@@ -26,6 +29,7 @@ from steps.main import request_version
 from steps.store import ArtifactStore
 
 HERE = str(Path(__file__).parent)
+OUTSIDE = [in_subprocess, in_container]
 
 
 @pytest.fixture(autouse=True)
@@ -35,6 +39,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("DG4D_CODE_VERSION", "test")
     monkeypatch.setenv("PYTHONPATH", HERE)
     monkeypatch.setenv("FAKE_LOG", str(tmp_path / "log"))
+    monkeypatch.setenv("DG4D_ENGINE", str(stand_in_engine.install(tmp_path)))
     return tmp_path
 
 
@@ -50,14 +55,15 @@ def ignore(done: int, total: int, values: dict[str, float]) -> None:
     pass
 
 
-def test_a_process_of_its_own_gives_the_same_digests_as_this_one(place: Path) -> None:
+@pytest.mark.parametrize("execute", OUTSIDE)
+def test_a_process_or_container_gives_the_same_digests_as_this_process(place: Path, execute: Execute) -> None:
     spec, request = ask(place, "hello moving")
-    here, there = in_process(spec, request, ignore), in_subprocess(spec, request, ignore)
+    here, there = in_process(spec, request, ignore), execute(spec, request, ignore)
     assert here.outputs == there.outputs
     assert here.provenance.digest() == there.provenance.digest()
 
 
-@pytest.mark.parametrize("execute", [in_process, in_subprocess])
+@pytest.mark.parametrize("execute", [in_process, *OUTSIDE])
 def test_what_the_library_logs_is_handed_on(place: Path, execute: Execute) -> None:
     said: list[str] = []
     execute(*ask(place, "prepare_subject=log:compiling"), ignore, said.append)
@@ -74,66 +80,124 @@ def test_what_the_library_logs_is_handed_on(place: Path, execute: Execute) -> No
         ("crash", StepCrashed),
     ],
 )
-def test_both_executors_raise_the_same_error(place: Path, word: str, error: type[StepError]) -> None:
+@pytest.mark.parametrize("execute", OUTSIDE)
+def test_all_executors_raise_the_same_error(place: Path, word: str, error: type[StepError], execute: Execute) -> None:
     spec, request = ask(place, f"prepare_subject={word}")
     with pytest.raises(error) as here:
         in_process(spec, request, ignore)
     with pytest.raises(error) as there:
-        in_subprocess(spec, request, ignore)
+        execute(spec, request, ignore)
     assert here.value.message == there.value.message
     assert here.value.pictures == there.value.pictures
     assert bool(here.value.pictures) == (error is StepDiverged)
 
 
-def test_a_step_that_is_killed_from_outside_ran_out_of_memory(place: Path) -> None:
+@pytest.mark.parametrize("execute", OUTSIDE)
+def test_a_step_that_is_killed_from_outside_ran_out_of_memory(place: Path, execute: Execute) -> None:
     with pytest.raises(StepOutOfMemory, match="memory"):
-        in_subprocess(*ask(place, "prepare_subject=die"), ignore)
+        execute(*ask(place, "prepare_subject=die"), ignore)
 
 
-def test_a_step_that_takes_too_long_is_stopped(place: Path) -> None:
+@pytest.mark.parametrize("execute", OUTSIDE)
+def test_a_step_that_takes_too_long_is_stopped(place: Path, execute: Execute) -> None:
     spec, request = ask(place, "prepare_subject=sleep:60")
     start = time.monotonic()
     with pytest.raises(StepTimedOut, match=r"no result after 1\.5 s"):
-        in_subprocess(spec.model_copy(update={"timeout_s": 1.5}), request, ignore)
+        execute(spec.model_copy(update={"timeout_s": 1.5}), request, ignore)
     assert time.monotonic() - start < 20
+    assert not [pid for pid in _processes() if "steps.main" in _command_of(pid) and _reads(pid, place)]
     assert list((place / "home" / "scratch").iterdir()) == []
 
 
-def test_a_step_is_killed_when_the_command_is(place: Path) -> None:
+@pytest.mark.parametrize("execute", OUTSIDE)
+def test_a_step_is_killed_when_the_command_is(place: Path, execute: Execute) -> None:
     spec, request = ask(place, "prepare_subject=sleep:60")
     program = f"""
         from fake_steps import STEPS
-        from flows.executors import in_subprocess
+        from flows.executors import {execute.__name__}
         from steps.contract import StepRequest
         request = StepRequest.model_validate_json({request.model_dump_json()!r})
-        in_subprocess(STEPS[{spec.name!r}], request, lambda *_: None)
+        {execute.__name__}(STEPS[{spec.name!r}], request, lambda *_: None)
     """
     parent = subprocess.Popen([sys.executable, "-c", textwrap.dedent(program)])
     log = place / "log"
     deadline = time.monotonic() + 30
     while not log.exists() and time.monotonic() < deadline:
         time.sleep(0.02)
-    (child,) = (int(p.name) for p in Path("/proc").iterdir() if p.name.isdigit() and _parent_of(p) == parent.pid)
+    (child,) = (pid for pid in _processes() if _command_of(pid)[1:3] == ["-m", "steps.main"] and _reads(pid, place))
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    while _alive(child) and time.monotonic() < deadline:
+    while child in _processes() and time.monotonic() < deadline:
         time.sleep(0.02)
-    assert not _alive(child)
+    assert child not in _processes()
     in_subprocess(*ask(place, "fine"), ignore)  # the next command clears up
     assert list((place / "home" / "scratch").iterdir()) == []
 
 
+def test_a_container_sees_its_own_files_and_no_network_and_no_secret(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("AWS_SECRET_ACCESS_KEY", "HF_TOKEN", "DG4D_SIGNING_KEY"):
+        monkeypatch.setenv(name, "a secret")
+    monkeypatch.setenv("DG4D_MEMORY", "2g")
+    in_container(*ask(place, "hello"), ignore)
+    (words,) = (words for words in stand_in_engine.asked(place) if words[0] == "run")
+    home = place / "home"
+    folders = [Path(word.split("target=")[1]) for word in words if word.startswith("type=bind")]
+    assert [folder.relative_to(home).parts[0] for folder in folders] == ["scratch", "kernels", "store"]
+    said = " ".join(words)
+    assert "--network none --" in said and "--read-only" in said and "--cap-drop all" in said and "--memory 2g" in said
+    assert "a secret" not in said
+    assert [word for word in words if "AWS_" in word or "TOKEN" in word or "SIGNING" in word] == []
+
+
+def test_the_keys_of_a_bucket_are_handed_over_by_name_only(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "a secret")
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9000")
+    _, request = ask(place, "hello")
+    words = container(request, tmp_path, "s3://bucket/prefix").command
+    assert "AWS_SECRET_ACCESS_KEY" in words and "a secret" not in " ".join(words)
+    assert words[words.index("--network") + 1] == "host"  # the store is on this machine
+
+
+def test_the_record_names_the_image(place: Path) -> None:
+    done = in_container(*ask(place, "hello"), ignore)
+    assert done.provenance.machine["image"] == f"dg4d/cpu@sha256:{stand_in_engine.CONTENT}"
+
+
+def test_an_image_that_is_not_here_is_named(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DG4D_IMAGE_CPU", "registry.example/other:1")
+    with pytest.raises(StepMissing, match=r"registry\.example/other:1.*containers\.sh"):
+        in_container(*ask(place, "hello"), ignore)
+
+
+def test_an_engine_that_is_not_here_is_refused(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DG4D_ENGINE", "/nowhere/podman")
+    with pytest.raises(StepMissing, match="docker or podman"):
+        in_container(*ask(place, "hello"), ignore)
+
+
 def test_an_executor_that_does_not_exist_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DG4D_EXECUTOR", "rocket")
-    with pytest.raises(StepMissing, match="subprocess, in_process"):
+    with pytest.raises(StepMissing, match="subprocess, container, in_process"):
         chosen()
 
 
-def _parent_of(process: Path) -> int:
+def _processes() -> list[int]:
+    return [int(place.name) for place in Path("/proc").iterdir() if place.name.isdigit() and _alive(int(place.name))]
+
+
+def _command_of(pid: int) -> list[str]:
     try:
-        return int((process / "stat").read_text().rpartition(")")[2].split()[1])
+        return Path(f"/proc/{pid}/cmdline").read_text().split("\0")
     except OSError:
-        return 0
+        return []
+
+
+def _reads(pid: int, place: Path) -> bool:
+    return any(word.startswith(str(place)) for word in _command_of(pid))
 
 
 def _alive(pid: int) -> bool:

@@ -2,19 +2,14 @@
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
 import time
-import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-from prefect.client.orchestration import get_client
-from prefect.settings import PREFECT_API_URL
 from typer.testing import CliRunner, Result
 
 from flows import cli, home, tasks
@@ -24,7 +19,7 @@ from flows.make import make, save_pictures
 from flows.orders import Order, Wish
 from flows.orphans import settle_orphans
 from flows.server import Server
-from flows.summary import Row
+from flows.summary import NOT_ACCEPTED, Row, Tally
 from steps.profiles import PREVIEW, revise
 
 EVERY_STEP = [
@@ -64,10 +59,6 @@ def ran(log: Path) -> list[str]:
 def order(words: str, folder: Path, *, name: str = "fake.png", item: str = "fake", **changes: object) -> Order:
     (folder / name).write_text(words)
     return Wish(item=item, picture=folder / name, settings=revise(PREVIEW, dict(changes))).order(home.store())
-
-
-def server_address() -> str:
-    return str(PREFECT_API_URL.value()).removesuffix("/api")
 
 
 def tree(folder: Path, *but: str) -> dict[str, bytes]:
@@ -152,6 +143,13 @@ def test_a_mesh_per_frame_is_made_in_parts_and_joined(log: Path, tmp_path: Path)
     assert (tmp_path / "two" / "asset.glb").read_bytes() == (tmp_path / "five" / "asset.glb").read_bytes()
 
 
+def test_every_frame_gets_a_mesh_where_one_cannot_follow(log: Path, tmp_path: Path) -> None:
+    make(order("flutters", tmp_path, **{"mesh.mode": "auto", "mesh.frames_per_task": 3}), tmp_path / "out")
+    assert ran(log).count("extract_mesh") == 3  # once to see that it does not follow, then five frames in two parts
+    make(order("flutters", tmp_path, **{"mesh.mode": "tracked"}), tmp_path / "one")
+    assert ran(log).count("extract_mesh") == 1
+
+
 @pytest.mark.parametrize(
     ("word", "error", "attempts"),
     [
@@ -177,31 +175,6 @@ def test_only_what_may_heal_is_tried_again(
 def test_memory_that_is_free_again_is_enough(log: Path, tmp_path: Path) -> None:
     make(order("fit_motion=memory-once", tmp_path), tmp_path / "out")
     assert ran(log).count("fit_motion") == 2
-
-
-def test_every_step_leaves_a_page_with_its_picture_on_the_server(log: Path, tmp_path: Path) -> None:
-    make(order("pages", tmp_path, item="paged"), tmp_path / "out")
-    wanted = {"artifacts": {"key": {"like_": "-paged-"}}, "limit": 200}
-    with get_client(sync_client=True) as client:
-        pages: list[Any] = client.request("POST", "/artifacts/latest/filter", json=wanted).json()
-    paged = {page["key"]: page["data"] for page in pages if page["type"] == "markdown"}
-    files = {key: data for key, data in paged.items() if key.startswith("file-")}  # links are Markdown to Prefect
-    ours = {key: data for key, data in paged.items() if key not in files}
-    assert len(ours) == len(EVERY_STEP) + 1
-    motion = next(data for key, data in ours.items() if key.startswith("fit-motion"))
-    assert "data:image/webp;base64," in motion
-    assert "| 2 | 0.01 |" in motion
-    assert len(files) == len(EVERY_STEP)
-    subject = next(data for key, data in files.items() if key.startswith("file-prepare-subject"))
-    with urllib.request.urlopen(server_address() + re.findall(r"/dg4d/[^)\s\]]+", subject)[0]) as answer:
-        assert answer.headers["content-type"] == "image/png"
-        assert answer.read().startswith(b"\x89PNG")
-    tables = [page for page in pages if page["type"] == "table"]
-    assert len(tables) == len(EVERY_STEP)
-    progress = next(
-        page for page in pages if page["type"] == "progress" and page["key"].startswith("progress-fit-gauss")
-    )
-    assert progress["data"] == 100
 
 
 @pytest.fixture
@@ -358,8 +331,9 @@ def wait_until(condition: Callable[[], bool], timeout_s: float = 60) -> None:
 def test_a_strict_batch_begins_nothing_after_an_item_that_is_not_accepted(log: Path, tmp_path: Path) -> None:
     names = ("first", "torn", "last")
     orders = [order(f"strict {name}", tmp_path, name=f"{name}.png", item=name) for name in names]
-    rows: list[Row] = []
-    convert_all(orders, tmp_path / "out", 1, "strict", rows.append, strict=True)
+    tally = Tally(3)
+    convert_all(orders, tmp_path / "out", 1, "strict", tally, strict=True)
+    rows = list(tally.rows.values())
     assert [(row.item, row.status, row.failing) for row in rows] == [
         ("first", "done", []),
         ("torn", "failed", ["silhouette"]),
@@ -368,11 +342,13 @@ def test_a_strict_batch_begins_nothing_after_an_item_that_is_not_accepted(log: P
     assert "torn was not accepted" in rows[2].message
     assert (tmp_path / "out" / "torn" / "report.html").exists()
     assert not (tmp_path / "out" / "last").exists()
-    rows.clear()
-    convert_all(orders[2:], tmp_path / "out", 1, "refused before", rows.append, strict=True, refused=["torn"])
-    assert [row.status for row in rows] == ["skipped"]
-    rows.clear()
-    convert_all(orders, tmp_path / "out", 1, "lenient", rows.append)
+    made_before = Row(item="torn", status="failed", kind=NOT_ACCEPTED, failing=["silhouette"])
+    tally = Tally(2)
+    convert_all([made_before, orders[2]], tmp_path / "out", 1, "refused before", tally, strict=True)
+    assert [row.status for row in tally.rows.values()] == ["failed", "skipped"]
+    tally = Tally(3)
+    convert_all(orders, tmp_path / "out", 1, "lenient", tally)
+    rows = list(tally.rows.values())
     assert [(row.status, row.failing) for row in rows] == [("done", []), ("done", ["silhouette"]), ("done", [])]
 
 

@@ -1,11 +1,13 @@
 import csv
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tiny_s3 import BUCKET, TinyS3
 
-from dg4d_lib.errors import BadInput, DG4DError
+from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
 from flows.manifest import Item, distinct, items_of, parse_changes
 
 
@@ -15,7 +17,7 @@ def touch(folder: Path, *names: str) -> None:
         (folder / name).write_bytes(b"x")
 
 
-def items(inputs: Path, out: str = "out", **changes: object) -> list[Item]:
+def items(inputs: Path | str, out: str = "out", **changes: object) -> list[Item]:
     return items_of(inputs, Path(out), "preview", changes, 3)
 
 
@@ -127,6 +129,8 @@ def test_a_bad_row_is_a_bad_item_and_no_more(tmp_path: Path) -> None:
         ("m.csv", "path,seed\n,1\n", "row 1: neither a path nor a text"),
         ("m.json", "{", "cannot be read"),
         ("m.json", '{"path": 1}', "list of rows"),
+        ("m.jsonl", '{"path": "a.png"}\n{', "cannot be read"),
+        ("m.parquet", "PAR1", "cannot be read"),
         ("m.txt", "x", "neither a folder nor a manifest"),
         ("m.csv", "path\n", "holds no pictures"),
     ],
@@ -178,3 +182,136 @@ def test_a_link_that_leads_out_of_a_folder_is_a_bad_item(tmp_path: Path) -> None
         ("b", True),
         ("c", False),
     ]
+
+
+def test_a_pattern_gives_what_it_matches_named_from_its_first_plain_folder(tmp_path: Path) -> None:
+    touch(tmp_path, "in/a.png", "in/deep/b.png", "in/deep/c.jpg", "in/.d.png", "in/out/e.png", "f.png")
+    found = items(f"{tmp_path}/in/**/*.png", f"{tmp_path}/in/out")
+    assert [(item.name, item.wish and item.wish.picture) for item in found] == [
+        ("a", tmp_path / "in/a.png"),
+        ("deep/b", tmp_path / "in/deep/b.png"),
+    ]
+    with pytest.raises(BadInput, match="holds no pictures"):
+        items(f"{tmp_path}/in/*.webp")
+    with pytest.raises(BadInput, match="nowhere, where the pattern"):
+        items(f"{tmp_path}/nowhere/*.png")
+
+
+def test_a_folder_whose_name_looks_like_a_pattern_is_a_folder(tmp_path: Path) -> None:
+    touch(tmp_path, "take[1]/a.png")
+    assert [item.name for item in items(tmp_path / "take[1]")] == ["a"]
+
+
+def test_packages_below_a_pattern_are_no_inputs(tmp_path: Path) -> None:
+    touch(tmp_path, "made/input/subject.png", "a.png")
+    (tmp_path / "made" / "provenance.json").write_text(json.dumps({"files": {}}))
+    assert [item.name for item in items(f"{tmp_path}/**/*.png")] == ["a"]
+
+
+ROWS = [
+    {"path": "low.png", "priority": -1, "seed": 3},
+    {"path": "first.png"},
+    {"path": "urgent.png", "priority": 7, "mesh.grid": 64},
+    {"path": "second.png"},
+]
+
+
+@pytest.mark.parametrize("kind", ["csv", "json", "jsonl", "parquet"])
+def test_every_kind_of_manifest_says_the_same_and_higher_priority_comes_first(tmp_path: Path, kind: str) -> None:
+    file = tmp_path / f"m.{kind}"
+    if kind == "parquet":
+        arrow = pytest.importorskip("pyarrow", reason="Parquet needs pyarrow")
+        parquet = pytest.importorskip("pyarrow.parquet")
+        parquet.write_table(
+            arrow.Table.from_pylist([{"priority": None, "seed": None, "mesh.grid": None} | r for r in ROWS]), file
+        )
+    elif kind == "csv":
+        with file.open("w", newline="") as lines:
+            table = csv.DictWriter(lines, ["path", "priority", "seed", "mesh.grid"])
+            table.writeheader()
+            table.writerows(ROWS)
+    else:
+        text = "\n\n".join(map(json.dumps, ROWS)) if kind == "jsonl" else json.dumps(ROWS)
+        file.write_text(text)
+    found = items(file)
+    assert [item.name for item in found] == ["urgent", "first", "second", "low"]
+    assert all(item.error == "" for item in found)
+    settings = [item.wish.settings.mesh.grid for item in found if item.wish]
+    assert settings[0] == 64 != settings[1]
+    assert found[0].wish is not None and found[0].wish.seed == 3  # the seed of the batch
+
+
+def test_without_pyarrow_a_parquet_manifest_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "m.parquet").write_bytes(b"PAR1")
+    monkeypatch.setattr("flows.manifest.find_spec", lambda name: None)
+    with pytest.raises(BackendUnavailable, match=re.escape("pip install 'dg4d[parquet]'")):
+        items(tmp_path / "m.parquet")
+
+
+@pytest.mark.parametrize(("column", "value"), [("seed", 1.5), ("seed", "x"), ("priority", "high"), ("seed", -1)])
+def test_a_number_that_is_none_is_a_bad_item(tmp_path: Path, column: str, value: object) -> None:
+    (tmp_path / "m.json").write_text(json.dumps([{"path": "a.png", column: value}]))
+    (item,) = items(tmp_path / "m.json")
+    assert item.wish is None and column in item.error
+
+
+def test_the_files_of_a_manifest_may_lie_below_a_root_and_nowhere_else(tmp_path: Path) -> None:
+    touch(tmp_path, "pictures/a.png", "lists/b.png")
+    (tmp_path / "lists/m.json").write_text(json.dumps([{"path": "a.png"}, {"path": "../lists/b.png"}]))
+    a, b = items_of(tmp_path / "lists/m.json", Path("out"), "preview", {}, 0, root=tmp_path / "pictures")
+    assert a.wish is not None and a.wish.picture == tmp_path / "pictures/a.png"
+    assert b.wish is None and "leads out of the folder" in b.error
+    with pytest.raises(BadInput, match="--root"):
+        items_of(tmp_path / "pictures", Path("out"), "preview", {}, 0, root=tmp_path)
+    with pytest.raises(BadInput, match="is not a folder"):
+        items_of(tmp_path / "lists/m.json", Path("out"), "preview", {}, 0, root=tmp_path / "gone")
+
+
+def test_rows_that_want_the_same_share_their_settings(tmp_path: Path) -> None:
+    (tmp_path / "m.json").write_text(json.dumps([{"path": f"{i}.png", "mesh.grid": 64} for i in range(50)]))
+    assert len({id(item.wish.settings) for item in items(tmp_path / "m.json") if item.wish}) == 1
+
+
+@pytest.fixture
+def bucket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TinyS3]:
+    server = TinyS3()
+    for name, value in server.environment.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path / "home"))
+    yield server
+    server.stop()
+
+
+def test_a_prefix_of_an_object_store_gives_its_pictures_which_are_fetched_in_their_turn(
+    bucket: TinyS3, tmp_path: Path
+) -> None:
+    for key in ("in/b.png", "in/deep/a.mp4", "in/notes.txt", "in/.hidden.png", "other/c.png"):
+        bucket.objects[key] = (f"bytes of {key}".encode(), 0.0)
+    found = items(f"s3://{BUCKET}/in/")
+    assert [item.name for item in found] == ["b", "deep/a"]
+    with found[1].here() as wish:
+        assert wish.picture is not None and wish.source_name == "a.mp4"
+        assert wish.picture.read_bytes() == b"bytes of in/deep/a.mp4"
+    assert not wish.picture.exists()
+    del bucket.objects["in/b.png"]
+    with pytest.raises(BadInput, match=r"not in .* any more"), found[0].here():
+        pass
+    with pytest.raises(BadInput, match="holds no pictures"):
+        items(f"s3://{BUCKET}/empty/")
+
+
+def test_objects_that_are_named_as_if_they_lay_outside_are_bad_items(bucket: TinyS3) -> None:
+    bucket.objects["in/a\\..\\up.png"] = (b"x", 0.0)
+    bucket.objects["in/a.png"] = (b"x", 0.0)
+    found = items(f"s3://{BUCKET}/in")
+    assert sorted((bool(item.error), item.wish is None) for item in found) == [(False, False), (True, True)]
+
+
+def test_an_object_store_that_does_not_answer_is_named(bucket: TinyS3, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("steps.opening.PATIENCE_S", 0.2)
+    bucket.stop()
+    with pytest.raises(BackendUnavailable, match="does not answer"):
+        items(f"s3://{BUCKET}/in2/")
+    bucket.start()

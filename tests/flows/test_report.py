@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 from flows import report
+from flows.curves import HEIGHT, WIDTH
 from flows.orders import Order
-from flows.summary import Row, write_summary
+from flows.summary import Row, Writer
 from flows.tasks import Finished, Made
 from steps.contract import ArtifactRef, ProvenanceRecord, StepResult
 from steps.profiles import PREVIEW, revise
@@ -183,7 +184,7 @@ def test_a_curve_goes_from_top_left_to_bottom_right_on_a_logarithmic_scale() -> 
     svg = report.curve(CURVES)
     (points,) = re.findall(r'points="([^"]*)"', svg)
     places = [tuple(map(float, pair.split(","))) for pair in points.split()]
-    assert places == [(0, 0), (report.PLOT_WIDTH / 2, report.PLOT_HEIGHT / 2), (report.PLOT_WIDTH, report.PLOT_HEIGHT)]
+    assert places == [(0, 0), (WIDTH / 2, HEIGHT / 2), (WIDTH, HEIGHT)]
     assert "logarithmic" in svg
 
 
@@ -195,17 +196,17 @@ def test_odd_curves_break_no_page(values: list[float]) -> None:
 
 def test_a_summary_counts_and_the_overview_links_what_is_there(tmp_path: Path) -> None:
     (tmp_path / "a b").mkdir()
-    (tmp_path / "a b" / "preview.mp4").touch()
+    (tmp_path / "a b" / "preview.webp").touch()
     rows = [
         Row(item="a b", status="done", seconds=3),
         Row(item="z/y", status="failed", message="<ugly>"),
         Row(item="c", status="unchanged"),
     ]
-    write_summary(tmp_path, rows)
+    Writer(tmp_path).write(rows, 1.0)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["counts"] == {"done": 1, "unchanged": 1, "failed": 1, "skipped": 0}
     assert summary["commercial_only"] is False
     page = (tmp_path / "index.html").read_text()
-    assert Links(page).addresses.count("a%20b/preview.mp4") == 1
+    assert Links(page).addresses.count("a%20b/preview.webp") == 1
     assert "&lt;ugly&gt;" in page
     assert page.index("z/y") < page.index("a b")

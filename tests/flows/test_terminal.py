@@ -4,7 +4,7 @@ import pytest
 from rich.console import Console
 
 from flows.events import StepEvent, tell
-from flows.terminal import StepBars, numbers, steps_shown, tell_rows
+from flows.terminal import BatchTable, StepBars, numbers, steps_shown, tell_rows
 
 EVENT = StepEvent("newt", "fit_gaussians", "progress", done=114, total=250, values={"loss": 9.437, "reference": 12.57})
 
@@ -42,3 +42,24 @@ def test_rows_stand_in_columns_and_words_in_brackets_stay():
     screen = io.StringIO()
     tell_rows(Console(file=screen, width=200), [("a", "whole", ""), ("asset.glb", "altered", "[why]")])
     assert screen.getvalue() == "a          whole\nasset.glb  altered  [why]\n"
+
+
+def test_a_long_batch_shows_what_runs_and_what_failed_last_and_no_more_than_fits():
+    table = BatchTable([f"item-{i:04d}" for i in range(1000)])
+    for i in range(900):
+        table.settle(f"item-{i:04d}", "failed" if i % 2 else "done", "no reason")
+    table(StepEvent("item-0901", "fit_gaussians", "started"))
+    screen = io.StringIO()
+    Console(file=screen, width=120, color_system=None).print(table)
+    text = screen.getvalue()
+    assert "900 of 1000" in text
+    assert "item-0901" in text and "item-0899" in text
+    assert "item-0001" not in text and "item-0898" not in text
+    assert len(text.splitlines()) < 40
+
+
+def test_an_item_that_is_tried_again_is_running_again():
+    table = BatchTable(["a"])
+    table.settle("a", "failed", "crashed")
+    table(StepEvent("a", "fit_gaussians", "started"))
+    assert table.status["a"] == "running"

@@ -17,8 +17,9 @@ from flows import leases
 from flows.collecting import collect
 from flows.store import store as command
 from flows.versions import StepDone, Version, faults, versions
-from steps.bucket import BucketStore, open_store
+from steps.bucket import BucketStore
 from steps.contract import ArtifactRef
+from steps.opening import open_store
 from steps.store import ArtifactStore, object_name
 
 DAY = 24 * 3600.0
@@ -128,7 +129,7 @@ def test_two_runs_of_one_item_share_a_lease(store: ArtifactStore) -> None:
 PROGRAM = """
 import sys, time
 from flows import leases
-from steps.bucket import open_store
+from steps.opening import open_store
 store = open_store(sys.argv[1])
 with (leases.collecting(store) if sys.argv[2] == "collect" else leases.running(store, "cat")):
     if sys.argv[2] != "collect":

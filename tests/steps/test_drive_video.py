@@ -15,7 +15,7 @@ from steps.job import Facts, Job
 from steps.media import read_frames, read_png, write_frames, write_png
 from steps.profiles import DriveVideoSettings
 
-PORTS = {"driving_video": "zip", "candidates": "png", "ranking": "json", "films": "zip"}
+PORTS = {"driving_video": "zip", "picture": "png", "candidates": "png", "ranking": "json", "films": "zip"}
 
 
 def drive(folder: Path, inputs: dict[str, Path], seed: int = 0, kind: type = WarpSettings, **driving: object) -> Facts:
@@ -40,6 +40,8 @@ def test_footage_goes_through_untouched(tmp_path, subject):
     footage = footage_of(tmp_path / "footage.zip", 3, 64)
     drive(tmp_path, {"subject": subject, "footage": footage})
     assert (tmp_path / "driving_video.zip").read_bytes() == footage.read_bytes()
+    height, width = read_png(tmp_path / "picture.png").shape[:2]
+    assert width > 3 * 160 > 2 * height  # three frames in a row
 
 
 @pytest.mark.parametrize(("count", "size", "message"), [(1, 64, "at least two"), (3, 32, "32 x 32 .* 64 x 64")])

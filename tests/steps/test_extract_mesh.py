@@ -104,6 +104,20 @@ def test_the_same_job_gives_the_same_bytes(tracked: tuple[Path, Facts], tmp_path
         assert (tmp_path / name).read_bytes() == (tracked[0] / name).read_bytes()
 
 
+@pytest.mark.parametrize(("followed", "outputs"), [(0.9, {"tracked", "picture"}), (0.8, {"picture"})])
+def test_in_auto_there_is_one_mesh_only_where_it_follows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, followed: float, outputs: set[str]
+) -> None:
+    monkeypatch.setattr(extract_mesh, "best_rest", lambda *given: (1, followed))
+    job, facts = extract(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}))
+    assert {name for name, path in job.outputs.items() if path.exists()} == outputs
+    assert any("does not follow this motion (80.0% IoU" in note for note in facts.notes) == (followed == 0.8)
+    picture = read_png(job.outputs["picture"])[..., :3]
+    assert picture.shape == (256, 1024, 3)
+    blue = (picture[..., 2] - picture[..., 0] > 0.3).float().mean()
+    assert 0.05 < blue < 0.5
+
+
 def test_a_mesh_per_frame_stands_where_the_cloud_is_then(tmp_path: Path) -> None:
     _, facts = extract(tmp_path, ball(), MESH.model_copy(update={"mode": "per_frame"}), first_frame=1, end_frame=3)
     assert facts.notes[1:] == ("2 of 2 meshes from frame 1 on bound solids",)

@@ -130,6 +130,11 @@ def test_every_trouble_has_its_kind_and_keeps_its_pictures(store: ArtifactStore,
     assert store.path(found.pictures["last"]).read_bytes() == b"picture"
 
 
+@pytest.mark.parametrize("trouble", ["memory", "torch memory"])
+def test_without_memory_a_step_says_what_to_do(store: ArtifactStore, trouble: str) -> None:
+    assert "choose smaller settings" in failure(request_for(store, trouble=trouble), store).message
+
+
 def test_a_forgotten_output_is_named(store: ArtifactStore) -> None:
     assert "loud" in failure(request_for(store, trouble="forgets"), store).message
 
@@ -229,3 +234,16 @@ def test_a_step_ends_with_the_process_that_wanted_it(store: ArtifactStore, tmp_p
 def test_the_catalog_of_the_product_names_existing_settings() -> None:
     for spec in STEPS.values():
         assert issubclass(host._named(spec.settings), Settings)
+
+
+def test_processor_time_is_that_of_the_step_and_of_what_it_started() -> None:
+    before = host._cpu_seconds()
+    spin = "import time\nwhile time.process_time() < 0.3: pass"
+    subprocess.run([sys.executable, "-c", spin], check=True)
+    assert 0.3 <= host._cpu_seconds() - before < 3
+
+
+def test_the_source_is_read_once_for_many_requests(monkeypatch: pytest.MonkeyPatch) -> None:
+    version = host.request_version(CATALOG["shout"])
+    monkeypatch.setattr(host, "_source_files", lambda: pytest.fail("it was read already"))
+    assert host.request_version(CATALOG["shout"]) == version

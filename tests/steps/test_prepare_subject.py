@@ -14,7 +14,7 @@ from steps.prepare_subject import run
 
 def prepare(source: Path, out: Path, **settings: object) -> Facts:
     out.mkdir()
-    outputs = {"subject": out / "subject.png", "footage": out / "footage.zip"}
+    outputs = {"subject": out / "subject.png", "footage": out / "footage.zip", "picture": out / "picture.png"}
     return run(Job({"source": source}, outputs, SubjectSettings(size=64, **settings), 0, lambda *_: None, out))
 
 
@@ -25,6 +25,17 @@ def test_a_picture_becomes_a_square_cutout_and_no_footage(tmp_path):
     assert subject.shape == (64, 64, 4)
     assert (right - left, bottom - top) == (pytest.approx(51, abs=3), pytest.approx(51, abs=3))
     assert not (tmp_path / "out" / "footage.zip").exists()
+
+
+def test_the_source_its_matte_and_the_cutout_are_shown_side_by_side(tmp_path):
+    prepare(save(tmp_path / "a.png", opaque(disc())[:, 8:-8]), tmp_path / "out")
+    source, matte, cutout = read_png(tmp_path / "out" / "picture.png").split(256, 1)
+    subject = read_png(tmp_path / "out" / "subject.png")[..., 3]
+    assert source.shape == matte.shape == cutout.shape == (256, 256, 3)
+    assert float(matte.mean()) == pytest.approx(float(subject.mean()), abs=0.01)
+    assert matte[128, 128].min() == 1 and matte[0, 0].max() == 0
+    assert cutout[0, 0].min() == 1
+    assert torch.allclose(source[128, 128], cutout[128, 128], atol=0.02)
 
 
 def test_a_video_becomes_footage_whose_first_frame_is_the_subject(tmp_path):
@@ -40,7 +51,7 @@ def test_the_same_file_gives_the_same_bytes(tmp_path):
     source = save_clip(tmp_path / "a.mp4", walk(4), "libx264", "yuv420p")
     for name in ("one", "two"):
         prepare(source, tmp_path / name)
-    for name in ("subject.png", "footage.zip"):
+    for name in ("subject.png", "footage.zip", "picture.png"):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
 
 

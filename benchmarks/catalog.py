@@ -1,0 +1,324 @@
+"""How many items an hour the engine can take: a batch of tiny pictures, each through two cheap real steps.
+
+Run with `python -m benchmarks.catalog` (`--items 1000 --workers 2 --database sqlite --json FILE`). A picture is cut out
+and resized to 32 pixels (prepare_subject), a film of two frames is made of it and packed into a zip (drive_video), and
+that is published as a package with its record. Nothing is a stand-in: the batch, the tasks with their keys, locks and
+artifacts, the store, the server and its database are the product's; steps run in the process of the batch.
+
+The catalog is made three times: `made` anew, `cached` into another folder from finished steps, `unchanged` into the
+first folder again. Lost is an item without its package or without a completed run in the database; duplicated, one with
+more than one. Memory is that of the process of the batch: the growth from a tenth of the way to the end.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from PIL import Image, ImageDraw
+from prefect import flow
+from prefect.client.orchestration import get_client
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.measure import machine, write_rows
+from flows import home, summary
+from flows.batch import ready
+from flows.catalog import convert_all
+from flows.image_to_4d import drive
+from flows.manifest import Item, items_of
+from flows.orders import Order
+from flows.publish import RECORD, Files, publish
+from flows.server import HOST, SETTINGS, answers
+from flows.tasks import Steps
+
+DATABASES = ("sqlite", "postgresql")
+STEPS = ("prepare_subject", "drive_video")
+KNOBS = {"subject.size": 32, "driving.frames": 2}
+SETTLE_S = 120.0  # the server writes what it was told in batches
+START_S = 600.0  # of a machine that is busy with other things
+
+
+@dataclass(frozen=True)
+class Row:
+    """One pass over the catalog; seconds, `cpu` of the process of the batch, `server_cpu` of server and database."""
+
+    database: str
+    what: str
+    items: int
+    wall: float
+    cpu: float
+    server_cpu: float
+    per_second: float
+    growth_mb: float
+    lost: int
+    duplicated: int
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--items", type=int, default=1000)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--database", choices=DATABASES, action="append", help="default: both")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
+    parser.add_argument("--one", choices=DATABASES, help=argparse.SUPPRESS)  # in a process of its own: this one
+    parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.one:
+        write_rows(options.json, passes(options.one, options.items, options.workers, options.folder))
+        return
+    rows = []
+    for database in options.database or DATABASES:
+        with tempfile.TemporaryDirectory(prefix="dg4d-catalog-", ignore_cleanup_errors=True) as name:
+            rows += measured(database, options.items, options.workers, Path(name))
+    console = Console(width=150)  # also where it goes into a file
+    console.print(machine())
+    console.print(table(rows))
+    if options.json:
+        write_rows(options.json, rows)
+
+
+def measured(database: str, items: int, workers: int, folder: Path) -> list[Row]:
+    """All passes with one database, in a process of their own, with a server of its own."""
+    folder.chmod(0o755)  # the database's user reads what lies in it
+    for i in range(items):
+        draw(folder / "pictures" / f"{i:05d}.png", i)
+    with ExitStack() as running:
+        address = running.enter_context(postgresql(folder)) if database == "postgresql" else ""
+        port = running.enter_context(server(folder, address))
+        found = folder / "rows.json"
+        subprocess.run(
+            [
+                *(sys.executable, "-m", "benchmarks.catalog", "--one", database, "--items", str(items)),
+                *("--workers", str(workers), "--folder", str(folder), "--json", str(found)),
+            ],
+            env={**environment(folder), "PREFECT_API_URL": f"http://127.0.0.1:{port}/api"},
+            check=True,
+        )
+        return [Row(**row) for row in json.loads(found.read_text(encoding="utf-8"))["rows"]]
+
+
+def passes(database: str, count: int, workers: int, folder: Path) -> list[Row]:
+    """Make the catalog anew, from finished steps, and again; the environment names the server."""
+    rows, runs = [], 0
+    for what, out in (("made", "one"), ("cached", "two"), ("unchanged", "one")):
+        items = items_of(folder / "pictures", folder / out, "preview", KNOBS, 0)
+        wall, cpu, servers = time.monotonic(), time.process_time(), server_seconds(folder)
+        growth = run(items, folder / out, workers, what)
+        wall, cpu = time.monotonic() - wall, time.process_time() - cpu
+        runs += count if what != "unchanged" else 0
+        names = completed(runs)
+        missing = [item.name for item in items if not (folder / out / item.name / "provenance.json").is_file()]
+        wanted = 1 + (what != "made")
+        rows.append(
+            Row(
+                database=database,
+                what=what,
+                items=count,
+                wall=round(wall, 2),
+                cpu=round(cpu, 2),
+                server_cpu=round(server_seconds(folder) - servers, 2),
+                per_second=round(count / wall, 2),
+                growth_mb=round(growth, 1),
+                lost=len({*missing, *(item.name for item in items if names[item.name] < wanted)}),
+                duplicated=sum(names[item.name] > wanted for item in items),
+            )
+        )
+    return rows
+
+
+def run(items: list[Item], out: Path, workers: int, what: str) -> float:
+    """One pass; by how many MB the process grew after a tenth of it."""
+    sizes: list[float] = []
+
+    def settled(row: summary.Row) -> None:
+        if row.status not in {"done", "unchanged"}:
+            raise RuntimeError(f"{row.item}: {row.message}")
+        sizes.append(memory_mb())
+        writer.write_sometimes(list(tally.rows.values()), tally.seconds)
+
+    writer, tally = summary.Writer(out), summary.Tally(len(items), settled)
+    out.mkdir(exist_ok=True)
+    todo = (ready(item, out, strict=False) for item in items)
+    convert_all(todo, out, workers, f"{what}: {len(items)} items", tally, work=work)
+    writer.write(list(tally.rows.values()), tally.seconds)
+    return sizes[-1] - sizes[len(sizes) // 10]
+
+
+def work(order: Order, folder: Path) -> tuple[Any, bool]:
+    """Resize, pack and publish; whether every step had been done before."""
+    packed, cached = resize_and_pack(order)
+
+    def finish(staging: Path, files: Files) -> Files:
+        (staging / RECORD).write_text(json.dumps({"order": order.digest(), "files": files}), encoding="utf-8")
+        return files
+
+    return publish(home.store().path(packed), folder, finish), cached
+
+
+def resize_and_pack(order: Order) -> tuple[Any, bool]:
+    """A flow of two steps."""
+
+    @flow(name="resize_and_pack", flow_run_name="{item}", persist_result=False)
+    def two_steps(item: str) -> None:
+        prepared = steps.run("prepare_subject", {"source": order.source}, order.settings.subject)
+        steps.run("drive_video", {"subject": prepared["subject"]}, drive(order.settings))
+
+    steps = Steps(order.item, order.seed)
+    two_steps(order.item)
+    return steps.finished[-1].result.outputs["driving_video"], all(done.cached for done in steps.finished)
+
+
+def completed(expected: int) -> Counter[str]:
+    """How many completed runs of the flow the database has by item, when all are there or time is up."""
+    deadline = time.monotonic() + SETTLE_S
+    while True:
+        names: Counter[str] = Counter()
+        with get_client(sync_client=True) as client:
+            wanted = {"flows": {"name": {"any_": ["resize_and_pack"]}}, "sort": "ID_DESC", "limit": 200}
+            wanted["flow_runs"] = {"state": {"type": {"any_": ["COMPLETED"]}}}
+            while page := client.request("POST", "/flow_runs/filter", json=wanted | {"offset": names.total()}).json():
+                names.update(found["name"] for found in page)
+        if names.total() >= expected or time.monotonic() > deadline:
+            return names
+        time.sleep(1.0)
+
+
+def draw(path: Path, number: int) -> None:
+    """A picture of 40 pixels unlike any other: a disc on nothing."""
+    path.parent.mkdir(exist_ok=True)
+    picture = Image.new("RGBA", (40, 40))
+    color = (number % 256, number // 256 % 256, 90, 255)
+    ImageDraw.Draw(picture).ellipse((8, 8, 31, 31), fill=color)
+    picture.save(path)
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """Of the batch and its server, without what the caller's shell says about others."""
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PREFECT_", "DG4D_"))}
+    return {
+        **inherited,
+        **home.CLIENT_SETTINGS,
+        "DG4D_HOME": str(folder / "home"),
+        "DG4D_EXECUTOR": "in_process",
+        "PREFECT_HOME": str(folder / "prefect"),
+    }
+
+
+@contextmanager
+def server(folder: Path, address: str) -> Iterator[int]:
+    """The product's server; gives its port.
+
+    Args:
+        folder: where its database is, if it is a file.
+        address: of another database; empty for a file.
+    """
+    port = free_port()
+    settings = {**environment(folder), **SETTINGS, "PREFECT__SERVER_FINAL": "1"}
+    if address:
+        settings["PREFECT_API_DATABASE_CONNECTION_URL"] = address
+    program = ["uvicorn", "--factory", "flows.server_app:create_app", "--host", HOST, "--port", str(port)]
+    process = subprocess.Popen([sys.executable, "-m", *program, "--log-level", "warning"], env=settings)
+    (folder / "server.pid").write_text(str(process.pid), encoding="ascii")
+    try:
+        deadline = time.monotonic() + START_S
+        while not answers(f"http://{HOST}:{port}", timeout_s=5.0):
+            if process.poll() is not None or time.monotonic() > deadline:
+                raise RuntimeError("the server did not start")
+            time.sleep(0.2)
+        yield port
+    finally:
+        process.terminate()
+        process.wait()
+
+
+@contextmanager
+def postgresql(folder: Path) -> Iterator[str]:
+    """A database server of its own, under the user `postgres` where this one is root; gives its address."""
+    place, port = folder / "postgresql", free_port()
+    place.mkdir()
+    user = ["runuser", "-u", "postgres", "--"] if os.getuid() == 0 else []
+    if user:
+        shutil.chown(place, "postgres")
+    options = f"-p {port} -k {place} -c listen_addresses=127.0.0.1"
+    subprocess.run(
+        [*user, tool("initdb"), "-D", place / "data", "-A", "trust", "-U", "dg4d"],
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
+    control = [*user, tool("pg_ctl"), "-D", str(place / "data"), "-w", "-l", str(place / "log")]
+    subprocess.run([*control, "-o", options, "start"], check=True, stdout=subprocess.DEVNULL)
+    try:
+        yield f"postgresql+asyncpg://dg4d@127.0.0.1:{port}/postgres"
+    finally:
+        subprocess.run([*control, "-m", "immediate", "stop"], check=True, stdout=subprocess.DEVNULL)
+
+
+def tool(name: str) -> str:
+    """A program of PostgreSQL, which Debian does not put on the path."""
+    places = sorted(Path("/usr/lib/postgresql").glob(f"*/bin/{name}"))
+    found = shutil.which(name) or (str(places[-1]) if places else "")
+    if not found:
+        raise SystemExit(f"{name} is not here: apt-get install postgresql, or --database sqlite")
+    return found
+
+
+def server_seconds(folder: Path) -> float:
+    """What the server, and the database server where there is one, have used of all cores."""
+    root = int((folder / "server.pid").read_text(encoding="ascii"))
+    data = str(folder / "postgresql")
+    ticks = 0
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+            command = (stat.parent / "cmdline").read_text(encoding="utf-8", errors="replace")
+            parent = int(fields[1])
+            of_database = data in command or data in (Path(f"/proc/{parent}") / "cmdline").read_text(errors="replace")
+        except (OSError, IndexError):
+            continue
+        if int(stat.parent.name) == root or of_database:
+            ticks += int(fields[11]) + int(fields[12])
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def memory_mb() -> float:
+    """What this process holds, in MB."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def free_port() -> int:
+    """A port of this machine that nobody uses."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def table(rows: list[Row]) -> Table:
+    """Rows as they are printed."""
+    steps = len(STEPS)
+    shown = Table("database", "pass", "items", "wall s", "items/s", "CPU ms/item", "ms/step", "server CPU ms/item",
+                  "growth MB", "lost", "duplicated")  # fmt: skip
+    for row in rows:
+        per_step = f"{1e3 * row.cpu / row.items / steps:.0f}" if row.what != "unchanged" else "-"
+        cells = (1e3 * row.cpu / row.items, 1e3 * row.server_cpu / row.items)
+        shown.add_row(
+            row.database, row.what, str(row.items), f"{row.wall:.1f}", f"{row.per_second:.1f}", f"{cells[0]:.1f}",
+            per_step, f"{cells[1]:.1f}", f"{row.growth_mb:.1f}", str(row.lost), str(row.duplicated),
+        )  # fmt: skip
+    return shown
+
+
+if __name__ == "__main__":
+    main()

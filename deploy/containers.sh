@@ -1,0 +1,58 @@
+#!/usr/bin/env bash
+# Builds the images of deploy/images with docker, else with podman.
+#
+#   deploy/containers.sh build [cpu|cuda|flows ...] [-- ARGUMENT ...]   dg4d/NAME; default: cpu flows
+#   deploy/containers.sh base                                           python:3.11-slim-bookworm out of Debian's own
+#                                                                       packages, where no registry can be reached
+#
+# What follows `--` goes to the engine, for example --secret id=pip,src=pip.conf for a package index of your own.
+# $DG4D_ENGINE chooses the engine.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+base=docker.io/library/python:3.11-slim-bookworm
+
+engine() {
+    if [ -n "${DG4D_ENGINE:-}" ]; then echo "$DG4D_ENGINE"; return; fi
+    for name in docker podman; do
+        if "$name" ps --quiet >/dev/null 2>&1; then echo "$name"; return; fi
+    done
+    echo "Neither docker nor podman runs here. On Debian: apt-get install podman runc" >&2
+    exit 69
+}
+
+# Without a daemon of its own, podman builds in a plain chroot, which also works inside of other containers.
+builder() {
+    case "$(basename "$1")" in
+        podman) echo "$1 build --isolation chroot --format docker --ignorefile .dockerignore" ;;
+        *) echo "$1 build" ;;
+    esac
+}
+
+build() {
+    local names=() program
+    while [ $# -gt 0 ] && [ "$1" != -- ]; do names+=("$1"); shift; done
+    [ $# -gt 0 ] && shift
+    program=$(engine)
+    [ ${#names[@]} -gt 0 ] || names=(cpu flows)
+    for name in "${names[@]}"; do
+        [ -f "deploy/images/$name.Dockerfile" ] || { echo "There is no image $name." >&2; exit 2; }
+        $(builder "$program") --file "deploy/images/$name.Dockerfile" --tag "dg4d/$name" "$@" .
+    done
+}
+
+base() {
+    local folder program
+    program=$(engine)
+    command -v debootstrap >/dev/null || { echo "On Debian: apt-get install debootstrap (as root)" >&2; exit 69; }
+    folder=$(mktemp -d)
+    trap 'rm -rf "$folder"' EXIT
+    debootstrap --variant=minbase --include=python3,python3-venv,ca-certificates bookworm "$folder/root"
+    ln -s python3 "$folder/root/usr/bin/python"
+    tar -C "$folder/root" -c . | "$program" import --change 'CMD ["python"]' - "$base"
+}
+
+case "${1:-}" in
+    build) shift; build "$@" ;;
+    base) base ;;
+    *) sed -n '2,9s/^# \{0,1\}//p' "$0"; exit 2 ;;
+esac

@@ -1,0 +1,45 @@
+# The steps on NVIDIA GPUs: as cpu.Dockerfile, with torch for CUDA 13, gsplat's kernels and the diffusion models.
+# The kernels are compiled here, for the GPUs of $ARCHITECTURES, so the image needs no compiler when it runs.
+ARG PYTHON=python:3.11-slim-bookworm
+ARG CUDA=nvidia/cuda:13.0.2-devel-ubuntu22.04
+
+FROM ${CUDA} AS toolkit
+
+FROM ${PYTHON} AS packages
+ARG ARCHITECTURES="7.5 8.0 8.6 8.9 9.0 12.0"
+WORKDIR /src
+COPY constraints.txt deploy/images/steps.txt ./
+RUN --mount=type=secret,id=pip,target=/etc/pip.conf \
+    python -m venv /opt/dg4d && \
+    /opt/dg4d/bin/pip install --no-cache-dir -c constraints.txt -r steps.txt \
+        torch gsplat accelerate diffusers huggingface_hub transformers
+# hadolint ignore=DL3008
+RUN apt-get update && apt-get install -y --no-install-recommends g++ && rm -rf /var/lib/apt/lists/*
+COPY --from=toolkit /usr/local/cuda /usr/local/cuda
+COPY deploy/images/gsplat_kernels.py ./
+RUN CUDA_HOME=/usr/local/cuda TORCH_CUDA_ARCH_LIST="${ARCHITECTURES}" PATH="/opt/dg4d/bin:$PATH" python gsplat_kernels.py
+
+FROM packages AS code
+COPY pyproject.toml README.md LICENSE ./
+COPY dg4d_lib dg4d_lib
+COPY steps steps
+# the command `dg4d` needs flows, which are not here
+RUN --mount=type=secret,id=pip,target=/etc/pip.conf \
+    /opt/dg4d/bin/pip install --no-cache-dir --no-deps --target /opt/code . && rm -r /opt/code/bin
+
+FROM ${PYTHON}
+# pymeshlab loads these two libraries; Debian keeps only their newest version, so none can be named
+# hadolint ignore=DL3008
+RUN apt-get update && \
+    apt-get install -y --no-install-recommends libgl1 libopengl0 && \
+    rm -rf /var/lib/apt/lists/* && \
+    useradd --uid 10001 --create-home dg4d
+COPY --from=packages /opt/dg4d /opt/dg4d
+ENV PATH=/opt/dg4d/bin:$PATH PYTHONPATH=/opt/code \
+    NVIDIA_VISIBLE_DEVICES=all NVIDIA_DRIVER_CAPABILITIES=compute,utility
+RUN python -c "import pymeshlab; assert len(pymeshlab.filter_list()) >= 281"
+COPY --from=code /opt/code /opt/code
+USER 10001
+WORKDIR /home/dg4d
+HEALTHCHECK --interval=60s --timeout=20s --start-period=20s CMD ["python", "-m", "steps.main", "--help"]
+ENTRYPOINT ["python", "-m", "steps.main"]

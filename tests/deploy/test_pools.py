@@ -1,0 +1,130 @@
+"""Pools and deployments: what a worker makes of them, and mistakes that a server would take without a word."""
+
+from pathlib import Path
+from typing import Any
+
+import kubernetes_validate
+import pytest
+import rendering
+import yaml
+from prefect.flows import load_flow_from_entrypoint
+from prefect.utilities.callables import parameter_schema
+from prefect.utilities.schema_tools.validation import validate
+
+from dg4d_lib.errors import BadInput
+from flows.pools import DEPLOYMENTS, Pool, read_deployments, read_pools
+
+POOLS = read_pools()
+KUBERNETES = "1.33"
+
+
+def pools_of(kind: str) -> list[Pool]:
+    return [pool for pool in POOLS.values() if pool.type == kind]
+
+
+def changed(tmp_path: Path, old: str, new: str, file: Path = DEPLOYMENTS) -> Path:
+    text = file.read_text(encoding="utf-8")
+    assert old in text
+    path = tmp_path / file.name
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    return path
+
+
+def test_every_flow_is_deployed_in_every_pool() -> None:
+    deployments = read_deployments(POOLS, rendering.default_templates(), {})
+    flows = {deployment["entrypoint"] for deployment in deployments}
+    assert len(flows) == 4
+    where = {(deployment["entrypoint"], deployment["work_pool"]["name"]) for deployment in deployments}
+    assert where == {(flow, pool) for flow in flows for pool in POOLS}
+    for entrypoint in flows:
+        assert load_flow_from_entrypoint(entrypoint).name in {"image-to-4d", "video-to-4d", "catalog", "benchmark"}
+
+
+def test_the_names_of_flows_are_their_tags() -> None:
+    for deployment in read_deployments(POOLS, rendering.default_templates(), {}):
+        assert deployment["tags"] == [load_flow_from_entrypoint(deployment["entrypoint"]).name]
+
+
+def test_parameters_of_deployments_triggers_and_schedules_fit_their_flows() -> None:
+    for deployment in read_deployments(POOLS, rendering.default_templates(), {}):
+        schema: dict[str, Any] = parameter_schema(load_flow_from_entrypoint(deployment["entrypoint"])).model_dump()
+        for given in (deployment, *deployment.get("schedules", []), *deployment.get("triggers", [])):
+            parameters = given.get("parameters", {})
+            assert set(parameters) <= set(schema["properties"])
+        assert not validate(deployment.get("parameters", {}), schema, raise_on_error=False, ignore_required=True)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("{name: process-gpu}", "{name: proces-gpu}", "no pool 'proces-gpu'"),
+        ("{name: docker-cpu}", "{name: docker-cpu, job_variables: {imge: x}}", "no job variable 'imge'"),
+        ("tags: [catalog]", 'tags: [catalog, "{{ $SOMEWHERE }}"]', r"\$SOMEWHERE is not set"),
+    ],
+)
+def test_a_mistake_in_a_deployment_is_found(tmp_path: Path, old: str, new: str, says: str) -> None:
+    with pytest.raises(BadInput, match=says):
+        read_deployments(POOLS, rendering.default_templates(), {"SOMEWHERE": ""}, changed(tmp_path, old, new))
+
+
+def test_a_variable_of_the_environment_may_stand_in_a_deployment(tmp_path: Path) -> None:
+    file = changed(tmp_path, "tags: [catalog]", 'tags: [catalog, "{{ $SOMEWHERE }}"]')
+    assert len(read_deployments(POOLS, rendering.default_templates(), {"SOMEWHERE": "here"}, file)) == 24
+
+
+def test_a_misspelt_variable_of_a_pool_is_found() -> None:
+    pool = POOLS["docker-cpu"].model_copy(update={"variables": {"mem_limits": "8g"}})
+    with pytest.raises(BadInput, match="no job variable 'mem_limits'"):
+        pool.template(rendering.default_templates()["docker"])
+
+
+def test_a_pool_of_an_unknown_kind_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match=r"process-cpu"):
+        read_pools(changed(tmp_path, "type: process", "type: proces", DEPLOYMENTS.with_name("pools.yaml")))
+
+
+@pytest.mark.parametrize("pool", pools_of("docker"))
+def test_a_container_is_confined_and_limited(pool: Pool) -> None:
+    settings = rendering.container(pool)
+    assert settings["image"].startswith("dg4d/flows")
+    assert settings["mem_limit"].endswith("g")
+    assert settings["cap_drop"] == ["ALL"] and not settings["privileged"]
+    assert settings["security_opt"] == ["no-new-privileges"]
+    assert settings["environment"]["PREFECT_HOME"] == "/tmp/prefect"  # not that of the worker
+    assert settings["environment"]["DG4D_HOME"] == "/data/home"
+    assert settings["volumes"] == ["dg4d-data:/data"]
+
+
+def test_only_the_gpu_pool_asks_for_a_gpu() -> None:
+    gpu = [{"Driver": "nvidia", "Count": 1, "Capabilities": [["gpu"]]}]
+    assert rendering.container(POOLS["docker-gpu"])["device_requests"] == gpu
+    assert "device_requests" not in rendering.container(POOLS["docker-cpu"])
+    limits = {kind: job_container(POOLS[f"kubernetes-{kind}"])["resources"]["limits"] for kind in ("cpu", "gpu")}
+    assert limits["gpu"]["nvidia.com/gpu"] == 1
+    assert "nvidia.com/gpu" not in limits["cpu"]
+    assert POOLS["process-gpu"].limit == POOLS["docker-gpu"].limit == 1  # one GPU, one run
+
+
+@pytest.mark.parametrize("pool", pools_of("kubernetes"))
+def test_a_job_is_valid_confined_and_limited(pool: Pool) -> None:
+    manifest = rendering.job(pool)
+    for name in ("completions", "parallelism"):  # Prefect insists on them where they mean nothing; clusters drop them
+        del manifest["spec"]["template"]["spec"][name]
+    kubernetes_validate.validate(manifest, KUBERNETES, strict=True)
+    pod, (container,) = manifest["spec"]["template"]["spec"], [job_container(pool)]
+    assert pod["securityContext"]["runAsNonRoot"] and not pod["automountServiceAccountToken"]
+    assert container["securityContext"] == {"allowPrivilegeEscalation": False, "capabilities": {"drop": ["ALL"]}}
+    assert {"cpu", "memory"} <= set(container["resources"]["limits"])
+    assert container["envFrom"][1] == {"secretRef": {"name": "dg4d"}}
+    environment = {entry["name"]: entry.get("value") for entry in container["env"]}
+    assert environment["PREFECT_HOME"] == "/tmp/prefect" and environment["DG4D_HOME"] == "/data/home"
+    assert manifest["spec"]["backoffLimit"] == 0  # Prefect counts attempts
+
+
+def job_container(pool: Pool) -> dict[str, Any]:
+    (container,) = rendering.job(pool)["spec"]["template"]["spec"]["containers"]
+    return dict(container)
+
+
+def test_anchors_of_the_file_are_plain_yaml_to_prefect() -> None:
+    assert all("<<" not in deployment for deployment in yaml.safe_load(DEPLOYMENTS.read_text())["deployments"])

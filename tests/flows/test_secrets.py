@@ -1,0 +1,59 @@
+"""What only the environment may know is in nothing that a run leaves behind, whether it ends well or badly."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from prefect.logging.handlers import APILogHandler
+from signing import identity
+
+from flows import home, tasks
+from flows.executors import StepCrashed
+from flows.make import make
+from flows.orders import Wish
+from flows.server import Server
+from steps.profiles import PREVIEW
+
+MARKER = "c0ffee-and-nobody-else-knows"
+SECRETS = ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "HF_TOKEN")
+
+
+@pytest.fixture
+def place(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Fake steps in processes of their own, under the home folder of the server, with secrets in the environment."""
+    monkeypatch.setenv("DG4D_HOME", str(server.folder.parent))
+    monkeypatch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
+    monkeypatch.setenv("DG4D_CODE_VERSION", "secrets")
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
+    monkeypatch.setattr(tasks, "RETRY_DELAY_S", 0.01)
+    for name in SECRETS:
+        monkeypatch.setenv(name, MARKER)
+    with identity(tmp_path / MARKER).configured():
+        yield tmp_path
+
+
+def left_by(words: str, place: Path) -> dict[str, bytes]:
+    """Everything that is on disk after a run with these words: the package, records, artifacts, logs, the database."""
+    (place / "secret.png").write_text(words)
+    wish = Wish(item="secret", picture=place / "secret.png", settings=PREVIEW)
+    try:
+        make(wish.order(home.store()), place / "out")
+    except StepCrashed:
+        assert "crash" in words
+    APILogHandler().flush()
+    files = (path for folder in (place / "out", home.home()) for path in folder.rglob("*") if path.is_file())
+    return {str(path): path.read_bytes() for path in files}
+
+
+@pytest.mark.parametrize("words", ["fine", "fit_motion=crash"])
+def test_secrets_of_the_environment_are_nowhere(words: str, place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    found = left_by(words, place)
+    assert any(name.endswith(".db") for name in found) and any("results" in name for name in found)
+    key = (place / MARKER / "key.pem").read_bytes().splitlines()[1]
+    assert [name for name, content in found.items() if MARKER.encode() in content or key in content] == []
+    assert MARKER not in "".join(capfd.readouterr())
+    if words == "fine":
+        assert any(b"Test company" in content for content in found.values())  # it was signed with that key
+    else:
+        assert not (place / "out").exists()
