@@ -18,19 +18,19 @@ _revived: list[Server] = []  # they end when nobody uses them, and this process 
 
 
 def show(create: Callable[..., Any], **what: Any) -> None:
-    """Call what makes an artifact; while the server is away, start it if it is ours, and try again.
+    """Call what makes an artifact; if the server is away, start it if it is ours, and wait for it.
 
     A page is not worth a failed step: without an answer for `PATIENCE_S` seconds it is left out.
     """
     deadline = time.monotonic() + PATIENCE_S
     while True:
+        revive()  # first, for clients of Prefect wait long, and longer each time, before they say that it is away
         try:
             create(**what)
         except httpx.TransportError as error:
             if time.monotonic() > deadline:
                 get_run_logger().warning("the Prefect server does not answer; a page is left out: %s", error)
                 return
-            revive()
             time.sleep(POLL_S)
         else:
             return

@@ -28,7 +28,7 @@ from flows.caching import FileLocks, RequestPolicy
 from flows.events import StepEvent, tell
 from flows.executors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable, chosen
 from flows.leases import hold
-from flows.showing import show
+from flows.showing import revive, show
 from steps.contract import ArtifactRef, StepRequest, StepResult
 from steps.main import catalog, request_version
 from steps.store import StoreUnreachable
@@ -247,6 +247,7 @@ class _ProgressPage:
         self._last = now
         share = PROGRESS_DONE * done / max(total, 1)
         text = ", ".join([f"{self._what}: {done}/{total}", *(f"{name} {value:.4g}" for name, value in values.items())])
+        revive()
         with suppress(httpx.TransportError):  # the step goes on while the server is away
             if self._artifact is None:
                 self._artifact = create_progress_artifact(share, key=self._key, description=text)

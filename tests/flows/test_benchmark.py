@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from prefect.client.orchestration import get_client
+from prefect.client.schemas.filters import ArtifactFilter, ArtifactFilterKey
 from rich.console import Console
 
 from dg4d_lib.errors import BadInput
@@ -86,7 +87,7 @@ def test_a_benchmark_makes_judges_and_writes_everything_and_a_second_one_does_no
         assert film in page
     assert (out / "assets" / "a" / "provenance.json").is_file()
     with get_client(sync_client=True) as client:
-        (artifact,) = [one for one in client.read_artifacts() if one.key == "benchmark"]
+        (artifact,) = client.read_artifacts(artifact_filter=ArtifactFilter(key=ArtifactFilterKey(any_=["benchmark"])))
     assert [row["method"] for row in json.loads(str(artifact.data))] == ["its first frame at every view", "preview"]
 
     made = ran(log, "pack_asset"), ran(log, "score_asset")

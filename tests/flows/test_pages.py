@@ -129,9 +129,9 @@ def test_files_and_the_viewer_are_a_link_away(place: Path) -> None:
 
 
 def test_the_same_item_again_is_a_new_version_under_the_same_keys(place: Path) -> None:
-    make(order("one", place, "versioned"), place / "out")
-    make(order("another", place, "versioned"), place / "out")
-    make(order("another", place, "versioned"), place / "out")
+    make(order("version one", place, "versioned"), place / "out")
+    make(order("version two", place, "versioned"), place / "out")
+    make(order("version two", place, "versioned"), place / "out")
     every, latest = artifacts("versioned", "/artifacts/filter"), artifacts("versioned")
     assert {key: len(versions) for key, versions in every.items() if key in ("asset", "timings", "fit-motion")} == {
         "asset": 3, "timings": 3, "fit-motion": 2,

@@ -50,6 +50,7 @@ TINY: dict[str, Any] = {
     "motion.ladder": LADDER,
     "mesh.grid": 32,
     "mesh.edge_length": 0.06,
+    "mesh.max_faces": 400,
     "mesh.texture_size": 64,
     "mesh.render_size": 64,
     "driving.frames": FRAMES,
