@@ -64,6 +64,7 @@ def make(
     with clear_ending():
         from dg4d_lib.errors import BadInput
         from flows import home, terminal
+        from flows.acceptance import failing_in
         from flows.manifest import parse_changes
         from flows.orders import Wish, name_of
         from flows.publish import check_folder, is_current, record_of
@@ -99,6 +100,10 @@ def make(
         terminal.tell_where(console, folder, {name: fact["size_bytes"] for name, fact in files.items()})
         if (folder / "report.html").is_file():
             console.print(f"report: {folder / 'report.html'}", markup=False)
+        if failing := failing_in(folder):
+            console.print(
+                f"not accepted: {', '.join(failing)}; the report says what to do", markup=False, style="yellow"
+            )
 
 
 @app.command()

@@ -225,6 +225,14 @@ def test_two_commands_at_once_do_the_work_once(log: Path, tmp_path: Path) -> Non
     assert tree(tmp_path / "a", *RUN_FACTS) == tree(tmp_path / "b", *RUN_FACTS)
 
 
+def test_what_a_gate_does_not_let_pass_is_said_at_the_end(dg4d: Run, log: Path, tmp_path: Path) -> None:
+    for words, told in (("torn again", True), ("fine again", False)):
+        (tmp_path / "x.png").write_text(words)
+        done = dg4d("make", "x.png")
+        assert done.exit_code == 0
+        assert ("not accepted: silhouette; the report says what to do" in done.stdout) == told
+
+
 def test_a_command_with_nothing_to_do_says_so(dg4d: Run, log: Path, tmp_path: Path) -> None:
     (tmp_path / "x.png").write_text("nothing")
     assert "nothing to do" not in dg4d("make", "x.png").output
