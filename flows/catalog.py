@@ -11,7 +11,7 @@ from prefect import flow, task
 from prefect.artifacts import create_progress_artifact, create_table_artifact, update_progress_artifact
 from prefect.cache_policies import NO_CACHE
 from prefect.futures import PrefectFuture
-from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
+from prefect.settings import temporary_settings
 
 from dg4d_lib.errors import DG4DError
 from flows import pages
@@ -20,6 +20,7 @@ from flows.make import make, save_pictures
 from flows.orders import Order
 from flows.runners import item_runner
 from flows.summary import Row, Tally, judged
+from flows.tasks import QUICK
 from steps.store import ArtifactMissing, StoreUnreachable
 
 Make = Callable[[Order, Path], tuple[Any, bool]]
@@ -65,7 +66,7 @@ def convert_all(
 
     token = _body.set(rounds)
     try:
-        with temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):  # a second at the end of every flow
+        with temporary_settings(QUICK):
             catalog.with_options(task_runner=item_runner(workers))(title)
     finally:
         _body.reset(token)

@@ -6,13 +6,13 @@ Exit status: 0 done · 1 an item of a batch failed, or something broke · 2 wron
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from flows.checking import bench, rebuild, score, verify
 from flows.endings import clear_ending
-from flows.options import Changes, Commercial, Profile, Rate, Seed, Texture, Triangles
+from flows.options import Changes, Commercial, Profile, Rate, Seed, Texture, Triangles, knobs_of
 from flows.services import down, up, watch
 from flows.store import store
 from flows.weights import weights
@@ -74,7 +74,7 @@ def make(
         console = terminal.console()
         if pick and video:
             raise BadInput("--pick takes one of the motions that are made up; with --video the video is followed")
-        short = _short(triangles, texture, fps) | ({"driving.pick": pick} if pick else {})
+        short = knobs_of(triangles, texture, fps) | ({"driving.pick": pick} if pick else {})
         settings = revise(named(profile), parse_changes(changes or []) | short)
         item = picture.stem if picture else name_of(text)
         wish = Wish(
@@ -198,7 +198,7 @@ def batch(
         from flows.manifest import parse_changes
 
         console = terminal.console()
-        wanted = parse_changes(changes or []) | _short(triangles, texture, fps)
+        wanted = parse_changes(changes or []) | knobs_of(triangles, texture, fps)
         asked = (profile, wanted, seed, workers, commercial_only, strict, root, price_per_hour)
         if status := tell(make_all(inputs, out, console, *asked), out, console):
             raise typer.Exit(status)
@@ -271,12 +271,6 @@ for command in (score, bench, verify, rebuild, up, down, watch):
 def main() -> None:
     """The entry point of `dg4d`."""
     app()
-
-
-def _short(triangles: int | None, texture: int | None, fps: float | None) -> dict[str, Any]:
-    """The knobs behind options that are short for them."""
-    given = {"mesh.max_faces": triangles, "mesh.texture_size": texture, "pack.fps": fps}
-    return {knob: value for knob, value in given.items() if value is not None}
 
 
 def _made(order: "Order", folder: Path, console: "Console") -> dict[str, dict[str, int]]:

@@ -18,6 +18,7 @@ from flows.batch import batch, tell
 from flows.benchmark import bench
 from flows.fetching import at_hand
 from flows.make import connect, make
+from flows.options import knobs_of
 from flows.orders import Wish
 from flows.publish import check_folder, is_current
 from flows.terminal import console
@@ -44,8 +45,7 @@ class Options(Frozen):
 
     def knobs(self) -> dict[str, Any]:
         """Every change to the profile."""
-        short = {"mesh.max_faces": self.triangles, "mesh.texture_size": self.texture, "pack.fps": self.fps}
-        return self.changes | {knob: value for knob, value in short.items() if value is not None}
+        return self.changes | knobs_of(self.triangles, self.texture, self.fps)
 
 
 PREVIEW = Options()

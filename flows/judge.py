@@ -5,14 +5,14 @@ from typing import Any, Literal
 
 from prefect import flow, tags
 from prefect.artifacts import create_table_artifact
-from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
+from prefect.settings import temporary_settings
 
 from dg4d_lib.errors import BadInput
 from flows import home, scores
 from flows.executors import StepError
 from flows.orphans import process_tag
 from flows.scores import ObjectScores, Results
-from flows.tasks import Steps
+from flows.tasks import QUICK, Steps
 from steps.contract import ArtifactRef, Frozen
 from steps.profiles import ScoreAssetSettings
 
@@ -87,8 +87,7 @@ def benchmark(entries: list[Entry], settings: ScoreAssetSettings, title: str, ou
 
 def judge(entries: list[Entry], settings: ScoreAssetSettings, title: str, ours: str, seed: int = 0) -> Judged:
     """Run the flow."""
-    quick = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # a sync flow waits a second for its heart to stop
-    with temporary_settings(quick), tags(process_tag()):
+    with temporary_settings(QUICK), tags(process_tag()):
         return benchmark(entries, settings, title, ours, seed)
 
 

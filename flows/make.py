@@ -126,12 +126,12 @@ def make_motions(order: Order, folder: Path) -> dict[str, Any]:
 def _surroundings(order: Order) -> Iterator[None]:
     """What a flow of an order runs in."""
     from prefect import tags
-    from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
+    from prefect.settings import temporary_settings
 
     from flows.orphans import process_tag
+    from flows.tasks import QUICK
 
-    quick = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # a sync flow waits a second for its heart to stop
-    with temporary_settings(quick), tags(process_tag(), f"profile:{order.profile}"):
+    with temporary_settings(QUICK), tags(process_tag(), f"profile:{order.profile}"):
         yield
 
 

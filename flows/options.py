@@ -1,6 +1,6 @@
 """Options that several commands share."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -15,3 +15,9 @@ Seed = Annotated[int, typer.Option(min=0, help="of everything random; equal seed
 Triangles = Annotated[int | None, typer.Option(help="of the mesh, at most; short for --set mesh.max_faces=")]
 Texture = Annotated[int | None, typer.Option("--texture", help="texels of a side; short for --set mesh.texture_size=")]
 Rate = Annotated[float | None, typer.Option("--fps", help="frames per second of the files; short for --set pack.fps=")]
+
+
+def knobs_of(triangles: int | None, texture: int | None, fps: float | None) -> dict[str, Any]:
+    """The knobs behind options that are short for them."""
+    given = {"mesh.max_faces": triangles, "mesh.texture_size": texture, "pack.fps": fps}
+    return {knob: value for knob, value in given.items() if value is not None}

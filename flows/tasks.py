@@ -19,6 +19,7 @@ from prefect.cache_policies import CachePolicy
 from prefect.client.schemas.objects import State, TaskRun
 from prefect.futures import PrefectFuture
 from prefect.logging import get_run_logger
+from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY
 from prefect.tasks import Task, exponential_backoff
 from prefect.transactions import IsolationLevel
 from pydantic import BaseModel
@@ -35,6 +36,7 @@ from steps.store import StoreUnreachable
 from steps.weights import identities, weights_in
 
 PROGRESS_PAGE_EVERY_S = 3.0
+QUICK = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # settings: a flow waits a second at its end for its heart to stop
 RETRIES = 2
 RETRY_DELAY_S = 2.0  # doubled each time
 PROGRESS_DONE = 100.0
