@@ -1,11 +1,17 @@
 """The application of the background server: Prefect's own, and at two more addresses what the store holds."""
 
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager
 from pathlib import Path, PurePath
 
 from fastapi import FastAPI, Response
 from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse
 from prefect.server.api.server import create_app as prefect_app
+from prefect.server.database.configurations import AioSqliteConfiguration
+from prefect.server.database.dependencies import MODELS_DEPENDENCIES
+from prefect.settings import PREFECT_API_DATABASE_CONNECTION_URL
 from pydantic import ValidationError
+from sqlalchemy.ext.asyncio import AsyncSession, AsyncSessionTransaction
 
 from dg4d_lib.errors import BadInput
 from flows import home
@@ -16,8 +22,27 @@ from steps.contract import ArtifactRef
 SHOWN = {".png": "image/png", ".json": "application/json"}  # what a browser shows; the rest is saved to disk
 
 
+class OneWriter(AioSqliteConfiguration):
+    """SQLite whose transactions take their turn at the beginning.
+
+    One that begins to write after it has read is refused at once if another has written in between; the server then
+    answers 503, and a client waits two seconds and more before it asks again: half the time of a batch.
+    """
+
+    @asynccontextmanager
+    async def begin_transaction(
+        self, session: AsyncSession, with_for_update: bool = False
+    ) -> AsyncGenerator[AsyncSessionTransaction, None]:
+        """As Prefect's, with the lock for writing from the beginning."""
+        async with super().begin_transaction(session, with_for_update=True) as transaction:
+            yield transaction
+
+
 def create_app() -> FastAPI:
     """Prefect's application with the artifacts in front; needs DG4D_HOME in the environment."""
+    database = PREFECT_API_DATABASE_CONNECTION_URL.value()
+    if database.startswith("sqlite"):
+        MODELS_DEPENDENCIES["database_config"] = OneWriter(connection_url=database)
     application = prefect_app()
     routes = application.router.routes
     for place, answer in ((ARTIFACT_ADDRESS, artifact), (VIEWER_ADDRESS, viewer)):

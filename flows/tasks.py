@@ -225,7 +225,7 @@ def _task(step: str, item: str, label: str) -> Task[..., Any]:
     return run_step.with_options(
         name=step,
         task_run_name=f"{label}: {item}",
-        tags=[f"step:{step}", f"item:{item}", f"resource:{catalog()[step].resource}"],
+        tags=[f"step:{step}", f"resource:{catalog()[step].resource}"],  # Prefect keeps a thread and a client per set
         cache_policy=policy.configure(isolation_level=IsolationLevel.SERIALIZABLE, lock_manager=locks),
         result_storage=home.records(),
         retries=RETRIES,
