@@ -19,6 +19,7 @@ from dg4d_lib.mesh.check import MeshFacts, checked, welded
 from dg4d_lib.mesh.clean import clean
 from dg4d_lib.mesh.density import density_field
 from dg4d_lib.mesh.extract import best_level, surface, usable_level
+from dg4d_lib.mesh.register import FOLLOWS, register
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.rest import best_rest, since
 from dg4d_lib.mesh.ride import ride
@@ -34,7 +35,6 @@ from steps.motions import read_motion
 from steps.profiles import ExtractMeshSettings
 
 PICTURE_CAMERAS = [OrbitCamera(0, azimuth, width=256, height=256) for azimuth in (0.0, 75.0, 180.0, 285.0)]
-FOLLOWS = 0.85  # intersection over union on trial, below which one mesh does not follow a motion
 FPS_UNKNOWN = 1.0  # frames per second: motion has no clock; refine_texture, which sees the driving video, sets it
 
 
@@ -63,14 +63,17 @@ def run(job: Job) -> Facts:
 
     if one:
         job.progress(1, 3, {})
-        mesh, offsets = _tracked(states, displacement, frame, level, rasterize, settings.mesh)
+        mesh, offsets, agreed = _tracked(states, displacement, frame, level, rasterize, settings.mesh)
         job.progress(2, 3, {})
         write_tracked(job.outputs["tracked"], Asset4D(mesh, offsets, FPS_UNKNOWN, rest=frame))
         picture = _picture(mesh)
         notes.append(f"one mesh for {frames} frames: {len(mesh.vertices)} vertices, {len(mesh.faces)} triangles")
         notes.append(f"at rest it is {_facts(mesh)}")
         notes.append(f"it is the surface of frame {frame}, which follows the motion best ({followed:.1%} IoU on trial)")
-        if followed < FOLLOWS:
+        notes.append(
+            f"its outlines agree with the Gaussians' to {agreed.mean():.1%} (IoU), to {agreed.min():.1%} at worst"
+        )
+        if agreed.mean() < FOLLOWS:
             notes.append("one mesh follows this motion poorly: --set mesh.mode=per_frame gives a mesh per frame")
     else:
         end = settings.end_frame or frames
@@ -100,13 +103,18 @@ def _tracked(
     level: float,
     rasterize: Rasterizer,
     settings: MeshSettings,
-) -> tuple[TexturedMesh, Float[Tensor, "t v 3"]]:
-    """The mesh of the cloud as it is at one frame, and what to add to its vertices at every frame."""
+) -> tuple[TexturedMesh, Float[Tensor, "t v 3"], Float[Tensor, " t"]]:
+    """The mesh of the cloud as it is at one frame, what to add to its vertices at every frame, and how well that does.
+
+    The last is the agreement of outlines (`register`).
+    """
     rest = states.at(frame)
     vertices, faces = _cleaned_surface(rest, level, settings)
     mesh, copied = _colored(vertices, faces, rest, rasterize, settings)
     carried = ride(vertices, rest, since(displacement, frame))
-    return mesh, snap(vertices, carried, faces, states, level, settings)[:, copied]
+    snapped = snap(vertices, carried, faces, states, level, settings)
+    offsets, agreed = register(vertices, snapped, faces, states, level, rasterize, settings)
+    return mesh, offsets[:, copied], agreed
 
 
 def _cleaned_surface(

@@ -4,27 +4,20 @@ Parts that touch at the moment of extraction share a surface and tear when they 
 no surface to unfold. So a few moments are tried on a coarse grid, and the outlines over the whole motion decide.
 """
 
-from collections.abc import Sequence
-
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 
-from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.density import density_field
 from dg4d_lib.mesh.extract import best_level, surface
+from dg4d_lib.mesh.outlines import agreement, outlines_of
 from dg4d_lib.mesh.ride import ride
-from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
 
 CANDIDATES = 12  # moments that are tried
 MOMENTS = 8  # at which outlines are compared
 GRID = 64  # cells of the trial's density field
-SIZE = 128  # pixels of an outline
-VIEWS = ((0.0, 2.0), (75.0, 1.0))  # azimuth in degrees and weight: an eye compares at the input view
 GAIN = 0.005  # of intersection over union: less is no reason to leave the first frame
 
 
@@ -52,7 +45,7 @@ def best_rest(
     """
     frames = len(states.means)
     moments = evenly(frames, MOMENTS)
-    truth = [_splat_outlines(states, moments, azimuth, rasterize) for azimuth, _ in VIEWS]
+    outlines = outlines_of(states, moments, rasterize)
     scores = {}
     for frame in evenly(frames, CANDIDATES):
         rest = states.at(frame)
@@ -62,13 +55,7 @@ def best_rest(
         motion = since(displacement, frame)
         some = Displacement(**{name: value[moments] for name, value in vars(motion).items()})
         moved = vertices + ride(vertices, rest, some)
-        total = 0.0
-        for (azimuth, weight), outline in zip(VIEWS, truth, strict=True):
-            camera = OrbitCamera(0, azimuth, width=SIZE, height=SIZE)
-            drawn = rasterize_mesh(moved, faces, [camera] * len(moments)).faces >= 0
-            shared, either = (mask.flatten(1).sum(1) for mask in (drawn & outline, drawn | outline))
-            total += weight * float((shared / either.clamp(min=1)).mean())
-        scores[frame] = total / sum(weight for _, weight in VIEWS)
+        scores[frame] = float(agreement(moved, faces, outlines).mean())
     best = max(scores, key=lambda frame: scores[frame])
     chosen = best if scores[best] > scores[0] + GAIN else 0
     return chosen, scores[chosen]
@@ -77,11 +64,3 @@ def best_rest(
 def evenly(total: int, count: int) -> list[int]:
     """Up to `count` different numbers below `total`, the first and the last included."""
     return sorted({round(i * (total - 1) / max(min(count, total) - 1, 1)) for i in range(min(count, total))})
-
-
-def _splat_outlines(
-    states: Gaussians, moments: Sequence[int], azimuth_deg: float, rasterize: Rasterizer
-) -> Bool[Tensor, "m h w"]:
-    camera = OrbitCamera(0, azimuth_deg, width=SIZE, height=SIZE)
-    with torch.no_grad():
-        return rasterize(states.states(moments), [camera] * len(moments), torch.zeros(3)).alpha[..., 0] > 0.5

@@ -1,0 +1,47 @@
+import torch
+import trimesh
+
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.initialize import isotropic
+from dg4d_lib.mesh.density import density_field
+from dg4d_lib.mesh.extract import surface
+from dg4d_lib.mesh.outlines import agreement, outlines_of
+from dg4d_lib.mesh.register import FOLLOWS, register
+from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.settings import MeshSettings
+
+SETTINGS = MeshSettings(grid=48)
+LEVEL = 0.5
+
+
+def ball(stretch: tuple[float, float, float]) -> Gaussians:
+    """Opaque Gaussians in a ball of radius 0.4 that is stretched along the axes."""
+    places = torch.nn.functional.normalize(torch.randn(2500, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    radii = 0.36 * torch.rand(2500, 1, generator=torch.Generator().manual_seed(1)) ** (1 / 3)
+    return isotropic(places * radii * torch.tensor(stretch), torch.full((2500,), 0.04), torch.full((2500, 3), 0.5), 0.9)
+
+
+def test_vertices_that_were_left_behind_come_to_the_outlines_and_others_stay():
+    rest, stretched = ball((1, 1, 1)), ball((1.9, 0.6, 1))
+    both = {name: torch.stack([getattr(rest, name), getattr(stretched, name)]) for name in ("means", "quats")}
+    states = Gaussians(
+        log_scales=torch.stack([rest.log_scales] * 2),
+        opacity_logits=rest.opacity_logits,
+        harmonics=rest.harmonics,
+        **both,
+    )
+    rasterize = choose_rasterizer("cpu")
+    vertices, faces = (torch.from_numpy(a) for a in surface(density_field(rest, SETTINGS), LEVEL))
+    nothing = torch.zeros(2, len(vertices), 3)
+    offsets, agreed = register(vertices, nothing, faces, states, LEVEL, rasterize, SETTINGS)
+    outlines = outlines_of(states, [0, 1], rasterize)
+    before, after = (agreement(vertices + offset, faces, outlines) for offset in (nothing, offsets))
+    torch.testing.assert_close(after, agreed)
+    assert before[0] > FOLLOWS > before[1]
+    assert torch.equal(offsets[0], nothing[0])
+    assert before[1] < 0.65
+    assert after[1] > 0.93
+    moved = trimesh.Trimesh((vertices + offsets[1]).numpy(), faces.numpy(), process=False)
+    aim = trimesh.Trimesh(*surface(density_field(stretched, SETTINGS), LEVEL), process=False)
+    assert moved.is_watertight
+    assert abs(moved.extents / aim.extents - 1).max() < 0.1
