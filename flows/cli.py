@@ -5,6 +5,7 @@ Exit status: 0 done · 1 an item of a batch failed, or something broke · 2 wron
 """
 
 import os
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="dg4d",
-    help="Pictures and videos become animated, textured 3D assets.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -32,6 +32,21 @@ app = typer.Typer(
 
 app.add_typer(weights)
 app.add_typer(store)
+
+
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"dg4d {version('dg4d')}")
+        raise typer.Exit
+
+
+@app.callback()
+def dg4d(
+    version: Annotated[
+        bool, typer.Option("--version", help="say which version this is", callback=_say_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Pictures and videos become animated, textured 3D assets."""
 
 
 @app.command()

@@ -3,6 +3,7 @@ import json
 import os
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -118,6 +119,14 @@ def test_wrong_usage() -> None:
     assert dg4d("make", "cat.png", "--seed", "-1").exit_code == 2
     assert dg4d("batch", ".").exit_code == 2
     assert dg4d("render", ".", "--azimuths=left", "-o", "out").exit_code == 2
+
+
+def test_the_version() -> None:
+    result = dg4d("--version")
+    declared = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+        "version"
+    ]
+    assert (result.exit_code, result.stdout) == (0, f"dg4d {declared}\n")
 
 
 def test_a_batch_of_nothing() -> None:
