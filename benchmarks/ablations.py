@@ -2,9 +2,9 @@
 
 Every variant is a set of the pipeline's own settings. The prior is the oracle, which knows true views (never those that
 are scored); with `--imperfect` they are blurred, beside the view, and shifted and tinted otherwise in every frame.
-Objects are our own, or those of a data set with banks (`--data DIR`). The table has means over objects and seeds and,
-behind a +-, the standard deviation over them; the sentence below compares pairs: the same object, the same seed.
-`--quick` is a smoke test.
+Objects are our own, or those of a data set (`--data DIR`): a folder per object with input/, view_AZIMUTH/ and bank/, as
+`dg4d bench --bank` reads them. The table has means over objects and seeds and, behind a +-, the standard deviation over
+them; the sentence below compares pairs: the same object, the same seed. `--quick` is a smoke test.
 
 An oracle is no diffusion model: it never disagrees with itself from one iteration to the next. What of the paper rests
 on that cannot be seen here, and is said so.
@@ -12,18 +12,21 @@ on that cannot be seen here, and is said so.
 
 import argparse
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
 
 from rich.console import Console
 from rich.table import Column, Table
+from scipy.stats import t as student
 
 from benchmarks.fits import Figures, fits_per_frame, moving_fit, score, static_fit
 from benchmarks.measure import write_rows
 from benchmarks.objects.specimens import OBJECTS, Specimen, made, read
+from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from flows.manifest import parse_changes
 from steps.profiles import PipelineSettings, revise
@@ -31,7 +34,9 @@ from steps.truth import find_truths
 
 DIGITS = {"psnr": 2, "psnr_obj": 2, "iou": 3, "terr": 3}
 LESS_IS_BETTER = {"terr"}
-SIGNIFICANT = 2.0  # standard errors of the mean of the differences
+CONFIDENCE = 0.95  # of the interval that a gain lies in, by Student's t over the pairs
+SLIGHT = {"psnr": 0.1, "psnr_obj": 0.1, "iou": 0.005, "terr": 0.01}  # gains nobody would see
+SHARES = ("subject.max_frames", "deformation.temporal")  # a fraction of these is one of the frames there are
 
 SMALL: dict[str, Any] = {  # the paper's schedule, scaled to seconds on a processor: fewer iterations, larger steps
     "prior.kind": "oracle",
@@ -66,7 +71,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class Claim:
-    """One variant is better than another by a figure, or (`alike`) not significantly."""
+    """One variant is better than another by a figure, or (`alike`) only slightly so."""
 
     better: str
     other: str
@@ -193,7 +198,7 @@ ABLATIONS: dict[str, Ablation] = {
             "smoothness 100": Variant({"subject.max_frames": 0.5, "deformation.smoothness_weight": 100.0}),
             "variation .0001": Variant({"subject.max_frames": 0.5, "deformation.variation_weight": 1e-4}),
             "sparsity .0001": Variant({"subject.max_frames": 0.5, "deformation.sparsity_weight": 1e-4}),
-            "T as the frames": Variant({"subject.max_frames": 0.5, "deformation.temporal": 6}),
+            "T as the frames": Variant({"subject.max_frames": 0.5, "deformation.temporal": 0.5}),
         },
         (Claim("smoothness .01", "off", "terr"), Claim("smoothness .01", "off", "psnr_obj")),
         caveat="half of the frames were fitted, all are scored",
@@ -230,17 +235,16 @@ class Row:
 
 
 def settings_of(changes: Mapping[str, Any], size: int, frames: int) -> PipelineSettings:
-    """The small schedule with changes; a fraction as `subject.max_frames` is one of the frames there are."""
+    """The small schedule with changes, `SHARES` among them."""
     ladder = [{"until": 1.0, "size": size}]
     sizes = {
         f"{stage}.{name}": value
         for stage in ("static", "motion")
         for name, value in (("ladder", ladder), ("reference_size", size))
     }
-    share = changes.get("subject.max_frames", 1.0)
-    return revise(
-        PipelineSettings(), {**SMALL, **sizes, **changes, "subject.max_frames": max(2, round(share * frames))}
-    )
+    wanted = {**SMALL, **sizes, "subject.max_frames": 1.0, **changes}
+    counts = {key: max(2, round(wanted[key] * frames)) for key in SHARES if isinstance(wanted.get(key), float)}
+    return revise(PipelineSettings(), {**wanted, **counts})
 
 
 class Laboratory:
@@ -284,14 +288,24 @@ def verdict(ablation: Ablation, rows: Sequence[Row]) -> str:
             for pair in pairs
         ]
         gain, error = mean(gains), stdev(gains) / math.sqrt(len(gains)) if len(gains) > 1 else math.inf
-        ahead, behind = gain > SIGNIFICANT * error, gain < -SIGNIFICANT * error
-        outcomes.append("no" if (ahead if claim.alike else behind) else "yes" if claim.alike or ahead else "open")
+        outcomes.append(_outcome(claim, gain, error, len(pairs)))
         digits = DIGITS[claim.figure]
         parts.append(f"{claim.better} against {claim.other}: {gain:+.{digits}f} +- {error:.{digits}f} {claim.figure}")
     word = {"yes": "Reproduced", "open": "Not decided", "no": "Not reproduced"}
     outcome = word["no" if "no" in outcomes else "open" if "open" in outcomes else "yes"]
     caveat = f" (but {ablation.caveat})" if ablation.caveat else ""
     return f"{outcome}{caveat}: {ablation.says}; gains: {'; '.join(parts)}."
+
+
+def _outcome(claim: Claim, gain: float, error: float, pairs: int) -> str:
+    """Whether one claim holds; a single pair decides nothing."""
+    if pairs < 2:
+        return "open"
+    reach = float(student.ppf((1 + CONFIDENCE) / 2, pairs - 1)) * error
+    bound = SLIGHT[claim.figure] if claim.alike else 0.0
+    if gain - reach <= bound <= gain + reach:
+        return "open"
+    return "yes" if (gain > bound) != claim.alike else "no"
 
 
 def table(title: str, rows: Sequence[Row]) -> Table:
@@ -318,7 +332,14 @@ def main() -> None:
     parser.add_argument(
         "--objects", nargs="+", metavar="NAME", help=f"of {', '.join(OBJECTS)}, or of DIR; default: all"
     )
-    parser.add_argument("--data", type=Path, metavar="DIR", help="a data set with banks, instead of our own objects")
+    parser.add_argument(
+        "--data",
+        type=Path,
+        metavar="DIR",
+        help="a data set with banks, instead of our own objects; all ablations need videos but those of the static "
+        f"stage ({', '.join(name for name, one in ABLATIONS.items() if one.still)}), which take pictures, too; "
+        "those of the refinement need weights: benchmarks.refinement",
+    )
     parser.add_argument("--seeds", type=int, default=2, help="fits of every variant and object")
     parser.add_argument("--frames", type=int, default=16, help="of the video, at most")
     parser.add_argument("--size", type=int, default=96, help="pixels of what is fitted, and of our own objects' views")
@@ -327,6 +348,18 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="one seed, four frames, a few iterations")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
     options = parser.parse_args()
+    try:
+        run(options, Console())
+    except BadInput as error:
+        parser.error(str(error))
+
+
+def run(options: argparse.Namespace, console: Console) -> None:
+    """Fit and print what the options ask for.
+
+    Raises:
+        BadInput: a data set, an object or a setting cannot be used.
+    """
     if options.quick:
         options.seeds, options.frames, options.size = 1, 4, 48
     base = {
@@ -334,8 +367,12 @@ def main() -> None:
         **(IMPERFECT if options.imperfect else {}),
         **parse_changes(options.set),
     }
-    laboratory, console, rows = Laboratory(base, options.size), Console(), list[Row]()
+    laboratory, rows = Laboratory(base, options.size), list[Row]()
     specimens = find_specimens(options.data, options.objects, options.frames, options.size)
+    pictures = [specimen.name for specimen in specimens if len(specimen.cutouts) < 2]
+    moving = [name for name in options.names if not ABLATIONS[name].still]
+    if pictures and moving:
+        raise BadInput(f"{', '.join(moving)}: needs a video; of {', '.join(pictures)} there is one picture")
     scale = f"{options.seeds} seeds, {len(specimens[0].cutouts)} frames, {options.size} px"
     about = f"{', '.join(specimen.name for specimen in specimens)}; {scale}"
     for name in options.names:
@@ -353,10 +390,17 @@ def main() -> None:
 
 
 def find_specimens(data: Path | None, names: Sequence[str] | None, frames: int, size: int) -> list[Specimen]:
-    """Our own objects, or those of a data set."""
-    if data is None:
-        return [made(name, frames, size) for name in names or OBJECTS]
-    return [read(truth, frames) for truth in find_truths(data) if not names or truth.name in names]
+    """Our own objects, or those of a data set.
+
+    Raises:
+        BadInput: the data set cannot be used, or does not have all that are named.
+    """
+    known: dict[str, Callable[[], Specimen]] = {name: partial(made, name, frames, size) for name in OBJECTS}
+    if data is not None:
+        known = {truth.name: partial(read, truth, frames) for truth in find_truths(data)}
+    if unknown := sorted(set(names or ()) - set(known)):
+        raise BadInput(f"there is no object {', '.join(unknown)}; there are: {', '.join(known)}")
+    return [known[name]() for name in names or known]
 
 
 if __name__ == "__main__":

@@ -20,10 +20,10 @@ from rich.table import Column, Table
 from torch import Tensor
 
 from dg4d_lib.assets.animated import moved
+from dg4d_lib.assets.compact import read_compact
 from dg4d_lib.assets.glb import read_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.mesh.density import density_field
 from dg4d_lib.mesh.extract import best_level
 from dg4d_lib.mesh.render import render_mesh
@@ -33,8 +33,7 @@ from dg4d_lib.metrics.surface import chamfer
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
 from dg4d_lib.settings import MeshSettings
 from steps.extract_mesh import textured
-from steps.motions import read_motion
-from steps.packages import ASSET, GAUSSIANS, MOTION
+from steps.packages import ASSET, COMPACT
 
 AZIMUTHS_DEG = (0.0, 90.0)  # the input view, and the right side
 SIZE = 512  # pixels
@@ -61,8 +60,8 @@ class Row:
 
 def of_package(folder: Path, count: int, rasterize: Rasterizer) -> list[Row]:
     asset = read_glb((folder / ASSET).read_bytes())
-    deformation, frames = read_motion(folder / MOTION)
-    gaussians = read_ply(folder / GAUSSIANS)
+    fit = read_compact(folder / COMPACT)
+    gaussians, deformation, frames = fit.gaussians, fit.deformation, fit.frames
     first = moved(gaussians, deformation, frames, torch.zeros(1)).at(0)
     level, _ = best_level(density_field(first, SETTINGS), first, rasterize, SETTINGS.density_threshold)
     chosen = [i * frames // count for i in range(count)]

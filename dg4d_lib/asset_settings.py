@@ -15,7 +15,9 @@ class GltfSettings(Settings):
         description="format of textures; png: exact, larger; webp: smallest, EXT_texture_webp, with a jpeg of 512 "
         "pixels for other readers",
     )
-    quality: int = Field(95, ge=1, le=100, description="of jpeg and webp")
+    quality: int = Field(
+        85, ge=1, le=100, description="of jpeg and webp; from 95 on, jpeg keeps colors as fine as brightness"
+    )
     quantized: bool = Field(False, description="16 bits instead of 32, 8 for normals at rest: KHR_mesh_quantization")
     meshopt: bool = Field(
         False, description="packed: EXT_meshopt_compression, which web players know and Blender does not"

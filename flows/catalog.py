@@ -158,7 +158,8 @@ class _Page:
     """How far the batch is, on the server: a bar with a line of numbers, and a table at the end."""
 
     def __init__(self, title: str, tally: Tally) -> None:
-        self._key, self._title, self._tally = pages.key("catalog", title.partition(":")[0]), title, tally
+        self._name, self._tally = title.partition(":")[0], tally
+        self._key = pages.key("catalog", self._name)
         self._bar: Any = create_progress_artifact(0.0, key=f"progress-{self._key}", description=self._text())
         self._next = 0.0
 
@@ -173,9 +174,20 @@ class _Page:
         self._next = 0.0
         self.update()
         rows = sorted(self._tally.rows.values(), key=lambda row: (row.status != "failed", not row.failing))
-        shown = [row.model_dump(mode="json", exclude={"pictures"}) for row in rows[:ROWS_SHOWN]]
+        shown = [_cells(row) for row in rows[:ROWS_SHOWN]]
         more = f"; {ROWS_SHOWN} of {len(rows)} are shown, all are in summary.csv" if len(rows) > ROWS_SHOWN else ""
-        create_table_artifact(table=shown, key=self._key, description=f"{self._title}: {self._tally.line()}{more}")
+        create_table_artifact(table=shown, key=self._key, description=f"{self._text()}{more}")
 
     def _text(self) -> str:
-        return f"{self._title}: {self._tally.line()}"
+        return f"{self._name}: {self._tally.line()}"
+
+
+def _cells(row: Row) -> dict[str, Any]:
+    """What a page has room for, the longest last."""
+    return {
+        "item": row.item,
+        "status": "not accepted" if row.failing else row.status,
+        "seconds": row.seconds,
+        "asset": f"[page](/artifacts/key/{pages.key('asset', row.item)})" if row.made else "",
+        "message": ", ".join(row.failing or ()) or row.message,
+    }

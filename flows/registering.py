@@ -17,13 +17,49 @@ from dg4d_lib.errors import BackendUnavailable
 from flows.pools import DEPLOYMENTS, Json, Pool, read_deployments
 from flows.workers import HEARTBEAT_S
 
-DEAD = "dg4d: runs whose process died"  # the name of the automation
 MISSED = 3  # heartbeats, before a run is taken for dead
-ENDINGS = ("Completed", "Failed", "Cancelled", "Crashed")
+LONGEST = timedelta(days=7)  # of a run that is begun again when it died
+ALIVE = "prefect.flow-run.heartbeat"  # of runs of deployments; those of commands have none
+ENDINGS = {f"prefect.flow-run.{ending}" for ending in ("Completed", "Failed", "Cancelled", "Crashed")}
+
+
+def _trigger(expect: set[str], posture: Posture, within: timedelta) -> EventTrigger:
+    """What happens, or does not, to a run that was alive."""
+    return EventTrigger(
+        after={ALIVE},
+        expect=expect,
+        match=ResourceSpecification({"prefect.resource.id": ["prefect.flow-run.*"]}),
+        for_each={"prefect.resource.id"},
+        posture=posture,
+        threshold=1,
+        within=within,
+    )
+
+
+AUTOMATIONS = (
+    AutomationCore(
+        name="dg4d: runs whose process died",
+        description="A worker or a whole machine that dies reports nothing; its runs would stay Running for ever.",
+        trigger=_trigger({ALIVE, *ENDINGS}, Posture.Proactive, timedelta(seconds=MISSED * HEARTBEAT_S)),
+        actions=[
+            ChangeFlowRunState(
+                state=StateType.CRASHED,
+                name=None,
+                message=f"no heartbeat for {MISSED * HEARTBEAT_S} s: its process was killed, or its machine is gone",
+            )
+        ],
+    ),
+    AutomationCore(
+        name="dg4d: runs that died go on",
+        description="After their last finished step, on any worker; a run that dies again and again fails.",
+        trigger=_trigger({"prefect.flow-run.Crashed"}, Posture.Reactive, LONGEST),
+        actions=[ChangeFlowRunState(state=StateType.SCHEDULED, name="AwaitingRetry", message="its process died")],
+    ),
+)
 
 
 def register(pools: Mapping[str, Pool], chosen: list[str]) -> list[str]:
-    """Have the chosen pools, their deployments, and an automation that notices runs whose process died.
+    """Have the chosen pools, their deployments, and automations that notice runs whose process died, and go on.
 
     Args:
         pools: every pool that there may be, by name.
@@ -57,7 +93,7 @@ def register(pools: Mapping[str, Pool], chosen: list[str]) -> list[str]:
                 overwrite=True,
             )
         _deploy(sorted({deployment["name"] for deployment in deployments}))
-        _notice_the_dead(client)
+        _automate(client)
         there = {f"{client.read_flow(found.flow_id).name}/{found.name}" for found in client.read_deployments()}
     wanted = [f"{deployment['tags'][0]}/{deployment['name']}" for deployment in deployments]
     if missing := [name for name in wanted if name not in there]:
@@ -89,30 +125,10 @@ def _deploy(names: list[str]) -> None:
         raise BackendUnavailable(f"`prefect deploy` failed: {(done.stderr or done.stdout).strip()[-1000:]}")
 
 
-def _notice_the_dead(client: SyncPrefectClient) -> None:
-    """A run that was alive and misses its heartbeats has crashed; `dg4d make` has no heartbeats and is not meant."""
-    automation = AutomationCore(
-        name=DEAD,
-        description="A worker or a whole machine that dies reports nothing; its runs would stay Running for ever.",
-        trigger=EventTrigger(
-            after={"prefect.flow-run.heartbeat"},
-            expect={"prefect.flow-run.heartbeat", *(f"prefect.flow-run.{ending}" for ending in ENDINGS)},
-            match=ResourceSpecification({"prefect.resource.id": ["prefect.flow-run.*"]}),
-            for_each={"prefect.resource.id"},
-            posture=Posture.Proactive,
-            threshold=1,
-            within=timedelta(seconds=MISSED * HEARTBEAT_S),
-        ),
-        actions=[
-            ChangeFlowRunState(
-                state=StateType.CRASHED,
-                name=None,
-                message=f"no heartbeat for {MISSED * HEARTBEAT_S} s: its process was killed, or its machine is gone",
-            )
-        ],
-    )
-    known = client.find_automation(DEAD)
-    if known is None:
-        client.create_automation(automation)
-    else:
-        client.update_automation(known.id, automation)
+def _automate(client: SyncPrefectClient) -> None:
+    for automation in AUTOMATIONS:
+        known = client.find_automation(automation.name)
+        if known is None:
+            client.create_automation(automation)
+        else:
+            client.update_automation(known.id, automation)

@@ -4,7 +4,7 @@ from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from pathlib import Path, PurePath
 
-from fastapi import FastAPI, Response
+from fastapi import FastAPI, Request, Response
 from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse
 from prefect.server.api.server import create_app as prefect_app
 from prefect.server.database.configurations import AioSqliteConfiguration
@@ -45,10 +45,18 @@ def create_app() -> FastAPI:
         MODELS_DEPENDENCIES["database_config"] = OneWriter(connection_url=database)
     application = prefect_app()
     routes = application.router.routes
+    for route in routes:
+        if isinstance(part := getattr(route, "app", None), FastAPI):
+            part.add_exception_handler(ConnectionError, database_away)
     for place, answer in ((ARTIFACT_ADDRESS, artifact), (VIEWER_ADDRESS, viewer)):
         application.add_api_route(place + "{digest}/{size}/{name}", answer, response_class=Response)
         routes.insert(0, routes.pop())  # before the user interface, which answers to every address
     return application
+
+
+def database_away(request: Request, error: Exception) -> Response:
+    """What a client hears while the database starts: "ask again", where Prefect says "broken"."""
+    return PlainTextResponse("the database does not answer", 503)
 
 
 def artifact(digest: str, size: int, name: str) -> Response:

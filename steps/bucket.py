@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from obstore.store import ClientConfig, ObjectStore
 
 CONNECT_S = 10.0
+YES = {"1", "on", "true", "y", "yes"}  # of $AWS_ALLOW_HTTP, as the library reads it
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 5.0  # between two attempts
 MOST_ATTEMPTS = 10_000  # patience ends them first
 READ_AHEAD = 8 * CHUNK  # bytes of one request for a part of an artifact
@@ -249,10 +250,13 @@ def open_bucket(address: str, copies: Path, patience_s: float) -> BucketStore:
 
 
 def _client_options() -> "ClientConfig":
-    """Plain http goes to this machine itself; elsewhere $AWS_ALLOW_HTTP must allow it."""
+    """Plain http goes to this machine itself; elsewhere $AWS_ALLOW_HTTP must allow it.
+
+    The library reads that variable only where it is given no options.
+    """
     options: ClientConfig = {"connect_timeout": timedelta(seconds=CONNECT_S)}
     endpoint = next((os.environ[name] for name in ENDPOINTS if os.environ.get(name)), "")
-    if urlsplit(endpoint).hostname in LOOPBACK:
+    if urlsplit(endpoint).hostname in LOOPBACK or os.environ.get("AWS_ALLOW_HTTP", "").lower() in YES:
         options["allow_http"] = True
     return options
 

@@ -22,7 +22,7 @@ from dg4d_lib.video.driving import DrivingVideo
 from steps.archives import unpack
 from steps.job import Facts, Job
 from steps.media import read_frames, read_png, write_png
-from steps.packages import ASSET, GAUSSIANS, MANIFEST, MESHES, MOTION, read_manifest
+from steps.packages import ASSET, COMPACT, MANIFEST, MESHES, read_manifest
 from steps.packages import SPLATS as SPLATS_FOLDER
 from steps.profiles import CheckAssetSettings
 from steps.render_asset import BATCH, States, Surface, drawn_mesh, mesh_at, read_states, read_surface
@@ -78,7 +78,7 @@ def read_parts(package: Path, folder: Path) -> Parts:
     Raises:
         BadInput: files are missing or broken.
     """
-    wanted = (MANIFEST, ASSET, GAUSSIANS, MOTION, f"{MESHES}/", f"{SPLATS_FOLDER}/")
+    wanted = (MANIFEST, ASSET, COMPACT, f"{MESHES}/", f"{SPLATS_FOLDER}/")
     unpack(package, folder, "the package", lambda name: name.startswith(wanted))
     manifest = read_manifest(folder)
     return Parts(read_states(folder, manifest), read_surface(folder, manifest), manifest.frames)

@@ -9,19 +9,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.assets.animated import moved
+from dg4d_lib.assets.compact import read_compact
 from dg4d_lib.assets.compose import Actor, Body, compose_glb, in_a_row, scene_duration
 from dg4d_lib.assets.preview import pictures_over, studio, write_film
 from dg4d_lib.assets.scene import Item, Scene
 from dg4d_lib.assets.usd import UsdPlacement, compose_usdz
 from dg4d_lib.cameras.orbit import FOV_Y_DEG, RADIUS, OrbitCamera
-from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.placing import joined, placed
-from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.rasterizer.interface import choose_rasterizer
-from steps.motions import read_motion
-from steps.packages import ASSET, GAUSSIANS, MOTION, USD, read_manifest
+from steps.packages import ASSET, COMPACT, USD, read_manifest
 
 FILM_SIZE = 384  # pixels of a side
 MOST_PICTURES = 300  # of a film; they are kept until it is written
@@ -166,15 +164,14 @@ class _Cloud:
     """The Gaussians of a package and their motion."""
 
     def __init__(self, folder: Path) -> None:
-        self.gaussians: Gaussians = read_ply(folder / GAUSSIANS)
-        self.deformation: Deformation
-        self.deformation, self.frames = read_motion(folder / MOTION)
-        self.fps = read_manifest(folder).fps
+        self.fit = read_compact(folder / COMPACT)
+        self.fps = self.fit.frames / read_manifest(folder).duration_s  # written frames may be others
 
     def at(self, actor: Actor, times_s: Float[Tensor, " b"]) -> Gaussians:
         """Its states at times of the scene, where the actor stands."""
         played = torch.from_numpy(actor.seconds(times_s.numpy()))
-        states = moved(self.gaussians, self.deformation, self.frames, (played * self.fps).clamp(max=self.frames))
+        fit, positions = self.fit, (played * self.fps).clamp(max=self.fit.frames)
+        states = moved(fit.gaussians, fit.deformation, fit.frames, positions)
         quat = torch.from_numpy(actor.turn.as_quat(canonical=True))[[3, 0, 1, 2]]
         return placed(states, quat, actor.item.scale, torch.from_numpy(actor.origin))
 

@@ -146,11 +146,7 @@ class Contents:
 
     def write_canonical(self) -> Notes:
         """What everything else was made from."""
-        for name, port in (
-            (packages.GAUSSIANS, "gaussians"),
-            (packages.MOTION, "motion"),
-            (packages.SUBJECT, "subject"),
-        ):
+        for name, port in ((packages.GAUSSIANS, "gaussians"), (packages.SUBJECT, "subject")):
             self.place(name).write_bytes(self.inputs[port].read_bytes())
         video = self.video
         exact = Compact(self.gaussians, self.deformation, self.fitted, len(video), video.fps)

@@ -18,7 +18,6 @@ WEB_SPLATS = "splats/moving.websplats"
 MESHES = "meshes"
 LEVELS = "lod"
 GAUSSIANS = "canonical/gaussians.ply"
-MOTION = "canonical/motion.safetensors"
 COMPACT = "canonical/asset4d.safetensors"
 SUBJECT = "input/subject.png"
 DRIVING = "input/driving.mp4"
@@ -33,8 +32,7 @@ ABOUT = {
     USD: "animated mesh, and as a variant moving splats, USDZ",
     WEB_SPLATS: "moving splats for the viewer",
     GAUSSIANS: "Gaussians at rest, 3DGS PLY",
-    MOTION: "their deformation over time, safetensors",
-    COMPACT: "Gaussians and deformation in one file, safetensors",
+    COMPACT: "Gaussians and their deformation over time, safetensors",
     SUBJECT: "the cut-out input",
     DRIVING: "what the motion follows, MP4",
     PREVIEW: "it moves while the camera goes round, MP4",

@@ -11,18 +11,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.assets.animated import Asset4D, between, moved
+from dg4d_lib.assets.compact import read_compact
 from dg4d_lib.assets.glb import read_glb, read_mesh_glb
 from dg4d_lib.assets.splats import read_splats
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
 from steps.media import write_png
-from steps.motions import read_motion
-from steps.packages import ASSET, GAUSSIANS, MESHES, MOTION, SPLATS, Manifest, read_manifest
+from steps.packages import ASSET, COMPACT, MESHES, SPLATS, Manifest, read_manifest
 
 BATCH = 8  # pictures drawn at once, bounds the memory
 SIZES = (16, 4096)  # pixels
@@ -94,8 +93,8 @@ def read_states(folder: Path, manifest: Manifest) -> States:
         stored = read_splats(folder / SPLATS)
         _check_frames(SPLATS, len(stored.means), manifest)
         return partial(states_between, stored)
-    gaussians, (deformation, frames) = read_ply(folder / GAUSSIANS), read_motion(folder / MOTION)
-    return lambda positions: moved(gaussians, deformation, frames, positions * frames / manifest.frames)
+    fit = read_compact(folder / COMPACT)
+    return lambda positions: moved(fit.gaussians, fit.deformation, fit.frames, positions * fit.frames / manifest.frames)
 
 
 def states_between(states: Gaussians, positions: Float[Tensor, " b"]) -> Gaussians:

@@ -1,8 +1,7 @@
 """What is true of an object: the video of the input camera, the bank of a prior, and views for scoring alone."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -84,20 +83,31 @@ def read(truth: Truth, frames: int) -> Specimen:
     Of a longer video every second, third ... frame is taken, whatever gives at most `frames`.
 
     Raises:
-        BadInput: it has no bank.
+        BadInput: it has no bank, or one without the first frame; no views; or pictures that cannot be compared.
     """
     if truth.bank is None:
         raise BadInput(f"{truth.name} has no bank/ of true views, which the oracle prior needs")
+    if not truth.views:
+        raise BadInput(f"{truth.name} has no view_<azimuth>/ of true views, against which fits are scored")
     stride = -(-len(truth.inputs) // frames)
     whole = read_bank_folder(truth.bank)
     kept = [column for column, frame in enumerate(whole.frames) if frame % stride == 0]
     moments = tuple(whole.frames[column] // stride for column in kept)
-    views = torch.stack([_pictures(view.frames[::stride]) for view in truth.views])
-    height, width = views.shape[2:4]
-    cameras = tuple(OrbitCamera(0, view.azimuth_deg, width=width, height=height) for view in truth.views)
+    if 0 not in moments:
+        raise BadInput(f"the bank/ of {truth.name} does not have frame 0, of which the static object is fitted")
     bank = Bank(whole.cameras, moments, whole.pictures[:, kept])
-    return Specimen(truth.name, _pictures(truth.inputs[::stride]), bank, cameras, views)
+    pictures = _pictures(truth, stride)
+    size = pictures.shape[2]
+    cameras = tuple(OrbitCamera(0, view.azimuth_deg, width=size, height=size) for view in truth.views)
+    return Specimen(truth.name, pictures[0], bank, cameras, pictures[1:])
 
 
-def _pictures(paths: Sequence[Path]) -> Float[Tensor, "t h w 4"]:
-    return torch.stack([read_png(path) for path in paths])
+def _pictures(truth: Truth, stride: int) -> Float[Tensor, "v t s s 4"]:
+    """What the input camera sees, and then all views: as many frames of each."""
+    folders = [truth.inputs, *(view.frames for view in truth.views)]
+    rows = [[read_png(path) for path in folder[: len(truth.inputs) : stride]] for folder in folders]
+    shapes = {picture.shape for row in rows for picture in row}
+    if len(shapes) > 1 or any(height != width or channels != 4 for height, width, channels in shapes):
+        found = ", ".join(sorted(" x ".join(map(str, shape)) for shape in shapes))
+        raise BadInput(f"input and views of {truth.name} must be square, of one size and RGBA; found {found}")
+    return torch.stack([torch.stack(row) for row in rows])

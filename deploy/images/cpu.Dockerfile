@@ -13,11 +13,12 @@ RUN --mount=type=secret,id=pip,target=/etc/pip.conf \
 
 FROM packages AS code
 COPY pyproject.toml README.md LICENSE ./
+COPY deploy/pools.yaml deploy/prefect.yaml deploy/
 COPY dg4d_lib dg4d_lib
 COPY steps steps
-# the command `dg4d` needs flows, which are not here
+# the command `dg4d` needs flows, which are not here, and they its data
 RUN --mount=type=secret,id=pip,target=/etc/pip.conf \
-    /opt/dg4d/bin/pip install --no-cache-dir --no-deps --target /opt/code . && rm -r /opt/code/bin
+    /opt/dg4d/bin/pip install --no-cache-dir --no-deps --target /opt/code . && rm -r /opt/code/bin /opt/code/share
 
 FROM ${PYTHON}
 # pymeshlab loads these two libraries; Debian keeps only their newest version, so none can be named
@@ -32,5 +33,5 @@ RUN python -c "import pymeshlab; assert len(pymeshlab.filter_list()) >= 281"
 COPY --from=code /opt/code /opt/code
 USER 10001
 WORKDIR /home/dg4d
-HEALTHCHECK --interval=60s --timeout=20s --start-period=20s CMD ["python", "-m", "steps.main", "--help"]
+HEALTHCHECK --interval=60s --timeout=20s --start-period=20s --retries=3 CMD ["python", "-m", "steps.main", "--help"]
 ENTRYPOINT ["python", "-m", "steps.main"]

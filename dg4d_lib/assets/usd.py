@@ -17,7 +17,6 @@ Splats are `ParticleField3DGaussianSplat` of OpenUSD's UsdVol: linear scales and
 harmonics of sRGB colors, which the color space says.
 """
 
-import io
 import itertools
 import json
 import re
@@ -31,14 +30,13 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from PIL import Image
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdVol, Vt
 from torch import Tensor
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.normals import SmoothNormals
-from dg4d_lib.assets.surfaces import PNG_LEVEL, pixels_of
+from dg4d_lib.assets.surfaces import picture_file, pixels_of
 from dg4d_lib.assets.usdz import UsdzPackage, write_usdz_package
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -367,10 +365,7 @@ def _picture(name: str, pixels: Float[Tensor, "h w 3"], settings: GltfSettings) 
     A digest in the name tells pictures of several assets apart: Blender takes files of one name for one picture.
     """
     kind = "png" if settings.image == "png" else "jpeg"
-    options = {"compress_level": PNG_LEVEL} if kind == "png" else {"quality": settings.quality, "subsampling": 0}
-    file = io.BytesIO()
-    Image.fromarray(pixels_of(pixels)).save(file, kind, **options)
-    content = file.getvalue()
+    content = picture_file(pixels_of(pixels), kind, settings.quality)
     return f"textures/{name}_{sha256(content).hexdigest()[:8]}.{kind}", content
 
 

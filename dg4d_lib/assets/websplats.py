@@ -4,7 +4,7 @@ Layout: the four bytes "D4WS"; the length of the header as little-endian uint32;
 Color does not move and comes first: red, green, blue and opacity as planes of n bytes in 1/255. Then, for every frame
 and axis, come three fields of n 16-bit whole numbers each:
 
-    position    `center` + `position_step` * number; the longest side of the box of all frames has 32,767.5 steps
+    position    `corner` of the box of all frames + `position_step` * number; its longest side has 4,096 steps
     rotation    `rotation_step` radians * number: the rotation vector, axis times angle
     scale       `scale_step` * number: its natural logarithm
 
@@ -28,11 +28,11 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.harmonics import harmonics_of_color
 
 MAGIC = b"D4WS"
-VERSION = 1
-POSITION_STEPS = 32767.5  # along the longest side of the box; rounding is off by 1/65535 of it at most
-ROTATION_STEP = 1 / 64  # radians; a rotation is off by .8 degrees at most, .4 on average
+VERSION = 2
+POSITION_STEPS = 4096  # along the longest side of the box; a place is off by 1/8192 of it at most, .2 mm of 1.6 m
+ROTATION_STEP = 1 / 32  # radians; a rotation is off by 1.6 degrees at most, .9 on average
 SCALE_STEP = 1 / 16  # of the logarithm; a scale is off by 3 percent at most
-MORTON_BITS = 10  # per axis
+MORTON_BITS = POSITION_STEPS.bit_length()  # per axis
 
 _FOREIGN = (KeyError, TypeError, ValueError, struct.error, zlib.error)
 
@@ -40,7 +40,7 @@ _FOREIGN = (KeyError, TypeError, ValueError, struct.error, zlib.error)
 def write_web_splats(states: Gaussians, fps: float) -> bytes:
     """The file of a batch of states, one per frame; equal states give equal bytes.
 
-    Per splat and frame, 5 to 7 bytes are usual. Scales below e^-2048 and the order of the Gaussians are lost.
+    Per splat and frame, 3 to 5 bytes are usual. Scales below e^-2048 and the order of the Gaussians are lost.
 
     Args:
         states: "t n 3", color of degree 0.
@@ -57,8 +57,8 @@ def write_web_splats(states: Gaussians, fps: float) -> bytes:
         raise BadInput("the states of these splats hold numbers that are not finite")
     means = states.means.detach().cpu().double()
     low, high = means.amin((0, 1)), means.amax((0, 1))
-    center, step = (low + high) / 2, max(float((high - low).max()), 1e-9) / POSITION_STEPS
-    places = _steps((means - center) / step)
+    step = max(float((high - low).max()), 1e-9) / POSITION_STEPS
+    places = _steps((means - low) / step)
     order = _morton(places[0])
     fields = (
         places,
@@ -71,7 +71,7 @@ def write_web_splats(states: Gaussians, fps: float) -> bytes:
         "count": len(order),
         "frames": len(means),
         "fps": float(fps),
-        "center": center.tolist(),
+        "corner": low.tolist(),
         "position_step": step,
         "rotation_step": ROTATION_STEP,
         "scale_step": SCALE_STEP,
@@ -100,7 +100,7 @@ def read_web_splats(content: bytes) -> tuple[Gaussians, float]:
         paint, moving = np.split(planes, [4 * count])
         places, turns, sizes = (_unpacked(part, frames, count) for part in np.split(moving, 3))
         colors = torch.from_numpy(paint.reshape(4, count).T / 255).float()
-        means = torch.tensor(header["center"]).double() + header["position_step"] * places
+        means = torch.tensor(header["corner"]).double() + header["position_step"] * places
         return (
             Gaussians(
                 means.float(),
@@ -138,7 +138,7 @@ def _quats(vectors: Float[Tensor, "t n 3"]) -> Float[Tensor, "t n 4"]:
 
 def _morton(places: Int[NDArray[np.int16], "n 3"]) -> Int[NDArray[np.int64], " n"]:
     """The order along a curve that visits neighbors together: by interleaved bits of the coordinates."""
-    cells = (places.astype(np.int64) + (1 << 15)) >> (16 - MORTON_BITS)
+    cells = places.astype(np.int64)
     codes = sum((cells[:, axis] >> bit & 1) << (3 * bit + axis) for bit in range(MORTON_BITS) for axis in range(3))
     return np.argsort(codes, kind="stable")
 

@@ -1,15 +1,19 @@
+import json
 from dataclasses import replace
+from pathlib import Path
+from shutil import copytree
 
 import pytest
 import torch
 
-from benchmarks.ablations import ABLATIONS, IMPERFECT, QUICK, Ablation, Claim, Row, Variant, settings_of, verdict
+from benchmarks.ablations import ABLATIONS, IMPERFECT, QUICK, Ablation, Claim, Row, Variant, main, settings_of, verdict
 from benchmarks.fits import Figures, fits_per_frame, moving_fit, score, static_fit, thinned
 from benchmarks.objects.specimens import Specimen
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.initialize import isotropic
 from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.rasterizer.interface import choose_rasterizer
+from steps.media import write_png
 
 SIZE, FRAMES = 32, 4
 CHANGES = {**QUICK, "static.points": 60, "static.iterations": 40, "motion.iterations": 30, "motion.plane_rate": 0.05}
@@ -90,9 +94,13 @@ def rows(first: list[float], second: list[float]) -> list[Row]:
         ([5.0, 6.0, 7.0], [4.0, 5.1, 5.9], Claim("b", "a", "psnr_obj"), "Not reproduced"),
         ([5.0, 6.0, 7.0], [4.0, 5.1, 5.9], Claim("b", "a", "terr"), "Reproduced"),
         ([5.0, 6.0, 7.0], [5.5, 5.5, 7.1], Claim("a", "b", "psnr_obj"), "Not decided"),
-        ([5.0, 6.0, 7.0], [5.5, 5.5, 7.1], Claim("a", "b", "psnr_obj", alike=True), "Reproduced"),
+        ([5.0, 6.0], [4.0, 5.2], Claim("a", "b", "psnr_obj"), "Not decided"),
+        ([5.0, 6.0, 7.0], [5.01, 5.99, 7.01], Claim("a", "b", "psnr_obj", alike=True), "Reproduced"),
+        ([5.0, 6.0, 7.0], [5.5, 6.5, 7.5], Claim("a", "b", "psnr_obj", alike=True), "Reproduced"),
+        ([5.0, 6.0, 7.0], [5.5, 5.5, 7.1], Claim("a", "b", "psnr_obj", alike=True), "Not decided"),
         ([5.0, 6.0, 7.0], [4.0, 5.1, 5.9], Claim("a", "b", "psnr_obj", alike=True), "Not reproduced"),
         ([5.0], [4.0], Claim("a", "b", "psnr_obj"), "Not decided"),
+        ([5.0], [5.0], Claim("a", "b", "psnr_obj", alike=True), "Not decided"),
     ],
 )
 def test_the_verdict_follows_from_pairs_and_their_spread(first, second, claim, outcome):
@@ -100,3 +108,68 @@ def test_the_verdict_follows_from_pairs_and_their_spread(first, second, claim, o
     sentence = verdict(ablation, rows(first, second))
     assert sentence.startswith(f"{outcome}: a is better")
     assert sentence.endswith(f"{claim.figure}.")
+
+
+@pytest.fixture
+def dataset(specimen: Specimen, tmp_path: Path) -> Path:
+    """The balls as a data set has them, and as a picture of which no more is known."""
+    views = {
+        f"view_{camera.azimuth_deg:g}": film for camera, film in zip(specimen.cameras, specimen.views, strict=True)
+    }
+    for name, film in {"input": specimen.cutouts, **views}.items():
+        (tmp_path / "balls" / name).mkdir(parents=True)
+        for i, picture in enumerate(film):
+            write_png(tmp_path / "balls" / name / f"{i}.png", picture)
+    sheets = tmp_path / "balls" / "bank"
+    sheets.mkdir()
+    for i, film in enumerate(specimen.bank.pictures):
+        write_png(sheets / f"{i}.png", torch.cat(list(film), 1) / 255)
+    known = [
+        {"file": f"{i}.png", "azimuth": camera.azimuth_deg, "elevation": camera.elevation_deg, "radius": camera.radius}
+        for i, camera in enumerate(specimen.bank.cameras)
+    ]
+    about = {"frames": list(range(FRAMES)), "tile": [1, FRAMES], "tile_size": SIZE, "views": known}
+    (sheets / "bank.json").write_text(json.dumps(about))
+    copytree(tmp_path / "balls", tmp_path / "picture")
+    for frame in range(1, FRAMES):
+        (tmp_path / "picture" / "input" / f"{frame}.png").unlink()
+    return tmp_path
+
+
+def called(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
+    monkeypatch.setattr("sys.argv", ["ablations", *words])
+    main()
+
+
+def test_a_data_set_is_fitted_and_scored_as_the_objects_are(dataset, specimen, monkeypatch, capsys):
+    settings = ["static.points=60", "static.iterations=10", "motion.iterations=5"]
+    words = [*(f"--set={setting}" for setting in settings), "--objects=balls", "--seeds=1", f"--size={SIZE}"]
+    rows = dataset / "rows.json"
+    called(monkeypatch, "zero-start", "static", f"--data={dataset}", f"--json={rows}", *words)
+    printed = capsys.readouterr().out
+    assert f"zero-start: balls; 1 seeds, {FRAMES} frames" in printed and "Not decided" in printed
+    found = {row["variant"]: row for row in json.loads(rows.read_text())["rows"]}
+    assert set(found) == {"zero", "random", *ABLATIONS["static"].variants}
+    chosen = settings_of({"static.points": 60, "static.iterations": 10, "motion.iterations": 5}, SIZE, FRAMES)
+    direct = score(specimen, moving_fit(specimen, static_fit(specimen, chosen, 0), chosen, 0))
+    assert found["zero"]["figures"]["psnr_obj"] == pytest.approx(direct.psnr_obj, abs=0.2)
+    assert found["1 view, white"]["figures"]["terr"] is None
+
+
+def test_what_cannot_be_run_is_refused_with_what_can(dataset, monkeypatch, capsys):
+    for words, message in (
+        (["noise", f"--data={dataset}", "--objects", "cat"], "there is no object cat; there are: balls, picture"),
+        (["static", "--objects", "cat"], "there is no object cat; there are: newt, parrot, jellyfish, excavator"),
+        (["static", "noise", f"--data={dataset}"], "noise: needs a video; of picture there is one picture"),
+        (["static", f"--data={dataset / 'nowhere'}"], "is no data set"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            called(monkeypatch, *words)
+        assert ended.value.code == 2 and message in " ".join(capsys.readouterr().err.split())
+
+
+def test_fractions_are_of_the_frames_there_are():
+    settings = settings_of({"subject.max_frames": 0.5, "deformation.temporal": 0.5}, SIZE, 12)
+    assert settings.subject.max_frames == settings.deformation.temporal == 6
+    assert settings_of({"subject.max_frames": 5}, SIZE, 12).subject.max_frames == 5
+    assert settings_of({}, SIZE, 12).subject.max_frames == 12

@@ -1,4 +1,6 @@
+import json
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,8 +10,10 @@ from benchmarks.objects.drawing import Painted
 from benchmarks.objects.specimens import OBJECTS, SCORED_AZIMUTHS_DEG, made, read
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
-from steps.truth import Truth
+from steps.media import read_png, write_png
+from steps.truth import Truth, View
 
+SIZE = 8  # of made-up pictures
 EVERY_OBJECT = pytest.mark.parametrize("name", OBJECTS)
 
 
@@ -74,6 +78,61 @@ def test_the_same_object_is_drawn_twice_alike():
     assert torch.equal(first, second)
 
 
-def test_a_data_set_without_a_bank_is_refused(tmp_path):
-    with pytest.raises(BadInput, match="no bank"):
-        read(Truth(name="cat", inputs=(tmp_path / "0.png",)), 4)
+def frames(folder: Path, pictures: torch.Tensor) -> tuple[Path, ...]:
+    folder.mkdir(parents=True)
+    for i, picture in enumerate(pictures):
+        write_png(folder / f"{i:03d}.png", picture)
+    return tuple(sorted(folder.iterdir()))
+
+
+def bank(folder: Path, moments: list[int], pictures: torch.Tensor) -> Path:
+    """One level view of so many moments, side by side."""
+    folder.mkdir()
+    write_png(folder / "sheet.png", torch.cat(list(pictures), 1))
+    view = {"file": "sheet.png", "azimuth": 90.0, "elevation": 0.0, "radius": 2.0}
+    about = {"frames": moments, "tile": [1, len(moments)], "tile_size": SIZE, "views": [view]}
+    (folder / "bank.json").write_text(json.dumps(about))
+    return folder
+
+
+@pytest.fixture
+def truth(tmp_path: Path) -> Truth:
+    """Six frames from two sides, every second of them in the bank."""
+    shown = torch.rand(2, 6, SIZE, SIZE, 4, generator=torch.Generator().manual_seed(0))
+    return Truth(
+        name="cat",
+        inputs=frames(tmp_path / "input", shown[0]),
+        views=(View(azimuth_deg=15, frames=frames(tmp_path / "view_15", shown[1])),),
+        bank=bank(tmp_path / "bank", [0, 2, 4], 1 - shown[0, ::2]),
+    )
+
+
+def test_of_a_data_set_every_second_frame_is_taken_and_what_the_bank_knows_of_it(truth):
+    half = read(truth, 3)
+    assert torch.equal(half.cutouts, torch.stack([read_png(path) for path in truth.inputs[::2]]))
+    assert torch.equal(half.views[0], torch.stack([read_png(path) for path in truth.views[0].frames[::2]]))
+    assert half.cameras == (OrbitCamera(0, 15, width=SIZE, height=SIZE),)
+    assert half.bank.frames == (0, 1, 2) and half.bank.cameras[0].azimuth_deg == 90
+    assert (half.bank.pictures[0].float() / 255 + half.cutouts - 1).abs().max() < 1.01 / 255
+    assert read(truth, 6).bank.frames == (0, 2, 4)
+    assert read(truth, 2).bank.frames == (0,)
+
+
+def test_of_a_picture_the_first_frame_of_every_view_is_taken(truth):
+    still = read(truth.model_copy(update={"inputs": truth.inputs[:1]}), 3)
+    assert len(still.cutouts) == 1 and still.views.shape == (1, 1, SIZE, SIZE, 4)
+
+
+def test_a_data_set_that_lacks_something_is_refused(truth, tmp_path):
+    late = bank(tmp_path / "late", [2], torch.ones(1, SIZE, SIZE, 4))
+    large = frames(tmp_path / "large", torch.ones(6, 2 * SIZE, 2 * SIZE, 4))
+    opaque = frames(tmp_path / "opaque", torch.ones(6, SIZE, SIZE, 3))
+    for change, message in (
+        ({"bank": None}, "cat has no bank/"),
+        ({"bank": late}, "does not have frame 0"),
+        ({"views": ()}, "cat has no view_<azimuth>/"),
+        ({"views": (View(azimuth_deg=15, frames=large),)}, "16 x 16 x 4, 8 x 8 x 4"),
+        ({"inputs": opaque}, "8 x 8 x 3, 8 x 8 x 4"),
+    ):
+        with pytest.raises(BadInput, match=message):
+            read(truth.model_copy(update=change), 3)

@@ -1,10 +1,14 @@
 """The images: linted, complete, and steps that give in a container what they give elsewhere."""
 
+import json
+import os
 import re
 import subprocess
 import sys
+import threading
 import tomllib
 from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -29,6 +33,7 @@ COMMAND_ONLY = {
     "prefect",
     "pyyaml",
     "rich",
+    "sqlalchemy",
     "typer",
 }  # of the dependencies: what flows alone import
 LADDER = [{"until": 1.0, "size": 32}]
@@ -91,6 +96,61 @@ def test_the_context_of_a_build_is_what_images_are_made_of() -> None:
         for word in line.split()
     }
     assert copied == allowed
+
+
+@pytest.mark.parametrize("path", DOCKERFILES, ids=lambda path: path.name)
+def test_an_image_is_built_with_every_file_that_the_project_installs(path: Path) -> None:
+    tools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    wanted = {name for names in tools["data-files"].values() for name in names}
+    stages = re.split(r"^FROM ", path.read_text(), flags=re.MULTILINE)
+    (installing,) = (stage for stage in stages if re.search(r"pip install .*[ \"]\.[ \"[]", stage))
+    copied = {
+        word for line in re.findall(r"^COPY (?!--from)(.+) \S+$", installing, re.MULTILINE) for word in line.split()
+    }
+    assert wanted and wanted <= copied
+
+
+def health_check(path: Path) -> list[str]:
+    """What an image is asked for its health, for this Python."""
+    text = path.read_text().replace("\\\n", "")
+    (check,) = re.findall(r"^HEALTHCHECK (?=.*--retries=3 ).*CMD (\[.*\])$", text, re.MULTILINE)
+    command: list[str] = json.loads(check)
+    assert command[0] == "python"
+    return [sys.executable, *command[1:]]
+
+
+def status_of(path: Path, **environment: str) -> int:
+    command = health_check(path)
+    return subprocess.run(command, capture_output=True, env={**os.environ, **environment}, check=False).returncode
+
+
+@pytest.mark.parametrize("name", ["cpu", "cuda"])
+def test_an_image_of_steps_is_healthy_if_and_only_if_steps_can_start(name: str, tmp_path: Path) -> None:
+    (tmp_path / "pydantic.py").write_text("raise ImportError")
+    path = IMAGES / f"{name}.Dockerfile"
+    assert status_of(path, PYTHONPATH=str(ROOT)) == 0
+    assert status_of(path, PYTHONPATH=f"{tmp_path}:{ROOT}") != 0
+
+
+@pytest.mark.parametrize(("status", "healthy"), [(200, True), (503, False)])
+def test_an_image_of_flows_is_healthy_if_and_only_if_its_server_is(status: int, healthy: bool) -> None:
+    class Answer(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(status if self.path == "/api/health" else 404)
+            self.end_headers()
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    path = IMAGES / "flows.Dockerfile"
+    with ThreadingHTTPServer(("127.0.0.1", 0), Answer) as server:
+        address = f"http://127.0.0.1:{server.server_port}/api"
+        threading.Thread(target=server.serve_forever).start()
+        try:
+            assert (status_of(path, PREFECT_API_URL=address) == 0) is healthy
+        finally:
+            server.shutdown()
+    assert status_of(path, PREFECT_API_URL=address) != 0  # nobody answers any more
 
 
 @pytest.fixture(scope="module")

@@ -77,6 +77,26 @@ def test_a_lasting_service_has_a_health_check(name: str) -> None:
     assert SERVICES[name]["healthcheck"]["test"][0] == "CMD"
 
 
+def test_a_server_that_cannot_write_its_own_files_has_another_place_for_its_pages() -> None:
+    name, (container,) = "PREFECT_SERVER_UI_STATIC_DIRECTORY", PODS["server"]["spec"]["containers"]
+    assert SERVICES["server"]["read_only"] and container["securityContext"]["readOnlyRootFilesystem"]
+    assert SERVICES["server"]["environment"][name].startswith("/tmp/")
+    assert {"name": name, "value": SERVICES["server"]["environment"][name]} in container["env"]
+    assert {"name": "scratch", "mountPath": "/tmp"} in container["volumeMounts"]
+
+
+@pytest.mark.parametrize("name", ["worker-cpu", "worker-gpu"])
+def test_a_worker_that_cannot_write_its_own_files_has_another_place_for_compiled_kernels(name: str) -> None:
+    worker = SERVICES[name]
+    assert worker["read_only"] and worker["volumes"] == ["data:/data"]
+    assert worker["environment"]["NUMBA_CACHE_DIR"].startswith("/data/")
+
+
+def test_redis_answers_other_machines_without_its_image_saying_so() -> None:
+    for words in (SERVICES["redis"]["command"], PODS["redis"]["spec"]["containers"][0]["args"]):
+        assert words[words.index("--protected-mode") + 1] == "no"
+
+
 def test_secrets_of_the_compose_file_come_from_outside_and_must_be_given() -> None:
     given = [
         value

@@ -2,17 +2,15 @@
 
 import json
 import os
-import shutil
-import socket
 import subprocess
 import sys
 import time
-import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from postgresql import free_port, server_on_postgresql
 from prefect.client.orchestration import get_client
 from prefect.settings import PREFECT_API_URL, temporary_settings
 from prefect.task_runners import ThreadPoolTaskRunner
@@ -21,7 +19,7 @@ from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows import registering
 from flows.pools import read_pools
 from flows.runners import item_runner
-from flows.server import SETTINGS, Server
+from flows.server import Server
 from flows.workers import environment
 
 FAKES = {
@@ -31,7 +29,6 @@ FAKES = {
     "DG4D_CPUS": "2",
     "PYTHONPATH": str(Path(__file__).parent),
 }
-POSTGRES = next(Path("/usr/lib/postgresql").glob("*/bin"), None) or Path("/usr/local/bin")
 
 
 @pytest.fixture
@@ -80,10 +77,7 @@ def cluster(place: Path) -> Iterator[str]:
         for name, *words in commands
     ]
     yield f"dask://127.0.0.1:{port}"
-    for process in reversed(running):
-        process.terminate()
-    for process in running:
-        process.wait(60)
+    end(running)
 
 
 @pytest.mark.slow
@@ -109,60 +103,18 @@ def test_a_dask_cluster_of_two_workers_makes_a_batch(
     assert len(set(tags)) == 2  # two processes made them
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-@pytest.fixture
-def database(tmp_path: Path) -> Iterator[str]:
-    """The address of an empty PostgreSQL database."""
-    if not (POSTGRES / "initdb").exists():
-        pytest.skip("PostgreSQL is not here (Debian: apt-get install postgresql)")
-    folder = tmp_path / "database"
-    folder.mkdir()
-    as_user: list[str] = []
-    if os.getuid() == 0:  # it does not run as root
-        shutil.chown(folder, "postgres")
-        for above in folder.parents:
-            if above.stat().st_uid == 0 and above.is_relative_to("/tmp") and above != Path("/tmp"):
-                above.chmod(0o755)
-        as_user = ["setpriv", "--reuid=postgres", "--regid=postgres", "--clear-groups"]
-    port = free_port()
-    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "cwd": folder}
-    initdb = [str(POSTGRES / "initdb"), "-D", str(folder / "db"), "-U", "prefect", "-A", "trust", "--no-sync"]
-    subprocess.run([*as_user, *initdb], check=True, **quiet)
-    options = ["-c", "fsync=off", "-c", "listen_addresses=127.0.0.1", "-c", f"unix_socket_directories={folder}"]
-    with (tmp_path / "postgres.log").open("wb") as log:
-        server = subprocess.Popen(
-            [*as_user, str(POSTGRES / "postgres"), "-D", str(folder / "db"), "-p", str(port), *options],
-            stderr=log,
-            **quiet,
-        )
-    ready = [str(POSTGRES / "pg_isready"), "-h", "127.0.0.1", "-p", str(port), "-U", "prefect"]
-    wait_until(lambda: subprocess.run(ready, check=False, **quiet).returncode == 0)
-    yield f"postgresql+asyncpg://prefect@127.0.0.1:{port}/postgres"
-    server.terminate()
-    server.wait(60)
-
-
 @pytest.mark.slow
-def test_two_workers_on_one_postgresql_server_make_an_item_each(place: Path, database: str) -> None:
-    port = free_port()
-    api_url = f"http://127.0.0.1:{port}/api"
-    own = {**os.environ, **SETTINGS, **environment(api_url), "PREFECT_HOME": str(place / "prefect")}
-    application = ["uvicorn", "--factory", "flows.server_app:create_app", "--port", str(port), "--log-level", "warning"]
-    running = [
-        subprocess.Popen(
-            [sys.executable, "-m", *application], env={**own, "PREFECT_API_DATABASE_CONNECTION_URL": database}
-        )
-    ]
+def test_two_workers_on_one_postgresql_server_make_an_item_each(place: Path) -> None:
+    running: list[subprocess.Popen[bytes]] = []
     try:
-        wait_until(lambda: answers(f"{api_url}/health"))
-        with temporary_settings({PREFECT_API_URL: api_url}), pytest.MonkeyPatch.context() as patch:
+        with (
+            server_on_postgresql(place / "prefect") as (api_url, _),
+            temporary_settings({PREFECT_API_URL: api_url}),
+            pytest.MonkeyPatch.context() as patch,
+        ):
             patch.setenv("PREFECT_API_URL", api_url)
             registering.register(read_pools(), ["process-cpu"])
+            own = {**os.environ, **environment(api_url), "PREFECT_HOME": str(place / "prefect")}
             worker = [sys.executable, "-m", "prefect", "worker", "start", "--pool", "process-cpu", "--limit", "1"]
             running += [
                 subprocess.Popen([*worker, "--name", name], env=own, cwd=place, stdout=subprocess.DEVNULL)
@@ -175,23 +127,20 @@ def test_two_workers_on_one_postgresql_server_make_an_item_each(place: Path, dat
                     wanted = {"picture": str(place / "in" / f"{name}.png"), "out": str(place / "out" / name)}
                     client.create_flow_run_from_deployment(deployment.id, parameters=wanted)
                 runs = wait_until(lambda: all_ended(client.read_flow_runs()))
+            end(running)
         ours = [run for run in runs if run.deployment_id == deployment.id]
         assert [run.state.is_completed() for run in ours] == [True, True]
         assert all((place / "out" / name / "asset.glb").exists() for name in ("one", "two"))
     finally:
-        for process in reversed(running):
-            process.terminate()
-        for process in running:
-            process.wait(60)
+        end(running)
+
+
+def end(running: list["subprocess.Popen[bytes]"]) -> None:
+    for process in reversed(running):
+        process.terminate()
+    for process in running:
+        process.wait(60)
 
 
 def all_ended(runs: list[Any]) -> list[Any]:
     return runs if len(runs) == 4 and all(run.state.is_final() for run in runs) else []
-
-
-def answers(address: str) -> bool:
-    try:
-        urllib.request.urlopen(address, timeout=5).close()
-    except OSError:
-        return False
-    return True

@@ -13,10 +13,14 @@ from pathlib import Path
 
 import fake_steps
 import pytest
+from postgresql import server_on_postgresql
 from prefect.client.orchestration import get_client
+from prefect.settings import PREFECT_API_URL, temporary_settings
+from rich.console import Console
 
 from dg4d_lib.errors import BadInput
 from flows import home, leases, tasks
+from flows.batch import batch
 from flows.collecting import collect
 from flows.executors import StepBadInput, StepOutOfMemory, StepTimedOut
 from flows.make import make
@@ -34,6 +38,7 @@ EVERY_STEP = [
 ]  # fmt: skip
 RUN_FACTS = ("report.json", "report.html", "provenance.json", "ro-crate-metadata.json")  # these say when and how long
 DAY_S = 86400.0
+AWAY_S = 3.0  # a database that starts anew
 
 
 @pytest.fixture
@@ -197,6 +202,36 @@ def test_a_database_that_is_locked_for_a_while_delays_a_run_and_no_more(
     assert time.monotonic() - began > locked_s
     assert ran(log) == EVERY_STEP
     whole(tmp_path / "out")
+
+
+def test_a_database_that_crashes_during_a_batch_and_comes_back_loses_and_doubles_nothing(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = [str(number) for number in range(6)]
+    (tmp_path / "in").mkdir()
+    for name in names:
+        (tmp_path / "in" / f"{name}.png").write_text(f"{name} fit_motion=sleep:0.5")
+    with server_on_postgresql(tmp_path / "prefect") as (api_url, database):
+
+        def crash() -> None:
+            database.crash()
+            time.sleep(AWAY_S)
+            database.start()
+
+        monkeypatch.setenv("PREFECT_API_URL", api_url)
+        with temporary_settings({PREFECT_API_URL: api_url}):
+            crasher = during("extract_mesh", log, crash)
+            rows = batch(str(tmp_path / "in"), tmp_path / "out", Console(quiet=True), workers=2)
+            crasher.join()
+            with get_client(sync_client=True) as client:
+                runs = client.read_flow_runs()
+    assert {row.item: (row.status, row.attempts) for row in rows} == dict.fromkeys(names, ("done", 1))
+    assert sorted(ran(log)) == sorted(EVERY_STEP * len(names))
+    assert sorted(run.name for run in runs if run.name in names) == names
+    assert {run.state.name for run in runs if run.state is not None} == {"Completed"}
+    for name in names:
+        whole(tmp_path / "out" / name)
+    assert is_whole()
 
 
 def test_a_full_disk_is_a_clear_message_and_with_more_room_the_run_goes_on(

@@ -208,4 +208,4 @@ def test_real_steps_give_equal_bytes_again(server: Server, tmp_path: Path, monke
     assert verify(tmp_path / "egg").exit_code == 0
     rebuilt = again(tmp_path / "egg")
     assert {name: outcome for name, outcome in outcomes(rebuilt).items() if outcome != "identical"} == {}
-    assert {"fit_motion", "asset.glb", "preview.mp4", "canonical/motion.safetensors"} <= set(outcomes(rebuilt))
+    assert {"fit_motion", "asset.glb", "preview.mp4", "canonical/asset4d.safetensors"} <= set(outcomes(rebuilt))

@@ -195,6 +195,20 @@ def test_plain_http_goes_to_this_machine_only(server: TinyS3, tmp_path: Path, mo
     assert time.monotonic() - begin < 4  # refused by the client; nobody was asked
 
 
+@pytest.mark.parametrize(("allowed", "goes"), [("true", True), ("1", True), ("false", False), ("", False)])
+def test_plain_http_goes_elsewhere_where_the_environment_allows_it(
+    server: TinyS3, monkeypatch: pytest.MonkeyPatch, allowed: str, goes: bool
+) -> None:
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.1:{server.port}")  # not a name that stands for this machine
+    monkeypatch.setenv("AWS_ALLOW_HTTP", allowed)
+    store = open_store(f"s3://{BUCKET}/{uuid.uuid4()}", patience_s=1)
+    if goes:
+        assert store.path(store.put_bytes(b"x", "a/b")).read_bytes() == b"x"
+    else:
+        with pytest.raises(StoreUnreachable):
+            store.has(NOTHING)
+
+
 def test_the_environment_chooses_the_store(server: TinyS3, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DG4D_HOME", str(tmp_path))
     assert open_store().address == str(tmp_path / "store")

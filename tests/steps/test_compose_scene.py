@@ -101,6 +101,16 @@ def test_a_film_waits_for_an_asset_to_start(package: Path, tmp_path: Path) -> No
     assert abs(middles[6] - middles[0]) < 6 < abs(middles[-1] - middles[6])  # pixels; the camera swings a little
 
 
+def test_a_film_does_not_depend_on_how_often_the_package_has_the_motion(package: Path, tmp_path: Path) -> None:
+    films = []
+    for folder in (package, packed(tmp_path / "fine", fps=4 * FPS)):
+        film, scene = tmp_path / f"{len(films)}.mp4", Scene(items=(item("a"),), fps=2 * FPS, duration_s=SECONDS)
+        cast_of(folder, *scene.items).write_preview(film, scene, "reference")
+        films.append([blue(picture).mean() for picture in pictures(film)])
+    assert np.ptp(films[0]) > 6  # pixels; it moves
+    np.testing.assert_allclose(*films, atol=1)
+
+
 def test_a_film_has_an_end(package: Path, tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="pictures"):
         cast_of(package, item("a")).write_preview(

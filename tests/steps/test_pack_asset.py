@@ -19,8 +19,8 @@ from steps.packages import read_manifest
 
 COMMON = {
     "asset.json", "asset.glb", "asset.usdz", "preview.mp4", "preview.webp", "turntable.mp4", "contact_sheet.png",
-    "canonical/gaussians.ply", "canonical/motion.safetensors", "canonical/asset4d.safetensors",
-    "input/subject.png", "input/driving.mp4", "splats/moving.websplats",
+    "canonical/gaussians.ply", "canonical/asset4d.safetensors", "input/subject.png", "input/driving.mp4",
+    "splats/moving.websplats",
 }  # fmt: skip
 SPLATS = {f"splats/{i:03d}.{form}" for i in range(FRAMES) for form in ("ply", "spz")}
 RIGGED = {"asset_rigged.glb"}
@@ -118,7 +118,6 @@ def test_every_frame_has_its_own_mesh(per_frame: Path) -> None:
 def test_inputs_are_handed_on_byte_by_byte(package: Path) -> None:
     given = inputs(package.parent / "inputs")
     assert (package / "canonical/gaussians.ply").read_bytes() == given["gaussians"].read_bytes()
-    assert (package / "canonical/motion.safetensors").read_bytes() == given["motion"].read_bytes()
     assert (package / "input/subject.png").read_bytes() == given["subject"].read_bytes()
 
 

@@ -157,7 +157,7 @@ def test_the_surface_is_as_rough_and_metallic_as_asked() -> None:
     assert (surface["roughnessFactor"], surface["metallicFactor"]) == (0.4, 0.75)
 
 
-@pytest.mark.parametrize(("image", "worst"), [("png", 0.51), ("jpeg", 6.0), ("webp", 12.0)])
+@pytest.mark.parametrize(("image", "worst"), [("png", 0.51), ("jpeg", 8.0), ("webp", 12.0)])
 def test_pictures_come_back_as_their_format_keeps_them(image: Any, worst: float) -> None:
     content = write_mesh_glb(ball(), GltfSettings(image=image))
     torch.testing.assert_close(read_mesh_glb(content).texture, ball().texture, atol=worst / 255, rtol=0)
@@ -171,7 +171,7 @@ def test_a_reader_without_webp_finds_the_same_picture_as_jpeg() -> None:
     with Image.open(io.BytesIO(parsed.view(image["bufferView"]))) as picture:
         assert picture.format == "JPEG"
         pixels = torch.from_numpy(np.array(picture)) / 255
-    torch.testing.assert_close(pixels, ball().texture, atol=6 / 255, rtol=0)
+    torch.testing.assert_close(pixels, ball().texture, atol=8 / 255, rtol=0)
 
 
 def test_a_picture_too_large_for_webp_is_refused() -> None:

@@ -5,12 +5,21 @@ import json
 import re
 import subprocess
 import sys
+import zlib
 from html.parser import HTMLParser
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
+import trimesh
 
+from dg4d_lib.asset_settings import GltfSettings
+from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.assets.glb import write_glb
+from dg4d_lib.assets.gltf import Parsed
 from dg4d_lib.assets.viewer_page import viewer_page
+from dg4d_lib.mesh.textured import TexturedMesh
 
 NASTY = "</script><script>alert(1)</script><!-- @data@ @title@ & \"ümlaut\" 'π'"
 GLB = bytes(range(256))
@@ -48,8 +57,43 @@ def page(title: str = "Fox", facts: dict[str, Any] | None = None) -> str:
 def test_the_data_can_be_read_out_again() -> None:
     scripts = Blocks(page()).scripts
     assert set(scripts) == {"data-glb", "data-splats", "data-video", "data-facts", None}
-    assert base64.b64decode(scripts["data-glb"]) == GLB
-    assert base64.b64decode(scripts["data-video"]) == b"film"
+    for name, given in (("glb", GLB), ("splats", b"splats"), ("video", b"film")):
+        assert zlib.decompress(base64.b64decode(scripts[f"data-{name}"])) == given
+
+
+def moving_ball(settings: GltfSettings) -> bytes:
+    """A GLB of a ball that changes its size."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.6)
+    vertices = torch.tensor(ball.vertices, dtype=torch.float32)
+    mesh = TexturedMesh(vertices, torch.tensor(ball.faces), vertices[:, :2] / 2 + 0.5, torch.rand(4, 4, 3))
+    return write_glb(Asset4D(mesh, vertices * torch.linspace(0, 0.3, 5)[:, None, None], 7.0), settings)
+
+
+def mesh_in(text: str) -> bytes:
+    return zlib.decompress(base64.b64decode(Blocks(text).scripts["data-glb"]))
+
+
+def test_the_mesh_of_a_page_has_the_bits_that_are_seen() -> None:
+    content = moving_ball(GltfSettings())
+    text = viewer_page("Ball", content, None, None, None, {})
+    given, seen = Parsed(content), Parsed(mesh_in(text))
+    assert seen.tree == given.tree
+    kinds = {"positions": 2**-15, "coordinates": 2**-15, "normals": None}
+    for number, accessor in enumerate(given.tree["accessors"]):
+        error = kinds.get(accessor["name"].split()[-1], 0.0)
+        wanted = np.zeros(3) if error is None else given.accessor(number)
+        np.testing.assert_allclose(
+            seen.accessor(number), np.broadcast_to(wanted, seen.accessor(number).shape), error or 0
+        )
+    picture = given.tree["images"][0]["bufferView"]
+    assert seen.view(picture) == given.view(picture)
+    empty = len(viewer_page("Ball", b"", None, None, None, {}))
+    assert len(text) - empty < 0.6 * len(content)
+
+
+def test_a_mesh_of_whole_numbers_goes_into_a_page_as_it_is() -> None:
+    content = moving_ball(GltfSettings(quantized=True))
+    assert mesh_in(viewer_page("Ball", content, None, None, None, {})) == content
 
 
 def test_text_stays_text() -> None:

@@ -45,12 +45,12 @@ def angles_between(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     return ((turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1).acos()
 
 
-def test_positions_are_off_by_less_than_a_65535th_of_the_box() -> None:
+def test_positions_are_off_by_less_than_an_8192nd_of_the_box() -> None:
     given = cloud()
     side = (given.means.amax((0, 1)) - given.means.amin((0, 1))).max()
     rounding = 4 * torch.finfo(torch.float32).eps * given.means.abs().max()
     error = (back(given).means - given.means).abs().max()
-    assert side / POSITION_STEPS / 4 < error < side / 65535 + rounding
+    assert side / POSITION_STEPS / 4 < error < side / 8192 + rounding
 
 
 def test_rotations_are_off_by_less_than_the_diagonal_of_half_a_step() -> None:
@@ -111,7 +111,7 @@ def test_neighbors_that_move_alike_cost_less_than_a_third_of_their_numbers() -> 
 @pytest.mark.parametrize(("frames", "count"), [(1, 1), (1, 7), (9, 1)])
 def test_the_smallest_clouds_come_back(frames: int, count: int) -> None:
     given = cloud(frames, count)
-    torch.testing.assert_close(back(given).means, given.means, rtol=0, atol=1e-4)
+    torch.testing.assert_close(back(given).means, given.means, rtol=0, atol=1e-3)  # of 5 units
 
 
 def test_a_cloud_in_one_point_comes_back() -> None:
@@ -144,7 +144,7 @@ def broken(change: str) -> bytes:
     (length,) = struct.unpack_from("<I", content, 4)
     header = json.loads(content[8 : 8 + length])
     if change == "version":
-        text = json.dumps(header | {"version": 2}).encode()
+        text = json.dumps(header | {"version": 1}).encode()
         return content[:4] + struct.pack("<I", len(text)) + text + content[8 + length :]
     if change == "fewer":
         return content[: 8 + length] + zlib.compress(zlib.decompress(content[8 + length :])[:-1])

@@ -1,14 +1,20 @@
-// What the page was filled with: elements that hold base64 or JSON, by their id.
+// What the page was filled with, by the id of its elements: deflated bytes in base64, or JSON.
 
 /** The bytes of a block; null if the page has none of this name. */
-export function bytesOf(name) {
+export async function bytesOf(name) {
   const element = document.getElementById(`data-${name}`);
   if (!element) return null;
   const text = atob(element.textContent);
-  element.remove(); // the decoded bytes are enough
+  element.remove(); // the bytes are enough
   const bytes = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
-  return bytes;
+  return inflate(bytes);
+}
+
+/** The bytes behind a zlib stream. */
+export async function inflate(bytes) {
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
 /** The provenance: nested objects of strings and numbers. */

@@ -15,14 +15,14 @@ const stageElement = document.getElementById("stage");
 
 /** What there is to show, by the modes it has. */
 async function read() {
-  const [glb, packed] = [bytesOf("glb"), bytesOf("splats")];
-  const mesh = await readMesh(glb);
+  const mesh = await readMesh(await bytesOf("glb"));
+  const packed = await bytesOf("splats");
   const splats = packed && (await readSplats(packed));
   return { mesh, cloud: splats && new Cloud(splats) };
 }
 
 async function start() {
-  const video = fillPanel(facts(), bytesOf("picture"), bytesOf("video"));
+  const video = fillPanel(facts(), await bytesOf("picture"), await bytesOf("video"));
   if (!canDraw()) throw new Error(NO_WEBGL);
   const { mesh, cloud } = await read();
   const player = new Player(Math.max(mesh.duration, cloud?.splats.duration ?? 0), cloud?.splats.fps || mesh.fps || 1);

@@ -1,4 +1,5 @@
 // Moving splats out of their compact form; the writer, and what the numbers mean: dg4d_lib/assets/websplats.py.
+import { inflate } from "./embedded.js";
 
 const MAGIC = "D4WS";
 
@@ -51,7 +52,7 @@ class MovingSplats {
     for (let axis = 0; axis < 3; axis++) {
       const [place, size] = [field(this.places, axis), field(this.sizes, axis)];
       for (let i = 0; i < this.count; i++) {
-        rows[12 * i + axis] = this.center[axis] + this.position_step * place[i];
+        rows[12 * i + axis] = this.corner[axis] + this.position_step * place[i];
         rows[12 * i + 8 + axis] = this.scale_step * size[i];
       }
     }
@@ -78,9 +79,4 @@ function undone(bytes, frames, count) {
   for (let i = 0; i < size; i++) if (i % count) values[i] += values[i - 1];
   for (let i = 3 * count; i < size; i++) values[i] += values[i - 3 * count];
   return values;
-}
-
-async function inflate(bytes) {
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-  return new Uint8Array(await new Response(stream).arrayBuffer());
 }
