@@ -133,7 +133,7 @@ ABLATIONS: dict[str, Ablation] = {
             Claim("HexPlane", "every frame from a blob", "terr"),
             Claim("frame-wise, static start", "frame-wise, scattered", "psnr_obj"),
         ),
-        caveat="a perfect oracle says the same of every frame, which leaves no flicker to regularize: see --imperfect",
+        caveat="a perfect oracle says the same of every frame and leaves no flicker to regularize; --imperfect does",
     ),
     "resolution": Ablation(
         "32 cells of space and of time are best",
