@@ -13,8 +13,6 @@ more than one. Memory is that of the process of the batch: the growth from a ten
 import argparse
 import json
 import os
-import shutil
-import socket
 import subprocess
 import sys
 import tempfile
@@ -33,6 +31,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.measure import machine, write_rows
+from benchmarks.postgresql import Database, free_port
 from flows import home, summary
 from flows.batch import ready
 from flows.catalog import convert_all
@@ -245,33 +244,15 @@ def server(folder: Path, address: str) -> Iterator[int]:
 
 @contextmanager
 def postgresql(folder: Path) -> Iterator[str]:
-    """A database server of its own, under the user `postgres` where this one is root; gives its address."""
-    place, port = folder / "postgresql", free_port()
+    """A database server of its own; gives its address."""
+    place = folder / "postgresql"
     place.mkdir()
-    user = ["runuser", "-u", "postgres", "--"] if os.getuid() == 0 else []
-    if user:
-        shutil.chown(place, "postgres")
-    options = f"-p {port} -k {place} -c listen_addresses=127.0.0.1"
-    subprocess.run(
-        [*user, tool("initdb"), "-D", place / "data", "-A", "trust", "-U", "dg4d"],
-        check=True,
-        stdout=subprocess.DEVNULL,
-    )
-    control = [*user, tool("pg_ctl"), "-D", str(place / "data"), "-w", "-l", str(place / "log")]
-    subprocess.run([*control, "-o", options, "start"], check=True, stdout=subprocess.DEVNULL)
+    database = Database(place)
+    database.start()
     try:
-        yield f"postgresql+asyncpg://dg4d@127.0.0.1:{port}/postgres"
+        yield database.address
     finally:
-        subprocess.run([*control, "-m", "immediate", "stop"], check=True, stdout=subprocess.DEVNULL)
-
-
-def tool(name: str) -> str:
-    """A program of PostgreSQL, which Debian does not put on the path."""
-    places = sorted(Path("/usr/lib/postgresql").glob(f"*/bin/{name}"))
-    found = shutil.which(name) or (str(places[-1]) if places else "")
-    if not found:
-        raise SystemExit(f"{name} is not here: apt-get install postgresql, or --database sqlite")
-    return found
+        database.crash()
 
 
 def server_seconds(folder: Path) -> float:
@@ -296,13 +277,6 @@ def memory_mb() -> float:
     """What this process holds, in MB."""
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-def free_port() -> int:
-    """A port of this machine that nobody uses."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def table(rows: list[Row]) -> Table:

@@ -13,7 +13,7 @@ CLIENT_SETTINGS = {
     "PREFECT_TELEMETRY_ENABLE_RESOURCE_METRICS": "false",
     "PREFECT_SERVER_ANALYTICS_ENABLED": SETTINGS["PREFECT_SERVER_ANALYTICS_ENABLED"],
     "PREFECT_CLI_PROMPT": "false",
-    "PREFECT_CLIENT_MAX_RETRIES": "10",  # the one database file may be busy for a moment
+    "PREFECT_CLIENT_MAX_RETRIES": "7",  # four minutes: a database may be busy, a server begin again; 10: 34 minutes
     "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "CRITICAL",  # the command says what matters; the rest goes to the server
 }
 

@@ -26,6 +26,7 @@ from dg4d_lib.cameras.viewpoints import baking_views
 from dg4d_lib.errors import DG4DError
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.kernels.workers import run
+from dg4d_lib.mesh.outlines import SOLID
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
@@ -33,7 +34,6 @@ from dg4d_lib.settings import MeshSettings
 SHARPNESS = 2  # power in a view's weight of how far the cosine is above the least; views fade in and out without seams
 INPUT_WEIGHT = 200.0  # of the input view against another one: only there the colors come from a picture
 INPUT_FLATTER = 0.6  # of `min_cosine` in the input view: a stretched true color is better than a guessed one
-SOLID = 0.5  # alpha below which a pixel is background
 OUTLINE = 2  # pixels: the band along outlines and along nearer surfaces that is not trusted
 LAST_RESORT = 1e-4  # weight of views that are too flat or on an outline: they count where nothing better is
 FLATTEST = 0.05  # cosine below which a view does not count at all

@@ -10,6 +10,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.density import DensityField
+from dg4d_lib.mesh.outlines import SOLID
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 
@@ -62,7 +63,7 @@ def best_level(field: DensityField, gaussians: Gaussians, rasterize: Rasterizer,
     """
     cameras = [OrbitCamera(e, a, width=OUTLINE_SIZE, height=OUTLINE_SIZE) for e, a in OUTLINE_VIEWS_DEG]
     with torch.no_grad():
-        truth = rasterize(gaussians, cameras, torch.zeros(3)).alpha[..., 0] > 0.5
+        truth = rasterize(gaussians, cameras, torch.zeros(3)).alpha[..., 0] > SOLID
 
     def agreement(candidate: float) -> float:
         if not float(field.values.max()) > candidate:

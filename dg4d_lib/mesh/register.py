@@ -7,7 +7,6 @@ iterative closest points of Amberg et al. (2007).
 """
 
 from functools import partial
-from itertools import groupby
 
 import numpy as np
 import torch
@@ -53,14 +52,15 @@ def register(
         settings: of the mesh.
 
     Returns:
-        The offsets, and how far the outlines agree with them at every frame, in [0, 1]: never less than before.
+        The offsets, and how far the outlines agree at every frame with these, in [0, 1]: never less than before.
     """
     outlines = outlines_of(states, range(len(offsets)), rasterize)
     followed = agreement(vertices + offsets, faces, outlines)
     astray = torch.nonzero(followed < FOLLOWS)[:, 0].tolist()
     if not astray:
         return offsets, followed
-    smooth = {stiffness: splu(_smoothing(faces, len(vertices), stiffness)) for stiffness, _ in groupby(STIFFNESS)}
+    still, uneven = eye_array(len(vertices)), _laplacian(faces, len(vertices))
+    smooth = {stiffness: splu(csc_array(still + stiffness * uneven)) for stiffness in set(STIFFNESS)}
     registered = offsets.clone()
 
     def pull(frame: int) -> None:
@@ -82,7 +82,7 @@ def register(
 
 
 def _ways(points: Float[np.ndarray, "v 6"], aims: Float[np.ndarray, "w 6"], tree: cKDTree) -> Float[np.ndarray, "v 3"]:
-    """How far to go: to the nearest aim, and half as far where the aims whose nearest it is are elsewhere."""
+    """How far to go: to the nearest aim; half of that and half to the aims that have this point as their nearest."""
     ways = aims[tree.query(points)[1], :3] - points[:, :3]
     nearest = cKDTree(points).query(aims)[1]
     count = np.bincount(nearest, minlength=len(points))
@@ -97,9 +97,9 @@ def _with_normals(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> 
     return torch.cat([vertices, FACING * vertex_normals(vertices, faces)], 1).double().numpy()
 
 
-def _smoothing(faces: Int[Tensor, "f 3"], count: int, stiffness: float) -> csc_array:
-    """The identity and the Laplacian of the mesh, whose inverse spreads a step over the neighbors."""
+def _laplacian(faces: Int[Tensor, "f 3"], count: int) -> csc_array:
+    """What a value at a vertex has above those of its neighbors, in all."""
     ends = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).long().numpy().T
     edges = coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(count, count)).tocsr()
     joined = ((edges + edges.T) > 0).astype(np.float64)
-    return csc_array(eye_array(count) + stiffness * (diags_array(joined.sum(axis=1)) - joined))
+    return csc_array(diags_array(joined.sum(axis=1)) - joined)
