@@ -28,7 +28,7 @@ from benchmarks.measure import write_rows
 from benchmarks.objects.specimens import OBJECTS, Specimen, made, read
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from flows.manifest import parse_changes
+from flows.inputs.manifest import parse_changes
 from steps.profiles import PipelineSettings, revise
 from steps.truth import find_truths
 

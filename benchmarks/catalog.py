@@ -32,15 +32,16 @@ from rich.table import Table
 
 from benchmarks.measure import machine, write_rows
 from benchmarks.postgresql import Database, free_port
-from flows import home, summary
-from flows.batch import ready
+from flows import home
 from flows.catalog import convert_all
+from flows.commands.batch import ready
+from flows.engine.tasks import Steps
 from flows.image_to_4d import drive
-from flows.manifest import Item, items_of
-from flows.orders import Order
-from flows.publish import RECORD, Files, publish
-from flows.server import HOST, SETTINGS, answers
-from flows.tasks import Steps
+from flows.inputs.manifest import Item, items_of
+from flows.inputs.orders import Order
+from flows.packages import summary
+from flows.packages.publish import RECORD, Files, publish
+from flows.serving.server import HOST, SETTINGS, answers
 
 DATABASES = ("sqlite", "postgresql")
 STEPS = ("prepare_subject", "drive_video")
@@ -227,7 +228,7 @@ def server(folder: Path, address: str) -> Iterator[int]:
     settings = {**environment(folder), **SETTINGS, "PREFECT__SERVER_FINAL": "1"}
     if address:
         settings["PREFECT_API_DATABASE_CONNECTION_URL"] = address
-    program = ["uvicorn", "--factory", "flows.server_app:create_app", "--host", HOST, "--port", str(port)]
+    program = ["uvicorn", "--factory", "flows.serving.server_app:create_app", "--host", HOST, "--port", str(port)]
     process = subprocess.Popen([sys.executable, "-m", *program, "--log-level", "warning"], env=settings)
     (folder / "server.pid").write_text(str(process.pid), encoding="ascii")
     try:

@@ -38,7 +38,7 @@ from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.metrics.gates import Gate, judge
 from dg4d_lib.rasterizer.interface import choose_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
-from flows.publish import whole
+from flows.packages.publish import whole
 from steps.check_asset import Parts, gather
 from steps.contract import ArtifactRef
 from steps.media import read_frames, read_png

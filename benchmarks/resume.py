@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.measure import write_rows
-from flows.publish import whole
+from flows.packages.publish import whole
 
 SMALL = {
     "subject.size": "64",

@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.measure import write_rows
-from flows.publish import RECORD, whole
+from flows.packages.publish import RECORD, whole
 
 STAGES = {
     "prepare_subject": "subject",

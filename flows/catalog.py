@@ -14,13 +14,13 @@ from prefect.futures import PrefectFuture
 from prefect.settings import temporary_settings
 
 from dg4d_lib.errors import DG4DError
-from flows import pages
-from flows.executors import StepCrashed, StepError, StepOutOfMemory, StepTimedOut, StepUnreachable, stop_all
-from flows.make import make, save_pictures
-from flows.orders import Order
-from flows.runners import item_runner
-from flows.summary import Row, Tally, judged
-from flows.tasks import QUICK
+from flows.commands.make import make, save_pictures
+from flows.engine.executors import StepCrashed, StepError, StepOutOfMemory, StepTimedOut, StepUnreachable, stop_all
+from flows.engine.runners import item_runner
+from flows.engine.tasks import QUICK
+from flows.inputs.orders import Order
+from flows.packages.summary import Row, Tally, judged
+from flows.ui import pages
 from steps.store import ArtifactMissing, StoreUnreachable
 
 Make = Callable[[Order, Path], tuple[Any, bool]]

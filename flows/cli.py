@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flows.checking import bench, rebuild, score, verify
-from flows.endings import clear_ending
-from flows.options import Changes, Commercial, Profile, Rate, Seed, Texture, Triangles, knobs_of
-from flows.services import down, up, watch
-from flows.store import store
-from flows.weights import weights
+from flows.commands.checking import bench, rebuild, score, verify
+from flows.commands.endings import clear_ending
+from flows.commands.options import Changes, Commercial, Profile, Rate, Seed, Texture, Triangles, knobs_of
+from flows.commands.services import down, up, watch
+from flows.commands.store import store
+from flows.commands.weights import weights
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from flows.orders import Order
+    from flows.inputs.orders import Order
 
 app = typer.Typer(
     name="dg4d",
@@ -78,11 +78,12 @@ def make(
         raise typer.BadParameter("give a picture, a video, or --text WORDS")
     with clear_ending():
         from dg4d_lib.errors import BadInput
-        from flows import home, terminal
-        from flows.acceptance import failing_in
-        from flows.manifest import parse_changes
-        from flows.orders import Wish, name_of
-        from flows.publish import check_folder, is_current, record_of
+        from flows import home
+        from flows.commands import terminal
+        from flows.inputs.manifest import parse_changes
+        from flows.inputs.orders import Wish, name_of
+        from flows.packages.acceptance import failing_in
+        from flows.packages.publish import check_folder, is_current, record_of
         from steps.profiles import profile as named
         from steps.profiles import revise
 
@@ -135,11 +136,12 @@ def motions(
 ) -> None:
     """Show the motions that a picture could make, the best first; `dg4d make PICTURE --pick K` takes number K."""
     with clear_ending():
-        from flows import home, terminal
-        from flows.make import make_motions
-        from flows.manifest import parse_changes
-        from flows.orders import Wish
-        from flows.publish import check_writable
+        from flows import home
+        from flows.commands import terminal
+        from flows.commands.make import make_motions
+        from flows.inputs.manifest import parse_changes
+        from flows.inputs.orders import Wish
+        from flows.packages.publish import check_writable
         from steps.profiles import profile as named
         from steps.profiles import revise
 
@@ -207,10 +209,10 @@ def batch(
     """
     with clear_ending():
         os.environ.update({name: str(n) for name, n in {"DG4D_GPUS": gpus, "DG4D_CPUS": cpus}.items() if n is not None})
-        from flows import terminal
-        from flows.batch import batch as make_all
-        from flows.batch import tell
-        from flows.manifest import parse_changes
+        from flows.commands import terminal
+        from flows.commands.batch import batch as make_all
+        from flows.commands.batch import tell
+        from flows.inputs.manifest import parse_changes
 
         console = terminal.console()
         wanted = parse_changes(changes or []) | knobs_of(triangles, texture, fps)
@@ -235,7 +237,7 @@ def render(
             angles = [float(angle) for angle in azimuths.split(",")]
         except ValueError:
             raise typer.BadParameter(f"{azimuths!r} is not a list of degrees such as 0,-75,15") from None
-        from flows.publish import check_writable
+        from flows.packages.publish import check_writable
 
         check_writable(out)
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -252,7 +254,7 @@ def view(
 ) -> None:
     """Check a package and show the page that plays it; prints where the page is."""
     with clear_ending():
-        from flows.view import view as check_and_show
+        from flows.packages.view import view as check_and_show
 
         typer.echo(check_and_show(package, show))
 
@@ -272,7 +274,7 @@ def compose(
     """Put several assets into one animated scene: side by side, or as a scene file says."""
     with clear_ending():
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-        from flows.compose import compose as compose_scene
+        from flows.commands.compose import compose as compose_scene
 
         for note in compose_scene(packages or [], out, scene, spacing, preview):
             typer.echo(note, err=True)
@@ -290,8 +292,8 @@ def main() -> None:
 
 def _made(order: "Order", folder: Path, console: "Console") -> dict[str, dict[str, int]]:
     """Run the flow of an order with its steps on the terminal; the files of the package."""
-    from flows import terminal
-    from flows.make import make
+    from flows.commands import terminal
+    from flows.commands.make import make
 
     files, cached = terminal.with_steps(order, console, lambda: make(order, folder))
     if cached:

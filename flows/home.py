@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from flows.server import SETTINGS, Server
+from flows.serving.server import SETTINGS, Server
 from steps.opening import open_store
 from steps.store import ArtifactStore, home
 

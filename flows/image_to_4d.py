@@ -8,9 +8,9 @@ from prefect.task_runners import ThreadPoolTaskRunner
 
 from dg4d_lib.settings import GeometricPriorSettings
 from flows import home
-from flows.asset_page import show_asset
-from flows.merging import frames_in, merged
-from flows.tasks import Made, Steps
+from flows.engine.merging import frames_in, merged
+from flows.engine.tasks import Made, Steps
+from flows.ui.asset_page import show_asset
 from steps.contract import ArtifactRef
 from steps.profiles import (
     CheckAssetSettings,

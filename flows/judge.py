@@ -8,11 +8,12 @@ from prefect.artifacts import create_table_artifact
 from prefect.settings import temporary_settings
 
 from dg4d_lib.errors import BadInput
-from flows import home, scores
-from flows.executors import StepError
-from flows.orphans import process_tag
-from flows.scores import ObjectScores, Results
-from flows.tasks import QUICK, Steps
+from flows import home
+from flows.engine.executors import StepError
+from flows.engine.orphans import process_tag
+from flows.engine.tasks import QUICK, Steps
+from flows.packages import scores
+from flows.packages.scores import ObjectScores, Results
 from steps.contract import ArtifactRef, Frozen
 from steps.profiles import ScoreAssetSettings
 

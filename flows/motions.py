@@ -7,9 +7,9 @@ from typing import Any
 from prefect import flow
 
 from flows import home
-from flows.executors import StepBadInput
+from flows.engine.executors import StepBadInput
+from flows.engine.tasks import Steps
 from flows.image_to_4d import drive
-from flows.tasks import Steps
 from steps.archives import unpack as unpack_zip
 from steps.contract import ArtifactRef
 from steps.profiles import PipelineSettings

@@ -2,8 +2,8 @@
 
 from prefect import flow
 
+from flows.engine.tasks import Made, Steps
 from flows.image_to_4d import RUNNER, finish
-from flows.tasks import Made, Steps
 from steps.contract import ArtifactRef
 from steps.profiles import PipelineSettings
 

@@ -2,9 +2,9 @@
 
 from prefect import flow
 
-from flows.executors import StepBadInput
+from flows.engine.executors import StepBadInput
+from flows.engine.tasks import Made, Steps
 from flows.image_to_4d import RUNNER, finish
-from flows.tasks import Made, Steps
 from steps.contract import ArtifactRef
 from steps.profiles import PipelineSettings
 

@@ -30,7 +30,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, TextIO
@@ -168,13 +168,14 @@ def main(arguments: list[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     if given.parent is not None:
         _die_with(given.parent)
-    _prepare_process()
+    prepare_process()
     with _progress_file(given.progress) as file:
         try:
             request = StepRequest.model_validate_json(given.request.read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError, ValidationError) as trouble:
             failure = StepFailure(step="", kind="bad_input", message=f"{given.request} is not a StepRequest: {trouble}")
             return _finish(failure, None, given.result)
+        _show(request.step)
         with notes_to(note_lines(file)):
             outcome, error = perform(request, open_store(given.store), progress_lines(file))
         return _finish(outcome, error, given.result)
@@ -412,8 +413,8 @@ def _progress_file(path: Path | None) -> TextIO:
     return os.fdopen(own, "w", encoding="utf-8")
 
 
-def _prepare_process() -> None:
-    """What has to be set before torch is imported."""
+def prepare_process() -> None:
+    """Set what has to be set before torch is imported."""
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # torch's threads would spin after every operation
     if not sys.platform.startswith("linux"):
         return
@@ -424,6 +425,12 @@ def _prepare_process() -> None:
     mallopt(M_MMAP_MAX, 0)
     mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
     mallopt(M_TOP_PAD, 256 * 2**20)
+
+
+def _show(step: str) -> None:
+    """Have `top` and `ps` say which step this process does."""
+    with suppress(OSError):  # no Linux
+        Path("/proc/self/comm").write_text(f"dg4d {step}", encoding="ascii")
 
 
 def _die_with(parent: str) -> None:

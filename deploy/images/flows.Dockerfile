@@ -11,11 +11,11 @@ COPY dg4d_lib dg4d_lib
 COPY steps steps
 COPY flows flows
 COPY deploy/pools.yaml deploy/prefect.yaml deploy/
-# the folder of results belongs to whoever runs here; a volume may take its place
+# these folders belong to whoever runs here; a new volume that takes the place of one belongs to them too
 RUN --mount=type=secret,id=pip,target=/etc/pip.conf \
     pip install --no-cache-dir -c constraints.txt ".[${EXTRAS}]" && \
     rm -rf /src/* /opt/code && \
-    install --directory --owner 10001 --group 10001 /home/dg4d/data
+    install --directory --owner 10001 --group 10001 /home/dg4d/data /data
 USER 10001
 WORKDIR /home/dg4d
 # whatever runs here needs the server

@@ -92,7 +92,7 @@ def test_a_path_of_one_machine_would_be_noticed(literal: str) -> None:
 def test_no_path_of_one_machine_is_in_the_product() -> None:
     product = [*PACKAGES, *repository.modules("examples", "benchmarks")]
     found = {path: literals for path in product if (literals := machine_paths(repository.tree(path)))}
-    assert found == {"flows/containers.py": ["/tmp"]}  # a folder in a container, not on a machine
+    assert found == {"flows/engine/containers.py": ["/tmp"]}  # a folder in a container, not on a machine
 
 
 def test_every_module_says_what_it_is() -> None:

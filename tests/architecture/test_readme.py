@@ -8,10 +8,10 @@ import pytest
 import repository
 
 import flows.cli
-import flows.endings
-from flows.manifest import parse_changes
-from flows.publish import RECORD
-from flows.report import BESIDE
+import flows.commands.endings
+from flows.inputs.manifest import parse_changes
+from flows.packages.publish import RECORD
+from flows.packages.report import BESIDE
 from steps import packages
 from steps.profiles import PROFILES, profile, revise
 
@@ -119,7 +119,7 @@ def test_every_profile_is_explained() -> None:
 
 
 def test_the_exit_codes_are_those_of_the_command() -> None:
-    codes = {value for name, value in vars(flows.endings).items() if name.startswith("EXIT_")}
+    codes = {value for name, value in vars(flows.commands.endings).items() if name.startswith("EXIT_")}
     section = README.split("\n## Exit codes\n", 1)[1].split("\n## ", 1)[0]
     assert set(map(int, re.findall(r"^\| (\d+) \|", section, re.MULTILINE))) == {0, 2, *codes}
 

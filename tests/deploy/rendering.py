@@ -12,7 +12,7 @@ from prefect.client.schemas.objects import FlowRun
 from prefect_docker.worker import DockerWorker, DockerWorkerJobConfiguration
 from prefect_kubernetes.worker import KubernetesWorkerJobConfiguration
 
-from flows.pools import Pool
+from flows.serving.pools import Pool
 
 REGISTRY = Path(prefect.__file__).parent / "server/api/collections_data/views/aggregate-worker-metadata.json"
 RUN = FlowRun(id="00000000-0000-4000-8000-000000000000", name="example", flow_id="00000000-0000-4000-8000-000000000001")

@@ -16,8 +16,8 @@ import torch
 
 from dg4d_lib.errors import BackendUnavailable
 from flows import home, image_to_4d
-from flows.containers import container
-from flows.executors import EXECUTORS, StepBadInput
+from flows.engine.containers import container
+from flows.engine.executors import EXECUTORS, StepBadInput
 from steps.catalog import STEPS
 from steps.contract import ArtifactRef, StepRequest, StepResult
 from steps.main import request_version

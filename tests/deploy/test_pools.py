@@ -12,7 +12,7 @@ from prefect.utilities.callables import parameter_schema
 from prefect.utilities.schema_tools.validation import validate
 
 from dg4d_lib.errors import BadInput
-from flows.pools import DEPLOYMENTS, Pool, read_deployments, read_pools
+from flows.serving.pools import DEPLOYMENTS, Pool, read_deployments, read_pools
 
 POOLS = read_pools()
 KUBERNETES = "1.33"

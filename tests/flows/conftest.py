@@ -7,7 +7,7 @@ from prefect.logging.handlers import APILogHandler
 from prefect.settings import PREFECT_API_URL, temporary_settings
 
 from flows import home
-from flows.server import Server
+from flows.serving.server import Server
 
 
 @pytest.fixture(scope="session")

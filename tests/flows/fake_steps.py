@@ -185,6 +185,9 @@ def _obey(command: str, job: Job, step: str) -> None:
             raise MemoryError("not enough")
         case "die":
             os.kill(os.getpid(), signal.SIGKILL)
+        case "kill":
+            os.kill(int(value), signal.SIGKILL)
+            time.sleep(20)
         case "sleep":
             time.sleep(float(value))
         case "die-once" | "memory-once" | "sleep-once" if not once.exists():

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.credentials import configured
-from flows.orders import Order
-from flows.publish import publish
-from flows.report import complete
-from flows.tasks import Finished, Made
+from flows.engine.tasks import Finished, Made
+from flows.inputs.orders import Order
+from flows.packages.credentials import configured
+from flows.packages.publish import publish
+from flows.packages.report import complete
 from steps.contract import ArtifactRef, ProvenanceRecord, StepResult
 from steps.profiles import PREVIEW
 from steps.store import ArtifactStore

@@ -14,7 +14,7 @@ from prefect.logging.handlers import APILogHandler
 
 from benchmarks.postgresql import Database, free_port
 from dg4d_lib.errors import BackendUnavailable
-from flows.server import SETTINGS, answers
+from flows.serving.server import SETTINGS, answers
 
 START_S = 400.0  # on a machine that is busy with other things
 
@@ -33,7 +33,7 @@ def server_on_postgresql(prefect_home: Path) -> Iterator[tuple[str, Database]]:
         database.start()
         port = free_port()
         server = subprocess.Popen(
-            [sys.executable, "-m", "uvicorn", "--factory", "flows.server_app:create_app", "--port", str(port),
+            [sys.executable, "-m", "uvicorn", "--factory", "flows.serving.server_app:create_app", "--port", str(port),
              "--log-level", "critical"],
             env={
                 **os.environ,

@@ -12,14 +12,15 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from flows import cli, home, tasks
+from flows import cli, home
 from flows.catalog import convert_all
-from flows.executors import StepBadInput, StepCrashed, StepDiverged, StepError, StepMissing, StepOutOfMemory
-from flows.make import make, save_pictures
-from flows.orders import Order, Wish
-from flows.orphans import settle_orphans
-from flows.server import Server
-from flows.summary import NOT_ACCEPTED, Row, Tally
+from flows.commands.make import make, save_pictures
+from flows.engine import tasks
+from flows.engine.executors import StepBadInput, StepCrashed, StepDiverged, StepError, StepMissing, StepOutOfMemory
+from flows.engine.orphans import settle_orphans
+from flows.inputs.orders import Order, Wish
+from flows.packages.summary import NOT_ACCEPTED, Row, Tally
+from flows.serving.server import Server
 from steps.profiles import PREVIEW, revise
 
 EVERY_STEP = [
@@ -181,7 +182,7 @@ def test_memory_that_is_free_again_is_enough(log: Path, tmp_path: Path) -> None:
 def dg4d(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     """The command in this process, which is connected already."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("flows.make.connect", lambda: None)
+    monkeypatch.setattr("flows.commands.make.connect", lambda: None)
     return lambda *arguments: CliRunner().invoke(cli.app, arguments)
 
 

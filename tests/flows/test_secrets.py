@@ -7,11 +7,12 @@ import pytest
 from prefect.logging.handlers import APILogHandler
 from signing import identity
 
-from flows import home, tasks
-from flows.executors import StepCrashed
-from flows.make import make
-from flows.orders import Wish
-from flows.server import Server
+from flows import home
+from flows.commands.make import make
+from flows.engine import tasks
+from flows.engine.executors import StepCrashed
+from flows.inputs.orders import Wish
+from flows.serving.server import Server
 from steps.profiles import PREVIEW
 
 MARKER = "c0ffee-and-nobody-else-knows"

@@ -1,0 +1,131 @@
+"""`dg4d batch`: many assets out of a folder, a pattern, an object store or a manifest; what is made is left alone."""
+
+import itertools
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dg4d_lib.errors import DG4DError
+from flows import home
+from flows.commands import make, terminal
+from flows.commands.endings import EXIT_BAD_INPUT, EXIT_FAILED
+from flows.engine import resources
+from flows.inputs.manifest import Item, items_of, only_commercial
+from flows.inputs.orders import Order
+from flows.packages.publish import check_folder, check_writable, is_current
+from flows.packages.summary import BAD_INPUT, Row, Tally, Writer, judged
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def batch(
+    inputs: str,
+    out: Path,
+    console: "Console",
+    profile_name: str = "preview",
+    changes: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    workers: int = 1,
+    commercial_only: bool = False,
+    strict: bool = False,
+    root: Path | None = None,
+    price_per_hour: float | None = None,
+    connect: Callable[[], None] | None = None,
+) -> list[Row]:
+    """Make every item of `inputs` that is not made yet; what became of each, in the order in which they are made.
+
+    OUT gets a folder per item, summary.json, summary.csv and index.html. Items are read and prepared one ahead of
+    those at work, so that a batch of thousands begins at once.
+
+    Args:
+        inputs: a folder, a pattern, s3://BUCKET/PREFIX, or a manifest.
+        out: made if it is not there.
+        console: where to show how far it is.
+        profile_name: of items that do not name one.
+        changes: of its knobs.
+        seed: of items that do not have one.
+        workers: items at a time.
+        commercial_only: refuse weights whose license forbids commercial use.
+        strict: an asset that a gate does not let pass is a failure, and ends the batch.
+        root: where a manifest's files are.
+        price_per_hour: of the machine, in any currency, for the summary.
+        connect: finds a Prefect server, when the first item needs one; default: as every command does.
+
+    Raises:
+        BadInput: the batch as a whole cannot be used, or `out` cannot be written.
+        BackendUnavailable: something that all of it needs is missing.
+        KeyboardInterrupt: the user stopped it; what is done stays, and the summary says what was not.
+    """
+    items = items_of(inputs, out, profile_name, changes or {}, seed, root)
+    items = only_commercial(items) if commercial_only else items
+    resources.cpus(), resources.gpus()  # wrong numbers are refused before any work
+    check_writable(out)
+    out.mkdir(parents=True, exist_ok=True)
+    writer = Writer(out, commercial_only, price_per_hour)
+    with terminal.batch_shown(console, [item.name for item in items]) as table:
+
+        def show(row: Row) -> None:
+            table.settle(row.item, row.status, row.message)
+            if not console.is_terminal:
+                console.print(f"{row.item}: {row.status} {row.message}".rstrip(), markup=False)
+            writer.write_sometimes(list(tally.rows.values()), tally.seconds)
+
+        tally = Tally(len(items), show)
+        try:
+            _make_all(items, out, workers, f"{Path(inputs).name}: {len(items)} items", tally, strict, connect)
+        finally:
+            stopped = (Row(item=item.name, status="skipped", message="not begun, or stopped") for item in items)
+            rows = [tally.rows.get(row.item, row) for row in stopped]
+            writer.write(rows, tally.seconds)
+    return rows
+
+
+def tell(rows: list[Row], out: Path, console: "Console") -> int:
+    """Say how a batch ended; the exit status of the command."""
+    failed = [row for row in rows if row.status == "failed"]
+    for row in failed:
+        console.print(f"failed: {row.item}: {row.message}", markup=False, style="red")
+    for row in rows:
+        if row.failing and row.status != "failed":
+            console.print(f"not accepted: {row.item}: {', '.join(row.failing)}", markup=False, style="yellow")
+    if all(row.status == "unchanged" for row in rows):
+        console.print("nothing to do: every item was already done")
+    console.print(f"{sum(row.made for row in rows)} of {len(rows)} items are in {out}", markup=False)
+    console.print(f"overview: {out / 'index.html'}", markup=False)
+    if not failed:
+        return 0
+    return EXIT_BAD_INPUT if all(row.kind in BAD_INPUT for row in rows) else EXIT_FAILED
+
+
+def _make_all(
+    items: list[Item],
+    out: Path,
+    workers: int,
+    title: str,
+    tally: Tally,
+    strict: bool,
+    connect: Callable[[], None] | None,
+) -> None:
+    todo = (ready(item, out, strict) for item in items)
+    for first in todo:
+        if isinstance(first, Row):  # no server is needed for these
+            tally.settle(first)
+            continue
+        (connect or make.connect)()
+        from flows.catalog import convert_all
+
+        convert_all(itertools.chain([first], todo), out, workers, title, tally, strict)
+
+
+def ready(item: Item, out: Path, strict: bool) -> Order | Row:
+    """The order of an item, or what became of it already."""
+    row = Row(item=item.name, source=item.wish.source_name if item.wish else "", status="unchanged")
+    try:
+        with item.here() as wish:
+            wish.check()
+            check_folder(out / item.name)
+            order = wish.order(home.store())
+    except DG4DError as error:
+        return row.model_copy(update={"status": "failed", "kind": type(error).__name__, "message": str(error)})
+    return judged(row, out / item.name, strict) if is_current(out / item.name, order.digest()) else order

@@ -1,0 +1,159 @@
+"""One order becomes one folder: connect to a server, run the flow, publish what it made."""
+
+import os
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from flows import home
+from flows.inputs.orders import Order
+from flows.packages.credentials import Signer, configured
+from flows.packages.publish import Files, publish
+from flows.serving.server import ServerUnavailable
+from steps.store import ArtifactMissing
+
+if TYPE_CHECKING:
+    from flows.engine.tasks import Made
+
+ANSWER_S = 10.0  # for a server of the user's own
+
+
+def connect() -> None:
+    """Have a Prefect server, and import Prefect while it starts.
+
+    Raises:
+        ServerUnavailable: there is none; says what to do.
+    """
+    own = os.environ.get("PREFECT_API_URL")
+    if own:
+        home.set_environment(own)
+        _check(own)
+    else:
+        server = home.background_server()
+        server.start()
+        home.set_environment(f"{server.wait_for_address()}/api")
+        import prefect.main  # noqa: F401 - takes seconds, and so does the server
+
+        server.wait()
+    from flows.engine.orphans import settle_orphans
+
+    settle_orphans()
+
+
+def make(order: Order, folder: Path) -> tuple[Files, bool]:
+    """Run the flow of an order and put the package into `folder`, signed if a key is configured; keep it as a version.
+
+    What turns out to be damaged or gone on the way is made again.
+
+    Returns:
+        The files of the package, and whether every step had been done before.
+
+    Raises:
+        StepError: a step did not finish; `folder` is as it was.
+        BadInput: the folder cannot be written, the disk is full, or the key cannot sign; it is as it was.
+        BackendUnavailable: a key is configured, and signing is not installed.
+    """
+    from flows.engine.executors import StepLost
+
+    signer = configured()
+    try:
+        return _make(order, folder, signer)
+    except (ArtifactMissing, StepLost):  # it was dropped when it was found, and so was the result that named it
+        return _make(order, folder, signer)
+
+
+def run(order: Order, refresh: bool = False) -> "Made":
+    """Run the flow of an order.
+
+    Args:
+        order: what to make.
+        refresh: do every step, also those whose result is there already.
+
+    Raises:
+        StepError: a step did not finish.
+    """
+    from prefect.settings import PREFECT_TASKS_REFRESH_CACHE, temporary_settings
+
+    from flows.image_to_4d import image_to_4d
+    from flows.text_to_4d import text_to_4d
+    from flows.video_to_4d import video_to_4d
+
+    flow = text_to_4d if order.drawn else video_to_4d if order.moving else image_to_4d
+    with temporary_settings({PREFECT_TASKS_REFRESH_CACHE: refresh}), _surroundings(order):
+        return flow(order.source, order.settings, order.seed, order.item, order.bank)
+
+
+def deliver(order: Order, made: "Made", folder: Path, signer: Signer | None) -> Files:
+    """Put what a flow made into a folder; raises as `make` does."""
+    from flows.packages.report import complete
+
+    store = home.store()
+    return publish(
+        store.path(made.package),
+        folder,
+        lambda staging, files: complete(staging, files, order, made, store, signer),
+    )
+
+
+def _make(order: Order, folder: Path, signer: Signer | None) -> tuple[Files, bool]:
+    from flows.engine.leases import running
+    from flows.packages.versions import keep_version
+
+    store = home.store()
+    with running(store, order.item):
+        made = run(order)
+        keep_version(store, order, made)
+        return deliver(order, made, folder, signer), all(done.cached for done in made.steps)
+
+
+def make_motions(order: Order, folder: Path) -> dict[str, Any]:
+    """Hold the tournament of an order's motions and put sheet, ranking and films into `folder`; the ranking.
+
+    Raises:
+        StepError: a step did not finish.
+    """
+    from flows.motions import motions, unpack
+
+    with _surroundings(order):
+        made = motions(order.source, order.settings, order.seed, order.item)
+    return unpack(made, folder)
+
+
+@contextmanager
+def _surroundings(order: Order) -> Iterator[None]:
+    """What a flow of an order runs in."""
+    from prefect import tags
+    from prefect.settings import temporary_settings
+
+    from flows.engine.orphans import process_tag
+    from flows.engine.tasks import QUICK
+
+    with temporary_settings(QUICK), tags(process_tag(), f"profile:{order.profile}"):
+        yield
+
+
+def save_pictures(order: Order, error: Exception) -> list[Path]:
+    """Keep the pictures that explain a failure where the user can look at them."""
+    saved = []
+    for name, ref in getattr(error, "pictures", {}).items():
+        path = home.failures() / f"{order.item.replace('/', '-')}-{getattr(error, 'step', 'step')}-{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            home.store().get(ref, path)
+        except (OSError, ArtifactMissing):
+            continue
+        saved.append(path)
+    return saved
+
+
+def _check(api_url: str) -> None:
+    try:
+        urllib.request.urlopen(f"{api_url.rstrip('/')}/health", timeout=ANSWER_S).close()
+    except (urllib.error.URLError, OSError, ValueError) as error:
+        raise ServerUnavailable(
+            f"PREFECT_API_URL is {api_url} and nothing answers there ({error}); "
+            "start that server, or unset the variable to have one started"
+        ) from error

@@ -1,0 +1,95 @@
+"""Commands for what runs in the background: up, down, watch."""
+
+import os
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flows.commands.endings import clear_ending
+
+LOOK_S = 1.0  # between two looks at a watched folder
+
+
+def up(
+    pools: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--pool", help="of deploy/pools.yaml; may be repeated  [default: process-cpu, -gpu if there is one]"
+        ),
+    ] = None,
+    workers: Annotated[
+        bool, typer.Option("--worker/--no-worker", help="whether this machine does what is asked of the server")
+    ] = True,
+) -> None:
+    """Keep a server with deployments, and a worker, until `dg4d down`; prints the address of its pages.
+
+    What is there already stays. With $PREFECT_API_URL, pools and deployments are put on that server.
+    """
+    with clear_ending():
+        from dg4d_lib.errors import BadInput
+        from dg4d_lib.rasterizer.choice import cuda_devices
+        from flows import home
+        from flows.commands.make import connect
+        from flows.serving.pools import read_pools
+        from flows.serving.workers import Worker
+
+        known = read_pools()
+        chosen = pools or ["process-cpu", *(["process-gpu"] if cuda_devices() else [])]
+        if unknown := [name for name in chosen if name not in known]:
+            raise BadInput(f"there is no pool {unknown[0]!r} in deploy/pools.yaml; there are: {', '.join(known)}")
+        server = home.background_server()
+        if "PREFECT_API_URL" not in os.environ:
+            server.start()
+            server.keep()
+        connect()
+        from flows.serving.registering import register
+
+        for name in register(known, chosen):
+            typer.echo(name)
+        api_url = os.environ["PREFECT_API_URL"]
+        server.folder.mkdir(parents=True, exist_ok=True)
+        for name in chosen if workers else ():
+            Worker(name, server.folder).start(api_url)
+        typer.echo(api_url.removesuffix("/api"))
+
+
+def down() -> None:
+    """Stop the server and the workers of this machine."""
+    with clear_ending():
+        from flows import home
+        from flows.serving.workers import running
+
+        server = home.background_server()
+        stopped = [worker.stop() for worker in running(server.folder)]
+        typer.echo("stopped" if server.stop() or stopped else "nothing was running")
+
+
+def watch(
+    folder: Annotated[Path, typer.Argument(help="where people drop pictures, videos or a manifest")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="OUT/<item>/ is a package each")],
+    rest_s: Annotated[
+        float, typer.Option("--rest", min=1, help="seconds without a change before its content counts")
+    ] = 10.0,
+) -> None:
+    """Have the deployment catalog/local convert what is dropped into a folder; goes on until it is stopped."""
+    with clear_ending():
+        from flows import home
+        from flows.commands.make import connect
+        from flows.packages.publish import check_writable
+        from steps.contract import digest_of
+
+        check_writable(out)
+        connect()
+        from flows.serving.watching import Watcher, announce
+
+        name = digest_of([str(folder.resolve()), str(out.resolve())]).removeprefix("sha256:")[:16]
+        watcher = Watcher(folder, out, rest_s, home.background_server().folder / f"watched-{name}")
+        typer.echo(f"watching {watcher.folder}")
+        while True:
+            if (digest := watcher.look(time.monotonic())) is not None:
+                announce(watcher.folder, watcher.out, digest)
+                watcher.told(digest)
+                typer.echo(f"told the server: {digest}")
+            time.sleep(LOOK_S)

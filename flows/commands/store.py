@@ -1,0 +1,184 @@
+"""`dg4d store`: what the store holds, what refers to what, removing what nobody needs, checking every byte."""
+
+import re
+import zipfile
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from flows.commands.endings import EXIT_BAD_INPUT, clear_ending
+
+if TYPE_CHECKING:
+    from flows.packages.versions import Version
+    from steps.store import ArtifactStore
+
+LEAST_DIGITS = 6  # of a digest, to be taken for one
+SHOWN_DIGITS = 12
+
+store = typer.Typer(
+    name="store",
+    help="Everything that was made, version by version, and the files it was made of.",
+    no_args_is_help=True,
+)
+
+
+@store.command("ls")
+def list_versions() -> None:
+    """Show every item with its versions, the newest first: what they take alone, and with all they were made of."""
+    with clear_ending():
+        from rich.table import Column, Table
+
+        from flows import home
+        from flows.commands import terminal
+        from flows.packages.publish import readable
+        from flows.packages.versions import versions
+
+        place = home.store()
+        sizes = {entry.name: entry.size_bytes for entry in place.artifacts()}
+        known = versions(place)
+        words = (Column("item", overflow="fold"), "version", "finished", "profile")
+        numbers = (Column("package", justify="right"), Column("in all", justify="right"))
+        table = Table(*words, *numbers, box=None, pad_edge=False)
+        before = None
+        for version in known:
+            table.add_row(
+                version.item if version.item != before else "",
+                _short(version.order),
+                _when(version),
+                version.profile,
+                readable(version.package.size_bytes),
+                readable(sum(sizes.get(digest, 0) for digest in version.artifacts())),
+            )
+            before = version.item
+        out = terminal.console()
+        if known:
+            out.print(table)
+        items = len({version.item for version in known})
+        total = f"{len(sizes)} artifacts, {readable(sum(sizes.values()))}"
+        out.print(f"{items} items, {len(known)} versions, {total} in {place.address}", markup=False)
+
+
+@store.command()
+def show(
+    name: Annotated[str, typer.Argument(metavar="ITEM|DIGEST", help="an item, or the first digits of a digest")],
+) -> None:
+    """Show the versions of an item; one version with its steps and files; or who refers to an artifact."""
+    with clear_ending():
+        from dg4d_lib.errors import BadInput
+        from flows import home
+        from flows.packages.versions import versions
+
+        place = home.store()
+        known = versions(place)
+        if of_item := [version for version in known if version.item == name]:
+            for version in of_item:
+                _show_version(version, place)
+            return
+        digits = name.removeprefix("sha256:").lower()
+        if not re.fullmatch(rf"[0-9a-f]{{{LEAST_DIGITS},64}}", digits):
+            items = sorted({version.item for version in known})
+            some = ", ".join(items[:5]) + (", ..." if len(items) > 5 else "")
+            raise BadInput(
+                f"there is no item {name!r} ({some or 'none yet'}), and no digest of {LEAST_DIGITS} digits or more"
+            )
+        digest = f"sha256:{digits}"
+        of_order = [version for version in known if version.order.startswith(digest)]
+        artifacts = [entry for entry in place.artifacts() if entry.name.startswith(digest)]
+        if not of_order and not artifacts:
+            raise BadInput(f"no version and no artifact in {place.address} begins with {digits}")
+        for version in of_order:
+            _show_version(version, place)
+        for entry in artifacts:
+            _show_artifact(entry.name, entry.size_bytes, known)
+
+
+@store.command()
+def gc(
+    keep: Annotated[
+        int | None, typer.Option(min=1, help="of each item keep so many of the newest versions  [default: all]")
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="only say what would be removed")] = False,
+    grace_hours: Annotated[float, typer.Option(min=0, help="what is younger stays, for it may be in use")] = 24.0,
+) -> None:
+    """Remove what no version and no running command needs; it may run at any time."""
+    with clear_ending():
+        from flows import home
+        from flows.engine.collecting import collect
+        from flows.packages.publish import readable
+
+        place = home.store()
+        gone = collect(place, home.records(), keep, dry_run, grace_hours * 3600)
+        for version in gone.versions:
+            typer.echo(f"version {_short(version.order)} of {version.item}, {_when(version)}")
+        size = readable(sum(entry.size_bytes for entry in gone.artifacts))
+        verb = "would be removed" if dry_run else "were removed"
+        typer.echo(
+            f"{len(gone.versions)} versions and {len(gone.artifacts)} artifacts ({size}) {verb} from {place.address}"
+        )
+
+
+@store.command()
+def verify() -> None:
+    """Read every artifact again: name those that are damaged, and those that versions need and are missing."""
+    with clear_ending():
+        from flows import home
+        from flows.packages.versions import faults, users, versions
+
+        place = home.store()
+        known = versions(place)
+        sizes = {entry.name: entry.size_bytes for entry in place.artifacts()}
+        wrong = faults(place, known, sizes)
+        of = users(known)
+        for digest, what in sorted(wrong.items()):
+            typer.echo(f"{digest} {what}: {_needed_by(of.get(digest, []))}")
+        if wrong:
+            typer.echo(
+                f"dg4d: {len(wrong)} of {len(sizes | wrong)} artifacts are damaged or missing; "
+                "the next run that needs them makes them again",
+                err=True,
+            )
+            raise typer.Exit(EXIT_BAD_INPUT)
+        typer.echo(f"{len(sizes)} artifacts of {len(known)} versions are whole")
+
+
+def _show_version(version: "Version", place: "ArtifactStore") -> None:
+    from flows.packages.publish import readable
+
+    sizes = {entry.name: entry.size_bytes for entry in place.artifacts()}
+    typer.echo(f"{version.item}  version {version.order}")
+    typer.echo(f"  finished  {_when(version)}, profile {version.profile}, seed {version.seed}")
+    for digest, what in version.artifacts().items():
+        size = readable(sizes[digest]) if digest in sizes else "missing"
+        typer.echo(f"  {_short(digest)}  {size:>9}  {what}")
+    if version.package.digest in sizes:
+        with zipfile.ZipFile(place.path(version.package)) as package:
+            typer.echo("  files of the package")
+            for entry in package.infolist():
+                typer.echo(f"  {'':{SHOWN_DIGITS}}  {readable(entry.file_size):>9}  {entry.filename}")
+
+
+def _show_artifact(digest: str, size_bytes: int, known: list["Version"]) -> None:
+    from flows.packages.publish import readable
+    from flows.packages.versions import users
+
+    typer.echo(f"{digest}  {readable(size_bytes)}")
+    for version, what in users(known).get(digest, []):
+        typer.echo(f"  {what} of {version.item}, version {_short(version.order)}")
+    if digest not in users(known):
+        typer.echo("  no version refers to it")
+
+
+def _needed_by(of: list[tuple["Version", str]]) -> str:
+    if not of:
+        return "no version refers to it"
+    version, what = of[0]
+    more = f", and {len(of) - 1} more" if len(of) > 1 else ""
+    return f"{what} of {version.item}, version {_short(version.order)}{more}"
+
+
+def _short(digest: str) -> str:
+    return digest.removeprefix("sha256:")[:SHOWN_DIGITS]
+
+
+def _when(version: "Version") -> str:
+    return version.finished.replace("T", " ").removesuffix("+00:00") + " UTC"

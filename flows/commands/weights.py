@@ -1,0 +1,142 @@
+"""`dg4d weights`: which weights there are, getting them, checking them."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from flows.commands.endings import clear_ending
+
+if TYPE_CHECKING:
+    from dg4d_lib.weights.lock import Locked
+    from dg4d_lib.weights.registry import Weights
+
+weights = typer.Typer(
+    name="weights",
+    help="Trained weights: what there is, what it costs, what its license allows.",
+    no_args_is_help=True,
+)
+
+Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="a name of the list, or an id of the hub")]
+
+
+@weights.command("list")
+def show(
+    files: Annotated[bool, typer.Option("--files", help="and every file that was pulled: sha256, bytes, name")] = False,
+) -> None:
+    """Show all weights that profiles name, and those that were pulled besides: license, size, whether they are here."""
+    with clear_ending():
+        from rich.table import Column, Table
+
+        from dg4d_lib.weights.lock import read_lock
+        from flows.commands import terminal
+        from steps.weights import weights_home
+
+        about = Column("license, purpose, id of the hub", overflow="fold")
+        table = Table("name", "here", "GB", "revision", "commercial", about, box=None, pad_edge=False)
+        locks = read_lock(weights_home())
+        for one in _all_of_them():
+            table.add_row(*_row(one, locks.get(one.name)))
+            table.add_row("", "", "", "", "", one.purpose, style="dim")
+            table.add_row("", "", "", "", "", one.hub_id, style="dim", end_section=True)
+        out = terminal.console()
+        out.print(table)
+        out.print(f"kept in {weights_home()}; a setting may name a folder instead", markup=False)
+        out.print("revision and digests are written down by the first pull, and compared from then on")
+        for name, locked in locks.items() if files else ():
+            for path, file in locked.files.items():
+                typer.echo(f"{file.sha256}  {file.size:>12}  {name}/{path}")
+
+
+@weights.command()
+def pull(names: Names) -> None:
+    """Download weights, and write down revision and digests of what came; what is here already is left alone."""
+    with clear_ending():
+        from dg4d_lib.errors import BadInput
+        from dg4d_lib.weights.locate import given_folder
+        from dg4d_lib.weights.pull import pull as get
+        from dg4d_lib.weights.registry import weights_called
+        from steps.weights import license_of, weights_home
+
+        for name in names:
+            if given_folder(name) is not None:
+                raise BadInput(f"{name} is a folder on this machine; name weights, or an id of the Hugging Face hub")
+            home = weights_home()
+            home.mkdir(parents=True, exist_ok=True)
+            locked = get(weights_called(name), home)
+            typer.echo(f"{name}: {_size(locked)} GB, revision {locked.revision}; {license_of(name)}")
+
+
+@weights.command()
+def check(
+    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="default: all here")] = None,
+) -> None:
+    """Read every file again and compare it with what was pulled."""
+    with clear_ending():
+        from dg4d_lib.errors import BackendUnavailable
+        from dg4d_lib.weights.locate import find_weights, troubles
+        from dg4d_lib.weights.lock import read_lock
+        from dg4d_lib.weights.registry import weights_called
+        from steps.weights import weights_home
+
+        home = weights_home()
+        locks = read_lock(home)
+        broken = []
+        wanted = names or [one.name for one in _all_of_them() if _place(one) is not None]
+        if not wanted:
+            typer.echo("no weights are here, so there is nothing to check")
+        for name in wanted:
+            one = weights_called(name)
+            folder = _place(one) or find_weights(name, home)
+            locked = locks.get(one.name) if folder.parent == home else None
+            wrong = troubles(folder, one, locked)
+            for file, what in wrong.items():
+                typer.echo(f"{name}: {file} {what}")
+            if wrong:
+                broken.append(name)
+            elif locked is None:
+                typer.echo(
+                    f"{name}: complete; it was not pulled by this command, so there is nothing to compare it with"
+                )
+            else:
+                count = f"{len(locked.files)} file{'s' * (len(locked.files) != 1)}"
+                typer.echo(f"{name}: whole, {count}, {_size(locked)} GB")
+        if broken:
+            raise BackendUnavailable(f"not whole; `dg4d weights pull {' '.join(broken)}` gets it again")
+
+
+def _all_of_them() -> list["Weights"]:
+    from dg4d_lib.weights.lock import read_lock
+    from dg4d_lib.weights.registry import KNOWN, weights_called
+    from steps.weights import weights_home
+
+    pulled = {name: locked.license for name, locked in read_lock(weights_home()).items()}
+    return [*KNOWN.values(), *(weights_called(name, card) for name, card in pulled.items() if name not in KNOWN)]
+
+
+def _place(one: "Weights") -> Path | None:
+    """Where weights lie, whole or not; None where they are not here."""
+    from dg4d_lib.weights.locate import folder_name, in_hub_cache
+    from steps.weights import weights_home
+
+    folder = weights_home() / folder_name(one)
+    return folder if folder.exists() else in_hub_cache(one)
+
+
+def _row(one: "Weights", locked: "Locked | None") -> list[str]:
+    from dg4d_lib.weights.locate import MEMORY, troubles
+    from steps.weights import weights_home
+
+    place = _place(one)
+    here = "no"
+    if place is not None:
+        own = place.parent == weights_home()
+        whole = not troubles(place, one, locked if own else None, weights_home() / MEMORY)
+        here = ("yes" if own else "hub cache") if whole else "damaged"
+    size = _size(locked) if locked else f"~{one.about_gb:g}" if one.about_gb else "?"
+    revision = locked.revision[:10] if locked else one.revision or "-"
+    return [one.name, here, size, revision, one.license.commercial, one.license.name]
+
+
+def _size(locked: "Locked") -> str:
+    return f"{sum(file.size for file in locked.files.values()) / 1e9:.2f}"

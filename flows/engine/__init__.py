@@ -1,0 +1,1 @@
+"""How a step becomes a cached, retried task, and where and when it runs."""

@@ -1,0 +1,1 @@
+"""What a run leaves: packages, their records, reports and versions."""

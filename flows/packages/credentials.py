@@ -1,0 +1,274 @@
+"""Content credentials (C2PA): signatures that say what made a file, and that it has not changed since.
+
+Pictures and films carry theirs inside; for formats that cannot, and for the crate, which holds the digest of every
+file of the package, it lies beside as a file. Nothing is fetched from or sent to anybody: there are no time stamps.
+"""
+
+import base64
+import hashlib
+import io
+import json
+import os
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, BinaryIO, Literal
+
+from dg4d_lib.errors import BackendUnavailable, BadInput
+from flows.packages.publish import Files, fact_of
+
+KEY, CERTIFICATE = "DG4D_SIGNING_KEY", "DG4D_SIGNING_CERTIFICATE"
+EMBEDDED = {".mp4": "video/mp4", ".png": "image/png"}  # formats that carry credentials, and what they are called
+BESIDE = (".glb", ".usdz")  # a USDZ that carries some breaks the rule that every entry starts at a multiple of 64 bytes
+ANY_BYTES = "application/octet-stream"
+SOURCE_TYPES = "http://cv.iptc.org/newscodes/digitalsourcetype/"
+TRAINED, ALGORITHMIC = f"{SOURCE_TYPES}trainedAlgorithmicMedia", f"{SOURCE_TYPES}algorithmicMedia"
+ALGORITHMS = {
+    "secp256r1": "es256",
+    "secp384r1": "es384",
+    "secp521r1": "es512",
+    "RSAPrivateKey": "ps256",
+    "Ed25519PrivateKey": "ed25519",
+}  # by curve, or by class where there is none
+SETTINGS = {
+    "builder": {"thumbnail": {"enabled": False}},
+    "verify": {"remote_manifest_fetch": False, "ocsp_fetch": False},
+}
+
+State = Literal["trusted", "untrusted", "invalid", "missing"]
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What is signed.
+
+    Attributes:
+        trained: whether a generative model made some of it.
+        about: one or two sentences for people.
+    """
+
+    trained: bool
+    about: str
+
+    def manifest(self, name: str) -> str:
+        """The claim about a file, in the form that C2PA reads."""
+        agent = {"name": "dg4d", "version": version("dg4d")}
+        action = {
+            "action": "c2pa.created",
+            "digitalSourceType": TRAINED if self.trained else ALGORITHMIC,
+            "softwareAgent": agent,
+            "description": self.about,
+        }
+        assertion = {"label": "c2pa.actions.v2", "data": {"actions": [action]}}
+        return json.dumps({"claim_generator_info": [agent], "title": name, "assertions": [assertion]})
+
+
+@dataclass(frozen=True)
+class Signature:
+    """What a signature is worth.
+
+    Attributes:
+        state: "untrusted": it holds, but nobody here vouches for who signed.
+        signer: the name in the certificate.
+        detail: why it is invalid.
+    """
+
+    state: State
+    signer: str = ""
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class Signer:
+    """A key, and the certificates that say whose it is.
+
+    Attributes:
+        key: PEM, PKCS #8.
+        chain: certificates in PEM, the key's own first.
+        algorithm: as C2PA calls it.
+        subject: the name in the certificate.
+    """
+
+    key: bytes = field(repr=False)
+    chain: bytes = field(repr=False)
+    algorithm: str
+    subject: str
+
+    def sign_package(self, folder: Path, files: Files, claim: Claim) -> tuple[Files, dict[str, dict[str, Any]]]:
+        """Sign what people take out of a package: pictures, films and assets at its top.
+
+        Args:
+            folder: of the files, which may change.
+            files: their facts.
+            claim: what to say of them.
+
+        Returns:
+            The facts as they are now, those of sidecars included; and for every signed file its facts before it was
+            signed, or the name of its sidecar.
+
+        Raises:
+            BadInput: the certificate is not good for signing.
+        """
+        now, signed = dict(files), dict[str, dict[str, Any]]()
+        for name in files:
+            path = folder / name
+            if path.parent != folder:
+                continue
+            if path.suffix in EMBEDDED:
+                self._embed(path, claim)
+                signed[name] = {"unsigned": files[name]}
+                now[name] = fact_of(path)
+            elif path.suffix in BESIDE:
+                sidecar = self.sign_beside(path, claim)
+                signed[name] = {"sidecar": sidecar.name}
+                now[sidecar.name] = fact_of(sidecar)
+        return now, signed
+
+    def sign_beside(self, path: Path, claim: Claim) -> Path:
+        """Write credentials of a file beside it, under `sidecar_of` its name.
+
+        Raises:
+            BadInput: the certificate is not good for signing.
+        """
+        sidecar = path.with_name(sidecar_of(path.name))
+        with path.open("rb") as source:
+            sidecar.write_bytes(self._signed(path, claim, ANY_BYTES, source, io.BytesIO(), embed=False))
+        return sidecar
+
+    def _embed(self, path: Path, claim: Claim) -> None:
+        draft = path.with_name(f".{path.name}.signed")
+        with path.open("rb") as source, draft.open("w+b") as target:
+            self._signed(path, claim, EMBEDDED[path.suffix], source, target)
+        draft.replace(path)
+
+    def _signed(
+        self, path: Path, claim: Claim, media_type: str, source: BinaryIO, target: BinaryIO, embed: bool = True
+    ) -> bytes:
+        """Copy a file with credentials inside, or only compute them; the credentials."""
+        library = _library()
+        info = library.C2paSignerInfo(self.algorithm.encode(), self.chain, self.key, None)
+        try:
+            builder = library.Builder(claim.manifest(path.name), _context())
+            if not embed:
+                builder.set_no_embed()
+            content: bytes = builder.sign(library.Signer.from_info(info), media_type, source, target)
+        except library.C2paError as error:
+            raise BadInput(
+                f"{path.name} could not be signed with ${CERTIFICATE} ({error}); the certificate must be valid today, "
+                "allow digital signatures and have the extended usage emailProtection or documentSigning"
+            ) from error
+        return content
+
+
+def configured() -> Signer | None:
+    """Who signs: what `$DG4D_SIGNING_KEY` and `$DG4D_SIGNING_CERTIFICATE` name; None where neither is set.
+
+    Raises:
+        BadInput: one of them is not set, cannot be read, or is no key or certificate, or they do not belong together.
+        BackendUnavailable: signing is not installed.
+    """
+    if certificate() is None:
+        return None
+    _library()
+    serialization: Any = import_module("cryptography.hazmat.primitives.serialization")
+    x509: Any = import_module("cryptography.x509")
+    chain = _pem(CERTIFICATE)
+    try:
+        key = serialization.load_pem_private_key(_pem(KEY), None)
+        own = x509.load_pem_x509_certificates(chain)[0]
+    except (ValueError, TypeError) as error:
+        raise BadInput(
+            f"${KEY} must name a PEM file with a private key without a password, and ${CERTIFICATE} one with its "
+            f"certificate and then those of its issuers; one of them is something else ({error})"
+        ) from error
+    kind = getattr(getattr(key, "curve", None), "name", type(key).__name__)
+    if kind not in ALGORITHMS:
+        raise BadInput(f"a key of the kind {kind} cannot sign; use one of: {', '.join(ALGORITHMS)}")
+    if key.public_key() != own.public_key():
+        raise BadInput(f"the key in ${KEY} is not that of the first certificate in ${CERTIFICATE}")
+    plain = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    return Signer(plain, chain, ALGORITHMS[kind], own.subject.rfc4514_string())
+
+
+def certificate() -> str | None:
+    """The sha256 of the configured certificate, which stands for who signs; None where nobody does.
+
+    Raises:
+        BadInput: only one of key and certificate is named, or the certificate cannot be read.
+    """
+    if not os.environ.get(KEY) and not os.environ.get(CERTIFICATE):
+        return None
+    _pem(KEY)
+    text = _pem(CERTIFICATE).decode("ascii", "replace")
+    body = text.partition("-----BEGIN CERTIFICATE-----")[2].partition("-----END CERTIFICATE-----")[0]
+    try:
+        content = base64.b64decode("".join(body.split()), validate=True)
+    except ValueError:
+        content = b""
+    if not content:
+        raise BadInput(f"${CERTIFICATE} names a file without a certificate in PEM: {os.environ[CERTIFICATE]}")
+    return f"sha256:{hashlib.sha256(content).hexdigest()}"
+
+
+def sidecar_of(name: str) -> str:
+    """The name of the credentials beside a file: asset.glb has asset.c2pa, other files their whole name and .c2pa."""
+    return f"{name.removesuffix('.glb')}.c2pa"
+
+
+def signature_of(path: Path, sidecar: Path | None = None, anchors: str = "") -> Signature:
+    """What the signature of a file is worth.
+
+    Args:
+        path: the file.
+        sidecar: where its credentials are; None: inside.
+        anchors: certificates in PEM of those who are trusted to vouch for signers.
+
+    Raises:
+        BackendUnavailable: signing is not installed.
+        OSError: a file cannot be read.
+    """
+    library = _library()
+    media_type = EMBEDDED[path.suffix] if sidecar is None else ANY_BYTES
+    manifest = None if sidecar is None else sidecar.read_bytes()
+    try:
+        with path.open("rb") as file:
+            found = json.loads(library.Reader(media_type, file, manifest, context=_context(anchors)).json())
+    except library.C2paError as error:
+        missing = str(error).startswith("ManifestNotFound")
+        return Signature("missing" if missing else "invalid", detail="" if missing else str(error))
+    active = found["manifests"][found["active_manifest"]].get("signature_info", {})
+    signer = ", ".join(str(active[key]) for key in ("common_name", "issuer") if active.get(key))
+    if found["validation_state"] == "Trusted":
+        return Signature("trusted", signer)
+    failures = found.get("validation_results", {}).get("activeManifest", {}).get("failure", ())
+    codes = sorted({failure["code"] for failure in failures} - {"signingCredential.untrusted"})
+    if found["validation_state"] != "Valid" or codes:
+        return Signature("invalid", signer, ", ".join(codes))
+    return Signature("untrusted", signer)
+
+
+def _context(anchors: str = "") -> Any:
+    library = _library()
+    trust = {"trust": {"user_anchors": anchors}} if anchors else {}
+    return library.Context(library.Settings.from_dict({**SETTINGS, **trust}))
+
+
+def _library() -> Any:
+    try:
+        return import_module("c2pa")
+    except ImportError as error:
+        raise BackendUnavailable("content credentials need c2pa-python: pip install 'dg4d[signing]'") from error
+
+
+def _pem(name: str) -> bytes:
+    """The file that an environment variable names."""
+    place = os.environ.get(name)
+    if not place:
+        raise BadInput(f"${KEY} and ${CERTIFICATE} go together, and ${name} is not set; set both, or neither")
+    try:
+        return Path(place).expanduser().read_bytes()
+    except OSError as error:
+        raise BadInput(f"${name} names {place}, which cannot be read: {error.strerror}") from error

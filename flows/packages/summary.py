@@ -1,0 +1,264 @@
+"""What lies beside the packages of a batch: `summary.json` and `summary.csv` for programs, `index.html` for people."""
+
+import csv
+import html
+import io
+import json
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, get_args
+from urllib.parse import quote
+
+from pydantic import BaseModel
+
+from flows.packages.acceptance import failing_in
+from flows.packages.publish import record_of
+from steps.store import write_atomically
+
+Status = Literal["done", "unchanged", "failed", "skipped"]
+NOT_ACCEPTED = "NotAccepted"  # the kind of failure of an item that was made, but fails a gate in a strict batch
+BAD_INPUT = {"BadInput", "StepBadInput", "BackendUnavailable"}  # kinds for which what was given is to blame
+CSV_COLUMNS = (
+    "item", "source", "status", "kind", "message", "attempts", "seconds", "computed_s", "cpu_s", "gpu_s", "cost",
+    "failing",
+)  # fmt: skip
+WRITE_EVERY_S = 5.0  # at most so often while a batch runs
+WRITING_SHARE = 0.05  # of the time of a batch, at most, for writing the summary
+
+
+class Row(BaseModel):
+    """What became of one item.
+
+    Attributes:
+        item: its name, and its folder below that of the batch.
+        source: what people call what it was made of.
+        status: what became of it; `unchanged` was made before.
+        kind: of its failure.
+        message: for people.
+        attempts: how often it was begun in this batch.
+        seconds: in this batch, with waiting.
+        computed_s: in which its steps were computed, now or before.
+        cpu_s: of all cores, in these steps.
+        gpu_s: of `computed_s`, in steps that used a GPU.
+        pictures: that explain a failure.
+        failing: gates; None where there is no verdict.
+    """
+
+    item: str
+    source: str = ""
+    status: Status
+    kind: str = ""
+    message: str = ""
+    attempts: int = 0
+    seconds: float = 0.0
+    computed_s: float = 0.0
+    cpu_s: float = 0.0
+    gpu_s: float = 0.0
+    pictures: list[str] = []
+    failing: list[str] | None = None
+
+    @property
+    def made(self) -> bool:
+        """Whether there is a package, be it accepted or not."""
+        return self.status in {"done", "unchanged"} or self.kind == NOT_ACCEPTED
+
+
+class Tally:
+    """What became of the items of a batch so far; may be told from several threads.
+
+    Args:
+        total: how many items there are.
+        listener: told every row as it comes.
+    """
+
+    def __init__(self, total: int, listener: Callable[[Row], None] = lambda row: None) -> None:
+        self.total = total
+        self.rows: dict[str, Row] = {}
+        self._listener = listener
+        self._mutex = threading.RLock()  # a listener may ask
+        self._begun = time.monotonic()
+
+    def settle(self, row: Row) -> None:
+        """Note what became of an item; the last word counts."""
+        with self._mutex:
+            self.rows[row.item] = row
+            self._listener(row)
+
+    @property
+    def seconds(self) -> float:
+        """Since the batch began."""
+        return time.monotonic() - self._begun
+
+    @property
+    def refused(self) -> str:
+        """An item that a strict batch does not accept; empty if there is none."""
+        with self._mutex:
+            return next((row.item for row in self.rows.values() if row.kind == NOT_ACCEPTED), "")
+
+    @property
+    def share(self) -> float:
+        """Of the items that are settled, from 0 to 1."""
+        return len(self.rows) / max(self.total, 1)
+
+    def line(self) -> str:
+        """How far the batch is: items, failures, rate, the time that is left by the rate so far."""
+        with self._mutex:
+            rows = list(self.rows.values())
+        worked = [row for row in rows if row.status != "unchanged"]
+        parts = [f"{len(rows)} of {self.total} items", f"{sum(row.status == 'failed' for row in rows)} failed"]
+        if worked:
+            rate = len(worked) / max(self.seconds, 1e-9)
+            parts.append(f"{3600 * rate:.0f} an hour" if rate < 1 else f"{rate:.1f} a second")
+            if left := self.total - len(rows):
+                parts.append(f"about {_duration(left / rate)} left")
+        return ", ".join(parts)
+
+
+class Writer:
+    """Writes the summary of a batch now and then while it runs, and whole at its end.
+
+    Args:
+        out: the folder of the batch.
+        commercial_only: whether weights had to allow commercial use.
+        price_per_hour: of the machine, in any currency; None where nobody asks.
+    """
+
+    def __init__(self, out: Path, commercial_only: bool = False, price_per_hour: float | None = None) -> None:
+        self._out, self._commercial_only, self._price = out, commercial_only, price_per_hour
+        self._next = 0.0
+
+    def write_sometimes(self, rows: list[Row], seconds: float) -> None:
+        """As `write`, unless that was a moment ago; all writing takes a small share of the time of a batch."""
+        start = time.monotonic()
+        if start >= self._next:
+            self.write(rows, seconds)
+            took = time.monotonic() - start
+            self._next = start + max(WRITE_EVERY_S, took / WRITING_SHARE)
+
+    def write(self, rows: list[Row], seconds: float) -> None:
+        """Write what is known.
+
+        Args:
+            rows: of the items so far.
+            seconds: since the batch began.
+
+        Raises:
+            DiskFull: there is no room; what was there stays.
+        """
+        counts = {status: sum(row.status == status for row in rows) for status in get_args(Status)}
+        items = [row.model_dump(mode="json") | {"cost": self._cost(row.computed_s)} for row in rows]
+        totals: dict[str, Any] = {
+            name: round(sum(getattr(row, name) for row in rows), 3) for name in ("computed_s", "cpu_s", "gpu_s")
+        }
+        summary = {
+            "counts": counts,
+            "made": sum(row.made for row in rows),
+            "not_accepted": [row.item for row in rows if row.failing],
+            "commercial_only": self._commercial_only,
+            "seconds": round(seconds, 1),
+            "totals": totals | {"cost": self._cost(totals["computed_s"])},
+            "price_per_hour": self._price,
+            "items": items,
+        }
+        write_atomically(self._out / "summary.json", json.dumps(summary, indent=1, ensure_ascii=False) + "\n")
+        write_atomically(self._out / "summary.csv", _csv(items))
+        write_atomically(self._out / "index.html", index(self._out, rows, counts))
+
+    def _cost(self, computed_s: float) -> float | None:
+        """What computing so long costs, were the machine to do nothing else."""
+        return None if self._price is None else round(self._price * computed_s / 3600, 6)
+
+
+def with_costs(row: Row, folder: Path) -> Row:
+    """The row of an item whose package lies in `folder`, with what its steps took, by their records."""
+    steps = (record_of(folder) or {}).get("run", {}).get("steps", [])
+    return row.model_copy(
+        update={
+            "computed_s": round(sum(step.get("duration_s", 0.0) for step in steps), 3),
+            "cpu_s": round(sum(step.get("cpu_s", 0.0) for step in steps), 3),
+            "gpu_s": round(sum(step["duration_s"] for step in steps if step.get("machine", {}).get("gpu")), 3),
+        }
+    )
+
+
+def judged(row: Row, folder: Path, strict: bool) -> Row:
+    """The row of an item whose package lies in `folder`, with what the gates say; with `strict` a verdict counts."""
+    failing = failing_in(folder)
+    row = with_costs(row, folder).model_copy(update={"failing": failing})
+    if not strict or not failing:
+        return row
+    message = f"not accepted: {', '.join(failing)}; {folder / 'report.html'} says what to do"
+    return row.model_copy(update={"status": "failed", "kind": NOT_ACCEPTED, "message": message})
+
+
+def index(out: Path, rows: list[Row], counts: dict[str, int]) -> str:
+    """A page with a moving picture of every asset; the failed ones first, then those that are not accepted."""
+    ordered = sorted(rows, key=lambda row: (row.status != "failed", not row.failing, row.item))
+    tally = ", ".join(f"{number} {status}" for status, number in counts.items() if number)
+    if refused := sum(bool(row.failing) for row in rows):
+        tally += f"; {refused} not accepted"
+    return _PAGE.format(tally=html.escape(tally), cards="\n".join(_card(out, row) for row in ordered))
+
+
+def _csv(items: list[dict[str, Any]]) -> str:
+    table = io.StringIO()
+    writer = csv.DictWriter(table, CSV_COLUMNS, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(item | {"failing": " ".join(item["failing"] or ())} for item in items)
+    return table.getvalue()
+
+
+def _duration(seconds: float) -> str:
+    minutes = round(seconds / 60)
+    if minutes < 1:
+        return f"{seconds:.0f} s"
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def _card(out: Path, row: Row) -> str:
+    folder, name = quote(row.item), html.escape(row.item)
+    if not row.made:
+        return f"<article class={row.status}><h2>{name}</h2><p>{html.escape(row.message)}</p></article>"
+    shown = next((file for file in ("preview.webp", "contact_sheet.png") if (out / row.item / file).is_file()), None)
+    picture = f'<img src="{folder}/{shown}" alt="" loading="lazy">' if shown else ""
+    return (
+        f"<article class={'failed' if row.failing else row.status}>"
+        f"<a href='{folder}/report.html'>{picture}<h2>{name}</h2></a>"
+        f"<p>{row.status}{f', {row.seconds:.0f} s' if row.seconds else ''}"
+        f" · <a href='{folder}/asset.glb'>asset.glb</a></p>{_verdict(row)}</article>"
+    )
+
+
+def _verdict(row: Row) -> str:
+    if row.failing is None:
+        return ""
+    return (
+        f"<p class=verdict>not accepted: {html.escape(', '.join(row.failing))}</p>"
+        if row.failing
+        else "<p>accepted</p>"
+    )
+
+
+_PAGE = """<!doctype html>
+<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{tally}</title>
+<style>
+:root {{ color-scheme: light dark; }}
+body {{ font: 15px/1.5 system-ui, sans-serif; margin: 2rem; }}
+main {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(240px, 1fr)); gap: 1rem; }}
+article {{ border: 1px solid #8884; border-radius: 8px; padding: .6rem; overflow-wrap: anywhere; }}
+h2 {{ font-size: 1rem; margin: .4rem 0 0; }} p {{ margin: .2rem 0 0; font-size: .85rem; }}
+article {{ content-visibility: auto; contain-intrinsic-size: auto 320px; }}
+img {{ width: 100%; aspect-ratio: 1; object-fit: contain; border-radius: 4px;
+  background: repeating-conic-gradient(#fff 0 25%, #eee 0 50%) 0 0 / 20px 20px; }}
+.failed {{ border-color: #dc2626; }} .failed h2, .verdict {{ color: #dc2626; }}
+.skipped {{ opacity: .6; }}
+</style>
+<h1>{tally}</h1>
+<main>
+{cards}
+</main>
+</html>
+"""

@@ -1,0 +1,1 @@
+"""Servers, workers, deployments: what stays when a command has ended."""

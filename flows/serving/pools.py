@@ -1,0 +1,124 @@
+"""Work pools and deployments as `deploy/` describes them, checked: a server takes mistakes without a word."""
+
+import copy
+import re
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import Field, TypeAdapter, ValidationError
+
+from dg4d_lib.errors import BadInput
+from steps.contract import Frozen
+
+SOURCE = Path(__file__).parents[2] / "deploy"
+DEPLOY = SOURCE if SOURCE.is_dir() else Path(sys.prefix) / "share" / "dg4d"  # of a source tree, or installed
+DEPLOYMENTS = DEPLOY / "prefect.yaml"
+VARIABLE = re.compile(r"\{\{\s*\$(\w+)\s*\}\}")  # of the environment, put in by `prefect deploy`
+
+Json = dict[str, Any]
+
+
+class Pool(Frozen):
+    """A work pool.
+
+    Attributes:
+        type: the kind of its workers.
+        limit: runs at a time.
+        description: for people.
+        variables: defaults of the job variables.
+        job: each is put over the job that such a worker makes.
+    """
+
+    type: Literal["process", "docker", "kubernetes"]
+    limit: int
+    description: str
+    variables: dict[str, Any] = Field({})
+    job: tuple[dict[str, Any], ...] = ()
+
+    def template(self, default: Json) -> Json:
+        """The base job template.
+
+        Args:
+            default: that of the kind of worker.
+
+        Raises:
+            BadInput: a variable is not one of the worker's.
+        """
+        template = copy.deepcopy(default)
+        known = template["variables"]["properties"]
+        _require_known(self.variables, known, f"a pool of type {self.type}")
+        for name, value in self.variables.items():
+            known[name]["default"] = value
+        for patch in self.job:
+            _put_over(template["job_configuration"], patch)
+        return template
+
+
+def read_pools(file: Path = DEPLOY / "pools.yaml") -> dict[str, Pool]:
+    """The pools by name.
+
+    Raises:
+        BadInput: the file is not there, or says something else.
+    """
+    try:
+        return TypeAdapter(dict[str, Pool]).validate_python(_read(file))
+    except ValidationError as error:
+        raise BadInput(f"{file}: {error}") from error
+
+
+def read_deployments(
+    pools: Mapping[str, Pool], defaults: Mapping[str, Json], environment: Mapping[str, str], file: Path = DEPLOYMENTS
+) -> list[Json]:
+    """The deployments of a `prefect.yaml`, none of which would go wrong later.
+
+    Args:
+        pools: that there are, or will be.
+        defaults: base job templates by kind of worker.
+        environment: of whoever registers them.
+        file: the `prefect.yaml`.
+
+    Raises:
+        BadInput: a pool, a variable of a job or one of the environment that does not exist.
+    """
+    deployments: list[Json] = _read(file)["deployments"]
+    for deployment in deployments:
+        what = f"{file}: {deployment['entrypoint']} as {deployment['name']!r}"
+        place = deployment["work_pool"]
+        if place["name"] not in pools:
+            raise BadInput(f"{what}: there is no pool {place['name']!r}; there are: {', '.join(pools)}")
+        known = defaults[pools[place["name"]].type]["variables"]["properties"]
+        _require_known(place.get("job_variables", {}), known, f"{what}, pool {place['name']}")
+        if unset := sorted(name for name in VARIABLE.findall(str(deployment)) if not environment.get(name)):
+            raise BadInput(f"{what}: ${unset[0]} is not set; it would become an empty text")
+    return deployments
+
+
+def _read(file: Path) -> Json:
+    try:
+        content: Json = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError) as error:
+        raise BadInput(
+            f"{file} cannot be read: {error}; deployments are described in the source tree of dg4d"
+        ) from error
+    return content
+
+
+def _require_known(names: Mapping[str, Any], known: Mapping[str, Any], where: str) -> None:
+    if unknown := sorted(set(names) - set(known)):
+        raise BadInput(f"{where}: there is no job variable {unknown[0]!r}; there are: {', '.join(sorted(known))}")
+
+
+def _put_over(tree: Json, patch: Json) -> None:
+    """Merge `patch` into `tree`, the items of a list that is there already one by one."""
+    for key, value in patch.items():
+        below = tree.get(key)
+        if isinstance(value, dict) and isinstance(below, dict):
+            _put_over(below, value)
+        elif isinstance(value, list) and isinstance(below, list):
+            for item, change in zip(below, value, strict=True):
+                _put_over(item, change)
+        else:
+            tree[key] = copy.deepcopy(value)

@@ -1,0 +1,134 @@
+"""Work pools, deployments and automations put on a Prefect server, again and again with the same result."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from datetime import timedelta
+
+from prefect.client.orchestration import SyncPrefectClient, get_client
+from prefect.client.schemas.actions import WorkPoolCreate
+from prefect.client.schemas.objects import StateType
+from prefect.events.actions import ChangeFlowRunState
+from prefect.events.schemas.automations import AutomationCore, EventTrigger, Posture
+from prefect.events.schemas.events import ResourceSpecification
+
+from dg4d_lib.errors import BackendUnavailable
+from flows.serving.pools import DEPLOYMENTS, Json, Pool, read_deployments
+from flows.serving.workers import HEARTBEAT_S
+
+MISSED = 3  # heartbeats, before a run is taken for dead
+LONGEST = timedelta(days=7)  # of a run that is begun again when it died
+ALIVE = "prefect.flow-run.heartbeat"  # of runs of deployments; those of commands have none
+ENDINGS = {f"prefect.flow-run.{ending}" for ending in ("Completed", "Failed", "Cancelled", "Crashed")}
+
+
+def _trigger(expect: set[str], posture: Posture, within: timedelta) -> EventTrigger:
+    """What happens, or does not, to a run that was alive."""
+    return EventTrigger(
+        after={ALIVE},
+        expect=expect,
+        match=ResourceSpecification({"prefect.resource.id": ["prefect.flow-run.*"]}),
+        for_each={"prefect.resource.id"},
+        posture=posture,
+        threshold=1,
+        within=within,
+    )
+
+
+AUTOMATIONS = (
+    AutomationCore(
+        name="dg4d: runs whose process died",
+        description="A worker or a whole machine that dies reports nothing; its runs would stay Running for ever.",
+        trigger=_trigger({ALIVE, *ENDINGS}, Posture.Proactive, timedelta(seconds=MISSED * HEARTBEAT_S)),
+        actions=[
+            ChangeFlowRunState(
+                state=StateType.CRASHED,
+                name=None,
+                message=f"no heartbeat for {MISSED * HEARTBEAT_S} s: its process was killed, or its machine is gone",
+            )
+        ],
+    ),
+    AutomationCore(
+        name="dg4d: runs that died go on",
+        description="After their last finished step, on any worker; a run that dies again and again fails.",
+        trigger=_trigger({"prefect.flow-run.Crashed"}, Posture.Reactive, LONGEST),
+        actions=[ChangeFlowRunState(state=StateType.SCHEDULED, name="AwaitingRetry", message="its process died")],
+    ),
+)
+
+
+def register(pools: Mapping[str, Pool], chosen: list[str]) -> list[str]:
+    """Have the chosen pools, their deployments, and automations that notice runs whose process died, and go on.
+
+    Args:
+        pools: every pool that there may be, by name.
+        chosen: the names of those to make.
+
+    Returns:
+        The full names of the deployments.
+
+    Raises:
+        BadInput: a pool or a deployment that cannot be; nothing was changed.
+        BackendUnavailable: the server did not take it.
+    """
+    with get_client(sync_client=True) as client:
+        defaults = default_templates(client)
+        deployments = [
+            deployment
+            for deployment in read_deployments(pools, defaults, os.environ)
+            if deployment["work_pool"]["name"] in chosen
+        ]
+        templates = {name: pools[name].template(defaults[pools[name].type]) for name in chosen}
+        for name, template in templates.items():
+            pool = pools[name]
+            client.create_work_pool(
+                WorkPoolCreate(
+                    name=name,
+                    type=pool.type,
+                    description=pool.description,
+                    base_job_template=template,
+                    concurrency_limit=pool.limit,
+                ),
+                overwrite=True,
+            )
+        _deploy(sorted({deployment["name"] for deployment in deployments}))
+        _automate(client)
+        there = {f"{client.read_flow(found.flow_id).name}/{found.name}" for found in client.read_deployments()}
+    wanted = [f"{deployment['tags'][0]}/{deployment['name']}" for deployment in deployments]
+    if missing := [name for name in wanted if name not in there]:
+        raise BackendUnavailable(f"the Prefect server did not take the deployments {', '.join(missing)}")
+    return wanted
+
+
+def default_templates(client: SyncPrefectClient) -> dict[str, Json]:
+    """The base job template of every kind of worker."""
+    collections = client.read_worker_metadata().values()
+    return {
+        kind: worker["default_base_job_configuration"]
+        for collection in collections
+        for kind, worker in collection.items()
+    }
+
+
+def _deploy(names: list[str]) -> None:
+    """Prefect's own reading of the file, so that it means here what it means elsewhere."""
+    chosen = [word for name in names for word in ("--name", name)]
+    done = subprocess.run(
+        [sys.executable, "-m", "prefect", "--no-prompt", "deploy", "--prefect-file", str(DEPLOYMENTS), *chosen],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=DEPLOYMENTS.parents[1],
+    )
+    if done.returncode:
+        raise BackendUnavailable(f"`prefect deploy` failed: {(done.stderr or done.stdout).strip()[-1000:]}")
+
+
+def _automate(client: SyncPrefectClient) -> None:
+    for automation in AUTOMATIONS:
+        known = client.find_automation(automation.name)
+        if known is None:
+            client.create_automation(automation)
+        else:
+            client.update_automation(known.id, automation)

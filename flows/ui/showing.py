@@ -1,0 +1,46 @@
+"""Artifacts for a Prefect server that may be away for a while, because it was killed or is started anew."""
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import httpx
+from prefect.logging import get_run_logger
+from prefect.settings import PREFECT_API_URL
+
+from flows import home
+from flows.serving.server import HOST, Server
+
+PATIENCE_S = 120.0  # as long as a server may take to start
+POLL_S = 0.5
+_revived: list[Server] = []  # they end when nobody uses them, and this process does
+
+
+def show(create: Callable[..., Any], **what: Any) -> None:
+    """Call what makes an artifact; if the server is away, start it if it is ours, and wait for it.
+
+    A page is not worth a failed step: without an answer for `PATIENCE_S` seconds it is left out.
+    """
+    deadline = time.monotonic() + PATIENCE_S
+    while True:
+        revive()  # first, for clients of Prefect wait long, and longer each time, before they say that it is away
+        try:
+            create(**what)
+        except httpx.TransportError as error:
+            if time.monotonic() > deadline:
+                get_run_logger().warning("the Prefect server does not answer; a page is left out: %s", error)
+                return
+            time.sleep(POLL_S)
+        else:
+            return
+
+
+def revive() -> None:
+    """Start the background server again, at the address where this process knows it, unless it runs."""
+    server = home.background_server()
+    with suppress(OSError):
+        port = (server.folder / "port").read_text(encoding="ascii").strip()
+        if PREFECT_API_URL.value() == f"http://{HOST}:{port}/api" and server.address() is None:
+            server.start()
+            _revived.append(server)

@@ -1,0 +1,100 @@
+"""Steps without the wait for imports: a process that has imported what steps need, and forks itself for each of them.
+
+`python -m steps.fork_server SOCKET` does what it is told through a socket (SOCK_SEQPACKET) that it inherits as a file
+descriptor. An order is `{"arguments": [...], "environment": {...}}`: arguments of `steps.main`, and what the step's
+environment has beside that of this process. With it come descriptors: standard input, output and error, and what else
+the step should hold open. The answers are `{"pid": 7}`, in the order of the orders, and later
+`{"pid": 7, "status": 0}`: an exit status, or the negative number of a signal. When the other end of the socket is
+closed this process ends.
+
+A step is a process group of its own, as it is when it is begun by `python -m steps.main`. Whoever asks should tell
+it to end with its parent, which is this process.
+"""
+
+import gc
+import importlib
+import json
+import os
+import selectors
+import signal
+import socket
+import sys
+import tempfile
+from contextlib import suppress
+
+from steps import main as step
+
+ORDER_BYTES = 2**16
+ORDER_HANDLES = 16
+
+
+def main() -> int:
+    """Serve until the socket is closed; in a fork, do the step, and return its exit status."""
+    control = socket.socket(fileno=int(sys.argv[1]))
+    control.set_inheritable(False)
+    step.prepare_process()
+    for spec in step.catalog().values():
+        with suppress(Exception):  # the step will say what is wrong
+            importlib.import_module(spec.entry.partition(":")[0])
+    gc.freeze()  # what forks share stays shared
+    arguments = _serve(control)
+    return 0 if arguments is None else step.main(arguments)
+
+
+def _serve(control: socket.socket) -> list[str] | None:
+    """Fork for every order; arguments of a step in a fork, nothing here when there will be no more orders."""
+    ended, signaled = socket.socketpair()
+    for end in (ended, signaled):
+        end.setblocking(False)
+    signal.signal(signal.SIGCHLD, lambda number, frame: None)
+    signal.set_wakeup_fd(signaled.fileno(), warn_on_full_buffer=False)
+    with selectors.DefaultSelector() as events, control, ended, signaled:
+        events.register(control, selectors.EVENT_READ)
+        events.register(ended, selectors.EVENT_READ)
+        while True:
+            ready = [key.fileobj for key, _ in events.select()]
+            if ended in ready:
+                with suppress(BlockingIOError):
+                    ended.recv(ORDER_BYTES)
+                _tell_of_ended(control)
+            if control in ready:
+                text, handles, _, _ = socket.recv_fds(control, ORDER_BYTES, ORDER_HANDLES)
+                if not text:
+                    return None
+                order = json.loads(text)
+                pid = os.fork()
+                if pid == 0:
+                    signal.set_wakeup_fd(-1)
+                    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+                    _become(order["environment"], handles)
+                    return list(order["arguments"])
+                os.setpgid(pid, pid)  # here too, so that whoever hears its number can end the group
+                for handle in handles:
+                    os.close(handle)
+                _tell(control, {"pid": pid})
+
+
+def _become(environment: dict[str, str], handles: list[int]) -> None:
+    """Make this fork the process that was ordered."""
+    with suppress(PermissionError):  # done already
+        os.setpgid(0, 0)
+    os.environ.update(environment)
+    tempfile.tempdir = None  # as the environment says, not what an import found
+    for number, handle in enumerate(handles[:3]):
+        os.dup2(handle, number)
+        os.close(handle)
+
+
+def _tell_of_ended(control: socket.socket) -> None:
+    with suppress(ChildProcessError):
+        while (gone := os.waitpid(-1, os.WNOHANG))[0]:
+            _tell(control, {"pid": gone[0], "status": os.waitstatus_to_exitcode(gone[1])})
+
+
+def _tell(control: socket.socket, answer: dict[str, int]) -> None:
+    with suppress(BrokenPipeError, ConnectionResetError):  # nobody listens any more: the next read says so
+        control.sendall(json.dumps(answer).encode())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,288 @@
+"""A whole batch: its order, what is tried again, what it writes, how it ends; a function stands in for all steps."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prefect.client.orchestration import get_client
+from rich.console import Console
+
+from flows import home
+from flows.catalog import ROWS_SHOWN, convert_all
+from flows.commands import batch as module
+from flows.commands.batch import batch, ready, tell
+from flows.engine import resources
+from flows.engine.executors import StepBadInput, StepCrashed, StepOutOfMemory
+from flows.inputs.manifest import items_of
+from flows.inputs.orders import Order, Wish
+from flows.packages.summary import NOT_ACCEPTED, Row, Tally, Writer
+from flows.serving.server import Server
+from steps.profiles import PREVIEW
+
+QUIET = Console(quiet=True)
+
+
+@pytest.fixture(scope="module")
+def place(server: Server) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DG4D_HOME", str(server.folder.parent))
+        patch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
+        patch.setenv("DG4D_CODE_VERSION", "batch")
+        patch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+        yield
+
+
+def orders(folder: Path, *names: str) -> list[Order]:
+    for name in names:
+        (folder / f"{name}.png").write_text(f"batch {name}")
+    wishes = [Wish(item=name, picture=folder / f"{name}.png", settings=PREVIEW) for name in names]
+    return [wish.order(home.store()) for wish in wishes]
+
+
+def test_what_died_is_tried_once_more_at_the_end_and_bad_input_is_not(place: None, tmp_path: Path) -> None:
+    begun: list[str] = []
+
+    def work(order: Order, folder: Path) -> tuple[None, bool]:
+        begun.append(order.item)
+        match order.item:
+            case "dies" if begun.count("dies") == 1:
+                raise StepOutOfMemory("fit_motion", "killed")
+            case "hopeless":
+                raise StepCrashed("fit_motion", "broken")
+            case "bad":
+                raise StepBadInput("prepare_subject", "ugly")
+        return None, False
+
+    names = ("dies", "bad", "hopeless", "fine")
+    tally = Tally(4)
+    convert_all(orders(tmp_path, *names), tmp_path, 1, "retries", tally, work=work)
+    assert begun == [*names, "dies", "hopeless"]
+    assert {row.item: (row.status, row.attempts) for row in tally.rows.values()} == {
+        "dies": ("done", 2),
+        "bad": ("failed", 1),
+        "hopeless": ("failed", 2),
+        "fine": ("done", 1),
+    }
+    assert "again" not in tally.rows["hopeless"].message
+
+
+def test_items_are_prepared_one_ahead_of_those_at_work(place: None, tmp_path: Path) -> None:
+    finished, ahead = 0, []
+
+    def work(order: Order, folder: Path) -> tuple[None, bool]:
+        nonlocal finished
+        time.sleep(0.05)
+        finished += 1
+        return None, False
+
+    def todo() -> Iterator[Order]:
+        for drawn, order in enumerate(orders(tmp_path, *"abcdefgh"), 1):
+            ahead.append(drawn - finished)
+            yield order
+
+    tally = Tally(8)
+    convert_all(todo(), tmp_path, 2, "ahead", tally, work=work)
+    assert max(ahead) <= 3
+    assert [row.status for row in tally.rows.values()] == ["done"] * 8
+
+
+def test_meshing_of_one_item_overlaps_fitting_of_the_next_and_fits_never_overlap(
+    place: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
+    monkeypatch.setenv("DG4D_CPUS", "1")
+    fits, second_fit, mutex = 0, threading.Event(), threading.Lock()
+    most = 0
+
+    def work(order: Order, folder: Path) -> tuple[None, bool]:
+        nonlocal fits, most
+        with resources.slot("gpu", lambda text: None):
+            with mutex:
+                fits += 1
+                most = max(most, fits)
+            if order.item == "second":
+                second_fit.set()
+            time.sleep(0.2)
+            with mutex:
+                fits -= 1
+        with resources.slot("cpu", lambda text: None):
+            if order.item == "first":
+                assert second_fit.wait(30), "nothing is fitted while a mesh is made"
+        return None, False
+
+    tally = Tally(2)
+    convert_all(orders(tmp_path, "first", "second"), tmp_path, 2, "overlap", tally, work=work)
+    assert [row.status for row in tally.rows.values()] == ["done", "done"]
+    assert most == 1
+
+
+def test_the_server_shows_how_far_a_batch_is_and_a_table_that_can_be_read(place: None, tmp_path: Path) -> None:
+    rows = [Row(item=f"{i:04d}", status="unchanged") for i in range(3 * ROWS_SHOWN)]
+    (one,) = orders(tmp_path, "zebra")
+
+    def work(order: Order, folder: Path) -> tuple[None, bool]:
+        raise StepBadInput("prepare_subject", "ugly")
+
+    tally = Tally(len(rows) + 1)
+    convert_all([*rows, one], tmp_path, 1, "many: 301 items", tally, work=work)
+    with get_client(sync_client=True) as client:
+        wanted = {"artifacts": {"key": {"like_": "catalog-many-"}}, "limit": 10}
+        pages: list[Any] = client.request("POST", "/artifacts/latest/filter", json=wanted).json()
+    by_type = {page["type"]: page for page in pages}
+    table = json.loads(by_type["table"]["data"])
+    assert len(table) == ROWS_SHOWN
+    assert table[0]["item"] == "zebra"  # what failed comes first
+    assert by_type["progress"]["data"] == 100
+    assert "301 of 301 items, 1 failed" in by_type["progress"]["description"]
+    assert "all are in summary.csv" in by_type["table"]["description"]
+
+
+def test_a_user_who_stops_a_batch_keeps_what_is_done(place: None, tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    for name, words in {"a": "quick", "b": "fit_motion=sleep:300", "c": "never"}.items():
+        (tmp_path / "in" / f"{name}.png").write_text(f"stopped {words}")
+    log = tmp_path / "ran"
+    command = subprocess.Popen(
+        [sys.executable, "-m", "flows.cli", "batch", "in", "-o", "out"],
+        cwd=tmp_path,
+        env={**os.environ, "FAKE_LOG": str(log), "DG4D_EXECUTOR": "subprocess"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    wait_until(lambda: log.exists() and log.read_text().split().count("fit_motion") == 2)
+    command.send_signal(signal.SIGINT)
+    _, trouble = command.communicate(timeout=120)
+    assert command.returncode == 130, trouble
+    assert "the same command goes on" in trouble
+    assert log.read_text().split().count("fit_motion") == 2  # what was stopped is not begun again
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert {row["item"]: row["status"] for row in summary["items"]} == {"a": "done", "b": "skipped", "c": "skipped"}
+    assert (tmp_path / "out" / "a" / "asset.glb").is_file()
+
+
+def test_a_made_batch_needs_no_server_and_says_that_there_is_nothing_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path / "home"))
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "a.png").write_text("x")
+    monkeypatch.setattr(module, "is_current", lambda folder, digest: True)
+
+    def no_server() -> None:
+        pytest.fail("nothing is to be made")
+
+    rows = batch(str(tmp_path / "in"), tmp_path / "out", QUIET, connect=no_server)
+    assert [row.status for row in rows] == ["unchanged"]
+
+
+def test_a_hundred_items_are_found_unchanged_in_a_moment_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path / "home"))
+    monkeypatch.delenv("DG4D_CODE_VERSION", raising=False)
+    (tmp_path / "in").mkdir()
+    for i in range(100):
+        (tmp_path / "in" / f"{i}.png").write_text(str(i))
+        (tmp_path / "out" / f"{i}").mkdir(parents=True)
+    found = items_of(tmp_path / "in", tmp_path / "out", "preview", {}, 0)
+    ready(found[0], tmp_path / "out", strict=False)  # reads the source
+    for item in found:
+        order = ready(item, tmp_path / "out", strict=False)
+        assert isinstance(order, Order)
+        record = {"order": order.digest(), "files": {}}
+        (tmp_path / "out" / item.name / "provenance.json").write_text(json.dumps(record))
+    start = time.process_time()
+    rows = [ready(item, tmp_path / "out", strict=False) for item in found]
+    seconds = time.process_time() - start
+    assert all(isinstance(row, Row) and row.status == "unchanged" for row in rows)
+    assert seconds < 100 * 0.06  # 1,000 in a minute; measured 0.3 s
+
+
+@pytest.mark.parametrize(
+    ("rows", "status", "says"),
+    [
+        ([Row(item="a", status="done"), Row(item="b", status="unchanged")], 0, "2 of 2 items"),
+        ([Row(item="a", status="done", failing=["motion"])], 0, "not accepted: a: motion"),
+        ([Row(item="a", status="failed", kind=NOT_ACCEPTED, failing=["motion"])], 1, "1 of 1 items"),
+        ([Row(item="a", status="failed", kind="StepCrashed"), Row(item="b", status="done")], 1, "1 of 2 items"),
+        ([Row(item="a", status="failed", kind="BadInput"), Row(item="b", status="done")], 1, "1 of 2 items"),
+        ([Row(item="a", status="failed", kind="BadInput")], 65, "0 of 1 items"),
+        ([Row(item="a", status="failed", kind="StepCrashed")], 1, "failed: a"),
+        ([Row(item="a", status="unchanged")], 0, "nothing to do"),
+    ],
+)
+def test_the_exit_status_says_how_a_batch_ended(
+    rows: list[Row], status: int, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert tell(rows, tmp_path, Console(soft_wrap=True)) == status
+    assert says in capsys.readouterr().out
+
+
+def test_a_summary_has_times_and_costs_by_item_and_in_total(tmp_path: Path) -> None:
+    rows = [
+        Row(item="a", status="done", computed_s=1800, cpu_s=3000.5, gpu_s=900, failing=["motion", "floaters"]),
+        Row(item="b", status="unchanged", computed_s=180, cpu_s=200),
+        Row(item="c", status="failed", message='a "bad", thing'),
+    ]
+    Writer(tmp_path, price_per_hour=2.0).write(rows, 12.34)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["totals"] == {"computed_s": 1980, "cpu_s": 3200.5, "gpu_s": 900, "cost": 1.1}
+    assert [item["cost"] for item in summary["items"]] == [1.0, 0.1, 0.0]
+    assert (summary["made"], summary["seconds"], summary["price_per_hour"]) == (2, 12.3, 2.0)
+    with (tmp_path / "summary.csv").open(newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert [line["item"] for line in lines] == ["a", "b", "c"]
+    assert (lines[0]["gpu_s"], lines[0]["cost"], lines[0]["failing"]) == ("900.0", "1.0", "motion floaters")
+    assert lines[2]["message"] == 'a "bad", thing'
+    Writer(tmp_path).write(rows, 1.0)
+    assert json.loads((tmp_path / "summary.json").read_text())["totals"]["cost"] is None
+
+
+def test_a_batch_of_thousands_is_summed_up_now_and_then_and_its_page_loads_what_is_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writes = 0
+
+    def counted(path: Path, text: str) -> None:
+        nonlocal writes
+        writes += 1
+        path.write_text(text)
+
+    monkeypatch.setattr("flows.packages.summary.write_atomically", counted)
+    writer, rows = Writer(tmp_path), []
+    for i in range(1000):
+        (tmp_path / f"{i}").mkdir()
+        (tmp_path / f"{i}" / "preview.webp").touch()
+        rows.append(Row(item=f"{i}", status="done"))
+        writer.write_sometimes(rows, 1.0)
+    assert writes < 60  # three files, every few seconds
+    writer.write(rows, 1.0)
+    page = (tmp_path / "index.html").read_text()
+    assert page.count("<img ") == page.count('loading="lazy"') == 1000
+    assert "autoplay" not in page
+
+
+def test_a_line_says_how_far_a_batch_is_and_when_it_will_be_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    tally = Tally(103)
+    for i in range(3):
+        tally.settle(Row(item=f"old {i}", status="unchanged"))
+    assert tally.line() == "3 of 103 items, 0 failed"
+    for i in range(10):
+        tally.settle(Row(item=f"{i}", status="failed" if i == 4 else "done"))
+    monkeypatch.setattr(Tally, "seconds", property(lambda self: 600.0))
+    assert tally.line() == "13 of 103 items, 1 failed, 60 an hour, about 90 min left"
+
+
+def wait_until(condition: Callable[[], bool], timeout_s: float = 240) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen"
+        time.sleep(0.05)

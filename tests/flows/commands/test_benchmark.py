@@ -1,0 +1,179 @@
+"""`dg4d score` and `dg4d bench` with a real server and steps that do next to nothing."""
+
+import csv
+import json
+from collections.abc import Iterator
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from prefect.client.orchestration import get_client
+from prefect.client.schemas.filters import ArtifactFilter, ArtifactFilterKey
+from rich.console import Console
+
+from dg4d_lib.errors import BadInput
+from flows.commands.benchmark import bench, put_truth, score
+from flows.engine import tasks
+from flows.packages.scores import Results
+from flows.serving.server import Server
+from steps.store import ArtifactStore
+from steps.truth import find_truth
+
+VIEWS = ("view_-75", "view_15")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def place(server: Server, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DG4D_HOME", str(tmp_path_factory.mktemp("home")))
+        patch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
+        patch.setenv("DG4D_CODE_VERSION", "test")
+        patch.setenv("DG4D_EXECUTOR", "in_process")
+        patch.setattr(tasks, "RETRY_DELAY_S", 0.01)
+        patch.setattr("flows.commands.make.connect", lambda: None)  # this process is connected already
+        yield
+
+
+@pytest.fixture(autouse=True)
+def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
+    return tmp_path / "ran"
+
+
+def ran(log: Path, step: str) -> int:
+    return log.read_text().split().count(step) if log.exists() else 0
+
+
+def thing(folder: Path, words: str, pattern: str = "{:03d}.png") -> Path:
+    """An object of two frames; what steps should do stands in its pictures."""
+    for name in ("input", *VIEWS):
+        (folder / name).mkdir(parents=True)
+        for i in range(2):
+            (folder / name / pattern.format(i)).write_text(f"moving frame {i} of {name} {folder.name} {words} ")
+    return folder
+
+
+def run(dataset: Path, out: Path, **options: object) -> Results:
+    return bench(dataset, out, Console(file=StringIO()), **options)  # type: ignore[arg-type]
+
+
+def test_a_benchmark_makes_judges_and_writes_everything_and_a_second_one_does_nothing(
+    tmp_path: Path, log: Path
+) -> None:
+    for name in ("a", "b", "c"):
+        thing(tmp_path / "data" / name, f"seen in {name}")
+    out = tmp_path / "out"
+    results = run(tmp_path / "data", out, limit=2)
+    assert [one.object for one in results.objects] == ["a", "b"]
+    assert not results.failed
+    assert results.mean["preview"]["psnr"] == 20
+    assert results.mean["input_frozen"]["psnr"] == 10
+    assert results.mean["preview"]["seconds"] >= 0
+    assert "lpips" in results.missing
+
+    written = Results.model_validate_json((out / "results.json").read_text())
+    assert written == results
+    rows = list(csv.DictReader(StringIO((out / "results.csv").read_text())))
+    assert {(row["object"], row["method"], row["view"]) for row in rows} >= {
+        ("a", "preview", "input"), ("a", "preview", "-75"), ("b", "preview", "mean"), ("b", "input_frozen", "15"),
+    }  # fmt: skip
+    table = (out / "table.md").read_text()
+    assert "| method | LPIPS ↓ | CLIP ↑ | FVD (Consistent4D) ↓ | time, s ↓ |" in table
+    assert "| preview | missing |" in table
+    page = (out / "index.html").read_text()
+    assert "&lt;gets it&gt;" in page
+    for film in ("films/a/truth/view_-75.mp4", "films/b/ours/input.mp4"):
+        assert (out / film).read_bytes() == b"film"
+        assert film in page
+    assert (out / "assets" / "a" / "provenance.json").is_file()
+    with get_client(sync_client=True) as client:
+        (artifact,) = client.read_artifacts(artifact_filter=ArtifactFilter(key=ArtifactFilterKey(any_=["benchmark"])))
+    assert [row["method"] for row in json.loads(str(artifact.data))] == ["its first frame at every view", "preview"]
+
+    made = ran(log, "pack_asset"), ran(log, "score_asset")
+    assert made == (2, 4)
+    assert run(tmp_path / "data", out, limit=2) == results
+    assert (ran(log, "pack_asset"), ran(log, "score_asset")) == made
+
+
+def test_frechet_distance_is_taken_over_all_films(tmp_path: Path) -> None:
+    """Two objects with two views are four films, more than the one number that the fake network gives of a film."""
+    for name in ("p", "qq"):
+        thing(tmp_path / "data" / name, f"film of {name}")
+    results = run(tmp_path / "data", tmp_path / "out")
+    assert results.mean["preview"]["fvd"] == pytest.approx(4)  # every film 2 further than the truth's
+    alone = run(tmp_path / "data", tmp_path / "alone", limit=1)
+    assert alone.mean["preview"]["fvd"] == pytest.approx(4)
+
+
+def test_an_object_that_fails_stops_no_other_and_is_left_out_of_the_means(tmp_path: Path) -> None:
+    thing(tmp_path / "data" / "good", "all fine")
+    thing(tmp_path / "data" / "ill", "fit_motion=bad:crooked .")
+    thing(tmp_path / "data" / "odd", "score_asset=bad:strange .")
+    results = run(tmp_path / "data", tmp_path / "out")
+    assert {one.object: one.error for one in results.failed} == {
+        "ill": "the picture is crooked",
+        "odd": "the picture is strange",
+    }
+    assert results.mean["preview"]["psnr"] == 20
+    assert "- ill failed: the picture is crooked" in (tmp_path / "out" / "table.md").read_text()
+    assert "crooked" in (tmp_path / "out" / "index.html").read_text()
+
+
+def test_a_finished_asset_is_judged_and_nothing_is_made(tmp_path: Path, log: Path) -> None:
+    thing(tmp_path / "data" / "newt", "walks")
+    run(tmp_path / "data", tmp_path / "out")
+    before = ran(log, "pack_asset")
+    file = tmp_path / "new" / "newt.json"
+    asset, truth = tmp_path / "out" / "assets" / "newt", tmp_path / "data" / "newt"
+    results = score(asset, truth, Console(file=StringIO()), out=file)
+    assert results.mean["newt"]["psnr"] == 20
+    assert Results.model_validate_json(file.read_text()) == results
+    assert ran(log, "pack_asset") == before
+
+
+def test_true_views_are_the_prior_where_the_bank_is_asked_for(tmp_path: Path) -> None:
+    folder = thing(tmp_path / "data" / "newt", "with a bank")
+    with pytest.raises(BadInput, match=r"no bank of true views: newt"):
+        run(tmp_path / "data", tmp_path / "out", bank=True)
+    (folder / "bank").mkdir()
+    (folder / "bank" / "bank.json").write_text("{}")
+    results = run(tmp_path / "data", tmp_path / "out", bank=True)
+    assert results.settings["changes"] == {"prior.kind": "oracle"}
+    record = json.loads((tmp_path / "out" / "assets" / "newt" / "provenance.json").read_text())
+    (fit,) = [step for step in record["steps"] if step["step"] == "fit_gaussians"]
+    assert fit["settings"]["prior"]["kind"] == "oracle"
+    assert "bank" in fit["inputs"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        (["score.sze=64"], r"score\.sze"),
+        (["score.size=1"], "greater than or equal to 32"),
+        (["score.clip_weights=./nowhere"], "no such folder"),
+        (["motion.iteration=3"], "unknown setting"),
+    ],
+)
+def test_a_wrong_setting_is_refused_before_any_work(tmp_path: Path, log: Path, changes: list[str], says: str) -> None:
+    thing(tmp_path / "data" / "newt", "settings")
+    with pytest.raises(BadInput, match=says):
+        run(tmp_path / "data", tmp_path / "out", changes=changes)
+    assert not log.exists()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_finished_asset_takes_no_knobs_of_the_conversion(tmp_path: Path) -> None:
+    thing(tmp_path / "newt", "x")
+    with pytest.raises(BadInput, match=r"only knobs that begin with 'score\.'.*motion\.views"):
+        score(tmp_path, tmp_path / "newt", Console(), changes=["motion.views=1"])
+    with pytest.raises(BadInput, match="is no asset"):
+        score(tmp_path, tmp_path / "newt", Console())
+
+
+def test_equal_truths_are_one_artifact_whatever_their_files_are_called(tmp_path: Path) -> None:
+    store = ArtifactStore(tmp_path / "store")
+    first, second = thing(tmp_path / "1" / "newt", "x"), thing(tmp_path / "2" / "newt", "x", "{}.png")
+    assert put_truth(find_truth(first), store) == put_truth(find_truth(second), store)
+    (second / VIEWS[0] / "0.png").write_text("another picture")
+    assert put_truth(find_truth(first), store) != put_truth(find_truth(second), store)

@@ -1,0 +1,212 @@
+"""Packages made again: fake steps for the verdicts, real ones with small numbers for the truth; one server for all."""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import fake_steps
+import numpy as np
+import pytest
+from made_package import SOURCE, made_package, record_in
+from PIL import Image
+
+from dg4d_lib.errors import BadInput
+from flows import home
+from flows.commands.make import make
+from flows.commands.rebuild import Rebuilt, rebuild
+from flows.engine import tasks
+from flows.inputs.orders import Order, Wish, order_again
+from flows.packages.publish import record_of
+from flows.packages.verify import verify
+from flows.serving.server import Server
+from steps.job import Facts, Job
+from steps.profiles import PREVIEW, revise
+from steps.store import ArtifactStore
+
+TINY = {
+    "subject.size": 64,
+    "driving.frames": 2,
+    "prior.size": 48,
+    "static.iterations": 2,
+    "static.views": 1,
+    "static.points": 300,
+    "static.reference_size": 48,
+    "static.ladder": [{"until": 1.0, "size": 48}],
+    "motion.iterations": 2,
+    "motion.reference_size": 48,
+    "motion.ladder": [{"until": 1.0, "size": 48}],
+    "mesh.grid": 24,
+    "mesh.edge_length": 0.1,
+    "mesh.texture_size": 64,
+    "mesh.render_size": 64,
+    "pack.preview_size": 64,
+    "pack.preview_turns": 1,
+    "pack.sheet_size": 48,
+    "pack.sheet_frames": 2,
+}
+
+
+@pytest.fixture
+def fakes(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where fake steps say that they ran."""
+    monkeypatch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
+    monkeypatch.setenv("DG4D_CODE_VERSION", "test")
+    monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
+    monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
+    monkeypatch.setattr(tasks, "RETRY_DELAY_S", 0.01)
+    return tmp_path / "ran"
+
+
+def order(words: str, folder: Path, name: str = "fake.png", **changes: object) -> Order:
+    (folder / name).write_text(words)
+    return Wish(item="fake", picture=folder / name, settings=revise(PREVIEW, dict(changes)), seed=5).order(home.store())
+
+
+def again(folder: Path, out: Path | None = None, source: Path | None = None) -> Rebuilt:
+    record = record_of(folder)
+    assert record is not None
+    return rebuild(folder, record, order_again(record, home.store(), source), out)
+
+
+def outcomes(rebuilt: Rebuilt) -> dict[str, str]:
+    return {likeness.name: likeness.outcome for likeness in rebuilt.likenesses}
+
+
+def altered(step: Callable[[Job], Facts], port: str, change: Callable[[bytes], bytes]) -> Callable[[Job], Facts]:
+    """A step whose output comes out otherwise."""
+
+    def run(job: Job) -> Facts:
+        facts = step(job)
+        job.outputs[port].write_bytes(change(job.outputs[port].read_bytes()))
+        return facts
+
+    return run
+
+
+def test_every_step_runs_again_and_gives_the_same(fakes: Path, tmp_path: Path) -> None:
+    wanted = order("same", tmp_path)
+    make(wanted, tmp_path / "out")
+    ran = fakes.read_text()
+    fakes.unlink()
+    rebuilt = again(tmp_path / "out", tmp_path / "again")
+    assert fakes.read_text() == ran
+    assert set(outcomes(rebuilt).values()) == {"identical"}
+    assert len(rebuilt.likenesses) == len(ran.split()) + 4  # files
+    assert rebuilt.circumstances == ()
+    assert list(rebuilt.rows())[-1] == ("4 files", "identical", "")
+    assert rebuilt.exit_code == 0
+    one, two = (record_of(tmp_path / name) for name in ("out", "again"))
+    assert one is not None and two is not None
+    assert one.pop("run") != two.pop("run")
+    assert one == two
+    assert verify(tmp_path / "again").exit_code == 0
+
+
+def test_words_and_meshes_per_frame_are_rebuilt_too(fakes: Path, tmp_path: Path) -> None:
+    settings = revise(
+        PREVIEW, {"text.weights": "somebody/pictures", "mesh.mode": "per_frame", "mesh.frames_per_task": 2}
+    )
+    make(Wish(item="words", text="a red  fox", settings=settings).order(home.store()), tmp_path / "out")
+    record = record_of(tmp_path / "out")
+    assert record is not None
+    assert record["recipe"]["text"] == "a red fox"
+    found = outcomes(rebuild(tmp_path / "out", record, order_again(record, ArtifactStore(home.store().root))))
+    assert set(found.values()) == {"identical"}
+    assert {"draw_picture", "extract_mesh 1/3", "extract_mesh 3/3"} <= set(found)
+
+
+def curves(factor: float) -> Callable[[bytes], bytes]:
+    def change(content: bytes) -> bytes:
+        tree = json.loads(content)
+        tree["series"]["loss"] = [value * factor for value in tree["series"]["loss"]]
+        return json.dumps(tree).encode()
+
+    return change
+
+
+def test_a_little_is_within_tolerance_more_is_different_and_what_is_lost_is_not_compared(
+    fakes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make(order("near", tmp_path), tmp_path / "out")
+    record = record_of(tmp_path / "out")
+    assert record is not None
+    (motion,) = [step["outputs"]["motion"] for step in record["steps"] if step["step"] == "fit_motion"]
+    plain = fake_steps.fit_motion
+
+    monkeypatch.setattr(fake_steps, "fit_motion", altered(plain, "curves", curves(1.001)))
+    rebuilt = again(tmp_path / "out")
+    (near,) = [likeness for likeness in rebuilt.likenesses if likeness.outcome != "identical"]
+    assert (near.name, near.outcome) == ("fit_motion", "within tolerance")
+    assert near.difference == pytest.approx(0.001 / math.sqrt(3), rel=0.02)
+    assert "curves" in near.detail
+    assert rebuilt.exit_code == 0
+
+    monkeypatch.setattr(fake_steps, "fit_motion", altered(plain, "curves", curves(2.0)))
+    rebuilt = again(tmp_path / "out")
+    assert outcomes(rebuilt)["fit_motion"] == "different"
+    assert rebuilt.exit_code == 1
+
+    (blob,) = (home.store().root / "sha256").rglob(motion.removeprefix("sha256:"))
+    blob.unlink()
+    monkeypatch.setattr(fake_steps, "fit_motion", altered(plain, "motion", lambda content: content + b"!"))
+    rebuilt = again(tmp_path / "out")
+    found = {likeness.name: likeness for likeness in rebuilt.likenesses}
+    assert found["fit_motion"].outcome == "not compared"
+    assert "motion" in found["fit_motion"].detail and "not in the store" in found["fit_motion"].detail
+    assert "no measure" in found["asset.glb"].detail  # a fake, which no reader reads
+    assert rebuilt.exit_code == 0
+
+
+def test_another_file_is_different_and_other_code_is_told(
+    fakes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make(order("code", tmp_path), tmp_path / "out")
+    monkeypatch.setenv("DG4D_CODE_VERSION", "newer")
+    monkeypatch.setenv("DG4D_IMAGE", "dg4d/cpu:2")
+    noise = np.random.default_rng(0).integers(0, 255, (6, 8, 3), np.uint8)
+    Image.fromarray(noise).save(tmp_path / "noise.png")
+    monkeypatch.setattr(fake_steps, "PNG", (tmp_path / "noise.png").read_bytes())
+    monkeypatch.setattr(fake_steps, "_begin", lambda step, job, words: b"code")
+    rebuilt = again(tmp_path / "out")
+    assert outcomes(rebuilt)["contact_sheet.png"] == "different"
+    assert rebuilt.exit_code == 1
+    assert "image: none then, dg4d/cpu:2 now" in rebuilt.circumstances
+    assert any(text.startswith("code: ") and text.endswith("+newer now") for text in rebuilt.circumstances)
+
+
+def test_a_source_that_is_not_in_the_store_must_be_given_and_be_the_same(tmp_path: Path) -> None:
+    record = record_in(made_package(tmp_path))
+    elsewhere = ArtifactStore(tmp_path / "elsewhere")
+    with pytest.raises(BadInput, match="give it with --source"):
+        order_again(record, elsewhere)
+    (tmp_path / "other.png").write_text("other")
+    with pytest.raises(BadInput, match="is not what this package was made from"):
+        order_again(record, elsewhere, tmp_path / "other.png")
+    (tmp_path / "same.png").write_bytes(SOURCE)
+    found = order_again(record, elsewhere, tmp_path / "same.png")
+    assert found.recipe() == record["recipe"]
+    assert (found.item, found.source_name, found.profile, found.seed) == ("red fox", "fox.png", "preview", 3)
+
+
+@pytest.mark.parametrize("damage", ["recipe", "run"])
+def test_a_record_of_another_version_is_refused(tmp_path: Path, damage: str) -> None:
+    record = record_in(made_package(tmp_path))
+    del record[damage]
+    with pytest.raises(BadInput, match="another version"):
+        order_again(record, ArtifactStore(tmp_path / "store"))
+
+
+@pytest.mark.slow
+def test_real_steps_give_equal_bytes_again(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows, columns = np.mgrid[-1:1:96j, -1:1:96j]
+    inside = (rows / 0.7) ** 2 + (columns / 0.5) ** 2 < 1
+    egg = np.stack([inside * (rows + 1) / 2, inside * 0.4, inside * (columns + 1) / 2, inside], -1)
+    Image.fromarray((egg * 255).astype(np.uint8)).save(tmp_path / "egg.png")
+    wanted = Wish(item="egg", picture=tmp_path / "egg.png", settings=revise(PREVIEW, dict(TINY))).order(home.store())
+    monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
+    make(wanted, tmp_path / "egg")
+    assert verify(tmp_path / "egg").exit_code == 0
+    rebuilt = again(tmp_path / "egg")
+    assert {name: outcome for name, outcome in outcomes(rebuilt).items() if outcome != "identical"} == {}
+    assert {"fit_motion", "asset.glb", "preview.mp4", "canonical/asset4d.safetensors"} <= set(outcomes(rebuilt))

@@ -1,0 +1,65 @@
+import io
+
+import pytest
+from rich.console import Console
+
+from flows.commands.terminal import BatchTable, StepBars, numbers, steps_shown, tell_rows
+from flows.engine.events import StepEvent, tell
+
+EVENT = StepEvent("newt", "fit_gaussians", "progress", done=114, total=250, values={"loss": 9.437, "reference": 12.57})
+
+
+def test_numbers_say_how_far_and_how_good():
+    assert numbers(EVENT) == "114/250  loss 9.437  reference 12.57"
+    assert numbers(EVENT, 1) == "114/250  loss 9.437"
+
+
+@pytest.mark.parametrize(
+    ("width", "shown", "hidden"), [(80, "loss 9.437", "reference"), (160, "reference 12.57", None)]
+)
+def test_the_loss_of_a_step_fits_on_a_terminal_of_any_width(width: int, shown: str, hidden: str | None):
+    screen = io.StringIO()
+    bars = StepBars(Console(file=screen, width=width, force_terminal=True, color_system=None))
+    with bars.progress:
+        bars(EVENT)
+    text = screen.getvalue()
+    assert "fit_gaussians" in text
+    assert "…" not in text
+    assert shown in text
+    assert hidden is None or hidden not in text
+
+
+def test_what_the_library_has_to_say_is_shown():
+    note = StepEvent("newt", "fit_gaussians", "note", text="compiling kernels")
+    for interactive in (True, False):
+        screen = io.StringIO()
+        with steps_shown(Console(file=screen, width=100, force_terminal=interactive, color_system=None)):
+            tell(note)
+        assert "compiling kernels" in screen.getvalue()
+
+
+def test_rows_stand_in_columns_and_words_in_brackets_stay():
+    screen = io.StringIO()
+    tell_rows(Console(file=screen, width=200), [("a", "whole", ""), ("asset.glb", "altered", "[why]")])
+    assert screen.getvalue() == "a          whole\nasset.glb  altered  [why]\n"
+
+
+def test_a_long_batch_shows_what_runs_and_what_failed_last_and_no_more_than_fits():
+    table = BatchTable([f"item-{i:04d}" for i in range(1000)])
+    for i in range(900):
+        table.settle(f"item-{i:04d}", "failed" if i % 2 else "done", "no reason")
+    table(StepEvent("item-0901", "fit_gaussians", "started"))
+    screen = io.StringIO()
+    Console(file=screen, width=120, color_system=None).print(table)
+    text = screen.getvalue()
+    assert "900 of 1000" in text
+    assert "item-0901" in text and "item-0899" in text
+    assert "item-0001" not in text and "item-0898" not in text
+    assert len(text.splitlines()) < 40
+
+
+def test_an_item_that_is_tried_again_is_running_again():
+    table = BatchTable(["a"])
+    table.settle("a", "failed", "crashed")
+    table(StepEvent("a", "fit_gaussians", "started"))
+    assert table.status["a"] == "running"

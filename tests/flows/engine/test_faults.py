@@ -1,0 +1,330 @@
+"""What goes wrong for real, with a real server and steps that do next to nothing: whatever it is, work goes on."""
+
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import fake_steps
+import pytest
+from postgresql import server_on_postgresql
+from prefect.client.orchestration import get_client
+from prefect.settings import PREFECT_API_URL, temporary_settings
+from rich.console import Console
+
+from dg4d_lib.errors import BadInput
+from flows import home
+from flows.commands.batch import batch
+from flows.commands.make import make
+from flows.engine import leases, tasks
+from flows.engine.collecting import collect
+from flows.engine.executors import StepBadInput, StepOutOfMemory, StepTimedOut
+from flows.engine.orphans import settle_orphans
+from flows.inputs.orders import Order, Wish
+from flows.packages.publish import whole
+from flows.packages.versions import faults, versions
+from flows.serving.server import Server, answers
+from steps.profiles import PREVIEW
+from steps.store import ArtifactStore
+
+EVERY_STEP = [
+    "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "extract_mesh", "refine_texture", "pack_asset",
+    "check_asset",
+]  # fmt: skip
+RUN_FACTS = ("report.json", "report.html", "provenance.json", "ro-crate-metadata.json")  # these say when and how long
+DAY_S = 86400.0
+AWAY_S = 3.0  # a database that starts anew
+
+
+@pytest.fixture
+def log(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where fake steps say that they ran, in this process and in those that it starts, under the server's home."""
+    monkeypatch.setenv("DG4D_HOME", str(server.folder.parent))
+    monkeypatch.setenv("DG4D_STORE", str(tmp_path / "store"))
+    monkeypatch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
+    monkeypatch.setenv("DG4D_CODE_VERSION", tmp_path.name)  # nobody has done it before
+    monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+    monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
+    monkeypatch.setattr(tasks, "RETRY_DELAY_S", 0.01)
+    return tmp_path / "ran"
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 256 KiB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    if _mount("-t", "tmpfs", "-o", "size=256k", "tmpfs", place) != 0:
+        pytest.skip("a file system of a chosen size cannot be mounted here (it takes root)")
+    yield place
+    subprocess.run(["umount", str(place)], check=True)
+
+
+def ran(log: Path) -> list[str]:
+    steps = log.read_text().split() if log.exists() else []
+    log.unlink(missing_ok=True)
+    return steps
+
+
+def order(words: str, folder: Path) -> Order:
+    (folder / "fake.png").write_text(words)
+    return Wish(item="fake", picture=folder / "fake.png", settings=PREVIEW).order(home.store())
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name not in RUN_FACTS)
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+def start(*arguments: str) -> "subprocess.Popen[str]":
+    """The command in a process of its own, with steps in theirs."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "flows.cli", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "DG4D_EXECUTOR": "subprocess"},
+    )
+
+
+def wait_until(condition: Callable[[], bool], timeout_s: float = 120) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen"
+        time.sleep(0.05)
+
+
+def during(step: str, log: Path, do: Callable[[], None]) -> threading.Thread:
+    """Do something as soon as a step runs."""
+
+    def wait_and_do() -> None:
+        wait_until(lambda: log.exists() and step in log.read_text())
+        do()
+
+    thread = threading.Thread(target=wait_and_do)
+    thread.start()
+    return thread
+
+
+def is_whole() -> bool:
+    store = home.store()
+    return not faults(store, versions(store), {entry.name: entry.size_bytes for entry in store.artifacts()})
+
+
+def test_a_command_killed_in_every_stage_ends_with_the_bytes_of_an_undisturbed_one(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settle_orphans()
+    (tmp_path / "fake.png").write_text(" ".join(f"{step}=sleep-once:120" for step in EVERY_STEP))
+    for number, step in enumerate(EVERY_STEP):
+        command = start("make", str(tmp_path / "fake.png"), "-o", str(tmp_path / "out"))
+        wait_until((tmp_path / f"ran.{step}").exists)  # it sleeps there, and not the next time
+        command.send_signal(signal.SIGKILL)
+        command.communicate()
+        assert ran(log) == EVERY_STEP[max(0, number - 1) : number + 1], step
+        assert not (tmp_path / "out").exists()
+    assert settle_orphans() == 1  # every command settles the one before
+    words = (tmp_path / "fake.png").read_text()
+    make(order(words, tmp_path), tmp_path / "out")
+    assert ran(log) == EVERY_STEP[-1:]
+    monkeypatch.delenv("DG4D_STORE")
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path / "fresh"))  # where nothing is done yet
+    make(order(words, tmp_path), tmp_path / "other")
+    assert ran(log) == EVERY_STEP
+    assert content(tmp_path / "out") == content(tmp_path / "other")
+
+
+def test_two_batches_of_the_same_folder_at_once_do_the_work_once(log: Path, tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    for name in ("a", "b"):
+        (tmp_path / "in" / f"{name}.png").write_text(f"{name} fit_gaussians=sleep:0.5")
+    both = [start("batch", str(tmp_path / "in"), "-o", str(tmp_path / "out")) for _ in range(2)]
+    for command in both:
+        _, trouble = command.communicate()
+        assert command.returncode == 0, trouble
+    assert sorted(ran(log)) == sorted(EVERY_STEP * 2)
+    for name in ("a", "b"):
+        whole(tmp_path / "out" / name)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert sorted(row["item"] for row in summary["items"]) == ["a", "b"]
+    assert [path.name for path in (tmp_path / "out").iterdir() if path.name.startswith(".")] == []
+    assert is_whole()
+
+
+def test_a_server_killed_during_a_run_is_started_again_and_the_run_goes_on(
+    server: Server, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("DG4D_STORE")  # the new server outlives this test and its store
+    address = server.address()
+    assert address is not None
+
+    def kill() -> None:
+        guard = json.loads((server.folder / "server.json").read_text())["guard"]
+        children = Path(f"/proc/{guard}/task/{guard}/children").read_text().split()
+        os.kill(int(children[0]), signal.SIGKILL)
+        wait_until(lambda: not server.is_guarded())
+
+    killer = during("fit_motion", log, kill)
+    make(order("server fit_motion=sleep-once:2", tmp_path), tmp_path / "out")
+    killer.join()
+    assert ran(log) == EVERY_STEP
+    assert server.address() == address and answers(address, timeout_s=10)
+    with get_client(sync_client=True) as client:
+        (newest,) = client.read_flow_runs(limit=1, sort="START_TIME_DESC")  # type: ignore[arg-type]
+    assert newest.name == "fake" and newest.state is not None and newest.state.is_completed()
+    whole(tmp_path / "out")
+
+
+def test_a_database_that_is_locked_for_a_while_delays_a_run_and_no_more(
+    server: Server, log: Path, tmp_path: Path
+) -> None:
+    database = server.folder.parent / "prefect" / "prefect.db"
+    assert database.exists()
+    locked_s = 4.0
+
+    def hold() -> None:
+        with sqlite3.connect(database, timeout=30, isolation_level=None) as connection:
+            connection.execute("BEGIN EXCLUSIVE")
+            time.sleep(locked_s)
+            connection.execute("ROLLBACK")
+        connection.close()
+
+    holder = during("prepare_subject", log, hold)
+    began = time.monotonic()
+    make(order("locked prepare_subject=sleep-once:0.5", tmp_path), tmp_path / "out")
+    holder.join()
+    assert time.monotonic() - began > locked_s
+    assert ran(log) == EVERY_STEP
+    whole(tmp_path / "out")
+
+
+def test_a_database_that_crashes_during_a_batch_and_comes_back_loses_and_doubles_nothing(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = [str(number) for number in range(6)]
+    (tmp_path / "in").mkdir()
+    for name in names:
+        (tmp_path / "in" / f"{name}.png").write_text(f"{name} fit_motion=sleep:0.5")
+    with server_on_postgresql(tmp_path / "prefect") as (api_url, database):
+
+        def crash() -> None:
+            database.crash()
+            time.sleep(AWAY_S)
+            database.start()
+
+        monkeypatch.setenv("PREFECT_API_URL", api_url)
+        with temporary_settings({PREFECT_API_URL: api_url}):
+            crasher = during("extract_mesh", log, crash)
+            rows = batch(str(tmp_path / "in"), tmp_path / "out", Console(quiet=True), workers=2)
+            crasher.join()
+            with get_client(sync_client=True) as client:
+                runs = client.read_flow_runs()
+    assert {row.item: (row.status, row.attempts) for row in rows} == dict.fromkeys(names, ("done", 1))
+    assert sorted(ran(log)) == sorted(EVERY_STEP * len(names))
+    assert sorted(run.name for run in runs if run.name in names) == names
+    assert {run.state.name for run in runs if run.state is not None} == {"Completed"}
+    for name in names:
+        whole(tmp_path / "out" / name)
+    assert is_whole()
+
+
+def test_a_full_disk_is_a_clear_message_and_with_more_room_the_run_goes_on(
+    log: Path, disk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DG4D_STORE", str(disk / "store"))
+    wanted = order("x" * 60_000, tmp_path)  # every artifact is as large
+    with pytest.raises(StepBadInput, match=r"disk.* full"):
+        make(wanted, tmp_path / "out")
+    done = ran(log)
+    assert 1 <= len(done) < len(EVERY_STEP)
+    assert not (tmp_path / "out").exists()
+    assert list((disk / "store" / "incoming").glob("*")) == []
+    assert _mount("-o", "remount,size=64m", disk) == 0
+    make(wanted, tmp_path / "out")
+    assert ran(log) == EVERY_STEP[len(done) - 1 :]
+    assert is_whole()
+
+
+def test_a_step_whose_memory_is_limited_is_tried_again_and_then_says_so(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DG4D_EXECUTOR", "subprocess")
+    with pytest.raises(StepOutOfMemory, match="memory ran out: end other programs, or choose smaller settings"):
+        make(order("prepare_subject=hoard", tmp_path), tmp_path / "out")
+    assert ran(log) == EVERY_STEP[:1] * (1 + tasks.RETRIES)
+
+
+def test_a_step_that_hangs_is_killed_and_the_next_run_begins_with_it(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DG4D_EXECUTOR", "subprocess")
+    patient = fake_steps.STEPS["drive_video"]
+    with monkeypatch.context() as hasty:
+        hasty.setitem(fake_steps.STEPS, "drive_video", patient.model_copy(update={"timeout_s": 8.0}))
+        wanted = order("drive_video=sleep-once:300", tmp_path)
+        began = time.monotonic()
+        with pytest.raises(StepTimedOut, match="no result after 8 s, so it was stopped"):
+            make(wanted, tmp_path / "out")
+    assert time.monotonic() - began < 200
+    assert ran(log) == EVERY_STEP[:2]  # the same again would hang again
+    monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
+    make(wanted, tmp_path / "out")
+    assert ran(log) == EVERY_STEP[1:]
+
+
+@pytest.mark.parametrize("skew_s", [-400 * DAY_S, 400 * DAY_S])
+def test_results_are_used_whatever_the_clock_said_when_they_were_made(log: Path, tmp_path: Path, skew_s: float) -> None:
+    make(order("skew", tmp_path), tmp_path / "one")
+    assert ran(log) == EVERY_STEP
+    for folder in (home.store().root, home.records()):
+        for path in folder.rglob("*"):
+            os.utime(path, times=(time.time() + skew_s,) * 2)
+    _, cached = make(order("skew", tmp_path), tmp_path / "two")
+    assert cached and ran(log) == []
+    assert content(tmp_path / "one") == content(tmp_path / "two")
+
+
+@pytest.mark.parametrize("skew_s", [-400 * DAY_S, 400 * DAY_S])
+def test_a_clock_that_jumps_during_a_run_makes_nothing_needed_go(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, skew_s: float
+) -> None:
+    make(order("jump", tmp_path), tmp_path / "one")
+    store, true_time = home.store(), time.time
+    unwanted = store.put_bytes(b"of nobody", "text/plain")
+    with leases.running(store, "fake"):
+        needed = store.put_bytes(b"made by this run", "text/plain")
+        monkeypatch.setattr(time, "time", lambda: true_time() + skew_s)
+        collect(store, home.records())
+        assert store.has(needed) and is_whole()
+        with leases.collecting(store), pytest.raises(BadInput, match="at the moment"), leases.collecting(store):
+            pass
+    collect(store, home.records())
+    assert is_whole()
+    assert store.has(unwanted) == (skew_s < 0)  # what is from the future is not old
+
+
+def test_a_lock_from_the_future_on_another_machine_does_not_hold_for_ever(tmp_path: Path) -> None:
+    store = ArtifactStore(tmp_path)
+    theirs = leases.Collecting(host="another", pid=1, start="1", token="t")
+    store.write(leases.LOCK, theirs.model_dump_json())
+    lock = tmp_path / leases.LOCK
+    os.utime(lock, times=(time.time() + 60,) * 2)  # their clock is a minute ahead: they are alive
+    with pytest.raises(BadInput, match="at the moment"), leases.collecting(store):
+        pass
+    os.utime(lock, times=(time.time() + 400 * DAY_S,) * 2)
+    with leases.collecting(store):
+        assert store.read(leases.LOCK) != theirs.model_dump_json().encode()
+
+
+def _mount(*arguments: object) -> int:
+    try:
+        return subprocess.run(["mount", *map(str, arguments)], capture_output=True, check=False).returncode
+    except FileNotFoundError:
+        return 1

@@ -1,0 +1,189 @@
+"""What steps share: a GPU has one step at a time, whoever asks; the processor's turns go on meanwhile."""
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dg4d_lib.errors import BadInput
+from flows.engine import resources
+from flows.engine.resources import Resource, Stopped, resource_of, slot
+from steps.contract import StepRequest
+
+HOLDER = """
+import sys, time
+from flows.engine.resources import slot
+for _ in range(3):
+    with slot("gpu", lambda text: None), open(sys.argv[1], "a") as log:
+        log.write("begin\\n"); log.flush(); time.sleep(0.15); log.write("end\\n")
+"""
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
+    monkeypatch.setenv("DG4D_CPUS", "1")
+    monkeypatch.delenv("DG4D_GPUS", raising=False)
+
+
+def silent(text: str) -> None:
+    pass
+
+
+def all_at_once(*work: Callable[[], None]) -> None:
+    threads = [threading.Thread(target=one) for one in work]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20)
+        assert not thread.is_alive(), "it waits for ever"
+
+
+def are_inside(resource: Resource, count: int) -> None:
+    """Of twice as many users, exactly so many are inside at a time: they meet there, and there never are more."""
+    meeting = threading.Barrier(count, timeout=20)
+    inside, most, mutex = 0, 0, threading.Lock()
+
+    def use() -> None:
+        nonlocal inside, most
+        with slot(resource, silent):
+            with mutex:
+                inside += 1
+                most = max(most, inside)
+            meeting.wait()
+            time.sleep(0.1)  # time for one too many to come in
+            with mutex:
+                inside -= 1
+
+    all_at_once(*[use] * (2 * count))
+    assert not meeting.broken
+    assert most == count
+
+
+def test_a_gpu_has_one_step_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    are_inside("gpu", 1)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
+    are_inside("gpu", 2)
+    monkeypatch.setenv("DG4D_GPUS", "1")
+    are_inside("gpu", 1)
+
+
+def test_the_processor_has_as_many_turns_as_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    are_inside("cpu", 1)
+    monkeypatch.setenv("DG4D_CPUS", "3")
+    are_inside("cpu", 3)
+
+
+def test_a_step_on_the_processor_runs_beside_one_on_a_gpu() -> None:
+    both_inside = threading.Barrier(2, timeout=10)
+
+    def use(resource: Resource) -> Callable[[], None]:
+        def inside() -> None:
+            with slot(resource, silent):
+                both_inside.wait()
+
+        return inside
+
+    all_at_once(use("gpu"), use("cpu"))
+    assert not both_inside.broken
+
+
+def test_two_commands_share_the_gpus_of_one_user(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", HOLDER, str(tmp_path / "log")]
+    both = [subprocess.Popen(command) for _ in range(2)]
+    assert [one.wait(60) for one in both] == [0, 0]
+    assert (tmp_path / "log").read_text().split() == ["begin", "end"] * 6
+
+
+def test_a_gpu_is_taken_until_the_process_of_its_step_has_ended() -> None:
+    with slot("gpu", silent):
+        step = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE, pass_fds=resources.handles())
+    waited = threading.Event()
+    got = threading.Event()
+
+    def next_step() -> None:
+        with slot("gpu", lambda text: waited.set()):
+            got.set()
+
+    thread = threading.Thread(target=next_step)
+    thread.start()
+    assert waited.wait(10)
+    assert not got.wait(0.3)
+    step.kill()
+    step.wait()
+    assert got.wait(10)
+    thread.join()
+    assert step.stdin is not None
+    step.stdin.close()
+
+
+def test_steps_on_two_gpus_see_one_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "GPU-a1, GPU-b2")
+    seen: set[str] = set()
+    both_inside = threading.Barrier(2, timeout=10)
+
+    def use() -> None:
+        with slot("gpu", silent):
+            both_inside.wait()
+            seen.add(resources.environment()["CUDA_VISIBLE_DEVICES"])
+
+    all_at_once(use, use)
+    assert seen == {"GPU-a1", "GPU-b2"}
+    with slot("cpu", silent):
+        assert resources.environment() == {}
+    assert (resources.environment(), resources.handles()) == ({}, ())
+
+
+@pytest.mark.parametrize(
+    ("step", "settings", "weights", "needs"),
+    [
+        ("fit_gaussians", {"rasterizer": "cuda_gsplat"}, {}, "gpu"),
+        ("fit_gaussians", {"rasterizer": "cpu"}, {}, "cpu"),
+        ("fit_gaussians", {"rasterizer": "cpu"}, {"zero123-xl": "sha256:" + "1" * 64}, "gpu"),
+        ("fit_motion", {"rasterizer": "cuda_gsplat"}, {}, "gpu"),
+        ("drive_video", {}, {"svd": "sha256:" + "1" * 64}, "gpu"),
+        ("drive_video", {}, {}, "cpu"),
+        ("extract_mesh", {"rasterizer": "cuda_gsplat"}, {}, "cpu"),
+        ("pack_asset", {"rasterizer": "cuda_gsplat"}, {}, "cpu"),
+    ],
+)
+def test_only_steps_that_fill_a_gpu_wait_for_one(
+    step: str, settings: dict[str, str], weights: dict[str, str], needs: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    request = StepRequest(step=step, version="1", inputs={}, settings=settings, seed=0, weights=weights)
+    assert resource_of(request) == needs
+    monkeypatch.setenv("DG4D_GPUS", "0")
+    assert resource_of(request) == "cpu"
+
+
+@pytest.mark.parametrize(("name", "value"), [("DG4D_GPUS", "all"), ("DG4D_GPUS", "-1"), ("DG4D_CPUS", "0")])
+def test_a_number_that_is_none_is_refused(name: str, value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(name, value)
+    with pytest.raises(BadInput, match=name):
+        resources.gpus(), resources.cpus()
+
+
+def test_few_cores_take_one_step_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DG4D_CPUS")
+    for cores, steps in ((1, 1), (2, 1), (4, 1), (16, 4)):
+        monkeypatch.setattr(resources.os, "sched_getaffinity", lambda pid, cores=cores: set(range(cores)))
+        assert resources.cpus() == steps
+
+
+def test_a_step_that_waits_ends_when_the_user_stops_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    stopping = threading.Event()
+    monkeypatch.setattr(resources, "stopping", stopping)
+    told: list[str] = []
+
+    def stop(text: str) -> None:
+        told.append(text)
+        stopping.set()
+
+    with slot("gpu", silent), pytest.raises(Stopped), slot("gpu", stop):
+        pass
+    assert told == ["waiting for a GPU"]

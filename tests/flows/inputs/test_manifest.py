@@ -1,0 +1,317 @@
+import csv
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tiny_s3 import BUCKET, TinyS3
+
+from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
+from flows.inputs.manifest import Item, distinct, items_of, parse_changes
+
+
+def touch(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"x")
+
+
+def items(inputs: Path | str, out: str = "out", **changes: object) -> list[Item]:
+    return items_of(inputs, Path(out), "preview", changes, 3)
+
+
+def test_a_folder_gives_its_pictures_and_videos_with_their_places(tmp_path: Path) -> None:
+    touch(tmp_path, "b.png", "deep/er/c.mp4", "a.JPG", "notes.txt", ".hidden.png", ".git/d.png")
+    assert [item.name for item in items(tmp_path)] == ["a", "b", "deep/er/c"]
+
+
+def test_packages_and_the_output_folder_are_no_inputs(tmp_path: Path) -> None:
+    touch(tmp_path, "a.png", "out/a/contact_sheet.png", "made/contact_sheet.png")
+    (tmp_path / "made" / "provenance.json").write_text(json.dumps({"files": {}}))
+    assert [item.name for item in items(tmp_path, str(tmp_path / "out"))] == ["a"]
+
+
+def test_no_two_items_share_a_folder_and_none_lies_within_another(tmp_path: Path) -> None:
+    touch(tmp_path, "a.png", "A.mp4", "b.png", "b/c.png", "d.png")
+    assert [item.name for item in items(tmp_path)] == ["A-mp4", "a-png", "b/c", "b-png", "d"]
+    assert distinct([("x", ""), ("x", ""), ("x-2", "")]) == ["x", "x-2", "x-2-2"]
+
+
+def test_a_csv_has_a_row_per_item_with_knobs_of_its_own(tmp_path: Path) -> None:
+    (tmp_path / "m.csv").write_text(
+        "path,video,name,seed,set,mesh.grid\n"
+        "p/cat.png,,,,,\n"
+        "p/dog.png,p/run.mp4,hero,7,motion.views=2; pack.splats=false,64\n"
+    )
+    cat, dog = items(tmp_path / "m.csv", **{"static.iterations": 9})
+    assert cat.wish is not None
+    assert dog.wish is not None
+    assert (cat.name, cat.wish.picture, cat.wish.seed, cat.wish.video) == ("cat", tmp_path / "p/cat.png", 3, None)
+    assert (dog.name, dog.wish.video, dog.wish.seed) == ("hero", tmp_path / "p/run.mp4", 7)
+    settings = dog.wish.settings
+    assert (settings.motion.views, settings.pack.splats, settings.mesh.grid) == (2, False, 64)
+    assert cat.wish.settings.mesh.grid != 64
+    assert settings.static.iterations == cat.wish.settings.static.iterations == 9
+
+
+def test_a_json_manifest_says_the_same(tmp_path: Path) -> None:
+    rows = [{"path": "p/cat.png", "set": {"mesh.grid": 32}, "name": "../../cat"}]
+    (tmp_path / "m.json").write_text(json.dumps(rows))
+    (cat,) = items(tmp_path / "m.json")
+    assert cat.wish is not None
+    assert (cat.name, cat.wish.picture, cat.wish.settings.mesh.grid) == ("cat", tmp_path / "p/cat.png", 32)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".json"])
+def test_words_may_stand_in_place_of_a_path(tmp_path: Path, suffix: str) -> None:
+    rows = [
+        {"text": "A red, red dragon!", "text.weights": "some/pictures", "seed": "7"},
+        {"text": "a RED red dragon", "name": "deep/second"},
+        {"text": "a red red dragon"},
+        {"path": "a.png"},
+    ]
+    file = tmp_path / f"m{suffix}"
+    if suffix == ".json":
+        file.write_text(json.dumps(rows))
+    else:
+        with file.open("w", newline="") as lines:
+            table = csv.DictWriter(lines, ["path", "text", "name", "seed", "text.weights"])
+            table.writeheader()
+            table.writerows(rows)
+    found = items(file)
+    assert [item.name for item in found] == ["a-red-red-dragon", "deep/second", "a-red-red-dragon-2", "a"]
+    first, _, _, picture = (item.wish for item in found)
+    assert first is not None and picture is not None
+    assert (first.picture, first.text, first.seed) == (None, "A red, red dragon!", 7)
+    assert first.settings.text.weights == "some/pictures"
+    assert (picture.picture, picture.text) == (tmp_path / "a.png", "")
+
+
+@pytest.mark.parametrize(
+    ("row", "says"),
+    [
+        ({"text": "a fox"}, "text.weights=FOLDER"),
+        ({"text": "a fox", "path": "fox.png", "text.weights": "some/pictures"}, "not both"),
+        ({"text": "a fox", "video": "fox.mp4", "text.weights": "some/pictures"}, "not both"),
+        ({"text": "  ", "text.weights": "some/pictures"}, "is empty"),
+        ({"text": "a fox", "text.weights": "some/pictures"}, "dg4d weights pull some/pictures"),
+    ],
+)
+def test_words_that_nothing_can_be_made_of_are_refused_before_any_work(
+    tmp_path: Path, row: dict[str, str], says: str
+) -> None:
+    touch(tmp_path, "fox.png", "fox.mp4")
+    (tmp_path / "m.json").write_text(json.dumps([row]))
+    (item,) = items(tmp_path / "m.json")
+    assert item.wish is not None
+    with pytest.raises(DG4DError, match=re.escape(says)):
+        item.wish.check()
+
+
+def test_a_bad_row_is_a_bad_item_and_no_more(tmp_path: Path) -> None:
+    rows = [
+        {"path": "a.png", "mesh.grit": 1},
+        {"path": "b.png", "seed": "x"},
+        {"path": "c.png"},
+        {"path": "d", "seed": -1},
+    ]
+    (tmp_path / "m.json").write_text(json.dumps(rows))
+    found = items(tmp_path / "m.json")
+    assert [bool(item.wish) for item in found] == [False, False, True, False]
+    assert "mesh.grit" in found[0].error
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("m.csv", "file\nx.png\n", "unknown column 'file'"),
+        ("m.csv", "path,seed\n,1\n", "row 1: neither a path nor a text"),
+        ("m.json", "{", "cannot be read"),
+        ("m.json", '{"path": 1}', "list of rows"),
+        ("m.jsonl", '{"path": "a.png"}\n{', "cannot be read"),
+        ("m.parquet", "PAR1", "cannot be read"),
+        ("m.txt", "x", "neither a folder nor a manifest"),
+        ("m.csv", "path\n", "holds no pictures"),
+    ],
+)
+def test_a_manifest_that_is_wrong_as_a_whole_is_refused(tmp_path: Path, name: str, content: str, says: str) -> None:
+    (tmp_path / name).write_text(content)
+    with pytest.raises(BadInput, match=says):
+        items(tmp_path / name)
+
+
+def test_an_empty_or_missing_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="no pictures"):
+        items(tmp_path)
+    with pytest.raises(BadInput, match="does not exist"):
+        items(tmp_path / "nothing")
+
+
+def test_values_are_json_where_they_can_be_and_kinds_come_first() -> None:
+    changes = parse_changes(
+        ["prior.size=64", "a.b=[1, 2]", "pack.splats=false", "mesh.mode=per_frame", "prior.kind=geometric"]
+    )
+    assert changes == {
+        "prior.kind": "geometric", "prior.size": 64, "a.b": [1, 2], "pack.splats": False, "mesh.mode": "per_frame",
+    }  # fmt: skip
+    assert next(iter(changes)) == "prior.kind"
+    with pytest.raises(BadInput, match="knob=value"):
+        parse_changes(["motion.iterations"])
+
+
+@pytest.mark.parametrize("column", ["path", "video", "bank"])
+@pytest.mark.parametrize("name", ["../outside.png", "/etc/hostname", "p/link.png", "round", "p/\0.png"])
+def test_what_leads_out_of_the_folder_of_a_list_is_a_bad_item(tmp_path: Path, column: str, name: str) -> None:
+    touch(tmp_path, "outside.png", "list/p/cat.png")
+    (tmp_path / "list/p/link.png").symlink_to(tmp_path / "outside.png")
+    (tmp_path / "list/round").symlink_to(tmp_path / "list/round")
+    row = {"path": "p/cat.png", column: name, "name": "bad"}
+    (tmp_path / "list/m.json").write_text(json.dumps([row, {"path": "p/cat.png", "name": "good"}]))
+    bad, good = items(tmp_path / "list/m.json")
+    assert (bad.wish, good.error) == (None, "")
+    assert re.search(f"{column} .* leads out of the folder", bad.error)
+
+
+def test_a_link_that_leads_out_of_a_folder_is_a_bad_item(tmp_path: Path) -> None:
+    touch(tmp_path, "outside.png", "in/a.png")
+    (tmp_path / "in/b.png").symlink_to(tmp_path / "outside.png")
+    (tmp_path / "in/c.png").symlink_to(tmp_path / "in/a.png")
+    assert [(item.name, bool(item.error)) for item in items(tmp_path / "in")] == [
+        ("a", False),
+        ("b", True),
+        ("c", False),
+    ]
+
+
+def test_a_pattern_gives_what_it_matches_named_from_its_first_plain_folder(tmp_path: Path) -> None:
+    touch(tmp_path, "in/a.png", "in/deep/b.png", "in/deep/c.jpg", "in/.d.png", "in/out/e.png", "f.png")
+    found = items(f"{tmp_path}/in/**/*.png", f"{tmp_path}/in/out")
+    assert [(item.name, item.wish and item.wish.picture) for item in found] == [
+        ("a", tmp_path / "in/a.png"),
+        ("deep/b", tmp_path / "in/deep/b.png"),
+    ]
+    with pytest.raises(BadInput, match="holds no pictures"):
+        items(f"{tmp_path}/in/*.webp")
+    with pytest.raises(BadInput, match="nowhere, where the pattern"):
+        items(f"{tmp_path}/nowhere/*.png")
+
+
+def test_a_folder_whose_name_looks_like_a_pattern_is_a_folder(tmp_path: Path) -> None:
+    touch(tmp_path, "take[1]/a.png")
+    assert [item.name for item in items(tmp_path / "take[1]")] == ["a"]
+
+
+def test_packages_below_a_pattern_are_no_inputs(tmp_path: Path) -> None:
+    touch(tmp_path, "made/input/subject.png", "a.png")
+    (tmp_path / "made" / "provenance.json").write_text(json.dumps({"files": {}}))
+    assert [item.name for item in items(f"{tmp_path}/**/*.png")] == ["a"]
+
+
+ROWS = [
+    {"path": "low.png", "priority": -1, "seed": 3},
+    {"path": "first.png"},
+    {"path": "urgent.png", "priority": 7, "mesh.grid": 64},
+    {"path": "second.png"},
+]
+
+
+@pytest.mark.parametrize("kind", ["csv", "json", "jsonl", "parquet"])
+def test_every_kind_of_manifest_says_the_same_and_higher_priority_comes_first(tmp_path: Path, kind: str) -> None:
+    file = tmp_path / f"m.{kind}"
+    if kind == "parquet":
+        arrow = pytest.importorskip("pyarrow", reason="Parquet needs pyarrow")
+        parquet = pytest.importorskip("pyarrow.parquet")
+        parquet.write_table(
+            arrow.Table.from_pylist([{"priority": None, "seed": None, "mesh.grid": None} | r for r in ROWS]), file
+        )
+    elif kind == "csv":
+        with file.open("w", newline="") as lines:
+            table = csv.DictWriter(lines, ["path", "priority", "seed", "mesh.grid"])
+            table.writeheader()
+            table.writerows(ROWS)
+    else:
+        text = "\n\n".join(map(json.dumps, ROWS)) if kind == "jsonl" else json.dumps(ROWS)
+        file.write_text(text)
+    found = items(file)
+    assert [item.name for item in found] == ["urgent", "first", "second", "low"]
+    assert all(item.error == "" for item in found)
+    settings = [item.wish.settings.mesh.grid for item in found if item.wish]
+    assert settings[0] == 64 != settings[1]
+    assert found[0].wish is not None and found[0].wish.seed == 3  # the seed of the batch
+
+
+def test_without_pyarrow_a_parquet_manifest_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "m.parquet").write_bytes(b"PAR1")
+    monkeypatch.setattr("flows.inputs.manifest.find_spec", lambda name: None)
+    with pytest.raises(BackendUnavailable, match=re.escape("pip install 'dg4d[parquet]'")):
+        items(tmp_path / "m.parquet")
+
+
+@pytest.mark.parametrize(("column", "value"), [("seed", 1.5), ("seed", "x"), ("priority", "high"), ("seed", -1)])
+def test_a_number_that_is_none_is_a_bad_item(tmp_path: Path, column: str, value: object) -> None:
+    (tmp_path / "m.json").write_text(json.dumps([{"path": "a.png", column: value}]))
+    (item,) = items(tmp_path / "m.json")
+    assert item.wish is None and column in item.error
+
+
+def test_the_files_of_a_manifest_may_lie_below_a_root_and_nowhere_else(tmp_path: Path) -> None:
+    touch(tmp_path, "pictures/a.png", "lists/b.png")
+    (tmp_path / "lists/m.json").write_text(json.dumps([{"path": "a.png"}, {"path": "../lists/b.png"}]))
+    a, b = items_of(tmp_path / "lists/m.json", Path("out"), "preview", {}, 0, root=tmp_path / "pictures")
+    assert a.wish is not None and a.wish.picture == tmp_path / "pictures/a.png"
+    assert b.wish is None and "leads out of the folder" in b.error
+    with pytest.raises(BadInput, match="--root"):
+        items_of(tmp_path / "pictures", Path("out"), "preview", {}, 0, root=tmp_path)
+    with pytest.raises(BadInput, match="is not a folder"):
+        items_of(tmp_path / "lists/m.json", Path("out"), "preview", {}, 0, root=tmp_path / "gone")
+
+
+def test_rows_that_want_the_same_share_their_settings(tmp_path: Path) -> None:
+    (tmp_path / "m.json").write_text(json.dumps([{"path": f"{i}.png", "mesh.grid": 64} for i in range(50)]))
+    assert len({id(item.wish.settings) for item in items(tmp_path / "m.json") if item.wish}) == 1
+
+
+@pytest.fixture
+def bucket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TinyS3]:
+    server = TinyS3()
+    for name, value in server.environment.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path / "home"))
+    yield server
+    server.stop()
+
+
+def test_a_prefix_of_an_object_store_gives_its_pictures_which_are_fetched_in_their_turn(
+    bucket: TinyS3, tmp_path: Path
+) -> None:
+    for key in ("in/b.png", "in/deep/a.mp4", "in/notes.txt", "in/.hidden.png", "other/c.png"):
+        bucket.objects[key] = (f"bytes of {key}".encode(), 0.0)
+    found = items(f"s3://{BUCKET}/in/")
+    assert [item.name for item in found] == ["b", "deep/a"]
+    with found[1].here() as wish:
+        assert wish.picture is not None and wish.source_name == "a.mp4"
+        assert wish.picture.read_bytes() == b"bytes of in/deep/a.mp4"
+    assert not wish.picture.exists()
+    del bucket.objects["in/b.png"]
+    with pytest.raises(BadInput, match=r"not in .* any more"), found[0].here():
+        pass
+    with pytest.raises(BadInput, match="holds no pictures"):
+        items(f"s3://{BUCKET}/empty/")
+
+
+def test_objects_that_are_named_as_if_they_lay_outside_are_bad_items(bucket: TinyS3) -> None:
+    bucket.objects["in/a\\..\\up.png"] = (b"x", 0.0)
+    bucket.objects["in/a.png"] = (b"x", 0.0)
+    found = items(f"s3://{BUCKET}/in")
+    assert sorted((bool(item.error), item.wish is None) for item in found) == [(False, False), (True, True)]
+
+
+def test_an_object_store_that_does_not_answer_is_named(bucket: TinyS3, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("steps.opening.PATIENCE_S", 0.2)
+    bucket.stop()
+    with pytest.raises(BackendUnavailable, match="does not answer"):
+        items(f"s3://{BUCKET}/in2/")
+    bucket.start()

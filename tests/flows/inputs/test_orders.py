@@ -1,0 +1,242 @@
+from pathlib import Path
+
+import pytest
+
+from dg4d_lib.errors import BackendUnavailable, BadInput
+from dg4d_lib.rasterizer import choice
+from flows.inputs.orders import Order, Wish, name_of
+from steps.profiles import PREVIEW, revise
+from steps.store import ArtifactStore
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> ArtifactStore:
+    return ArtifactStore(tmp_path / "store")
+
+
+@pytest.fixture(autouse=True)
+def code(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DG4D_CODE_VERSION", "test")
+
+
+def wish(picture: Path, video: Path | None = None, bank: Path | None = None, **changes: object) -> Wish:
+    return Wish(item="x", picture=picture, video=video, bank=bank, settings=revise(PREVIEW, dict(changes)))
+
+
+def order(wish: Wish, store: ArtifactStore) -> Order:
+    wish.check()
+    return wish.order(store)
+
+
+def frames(folder: Path, count: int) -> Path:
+    folder.mkdir(exist_ok=True)
+    for i in range(count):
+        (folder / f"{i:03d}.png").write_bytes(bytes([i]))
+    (folder / "notes.txt").write_text("not a frame")
+    return folder
+
+
+def test_names_do_not_count_but_content_settings_and_seed_do(tmp_path: Path, store: ArtifactStore) -> None:
+    (tmp_path / "a.png").write_bytes(b"picture")
+    (tmp_path / "b.png").write_bytes(b"picture")
+    (tmp_path / "c.png").write_bytes(b"another")
+    first = order(wish(tmp_path / "a.png"), store)
+    assert order(wish(tmp_path / "b.png"), store).digest() == first.digest()
+    assert first.model_copy(update={"item": "y", "profile": "p"}).digest() == first.digest()
+    others = [
+        order(wish(tmp_path / "c.png"), store),
+        order(wish(tmp_path / "a.png", **{"mesh.grid": 64}), store),
+        first.model_copy(update={"seed": 1}),
+        first.model_copy(update={"moving": True}),
+    ]
+    assert len({first.digest(), *(other.digest() for other in others)}) == 5
+
+
+def test_other_code_is_another_order(tmp_path: Path, store: ArtifactStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.png").write_bytes(b"picture")
+    one = order(wish(tmp_path / "a.png"), store)
+    before = one.digest()
+    monkeypatch.setenv("DG4D_CODE_VERSION", "other")
+    assert one.digest() != before
+
+
+def test_another_backend_is_another_order(
+    tmp_path: Path, store: ArtifactStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a.png").write_bytes(b"picture")
+    digests = []
+    for lack in ("no GPU", ""):
+        monkeypatch.setattr(choice, "what_gsplat_lacks", lambda lack=lack: lack)
+        digests.append(order(wish(tmp_path / "a.png"), store).digest())
+    assert digests[0] != digests[1]
+
+
+def test_a_rasterizer_that_cannot_run_is_refused_before_any_work(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"picture")
+    with pytest.raises(BadInput, match="rasterizer = 'gpu'"):
+        wish(tmp_path / "a.png", rasterizer="gpu")
+    gsplat = wish(tmp_path / "a.png", rasterizer="cuda_gsplat")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(choice, "what_gsplat_lacks", lambda: "no GPU")
+        with pytest.raises(BackendUnavailable, match="no GPU; or choose rasterizer=cpu"):
+            gsplat.check()
+        patch.setattr(choice, "what_gsplat_lacks", str)
+        gsplat.check()
+
+
+def test_a_folder_of_frames_is_a_video_and_equal_frames_are_equal_sources(tmp_path: Path, store: ArtifactStore) -> None:
+    (tmp_path / "a.png").write_bytes(b"picture")
+    one = order(wish(tmp_path / "a.png", frames(tmp_path / "one", 3)), store)
+    two = order(wish(tmp_path / "a.png", frames(tmp_path / "two", 3)), store)
+    assert one.source == two.source
+    assert one.moving
+    assert (one.source_name, one.picture_name) == ("one", "a.png")
+    assert order(wish(tmp_path / "a.png", frames(tmp_path / "one", 4)), store).source != one.source
+
+
+@pytest.mark.parametrize(("name", "moving"), [("a.mp4", True), ("a.WEBM", True), ("a.gif", False), ("a.png", False)])
+def test_a_video_can_be_the_main_argument(tmp_path: Path, store: ArtifactStore, name: str, moving: bool) -> None:
+    (tmp_path / name).write_bytes(b"x")
+    assert order(wish(tmp_path / name), store).moving == moving
+
+
+def test_what_cannot_work_is_refused_before_any_work(tmp_path: Path) -> None:
+    good = tmp_path / "good.png"
+    good.write_bytes(b"x")
+    (tmp_path / "empty.png").touch()
+    bank = frames(tmp_path / "bank", 1)
+    cases = {
+        "does not exist": wish(tmp_path / "none.png"),
+        "is a folder; give one file": wish(tmp_path),
+        "empty": wish(tmp_path / "empty.png"),
+        "does not exist;": wish(good, tmp_path / "none.mp4"),
+        "holds 1 picture;": wish(good, frames(tmp_path / "single", 1)),
+        "holds no pictures;": wish(good, frames(tmp_path / "bare", 0)),
+        "needs the true views": wish(good, **{"prior.kind": "oracle"}),
+        r"no file bank\.json": wish(good, bank=bank, **{"prior.kind": "oracle"}),
+    }
+    for says, bad in cases.items():
+        with pytest.raises(BadInput, match=says):
+            bad.check()
+    (bank / "bank.json").write_text("{}")
+    wish(good, bank=bank, **{"prior.kind": "oracle"}).check()
+    with pytest.raises(BadInput, match=r"prior\.kind=oracle"):
+        wish(good, bank=bank).check()
+
+
+TEXT = {"text.weights": "somebody/pictures"}
+
+
+@pytest.fixture
+def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of all weights, with one set in it."""
+    monkeypatch.setenv("DG4D_WEIGHTS", str(tmp_path / "weights"))
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
+    return pipeline(tmp_path / "weights" / "somebody--pictures").parent
+
+
+def pipeline(folder: Path) -> Path:
+    (folder / "unet").mkdir(parents=True)
+    (folder / "unet" / "model.safetensors").write_bytes(b"tensors")
+    return folder
+
+
+def words(text: str, **changes: object) -> Wish:
+    return Wish(item="x", text=text, settings=revise(PREVIEW, {**TEXT, **changes}))
+
+
+def test_words_are_a_source_whatever_the_spaces_between_them(weights: Path, store: ArtifactStore) -> None:
+    one = order(words("a red dragon"), store)
+    assert one.drawn
+    assert not one.moving
+    assert one.source_name == '"a red dragon"'
+    assert order(words(" a  red\ndragon "), store).digest() == one.digest()
+    assert order(words("a red newt"), store).digest() != one.digest()
+    assert order(words("a red dragon", **{"text.steps": 3}), store).digest() != one.digest()
+
+
+def test_a_file_that_holds_the_same_words_is_another_order(weights: Path, tmp_path: Path, store: ArtifactStore) -> None:
+    (tmp_path / "a.png").write_bytes(b"a red dragon")
+    assert order(wish(tmp_path / "a.png", **TEXT), store).digest() != order(words("a red dragon"), store).digest()
+
+
+def test_words_that_cannot_work_are_refused_before_any_work(weights: Path, tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"x")
+    cases = {
+        "--text is empty": words(" "),
+        "has 1001 characters": words("x" * 1001),
+        "not both": words("a newt").model_copy(update={"picture": tmp_path / "a.png"}),
+        "--set text.weights": words("a newt", **{"text.weights": ""}),
+        "nothing to make": Wish(item="x", settings=PREVIEW),
+    }
+    for says, bad in cases.items():
+        with pytest.raises(BadInput, match=says):
+            bad.check()
+    with pytest.raises(BackendUnavailable, match="`dg4d weights pull other/pictures`"):
+        words("a newt", **{"text.weights": "other/pictures"}).check()
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("A red dragon!", "a-red-dragon"),
+        ("../../etc/passwd", "etc-passwd"),
+        ("Grüne Äpfel, 3", "grüne-äpfel-3"),
+        ("...", "asset"),
+        ("word " * 40, "-".join(["word"] * 12)),
+    ],
+)
+def test_words_name_the_asset(text: str, name: str) -> None:
+    assert name_of(text) == name
+
+
+def test_other_weights_are_another_order_and_their_place_does_not_count(
+    weights: Path, tmp_path: Path, store: ArtifactStore
+) -> None:
+    one, two = pipeline(tmp_path / "one" / "mine"), pipeline(tmp_path / "two" / "mine")
+    first = order(words("a newt", **{"text.weights": str(one)}), store)
+    second = order(words("a newt", **{"text.weights": str(two)}), store)
+    assert first.digest() == second.digest()
+    assert str(tmp_path) not in first.model_dump_json()
+    (two / "unet" / "model.safetensors").write_bytes(b"changed")
+    assert order(words("a newt", **{"text.weights": str(two)}), store).digest() != first.digest()
+    named = order(words("a newt"), store).digest()
+    (weights / "somebody--pictures" / "unet" / "model.safetensors").write_bytes(b"changed")
+    assert order(words("a newt"), store).digest() != named
+
+
+def test_weights_that_no_step_will_load_need_not_be_here(weights: Path, tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"x")
+    (tmp_path / "a.mp4").write_bytes(b"x")
+    (tmp_path / "a.gif").write_bytes(b"x")
+    animated = {"driving.kind": "svd"}
+    wish(tmp_path / "a.png", **{"text.weights": "not/here"}).check()
+    wish(tmp_path / "a.mp4", **animated).check()
+    wish(tmp_path / "a.gif", **animated).check()  # whether it moves, its content says
+    wish(tmp_path / "a.png", video=tmp_path / "a.mp4", **animated).check()
+    with pytest.raises(BackendUnavailable, match="`dg4d weights pull svd`"):
+        wish(tmp_path / "a.png", **animated).check()
+
+
+def test_only_weights_that_allow_commercial_use_pass_where_that_is_asked_for(weights: Path, tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"x")
+
+    def strict(**changes: object) -> Wish:
+        return wish(tmp_path / "a.png", **changes).model_copy(update={"commercial_only": True})
+
+    strict().check_licenses()
+    strict(**{"driving.kind": "svd"}).check_licenses()
+    with pytest.raises(BadInput, match=r"--commercial-only: .* zero123-xl \("):
+        strict(**{"prior.kind": "zero123"}).check_licenses()
+    with pytest.raises(BadInput, match=r"stable-zero123 .*non-commercial"):
+        strict(**{"prior.kind": "zero123", "prior.weights": "stable-zero123"}).check()
+    with pytest.raises(BadInput, match="somebody/pictures"):
+        words("a newt").model_copy(update={"commercial_only": True}).check()
+
+
+def test_whether_licenses_mattered_is_part_of_the_order(tmp_path: Path, store: ArtifactStore) -> None:
+    (tmp_path / "a.png").write_bytes(b"x")
+    free = wish(tmp_path / "a.png")
+    strict = free.model_copy(update={"commercial_only": True})
+    assert order(strict, store).commercial_only
+    assert order(strict, store).digest() != order(free, store).digest()

@@ -1,0 +1,159 @@
+"""The crate, read by rocrate, and checked against the tables of requirements of its profile."""
+
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from made_package import MACHINE, STEPS, WEIGHTS, made_package, record_in
+from rocrate.rocrate import ROCrate
+from signing import identity
+
+from flows.packages.crate import CRATE, crate_text, files_in, own_digest, rendered
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_package(tmp_path_factory.mktemp("made"), weights=WEIGHTS)
+
+
+@pytest.fixture(scope="module")
+def crate(folder: Path) -> ROCrate:
+    return ROCrate(str(folder))
+
+
+def document(folder: Path) -> Any:
+    return json.loads((folder / CRATE).read_text())
+
+
+def entities(folder: Path, kind: str) -> list[dict[str, Any]]:
+    return [entity for entity in document(folder)["@graph"] if entity["@type"] == kind]
+
+
+def references(value: Any) -> Iterator[str]:
+    match value:
+        case {"@id": str(name), **others} if not others:
+            yield name
+        case dict():
+            for its in value.values():
+                yield from references(its)
+        case list():
+            for its in value:
+                yield from references(its)
+
+
+def several(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
+
+
+def test_another_reader_finds_every_file_with_its_content(crate: ROCrate, folder: Path) -> None:
+    parts = [part for part in crate.data_entities if part.type == "File"]
+    on_disk = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert {part["name"] for part in parts} == on_disk - {CRATE}
+    for part in parts:
+        content = (folder / part["name"]).read_bytes()
+        assert part["sha256"] == hashlib.sha256(content).hexdigest()
+        assert part["contentSize"] == str(len(content))
+        assert "/" in part["encodingFormat"]
+
+
+def test_the_package_is_what_ro_crate_and_the_profile_require(crate: ROCrate) -> None:
+    root = crate.root_dataset
+    assert crate.version == "1.1"
+    assert root["conformsTo"].id == "https://w3id.org/ro/wfrun/process/0.5"
+    assert root["conformsTo"].type == "CreativeWork"
+    assert root["name"] == "red fox"
+    assert "guessed" in root["description"]
+    assert root["datePublished"] == "2026-11-22T10:00:04.750+00:00"
+    assert {its.id for its in root["license"]} == {"#license", "#license-svd"}
+    assert [action.id for action in root["mentions"]] == [f"#{i}-{step}" for i, step in enumerate(STEPS, 1)]
+
+
+def test_every_step_is_an_action_with_tool_times_parameters_and_results(crate: ROCrate) -> None:
+    for action in crate.root_dataset["mentions"]:
+        assert action.type == "CreateAction"
+        tool = action["instrument"]
+        assert tool.type == "SoftwareApplication"
+        assert tool["softwareVersion"] == "0.1.0+abc"
+        assert tool["softwareRequirements"]["softwareVersion"] == MACHINE["packages"]
+        assert action["startTime"] < action["endTime"]
+        parameters = {its["name"]: its["value"] for its in action["object"] if its.type == "PropertyValue"}
+        assert parameters == {"settings": '{"share":0.5,"size":256}', "seed": "3", "backend": "cpu"}
+        usage = {its["name"]: its for its in action["resourceUsage"]}
+        assert all(its["propertyID"] == f"urn:dg4d:{name}" for name, its in usage.items())
+        assert (usage["duration_s"]["value"], usage["duration_s"]["unitCode"]) == (
+            "1.25",
+            "https://qudt.org/vocab/unit/SEC",
+        )
+        assert (usage["processor"]["value"], usage["cores"]["value"]) == ("Abacus 9", "2")
+        image = action["containerImage"]
+        assert (image["registry"], image["name"], image["tag"]) == ("registry.example:5000", "dg4d/cpu", "1.2")
+        assert image["sha256"] == "e" * 64
+
+
+def test_actions_lead_from_the_source_to_the_files_of_the_package(crate: ROCrate, folder: Path) -> None:
+    actions = crate.root_dataset["mentions"]
+    files = {part["name"] for part in crate.data_entities if part.type == "File"}
+    given = [{its.id for its in action["object"]} for action in actions]
+    results = [{its.id for its in several(action["result"])} for action in actions]
+    assert f"#{record_in(folder)['source'].replace(':', '-')}" in given[0]
+    for made, needed in zip(results, given[1:], strict=False):
+        assert made & needed
+    assert {"asset.glb", "splats/000.ply"} <= results[-1] & files
+
+
+def test_weights_have_their_digest_and_license(crate: ROCrate) -> None:
+    (weights,) = [its for its in crate.root_dataset["mentions"][1]["object"] if its.id.startswith("#weights-")]
+    assert weights["name"] == "weights svd/unet.safetensors"
+    assert weights["sha256"] == "c" * 64
+    assert weights["license"]["description"] == "Some License: with terms"
+
+
+def test_every_reference_leads_to_an_entity_and_every_entity_has_one_name(folder: Path) -> None:
+    graph = document(folder)["@graph"]
+    names = [entity["@id"] for entity in graph]
+    assert len(names) == len(set(names))
+    assert (
+        not set(references(graph))
+        - {*names, "https://w3id.org/ro/crate/1.1"}
+        - {"https://w3id.org/ro/terms/workflow-run#DockerImage"}
+    )
+
+
+def test_names_of_files_are_quoted_where_they_are_addresses(tmp_path: Path) -> None:
+    record = record_in(made_package(tmp_path))
+    record["files"]["splats/a b#1.ply"] = record["files"]["asset.glb"]
+    text = crate_text(record, {}, "about")
+    assert "splats/a%20b%231.ply" in {part["@id"] for part in json.loads(text)["@graph"]}
+    assert "splats/a b#1.ply" in files_in(json.loads(text))
+
+
+def test_equal_runs_give_equal_crates(folder: Path, tmp_path: Path) -> None:
+    again = made_package(tmp_path, weights=WEIGHTS)
+    assert (again / CRATE).read_bytes() == (folder / CRATE).read_bytes()
+
+
+def test_a_crate_names_its_own_digest(folder: Path) -> None:
+    crate = document(folder)
+    assert crate["@graph"][0]["sha256"] == own_digest(crate)
+    assert rendered(crate) == (folder / CRATE).read_text()
+    crate["@graph"][1]["name"] = "blue fox"
+    assert crate["@graph"][0]["sha256"] != own_digest(crate)
+
+
+def test_a_package_without_weights_says_so_and_names_no_license_of_a_model(tmp_path: Path) -> None:
+    folder = made_package(tmp_path)
+    (license_,) = [entity for entity in document(folder)["@graph"] if entity["@id"].startswith("#license")]
+    assert "No weights were used" in license_["description"]
+
+
+def test_signed_files_say_what_they_were_before_and_where_their_credentials_are(tmp_path: Path) -> None:
+    plain = record_in(made_package(tmp_path / "plain"))["files"]["contact_sheet.png"]["digest"]
+    with identity(tmp_path / "keys").configured():
+        folder = made_package(tmp_path / "signed")
+    files = {entity["name"]: entity for entity in entities(folder, "File")}
+    assert plain in files["contact_sheet.png"]["description"]
+    assert files["asset.glb"]["subjectOf"] == {"@id": "asset.c2pa"}
+    assert files["asset.c2pa"]["encodingFormat"] == "application/c2pa"

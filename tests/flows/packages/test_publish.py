@@ -1,0 +1,158 @@
+import errno
+import json
+import os
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from dg4d_lib.errors import BadInput
+from flows.packages.publish import Files, check_folder, is_current, publish, record_of
+from steps.store import DiskFull
+
+
+def zipped(path: Path, **entries: str) -> Path:
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in entries.items():
+            archive.writestr(name.replace("__", "/").replace("_dot_", "."), content)
+    return path
+
+
+def finish(folder: Path, files: Files) -> Files:
+    (folder / "provenance.json").write_text(json.dumps({"order": "o1", "files": files, "beside": ["report.html"]}))
+    (folder / "report.html").write_text("r")
+    return files
+
+
+def tree(folder: Path) -> dict[str, str]:
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes().decode("latin-1")
+        for p in sorted(folder.rglob("*"))
+        if p.is_file()
+    }
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    return zipped(tmp_path / "package.zip", asset_dot_glb="mesh", splats__000_dot_ply="s0")
+
+
+def test_a_package_appears_with_what_goes_with_it(package: Path, tmp_path: Path) -> None:
+    files = publish(package, tmp_path / "deep" / "out", finish)
+    assert set(files) == {"asset.glb", "splats/000.ply"}
+    assert set(tree(tmp_path / "deep" / "out")) == {*files, "provenance.json", "report.html"}
+    assert is_current(tmp_path / "deep" / "out", "o1")
+    assert not is_current(tmp_path / "deep" / "out", "o2")
+    assert [p.name for p in (tmp_path / "deep").iterdir()] == ["out"]
+
+
+def test_a_new_package_replaces_the_old_and_keeps_files_of_the_user(package: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    publish(package, out, finish)
+    (out / "renders").mkdir()
+    (out / "renders" / "mine.png").write_text("mine")
+    publish(zipped(tmp_path / "other.zip", asset_dot_glb="new"), out, finish)
+    assert tree(out)["asset.glb"] == "new"
+    assert tree(out)["renders/mine.png"] == "mine"
+    assert "splats/000.ply" not in tree(out)
+    assert is_current(out, "o1")
+
+
+def test_a_package_without_its_report_is_not_current(package: Path, tmp_path: Path) -> None:
+    publish(package, tmp_path / "out", finish)
+    (tmp_path / "out" / "report.html").unlink()
+    assert not is_current(tmp_path / "out", "o1")
+
+
+@pytest.mark.parametrize("where", ["files", "beside"])
+def test_a_record_whose_names_lead_outside_is_none(package: Path, tmp_path: Path, where: str) -> None:
+    out = tmp_path / "out"
+    publish(package, out, finish)
+    record = json.loads((out / "provenance.json").read_text())
+    record[where] = {"../mine.txt": {}}
+    (out / "provenance.json").write_text(json.dumps(record))
+    assert record_of(out) is None
+    with pytest.raises(BadInput, match="holds other files"):
+        check_folder(out)
+
+
+@pytest.mark.parametrize("damage", ["change", "delete", "truncate"])
+def test_a_damaged_package_is_not_current(package: Path, tmp_path: Path, damage: str) -> None:
+    publish(package, tmp_path / "out", finish)
+    file = tmp_path / "out" / "asset.glb"
+    {"change": lambda: file.write_text("MESH"), "delete": file.unlink, "truncate": lambda: os.truncate(file, 1)}[
+        damage
+    ]()
+    assert not is_current(tmp_path / "out", "o1")
+
+
+def test_a_full_disk_leaves_the_old_package_whole_and_nothing_else(
+    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publish(package, tmp_path / "out", finish)
+    before = tree(tmp_path)
+
+    def full(source: object, target: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("shutil.copyfileobj", full)
+    with pytest.raises(DiskFull, match="free some space"):
+        publish(package, tmp_path / "out", finish)
+    with pytest.raises(DiskFull):
+        publish(package, tmp_path / "new" / "out", finish)
+    assert tree(tmp_path) == before
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_folder_that_cannot_be_renamed_is_filled_in_place(
+    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    publish(package, out, finish)
+    monkeypatch.chdir(out)  # a user who stands in the folder must not find it gone
+    inode = out.stat().st_ino
+    publish(zipped(tmp_path / "other.zip", asset_dot_glb="new"), out, finish)
+    assert out.stat().st_ino == inode
+    assert set(tree(out)) == {"asset.glb", "provenance.json", "report.html"}
+    assert is_current(out, "o1")
+
+
+def test_what_a_killed_command_left_is_cleared_up_or_put_back(package: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    publish(package, out, finish)
+    (out / "notes.txt").write_text("mine")
+    dead = 2**22 + 1  # above the largest number a process can have
+    out.rename(tmp_path / f".out.outgoing-{dead}")  # killed between the two renames
+    (tmp_path / f".out.incoming-{dead}").mkdir()
+    publish(package, out, finish)
+    assert tree(out)["notes.txt"] == "mine"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "package.zip"]
+
+
+def test_an_entry_outside_the_package_is_refused(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "evil.zip", "w") as archive:
+        archive.writestr("../evil.txt", "x")
+    with pytest.raises(BadInput, match="outside"):
+        publish(tmp_path / "evil.zip", tmp_path / "out", finish)
+    assert not (tmp_path / "evil.txt").exists()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "thesis.doc").write_text("years of work")
+    with pytest.raises(BadInput, match=r"thesis\.doc"):
+        check_folder(tmp_path)
+
+
+def test_a_file_or_a_place_under_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadInput, match="is a file"):
+        check_folder(tmp_path / "file")
+    with pytest.raises(BadInput, match="cannot be written"):
+        check_folder(tmp_path / "file" / "out")
+
+
+def test_looking_at_a_folder_leaves_nothing_there(tmp_path: Path) -> None:
+    check_folder(tmp_path / "a" / "b")
+    assert list(tmp_path.iterdir()) == []
+    assert record_of(tmp_path) is None

@@ -1,0 +1,212 @@
+import io
+import json
+import re
+import zipfile
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows.engine.tasks import Finished, Made
+from flows.inputs.orders import Order
+from flows.packages import report
+from flows.packages.summary import Row, Writer
+from flows.ui.curves import HEIGHT, WIDTH
+from steps.contract import ArtifactRef, ProvenanceRecord, StepResult
+from steps.profiles import PREVIEW, revise
+from steps.store import ArtifactStore
+
+FILES = {
+    name: {"digest": "sha256:" + "a" * 64, "size_bytes": size}
+    for name, size in {
+        "asset.glb": 5_400_000,
+        "contact_sheet.png": 99_000,
+        "preview.mp4": 1,
+        "splats/000.ply": 7,
+    }.items()
+}
+CURVES = {"title": "static <fit>", "x": [0, 10, 20], "series": {"loss": [100.0, 1.0, 0.01]}, "notes": []}
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> ArtifactStore:
+    return ArtifactStore(tmp_path / "store")
+
+
+def finished(step: str, store: ArtifactStore, seconds: float, **outputs: ArtifactRef) -> Finished:
+    record = ProvenanceRecord(
+        step=step,
+        code_version="1",
+        request_digest="sha256:" + "b" * 64,
+        inputs={},
+        outputs={name: ref.digest for name, ref in outputs.items()},
+        settings={},
+        seed=0,
+        backend="cpu",
+        notes=("Twice said.", "<b>bold</b>"),
+        run_notes=("memory ran out",) if seconds > 5 else (),
+        flops={"Unet": 7} if seconds > 5 else {},
+        duration_s=seconds,
+        peak_memory_mb=seconds * 10,
+    )
+    result = StepResult(outputs=outputs, provenance=record)
+    return Finished(label=step, cached=seconds > 5, seconds=seconds, result=result)
+
+
+@pytest.fixture
+def unpacked(tmp_path: Path) -> Path:
+    """The files of the package."""
+    (tmp_path / "asset.glb").write_bytes(b"a mesh")
+    return tmp_path
+
+
+def made(store: ArtifactStore, seconds: float = 2.0) -> tuple[Order, Made]:
+    source = store.put_bytes(b"s", "application/octet-stream")
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.writestr(zipfile.ZipInfo("asset.glb"), b"a mesh")
+    package = store.put_bytes(packed.getvalue(), "application/zip")
+    curves = store.put_bytes(json.dumps(CURVES).encode(), "application/vnd.dg4d.curves+json")
+    order = Order(
+        item="<fox>", source=source, moving=False, profile="preview", settings=PREVIEW, seed=0, source_name="fox.png"
+    )
+    steps = [finished("fit_gaussians", store, seconds, curves=curves), finished("pack_asset", store, seconds + 1)]
+    return order, Made(package=package, steps=steps, flow_run=f"run {seconds}")
+
+
+class Links(HTMLParser):
+    """Every tag and every address of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.addresses: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.addresses += [value for name, value in attrs if name in {"src", "href"} and value]
+
+
+def test_the_page_is_self_contained_and_escapes_what_it_is_given(store: ArtifactStore, unpacked: Path) -> None:
+    order, what = made(store)
+    page = report.texts(order, what, FILES, store, unpacked)["report.html"]
+    links = Links(page)
+    assert "script" not in links.tags
+    assert "fox" not in links.tags
+    assert "b" in links.tags
+    assert "<b>bold</b>" not in page
+    assert not [address for address in links.addresses if re.match(r"\w+:|//", address)]
+    assert {"preview.mp4", "contact_sheet.png", "asset.glb", "splats/", "provenance.json"} <= set(links.addresses)
+    assert links.tags.count("polyline") == 1
+    assert "5.4 MB" in page
+
+
+def test_the_banner_is_honest(store: ArtifactStore) -> None:
+    order, what = made(store)
+    assert "the motion was made up" in report.banner(order, what)
+    assert "guessed without a model" in report.banner(order, what)
+    moving = what.model_copy(update={"steps": [finished("prepare_subject", store, 1, footage=order.source)]})
+    assert "the motion follows the video" in report.banner(order, moving)
+    oracle = order.model_copy(update={"settings": revise(PREVIEW, {"prior.kind": "oracle"})})
+    assert "true views were known" in report.banner(oracle, what)
+
+
+def with_weights(step: Finished, licenses: dict[str, str]) -> Finished:
+    record = step.result.provenance.model_copy(
+        update={"weights": {f"{name}/unet": "sha256:" + "c" * 64 for name in licenses}, "licenses": licenses}
+    )
+    return step.model_copy(update={"result": step.result.model_copy(update={"provenance": record})})
+
+
+def test_the_banner_says_what_models_did(store: ArtifactStore) -> None:
+    order, what = made(store)
+    fit, drive = finished("fit_gaussians", store, 1), finished("drive_video", store, 1)
+    by_prior = what.model_copy(update={"steps": [with_weights(fit, {"zero123-xl": "x"}), drive]})
+    assert "the motion was made up; shape and the sides nobody saw were guessed by a model" in report.banner(
+        order, by_prior
+    )
+    by_video = what.model_copy(update={"steps": [fit, with_weights(drive, {"svd": "x"})]})
+    assert "the motion was made up by a model; " in report.banner(order, by_video)
+    assert "guessed without a model" in report.banner(order, by_video)
+
+
+def test_what_networks_did_is_said_for_every_step(store: ArtifactStore, unpacked: Path) -> None:
+    order, what = made(store)
+    fit, pack = what.steps
+    record = fit.result.provenance.model_copy(update={"flops": {"Unet": 15_250_000_000_000, "Vae": 3_000_000}})
+    fit = fit.model_copy(update={"result": fit.result.model_copy(update={"provenance": record})})
+    texts = report.texts(order, what.model_copy(update={"steps": [fit, pack]}), FILES, store, unpacked)
+    stages = json.loads(texts["report.json"])["steps"]
+    assert [stage["flops"] for stage in stages] == [record.flops, {}]
+    assert texts["report.html"].count("FLOP") == 2
+    assert "Unet 15.2 TFLOP, Vae 3.0 MFLOP" in texts["report.html"]
+    assert json.loads(texts["provenance.json"])["run"]["steps"][0]["flops"] == record.flops
+
+
+def test_licenses_follow_the_asset_only_where_weights_were_used(store: ArtifactStore, unpacked: Path) -> None:
+    order, what = made(store)
+    texts = report.texts(order, what, FILES, store, unpacked)
+    assert "No weights were used" in texts["report.html"]
+    assert json.loads(texts["provenance.json"])["licenses"] == {}
+    used = what.model_copy(update={"steps": [with_weights(step, {"svd": "S & Co"}) for step in what.steps]})
+    texts = report.texts(order, used, FILES, store, unpacked)
+    assert "No weights were used" not in texts["report.html"]
+    assert "S &amp; Co" in texts["report.html"]
+    assert json.loads(texts["provenance.json"])["licenses"] == {"svd": "S & Co"}
+    assert json.loads(texts["report.json"])["licenses"] == {"svd": "S & Co"}
+
+
+def test_notes_are_said_once_and_a_picture_that_only_names_is_mentioned(store: ArtifactStore) -> None:
+    order, what = made(store)
+    order = order.model_copy(update={"picture_name": "fox.jpg", "source_name": "run.mp4"})
+    notes = report.notes(order, what)
+    assert notes[1:] == ["Twice said.", "<b>bold</b>"]
+    assert report.notes(*made(store, 9.0)) == ["Twice said.", "<b>bold</b>", "memory ran out"]
+    assert "run.mp4" in notes[0]
+    assert "fox.jpg only names" in notes[0]
+
+
+def test_provenance_differs_between_runs_only_under_run(store: ArtifactStore, unpacked: Path) -> None:
+    one = json.loads(report.texts(*made(store, 1.0), FILES, store, unpacked)["provenance.json"])
+    two = json.loads(report.texts(*made(store, 9.0), FILES, store, unpacked)["provenance.json"])
+    assert one != two
+    runs = [record.pop("run")["steps"][0] for record in (one, two)]
+    for fact in ("duration_s", "peak_memory_mb", "flops", "run_notes"):
+        assert runs[0][fact] != runs[1][fact]
+    assert runs[1]["run_notes"] == ["memory ran out"]
+    assert one == two
+    assert one["files"] == FILES
+
+
+def test_a_curve_goes_from_top_left_to_bottom_right_on_a_logarithmic_scale() -> None:
+    svg = report.curve(CURVES)
+    (points,) = re.findall(r'points="([^"]*)"', svg)
+    places = [tuple(map(float, pair.split(","))) for pair in points.split()]
+    assert places == [(0, 0), (WIDTH / 2, HEIGHT / 2), (WIDTH, HEIGHT)]
+    assert "logarithmic" in svg
+
+
+@pytest.mark.parametrize("values", [[], [1.0], [float("nan"), float("nan")], [0.0, 0.0], [-1.0, 2.0]])
+def test_odd_curves_break_no_page(values: list[float]) -> None:
+    curves: dict[str, Any] = {"title": "t", "x": list(range(len(values))), "series": {"a": values}, "notes": []}
+    assert "nan" not in report.curve(curves)
+
+
+def test_a_summary_counts_and_the_overview_links_what_is_there(tmp_path: Path) -> None:
+    (tmp_path / "a b").mkdir()
+    (tmp_path / "a b" / "preview.webp").touch()
+    rows = [
+        Row(item="a b", status="done", seconds=3),
+        Row(item="z/y", status="failed", message="<ugly>"),
+        Row(item="c", status="unchanged"),
+    ]
+    Writer(tmp_path).write(rows, 1.0)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["counts"] == {"done": 1, "unchanged": 1, "failed": 1, "skipped": 0}
+    assert summary["commercial_only"] is False
+    page = (tmp_path / "index.html").read_text()
+    assert Links(page).addresses.count("a%20b/preview.webp") == 1
+    assert "&lt;ugly&gt;" in page
+    assert page.index("z/y") < page.index("a b")

@@ -1,0 +1,210 @@
+"""Deployments on a real server: what a form asks for, what the server refuses, and runs by a worker."""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+from prefect.client.orchestration import SyncPrefectClient, get_client
+from prefect.exceptions import PrefectHTTPStatusError
+from prefect.settings import PREFECT_API_URL
+from tiny_s3 import TinyS3
+
+from dg4d_lib.errors import BackendUnavailable
+from flows.packages.publish import whole
+from flows.serving import deployments, registering
+from flows.serving.pools import read_pools
+from flows.serving.server import Server
+from flows.serving.watching import announce
+from flows.serving.workers import Worker, running
+from steps.profiles import PREVIEW, PROFILES, revise
+
+FLOWS = ["image-to-4d", "video-to-4d", "catalog", "benchmark"]
+
+
+@pytest.fixture(scope="module")
+def client(server: Server) -> Iterator[SyncPrefectClient]:
+    """Of a server that has the pool process-cpu and its deployments."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DG4D_HOME", str(server.folder.parent))
+        patch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
+        patch.setenv("DG4D_CODE_VERSION", "test")
+        patch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+        patch.setenv("PREFECT_API_URL", str(PREFECT_API_URL.value()))
+        registering.register(read_pools(), ["process-cpu"])
+        with get_client(sync_client=True) as client:
+            yield client
+
+
+def wait_until(happens: Callable[[], Any], timeout_s: float = 400) -> Any:
+    deadline = time.monotonic() + timeout_s
+    while not (found := happens()):
+        assert time.monotonic() < deadline, "it did not happen"
+        time.sleep(0.3)
+    return found
+
+
+def test_the_form_offers_every_profile() -> None:
+    assert set(get_args(deployments.Options.model_fields["profile"].annotation)) == set(PROFILES)
+
+
+@pytest.mark.parametrize(
+    ("name", "titles"),
+    [
+        ("image-to-4d", ["Picture", "Folder for what is made", "How it is made"]),
+        ("video-to-4d", ["Video", "Folder for what is made", "How it is made"]),
+        ("catalog", ["Pictures and videos", "Folder for what is made", "Items at a time", "Stop at a faulty asset",
+                     "How it is made"]),
+        ("benchmark", ["Data set", "Folder for what is made", "Objects at most", "Judge the meshes",
+                       "True views as the prior", "Items at a time", "How it is made"]),
+    ],
+)  # fmt: skip
+def test_a_form_has_a_plain_field_for_everything_in_a_sensible_order(
+    client: SyncPrefectClient, name: str, titles: list[str]
+) -> None:
+    form = client.read_deployment_by_name(f"{name}/local").parameter_openapi_schema
+    assert form is not None
+    assert [field["title"] for field in in_order(form)] == titles
+    assert [field["title"] for field in in_order(form) if "default" not in field] == titles[:2]
+    pictures = name in {"image-to-4d", "catalog"}
+    options = form["definitions"]["PictureOptions" if pictures else "Options"]
+    assert [field["title"] for field in in_order(options)] == [
+        "Profile", *(["Motion"] if pictures else []), "Triangles", "Texture size", "Frames per second", "Seed",
+        "Commercial use only", "Further settings",
+    ]  # fmt: skip
+    for field in [*in_order(form)[:-1], *in_order(options)]:
+        assert field["description"] and field["title"][0].isupper()
+        assert field["type"] in {"string", "integer", "number", "boolean", "array"}  # a choice of types is a riddle
+        assert field.get("default", "") is not None
+        bounds = [field[bound] for bound in ("minimum", "maximum") if field.get(bound)]
+        assert all(f"{bound:g}" in field["description"] for bound in bounds)
+    assert form["properties"]["options"]["default"] == {
+        "profile": "preview", "seed": 0, "commercial_only": False, "settings": [],
+    }  # fmt: skip
+
+
+def in_order(schema: dict[str, Any]) -> list[dict[str, Any]]:
+    """The fields as forms show them."""
+    fields = list(schema["properties"].values())
+    assert sorted(field["position"] for field in fields) == list(range(len(fields)))
+    return sorted(fields, key=lambda field: int(field["position"]))
+
+
+def test_what_a_form_asks_for_reaches_the_knobs() -> None:
+    filled = {"triangles": 400, "fps": None, "motion": "wave", "settings": ["mesh.max_faces=7", "subject.size = 64"]}
+    options = deployments.PictureOptions.model_validate(filled)
+    assert options.knobs() == {"mesh.max_faces": 400, "driving.motion": "wave", "subject.size": 64}
+    assert revise(PREVIEW, options.knobs()).driving.motion == "wave"  # type: ignore[union-attr]
+
+
+def test_registering_again_changes_nothing(client: SyncPrefectClient) -> None:
+    def there() -> tuple[list[Any], list[str]]:
+        found = [(one.id, one.parameters, one.work_pool_name) for one in client.read_deployments()]
+        return sorted(found, key=str), sorted(one.name for one in client.read_automations())
+
+    before = there()
+    assert registering.register(read_pools(), ["process-cpu"]) == [
+        "image-to-4d/local", "video-to-4d/local", "benchmark/local", "catalog/local",
+    ]  # fmt: skip
+    assert there() == before
+    assert {automation.name for automation in registering.AUTOMATIONS} <= set(before[1])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"seed": -1}, {"texture": 63}, {"profile": "papre"}, {"triangles": "many"}, {"tecture": 64},
+     {"motion": "swim"}, {"settings": ["motion.iterations"]}, {"settings": "seed=1"}],
+)  # fmt: skip
+def test_the_server_refuses_options_that_cannot_be(client: SyncPrefectClient, options: dict[str, Any]) -> None:
+    catalog = client.read_deployment_by_name("catalog/local")
+    wanted = {"inputs": "in", "out": "out", "options": options}
+    with pytest.raises(PrefectHTTPStatusError, match=r"409|422"):
+        client.create_flow_run_from_deployment(catalog.id, parameters=wanted)
+
+
+@pytest.fixture(scope="module")
+def worker(
+    client: SyncPrefectClient, server: Server, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[TinyS3, Path]]:
+    """The object store that it sees, and the file in which its steps note that they ran."""
+    place, objects = tmp_path_factory.mktemp("worker"), TinyS3()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DG4D_EXECUTOR", "in_process")
+        patch.setenv("FAKE_LOG", str(place / "ran"))
+        for name, value in objects.environment.items():
+            patch.setenv(name, value)
+        worker = Worker("process-cpu", server.folder)
+        worker.start(str(PREFECT_API_URL.value()))
+        try:
+            wait_until(lambda: running(server.folder))
+            worker.start(str(PREFECT_API_URL.value()))  # does nothing
+            yield objects, place / "ran"
+        finally:
+            objects.stop()
+            assert worker.stop()
+    assert not running(server.folder)
+    assert not worker.stop()
+
+
+def ask(client: SyncPrefectClient, name: str, **parameters: Any) -> Any:
+    """Ask for a run as a form does; the run, once it is over."""
+    deployment = client.read_deployment_by_name(f"{name}/local")
+    client.create_flow_run_from_deployment(deployment.id, parameters=parameters)
+    return wait_until(lambda: ended(client, parameters["out"]))
+
+
+def ended(client: SyncPrefectClient, out: str) -> Any:
+    """The run that was asked for `out`, once it is over for good."""
+    runs = [run for run in client.read_flow_runs() if run.parameters.get("out") == out]
+    over = (run for run in runs if run.state is not None and (run.state.is_completed() or run.state.is_failed()))
+    return next(over, None)
+
+
+def test_what_is_dropped_into_a_folder_is_converted_by_a_worker(
+    worker: tuple[TinyS3, Path], client: SyncPrefectClient, tmp_path: Path
+) -> None:
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "dropped.png").write_text("dropped")
+    announce(tmp_path / "in", tmp_path / "out", "sha256:0")
+    run = wait_until(lambda: ended(client, str(tmp_path / "out")))
+    assert run.parameters["inputs"] == str(tmp_path / "in")
+    assert run.state.is_completed() and run.state.message == f"1 of 1 items are in {tmp_path / 'out'}"
+    status = json.loads((tmp_path / "out" / "summary.json").read_text())["items"][0]["status"]
+    assert status == "done"
+
+
+def test_a_run_whose_process_was_killed_goes_on_after_its_last_finished_step(
+    worker: tuple[TinyS3, Path], client: SyncPrefectClient, tmp_path: Path
+) -> None:
+    (tmp_path / "killed.png").write_text(f"{tmp_path} fit_gaussians=sleep:2 fit_motion=die-once")
+    _, log = worker
+    before = len(log.read_text().split()) if log.exists() else 0
+    run = ask(client, "image-to-4d", picture=str(tmp_path / "killed.png"), out=str(tmp_path / "out"))
+    assert run.state.is_completed() and run.run_count == 2
+    steps = log.read_text().split()[before:]
+    assert steps[:4] == ["prepare_subject", "drive_video", "fit_gaussians", "fit_motion"]
+    assert steps[4:] == ["fit_motion", "extract_mesh", "refine_texture", "pack_asset", "check_asset"]
+    whole(tmp_path / "out")
+
+
+def test_a_run_that_was_begun_too_often_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PREFECT__RUNTIME__FLOW_RUN__RUN_COUNT", str(deployments.BEGUN + 1))
+    with pytest.raises(BackendUnavailable, match="begun 3 times"):
+        deployments.image_to_4d.fn("in.png", "out")
+
+
+def test_a_picture_of_an_object_store_is_fetched_and_converted(
+    worker: tuple[TinyS3, Path], client: SyncPrefectClient, tmp_path: Path
+) -> None:
+    objects, _ = worker
+    objects.objects["pictures/a fox.png"] = f"a fox of {tmp_path}".encode(), time.time()
+    run = ask(client, "image-to-4d", picture="s3://bucket/pictures/a fox.png", out=str(tmp_path / "fox"))
+    assert run.state.is_completed(), run.state.message
+    record = json.loads((tmp_path / "fox" / "provenance.json").read_text())
+    assert record["item"] == "a fox"
+    objects.objects.clear()
+    run = ask(client, "image-to-4d", picture="s3://bucket/pictures/a fox.png", out=str(tmp_path / "gone"))
+    assert run.state.is_failed() and "a fox.png" in run.state.message
+    assert not (tmp_path / "gone").exists()

@@ -1,0 +1,204 @@
+"""What the Prefect server keeps and shows of an item: asked of its API, and looked at in a browser."""
+
+import base64
+import io
+import re
+import urllib.error
+import urllib.request
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from prefect.client.orchestration import get_client
+from prefect.settings import PREFECT_API_URL
+
+from flows import home
+from flows.commands.make import make
+from flows.engine import tasks
+from flows.engine.executors import StepDiverged
+from flows.inputs.orders import Order, Wish
+from flows.serving.server import Server
+from flows.ui import curves, pages
+from flows.ui.asset_page import PICTURES
+from steps.contract import ArtifactRef
+from steps.profiles import PREVIEW
+from steps.store import ArtifactStore
+from tests.clients.node import run_node
+
+EVERY_STEP = [
+    "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "extract_mesh", "refine_texture", "pack_asset",
+    "check_asset",
+]  # fmt: skip
+TITLES = [title for (step, _), title in PICTURES.items() if step in EVERY_STEP]
+LOSSES = 2  # drawings of losses, of the two fits
+
+
+@pytest.fixture
+def place(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Fake steps in this process, under the home folder of the server, which looks for artifacts there."""
+    monkeypatch.setenv("DG4D_HOME", str(server.folder.parent))
+    monkeypatch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
+    monkeypatch.setenv("DG4D_CODE_VERSION", "test")
+    monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
+    monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
+    monkeypatch.setattr(tasks, "RETRY_DELAY_S", 0.01)
+    return tmp_path
+
+
+def order(words: str, folder: Path, item: str) -> Order:
+    (folder / "fake.png").write_text(words)
+    return Wish(item=item, picture=folder / "fake.png", settings=PREVIEW).order(home.store())
+
+
+def artifacts(item: str, path: str = "/artifacts/latest/filter") -> dict[str, list[dict[str, Any]]]:
+    """What the server keeps of an item, by the key without the item, the newest first."""
+    wanted = {"artifacts": {"key": {"like_": f"-{item}-"}}, "limit": 200}
+    with get_client(sync_client=True) as client:
+        found: list[dict[str, Any]] = client.request("POST", path, json=wanted).json()
+    by_key: dict[str, list[dict[str, Any]]] = {}
+    for each in sorted(found, key=lambda each: each["created"], reverse=True):
+        by_key.setdefault(each["key"].partition(f"-{item}-")[0], []).append(each)
+    return by_key
+
+
+def server_address() -> str:
+    return str(PREFECT_API_URL.value()).removesuffix("/api")
+
+
+def fetched(address: str) -> tuple[str, bytes]:
+    with urllib.request.urlopen(server_address() + address) as answer:
+        return answer.headers["content-type"], answer.read()
+
+
+def test_an_item_leaves_a_page_per_step_and_one_with_everything(place: Path) -> None:
+    _, cached = make(order("pages", place, "paged"), place / "out")
+    assert not cached
+    kept = {key: latest[0] for key, latest in artifacts("paged").items()}
+    labels = {step.replace("_", "-") for step in EVERY_STEP}
+    assert set(kept) == (
+        labels
+        | {f"{kind}-{label}" for kind in ("outputs", "file", "progress") for label in labels}
+        | {"asset", "timings", "gates", "package", "viewer"}
+    )
+    assert kept["progress-fit-gaussians"]["data"] == 100
+    motion = kept["fit-motion"]["data"]
+    assert "data:image/webp;base64," in motion and "| 2 | 0.01 |" in motion
+
+    page = kept["asset"]["data"]
+    record = (place / "out" / "provenance.json").read_text()
+    (package,) = re.findall(r"`(sha256:[0-9a-f]{64})`", page)
+    assert f'"package": "{package}"' in record
+    embedded = re.findall(r"!\[([^\]]+)\]\(data:image/(webp|svg\+xml);base64,([^)]+)\)", page)
+    assert [title for title, kind, _ in embedded if kind == "webp"] == TITLES
+    assert sum(kind == "svg+xml" for _, kind, _ in embedded) == LOSSES
+    for _, kind, content in embedded:
+        if kind == "webp":
+            assert Image.open(io.BytesIO(base64.b64decode(content))).size == (8, 6)
+    assert "Accepted: all 1 gates passed." in page and "| passed | silhouette | 0.9 |" in page
+    assert "- This asset is a fake." in page
+    rows = re.findall(
+        r"\| (\w+) \| computed \| [\d.]+ \| [\d.]+ s \| \d+ MiB \| [0-9a-f]{12} \| ([0-9a-f]{12}) \|", page
+    )
+    assert [step for step, _ in rows] == EVERY_STEP
+    assert all(f'"digest": "sha256:{digest}' in record for _, digest in rows)
+
+
+def test_files_and_the_viewer_are_a_link_away(place: Path) -> None:
+    make(order("links", place, "linked"), place / "out")
+    kept = {key: latest[0]["data"] for key, latest in artifacts("linked").items()}
+    to = {key: re.findall(r"/dg4d/[^)\s\]]+", str(data)) for key, data in kept.items()}
+    kind, subject = fetched(to["file-prepare-subject"][0])
+    assert kind == "image/png" and subject.startswith(b"\x89PNG")
+    _, package = fetched(to["package"][0])
+    with zipfile.ZipFile(io.BytesIO(package)) as archive:
+        mesh = archive.read("asset.glb")
+    assert mesh == (place / "out" / "asset.glb").read_bytes()
+    kind, viewer = fetched(to["viewer"][0])
+    assert kind.startswith("text/html")
+    assert base64.b64encode(zlib.compress(mesh)) in viewer
+    assert to["asset"] == [to["package"][0], to["viewer"][0]]
+    for absent in (
+        to["viewer"][0].replace(re.findall(r"[0-9a-f]{64}", to["viewer"][0])[0], "0" * 64),
+        "/dg4d/viewer/x/1/y",
+    ):
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            fetched(absent)
+    with pytest.raises(urllib.error.HTTPError, match="404"):  # a picture is no package
+        fetched(to["file-prepare-subject"][0].replace("artifacts", "viewer"))
+
+
+def test_the_same_item_again_is_a_new_version_under_the_same_keys(place: Path) -> None:
+    make(order("version one", place, "versioned"), place / "out")
+    make(order("version two", place, "versioned"), place / "out")
+    make(order("version two", place, "versioned"), place / "out")
+    every, latest = artifacts("versioned", "/artifacts/filter"), artifacts("versioned")
+    assert {key: len(versions) for key, versions in every.items() if key in ("asset", "timings", "fit-motion")} == {
+        "asset": 3, "timings": 3, "fit-motion": 2,
+    }  # fmt: skip
+    assert set(every) == set(latest)
+    assert [page["data"].count("| cached |") for page in every["asset"]] == [len(EVERY_STEP), 0, 0]
+    assert latest["asset"][0]["data"] == every["asset"][0]["data"]
+
+
+def test_a_step_that_failed_leaves_its_reason_and_its_last_good_state(place: Path) -> None:
+    with pytest.raises(StepDiverged):
+        make(order("fit_motion=diverge", place, "diverged"), place / "out")
+    kept = {key: latest[0]["data"] for key, latest in artifacts("diverged").items()}
+    assert "iteration 7" in kept["fit-motion"] and "![last_good](data:image/webp;base64," in kept["fit-motion"]
+    assert "asset" not in kept and "package" not in kept
+
+
+def test_a_browser_draws_every_picture_of_the_page(place: Path) -> None:
+    make(order("drawn", place, "drawn"), place / "out")
+    (version,) = artifacts("drawn", "/artifacts/filter")["asset"]
+    seen = run_node(
+        "prefect.mjs",
+        f'{{"address": "{server_address()}/artifacts/artifact/{version["id"]}", "wait": {len(TITLES) + LOSSES}, '
+        f'"text": "Contact sheet", "screenshot": "{place / "page.png"}"}}',
+    )
+    assert [picture["name"] for picture in seen["pictures"]] == [*TITLES, *["Losses of the fake"] * LOSSES]
+    screen = np.asarray(Image.open(place / "page.png").convert("RGB")).astype(int)
+    ink = [int(curves.INKS[0][at : at + 2], 16) for at in (1, 3, 5)]
+    for picture in seen["pictures"]:
+        left, top, width, height = (round(side) for side in picture["box"])
+        drawn = screen[top : top + height, left : left + width]
+        if picture["name"] in TITLES:  # every fake step makes the same
+            assert np.abs(drawn[height // 2, width // 2] - [100, 200, 90]).max() < 40, picture
+        else:
+            assert (np.abs(drawn - ink).max(-1) < 40).sum() > 100, picture
+            assert (drawn.min(-1) > 250).mean() > 0.5, picture
+    assert "silhouette" in seen["text"] and "This asset is a fake." in seen["text"]
+    assert {address.split("/")[4] for address in seen["links"] if "/dg4d/" in address} == {"artifacts", "viewer"}
+
+
+def test_a_picture_is_shown_as_large_as_its_bytes_allow(tmp_path: Path) -> None:
+    store = ArtifactStore(tmp_path)
+    noise = np.random.default_rng(0).integers(0, 255, (500, 2000, 3), dtype=np.uint8)
+    plain, hard = (_stored(store, Image.fromarray(pixels)) for pixels in (noise * 0 + 90, noise))
+    sizes = []
+    for ref, most in ((plain, 50_000), (hard, 50_000), (hard, 20_000)):
+        small = pages.thumbnail(ref, store, most)
+        assert small is not None and len(small) <= most
+        sizes.append(Image.open(io.BytesIO(small)).size)
+    assert sizes[0] == (960, 240)
+    assert sizes[2][0] < sizes[1][0]
+    assert pages.thumbnail(hard, store, 200) is None
+    assert pages.thumbnail(store.put_bytes(b"no picture", "image/png"), store) is None
+
+
+def test_a_loss_that_cannot_be_drawn_is_left_out() -> None:
+    assert curves.picture({"title": "t", "x": [], "series": {"a": []}, "notes": []}) == ""
+    assert curves.picture({"title": "t", "x": [1, 2], "series": {"a": [float("nan")] * 2}, "notes": []}) == ""
+    assert "&lt;loss&gt; 3" in curves.picture(
+        {"title": "t", "x": [1, 2], "series": {"<loss>": [2.0, 3.0]}, "notes": []}
+    )
+
+
+def _stored(store: ArtifactStore, picture: Image.Image) -> ArtifactRef:
+    content = io.BytesIO()
+    picture.save(content, "PNG")
+    return store.put_bytes(content.getvalue(), "image/png")
