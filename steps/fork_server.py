@@ -11,6 +11,7 @@ A step is a process group of its own, as it is when it is begun by `python -m st
 it to end with its parent, which is this process.
 """
 
+import argparse
 import gc
 import importlib
 import json
@@ -30,7 +31,9 @@ ORDER_HANDLES = 16
 
 def main() -> int:
     """Serve until the socket is closed; in a fork, do the step, and return its exit status."""
-    control = socket.socket(fileno=int(sys.argv[1]))
+    parser = argparse.ArgumentParser(prog="python -m steps.fork_server", description="Begin steps for a program.")
+    parser.add_argument("socket", type=int, help="file descriptor of a socket that the program holds the other end of")
+    control = socket.socket(fileno=parser.parse_args().socket)
     control.set_inheritable(False)
     step.prepare_process()
     for spec in step.catalog().values():

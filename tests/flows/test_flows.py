@@ -5,12 +5,12 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner, Result
+from waiting import wait_until
 
 from flows import cli, home
 from flows.catalog import convert_all
@@ -328,13 +328,6 @@ def test_there_is_one_server(place: None, server: Server) -> None:
     other.start()
     assert other.wait() == server.wait() == f"{server.address()}/api"
     other.release()
-
-
-def wait_until(condition: Callable[[], bool], timeout_s: float = 60) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.05)
 
 
 def test_a_strict_batch_begins_nothing_after_an_item_that_is_not_accepted(log: Path, tmp_path: Path) -> None:

@@ -8,13 +8,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from prefect.client.orchestration import get_client
 from rich.console import Console
+from waiting import wait_until
 
 from flows import home
 from flows.catalog import ROWS_SHOWN, convert_all
@@ -279,10 +280,3 @@ def test_a_line_says_how_far_a_batch_is_and_when_it_will_be_done(monkeypatch: py
         tally.settle(Row(item=f"{i}", status="failed" if i == 4 else "done"))
     monkeypatch.setattr(Tally, "seconds", property(lambda self: 600.0))
     assert tally.line() == "13 of 103 items, 1 failed, 60 an hour, about 90 min left"
-
-
-def wait_until(condition: Callable[[], bool], timeout_s: float = 240) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.05)

@@ -4,8 +4,7 @@ import json
 import os
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from postgresql import free_port, server_on_postgresql
 from prefect.client.orchestration import get_client
 from prefect.settings import PREFECT_API_URL, temporary_settings
 from prefect.task_runners import ThreadPoolTaskRunner
+from waiting import wait_until
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows.engine.runners import item_runner
@@ -42,14 +42,6 @@ def place(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     for name in ("one", "two"):
         (tmp_path / "in" / f"{name}.png").write_text(f"{name} of {tmp_path} fit_motion=sleep:2")
     return tmp_path
-
-
-def wait_until(happens: Callable[[], Any], timeout_s: float = 400) -> Any:
-    deadline = time.monotonic() + timeout_s
-    while not (found := happens()):
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.3)
-    return found
 
 
 def test_threads_make_the_items_unless_a_cluster_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

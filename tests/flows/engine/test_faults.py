@@ -17,6 +17,7 @@ from postgresql import server_on_postgresql
 from prefect.client.orchestration import get_client
 from prefect.settings import PREFECT_API_URL, temporary_settings
 from rich.console import Console
+from waiting import wait_until
 
 from dg4d_lib.errors import BadInput
 from flows import home
@@ -92,13 +93,6 @@ def start(*arguments: str) -> "subprocess.Popen[str]":
         text=True,
         env={**os.environ, "DG4D_EXECUTOR": "subprocess"},
     )
-
-
-def wait_until(condition: Callable[[], bool], timeout_s: float = 120) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.05)
 
 
 def during(step: str, log: Path, do: Callable[[], None]) -> threading.Thread:

@@ -1,11 +1,12 @@
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import fake_steps
 import pytest
+from waiting import wait_until
 
 from flows.engine import forks
 from flows.engine.executors import StepOutOfMemory, in_subprocess
@@ -76,7 +77,7 @@ def test_steps_end_with_their_server_and_the_server_begins_no_more(
     process = begin(server, begun, place, "prepare_subject=sleep:30")
     server.end()
     assert process.wait(20) == -signal.SIGKILL
-    _until(lambda: not Path(f"/proc/{process.pid}/stat").exists())
+    wait_until(lambda: not Path(f"/proc/{process.pid}/stat").exists())
     assert server.has_ended()
     with (place / "stderr").open("ab") as stderr:
         assert server.fork([], {}, stderr, []) is None
@@ -117,7 +118,7 @@ def test_the_next_step_is_a_fork_of_the_same_process_and_one_for_another_environ
     assert parent() == first
     monkeypatch.setenv("DG4D_STORE", str(place / "elsewhere"))
     assert parent() != first
-    _until(lambda: not Path(f"/proc/{first}/stat").exists())
+    wait_until(lambda: not Path(f"/proc/{first}/stat").exists())
 
 
 def test_a_server_that_was_killed_is_followed_by_another(place: Path) -> None:
@@ -141,10 +142,3 @@ def _request(place: Path, words: str) -> StepRequest:
     spec = fake_steps.STEPS["prepare_subject"]
     source = ArtifactStore(place / "store").put_bytes(words.encode(), "application/octet-stream")
     return StepRequest(step=spec.name, version=request_version(spec), inputs={"source": source}, settings={}, seed=0)
-
-
-def _until(true: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 20
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)

@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
@@ -11,6 +11,7 @@ from prefect.client.orchestration import SyncPrefectClient, get_client
 from prefect.exceptions import PrefectHTTPStatusError
 from prefect.settings import PREFECT_API_URL
 from tiny_s3 import TinyS3
+from waiting import wait_until
 
 from dg4d_lib.errors import BackendUnavailable
 from flows.packages.publish import whole
@@ -36,14 +37,6 @@ def client(server: Server) -> Iterator[SyncPrefectClient]:
         registering.register(read_pools(), ["process-cpu"])
         with get_client(sync_client=True) as client:
             yield client
-
-
-def wait_until(happens: Callable[[], Any], timeout_s: float = 400) -> Any:
-    deadline = time.monotonic() + timeout_s
-    while not (found := happens()):
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.3)
-    return found
 
 
 def test_the_form_offers_every_profile() -> None:

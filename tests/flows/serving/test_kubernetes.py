@@ -4,8 +4,7 @@ import json
 import os
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import kubernetes_validate
@@ -14,6 +13,7 @@ import yaml
 from prefect.client.orchestration import get_client
 from prefect.settings import PREFECT_API_URL
 from stand_in_cluster import Asked, Cluster, cluster
+from waiting import wait_until
 
 from flows.serving import registering
 from flows.serving.pools import DEPLOY, read_pools
@@ -35,13 +35,6 @@ def named(kind: str, name: str) -> dict[str, Any]:
 
 def names(kind: str) -> set[str]:
     return {one["metadata"]["name"] for one in MANIFESTS if one["kind"] == kind}
-
-
-def wait_until(happens: Callable[[], Any], timeout_s: float = 200) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not happens():
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.1)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +61,7 @@ def busy(server: Server, tmp_path_factory: pytest.TempPathFactory) -> Iterator[C
             try:
                 wait_until(lambda: api.created and len({*api.allowed, *api.forbidden}) >= 5)
             finally:
-                worker.terminate()
+                worker.kill()  # it would wait for what it watches
                 worker.wait()
                 client.delete_flow_run(run.id)
             yield api
