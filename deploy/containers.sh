@@ -41,10 +41,10 @@ build() {
 }
 
 base() {
-    local folder program
+    local program
     program=$(engine)
     command -v debootstrap >/dev/null || { echo "On Debian: apt-get install debootstrap (as root)" >&2; exit 69; }
-    folder=$(mktemp -d)
+    folder=$(mktemp -d)  # not local: the trap runs outside of this function
     trap 'rm -rf "$folder"' EXIT
     debootstrap --variant=minbase --include=python3,python3-venv,ca-certificates bookworm "$folder/root"
     ln -s python3 "$folder/root/usr/bin/python"

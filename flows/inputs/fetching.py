@@ -32,8 +32,7 @@ def at_hand(address: str) -> Iterator[Path]:
     if "://" not in address:
         yield Path(address)
         return
-    parts = urlsplit(address)
-    shown = f"{parts.scheme}://{parts.hostname}{parts.path}"  # neither a password nor a signature
+    parts, shown = urlsplit(address), without_secrets(address)
     name = PurePosixPath(unquote(parts.path)).name
     if parts.scheme not in {"http", "https", "s3"} or not name or "\0" in name:
         raise BadInput(f"{shown} names no file: give a path, https://HOST/FILE or s3://BUCKET/KEY")
@@ -52,6 +51,12 @@ def at_hand(address: str) -> Iterator[Path]:
         except (urllib.error.URLError, http.client.HTTPException, TimeoutError) as error:
             raise BadInput(f"{shown} cannot be fetched: {getattr(error, 'reason', '') or error}") from error
         yield path
+
+
+def without_secrets(address: str) -> str:
+    """The address as people may see it, with neither a password nor a signature."""
+    parts = urlsplit(address)
+    return f"{parts.scheme}://{parts.hostname}{parts.path}" if "://" in address else address
 
 
 def _download(address: str, path: Path, shown: str) -> None:

@@ -21,7 +21,7 @@ from flows.commands.benchmark import bench
 from flows.commands.make import connect, make
 from flows.commands.options import knobs_of
 from flows.commands.terminal import console
-from flows.inputs.fetching import at_hand
+from flows.inputs.fetching import at_hand, without_secrets
 from flows.inputs.manifest import parse_changes
 from flows.inputs.orders import Wish
 from flows.packages.publish import check_folder, is_current
@@ -130,7 +130,7 @@ Wanted = Annotated[Options, Field(json_schema_extra=_filled_in(Options()))]
 WantedOfPictures = Annotated[PictureOptions, Field(json_schema_extra=_filled_in(PictureOptions()))]
 
 
-@flow(name="image-to-4d", flow_run_name="{picture}", persist_result=False)
+@flow(name="image-to-4d", flow_run_name=lambda: _name("picture"), persist_result=False)
 def image_to_4d(
     picture: Annotated[Text, Field(json_schema_extra=_title("Picture"))],
     out: Folder,
@@ -149,7 +149,7 @@ def image_to_4d(
         _make(picture, Path(out), options, picture=path)
 
 
-@flow(name="video-to-4d", flow_run_name="{video}", persist_result=False)
+@flow(name="video-to-4d", flow_run_name=lambda: _name("video"), persist_result=False)
 def video_to_4d(
     video: Annotated[Text, Field(json_schema_extra=_title("Video"))],
     out: Folder,
@@ -227,6 +227,11 @@ def benchmark(
     _refuse_to_die_again()
     pairs = [f"{knob}={json.dumps(value)}" for knob, value in options.knobs().items()]
     bench(Path(dataset), Path(out), console(), options.profile, pairs, options.seed, mesh, bank, limit or None, workers)
+
+
+def _name(source: str) -> str:
+    """Of a run, by the parameter that says what it is made of."""
+    return without_secrets(runtime.flow_run.parameters[source])
 
 
 def _refuse_to_die_again() -> None:

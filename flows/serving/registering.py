@@ -130,5 +130,10 @@ def _automate(client: SyncPrefectClient) -> None:
         known = client.find_automation(automation.name)
         if known is None:
             client.create_automation(automation)
-        else:
+        elif _content(known) != _content(automation):  # a server forgets the runs that it follows for one that changes
             client.update_automation(known.id, automation)
+
+
+def _content(automation: AutomationCore) -> Json:
+    """What an automation does, without what a server adds."""
+    return automation.model_dump(include=set(AutomationCore.model_fields))

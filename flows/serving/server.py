@@ -42,6 +42,8 @@ SETTINGS = {
     "PREFECT_SERVER_SERVICES_EVENT_PERSISTER_READ_BATCH_SIZE": "200",
     # a slot that a killed run held is free again, also after the server was started anew
     "PREFECT_SERVER_CONCURRENCY_LEASE_STORAGE": "prefect.server.concurrency.lease_storage.filesystem",
+    # and a run that was killed goes on then
+    "PREFECT_SERVER_EVENTS_CAUSAL_ORDERING": "flows.serving.ordering",
 }
 
 

@@ -110,6 +110,26 @@ def test_an_image_is_built_with_every_file_that_the_project_installs(path: Path)
     assert wanted and wanted <= copied
 
 
+def test_a_base_image_is_made_of_what_debootstrap_made_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    programs, scratch = tmp_path / "bin", tmp_path / "scratch"
+    programs.mkdir()
+    scratch.mkdir()
+    for name, does in {
+        "debootstrap": 'for place; do :; done; mkdir -p "$place/usr/bin"; echo it > "$place/usr/bin/python3"',
+        "podman": f'echo "$@" > {tmp_path}/asked; tar -t > {tmp_path}/given',
+    }.items():
+        (programs / name).write_text(f"#!/bin/sh\n{does}\n")
+        (programs / name).chmod(0o755)
+    environment = {"PATH": f"{programs}:{os.environ['PATH']}", "TMPDIR": str(scratch), "DG4D_ENGINE": "podman"}
+    done = subprocess.run(
+        [ROOT / "deploy" / "containers.sh", "base"], env=environment, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "asked").read_text().split()[-1] == "docker.io/library/python:3.11-slim-bookworm"
+    assert {"./usr/bin/python", "./usr/bin/python3"} <= set((tmp_path / "given").read_text().split())
+    assert list(scratch.iterdir()) == []
+
+
 def health_check(path: Path) -> list[str]:
     """What an image is asked for its health, for this Python."""
     text = path.read_text().replace("\\\n", "")

@@ -13,7 +13,7 @@ from prefect.settings import PREFECT_API_URL
 from tiny_s3 import TinyS3
 from waiting import wait_until
 
-from dg4d_lib.errors import BackendUnavailable
+from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows.packages.publish import whole
 from flows.serving import deployments, registering
 from flows.serving.pools import read_pools
@@ -103,6 +103,27 @@ def test_registering_again_changes_nothing(client: SyncPrefectClient) -> None:
     ]  # fmt: skip
     assert there() == before
     assert {automation.name for automation in registering.AUTOMATIONS} <= set(before[1])
+
+
+def test_a_server_goes_on_following_the_runs_that_it_followed_when_it_is_registered_again(
+    client: SyncPrefectClient,
+) -> None:
+    def followers() -> dict[str, str]:
+        found = client.request("POST", "/automations/filter", json={}).json()
+        return {one["name"]: one["trigger"]["id"] for one in found if one["name"] in names}
+
+    names = {automation.name for automation in registering.AUTOMATIONS}
+    before = followers()
+    assert set(before) == names
+    registering.register(read_pools(), ["process-cpu"])
+    assert followers() == before  # what it knows of runs is kept under these
+    one = registering.AUTOMATIONS[0]
+    known = client.find_automation(one.name)
+    assert known is not None
+    client.update_automation(known.id, one.model_copy(update={"description": "of an older dg4d"}))
+    registering.register(read_pools(), ["process-cpu"])
+    again = client.find_automation(one.name)
+    assert again is not None and again.description == one.description
 
 
 @pytest.mark.parametrize(
@@ -201,3 +222,10 @@ def test_a_picture_of_an_object_store_is_fetched_and_converted(
     run = ask(client, "image-to-4d", picture="s3://bucket/pictures/a fox.png", out=str(tmp_path / "gone"))
     assert run.state.is_failed() and "a fox.png" in run.state.message
     assert not (tmp_path / "gone").exists()
+
+
+def test_the_name_of_a_run_tells_no_signature(client: SyncPrefectClient, tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="cannot be fetched"):
+        deployments.image_to_4d("http://user:word@127.0.0.1:1/fox.png?signature=key", str(tmp_path / "out"))
+    (run,) = (run for run in client.read_flow_runs() if run.parameters.get("out") == str(tmp_path / "out"))
+    assert run.name == "http://127.0.0.1/fox.png"

@@ -1,0 +1,59 @@
+"""`dg4d up` and `dg4d down`: what they leave behind, on a server that the user names."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from prefect.settings import PREFECT_API_URL
+from waiting import wait_until
+
+from flows.serving.server import Server
+from flows.serving.workers import running
+
+
+@pytest.fixture
+def folder(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the commands keep their state; the server is one that they did not start."""
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path))
+    monkeypatch.setenv("PREFECT_API_URL", str(PREFECT_API_URL.value()))
+    return tmp_path / "server"
+
+
+def dg4d(*arguments: str) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-m", "flows.cli", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop(folder: Path) -> None:
+    said = dg4d("up", "--pool", "process-cpu")
+    assert said.returncode == 0, said.stderr
+    *deployments, address = said.stdout.split()
+    assert deployments == ["image-to-4d/local", "video-to-4d/local", "benchmark/local", "catalog/local"]
+    assert address == os.environ["PREFECT_API_URL"].removesuffix("/api")
+    try:
+        wait_until(lambda: [worker.pool for worker in running(folder)] == ["process-cpu"])
+        log = folder / "worker-process-cpu.log"
+        wait_until(lambda: "started!" in log.read_text())
+        assert running(folder)
+    finally:
+        stopped = dg4d("down")
+    assert (stopped.returncode, stopped.stdout) == (0, "stopped\n")
+    assert running(folder) == []
+    assert dg4d("down").stdout == "nothing was running\n"
+
+
+def test_a_pool_that_is_not_described_is_refused_before_anything_is_started(folder: Path) -> None:
+    said = dg4d("up", "--pool", "process-cpo")
+    assert said.returncode == 65
+    assert "there is no pool 'process-cpo'" in said.stderr and "process-cpu" in said.stderr
+    assert not folder.exists()
+
+
+def test_a_server_is_reached_from_this_machine_only(server: Server) -> None:
+    port = int(str(server.address()).rpartition(":")[2])
+    tables = [table.read_text().splitlines()[1:] for table in Path("/proc/net").glob("tcp*")]
+    sockets = [line.split()[1:4:2] for lines in tables for line in lines]
+    listening = [place for place, state in sockets if state == "0A" and int(place.rpartition(":")[2], 16) == port]
+    assert listening == [f"0100007F:{port:04X}"]
