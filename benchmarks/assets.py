@@ -29,10 +29,12 @@ from dg4d_lib.asset_settings import GltfSettings, PackSettings
 from dg4d_lib.assets.animated import Asset4D, moved
 from dg4d_lib.assets.compact import Compact, write_compact
 from dg4d_lib.assets.glb import write_glb
-from dg4d_lib.assets.preview import write_preview
+from dg4d_lib.assets.preview import write_preview, write_turntable
+from dg4d_lib.assets.rigged import rig_of, write_rigged_glb
 from dg4d_lib.assets.splats import write_splat_glb_frames, write_splats, write_spz_frames
 from dg4d_lib.assets.usd import write_usdz
 from dg4d_lib.assets.viewer_page import viewer_page
+from dg4d_lib.assets.webp import write_webp
 from dg4d_lib.assets.websplats import write_web_splats
 from dg4d_lib.deformation.kinds import new_deformation
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -54,8 +56,8 @@ GLTF = {
 GOALS_MB = {"asset.glb, default": 8.0, "web splats": 0.4, "viewer page, empty": 1.0}  # with 5,000 splats
 GOAL_S = 5.0  # on two cores
 EVERY_KIND = (
-    "asset.glb, default", "viewer page, empty", "splats, PLY", "splats, SPZ", "web splats", "compact, exact",
-    "asset.usdz, mesh and splats", "preview.mp4",
+    "asset.glb, default", "asset_rigged.glb", "viewer page, empty", "splats, PLY", "splats, SPZ", "web splats",
+    "compact, exact", "asset.usdz, mesh and splats", "preview.mp4", "turntable.mp4", "preview.webp",
 )  # fmt: skip
 
 Write = Callable[[Path], object]  # into this empty folder
@@ -132,6 +134,7 @@ def waving_splats(count: int) -> Compact:
 def mesh_writers(asset: Asset4D) -> Iterator[tuple[str, Write]]:
     for name, settings in GLTF.items():
         yield f"asset.glb, {name}", lambda folder, s=settings: (folder / "a.glb").write_bytes(write_glb(asset, s))
+    yield "asset_rigged.glb", lambda folder: write_rig(folder / "a.glb", asset)
     yield "asset.usdz, mesh", lambda folder: write_usdz(folder / "a.usdz", asset, FPS)
     yield (
         "viewer page, empty",
@@ -150,9 +153,25 @@ def splat_writers(asset: Asset4D, splats: Compact, pack: PackSettings) -> Iterat
     yield "compact, exact", lambda folder: write_compact(folder / "a.safetensors", splats)
     yield "asset.usdz, mesh and splats", lambda folder: write_usdz(folder / "a.usdz", asset, FPS, states)
     yield (
+        "asset.usdz, quantized",
+        lambda folder: write_usdz(folder / "a.usdz", asset, FPS, states, settings=GltfSettings(quantized=True)),
+    )
+    yield (
         "preview.mp4",
         lambda folder: write_preview(folder / "a.mp4", cloud, field, FRAMES, FPS, rasterizer, pack),
     )
+    yield "turntable.mp4", lambda folder: write_turntable(folder / "a.mp4", states.at(0), rasterizer, pack)
+    yield (
+        "preview.webp",
+        lambda folder: write_webp(folder / "a.webp", cloud, field, FRAMES, FPS, rasterizer, pack),
+    )
+
+
+def write_rig(path: Path, asset: Asset4D) -> None:
+    """Find the asset's rig and write it."""
+    rig, _ = rig_of(asset, PackSettings().rig_bones, largest_error=1)
+    assert rig is not None
+    path.write_bytes(write_rigged_glb(asset, rig, GltfSettings()))
 
 
 def fourdgs(folder: Path) -> Write:

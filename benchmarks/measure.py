@@ -13,6 +13,7 @@ from statistics import median
 from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # torch's idle threads would count as CPU time
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the steps
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,11 @@ class GltfSettings(Settings):
     quality: int = Field(
         85, ge=1, le=100, description="of jpeg and webp; from 95 on, jpeg keeps colors as fine as brightness"
     )
-    quantized: bool = Field(False, description="16 bits instead of 32, 8 for normals at rest: KHR_mesh_quantization")
+    quantized: bool = Field(
+        False,
+        description="16 bits instead of 32, 8 for normals at rest: KHR_mesh_quantization; in USDZ, splats in half "
+        "floats",
+    )
     meshopt: bool = Field(
         False, description="packed: EXT_meshopt_compression, which web players know and Blender does not"
     )

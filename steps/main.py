@@ -416,6 +416,7 @@ def _progress_file(path: Path | None) -> TextIO:
 def prepare_process() -> None:
     """Set what has to be set before torch is imported."""
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # torch's threads would spin after every operation
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy's would spin too, and its matrices are small
     if not sys.platform.startswith("linux"):
         return
     try:  # keep freed memory: large temporaries would be mapped and unmapped at every operation

@@ -147,7 +147,7 @@ def pictures_over(
     """Every state from its camera, over a background picture, without gradients."""
     with torch.no_grad():
         drawn = rasterizer(states, cameras, states.means.new_zeros(3))
-        return (drawn.color + (1 - drawn.alpha) * background.to(drawn.color)).clamp(0, 1)
+        return torch.addcmul(drawn.color, 1 - drawn.alpha, background.to(drawn.color)).clamp_(0, 1)
 
 
 def studio(size: int) -> Float[Tensor, "h w 3"]:

@@ -1,8 +1,8 @@
 """Animated meshes and moving splats as one USDZ, and several of them as one scene.
 
 Frame i stands at time code i, and the stage has as many time codes per second as the asset has frames. Animations are
-closed as in the GLB: one more key after the last frame shows the first again. A package holds one layer, `/asset` in
-it, and the textures:
+closed as in the GLB: one more key after the last frame shows the first again; without a time, everything is as in the
+first. A package holds one layer, `/asset` in it, and the textures:
 
     /asset                      variant set "representation": "mesh" (chosen) or "splats"
     /asset/mesh/subject         the tracked mesh; or /asset/mesh/frame_000, ... for meshes per frame
@@ -14,7 +14,8 @@ a single frame is a mesh without points at all other times, since Blender ignore
 ignore textures that change over time (Blender does) show the texture of the first frame.
 
 Splats are `ParticleField3DGaussianSplat` of OpenUSD's UsdVol: linear scales and opacities, unit quaternions, and
-harmonics of sRGB colors, which the color space says.
+harmonics of sRGB colors, which the color space says. What moves is in floats, or in the schema's attributes of half
+floats, which not every reader looks for.
 """
 
 import itertools
@@ -45,6 +46,7 @@ from dg4d_lib.mesh.textured import TexturedMesh
 DEFAULTS = GltfSettings()
 ABOUT = "dg4d"  # key of the layer's custom data: what the writer wants to say, as JSON
 EXTENT_SIGMAS = 3.0  # standard deviations of a Gaussian that its bounds hold
+LEAST_HALF = 2.0**-14  # world units; smaller numbers have less than eleven bits as half floats, or become 0
 
 
 def write_usdz(
@@ -63,7 +65,8 @@ def write_usdz(
         fps: frames per second.
         states: one state of the cloud per frame.
         about: JSON about the asset, kept as text in the layer's custom data; its `name` is the asset's display name.
-        settings: image (USDZ knows no webp, so jpeg stands for it), quality, moving_normals, roughness and metallic.
+        settings: image (USDZ knows no webp, so jpeg stands for it), quality, quantized (of splats), moving_normals,
+            roughness and metallic.
 
     Raises:
         BadInput: no frames, no triangles, another number of states than frames, an fps that is not positive, or
@@ -84,7 +87,7 @@ def write_usdz(
     else:
         pictures = _add_frames(stage, meshes, settings)
     if states is not None:
-        _add_splats(stage, states)
+        _add_splats(stage, states, settings.quantized)
     write_usdz_package(path, stage, "asset.usdc", pictures)
 
 
@@ -265,6 +268,7 @@ def _empty_except_at(mesh: UsdGeom.Mesh, frame: int, frames: int) -> None:
     for attribute in (*attributes, mesh.GetFaceVertexIndicesAttr(), st.GetIndicesAttr()):
         value = attribute.Get(0)
         attribute.Clear()
+        attribute.Set(value if frame == 0 else type(value)())
         for time, there in sorted(keys.items()):
             attribute.Set(value if there else type(value)(), time)
 
@@ -299,7 +303,7 @@ def _add_shader(stage: Usd.Stage, path: str, kind: str) -> UsdShade.Shader:
     return shader
 
 
-def _add_splats(stage: Usd.Stage, states: Gaussians) -> None:
+def _add_splats(stage: Usd.Stage, states: Gaussians, half: bool) -> None:
     """Offer splats instead of the mesh, which stays what is shown at first."""
     choice = stage.GetDefaultPrim().GetVariantSets().AddVariantSet("representation")
     for name in ("mesh", "splats"):
@@ -307,43 +311,51 @@ def _add_splats(stage: Usd.Stage, states: Gaussians) -> None:
     choice.SetVariantSelection("splats")
     with choice.GetVariantEditContext():
         stage.OverridePrim("/asset/mesh").SetActive(False)
-        _define_splats(stage, states)
+        _define_splats(stage, states, half)
     choice.SetVariantSelection("mesh")
 
 
-def _define_splats(stage: Usd.Stage, states: Gaussians) -> None:
+def _define_splats(stage: Usd.Stage, states: Gaussians, half: bool) -> None:
     splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/asset/splats")
     means, scales, harmonics = _array(states.means), _array(states.scales), _array(states.harmonics)
     quats = _array(torch.nn.functional.normalize(states.quats, dim=-1))
     reach = EXTENT_SIGMAS * np.sqrt(_array(states.covariances.diagonal(dim1=-2, dim2=-1)))
-    _animate(splats.CreatePositionsAttr(), [_vectors(mean) for mean in means])
-    _animate(splats.CreateOrientationsAttr(), [_quaternions(quat) for quat in quats])
-    _animate(splats.CreateScalesAttr(), [_vectors(scale) for scale in scales])
     _animate(splats.CreateExtentAttr(), [_bounds(m - r, m + r) for m, r in zip(means, reach, strict=True)])
+    places, turns, sizes = splats.CreatePositionsAttr, splats.CreateOrientationsAttr, splats.CreateScalesAttr
+    if half:
+        places, turns, sizes = splats.CreatePositionshAttr, splats.CreateOrientationshAttr, splats.CreateScaleshAttr
+        means, quats, scales = (values.astype("<f2") for values in (means, quats, scales.clip(LEAST_HALF)))
+    _animate(places(), [_vectors(mean) for mean in means])
+    _animate(turns(), [_quaternions(quat) for quat in quats])
+    _animate(sizes(), [_vectors(scale) for scale in scales])
     splats.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(_array(states.opacities)))
     splats.CreateRadianceSphericalHarmonicsDegreeAttr(round(harmonics.shape[1] ** 0.5) - 1)
-    splats.CreateRadianceSphericalHarmonicsCoefficientsAttr(_vectors(harmonics.reshape(-1, 3)))
+    colors = splats.CreateRadianceSphericalHarmonicsCoefficientsAttr(_vectors(harmonics.reshape(-1, 3)))
+    colors.SetMetadata("interpolation", UsdGeom.Tokens.vertex)  # the schema does not need it, Omniverse does
+    colors.SetMetadata("elementSize", harmonics.shape[1])
     splats.CreateProjectionModeHintAttr(UsdVol.Tokens.perspective)
     splats.CreateSortingModeHintAttr(UsdVol.Tokens.zDepth)
     Usd.ColorSpaceAPI.Apply(splats.GetPrim()).CreateColorSpaceNameAttr(Gf.ColorSpaceNames.SRGBRec709)
 
 
 def _animate(attribute: Usd.Attribute, values: Sequence[Any]) -> None:
-    """Set a value per frame, and the first again one frame after the last."""
+    """Set a value per frame, the first again one frame after the last, and for those who name no time."""
     for time, value in enumerate((*values, values[0])):
         attribute.Set(value, time)
+    attribute.Set(values[0])
 
 
 def _array(values: Tensor) -> NDArray[Any]:
     return values.detach().cpu().numpy().astype("<f4")
 
 
-def _vectors(rows: NDArray[Any]) -> Vt.Vec3fArray:
-    return Vt.Vec3fArray.FromNumpy(rows)
+def _vectors(rows: NDArray[Any]) -> Vt.Vec3fArray | Vt.Vec3hArray:
+    return (Vt.Vec3hArray if rows.dtype == np.float16 else Vt.Vec3fArray).FromNumpy(rows)
 
 
-def _quaternions(wxyz: NDArray[Any]) -> Vt.QuatfArray:
-    return Vt.QuatfArray.FromNumpy(np.roll(wxyz, -1, axis=-1))  # in memory the real part stands last
+def _quaternions(wxyz: NDArray[Any]) -> Vt.QuatfArray | Vt.QuathArray:
+    kind = Vt.QuathArray if wxyz.dtype == np.float16 else Vt.QuatfArray
+    return kind.FromNumpy(np.roll(wxyz, -1, axis=-1))  # in memory the real part stands last
 
 
 def _integers(values: NDArray[Any]) -> Vt.IntArray:
@@ -364,9 +376,9 @@ def _picture(name: str, pixels: Float[Tensor, "h w 3"], settings: GltfSettings) 
 
     A digest in the name tells pictures of several assets apart: Blender takes files of one name for one picture.
     """
-    kind = "png" if settings.image == "png" else "jpeg"
+    kind, suffix = ("png", "png") if settings.image == "png" else ("jpeg", "jpg")
     content = picture_file(pixels_of(pixels), kind, settings.quality)
-    return f"textures/{name}_{sha256(content).hexdigest()[:8]}.{kind}", content
+    return f"textures/{name}_{sha256(content).hexdigest()[:8]}.{suffix}", content
 
 
 def _identifiers(names: Sequence[str]) -> list[str]:

@@ -7,7 +7,7 @@ drawn at random.
 """
 
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import combinations
 
 import numpy as np
 import torch
@@ -113,12 +113,12 @@ def skinned(rig: Rig, vertices: Float[Tensor, "v 3"]) -> Float[Tensor, "t v 3"]:
     turns, rest, places, weights = (
         x.to(vertices) for x in (rotation_matrix(rig.quats), rig.rest, rig.places, rig.weights)
     )
-    arms = vertices[:, None] - rest[rig.bones]
-    moved = vertices.new_empty(len(turns), *vertices.shape)
-    for turn, place, row in zip(turns, places, moved, strict=True):
-        there = (turn[rig.bones] @ arms[..., None])[..., 0] + place[rig.bones]
-        row[:] = (weights[..., None] * there).sum(1) - vertices
-    return moved
+    moves = turns - torch.eye(3).to(vertices)
+    shifts = places - rest - (moves @ rest[..., None])[..., 0]
+    maps = torch.cat((moves.mT, shifts[:, :, None]), 2).flatten(1, 2)  # t b*4 3: homogeneous rows to displacements
+    shares = vertices.new_zeros(len(vertices), len(rest)).scatter_add_(1, rig.bones, weights)
+    ends = torch.cat((vertices, torch.ones_like(vertices[:, :1])), 1)
+    return (shares[..., None] * ends[:, None]).flatten(1) @ maps
 
 
 def _fewest(rest: Array, moved: Array, goal: float, most: int) -> tuple[Array, Array]:
@@ -201,9 +201,9 @@ def _rigid(rest: Array, moved: Array, shares: Array) -> Array:
     shares = shares / shares.sum(0)
     centers, flat = shares.T @ rest, moved.reshape(len(moved), -1)
     drift = (shares.T @ flat).reshape(len(centers), -1, 3)
-    arms = shares[..., None] * (rest[:, None] - centers)  # n k 3
-    spread = np.einsum("nka,nb->kab", arms, rest)
-    cross = (arms.reshape(len(rest), -1).T @ flat).reshape(len(centers), 3, -1, 3).swapaxes(1, 2) + spread[:, None]
+    arms = (shares[..., None] * (rest[:, None] - centers)).reshape(len(rest), -1)  # n k*3
+    spread = (arms.T @ rest).reshape(len(centers), 3, 3)
+    cross = (arms.T @ flat).reshape(len(centers), 3, -1, 3).swapaxes(1, 2) + spread[:, None]
     cross += (STIFF * np.trace(spread, axis1=1, axis2=2)[:, None, None] * np.eye(3))[:, None]
     left, _, right = np.linalg.svd(cross)
     left[..., 2] *= np.sign(np.linalg.det(left) * np.linalg.det(right))[..., None]
@@ -223,7 +223,7 @@ def _along(rest: Array, moved: Array, maps: Array) -> Array:
     bones, frames = maps.shape[:2]
     columns = maps.transpose(1, 2, 0, 3).reshape(3 * frames, 4 * bones)
     products = (moved.reshape(len(moved), -1) @ columns).reshape(len(rest), bones, 4)
-    return (products @ _ends(rest)[..., None])[..., 0]
+    return np.einsum("nkc,nc->nk", products, _ends(rest))
 
 
 def _ends(rest: Array) -> Array:
@@ -273,26 +273,39 @@ def _chosen(gram: Array, given: Array) -> Array:
 
 
 def _convex(gram: Array, given: Array) -> Array:
-    """The convex weights w with the least w G w - 2 w g, for up to four bones: every choice of bones is tried."""
+    """The convex weights w with the least w G w - 2 w g, for up to four bones.
+
+    Where those that only sum to 1 are not negative, they are it; elsewhere every choice of fewer bones is tried.
+    """
+    count = gram.shape[1]
+    weights = _balanced(gram, given)
+    (left,) = np.nonzero((weights < 0).any(1))
+    gram, given = gram[left], given[left]
+    alone = np.einsum("naa->na", gram) - 2 * given
+    best, found = alone.min(1), np.eye(count)[alone.argmin(1)]
+    for number in range(2, count):
+        for taken in map(list, combinations(range(count), number)):
+            inner, outer = gram[:, np.array(taken)[:, None], taken], given[:, taken]
+            some = _balanced(inner, outer)
+            cost = np.einsum("na,nab,nb->n", some, inner, some) - 2 * (some * outer).sum(1)
+            better = (some >= 0).all(1) & (cost < best)
+            best[better] = cost[better]
+            found[better] = 0
+            found[np.ix_(better, taken)] = some[better]
+    weights[left] = found
+    return weights / weights.sum(1, keepdims=True)
+
+
+def _balanced(gram: Array, given: Array) -> Array:
+    """The weights w with the least w G w - 2 w g that sum to 1; they may be negative."""
     count = gram.shape[1]
     scale = np.trace(gram, axis1=1, axis2=2)[:, None, None] + np.finfo(float).tiny
-    best, weights = np.full(len(gram), np.inf), np.zeros(given.shape)
-    for choice in product((False, True), repeat=count):
-        taken = np.flatnonzero(choice)
-        if len(taken) == 0:
-            continue
-        system = np.ones((len(gram), len(taken) + 1, len(taken) + 1))
-        system[:, :-1, :-1] = gram[:, taken[:, None], taken] / scale + STIFF * np.eye(len(taken))
-        system[:, -1, -1] = 0
-        right = np.ones((len(gram), len(taken) + 1, 1))
-        right[:, :-1] = given[:, taken, None] / scale
-        some = np.linalg.solve(system, right)[:, :-1, 0]
-        cost = np.einsum("na,nab,nb->n", some, system[:, :-1, :-1], some) - 2 * (some * right[:, :-1, 0]).sum(1)
-        better = (some >= 0).all(1) & (cost < best)
-        best[better] = cost[better]
-        weights[np.ix_(better, taken)] = some[better]
-        weights[np.ix_(better, np.flatnonzero(~np.array(choice)))] = 0
-    return weights / weights.sum(1, keepdims=True)
+    system = np.ones((len(gram), count + 1, count + 1))
+    system[:, :-1, :-1] = gram / scale + STIFF * np.eye(count)
+    system[:, -1, -1] = 0
+    right = np.ones((len(gram), count + 1, 1))
+    right[:, :-1] = given[..., None] / scale
+    return np.asarray(np.linalg.solve(system, right)[:, :-1, 0])
 
 
 def _displaced(rest: Array, maps: Array) -> Array:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import small_package
 import torch
 from small_package import FPS, FRAMES, NOTE, REACH, cloud, gem, inputs, job, packed, tracked
 
@@ -162,6 +163,18 @@ def test_the_driving_video_sets_the_frame_rate(tmp_path: Path) -> None:
     run(job(given, tmp_path / "out"))
     with zipfile.ZipFile(tmp_path / "out/package.zip") as archive:
         assert read_glb(archive.read("asset.glb")).fps == FPS
+
+
+def test_a_single_frame_stands_still_in_every_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(small_package, "FRAMES", 1)
+    given = inputs(tmp_path / "inputs")
+    write_tracked(given["tracked"], tracked(frames=1))
+    run(job(given, tmp_path / "out"))
+    with zipfile.ZipFile(tmp_path / "out/package.zip") as archive:
+        names = set(archive.namelist())
+        manifest = json.loads(archive.read("asset.json"))
+    assert COMMON | RIGGED | {"splats/000.ply", "splats/000.spz"} == names
+    assert (manifest["frames"], manifest["duration_s"]) == (1, pytest.approx(1 / FPS))
 
 
 def test_a_package_needs_one_kind_of_mesh(tmp_path: Path) -> None:

@@ -12,75 +12,19 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import trimesh
 from PIL import Image
-from pxr import Gf, Usd, UsdGeom, UsdShade, UsdUtils, UsdValidation, UsdVol
+from pxr import Usd, UsdGeom, UsdShade, UsdUtils, UsdValidation
+from usd_samples import FPS, FRAMES, HALF, ball, balls, cloud, colorful_ball, growing_ball, torn_ball
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.usd import UsdPlacement, compose_usdz, write_usdz
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.quaternion import rotation_matrix
 from dg4d_lib.mesh.textured import TexturedMesh
 from tests.clients.node import run_node
 
-FRAMES, FPS = 4, 12.0
 PNG = GltfSettings(image="png")
-
-
-def ball(subdivisions: int = 1) -> TexturedMesh:
-    """A sphere whose triangles share no vertex, as if every edge were a seam."""
-    sphere = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.5)
-    vertices = torch.tensor(sphere.triangles.reshape(-1, 3), dtype=torch.float32)
-    generator = torch.Generator().manual_seed(subdivisions)
-    return TexturedMesh(
-        vertices,
-        torch.arange(len(vertices)).reshape(-1, 3),
-        torch.rand(len(vertices), 2, generator=generator),
-        torch.randint(0, 256, (16, 8, 3), generator=generator) / 255,
-    )
-
-
-def growing_ball(frames: int = FRAMES) -> Asset4D:
-    """Every frame is the ball again, larger by a quarter of its first size."""
-    mesh = ball()
-    return Asset4D(mesh, torch.arange(frames)[:, None, None] * mesh.vertices / 4, 7.0)
-
-
-def torn_ball() -> Asset4D:
-    """Copies of a vertex part."""
-    offsets = torch.randn(FRAMES, len(ball().vertices), 3, generator=torch.Generator().manual_seed(1))
-    return Asset4D(ball(), offsets, 7.0)
-
-
-def colorful_ball() -> Asset4D:
-    textures = torch.randint(0, 256, (FRAMES, 16, 8, 3), generator=torch.Generator().manual_seed(2)) / 255
-    return replace(growing_ball(), textures=textures)
-
-
-def cloud(frames: int = FRAMES, count: int = 5, bases: int = 4) -> Gaussians:
-    generator = torch.Generator().manual_seed(3)
-
-    def rand(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator)
-
-    return Gaussians(
-        rand(frames, count, 3), rand(frames, count, 3) - 3, rand(frames, count, 4), rand(count), rand(count, bases, 3)
-    )
-
-
-def balls(frames: int = FRAMES) -> list[TexturedMesh]:
-    """Unrelated meshes: a coarse and a fine one in turn, every one larger than the one before."""
-    meshes = [ball(frame % 2) for frame in range(frames)]
-    return [
-        replace(
-            mesh,
-            vertices=mesh.vertices * (1 + frame),
-            texture=torch.full((4, 4, 3), frame / 255),
-        )
-        for frame, mesh in enumerate(meshes)
-    ]
 
 
 def at(x: float = 0.0, turn_deg: float = 0.0, scale: float = 1.0) -> torch.Tensor:
@@ -104,6 +48,7 @@ WRITTEN = {
     "tracked": lambda path: write_usdz(path, growing_ball(), FPS),
     "torn": lambda path: write_usdz(path, torn_ball(), FPS),
     "with splats": lambda path: write_usdz(path, growing_ball(), FPS, cloud()),
+    "half splats": lambda path: write_usdz(path, growing_ball(), FPS, cloud(), settings=HALF),
     "changing textures": lambda path: write_usdz(path, colorful_ball(), FPS),
     "per frame": lambda path: write_usdz(path, balls(), FPS, cloud()),
     "one frame": lambda path: write_usdz(path, growing_ball(1), FPS, cloud(1)),
@@ -184,7 +129,7 @@ def test_everything_a_package_needs_is_inside_aligned_and_without_dates(kind: st
         assert (entry.compress_type, entry.date_time) == (zipfile.ZIP_STORED, (1980, 1, 1, 0, 0, 0))
 
 
-@pytest.mark.parametrize("kind", ["with splats", "changing textures", "per frame", "scene"])
+@pytest.mark.parametrize("kind", ["with splats", "half splats", "changing textures", "per frame", "scene"])
 def test_equal_input_gives_equal_bytes(kind: str, path: Path) -> None:
     WRITTEN[kind](path)
     other = path.parent / "elsewhere"
@@ -262,6 +207,14 @@ def test_the_texture_is_the_picture_and_is_srgb(path: Path) -> None:
     assert color.GetInput("sourceColorSpace").Get() == "sRGB"
 
 
+@pytest.mark.parametrize("side", [1, 3])
+def test_tiny_textures_are_written(side: int, path: Path) -> None:
+    texture = torch.full((side, side, 3), 51 / 255)
+    write_usdz(path, replace(growing_ball(), mesh=replace(ball(), texture=texture)), FPS, settings=PNG)
+    (picture,) = pictures(path).values()
+    assert np.array_equal(picture, np.full((side, side, 3), 51))
+
+
 def test_jpeg_is_nearly_the_picture(path: Path) -> None:
     smooth = torch.linspace(0, 1, 32)[:, None, None].expand(32, 32, 3)
     write_usdz(path, replace(growing_ball(), mesh=replace(ball(), texture=smooth)), FPS)
@@ -285,50 +238,17 @@ def test_roughness_and_metallic_are_the_settings(path: Path) -> None:
     assert [surface.GetInput(name).Get() for name in ("roughness", "metallic")] == [0.25, 0.75]
 
 
-def test_splats_are_the_states(path: Path) -> None:
-    states = cloud()
-    write_usdz(path, growing_ball(), FPS, states)
+@pytest.mark.parametrize("kind", ["with splats", "half splats", "changing textures", "per frame"])
+def test_who_names_no_time_sees_the_first_frame(kind: str, path: Path) -> None:
+    WRITTEN[kind](path)
     stage = Usd.Stage.Open(str(path))
-    stage.GetDefaultPrim().GetVariantSet("representation").SetVariantSelection("splats")
-    splats = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/asset/splats"))
-    for time in range(FRAMES + 1):
-        state = states.at(time % FRAMES)
-        assert np.array_equal(splats.GetPositionsAttr().Get(time), state.means.numpy())
-        scales = np.array(splats.GetScalesAttr().Get(time))
-        np.testing.assert_allclose(scales, state.log_scales.exp(), rtol=1e-6)
-        quats = [(q.GetReal(), *q.GetImaginary()) for q in splats.GetOrientationsAttr().Get(time)]
-        np.testing.assert_allclose(np.linalg.norm(quats, axis=1), 1, atol=1e-6)
-        turns = rotation_matrix(torch.tensor(quats))
-        np.testing.assert_allclose(turns, rotation_matrix(state.quats), atol=1e-5)
-        low, high = np.array(splats.GetExtentAttr().Get(time))
-        reach = 3 * state.covariances.diagonal(dim1=-2, dim2=-1).sqrt()
-        np.testing.assert_allclose(low, (state.means - reach).amin(0), rtol=1e-4)
-        np.testing.assert_allclose(high, (state.means + reach).amax(0), rtol=1e-4)
-    np.testing.assert_allclose(splats.GetOpacitiesAttr().Get(), states.opacity_logits.sigmoid(), rtol=1e-6)
-    coefficients = np.array(splats.GetRadianceSphericalHarmonicsCoefficientsAttr().Get())
-    assert np.array_equal(coefficients.reshape(5, 4, 3), states.harmonics)
-    assert splats.GetRadianceSphericalHarmonicsDegreeAttr().Get() == 1
-    assert Usd.ColorSpaceAPI(splats.GetPrim()).GetColorSpaceNameAttr().Get() == Gf.ColorSpaceNames.SRGBRec709
-
-
-def test_orientations_of_usd_turn_as_ours(path: Path) -> None:
-    quarter = torch.tensor([[[math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4)]]])  # around z: x becomes y
-    write_usdz(path, growing_ball(1), FPS, replace(cloud(1, 1, 1), quats=quarter))
-    stage = Usd.Stage.Open(str(path))
-    stage.GetDefaultPrim().GetVariantSet("representation").SetVariantSelection("splats")
-    (quat,) = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/asset/splats")).GetOrientationsAttr().Get(0)
-    assert Gf.IsClose(quat.Transform(Gf.Vec3f(1, 0, 0)), Gf.Vec3f(0, 1, 0), 1e-6)
-
-
-def test_mesh_and_splats_are_never_shown_together(path: Path) -> None:
-    write_usdz(path, growing_ball(), FPS, cloud())
-    stage = Usd.Stage.Open(str(path))
-    shown = {}
-    for choice in (None, "splats", "mesh"):
-        if choice:
-            stage.GetDefaultPrim().GetVariantSet("representation").SetVariantSelection(choice)
-        shown[choice] = [prim.GetName() for prim in stage.Traverse() if prim.IsA(UsdGeom.Gprim)]
-    assert shown == {None: ["subject"], "splats": ["splats"], "mesh": ["subject"]}
+    splats = stage.GetDefaultPrim().GetVariantSet("representation")
+    for choice in ("mesh", "splats") if splats.GetVariantNames() else ("mesh",):
+        splats.SetVariantSelection(choice)
+        moving = [a for prim in stage.Traverse() for a in prim.GetAttributes() if a.GetNumTimeSamples()]
+        assert moving
+        for attribute in moving:
+            assert np.array_equal(np.array(attribute.Get()), np.array(attribute.Get(0))), attribute.GetPath()
 
 
 @pytest.mark.parametrize("frames", [1, 2, FRAMES])
