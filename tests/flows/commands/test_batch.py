@@ -149,7 +149,7 @@ def test_the_server_shows_how_far_a_batch_is_and_a_table_that_can_be_read(place:
 
 HEEDS_INTERRUPTS = """
 import signal
-signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background ignores it, and so do its children
+signal.signal(signal.SIGINT, signal.default_int_handler)  # what is in the background ignores it
 from flows.cli import main
 main()
 """
