@@ -71,7 +71,8 @@ def _serve(control: socket.socket) -> list[str] | None:
                     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
                     _become(order["environment"], handles)
                     return list(order["arguments"])
-                os.setpgid(pid, pid)  # here too, so that whoever hears its number can end the group
+                with suppress(OSError):  # it has ended
+                    os.setpgid(pid, pid)  # here too, so that whoever hears its number can end the group
                 for handle in handles:
                     os.close(handle)
                 _tell(control, {"pid": pid})
@@ -79,8 +80,7 @@ def _serve(control: socket.socket) -> list[str] | None:
 
 def _become(environment: dict[str, str], handles: list[int]) -> None:
     """Make this fork the process that was ordered."""
-    with suppress(PermissionError):  # done already
-        os.setpgid(0, 0)
+    os.setpgid(0, 0)
     os.environ.update(environment)
     tempfile.tempdir = None  # as the environment says, not what an import found
     for number, handle in enumerate(handles[:3]):

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -40,6 +41,8 @@ from steps.profiles import PackAssetSettings
 
 Surface = Asset4D | list[TexturedMesh]
 Notes = Sequence[str]
+
+LANES = 2  # writers at a time: the rig takes one core, films leave gaps
 
 
 @dataclass(frozen=True)
@@ -201,9 +204,10 @@ def run(job: Job) -> Facts:
             contents.write_canonical,
             contents.write_previews,
         )
-        for done, write in enumerate(writers, 1):
-            notes += write()
-            job.progress(done, len(writers), {})
+        with ThreadPoolExecutor(LANES) as lanes:
+            for done, written in enumerate([lanes.submit(write) for write in writers], 1):
+                notes += written.result()
+                job.progress(done, len(writers), {})
         job.outputs["sheet"].write_bytes((contents.folder / packages.SHEET).read_bytes())
         names = sorted(path.relative_to(contents.folder).as_posix() for path in contents.folder.rglob("*.*"))
         manifest = Manifest(
