@@ -55,6 +55,17 @@ def test_an_empty_picture() -> None:
     refused(dg4d("make", "none.png", "-o", "out"), "empty (0 bytes)")
 
 
+@pytest.mark.parametrize("command", [("make", "cat.png"), ("batch", "."), ("motions", "cat.png")])
+def test_a_folder_in_which_nothing_may_be_written(place: Path, command: tuple[str, str]) -> None:
+    (place / "kept").mkdir(mode=0o555)
+    as_others = ["setpriv", "--bounding-set=-dac_override"] if os.geteuid() == 0 else []  # root may write everywhere
+    program = [*as_others, sys.executable, "-m", "flows.cli", *command, "-o", "kept/out"]
+    done = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert done.returncode == 65, done.stderr
+    assert "cannot be written: Permission denied" in done.stderr and "choose another with -o" in done.stderr
+    assert list((place / "kept").iterdir()) == []
+
+
 def test_a_video_that_is_missing_or_has_one_frame() -> None:
     refused(dg4d("make", "cat.png", "--video", "run.mp4", "-o", "out"), "run.mp4 does not exist")
     Path("run").mkdir()
