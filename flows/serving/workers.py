@@ -74,7 +74,7 @@ class Worker:
             if not alone:
                 return 0  # another guard was quicker
             signal.signal(signal.SIGTERM, leave)
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            signal.signal(signal.SIGINT, lambda *_: None)  # SIG_IGN would be the worker's too, which ends by it
             self._place("pid").write_text(str(os.getpid()), encoding="ascii")
             server = Server(self.folder, self.folder)
             own = server.is_at(api_url)

@@ -147,21 +147,13 @@ def test_the_server_shows_how_far_a_batch_is_and_a_table_that_can_be_read(place:
     assert "all are in summary.csv" in by_type["table"]["description"]
 
 
-HEEDS_INTERRUPTS = """
-import signal
-signal.signal(signal.SIGINT, signal.default_int_handler)  # what is in the background ignores it
-from flows.cli import main
-main()
-"""
-
-
 def test_a_user_who_stops_a_batch_keeps_what_is_done(place: None, tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     for name, words in {"a": "quick", "b": "fit_motion=sleep:300", "c": "never"}.items():
         (tmp_path / "in" / f"{name}.png").write_text(f"stopped {words}")
     log = tmp_path / "ran"
     command = subprocess.Popen(
-        [sys.executable, "-c", HEEDS_INTERRUPTS, "batch", "in", "-o", "out"],
+        [sys.executable, "-m", "flows.cli", "batch", "in", "-o", "out"],
         cwd=tmp_path,
         env={**os.environ, "FAKE_LOG": str(log), "DG4D_EXECUTOR": "subprocess"},
         stdout=subprocess.PIPE,
