@@ -161,8 +161,8 @@ def _server() -> ForkServer:
             if server.has_ended() or (server.environment != now and server.is_idle()):
                 _servers.remove(server)
                 server.end()
-        fitting = [server for server in _servers if server.environment == now]
-        if not fitting:
-            fitting = [ForkServer(now)]
-            _servers.extend(fitting)
-        return fitting[0]
+        for server in _servers:
+            if server.environment == now:
+                return server
+        _servers.append(ForkServer(now))
+        return _servers[-1]

@@ -1,16 +1,13 @@
 """The flows with a real server and steps that do next to nothing; one module, for every server costs seconds."""
 
 import json
-import os
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner, Result
-from waiting import wait_until
+from waiting import start, wait_until
 
 from flows import cli, home
 from flows.catalog import convert_all
@@ -186,20 +183,9 @@ def dg4d(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     return lambda *arguments: CliRunner().invoke(cli.app, arguments)
 
 
-def _start(*arguments: str) -> "subprocess.Popen[str]":
-    """The command in a process of its own, with steps in theirs."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "flows.cli", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "DG4D_EXECUTOR": "subprocess"},
-    )
-
-
 def test_a_killed_command_goes_on_where_it_was_and_gives_the_same_bytes(log: Path, tmp_path: Path) -> None:
     (tmp_path / "x.png").write_text("kill fit_motion=sleep-once:60")
-    command = _start("make", str(tmp_path / "x.png"), "-o", str(tmp_path / "out"))
+    command = start("make", str(tmp_path / "x.png"), "-o", str(tmp_path / "out"))
     wait_until(lambda: log.exists() and "fit_motion" in log.read_text())
     command.send_signal(signal.SIGKILL)
     command.communicate()
@@ -207,7 +193,7 @@ def test_a_killed_command_goes_on_where_it_was_and_gives_the_same_bytes(log: Pat
     assert not (tmp_path / "out").exists()
     assert settle_orphans() == 1
     assert settle_orphans() == 0
-    command = _start("make", str(tmp_path / "x.png"), "-o", str(tmp_path / "out"))
+    command = start("make", str(tmp_path / "x.png"), "-o", str(tmp_path / "out"))
     said, trouble = command.communicate()
     assert command.returncode == 0, trouble
     assert ran(log) == EVERY_STEP[3:]
@@ -218,7 +204,7 @@ def test_a_killed_command_goes_on_where_it_was_and_gives_the_same_bytes(log: Pat
 
 def test_two_commands_at_once_do_the_work_once(log: Path, tmp_path: Path) -> None:
     (tmp_path / "x.png").write_text("both fit_gaussians=sleep:1")
-    both = [_start("make", str(tmp_path / "x.png"), "-o", str(tmp_path / out)) for out in ("a", "b")]
+    both = [start("make", str(tmp_path / "x.png"), "-o", str(tmp_path / out)) for out in ("a", "b")]
     for command in both:
         _, trouble = command.communicate()
         assert command.returncode == 0, trouble

@@ -1,5 +1,8 @@
-"""For what other processes do."""
+"""Commands in processes of their own, and what is waited for."""
 
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from typing import TypeVar
@@ -8,6 +11,17 @@ Found = TypeVar("Found")
 
 EVERY_S = 0.1
 LONG_S = 400.0  # on a machine that is busy with other things
+
+
+def start(*arguments: str) -> "subprocess.Popen[str]":
+    """The command in a process of its own, with steps in theirs."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "flows.cli", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "DG4D_EXECUTOR": "subprocess"},
+    )
 
 
 def wait_until(happens: Callable[[], Found]) -> Found:

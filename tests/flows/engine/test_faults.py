@@ -5,7 +5,6 @@ import os
 import signal
 import sqlite3
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -17,7 +16,7 @@ from postgresql import server_on_postgresql
 from prefect.client.orchestration import get_client
 from prefect.settings import PREFECT_API_URL, temporary_settings
 from rich.console import Console
-from waiting import wait_until
+from waiting import start, wait_until
 
 from dg4d_lib.errors import BadInput
 from flows import home
@@ -82,17 +81,6 @@ def order(words: str, folder: Path) -> Order:
 def content(folder: Path) -> dict[str, bytes]:
     files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name not in RUN_FACTS)
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
-
-
-def start(*arguments: str) -> "subprocess.Popen[str]":
-    """The command in a process of its own, with steps in theirs."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "flows.cli", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "DG4D_EXECUTOR": "subprocess"},
-    )
 
 
 def during(step: str, log: Path, do: Callable[[], None]) -> threading.Thread:
