@@ -9,12 +9,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dg4d_lib.deformation.hexplane_kernel import hexplane_features
+from dg4d_lib.deformation.hexplane_kernel import SPATIAL_AXES, hexplane_features
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.settings import HexPlaneSettings
 
 ROWS = 1 << 13  # Gaussians times moments that the network reads at a time
-PLANE_AXES = ((0, 1), (0, 2), (1, 2))  # xy, xz, yz; the time planes are xt, yt, zt
 
 
 class ResidualHead(nn.Module):
@@ -92,7 +91,7 @@ class HexPlane(nn.Module):
         """What to add at every time in [0, 1]; means outside the box read its border."""
         low, high = self.bounds
         coordinates = ((means - low) / (high - low) * 2 - 1).clamp(-1, 1)
-        on_cpu = means.device.type == "cpu" and means.dtype == torch.float32 and not coordinates.requires_grad
+        on_cpu = means.device.type == "cpu" and means.dtype == torch.float32
         read = hexplane_features if on_cpu else plane_features
         moments = self.last * times
         features = [
@@ -137,7 +136,7 @@ def plane_features(
 
     Plain torch: the definition of `hexplane_features`, and what runs on other devices and precisions.
     """
-    pairs = torch.stack([coordinates[:, list(axes)] for axes in PLANE_AXES])
+    pairs = torch.stack([coordinates[:, list(axes)] for axes in SPATIAL_AXES])
     space = functional.grid_sample(planes, pairs[:, None], align_corners=True, padding_mode="border")[:, :, 0].prod(0)
     last = lines.shape[-1] - 1
     place = (coordinates + 1) / 2 * last

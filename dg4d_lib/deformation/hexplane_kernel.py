@@ -21,6 +21,7 @@ from torch.nn import functional
 from dg4d_lib.kernels.vectors import FLOAT, INT, KERNEL, LANES, LONG, Value, Vectors, pointers
 from dg4d_lib.kernels.workers import ranges, run
 
+SPATIAL_AXES = ((0, 1), (0, 2), (1, 2))  # xy, xz, yz: the axis along the columns and that along the rows
 BLOCKS = 4  # of points, each with sums of its own in backward
 BLOCK_BYTES = 1 << 26  # of the sums at most; fewer blocks where they would be larger
 
@@ -28,19 +29,16 @@ BLOCK_BYTES = 1 << 26  # of the sums at most; fewer blocks where they would be l
 def hexplane_features(
     coordinates: Float[Tensor, "n 3"], planes: Float[Tensor, "3 c r r"], lines: Float[Tensor, "3 t c r"]
 ) -> Float[Tensor, "t n c"]:
-    """Product of six samples for every point and time; differentiable once, in planes and lines.
+    """Product of six samples for every point and time; differentiable once.
 
     Args:
-        coordinates: in [-1, 1], from the centers of the first to those of the last cells; outside reads the border.
-            They get no gradient.
+        coordinates: in [-1, 1], from the centers of the first to those of the last cells; outside reads the border,
+            without a gradient.
         planes: xy, xz and yz; rows are the second axis, columns the first; read bilinearly.
         lines: xt, yt and zt at the times asked for; read linearly.
 
     Returns:
         Features in the precision of the planes, computed in float32.
-
-    Raises:
-        ValueError: the coordinates want a gradient.
     """
     features: Tensor = _Features.apply(coordinates, planes.float(), lines.float())
     return features.to(planes.dtype)
@@ -51,8 +49,6 @@ class _Features(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, coordinates: Tensor, planes: Tensor, lines: Tensor) -> Tensor:
-        if ctx.needs_input_grad[0]:
-            raise ValueError("HexPlane features have no gradient in the coordinates; detach them")
         channels = planes.shape[1]
         plane_buffer = _padded(planes.permute(0, 2, 3, 1))
         line_buffer = _padded(lines.permute(0, 3, 1, 2))
@@ -62,27 +58,30 @@ class _Features(torch.autograd.Function):
         parts = ranges(len(coordinates), torch.get_num_threads())
         run([partial(_read, *arrays, features.numpy(), *part) for part in parts])
         ctx.arrays, ctx.channels = arrays, channels
+        ctx.slope = (coordinates.abs() < 1) * (planes.shape[-1] - 1) / 2  # of the shares in the coordinates
         return features[..., :channels]
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, incoming: Tensor) -> tuple[None, Tensor, Tensor]:
+    def backward(ctx: Any, incoming: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
         """Threads take blocks of points and sixteen channels; neither blocks nor sums depend on the threads."""
         buffers = ctx.arrays[2:]
         gradient = _padded(incoming).numpy()
         blocks = max(1, min(BLOCKS, BLOCK_BYTES // sum(buffer.nbytes for buffer in buffers)))
         parts = ranges(gradient.shape[1], blocks)
         found = [np.zeros((len(parts), *buffer.shape), np.float32) for buffer in buffers]
+        of_shares = np.empty((3, *gradient.shape[1:]), np.float32) if ctx.needs_input_grad[0] else None
         run(
             [
-                partial(_write_back, *ctx.arrays, gradient, *(array[i] for array in found), *part, channel)
+                partial(_write_back, *ctx.arrays, gradient, *(array[i] for array in found), of_shares, *part, channel)
                 for i, part in enumerate(parts)
                 for channel in range(0, gradient.shape[2], LANES)
             ]
         )
         sums = (torch.from_numpy(array.sum(0)) for array in found)
         planes, lines = (total[..., : ctx.channels] for total in sums)
-        return None, planes.permute(0, 3, 1, 2), lines.permute(0, 2, 3, 1)
+        of_coordinates = None if of_shares is None else torch.from_numpy(of_shares.sum(-1).T) * ctx.slope
+        return of_coordinates, planes.permute(0, 3, 1, 2), lines.permute(0, 2, 3, 1)
 
 
 def _padded(tensor: Tensor) -> Tensor:
@@ -110,12 +109,12 @@ def _read(cells, shares, planes, lines, features, start, stop):
 
 @njit(**KERNEL)
 @no_type_check
-def _write_back(cells, shares, planes, lines, gradient, grad_planes, grad_lines, start, stop, channel):
+def _write_back(cells, shares, planes, lines, gradient, grad_planes, grad_lines, grad_shares, start, stop, channel):
     size, times, channels = planes.shape[1], lines.shape[2], planes.shape[3]
     points = gradient.shape[1]
     for point in range(start, stop):
         _write_back_point(
-            cells, shares, planes, lines, gradient, grad_planes, grad_lines,
+            cells, shares, planes, lines, gradient, grad_planes, grad_lines, grad_shares,
             point, channel, size, times, channels, points,
         )  # fmt: skip
 
@@ -148,17 +147,21 @@ def _read_point(typing_context, cells, shares, planes, lines, features, point, c
 @intrinsic
 @no_type_check
 def _write_back_point(
-    typing_context, cells, shares, planes, lines, gradient, grad_planes, grad_lines,
+    typing_context, cells, shares, planes, lines, gradient, grad_planes, grad_lines, grad_shares,
     point, channel, size, times, channels, points,
 ):  # fmt: skip
-    """Add the gradient of one point and sixteen channels to those of the planes and lines that it read."""
+    """Add the gradient of one point and sixteen channels to those of the planes and lines that it read.
+
+    That of its shares is written too, channels apart, unless it is None.
+    """
     scalars = [types.int64] * 6
-    signature = types.void(cells, shares, planes, lines, gradient, grad_planes, grad_lines, *scalars)
+    signature = types.void(cells, shares, planes, lines, gradient, grad_planes, grad_lines, grad_shares, *scalars)
+    axes = () if isinstance(grad_shares, types.NoneType) else range(3)
 
     def generate(context, builder, signature, arguments):
         e = Vectors(builder)
         data = pointers(context, builder, signature, arguments)
-        corner = _Corner(e, data, arguments[7:])
+        corner = _Corner(e, data, arguments[8:])
         first, second, third = corner.spatial()
         product = e.multiply(e.multiply(first, second), third)
 
@@ -174,14 +177,19 @@ def _write_back_point(
             for axis, part in enumerate(parts):
                 for index, weight in corner.ends(axis, time):
                     add(data[6], index, weight, part)
-            return [e.fma(incoming, e.multiply(xy, z), carried[0])]
+            slopes = [e.fma(parts[axis], corner.line_slope(axis, time), carried[1 + axis]) for axis in axes]
+            return [e.fma(incoming, e.multiply(xy, z), carried[0]), *slopes]
 
-        (total,) = e.loop(_long(0), arguments[10], [e.constant(0)], at_time)
+        total, *slopes = e.loop(_long(0), arguments[11], [e.constant(0)] * (1 + len(axes)), at_time)
         others = (e.multiply(second, third), e.multiply(first, third), e.multiply(first, second))
         for plane, other in enumerate(others):
             part = e.multiply(total, other)
             for index, weight in corner.corners(plane):
                 add(data[5], index, weight, part)
+            for axis, slope in corner.plane_slopes(plane) if axes else ():
+                slopes[axis] = e.fma(part, slope, slopes[axis])
+        for axis in axes:
+            e.store(data[7], corner.share(axis), slopes[axis])
         return context.get_dummy_value()
 
     return signature, generate
@@ -203,7 +211,7 @@ class _Corner:
     def corners(self, plane: int) -> list[tuple[Value, Value]]:
         """Place and weight of the four cells of a spatial plane."""
         builder = self.e.builder
-        column, row = ((0, 1), (0, 2), (1, 2))[plane]
+        column, row = SPATIAL_AXES[plane]
         found = []
         for down, row_weight in enumerate((self.left[row], self.right[row])):
             line = builder.add(builder.mul(self.size, _long(plane)), builder.add(self.cells[row], _long(down)))
@@ -225,9 +233,16 @@ class _Corner:
 
     def feature(self, time: Value) -> Value:
         """Place of the point's features at a time."""
+        return self._of_point(time)
+
+    def share(self, axis: int) -> Value:
+        """Place of the gradient of the point's share on an axis."""
+        return self._of_point(_long(axis))
+
+    def _of_point(self, row: Value) -> Value:
         builder = self.e.builder
-        row = builder.add(builder.mul(time, self.points), self.point)
-        return builder.add(builder.mul(row, self.channels), self.channel)
+        place = builder.add(builder.mul(row, self.points), self.point)
+        return builder.add(builder.mul(place, self.channels), self.channel)
 
     def spatial(self) -> list[Value]:
         """Samples of the three spatial planes."""
@@ -236,6 +251,23 @@ class _Corner:
     def temporal(self, time: Value) -> list[Value]:
         """Samples of the three lines at a time."""
         return [self._sample(self.lines, self.ends(axis, time)) for axis in range(3)]
+
+    def plane_slopes(self, plane: int) -> list[tuple[int, Value]]:
+        """The derivatives of a spatial plane's sample in the shares of its two axes, each with its axis."""
+        e = self.e
+        column, row = SPATIAL_AXES[plane]
+        above, above_right, below, below_right = (e.load(self.planes, index) for index, _ in self.corners(plane))
+        along = self._between(row, e.subtract(above_right, above), e.subtract(below_right, below))
+        down = self._between(column, e.subtract(below, above), e.subtract(below_right, above_right))
+        return [(column, along), (row, down)]
+
+    def line_slope(self, axis: int, time: Value) -> Value:
+        """The derivative of a line's sample in the share of its axis."""
+        left, right = (self.e.load(self.lines, index) for index, _ in self.ends(axis, time))
+        return self.e.subtract(right, left)
+
+    def _between(self, axis: int, left: Value, right: Value) -> Value:
+        return self.e.fma(self.right[axis], right, self.e.multiply(self.left[axis], left))
 
     def _sample(self, array: Value, terms: list[tuple[Value, Value]]) -> Value:
         (index, weight), *others = terms

@@ -30,19 +30,20 @@ def inputs(points, times, channels, size, dtype=torch.float32):
     coordinates = 2.4 * torch.rand(points, 3, generator=generator) - 1.2  # some outside
     planes = 0.5 + torch.rand(3, channels, size, size, generator=generator)
     lines = 0.5 + torch.rand(3, times, channels, size, generator=generator)
-    return coordinates.to(dtype), planes.to(dtype).requires_grad_(), lines.to(dtype).requires_grad_()
+    return coordinates.to(dtype).requires_grad_(), planes.to(dtype).requires_grad_(), lines.to(dtype).requires_grad_()
 
 
 @pytest.mark.parametrize(("points", "times", "channels", "size"), [(300, 4, 32, 9), (50, 1, 7, 2), (40, 3, 20, 33)])
 def test_features_and_gradients_are_those_of_plain_torch(points, times, channels, size):
     coordinates, planes, lines = inputs(points, times, channels, size)
     found = hexplane_features(coordinates, planes, lines)
-    exact_planes, exact_lines = (value.detach().double().requires_grad_() for value in (planes, lines))
-    truth = in_plain_torch(coordinates.double(), exact_planes, exact_lines)
+    given = (coordinates, planes, lines)
+    exact = [value.detach().double().requires_grad_() for value in given]
+    truth = in_plain_torch(*exact)
     torch.testing.assert_close(found.double(), truth, rtol=2e-5, atol=1e-6)  # places are rounded to float32 in cells
     cotangent = torch.randn(truth.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    gradients = torch.autograd.grad(found, (planes, lines), cotangent.float())
-    true_gradients = torch.autograd.grad(truth, (exact_planes, exact_lines), cotangent)
+    gradients = torch.autograd.grad(found, given, cotangent.float())
+    true_gradients = torch.autograd.grad(truth, exact, cotangent)
     for gradient, true_gradient in zip(gradients, true_gradients, strict=True):
         assert (gradient - true_gradient).norm() / true_gradient.norm() < 2e-6
 
@@ -62,7 +63,7 @@ def test_the_number_of_threads_does_not_change_a_byte():
         for threads in (1, 2, 5):
             torch.set_num_threads(threads)
             found = hexplane_features(coordinates, planes, lines)
-            results.append((found, *torch.autograd.grad(found.square().sum(), (planes, lines))))
+            results.append((found, *torch.autograd.grad(found.square().sum(), (coordinates, planes, lines))))
     finally:
         torch.set_num_threads(before)
     assert all(a.equal(b) for result in results[1:] for a, b in zip(result, results[0], strict=True))
@@ -84,10 +85,19 @@ def test_no_points_have_no_gradient():
     assert all((gradient == 0).all() for gradient in torch.autograd.grad(features.sum(), (planes, lines)))
 
 
-def test_a_gradient_in_the_coordinates_is_refused():
-    coordinates, planes, lines = inputs(4, 2, 5, 3)
-    with pytest.raises(ValueError, match="detach"):
-        hexplane_features(coordinates.requires_grad_(), planes, lines)
+def test_outside_there_is_no_gradient_in_the_coordinates():
+    _, planes, lines = inputs(1, 2, 5, 3)
+    coordinates = torch.tensor([[0.3, -1.5, 1.1]], requires_grad=True)
+    (gradient,) = torch.autograd.grad(hexplane_features(coordinates, planes, lines).sum(), coordinates)
+    assert gradient[0, 0] != 0
+    assert (gradient[0, 1:] == 0).all()
+
+
+def test_the_gradients_of_planes_are_the_same_bytes_where_coordinates_want_none():
+    coordinates, planes, lines = inputs(100, 3, 16, 8)
+    wanted = torch.autograd.grad(hexplane_features(coordinates, planes, lines).sum(), (planes, lines))
+    alone = torch.autograd.grad(hexplane_features(coordinates.detach(), planes, lines).sum(), (planes, lines))
+    assert all(a.equal(b) for a, b in zip(wanted, alone, strict=True))
 
 
 def test_coordinates_that_are_not_finite_give_features_that_are_not():
