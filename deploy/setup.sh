@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Makes the virtual environment: pinned packages, the CPU build of torch, the `dg4d` command, and the two system
-# libraries that pymeshlab needs.
+# Makes the virtual environment: pinned packages, the CPU build of torch, the `dg4d` command, a new database for Prefect,
+# and the two system libraries that pymeshlab needs.
 set -euo pipefail
 : "${PYTHON:=python3}" "${VENV:=.venv}" "${TORCH_INDEX:=https://download.pytorch.org/whl/cpu}"
 
@@ -19,6 +19,7 @@ pip install --quiet "$torch+cpu" -c constraints.txt 2>/dev/null ||
     pip install --quiet "$torch+cpu" -c constraints.txt --extra-index-url "$TORCH_INDEX"
 pip install --quiet --upgrade 'pip>=25.1' -c constraints.txt
 pip install --quiet -c constraints.txt --editable . --group dev
+"$VENV/bin/python" -m flows.serving.fresh
 
 # pymeshlab imports without these but then lacks its filters.
 filters() { "$VENV/bin/python" -c 'import pymeshlab; print(len(pymeshlab.filter_list()))' 2>/dev/null || echo 0; }

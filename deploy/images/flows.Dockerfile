@@ -14,6 +14,7 @@ COPY deploy/pools.yaml deploy/prefect.yaml deploy/
 # these folders belong to whoever runs here; a new volume that takes the place of one belongs to them too
 RUN --mount=type=secret,id=pip,target=/etc/pip.conf \
     pip install --no-cache-dir -c constraints.txt ".[${EXTRAS}]" && \
+    python -m flows.serving.fresh && \
     rm -rf /src/* /opt/code && \
     install --directory --owner 10001 --group 10001 /home/dg4d/data /data
 USER 10001

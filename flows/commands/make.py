@@ -21,8 +21,11 @@ if TYPE_CHECKING:
 ANSWER_S = 10.0  # for a server of the user's own
 
 
-def connect() -> None:
+def connect(steps: bool = True) -> None:
     """Have a Prefect server, and import Prefect while it starts.
+
+    Args:
+        steps: whether this process is going to run some; what they import is imported meanwhile too.
 
     Raises:
         ServerUnavailable: there is none; says what to do.
@@ -31,10 +34,12 @@ def connect() -> None:
     if own:
         home.set_environment(own)
         _check(own)
+        _prepare(steps)
     else:
         server = home.background_server()
         server.start()
         home.set_environment(f"{server.wait_for_address()}/api")
+        _prepare(steps)
         import prefect.main  # noqa: F401 - takes seconds, and so does the server
 
         server.wait()
@@ -147,6 +152,13 @@ def save_pictures(order: Order, error: Exception) -> list[Path]:
             continue
         saved.append(path)
     return saved
+
+
+def _prepare(steps: bool) -> None:
+    from flows.engine import executors
+
+    if steps:
+        executors.prepare()
 
 
 def _check(api_url: str) -> None:

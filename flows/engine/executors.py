@@ -19,11 +19,10 @@ from typing import BinaryIO
 from pydantic import ValidationError
 
 from dg4d_lib.errors import BackendUnavailable
-from flows.engine import resources
+from flows.engine import forks, resources
 from flows.engine.containers import container
-from flows.engine.forks import Fork, fork
+from flows.engine.processes import locked
 from flows.home import store
-from flows.serving.server import locked
 from steps.contract import (
     EXIT_BAD_INPUT,
     EXIT_MISSING,
@@ -127,9 +126,9 @@ def in_subprocess(
     """Run a step in a process of its own, which ends with this one and is killed after `spec.timeout_s`."""
     with _scratch() as folder:
 
-        def start(stderr: BinaryIO) -> Fork:
+        def start(stderr: BinaryIO) -> forks.Fork:
             environment = {"TMPDIR": str(folder), **resources.environment()}
-            begun = fork(_arguments(folder), environment, stderr, resources.handles())
+            begun = forks.fork(_arguments(folder), environment, stderr, resources.handles())
             if begun is None:
                 raise StepCrashed(spec.name, "the process that begins steps ended: python -m steps.fork_server")
             return begun
@@ -162,7 +161,7 @@ def in_container(
         return _result_of(_Program(start, end=run.remove), folder, spec, request, on_progress, say)
 
 
-Process = Fork | subprocess.Popen[str]
+Process = forks.Fork | subprocess.Popen[str]
 
 
 @dataclass(frozen=True)
@@ -210,6 +209,12 @@ def chosen() -> Execute:
     if name not in EXECUTORS:
         raise StepMissing("executor", f"$DG4D_EXECUTOR is {name!r}; choose one of: {', '.join(EXECUTORS)}")
     return EXECUTORS[name]
+
+
+def prepare() -> None:
+    """Begin what the first step would wait for; for who is about to run one."""
+    if chosen() is in_subprocess:
+        forks.prepare()
 
 
 _running: dict[Process, Callable[[], None]] = {}

@@ -18,6 +18,11 @@ from steps.fork_server import ORDER_BYTES
 ATTEMPTS = 2  # a server may have been killed since its last step
 
 
+def prepare() -> None:
+    """Have the imports of steps begin now, so that the first step need not wait for them."""
+    _server()
+
+
 class Fork:
     """A step's process, as `subprocess.Popen` shows one.
 

@@ -1,12 +1,19 @@
-"""Which process is which: a number, the moment it began, for numbers are used again, and where that number counts."""
+"""Which process is which, which one is alone with a file, and which ends with another."""
 
+import ctypes
+import fcntl
 import os
+import signal
 import socket
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
 def start_of(pid: int) -> str:
-    """When a process began, in the kernel's ticks; empty if there is none."""
+    """When a process began, in the kernel's ticks, for numbers are used again; empty if there is none."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
     except OSError:
@@ -20,6 +27,37 @@ def place() -> str:
         return f"{socket.gethostname()}-{Path('/proc/self/ns/pid').stat().st_ino}"
     except OSError:  # no Linux
         return socket.gethostname()
+
+
+def die_with_parent() -> None:
+    """Have the kernel end this process when the one that started it ends, however it does."""
+    if sys.platform.startswith("linux"):
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+
+
+@contextmanager
+def locked(path: Path, *, shared: bool = False, patience_s: float = 0.0) -> Iterator[bool]:
+    """Hold the lock of a file while the block runs; gives whether it could be had.
+
+    Args:
+        path: of the file; it is made.
+        shared: only look whether somebody holds it alone, and disturb nobody who also looks.
+        patience_s: seconds to try, for those who look hold it for a moment too.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    deadline = time.monotonic() + patience_s
+    with path.open("a") as file:
+        while True:
+            try:
+                fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if time.monotonic() < deadline:
+                    time.sleep(0.02)
+                    continue
+                yield False
+                return
+            yield True
+            return
 
 
 OWN_START = start_of(os.getpid())

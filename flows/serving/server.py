@@ -5,7 +5,6 @@ FOLDER/server.json, and watches.
 Commands hold a shared lock on FOLDER/in-use while they run; the kernel frees it when they end, however they end.
 """
 
-import ctypes
 import fcntl
 import http.client
 import json
@@ -15,11 +14,13 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 from typing import IO
+
+from flows.engine.processes import die_with_parent, locked
+from flows.serving import fresh
 
 HOST = "127.0.0.1"  # the server asks nobody who they are, so nobody else may reach it
 START_TIMEOUT_S = 120.0
@@ -234,6 +235,7 @@ def _watch(process: subprocess.Popen[bytes], folder: Path, idle_s: float) -> int
 
 def _serve(port: int, prefect_home: Path) -> subprocess.Popen[bytes]:
     prefect_home.mkdir(parents=True, exist_ok=True)
+    fresh.put(prefect_home)
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
     environment |= SETTINGS | {"PREFECT_HOME": str(prefect_home), "PREFECT__SERVER_FINAL": "1"}
     application = ["--factory", "flows.serving.server_app:create_app"]
@@ -260,12 +262,6 @@ def leave(number: int, frame: FrameType | None) -> None:
     sys.exit(0)
 
 
-def die_with_parent() -> None:
-    """Have the kernel end this process when the one that started it ends, however it does."""
-    if sys.platform.startswith("linux"):
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
-
-
 def _free_port(state: Path) -> int:
     """The port of last time, so that addresses stay; or one that is free."""
     before = 0
@@ -282,31 +278,6 @@ def _free_port(state: Path) -> int:
         (state.parent / "port").write_text(str(free), encoding="ascii")
         return free
     raise ServerUnavailable(f"no port is free on {HOST}")
-
-
-@contextmanager
-def locked(path: Path, *, shared: bool = False, patience_s: float = 0.0) -> Iterator[bool]:
-    """Hold the lock of a file while the block runs; gives whether it could be had.
-
-    Args:
-        path: of the file; it is made.
-        shared: only look whether somebody holds it alone, and disturb nobody who also looks.
-        patience_s: seconds to try, for those who look hold it for a moment too.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    deadline = time.monotonic() + patience_s
-    with path.open("a") as file:
-        while True:
-            try:
-                fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-            except BlockingIOError:
-                if time.monotonic() < deadline:
-                    time.sleep(0.02)
-                    continue
-                yield False
-                return
-            yield True
-            return
 
 
 if __name__ == "__main__":

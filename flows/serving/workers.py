@@ -12,8 +12,8 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from flows.engine.processes import start_of
-from flows.serving.server import LOOK_S, Server, die_with_parent, leave, locked
+from flows.engine.processes import die_with_parent, locked, start_of
+from flows.serving.server import LOOK_S, Server, leave
 
 RESTART_S = 5.0  # between two starts of a worker
 GRACE_S = 10.0  # for a worker and its runs to end

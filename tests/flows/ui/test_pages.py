@@ -186,7 +186,7 @@ def test_a_picture_is_shown_as_large_as_its_bytes_allow(tmp_path: Path) -> None:
         sizes.append(Image.open(io.BytesIO(small)).size)
     assert sizes[0] == (960, 240)
     assert sizes[2][0] < sizes[1][0]
-    assert pages.thumbnail(hard, store, 200) is None
+    assert pages.thumbnail(hard, store, 100) is None
     assert pages.thumbnail(store.put_bytes(b"no picture", "image/png"), store) is None
 
 

@@ -1,0 +1,51 @@
+"""A new database for Prefect's server, made once per installation: the migrations that lead to it take ten seconds.
+
+`python -m flows.serving.fresh` makes it beside the interpreter, for every server that starts without a database.
+"""
+
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+import tempfile
+from contextlib import closing
+from importlib.metadata import version
+from pathlib import Path
+
+NAME = "prefect.db"  # in PREFECT_HOME
+
+
+def place() -> Path:
+    """Where the new database of this Prefect is, if it was made."""
+    return Path(sys.prefix) / "share" / "dg4d" / f"prefect-{version('prefect')}.db"
+
+
+def make(path: Path) -> None:
+    """Have Prefect make a new database, and put it there as one file.
+
+    Raises:
+        CalledProcessError: Prefect cannot.
+        OSError: there is no room, or the folder cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".new-") as folder:
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
+        command = [sys.executable, "-m", "prefect", "server", "database", "upgrade", "--yes"]
+        subprocess.run(command, env=environment | {"PREFECT_HOME": folder}, stdout=subprocess.DEVNULL, check=True)
+        whole = Path(folder) / "whole.db"
+        with closing(sqlite3.connect(Path(folder) / NAME)) as database:
+            database.execute("VACUUM INTO ?", [str(whole)])
+        whole.replace(path)
+
+
+def put(prefect_home: Path) -> None:
+    """Give a server that has no database a new one, if one was made; otherwise the server makes its own."""
+    if (prefect_home / NAME).exists() or not place().exists():
+        return
+    with tempfile.TemporaryDirectory(dir=prefect_home, prefix=".new-") as folder:
+        Path(shutil.copyfile(place(), Path(folder) / NAME)).replace(prefect_home / NAME)
+
+
+if __name__ == "__main__" and not place().exists():
+    make(place())

@@ -1,0 +1,47 @@
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from alembic.config import Config
+from alembic.script import ScriptDirectory
+from prefect.server.database import orm_models
+
+from flows.serving import fresh
+
+
+def test_the_database_that_the_set_up_made_is_what_this_prefect_migrates_to() -> None:
+    config = Config()
+    migrations = Path(orm_models.__file__).parent / "_migrations"
+    config.set_main_option("path_separator", "os")
+    config.set_main_option("script_location", str(migrations))
+    config.set_main_option("version_locations", str(migrations / "versions" / "sqlite"))
+    with closing(sqlite3.connect(f"file:{fresh.place()}?mode=ro", uri=True)) as database:
+        assert database.execute("SELECT version_num FROM alembic_version").fetchall() == [
+            (head,) for head in ScriptDirectory.from_config(config).get_heads()
+        ]
+        assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+        assert database.execute("SELECT count(*) FROM flow_run").fetchone() == (0,)
+
+
+def test_a_server_without_a_database_begins_with_a_copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "new.db").write_bytes(b"new")
+    monkeypatch.setattr(fresh, "place", lambda: tmp_path / "new.db")
+    home = tmp_path / "home"
+    home.mkdir()
+    fresh.put(home)
+    assert [(path.name, path.read_bytes()) for path in home.iterdir()] == [(fresh.NAME, b"new")]
+
+
+def test_a_database_that_is_there_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "new.db").write_bytes(b"new")
+    monkeypatch.setattr(fresh, "place", lambda: tmp_path / "new.db")
+    (tmp_path / fresh.NAME).write_bytes(b"old")
+    fresh.put(tmp_path)
+    assert (tmp_path / fresh.NAME).read_bytes() == b"old"
+
+
+def test_where_none_was_made_the_server_makes_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fresh, "place", lambda: tmp_path / "missing.db")
+    fresh.put(tmp_path)
+    assert not list(tmp_path.iterdir())
