@@ -112,6 +112,7 @@ def _make_all(
         if isinstance(first, Row):  # no server is needed for these
             tally.settle(first)
             continue
+        make.prepare(first)
         (connect or make.connect)()
         from flows.catalog import convert_all
 

@@ -21,11 +21,17 @@ if TYPE_CHECKING:
 ANSWER_S = 10.0  # for a server of the user's own
 
 
-def connect(steps: bool = True) -> None:
-    """Have a Prefect server, and import Prefect while it starts.
+def prepare(order: Order) -> None:
+    """Begin what the first step of an order would wait for, unless every step was done before."""
+    from flows.engine import executors
+    from flows.packages.versions import has_version
 
-    Args:
-        steps: whether this process is going to run some; what they import is imported meanwhile too.
+    if not has_version(home.store(), order):
+        executors.prepare()
+
+
+def connect() -> None:
+    """Have a Prefect server, and import Prefect and the flows while it starts.
 
     Raises:
         ServerUnavailable: there is none; says what to do.
@@ -34,13 +40,11 @@ def connect(steps: bool = True) -> None:
     if own:
         home.set_environment(own)
         _check(own)
-        _prepare(steps)
     else:
         server = home.background_server()
         server.start()
         home.set_environment(f"{server.wait_for_address()}/api")
-        _prepare(steps)
-        import prefect.main  # noqa: F401 - takes seconds, and so does the server
+        from flows import image_to_4d  # noqa: F401 - takes seconds, and so does the server
 
         server.wait()
     from flows.engine.orphans import settle_orphans
@@ -152,13 +156,6 @@ def save_pictures(order: Order, error: Exception) -> list[Path]:
             continue
         saved.append(path)
     return saved
-
-
-def _prepare(steps: bool) -> None:
-    from flows.engine import executors
-
-    if steps:
-        executors.prepare()
 
 
 def _check(api_url: str) -> None:

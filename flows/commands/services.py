@@ -43,7 +43,7 @@ def up(
         if "PREFECT_API_URL" not in os.environ:
             server.start()
             server.keep()
-        connect(steps=False)
+        connect()
         from flows.serving.registering import register
 
         for name in register(known, chosen):
@@ -81,7 +81,7 @@ def watch(
         from steps.contract import digest_of
 
         check_writable(out)
-        connect(steps=False)
+        connect()
         from flows.serving.watching import Watcher, announce
 
         name = digest_of([str(folder.resolve()), str(out.resolve())]).removeprefix("sha256:")[:16]

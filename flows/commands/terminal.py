@@ -35,12 +35,12 @@ def console(stderr: bool = False) -> Console:
 
 def with_steps(order: "Order", out: Console, work: Callable[[], Result]) -> Result:
     """What `work` gives, which runs a flow of this order, with its steps on the terminal."""
-    from flows.commands.make import connect, save_pictures
+    from flows.commands.make import connect, prepare, save_pictures
     from flows.engine.executors import StepBadInput
 
     with out.status("starting") if out.is_terminal else nullcontext():
+        prepare(order)
         connect()
-        from flows import image_to_4d  # noqa: F401 - takes a second
     try:
         with steps_shown(out):
             return work()

@@ -1,5 +1,6 @@
 """Processes of steps, forked from one that has imported what they need (`steps/fork_server.py`)."""
 
+import atexit
 import json
 import os
 import queue
@@ -10,11 +11,11 @@ import sys
 import threading
 from collections.abc import Sequence
 from concurrent.futures import Future
-from contextlib import suppress
 from typing import IO, BinaryIO
 
 from steps.fork_server import ORDER_BYTES
 
+SET_BY_IMPORTS = "OpenImageIO_ROOT"  # by a library, for its own programs
 ATTEMPTS = 2  # a server may have been killed since its last step
 
 
@@ -127,8 +128,7 @@ class ForkServer:
 
     def end(self) -> None:
         """End it, and every step of it that still runs."""
-        with suppress(OSError):  # it has ended
-            self._control.shutdown(socket.SHUT_RDWR)
+        self._process.kill()
         self._process.wait()
         self._listener.join()
         self._control.close()
@@ -158,9 +158,21 @@ _servers: list[ForkServer] = []
 _one_look = threading.Lock()
 
 
+@atexit.register
+def _end_all() -> None:
+    while _servers:
+        _servers.pop().end()
+
+
+def base_environment() -> dict[str, str]:
+    """What a process of steps has of this one's environment, at this moment: Prefect is nothing to it."""
+    own = {name: value for name, value in os.environ.items() if not name.startswith(("PREFECT_", SET_BY_IMPORTS))}
+    return {"DO_NOT_TRACK": "1", **own}
+
+
 def _server() -> ForkServer:
     """The server for the environment of this moment; others end when their last step has ended."""
-    now = dict(os.environ)
+    now = base_environment()
     with _one_look:
         for server in tuple(_servers):
             if server.has_ended() or (server.environment != now and server.is_idle()):

@@ -61,7 +61,7 @@ class Version(Frozen):
     @property
     def name(self) -> str:
         """Its place in the store: a folder per item, a file per order."""
-        return f"{FOLDER}/{_key(self.item)}/{self.order.removeprefix('sha256:')}.json"
+        return _name(self.item, self.order)
 
     def artifacts(self) -> dict[str, str]:
         """What the version needs, by digest: what it is to the version."""
@@ -114,6 +114,15 @@ def keep_version(store: ArtifactStore, order: Order, made: "Made") -> Version:
     return version
 
 
+def has_version(store: ArtifactStore, order: Order) -> bool:
+    """Whether this order was finished before.
+
+    Raises:
+        StoreUnreachable: the store does not answer.
+    """
+    return store.read(_name(order.item, order.digest())) is not None
+
+
 def versions(store: ArtifactStore) -> list[Version]:
     """Every version: items by name, the newest of each first.
 
@@ -158,6 +167,10 @@ def faults(store: ArtifactStore, of: list[Version], sizes: Mapping[str, int]) ->
     wrong = dict.fromkeys(users(of).keys() - sizes.keys(), "is missing")
     wrong.update({digest: "is damaged" for digest in sizes if store.content_digest(digest) not in (digest, None)})
     return wrong
+
+
+def _name(item: str, order: Digest) -> str:
+    return f"{FOLDER}/{_key(item)}/{order.removeprefix('sha256:')}.json"
 
 
 def _key(item: str) -> str:

@@ -114,7 +114,11 @@ def test_the_next_step_is_a_fork_of_the_same_process_and_one_for_another_environ
         process.wait(20)
         return number
 
+    forks.prepare()
+    (prepared,) = (each for each in forks._servers if each.environment == forks.base_environment())
     first = parent()
+    assert first == prepared._process.pid
+    monkeypatch.setenv("OpenImageIO_ROOT", "as that library sets it when it is imported")
     assert parent() == first
     monkeypatch.setenv("DG4D_STORE", str(place / "elsewhere"))
     assert parent() != first
@@ -128,10 +132,10 @@ def test_a_server_that_was_killed_is_followed_by_another(place: Path) -> None:
         in_subprocess(spec, _request(place, words), lambda *_: None)
 
     run("fine")
-    (server,) = (each for each in forks._servers if each.environment == dict(os.environ))
+    (server,) = (each for each in forks._servers if each.environment == forks.base_environment())
     server._process.kill()
     run("fine too")
-    (server,) = (each for each in forks._servers if each.environment == dict(os.environ))
+    (server,) = (each for each in forks._servers if each.environment == forks.base_environment())
 
     killed = server._process
     with pytest.raises(StepOutOfMemory):

@@ -1,0 +1,141 @@
+"""What orchestration adds to a conversion: the product's command against its steps called one after the other.
+
+Run with `python -m benchmarks.overhead PICTURE` (`--turns 2`, `--set KNOB=VALUE`, `--json FILE` keeps the rows). In every
+turn the same picture is converted three times in processes of their own, each with a store of its own: `steps`, a
+program that imports the steps and calls them, without Prefect, records, a cache or processes; `first`, `dg4d make`
+where no server runs yet; `next`, `dg4d make` with the server of before. Wall time, for that is what people wait for:
+let the machine do nothing else.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+from pydantic import BaseModel
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.measure import machine, write_rows
+from flows.packages.publish import whole
+
+WAYS = ("steps", "first", "next")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One way to convert the picture, medians over the turns.
+
+    Attributes:
+        way: one of `WAYS`.
+        wall_s: from the start of the process to its end.
+        added: share of that by which it is longer than `steps`.
+    """
+
+    way: str
+    wall_s: float
+    added: float
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("picture", type=Path)
+    parser.add_argument("--turns", type=int, default=2)
+    parser.add_argument("--set", action="append", default=[], metavar="KNOB=VALUE", help="as `dg4d make --set`")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
+    parser.add_argument("--seed", type=int, help=argparse.SUPPRESS)  # in a process of its own: the steps
+    options = parser.parse_args()
+    if options.seed is not None:
+        in_order(options.picture, options.set, options.seed)
+        return
+    taken: dict[str, list[float]] = {way: [] for way in WAYS}
+    for seed in range(options.turns):
+        for way, seconds in turn(options.picture.resolve(), options.set, seed).items():
+            taken[way].append(seconds)
+    plain = median(taken["steps"])
+    rows = [Row(way, median(of), 1 - plain / median(of)) for way, of in taken.items()]
+    show(rows, Console())
+    if options.json:
+        write_rows(options.json, rows)
+
+
+def turn(picture: Path, knobs: list[str], seed: int) -> dict[str, float]:
+    """Seconds of each way with this seed."""
+    changes = [word for knob in knobs for word in ("--set", knob)]
+    with tempfile.TemporaryDirectory(prefix="dg4d-overhead-") as folder:
+        homes = {way: str(Path(folder) / way) for way in WAYS}
+
+        def command(way: str, **more: str) -> float:
+            out = str(Path(folder) / f"{way}-out")
+            make = [sys.executable, "-m", "flows.cli", "make", str(picture), "--seed", str(seed), "-o", out, *changes]
+            seconds = timed(make, {"DG4D_HOME": homes[way], **more})
+            whole(Path(out))
+            return seconds
+
+        steps = [sys.executable, "-m", "benchmarks.overhead", str(picture), "--seed", str(seed), *changes]
+        seconds = {"steps": timed(steps, {"DG4D_HOME": homes["steps"]})}
+        try:
+            seconds["first"] = command("first")
+            port = (Path(homes["first"]) / "server" / "port").read_text(encoding="ascii")
+            seconds["next"] = command("next", PREFECT_API_URL=f"http://127.0.0.1:{port}/api")
+        finally:
+            down = [sys.executable, "-m", "flows.cli", "down"]
+            subprocess.run(down, env={**os.environ, "DG4D_HOME": homes["first"]}, stdout=subprocess.DEVNULL, check=True)
+    return seconds
+
+
+def timed(command: list[str], environment: Mapping[str, str]) -> float:
+    """Seconds that a program takes.
+
+    Raises:
+        CalledProcessError: it failed.
+    """
+    start = time.perf_counter()
+    subprocess.run(command, env={**os.environ, **environment}, stdout=subprocess.DEVNULL, check=True)
+    return time.perf_counter() - start
+
+
+def in_order(picture: Path, knobs: list[str], seed: int) -> None:
+    """The steps of a conversion, one after the other in this process."""
+    from flows import home
+    from flows.engine.executors import in_process
+    from flows.engine.tasks import Finished, Steps
+    from flows.image_to_4d import build
+    from flows.inputs.manifest import parse_changes
+    from flows.inputs.orders import Wish
+    from steps.contract import ArtifactRef
+    from steps.main import catalog, prepare_process
+    from steps.profiles import profile, revise
+
+    class Bare(Steps):
+        def run(
+            self, step: str, inputs: dict[str, ArtifactRef | None], settings: BaseModel
+        ) -> dict[str, ArtifactRef]:
+            request = self._request(step, inputs, settings)
+            result = in_process(catalog()[step], request, lambda done, total, values: None)
+            self.finished.append(Finished(label=step, cached=False, seconds=0, result=result))
+            return result.outputs
+
+    prepare_process()
+    settings = revise(profile("preview"), parse_changes(knobs))
+    order = Wish(item=picture.stem, picture=picture, profile="preview", settings=settings, seed=seed).order(home.store())
+    bare = Bare(order.item, seed)
+    build(bare, bare.run("prepare_subject", {"source": order.source}, settings.subject), settings, order.bank)
+
+
+def show(rows: list[Row], console: Console) -> None:
+    """A table."""
+    table = Table("way", "wall s", "more than the steps alone", title=f"One conversion ({machine()})")
+    for row in rows:
+        table.add_row(row.way, f"{row.wall_s:.1f}", "" if row.way == "steps" else f"{row.added:.1%}")
+    console.print(table)
+
+
+if __name__ == "__main__":
+    main()
