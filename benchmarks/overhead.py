@@ -1,13 +1,14 @@
 """What orchestration adds to a conversion: the product's command against its steps called one after the other.
 
-Run with `python -m benchmarks.overhead PICTURE` (`--turns 2`, `--set KNOB=VALUE`, `--json FILE` keeps the rows). In every
-turn the same picture is converted three times in processes of their own, each with a store of its own: `steps`, a
-program that imports the steps and calls them, without Prefect, records, a cache or processes; `first`, `dg4d make`
-where no server runs yet; `next`, `dg4d make` with the server of before. Wall time, for that is what people wait for:
-let the machine do nothing else.
+Run with `python -m benchmarks.overhead PICTURE` (`--turns 2`, `--set KNOB=VALUE`, `--json FILE` keeps the rows). In
+every turn the same picture is converted three times in processes of their own, each with a store of its own: `first`,
+`dg4d make` where no server runs yet; `next`, `dg4d make` with that server; `steps`, a program that imports the steps
+and calls them, without Prefect, cache, pages or processes, and must give the same digests. Wall time, for that is what
+people wait for: let the machine do nothing else.
 """
 
 import argparse
+import json
 import os
 import subprocess
 import sys
@@ -17,13 +18,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from types import MappingProxyType
 
-from pydantic import BaseModel
 from rich.console import Console
 from rich.table import Table
 
 from benchmarks.measure import machine, write_rows
-from flows.packages.publish import whole
+from flows.inputs.orders import Wish
+from flows.packages.publish import RECORD, whole
+from steps.contract import StepFailure, StepRequest
+from steps.main import catalog, perform, prepare_process, request_version
+from steps.profiles import profile
+from steps.store import ArtifactStore
 
 WAYS = ("steps", "first", "next")
 
@@ -49,10 +55,10 @@ def main() -> None:
     parser.add_argument("--turns", type=int, default=2)
     parser.add_argument("--set", action="append", default=[], metavar="KNOB=VALUE", help="as `dg4d make --set`")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
-    parser.add_argument("--seed", type=int, help=argparse.SUPPRESS)  # in a process of its own: the steps
+    parser.add_argument("--again", nargs=2, type=Path, help=argparse.SUPPRESS)  # record and store: only the steps
     options = parser.parse_args()
-    if options.seed is not None:
-        in_order(options.picture, options.set, options.seed)
+    if options.again:
+        in_order(options.picture, *options.again)
         return
     taken: dict[str, list[float]] = {way: [] for way in WAYS}
     for seed in range(options.turns):
@@ -78,19 +84,19 @@ def turn(picture: Path, knobs: list[str], seed: int) -> dict[str, float]:
             whole(Path(out))
             return seconds
 
-        steps = [sys.executable, "-m", "benchmarks.overhead", str(picture), "--seed", str(seed), *changes]
-        seconds = {"steps": timed(steps, {"DG4D_HOME": homes["steps"]})}
         try:
-            seconds["first"] = command("first")
+            seconds = {"first": command("first")}
             port = (Path(homes["first"]) / "server" / "port").read_text(encoding="ascii")
             seconds["next"] = command("next", PREFECT_API_URL=f"http://127.0.0.1:{port}/api")
+            again = [str(Path(folder) / "first-out" / RECORD), homes["steps"]]
+            seconds["steps"] = timed([sys.executable, "-m", "benchmarks.overhead", str(picture), "--again", *again])
         finally:
             down = [sys.executable, "-m", "flows.cli", "down"]
             subprocess.run(down, env={**os.environ, "DG4D_HOME": homes["first"]}, stdout=subprocess.DEVNULL, check=True)
     return seconds
 
 
-def timed(command: list[str], environment: Mapping[str, str]) -> float:
+def timed(command: list[str], environment: Mapping[str, str] = MappingProxyType({})) -> float:
     """Seconds that a program takes.
 
     Raises:
@@ -101,32 +107,29 @@ def timed(command: list[str], environment: Mapping[str, str]) -> float:
     return time.perf_counter() - start
 
 
-def in_order(picture: Path, knobs: list[str], seed: int) -> None:
-    """The steps of a conversion, one after the other in this process."""
-    from flows import home
-    from flows.engine.executors import in_process
-    from flows.engine.tasks import Finished, Steps
-    from flows.image_to_4d import build
-    from flows.inputs.manifest import parse_changes
-    from flows.inputs.orders import Wish
-    from steps.contract import ArtifactRef
-    from steps.main import catalog, prepare_process
-    from steps.profiles import profile, revise
+def in_order(picture: Path, record: Path, folder: Path) -> None:
+    """The steps of a finished conversion again, one after the other in this process.
 
-    class Bare(Steps):
-        def run(
-            self, step: str, inputs: dict[str, ArtifactRef | None], settings: BaseModel
-        ) -> dict[str, ArtifactRef]:
-            request = self._request(step, inputs, settings)
-            result = in_process(catalog()[step], request, lambda done, total, values: None)
-            self.finished.append(Finished(label=step, cached=False, seconds=0, result=result))
-            return result.outputs
-
+    Raises:
+        ValueError: one of them gave something else.
+    """
     prepare_process()
-    settings = revise(profile("preview"), parse_changes(knobs))
-    order = Wish(item=picture.stem, picture=picture, profile="preview", settings=settings, seed=seed).order(home.store())
-    bare = Bare(order.item, seed)
-    build(bare, bare.run("prepare_subject", {"source": order.source}, settings.subject), settings, order.bank)
+    store = ArtifactStore(folder)
+    wish = Wish(item=picture.stem, picture=picture, profile="preview", settings=profile("preview"))
+    source = wish.order(store).source
+    known = {source.digest: source}
+    for done in json.loads(record.read_text(encoding="utf-8"))["steps"]:
+        request = StepRequest(
+            step=done["step"],
+            version=request_version(catalog()[done["step"]]),
+            inputs={name: known[digest] for name, digest in done["inputs"].items()},
+            settings=done["settings"],
+            seed=done["seed"],
+        )
+        outcome, _ = perform(request, store)
+        if isinstance(outcome, StepFailure) or {n: ref.digest for n, ref in outcome.outputs.items()} != done["outputs"]:
+            raise ValueError(f"{request.step} gave something else than in the flow: {outcome}")
+        known |= {ref.digest: ref for ref in outcome.outputs.values()}
 
 
 def show(rows: list[Row], console: Console) -> None:
