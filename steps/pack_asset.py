@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.compact import Compact, write_compact
 from dg4d_lib.assets.glb import write_frames_glb, write_glb, write_mesh_glb
@@ -42,7 +43,7 @@ from steps.profiles import PackAssetSettings
 Surface = Asset4D | list[TexturedMesh]
 Notes = Sequence[str]
 
-LANES = 2  # writers at a time: the rig takes one core, films leave gaps
+LANES = 2  # writers at a time: each takes one core most of the time
 
 
 @dataclass(frozen=True)
@@ -158,31 +159,29 @@ class Contents:
         write_film(self.place(packages.DRIVING), video.over(torch.ones(3))[:, :even, :even], video.fps)
         return ()
 
-    def write_previews(self) -> Notes:
-        """Films, a moving picture, and the contact sheet."""
-        pack, video = self.settings.pack, self.video
-        told = write_preview(
-            self.place(packages.PREVIEW),
-            self.gaussians,
-            self.deformation,
-            len(video),
-            video.fps,
-            self.rasterizer,
-            pack,
-        )
-        write_turntable(self.place(packages.TURNTABLE), self.states.at(0), self.rasterizer, pack)
-        write_webp(
-            self.place(packages.MOVING_PICTURE),
-            self.gaussians,
-            self.deformation,
-            len(video),
-            video.fps,
-            self.rasterizer,
-            pack,
-        )
-        sheet = contact_sheet(self.gaussians, self.deformation, video, self.rasterizer, pack)
+    def write_preview(self) -> Notes:
+        """The film in which it moves while the camera goes round."""
+        return write_preview(self.place(packages.PREVIEW), *self._moving)
+
+    def write_moving_picture(self) -> Notes:
+        """The small one, for pages."""
+        write_webp(self.place(packages.MOVING_PICTURE), *self._moving)
+        return ()
+
+    @property
+    def _moving(self) -> tuple[Gaussians, AnyDeformation, int, float, Rasterizer, PackSettings]:
+        video = self.video
+        return self.gaussians, self.deformation, len(video), video.fps, self.rasterizer, self.settings.pack
+
+    def write_turntable(self) -> Notes:
+        """The film in which it holds still and is turned."""
+        return write_turntable(self.place(packages.TURNTABLE), self.states.at(0), self.rasterizer, self.settings.pack)
+
+    def write_sheet(self) -> Notes:
+        """The contact sheet."""
+        sheet = contact_sheet(self.gaussians, self.deformation, self.video, self.rasterizer, self.settings.pack)
         write_png(self.place(packages.SHEET), sheet)
-        return told
+        return ()
 
 
 def run(job: Job) -> Facts:
@@ -195,14 +194,17 @@ def run(job: Job) -> Facts:
     with TemporaryDirectory() as scratch:
         contents = _contents(job, Path(scratch))
         notes: list[str] = []
-        writers = (
-            contents.write_meshes,
-            contents.write_levels,
+        writers = (  # those that take longest first
+            contents.write_preview,
             contents.write_rig,
+            contents.write_moving_picture,
             contents.write_usd,
+            contents.write_meshes,
+            contents.write_turntable,
+            contents.write_levels,
+            contents.write_sheet,
             contents.write_splats,
             contents.write_canonical,
-            contents.write_previews,
         )
         with ThreadPoolExecutor(LANES) as lanes:
             for done, written in enumerate([lanes.submit(write) for write in writers], 1):
