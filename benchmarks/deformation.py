@@ -5,6 +5,7 @@ Times of the deformation are of one call for all moments, those of SSIM of one p
 
 `grid_sample`            all six planes sampled at every Gaussian and moment, as in the papers' code
 `grid_sample_once`       the three planes of space sampled once per Gaussian, those of time at every moment
+`grid_sample..._means`   the same with a gradient in the Gaussians' means too, as `motion.fine_tune` wants it
 `grid_sample..._heads`   the same with the network behind: trunk and residual heads one by one
 `conv2d`                 SSIM by convolutions, as in 3DGS's code
 
@@ -26,8 +27,8 @@ from rich.table import Column, Table
 from torch import Tensor
 from torch.nn import functional
 
-from dg4d_lib.deformation.hexplane import PLANE_AXES, HexPlane, time_lines
-from dg4d_lib.deformation.hexplane_kernel import hexplane_features
+from dg4d_lib.deformation.hexplane import HexPlane, time_lines
+from dg4d_lib.deformation.hexplane_kernel import SPATIAL_AXES, hexplane_features
 from dg4d_lib.metrics.ssim import C1, C2, SIGMA, WINDOW, ssim
 from dg4d_lib.settings import HexPlaneSettings
 
@@ -59,7 +60,7 @@ def naive_features(coordinates: Tensor, times: Tensor, space: Tensor, time: Tens
     everywhere = coordinates.expand(t, n, 3).reshape(-1, 3)
     moments = (2 * times - 1)[:, None].expand(t, n).reshape(-1)
     product = torch.ones(())
-    for plane, axes in zip(space, PLANE_AXES, strict=True):
+    for plane, axes in zip(space, SPATIAL_AXES, strict=True):
         product = product * sampled(plane, everywhere[:, list(axes)])
     for axis, plane in enumerate(time):
         product = product * sampled(plane, torch.stack([everywhere[:, axis], moments], -1))
@@ -70,7 +71,7 @@ def features_with_space_once(coordinates: Tensor, times: Tensor, space: Tensor, 
     """The same; what does not depend on time is not sampled at every moment."""
     t, n = len(times), len(coordinates)
     product = torch.ones(())
-    for plane, axes in zip(space, PLANE_AXES, strict=True):
+    for plane, axes in zip(space, SPATIAL_AXES, strict=True):
         product = product * sampled(plane, coordinates[:, list(axes)])
     for axis, plane in enumerate(time):
         places = torch.stack([coordinates[:, axis].expand(t, n), (2 * times - 1)[:, None].expand(t, n)], -1)
@@ -103,7 +104,7 @@ def by_convolution(images: Tensor, truth: Tensor) -> Tensor:
 
 
 def of_deformation(count: int, settings: HexPlaneSettings, rounds: int) -> Iterator[Row]:
-    """Features alone, then with the network."""
+    """Features alone, those of Gaussians that are fitted too, then with the network."""
     generator = torch.Generator().manual_seed(0)
     means = torch.rand(count, 3, generator=generator) * 2 - 1
     times = torch.linspace(0, 1, TIMES)
@@ -122,6 +123,10 @@ def of_deformation(count: int, settings: HexPlaneSettings, rounds: int) -> Itera
     def features(read: Callable[..., Tensor]) -> None:
         torch.autograd.grad(read(means, times, space, time), [space, time], pull)
 
+    def features_of_means(read: Callable[..., Tensor]) -> None:
+        moving = means.clone().requires_grad_()
+        torch.autograd.grad(read(moving, times, space, time), [moving, space, time], pull)
+
     def displaced(read: Callable[..., Tensor]) -> None:
         if read is fused_features:
             moved = field.displace(means, times)
@@ -130,7 +135,7 @@ def of_deformation(count: int, settings: HexPlaneSettings, rounds: int) -> Itera
             outputs = heads_one_by_one(field, read(means, times, space, time))
         torch.autograd.grad(outputs, list(field.parameters()), pulls)
 
-    for suffix, whole in (("", features), ("_heads", displaced)):
+    for suffix, whole in (("", features), ("_means", features_of_means), ("_heads", displaced)):
         taken = interleaved({name: partial(whole, read) for name, read in readers.items()}, rounds)
         ours = taken.pop("ours").cpu_ms
         for peer, measured in taken.items():
