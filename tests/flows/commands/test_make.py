@@ -1,0 +1,34 @@
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from flows import home
+from flows.commands.make import prepare
+from flows.engine import executors
+from flows.inputs.orders import Wish
+from flows.packages.versions import has_version, keep_version
+from steps.profiles import PREVIEW
+
+
+def test_processes_for_steps_begin_only_where_the_order_was_not_finished_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path / "home"))
+    begun: list[str] = []
+    monkeypatch.setattr(executors, "prepare", lambda: begun.append("processes"))
+    Image.new("RGBA", (8, 8)).save(tmp_path / "a.png")
+    orders = [
+        Wish(item="a", picture=tmp_path / "a.png", profile="preview", settings=PREVIEW, seed=seed).order(home.store())
+        for seed in range(2)
+    ]
+    prepare(orders[0])
+    assert len(begun) == 1
+    made: Any = SimpleNamespace(package=home.store().put_bytes(b"package", "a/b"), steps=[])
+    keep_version(home.store(), orders[0], made)
+    assert [has_version(home.store(), order) for order in orders] == [True, False]
+    for order in orders:
+        prepare(order)
+    assert len(begun) == 2
