@@ -219,10 +219,10 @@ def main() -> None:
     grid, texels, counts, rounds = (30, 256, (500,), 1) if options.quick else (100, 1024, (5_000, 20_000), 3)
     pack = PackSettings(preview_size=64) if options.quick else PackSettings()
     console, asset = Console(), waving_ball(grid, texels)
-    rows = measured(dict(mesh_writers(asset)), None, rounds)
-    for count in counts:
-        splats = waving_splats(count)
-        writers = dict(splat_writers(asset, splats, pack))
+    of_mesh = dict(mesh_writers(asset))
+    of_splats = {count: dict(splat_writers(asset, waving_splats(count), pack)) for count in counts}
+    rows = measured(of_mesh, None, rounds)
+    for count, writers in of_splats.items():
         with TemporaryDirectory() as scratch:
             writers["splats, PLY"](Path(scratch))
             try:
@@ -232,10 +232,12 @@ def main() -> None:
             rows += measured(writers, count, rounds)
     title = f"{machine()}; {FRAMES} frames, {len(asset.mesh.vertices)} vertices, {texels} x {texels} texels"
     console.print(table(title, rows))
-    writers = {**dict(mesh_writers(asset)), **dict(splat_writers(asset, waving_splats(counts[0]), pack))}
+    every_writer = of_mesh | of_splats[counts[0]]
     seconds = {row.writer: row.wall_s for row in rows if row.splats in (None, counts[0])}
     longest_first = sorted(EVERY_KIND, key=seconds.__getitem__, reverse=True)
-    (whole,) = measured({"every kind": partial(side_by_side, [writers[name] for name in longest_first])}, None, rounds)
+    (whole,) = measured(
+        {"every kind": partial(side_by_side, [every_writer[name] for name in longest_first])}, None, rounds
+    )
     console.print(
         f"one file of every kind, {counts[0]} splats: {sum(seconds[name] for name in EVERY_KIND):.2f} s one after the "
         f"other, {whole.wall_s:.2f} s {LANES} at a time; goal {GOAL_S:.0f} s"

@@ -14,11 +14,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from types import MappingProxyType
 
 from rich.console import Console
 from rich.table import Table
@@ -26,6 +24,7 @@ from rich.table import Table
 from benchmarks.measure import machine, write_rows
 from flows.inputs.orders import Wish
 from flows.packages.publish import RECORD, whole
+from flows.serving.server import Server
 from steps.contract import StepFailure, StepRequest
 from steps.main import catalog, perform, prepare_process, request_version
 from steps.profiles import profile
@@ -41,12 +40,12 @@ class Row:
     Attributes:
         way: one of `WAYS`.
         wall_s: from the start of the process to its end.
-        added: share of that by which it is longer than `steps`.
+        orchestration: share of that in which `steps` are done already.
     """
 
     way: str
     wall_s: float
-    added: float
+    orchestration: float
 
 
 def main() -> None:
@@ -76,28 +75,27 @@ def turn(picture: Path, knobs: list[str], seed: int) -> dict[str, float]:
     changes = [word for knob in knobs for word in ("--set", knob)]
     with tempfile.TemporaryDirectory(prefix="dg4d-overhead-") as folder:
         homes = {way: str(Path(folder) / way) for way in WAYS}
+        server = Server(Path(homes["first"]) / "server", Path(homes["first"]) / "prefect")
 
         def command(way: str, **more: str) -> float:
             out = str(Path(folder) / f"{way}-out")
             make = [sys.executable, "-m", "flows.cli", "make", str(picture), "--seed", str(seed), "-o", out, *changes]
-            seconds = timed(make, {"DG4D_HOME": homes[way], **more})
+            seconds = timed(make, DG4D_HOME=homes[way], **more)
             whole(Path(out))
             return seconds
 
         try:
             seconds = {"first": command("first")}
-            port = (Path(homes["first"]) / "server" / "port").read_text(encoding="ascii")
-            seconds["next"] = command("next", PREFECT_API_URL=f"http://127.0.0.1:{port}/api")
+            seconds["next"] = command("next", PREFECT_API_URL=server.wait())
             again = [str(Path(folder) / "first-out" / RECORD), homes["steps"]]
             seconds["steps"] = timed([sys.executable, "-m", "benchmarks.overhead", str(picture), "--again", *again])
         finally:
-            down = [sys.executable, "-m", "flows.cli", "down"]
-            subprocess.run(down, env={**os.environ, "DG4D_HOME": homes["first"]}, stdout=subprocess.DEVNULL, check=True)
+            server.stop()
     return seconds
 
 
-def timed(command: list[str], environment: Mapping[str, str] = MappingProxyType({})) -> float:
-    """Seconds that a program takes.
+def timed(command: list[str], **environment: str) -> float:
+    """Seconds that a program takes, with this in its environment.
 
     Raises:
         CalledProcessError: it failed.
@@ -134,9 +132,9 @@ def in_order(picture: Path, record: Path, folder: Path) -> None:
 
 def show(rows: list[Row], console: Console) -> None:
     """A table."""
-    table = Table("way", "wall s", "more than the steps alone", title=f"One conversion ({machine()})")
+    table = Table("way", "wall s", "orchestration", title=f"One conversion ({machine()})")
     for row in rows:
-        table.add_row(row.way, f"{row.wall_s:.1f}", "" if row.way == "steps" else f"{row.added:.1%}")
+        table.add_row(row.way, f"{row.wall_s:.1f}", "" if row.way == "steps" else f"{row.orchestration:.1%} of it")
     console.print(table)
 
 

@@ -1,5 +1,6 @@
 """One order becomes one folder: connect to a server, run the flow, publish what it made."""
 
+import importlib
 import os
 import urllib.error
 import urllib.request
@@ -44,8 +45,7 @@ def connect() -> None:
         server = home.background_server()
         server.start()
         home.set_environment(f"{server.wait_for_address()}/api")
-        from flows import image_to_4d  # noqa: F401 - takes seconds, and so does the server
-
+        importlib.import_module("flows.image_to_4d")  # takes seconds, and so does the server
         server.wait()
     from flows.engine.orphans import settle_orphans
 

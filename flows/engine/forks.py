@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from typing import IO, BinaryIO
 
+from flows.engine.processes import without_prefect
 from steps.fork_server import ORDER_BYTES
 
 SET_BY_IMPORTS = "OpenImageIO_ROOT"  # by a library, for its own programs
@@ -166,7 +167,7 @@ def _end_all() -> None:
 
 def base_environment() -> dict[str, str]:
     """What a process of steps has of this one's environment, at this moment: Prefect is nothing to it."""
-    own = {name: value for name, value in os.environ.items() if not name.startswith(("PREFECT_", SET_BY_IMPORTS))}
+    own = {name: value for name, value in without_prefect().items() if name != SET_BY_IMPORTS}
     return {"DO_NOT_TRACK": "1", **own}
 
 

@@ -1,4 +1,4 @@
-"""Which process is which, which one is alone with a file, and which ends with another."""
+"""Which process is which, which one is alone with a file, which ends with another, and what it has from us."""
 
 import ctypes
 import fcntl
@@ -27,6 +27,11 @@ def place() -> str:
         return f"{socket.gethostname()}-{Path('/proc/self/ns/pid').stat().st_ino}"
     except OSError:  # no Linux
         return socket.gethostname()
+
+
+def without_prefect() -> dict[str, str]:
+    """The environment, for a process that is to have none of Prefect's settings, or its own."""
+    return {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
 
 
 def die_with_parent() -> None:

@@ -3,7 +3,6 @@
 `python -m flows.serving.fresh` makes it beside the interpreter, for every server that starts without a database.
 """
 
-import os
 import shutil
 import sqlite3
 import subprocess
@@ -12,6 +11,8 @@ import tempfile
 from contextlib import closing
 from importlib.metadata import version
 from pathlib import Path
+
+from flows.engine.processes import without_prefect
 
 NAME = "prefect.db"  # in PREFECT_HOME
 
@@ -30,9 +31,8 @@ def make(path: Path) -> None:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".new-") as folder:
-        environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
         command = [sys.executable, "-m", "prefect", "server", "database", "upgrade", "--yes"]
-        subprocess.run(command, env=environment | {"PREFECT_HOME": folder}, stdout=subprocess.DEVNULL, check=True)
+        subprocess.run(command, env=without_prefect() | {"PREFECT_HOME": folder}, stdout=subprocess.DEVNULL, check=True)
         whole = Path(folder) / "whole.db"
         with closing(sqlite3.connect(Path(folder) / NAME)) as database:
             database.execute("VACUUM INTO ?", [str(whole)])

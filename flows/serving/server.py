@@ -19,7 +19,7 @@ from pathlib import Path
 from types import FrameType
 from typing import IO
 
-from flows.engine.processes import die_with_parent, locked
+from flows.engine.processes import die_with_parent, locked, without_prefect
 from flows.serving import fresh
 
 HOST = "127.0.0.1"  # the server asks nobody who they are, so nobody else may reach it
@@ -236,8 +236,7 @@ def _watch(process: subprocess.Popen[bytes], folder: Path, idle_s: float) -> int
 def _serve(port: int, prefect_home: Path) -> subprocess.Popen[bytes]:
     prefect_home.mkdir(parents=True, exist_ok=True)
     fresh.put(prefect_home)
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
-    environment |= SETTINGS | {"PREFECT_HOME": str(prefect_home), "PREFECT__SERVER_FINAL": "1"}
+    environment = without_prefect() | SETTINGS | {"PREFECT_HOME": str(prefect_home), "PREFECT__SERVER_FINAL": "1"}
     application = ["--factory", "flows.serving.server_app:create_app"]
     return subprocess.Popen(
         [sys.executable, "-m", "uvicorn", *application, "--host", HOST, "--port", str(port), "--log-level", "warning"],
