@@ -172,8 +172,9 @@ def resize_and_pack(order: Order) -> tuple[Any, bool]:
 
     @flow(name="resize_and_pack", flow_run_name="{item}", persist_result=False)
     def two_steps(item: str) -> None:
-        prepared = steps.run("prepare_subject", {"source": order.source}, order.settings.subject)
-        steps.run("drive_video", {"subject": prepared["subject"]}, drive(order.settings))
+        with steps:
+            prepared = steps.run("prepare_subject", {"source": order.source}, order.settings.subject)
+            steps.run("drive_video", {"subject": prepared["subject"]}, drive(order.settings))
 
     steps = Steps(order.item, order.seed)
     two_steps(order.item)

@@ -45,9 +45,9 @@ def image_to_4d(
     Raises:
         StepError: a step did not finish; says which and why.
     """
-    steps = Steps(item, seed)
-    prepared = steps.run("prepare_subject", {"source": source}, settings.subject)
-    return finish(steps, prepared, settings, bank)
+    with Steps(item, seed) as steps:
+        prepared = steps.run("prepare_subject", {"source": source}, settings.subject)
+        return finish(steps, prepared, settings, bank)
 
 
 def finish(

@@ -96,9 +96,9 @@ def _judge(
     entry: Entry, settings: ScoreAssetSettings, seed: int
 ) -> tuple[dict[str, ArtifactRef], dict[str, ArtifactRef]]:
     """What the naive guesses score, and what the asset does."""
-    steps = Steps(entry.name, seed)
-    guessed = steps.run(STEP, {"truth": entry.truth}, settings.model_copy(update={"mesh": False}))
-    return guessed, steps.run(STEP, {"truth": entry.truth, "package": entry.package}, settings)
+    with Steps(entry.name, seed) as steps:
+        guessed = steps.run(STEP, {"truth": entry.truth}, settings.model_copy(update={"mesh": False}))
+        return guessed, steps.run(STEP, {"truth": entry.truth, "package": entry.package}, settings)
 
 
 def _read(ref: ArtifactRef) -> dict[str, Any]:

@@ -24,11 +24,11 @@ def motions(
     Raises:
         StepError: a step did not finish; says which and why.
     """
-    steps = Steps(item, seed)
-    prepared = steps.run("prepare_subject", {"source": source}, settings.subject)
-    if "footage" in prepared:
-        raise StepBadInput("prepare_subject", "this is a video and has its motion already; give a picture")
-    return steps.run("drive_video", {"subject": prepared["subject"]}, drive(settings))
+    with Steps(item, seed) as steps:
+        prepared = steps.run("prepare_subject", {"source": source}, settings.subject)
+        if "footage" in prepared:
+            raise StepBadInput("prepare_subject", "this is a video and has its motion already; give a picture")
+        return steps.run("drive_video", {"subject": prepared["subject"]}, drive(settings))
 
 
 def unpack(made: dict[str, ArtifactRef], folder: Path) -> dict[str, Any]:

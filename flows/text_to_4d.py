@@ -26,7 +26,7 @@ def text_to_4d(
     Raises:
         StepError: a step did not finish; says which and why.
     """
-    steps = Steps(item, seed)
-    picture = steps.run("draw_picture", {"text": source}, settings.text)["picture"]
-    prepared = steps.run("prepare_subject", {"source": picture}, settings.subject)
-    return finish(steps, prepared, settings, bank)
+    with Steps(item, seed) as steps:
+        picture = steps.run("draw_picture", {"text": source}, settings.text)["picture"]
+        prepared = steps.run("prepare_subject", {"source": picture}, settings.subject)
+        return finish(steps, prepared, settings, bank)

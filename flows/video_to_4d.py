@@ -27,8 +27,10 @@ def video_to_4d(
     Raises:
         StepError: a step did not finish; says which and why.
     """
-    steps = Steps(item, seed)
-    prepared = steps.run("prepare_subject", {"source": source}, settings.subject)
-    if "footage" not in prepared:
-        raise StepBadInput("prepare_subject", "this is a single picture, not a video: a video has two frames or more")
-    return finish(steps, prepared, settings, bank)
+    with Steps(item, seed) as steps:
+        prepared = steps.run("prepare_subject", {"source": source}, settings.subject)
+        if "footage" not in prepared:
+            raise StepBadInput(
+                "prepare_subject", "this is a single picture, not a video: a video has two frames or more"
+            )
+        return finish(steps, prepared, settings, bank)

@@ -74,6 +74,7 @@ STEPS: dict[str, StepSpec] = {
                 "films": _optional(FILMS),
             },
             resource="gpu",
+            late_imports=("dg4d_lib.kernels.compiling:load",),
         ),
         StepSpec(
             name="fit_gaussians",
@@ -83,6 +84,7 @@ STEPS: dict[str, StepSpec] = {
             inputs={"subject": PNG, "bank": _optional(BANK)},
             outputs={"gaussians": PLY, "curves": CURVES, "picture": PNG},
             resource="gpu",
+            late_imports=("dg4d_lib.rasterizer.cpu", "torch._dynamo"),  # the latter: of any optimizer
         ),
         StepSpec(
             name="fit_motion",

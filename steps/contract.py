@@ -56,6 +56,9 @@ class StepSpec(Frozen):
         "cpu", description="gpu: it has a GPU to itself where its settings use one; drawing on one in passing is cpu"
     )
     timeout_s: float = Field(3600, gt=0)
+    late_imports: tuple[str, ...] = Field(
+        (), description="modules, and module:function that imports some, which its code needs only when it runs"
+    )
 
 
 class StepRequest(Frozen):

@@ -21,6 +21,7 @@ import signal
 import socket
 import sys
 import tempfile
+from collections.abc import Iterator
 from contextlib import suppress
 
 from steps import main as step
@@ -36,11 +37,7 @@ def main() -> int:
     control = socket.socket(fileno=parser.parse_args().socket)
     control.set_inheritable(False)
     step.prepare_process()
-    for spec in step.catalog().values():
-        with suppress(Exception):  # the step will say what is wrong
-            importlib.import_module(spec.entry.partition(":")[0])
-    gc.freeze()  # what forks share stays shared
-    arguments = _serve(control)
+    arguments = _serve(control, _wanted())
     if arguments is None:
         return 0
     status = step.main(arguments)
@@ -49,8 +46,20 @@ def main() -> int:
     os._exit(status)  # nothing is left to tidy, and to take apart what was imported takes up to a second
 
 
-def _serve(control: socket.socket) -> list[str] | None:
-    """Fork for every order; arguments of a step in a fork, nothing here when there will be no more orders."""
+def _wanted() -> Iterator[str]:
+    """What steps would wait for, in the order in which they come to it: modules, and functions to call."""
+    for spec in step.catalog().values():
+        yield spec.entry.partition(":")[0]
+        yield from spec.late_imports
+
+
+def _serve(control: socket.socket, wanted: Iterator[str]) -> list[str] | None:
+    """Import what is wanted, and fork for every order; the first steps need not wait for what only later ones import.
+
+    Returns:
+        Arguments of a step in a fork; nothing here, when there will be no more orders.
+    """
+    coming = next(wanted, None)
     ended, signaled = socket.socketpair()
     for end in (ended, signaled):
         end.setblocking(False)
@@ -60,7 +69,11 @@ def _serve(control: socket.socket) -> list[str] | None:
         events.register(control, selectors.EVENT_READ)
         events.register(ended, selectors.EVENT_READ)
         while True:
-            ready = [key.fileobj for key, _ in events.select()]
+            ready = [key.fileobj for key, _ in events.select(0 if coming else None)]
+            if coming and not ready:
+                with suppress(Exception):  # the step will say what is wrong
+                    _have(coming)
+                coming = next(wanted, None)
             if ended in ready:
                 with suppress(BlockingIOError):
                     ended.recv(ORDER_BYTES)
@@ -70,6 +83,7 @@ def _serve(control: socket.socket) -> list[str] | None:
                 if not text:
                     return None
                 order = json.loads(text)
+                gc.freeze()  # what forks share stays shared
                 pid = os.fork()
                 if pid == 0:
                     signal.set_wakeup_fd(-1)
@@ -81,6 +95,14 @@ def _serve(control: socket.socket) -> list[str] | None:
                 for handle in handles:
                     os.close(handle)
                 _tell(control, {"pid": pid})
+
+
+def _have(entry: str) -> None:
+    """Import a module; call a function of it, if one is named."""
+    module, _, function = entry.partition(":")
+    loaded = importlib.import_module(module)
+    if function:
+        getattr(loaded, function)()
 
 
 def _become(environment: dict[str, str], handles: list[int]) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 import numba
 from numba.core import event
 from numba.core.caching import InTreeCacheLocator, UserProvidedCacheLocator, UserWideCacheLocator
+from numba.core.registry import cpu_target
 
 NOTICE = "compiling kernels for this processor: some ten seconds, once"
 
@@ -27,6 +28,12 @@ def prepare() -> None:
     places = ",".join([*ours, "IPythonCacheLocator", "ZipCacheLocator"])  # Numba's others, for code that is not ours
     numba.config.CACHE_LOCATOR_CLASSES = places  # type: ignore[attr-defined]
     event.register("numba:compile", _Teller())
+
+
+def load() -> None:
+    """Have Numba import what it would for its first kernel, .4 s that forks of this process need not spend."""
+    cpu_target.typing_context.refresh()
+    cpu_target.target_context.refresh()
 
 
 class _Teller(event.Listener):

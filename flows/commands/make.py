@@ -84,15 +84,11 @@ def run(order: Order, refresh: bool = False) -> "Made":
     Raises:
         StepError: a step did not finish.
     """
-    from prefect.settings import PREFECT_TASKS_REFRESH_CACHE, temporary_settings
-
-    from flows.image_to_4d import image_to_4d
-    from flows.text_to_4d import text_to_4d
-    from flows.video_to_4d import video_to_4d
-
-    flow = text_to_4d if order.drawn else video_to_4d if order.moving else image_to_4d
-    with temporary_settings({PREFECT_TASKS_REFRESH_CACHE: refresh}), _surroundings(order):
-        return flow(order.source, order.settings, order.seed, order.item, order.bank)
+    name = "text_to_4d" if order.drawn else "video_to_4d" if order.moving else "image_to_4d"
+    flow = getattr(importlib.import_module(f"flows.{name}"), name)
+    with _surroundings(order, refresh):
+        made: Made = flow(order.source, order.settings, order.seed, order.item, order.bank)
+    return made
 
 
 def deliver(order: Order, made: "Made", folder: Path, signer: Signer | None) -> Files:
@@ -132,15 +128,16 @@ def make_motions(order: Order, folder: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def _surroundings(order: Order) -> Iterator[None]:
-    """What a flow of an order runs in."""
+def _surroundings(order: Order, refresh: bool = False) -> Iterator[None]:
+    """What a flow of an order runs in; `refresh` as in `run`."""
     from prefect import tags
-    from prefect.settings import temporary_settings
+    from prefect.settings import PREFECT_TASKS_REFRESH_CACHE, temporary_settings
 
     from flows.engine.orphans import process_tag
     from flows.engine.tasks import QUICK
 
-    with temporary_settings(QUICK), tags(process_tag(), f"profile:{order.profile}"):
+    changed = {**QUICK, PREFECT_TASKS_REFRESH_CACHE: refresh}
+    with temporary_settings(changed), tags(process_tag(), f"profile:{order.profile}"):
         yield
 
 

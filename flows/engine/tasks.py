@@ -4,7 +4,8 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+from typing import Any, Self
 
 import httpx
 from prefect import task
@@ -31,7 +32,7 @@ from flows.engine.events import StepEvent, tell
 from flows.engine.executors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable, chosen
 from flows.engine.leases import hold
 from flows.ui import pages
-from flows.ui.showing import revive, show
+from flows.ui.showing import Beside, later, revive, show
 from steps.contract import ArtifactRef, StepRequest, StepResult
 from steps.main import catalog, request_version
 from steps.store import StoreUnreachable
@@ -96,6 +97,13 @@ def run_step(request: StepRequest, item: str, label: str) -> dict[str, Any]:
     page.update(1, 1, {})
     for note in (*result.provenance.notes, *result.provenance.run_notes):
         get_run_logger().info(note)
+    later(partial(_show_result, item, label, result))
+    return result.model_dump(mode="json")
+
+
+def _show_result(item: str, label: str, result: StepResult) -> None:
+    """A page, a table of the files, and a link to the first of them."""
+    spec = catalog()[result.provenance.step]
     show(
         create_markdown_artifact,
         key=pages.key(label, item),
@@ -116,7 +124,6 @@ def run_step(request: StepRequest, item: str, label: str) -> dict[str, Any]:
         link_text=f"{name}{spec.outputs[name].suffix}",
         description=f"What {label} of {item} made",
     )
-    return result.model_dump(mode="json")
 
 
 def may_help(_task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
@@ -136,6 +143,8 @@ def may_help(_task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
 class Steps:
     """Asks for the steps of one asset, one after the other, and remembers what each gave.
 
+    Used in a `with` block, at the end of which the pages of all steps are there.
+
     Attributes:
         item: name of the asset.
         seed: of every step.
@@ -146,6 +155,15 @@ class Steps:
     seed: int
     finished: list[Finished] = field(default_factory=list)
     _makers: dict[str, State[Any]] = field(default_factory=dict)
+    _pages: Beside = field(default_factory=Beside)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._pages.finish(stopped=kind is KeyboardInterrupt)
+        if kind is None:
+            self._pages.check()
 
     def run(self, step: str, inputs: dict[str, ArtifactRef | None], settings: BaseModel) -> dict[str, ArtifactRef]:
         """Run a step, or take what it gave before; its outputs by name. Inputs that are None are left out.
@@ -155,9 +173,10 @@ class Steps:
         """
         request = self._request(step, inputs, settings)
         start = time.monotonic()
-        state: State[Any] = _task(step, self.item, step)(
-            request, self.item, step, wait_for=self._before(request), return_state=True
-        )
+        with self._pages.offered():
+            state: State[Any] = _task(step, self.item, step)(
+                request, self.item, step, wait_for=self._before(request), return_state=True
+            )
         return self._note(step, state, start)
 
     def run_parts(
@@ -227,7 +246,7 @@ def _task(step: str, item: str, label: str) -> Task[..., Any]:
     return run_step.with_options(
         name=step,
         task_run_name=f"{label}: {item}",
-        tags=[f"step:{step}", f"resource:{catalog()[step].resource}"],  # Prefect keeps a thread and a client per set
+        tags=[f"resource:{catalog()[step].resource}"],  # Prefect makes and keeps a thread and a client per set
         cache_policy=policy.configure(isolation_level=IsolationLevel.SERIALIZABLE, lock_manager=locks),
         result_storage=home.records(),
         retries=RETRIES,

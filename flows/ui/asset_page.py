@@ -15,7 +15,6 @@ from steps.store import ArtifactStore
 if TYPE_CHECKING:
     from flows.engine.tasks import Finished
 
-PICTURE_BYTES = 20_000  # of each; together a page stays small enough for the database
 PICTURES = {
     ("pack_asset", "sheet"): "Contact sheet",
     ("draw_picture", "picture"): "Drawn from the words",
@@ -68,7 +67,7 @@ def asset_page(item: str, finished: Sequence["Finished"], package: ArtifactRef, 
     lines = [f"# {item}", "", " · ".join([*links, f"`{package.digest}`"]), ""]
     first = {done.result.provenance.step: done.result.outputs for done in reversed(finished)}
     for (step, output), title in PICTURES.items():
-        if output in first.get(step, {}) and (small := pages.thumbnail(first[step][output], store, PICTURE_BYTES)):
+        if output in first.get(step, {}) and (small := pages.thumbnail(first[step][output], store)):
             lines += [f"## {title}", "", pages.embedded(title, "image/webp", small), ""]
     for result in (done.result for done in finished):
         for ref in result.outputs.values():

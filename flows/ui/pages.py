@@ -5,6 +5,7 @@ import hashlib
 import json
 import re
 import tempfile
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,8 @@ from steps.store import ArtifactMissing, ArtifactStore
 
 THUMBNAIL_SIZES = (960, 640, 320)  # pixels of the longer side
 WEBP_METHOD = 4  # libwebp's own; with OpenImageIO's, 6, alpha takes a hundred times as long
-THUMBNAIL_BYTES = 50_000  # the server keeps pages in its database
+THUMBNAIL_BYTES = 30_000  # the server keeps pages in its database
+THUMBNAILS_KEPT = 32  # the page of an asset shows those of its steps again
 ROWS_OF_A_CURVE = 8
 ARTIFACT_ADDRESS = "/dg4d/artifacts/"  # of the background server
 VIEWER_ADDRESS = "/dg4d/viewer/"
@@ -105,24 +107,30 @@ def thumbnail(ref: ArtifactRef, store: ArtifactStore, most_bytes: int = THUMBNAI
         None if it cannot be made, for a page is not worth a failed step.
     """
     try:
-        picture = oiio.ImageBuf(str(store.path(ref)))
+        return _small(store.path(ref), most_bytes)
     except ArtifactMissing:
         return None
+
+
+@lru_cache(THUMBNAILS_KEPT)
+def _small(path: Path, most_bytes: int) -> bytes | None:
+    """As `thumbnail`, of a file that never changes."""
+    picture = oiio.ImageBuf(str(path))
     if not picture.read() or not picture.spec().width:
         picture.geterror()  # it was taken note of
         return None
     with tempfile.TemporaryDirectory(prefix="dg4d-page-") as folder:
-        path = Path(folder) / "small.webp"
+        target = Path(folder) / "small.webp"
         small = picture
         for size in THUMBNAIL_SIZES:
             small = _shrunk(small, size)
             for quality in (80, 50, 20):
                 small.specmod().attribute("Compression", f"webp:{quality}")
                 small.specmod().attribute("webp:method", WEBP_METHOD)
-                if not small.write(str(path)):
+                if not small.write(str(target)):
                     return None
-                if path.stat().st_size <= most_bytes:
-                    return path.read_bytes()
+                if target.stat().st_size <= most_bytes:
+                    return target.read_bytes()
     return None
 
 

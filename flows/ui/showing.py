@@ -1,8 +1,10 @@
 """Artifacts for a Prefect server that may be away for a while, because it was killed or is started anew."""
 
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar, copy_context
 from typing import Any
 
 import httpx
@@ -34,6 +36,48 @@ def show(create: Callable[..., Any], **what: Any) -> None:
             time.sleep(POLL_S)
         else:
             return
+
+
+class Beside:
+    """Makes pages while the flow goes on, one after the other, in a thread of its own."""
+
+    def __init__(self) -> None:
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="pages")
+        self._made: list[Future[None]] = []
+
+    @contextmanager
+    def offered(self) -> Iterator[None]:
+        """Let what runs in the block, in this thread, leave its pages to `later`."""
+        token = _beside.set(self)
+        try:
+            yield
+        finally:
+            _beside.reset(token)
+
+    def take(self, make: Callable[[], None]) -> None:
+        """Call this when its turn comes, in the context of this moment."""
+        self._made.append(self._thread.submit(copy_context().run, make))
+
+    def finish(self, stopped: bool = False) -> None:
+        """Wait for all of them, or only for the one in hand if the user stopped the flow."""
+        self._thread.shutdown(cancel_futures=stopped)
+
+    def check(self) -> None:
+        """Raise what one of them raised."""
+        for made in self._made:
+            made.result()
+
+
+_beside: ContextVar[Beside | None] = ContextVar("beside", default=None)
+
+
+def later(make: Callable[[], None]) -> None:
+    """Make pages beside what the flow does next; at once where no flow waits for them, as on another machine."""
+    beside = _beside.get()
+    if beside is None:
+        make()
+    else:
+        beside.take(make)
 
 
 def revive() -> None:

@@ -30,7 +30,8 @@ def _png() -> bytes:
 
 PNG = _png()  # 8 x 6 pixels
 STEPS = {
-    name: spec.model_copy(update={"entry": f"fake_steps:{name}", "timeout_s": 60.0}) for name, spec in REAL.items()
+    name: spec.model_copy(update={"entry": f"fake_steps:{name}", "timeout_s": 60.0, "late_imports": ()})
+    for name, spec in REAL.items()
 }
 
 
