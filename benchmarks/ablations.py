@@ -13,7 +13,7 @@ on that cannot be seen here, and is said so.
 import argparse
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from statistics import mean, stdev
@@ -32,8 +32,8 @@ from flows.inputs.manifest import parse_changes
 from steps.profiles import PipelineSettings, revise
 from steps.truth import find_truths
 
-DIGITS = {"psnr": 2, "psnr_obj": 2, "iou": 3, "terr": 3}
-LESS_IS_BETTER = {"terr"}
+DIGITS = {"psnr": 2, "psnr_obj": 2, "iou": 3, "terr": 3, "flicker": 2}
+LESS_IS_BETTER = {"terr", "flicker"}
 CONFIDENCE = 0.95  # of the interval that a gain lies in, by Student's t over the pairs
 SLIGHT = {"psnr": 0.1, "psnr_obj": 0.1, "iou": 0.005, "terr": 0.01}  # gains nobody would see
 SHARES = ("subject.max_frames", "deformation.temporal")  # a fraction of these is one of the frames there are
@@ -225,13 +225,13 @@ ABLATIONS: dict[str, Ablation] = {
 
 @dataclass(frozen=True)
 class Row:
-    """One fit."""
+    """One fit; its figures are a dataclass with names from `DIGITS`."""
 
     ablation: str
     variant: str
     specimen: str
     seed: int
-    figures: Figures
+    figures: Any
 
 
 def settings_of(changes: Mapping[str, Any], size: int, frames: int) -> PipelineSettings:
@@ -310,15 +310,16 @@ def _outcome(claim: Claim, gain: float, error: float, pairs: int) -> str:
 
 def table(title: str, rows: Sequence[Row]) -> Table:
     """Means and spread over objects and seeds."""
-    result = Table(Column("variant", no_wrap=True), *DIGITS, title=title)
+    names = [field.name for field in fields(rows[0].figures)]
+    result = Table(Column("variant", no_wrap=True), *names, title=title)
     for variant in dict.fromkeys(row.variant for row in rows):
         result.add_row(
-            variant, *(_cell([row.figures for row in rows if row.variant == variant], name) for name in DIGITS)
+            variant, *(_cell([row.figures for row in rows if row.variant == variant], name) for name in names)
         )
     return result
 
 
-def _cell(figures: Sequence[Figures], name: str) -> str:
+def _cell(figures: Sequence[Any], name: str) -> str:
     values = [value for one in figures if (value := getattr(one, name)) is not None]
     if not values:
         return ""
@@ -338,7 +339,7 @@ def main() -> None:
         metavar="DIR",
         help="a data set with banks, instead of our own objects; all ablations need videos but those of the static "
         f"stage ({', '.join(name for name, one in ABLATIONS.items() if one.still)}), which take pictures, too; "
-        "those of the refinement need weights: benchmarks.refinement",
+        "those of the refinement: benchmarks.oracle_refinement, and with weights benchmarks.refinement",
     )
     parser.add_argument("--seeds", type=int, default=2, help="fits of every variant and object")
     parser.add_argument("--frames", type=int, default=16, help="of the video, at most")

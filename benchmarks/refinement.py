@@ -5,8 +5,8 @@ pull`), best on a GPU; FRAMES is the folder of cut-outs of the asset's driving v
 own step with a texture per frame. Flicker is the mean change of a texel from frame to frame, in levels of 255, over the
 texels that were refined; sharpness is the mean step between neighboring texels there, in units of what it was before.
 The paper says: whole videos flicker less than single pictures; with .6 of the noise levels skipped textures come out
-too smooth, with .8 too noisy, .7 is best. Without the weights there is nothing to measure: what such models paint is
-the question, and no stand-in knows it.
+too smooth, with .8 too noisy, .7 is best. What such models paint no stand-in knows; what the loop makes of pictures
+that are as consistent, or as inconsistent, as theirs is measured by `benchmarks.oracle_refinement`.
 """
 
 import argparse
