@@ -46,7 +46,7 @@ base() {
     command -v debootstrap >/dev/null || { echo "On Debian: apt-get install debootstrap (as root)" >&2; exit 69; }
     folder=$(mktemp -d)  # not local: the trap runs outside of this function
     trap 'rm -rf "$folder"' EXIT
-    debootstrap --variant=minbase --include=python3,python3-venv,ca-certificates bookworm "$folder/root"
+    debootstrap --variant=minbase --include=python3,python3-venv,python3-dev,ca-certificates bookworm "$folder/root"
     ln -s python3 "$folder/root/usr/bin/python"
     tar -C "$folder/root" -c . | "$program" import --change 'CMD ["python"]' - "$base"
 }

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar, copy_context
 from typing import Any
@@ -43,7 +43,6 @@ class Beside:
 
     def __init__(self) -> None:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="pages")
-        self._made: list[Future[None]] = []
 
     @contextmanager
     def offered(self) -> Iterator[None]:
@@ -56,28 +55,33 @@ class Beside:
 
     def take(self, make: Callable[[], None]) -> None:
         """Call this when its turn comes, in the context of this moment."""
-        self._made.append(self._thread.submit(copy_context().run, make))
+        self._thread.submit(copy_context().run, make)
 
     def finish(self, stopped: bool = False) -> None:
         """Wait for all of them, or only for the one in hand if the user stopped the flow."""
         self._thread.shutdown(cancel_futures=stopped)
-
-    def check(self) -> None:
-        """Raise what one of them raised."""
-        for made in self._made:
-            made.result()
 
 
 _beside: ContextVar[Beside | None] = ContextVar("beside", default=None)
 
 
 def later(make: Callable[[], None]) -> None:
-    """Make pages beside what the flow does next; at once where no flow waits for them, as on another machine."""
+    """Make pages beside what the flow does next; at once where no flow waits for them, as on another machine.
+
+    A page is not worth a failed step: what goes wrong with it is in the log of the run.
+    """
+
+    def attempt() -> None:
+        try:
+            make()
+        except Exception:
+            get_run_logger().warning("a page is left out", exc_info=True)
+
     beside = _beside.get()
     if beside is None:
-        make()
+        attempt()
     else:
-        beside.take(make)
+        beside.take(attempt)
 
 
 def revive() -> None:

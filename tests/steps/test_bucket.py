@@ -188,6 +188,7 @@ def test_trouble_with_a_bucket_is_told_without_secrets(server: TinyS3, tmp_path:
 
 def test_plain_http_goes_to_this_machine_only(server: TinyS3, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     open_store(f"s3://{BUCKET}/{uuid.uuid4()}", patience_s=0.1).put_bytes(b"x", "a/b")
+    monkeypatch.delenv("AWS_ALLOW_HTTP", raising=False)
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://192.0.2.1:9")  # an address for documents, which nobody has
     begin = time.monotonic()
     with pytest.raises(BackendUnavailable):
