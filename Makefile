@@ -31,8 +31,8 @@ check: setup
 	$(BIN)/lint-imports --no-cache
 
 audit: setup
-	$(BIN)/python -m venv out/audit && out/audit/bin/pip install -q pip-audit
-	out/audit/bin/pip-audit -r constraints.txt --no-deps --disable-pip -f json --progress-spinner off | $(BIN)/python deploy/audit.py
+	$(BIN)/python -m venv out/audit && timeout 300 out/audit/bin/pip install -q pip-audit
+	timeout 300 out/audit/bin/pip-audit -r constraints.txt --no-deps --disable-pip -f json --progress-spinner off | $(BIN)/python deploy/audit.py
 
 examples: setup
 	$(BIN)/python -m examples.make_examples
