@@ -30,8 +30,11 @@ check: setup
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 
-audit: setup
+out/audit/bin/pip-audit: $(VENV)/.ready
 	$(BIN)/python -m venv out/audit && timeout 300 out/audit/bin/pip install -q pip-audit
+	touch $@
+
+audit: setup out/audit/bin/pip-audit
 	timeout 300 out/audit/bin/pip-audit -r constraints.txt --no-deps --disable-pip -f json --progress-spinner off | $(BIN)/python deploy/audit.py
 
 examples: setup

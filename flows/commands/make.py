@@ -84,9 +84,11 @@ def run(order: Order, refresh: bool = False) -> "Made":
     Raises:
         StepError: a step did not finish.
     """
+    from prefect.settings import PREFECT_TASKS_REFRESH_CACHE
+
     name = "text_to_4d" if order.drawn else "video_to_4d" if order.moving else "image_to_4d"
     flow = getattr(importlib.import_module(f"flows.{name}"), name)
-    with _surroundings(order, refresh):
+    with _surroundings(order, {PREFECT_TASKS_REFRESH_CACHE: refresh}):
         made: Made = flow(order.source, order.settings, order.seed, order.item, order.bank)
     return made
 
@@ -128,16 +130,15 @@ def make_motions(order: Order, folder: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def _surroundings(order: Order, refresh: bool = False) -> Iterator[None]:
-    """What a flow of an order runs in; `refresh` as in `run`."""
+def _surroundings(order: Order, settings: dict[Any, Any] | None = None) -> Iterator[None]:
+    """What a flow of an order runs in, with these settings of Prefect beside those of every flow."""
     from prefect import tags
-    from prefect.settings import PREFECT_TASKS_REFRESH_CACHE, temporary_settings
+    from prefect.settings import temporary_settings
 
     from flows.engine.orphans import process_tag
     from flows.engine.tasks import QUICK
 
-    changed = {**QUICK, PREFECT_TASKS_REFRESH_CACHE: refresh}
-    with temporary_settings(changed), tags(process_tag(), f"profile:{order.profile}"):
+    with temporary_settings({**QUICK, **(settings or {})}), tags(process_tag(), f"profile:{order.profile}"):
         yield
 
 
