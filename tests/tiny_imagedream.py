@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 from tiny_weights import tiny_vae, write_scheduler
 
 from dg4d_lib.diffusion.multiview import MultiViewShape, MultiViewUnet
@@ -54,6 +54,8 @@ def write_imagedream(model: Path, seed: int = 0) -> Path:
         CLIPTextModel(text).save_pretrained(model / "text_encoder")
         eye = CLIPVisionConfig(hidden_size=48, image_size=224, patch_size=56, **sizes)
         CLIPVisionModel(eye).save_pretrained(model / "image_encoder")
+    _name_as_published(model / "text_encoder", "text_model.")
+    _name_as_published(model / "image_encoder", "vision_model.")
     (model / "unet").mkdir()
     (model / "unet" / "config.json").write_text(json.dumps(UNET_CONFIG))
     save_file(unet.state_dict(), model / "unet" / "diffusion_pytorch_model.safetensors")
@@ -64,6 +66,12 @@ def write_imagedream(model: Path, seed: int = 0) -> Path:
     about = {**ENDS, "unk_token": ENDS["eos_token"], "pad_token": ENDS["eos_token"], "model_max_length": 77}
     (model / "tokenizer" / "tokenizer_config.json").write_text(json.dumps(about))
     return model
+
+
+def _name_as_published(part: Path, prefix: str) -> None:
+    """Put the prefix before the names of the tensors, as transformers did in 2023."""
+    file = part / "model.safetensors"
+    save_file({f"{prefix}{name}": tensor for name, tensor in load_file(file).items()}, file, {"format": "pt"})
 
 
 def write_lgm(folder: Path, seed: int = 0) -> Path:

@@ -120,6 +120,21 @@ def troubles(
     return wrong | dict.fromkeys(sorted(other), "is not the file that was pulled: its sha256 differs")
 
 
+def unpublished(folder: Path, weights: Weights, memory: Path | None = None) -> dict[str, str]:
+    """Files that are not what was published, and how so; files of which nothing is known, or that are not here, pass.
+
+    Args:
+        folder: where the weights lie.
+        weights: what they should be.
+        memory: as in `digests`.
+    """
+    have = _digests_of([path for name in weights.published if (path := folder / name).is_file()], memory)
+    found = {path.relative_to(folder).as_posix(): digest for path, digest in have.items()}
+    where = f" at revision {weights.revision[:10]}" if weights.revision else ""
+    other = [name for name, digest in found.items() if digest != weights.published[name]]
+    return dict.fromkeys(other, f"is not the file that was published{where}: its sha256 differs")
+
+
 def digests(folder: Path, parts: tuple[str, ...] = (), memory: Path | None = None) -> dict[str, str]:
     """The sha256 (64 hexadecimal digits) of every file that loading may read, by its path within the folder.
 
@@ -142,18 +157,16 @@ def identity(files: dict[str, str]) -> str:
 
 
 def in_hub_cache(weights: Weights) -> Path | None:
-    """The newest snapshot that other programs downloaded; None where there is none."""
+    """What other programs downloaded: the snapshot of the pinned commit, else the newest; None where there is none."""
     if find_spec("huggingface_hub") is None:
         return None
     from huggingface_hub import constants  # noqa: PLC0415 - reads the environment when it is imported
 
     repository = Path(constants.HF_HUB_CACHE) / f"models--{weights.hub_id.replace('/', '--')}"
-    try:
-        commit = (repository / "refs" / (weights.revision or "main")).read_text(encoding="utf-8").strip()
-    except OSError:
-        commit = weights.revision or ""
-    snapshot = repository / "snapshots" / commit
-    return snapshot if commit and snapshot.is_dir() else None
+    main = repository / "refs" / "main"
+    commits = [weights.revision or "", main.read_text(encoding="utf-8").strip() if main.is_file() else ""]
+    snapshots = [repository / "snapshots" / commit for commit in commits if commit]
+    return next((snapshot for snapshot in snapshots if snapshot.is_dir()), None)
 
 
 def _called_by_content(name: str, home: Path | None) -> Path:

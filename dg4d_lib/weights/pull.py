@@ -23,7 +23,8 @@ def pull(weights: Weights, home: Path) -> Locked:
         What the lock now says.
 
     Raises:
-        BackendUnavailable: the hub cannot be reached or does not give them, or what came is not what the hub lists.
+        BackendUnavailable: the hub cannot be reached or does not give them, or what came is not what the hub lists and
+            what was published.
         OSError: the disk is full.
     """
     try:
@@ -42,6 +43,8 @@ def pull(weights: Weights, home: Path) -> Locked:
         )
         listed = info.siblings or []
         published = {file.rfilename: file.lfs.sha256 for file in listed if file.lfs is not None}
+        if weights.revision in (None, info.sha):
+            published |= weights.published
         chosen = needed([file.rfilename for file in listed], weights.parts)
         folder.mkdir(parents=True, exist_ok=True)
         hub.snapshot_download(weights.hub_id, revision=info.sha, local_dir=folder, allow_patterns=chosen)

@@ -1,10 +1,12 @@
 """The weights that profiles and scores name: where they come from, what of them is needed, what their license allows.
 
-Revisions and digests are not written here: the first `dg4d weights pull` records what it got (trust on first use, see
-lock.py), and every later use is compared with that. `revision` pins a commit of the hub where one must not change.
+`revision` pins a commit of the hub, `published` says what the files of tensors are there, as far as public records
+tell. The first `dg4d weights pull` compares what it gets with that and writes all of it down (lock.py); every later use
+is compared with what was written. What no public record tells is trusted on first use.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 Commercial = Literal["yes", "conditions", "no", "unverified"]
@@ -43,7 +45,8 @@ class Weights:
         purpose: what it is for.
         license: of the weights, not of the code around them.
         parts: folders (of a model in diffusers' layout) or single files that are needed; empty: all of the repository.
-        revision: a commit or tag of the hub; None: the newest at the first pull, which the lock then remembers.
+        revision: a commit of the hub; None: the newest at the first pull, which the lock then remembers.
+        published: sha256 of files at that commit, by path: those of tensors as far as they are known.
         about_gb: size of the download in units of 1e9 bytes as far as it is known without asking the hub.
     """
 
@@ -53,6 +56,7 @@ class Weights:
     license: License
     parts: tuple[str, ...] = ()
     revision: str | None = None
+    published: Mapping[str, str] = field(default_factory=dict)
     about_gb: float | None = None
 
 
@@ -64,93 +68,9 @@ STABILITY_RESEARCH = License(
 STABILITY_COMMUNITY = License(
     "Stability AI Community License",
     "conditions",
-    "commercial use is free below one million US dollars of yearly revenue, with registration and attribution; above, "
-    "it takes an enterprise license (https://stability.ai/license)",
+    "commercial use is free up to one million US dollars of yearly revenue, affiliates included, with registration and "
+    '"Powered by Stability AI" in sight; above, it takes an enterprise license (https://stability.ai/license)',
 )
-UNVERIFIED = "no statement of the authors on commercial use was found; read the model card before you use the weights"
-
-ZERO123_PARTS = ("vae", "unet", "image_encoder", "clip_camera_projection", "scheduler")
-SVD_PARTS = ("vae", "unet", "image_encoder", "scheduler")
-
-KNOWN: dict[str, Weights] = {
-    weights.name: weights
-    for weights in (
-        Weights(
-            name="zero123-xl",
-            hub_id="ashawkey/zero123-xl-diffusers",
-            purpose="prior: other sides (Zero-1-to-3-XL)",
-            license=License("license of Zero-1-to-3-XL", "unverified", UNVERIFIED),
-            parts=ZERO123_PARTS,
-        ),
-        Weights(
-            name="stable-zero123",
-            hub_id="ashawkey/stable-zero123-diffusers",
-            purpose="prior: other sides (Stable-Zero123)",
-            license=STABILITY_RESEARCH,
-            parts=ZERO123_PARTS,
-        ),
-        Weights(
-            name="svd",
-            hub_id="stabilityai/stable-video-diffusion-img2vid",
-            purpose="motions of 14 frames, textures",
-            license=STABILITY_COMMUNITY,
-            parts=SVD_PARTS,
-            about_gb=4.5,
-        ),
-        Weights(
-            name="svd-xt",
-            hub_id="stabilityai/stable-video-diffusion-img2vid-xt",
-            purpose="motions of 25 frames",
-            license=STABILITY_COMMUNITY,
-            parts=SVD_PARTS,
-            about_gb=4.5,
-        ),
-        Weights(
-            name="imagedream",
-            hub_id="ashawkey/imagedream-ipmv-diffusers",
-            purpose="four views of an object, for LGM",
-            license=License("license of ImageDream", "unverified", UNVERIFIED),
-            about_gb=4.0,
-        ),
-        Weights(
-            name="lgm",
-            hub_id="ashawkey/LGM",
-            purpose="Gaussians out of four views",
-            license=License("license of LGM", "unverified", UNVERIFIED),
-            parts=("model_fp16_fixrot.safetensors",),
-            about_gb=0.83,
-        ),
-        Weights(
-            name="vgg16",
-            hub_id="timm/vgg16.tv_in1k",
-            purpose="scores: the network of LPIPS (torchvision's VGG16)",
-            license=License("BSD-3-Clause", "yes", "commercial use is allowed; trained on ImageNet"),
-            parts=("model.safetensors",),
-            about_gb=0.55,
-        ),
-        Weights(
-            name="lpips-vgg",
-            hub_id="chaofengc/IQA-PyTorch-Weights",
-            purpose="scores: LPIPS on top of vgg16 (7 kB)",
-            license=License("BSD-2-Clause", "yes", "commercial use is allowed; vgg.pth of the package lpips"),
-            parts=("LPIPS_v0.1_vgg-a78928a0.pth",),
-        ),
-        Weights(
-            name="clip-vit-b-32",
-            hub_id="openai/clip-vit-base-patch32",
-            purpose="scores: CLIP similarity",
-            license=License("license of CLIP's weights", "unverified", UNVERIFIED),
-        ),
-        Weights(
-            name="i3d",
-            hub_id="flateon/FVD-I3D-torchscript",
-            purpose="scores: FVD",
-            license=License("license of I3D's weights", "unverified", UNVERIFIED),
-            parts=("i3d_torchscript.pt",),
-        ),
-    )
-}
-
 
 ON_CARDS: dict[str, Commercial] = {
     **dict.fromkeys(("apache-2.0", "mit", "bsd-3-clause", "cc0-1.0", "cc-by-4.0"), "yes"),
@@ -164,15 +84,175 @@ TERMS: dict[Commercial, str] = {
     "unverified": "read the license of these weights before you use them",
 }
 
+ZERO123_PARTS = ("vae", "unet", "image_encoder", "clip_camera_projection", "scheduler")
+SVD_PARTS = ("vae", "unet", "image_encoder", "scheduler")
+SD_VAE = "3e4c08995484ee61270175e9e7a072b66a6e4eeb5f0c266667fe1f45b90daf9a"  # Stable Diffusion's, half precision
+SVD_SHARED = {
+    "vae/diffusion_pytorch_model.fp16.safetensors": "af602cd0eb4ad6086ec94fbf1438dfb1be5ec9ac03fd0215640854e90d6463a3",
+    "image_encoder/model.fp16.safetensors": "ae616c24393dd1854372b0639e5541666f7521cbe219669255e865cb7f89466a",
+}  # of both lengths
+
+KNOWN: dict[str, Weights] = {
+    weights.name: weights
+    for weights in (
+        Weights(
+            name="zero123-xl",
+            hub_id="ashawkey/zero123-xl-diffusers",
+            purpose="prior: other sides (Zero-1-to-3-XL)",
+            license=License(
+                "MIT on its card",
+                "unverified",
+                "the card says MIT, but the authors of Zero-1-to-3 call the model intended for research only, and it "
+                "was fine-tuned from one under CreativeML OpenRAIL-M; clear it up with them before any commercial use",
+            ),
+            parts=ZERO123_PARTS,
+            revision="10e9e8e75adaa3bf77f5ac9c381419016fed68c7",
+            about_gb=2.5,
+        ),
+        Weights(
+            name="stable-zero123",
+            hub_id="ashawkey/stable-zero123-diffusers",
+            purpose="prior: other sides (Stable-Zero123)",
+            license=STABILITY_RESEARCH,
+            parts=ZERO123_PARTS,
+            revision="a6c09344fbd45843d35f2095c203c4a8e55b4dbb",
+            published={
+                "unet/diffusion_pytorch_model.safetensors": (
+                    "df42cdcac55d5b89c15a0512845db20a6213f1eaa129f201dfc080fc8642d220"
+                ),
+                "vae/diffusion_pytorch_model.safetensors": SD_VAE,
+                "clip_camera_projection/diffusion_pytorch_model.safetensors": (
+                    "0cb292c6da02a0d8866c4378cd6053e097c7a6bdf0886cc4ac1fba2bda3af6f0"
+                ),
+            },
+            about_gb=2.5,
+        ),
+        Weights(
+            name="svd",
+            hub_id="stabilityai/stable-video-diffusion-img2vid",
+            purpose="motions of 14 frames, textures",
+            license=STABILITY_COMMUNITY,
+            parts=SVD_PARTS,
+            revision="9cf024d5bfa8f56622af86c884f26a52f6676f2e",
+            published={
+                "unet/diffusion_pytorch_model.fp16.safetensors": (
+                    "cb552818963e736506c6693ffc279d59df423d63aced38902ea4373ab1fd2932"
+                ),
+                **SVD_SHARED,
+            },
+            about_gb=4.5,
+        ),
+        Weights(
+            name="svd-xt",
+            hub_id="stabilityai/stable-video-diffusion-img2vid-xt",
+            purpose="motions of 25 frames",
+            license=STABILITY_COMMUNITY,
+            parts=SVD_PARTS,
+            revision="9e43909513c6714f1bc78bcb44d96e733cd242aa",
+            published={
+                "unet/diffusion_pytorch_model.fp16.safetensors": (
+                    "9fbc02e90f37d422f5e3a4aeaee95f6629dc8c45ca211b951626e930daf2bddf"
+                ),
+                **SVD_SHARED,
+            },
+            about_gb=4.5,
+        ),
+        Weights(
+            name="imagedream",
+            hub_id="ashawkey/imagedream-ipmv-diffusers",
+            purpose="four views of an object, for LGM",
+            license=License("OpenRAIL", "conditions", TERMS["conditions"]),
+            revision="73a034178e748421506492e91790cc62d6aefef5",
+            published={
+                "unet/diffusion_pytorch_model.safetensors": (
+                    "28d8b241a54125fa0a041c1818a5dcdb717e6f5270eea1268172acd3ab0238e0"
+                ),
+                "vae/diffusion_pytorch_model.safetensors": SD_VAE,
+                "text_encoder/model.safetensors": "bc1827c465450322616f06dea41596eac7d493f4e95904dcb51f0fc745c4e13f",
+                "image_encoder/model.safetensors": "2a56cfd4ffcf40be097c430324ec184cc37187f6dafef128ef9225438a3c03c4",
+            },
+            about_gb=4.0,
+        ),
+        Weights(
+            name="lgm",
+            hub_id="ashawkey/LGM",
+            purpose="Gaussians out of four views",
+            license=License("MIT", "yes", "commercial use is allowed; trained on objects of Objaverse"),
+            parts=("model_fp16_fixrot.safetensors",),
+            revision="1c28a2fd3bb1982414f722503ae862bdbb82636c",
+            published={
+                "model_fp16_fixrot.safetensors": "744d6324656342c64f871308e73db97f0eb51858d94329b30090e986a6d050ab"
+            },
+            about_gb=0.83,
+        ),
+        Weights(
+            name="vgg16",
+            hub_id="timm/vgg16.tv_in1k",
+            purpose="scores: the network of LPIPS (torchvision's VGG16)",
+            license=License("BSD-3-Clause", "yes", "commercial use is allowed; trained on ImageNet"),
+            parts=("model.safetensors",),
+            revision="b8d8aa2dd860af9233c8c67385a8097fd6c35d3f",
+            published={"model.safetensors": "57b026918159a6bf9faf8405c3a551903768e7138989d9c6224a14227203fad8"},
+            about_gb=0.55,
+        ),
+        Weights(
+            name="lpips-vgg",
+            hub_id="chaofengc/IQA-PyTorch-Weights",
+            purpose="scores: LPIPS on top of vgg16 (7 kB)",
+            license=License(
+                "BSD-2-Clause",
+                "yes",
+                "commercial use is allowed; byte for byte vgg.pth of the package lpips, though the card of the hub's "
+                "repository says CC BY-NC-SA 4.0",
+            ),
+            parts=("LPIPS_v0.1_vgg-a78928a0.pth",),
+            revision="e03d58097b4b231515f900fa8006a2168becc745",
+            published={
+                "LPIPS_v0.1_vgg-a78928a0.pth": "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"
+            },
+        ),
+        Weights(
+            name="clip-vit-b-32",
+            hub_id="openai/clip-vit-base-patch32",
+            purpose="scores: CLIP similarity",
+            license=License(
+                "none stated",
+                "unverified",
+                "the code is under MIT; of the weights, OpenAI's card says only that any deployed use is out of scope",
+            ),
+            revision="3d74acf9a28c67741b2f4f2ea7635f0aaf6f0268",
+            published={"pytorch_model.bin": "a63082132ba4f97a80bea76823f544493bffa8082296d62d71581a4feff1576f"},
+            about_gb=0.61,
+        ),
+        Weights(
+            name="i3d",
+            hub_id="flateon/FVD-I3D-torchscript",
+            purpose="scores: FVD",
+            license=License(
+                "none stated",
+                "unverified",
+                "this copy says nothing; DeepMind released the checkpoints that it was made from under Apache-2.0",
+            ),
+            parts=("i3d_torchscript.pt",),
+            published={"i3d_torchscript.pt": "bec6519f66ea534e953026b4ae2c65553c17bf105611c746d904657e5860a5e2"},
+            about_gb=0.05,
+        ),
+    )
+}
+
 
 def weights_called(name: str, card: str = "") -> Weights:
     """The weights of a name or a hub id.
 
     Args:
         name: as a user wrote it.
-        card: what the model card calls the license; it counts for weights that are not known here.
+        card: what the model card calls the license; it counts for weights that are not known here, but nobody frees
+            weights by copying them: whose name holds the name of weights that forbid commercial use has their license.
     """
     by_id = {weights.hub_id.lower(): weights for weights in KNOWN.values()}
     commercial = ON_CARDS.get(card, "unverified")
     theirs = License(card or "unknown license", commercial, TERMS[commercial])
+    for weights in KNOWN.values():
+        if weights.license.commercial == "no" and weights.name in name.lower():
+            theirs = weights.license
     return KNOWN.get(name) or by_id.get(name.lower()) or Weights(name, name, "named by the user", theirs)

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from flows.engine.events import StepEvent, listening
 from flows.packages.publish import readable
+from flows.ui.curves import amount
 
 if TYPE_CHECKING:
     from flows.inputs.orders import Order
@@ -190,7 +191,7 @@ def batch_shown(out: Console, items: list[str]) -> Iterator[BatchTable]:
 def numbers(event: StepEvent, most: int | None = None) -> str:
     """How far a step is, and its current values, at most the first `most` of them."""
     parts = [f"{event.done}/{event.total}"] if event.total > COUNTED else []
-    return "  ".join([*parts, *(f"{name} {value:.4g}" for name, value in list(event.values.items())[:most])])
+    return "  ".join([*parts, *(f"{name} {amount(value)}" for name, value in list(event.values.items())[:most])])
 
 
 def tell_where(out: Console, folder: Path, sizes: dict[str, int]) -> None:

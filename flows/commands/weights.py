@@ -17,12 +17,15 @@ weights = typer.Typer(
     no_args_is_help=True,
 )
 
+NOT_COMPARED = "there is nothing to compare it with"
 Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="a name of the list, or an id of the hub")]
 
 
 @weights.command("list")
 def show(
-    files: Annotated[bool, typer.Option("--files", help="and every file that was pulled: sha256, bytes, name")] = False,
+    files: Annotated[
+        bool, typer.Option("--files", help="and every file that was pulled, or will be if known: sha256, bytes, name")
+    ] = False,
 ) -> None:
     """Show all weights that profiles name, and those that were pulled besides: license, size, whether they are here."""
     with clear_ending():
@@ -43,9 +46,9 @@ def show(
         out.print(table)
         out.print(f"kept in {weights_home()}; a setting may name a folder instead", markup=False)
         out.print("revision and digests are written down by the first pull, and compared from then on")
-        for name, locked in locks.items() if files else ():
-            for path, file in locked.files.items():
-                typer.echo(f"{file.sha256}  {file.size:>12}  {name}/{path}")
+        for one in _all_of_them() if files else ():
+            for path, sha256, size in _files_of(one, locks.get(one.name)):
+                typer.echo(f"{sha256}  {size:>12}  {one.name}/{path}")
 
 
 @weights.command()
@@ -71,10 +74,10 @@ def pull(names: Names) -> None:
 def check(
     names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="default: all here")] = None,
 ) -> None:
-    """Read every file again and compare it with what was pulled."""
+    """Read every file again and compare it with what was pulled, else with what is known to be published."""
     with clear_ending():
         from dg4d_lib.errors import BackendUnavailable
-        from dg4d_lib.weights.locate import find_weights, troubles
+        from dg4d_lib.weights.locate import find_weights, troubles, unpublished
         from dg4d_lib.weights.lock import read_lock
         from dg4d_lib.weights.registry import weights_called
         from steps.weights import weights_home
@@ -89,14 +92,16 @@ def check(
             one = weights_called(name)
             folder = _place(one) or find_weights(name, home)
             locked = locks.get(one.name) if folder.parent == home else None
-            wrong = troubles(folder, one, locked)
+            wrong = troubles(folder, one, locked) or (unpublished(folder, one) if locked is None else {})
             for file, what in wrong.items():
                 typer.echo(f"{name}: {file} {what}")
             if wrong:
                 broken.append(name)
             elif locked is None:
+                known = sum((folder / file).is_file() for file in one.published)
                 typer.echo(
-                    f"{name}: complete; it was not pulled by this command, so there is nothing to compare it with"
+                    f"{name}: complete; it was not pulled by this command: "
+                    + (f"{known} of its files {'is' if known == 1 else 'are'} as published" if known else NOT_COMPARED)
                 )
             else:
                 count = f"{len(locked.files)} file{'s' * (len(locked.files) != 1)}"
@@ -134,8 +139,15 @@ def _row(one: "Weights", locked: "Locked | None") -> list[str]:
         whole = not troubles(place, one, locked if own else None, weights_home() / MEMORY)
         here = ("yes" if own else "hub cache") if whole else "damaged"
     size = _size(locked) if locked else f"~{one.about_gb:g}" if one.about_gb else "?"
-    revision = locked.revision[:10] if locked else one.revision or "-"
-    return [one.name, here, size, revision, one.license.commercial, one.license.name]
+    revision = locked.revision if locked else one.revision or "-"
+    return [one.name, here, size, revision[:10], one.license.commercial, one.license.name]
+
+
+def _files_of(one: "Weights", locked: "Locked | None") -> list[tuple[str, str, str]]:
+    """Path, sha256 and bytes of what was pulled, else of what is known to be published."""
+    if locked:
+        return [(path, file.sha256, str(file.size)) for path, file in locked.files.items()]
+    return [(path, sha256, "-") for path, sha256 in one.published.items()]
 
 
 def _size(locked: "Locked") -> str:

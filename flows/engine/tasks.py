@@ -32,6 +32,7 @@ from flows.engine.events import StepEvent, tell
 from flows.engine.executors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable, chosen
 from flows.engine.leases import hold
 from flows.ui import pages
+from flows.ui.curves import amount
 from flows.ui.showing import Beside, later, revive, show
 from steps.contract import ArtifactRef, StepRequest, StepResult
 from steps.main import catalog, request_version
@@ -267,7 +268,9 @@ class _ProgressPage:
             return
         self._last = now
         share = PROGRESS_DONE * done / max(total, 1)
-        text = ", ".join([f"{self._what}: {done}/{total}", *(f"{name} {value:.4g}" for name, value in values.items())])
+        text = ", ".join(
+            [f"{self._what}: {done}/{total}", *(f"{name} {amount(value)}" for name, value in values.items())]
+        )
         revive()
         with suppress(httpx.TransportError):  # the step goes on while the server is away
             if self._artifact is None:

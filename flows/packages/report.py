@@ -15,7 +15,7 @@ from flows.packages.crate import CRATE, crate_text
 from flows.packages.credentials import Claim, Signer, certificate, sidecar_of
 from flows.packages.publish import FORMAT, RECORD, Files, fact_of_bytes, readable
 from flows.packages.view import VIEWER, page_of
-from flows.ui.curves import HEIGHT, WIDTH, drawing, inked, summary
+from flows.ui.curves import HEIGHT, WIDTH, amount, drawing, inked, summary
 from steps.contract import RUN_ONLY, StepResult, canonical
 from steps.store import ArtifactStore
 
@@ -185,7 +185,7 @@ def curve(curves: dict[str, Any]) -> str:
     if not drawn:
         return ""
     legend = [
-        f'<span style="color:{ink}">&#9632; {_text(name)} {points[-1]:.4g}</span>'
+        f'<span style="color:{ink}">&#9632; {_text(name)} {amount(points[-1])}</span>'
         for ink, name, points in inked(curves)
     ]
     return (

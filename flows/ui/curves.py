@@ -41,7 +41,7 @@ def picture(curves: dict[str, Any]) -> str:
     drawn = drawing(curves)
     if not drawn:
         return ""
-    words = [("#666", summary(curves)), *((ink, f"{name} {points[-1]:.4g}") for ink, name, points in inked(curves))]
+    words = [("#666", summary(curves)), *((ink, f"{name} {amount(points[-1])}") for ink, name, points in inked(curves))]
     below = "".join(
         f'<text x="0" y="{HEIGHT + LINE * number}" fill="{ink}">{html.escape(text)}</text>'
         for number, (ink, text) in enumerate(words, 1)
@@ -58,7 +58,12 @@ def summary(curves: dict[str, Any]) -> str:
     """The range of what is drawn, in words."""
     values = _values(curves)
     scale = ", logarithmic" if is_logarithmic(curves) else ""
-    return f"{max(values):.3g} to {min(values):.3g}{scale}; iterations {curves['x'][0]} to {curves['x'][-1]}"
+    return f"{amount(max(values))} to {amount(min(values))}{scale}; iterations {curves['x'][0]} to {curves['x'][-1]}"
+
+
+def amount(value: float) -> str:
+    """A value as people read it: four digits; counts, which are whole, with all of theirs."""
+    return f"{value:,.0f}" if abs(value) >= 1000 and float(value).is_integer() else f"{value:.4g}"
 
 
 def inked(curves: dict[str, Any]) -> Iterator[tuple[str, str, list[float]]]:

@@ -1,6 +1,7 @@
 import hashlib
 import json
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -137,6 +138,9 @@ def test_the_hub_cache_is_used_as_other_programs_left_it(no_hub_cache: Path, hom
     (repository / "refs" / "main").write_text("abc")
     assert find_weights("svd", home) == snapshot
     assert find_weights("svd") == snapshot
+    pinned = fill(repository / "snapshots" / str(KNOWN["svd"].revision))
+    assert find_weights("svd", home) == pinned
+    shutil.rmtree(pinned)
     (snapshot / "vae" / "diffusion_pytorch_model.safetensors").unlink()
     with pytest.raises(BackendUnavailable, match="dg4d weights pull svd"):
         find_weights("svd", home)

@@ -1,5 +1,6 @@
 import errno
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,7 +14,7 @@ from dg4d_lib.weights.lock import read_lock
 from dg4d_lib.weights.pull import needed, pull
 from dg4d_lib.weights.registry import KNOWN, weights_called
 
-SVD = KNOWN["svd"]
+SVD = replace(KNOWN["svd"], revision=None, published={})
 REPOSITORY = {
     "README.md": b"card",
     "model_index.json": b"{}",
@@ -126,6 +127,20 @@ def test_a_download_that_is_not_what_the_hub_lists_is_refused(hub: Hub, tmp_path
     assert read_lock(tmp_path)
 
 
+def test_what_the_hub_lists_is_refused_where_something_else_was_published(hub: Hub, tmp_path: Path) -> None:
+    file = "unet/model.fp16.safetensors"
+    right = hashlib.sha256(REPOSITORY[file]).hexdigest()
+    for revision in (None, hub.newest):
+        other = replace(SVD, revision=revision, published={file: "0" * 64})
+        with pytest.raises(BackendUnavailable, match=r"unet/model\.fp16\.safetensors is damaged"):
+            pull(other, tmp_path / "other")
+        assert not (tmp_path / "other" / "svd" / file).exists()
+    pull(replace(SVD, published={file: right, "not/needed.safetensors": "0" * 64}), tmp_path / "right")
+    hub.newest = "b" * 40
+    pull(replace(SVD, published={file: right}), tmp_path / "right")
+    assert read_lock(tmp_path / "right")["svd"].revision == "a" * 40
+
+
 def test_a_download_without_a_file_is_refused(hub: Hub, tmp_path: Path) -> None:
     del hub.files["vae/config.json"]
     with pytest.raises(BackendUnavailable, match=r"vae/config\.json did not come"):
@@ -168,8 +183,6 @@ def test_without_the_package_the_extra_is_named(tmp_path: Path, monkeypatch: pyt
 
 
 def test_a_pin_of_the_registry_is_what_is_asked_for(hub: Hub, tmp_path: Path) -> None:
-    from dataclasses import replace
-
     pull(replace(SVD, revision="d" * 40), tmp_path)
     assert hub.revisions == ["d" * 40]
 

@@ -1,5 +1,8 @@
+import re
+
 import pytest
 
+from dg4d_lib.weights.pull import needed
 from dg4d_lib.weights.registry import KNOWN, weights_called
 
 
@@ -10,9 +13,16 @@ def test_a_name_and_its_hub_id_mean_the_same() -> None:
         assert weights_called(weights.hub_id.upper()) is weights
 
 
+def test_pins_are_commits_and_digests_of_files_that_are_needed() -> None:
+    for weights in KNOWN.values():
+        assert re.fullmatch("[0-9a-f]{40}", weights.revision or "0" * 40)
+        assert all(re.fullmatch("[0-9a-f]{64}", digest) for digest in weights.published.values())
+        assert needed(weights.published, weights.parts) == sorted(weights.published)
+
+
 def test_what_is_not_verified_is_not_commercial() -> None:
     allowed = {name for name, weights in KNOWN.items() if weights.license.allows_commercial_use}
-    assert allowed == {"svd", "svd-xt", "vgg16", "lpips-vgg"}
+    assert allowed == {"svd", "svd-xt", "imagedream", "lgm", "vgg16", "lpips-vgg"}
     assert weights_called("stable-zero123").license.commercial == "no"
     assert not weights_called("somebody/something").license.allows_commercial_use
 
@@ -29,3 +39,10 @@ def test_a_model_card_counts_for_weights_that_are_not_known(card: str, commercia
 
 def test_a_model_card_does_not_change_what_is_known() -> None:
     assert weights_called("stable-zero123", "mit").license.commercial == "no"
+
+
+def test_a_copy_is_no_freer_than_what_it_is_a_copy_of() -> None:
+    copied = weights_called("Somebody/Stable-Zero123-diffusers", "mit")
+    assert copied.license == KNOWN["stable-zero123"].license
+    assert copied.hub_id == "Somebody/Stable-Zero123-diffusers"
+    assert weights_called("somebody/zero123", "mit").license.commercial == "yes"

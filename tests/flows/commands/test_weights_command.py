@@ -3,6 +3,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import huggingface_hub
@@ -57,7 +58,11 @@ def test_the_list_names_all_weights_their_licenses_and_what_is_here(home: Path) 
     listing = dg4d("weights", "list").stdout
     assert line_of("lgm", listing).split()[1:4] == ["yes", "0.00", "c0ffee0000"]
     of_the_file = [hashlib.sha256(file.read_bytes()).hexdigest(), "7000", f"lgm/{LGM}"]
-    assert dg4d("weights", "list", "--files").stdout.splitlines()[-1].split() == of_the_file
+    files = [line.split() for line in dg4d("weights", "list", "--files").stdout.splitlines()]
+    assert of_the_file in files
+    for name, weights in KNOWN.items():
+        for path, digest in weights.published.items():
+            assert ([digest, "-", f"{name}/{path}"] in files) == (name != "lgm")
     assert LGM not in listing
     file.write_bytes(b"cut")
     assert line_of("lgm", dg4d("weights", "list").stdout).split()[1] == "damaged"
@@ -98,12 +103,25 @@ def test_check_names_what_is_missing(home: Path) -> None:
     assert dg4d("weights", "check", "svt").exit_code == 65
 
 
-def test_weights_that_were_copied_are_complete_but_not_compared(home: Path) -> None:
+def test_weights_that_were_copied_are_compared_with_what_was_published(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (home / "lgm").mkdir(parents=True)
-    (home / "lgm" / LGM).touch()
-    copied = dg4d("weights", "check")
-    assert copied.exit_code == 0
-    assert "nothing to compare it with" in copied.stdout
+    (home / "lgm" / LGM).write_bytes(b"tensors")
+    other = dg4d("weights", "check")
+    assert other.exit_code == 69
+    assert f"lgm: {LGM} is not the file that was published at revision 1c28a2fd3b" in other.stdout
+    told = replace(KNOWN["lgm"], published={LGM: hashlib.sha256(b"tensors").hexdigest(), "more": "0" * 64})
+    monkeypatch.setitem(KNOWN, "lgm", told)
+    assert "lgm: complete; it was not pulled by this command: 1 of its files is as published" in check()
+    monkeypatch.setitem(KNOWN, "lgm", replace(told, published={}))
+    assert "there is nothing to compare it with" in check()
+
+
+def check() -> str:
+    result = dg4d("weights", "check")
+    assert result.exit_code == 0, result.output
+    return result.stdout
 
 
 def test_pull_without_a_network_is_one_message(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -202,3 +202,9 @@ def _stored(store: ArtifactStore, picture: Image.Image) -> ArtifactRef:
     content = io.BytesIO()
     picture.save(content, "PNG")
     return store.put_bytes(content.getvalue(), "image/png")
+
+
+def test_counts_are_read_with_all_their_digits() -> None:
+    values = [65536, 5000.0, 12.0, 2748.64, -123456.7, 0.0, float("nan"), float("inf")]
+    said = ["65,536", "5,000", "12", "2749", "-1.235e+05", "0", "nan", "inf"]
+    assert [curves.amount(value) for value in values] == said
