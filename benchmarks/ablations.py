@@ -24,7 +24,7 @@ from rich.table import Column, Table
 from scipy.stats import t as student
 
 from benchmarks.fits import Figures, fits_per_frame, moving_fit, score, static_fit
-from benchmarks.measure import write_rows
+from benchmarks.measure import new_console, write_rows
 from benchmarks.objects.specimens import OBJECTS, Specimen, made, read
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -350,7 +350,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
     options = parser.parse_args()
     try:
-        run(options, Console())
+        run(options, new_console())
     except BadInput as error:
         parser.error(str(error))
 

@@ -18,10 +18,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from benchmarks.measure import interleaved, machine, write_rows  # before torch: how its threads wait
+from benchmarks.measure import interleaved, machine, new_console, write_rows  # before torch: how its threads wait
 
 import torch  # isort: skip
-from rich.console import Console
 from rich.table import Column, Table
 from torch import Tensor
 from torch.nn.functional import interpolate
@@ -218,7 +217,7 @@ def main() -> None:
     options = parser.parse_args()
     grid, texels, counts, rounds = (30, 256, (500,), 1) if options.quick else (100, 1024, (5_000, 20_000), 3)
     pack = PackSettings(preview_size=64) if options.quick else PackSettings()
-    console, asset = Console(), waving_ball(grid, texels)
+    console, asset = new_console(), waving_ball(grid, texels)
     of_mesh = dict(mesh_writers(asset))
     of_splats = {count: dict(splat_writers(asset, waving_splats(count), pack)) for count in counts}
     rows = measured(of_mesh, None, rounds)

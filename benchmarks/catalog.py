@@ -27,10 +27,9 @@ from typing import Any
 from PIL import Image, ImageDraw
 from prefect import flow
 from prefect.client.orchestration import get_client
-from rich.console import Console
 from rich.table import Table
 
-from benchmarks.measure import machine, write_rows
+from benchmarks.measure import machine, new_console, write_rows
 from benchmarks.postgresql import Database, free_port
 from flows import home
 from flows.catalog import convert_all
@@ -82,7 +81,7 @@ def main() -> None:
     for database in options.database or DATABASES:
         with tempfile.TemporaryDirectory(prefix="dg4d-catalog-", ignore_cleanup_errors=True) as name:
             rows += measured(database, options.items, options.workers, Path(name))
-    console = Console(width=150)  # also where it goes into a file
+    console = new_console()
     console.print(machine())
     console.print(table(rows))
     if options.json:

@@ -19,10 +19,9 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from benchmarks.measure import interleaved, machine, write_rows  # before torch: how its threads wait
+from benchmarks.measure import interleaved, machine, new_console, write_rows  # before torch: how its threads wait
 
 import torch  # isort: skip
-from rich.console import Console
 from rich.table import Column, Table
 from torch import Tensor
 from torch.nn import functional
@@ -164,7 +163,7 @@ def main() -> None:
     options = parser.parse_args()
     paper, small = HexPlaneSettings(), HexPlaneSettings(features=16, hidden=32)
     counts, sizes, rounds = ((2_000,), (128,), 3) if options.quick else ((5_000, 20_000), (256, 512), 5)
-    console, rows = Console(), []
+    console, rows = new_console(), []
     for settings in (paper,) if options.quick else (paper, small):
         title = f"{machine()}; {settings.features} features, {settings.hidden} hidden units, {TIMES} moments"
         found = [row for count in counts for row in of_deformation(count, settings, rounds)]

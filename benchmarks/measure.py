@@ -5,6 +5,7 @@ CPU time (user and system, all threads of the process) is what to compare: wall 
 
 import json
 import os
+import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
@@ -12,6 +13,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from rich.console import Console
+
+WIDTH = 150  # characters, of tables that go into a file
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # torch's idle threads would count as CPU time
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the steps
 
@@ -53,6 +57,11 @@ def machine() -> str:
     lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "processor")
     return f"{model}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"
+
+
+def new_console() -> Console:
+    """Where tables are printed: as wide as the terminal, or wide enough for all of them where there is none."""
+    return Console(width=None if sys.stdout.isatty() else WIDTH)
 
 
 def write_rows(path: Path, rows: Iterable[Any]) -> None:

@@ -24,12 +24,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from benchmarks.measure import Times, interleaved, machine, write_rows  # before torch: how its threads wait
+from benchmarks.measure import Times, interleaved, machine, new_console, write_rows  # before torch: its threads
 
 import numpy as np  # isort: skip
 import torch
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.table import Column, Table
 from torch import Tensor
 from torch.nn.functional import grid_sample
@@ -214,7 +213,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
     options = parser.parse_args()
     count, sizes, frames, rounds = (5_000, (128,), 3, 3) if options.quick else (50_000, (256, 512), FRAMES, 7)
-    console, (peers, missing) = Console(), installed()
+    console, (peers, missing) = new_console(), installed()
     found = []
     for size in sizes:
         scene = bumpy_ball(count, size, frames)

@@ -12,10 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from benchmarks.measure import machine, write_rows  # before torch: how its threads wait
+from benchmarks.measure import machine, new_console, write_rows  # before torch: how its threads wait
 
 import torch  # isort: skip
-from rich.console import Console
 from rich.table import Column, Table
 from torch import Tensor
 
@@ -113,7 +112,7 @@ def main() -> None:
     count = 2 if options.quick else options.frames
     rows = [row for folder in options.packages for row in of_package(folder, count, rasterize)]
     means = [mean_row("mean", [row for row in rows if row.mode == mode]) for mode in MODES]
-    Console().print(table(f"{machine()}; {SIZE} px, {POINTS} points a surface", [*rows, *means]))
+    new_console().print(table(f"{machine()}; {SIZE} px, {POINTS} points a surface", [*rows, *means]))
     if options.json:
         write_rows(options.json, rows)
 

@@ -23,11 +23,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.ablations import Ablation, Claim, Row, Variant, table, verdict
-from benchmarks.measure import write_rows  # before torch: how its threads wait
+from benchmarks.measure import new_console, write_rows  # before torch: how its threads wait
 
 import torch  # isort: skip
 from jaxtyping import Float
-from rich.console import Console
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -217,7 +216,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.quick:
         options.objects, options.frames, options.size, options.texels, options.iterations = ["parrot"], 3, 64, 128, 2
-    console, rows = Console(), list[Row]()
+    console, rows = new_console(), list[Row]()
     kinds = {  # texels of a side of what frames add, and what is asked
         "a texture per frame": (options.texels, (FLICKER, NOISE)),
         "one texture": (0, (NOISE,)),  # which cannot flicker

@@ -21,7 +21,7 @@ from statistics import median
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.measure import machine, write_rows
+from benchmarks.measure import machine, new_console, write_rows
 from flows.inputs.orders import Wish
 from flows.packages.publish import RECORD, whole
 from flows.serving.server import Server
@@ -65,7 +65,7 @@ def main() -> None:
             taken[way].append(seconds)
     plain = median(taken["steps"])
     rows = [Row(way, median(of), 1 - plain / median(of)) for way, of in taken.items()]
-    show(rows, Console())
+    show(rows, new_console())
     if options.json:
         write_rows(options.json, rows)
 

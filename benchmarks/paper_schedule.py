@@ -21,7 +21,7 @@ from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
-from benchmarks.measure import machine, write_rows  # before torch: how its threads wait
+from benchmarks.measure import machine, new_console, write_rows  # before torch: how its threads wait
 
 import torch  # isort: skip
 from diffusers import (
@@ -31,7 +31,6 @@ from diffusers import (
     UNetSpatioTemporalConditionModel,
 )
 from diffusers.utils import logging
-from rich.console import Console
 from rich.table import Column, Table
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
@@ -324,7 +323,7 @@ def main() -> None:
     if not found and not options.quick:
         parser.error("there is no CUDA device here; --quick runs tiny networks without one")
     device = torch.device("cuda" if found else "cpu")
-    console = Console()
+    console = new_console()
     name = machine()
     settings = revise(profile("paper"), QUICK if options.quick else {})
     if found:

@@ -20,14 +20,13 @@ from itertools import product
 from pathlib import Path
 from typing import no_type_check
 
-from benchmarks.measure import Times, interleaved, machine, write_rows  # before torch: how its threads wait
+from benchmarks.measure import Times, interleaved, machine, new_console, write_rows  # before torch: its threads
 
 import numpy as np  # isort: skip
 import torch
 from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
-from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
@@ -49,7 +48,6 @@ COUNTS, SIZES, VIEWS = (5_000, 20_000, 100_000), (128, 256, 512), (1, 16, 56)
 QUICK_COUNTS, QUICK_SIZES, QUICK_VIEWS = (5_000, 20_000), (128, 256), (1, 16)
 ROUNDS, QUICK_ROUNDS = 5, 3
 PEERS = ("gsplat_torch", "reference")
-WIDTH = 130  # of the tables, characters
 RADIUS = 0.74  # world units: 65 % of the picture
 OWN_STATES = "own states"  # a cloud with a state per view, as the dynamic stage draws
 SMALL = 16  # pixels of a side of the picture that plain torch draws
@@ -262,7 +260,7 @@ def main() -> None:
     counts, sizes, views, rounds = (
         (QUICK_COUNTS, QUICK_SIZES, QUICK_VIEWS, QUICK_ROUNDS) if given.quick else (COUNTS, SIZES, VIEWS, ROUNDS)
     )
-    console = Console(width=WIDTH)
+    console = new_console()
     console.print(f"{machine()}, {torch.get_num_threads()} threads")
     table, rows = compare(counts, sizes, views, rounds)
     console.print(table, inside(counts, sizes, 5 * rounds))

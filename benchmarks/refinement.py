@@ -14,11 +14,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from benchmarks.measure import machine, write_rows  # before torch: how its threads wait
+from benchmarks.measure import machine, new_console, write_rows  # before torch: how its threads wait
 
 import torch  # isort: skip
 from jaxtyping import Float
-from rich.console import Console
 from rich.table import Column, Table
 from torch import Tensor
 from torch.nn.functional import interpolate
@@ -123,7 +122,7 @@ def main() -> None:
     table = Table(Column("variant", no_wrap=True), "flicker", "sharpness", title=machine())
     for row in rows:
         table.add_row(row.variant, f"{row.flicker:.2f}", f"{row.sharpness:.2f}")
-    Console().print(table)
+    new_console().print(table)
     if options.json:
         write_rows(options.json, rows)
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.measure import write_rows
+from benchmarks.measure import new_console, write_rows
 from flows.packages.publish import whole
 
 SMALL = {
@@ -154,7 +154,7 @@ def main(arguments: list[str] | None = None) -> int:
             rows = measured(place, given.kills, given.seed)
         finally:
             place.close()
-    shown(rows, Console())
+    shown(rows, new_console())
     if given.json is not None:
         write_rows(given.json, rows)
     return 0 if all(row.same for row in rows) else 1

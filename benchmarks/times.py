@@ -13,10 +13,9 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
-from benchmarks.measure import write_rows
+from benchmarks.measure import new_console, write_rows
 from flows.packages.publish import RECORD, whole
 
 STAGES = {
@@ -146,7 +145,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
     options = parser.parse_args()
     rows = averaged([of_package(folder) for folder in options.packages])
-    console = Console()
+    console = new_console()
     console.print(table([*rows, *PAPER]))
     console.print(PAPER_TOTALS)
     if options.json:
