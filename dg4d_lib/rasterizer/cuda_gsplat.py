@@ -2,14 +2,19 @@
 
 gsplat 1.5.3 has the same blur, least and greatest alpha, exclusive stop, bounds, margin of the frustum, order and
 depth; all but the blur and the near plane are compiled in. What differs:
-- Gradients: the last transmittance of a pixel is 1 - alpha, which loses digits where little light is left; sums are
-  atomic, so two runs differ in the last digits; exponentials and divisions are CUDA's fast ones.
-- A pair whose exponent rounds below zero is left out (needles near their center).
+- Gradients: the last transmittance of a pixel is 1 - alpha, so where little light is left they are good to 1e-3 only;
+  sums are atomic, so two runs differ in the last digits; exponentials and divisions are CUDA's fast ones.
+- Gradients of several states with fewer Gaussians than a warp has lanes are mixed up: they are drawn one by one.
+- Covariances are formed in 3D: long needles lose digits, most of all the gradients of scales. In needles of a standard
+  deviation beyond some 1500 pixels, pairs whose exponent rounds below zero are left out, and then whole needles.
 - `visible` rounds the bounding box up to whole pixels: it may count a Gaussian that ends just outside of the picture.
-- A scale whose square overflows float32, or a quaternion of norm zero, has no defined picture.
+- Not drawn: a quaternion of norm zero, a depth beyond 1e10. A scale beyond 1e9 hides the Gaussian or everything behind
+  it, and may give gradients that are not finite.
 """
 
 from collections.abc import Sequence
+from functools import cache
+from importlib import import_module
 from typing import Any
 
 import torch
@@ -25,6 +30,7 @@ from dg4d_lib.rasterizer import reference
 from dg4d_lib.rasterizer.interface import BLUR, NEAR, Rendering, require_finite, shared_size, state_per_camera
 
 DEVICE = torch.device("cuda")
+WARP = 32
 
 
 def rasterize(
@@ -48,6 +54,9 @@ def rasterize(
     require_finite(gaussians)
     if len(gaussians) == 0:  # gsplat divides by their number
         return reference.rasterize(gaussians, cameras, background, screen_offsets)
+    if moving and len(cameras) > 1 and len(gaussians) < WARP:
+        return _one_by_one(gaussians, cameras, background, screen_offsets)
+    _require_kernels()
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
     means, quats, scales, opacities, colors = (value.to(DEVICE, torch.float32) for value in fields)
     caught: list[Tensor] = []
@@ -58,22 +67,49 @@ def rasterize(
     if moving:  # a batch of clouds with one camera each
         opacities, colors = opacities.expand(len(cameras), -1), colors.expand(len(cameras), -1, -1)
         poses, lenses, backgrounds = poses[:, None], lenses[:, None], backgrounds[:, None]
-    try:
-        pictures, alpha, info = rasterization(
-            means, quats, scales, opacities, colors, poses, lenses, width, height,
-            near_plane=NEAR, eps2d=BLUR, backgrounds=backgrounds, render_mode="RGB+D", packed=False,
-        )  # fmt: skip
-    except AttributeError as error:  # gsplat's kernels are None where there was nothing to compile them with
-        raise BackendUnavailable(
-            "gsplat has no kernels here: install the CUDA toolkit (nvcc) of torch's CUDA version, or a wheel of gsplat "
-            "that holds them (https://docs.gsplat.studio/whl); or choose rasterizer=cpu"
-        ) from error
+    pictures, alpha, info = rasterization(
+        means, quats, scales, opacities, colors, poses, lenses, width, height,
+        near_plane=NEAR, eps2d=BLUR, backgrounds=backgrounds, render_mode="RGB+D", packed=False,
+    )  # fmt: skip
     if screen_offsets is not None and info["means2d"].requires_grad:
         info["means2d"].register_hook(caught.append)
     views = (len(cameras), height, width)
     color, depth = pictures.reshape(*views, 4).to(gaussians.means).split((3, 1), -1)
     visible = (info["radii"] > 0).all(-1).reshape(len(cameras), len(gaussians)).to(gaussians.means.device)
     return Rendering(color, alpha.reshape(*views, 1).to(gaussians.means), depth, visible)
+
+
+@cache
+def _require_kernels() -> None:
+    """Have gsplat load its kernels or compile them; that takes minutes once, and fails in many ways.
+
+    Raises:
+        BackendUnavailable: it has none (None where there is no nvcc), or could not compile them.
+    """
+    try:
+        failure, kernels = None, import_module("gsplat.cuda._backend")._C
+    except (ImportError, OSError, RuntimeError) as error:
+        failure, kernels = error, None
+    if kernels is None:
+        reason = f" ({failure!s:.100})" if failure else ""
+        raise BackendUnavailable(
+            f"gsplat has no kernels here{reason}: install the CUDA toolkit (nvcc) of torch's CUDA version, or a wheel "
+            "of gsplat that holds them (https://docs.gsplat.studio/whl); or choose rasterizer=cpu"
+        ) from failure
+
+
+def _one_by_one(
+    gaussians: Gaussians,
+    cameras: Sequence[OrbitCamera],
+    background: Float[Tensor, " 3"],
+    screen_offsets: Float[Tensor, "b n 2"] | None,
+) -> Rendering:
+    """Every state in a call of its own: gsplat sums gradients in a warp by a Gaussian's number, whatever its state."""
+    views = []
+    for view, camera in enumerate(cameras):
+        offsets = None if screen_offsets is None else screen_offsets[view : view + 1]
+        views.append(vars(rasterize(gaussians.at(view), [camera], background, offsets)).values())
+    return Rendering(*(torch.cat(parts) for parts in zip(*views, strict=True)))
 
 
 def _lenses(cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b 3 3"]:

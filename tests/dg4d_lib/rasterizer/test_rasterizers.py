@@ -33,13 +33,15 @@ SCENES = {
     "several cameras": ({"cameras": 3}, SQUARE),
 }
 ILL_CONDITIONED = ("needles", "saturated")
+DARK = ("wide", "one tile", "huge")  # little light is left behind everything
 # what rounding may cost: mean error of color, error of a pixel, relative error of gradients; and where digits are lost.
 # Plain torch subtracts products of long axes and loses 1 - opacity near one; gsplat forms covariances in 3D, takes the
-# fast exponential, and the last transmittance as 1 - alpha.
+# fast exponential, and the last transmittance as 1 - alpha. Its numbers: its kernels run on a processor, 10 seeds, with
+# the worst rounding that CUDA documents: (1e-7, 8e-6, 2e-5), (1e-6, 2e-4, 2e-3).
 ROUNDING = {
     "reference": ((2e-7, 1e-5, 5e-6), (1e-6, 2e-3, 1e-3)),
     "cpu": ((2e-7, 1e-5, 5e-6), (2e-7, 1e-5, 2e-5)),
-    "cuda_gsplat": ((1e-6, 5e-5, 1e-4), (2e-6, 2e-3, 2e-3)),
+    "cuda_gsplat": ((5e-7, 3e-5, 1e-4), (3e-6, 1e-3, 4e-3)),
 }
 MOST_FLIPS = 1e-3  # share of pixels with a larger error: there a threshold falls the other way
 WORST_FLIP = 0.02  # a least alpha, in units of color and depth
@@ -53,7 +55,9 @@ def test_pictures_and_gradients_are_those_of_the_definition(scene, backend, rast
     cloud = random_cloud(150, **{name: value for name, value in shape.items() if name != "cameras"})
     found, leaves = drawn(rasterize, cloud, cameras, torch.float32)
     truth, true_leaves = drawn(reference.rasterize, cloud, cameras, torch.float64)
-    mean_error, pixel_error, gradient_error = ROUNDING[backend][scene in ILL_CONDITIONED]
+    mean_error, pixel_error, gradient_error = ROUNDING[backend][
+        scene in ILL_CONDITIONED or (backend == "cuda_gsplat" and scene in DARK)
+    ]
 
     errors = [(getattr(found, name) - getattr(truth, name)).abs() for name in ("color", "alpha", "depth")]
     flipped = torch.cat(errors, -1).amax(-1, keepdim=True) > pixel_error
@@ -251,6 +255,16 @@ def test_states_of_their_own_are_drawn_one_per_camera(rasterize, random_cloud):
     together = rasterize(moving, cameras, BACKGROUND)
     for i, camera in enumerate(cameras):
         assert together.color[i].equal(rasterize(moving.at(i), [camera], BACKGROUND).color[0])
+
+
+@pytest.mark.parametrize("count", [1, 7, 31])
+def test_few_gaussians_keep_the_gradients_of_every_state_apart(count, rasterize, random_cloud, forward_and_backward):
+    cameras = [replace(SQUARE, azimuth_deg=120.0 * i) for i in range(3)]
+    cloud = random_cloud(count, states=3, scale=0.1)
+    _, expected = forward_and_backward(reference.rasterize, cloud, cameras, torch.float64)
+    _, found = forward_and_backward(rasterize, cloud, cameras, torch.float32)
+    for name, gradient in found.items():
+        assert (gradient - expected[name]).norm() < 1e-3 * expected[name].norm(), name
 
 
 def test_a_wrong_number_of_states_or_cameras_of_two_sizes_are_refused(rasterize, random_cloud):
