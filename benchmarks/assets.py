@@ -36,6 +36,7 @@ from dg4d_lib.assets.usd import write_usdz
 from dg4d_lib.assets.viewer_page import viewer_page
 from dg4d_lib.assets.webp import write_webp
 from dg4d_lib.assets.websplats import write_web_splats
+from dg4d_lib.deformation.hexplane import HexPlane
 from dg4d_lib.deformation.kinds import new_deformation
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.harmonics import harmonics_of_color
@@ -122,6 +123,7 @@ def waving_splats(count: int) -> Compact:
     )
     settings = HexPlaneSettings(features=16, hidden=32)
     field = new_deformation(settings, torch.tensor([[-0.8] * 3, [0.8] * 3]), FRAMES, count, generator)
+    assert isinstance(field, HexPlane)
     phases = 6 * torch.rand(2, 3, settings.features, 1, 1, generator=generator)
     steps, cells = (torch.linspace(0, 2 * math.pi, size) for size in (settings.temporal, settings.spatial))
     with torch.no_grad():
@@ -134,13 +136,17 @@ def waving_splats(count: int) -> Compact:
 
 def mesh_writers(asset: Asset4D) -> Iterator[tuple[str, Write]]:
     for name, settings in GLTF.items():
-        yield f"asset.glb, {name}", lambda folder, s=settings: (folder / "a.glb").write_bytes(write_glb(asset, s))
+        yield f"asset.glb, {name}", partial(_glb, asset, settings)
     yield "asset_rigged.glb", lambda folder: write_rig(folder / "a.glb", asset)
     yield "asset.usdz, mesh", lambda folder: write_usdz(folder / "a.usdz", asset, FPS)
     yield (
         "viewer page, empty",
         lambda folder: (folder / "a.html").write_text(viewer_page("", b"", None, None, None, {})),
     )
+
+
+def _glb(asset: Asset4D, settings: GltfSettings, folder: Path) -> None:
+    (folder / "a.glb").write_bytes(write_glb(asset, settings))
 
 
 def splat_writers(asset: Asset4D, splats: Compact, pack: PackSettings) -> Iterator[tuple[str, Write]]:

@@ -46,7 +46,14 @@ from dg4d_lib.guidance.interface import GuidancePrior
 from dg4d_lib.guidance.zero123 import CAMERA_NUMBERS, LATENT_CHANNELS, Zero123
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
-from dg4d_lib.settings import MotionSettings, Precision, StaticSettings
+from dg4d_lib.settings import (
+    MotionSettings,
+    Precision,
+    StaticSettings,
+    SvdSettings,
+    VideoToVideoSettings,
+    Zero123PriorSettings,
+)
 from dg4d_lib.texture.refine import Stretch, refine_textures
 from dg4d_lib.texture.refiner import VideoToVideo
 from dg4d_lib.video.driving import DrivingVideo
@@ -160,18 +167,21 @@ class Schedule:
     def rows(self) -> Iterator[Row]:
         """Every stage after the other, each with what the one before made."""
         subject, clock = disc(self.settings.subject.size), Clock(self.device)
-        motion = self.video_model(self.settings.driving.model, clock)
-        row, video = self.measured("video", clock, lambda: self.drive(motion, subject))
+        driving, refiner, prior_settings = self.settings.driving, self.settings.refiner, self.settings.prior
+        assert isinstance(driving, SvdSettings) and isinstance(refiner, VideoToVideoSettings)
+        assert isinstance(prior_settings, Zero123PriorSettings)
+        motion = self.video_model(driving.model, clock)
+        row, video = self.measured("video", clock, lambda: StableVideo(driving, motion).generate(subject, seeded()))
         yield row
         del motion
-        prior = self.zero123()
+        prior = self.zero123(prior_settings)
         row, gaussians = self.measured("static", clock, lambda: self.fit(prior, subject, clock))
         yield row
         row, _ = self.measured("dynamic", clock, lambda: self.fit_motion(prior, gaussians, video, clock))
         yield row
         del prior
-        textures = self.video_model(self.settings.refiner.model, clock)
-        yield self.measured("refinement", clock, lambda: self.refine(textures, video))[0]
+        textures = self.video_model(refiner.model, clock)
+        yield self.measured("refinement", clock, lambda: self.refine(refiner, textures, video))[0]
 
     def measured(self, stage: str, clock: Clock, work: Callable[[], Any]) -> tuple[Row, Any]:
         on_gpu = self.device.type == "cuda"
@@ -194,9 +204,6 @@ class Schedule:
         )
         return row, made
 
-    def drive(self, model: VideoModel, subject: torch.Tensor) -> DrivingVideo:
-        return StableVideo(self.settings.driving, model).generate(subject, seeded())
-
     def fit(self, model: Zero123, subject: torch.Tensor, clock: Clock) -> Gaussians:
         static = self.settings.static
         start = blob(static.points, static.blob_radius, seeded()).to(device_of("auto"))
@@ -205,20 +212,22 @@ class Schedule:
 
     def fit_motion(self, model: Zero123, gaussians: Gaussians, video: DrivingVideo, clock: Clock) -> None:
         dynamic = self.settings.motion
-        deformation = new_deformation(self.settings.deformation, gaussians.to("cpu"), len(video), seeded())
+        deformation = new_deformation(
+            self.settings.deformation, gaussians.to(torch.device("cpu")), len(video), seeded()
+        )
         deformation.to(gaussians.means.device)
         prior = conditioned(model, torch.cat([video.frames, video.coverage], -1), dynamic, clock)
         fit_motion(gaussians, deformation, video, prior, choose_rasterizer("auto"), dynamic, seeded())
 
-    def refine(self, model: VideoModel, video: DrivingVideo) -> None:
+    def refine(self, settings: VideoToVideoSettings, model: VideoModel, video: DrivingVideo) -> None:
         there = DrivingVideo(video.frames.to(self.device), video.coverage.to(self.device), video.fps)
-        refiner = VideoToVideo(self.settings.refiner, model, there.over(there.frames.new_ones(3))[0])
+        refiner = VideoToVideo(settings, model, there.over(there.frames.new_ones(3))[0])
         mesh = ball(self.settings.mesh.texture_size, self.device)
         stretches = [Stretch(mesh, torch.zeros_like(mesh.vertices)[None])] * len(video)
-        refine_textures(stretches, there, refiner, self.settings.refiner.texture, seeded())
+        refine_textures(stretches, there, refiner, settings.texture, seeded())
 
-    def zero123(self) -> Zero123:
-        settings, sizes = self.settings.prior, self.sizes
+    def zero123(self, settings: Zero123PriorSettings) -> Zero123:
+        sizes = self.sizes
         tokens = sizes.clip.embedding
         make = partial(self.network, settings.precision, channels_last=self.device.type == "cuda")
         return Zero123(

@@ -219,7 +219,8 @@ def _multiply_add(turns: int) -> float:
 
 def compare(counts: Sequence[int], sizes: Sequence[int], views: Sequence[int], rounds: int) -> tuple[Table, list[Row]]:
     """Times of everything, and the rows of the file."""
-    several, rows = str(views[1]), []
+    several = str(views[1])
+    rows: list[Row] = []
     ours = [*(str(n) for n in views), OWN_STATES]
     headings = [*(f"V={name}" for name in ours), f"wall, V={several}", "one", "own"]
     table = Table("Gaussians", "pixels", *headings, *PEERS)

@@ -47,7 +47,7 @@ def smooth_chain(joints: Sequence[tuple[float, float, float, float]], count: int
     return Chain(values[:, :3], values[:, 3].clip(0.004))
 
 
-def ellipsoid(center: Sequence[float], radii: Sequence[float]) -> Field:
+def ellipsoid(center: Sequence[float] | ndarray, radii: Sequence[float]) -> Field:
     """An ellipsoid's distance, exact on its surface and nearly so around it."""
     middle, size = np.array(center), np.array(radii)
 
