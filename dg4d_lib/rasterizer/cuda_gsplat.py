@@ -12,9 +12,12 @@ depth; all but the blur and the near plane are compiled in. What differs:
   it, and may give gradients that are not finite.
 """
 
+import logging
 from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -22,6 +25,7 @@ from gsplat import rasterization
 from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.utils.cpp_extension import get_default_build_root
 
 from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
 from dg4d_lib.errors import BackendUnavailable
@@ -30,7 +34,10 @@ from dg4d_lib.rasterizer import reference
 from dg4d_lib.rasterizer.interface import BLUR, NEAR, Rendering, require_finite, shared_size, state_per_camera
 
 DEVICE = torch.device("cuda")
-WARP = 32
+WARP = 32  # lanes
+NOTICE = "compiling gsplat's kernels for this GPU: some minutes, once"
+
+_log = logging.getLogger(__name__)
 
 
 def rasterize(
@@ -86,12 +93,15 @@ def _require_kernels() -> None:
     Raises:
         BackendUnavailable: it has none (None where there is no nvcc), or could not compile them.
     """
+    if find_spec("gsplat.csrc") is None and not any(Path(get_default_build_root()).rglob("gsplat_cuda.so")):
+        _log.info(NOTICE)
     try:
         failure, kernels = None, import_module("gsplat.cuda._backend")._C
     except (ImportError, OSError, RuntimeError) as error:
         failure, kernels = error, None
     if kernels is None:
-        reason = f" ({failure!s:.100})" if failure else ""
+        first_line = str(failure or "").partition("\n")[0]
+        reason = f" ({first_line})" if first_line else ""
         raise BackendUnavailable(
             f"gsplat has no kernels here{reason}: install the CUDA toolkit (nvcc) of torch's CUDA version, or a wheel "
             "of gsplat that holds them (https://docs.gsplat.studio/whl); or choose rasterizer=cpu"

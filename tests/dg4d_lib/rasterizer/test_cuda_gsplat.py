@@ -44,6 +44,7 @@ class StandIn(ModuleType):
         super().__init__("gsplat")
         self.calls: list[tuple[int, ...]] = []
         self._C: object = "kernels"
+        self.__path__: list[str] = []  # a package
 
     def rasterization(
         self, means, quats, scales, opacities, colors, viewmats, Ks, width, height,
@@ -150,6 +151,21 @@ def test_kernels_that_were_not_compiled_are_named(adapter, monkeypatch, random_c
     monkeypatch.setattr(sys.modules[BACKEND], "_C", None)
     with pytest.raises(BackendUnavailable, match=r"nvcc.*rasterizer=cpu"):
         adapter.rasterize(random_cloud(3), CAMERAS, WHITE)
+
+
+def test_that_kernels_are_compiled_is_said_once(adapter, monkeypatch, tmp_path, caplog, random_cloud):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("TORCH_EXTENSIONS_DIR", raising=False)
+    monkeypatch.setattr(adapter, "find_spec", lambda name: None)
+    caplog.set_level("INFO", adapter.__name__)
+    for _ in range(2):
+        adapter.rasterize(random_cloud(3), CAMERAS, WHITE)
+    assert caplog.messages == [adapter.NOTICE]
+    (tmp_path / "torch_extensions" / "py311_cu130" / "gsplat_cuda").mkdir(parents=True)
+    (tmp_path / "torch_extensions" / "py311_cu130" / "gsplat_cuda" / "gsplat_cuda.so").touch()
+    adapter._require_kernels.cache_clear()
+    adapter.rasterize(random_cloud(3), CAMERAS, WHITE)
+    assert caplog.messages == [adapter.NOTICE]
 
 
 @pytest.mark.parametrize("failure", [RuntimeError("Error building extension\n[1/30] nvcc"), ImportError("no .so")])
