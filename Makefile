@@ -3,8 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+ARITHMETIC ?= fast
 
-.PHONY: setup clients demo test check audit examples clean
+.PHONY: setup clients demo test check audit gsplat examples clean
 
 setup: $(VENV)/.ready
 
@@ -36,6 +37,11 @@ out/audit/bin/pip-audit: $(VENV)/.ready
 
 audit: setup out/audit/bin/pip-audit
 	timeout 300 out/audit/bin/pip-audit -r constraints.txt --no-deps --disable-pip -f json --progress-spinner off | $(BIN)/python deploy/audit.py
+
+# the tests marked gpu on gsplat's own kernels, compiled for the processor; ARITHMETIC=noise rounds as badly as CUDA may
+gsplat: setup
+	$(BIN)/python -m tests.gsplat_on_cpu.build --arithmetic $(ARITHMETIC)
+	$(BIN)/python -m pytest -p tests.gsplat_on_cpu.plugin --arithmetic $(ARITHMETIC) -m gpu tests/dg4d_lib/rasterizer tests/dg4d_lib/fitting
 
 examples: setup
 	$(BIN)/python -m examples.make_examples

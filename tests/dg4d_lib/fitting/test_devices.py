@@ -19,11 +19,11 @@ from dg4d_lib.fitting.static import fit_gaussians
 from dg4d_lib.gaussians.growth import ScreenGradients, reset_opacity
 from dg4d_lib.gaussians.initialize import blob, isotropic, on_surface
 from dg4d_lib.guidance.interface import View
-from dg4d_lib.rasterizer.interface import Rendering, choose_rasterizer
+from dg4d_lib.rasterizer.interface import Rasterizer, Rendering, choose_rasterizer, device_of
 from dg4d_lib.settings import HexPlaneSettings, MlpSettings
 from dg4d_lib.video.driving import DrivingVideo
 
-META, CUDA = torch.device("meta"), torch.device("cuda")
+META = torch.device("meta")
 COUNT, FRAMES = 30, 4
 DEFORMATIONS = {
     "hexplane": lambda box: HexPlane(HexPlaneSettings(spatial=4, temporal=4, features=8, hidden=16), box, seed()),
@@ -85,36 +85,38 @@ def test_clouds_stay_on_the_device_of_their_points():
 
 
 @pytest.fixture
-def gsplat():
+def drawn_here_and_there(known) -> dict[str, tuple[torch.device, Rasterizer]]:
+    """The device and the rasterizer of the processor, and those of gsplat."""
     try:
-        return choose_rasterizer("cuda_gsplat")
+        gsplat = choose_rasterizer("cuda_gsplat")
     except BackendUnavailable as missing:
         pytest.skip(str(missing))
+    return {"here": (torch.device("cpu"), known.rasterize), "there": (device_of("cuda_gsplat"), gsplat)}
 
 
 @pytest.mark.gpu
-def test_the_static_fit_on_a_gpu_ends_where_the_processor_ends(known, static_settings, gsplat):
+def test_the_static_fit_on_a_gpu_ends_where_the_processor_ends(known, static_settings, drawn_here_and_there):
     """Density is controlled on the way; the sums of a GPU have no fixed order, so the losses agree, not the bytes."""
     settings = static_settings.model_copy(update={"iterations": 60, "densify_every": 25, "densify_gradient": 1e-4})
     start, ends = blob(settings.points, 0.5, seed()), {}
-    for device, rasterize in ((torch.device("cpu"), known.rasterize), (CUDA, gsplat)):
+    for place, (device, rasterize) in drawn_here_and_there.items():
         losses: list[float] = []
         fitted = fit_gaussians(
             start.to(device), known.subject(), known.prior(0.98), rasterize, settings, seed(),
             lambda _, values, losses=losses: losses.append(values["reference"]),
         )  # fmt: skip
         assert fitted.means.device.type == device.type
-        ends[device.type] = sum(losses[-10:]) / 10
-        assert ends[device.type] < 0.5 * losses[0]
-    assert ends["cuda"] == pytest.approx(ends["cpu"], rel=0.2)
+        ends[place] = sum(losses[-10:]) / 10
+        assert ends[place] < 0.5 * losses[0]
+    assert ends["there"] == pytest.approx(ends["here"], rel=0.2)
 
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("kind", DEFORMATIONS)
-def test_the_motion_fit_on_a_gpu_ends_where_the_processor_ends(kind, known, motion_settings, gsplat):
+def test_the_motion_fit_on_a_gpu_ends_where_the_processor_ends(kind, known, motion_settings, drawn_here_and_there):
     settings = motion_settings.model_copy(update={"iterations": 60, "rigidity_weight": 0.1})
     ends = {}
-    for device, rasterize in ((torch.device("cpu"), known.rasterize), (CUDA, gsplat)):
+    for place, (device, rasterize) in drawn_here_and_there.items():
         make = DEFORMATIONS[kind] if kind != "framewise" else lambda box: Framewise(FRAMES, len(known.gaussians))
         deformation = make(bounds_of(known.gaussians)).to(device)
         losses: list[float] = []
@@ -122,6 +124,6 @@ def test_the_motion_fit_on_a_gpu_ends_where_the_processor_ends(kind, known, moti
             known.gaussians.to(device), deformation, known.video(), known.prior(0.5), rasterize, settings, seed(),
             lambda _, values, losses=losses: losses.append(values["reference"]),
         )  # fmt: skip
-        ends[device.type] = sum(losses[-10:]) / 10
-        assert ends[device.type] < 0.5 * losses[0]
-    assert ends["cuda"] == pytest.approx(ends["cpu"], rel=0.2)
+        ends[place] = sum(losses[-10:]) / 10
+        assert ends[place] < 0.5 * losses[0]
+    assert ends["there"] == pytest.approx(ends["here"], rel=0.2)
