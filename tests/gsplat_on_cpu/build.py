@@ -6,6 +6,7 @@ The sources are those of the wheel that `constraints.txt` names. What no C++ com
 
 import argparse
 import hashlib
+import platform
 import re
 import shutil
 import subprocess
@@ -16,6 +17,7 @@ import zipfile
 from collections.abc import Sequence
 from importlib.metadata import distribution
 from pathlib import Path
+from typing import NoReturn
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
@@ -24,6 +26,7 @@ PACKAGES = OUT / "packages"  # the unpacked wheel
 SOURCES = OUT / "sources"  # rewritten
 TORCH = Path(str(distribution("torch").locate_file("torch")))
 LIBRARIES = ("torch_python", "torch", "torch_cpu", "c10")
+LACKING = 69  # exit status: something is not here
 DIGEST = "515a3773641f5e7f7717acab6276c0b1d6dbcad087b7968ca653337c3189a982"  # of the wheel that is rewritten, SHA-256
 
 ARITHMETICS = {
@@ -127,12 +130,14 @@ def build(arithmetic: str) -> None:
 
 def compiler(arithmetic: str) -> list[str]:
     """The command that compiles, without its files."""
+    if platform.machine() not in ("x86_64", "AMD64"):
+        lacking(f"the emulation is written for x86-64, and this is {platform.machine()}")
     found = shutil.which("g++")
     if found is None:
-        sys.exit("gsplat: g++ is not here (Debian: apt-get install g++)")
+        lacking("g++ is not here (Debian: apt-get install g++)")
     python = Path(sysconfig.get_paths()["include"])
     if not (python / "Python.h").is_file():
-        sys.exit(f"gsplat: Python's headers are not in {python} (Debian: apt-get install python3-dev)")
+        lacking(f"Python's headers are not in {python} (Debian: apt-get install python3-dev)")
     ours = (SOURCES / "headers", SOURCES / "include", SOURCES, SOURCES / "csrc" / "third_party" / "glm")
     theirs = (TORCH / "include", python)
     places = [*(f"-I{path}" for path in ours), *(f"-isystem{path}" for path in theirs)]
@@ -156,7 +161,7 @@ def fetch() -> None:
         pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "download", "--quiet", "--no-deps"]
         done = subprocess.run([*pip, f"gsplat=={pin[1]}", "--dest", str(OUT)], check=False)
         if done.returncode or not wheel.exists():
-            sys.exit(f"gsplat: pip could not fetch {wheel.name} (see above); it takes the network, or a package index")
+            lacking(f"pip could not fetch {wheel.name} (see above); it takes the network, or a package index")
     if hashlib.sha256(wheel.read_bytes()).hexdigest() != DIGEST:
         sys.exit(
             f"gsplat: {wheel} is not the wheel whose sources are known here. If constraints.txt names another version, "
@@ -210,6 +215,12 @@ def compile_kernels(command: Sequence[str], target: Path) -> None:
     )
     if linked.returncode:
         sys.exit("gsplat: the library could not be linked; the errors stand above")
+
+
+def lacking(what: str) -> NoReturn:
+    """End where this machine cannot do it: nothing is wrong with the project."""
+    say(what)
+    sys.exit(LACKING)
 
 
 def say(text: str) -> None:
