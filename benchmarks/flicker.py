@@ -1,0 +1,101 @@
+"""What the metric `flicker` rewards: true films that are seen a few degrees off, against films that stand still.
+
+`python -m benchmarks.flicker` (`--json FILE` keeps the rows) draws our own objects from the four sides that are scored.
+`temporal_error` of the same films stands beside it: 0 is the true motion, 1 is none.
+"""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+
+from benchmarks.measure import new_console, write_rows  # before torch: how its threads wait
+
+import torch  # isort: skip
+from jaxtyping import Float
+from rich.table import Column, Table
+from torch import Tensor
+
+from benchmarks.objects.drawing import Painted
+from benchmarks.objects.specimens import OBJECTS
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.metrics.video import flicker, temporal_error
+
+AZIMUTHS_DEG = (-75, 15, 105, 195)
+ERRORS_DEG = (1, 2, 5, 10)  # of the side from which a true film is seen
+FRONT = "the input view's first frame, held"
+OWN = "every view's true first frame, held"
+REPEATED = "the input at every view"
+
+
+@dataclass(frozen=True)
+class Film:
+    """Frames over white, and where the subject is."""
+
+    frames: Float[Tensor, "t h w 3"]
+    region: Float[Tensor, "t h w 1"]
+
+    def held(self) -> "Film":
+        """Its first frame, as long."""
+        return Film(self.frames[:1].expand_as(self.frames), self.region[:1].expand_as(self.region))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One film of one object, means over the sides."""
+
+    object: str
+    film: str
+    flicker: float
+    temporal_error: float
+
+
+def filmed(painted: Painted, azimuth_deg: float, frames: int, size: int) -> Film:
+    """One cycle of an object's motion from one side."""
+    camera = OrbitCamera(azimuth_deg=azimuth_deg, width=size, height=size)
+    cutouts = torch.cat([painted.draw(frame / frames, [camera]) for frame in range(frames)])
+    coverage = cutouts[..., 3:]
+    return Film(cutouts[..., :3] * coverage + 1 - coverage, (coverage > 0.5).float())
+
+
+def rows_of(name: str, frames: int, size: int) -> list[Row]:
+    """All films of one object."""
+    painted = Painted(OBJECTS[name]())
+    front = filmed(painted, 0, frames, size)
+    figures: dict[str, list[tuple[float, float]]] = {}
+    for azimuth in AZIMUTHS_DEG:
+        truth = filmed(painted, azimuth, frames, size)
+        films = {f"the truth, {off} degrees off": filmed(painted, azimuth + off, frames, size) for off in ERRORS_DEG}
+        for film, made in {**films, OWN: truth.held(), FRONT: front.held(), REPEATED: front}.items():
+            region = torch.maximum(made.region, truth.region)
+            found = flicker(made.frames, truth.frames, region), temporal_error(made.frames, truth.frames)
+            figures.setdefault(film, []).append((float(found[0]), float(found[1])))
+    return [Row(name, film, *(fmean(column) for column in zip(*pairs, strict=True))) for film, pairs in figures.items()]
+
+
+def table(rows: Sequence[Row]) -> Table:
+    """A line per film: its flicker for every object, the mean, and the mean temporal error."""
+    objects, films = (list(dict.fromkeys(getattr(row, field) for row in rows)) for field in ("object", "film"))
+    result = Table(Column("film", no_wrap=True), *objects, "mean flicker", "mean temporal error")
+    for film in films:
+        own = [row for row in rows if row.film == film]
+        means = fmean(row.flicker for row in own), fmean(row.temporal_error for row in own)
+        result.add_row(film, *(f"{row.flicker:.1f}" for row in own), f"{means[0]:.1f}", f"{means[1]:.2f}")
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="one object, four frames of 48 pixels")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
+    options = parser.parse_args()
+    frames, size = (4, 48) if options.quick else (32, 256)
+    rows = [row for name in list(OBJECTS)[: 1 if options.quick else None] for row in rows_of(name, frames, size)]
+    new_console().print(table(rows))
+    if options.json:
+        write_rows(options.json, rows)
+
+
+if __name__ == "__main__":
+    main()
