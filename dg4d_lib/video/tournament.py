@@ -164,7 +164,8 @@ def _area(cutouts: Float[Tensor, "t s s 4"], truth: Float[Tensor, "1 s s 4"]) ->
 def _color_kept(cutouts: Float[Tensor, "t s s 4"], truth: Float[Tensor, "1 s s 4"]) -> float:
     """What histograms of colors have in common with the input's, mean over the frames."""
     wanted = _histogram(truth[0])
-    return float(torch.stack([torch.minimum(_histogram(frame), wanted).sum() for frame in cutouts]).mean())
+    shared = torch.stack([torch.minimum(_histogram(frame), wanted).sum() for frame in cutouts])
+    return float(shared.mean().clamp(max=1))  # sums of a histogram are rounded
 
 
 def _histogram(cutout: Float[Tensor, "s s 4"]) -> Float[Tensor, " bins"]:
