@@ -24,7 +24,7 @@ from rich.table import Column, Table
 from scipy.stats import t as student
 
 from benchmarks.fits import Figures, fits_per_frame, moving_fit, score, static_fit
-from benchmarks.measure import new_console, write_rows
+from benchmarks.measure import new_console, parser_of, write_rows
 from benchmarks.objects.specimens import OBJECTS, Specimen, made, read
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -328,7 +328,7 @@ def _cell(figures: Sequence[Any], name: str) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = parser_of(__doc__, "one seed, four frames, a few iterations")
     parser.add_argument("names", nargs="+", choices=list(ABLATIONS), metavar="NAME", help=", ".join(ABLATIONS))
     parser.add_argument(
         "--objects", nargs="+", metavar="NAME", help=f"of {', '.join(OBJECTS)}, or of DIR; default: all"
@@ -346,8 +346,6 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=96, help="pixels of what is fitted, and of our own objects' views")
     parser.add_argument("--imperfect", action="store_true", help="an oracle with the flaws of a model")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of every variant")
-    parser.add_argument("--quick", action="store_true", help="one seed, four frames, a few iterations")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
     options = parser.parse_args()
     try:
         run(options, new_console())

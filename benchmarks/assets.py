@@ -7,7 +7,6 @@ fourdgs` and `PYTHONPATH=DIR` add it, and it is given the PLY files. Goals are s
 every kind, written as many at a time as the step that packs them does.
 """
 
-import argparse
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from benchmarks.measure import interleaved, machine, new_console, write_rows  # before torch: how its threads wait
+from benchmarks.measure import interleaved, machine, new_console, parser_of, write_rows  # before torch
 
 import torch  # isort: skip
 from rich.table import Column, Table
@@ -217,10 +216,7 @@ def measured(writers: dict[str, Write], splats: int | None, rounds: int) -> list
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="a small asset, one round")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
-    options = parser.parse_args()
+    options = parser_of(__doc__, "a small asset, one round").parse_args()
     grid, texels, counts, rounds = (30, 256, (500,), 1) if options.quick else (100, 1024, (5_000, 20_000), 3)
     pack = PackSettings(preview_size=64) if options.quick else PackSettings()
     console, asset = new_console(), waving_ball(grid, texels)

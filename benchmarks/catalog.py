@@ -29,7 +29,7 @@ from prefect import flow
 from prefect.client.orchestration import get_client
 from rich.table import Table
 
-from benchmarks.measure import machine, new_console, write_rows
+from benchmarks.measure import machine, new_console, parser_of, write_rows
 from benchmarks.postgresql import Database, free_port
 from flows import home
 from flows.catalog import convert_all
@@ -66,11 +66,10 @@ class Row:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--items", type=int, default=1000)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--database", choices=DATABASES, action="append", help="default: both")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
     parser.add_argument("--one", choices=DATABASES, help=argparse.SUPPRESS)  # in a process of its own: this one
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()

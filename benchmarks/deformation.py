@@ -13,13 +13,11 @@ Freed memory goes back to the system here. Steps keep it (`steps/main.py`), and 
 under their conditions set `MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=2147483647 MALLOC_TOP_PAD_=268435456`.
 """
 
-import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
-from benchmarks.measure import interleaved, machine, new_console, write_rows  # before torch: how its threads wait
+from benchmarks.measure import interleaved, machine, new_console, parser_of, write_rows  # before torch
 
 import torch  # isort: skip
 from rich.table import Column, Table
@@ -157,10 +155,7 @@ def of_ssim(size: int, rounds: int) -> Iterator[Row]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="small cases, few rounds")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
-    options = parser.parse_args()
+    options = parser_of(__doc__, "small cases, few rounds").parse_args()
     paper, small = HexPlaneSettings(), HexPlaneSettings(features=16, hidden=32)
     counts, sizes, rounds = ((2_000,), (128,), 3) if options.quick else ((5_000, 20_000), (256, 512), 5)
     console, rows = new_console(), []

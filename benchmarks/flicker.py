@@ -4,13 +4,11 @@
 `temporal_error` of the same films stands beside it: 0 is the true motion, 1 is none.
 """
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import fmean
 
-from benchmarks.measure import new_console, write_rows  # before torch: how its threads wait
+from benchmarks.measure import new_console, parser_of, write_rows  # before torch: how its threads wait
 
 import torch  # isort: skip
 from jaxtyping import Float
@@ -86,10 +84,7 @@ def table(rows: Sequence[Row]) -> Table:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="one object, four frames of 48 pixels")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
-    options = parser.parse_args()
+    options = parser_of(__doc__, "one object, four frames of 48 pixels").parse_args()
     frames, size = (4, 48) if options.quick else (32, 256)
     rows = [row for name in list(OBJECTS)[: 1 if options.quick else None] for row in rows_of(name, frames, size)]
     new_console().print(table(rows))

@@ -9,14 +9,13 @@ Every good asset is spoiled in every way below, each meant for one gate. A gate 
 and fails every one that is spoiled for it.
 """
 
-import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from benchmarks.measure import machine, write_rows  # before torch: how its threads wait
+from benchmarks.measure import WIDTH, machine, parser_of, write_rows  # before torch: how its threads wait
 
 import numpy as np  # isort: skip
 import torch
@@ -50,7 +49,6 @@ FRAMES, SIZE, FPS = 12, 256, 12.0  # of our own shapes
 SOLID = 3.0  # logit of the opacity of their splats
 SPREAD = 0.6  # standard deviation of such a splat, in edges
 INSET = 0.97  # how far from the middle its center is, in distances of the surface
-WIDTH = 150  # characters of the table
 
 
 @dataclass(frozen=True)
@@ -318,10 +316,9 @@ def _verdict(gates: dict[str, Gate]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("packages", nargs="*", type=Path, help="folders of good packages")
     parser.add_argument("--poor", nargs="*", default=[], type=Path, help="folders of packages with faults one can see")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
     options = parser.parse_args()
     console = Console(width=WIDTH, soft_wrap=True, highlight=False)
     found = rows([*map(read_package, options.packages), *map(own, SHAPES)], console.print)

@@ -3,6 +3,7 @@
 CPU time (user and system, all threads of the process) is what to compare: wall time says more about the neighbors.
 """
 
+import argparse
 import json
 import os
 import sys
@@ -62,6 +63,20 @@ def machine() -> str:
 def new_console() -> Console:
     """Where tables are printed: as wide as the terminal, or wide enough for all of them where there is none."""
     return Console(width=None if sys.stdout.isatty() else WIDTH)
+
+
+def parser_of(about: str | None, quick: str = "") -> argparse.ArgumentParser:
+    """Of a benchmark that can keep its rows (`--json`), and be quick.
+
+    Args:
+        about: the docstring of its module; its first line is shown.
+        quick: what `--quick` does; empty: there is no such option.
+    """
+    parser = argparse.ArgumentParser(description=(about or "").partition("\n")[0])
+    if quick:
+        parser.add_argument("--quick", action="store_true", help=quick)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
+    return parser
 
 
 def write_rows(path: Path, rows: Iterable[Any]) -> None:

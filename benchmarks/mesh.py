@@ -15,16 +15,14 @@ One iteration on a texture, value and gradient, of all frames: ours is trilinear
 `texture_frames`    grid_sample frame by frame in one call, the texture expanded
 """
 
-import argparse
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
-from benchmarks.measure import Times, interleaved, machine, new_console, write_rows  # before torch: its threads
+from benchmarks.measure import Times, interleaved, machine, new_console, parser_of, write_rows  # before torch
 
 import numpy as np  # isort: skip
 import torch
@@ -208,10 +206,7 @@ def finding(scene: Scene, peer: str, ours: Times, theirs: Times, agreement: floa
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="a small case, few rounds")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
-    options = parser.parse_args()
+    options = parser_of(__doc__, "a small case, few rounds").parse_args()
     count, sizes, frames, rounds = (5_000, (128,), 3, 3) if options.quick else (50_000, (256, 512), FRAMES, 7)
     console, (peers, missing) = new_console(), installed()
     found = []

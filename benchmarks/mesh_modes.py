@@ -7,12 +7,11 @@ has to itself is due to the points with which surfaces are compared. Pictures ar
 over white: PSNR at the pixels where either is seen, and intersection over union of the outlines.
 """
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from benchmarks.measure import machine, new_console, write_rows  # before torch: how its threads wait
+from benchmarks.measure import machine, new_console, parser_of, write_rows  # before torch: how its threads wait
 
 import torch  # isort: skip
 from rich.table import Column, Table
@@ -102,11 +101,9 @@ def mean_row(package: str, rows: Sequence[Row]) -> Row:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = parser_of(__doc__, "two frames per package")
     parser.add_argument("packages", type=Path, nargs="+", metavar="PACKAGE", help="folders that `dg4d make` wrote")
     parser.add_argument("--frames", type=int, default=4, help="frames per package, evenly spread")
-    parser.add_argument("--quick", action="store_true", help="two frames per package")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
     options = parser.parse_args()
     rasterize = choose_rasterizer("auto")
     count = 2 if options.quick else options.frames

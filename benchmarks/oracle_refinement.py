@@ -15,15 +15,13 @@ PSNR is on the object, in the views that ablations score; flicker is the mean ch
 levels of 255, and that of the truth is 0. With trained models: `benchmarks.refinement`.
 """
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from benchmarks.ablations import Ablation, Claim, Row, Variant, table, verdict
-from benchmarks.measure import new_console, write_rows  # before torch: how its threads wait
+from benchmarks.measure import new_console, parser_of, write_rows  # before torch: how its threads wait
 
 import torch  # isort: skip
 from jaxtyping import Float
@@ -204,15 +202,13 @@ def figures_of(model: Model, made: Refined, size: int) -> Figures:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = parser_of(__doc__, "one object, three frames, two iterations, 64 pixels")
     parser.add_argument("--objects", nargs="+", choices=list(OBJECTS), default=list(OBJECTS), metavar="NAME")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--size", type=int, default=128, help="pixels of what is refined, and scored")
     parser.add_argument("--texels", type=int, default=256, help="of a side of the texture")
     parser.add_argument("--iterations", type=int, default=TextureSettings().iterations)
-    parser.add_argument("--quick", action="store_true", help="one object, three frames, two iterations, 64 pixels")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
     options = parser.parse_args()
     if options.quick:
         options.objects, options.frames, options.size, options.texels, options.iterations = ["parrot"], 3, 64, 128, 2

@@ -21,7 +21,7 @@ from statistics import median
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.measure import machine, new_console, write_rows
+from benchmarks.measure import machine, new_console, parser_of, write_rows
 from flows.inputs.orders import Wish
 from flows.packages.publish import RECORD, whole
 from flows.serving.server import Server
@@ -49,11 +49,10 @@ class Row:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("picture", type=Path)
     parser.add_argument("--turns", type=int, default=2)
     parser.add_argument("--set", action="append", default=[], metavar="KNOB=VALUE", help="as `dg4d make --set`")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
     parser.add_argument("--again", nargs=2, type=Path, help=argparse.SUPPRESS)  # record and store: only the steps
     options = parser.parse_args()
     if options.again:

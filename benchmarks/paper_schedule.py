@@ -13,15 +13,13 @@ say nothing. Columns:
 `outside`  share of the time that no network was at work: drawing, losses, optimizers
 """
 
-import argparse
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial, wraps
-from pathlib import Path
 from typing import Any
 
-from benchmarks.measure import machine, new_console, write_rows  # before torch: how its threads wait
+from benchmarks.measure import machine, new_console, parser_of, write_rows  # before torch: how its threads wait
 
 import torch  # isort: skip
 from diffusers import (
@@ -324,9 +322,7 @@ def ball(texture: int, device: torch.device, rows: int = 100, columns: int = 200
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="tiny networks, small numbers, any device")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
+    parser = parser_of(__doc__, "tiny networks, small numbers, any device")
     options = parser.parse_args()
     found = torch.cuda.is_available()
     if not found and not options.quick:

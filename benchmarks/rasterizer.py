@@ -11,16 +11,14 @@ All programs of a cell run in turn in one process; times are CPU time per view. 
 The object is a bumpy closed surface of flat Gaussians that fills 65 % of the picture.
 """
 
-import argparse
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from itertools import product
-from pathlib import Path
 from typing import no_type_check
 
-from benchmarks.measure import Times, interleaved, machine, new_console, write_rows  # before torch: its threads
+from benchmarks.measure import Times, interleaved, machine, new_console, parser_of, write_rows  # before torch
 
 import numpy as np  # isort: skip
 import torch
@@ -255,10 +253,7 @@ def inside(counts: Sequence[int], sizes: Sequence[int], rounds: int) -> Table:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="fewer cells and rounds")
-    parser.add_argument("--json", type=Path, help="write the rows here")
-    given = parser.parse_args()
+    given = parser_of(__doc__, "fewer cells and rounds").parse_args()
     counts, sizes, views, rounds = (
         (QUICK_COUNTS, QUICK_SIZES, QUICK_VIEWS, QUICK_ROUNDS) if given.quick else (COUNTS, SIZES, VIEWS, ROUNDS)
     )

@@ -9,12 +9,11 @@ too smooth, with .8 too noisy, .7 is best. What such models paint no stand-in kn
 that are as consistent, or as inconsistent, as theirs is measured by `benchmarks.oracle_refinement`.
 """
 
-import argparse
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from benchmarks.measure import machine, new_console, write_rows  # before torch: how its threads wait
+from benchmarks.measure import machine, new_console, parser_of, write_rows  # before torch: how its threads wait
 
 import torch  # isort: skip
 from jaxtyping import Float
@@ -100,14 +99,12 @@ def _steps(pictures: Float[Tensor, "t i j 3"]) -> Float[Tensor, "i j"]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = parser_of(__doc__, "one iteration, 64 pixels")
     parser.add_argument("asset", type=Path, metavar="ASSET.glb", help="with a tracked mesh")
     parser.add_argument("frames", type=Path, metavar="FRAMES", help="folder of cut-outs, one per frame of the asset")
     parser.add_argument("--svd", default="svd", help="weights of Stable Video Diffusion: a name or a folder")
     parser.add_argument("--zero123", default="zero123-xl", help="weights of Zero-1-to-3: a name or a folder")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--quick", action="store_true", help="one iteration, 64 pixels")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
     options = parser.parse_args()
     asset = read_glb(options.asset.read_bytes())
     cutouts = torch.stack([read_png(path) for path in sorted(options.frames.glob("*.png"))])

@@ -5,7 +5,6 @@ machine with the same iterations, are averaged. Seconds are those in which a ste
 per frame is extracted in parts, two at a time, and the parts are added up. The paper's own figures stand below.
 """
 
-import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from typing import Any
 
 from rich.table import Table
 
-from benchmarks.measure import new_console, write_rows
+from benchmarks.measure import new_console, parser_of, write_rows
 from flows.packages.publish import RECORD, whole
 
 STAGES = {
@@ -138,11 +137,10 @@ def table(rows: Sequence[Row]) -> Table:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument(
         "packages", type=Path, nargs="+", metavar="PACKAGE", help=f"folders with {RECORD}, as `dg4d make` writes them"
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
     options = parser.parse_args()
     rows = averaged([of_package(folder) for folder in options.packages])
     console = new_console()
