@@ -33,6 +33,7 @@ from rich.table import Column, Table
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
 from dg4d_lib.diffusion.ledger import counted, counting_flops
+from dg4d_lib.diffusion.one_token import shorten_attention
 from dg4d_lib.diffusion.parts import Placement, dtype_on, frozen
 from dg4d_lib.diffusion.video_model import VideoModel
 from dg4d_lib.fitting.motion import fit_motion
@@ -230,11 +231,7 @@ class Schedule:
         make = partial(self.network, settings.precision, channels_last=self.device.type == "cuda")
         return Zero123(
             vae=make(lambda: AutoencoderKL(up_block_types=("UpDecoderBlock2D",) * 4, **vae(sizes))),
-            unet=make(
-                lambda: UNet2DConditionModel(
-                    in_channels=2 * LATENT_CHANNELS, block_out_channels=levels(sizes.unet), cross_attention_dim=tokens
-                )
-            ),
+            unet=shorten_attention(make(lambda: picture_unet(sizes))),
             image_encoder=make(lambda: image_encoder(sizes.clip)),
             camera_projection=make(lambda: torch.nn.Linear(tokens + CAMERA_NUMBERS, tokens)),
             settings=settings,
@@ -242,14 +239,7 @@ class Schedule:
 
     def video_model(self, settings: Any, clock: Clock) -> VideoModel:
         make, sizes = partial(self.network, settings.precision), self.sizes
-        unet = make(
-            lambda: UNetSpatioTemporalConditionModel(
-                block_out_channels=levels(sizes.unet),
-                num_attention_heads=tuple(max(1, channels // 64) for channels in levels(sizes.unet)),
-                cross_attention_dim=sizes.eye.embedding,
-                num_frames=14,
-            )
-        )
+        unet = shorten_attention(make(lambda: video_unet(sizes)))
         decoder = make(lambda: AutoencoderKLTemporalDecoder(**vae(sizes)))
         model = VideoModel(unet, decoder, make(lambda: image_encoder(sizes.eye)), settings, self.device)
         clock.watch(model, "look_at", "encode", "decode", "denoise")
@@ -268,6 +258,25 @@ def conditioned(
     over_white = cutouts[..., :3] * cutouts[..., 3:] + 1 - cutouts[..., 3:]
     clock.watch(prior := model.conditioned_on(over_white, Annealing(stage.noise_start, stage.noise_end)), "loss")
     return prior
+
+
+def picture_unet(sizes: Sizes) -> UNet2DConditionModel:
+    """Zero-1-to-3's."""
+    return UNet2DConditionModel(
+        in_channels=2 * LATENT_CHANNELS,
+        block_out_channels=levels(sizes.unet),
+        cross_attention_dim=sizes.clip.embedding,
+    )
+
+
+def video_unet(sizes: Sizes) -> UNetSpatioTemporalConditionModel:
+    """Stable Video Diffusion's."""
+    return UNetSpatioTemporalConditionModel(
+        block_out_channels=levels(sizes.unet),
+        num_attention_heads=tuple(max(1, channels // 64) for channels in levels(sizes.unet)),
+        cross_attention_dim=sizes.eye.embedding,
+        num_frames=14,
+    )
 
 
 def levels(width: int) -> tuple[int, ...]:

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn.functional import conv2d, interpolate, pad
 
 from dg4d_lib.diffusion.batching import MicroBatches
+from dg4d_lib.diffusion.one_token import shorten_attention
 from dg4d_lib.diffusion.parts import (
     CLIP_SIZE,
     Placement,
@@ -101,8 +102,9 @@ class VideoModel:
         """
         dtype = dtype_on(device, settings.precision)
         place = Placement(torch.device("cpu") if settings.low_memory else device, dtype)
-        parts = load_temporal_unet(folder, place), load_temporal_vae(folder, place), load_image_encoder(folder, place)
-        return cls(*parts, settings, device)
+        unet = shorten_attention(load_temporal_unet(folder, place))
+        vae, image_encoder = load_temporal_vae(folder, place), load_image_encoder(folder, place)
+        return cls(unet, vae, image_encoder, settings, device)
 
     def notes(self) -> tuple[str, ...]:
         """Sentences for the report: where memory ran out."""

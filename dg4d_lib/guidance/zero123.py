@@ -18,6 +18,7 @@ from torch.nn import functional
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.batching import MicroBatches
+from dg4d_lib.diffusion.one_token import shorten_attention
 from dg4d_lib.diffusion.parts import (
     CLIP_SIZE,
     BetaSchedule,
@@ -78,7 +79,7 @@ class Zero123:
         require_schedule(model, SCHEDULE)
         projection = read_linear(model / "clip_camera_projection", "proj", placement)
         encoder = load_image_encoder(model, placement)
-        vae, unet = load_vae(model, placement), load_unet(model, placement)
+        vae, unet = load_vae(model, placement), shorten_attention(load_unet(model, placement))
         found = {
             "inputs of the UNet": (unet.config.in_channels, 2 * LATENT_CHANNELS),
             "outputs of the UNet": (unet.config.out_channels, LATENT_CHANNELS),

@@ -7,6 +7,7 @@ from PIL import Image
 from tiny_svd import SCHEDULE, save_tiny_svd, tiny_svd
 
 from dg4d_lib.diffusion import batching
+from dg4d_lib.diffusion.one_token import OneToken
 from dg4d_lib.diffusion.video_model import VideoModel, clean, karras_sigmas, start_index
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import VideoModelSettings
@@ -143,6 +144,13 @@ def test_in_half_precision_the_encoder_alone_is_wider_and_its_weights_are_never_
     assert {parameter.dtype for parameter in half.vae.encoder.parameters()} == {torch.float32} == {latents.dtype}
     exact = VideoModel.load(folder, SETTINGS, CPU).encode(pixels[None] / 255)
     torch.testing.assert_close(latents, exact, rtol=0, atol=5e-3)
+
+
+def test_the_one_token_is_not_attended_to_at_length(model: VideoModel) -> None:
+    processors = model.unet.attn_processors
+    shortened = {name for name, processor in processors.items() if isinstance(processor, OneToken)}
+    assert shortened == {name for name in processors if ".attn2." in name}
+    assert any("temporal_transformer_blocks" in name for name in shortened)
 
 
 def test_a_missing_part_is_named(folder: Path, tmp_path: Path) -> None:

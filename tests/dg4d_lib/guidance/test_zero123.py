@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.batching import MicroBatches
+from dg4d_lib.diffusion.one_token import OneToken
 from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.interface import GuidancePrior, View
@@ -304,6 +305,12 @@ def test_networks_of_something_else_are_refused(model: Path, tmp_path: Path) -> 
     tiny_weights.tiny_unet(in_channels=4).save_pretrained(other / "unet")
     with pytest.raises(BadInput, match="inputs of the UNet: 4 instead of 8"):
         Zero123.load(other, SETTINGS, CPU)
+
+
+def test_the_one_token_is_not_attended_to_at_length(networks: Zero123) -> None:
+    processors = networks.unet.attn_processors
+    shortened = {name for name, processor in processors.items() if isinstance(processor, OneToken)}
+    assert shortened == {name for name in processors if ".attn2." in name} != set()
 
 
 def test_a_projection_of_another_width_is_refused(model: Path, tmp_path: Path) -> None:
