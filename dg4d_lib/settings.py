@@ -77,6 +77,12 @@ class VideoModelSettings(Settings):
     noise_augmentation: float = Field(
         0.02, ge=0, le=1, description="noise on the picture that is animated, pictures in [-1, 1]"
     )
+    memory_gb: float = Field(
+        24.0,
+        ge=6,
+        le=1024,
+        description="GiB of memory to plan for, say 12, 24 or 80: what goes through at once, at most the next two",
+    )
     videos_at_once: int = Field(
         2, ge=1, le=64, description="videos in the network at a time; each counts twice, with and without the picture"
     )

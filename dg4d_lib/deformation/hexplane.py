@@ -136,8 +136,9 @@ def plane_features(
 
     Plain torch: the definition of `hexplane_features`, and what runs on other devices and precisions.
     """
-    pairs = torch.stack([coordinates[:, list(axes)] for axes in SPATIAL_AXES])
-    space = functional.grid_sample(planes, pairs[:, None], align_corners=True, padding_mode="border")[:, :, 0].prod(0)
+    pairs = torch.stack([torch.stack([coordinates[:, axis] for axis in axes], -1) for axes in SPATIAL_AXES])
+    samples = functional.grid_sample(planes, pairs[:, None], align_corners=True, padding_mode="border")[:, :, 0]
+    space = samples[0] * samples[1] * samples[2]  # the gradient of `prod` has a GPU waited for
     last = lines.shape[-1] - 1
     place = (coordinates + 1) / 2 * last
     left = place.floor().clamp(0, last - 1)

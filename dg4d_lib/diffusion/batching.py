@@ -41,10 +41,13 @@ class MicroBatches:
         """
         return cls(name, int((memory_gb - resident_gb) / item_gb))
 
-    def run(self, function: Callable[[slice], Result], total: int) -> list[Result]:
+    def run(self, function: Callable[[slice], Result], total: int, most: int | None = None) -> list[Result]:
         """What `function` returns for consecutive slices of `range(total)`, in order.
 
-        `function` may be called for a slice again after it ran out of memory, so it must change nothing outside.
+        Args:
+            function: may be called for a slice again after it ran out of memory, so it must change nothing outside.
+            total: how many items there are.
+            most: of a piece of these items, where they are larger than others; at least 1.
 
         Raises:
             BackendUnavailable: there is no memory for a single item.
@@ -52,7 +55,7 @@ class MicroBatches:
         results: list[Result] = []
         start = 0
         while start < total:
-            piece = slice(start, min(start + self.size, total))
+            piece = slice(start, min(start + min(self.size, most or self.size), total))
             try:
                 results.append(function(piece))
             except RuntimeError as error:

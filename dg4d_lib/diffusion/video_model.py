@@ -33,6 +33,11 @@ from dg4d_lib.settings import VideoModelSettings
 
 SIGMA_MAX, SIGMA_MIN, RHO = 700.0, 0.002, 7.0
 
+GIB = 2**30
+OUTSIDE_GB = 1.5  # renders, and what CUDA takes
+# per byte of a number, million pixels and frame: what the tensors of the published networks take, and a tenth
+ENCODER_GB, DECODER_GB, UNET_GB = 0.66, 1.05, 0.15
+
 
 def karras_sigmas(steps: int) -> tuple[float, ...]:
     """Noise levels from 700 down to 0.002 whose 1/7th powers are evenly spaced, and 0 after them: `steps` + 1."""
@@ -86,6 +91,8 @@ class VideoModel:
                 part.to(torch.float32)
         self.unet, self.vae, self.image_encoder = unet, vae, image_encoder
         self.settings, self.device = settings, device
+        weights = [sum(value.nbytes for value in part.parameters()) / GIB for part in (unet, vae, image_encoder)]
+        self._spare_gb = settings.memory_gb - OUTSIDE_GB - (max(weights) if settings.low_memory else sum(weights))
         self._videos = MicroBatches("videos of the video model", settings.videos_at_once)
         self._frames = MicroBatches("frames of the video model", settings.frames_at_once)
         if not settings.low_memory:
@@ -156,7 +163,9 @@ class VideoModel:
         with self._awake(self.vae) as vae:
             inside = (latents / vae.config.scaling_factor).to(self.device, _dtype(vae.decoder))
             pictures = self._frames.run(
-                lambda part: vae.decode(inside[part], num_frames=len(inside[part])).sample, len(inside)
+                lambda part: vae.decode(inside[part], num_frames=len(inside[part])).sample,
+                len(inside),
+                self._room(DECODER_GB, inside, self.shrinkage),
             )
         decoded = torch.cat(pictures)
         return (decoded.to(_wide(decoded.dtype)).movedim(1, -1) / 2 + 0.5).clamp(0, 1)
@@ -193,7 +202,9 @@ class VideoModel:
         noisy = (torch.cat([latents, latents]) / math.sqrt(1 + sigma**2)).to(unet.dtype)
         seen = torch.cat([noisy, pictures[:, None].expand(-1, frames, -1, -1, -1).to(unet.dtype)], 2)
         velocities = self._videos.run(
-            lambda part: unet(seen[part], time, embedding[part], ids[part], return_dict=False)[0], len(seen)
+            lambda part: unet(seen[part], time, embedding[part], ids[part], return_dict=False)[0],
+            len(seen),
+            self._room(frames * UNET_GB, seen, self.shrinkage),
         )
         without, informed = torch.cat(velocities).to(latents).chunk(2)
         guidance = torch.linspace(self.settings.guidance_start, self.settings.guidance_end, frames)
@@ -203,8 +214,22 @@ class VideoModel:
         """Latents of pictures in [-1, 1]."""
         with self._awake(self.vae) as vae:
             seen = pictures.to(self.device, _dtype(vae.encoder))
-            latents = torch.cat(self._frames.run(lambda part: vae.encode(seen[part]).latent_dist.mode(), len(seen)))
-        return latents.to(_wide(latents.dtype))
+            latents = self._frames.run(
+                lambda part: vae.encode(seen[part]).latent_dist.mode(), len(seen), self._room(ENCODER_GB, seen)
+            )
+        modes = torch.cat(latents)
+        return modes.to(_wide(modes.dtype))
+
+    def _room(self, gb: float, inputs: Float[Tensor, "b *shape h w"], enlarged: int = 1) -> int:
+        """For how many inputs at a time the budget has room.
+
+        Args:
+            gb: GiB per byte of a number and million pixels.
+            inputs: of a network, as it computes.
+            enlarged: pixels of a side of the picture per number of the input.
+        """
+        pixels = inputs.shape[-2] * inputs.shape[-1] * enlarged**2
+        return max(1, int(self._spare_gb / (gb * inputs.dtype.itemsize * pixels / 1e6)))
 
     @contextmanager
     def _awake(self, part: Any) -> Iterator[Any]:

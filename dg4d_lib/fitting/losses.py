@@ -1,11 +1,13 @@
-"""The reference-view loss of both stages, and the check that a loss is a number."""
+"""The reference-view loss of both stages, and the check that losses are numbers."""
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
+from torch.nn.utils import get_total_norm
 
 from dg4d_lib.errors import FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -45,28 +47,37 @@ def reference_loss(
     return loss + ssim_weight * (1 - ssim(rendering.color, color).mean()) if ssim_weight else loss
 
 
-def check_finite(
-    stage: str, quantity: str, values: Iterable[Tensor | None], moment: str, advice: str, gaussians: Gaussians
-) -> None:
-    """Stop a fit whose numbers are none.
+def finite_numbers(
+    stage: str,
+    losses: Mapping[str, Tensor],
+    slopes: Iterable[Tensor | None],
+    moment: str,
+    advice: str,
+    gaussians: Gaussians,
+) -> dict[str, float]:
+    """The losses of an iteration, for people; stops a fit whose numbers are none.
 
-    A Gaussian that is no number is not drawn and its loss stays finite, so gradients are checked too.
+    A Gaussian that is no number is not drawn and its loss stays finite, so gradients are checked too. All are read at
+    once: a GPU is waited for a single time.
 
     Args:
         stage: name of the fit.
-        quantity: what is checked, "loss" or "gradient".
-        values: the tensors; None is left out.
+        losses: scalars by their names; "loss" is what is minimized.
+        slopes: the gradients; None is left out.
         moment: "iteration 3 of 200".
         advice: what the user can do.
         gaussians: the last good cloud.
 
     Raises:
-        Diverged: one of the values is not finite.
+        Diverged: "loss" or a gradient is not finite.
     """
-    for value in values:
-        if value is not None and not torch.isfinite(value).all():
-            bad = value.detach()[~torch.isfinite(value.detach())].flatten()[0].item()
-            raise Diverged(f"{stage}: the {quantity} became {bad} at {moment}; {advice}", gaussians.detach())
+    steepest = get_total_norm([slope for slope in slopes if slope is not None], torch.inf)
+    *values, slope = torch.stack([*(loss.detach() for loss in losses.values()), steepest]).tolist()
+    numbers = dict(zip(losses, values, strict=True))
+    for quantity, value in (("loss", numbers["loss"]), ("gradient", slope)):
+        if not math.isfinite(value):
+            raise Diverged(f"{stage}: the {quantity} became {value} at {moment}; {advice}", gaussians.detach())
+    return numbers
 
 
 class Diverged(FitDiverged):

@@ -11,7 +11,8 @@ from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.cameras.viewpoints import random_orbit
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.deformation.rigidity import neighborhoods, rigidity
-from dg4d_lib.fitting.losses import WHITE, check_finite, reference_loss, resized
+from dg4d_lib.devices import sent
+from dg4d_lib.fitting.losses import WHITE, finite_numbers, reference_loss, resized
 from dg4d_lib.fitting.schedules import log_linear, size_of
 from dg4d_lib.fitting.static import rates
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -72,19 +73,20 @@ def fit_motion(
         if settings.fine_tune:
             adam.param_groups[0]["lr"] = log_linear(settings.mean_rate, settings.mean_rate_end, progress)
         frames = choose_frames(len(video), settings.frames_per_iteration, generator)
-        moved = deformation.displace(gaussians.means, times[frames]).apply(gaussians)
+        chosen = sent(frames, device)
+        moved = deformation.displace(gaussians.means, times[chosen]).apply(gaussians)
 
         rendering = rasterize(moved, [camera] * len(frames), white)
         reference = reference_loss(
             rendering,
-            color[frames].permute(0, 2, 3, 1),
-            alpha[frames].permute(0, 2, 3, 1),
+            color[chosen].permute(0, 2, 3, 1),
+            alpha[chosen].permute(0, 2, 3, 1),
             settings.color_weight,
             settings.alpha_weight,
             settings.ssim_weight,
         )
         loss = progress * reference + deformation.roughness()
-        guidance = torch.zeros(())
+        guidance = torch.zeros((), device=device)
         if settings.views and settings.guidance_weight:
             views, rows = moments(prior, frames, settings, size_of(settings.ladder, progress), generator)
             if views:
@@ -94,14 +96,14 @@ def fit_motion(
                 loss = loss + settings.guidance_weight * guidance
         if neighbors is not None:
             loss = loss + settings.rigidity_weight * rigidity(moved, *neighbors)
-        moment = f"iteration {step} of {settings.iterations}"
-        check_finite("fit_motion", "loss", [loss], moment, ADVICE, gaussians)
         adam.zero_grad(set_to_none=True)
         loss.backward()
+        losses = {"loss": loss, "reference": reference, "guidance": guidance}
         slopes = [parameter.grad for group in adam.param_groups for parameter in group["params"]]
-        check_finite("fit_motion", "gradient", slopes, moment, ADVICE, gaussians)
+        moment = f"iteration {step} of {settings.iterations}"
+        numbers = finite_numbers("fit_motion", losses, slopes, moment, ADVICE, gaussians)
         adam.step()
-        report(step, {"loss": loss.item(), "reference": reference.item(), "guidance": guidance.item()})
+        report(step, numbers)
     return gaussians.detach()
 
 

@@ -9,7 +9,8 @@ from torch import Tensor, nn
 
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.cameras.viewpoints import random_orbit
-from dg4d_lib.fitting.losses import WHITE, Diverged, check_finite, reference_loss, resized
+from dg4d_lib.devices import sent
+from dg4d_lib.fitting.losses import WHITE, Diverged, finite_numbers, reference_loss, resized
 from dg4d_lib.fitting.schedules import log_linear, size_of
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.growth import Grown, ScreenGradients, grow, prune, reset_opacity
@@ -98,22 +99,22 @@ def fit_gaussians(
             rendering, color, alpha, settings.color_weight, settings.alpha_weight, settings.ssim_weight
         )
         loss = progress * reference
-        guidance = torch.zeros(())
+        guidance = torch.zeros((), device=device)
         if settings.views and settings.guidance_weight:
             size = size_of(settings.ladder, progress)
             views = [View(c) for c in viewpoints(prior, settings, size, generator)]
             offsets.append(torch.zeros(len(views), len(gaussians), 2, device=device, requires_grad=True))
-            behind = background(settings, generator).to(device)
+            behind = sent(background(settings, generator), device)
             rendering = rasterize(gaussians, [view.camera for view in views], behind, offsets[1])
             seen.append((rendering.visible, size))
             guidance = prior.loss(rendering.color, rendering.alpha, views, progress, generator)
             loss = loss + settings.guidance_weight * guidance
-        moment = f"iteration {step} of {settings.iterations}"
-        check_finite("fit_gaussians", "loss", [loss], moment, ADVICE, gaussians)
         cloud.adam.zero_grad(set_to_none=True)
         loss.backward()
+        losses = {"loss": loss, "reference": reference, "guidance": guidance}
         slopes = [parameter.grad for parameter in cloud.parameters.values()]
-        check_finite("fit_gaussians", "gradient", slopes, moment, ADVICE, gaussians)
+        moment = f"iteration {step} of {settings.iterations}"
+        numbers = finite_numbers("fit_gaussians", losses, slopes, moment, ADVICE, gaussians)
         for offset, (visible, size) in zip(offsets, seen, strict=True):
             if offset.grad is not None:
                 gradients.add(offset.grad, visible, size)
@@ -129,15 +130,7 @@ def fit_gaussians(
                 )
         if step % settings.reset_opacity_every == 0 and step < settings.iterations:
             cloud.parameters["opacity_logits"].data.copy_(reset_opacity(cloud.gaussians).opacity_logits)
-        report(
-            step,
-            {
-                "loss": loss.item(),
-                "reference": reference.item(),
-                "guidance": guidance.item(),
-                "Gaussians": len(cloud.gaussians),
-            },
-        )
+        report(step, {**numbers, "Gaussians": len(cloud.gaussians)})
     return cloud.gaussians.detach()
 
 

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from dg4d_lib.devices import sent
 from dg4d_lib.geometry.harmonics import color_of_harmonics
 from dg4d_lib.geometry.quaternion import rotation_matrix
 
@@ -66,9 +67,11 @@ class Gaussians:
 
     def states(self, rows: Sequence[int] | Int[Tensor, " m"]) -> "Gaussians":
         """Some states of a batch, in this order; not copied if they are all, each in its place."""
-        if torch.as_tensor(rows).tolist() == list(range(len(self.means))):
+        chosen = torch.as_tensor(rows, dtype=torch.long)
+        if chosen.tolist() == list(range(len(self.means))):
             return self
-        return replace(self, means=self.means[rows], log_scales=self.log_scales[rows], quats=self.quats[rows])
+        chosen = sent(chosen, self.means.device)
+        return replace(self, means=self.means[chosen], log_scales=self.log_scales[chosen], quats=self.quats[chosen])
 
     def at(self, frame: int) -> "Gaussians":
         """One state of a batch."""

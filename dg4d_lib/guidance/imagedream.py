@@ -20,6 +20,7 @@ from torch.nn.functional import pad
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import turntable
+from dg4d_lib.devices import sent
 from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.diffusion.multiview import MultiViewShape, MultiViewUnet
 from dg4d_lib.diffusion.parts import (
@@ -64,7 +65,8 @@ class Condition:
 
     def rows(self, objects: Sequence[int]) -> "Condition":
         """Some of the objects, in this order."""
-        return Condition(**{part.name: getattr(self, part.name)[list(objects)] for part in fields(self)})
+        chosen = sent(torch.tensor(list(objects)), self.latents.device)
+        return Condition(**{part.name: getattr(self, part.name)[chosen] for part in fields(self)})
 
 
 class ImageDream:
@@ -183,7 +185,8 @@ class ImageDream:
             torch.cat([torch.zeros_like(told), told]).to(like) for told in (condition.features, condition.latents)
         )
         poses = torch.stack([torch.stack([camera_numbers(camera) for camera in ring]) for ring in rings])
-        poses = pad(poses, (0, 0, 0, 1)).repeat(2, 1, 1).to(like)  # the picture itself has no camera
+        poses = pad(poses, (0, 0, 0, 1)).repeat(2, 1, 1)  # the picture itself has no camera
+        poses = sent(poses.to(like.dtype), like.device)
         seen = torch.cat([latents.repeat(2, 1, 1, 1, 1).to(like), fronts[:, None]], 1)
         without, told = self.unet(seen, timestep, poses, text, features)[:, :-1].to(latents).chunk(2)
         return without + guidance * (told - without)
@@ -255,7 +258,7 @@ class ImageDreamPrior:
         cameras = [[view.camera for view in ring] for ring in rings]
         timestep = self.noise.timestep(progress, generator)
         shape = (len(rings), RING * LATENT_CHANNELS, LATENT_SIZE, LATENT_SIZE)
-        noise = torch.randn(shape, dtype=images.dtype, generator=generator)
+        noise = sent(torch.randn(shape, dtype=images.dtype, generator=generator), self.condition.latents.device)
 
         def encode(pixels: Float[Tensor, "p rows w 3"]) -> Float[Tensor, "p c 32 32"]:
             latents = self.model.encode(pixels.unflatten(1, (RING, -1)).flatten(0, 1))

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.devices import sent
 from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.diffusion.one_token import shorten_attention
 from dg4d_lib.diffusion.parts import (
@@ -172,11 +173,10 @@ class ConditionedZero123:
             BadInput: a view of a frame that it does not know.
             BackendUnavailable: there is no memory for a single view.
         """
-        rows = torch.tensor([self._known(view.frame) for view in views], device=self.vae.device)
         timestep = self.noise.timestep(progress, generator)
         shape = (len(images), LATENT_CHANNELS, LATENT_SIZE, LATENT_SIZE)
-        noise = torch.randn(shape, dtype=images.dtype, generator=generator)
-        tokens, pictures = self.tokens(views), self.latents[rows]
+        noise = sent(torch.randn(shape, dtype=images.dtype, generator=generator), self.vae.device)
+        tokens, pictures = self.tokens(views), self.latents[self._rows(views)]
 
         def encode(pixels: Float[Tensor, "p h w 3"]) -> Float[Tensor, "p 4 32 32"]:
             return self.vae.config.scaling_factor * encoded(self.vae, pixels.to(self.vae.device))
@@ -212,14 +212,17 @@ class ConditionedZero123:
         """What the cross-attention of the UNet reads: one token per view, out of its frame and its camera."""
         told = self.settings.input_elevation_deg if self.settings.variant == "stable" else None
         cameras = torch.stack([camera_numbers(view.camera, self.input_camera, told) for view in views])
-        embeddings = self.embeddings[[self._known(view.frame) for view in views]]
+        embeddings = self.embeddings[self._rows(views)]
         with torch.no_grad():
-            return self.camera_projection(torch.cat([embeddings, cameras.to(embeddings)], -1))[:, None]
+            placed = sent(cameras.to(embeddings.dtype), embeddings.device)
+            return self.camera_projection(torch.cat([embeddings, placed], -1))[:, None]
 
-    def _known(self, frame: int) -> int:
-        if not 0 <= frame < len(self.embeddings):
-            raise BadInput(f"frame {frame} was asked for; there are {len(self.embeddings)}, counted from 0")
-        return frame
+    def _rows(self, views: Sequence[View]) -> Int64[Tensor, " b"]:
+        """Where the frames of some views stand."""
+        known = len(self.embeddings)
+        if wrong := [view.frame for view in views if not 0 <= view.frame < known]:
+            raise BadInput(f"frame {wrong[0]} was asked for; there are {known}, counted from 0")
+        return sent(torch.tensor([view.frame for view in views]), self.embeddings.device)
 
 
 def camera_numbers(

@@ -85,7 +85,9 @@ def refine_textures(
         raise BadInput(f"the mesh has {frames} frames and the driving video {len(driving)}; make them from one video")
     front = OrbitCamera(width=settings.size, height=settings.size)
     added = [_nothing_added(stretch, settings.frame_size) for stretch in stretches]
-    reference, facing = _look(stretches, added, [front] * frames, settings.min_cosine)
+    reference, drawn = _look(stretches, added, [front] * frames)
+    facing = _facing(stretches, drawn, [front] * frames, settings.min_cosine)
+    del drawn  # as large as the pictures
     wanted = _resized(driving.over(driving.frames.new_ones(3)), (settings.size, settings.size))
     textures = [stretch.mesh.texture for stretch in stretches]
     starts = [texture.clamp(DARKEST, 1 - DARKEST).logit() for texture in textures]
@@ -161,10 +163,9 @@ def _look(
     stretches: Sequence[Stretch],
     added: Sequence[Float[Tensor, "_ _ _ 3"] | None],
     cameras: Sequence[OrbitCamera],
-    min_cosine: float = -1.0,
-) -> tuple[list[_Look], Bool[Tensor, "t h w 1"]]:
-    """Where the pixels of every frame look, and which see the surface at a better cosine."""
-    looks, facing, first = [], [], 0
+) -> tuple[list[_Look], list[Fragments]]:
+    """Where the pixels of every frame look, and what was drawn for it."""
+    looks, drawn, first = [], [], 0
     for stretch, colors in zip(stretches, added, strict=True):
         mesh, moved = stretch.mesh, stretch.mesh.vertices + stretch.offsets
         mine = cameras[first : first + len(moved)]
@@ -180,12 +181,24 @@ def _look(
             ]
         )
         looks.append(_Look(shared, tuple(own)))
-        normals = torch.stack([vertex_normals(state, mesh.faces) for state in moved])
-        places = torch.stack([camera.position().to(moved) for camera in mine])[:, None, None]
-        rays = normalize(places - spread(fragments, mesh.faces, moved), dim=-1)
-        cosines = (rays * normalize(spread(fragments, mesh.faces, normals), dim=-1)).sum(-1, keepdim=True)
+        drawn.append(fragments)
+    return looks, drawn
+
+
+def _facing(
+    stretches: Sequence[Stretch], drawn: Sequence[Fragments], cameras: Sequence[OrbitCamera], min_cosine: float
+) -> Bool[Tensor, "t h w 1"]:
+    """Which pixels of every frame see the surface at a better cosine."""
+    places = torch.stack([camera.position() for camera in cameras])[:, None, None]
+    facing = []
+    for stretch, fragments in zip(stretches, drawn, strict=True):
+        faces, moved = stretch.mesh.faces, stretch.mesh.vertices + stretch.offsets
+        here, places = places[: len(moved)].to(moved), places[len(moved) :]
+        normals = torch.stack([vertex_normals(state, faces) for state in moved])
+        rays = normalize(here - spread(fragments, faces, moved), dim=-1)
+        cosines = (rays * normalize(spread(fragments, faces, normals), dim=-1)).sum(-1, keepdim=True)
         facing.append((fragments.faces >= 0)[..., None] & (cosines > min_cosine))
-    return looks, torch.cat(facing)
+    return torch.cat(facing)
 
 
 def _of_view(fragments: Fragments, view: int) -> Fragments:

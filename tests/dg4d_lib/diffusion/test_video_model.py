@@ -1,12 +1,14 @@
 import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from PIL import Image
 from tiny_svd import SCHEDULE, save_tiny_svd, tiny_svd
 
-from dg4d_lib.diffusion import batching
+from dg4d_lib.diffusion import batching, video_model
 from dg4d_lib.diffusion.one_token import OneToken
 from dg4d_lib.diffusion.video_model import VideoModel, clean, karras_sigmas, start_index
 from dg4d_lib.errors import BadInput
@@ -129,6 +131,33 @@ def test_where_memory_runs_out_less_is_done_at_once_and_said(
     assert any("memory ran out with 2 videos" in note for note in tight.notes())
     assert not model.notes()
     assert batching.is_out_of_memory(torch.OutOfMemoryError("no room"))
+
+
+def test_a_budget_says_how_much_goes_through_at_once(
+    folder: Path, pixels: torch.Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In float32, of what is left: two frames to the encoder, one to the decoder, three videos to the network."""
+    model = VideoModel.load(folder, VideoModelSettings(steps=STEPS, memory_gb=6, videos_at_once=9), CPU)
+    weights = [part.parameters() for part in (model.unet, model.vae, model.image_encoder)]
+    taken = sum(4 * value.numel() for part in weights for value in part) / 2**30
+    picture = 4 * SIDE**2 / 1e6
+    monkeypatch.setattr(video_model, "OUTSIDE_GB", 6 - taken - 1)
+    monkeypatch.setattr(video_model, "ENCODER_GB", 0.4 / picture)
+    monkeypatch.setattr(video_model, "DECODER_GB", 0.7 / picture)
+    monkeypatch.setattr(video_model, "UNET_GB", 0.3 / picture / FRAMES)
+    frugal = VideoModel(model.unet, model.vae, model.image_encoder, model.settings, CPU)
+    counts: dict[str, list[int]] = {"encode": [], "decode": [], "unet": []}
+
+    def counting(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda given, *rest, **named: (counts[name].append(len(given)), function(given, *rest, **named))[1]
+
+    for name in ("encode", "decode"):
+        monkeypatch.setattr(model.vae, name, counting(name, getattr(model.vae, name)))
+    monkeypatch.setattr(model.unet, "forward", counting("unet", model.unet.forward))
+    frugal.encode(pixels.expand(5, -1, -1, -1) / 255)
+    assert counts["encode"] == [2, 2, 1]
+    generated(frugal, pixels / 255, 1, 2)
+    assert counts["decode"] == [1] * 2 * FRAMES and counts["unet"] == [3, 1] * STEPS
 
 
 def test_in_half_precision_the_encoder_alone_is_wider_and_its_weights_are_never_copied(

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from dg4d_lib.errors import FitDiverged
-from dg4d_lib.fitting.losses import Diverged, check_finite, reference_loss, resized
+from dg4d_lib.fitting.losses import Diverged, finite_numbers, reference_loss, resized
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.rasterizer.interface import Rendering
 
@@ -36,11 +36,14 @@ def test_structural_similarity_counts_when_it_has_a_weight():
     assert rendering.color.grad is not None and rendering.color.grad.abs().sum() > 0
 
 
-def test_a_gradient_that_is_no_number_stops_the_fit():
+@pytest.mark.parametrize("broken", [torch.inf, torch.nan])
+def test_a_gradient_that_is_no_number_stops_the_fit(broken):
     cloud = blob(9, 0.5, torch.Generator().manual_seed(0))
-    check_finite("fit", "gradient", [None, torch.zeros(3)], "iteration 1 of 2", "rest", cloud)
-    broken = torch.tensor([1.0, torch.inf])
-    with pytest.raises(FitDiverged, match="fit: the gradient became inf at iteration 1 of 2; rest") as caught:
-        check_finite("fit", "gradient", [None, broken], "iteration 1 of 2", "rest", cloud)
+    losses = {"loss": torch.tensor(2.5), "reference": torch.tensor(1.0)}
+    numbers = finite_numbers("fit", losses, [None, torch.zeros(3)], "iteration 1 of 2", "rest", cloud)
+    assert numbers == {"loss": 2.5, "reference": 1.0}
+    slopes = [None, torch.zeros(4), torch.tensor([1.0, broken])]
+    with pytest.raises(FitDiverged, match=f"fit: the gradient became {broken} at iteration 1 of 2; rest") as caught:
+        finite_numbers("fit", losses, slopes, "iteration 1 of 2", "rest", cloud)
     assert isinstance(caught.value, Diverged)
     assert len(caught.value.gaussians) == 9
