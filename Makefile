@@ -4,10 +4,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 ARITHMETIC ?= fast
-GSPLAT := $(BIN)/python -m tests.gsplat_on_cpu.build --arithmetic $(ARITHMETIC)
-GPU_TESTS := $(BIN)/python -m pytest -p tests.gsplat_on_cpu.plugin --arithmetic $(ARITHMETIC) -m gpu tests/dg4d_lib/rasterizer tests/dg4d_lib/fitting
+EMULATION := $(BIN)/python -m tests.emulation.build --arithmetic $(ARITHMETIC)
+GPU_TESTS := $(BIN)/python -m pytest -p tests.emulation.plugin --arithmetic $(ARITHMETIC) -m gpu
 
-.PHONY: setup clients demo test check audit gsplat examples clean
+.PHONY: setup clients demo test check audit emulation examples clean
 
 setup: $(VENV)/.ready
 
@@ -26,7 +26,7 @@ clients: setup
 test: setup clients check
 	-$(MAKE) --no-print-directory audit
 	$(BIN)/python -m pytest -n 2 --dist loadscope --jaxtyping-packages=dg4d_lib,beartype.beartype\(conf=beartype.BeartypeConf\(is_pep484_tower=True\)\)
-	$(GSPLAT); case $$? in 0) $(GPU_TESTS);; 69) ;; *) exit 1;; esac
+	$(EMULATION); case $$? in 0) $(GPU_TESTS);; 69) ;; *) exit 1;; esac
 
 check: setup
 	$(BIN)/ruff format --check .
@@ -41,9 +41,9 @@ out/audit/bin/pip-audit: $(VENV)/.ready
 audit: setup out/audit/bin/pip-audit
 	timeout 300 out/audit/bin/pip-audit -r constraints.txt --no-deps --disable-pip -f json --progress-spinner off | $(BIN)/python deploy/audit.py
 
-# the tests marked gpu on gsplat's own kernels, compiled for the processor; ARITHMETIC=noise rounds as badly as CUDA may
-gsplat: setup
-	$(GSPLAT)
+# the tests marked gpu on an emulated one, with gsplat's own kernels; ARITHMETIC=noise rounds as badly as CUDA may
+emulation: setup
+	$(EMULATION)
 	$(GPU_TESTS)
 
 examples: setup

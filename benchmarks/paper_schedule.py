@@ -13,6 +13,7 @@ say nothing. Columns:
 `outside`  share of the time that no network was at work: drawing, losses, optimizers
 """
 
+import gc
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -185,6 +186,7 @@ class Schedule:
     def measured(self, stage: str, clock: Clock, work: Callable[[], Any]) -> tuple[Row, Any]:
         on_gpu = self.device.type == "cuda"
         if on_gpu:
+            gc.collect()  # what is counted and watched is part of a circle
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats(self.device)
         clock.seconds, start = 0.0, clock.now()

@@ -4,7 +4,12 @@ import os
 import shutil
 import signal
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
+
+from tests.emulation import gpu
 
 _HOME = Path(tempfile.mkdtemp(prefix="dg4d-tests-"))
 for _name in tuple(os.environ):
@@ -18,6 +23,15 @@ os.environ["DO_NOT_TRACK"] = "1"
 os.environ["PREFECT_SERVER_ANALYTICS_ENABLED"] = "false"
 os.environ["PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL"] = "CRITICAL"
 signal.signal(signal.SIGINT, signal.default_int_handler)  # shells have background jobs ignore it, with all they begin
+
+
+@pytest.fixture
+def emulated_gpu() -> Iterator[gpu.Emulated]:
+    """The GPU of `make emulation`, which counts; after the test it has memory again."""
+    if gpu.present is None:
+        pytest.skip("asks an emulated GPU, which `make emulation` has")
+    yield gpu.present
+    gpu.present.has_memory()
 
 
 def pytest_unconfigure() -> None:

@@ -4,8 +4,12 @@ import importlib
 from pathlib import Path
 
 import pytest
+import torch
 
 import benchmarks
+from benchmarks.paper_schedule import QUICK, Schedule, Sizes
+from dg4d_lib.rasterizer.interface import device_of
+from steps.profiles import profile, revise
 
 NAMES = sorted(path.stem for path in Path(benchmarks.__path__[0]).glob("[!_]*.py"))
 
@@ -15,3 +19,13 @@ def test_a_benchmark_finds_what_it_uses(name: str) -> None:
     module = importlib.import_module(f"benchmarks.{name}")
     source = Path(str(module.__file__)).read_text(encoding="utf-8")
     assert ('__name__ == "__main__"' in source) == hasattr(module, "main")
+
+
+@pytest.mark.gpu
+@pytest.mark.filterwarnings("ignore:There are modules in")
+def test_the_paper_schedule_is_measured_stage_by_stage() -> None:
+    device = device_of("auto")
+    rows = list(Schedule(revise(profile("paper"), QUICK), Sizes(), device).rows())
+    assert [row.stage for row in rows] == ["video", "static", "dynamic", "refinement"]
+    assert all(row.tflop > 0 and 0 < row.outside_networks < 1 for row in rows)
+    assert all(bool(row.peak_gib) == torch.cuda.is_available() for row in rows)

@@ -1,4 +1,4 @@
-"""Every trained profile by the real steps on a processor: tiny random weights in the real formats, small numbers."""
+"""Every trained profile by the real steps: tiny random weights in the real formats, small numbers, on a GPU too."""
 
 import json
 import zipfile
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from media_files import save, save_zip, walk
 from pydantic import BaseModel
 from tiny_imagedream import write_imagedream, write_lgm
@@ -65,6 +66,7 @@ TINY: dict[str, Any] = {
     "pack.sheet_size": 32,
     "pack.sheet_frames": 2,
 }
+OF_MODELS = ("driving.height", "driving.width", "driving.model", "refiner")
 WRITERS = {
     "zero123-xl": write_zero123,
     "stable-zero123": write_zero123,
@@ -85,8 +87,12 @@ class Run:
     records: list[ProvenanceRecord] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        started_by_model = profile(self.profile).static.start == "lgm"
-        self.settings = revise(profile(self.profile), {**TINY, **({"static.lgm.steps": 2} if started_by_model else {})})
+        changes = dict(TINY)
+        if self.profile == "preview":  # its stages have no models
+            changes = {key: value for key, value in TINY.items() if not key.startswith(OF_MODELS)}
+        if profile(self.profile).static.start == "lgm":
+            changes["static.lgm.steps"] = 2
+        self.settings = revise(profile(self.profile), changes)
 
     def step(self, name: str, inputs: Mapping[str, ArtifactRef | None], settings: BaseModel) -> dict[str, ArtifactRef]:
         tree = settings.model_dump(mode="json")
@@ -157,6 +163,7 @@ def source_of(folder: Path, store: ArtifactStore, moving: bool) -> ArtifactRef:
 
 
 @pytest.mark.slow
+@pytest.mark.gpu
 @pytest.mark.parametrize(
     ("name", "moving", "used"),
     [
@@ -180,6 +187,7 @@ def test_a_file_becomes_a_package_by_the_models_that_its_profile_names_and_no_ot
         assert record.licenses == {each: str(KNOWN[each].license) for each in named}, record.step
         assert {file.partition("/")[0] for file in record.weights} == named, record.step
         assert bool(record.flops) == bool(named) and all(count > 1e6 for count in record.flops.values()), record.step
+        assert ("gpu" in record.machine) == torch.cuda.is_available()
 
     said = run.notes()
     assert f"prior: Zero-1-to-3, weights {prior}" in said
@@ -197,6 +205,17 @@ def test_a_file_becomes_a_package_by_the_models_that_its_profile_names_and_no_ot
         *(f"{MESHES}/{frame:03d}.glb" for frame in range(FRAMES * per_frame)),
     }
     assert manifest["frames"] == FRAMES and set(said) <= set(manifest["notes"])
+
+
+@pytest.mark.gpu
+def test_the_preview_draws_wherever_there_is_a_device(tmp_path: Path) -> None:
+    """Its prior is the processor's everywhere."""
+    run = Run("preview", ArtifactStore(tmp_path / "store"))
+    with zipfile.ZipFile(run.make(source_of(tmp_path, run.store, moving=False))) as files:
+        assert files.read(ASSET).startswith(b"glTF")
+    assert not any(record.weights or record.flops for record in run.records)
+    assert all(("gpu" in record.machine) == torch.cuda.is_available() for record in run.records)
+    assert any("no model" in note for note in run.notes())
 
 
 @pytest.mark.parametrize("name", PROFILES)

@@ -1,11 +1,16 @@
 """Fits run where their cloud lies.
 
 Without a GPU: on torch's `meta` device tensors have shapes and no numbers, and an operation on tensors of two devices
-is refused, so what makes a tensor on the processor by accident is caught. With one: the fits themselves.
+is refused, so what makes a tensor on the processor by accident is caught. With one: the fits themselves, and how often
+they wait for it.
 """
+
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
+from tiny_weights import write_zero123
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.framewise import Framewise
@@ -18,10 +23,13 @@ from dg4d_lib.fitting.motion import bounds_of, fit_motion
 from dg4d_lib.fitting.static import fit_gaussians
 from dg4d_lib.gaussians.growth import ScreenGradients, reset_opacity
 from dg4d_lib.gaussians.initialize import blob, isotropic, on_surface
+from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.zero123 import ConditionedZero123, Zero123
 from dg4d_lib.rasterizer.interface import Rasterizer, Rendering, choose_rasterizer, device_of
-from dg4d_lib.settings import HexPlaneSettings, MlpSettings
+from dg4d_lib.settings import HexPlaneSettings, MlpSettings, MotionSettings, StaticSettings, Zero123PriorSettings
 from dg4d_lib.video.driving import DrivingVideo
+from tests.emulation.gpu import Emulated
 
 META = torch.device("meta")
 COUNT, FRAMES = 30, 4
@@ -127,3 +135,62 @@ def test_the_motion_fit_on_a_gpu_ends_where_the_processor_ends(kind, known, moti
         ends[place] = sum(losses[-10:]) / 10
         assert ends[place] < 0.5 * losses[0]
     assert ends["there"] == pytest.approx(ends["here"], rel=0.2)
+
+
+@pytest.fixture
+def on_gpu(known, emulated_gpu: Emulated, tmp_path: Path) -> ConditionedZero123:
+    """A tiny Zero-1-to-3 that knows the video."""
+    model = Zero123.load(write_zero123(tmp_path / "zero123"), Zero123PriorSettings(), device_of("cuda_gsplat"))
+    return model.conditioned_on(known.video().frames, Annealing(0.98))
+
+
+def waits_of_an_iteration(gpu: Emulated, fit: Callable[[Callable[..., None]], object]) -> dict[str, int]:
+    """What the fourth iteration waits for: by then all is there that is made once."""
+    counts = []
+    fit(lambda *_: counts.append(gpu.waits))
+    return dict(counts[3] - counts[2])
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("fit", ["static", "motion"])
+def test_an_iteration_waits_for_the_gpu_where_it_draws_and_for_its_losses_only(
+    fit: str, known, static_settings: StaticSettings, motion_settings: MotionSettings, emulated_gpu, on_gpu
+) -> None:
+    """Two drawings: are the Gaussians finite, and how many of gsplat's tiles are touched. Then all losses at once."""
+    draw, device = choose_rasterizer("cuda_gsplat"), device_of("cuda_gsplat")
+    cloud, few = known.gaussians.to(device), {"iterations": 4}
+
+    def run(report: Callable[..., None]) -> None:
+        if fit == "static":
+            settings = static_settings.model_copy(update=few)
+            fit_gaussians(cloud, known.subject(), on_gpu, draw, settings, seed(), report)
+        else:
+            settings = motion_settings.model_copy(update=few)
+            deformation = DEFORMATIONS["hexplane"](bounds_of(known.gaussians)).to(device)
+            fit_motion(cloud, deformation, known.video(), on_gpu, draw, settings, seed(), report)
+
+    waits = waits_of_an_iteration(emulated_gpu, run)
+    assert waits == {"aten::_local_scalar_dense": 4, "copy from the device": 1}
+
+
+@pytest.mark.gpu
+def test_a_batch_that_does_not_fit_into_the_memory_of_a_gpu_is_halved(emulated_gpu: Emulated, on_gpu) -> None:
+    """The loss of four views takes more than a quarter above that of one; the gradient is the same in pieces."""
+    views = [View(OrbitCamera(azimuth_deg=90.0 * i), 0) for i in range(4)]
+    pictures = torch.rand(4, 64, 64, 3, generator=seed()).to(device_of("cuda_gsplat"))
+
+    def gradient(count: int) -> torch.Tensor:
+        seen = pictures[:count].clone().requires_grad_()
+        on_gpu.loss(seen, seen[..., :1].detach(), views[:count], 0.5, seed()).backward()
+        return seen.grad
+
+    peaks = []
+    for count in (1, 4):
+        emulated_gpu.has_memory()
+        whole = gradient(count)
+        peaks.append(emulated_gpu.peak)
+    assert not on_gpu.batches.notes()
+    emulated_gpu.has_memory((peaks[0] + peaks[1]) // 2)
+    halved = gradient(4)
+    assert on_gpu.batches.notes() and on_gpu.batches.size < 4
+    torch.testing.assert_close(halved, whole, rtol=0.02, atol=1e-3 * float(whole.abs().max()))  # half precision

@@ -1,7 +1,8 @@
-"""Compiles gsplat's CUDA kernels for the processor: `python -m tests.gsplat_on_cpu.build`, which `make gsplat` calls.
+"""Compiles a GPU and gsplat's kernels for the processor: `python -m tests.emulation.build`, called by `make emulation`.
 
-The sources are those of the wheel that `constraints.txt` names. What no C++ compiler reads of them is rewritten here,
-`emulation.h` gives the rest a meaning; only what the adapter calls is compiled. Everything lies in `out/gsplat`.
+The GPU is `device.cpp`. The kernels are those of the wheel that `constraints.txt` names: what no C++ compiler reads of
+their sources is rewritten here, `emulation.h` gives the rest a meaning; only what the adapter calls is compiled.
+Everything lies in `out/emulation`.
 """
 
 import argparse
@@ -21,11 +22,13 @@ from typing import NoReturn
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
-OUT = ROOT / "out" / "gsplat"
+OUT = ROOT / "out" / "emulation"
 PACKAGES = OUT / "packages"  # the unpacked wheel
 SOURCES = OUT / "sources"  # rewritten
 TORCH = Path(str(distribution("torch").locate_file("torch")))
-LIBRARIES = ("torch_python", "torch", "torch_cpu", "c10")
+DEVICE_LIBRARIES = ("torch", "torch_cpu", "c10")
+LIBRARIES = ("torch_python", *DEVICE_LIBRARIES)
+OURS = ("device.cpp", "emulation.h", "fibers.cpp")
 LACKING = 69  # exit status: something is not here
 DIGEST = "515a3773641f5e7f7717acab6276c0b1d6dbcad087b7968ca653337c3189a982"  # of the wheel that is rewritten, SHA-256
 
@@ -62,7 +65,6 @@ OPERATORS = (
 LAUNCH = r"(\w+(?:<[^<>;(){}]*>)?)\s*<<<([^<>]*)>>>\("
 LAUNCHED = r"emulation::launch(\2, [](auto... given) { \1(given...); }, "
 REWRITTEN = (  # file, pattern, replacement, how often
-    ("include/Common.h", r"TORCH_CHECK\(x\.is_cuda\(\).*\)$", "", 1),
     *((f"csrc/{name}", LAUNCH, LAUNCHED, 1 if "Pixels" in name else 2) for name in KERNELS),
     *(
         (f"csrc/RasterizeToPixels3DGS{way}.cu", pattern, replacement, times)
@@ -112,10 +114,15 @@ def library(arithmetic: str) -> Path:
     return OUT / arithmetic / "csrc.so"
 
 
+def device(arithmetic: str) -> Path:
+    """Where the compiled GPU lies."""
+    return library(arithmetic).with_name("device.so")
+
+
 def build(arithmetic: str) -> None:
     """Fetch, rewrite and compile, unless the library was made of the same."""
-    command, target = compiler(arithmetic), library(arithmetic)
-    made_of, record = everything(command), target.with_suffix(".made_of")
+    command, options, target = compiler(), kernel_options(arithmetic), library(arithmetic)
+    made_of, record = everything([*command, *options]), target.with_suffix(".made_of")
     if target.exists() and PACKAGES.exists() and record.exists() and record.read_text() == made_of:
         return say(f"{target.relative_to(ROOT)} is there")
     start = time.monotonic()
@@ -123,30 +130,35 @@ def build(arithmetic: str) -> None:
     record.unlink(missing_ok=True)
     fetch()
     rewrite()
-    compile_kernels(command, target)
+    compile_all(command, options, target.parent)
     record.write_text(made_of)
     return say(f"{target.relative_to(ROOT)} is made, {time.monotonic() - start:.0f} s")
 
 
-def compiler(arithmetic: str) -> list[str]:
+def compiler() -> list[str]:
     """The command that compiles, without its files."""
     if platform.machine() not in ("x86_64", "AMD64"):
         lacking(f"the emulation is written for x86-64, and this is {platform.machine()}")
+    if (TORCH / "lib" / "libtorch_cuda.so").exists():
+        lacking("torch is its build for CUDA, which has devices of its own: python -m pytest -m gpu runs on a GPU")
     found = shutil.which("g++")
     if found is None:
         lacking("g++ is not here (Debian: apt-get install g++)")
     python = Path(sysconfig.get_paths()["include"])
     if not (python / "Python.h").is_file():
         lacking(f"Python's headers are not in {python} (Debian: apt-get install python3-dev)")
-    ours = (SOURCES / "headers", SOURCES / "include", SOURCES, SOURCES / "csrc" / "third_party" / "glm")
-    theirs = (TORCH / "include", python)
-    places = [*(f"-I{path}" for path in ours), *(f"-isystem{path}" for path in theirs)]
-    return [found, *FLAGS, *ARITHMETICS[arithmetic], *places, "-include", str(HERE / "emulation.h")]
+    return [found, *FLAGS, *(f"-isystem{path}" for path in (TORCH / "include", python))]
+
+
+def kernel_options(arithmetic: str) -> list[str]:
+    """What the kernels' sources are compiled with besides."""
+    places = (SOURCES / "headers", SOURCES / "include", SOURCES, SOURCES / "csrc" / "third_party" / "glm")
+    return [*ARITHMETICS[arithmetic], *(f"-I{path}" for path in places), "-include", str(HERE / "emulation.h")]
 
 
 def everything(command: Sequence[str]) -> str:
     """A digest of what a library is made of."""
-    files = (Path(__file__), HERE / "emulation.h", HERE / "emulation.cpp", ROOT / "constraints.txt")
+    files = (Path(__file__), *(HERE / name for name in OURS), ROOT / "constraints.txt")
     parts = [*(path.read_text() for path in files), distribution("torch").version, *command]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
@@ -164,8 +176,8 @@ def fetch() -> None:
             lacking(f"pip could not fetch {wheel.name} (see above); it takes the network, or a package index")
     if hashlib.sha256(wheel.read_bytes()).hexdigest() != DIGEST:
         sys.exit(
-            f"gsplat: {wheel} is not the wheel whose sources are known here. If constraints.txt names another version, "
-            f"give its digest in {Path(__file__).name}; if not, delete the file"
+            f"emulation: {wheel} is not the wheel whose sources are known here. If constraints.txt names another "
+            f"version, give its digest in {Path(__file__).name}; if not, delete the file"
         )
     shutil.rmtree(PACKAGES, ignore_errors=True)
     with zipfile.ZipFile(wheel) as archive:
@@ -181,7 +193,9 @@ def rewrite() -> None:
         known = source.read_text() if source.exists() else ""
         text, found = re.subn(pattern, replacement, known, flags=re.MULTILINE)
         if found != times:
-            sys.exit(f"gsplat: {name} has {found} places like {pattern}, where {times} were known: look what changed")
+            sys.exit(
+                f"emulation: {name} has {found} places like {pattern}, where {times} were known: look what changed"
+            )
         source.write_text(text)
     for name, text in HEADERS.items():
         header = SOURCES / "headers" / name
@@ -197,24 +211,29 @@ def including(names: Sequence[str]) -> str:
     return "".join(f'#include "csrc/{name}"\n' for name in names)
 
 
-def compile_kernels(command: Sequence[str], target: Path) -> None:
-    """All sources side by side, then the library."""
-    say("compiling, half a minute on two cores")
-    sources = (SOURCES / "callers.cpp", SOURCES / "kernels.cpp", HERE / "emulation.cpp")
-    objects = [target.parent / f"{source.stem}.o" for source in sources]
-    jobs = [
-        subprocess.Popen([*command, "-c", str(source), "-o", str(made)])
-        for source, made in zip(sources, objects, strict=True)
-    ]
-    if any([job.wait() for job in jobs]):
-        sys.exit("gsplat: g++ could not compile its sources; the errors stand above")
-    libraries = [f"-L{TORCH / 'lib'}", f"-Wl,-rpath,{TORCH / 'lib'}", *(f"-l{name}" for name in LIBRARIES)]
+def compile_all(command: Sequence[str], options: Sequence[str], target: Path) -> None:
+    """All sources side by side, then the libraries."""
+    say("compiling, three quarters of a minute on two cores")
+    kernels = [SOURCES / "callers.cpp", SOURCES / "kernels.cpp", HERE / "fibers.cpp"]
+    jobs = {
+        source: subprocess.Popen([*command, *given, "-c", str(source), "-o", str(target / f"{source.stem}.o")])
+        for given, sources in ((options, kernels), ((), [HERE / "device.cpp"]))
+        for source in sources
+    }
+    if any([job.wait() for job in jobs.values()]):
+        sys.exit("emulation: g++ could not compile its sources; the errors stand above")
     # what is not compiled is looked for when it is called, which nothing does
-    linked = subprocess.run(
-        [command[0], "-shared", "-Wl,-z,lazy", "-o", str(target), *map(str, objects), *libraries], check=False
-    )
+    link(target / "csrc.so", kernels, LIBRARIES, "-Wl,-z,lazy")
+    link(target / "device.so", [HERE / "device.cpp"], DEVICE_LIBRARIES)
+
+
+def link(library: Path, sources: Sequence[Path], names: Sequence[str], *options: str) -> None:
+    """A shared library of what was compiled from some sources."""
+    objects = [str(library.with_name(f"{source.stem}.o")) for source in sources]
+    libraries = [f"-L{TORCH / 'lib'}", f"-Wl,-rpath,{TORCH / 'lib'}", *(f"-l{name}" for name in names)]
+    linked = subprocess.run(["g++", "-shared", *options, "-o", str(library), *objects, *libraries], check=False)
     if linked.returncode:
-        sys.exit("gsplat: the library could not be linked; the errors stand above")
+        sys.exit(f"emulation: {library.name} could not be linked; the errors stand above")
 
 
 def lacking(what: str) -> NoReturn:
@@ -225,7 +244,7 @@ def lacking(what: str) -> NoReturn:
 
 def say(text: str) -> None:
     """A line of progress."""
-    sys.stdout.write(f"gsplat: {text}\n")
+    sys.stdout.write(f"emulation: {text}\n")
     sys.stdout.flush()
 
 

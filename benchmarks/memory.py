@@ -1,0 +1,121 @@
+"""GPU memory that goes with what passes through the large networks, against what is planned for it.
+
+Run with `python -m benchmarks.memory` on a machine with a CUDA device, or as `python -m tests.emulation.gpu
+benchmarks.memory` with an emulated one, which does not know what kernels take for themselves (five minutes, 12 GB;
+`--quick`: tiny networks; `--json FILE` keeps the rows). Networks of the published sizes, random weights, half precision
+but for SVD's encoder; pictures of 256 x 256. Columns:
+
+`GiB`      at most, weights included
+`each`     MiB that every item adds
+`planned`  MiB that the micro-batches count for it; the plan has to be the larger number
+"""
+
+import gc
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from benchmarks.measure import machine, new_console, parser_of, write_rows  # before torch: how its threads wait
+
+import torch  # isort: skip
+from diffusers.utils import logging
+from rich.table import Column, Table
+
+from benchmarks.paper_schedule import FULL, GIB, Clock, Schedule, Sizes, seeded
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.diffusion.video_model import DECODER_GB, ENCODER_GB, UNET_GB
+from dg4d_lib.guidance.distillation import Annealing
+from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.zero123 import SIZE, VIEW_GB
+from dg4d_lib.settings import SvdSettings, Zero123PriorSettings
+from steps.profiles import profile
+
+FRAMES, VIEWS = 14, 4
+MEGAPIXELS = SIZE * SIZE / 1e6
+
+
+@dataclass(frozen=True)
+class Row:
+    """One passage of some items; without a plan where only the weights are there."""
+
+    passage: str
+    items: int
+    peak_gib: float
+    each_mib: float | None = None
+    planned_mib: float | None = None
+
+
+def rows(sizes: Sizes, device: torch.device) -> Iterator[Row]:
+    """Both networks, weights first."""
+    settings = profile("paper")
+    schedule = Schedule(settings, sizes, device)
+    prior_settings, driving = settings.prior, settings.driving
+    assert isinstance(prior_settings, Zero123PriorSettings) and isinstance(driving, SvdSettings)
+
+    model = schedule.zero123(prior_settings)
+    prior = model.conditioned_on(torch.ones(1, SIZE, SIZE, 3), Annealing(settings.static.noise_start))
+    yield Row("Zero-1-to-3", 0, peak_of(lambda: None)[1])
+    pictures = torch.rand(VIEWS, SIZE, SIZE, 3, generator=seeded()).to(device).requires_grad_()
+    views = [View(OrbitCamera(azimuth_deg=90.0 * i), 0) for i in range(VIEWS)]
+    yield row("views, there and back", VIEWS, VIEW_GB[prior_settings.precision], lambda: judged(prior, pictures, views))
+    del model, prior
+
+    video_model = schedule.video_model(driving.model, Clock(device))
+    yield Row("SVD", 0, peak_of(lambda: None)[1])
+    condition = video_model.look_at(torch.rand(SIZE, SIZE, 3, generator=seeded()), [seeded()])
+    video = torch.rand(FRAMES, SIZE, SIZE, 3, generator=seeded()).to(device)
+    encoder, decoder = 4 * ENCODER_GB, 2 * DECODER_GB  # bytes of a number: the encoder overflows in half precision
+    yield row("frames, encoded", FRAMES, encoder * MEGAPIXELS, lambda: video_model.encode(video))
+    noise = video_model.noise(video_model.blank(1, FRAMES, SIZE, SIZE), [seeded()])
+    half = 2 * UNET_GB * MEGAPIXELS * FRAMES
+    yield row("videos, with and without the picture", 2, half, lambda: video_model.denoise(noise, condition, (9, 3)))
+    yield row("frames, decoded", FRAMES, decoder * MEGAPIXELS, lambda: video_model.decode(noise[0]))
+
+
+def judged(prior: Any, pictures: torch.Tensor, views: list[View]) -> None:
+    """The loss and its gradient."""
+    prior.loss(pictures, pictures[..., :1].detach(), views, 0.5, seeded()).backward()
+
+
+def row(passage: str, items: int, planned_gb: float, work: Callable[[], Any]) -> Row:
+    """What a passage takes; all of its items go at once."""
+    before, peak = peak_of(work)
+    return Row(passage, items, peak, (peak - before) / items * 1024, planned_gb * 1024)
+
+
+def peak_of(work: Callable[[], Any]) -> tuple[float, float]:
+    """GiB before, and at most."""
+    gc.collect()  # networks that are counted are part of a circle
+    torch.cuda.empty_cache()
+    torch.cuda.reset_peak_memory_stats()
+    before = torch.cuda.max_memory_allocated() / GIB
+    work()
+    return before, torch.cuda.max_memory_allocated() / GIB
+
+
+def main() -> None:
+    parser = parser_of(__doc__, "tiny networks")
+    options = parser.parse_args()
+    if not torch.cuda.is_available():
+        parser.error("there is no CUDA device here; python -m tests.emulation.gpu benchmarks.memory emulates one")
+    logging.set_verbosity_error()  # it is no mistake to cast a network
+    console = new_console()
+    console.print(f"{torch.cuda.get_device_name()}; {machine()}; torch {torch.__version__}")
+    found = list(rows(Sizes() if options.quick else FULL, torch.device("cuda")))
+    console.print(table(found))
+    if options.json:
+        write_rows(options.json, found)
+
+
+def table(rows: list[Row]) -> Table:
+    """Rows as they are printed."""
+    result = Table(Column("passage", no_wrap=True), "items", "GiB", "each", "planned")
+    for row in rows:
+        numbers = (row.each_mib, row.planned_mib)
+        cells = ("-" if number is None else f"{number:.0f}" for number in numbers)
+        result.add_row(row.passage, str(row.items or "-"), f"{row.peak_gib:.2f}", *cells)
+    return result
+
+
+if __name__ == "__main__":
+    main()
