@@ -18,21 +18,24 @@ from flows.serving.pools import DEPLOYMENTS, Json, Pool, read_deployments
 from flows.serving.workers import HEARTBEAT_S
 
 MISSED = 3  # heartbeats, before a run is taken for dead
-LONGEST = timedelta(days=7)  # of a run that is begun again when it died
-ALIVE = "prefect.flow-run.heartbeat"  # of runs of deployments; those of commands have none
-ENDINGS = {f"prefect.flow-run.{ending}" for ending in ("Completed", "Failed", "Cancelled", "Crashed")}
+SAID_S = 10  # after a process died; by then its worker has said so, which workers of processes do twice
+ALIVE = "prefect.flow-run.heartbeat"
+CRASHED = "prefect.flow-run.Crashed"
+ENDINGS = {f"prefect.flow-run.{ending}" for ending in ("Completed", "Failed", "Cancelled")}
+BEGINNINGS = {f"prefect.flow-run.{beginning}" for beginning in ("AwaitingRetry", "Scheduled", "Pending", "Running")}
 
 
-def _trigger(expect: set[str], posture: Posture, within: timedelta) -> EventTrigger:
-    """What happens, or does not, to a run that was alive."""
+def _trigger(after: str, expect: set[str], within_s: float) -> EventTrigger:
+    """What does not happen to the run of a deployment, which nobody watches, after something else did."""
     return EventTrigger(
-        after={ALIVE},
+        after={after},
         expect=expect,
         match=ResourceSpecification({"prefect.resource.id": ["prefect.flow-run.*"]}),
+        match_related=ResourceSpecification({"prefect.resource.role": ["deployment"]}),
         for_each={"prefect.resource.id"},
-        posture=posture,
+        posture=Posture.Proactive,
         threshold=1,
-        within=within,
+        within=timedelta(seconds=within_s),
     )
 
 
@@ -40,7 +43,7 @@ AUTOMATIONS = (
     AutomationCore(
         name="dg4d: runs whose process died",
         description="A worker or a whole machine that dies reports nothing; its runs would stay Running for ever.",
-        trigger=_trigger({ALIVE, *ENDINGS}, Posture.Proactive, timedelta(seconds=MISSED * HEARTBEAT_S)),
+        trigger=_trigger(ALIVE, {ALIVE, CRASHED, *ENDINGS}, MISSED * HEARTBEAT_S),
         actions=[
             ChangeFlowRunState(
                 state=StateType.CRASHED,
@@ -52,7 +55,7 @@ AUTOMATIONS = (
     AutomationCore(
         name="dg4d: runs that died go on",
         description="After their last finished step, on any worker; a run that dies again and again fails.",
-        trigger=_trigger({"prefect.flow-run.Crashed"}, Posture.Reactive, LONGEST),
+        trigger=_trigger(CRASHED, BEGINNINGS | ENDINGS, SAID_S),
         actions=[ChangeFlowRunState(state=StateType.SCHEDULED, name="AwaitingRetry", message="its process died")],
     ),
 )
