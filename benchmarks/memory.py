@@ -10,7 +10,6 @@ but for SVD's encoder; pictures of 256 x 256. Columns:
 `planned`  MiB that the micro-batches count for it; the plan has to be the larger number
 """
 
-import gc
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -21,9 +20,9 @@ import torch  # isort: skip
 from diffusers.utils import logging
 from rich.table import Column, Table
 
-from benchmarks.paper_schedule import FULL, GIB, Clock, Schedule, Sizes, seeded
+from benchmarks.paper_schedule import FULL, Clock, Schedule, Sizes, forget_peak, seeded
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.diffusion.video_model import DECODER_GB, ENCODER_GB, UNET_GB
+from dg4d_lib.diffusion.video_model import DECODER_GB, ENCODER_GB, GIB, UNET_GB
 from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.interface import View
 from dg4d_lib.guidance.zero123 import SIZE, VIEW_GB
@@ -85,9 +84,7 @@ def row(passage: str, items: int, planned_gb: float, work: Callable[[], Any]) ->
 
 def peak_of(work: Callable[[], Any]) -> tuple[float, float]:
     """GiB before, and at most."""
-    gc.collect()  # networks that are counted are part of a circle
-    torch.cuda.empty_cache()
-    torch.cuda.reset_peak_memory_stats()
+    forget_peak()
     before = torch.cuda.max_memory_allocated() / GIB
     work()
     return before, torch.cuda.max_memory_allocated() / GIB

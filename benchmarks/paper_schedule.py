@@ -36,7 +36,7 @@ from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 from dg4d_lib.diffusion.ledger import counted, counting_flops
 from dg4d_lib.diffusion.one_token import shorten_attention
 from dg4d_lib.diffusion.parts import Placement, dtype_on, frozen
-from dg4d_lib.diffusion.video_model import VideoModel
+from dg4d_lib.diffusion.video_model import GIB, VideoModel
 from dg4d_lib.fitting.motion import fit_motion
 from dg4d_lib.fitting.static import fit_gaussians
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -62,7 +62,6 @@ from steps.motions import new_deformation
 from steps.profiles import PipelineSettings, profile, revise
 
 FLOORS_S = {"video": 1.2, "static": 9.1, "dynamic": 12.8, "refinement": 21.7}  # the profile's video is 512 x 512
-GIB = 2**30
 LADDER = [{"until": 1.0, "size": 32}]
 QUICK = {
     "driving.frames": 2,
@@ -186,9 +185,7 @@ class Schedule:
     def measured(self, stage: str, clock: Clock, work: Callable[[], Any]) -> tuple[Row, Any]:
         on_gpu = self.device.type == "cuda"
         if on_gpu:
-            gc.collect()  # what is counted and watched is part of a circle
-            torch.cuda.empty_cache()
-            torch.cuda.reset_peak_memory_stats(self.device)
+            forget_peak()
         clock.seconds, start = 0.0, clock.now()
         with counting_flops() as flops:
             made = work()
@@ -251,6 +248,13 @@ class Schedule:
         placement = Placement(self.device, dtype_on(self.device, precision), channels_last)
         with self.device:
             return counted(frozen(build().to(placement.dtype), placement))
+
+
+def forget_peak() -> None:
+    """What is held now is the most memory of the GPU so far."""
+    gc.collect()  # networks that are counted or watched are part of a circle
+    torch.cuda.empty_cache()
+    torch.cuda.reset_peak_memory_stats()
 
 
 def conditioned(

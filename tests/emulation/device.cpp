@@ -156,7 +156,23 @@ const std::set<std::string> TELLING{  // the processor has to know a result: a n
     "aten::repeat_interleave", "aten::_unique2", "aten::unique_dim", "aten::unique_consecutive"};
 const std::set<std::string> INDEXING{"aten::index", "aten::index_put_", "aten::index_put", "aten::_index_put_impl_"};
 
+// Puts others in the place of all tensors of an argument or a result.
+template <class Change> void change_tensors(IValue &value, Change change) {
+    if (value.isTensor()) {
+        value = change(value.toTensor());
+    } else if (value.isTensorList()) {
+        auto list = value.toTensorVector();
+        for (auto &t : list) t = change(t);
+        value = list;
+    } else if (value.isOptionalTensorList()) {
+        c10::List<optional<Tensor>> list;
+        for (const optional<Tensor> &t : value.toOptionalTensorVector()) list.push_back(t ? change(*t) : t);
+        value = list;
+    }
+}
+
 void compute(const c10::OperatorHandle &op, torch::jit::Stack *stack) {
+    at::AutoDispatchBelowADInplaceOrView below;
     const std::string &name = op.schema().name();
     std::vector<std::pair<Tensor, Tensor>> pairs;  // on the device, lent
     bool here = false, there = false, masked = false;
@@ -174,17 +190,8 @@ void compute(const c10::OperatorHandle &op, torch::jit::Stack *stack) {
     };
     size_t count = op.schema().arguments().size();
     for (auto value = stack->end() - count; value != stack->end(); ++value) {
-        if (value->isTensor()) {
-            *value = lend(value->toTensor());
-        } else if (value->isTensorList()) {
-            auto list = value->toTensorVector();
-            for (auto &t : list) t = lend(t);
-            *value = list;
-        } else if (value->isOptionalTensorList()) {
-            c10::List<optional<Tensor>> list;
-            for (const optional<Tensor> &t : value->toOptionalTensorVector()) list.push_back(t ? lend(*t) : t);
-            *value = list;
-        } else if (value->isDevice() && value->toDevice().is_cuda()) {
+        change_tensors(*value, lend);
+        if (value->isDevice() && value->toDevice().is_cuda()) {
             there = true;
             *value = PROCESSOR;
         } else if (value->isGenerator()) {
@@ -215,19 +222,7 @@ void compute(const c10::OperatorHandle &op, torch::jit::Stack *stack) {
         return adopted(t);
     };
     size_t results = op.schema().returns().size();
-    for (auto value = stack->end() - results; value != stack->end(); ++value) {
-        if (value->isTensor()) {
-            *value = hand_on(value->toTensor());
-        } else if (value->isTensorList()) {
-            auto list = value->toTensorVector();
-            for (auto &t : list) t = hand_on(t);
-            *value = list;
-        }
-    }
-}
-void compute_below(const c10::OperatorHandle &op, torch::jit::Stack *stack) {
-    at::AutoDispatchBelowADInplaceOrView below;
-    compute(op, stack);
+    for (auto value = stack->end() - results; value != stack->end(); ++value) change_tensors(*value, hand_on);
 }
 
 Tensor empty(SymIntArrayRef size, optional<at::ScalarType> dtype, optional<at::Layout>, optional<Device>,
@@ -305,12 +300,12 @@ const bool registered = [] {
         std::string full = toString(name).substr(6);
         bool known = op->hasKernelForDispatchKey(DispatchKey::CPU) || full == "convolution" || full == "convolution_backward";
         if (own.count(full) || !known) continue;
-        auto kernel = c10::KernelFunction::makeFromBoxedFunction<&compute_below>();
+        auto kernel = c10::KernelFunction::makeFromBoxedFunction<&compute>();
         kept.push_back(dispatcher.registerImpl(name, DispatchKey::CUDA, kernel, std::nullopt, nullptr, "emulation"));
     }
     return true;
 }();
-TORCH_LIBRARY_IMPL(_, CUDA, m) { m.fallback(torch::CppFunction::makeFromBoxedFunction<&compute_below>()); }
+TORCH_LIBRARY_IMPL(_, CUDA, m) { m.fallback(torch::CppFunction::makeFromBoxedFunction<&compute>()); }
 TORCH_LIBRARY_IMPL(aten, CUDA, m) {
     m.impl("empty.memory_format", &empty);
     m.impl("empty_strided", &empty_strided);
