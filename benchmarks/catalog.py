@@ -40,6 +40,7 @@ from flows.inputs.manifest import Item, items_of
 from flows.inputs.orders import Order
 from flows.packages import summary
 from flows.packages.publish import RECORD, Files, publish
+from flows.serving.auth import auth_string
 from flows.serving.server import HOST, SETTINGS, answers
 
 DATABASES = ("sqlite", "postgresql")
@@ -206,12 +207,15 @@ def draw(path: Path, number: int) -> None:
 def environment(folder: Path) -> dict[str, str]:
     """Of the batch and its server, without what the caller's shell says about others."""
     inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PREFECT_", "DG4D_"))}
+    secret = auth_string(folder / "home" / "server")
     return {
         **inherited,
         **home.CLIENT_SETTINGS,
         "DG4D_HOME": str(folder / "home"),
         "DG4D_EXECUTOR": "in_process",
+        "PREFECT_API_AUTH_STRING": secret,
         "PREFECT_HOME": str(folder / "prefect"),
+        "PREFECT_SERVER_API_AUTH_STRING": secret,
     }
 
 

@@ -85,7 +85,9 @@ def turn(picture: Path, knobs: list[str], seed: int) -> dict[str, float]:
 
         try:
             seconds = {"first": command("first")}
-            seconds["next"] = command("next", PREFECT_API_URL=server.wait())
+            seconds["next"] = command(
+                "next", PREFECT_API_URL=server.wait(), PREFECT_API_AUTH_STRING=server.auth_string()
+            )
             again = [str(Path(folder) / "first-out" / RECORD), homes["steps"]]
             seconds["steps"] = timed([sys.executable, "-m", "benchmarks.overhead", str(picture), "--again", *again])
         finally:

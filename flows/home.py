@@ -1,12 +1,16 @@
-"""The places under `$DG4D_HOME`, and the environment in which Prefect is imported."""
+"""Places under `$DG4D_HOME`, private to the user, and the environment in which Prefect is imported."""
 
 import os
+import stat
+from contextlib import suppress
 from pathlib import Path
 
+from dg4d_lib.errors import BadInput
 from flows.serving.server import SETTINGS, Server
 from steps.opening import open_store
 from steps.store import ArtifactStore, home
 
+OTHERS = 0o077  # permissions of group and others
 CLIENT_SETTINGS = {
     "DO_NOT_TRACK": "1",
     "PREFECT_CLIENT_SERVER_VERSION_CHECK_ENABLED": "false",
@@ -24,6 +28,7 @@ def store() -> ArtifactStore:
     Raises:
         BadInput: that is no address of a store.
     """
+    make_private(home())
     return open_store()
 
 
@@ -44,10 +49,38 @@ def failures() -> Path:
 
 def background_server() -> Server:
     """The server that commands share unless PREFECT_API_URL names another."""
+    make_private(home())
     return Server(home() / "server", home() / "prefect")
 
 
+def make_private(folder: Path) -> None:
+    """Create a folder that only its owner can enter; close one that others can, with everything in it.
+
+    Raises:
+        BadInput: it belongs to somebody else.
+    """
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if not folder.stat().st_mode & OTHERS:
+        return
+    try:
+        folder.chmod(0o700)
+    except PermissionError as error:
+        raise BadInput(
+            f"{folder} can be read by other users and belongs to one of them; set DG4D_HOME to a folder of your own"
+        ) from error
+    for path in folder.rglob("*"):
+        with suppress(OSError):  # gone, or on a file system without permissions
+            if not path.is_symlink():
+                path.chmod(stat.S_IMODE(path.stat().st_mode) & ~OTHERS)
+
+
 def set_environment(api_url: str) -> None:
-    """What Prefect reads when it is imported: its server, its own folder, no telemetry. What the user set stays."""
+    """Set what Prefect reads when it is imported: its server, its own folder, no telemetry. What the user set stays."""
     for name, value in {**CLIENT_SETTINGS, "PREFECT_HOME": str(home() / "prefect"), "PREFECT_API_URL": api_url}.items():
         os.environ.setdefault(name, value)
+
+
+def set_own_server(server: Server, address: str) -> None:
+    """As `set_environment`, for the background server, with its secret; a secret of another server does not count."""
+    os.environ["PREFECT_API_AUTH_STRING"] = server.auth_string()
+    set_environment(f"{address}/api")

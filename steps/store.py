@@ -286,7 +286,7 @@ class ArtifactStore:
                     os.fsync(target.fileno())
                 place = self._place(digest)
                 place.parent.mkdir(parents=True, exist_ok=True)
-                scratch.chmod(0o444)
+                scratch.chmod(0o400)  # never changed; nobody else's business
                 scratch.replace(place)
             finally:
                 scratch.unlink(missing_ok=True)

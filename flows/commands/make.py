@@ -44,7 +44,7 @@ def connect() -> None:
     else:
         server = home.background_server()
         server.start()
-        home.set_environment(f"{server.wait_for_address()}/api")
+        home.set_own_server(server, server.wait_for_address())
         importlib.import_module("flows.image_to_4d")  # takes seconds, and so does the server
         server.wait()
     from flows.engine.orphans import settle_orphans

@@ -52,7 +52,8 @@ def up(
         server.folder.mkdir(parents=True, exist_ok=True)
         for name in chosen if workers else ():
             Worker(name, server.folder).start(api_url)
-        typer.echo(api_url.removesuffix("/api"))
+        address = api_url.removesuffix("/api")
+        typer.echo(server.login_address(address) if server.is_at(api_url) else address)
 
 
 def down() -> None:

@@ -1,7 +1,8 @@
-"""One Prefect server in the background, for every command of this user; it ends when nobody has used it for a while.
+"""Prefect server in the background, shared by all commands of a user; it ends when nobody has used it for a while.
 
-`python -m flows.serving.server FOLDER PREFECT_HOME` leaves a guard behind: it starts the server, says where it is in
-FOLDER/server.json, and watches.
+`python -m flows.serving.server FOLDER PREFECT_HOME` leaves a guard behind: it starts the server, writes its address to
+FOLDER/server.json, and watches it. The server listens on the loopback interface only and asks for the secret in
+FOLDER/auth.
 Commands hold a shared lock on FOLDER/in-use while they run; the kernel frees it when they end, however they end.
 """
 
@@ -18,11 +19,13 @@ from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 from typing import IO
+from urllib.parse import quote
 
 from flows.engine.processes import die_with_parent, locked, without_prefect
-from flows.serving import fresh
+from flows.serving import auth, fresh
 
-HOST = "127.0.0.1"  # the server asks nobody who they are, so nobody else may reach it
+HOST = "127.0.0.1"  # never another interface: the traffic is not encrypted
+LOGIN = "/dg4d/login"
 START_TIMEOUT_S = 120.0
 STARTS = 3  # before giving up on a server that ends
 GUARD_START_S = 20.0  # a bare interpreter
@@ -32,6 +35,7 @@ LOOK_S = 1.0  # between two looks of the guard
 SETTINGS = {
     "DO_NOT_TRACK": "1",
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+    "PREFECT_SERVER_CSRF_PROTECTION_ENABLED": "true",
     "PREFECT_SERVER_UI_API_URL": "/api",  # relative: whatever the port
     "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",
     "PREFECT_SERVER_LOGGING_LEVEL": "WARNING",
@@ -71,7 +75,8 @@ class Server:
 
     def start(self) -> None:
         """Start it unless it runs, without waiting for it. From here on this command counts as a user."""
-        self.folder.mkdir(parents=True, exist_ok=True)
+        self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self.auth_string()  # before anything can ask for it
         if self._in_use is None:
             self._in_use = (self.folder / "in-use").open("a")
             fcntl.flock(self._in_use, fcntl.LOCK_SH)  # waits for a guard that is just ending its server
@@ -84,8 +89,17 @@ class Server:
                     stderr=log,
                     cwd=self.folder,
                     start_new_session=True,
+                    umask=0o077,  # the database and the logs have what users asked for
                     check=False,
                 )
+
+    def auth_string(self) -> str:
+        """Return the secret that the server asks for, NAME:PASSWORD."""
+        return auth.auth_string(self.folder)
+
+    def login_address(self, address: str) -> str:
+        """Return the address that signs a browser in; what follows "#" is not sent over the network."""
+        return f"{address}{LOGIN}#{quote(self.auth_string(), safe=':')}"
 
     def wait_for_address(self) -> str:
         """Where it will be; known before it answers.
@@ -200,8 +214,9 @@ def guard(folder: Path, prefect_home: Path) -> int:
         state.unlink(missing_ok=True)
         os.truncate(folder / "server.log", 0)
         idle_s = float(os.environ.get("DG4D_SERVER_IDLE_S", IDLE_S))
-        port = _free_port(state)
-        process = _serve(port, prefect_home)
+        listener = _listener(state)
+        port = int(listener.getsockname()[1])
+        process = _serve(listener, folder, prefect_home)
         signal.signal(signal.SIGTERM, leave)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:
@@ -233,15 +248,23 @@ def _watch(process: subprocess.Popen[bytes], folder: Path, idle_s: float) -> int
                 return 0
 
 
-def _serve(port: int, prefect_home: Path) -> subprocess.Popen[bytes]:
-    prefect_home.mkdir(parents=True, exist_ok=True)
+def _serve(listener: socket.socket, folder: Path, prefect_home: Path) -> subprocess.Popen[bytes]:
+    prefect_home.mkdir(mode=0o700, parents=True, exist_ok=True)
     fresh.put(prefect_home)
-    environment = without_prefect() | SETTINGS | {"PREFECT_HOME": str(prefect_home), "PREFECT__SERVER_FINAL": "1"}
-    application = ["--factory", "flows.serving.server_app:create_app"]
+    port = listener.getsockname()[1]
+    environment = {
+        **without_prefect(),
+        **SETTINGS,
+        "PREFECT_HOME": str(prefect_home),
+        "PREFECT_SERVER_API_AUTH_STRING": auth.auth_string(folder),
+        "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": f"http://{HOST}:{port}",
+        "PREFECT__SERVER_FINAL": "1",
+    }
     return subprocess.Popen(
-        [sys.executable, "-m", "uvicorn", *application, "--host", HOST, "--port", str(port), "--log-level", "warning"],
+        [sys.executable, "-m", "flows.serving.server_app", str(listener.fileno())],
         env=environment,
         cwd=prefect_home,
+        pass_fds=[listener.fileno()],
         preexec_fn=die_with_parent,  # noqa: PLW1509 - the guard has one thread
     )
 
@@ -261,22 +284,25 @@ def leave(number: int, frame: FrameType | None) -> None:
     sys.exit(0)
 
 
-def _free_port(state: Path) -> int:
-    """The port of last time, so that addresses stay; or one that is free."""
+def _listener(state: Path) -> socket.socket:
+    """Bind the port of last time, so that addresses stay, or one that is free.
+
+    The guard keeps the socket: nobody else can take the port and be asked for the secret while the server starts.
+    """
     before = 0
-    with suppress(OSError, ValueError, KeyError, TypeError):
+    with suppress(OSError, ValueError):
         before = int((state.parent / "port").read_text(encoding="ascii"))
     for port in (before, 0):
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind((HOST, port))
-            except (OSError, OverflowError):
-                continue
-            free = int(probe.getsockname()[1])
-        (state.parent / "port").write_text(str(free), encoding="ascii")
-        return free
-    raise ServerUnavailable(f"no port is free on {HOST}")
+        listener = socket.socket()
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((HOST, port))
+        except (OSError, OverflowError):
+            listener.close()
+            continue
+        (state.parent / "port").write_text(str(listener.getsockname()[1]), encoding="ascii")
+        return listener
+    raise ServerUnavailable(f"No port is free on {HOST}.")
 
 
 if __name__ == "__main__":

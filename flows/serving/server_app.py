@@ -1,21 +1,28 @@
-"""The application of the background server: Prefect's own, and at two more addresses what the store holds."""
+"""ASGI application of the background server: Prefect's own, with artifacts and viewer below `/dg4d/`.
 
+`python -m flows.serving.server_app FD` serves it on a listening socket that it inherits.
+"""
+
+import socket
+import sys
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from pathlib import Path, PurePath
 
-from fastapi import FastAPI, Request, Response
+import uvicorn
+from fastapi import Depends, FastAPI, Request, Response
 from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse
 from prefect.server.api.server import create_app as prefect_app
 from prefect.server.database.configurations import AioSqliteConfiguration
 from prefect.server.database.dependencies import MODELS_DEPENDENCIES
-from prefect.settings import PREFECT_API_DATABASE_CONNECTION_URL
+from prefect.settings import PREFECT_API_DATABASE_CONNECTION_URL, PREFECT_SERVER_API_AUTH_STRING
 from pydantic import ValidationError
 from sqlalchemy.ext.asyncio import AsyncSession, AsyncSessionTransaction
 
 from dg4d_lib.errors import BadInput
 from flows import home
 from flows.packages.view import page_of_package
+from flows.serving.access import LOGIN, SESSION, SignIn, protect
 from flows.ui.pages import ARTIFACT_ADDRESS, VIEWER_ADDRESS
 from steps.contract import ArtifactRef
 
@@ -39,7 +46,17 @@ class OneWriter(AioSqliteConfiguration):
 
 
 def create_app() -> FastAPI:
-    """Prefect's application with the artifacts in front; needs DG4D_HOME in the environment."""
+    """Build Prefect's application with artifacts, viewer and access control; needs DG4D_HOME in the environment.
+
+    Raises:
+        RuntimeError: the server has no secret.
+    """
+    secret = PREFECT_SERVER_API_AUTH_STRING.value()
+    if not secret:
+        raise RuntimeError(
+            "PREFECT_SERVER_API_AUTH_STRING is not set: whoever reaches this server could run code on its workers. Set "
+            "it to NAME:PASSWORD here, and PREFECT_API_AUTH_STRING to the same for clients and workers."
+        )
     database = PREFECT_API_DATABASE_CONNECTION_URL.value()
     if database.startswith("sqlite"):
         MODELS_DEPENDENCIES["database_config"] = OneWriter(connection_url=database)
@@ -48,19 +65,33 @@ def create_app() -> FastAPI:
     for route in routes:
         if isinstance(part := getattr(route, "app", None), FastAPI):
             part.add_exception_handler(ConnectionError, database_away)
-    for place, answer in ((ARTIFACT_ADDRESS, artifact), (VIEWER_ADDRESS, viewer)):
-        application.add_api_route(place + "{digest}/{size}/{name}", answer, response_class=Response)
+    sign_in = SignIn(secret)
+    file = "{digest}/{size}/{name}"
+    for path, answer, signed_in in (
+        (ARTIFACT_ADDRESS + file, artifact, True),
+        (VIEWER_ADDRESS + file, viewer, True),
+        (LOGIN, sign_in.page, False),
+        (SESSION, sign_in.session, False),
+    ):
+        required = [Depends(sign_in.required)] if signed_in else []
+        application.add_api_route(path, answer, response_class=Response, dependencies=required, include_in_schema=False)
         routes.insert(0, routes.pop())  # before the user interface, which answers to every address
+    protect(application)
     return application
 
 
+def serve(listener: socket.socket) -> None:
+    """Serve the application on a bound socket until the process is told to stop."""
+    uvicorn.Server(uvicorn.Config(create_app(), log_level="warning")).run(sockets=[listener])
+
+
 def database_away(request: Request, error: Exception) -> Response:
-    """What a client hears while the database starts: "ask again", where Prefect says "broken"."""
+    """Return 503 (retryable) while the database starts."""
     return PlainTextResponse("the database does not answer", 503)
 
 
 def artifact(digest: str, size: int, name: str) -> Response:
-    """One file of the store, by the address that `pages.address` gives."""
+    """Return a file of the store, by the address that `pages.address` gives."""
     path = _path(digest, size)
     if isinstance(path, Response):
         return path
@@ -74,18 +105,19 @@ def artifact(digest: str, size: int, name: str) -> Response:
 
 
 def viewer(digest: str, size: int, name: str) -> Response:
-    """The page that plays a package of the store."""
+    """Return the page that plays a package of the store, in an origin of its own: it cannot read the secret."""
     path = _path(digest, size)
     if isinstance(path, Response):
         return path
     try:
-        return HTMLResponse(page_of_package(path, PurePath(name).stem))
+        page = page_of_package(path, PurePath(name).stem)
+        return HTMLResponse(page, headers={"Content-Security-Policy": "sandbox allow-scripts allow-downloads"})
     except BadInput as error:
         return PlainTextResponse(str(error), 404)
 
 
 def _path(digest: str, size: int) -> Path | Response:
-    """An artifact's file, or the answer that says why there is none."""
+    """Return the file of an artifact, or a 404."""
     try:
         ref = ArtifactRef(digest=f"sha256:{digest}", media_type="application/octet-stream", size_bytes=size)
     except ValidationError:
@@ -94,3 +126,7 @@ def _path(digest: str, size: int) -> Path | Response:
     if not store.has(ref):
         return PlainTextResponse("this artifact is not in the store; run the same command again to renew it", 404)
     return store.path(ref)
+
+
+if __name__ == "__main__":
+    serve(socket.socket(fileno=int(sys.argv[1])))

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 from prefect.logging.handlers import APILogHandler
-from prefect.settings import PREFECT_API_URL, temporary_settings
+from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
 
 from flows import home
 from flows.serving.server import Server
@@ -17,7 +17,11 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
         patch.setenv("DG4D_HOME", str(tmp_path_factory.mktemp("home")))
         running = home.background_server()
         running.start()
-    with temporary_settings({PREFECT_API_URL: running.wait()}):
+    with (
+        temporary_settings({PREFECT_API_URL: running.wait(), PREFECT_API_AUTH_STRING: running.auth_string()}),
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        patch.setenv("PREFECT_API_AUTH_STRING", running.auth_string())  # for commands and workers
         yield running
         APILogHandler().flush()  # what is not sent yet would be tried again for a minute
     running.release()

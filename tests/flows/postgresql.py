@@ -38,6 +38,7 @@ def server_on_postgresql(prefect_home: Path) -> Iterator[tuple[str, Database]]:
             env={
                 **os.environ,
                 **SETTINGS,
+                "PREFECT_SERVER_API_AUTH_STRING": os.environ["PREFECT_API_AUTH_STRING"],
                 "PREFECT_HOME": str(prefect_home),
                 "PREFECT_API_DATABASE_CONNECTION_URL": database.address,
             },

@@ -54,10 +54,14 @@ def test_a_server_that_cannot_start_is_unavailable_and_says_where_to_look(tmp_pa
 
 
 def test_a_port_is_kept_while_it_is_free(tmp_path: Path) -> None:
-    port = module._free_port(tmp_path / "server.json")
-    assert module._free_port(tmp_path / "server.json") == port
+    def bound() -> int:
+        with module._listener(tmp_path / "server.json") as listener:
+            return int(listener.getsockname()[1])
+
+    port = bound()
+    assert bound() == port
     with http.server.HTTPServer(("127.0.0.1", port), http.server.BaseHTTPRequestHandler):
-        assert module._free_port(tmp_path / "server.json") != port
+        assert bound() != port
 
 
 def test_what_does_not_answer_or_is_something_else_is_not_our_server() -> None:

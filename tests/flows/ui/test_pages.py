@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 from PIL import Image
 from prefect.client.orchestration import get_client
-from prefect.settings import PREFECT_API_URL
+from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL
 
 from flows import home
 from flows.commands.make import make
 from flows.engine import tasks
 from flows.engine.executors import StepDiverged
 from flows.inputs.orders import Order, Wish
+from flows.serving.auth import basic
 from flows.serving.server import Server
 from flows.ui import curves, pages
 from flows.ui.asset_page import PICTURES
@@ -70,7 +71,8 @@ def server_address() -> str:
 
 
 def fetched(address: str) -> tuple[str, bytes]:
-    with urllib.request.urlopen(server_address() + address) as answer:
+    signed_in = {"Authorization": basic(str(PREFECT_API_AUTH_STRING.value()))}
+    with urllib.request.urlopen(urllib.request.Request(server_address() + address, headers=signed_in)) as answer:
         return answer.headers["content-type"], answer.read()
 
 
