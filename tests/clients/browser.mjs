@@ -23,7 +23,7 @@ function findBrowser() {
 }
 
 // Serves {"/prefix/": folder, "/name.glb": file, "/page.html": {html: "..."}}; resolves to {origin, close}.
-async function serve(routes) {
+export async function serve(routes) {
   const server = createServer(async (request, response) => {
     const place = decodeURIComponent(new URL(request.url, "http://localhost").pathname);
     const prefix = Object.keys(routes).find((key) => (key.endsWith("/") ? place.startsWith(key) : place === key));
@@ -41,15 +41,29 @@ async function serve(routes) {
   return { origin: `http://127.0.0.1:${server.address().port}`, close: () => server.close() };
 }
 
-// Runs `work(page, origin)` with a page that sees `routes`; gives its result. What the page complains about is thrown.
-export async function inBrowser(routes, { width, height }, work) {
+// Opens a page of the Prefect server on the way of its sign-in. Prefect forgets the secret if it is asked for a second
+// page while it checks the secret for the first.
+export async function signIn(page, login, address) {
+  const url = new URL(login);
+  url.searchParams.set("next", address);
+  await page.goto(url.href);
+  await page.waitForURL((url) => !url.pathname.startsWith("/dg4d/"));
+}
+
+// A headless browser; ends the program with {"missing": ...} where there is none. Only 127.0.0.1 can be reached.
+export async function launch(flags = []) {
   const executablePath = findBrowser();
   if (!executablePath) {
     console.log(JSON.stringify({ missing: "no chromium or google-chrome on the PATH (or named by $CHROMIUM)" }));
     process.exit(0);
   }
+  return chromium.launch({ executablePath, args: [...FLAGS, ...flags] });
+}
+
+// Runs `work(page, origin)` with a page that sees `routes`; gives its result. What the page complains about is thrown.
+export async function inBrowser(routes, { width, height }, work) {
+  const browser = await launch();
   const server = await serve(routes);
-  const browser = await chromium.launch({ executablePath, args: FLAGS });
   try {
     const page = await browser.newPage({ viewport: { width, height } });
     const complaints = [];

@@ -1,18 +1,19 @@
 // Opens a page of the Prefect user interface, as a user does, and says which of its pictures are drawn.
 //
 // The one argument is a request, in JSON:
-//   {"address": of the page, "wait": for so many pictures, "text": for these words, "screenshot": a PNG of the page}
+//   {"login": address that signs in, "address": of the page, "wait": for so many pictures, "text": for these words,
+//    "screenshot": a PNG of the page}
 // Prints
 //   {"text": of the page, "pictures": [{"name": its alternative text, "width", "height": of the picture itself,
 //    "box": [left, top, width, height] on the screenshot, in pixels}, ...], "links": addresses}
-import { inBrowser } from "./browser.mjs";
+import { inBrowser, signIn } from "./browser.mjs";
 
-const { address, wait, text, screenshot } = JSON.parse(process.argv[2]);
+const { login, address, wait, text, screenshot } = JSON.parse(process.argv[2]);
 const PICTURES = "img[src^='data:']";
 const LONGEST = { timeout: 60_000 };
 
 const result = await inBrowser({}, { width: 1200, height: 4600 }, async (page) => {
-  await page.goto(address);
+  await signIn(page, login, address);
   await page.getByText(text).first().waitFor(LONGEST);
   await page.waitForFunction(
     ([pictures, wait]) => [...document.querySelectorAll(pictures)].filter((one) => one.naturalWidth > 0).length >= wait,

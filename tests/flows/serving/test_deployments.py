@@ -2,14 +2,12 @@
 
 import json
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
 import pytest
-from prefect.client.orchestration import SyncPrefectClient, get_client
+from prefect.client.orchestration import SyncPrefectClient
 from prefect.exceptions import PrefectHTTPStatusError
-from prefect.settings import PREFECT_API_URL
 from tiny_s3 import TinyS3
 from waiting import wait_until
 
@@ -17,26 +15,10 @@ from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows.packages.publish import whole
 from flows.serving import deployments, registering
 from flows.serving.pools import read_pools
-from flows.serving.server import Server
 from flows.serving.watching import announce
-from flows.serving.workers import Worker, running
 from steps.profiles import PREVIEW, PROFILES, revise
 
 FLOWS = ["image-to-4d", "video-to-4d", "catalog", "benchmark"]
-
-
-@pytest.fixture(scope="module")
-def client(server: Server) -> Iterator[SyncPrefectClient]:
-    """Of a server that has the pool process-cpu and its deployments."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("DG4D_HOME", str(server.folder.parent))
-        patch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
-        patch.setenv("DG4D_CODE_VERSION", "test")
-        patch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
-        patch.setenv("PREFECT_API_URL", str(PREFECT_API_URL.value()))
-        registering.register(read_pools(), ["process-cpu"])
-        with get_client(sync_client=True) as client:
-            yield client
 
 
 def test_the_form_offers_every_profile() -> None:
@@ -136,30 +118,6 @@ def test_the_server_refuses_options_that_cannot_be(client: SyncPrefectClient, op
     wanted = {"inputs": "in", "out": "out", "options": options}
     with pytest.raises(PrefectHTTPStatusError, match=r"409|422"):
         client.create_flow_run_from_deployment(catalog.id, parameters=wanted)
-
-
-@pytest.fixture(scope="module")
-def worker(
-    client: SyncPrefectClient, server: Server, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[tuple[TinyS3, Path]]:
-    """The object store that it sees, and the file in which its steps note that they ran."""
-    place, objects = tmp_path_factory.mktemp("worker"), TinyS3()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("DG4D_EXECUTOR", "in_process")
-        patch.setenv("FAKE_LOG", str(place / "ran"))
-        for name, value in objects.environment.items():
-            patch.setenv(name, value)
-        worker = Worker("process-cpu", server.folder)
-        worker.start(str(PREFECT_API_URL.value()))
-        try:
-            wait_until(lambda: running(server.folder))
-            worker.start(str(PREFECT_API_URL.value()))  # does nothing
-            yield objects, place / "ran"
-        finally:
-            objects.stop()
-            assert worker.stop()
-    assert not running(server.folder)
-    assert not worker.stop()
 
 
 def ask(client: SyncPrefectClient, name: str, **parameters: Any) -> Any:

@@ -2,6 +2,7 @@
 
 import base64
 import io
+import json
 import re
 import urllib.error
 import urllib.request
@@ -154,13 +155,20 @@ def test_a_step_that_failed_leaves_its_reason_and_its_last_good_state(place: Pat
     assert "asset" not in kept and "package" not in kept
 
 
-def test_a_browser_draws_every_picture_of_the_page(place: Path) -> None:
+def test_a_browser_draws_every_picture_of_the_page(server: Server, place: Path) -> None:
     make(order("drawn", place, "drawn"), place / "out")
     (version,) = artifacts("drawn", "/artifacts/filter")["asset"]
     seen = run_node(
         "prefect.mjs",
-        f'{{"address": "{server_address()}/artifacts/artifact/{version["id"]}", "wait": {len(TITLES) + LOSSES}, '
-        f'"text": "Contact sheet", "screenshot": "{place / "page.png"}"}}',
+        json.dumps(
+            {
+                "login": server.login_address(server_address()),
+                "address": f"/artifacts/artifact/{version['id']}",
+                "wait": len(TITLES) + LOSSES,
+                "text": "Contact sheet",
+                "screenshot": str(place / "page.png"),
+            }
+        ),
     )
     assert [picture["name"] for picture in seen["pictures"]] == [*TITLES, *["Losses of the fake"] * LOSSES]
     screen = np.asarray(Image.open(place / "page.png").convert("RGB")).astype(int)
