@@ -14,7 +14,7 @@ import typer
 from flows.commands.checking import bench, rebuild, score, verify
 from flows.commands.endings import clear_ending
 from flows.commands.options import Changes, Commercial, Profile, Rate, Seed, Texture, Triangles, knobs_of
-from flows.commands.services import down, up, watch
+from flows.commands.services import down, env, up, watch
 from flows.commands.store import store
 from flows.commands.weights import weights
 
@@ -281,7 +281,7 @@ def compose(
         typer.echo(out)
 
 
-for command in (score, bench, verify, rebuild, up, down, watch):
+for command in (score, bench, verify, rebuild, up, down, env, watch):
     app.command()(command)
 
 

@@ -1,4 +1,4 @@
-"""Commands for what runs in the background: up, down, watch."""
+"""Commands for background services: up, down, env, watch."""
 
 import os
 import time
@@ -65,6 +65,19 @@ def down() -> None:
         server = home.background_server()
         stopped = [worker.stop() for worker in running(server.folder)]
         typer.echo("stopped" if server.stop() or stopped else "nothing was running")
+
+
+def env() -> None:
+    """Print the variables with which Prefect's own commands reach the server: eval "$(dg4d env)"."""
+    with clear_ending():
+        from flows import home
+        from flows.serving.server import ServerUnavailable
+
+        server = home.background_server()
+        if (address := server.address()) is None:
+            raise ServerUnavailable("No server runs; start one with `dg4d up`.")
+        typer.echo(f"export PREFECT_API_URL={address}/api")
+        typer.echo(f"export PREFECT_API_AUTH_STRING={server.auth_string()}")
 
 
 def watch(

@@ -22,7 +22,8 @@ from sqlalchemy.ext.asyncio import AsyncSession, AsyncSessionTransaction
 from dg4d_lib.errors import BadInput
 from flows import home
 from flows.packages.view import page_of_package
-from flows.serving.access import LOGIN, SESSION, SignIn, protect
+from flows.serving.access import SESSION, SignIn, protect
+from flows.serving.server import LOGIN
 from flows.ui.pages import ARTIFACT_ADDRESS, VIEWER_ADDRESS
 from steps.contract import ArtifactRef
 

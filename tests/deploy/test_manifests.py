@@ -153,3 +153,16 @@ def test_pods_are_found_by_their_services() -> None:
 def test_the_kustomization_names_every_manifest() -> None:
     named = yaml.safe_load((DEPLOY / "k8s/kustomization.yaml").read_text(encoding="utf-8"))["resources"]
     assert sorted([*named, "kustomization.yaml"]) == sorted(path.name for path in (DEPLOY / "k8s").iterdir())
+
+
+def test_the_server_is_authenticated_and_answers_to_its_own_names_only() -> None:
+    (pod,) = (pod for name, pod in PODS.items() if name == "server")
+    (container,) = pod["spec"]["containers"]
+    cluster = {entry["name"]: entry.get("value", entry.get("valueFrom")) for entry in container["env"]}
+    for environment in (SERVICES["server"]["environment"], cluster):
+        assert environment["PREFECT_SERVER_API_AUTH_STRING"]
+        assert environment["PREFECT_SERVER_CSRF_PROTECTION_ENABLED"] == "true"
+        assert environment["PREFECT_SERVER_CORS_ALLOWED_ORIGINS"] == "http://127.0.0.1:4200"
+        assert "server" in environment["DG4D_SERVER_HOSTS"].split(",") and "*" not in environment["DG4D_SERVER_HOSTS"]
+    for probe in ("startupProbe", "readinessProbe", "livenessProbe"):  # a cluster asks by the address of the pod
+        assert container[probe]["httpGet"]["httpHeaders"] == [{"name": "Host", "value": "localhost"}]

@@ -58,3 +58,15 @@ def test_a_server_is_reached_from_this_machine_only(server: Server) -> None:
     sockets = [line.split()[1:4:2] for lines in tables for line in lines]
     listening = [place for place, state in sockets if state == "0A" and int(place.rpartition(":")[2], 16) == port]
     assert listening == [f"0100007F:{port:04X}"]
+
+
+def test_other_programs_get_address_and_secret_of_a_server_that_runs(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DG4D_HOME", str(server.folder.parent))
+    assert dg4d("env").stdout.splitlines() == [
+        f"export PREFECT_API_URL={server.address()}/api",
+        f"export PREFECT_API_AUTH_STRING={server.auth_string()}",
+    ]
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path))
+    assert dg4d("env").returncode == 69
