@@ -35,7 +35,7 @@ def run_apart(module: str, task: str, arrays: Mapping[str, NDArray[Any]]) -> Arr
     with tempfile.TemporaryDirectory(prefix="dg4d-mesh-") as folder:
         given, made = Path(folder) / "given.npz", Path(folder) / "made.npz"
         _write(given, arrays)
-        command = [sys.executable, "-m", module, str(given), str(made)]
+        command = [sys.executable, "-P", "-m", module, str(given), str(made)]
         child = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
         if child.returncode == EXIT_MISSING:
             raise BackendUnavailable(child.stderr.strip())

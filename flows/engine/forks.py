@@ -7,13 +7,12 @@ import queue
 import signal
 import socket
 import subprocess
-import sys
 import threading
 from collections.abc import Sequence
 from concurrent.futures import Future
 from typing import IO, BinaryIO
 
-from flows.engine.processes import without_prefect
+from flows.engine.processes import python, without_prefect
 from steps.fork_server import ORDER_BYTES
 
 SET_BY_IMPORTS = "OpenImageIO_ROOT"  # by a library, for its own programs
@@ -72,7 +71,7 @@ class ForkServer:
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "steps.fork_server", str(theirs.fileno())],
+                python("-m", "steps.fork_server", str(theirs.fileno())),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,

@@ -29,6 +29,11 @@ def place() -> str:
         return socket.gethostname()
 
 
+def python(*arguments: str) -> list[str]:
+    """Return the command line of a Python child that imports nothing from the current folder (`-P`)."""
+    return [sys.executable, "-P", *arguments]
+
+
 def without_prefect() -> dict[str, str]:
     """The environment, for a process that is to have none of Prefect's settings, or its own."""
     return {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}

@@ -12,7 +12,7 @@ from contextlib import closing
 from importlib.metadata import version
 from pathlib import Path
 
-from flows.engine.processes import without_prefect
+from flows.engine.processes import python, without_prefect
 
 NAME = "prefect.db"  # in PREFECT_HOME
 
@@ -31,7 +31,7 @@ def make(path: Path) -> None:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".new-") as folder:
-        command = [sys.executable, "-m", "prefect", "server", "database", "upgrade", "--yes"]
+        command = python("-m", "prefect", "server", "database", "upgrade", "--yes")
         subprocess.run(command, env=without_prefect() | {"PREFECT_HOME": folder}, stdout=subprocess.DEVNULL, check=True)
         whole = Path(folder) / "whole.db"
         with closing(sqlite3.connect(Path(folder) / NAME)) as database:

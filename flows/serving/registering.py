@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-import sys
 from collections.abc import Mapping
 from datetime import timedelta
 
@@ -14,6 +13,7 @@ from prefect.events.schemas.automations import AutomationCore, EventTrigger, Pos
 from prefect.events.schemas.events import ResourceSpecification
 
 from dg4d_lib.errors import BackendUnavailable
+from flows.engine.processes import python
 from flows.serving.pools import DEPLOYMENTS, Json, Pool, read_deployments
 from flows.serving.workers import HEARTBEAT_S
 
@@ -118,7 +118,7 @@ def _deploy(names: list[str]) -> None:
     """Prefect's own reading of the file, so that it means here what it means elsewhere."""
     chosen = [word for name in names for word in ("--name", name)]
     done = subprocess.run(
-        [sys.executable, "-m", "prefect", "--no-prompt", "deploy", "--prefect-file", str(DEPLOYMENTS), *chosen],
+        python("-m", "prefect", "--no-prompt", "deploy", "--prefect-file", str(DEPLOYMENTS), *chosen),
         capture_output=True,
         text=True,
         check=False,

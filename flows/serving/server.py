@@ -21,7 +21,7 @@ from types import FrameType
 from typing import IO
 from urllib.parse import quote
 
-from flows.engine.processes import die_with_parent, locked, without_prefect
+from flows.engine.processes import die_with_parent, locked, python, without_prefect
 from flows.serving import auth, fresh
 
 HOST = "127.0.0.1"  # never another interface: the traffic is not encrypted
@@ -83,7 +83,7 @@ class Server:
         if not self.is_guarded():
             with self.log.open("ab") as log:
                 subprocess.run(
-                    [sys.executable, "-m", "flows.serving.server", str(self.folder), str(self.prefect_home)],
+                    python("-m", "flows.serving.server", str(self.folder), str(self.prefect_home)),
                     stdin=subprocess.DEVNULL,
                     stdout=log,
                     stderr=log,
@@ -261,7 +261,7 @@ def _serve(listener: socket.socket, folder: Path, prefect_home: Path) -> subproc
         "PREFECT__SERVER_FINAL": "1",
     }
     return subprocess.Popen(
-        [sys.executable, "-m", "flows.serving.server_app", str(listener.fileno())],
+        python("-m", "flows.serving.server_app", str(listener.fileno())),
         env=environment,
         cwd=prefect_home,
         pass_fds=[listener.fileno()],

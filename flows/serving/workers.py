@@ -12,7 +12,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from flows.engine.processes import die_with_parent, locked, start_of
+from flows.engine.processes import die_with_parent, locked, python, start_of
 from flows.serving.server import LOOK_S, Server, leave
 
 RESTART_S = 5.0  # between two starts of a worker
@@ -48,7 +48,7 @@ class Worker:
             return
         with self.log.open("wb") as log:
             subprocess.run(
-                [sys.executable, "-m", "flows.serving.workers", self.pool, str(self.folder), api_url],
+                python("-m", "flows.serving.workers", self.pool, str(self.folder), api_url),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -89,7 +89,7 @@ class Worker:
     def _run(self, api_url: str, server: Server | None) -> None:
         """Run a worker until it ends by itself, or the server of this machine does."""
         process = subprocess.Popen(
-            [sys.executable, "-m", "prefect", "worker", "start", "--pool", self.pool],
+            python("-m", "prefect", "worker", "start", "--pool", self.pool),
             env={**os.environ, **environment(api_url)},
             cwd=self.folder,
             start_new_session=True,
@@ -111,6 +111,7 @@ def environment(api_url: str) -> dict[str, str]:
     """What a worker and its runs need to know."""
     return {
         "PREFECT_API_URL": api_url,
+        "PYTHONSAFEPATH": "1",  # for the processes of runs too
         "PREFECT_WORKER_QUERY_SECONDS": f"{QUERY_S:g}",
         "PREFECT_FLOWS_HEARTBEAT_FREQUENCY": str(HEARTBEAT_S),
         "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "INFO",

@@ -63,6 +63,18 @@ def test_a_process_or_container_gives_the_same_digests_as_this_process(place: Pa
     assert here.provenance.digest() == there.provenance.digest()
 
 
+def test_code_in_the_current_folder_is_not_run(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    foreign = place / "pictures"
+    for module in ("steps/__init__.py", "random.py", "dg4d_lib/__init__.py", "sitecustomize.py"):
+        (foreign / module).parent.mkdir(parents=True, exist_ok=True)
+        (foreign / module).write_text(f"open({str(place / 'run')!r}, 'a').write(__name__)\nraise ImportError")
+    monkeypatch.chdir(foreign)
+    monkeypatch.setenv("DG4D_CODE_VERSION", "foreign folder")  # another environment, so another process of steps
+    spec, request = ask(place, "hello")
+    assert in_subprocess(spec, request, ignore).outputs
+    assert not (place / "run").exists()
+
+
 @pytest.mark.parametrize("execute", [in_process, *OUTSIDE])
 def test_what_the_library_logs_is_handed_on(place: Path, execute: Execute) -> None:
     said: list[str] = []
