@@ -5,7 +5,7 @@ import secrets
 from importlib.resources import files
 from urllib.parse import quote, urlsplit
 
-from fastapi import FastAPI, HTTPException, Request, Response
+from fastapi import HTTPException, Request, Response
 from fastapi.responses import HTMLResponse, PlainTextResponse
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware.trustedhost import TrustedHostMiddleware
@@ -41,13 +41,13 @@ def allowed_hosts() -> list[str]:
     return [*LOCAL_HOSTS, *(name for name in given if name and name != "*")]
 
 
-def protect(application: FastAPI) -> None:
-    """Refuse requests with a foreign `Host` (DNS rebinding) or from pages of another origin.
+def protect(application: ASGIApp) -> ASGIApp:
+    """Wrap an application so that it refuses a foreign `Host` (DNS rebinding) and pages of other origins.
 
-    Requests for `/api` are authenticated by Prefect itself, those for `/dg4d/` by `SignIn`.
+    Requests for `/api` are authenticated by Prefect itself, those for `/dg4d/` by `SignIn`. The application is wrapped
+    rather than given middleware: Prefect's services call it within the process, under a host name of their own.
     """
-    application.add_middleware(SameOriginMiddleware)
-    application.add_middleware(TrustedHostMiddleware, allowed_hosts=allowed_hosts(), www_redirect=False)
+    return TrustedHostMiddleware(SameOriginMiddleware(application), allowed_hosts(), www_redirect=False)
 
 
 class SameOriginMiddleware:

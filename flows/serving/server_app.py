@@ -18,6 +18,7 @@ from prefect.server.database.dependencies import MODELS_DEPENDENCIES
 from prefect.settings import PREFECT_API_DATABASE_CONNECTION_URL, PREFECT_SERVER_API_AUTH_STRING
 from pydantic import ValidationError
 from sqlalchemy.ext.asyncio import AsyncSession, AsyncSessionTransaction
+from starlette.types import ASGIApp
 
 from dg4d_lib.errors import BadInput
 from flows import home
@@ -46,7 +47,7 @@ class OneWriter(AioSqliteConfiguration):
             yield transaction
 
 
-def create_app() -> FastAPI:
+def create_app() -> ASGIApp:
     """Build Prefect's application with artifacts, viewer and access control; needs DG4D_HOME in the environment.
 
     Raises:
@@ -77,8 +78,7 @@ def create_app() -> FastAPI:
         required = [Depends(sign_in.required)] if signed_in else []
         application.add_api_route(path, answer, response_class=Response, dependencies=required, include_in_schema=False)
         routes.insert(0, routes.pop())  # before the user interface, which answers to every address
-    protect(application)
-    return application
+    return protect(application)
 
 
 def serve(listener: socket.socket) -> None:

@@ -11,11 +11,13 @@ from pathlib import Path
 
 import pytest
 from prefect.logging.handlers import APILogHandler
+from prefect.settings import PREFECT_API_AUTH_STRING, temporary_settings
 
 from benchmarks.postgresql import Database, free_port
 from dg4d_lib.errors import BackendUnavailable
 from flows.serving.server import SETTINGS, answers
 
+SECRET = "test:a-secret-word"
 START_S = 400.0  # on a machine that is busy with other things
 
 
@@ -38,7 +40,7 @@ def server_on_postgresql(prefect_home: Path) -> Iterator[tuple[str, Database]]:
             env={
                 **os.environ,
                 **SETTINGS,
-                "PREFECT_SERVER_API_AUTH_STRING": os.environ["PREFECT_API_AUTH_STRING"],
+                "PREFECT_SERVER_API_AUTH_STRING": SECRET,
                 "PREFECT_HOME": str(prefect_home),
                 "PREFECT_API_DATABASE_CONNECTION_URL": database.address,
             },
@@ -48,8 +50,10 @@ def server_on_postgresql(prefect_home: Path) -> Iterator[tuple[str, Database]]:
             while not answers(f"http://127.0.0.1:{port}", timeout_s=5.0):
                 assert server.poll() is None and time.monotonic() < deadline, "the server did not start"
                 time.sleep(0.3)
-            yield f"http://127.0.0.1:{port}/api", database
-            APILogHandler().flush()  # or the end of this process waits for a server that is gone
+            with pytest.MonkeyPatch.context() as patch, temporary_settings({PREFECT_API_AUTH_STRING: SECRET}):
+                patch.setenv("PREFECT_API_AUTH_STRING", SECRET)
+                yield f"http://127.0.0.1:{port}/api", database
+                APILogHandler().flush()  # or the end of this process waits for a server that is gone
         finally:
             server.terminate()
             server.wait(60)
