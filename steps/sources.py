@@ -13,7 +13,7 @@ from torch import Tensor
 from dg4d_lib.errors import BadInput
 from dg4d_lib.video.framing import shrink
 from steps.clips import LARGEST_SIDE, MOST_FRAMES, Clip, evenly_spaced, thinned_rate, work_side
-from steps.media_types import ALLOWED, SNIFFED_BYTES, container_of, is_animated_png, is_frame_name, still_suffix
+from steps.media_types import ALLOWED, SNIFFED_BYTES, container_of, is_animated_png, is_frame_name, is_zip, still_suffix
 from steps.stills import decode_still, read_still
 from steps.webp import AnimatedWebp, is_animated
 
@@ -59,7 +59,7 @@ def read_source(path: Path, scratch: Path, max_frames: int) -> Source:
         raise BadInput(f"the file is empty (0 bytes); give {ALLOWED}")
     with path.open("rb") as file:
         head = file.read(SNIFFED_BYTES)
-    if head[:4] in (b"PK\3\4", b"PK\5\6"):
+    if is_zip(head):
         return _read_zip(path, scratch, max_frames)
     if is_animated(head):
         return _read_webp(path, scratch, max_frames)

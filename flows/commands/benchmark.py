@@ -23,6 +23,7 @@ from flows.packages.summary import Row, Tally
 from steps.archives import unpack
 from steps.catalog import PACKAGE, TRUTH
 from steps.contract import ArtifactRef
+from steps.media_types import check_arrays, check_still
 from steps.profiles import ScoreAssetSettings, profile, revise
 from steps.store import ArtifactStore, room_for, write_atomically
 from steps.truth import Truth, find_truth, find_truths
@@ -118,6 +119,8 @@ def bench(
         BackendUnavailable: what the profile needs is not here.
     """
     truths = find_truths(dataset)[:limit]
+    for truth in truths:
+        check_truth(truth)
     knobs, settings = _settings(changes, mesh)
     if bank:
         knobs = {"prior.kind": "oracle", **knobs}
@@ -161,8 +164,26 @@ def write(results: Results, judged: "Judged", out: Path) -> None:
         write_atomically(out / name, text)
 
 
+def check_truth(truth: Truth) -> None:
+    """Refuse a ground truth with files that are no pictures, or a mesh that is no NumPy archive.
+
+    Raises:
+        BadInput: says which file.
+    """
+    for path in (*truth.inputs, *(frame for view in truth.views for frame in view.frames)):
+        check_still(path)
+    if truth.mesh is not None:
+        check_arrays(truth.mesh)
+
+
 def put_truth(truth: Truth, store: ArtifactStore) -> ArtifactRef:
-    """Keep a ground truth in our own layout; equal pictures give equal bytes, whatever layout they had."""
+    """Keep a ground truth in our own layout; equal pictures give equal bytes, whatever layout they had.
+
+    Raises:
+        BadInput: a file is no picture, or the mesh no NumPy archive.
+        DiskFull: there is no room.
+    """
+    check_truth(truth)
     files = {f"input/{i:03d}{path.suffix.lower()}": path for i, path in enumerate(truth.inputs)}
     for view in truth.views:
         files |= {f"view_{view.name}/{i:03d}{path.suffix.lower()}": path for i, path in enumerate(view.frames)}

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fake_steps import picture
 from postgresql import free_port, server_on_postgresql
 from prefect.client.orchestration import get_client
 from prefect.settings import PREFECT_API_URL, temporary_settings
@@ -40,7 +41,7 @@ def place(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
     (tmp_path / "in").mkdir()
     for name in ("one", "two"):
-        (tmp_path / "in" / f"{name}.png").write_text(f"{name} of {tmp_path} fit_motion=sleep:2")
+        (tmp_path / "in" / f"{name}.png").write_text(picture(f"{name} of {tmp_path} fit_motion=sleep:2"))
     return tmp_path
 
 
