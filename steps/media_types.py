@@ -126,6 +126,8 @@ def check_head(head: bytes) -> None:
     Raises:
         BadInput: says what they are and what to give.
     """
+    if not head:
+        raise BadInput(f"the file is empty (0 bytes); give {ALLOWED}")
     if not is_zip(head) and not container_of(head):
         still_suffix(head)
 

@@ -22,7 +22,6 @@ SECRETS = {
     "letters of a sequence": b"8BPS OggS\n",
     "letters of a stream": (b"G" + b"o" * 187) * 3,
     "pickle": b"\x80\x04\x95" + bytes(40),
-    "nothing": b"",
 }
 
 
