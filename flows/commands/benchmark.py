@@ -3,7 +3,7 @@
 import json
 import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -97,6 +97,7 @@ def bench(
     bank: bool = False,
     limit: int | None = None,
     workers: int = 1,
+    allow: Callable[[Iterable[Path]], None] | None = None,
 ) -> Results:
     """Make an asset of every object of a data set, judge all, and write what was found; what is done is left alone.
 
@@ -113,6 +114,7 @@ def bench(
         bank: every object's own bank of true views is its prior.
         limit: only so many objects, the first by name.
         workers: objects at a time.
+        allow: raises BadInput for files that may not be read here.
 
     Raises:
         BadInput: the data set or a setting cannot be used, or `out` cannot be written.
@@ -120,6 +122,8 @@ def bench(
     """
     truths = find_truths(dataset)[:limit]
     for truth in truths:
+        if allow:
+            allow(truth.files)
         check_truth(truth)
     knobs, settings = _settings(changes, mesh)
     if bank:
@@ -170,7 +174,7 @@ def check_truth(truth: Truth) -> None:
     Raises:
         BadInput: says which file.
     """
-    for path in (*truth.inputs, *(frame for view in truth.views for frame in view.frames)):
+    for path in truth.pictures:
         check_still(path)
     if truth.mesh is not None:
         check_arrays(truth.mesh)

@@ -66,7 +66,10 @@ def without_secrets(address: str) -> str:
     """Return the address as people may see it, with neither a password nor a signature."""
     if "://" not in address:
         return address
-    parts = _split(address)
+    try:
+        parts = _split(address)
+    except BadInput:
+        return "an address that cannot be"
     return f"{parts.scheme}://{parts.hostname}{parts.path}"
 
 

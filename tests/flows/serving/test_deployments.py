@@ -1,6 +1,7 @@
 """Deployments on a real server: what a form asks for, what the server refuses, and runs by a worker."""
 
 import json
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +19,7 @@ from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows.packages.publish import whole
 from flows.serving import deployments, registering
 from flows.serving.pools import read_pools
+from flows.serving.roots import SOURCES
 from flows.serving.server import Server
 from flows.serving.watching import announce
 from flows.serving.workers import Worker, running
@@ -148,6 +150,7 @@ def worker(
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DG4D_EXECUTOR", "in_process")
         patch.setenv("FAKE_LOG", str(place / "ran"))
+        patch.setenv(SOURCES, f"{tmp_path_factory.getbasetemp()}{os.pathsep}s3://bucket/pictures")
         for name, value in objects.environment.items():
             patch.setenv(name, value)
         worker = Worker("process-cpu", server.folder)
@@ -225,7 +228,10 @@ def test_a_picture_of_an_object_store_is_fetched_and_converted(
     assert not (tmp_path / "gone").exists()
 
 
-def test_the_name_of_a_run_tells_no_signature(client: SyncPrefectClient, tmp_path: Path) -> None:
+def test_the_name_of_a_run_tells_no_signature(
+    client: SyncPrefectClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(SOURCES, str(tmp_path))
     with pytest.raises(BadInput, match="cannot be fetched"):
         deployments.image_to_4d("http://user:word@127.0.0.1:1/fox.png?signature=key", str(tmp_path / "out"))
     (run,) = (run for run in client.read_flow_runs() if run.parameters.get("out") == str(tmp_path / "out"))
