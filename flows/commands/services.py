@@ -28,7 +28,7 @@ def up(
             "--sources",
             metavar="DIR",
             help="folder that deployments may read, and write unless $DG4D_OUTPUTS says where, or s3://BUCKET/PREFIX; "
-            "may be repeated  [default: $DG4D_SOURCES, else the current folder]",
+            "may be repeated; default: $DG4D_SOURCES, else the current folder",
         ),
     ] = None,
 ) -> None:

@@ -105,7 +105,8 @@ def test_a_command_killed_in_every_stage_ends_with_the_bytes_of_an_undisturbed_o
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settle_orphans()
-    (tmp_path / "fake.png").write_text(picture(" ".join(f"{step}=sleep-once:120" for step in EVERY_STEP)))
+    words = " ".join(f"{step}=sleep-once:120" for step in EVERY_STEP)
+    (tmp_path / "fake.png").write_text(picture(words))
     for number, step in enumerate(EVERY_STEP):
         command = start("make", str(tmp_path / "fake.png"), "-o", str(tmp_path / "out"))
         wait_until((tmp_path / f"ran.{step}").exists)  # it sleeps there, and not the next time
@@ -114,7 +115,6 @@ def test_a_command_killed_in_every_stage_ends_with_the_bytes_of_an_undisturbed_o
         assert ran(log) == EVERY_STEP[max(0, number - 1) : number + 1], step
         assert not (tmp_path / "out").exists()
     assert settle_orphans() == 1  # every command settles the one before
-    words = (tmp_path / "fake.png").read_text()
     make(order(words, tmp_path), tmp_path / "out")
     assert ran(log) == EVERY_STEP[-1:]
     monkeypatch.delenv("DG4D_STORE")
