@@ -43,7 +43,8 @@ class Roots(Frozen):
     def of_this_process(cls) -> "Roots":
         """Read the environment, and the folders that are watched at the moment.
 
-        Without `$DG4D_SOURCES` it is the current folder; without `$DG4D_OUTPUTS`, the folders among the sources.
+        Without `$DG4D_SOURCES` it is the current folder, which Prefect makes anew, and empty, for each run of a process
+        worker; without `$DG4D_OUTPUTS`, the folders among the sources.
         """
         sources = _places(os.environ.get(SOURCES) or str(Path.cwd()))
         outputs = _places(os.environ.get(OUTPUTS, "")) or _folders(sources)

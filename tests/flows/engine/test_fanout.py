@@ -108,6 +108,7 @@ def test_two_workers_on_one_postgresql_server_make_an_item_each(place: Path) -> 
             patch.setenv("PREFECT_API_URL", api_url)
             registering.register(read_pools(), ["process-cpu"])
             own = {**os.environ, **environment(api_url), "PREFECT_HOME": str(place / "prefect")}
+            own["DG4D_SOURCES"] = str(place)  # a run has an empty folder of its own, whatever the folder of the worker
             worker = [sys.executable, "-m", "prefect", "worker", "start", "--pool", "process-cpu", "--limit", "1"]
             running += [
                 subprocess.Popen([*worker, "--name", name], env=own, cwd=place, stdout=subprocess.DEVNULL)
