@@ -1,7 +1,6 @@
 """What users hand in: a picture, a video, or a zip of numbered pictures; told apart by content, never by name."""
 
 import re
-import struct
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,52 +13,14 @@ from torch import Tensor
 from dg4d_lib.errors import BadInput
 from dg4d_lib.video.framing import shrink
 from steps.clips import LARGEST_SIDE, MOST_FRAMES, Clip, evenly_spaced, thinned_rate, work_side
+from steps.media_types import ALLOWED, SNIFFED_BYTES, container_of, is_animated_png, is_frame_name, is_zip, still_suffix
 from steps.stills import decode_still, read_still
 from steps.webp import AnimatedWebp, is_animated
 
 FOLDER_FPS = 12.0  # pictures in a folder have no rate; drawn animation usually holds a drawing for two frames of 24
 STILL_FPS = 1.0  # of a picture; it is never played
 MOST_ENTRY_BYTES = 512 * 2**20  # of one unpacked picture of a zip
-SNIFFED_BYTES = 4096
 NAMED_AT_MOST = 8  # missing frames that a message lists
-
-STILLS = (  # signature, suffix by which OpenImageIO finds the reader
-    (b"\x89PNG\r\n\x1a\n", ".png"),
-    (b"\xff\xd8\xff", ".jpg"),
-    (b"II*\0", ".tif"),
-    (b"MM\0*", ".tif"),
-    (b"II+\0", ".tif"),
-    (b"MM\0+", ".tif"),
-    (b"BM", ".bmp"),
-    (b"v/1\x01", ".exr"),
-    (b"#?RADIANCE", ".hdr"),
-    (b"#?RGBE", ".hdr"),
-    (b"\0\0\0\x0cJXL ", ".jxl"),
-    (b"\xff\x0a", ".jxl"),
-    (b"\0\0\0\x0cjP  ", ".jp2"),
-    (b"8BPS", ".psd"),
-    (b"P6", ".ppm"),
-    (b"P5", ".pgm"),
-)
-CLIPS = (  # offset of a signature, the signature, FFmpeg's name of the container
-    (0, b"GIF8", "gif"),
-    (0, b"\x1aE\xdf\xa3", "matroska"),
-    (4, b"ftyp", "mov"),
-    (4, b"moov", "mov"),
-    (4, b"mdat", "mov"),
-    (4, b"wide", "mov"),
-    (4, b"free", "mov"),
-    (4, b"skip", "mov"),
-    (8, b"AVI ", "avi"),
-    (0, b"FLV\x01", "flv"),
-    (0, b"OggS", "ogg"),
-    (0, b"\0\0\x01\xba", "mpeg"),
-)
-UNREADABLE_BRANDS = {b"heic": "HEIC", b"heix": "HEIC", b"mif1": "HEIC", b"avif": "AVIF", b"avis": "AVIF"}
-PICTURE_SUFFIXES = {
-    ".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".exr", ".hdr", ".jxl", ".jp2", ".psd", ".ppm", ".pgm",
-}  # fmt: skip
-ALLOWED = "pictures (PNG, JPEG, WebP, TIFF, BMP, EXR), videos (mp4, mov, webm, mkv, gif) and zips of numbered pictures"
 
 
 @dataclass(frozen=True)
@@ -98,14 +59,14 @@ def read_source(path: Path, scratch: Path, max_frames: int) -> Source:
         raise BadInput(f"the file is empty (0 bytes); give {ALLOWED}")
     with path.open("rb") as file:
         head = file.read(SNIFFED_BYTES)
-    if head[:4] in (b"PK\3\4", b"PK\5\6"):
+    if is_zip(head):
         return _read_zip(path, scratch, max_frames)
     if is_animated(head):
         return _read_webp(path, scratch, max_frames)
-    container = "apng" if _is_animated_png(head) else _container(head)
+    container = "apng" if is_animated_png(head) else container_of(head)
     if container:
         return _read_clip(path, container, max_frames)
-    picture, has_alpha = read_still(_link(path, _suffix(head), scratch), "the picture")
+    picture, has_alpha = read_still(_link(path, still_suffix(head), scratch), "the picture")
     return _picture(picture[None], has_alpha)
 
 
@@ -160,7 +121,7 @@ def _read_zip(path: Path, scratch: Path, max_frames: int) -> Source:
     try:
         with zipfile.ZipFile(path) as archive:
             entries = _numbered(
-                [info for info in archive.infolist() if not info.is_dir() and _is_picture_name(info.filename)]
+                [info for info in archive.infolist() if not info.is_dir() and is_frame_name(info.filename)]
             )
             wanted = evenly_spaced(len(entries), max_frames)
             side = min(LARGEST_SIDE, work_side(len(wanted)))
@@ -181,12 +142,6 @@ def _read_zip(path: Path, scratch: Path, max_frames: int) -> Source:
         raise BadInput("the zip of frames is broken or encrypted; pack it again") from error
     note = f"A folder of frames has no frame rate; {FOLDER_FPS:g} per second are assumed."
     return _video(torch.stack(frames), any_alpha, FOLDER_FPS, len(entries), (note,))
-
-
-def _is_picture_name(name: str) -> bool:
-    """Whether an entry of a zip is a frame; hidden files and macOS's copies of them are not."""
-    path = Path(name)
-    return path.suffix.lower() in PICTURE_SUFFIXES and not path.name.startswith(".") and "__MACOSX" not in path.parts
 
 
 def _numbered(entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo]:
@@ -232,7 +187,7 @@ def _zipped_picture(
     content = archive.read(info)
     if not content:
         raise BadInput(f"the frame {info.filename} is empty (0 bytes); export it again")
-    target = scratch / f"frame{_suffix(content[:SNIFFED_BYTES])}"
+    target = scratch / f"frame{still_suffix(content[:SNIFFED_BYTES])}"
     target.write_bytes(content)
     picture = decode_still(target, f"the frame {info.filename}")
     target.unlink()
@@ -245,47 +200,3 @@ def _link(path: Path, suffix: str, scratch: Path) -> Path:
     link.unlink(missing_ok=True)
     link.symlink_to(path.resolve())
     return link
-
-
-def _suffix(head: bytes) -> str:
-    """Which still picture this is.
-
-    Raises:
-        BadInput: none that is known.
-    """
-    if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
-        return ".webp"
-    for signature, suffix in STILLS:
-        if head.startswith(signature):
-            return suffix
-    kind = "a text file" if _is_text(head) else "of a format that is not known here"
-    raise BadInput(f"the file is {kind}, whatever its name says; give {ALLOWED}")
-
-
-def _container(head: bytes) -> str:
-    """FFmpeg's name of the container these bytes begin, or nothing; FFmpeg itself would also guess playlists."""
-    if head[4:8] == b"ftyp" and head[8:12] in UNREADABLE_BRANDS:
-        name = UNREADABLE_BRANDS[head[8:12]]
-        raise BadInput(f"{name} pictures cannot be read here; export the picture as PNG or JPEG")
-    if len(head) > 188 and head[0] == head[188] == 0x47:
-        return "mpegts"
-    return next((name for at, signature, name in CLIPS if head[at : at + len(signature)] == signature), "")
-
-
-def _is_animated_png(head: bytes) -> bool:
-    """Whether a PNG announces frames (acTL) before its first pixels."""
-    at = 8
-    while head[:4] == b"\x89PNG" and at + 8 <= len(head):
-        length, name = struct.unpack_from(">I4s", head, at)
-        if name in (b"acTL", b"IDAT"):
-            return bool(name == b"acTL")
-        at += 12 + length
-    return False
-
-
-def _is_text(head: bytes) -> bool:
-    try:
-        head[:-3].decode()
-    except UnicodeDecodeError:
-        return False
-    return b"\0" not in head

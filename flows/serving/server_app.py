@@ -13,6 +13,7 @@ import uvicorn
 from fastapi import Depends, FastAPI, Request, Response
 from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse
 from prefect.server.api.server import create_app as prefect_app
+from prefect.server.api.server import custom_internal_exception_handler
 from prefect.server.database.configurations import AioSqliteConfiguration
 from prefect.server.database.dependencies import MODELS_DEPENDENCIES
 from prefect.settings import PREFECT_API_DATABASE_CONNECTION_URL, PREFECT_SERVER_API_AUTH_STRING
@@ -67,6 +68,7 @@ def create_app() -> ASGIApp:
     for route in routes:
         if isinstance(part := getattr(route, "app", None), FastAPI):
             part.add_exception_handler(ConnectionError, database_away)
+    application.add_exception_handler(Exception, unavailable)  # Prefect's CSRF check reads the database before its API
     sign_in = SignIn(secret)
     file = "{digest}/{size}/{name}"
     for path, answer, signed_in in (
@@ -89,6 +91,13 @@ def serve(listener: socket.socket) -> None:
 def database_away(request: Request, error: Exception) -> Response:
     """Return 503 (retryable) while the database starts."""
     return PlainTextResponse("the database does not answer", 503)
+
+
+async def unavailable(request: Request, error: Exception) -> Response:
+    """Answer an error outside of the API: 503 if the request may be repeated, else 500."""
+    if isinstance(error, ConnectionError):
+        return database_away(request, error)
+    return await custom_internal_exception_handler(request, error)
 
 
 def artifact(digest: str, size: int, name: str) -> Response:

@@ -1,5 +1,6 @@
 """A server with deployments, and a worker of its own that runs fake steps."""
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from waiting import wait_until
 
 from flows.serving import registering
 from flows.serving.pools import read_pools
+from flows.serving.roots import SOURCES
 from flows.serving.server import Server
 from flows.serving.workers import Worker, running
 
@@ -38,6 +40,7 @@ def worker(
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DG4D_EXECUTOR", "in_process")
         patch.setenv("FAKE_LOG", str(place / "ran"))
+        patch.setenv(SOURCES, f"{tmp_path_factory.getbasetemp()}{os.pathsep}s3://bucket/pictures")
         for name, value in objects.environment.items():
             patch.setenv(name, value)
         worker = Worker("process-cpu", server.folder)
