@@ -23,9 +23,10 @@ from flows.commands.options import knobs_of
 from flows.commands.terminal import console
 from flows.inputs.fetching import at_hand, without_secrets
 from flows.inputs.manifest import parse_changes
+from flows.inputs.naming import clean
 from flows.inputs.orders import Wish
 from flows.packages.publish import check_folder, is_current
-from steps.contract import Frozen
+from steps.contract import LARGEST_SEED, Frozen
 from steps.profiles import profile, revise
 
 BEGUN = 3  # times, at most, is a run begun whose process dies
@@ -94,7 +95,9 @@ class Options(Frozen):
         description="of the files, from 1 to 240; empty: as the video, or the profile",
         json_schema_extra=_may_stay_empty,
     )
-    seed: int = Field(0, ge=0, title="Seed", description="another whole number gives another result of its kind")
+    seed: int = Field(
+        0, ge=0, le=LARGEST_SEED, title="Seed", description="another whole number gives another result of its kind"
+    )
     commercial_only: bool = Field(
         False, title="Commercial use only", description="refuse pretrained weights whose license forbids selling"
     )
@@ -247,7 +250,7 @@ def _make(address: str, folder: Path, options: Options, **files: Path) -> None:
     """As `dg4d make` does: what is made already is left alone."""
     connect()
     wish = Wish(
-        item=PurePosixPath(urlsplit(address).path).stem,
+        item=clean(PurePosixPath(urlsplit(address).path).stem) or "asset",
         profile=options.profile,
         settings=revise(profile(options.profile), options.knobs()),
         seed=options.seed,
