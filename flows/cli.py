@@ -1,7 +1,8 @@
 """The `dg4d` command: the only place that sees a user's paths.
 
 Exit status: 0 done · 1 an item of a batch failed, or something broke · 2 wrong usage · 65 bad input, or no room ·
-69 something needed is missing · 130 interrupted. Only what a command needs is imported, when it needs it.
+69 something needed is missing · 130 interrupted, 129 by SIGHUP, 143 by SIGTERM.
+Only what a command needs is imported, when it needs it.
 """
 
 import io

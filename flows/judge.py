@@ -14,6 +14,7 @@ from flows.engine.orphans import process_tag
 from flows.engine.tasks import QUICK, Steps
 from flows.packages import scores
 from flows.packages.scores import ObjectScores, Results
+from flows.ui.escaping import markdown
 from steps.contract import ArtifactRef, Frozen
 from steps.profiles import ScoreAssetSettings
 
@@ -82,7 +83,7 @@ def benchmark(entries: list[Entry], settings: ScoreAssetSettings, title: str, ou
         mean=mean,
         missing=missing | troubles,
     )
-    create_table_artifact(table=scores.table(results), key="benchmark", description=title)
+    create_table_artifact(table=scores.table(results), key="benchmark", description=markdown(title))
     return Judged(results=results, films=films)
 
 

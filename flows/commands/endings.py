@@ -1,10 +1,13 @@
-"""How a command ends: every error becomes one message and an exit status."""
+"""How a command ends: every error and every signal becomes one message and an exit status."""
 
 import errno
+import signal
 import sys
+import threading
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from types import FrameType
 from typing import NoReturn
 
 import typer
@@ -13,20 +16,63 @@ EXIT_FAILED = 1
 EXIT_BAD_INPUT = 65
 EXIT_MISSING = 69
 EXIT_INTERRUPTED = 130
+EXIT_SIGNAL = 128  # plus the number of the signal, as shells have it: SIGHUP 129, SIGINT 130, SIGTERM 143
+STOPPED = "stopped; the same command goes on after the last finished step"
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM or SIGHUP arrived; it ends a command as Ctrl-C does.
+
+    Args:
+        number: of the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
 
 
 @contextmanager
 def clear_ending() -> Iterator[None]:
-    """Turn every error into one message and an exit status."""
+    """Turn every error into one message and an exit status, and SIGTERM and SIGHUP into what Ctrl-C is."""
+    with _signals() as received:
+        try:
+            yield
+        except (typer.Exit, typer.Abort, typer.BadParameter):
+            raise
+        except KeyboardInterrupt as error:
+            _stop_steps()
+            _end(STOPPED, EXIT_SIGNAL + error.number if isinstance(error, Terminated) else EXIT_INTERRUPTED)
+        except Exception as error:
+            if received:  # a terminal that is gone cannot be written to, for example
+                _stop_steps()
+                _end(STOPPED, EXIT_SIGNAL + received[0])
+            _end(*_verdict(error))
+
+
+@contextmanager
+def _signals() -> Iterator[list[int]]:
+    """Raise `Terminated` for the first SIGTERM or SIGHUP while the block runs; gives the signals that arrived.
+
+    A signal that the parent has ignored, as `nohup` does with SIGHUP, stays ignored.
+    """
+    received: list[int] = []
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        if len(received) == 1:  # cleaning up is not interrupted
+            raise Terminated(number)
+
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is signal.SIG_DFL:
+                before[number] = signal.signal(number, stop)
     try:
-        yield
-    except (typer.Exit, typer.Abort, typer.BadParameter):
-        raise
-    except KeyboardInterrupt:
-        _stop_steps()
-        _end("stopped; the same command goes on after the last finished step", EXIT_INTERRUPTED)
-    except Exception as error:
-        _end(*_verdict(error))
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _verdict(error: Exception) -> tuple[str, int]:
@@ -70,5 +116,8 @@ def _stop_steps() -> None:
 
 
 def _end(message: str, status: int) -> NoReturn:
-    typer.echo(f"dg4d: {message}", err=True)
+    from flows.ui.escaping import visible
+
+    with suppress(OSError):  # nobody may be there to read it
+        typer.echo(f"dg4d: {visible(message)}", err=True)
     raise typer.Exit(status)

@@ -18,6 +18,7 @@ from prefect.artifacts import (
 )
 from prefect.cache_policies import CachePolicy
 from prefect.client.schemas.objects import State, TaskRun
+from prefect.exceptions import TerminationSignal
 from prefect.futures import PrefectFuture
 from prefect.logging import get_run_logger
 from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY
@@ -33,12 +34,14 @@ from flows.engine.executors import StepCrashed, StepError, StepOutOfMemory, Step
 from flows.engine.leases import hold
 from flows.ui import pages
 from flows.ui.curves import amount
+from flows.ui.escaping import markdown
 from flows.ui.showing import Beside, later, revive, show
 from steps.contract import ArtifactRef, StepRequest, StepResult
 from steps.main import catalog, request_version
 from steps.store import StoreUnreachable
 from steps.weights import identities, weights_in
 
+STOPS = (KeyboardInterrupt, TerminationSignal)  # how a user stops a flow
 PROGRESS_PAGE_EVERY_S = 3.0
 QUICK = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # settings: a flow waits a second at its end for its heart to stop
 RETRIES = 2
@@ -92,7 +95,7 @@ def run_step(request: StepRequest, item: str, label: str) -> dict[str, Any]:
             create_markdown_artifact,
             key=pages.key(label, item),
             markdown=pages.failure_page(label, item, error, home.store()),
-            description=f"{label} of {item} failed",
+            description=f"{label} of {markdown(item)} failed",
         )
         raise
     page.update(1, 1, {})
@@ -109,13 +112,13 @@ def _show_result(item: str, label: str, result: StepResult) -> None:
         create_markdown_artifact,
         key=pages.key(label, item),
         markdown=pages.step_page(label, item, result, home.store()),
-        description=f"{label} of {item}",
+        description=f"{label} of {markdown(item)}",
     )
     show(
         create_table_artifact,
         key=pages.key(f"outputs {label}", item),
         table=pages.output_rows(result, spec),
-        description=f"Files that {label} of {item} made",
+        description=f"Files that {label} of {markdown(item)} made",
     )
     name, ref = next(iter(result.outputs.items()))
     show(
@@ -123,7 +126,7 @@ def _show_result(item: str, label: str, result: StepResult) -> None:
         key=pages.key(f"file {label}", item),
         link=pages.address(name, ref, spec.outputs[name].suffix),
         link_text=f"{name}{spec.outputs[name].suffix}",
-        description=f"What {label} of {item} made",
+        description=f"What {label} of {markdown(item)} made",
     )
 
 
@@ -162,7 +165,7 @@ class Steps:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self._pages.finish(stopped=kind is KeyboardInterrupt)
+        self._pages.finish(stopped=kind is not None and issubclass(kind, STOPS))
 
     def run(self, step: str, inputs: dict[str, ArtifactRef | None], settings: BaseModel) -> dict[str, ArtifactRef]:
         """Run a step, or take what it gave before; its outputs by name. Inputs that are None are left out.
@@ -173,9 +176,7 @@ class Steps:
         request = self._request(step, inputs, settings)
         start = time.monotonic()
         with self._pages.offered():
-            state: State[Any] = _task(step, self.item, step)(
-                request, self.item, step, wait_for=self._before(request), return_state=True
-            )
+            state: State[Any] = _task(step)(request, self.item, step, wait_for=self._before(request), return_state=True)
         return self._note(step, state, start)
 
     def run_parts(
@@ -191,7 +192,7 @@ class Steps:
         for number, settings in enumerate(parts, 1):
             label = f"{step} {number}/{len(parts)}"
             request = self._request(step, inputs, settings)
-            ready = _task(step, self.item, label)
+            ready = _task(step)
             futures.append((label, ready.submit(request, self.item, label, wait_for=self._before(request))))
         for _, future in futures:
             future.wait()
@@ -237,14 +238,14 @@ class Steps:
 _locks: dict[str, FileLocks] = {}
 
 
-def _task(step: str, item: str, label: str) -> Task[..., Any]:
+def _task(step: str) -> Task[..., Any]:
     """The task under the step's own name, with its records where `$DG4D_HOME` is."""
     locks = _locks.setdefault(str(home.locks()), FileLocks(home.locks()))
     policy: CachePolicy = RequestPolicy(records=home.records(), store=home.store().address)
     home.records().mkdir(parents=True, exist_ok=True)
     return run_step.with_options(
         name=step,
-        task_run_name=f"{label}: {item}",
+        task_run_name="{label}: {item}",  # a template: names may have braces
         tags=[f"resource:{catalog()[step].resource}"],  # Prefect makes and keeps a thread and a client per set
         cache_policy=policy.configure(isolation_level=IsolationLevel.SERIALIZABLE, lock_manager=locks),
         result_storage=home.records(),
@@ -258,7 +259,7 @@ class _ProgressPage:
     """The progress bar in the UI, updated every few seconds."""
 
     def __init__(self, item: str, label: str) -> None:
-        self._key, self._what = f"progress-{pages.key(label, item)}", f"{label} of {item}"
+        self._key, self._what = f"progress-{pages.key(label, item)}", f"{label} of {markdown(item)}"
         self._artifact: Any = None
         self._last = 0.0
 

@@ -11,6 +11,9 @@ from urllib.parse import quote
 
 from pydantic import BaseModel
 
+from flows.ui.escaping import cell
+from flows.ui.escaping import markdown as escaped
+
 Figures = dict[str, float]
 
 
@@ -156,7 +159,7 @@ def csv_text(results: Results) -> str:
             whole |= _time(one, method == results.ours)
             for view, figures in {**views, "mean": whole}.items():
                 if figures:
-                    writer.writerow([one.object, method, view, *(figures.get(name, "") for name in names)])
+                    writer.writerow([cell(one.object), cell(method), view, *(figures.get(name, "") for name in names)])
     return text.getvalue()
 
 
@@ -167,15 +170,15 @@ def markdown(results: Results) -> str:
     more = _present(results, METRICS)
     means = [(called(method), figures) for method, figures in results.mean.items()]
     every = [
-        (f"{one.object}: {called(method)}", figures_of(judgment) | _time(one, method == results.ours))
+        (f"{escaped(one.object)}: {called(method)}", figures_of(judgment) | _time(one, method == results.ours))
         for one in results.objects
         for method, judgment in one.rows.items()
     ]
-    failures = [f"- {one.object} failed: {one.error}" for one in results.failed]
-    notes = [f"- {one.object}: {note}" for one in results.objects for note in one.notes]
+    failures = [f"- {escaped(one.object)} failed: {escaped(one.error)}" for one in results.failed]
+    notes = [f"- {escaped(one.object)}: {escaped(note)}" for one in results.objects for note in one.notes]
     missing = [f"- {metric}: {why}" for metric, why in results.missing.items()]
     parts = [
-        [f"# {results.title}"],
+        [f"# {escaped(results.title)}"],
         [f"{several}, {results.drawn}; all frames and views weigh the same."],
         _lines(PAPER_METRICS, means, results),
         _lines(more, means, results),

@@ -15,6 +15,7 @@ from pydantic import BaseModel
 
 from flows.packages.acceptance import failing_in
 from flows.packages.publish import record_of
+from flows.ui.escaping import cell
 from steps.store import write_atomically
 
 Status = Literal["done", "unchanged", "failed", "skipped"]
@@ -206,7 +207,8 @@ def _csv(items: list[dict[str, Any]]) -> str:
     table = io.StringIO()
     writer = csv.DictWriter(table, CSV_COLUMNS, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
-    writer.writerows(item | {"failing": " ".join(item["failing"] or ())} for item in items)
+    rows = (item | {"failing": " ".join(item["failing"] or ())} for item in items)
+    writer.writerows({column: cell(value) for column, value in row.items()} for row in rows)
     return table.getvalue()
 
 

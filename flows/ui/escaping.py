@@ -5,7 +5,9 @@ from typing import Any
 
 # control characters but for tab and line feed, marks that change the direction of writing, and lone surrogates
 _INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff\ud800-\udfff]")
-_MARKUP = re.compile(r"[\\`*_{}\[\]<>()#+\-.!|~:@&/=^$]")
+# what means something anywhere; emphasis outside of words; addresses that become links; lists, rules and headings
+_MARKUP = re.compile(r"[\\`*\[\]<>#|~@&]|(?<!\w)_|_(?!\w)|(?<=www)\.|:(?=//)|^[-+=]", re.IGNORECASE)
+_NUMBERED = re.compile(r"^(\d+)([.)])")
 SHOWN = 80  # letters of a value in a message
 # first letters of a formula, by OWASP's "CSV Injection"; the last four are the wide forms of the first
 _FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20")
@@ -21,7 +23,8 @@ def visible(text: str) -> str:
 
 def markdown(text: object) -> str:
     """Return text that Markdown shows letter by letter, in one line: no links, pictures, tables, HTML or emphasis."""
-    return _MARKUP.sub(r"\\\g<0>", " ".join(visible(str(text)).split()))
+    line = " ".join(visible(str(text)).split())
+    return _NUMBERED.sub(r"\1\\\2", _MARKUP.sub(r"\\\g<0>", line))
 
 
 def cell(value: Any) -> Any:

@@ -279,7 +279,7 @@ DEEP = "[" * 5000 + "]" * 5000
         (f"mesh.grid={DEEP[:-1]}", "mesh.grid = "),
         ("mesh.grid=" + "9" * 5000, "5000 digits"),
         ("mesh.max_faces=" + "9" * 40, "out of range"),
-        ("pack.fps=NaN", "NaN"), ("pack.fps=1e999", "too large"), ("pack.fps=0.5", "1 to 240"), ("pack.fps=-1", "pack.fps"),
+        ("pack.fps=NaN", "NaN"), ("pack.fps=1e999", "too large"), ("pack.fps=0.5", "1 to 240"),
         ("text.suffix=\"\\ud800\"", "half a character"), ('mesh={"grid": 3, "grid": 4}', "there twice"),
     ],
 )  # fmt: skip

@@ -33,9 +33,20 @@ def test_what_is_no_formula_stays(value: object) -> None:
 def test_markdown_has_no_letter_left_that_means_something() -> None:
     shown = markdown(NASTY)
     assert "\n" not in shown
-    for letter in "`*_[]()<>#|!~@&":
+    for letter in "`*[]<>#|~@&":
         assert shown.count(letter) == shown.count(f"\\{letter}") == NASTY.count(letter)
-    assert "http://" not in shown and "www." not in shown
+    assert "http://" not in shown and "www." not in shown and r" \_c\_ " in shown
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("fit_motion, 3.5 s (a-b)", "fit_motion, 3.5 s (a-b)"), ("1. one", r"1\. one"), ("- one", r"\- one"),
+        ("===", r"\==="), ("---", r"\---"), ("12) x", r"12\) x"), ("HTTPS://x WWW.y", r"HTTPS\://x WWW\.y"),
+    ],
+)  # fmt: skip
+def test_markdown_leaves_what_means_nothing_where_it_stands(text: str, shown: str) -> None:
+    assert markdown(text) == shown
 
 
 def test_a_table_with_a_nasty_cell_has_the_cells_that_it_should_have() -> None:
