@@ -30,7 +30,7 @@ from flows import home
 from flows.engine import resources
 from flows.engine.caching import FileLocks, RequestPolicy
 from flows.engine.events import StepEvent, tell
-from flows.engine.executors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable, chosen
+from flows.engine.executors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable, chosen, stop_all
 from flows.engine.leases import hold
 from flows.ui import pages
 from flows.ui.curves import amount
@@ -165,7 +165,10 @@ class Steps:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self._pages.finish(stopped=kind is not None and issubclass(kind, STOPS))
+        stopped = kind is not None and issubclass(kind, STOPS)
+        if stopped:
+            stop_all()  # parts that run side by side would be waited for
+        self._pages.finish(stopped=stopped)
 
     def run(self, step: str, inputs: dict[str, ArtifactRef | None], settings: BaseModel) -> dict[str, ArtifactRef]:
         """Run a step, or take what it gave before; its outputs by name. Inputs that are None are left out.

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from flows.commands import batch as module
 from flows.commands.batch import batch, ready, tell
 from flows.engine import resources
 from flows.engine.executors import StepBadInput, StepCrashed, StepOutOfMemory
+from flows.engine.processes import locked
 from flows.inputs.manifest import items_of
 from flows.inputs.orders import Order, Wish
 from flows.packages.summary import NOT_ACCEPTED, Row, Tally, Writer
@@ -147,28 +149,95 @@ def test_the_server_shows_how_far_a_batch_is_and_a_table_that_can_be_read(place:
     assert "all are in summary.csv" in by_type["table"]["description"]
 
 
-def test_a_user_who_stops_a_batch_keeps_what_is_done(place: None, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_user_who_stops_a_batch_keeps_what_is_done(
+    place: None, tmp_path: Path, number: signal.Signals, status: int
+) -> None:
     (tmp_path / "in").mkdir()
     for name, words in {"a": "quick", "b": "fit_motion=sleep:300", "c": "never"}.items():
-        (tmp_path / "in" / f"{name}.png").write_text(f"stopped {words}")
+        (tmp_path / "in" / f"{name}.png").write_text(f"stopped by {number.name} {words}")
     log = tmp_path / "ran"
-    command = subprocess.Popen(
-        [sys.executable, "-m", "flows.cli", "batch", "in", "-o", "out"],
-        cwd=tmp_path,
-        env={**os.environ, "FAKE_LOG": str(log), "DG4D_EXECUTOR": "subprocess"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    command = start(tmp_path, "batch", "in", "-o", "out")
     wait_until(lambda: log.exists() and log.read_text().split().count("fit_motion") == 2)
-    command.send_signal(signal.SIGINT)
+    command.send_signal(number)
     _, trouble = command.communicate(timeout=120)
-    assert command.returncode == 130, trouble
+    assert command.returncode == status, trouble
     assert "the same command goes on" in trouble
     assert log.read_text().split().count("fit_motion") == 2  # what was stopped is not begun again
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert {row["item"]: row["status"] for row in summary["items"]} == {"a": "done", "b": "skipped", "c": "skipped"}
     assert (tmp_path / "out" / "a" / "asset.glb").is_file()
+    assert left_behind(tmp_path) == []
+
+
+@pytest.mark.parametrize("step", ["fit_motion", "extract_mesh"])  # one alone, and several parts side by side
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_signal_ends_a_command_and_its_step_and_leaves_nothing_behind(
+    place: None, tmp_path: Path, number: signal.Signals, status: int, step: str
+) -> None:
+    (tmp_path / "a.png").write_text(f"ended by {number.name} {step}=sleep:300")
+    log = tmp_path / "ran"
+    command = start(tmp_path, "make", "a.png", "--set", "mesh.mode=per_frame", "-o", "out")
+    wait_until(lambda: log.exists() and step in log.read_text())
+    begun = time.monotonic()
+    command.send_signal(number)
+    _, trouble = command.communicate(timeout=60)
+    assert (command.returncode, "Traceback" in trouble) == (status, False), trouble
+    assert trouble.strip().endswith("dg4d: stopped; the same command goes on after the last finished step")
+    assert time.monotonic() - begun < 30
+    assert not (tmp_path / "out").exists()
+    assert left_behind(tmp_path) == []
+
+
+def test_a_command_that_is_to_survive_its_terminal_does(place: None, tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_text("nohup fit_motion=sleep:3")
+    log = tmp_path / "ran"
+    command = start(tmp_path, "make", "a.png", "-o", "out", survives=True)
+    wait_until(lambda: log.exists() and "fit_motion" in log.read_text())
+    command.send_signal(signal.SIGHUP)
+    _, trouble = command.communicate(timeout=120)
+    assert command.returncode == 0, trouble
+
+
+def start(folder: Path, *arguments: str, survives: bool = False) -> subprocess.Popen[str]:
+    """Begin a command in a folder, with steps in processes of their own and temporary files in the folder `tmp`."""
+    (folder / "tmp").mkdir()
+    deaf = ("sh", "-c", 'trap "" HUP; exec "$@"', "sh") if survives else ()  # as nohup does
+    return subprocess.Popen(
+        [*deaf, sys.executable, "-m", "flows.cli", *arguments],
+        cwd=folder,
+        env={
+            **os.environ, "FAKE_LOG": str(folder / "ran"), "DG4D_EXECUTOR": "subprocess", "TMPDIR": str(folder / "tmp"),
+        },
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )  # fmt: skip
+
+
+def left_behind(folder: Path) -> list[str]:
+    """What a command that ended has left: steps at work, temporary files, scratch folders, locks that are held."""
+    deadline = time.monotonic() + 10
+    while steps_of(folder) and time.monotonic() < deadline:  # what was killed takes a moment to go
+        time.sleep(0.1)
+    left = [f"process {pid}" for pid in steps_of(folder)]
+    left += [str(path) for path in (folder / "tmp").rglob("dg4d-*")]
+    left += [str(path) for path in (home.locks().parent / "scratch").glob("*")]
+    for lock in home.locks().rglob("*"):
+        with locked(lock) as free:
+            left += [] if free else [str(lock)]
+    return left
+
+
+def steps_of(folder: Path) -> list[int]:
+    """Processes whose environment names the log of this folder."""
+    mark = f"FAKE_LOG={folder / 'ran'}".encode()
+    found = []
+    for place in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            if mark in (place / "environ").read_bytes():
+                found.append(int(place.name))
+    return found
 
 
 def test_a_made_batch_needs_no_server_and_says_that_there_is_nothing_to_do(
