@@ -95,7 +95,7 @@ def convert(item: str, order: str, out: str, strict: bool, attempt: int, work: M
     """
     start = time.monotonic()
     row, may_heal = _converted(Order.model_validate_json(order), Path(out) / item, strict, work)
-    row = row.model_copy(update={"seconds": round(time.monotonic() - start, 1), "attempts": attempt})
+    row = row.model_copy(update={"wall_s": round(time.monotonic() - start, 1), "attempts": attempt})
     return row.model_dump(mode="json"), may_heal
 
 
@@ -189,7 +189,7 @@ def _cells(row: Row) -> dict[str, Any]:
     return {
         "item": markdown(row.item),
         "status": "not accepted" if row.failing else row.status,
-        "seconds": row.seconds,
+        "wall_s": row.wall_s,
         "asset": f"[page](/artifacts/key/{pages.key('asset', row.item)})" if row.made else "",
         "message": markdown(", ".join(row.failing or ()) or row.message),
     }

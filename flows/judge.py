@@ -30,6 +30,7 @@ class Entry(Frozen):
         truth: what it should look like.
         package: the asset; None where making it failed.
         error: why there is no asset.
+        kind: of that failure, the name of its exception.
         seconds: that it took.
     """
 
@@ -37,6 +38,7 @@ class Entry(Frozen):
     truth: ArtifactRef
     package: ArtifactRef | None = None
     error: str = ""
+    kind: str = ""
     seconds: float = 0.0
 
 
@@ -55,12 +57,12 @@ def benchmark(entries: list[Entry], settings: ScoreAssetSettings, title: str, ou
     missing: dict[str, str] = {}
     crowds: dict[str, list[list[float]]] = {"truth": [], "ours": []}
     for entry in entries:
-        one = ObjectScores(object=entry.name, error=entry.error, seconds=entry.seconds)
+        one = ObjectScores(object=entry.name, error=entry.error, kind=entry.kind, seconds=entry.seconds)
         if entry.package is not None:
             try:
                 guessed, judged = _judge(entry, settings, seed)
             except StepError as error:
-                one = one.model_copy(update={"error": error.message})
+                one = one.model_copy(update={"error": error.message, "kind": type(error).__name__})
             else:
                 theirs, mine = (_read(made["scores"]) for made in (guessed, judged))
                 films[entry.name] = {"truth": guessed["films"], "ours": judged["films"]}

@@ -17,6 +17,7 @@ EXIT_BAD_INPUT = 65
 EXIT_MISSING = 69
 EXIT_INTERRUPTED = 130
 EXIT_SIGNAL = 128  # plus the number of the signal, as shells have it: SIGHUP 129, SIGINT 130, SIGTERM 143
+UNREACHABLE = {errno.EACCES, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR}  # of paths that were given
 STOPPED = "stopped; the same command goes on after the last finished step"
 
 
@@ -91,8 +92,9 @@ def _verdict(error: Exception) -> tuple[str, int]:
             return text, EXIT_MISSING
         case StepError():
             return str(error), EXIT_FAILED
-        case OSError() if error.errno in NO_SPACE or error.errno == errno.EROFS:
-            return f"{error.strerror}: {error.filename or 'the disk'}; free some space and try again", EXIT_BAD_INPUT
+        case OSError() if error.errno in {*NO_SPACE, errno.EROFS, *UNREACHABLE}:
+            advice = "choose another place" if error.errno in UNREACHABLE else "free some space and try again"
+            return f"{error.strerror}: {error.filename or 'the disk'}; {advice}", EXIT_BAD_INPUT
     return f"something broke ({type(error).__name__}: {error}); details: {_saved_traceback(error)}", EXIT_FAILED
 
 

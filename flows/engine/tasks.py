@@ -55,22 +55,30 @@ class Finished(BaseModel):
     Attributes:
         label: the step, and the part of its work where it was divided.
         cached: whether the result was there already.
-        seconds: from asking for it to having it.
+        wall_s: seconds from asking for it to having it; parts that run side by side share them.
         result: what it gave.
     """
 
     label: str
     cached: bool
-    seconds: float
+    wall_s: float
     result: StepResult
 
 
 class Made(BaseModel):
-    """What a flow gives: the package, and how it came about."""
+    """What a flow gives: the package, and how it came about.
+
+    Attributes:
+        package: a zip.
+        steps: in the order in which they were asked for.
+        flow_run: its id.
+        wall_s: seconds on the clock from the first step to the last.
+    """
 
     package: ArtifactRef
     steps: list[Finished]
     flow_run: str = ""
+    wall_s: float = 0.0
 
 
 @task(name="run_step", persist_result=True, result_serializer="json", cache_result_in_memory=False)
@@ -160,6 +168,12 @@ class Steps:
     finished: list[Finished] = field(default_factory=list)
     _makers: dict[str, State[Any]] = field(default_factory=dict)
     _pages: Beside = field(default_factory=Beside)
+    _begun: float = field(default_factory=time.monotonic)
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds on the clock since the first step was asked for."""
+        return time.monotonic() - self._begun
 
     def __enter__(self) -> Self:
         return self
@@ -180,7 +194,7 @@ class Steps:
         start = time.monotonic()
         with self._pages.offered():
             state: State[Any] = _task(step)(request, self.item, step, wait_for=self._before(request), return_state=True)
-        return self._note(step, state, start)
+        return self._note(step, state, time.monotonic() - start)
 
     def run_parts(
         self, step: str, inputs: dict[str, ArtifactRef | None], parts: Sequence[BaseModel]
@@ -192,14 +206,18 @@ class Steps:
         """
         start = time.monotonic()
         futures: list[tuple[str, PrefectFuture[Any]]] = []
+        ends: dict[str, float] = {}
         for number, settings in enumerate(parts, 1):
             label = f"{step} {number}/{len(parts)}"
             request = self._request(step, inputs, settings)
             ready = _task(step)
-            futures.append((label, ready.submit(request, self.item, label, wait_for=self._before(request))))
-        for _, future in futures:
+            future = ready.submit(request, self.item, label, wait_for=self._before(request))
+            future.add_done_callback(partial(_note_end, ends, label))
+            futures.append((label, future))
+        for label, future in futures:
             future.wait()
-        return [self._note(label, future.state, start) for label, future in futures]
+            ends.setdefault(label, time.monotonic())
+        return [self._note(label, future.state, ends[label] - start) for label, future in futures]
 
     def notes(self) -> tuple[str, ...]:
         """What the steps so far have to say about the asset, and not about their run; each sentence once."""
@@ -221,8 +239,7 @@ class Steps:
         digests = {ref.digest for ref in request.inputs.values()}
         return [state for digest, state in self._makers.items() if digest in digests]
 
-    def _note(self, label: str, state: State[Any], start: float) -> dict[str, ArtifactRef]:
-        seconds = time.monotonic() - start
+    def _note(self, label: str, state: State[Any], seconds: float) -> dict[str, ArtifactRef]:
         if not state.is_completed():
             tell(StepEvent(self.item, label, "failed", seconds=seconds))
             error = state.result(raise_on_failure=False)
@@ -231,11 +248,15 @@ class Steps:
         cached = state.name == "Cached"
         if cached:
             hold(home.store(), self.item, (ref.digest for ref in result.outputs.values()))
-        self.finished.append(Finished(label=label, cached=cached, seconds=round(seconds, 3), result=result))
+        self.finished.append(Finished(label=label, cached=cached, wall_s=round(seconds, 3), result=result))
         for ref in result.outputs.values():
             self._makers[ref.digest] = state
         tell(StepEvent(self.item, label, "finished", seconds=seconds, cached=cached))
         return result.outputs
+
+
+def _note_end(ends: dict[str, float], label: str, _future: PrefectFuture[Any]) -> None:
+    ends.setdefault(label, time.monotonic())
 
 
 _locks: dict[str, FileLocks] = {}

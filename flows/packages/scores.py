@@ -11,6 +11,8 @@ from urllib.parse import quote
 
 from pydantic import BaseModel
 
+from flows.commands.endings import EXIT_BAD_INPUT, EXIT_FAILED
+from flows.packages.summary import BAD_INPUT
 from flows.ui.escaping import cell
 from flows.ui.escaping import markdown as escaped
 
@@ -73,6 +75,7 @@ class ObjectScores(BaseModel):
     Attributes:
         object: its name.
         error: why there are no scores; empty where there are.
+        kind: of that failure, the name of its exception.
         seconds: that the steps of the asset took to compute.
         frames: of every view.
         size: of a frame, pixels.
@@ -81,6 +84,7 @@ class ObjectScores(BaseModel):
 
     object: str
     error: str = ""
+    kind: str = ""
     seconds: float = 0.0
     frames: int = 0
     size: int = 0
@@ -113,6 +117,14 @@ class Results(BaseModel):
     def failed(self) -> list[ObjectScores]:
         """Objects without scores."""
         return [one for one in self.objects if one.error]
+
+    @property
+    def exit_code(self) -> int:
+        """0 if every object has scores, 65 if none has and bad input is to blame for all, else 1."""
+        if not self.failed:
+            return 0
+        bad = all(one.error and one.kind in BAD_INPUT for one in self.objects)
+        return EXIT_BAD_INPUT if bad else EXIT_FAILED
 
 
 def figures_of(judgment: Mapping[str, Any]) -> Figures:

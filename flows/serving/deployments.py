@@ -215,7 +215,7 @@ def benchmark(
     bank: Annotated[bool, Field(json_schema_extra=_title("True views as the prior"))] = False,
     workers: Workers = 1,
     options: Wanted = Options(),  # noqa: B008 - frozen
-) -> None:
+) -> State[None]:
     """Make an asset of every object of a data set and judge all of them against the truth.
 
     Args:
@@ -229,7 +229,11 @@ def benchmark(
     """
     _refuse_to_die_again()
     pairs = [f"{knob}={json.dumps(value)}" for knob, value in options.knobs().items()]
-    bench(Path(dataset), Path(out), console(), options.profile, pairs, options.seed, mesh, bank, limit or None, workers)
+    results = bench(
+        Path(dataset), Path(out), console(), options.profile, pairs, options.seed, mesh, bank, limit or None, workers
+    )
+    text = f"{len(results.objects) - len(results.failed)} of {len(results.objects)} objects have scores in {out}"
+    return Failed(message=text) if results.failed else Completed(message=text)
 
 
 def _name(source: str) -> str:

@@ -105,8 +105,8 @@ def timings(finished: Sequence["Finished"]) -> list[dict[str, str]]:
         {
             "step": done.label,
             "state": "cached" if done.cached else "computed",
-            "seconds": f"{done.seconds:.1f}",
-            "computed in": f"{done.result.provenance.duration_s:.1f} s",
+            "wall_s": f"{done.wall_s:.1f}",
+            "compute_s": f"{done.result.provenance.duration_s:.1f}",
             "memory": f"{done.result.provenance.peak_memory_mb:.0f} MiB",
             "key": done.result.provenance.request_digest[7:19],
             "record": done.result.provenance.digest()[7:19],

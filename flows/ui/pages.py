@@ -64,7 +64,7 @@ def step_page(label: str, item: str, result: StepResult, store: ArtifactStore) -
         if ref.media_type.endswith("gates+json"):
             lines += acceptance.markdown(json.loads(store.path(ref).read_text(encoding="utf-8")))
     rows = {
-        "seconds": f"{record.duration_s:.1f}",
+        "compute_s": f"{record.duration_s:.1f}",
         "peak memory": f"{record.peak_memory_mb:.0f} MiB",
         "backend": record.backend,
         "seed": record.seed,

@@ -298,15 +298,15 @@ def test_the_exit_status_says_how_a_batch_ended(
 
 def test_a_summary_has_times_and_costs_by_item_and_in_total(tmp_path: Path) -> None:
     rows = [
-        Row(item="a", status="done", computed_s=1800, cpu_s=3000.5, gpu_s=900, failing=["motion", "floaters"]),
-        Row(item="b", status="unchanged", computed_s=180, cpu_s=200),
+        Row(item="a", status="done", compute_s=1800, cpu_s=3000.5, gpu_s=900, failing=["motion", "floaters"]),
+        Row(item="b", status="unchanged", compute_s=180, cpu_s=200),
         Row(item="c", status="failed", message='a "bad", thing'),
     ]
     Writer(tmp_path, price_per_hour=2.0).write(rows, 12.34)
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["totals"] == {"computed_s": 1980, "cpu_s": 3200.5, "gpu_s": 900, "cost": 1.1}
+    assert summary["totals"] == {"compute_s": 1980, "cpu_s": 3200.5, "gpu_s": 900, "cost": 1.1}
     assert [item["cost"] for item in summary["items"]] == [1.0, 0.1, 0.0]
-    assert (summary["made"], summary["seconds"], summary["price_per_hour"]) == (2, 12.3, 2.0)
+    assert (summary["made"], summary["wall_s"], summary["price_per_hour"]) == (2, 12.3, 2.0)
     with (tmp_path / "summary.csv").open(newline="") as file:
         lines = list(csv.DictReader(file))
     assert [line["item"] for line in lines] == ["a", "b", "c"]
@@ -349,3 +349,19 @@ def test_a_line_says_how_far_a_batch_is_and_when_it_will_be_done(monkeypatch: py
         tally.settle(Row(item=f"{i}", status="failed" if i == 4 else "done"))
     monkeypatch.setattr(Tally, "seconds", property(lambda self: 600.0))
     assert tally.line() == "13 of 103 items, 1 failed, 60 an hour, about 90 min left"
+
+
+def test_formulas_in_a_summary_are_text_and_numbers_are_numbers(tmp_path: Path) -> None:
+    names = ["=cmd|calc!A1", "@SUM(1)", "+1", "-1", "plain"]
+    rows = [Row(item=name, source=name, status="failed", message=name, compute_s=1.5) for name in names]
+    Writer(tmp_path, price_per_hour=-3600.0).write(rows, 1.0)
+    with (tmp_path / "summary.csv").open(newline="") as file:
+        lines = list(csv.DictReader(file))
+    for line, name in zip(lines, names, strict=True):
+        expected = name if name == "plain" else f"'{name}"
+        assert (line["item"], line["source"], line["message"]) == (expected, expected, expected)
+        assert (float(line["cost"]), float(line["compute_s"])) == (-1.5, 1.5)
+    assert [item["item"] for item in json.loads((tmp_path / "summary.json").read_text())["items"]] == names
+    Writer(tmp_path).write([Row(item="<img src=x>", status="failed", message="<b>no</b>")], 1.0)
+    page = (tmp_path / "index.html").read_text()
+    assert "<img" not in page and "<b>" not in page and "&lt;b&gt;no" in page

@@ -340,3 +340,29 @@ def test_a_scene_of_another_suffix_is_refused_before_anything_is_loaded() -> Non
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == ["65", "[]"]
     assert "a scene is written as .glb or .usdz" in done.stderr
+
+
+def test_a_data_set_with_nothing_in_it() -> None:
+    Path("empty/gt").mkdir(parents=True)
+    refused(dg4d("bench", "empty", "-o", "out"), "holds no objects")
+    refused(dg4d("bench", "nowhere", "-o", "out"), "is no data set")
+    Path("one/thing/input").mkdir(parents=True)
+    refused(dg4d("bench", "one", "-o", "out"), "has no input frames")
+
+
+@pytest.mark.parametrize(
+    ("code", "status", "says"),
+    [
+        (errno.EACCES, 65, "Permission denied: a; choose another place"), (errno.ENAMETOOLONG, 65, "choose another"),
+        (errno.ENOSPC, 65, "free some space"), (errno.EROFS, 65, "free some space"),
+        (errno.EPIPE, 1, "something broke"),
+    ],
+)  # fmt: skip
+def test_what_the_system_refuses_is_said_in_a_line(
+    monkeypatch: pytest.MonkeyPatch, code: int, status: int, says: str
+) -> None:
+    def refuse(path: Path) -> None:
+        raise OSError(code, os.strerror(code), "a")
+
+    monkeypatch.setattr("flows.packages.publish.check_folder_name", refuse)
+    refused(dg4d("make", "cat.png", "-o", "out"), says, status)
