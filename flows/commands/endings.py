@@ -15,9 +15,9 @@ import typer
 EXIT_FAILED = 1
 EXIT_BAD_INPUT = 65
 EXIT_MISSING = 69
-EXIT_INTERRUPTED = 130
-EXIT_SIGNAL = 128  # plus the number of the signal, as shells have it: SIGHUP 129, SIGINT 130, SIGTERM 143
+EXIT_HANGUP, EXIT_INTERRUPTED, EXIT_TERMINATED = 129, 130, 143  # 128 and the number of the signal, as shells have it
 UNREACHABLE = {errno.EACCES, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR}  # of paths that were given
+CODES = {signal.SIGHUP: EXIT_HANGUP, signal.SIGTERM: EXIT_TERMINATED}
 STOPPED = "stopped; the same command goes on after the last finished step"
 
 
@@ -28,8 +28,8 @@ class Terminated(KeyboardInterrupt):
         number: of the signal.
     """
 
-    def __init__(self, number: int) -> None:
-        super().__init__(signal.Signals(number).name)
+    def __init__(self, number: signal.Signals) -> None:
+        super().__init__(number.name)
         self.number = number
 
 
@@ -43,30 +43,30 @@ def clear_ending() -> Iterator[None]:
             raise
         except KeyboardInterrupt as error:
             _stop_steps()
-            _end(STOPPED, EXIT_SIGNAL + error.number if isinstance(error, Terminated) else EXIT_INTERRUPTED)
+            _end(STOPPED, CODES[error.number] if isinstance(error, Terminated) else EXIT_INTERRUPTED)
         except Exception as error:
             if received:  # a terminal that is gone cannot be written to, for example
                 _stop_steps()
-                _end(STOPPED, EXIT_SIGNAL + received[0])
+                _end(STOPPED, CODES[received[0]])
             _end(*_verdict(error))
 
 
 @contextmanager
-def _signals() -> Iterator[list[int]]:
+def _signals() -> Iterator[list[signal.Signals]]:
     """Raise `Terminated` for the first SIGTERM or SIGHUP while the block runs; gives the signals that arrived.
 
     A signal that the parent has ignored, as `nohup` does with SIGHUP, stays ignored.
     """
-    received: list[int] = []
+    received: list[signal.Signals] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
-        received.append(number)
+        received.append(signal.Signals(number))
         if len(received) == 1:  # cleaning up is not interrupted
-            raise Terminated(number)
+            raise Terminated(received[0])
 
     before = {}
     if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGTERM, signal.SIGHUP):
+        for number in CODES:
             if signal.getsignal(number) is signal.SIG_DFL:
                 before[number] = signal.signal(number, stop)
     try:

@@ -96,7 +96,11 @@ class Options(Frozen):
         json_schema_extra=_may_stay_empty,
     )
     seed: int = Field(
-        0, ge=0, le=LARGEST_SEED, title="Seed", description="another whole number gives another result of its kind"
+        0,
+        ge=0,
+        le=LARGEST_SEED,
+        title="Seed",
+        description=f"from 0 to {LARGEST_SEED}; another whole number gives another result of its kind",
     )
     commercial_only: bool = Field(
         False, title="Commercial use only", description="refuse pretrained weights whose license forbids selling"

@@ -170,6 +170,22 @@ def test_a_user_who_stops_a_batch_keeps_what_is_done(
     assert left_behind(tmp_path) == []
 
 
+def test_a_batch_goes_on_after_items_that_nothing_can_be_made_of(place: None, tmp_path: Path) -> None:
+    names = [b"a.png", b"caf\xe9.png", b"{0}{item}.png", b"x" * 251 + b".png", b"summary.csv.png", b"z.png"]
+    (tmp_path / "in").mkdir()
+    for name in names:
+        (tmp_path / "in" / os.fsdecode(name)).write_text(f"goes on {ascii(name)[:20]}")
+    command = start(tmp_path, "batch", "in", "-o", "out", "--workers", "2")
+    told, trouble = command.communicate(timeout=300)
+    assert (command.returncode, "Traceback" in told + trouble) == (1, False), trouble
+    items = json.loads((tmp_path / "out" / "summary.json").read_text())["items"]
+    assert {row["item"] for row in items if row["status"] == "done"} == {"a", "{0}{item}", "z"}
+    assert {row["kind"] for row in items if row["status"] == "failed"} == {"BadInput"}
+    assert len(items) == len(names)
+    made = {path.parent.name for path in (tmp_path / "out").glob("*/asset.glb")}
+    assert made == {"a", "{0}{item}", "z"}
+
+
 @pytest.mark.parametrize("step", ["fit_motion", "extract_mesh"])  # one alone, and several parts side by side
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_signal_ends_a_command_and_its_step_and_leaves_nothing_behind(

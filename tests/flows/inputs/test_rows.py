@@ -56,7 +56,7 @@ def in_between(file: Path, content: str | bytes) -> tuple[str, str]:
         ('"name": "\\ud800"', "half a character"),
         ('"text": "\\udfff fox"', "half a character"),
         ('"name": "b", "name": "c"', "the key 'name' is there twice"),
-        ('"colour": "red"', "unknown column 'colour'"),
+        ('"color": "red"', "unknown column 'color'"),
         ('"pack.fps": 0.5', "1 to 240"),
         ('"pack.fps": 241', "less than or equal to 240"),
         ('"static.iterations": ' + "9" * 40, "static.iterations = 999"),
