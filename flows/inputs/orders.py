@@ -222,9 +222,12 @@ def order_again(
     try:
         names = {name: record[name] for name in NAMES & set(record)}
         order = Order.model_validate({**record["recipe"], **record["run"].get("names", {}), **names})
-    except (KeyError, ValidationError) as error:
+    except (KeyError, TypeError, AttributeError, ValidationError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        if isinstance(error, ValidationError):
+            reason = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
         raise BadInput(
-            f"the record of this package was written by another version of dg4d ({type(error).__name__}: {error}); "
+            f"the record of this package was written by another version of dg4d ({reason}); "
             "make the asset again from its source"
         ) from error
     require_backend(order.settings.rasterizer)

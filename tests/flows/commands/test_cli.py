@@ -366,3 +366,13 @@ def test_what_the_system_refuses_is_said_in_a_line(
 
     monkeypatch.setattr("flows.packages.publish.check_folder_name", refuse)
     refused(dg4d("make", "cat.png", "-o", "out"), says, status)
+
+
+@pytest.mark.parametrize(
+    "record",
+    [{}, {"recipe": 7, "run": {"names": 3}}, {"recipe": [], "run": []}, {"recipe": {"seed": 10**23}, "run": {}}],
+)
+def test_a_record_without_a_recipe_is_not_made_again(record: dict[str, object]) -> None:
+    Path("asset").mkdir()
+    Path("asset/provenance.json").write_text(json.dumps({"files": {}, **record}))
+    refused(dg4d("rebuild", "asset"), "")
