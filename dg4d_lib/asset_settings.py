@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from dg4d_lib.settings import NotNegative, Positive, Settings, Share
 
@@ -81,7 +81,7 @@ class PackSettings(Settings):
         ge=0,
         le=240,
         description="frames per second of what is written, 8, 12, 24, 30 or any: the motion is asked again at those "
-        "moments (paper's code: 4 times as many); 0: the driving video's; a mesh per frame keeps to that",
+        "moments, from 1 on (paper's code: 4 times as many); 0: the driving video's; a mesh per frame keeps to that",
     )
     gltf: GltfSettings = GltfSettings()
     lods: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = Field(
@@ -103,3 +103,10 @@ class PackSettings(Settings):
     sheet_azimuths_deg: tuple[Annotated[float, Field(ge=-360, le=360)], ...] = Field(
         (0.0, -75.0, 15.0, 105.0, 195.0), min_length=1, description="rows: angles"
     )
+
+    @field_validator("fps")
+    @classmethod
+    def _fps_is_a_rate(cls, fps: float) -> float:
+        if 0 < fps < 1:
+            raise ValueError("use 0 for the driving video's, or 1 to 240")
+        return fps

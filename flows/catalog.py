@@ -10,6 +10,7 @@ from typing import Any
 from prefect import flow, task
 from prefect.artifacts import create_progress_artifact, create_table_artifact, update_progress_artifact
 from prefect.cache_policies import NO_CACHE
+from prefect.exceptions import TerminationSignal
 from prefect.futures import PrefectFuture
 from prefect.settings import temporary_settings
 
@@ -21,6 +22,7 @@ from flows.engine.tasks import QUICK
 from flows.inputs.orders import Order
 from flows.packages.summary import Row, Tally, judged
 from flows.ui import pages
+from flows.ui.escaping import markdown
 from steps.store import ArtifactMissing, StoreUnreachable
 
 Make = Callable[[Order, Path], tuple[Any, bool]]
@@ -59,7 +61,7 @@ def convert_all(
         try:
             dead = list(_rounds(todo, out, workers, tally, strict, work, page, attempt=1))
             list(_rounds(dead, out, workers, tally, strict, work, page, attempt=2))
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, TerminationSignal):  # Prefect's own for SIGTERM, while a flow runs
             stop_all()
             raise
         page.finish()
@@ -93,7 +95,7 @@ def convert(item: str, order: str, out: str, strict: bool, attempt: int, work: M
     """
     start = time.monotonic()
     row, may_heal = _converted(Order.model_validate_json(order), Path(out) / item, strict, work)
-    row = row.model_copy(update={"seconds": round(time.monotonic() - start, 1), "attempts": attempt})
+    row = row.model_copy(update={"wall_s": round(time.monotonic() - start, 1), "attempts": attempt})
     return row.model_dump(mode="json"), may_heal
 
 
@@ -179,15 +181,15 @@ class _Page:
         create_table_artifact(table=shown, key=self._key, description=f"{self._text()}{more}")
 
     def _text(self) -> str:
-        return f"{self._name}: {self._tally.line()}"
+        return f"{markdown(self._name)}: {self._tally.line()}"
 
 
 def _cells(row: Row) -> dict[str, Any]:
     """What a page has room for, the longest last."""
     return {
-        "item": row.item,
+        "item": markdown(row.item),
         "status": "not accepted" if row.failing else row.status,
-        "seconds": row.seconds,
+        "wall_s": row.wall_s,
         "asset": f"[page](/artifacts/key/{pages.key('asset', row.item)})" if row.made else "",
-        "message": ", ".join(row.failing or ()) or row.message,
+        "message": markdown(", ".join(row.failing or ()) or row.message),
     }

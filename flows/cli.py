@@ -1,10 +1,14 @@
 """The `dg4d` command: the only place that sees a user's paths.
 
 Exit status: 0 done · 1 an item of a batch failed, or something broke · 2 wrong usage · 65 bad input, or no room ·
-69 something needed is missing · 130 interrupted. Only what a command needs is imported, when it needs it.
+69 something needed is missing · 130 interrupted, 129 by SIGHUP, 143 by SIGTERM.
+Only what a command needs is imported, when it needs it.
 """
 
+import io
+import math
 import os
+import sys
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,7 +17,7 @@ import typer
 
 from flows.commands.checking import bench, rebuild, score, verify
 from flows.commands.endings import clear_ending
-from flows.commands.options import Changes, Commercial, Profile, Rate, Seed, Texture, Triangles, knobs_of
+from flows.commands.options import Changes, Commercial, Profile, Rate, Seed, Texture, Triangles, finite, knobs_of
 from flows.commands.services import down, env, up, watch
 from flows.commands.store import store
 from flows.commands.weights import weights
@@ -81,6 +85,7 @@ def make(
         from flows import home
         from flows.commands import terminal
         from flows.inputs.manifest import parse_changes
+        from flows.inputs.naming import clean
         from flows.inputs.orders import Wish, name_of
         from flows.packages.acceptance import failing_in
         from flows.packages.publish import check_folder, is_current, record_of
@@ -92,7 +97,7 @@ def make(
             raise BadInput("--pick takes one of the motions that are made up; with --video the video is followed")
         short = knobs_of(triangles, texture, fps) | ({"driving.pick": pick} if pick else {})
         settings = revise(named(profile), parse_changes(changes or []) | short)
-        item = picture.stem if picture else name_of(text)
+        item = (clean(picture.stem) or "asset") if picture else name_of(text)
         wish = Wish(
             item=item,
             picture=picture,
@@ -140,6 +145,7 @@ def motions(
         from flows.commands import terminal
         from flows.commands.make import make_motions
         from flows.inputs.manifest import parse_changes
+        from flows.inputs.naming import clean
         from flows.inputs.orders import Wish
         from flows.packages.publish import check_writable
         from steps.profiles import profile as named
@@ -148,8 +154,9 @@ def motions(
         console = terminal.console()
         several = {"driving.candidates": candidates, "driving.pick": 0}
         settings = revise(named(profile), parse_changes(changes or []) | several)
+        item = clean(picture.stem) or "asset"
         wish = Wish(
-            item=picture.stem,
+            item=item,
             picture=picture,
             profile=profile,
             settings=settings,
@@ -157,7 +164,7 @@ def motions(
             commercial_only=commercial_only,
         )
         wish.check()
-        folder = out or Path("out") / f"{picture.stem}-motions"
+        folder = out or Path("out") / f"{item}-motions"
         check_writable(folder)
         order = wish.order(home.store())
         ranking = terminal.with_steps(order, console, lambda: make_motions(order, folder))
@@ -199,7 +206,13 @@ def batch(
         typer.Option(min=1, help="steps that compute on the processor at a time  [default: one per 4 cores]"),
     ] = None,
     price_per_hour: Annotated[
-        float | None, typer.Option(min=0, envvar="DG4D_PRICE_PER_HOUR", help="of this machine; the summary has costs")
+        float | None,
+        typer.Option(
+            min=0,
+            callback=finite,
+            envvar="DG4D_PRICE_PER_HOUR",
+            help="of this machine; the summary has costs",
+        ),
     ] = None,
 ) -> None:
     """Make many assets; those that are made already are left alone, and a bad one stops no other.
@@ -226,7 +239,7 @@ def render(
     package: Annotated[Path, typer.Argument(help="the folder of a package")],
     out: Annotated[Path, typer.Option("-o", "--out", help="OUT/view_<azimuth>/NNN.png")],
     azimuths: Annotated[str, typer.Option(help="degrees, separated by commas, for example --azimuths=0,-75,15")] = "0",
-    elevation: Annotated[float, typer.Option(min=-90, max=90, help="degrees")] = 0.0,
+    elevation: Annotated[float, typer.Option(min=-90, max=90, callback=finite, help="degrees")] = 0.0,
     size: Annotated[int, typer.Option(min=16, max=4096, help="pixels")] = 256,
     frames: Annotated[int | None, typer.Option(min=1, help="moments  [default: every frame]")] = None,
     mesh: Annotated[bool, typer.Option("--mesh", help="the textured mesh instead of the splats")] = False,
@@ -235,6 +248,8 @@ def render(
     with clear_ending():
         try:
             angles = [float(angle) for angle in azimuths.split(",")]
+            if not all(map(math.isfinite, angles)):
+                raise ValueError
         except ValueError:
             raise typer.BadParameter(f"{azimuths!r} is not a list of degrees such as 0,-75,15") from None
         from flows.packages.publish import check_writable
@@ -268,16 +283,19 @@ def compose(
     scene: Annotated[
         Path | None, typer.Option(help="a scene file (JSON): which packages stand where, and when")
     ] = None,
-    spacing: Annotated[float, typer.Option(min=0, max=1000, help="world units between neighbors in a row")] = 0.25,
+    spacing: Annotated[
+        float, typer.Option(min=0, max=1000, callback=finite, help="world units between neighbors in a row")
+    ] = 0.25,
     preview: Annotated[bool, typer.Option("--preview", help="also a film, beside the scene")] = False,
 ) -> None:
     """Put several assets into one animated scene: side by side, or as a scene file says."""
     with clear_ending():
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
         from flows.commands.compose import compose as compose_scene
+        from flows.ui.escaping import visible
 
         for note in compose_scene(packages or [], out, scene, spacing, preview):
-            typer.echo(note, err=True)
+            typer.echo(visible(note), err=True)
         typer.echo(out)
 
 
@@ -286,7 +304,10 @@ for command in (score, bench, verify, rebuild, up, down, env, watch):
 
 
 def main() -> None:
-    """The entry point of `dg4d`."""
+    """Run the command, with output that can hold file names in any encoding."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     app()
 
 

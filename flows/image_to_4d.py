@@ -77,7 +77,12 @@ def finish(
         CheckAssetSettings(rasterizer=settings.rasterizer, gates=settings.gates),
     )
     show_asset(steps.item, steps.finished, packed["package"], home.store())
-    return Made(package=packed["package"], steps=steps.finished, flow_run=str(flow_run.id or ""))
+    return Made(
+        package=packed["package"],
+        steps=steps.finished,
+        flow_run=str(flow_run.id or ""),
+        wall_s=round(steps.wall_s, 3),
+    )
 
 
 def extract(

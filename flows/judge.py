@@ -14,6 +14,7 @@ from flows.engine.orphans import process_tag
 from flows.engine.tasks import QUICK, Steps
 from flows.packages import scores
 from flows.packages.scores import ObjectScores, Results
+from flows.ui.escaping import markdown
 from steps.contract import ArtifactRef, Frozen
 from steps.profiles import ScoreAssetSettings
 
@@ -29,6 +30,7 @@ class Entry(Frozen):
         truth: what it should look like.
         package: the asset; None where making it failed.
         error: why there is no asset.
+        kind: of that failure, the name of its exception.
         seconds: that it took.
     """
 
@@ -36,6 +38,7 @@ class Entry(Frozen):
     truth: ArtifactRef
     package: ArtifactRef | None = None
     error: str = ""
+    kind: str = ""
     seconds: float = 0.0
 
 
@@ -54,12 +57,12 @@ def benchmark(entries: list[Entry], settings: ScoreAssetSettings, title: str, ou
     missing: dict[str, str] = {}
     crowds: dict[str, list[list[float]]] = {"truth": [], "ours": []}
     for entry in entries:
-        one = ObjectScores(object=entry.name, error=entry.error, seconds=entry.seconds)
+        one = ObjectScores(object=entry.name, error=entry.error, kind=entry.kind, seconds=entry.seconds)
         if entry.package is not None:
             try:
                 guessed, judged = _judge(entry, settings, seed)
             except StepError as error:
-                one = one.model_copy(update={"error": error.message})
+                one = one.model_copy(update={"error": error.message, "kind": type(error).__name__})
             else:
                 theirs, mine = (_read(made["scores"]) for made in (guessed, judged))
                 films[entry.name] = {"truth": guessed["films"], "ours": judged["films"]}
@@ -82,7 +85,7 @@ def benchmark(entries: list[Entry], settings: ScoreAssetSettings, title: str, ou
         mean=mean,
         missing=missing | troubles,
     )
-    create_table_artifact(table=scores.table(results), key="benchmark", description=title)
+    create_table_artifact(table=scores.table(results), key="benchmark", description=markdown(title))
     return Judged(results=results, films=films)
 
 

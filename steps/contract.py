@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 CONTRACT_VERSION = 1
+LARGEST_SEED = 2**63 - 1  # what every generator takes
 
 EXIT_DONE = 0
 EXIT_BAD_INPUT = 65  # the same again will fail again
@@ -68,7 +69,7 @@ class StepRequest(Frozen):
     version: str
     inputs: dict[str, ArtifactRef]
     settings: dict[str, Any]
-    seed: int = Field(ge=0, lt=2**63)
+    seed: int = Field(ge=0, le=LARGEST_SEED)
     weights: dict[str, Digest] = Field({}, description="identity of the weights that the settings name, by name")
 
     def digest(self) -> str:

@@ -25,6 +25,9 @@ from dg4d_lib.settings import (
     WarpSettings,
 )
 
+LARGEST_WHOLE = 2**53  # of a knob; readers of JSON disagree about larger numbers
+SHOWN = 80  # letters of a value in a message
+
 RasterizerName = Literal["auto", "reference", "cpu", "cuda_gsplat"]
 Backend = Annotated[RasterizerName, AfterValidator(backend_name)]  # never `auto`: a request says what will draw
 
@@ -117,6 +120,9 @@ def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSetti
         BadInput: a key that does not exist, or a value out of range; says which and what is allowed.
     """
     tree = settings.model_dump(mode="json")
+    for key, value in changes.items():
+        if isinstance(value, int) and abs(value) > LARGEST_WHOLE:
+            raise BadInput(f"{key} = {_shown(value)} is out of range; use at most {LARGEST_WHOLE}")
     for key, value in sorted(changes.items(), key=lambda change: not change[0].endswith(".kind")):
         *path, last = key.split(".")
         branch: Any = tree
@@ -133,8 +139,14 @@ def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSetti
     try:
         return PipelineSettings.model_validate(tree)
     except ValidationError as error:
-        lines = [f"{'.'.join(map(str, e['loc']))} = {e['input']!r}: {e['msg']}" for e in error.errors()]
+        lines = [f"{'.'.join(map(str, e['loc']))} = {_shown(e['input'])}: {e['msg']}" for e in error.errors()]
         raise BadInput("settings refused: " + "; ".join(lines)) from error
+
+
+def _shown(value: Any) -> str:
+    """A value in a message, shortened."""
+    text = repr(value)
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
 def _with_defaults(tree: dict[str, Any]) -> dict[str, Any]:

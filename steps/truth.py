@@ -180,7 +180,7 @@ def _check_cameras(path: Path, truth: Truth) -> None:
             for what, value in CAMERA.items()
             if abs(float(camera[what]) - value) > CLOSE
         ]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise BadInput(f"{path} does not say how every view was taken: {error!r}") from error
     if wrong:
         expected = ", ".join(f"{what} {value:g}" for what, value in CAMERA.items())

@@ -10,10 +10,12 @@ from flows import home
 from flows.commands import make, terminal
 from flows.commands.endings import EXIT_BAD_INPUT, EXIT_FAILED
 from flows.engine import resources
+from flows.inputs import naming
 from flows.inputs.manifest import Item, admitted, items_of, only_commercial
 from flows.inputs.orders import Order
 from flows.packages.publish import check_folder, check_writable, is_current
 from flows.packages.summary import BAD_INPUT, Row, Tally, Writer, judged
+from flows.ui.escaping import visible
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -123,13 +125,20 @@ def _make_all(
 
 
 def ready(item: Item, out: Path, strict: bool) -> Order | Row:
-    """The order of an item, or what became of it already."""
-    row = Row(item=item.name, source=item.wish.source_name if item.wish else "", status="unchanged")
+    """Return the order of an item, or what became of it already; whatever is wrong with it makes a row that failed."""
+    row = Row(item=item.name, source=visible(item.wish.source_name) if item.wish else "", status="unchanged")
+    failed = row.model_copy(update={"status": "failed"})
     try:
+        naming.check_not_reserved(item.name)
+        if item.wish is not None:
+            item.wish.check_names()  # before a file of this name is fetched
         with item.here() as wish:
             wish.check()
             check_folder(out / item.name)
             order = wish.order(home.store())
+        return judged(row, out / item.name, strict) if is_current(out / item.name, order.digest()) else order
     except DG4DError as error:
-        return row.model_copy(update={"status": "failed", "kind": type(error).__name__, "message": str(error)})
-    return judged(row, out / item.name, strict) if is_current(out / item.name, order.digest()) else order
+        return failed.model_copy(update={"kind": type(error).__name__, "message": visible(str(error))})
+    except Exception as error:  # it is this item's own
+        message = f"{type(error).__name__}: {visible(str(error))}"
+        return failed.model_copy(update={"kind": "Crashed", "message": message})

@@ -13,13 +13,14 @@ from dg4d_lib.asset_settings import ScoreSettings
 from dg4d_lib.errors import BadInput, DG4DError
 from flows import home
 from flows.commands import terminal
+from flows.engine.executors import StepError, StepMissing
 from flows.engine.merging import add
 from flows.inputs.manifest import parse_changes
 from flows.inputs.orders import Order, Wish
 from flows.packages import scores
 from flows.packages.publish import check_folder, check_writable, is_current, whole
 from flows.packages.scores import Results
-from flows.packages.summary import Row, Tally
+from flows.packages.summary import BAD_INPUT, Row, Tally
 from steps.archives import unpack
 from steps.catalog import PACKAGE, TRUTH
 from steps.contract import ArtifactRef
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 
 NEEDED = ("asset.json", "asset.glb", "splats/", "meshes/", "canonical/")  # of a package, to draw it
 OWN = "score."  # before the knobs of scoring
+MISSING = frozenset(["StepMissing", "StepLost", "StepUnreachable"])  # kinds of failure for which something is not here
 ASSETS, FILMS = "assets", "films"  # folders of a benchmark
 
 
@@ -70,7 +72,7 @@ def score(
     from flows.commands.make import connect
 
     connect()
-    from flows.judge import Entry, judge
+    from flows.judge import STEP, Entry, judge
 
     entry = Entry(
         name=found.name,
@@ -80,6 +82,10 @@ def score(
     )
     with terminal.steps_shown(console):
         judged = judge([entry], settings, f"{package.absolute().name} against {found.name}", package.absolute().name)
+    for one in judged.results.failed:
+        if one.kind in BAD_INPUT:
+            raise BadInput(f"{package} cannot be judged against {truth}: {one.error}")
+        raise (StepMissing if one.kind in MISSING else StepError)(STEP, one.error)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, _json(judged.results))
@@ -253,19 +259,19 @@ def _entry(truth: Truth, folder: Path, row: Row) -> "Entry":
 
     ref = put_truth(truth, home.store())
     if row.status == "failed":
-        return Entry(name=truth.name, truth=ref, error=row.message)
+        return Entry(name=truth.name, truth=ref, error=row.message, kind=row.kind)
     try:
         record = whole(folder)
         package = put_package(folder, record, home.store())
     except DG4DError as error:
-        return Entry(name=truth.name, truth=ref, error=str(error))
+        return Entry(name=truth.name, truth=ref, error=str(error), kind=type(error).__name__)
     return Entry(name=truth.name, truth=ref, package=package, seconds=_seconds(record))
 
 
 def _seconds(record: Mapping[str, Any]) -> float:
     """What the steps of a package took to compute, now or before."""
     steps = record.get("run", {}).get("steps", [])
-    return round(sum(float(step["duration_s"]) for step in steps), 1)
+    return round(sum(float(step.get("duration_s", 0.0)) for step in steps), 1)
 
 
 def _json(results: Results) -> str:

@@ -52,8 +52,13 @@ def bench(
 
         console = terminal.console()
         results = judge_all(dataset, out, console, profile, changes, seed, mesh, bank, limit, workers)
-        console.print(markdown(results), markup=False)
+        if len(results.failed) < len(results.objects):
+            console.print(markdown(results), markup=False)
+        for one in results.failed:
+            console.print(f"failed: {one.object}: {one.error}", markup=False, style="red")
         console.print(f"overview: {out / 'index.html'}", markup=False)
+        if results.exit_code:
+            raise typer.Exit(results.exit_code)
 
 
 def verify(

@@ -9,7 +9,6 @@ from pydantic import ValidationError
 from dg4d_lib.assets.scene import Item, Scene
 from dg4d_lib.errors import BadInput
 from flows.packages.publish import check_writable, record_of, whole
-from steps.compose_scene import Cast
 from steps.store import room_for
 
 SUFFIXES = (".glb", ".usdz")
@@ -53,6 +52,8 @@ def compose(
         folders = list(packages)
     for folder in dict.fromkeys(folders):
         whole(folder)
+    from steps.compose_scene import Cast
+
     cast = Cast(folders, plan.items, _names(folders, plan.items))
     if scene is None:
         cast.in_a_row(spacing)

@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flows import home
+from flows.engine.free_space import require_free_space
 from flows.inputs.orders import Order
 from flows.packages.credentials import Signer, configured
 from flows.packages.publish import Files, publish
 from flows.serving.server import ServerUnavailable
 from steps.store import ArtifactMissing
+from steps.store import home as store_home
 
 if TYPE_CHECKING:
     from flows.engine.tasks import Made
@@ -36,7 +38,9 @@ def connect() -> None:
 
     Raises:
         ServerUnavailable: there is none; says what to do.
+        DiskFull: there is no room for what a run keeps.
     """
+    require_free_space(store_home())
     own = os.environ.get("PREFECT_API_URL")
     if own:
         home.set_environment(own)

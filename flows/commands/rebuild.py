@@ -84,6 +84,10 @@ def rebuild(folder: Path, record: Mapping[str, Any], order: Order, out: Path | N
     """
     signer = configured() if out else None
     labels = [run["step"] for run in record["run"]["steps"]]
+    if len(labels) != len(record["steps"]):
+        raise BadInput(
+            f"{folder} cannot be made again: its record has {len(record['steps'])} steps, its run {len(labels)}"
+        )
     first = dict(zip(labels, record["steps"], strict=True))
     machines = {run["step"]: run.get("machine", {}) for run in record["run"]["steps"]}
     made = run_flow(order, refresh=True)

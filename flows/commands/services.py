@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from flows.commands.endings import clear_ending
+from flows.commands.options import finite
 
 LOOK_S = 1.0  # between two looks at a watched folder
 
@@ -100,7 +101,7 @@ def watch(
     folder: Annotated[Path, typer.Argument(help="where people drop pictures, videos or a manifest")],
     out: Annotated[Path, typer.Option("-o", "--out", help="OUT/<item>/ is a package each")],
     rest_s: Annotated[
-        float, typer.Option("--rest", min=1, help="seconds without a change before its content counts")
+        float, typer.Option("--rest", min=1, callback=finite, help="seconds without a change before its content counts")
     ] = 10.0,
 ) -> None:
     """Have the deployment catalog/local convert what is dropped into a folder; goes on until it is stopped."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flows.commands.endings import EXIT_BAD_INPUT, clear_ending
+from flows.commands.options import finite
 
 if TYPE_CHECKING:
     from flows.packages.versions import Version
@@ -42,7 +43,7 @@ def list_versions() -> None:
         before = None
         for version in known:
             table.add_row(
-                version.item if version.item != before else "",
+                terminal.plain(version.item) if version.item != before else "",
                 _short(version.order),
                 _when(version),
                 version.profile,
@@ -98,7 +99,9 @@ def gc(
         int | None, typer.Option(min=1, help="of each item keep so many of the newest versions  [default: all]")
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="only say what would be removed")] = False,
-    grace_hours: Annotated[float, typer.Option(min=0, help="what is younger stays, for it may be in use")] = 24.0,
+    grace_hours: Annotated[
+        float, typer.Option(min=0, callback=finite, help="what is younger stays, for it may be in use")
+    ] = 24.0,
 ) -> None:
     """Remove what no version and no running command needs; it may run at any time."""
     with clear_ending():
@@ -109,7 +112,7 @@ def gc(
         place = home.store()
         gone = collect(place, home.records(), keep, dry_run, grace_hours * 3600)
         for version in gone.versions:
-            typer.echo(f"version {_short(version.order)} of {version.item}, {_when(version)}")
+            _echo(f"version {_short(version.order)} of {version.item}, {_when(version)}")
         size = readable(sum(entry.size_bytes for entry in gone.artifacts))
         verb = "would be removed" if dry_run else "were removed"
         typer.echo(
@@ -130,7 +133,7 @@ def verify() -> None:
         wrong = faults(place, known, sizes)
         of = users(known)
         for digest, what in sorted(wrong.items()):
-            typer.echo(f"{digest} {what}: {_needed_by(of.get(digest, []))}")
+            _echo(f"{digest} {what}: {_needed_by(of.get(digest, []))}")
         if wrong:
             typer.echo(
                 f"dg4d: {len(wrong)} of {len(sizes | wrong)} artifacts are damaged or missing; "
@@ -145,27 +148,34 @@ def _show_version(version: "Version", place: "ArtifactStore") -> None:
     from flows.packages.publish import readable
 
     sizes = {entry.name: entry.size_bytes for entry in place.artifacts()}
-    typer.echo(f"{version.item}  version {version.order}")
-    typer.echo(f"  finished  {_when(version)}, profile {version.profile}, seed {version.seed}")
+    _echo(f"{version.item}  version {version.order}")
+    _echo(f"  finished  {_when(version)}, profile {version.profile}, seed {version.seed}")
     for digest, what in version.artifacts().items():
         size = readable(sizes[digest]) if digest in sizes else "missing"
-        typer.echo(f"  {_short(digest)}  {size:>9}  {what}")
+        _echo(f"  {_short(digest)}  {size:>9}  {what}")
     if version.package.digest in sizes:
         with zipfile.ZipFile(place.path(version.package)) as package:
-            typer.echo("  files of the package")
+            _echo("  files of the package")
             for entry in package.infolist():
-                typer.echo(f"  {'':{SHOWN_DIGITS}}  {readable(entry.file_size):>9}  {entry.filename}")
+                _echo(f"  {'':{SHOWN_DIGITS}}  {readable(entry.file_size):>9}  {entry.filename}")
 
 
 def _show_artifact(digest: str, size_bytes: int, known: list["Version"]) -> None:
     from flows.packages.publish import readable
     from flows.packages.versions import users
 
-    typer.echo(f"{digest}  {readable(size_bytes)}")
+    _echo(f"{digest}  {readable(size_bytes)}")
     for version, what in users(known).get(digest, []):
-        typer.echo(f"  {what} of {version.item}, version {_short(version.order)}")
+        _echo(f"  {what} of {version.item}, version {_short(version.order)}")
     if digest not in users(known):
-        typer.echo("  no version refers to it")
+        _echo("  no version refers to it")
+
+
+def _echo(text: str) -> None:
+    """Print a line with names in it that this process did not choose."""
+    from flows.ui.escaping import visible
+
+    typer.echo(visible(text))
 
 
 def _needed_by(of: list[tuple["Version", str]]) -> str:

@@ -6,16 +6,18 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.console import Console
 from rich.live import Live
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from flows.engine.events import StepEvent, listening
 from flows.packages.publish import readable
 from flows.ui.curves import amount
+from flows.ui.escaping import visible
 
 if TYPE_CHECKING:
     from flows.inputs.orders import Order
@@ -31,7 +33,14 @@ COUNTED = 1  # totals up to this say nothing as a fraction
 def console(stderr: bool = False) -> Console:
     """Where people read: standard output, or standard error where that is for machines."""
     stream = sys.stderr if stderr else sys.stdout
-    return Console(stderr=stderr, highlight=False, soft_wrap=not stream.isatty())
+    return _Terminal(stderr=stderr, highlight=False, soft_wrap=not stream.isatty())
+
+
+class _Terminal(Console):
+    """A console that writes out what a terminal would obey, in every text that is printed."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        super().print(*(visible(one) if isinstance(one, str) else one for one in objects), **options)
 
 
 def with_steps(order: "Order", out: Console, work: Callable[[], Result]) -> Result:
@@ -83,14 +92,14 @@ class StepBars:
     def __call__(self, event: StepEvent) -> None:
         """Show an event."""
         if event.step not in self._bars:
-            self._bars[event.step] = self.progress.add_task(event.step, total=None, numbers="")
+            self._bars[event.step] = self.progress.add_task(plain(event.step), total=None, numbers="")
         bar = self._bars[event.step]
         match event.kind:
             case "progress":
                 text = numbers(event, self._values)
                 self.progress.update(bar, completed=event.done, total=max(event.total, 1), numbers=text)
             case "note":
-                self.progress.update(bar, numbers=event.text)
+                self.progress.update(bar, numbers=plain(event.text))
             case "finished":
                 self.progress.update(bar, total=1, completed=1, numbers="cached" if event.cached else "")
             case "failed":
@@ -169,7 +178,8 @@ class BatchTable:
         for item in shown:
             status = self.status[item]
             took = self._took.get(item, time.monotonic() - self._since[item] if item in self._since else 0.0)
-            table.add_row(item, f"[{INK[status]}]{status}", f"{took:.0f} s" if took else "", self._doing.get(item, ""))
+            doing = plain(self._doing.get(item, ""))
+            table.add_row(plain(item), f"[{INK[status]}]{status}", f"{took:.0f} s" if took else "", doing)
         return table
 
 
@@ -194,9 +204,14 @@ def numbers(event: StepEvent, most: int | None = None) -> str:
     return "  ".join([*parts, *(f"{name} {amount(value)}" for name, value in list(event.values.items())[:most])])
 
 
+def plain(text: str) -> str:
+    """Return text for a place in which rich reads markup, so that it is shown letter by letter."""
+    return escape(visible(text))
+
+
 def tell_where(out: Console, folder: Path, sizes: dict[str, int]) -> None:
     """Everything in a package with its size."""
-    table = Table(title=str(folder), title_justify="left", show_header=False, box=None, title_style="bold")
+    table = Table(title=plain(str(folder)), title_justify="left", show_header=False, box=None, title_style="bold")
     table.add_column()
     table.add_column(justify="right")
     groups: dict[str, tuple[int, int]] = {}
@@ -205,7 +220,7 @@ def tell_where(out: Console, folder: Path, sizes: dict[str, int]) -> None:
         count, total = groups.get(group, (0, 0))
         groups[group] = count + 1, total + size
     for group, (count, total) in groups.items():
-        table.add_row(group + (f" ({_files(count)})" if group.endswith("/") else ""), readable(total))
+        table.add_row(plain(group) + (f" ({_files(count)})" if group.endswith("/") else ""), readable(total))
     out.print(table)
 
 

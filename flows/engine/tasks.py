@@ -18,6 +18,7 @@ from prefect.artifacts import (
 )
 from prefect.cache_policies import CachePolicy
 from prefect.client.schemas.objects import State, TaskRun
+from prefect.exceptions import TerminationSignal
 from prefect.futures import PrefectFuture
 from prefect.logging import get_run_logger
 from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY
@@ -29,16 +30,18 @@ from flows import home
 from flows.engine import resources
 from flows.engine.caching import FileLocks, RequestPolicy
 from flows.engine.events import StepEvent, tell
-from flows.engine.executors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable, chosen
+from flows.engine.executors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable, chosen, stop_all
 from flows.engine.leases import hold
 from flows.ui import pages
 from flows.ui.curves import amount
+from flows.ui.escaping import markdown
 from flows.ui.showing import Beside, later, revive, show
 from steps.contract import ArtifactRef, StepRequest, StepResult
 from steps.main import catalog, request_version
 from steps.store import StoreUnreachable
 from steps.weights import identities, weights_in
 
+STOPS = (KeyboardInterrupt, TerminationSignal)  # how a user stops a flow
 PROGRESS_PAGE_EVERY_S = 3.0
 QUICK = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # settings: a flow waits a second at its end for its heart to stop
 RETRIES = 2
@@ -52,22 +55,30 @@ class Finished(BaseModel):
     Attributes:
         label: the step, and the part of its work where it was divided.
         cached: whether the result was there already.
-        seconds: from asking for it to having it.
+        wall_s: seconds from asking for it to having it; parts that run side by side share them.
         result: what it gave.
     """
 
     label: str
     cached: bool
-    seconds: float
+    wall_s: float
     result: StepResult
 
 
 class Made(BaseModel):
-    """What a flow gives: the package, and how it came about."""
+    """What a flow gives: the package, and how it came about.
+
+    Attributes:
+        package: a zip.
+        steps: in the order in which they were asked for.
+        flow_run: its id.
+        wall_s: seconds on the clock from the first step to the last.
+    """
 
     package: ArtifactRef
     steps: list[Finished]
     flow_run: str = ""
+    wall_s: float = 0.0
 
 
 @task(name="run_step", persist_result=True, result_serializer="json", cache_result_in_memory=False)
@@ -92,7 +103,7 @@ def run_step(request: StepRequest, item: str, label: str) -> dict[str, Any]:
             create_markdown_artifact,
             key=pages.key(label, item),
             markdown=pages.failure_page(label, item, error, home.store()),
-            description=f"{label} of {item} failed",
+            description=f"{label} of {markdown(item)} failed",
         )
         raise
     page.update(1, 1, {})
@@ -109,13 +120,13 @@ def _show_result(item: str, label: str, result: StepResult) -> None:
         create_markdown_artifact,
         key=pages.key(label, item),
         markdown=pages.step_page(label, item, result, home.store()),
-        description=f"{label} of {item}",
+        description=f"{label} of {markdown(item)}",
     )
     show(
         create_table_artifact,
         key=pages.key(f"outputs {label}", item),
         table=pages.output_rows(result, spec),
-        description=f"Files that {label} of {item} made",
+        description=f"Files that {label} of {markdown(item)} made",
     )
     name, ref = next(iter(result.outputs.items()))
     show(
@@ -123,7 +134,7 @@ def _show_result(item: str, label: str, result: StepResult) -> None:
         key=pages.key(f"file {label}", item),
         link=pages.address(name, ref, spec.outputs[name].suffix),
         link_text=f"{name}{spec.outputs[name].suffix}",
-        description=f"What {label} of {item} made",
+        description=f"What {label} of {markdown(item)} made",
     )
 
 
@@ -157,12 +168,21 @@ class Steps:
     finished: list[Finished] = field(default_factory=list)
     _makers: dict[str, State[Any]] = field(default_factory=dict)
     _pages: Beside = field(default_factory=Beside)
+    _begun: float = field(default_factory=time.monotonic)
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds on the clock since the first step was asked for."""
+        return time.monotonic() - self._begun
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self._pages.finish(stopped=kind is KeyboardInterrupt)
+        stopped = kind is not None and issubclass(kind, STOPS)
+        if stopped:
+            stop_all()  # parts that run side by side would be waited for
+        self._pages.finish(stopped=stopped)
 
     def run(self, step: str, inputs: dict[str, ArtifactRef | None], settings: BaseModel) -> dict[str, ArtifactRef]:
         """Run a step, or take what it gave before; its outputs by name. Inputs that are None are left out.
@@ -173,10 +193,8 @@ class Steps:
         request = self._request(step, inputs, settings)
         start = time.monotonic()
         with self._pages.offered():
-            state: State[Any] = _task(step, self.item, step)(
-                request, self.item, step, wait_for=self._before(request), return_state=True
-            )
-        return self._note(step, state, start)
+            state: State[Any] = _task(step)(request, self.item, step, wait_for=self._before(request), return_state=True)
+        return self._note(step, state, time.monotonic() - start)
 
     def run_parts(
         self, step: str, inputs: dict[str, ArtifactRef | None], parts: Sequence[BaseModel]
@@ -188,14 +206,18 @@ class Steps:
         """
         start = time.monotonic()
         futures: list[tuple[str, PrefectFuture[Any]]] = []
+        ends: dict[str, float] = {}
         for number, settings in enumerate(parts, 1):
             label = f"{step} {number}/{len(parts)}"
             request = self._request(step, inputs, settings)
-            ready = _task(step, self.item, label)
-            futures.append((label, ready.submit(request, self.item, label, wait_for=self._before(request))))
-        for _, future in futures:
+            ready = _task(step)
+            future = ready.submit(request, self.item, label, wait_for=self._before(request))
+            future.add_done_callback(partial(_note_end, ends, label))
+            futures.append((label, future))
+        for label, future in futures:
             future.wait()
-        return [self._note(label, future.state, start) for label, future in futures]
+            ends.setdefault(label, time.monotonic())
+        return [self._note(label, future.state, ends[label] - start) for label, future in futures]
 
     def notes(self) -> tuple[str, ...]:
         """What the steps so far have to say about the asset, and not about their run; each sentence once."""
@@ -217,8 +239,7 @@ class Steps:
         digests = {ref.digest for ref in request.inputs.values()}
         return [state for digest, state in self._makers.items() if digest in digests]
 
-    def _note(self, label: str, state: State[Any], start: float) -> dict[str, ArtifactRef]:
-        seconds = time.monotonic() - start
+    def _note(self, label: str, state: State[Any], seconds: float) -> dict[str, ArtifactRef]:
         if not state.is_completed():
             tell(StepEvent(self.item, label, "failed", seconds=seconds))
             error = state.result(raise_on_failure=False)
@@ -227,24 +248,28 @@ class Steps:
         cached = state.name == "Cached"
         if cached:
             hold(home.store(), self.item, (ref.digest for ref in result.outputs.values()))
-        self.finished.append(Finished(label=label, cached=cached, seconds=round(seconds, 3), result=result))
+        self.finished.append(Finished(label=label, cached=cached, wall_s=round(seconds, 3), result=result))
         for ref in result.outputs.values():
             self._makers[ref.digest] = state
         tell(StepEvent(self.item, label, "finished", seconds=seconds, cached=cached))
         return result.outputs
 
 
+def _note_end(ends: dict[str, float], label: str, _future: PrefectFuture[Any]) -> None:
+    ends.setdefault(label, time.monotonic())
+
+
 _locks: dict[str, FileLocks] = {}
 
 
-def _task(step: str, item: str, label: str) -> Task[..., Any]:
+def _task(step: str) -> Task[..., Any]:
     """The task under the step's own name, with its records where `$DG4D_HOME` is."""
     locks = _locks.setdefault(str(home.locks()), FileLocks(home.locks()))
     policy: CachePolicy = RequestPolicy(records=home.records(), store=home.store().address)
     home.records().mkdir(parents=True, exist_ok=True)
     return run_step.with_options(
         name=step,
-        task_run_name=f"{label}: {item}",
+        task_run_name="{label}: {item}",  # a template: names may have braces
         tags=[f"resource:{catalog()[step].resource}"],  # Prefect makes and keeps a thread and a client per set
         cache_policy=policy.configure(isolation_level=IsolationLevel.SERIALIZABLE, lock_manager=locks),
         result_storage=home.records(),
@@ -258,7 +283,7 @@ class _ProgressPage:
     """The progress bar in the UI, updated every few seconds."""
 
     def __init__(self, item: str, label: str) -> None:
-        self._key, self._what = f"progress-{pages.key(label, item)}", f"{label} of {item}"
+        self._key, self._what = f"progress-{pages.key(label, item)}", f"{label} of {markdown(item)}"
         self._artifact: Any = None
         self._last = 0.0
 

@@ -1,29 +1,29 @@
 """The items of a batch: the rows of a manifest, or everything in a folder, a pattern or an object store, by name."""
 
-import csv
 import json
-from collections import Counter
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from dg4d_lib.errors import BackendUnavailable, BadInput
+from dg4d_lib.errors import BadInput, DG4DError
 from flows.inputs import listing, sources
+from flows.inputs.json_text import UnfitJSON, loads
+from flows.inputs.naming import check_path, clean, distinct
 from flows.inputs.orders import Wish, name_of
-from steps.contract import Frozen
+from flows.inputs.rows import MANIFESTS, Row, read_rows
+from flows.ui.escaping import quoted, visible
+from steps.contract import LARGEST_SEED, Frozen
 from steps.profiles import PipelineSettings, profile, revise
 
-COLUMNS = (
-    "path", "text", "video", "name", "profile", "seed", "bank", "priority", "set",
-)  # and any dotted knob, as mesh.grid  # fmt: skip
-MANIFESTS = (".csv", ".json", ".jsonl", ".parquet")
 WHAT = (
     "a folder of pictures and videos, a pattern such as 'photos/**/*.png', an object store (s3://BUCKET/PREFIX), or a "
     f"manifest ({', '.join(MANIFESTS)})"
 )
+HIGHEST_PRIORITY = 10**9
+TEXTS = frozenset(["path", "text", "video", "name", "profile", "bank"])  # columns
+WHOLE = re.compile(r"[+-]?[0-9]{1,30}(\.0*)?")
 
 
 class Item(Frozen):
@@ -88,6 +88,7 @@ def items_of(
     """
     settings = revise(profile(profile_name), dict(changes))
     path, given = Path(inputs), str(inputs)
+    check_path(path)
     if path.is_file() and path.suffix.lower() in MANIFESTS:
         items = _of_manifest(path, root or path.parent, profile_name, changes, seed)
         return sorted(items, key=lambda item: -item.priority)
@@ -148,34 +149,23 @@ def parse_changes(pairs: list[str]) -> dict[str, Any]:
     for pair in pairs:
         key, equals, value = pair.partition("=")
         if not equals or not key.strip():
-            raise BadInput(f"a setting is written knob=value, for example motion.iterations=200; this was {pair!r}")
-        changes[key.strip()] = _value(value.strip())
+            raise BadInput(
+                f"a setting is written knob=value, for example motion.iterations=200; this was {quoted(pair)}"
+            )
+        changes[key.strip()] = _value(key.strip(), value.strip())
     return dict(sorted(changes.items(), key=lambda pair: not pair[0].endswith(".kind")))  # a kind resets its knobs
-
-
-def distinct(wanted: list[tuple[str, str]]) -> list[str]:
-    """A name for each item: no two are equal, whatever the case of their letters, and none lies within another.
-
-    Args:
-        wanted: for each item the name it should have, and what to add where that is not clear.
-    """
-    count = Counter(name.lower() for name, _ in wanted)
-    inside = {parent.as_posix().lower() for name, _ in wanted for parent in PurePosixPath(name).parents}
-    names: list[str] = []
-    for name, addition in wanted:
-        clear = count[name.lower()] == 1 and name.lower() not in inside
-        names.append(_numbered(name if clear or not addition else f"{name}-{addition}", names, inside))
-    return names
 
 
 def _names(found: list[listing.Found]) -> list[str]:
     places = [PurePosixPath(file.name) for file in found]
-    return distinct([(place.with_suffix("").as_posix(), place.suffix.lower().lstrip(".")) for place in places])
+    return distinct(
+        [(clean(place.with_suffix("").as_posix()) or "asset", place.suffix.lower().lstrip(".")) for place in places]
+    )
 
 
 def _item(name: str, file: listing.Found, given: str, common: Wish) -> Item:
     if file.error:
-        return Item(name=_within(name) or "unnamed", error=file.error)
+        return Item(name=name, error=visible(file.error))
     wish = common.model_copy(update={"item": name, "picture": file.path})
     return Item(name=name, wish=wish, store=given if file.remote else "", remote=file.remote)
 
@@ -183,134 +173,130 @@ def _item(name: str, file: listing.Found, given: str, common: Wish) -> Item:
 def _of_manifest(file: Path, root: Path, profile_name: str, changes: Mapping[str, Any], seed: int) -> list[Item]:
     if not root.is_dir():
         raise BadInput(f"--root {root} is not a folder")
-    rows = _rows(file)
-    if not rows:
-        raise BadInput(f"{file} holds no pictures or videos: it has no rows")
+    rows = [_checked(row) for row in read_rows(file)]
     names = distinct([_wanted(row) for row in rows])
-    pipelines: dict[str, PipelineSettings] = {}  # many rows want the same: it is kept, and checked, once
-    items = []
-    for name, row in zip(names, rows, strict=True):
+    reader = _Reader(root, profile_name, changes, seed)
+    return [
+        Item(name=name, error=f"{row.place}: {row.error}") if row.error else reader.item(name, row)
+        for name, row in zip(names, rows, strict=True)
+    ]
+
+
+class _Reader:
+    """Makes items of rows.
+
+    Args:
+        root: where their files are.
+        profile_name: of rows that do not name one.
+        changes: of its knobs, for all rows.
+        seed: of rows that do not have one.
+    """
+
+    def __init__(self, root: Path, profile_name: str, changes: Mapping[str, Any], seed: int) -> None:
+        self._root, self._profile, self._changes, self._seed = root, profile_name, changes, seed
+        self._pipelines: dict[str, PipelineSettings] = {}  # many rows want the same: it is kept, and checked, once
+
+    def item(self, name: str, row: Row) -> Item:
+        """Make an item of a row; whatever is wrong with the row is in its `error`."""
         try:
-            chosen = str(row.get("profile") or profile_name)
-            knobs = {**changes, **_knobs(row)}
-            key = f"{chosen} {json.dumps(knobs, default=str)}"
-            if key not in pipelines:
-                pipelines[key] = revise(profile(chosen), knobs)
-            common = Wish(
-                item=name, profile=chosen, settings=pipelines[key], seed=_whole("seed", row.get("seed", seed), least=0)
-            )
-            items.append(
-                Item(name=name, wish=_wish(row, root, common), priority=_whole("priority", row.get("priority", 0)))
-            )
-        except BadInput as error:
-            items.append(Item(name=name, error=str(error)))
-    return items
+            wish = self._wish(name, row.cells)
+            priority = _whole("priority", row.cells.get("priority", 0), -HIGHEST_PRIORITY, HIGHEST_PRIORITY)
+        except DG4DError as error:
+            return Item(name=name, error=f"{row.place}: {visible(str(error))}")
+        except Exception as error:  # whatever it is, it is this row's own
+            return Item(name=name, error=f"{row.place}: {type(error).__name__}: {visible(str(error))}")
+        return Item(name=name, wish=wish, priority=priority)
+
+    def _wish(self, name: str, cells: Mapping[str, Any]) -> Wish:
+        chosen = cells.get("profile", self._profile)
+        return Wish(
+            item=name,
+            profile=chosen,
+            settings=self._settings(chosen, {**self._changes, **_knobs(cells)}),
+            seed=_whole("seed", cells.get("seed", self._seed), 0, LARGEST_SEED),
+            text=cells.get("text", ""),
+            picture=self._file(cells, "path"),
+            video=self._file(cells, "video"),
+            bank=self._file(cells, "bank"),
+        )
+
+    def _settings(self, chosen: str, knobs: dict[str, Any]) -> PipelineSettings:
+        key = f"{chosen} {json.dumps(knobs, default=str)}"
+        if key not in self._pipelines:
+            self._pipelines[key] = revise(profile(chosen), knobs)
+        return self._pipelines[key]
+
+    def _file(self, cells: Mapping[str, Any], column: str) -> Path | None:
+        return sources.inside(self._root, cells[column], column) if cells.get(column) else None
 
 
-def _wanted(row: dict[str, Any]) -> tuple[str, str]:
+def _checked(row: Row) -> Row:
+    """The row with text where a column holds text; with an error where there is something else."""
+    try:
+        texts = {column: _text(column, row.cells[column]) for column in TEXTS & row.cells.keys()}
+    except BadInput as error:
+        return row._replace(error=row.error or str(error))
+    return row._replace(cells={**row.cells, **texts})
+
+
+def _text(column: str, value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, int) and not isinstance(value, bool):  # a number can be a name
+        return str(value)
+    raise BadInput(f"{column} {quoted(value)} is no text")
+
+
+def _wanted(row: Row) -> tuple[str, str]:
     """The name that a row asks for, within the output folder; and its suffix, in case another asks for it too."""
-    path = PurePosixPath(str(row.get("path", "")))
-    own = path.stem or name_of(str(row.get("text", "")))
-    name = _within(str(row.get("name") or own)) or own
-    return name, "" if row.get("name") else path.suffix.lower().lstrip(".")
+    try:
+        cells = {column: _text(column, row.cells.get(column, "")) for column in ("path", "text", "name")}
+    except BadInput:
+        cells = {}
+    path = PurePosixPath(cells.get("path", ""))
+    if name := clean(cells.get("name", "")):
+        return name, ""
+    own = clean(path.stem) or (name_of(cells["text"]) if cells.get("text") else "")
+    return own or row.place.replace(" ", "-"), path.suffix.lower().lstrip(".")
 
 
-def _within(name: str) -> str:
-    """A name without parts that lead out of a folder."""
-    printable = "".join(letter for letter in name if letter.isprintable())
-    return "/".join(part for part in PurePosixPath(printable).parts if part.strip("/") not in {"", ".."})
-
-
-def _knobs(row: dict[str, Any]) -> dict[str, Any]:
+def _knobs(cells: Mapping[str, Any]) -> dict[str, Any]:
     """The knobs that a row sets: those in its column `set`, then those with a column of their own."""
-    own: Any = row.get("set") or {}
+    own: Any = cells.get("set", "")
     if isinstance(own, str):
         own = parse_changes([pair for pair in own.split(";") if pair.strip()])
-    return {
-        **own,
-        **{key: _value(value) if isinstance(value, str) else value for key, value in row.items() if "." in key},
+    elif not isinstance(own, dict):
+        raise BadInput(f'set {quoted(own)} holds no settings; write "a.b=c; d.e=f", or an object of knobs and values')
+    columns = {
+        knob: _value(knob, value) if isinstance(value, str) else value for knob, value in cells.items() if "." in knob
     }
+    return {**own, **columns}
 
 
-def _whole(what: str, value: Any, least: int | None = None) -> int:
-    try:
+def _whole(what: str, value: Any, least: int, most: int) -> int:
+    """A whole number, however a table says it: 7, 7.0 or "7"."""
+    if isinstance(value, str) and WHOLE.fullmatch(value.strip()):
+        number = int(value.strip().partition(".")[0])
+    elif isinstance(value, int) and not isinstance(value, bool):
+        number = value
+    elif isinstance(value, float) and value.is_integer():
         number = int(value)
-        if number != float(value):
-            raise ValueError
-    except (TypeError, ValueError, OverflowError) as error:
-        raise BadInput(f"{what} {value!r} is not a whole number") from error
-    if least is not None and number < least:
-        raise BadInput(f"{what} {number} is too small; use {least} or more")
+    else:
+        raise BadInput(f"{what} {quoted(value)} is not a whole number")
+    if not least <= number <= most:
+        raise BadInput(f"{what} {number} is out of range; use {least} to {most}")
     return number
 
 
-def _wish(row: dict[str, Any], root: Path, common: Wish) -> Wish:
-    def file(column: str) -> Path | None:
-        return sources.inside(root, str(row[column]), column) if row.get(column) else None
-
-    files = {"picture": file("path"), "video": file("video"), "bank": file("bank")}
-    return common.model_copy(update={"text": str(row.get("text", "")), **files})
-
-
-def _rows(file: Path) -> list[dict[str, Any]]:
-    """The rows of a manifest without empty cells.
+def _value(knob: str, text: str) -> Any:
+    """A value as JSON where it is some, else as text.
 
     Raises:
-        BadInput: it is not a table, or has columns that mean nothing.
-        BackendUnavailable: reading Parquet is not installed.
+        BadInput: JSON that cannot be used.
     """
     try:
-        rows = _table(file)
-    except (OSError, ValueError, csv.Error) as error:
-        raise BadInput(f"{file} cannot be read as a manifest: {error}") from error
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise BadInput(f"{file} should hold a list of rows, each with at least a path or a text")
-    for number, row in enumerate(rows, 1):
-        if unknown := sorted(key for key in row if key not in COLUMNS and ("." not in key)):
-            raise BadInput(
-                f"{file}, row {number}: unknown column {unknown[0]!r}; there are: {', '.join(COLUMNS)}, "
-                "and any knob such as motion.iterations"
-            )
-        if not row.get("path") and not row.get("text"):
-            raise BadInput(f"{file}, row {number}: neither a path nor a text")
-    return [{key: value for key, value in row.items() if not _is_empty(value)} for row in rows]
-
-
-def _table(file: Path) -> Any:
-    kind = file.suffix.lower()
-    if kind == ".parquet":
-        return _parquet(file)
-    text = file.read_text(encoding="utf-8-sig")
-    if kind == ".csv":
-        return list(csv.DictReader(text.splitlines(), restkey="too many cells"))
-    if kind == ".jsonl":
-        return [json.loads(line) for line in text.splitlines() if line.strip()]
-    return json.loads(text)
-
-
-def _parquet(file: Path) -> Any:
-    if find_spec("pyarrow") is None:
-        raise BackendUnavailable(f"{file} is Parquet, which pyarrow reads: pip install 'dg4d[parquet]'; or give a .csv")
-    return import_module("pyarrow.parquet").read_table(file).to_pylist()
-
-
-def _is_empty(value: Any) -> bool:
-    """Nothing in a cell, in the ways in which tables say so; what is not a number is unlike itself."""
-    return value is None or value == "" or value != value  # noqa: PLR0124
-
-
-def _numbered(name: str, taken: list[str], inside: set[str]) -> str:
-    used = {other.lower() for other in taken} | inside
-    if name.lower() not in used:
-        return name
-    number = 2
-    while f"{name}-{number}".lower() in used:
-        number += 1
-    return f"{name}-{number}"
-
-
-def _value(text: str) -> Any:
-    try:
-        return json.loads(text)
+        return loads(text)
+    except UnfitJSON as error:
+        raise BadInput(f"{knob} = {quoted(text)}: {error}") from error
     except ValueError:
         return text

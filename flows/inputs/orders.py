@@ -6,13 +6,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.rasterizer.choice import backend_name, require_backend
-from flows.inputs import sources
+from flows.inputs import naming, sources
 from flows.packages.credentials import certificate
-from steps.contract import ArtifactRef, Frozen, digest_of
+from steps.contract import LARGEST_SEED, ArtifactRef, Frozen, digest_of
 from steps.main import catalog, request_version
 from steps.profiles import PipelineSettings
 from steps.store import ArtifactStore
@@ -57,6 +57,9 @@ class Wish(Frozen):
             BadInput: says what is wrong and what to do.
             BackendUnavailable: the rasterizer that was asked for cannot run here, or weights are missing.
         """
+        self.check_names()
+        if not 0 <= self.seed <= LARGEST_SEED:
+            raise BadInput(f"the seed {self.seed} is out of range; use 0 to {LARGEST_SEED}")
         require_backend(self.settings.rasterizer)
         if (self.settings.pack.lods or self.settings.pack.gltf.meshopt) and not find_spec("meshoptimizer"):
             raise BackendUnavailable("pack.lods and pack.gltf.meshopt need meshoptimizer: pip install 'dg4d[meshopt]'")
@@ -71,6 +74,21 @@ class Wish(Frozen):
         self.check_licenses()
         for name in self._weights():
             open_weights(name)
+
+    def check_names(self) -> None:
+        """Refuse names that folders, records or pages could not hold.
+
+        Raises:
+            BadInput: says which and why.
+        """
+        for path in (self.picture, self.video):
+            if path is not None:
+                naming.check_text(path.name, "the file name")
+        for path in (self.picture, self.video, self.bank):
+            if path is not None:
+                naming.check_path(path)
+        naming.check_text(self.text, "the text")
+        naming.check_name(self.item, "rename the file" if self.picture else "choose a shorter name")
 
     def check_licenses(self) -> None:
         """Refuse weights that forbid commercial use, where only what allows it is wanted.
@@ -159,7 +177,7 @@ class Order(Frozen):
     bank: ArtifactRef | None = None
     profile: str
     settings: PipelineSettings
-    seed: int
+    seed: int = Field(ge=0, le=LARGEST_SEED)
     commercial_only: bool = False
     source_name: str = ""
     picture_name: str = ""
@@ -204,9 +222,12 @@ def order_again(
     try:
         names = {name: record[name] for name in NAMES & set(record)}
         order = Order.model_validate({**record["recipe"], **record["run"].get("names", {}), **names})
-    except (KeyError, ValidationError) as error:
+    except (KeyError, TypeError, AttributeError, ValidationError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        if isinstance(error, ValidationError):
+            reason = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
         raise BadInput(
-            f"the record of this package was written by another version of dg4d ({type(error).__name__}: {error}); "
+            f"the record of this package was written by another version of dg4d ({reason}); "
             "make the asset again from its source"
         ) from error
     require_backend(order.settings.rasterizer)

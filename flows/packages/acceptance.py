@@ -28,7 +28,7 @@ def failing_in(folder: Path) -> list[str] | None:
     """The gates that the package in a folder fails, by its report; None if there is no verdict."""
     try:
         return list(json.loads((folder / "report.json").read_text(encoding="utf-8"))["acceptance"]["failing"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
 

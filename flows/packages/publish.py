@@ -2,7 +2,6 @@
 
 import errno
 import hashlib
-import json
 import os
 import tempfile
 from collections.abc import Callable
@@ -11,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from dg4d_lib.errors import BadInput
+from flows.inputs.json_text import loads
+from flows.inputs.naming import check_folder_name
 from steps.archives import stays_inside, unpack
 from steps.store import remove_tree, room_for
 
@@ -28,6 +29,7 @@ def check_folder(folder: Path) -> None:
     Raises:
         BadInput: says what is in the way and what to do.
     """
+    check_folder_name(folder)
     if folder.exists() and not folder.is_dir():
         raise BadInput(f"{folder} is a file; choose a folder for the output with -o")
     if folder.is_dir() and record_of(folder) is None:
@@ -59,14 +61,18 @@ def check_writable(folder: Path) -> None:
 
 
 def record_of(folder: Path) -> dict[str, Any] | None:
-    """The provenance of the package in a folder; None if there is no package, or names of it lead out of the folder."""
+    """Return the provenance of the package in a folder.
+
+    None if there is no package, or its record cannot be used: names in it lead out of the folder, or it is nested too
+    deeply.
+    """
     try:
-        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        record = loads((folder / RECORD).read_text(encoding="utf-8"))
         sound = isinstance(record["files"], dict) and all(
             map(stays_inside, [*record["files"], *record.get("beside", ())])
         )
         return record if sound else None
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
 
@@ -93,7 +99,9 @@ def whole(folder: Path) -> dict[str, Any]:
     """
     record = record_of(folder)
     if record is None:
-        raise BadInput(f"{folder} is no asset: it has no {RECORD}; give a folder that `dg4d make` wrote")
+        raise BadInput(f"{folder} is no asset: it has no sound {RECORD}; give a folder that `dg4d make` wrote")
+    if not _is_complete(record):
+        raise BadInput(f"{folder} cannot be used: its {RECORD} has another form than `dg4d make` writes; make it again")
     faults = [f"{name} {fault}" for name, fact in record["files"].items() if (fault := _fault(folder / name, fact))]
     if faults:
         more = f" and {len(faults) - 3} more" if len(faults) > 3 else ""
@@ -181,6 +189,21 @@ def _publish(package: Path, folder: Path, finish: Finish, in_place: bool = False
         return files
     finally:
         remove_tree(staging)
+
+
+def _is_complete(record: dict[str, Any]) -> bool:
+    """Whether a record has the form that its readers count on."""
+    try:
+        steps = [*record.get("steps", ()), *record.get("run", {}).get("steps", ())]
+        return (
+            all(type(fact["digest"]) is str and type(fact["size_bytes"]) is int for fact in record["files"].values())
+            and all(isinstance(step["step"], str) for step in steps)
+            and all(isinstance(step.get(name, 0), int | float) for step in steps for name in ("duration_s", "cpu_s"))
+            and all(isinstance(step.get("machine", {}), dict) for step in steps)
+            and isinstance(record.get("item", ""), str)
+        )
+    except (KeyError, TypeError, AttributeError):
+        return False
 
 
 def _fault(path: Path, fact: dict[str, Any]) -> str:

@@ -113,7 +113,8 @@ def report_of(order: Order, made: Made, files: Files, store: ArtifactStore) -> d
         "commercial_only": order.commercial_only,
         "banner": banner(order, made),
         "notes": notes(order, made),
-        "seconds": round(sum(done.seconds for done in made.steps), 1),
+        "wall_s": round(made.wall_s, 1),
+        "compute_s": round(sum(done.result.provenance.duration_s for done in made.steps), 1),
         "peak_memory_mb": max(done.result.provenance.peak_memory_mb for done in made.steps),
         "acceptance": verdict_of(_results(made), store),
         "steps": [_stage(done, store) for done in made.steps],
@@ -214,8 +215,8 @@ def _stage(done: Finished, store: ArtifactStore) -> dict[str, Any]:
     return {
         "step": done.label,
         "cached": done.cached,
-        "seconds": done.seconds,
-        "computed_in_s": record.duration_s,
+        "wall_s": done.wall_s,
+        "compute_s": record.duration_s,
         "peak_memory_mb": record.peak_memory_mb,
         "backend": record.backend,
         "notes": [*record.notes, *record.run_notes],
@@ -245,10 +246,10 @@ def _pictures(files: dict[str, int]) -> str:
 
 
 def _stages(report: dict[str, Any]) -> str:
-    longest = max((stage["computed_in_s"] for stage in report["steps"]), default=0) or 1
+    longest = max((stage["compute_s"] for stage in report["steps"]), default=0) or 1
     rows = "".join(
-        f"<tr><td>{_text(stage['step'])}<td class=number>{stage['computed_in_s']:.1f} s"
-        f"<td><div class=bar style='width:{120 * stage['computed_in_s'] / longest:.0f}px'></div>"
+        f"<tr><td>{_text(stage['step'])}<td class=number>{stage['compute_s']:.1f} s"
+        f"<td><div class=bar style='width:{120 * stage['compute_s'] / longest:.0f}px'></div>"
         f"<td class=number>{stage['peak_memory_mb']:.0f} MiB<td>{_text(stage['backend'])}"
         f"<td>{_text(arithmetic(stage['flops']))}"
         f"<td>{'taken from before' if stage['cached'] else ''}"
@@ -256,7 +257,8 @@ def _stages(report: dict[str, Any]) -> str:
     )
     return (
         "<table><tr><th>stage<th>computed in<th><th>peak memory<th>backend<th>networks<th>"
-        f"{rows}</table><p class=small>{report['seconds']:.1f} s for this run.</p>"
+        f"{rows}</table><p class=small>{report['wall_s']:.1f} s on the clock for this run; "
+        f"{report['compute_s']:.1f} s of computing in all stages, now or before, some side by side.</p>"
     )
 
 

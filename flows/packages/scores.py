@@ -11,6 +11,11 @@ from urllib.parse import quote
 
 from pydantic import BaseModel
 
+from flows.commands.endings import EXIT_BAD_INPUT, EXIT_FAILED
+from flows.packages.summary import BAD_INPUT
+from flows.ui.escaping import cell
+from flows.ui.escaping import markdown as escaped
+
 Figures = dict[str, float]
 
 
@@ -70,6 +75,7 @@ class ObjectScores(BaseModel):
     Attributes:
         object: its name.
         error: why there are no scores; empty where there are.
+        kind: of that failure, the name of its exception.
         seconds: that the steps of the asset took to compute.
         frames: of every view.
         size: of a frame, pixels.
@@ -78,6 +84,7 @@ class ObjectScores(BaseModel):
 
     object: str
     error: str = ""
+    kind: str = ""
     seconds: float = 0.0
     frames: int = 0
     size: int = 0
@@ -110,6 +117,14 @@ class Results(BaseModel):
     def failed(self) -> list[ObjectScores]:
         """Objects without scores."""
         return [one for one in self.objects if one.error]
+
+    @property
+    def exit_code(self) -> int:
+        """0 if every object has scores, 65 if none has and bad input is to blame for all, else 1."""
+        if not self.failed:
+            return 0
+        bad = all(one.error and one.kind in BAD_INPUT for one in self.objects)
+        return EXIT_BAD_INPUT if bad else EXIT_FAILED
 
 
 def figures_of(judgment: Mapping[str, Any]) -> Figures:
@@ -156,7 +171,7 @@ def csv_text(results: Results) -> str:
             whole |= _time(one, method == results.ours)
             for view, figures in {**views, "mean": whole}.items():
                 if figures:
-                    writer.writerow([one.object, method, view, *(figures.get(name, "") for name in names)])
+                    writer.writerow([cell(one.object), cell(method), view, *(figures.get(name, "") for name in names)])
     return text.getvalue()
 
 
@@ -167,15 +182,15 @@ def markdown(results: Results) -> str:
     more = _present(results, METRICS)
     means = [(called(method), figures) for method, figures in results.mean.items()]
     every = [
-        (f"{one.object}: {called(method)}", figures_of(judgment) | _time(one, method == results.ours))
+        (f"{escaped(one.object)}: {called(method)}", figures_of(judgment) | _time(one, method == results.ours))
         for one in results.objects
         for method, judgment in one.rows.items()
     ]
-    failures = [f"- {one.object} failed: {one.error}" for one in results.failed]
-    notes = [f"- {one.object}: {note}" for one in results.objects for note in one.notes]
+    failures = [f"- {escaped(one.object)} failed: {escaped(one.error)}" for one in results.failed]
+    notes = [f"- {escaped(one.object)}: {escaped(note)}" for one in results.objects for note in one.notes]
     missing = [f"- {metric}: {why}" for metric, why in results.missing.items()]
     parts = [
-        [f"# {results.title}"],
+        [f"# {escaped(results.title)}"],
         [f"{several}, {results.drawn}; all frames and views weigh the same."],
         _lines(PAPER_METRICS, means, results),
         _lines(more, means, results),

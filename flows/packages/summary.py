@@ -15,13 +15,14 @@ from pydantic import BaseModel
 
 from flows.packages.acceptance import failing_in
 from flows.packages.publish import record_of
+from flows.ui.escaping import cell
 from steps.store import write_atomically
 
 Status = Literal["done", "unchanged", "failed", "skipped"]
 NOT_ACCEPTED = "NotAccepted"  # the kind of failure of an item that was made, but fails a gate in a strict batch
 BAD_INPUT = {"BadInput", "StepBadInput", "BackendUnavailable"}  # kinds for which what was given is to blame
 CSV_COLUMNS = (
-    "item", "source", "status", "kind", "message", "attempts", "seconds", "computed_s", "cpu_s", "gpu_s", "cost",
+    "item", "source", "status", "kind", "message", "attempts", "wall_s", "compute_s", "cpu_s", "gpu_s", "cost",
     "failing",
 )  # fmt: skip
 WRITE_EVERY_S = 5.0  # at most so often while a batch runs
@@ -38,10 +39,10 @@ class Row(BaseModel):
         kind: of its failure.
         message: for people.
         attempts: how often it was begun in this batch.
-        seconds: in this batch, with waiting.
-        computed_s: in which its steps were computed, now or before.
+        wall_s: seconds on the clock in this batch, with waiting.
+        compute_s: seconds in which its steps were computed, now or before, added up.
         cpu_s: of all cores, in these steps.
-        gpu_s: of `computed_s`, in steps that used a GPU.
+        gpu_s: of `compute_s`, in steps that used a GPU.
         pictures: that explain a failure.
         failing: gates; None where there is no verdict.
     """
@@ -52,8 +53,8 @@ class Row(BaseModel):
     kind: str = ""
     message: str = ""
     attempts: int = 0
-    seconds: float = 0.0
-    computed_s: float = 0.0
+    wall_s: float = 0.0
+    compute_s: float = 0.0
     cpu_s: float = 0.0
     gpu_s: float = 0.0
     pictures: list[str] = []
@@ -148,17 +149,17 @@ class Writer:
             DiskFull: there is no room; what was there stays.
         """
         counts = {status: sum(row.status == status for row in rows) for status in get_args(Status)}
-        items = [row.model_dump(mode="json") | {"cost": self._cost(row.computed_s)} for row in rows]
+        items = [row.model_dump(mode="json") | {"cost": self._cost(row.compute_s)} for row in rows]
         totals: dict[str, Any] = {
-            name: round(sum(getattr(row, name) for row in rows), 3) for name in ("computed_s", "cpu_s", "gpu_s")
+            name: round(sum(getattr(row, name) for row in rows), 3) for name in ("compute_s", "cpu_s", "gpu_s")
         }
         summary = {
             "counts": counts,
             "made": sum(row.made for row in rows),
             "not_accepted": [row.item for row in rows if row.failing],
             "commercial_only": self._commercial_only,
-            "seconds": round(seconds, 1),
-            "totals": totals | {"cost": self._cost(totals["computed_s"])},
+            "wall_s": round(seconds, 1),
+            "totals": totals | {"cost": self._cost(totals["compute_s"])},
             "price_per_hour": self._price,
             "items": items,
         }
@@ -166,9 +167,9 @@ class Writer:
         write_atomically(self._out / "summary.csv", _csv(items))
         write_atomically(self._out / "index.html", index(self._out, rows, counts))
 
-    def _cost(self, computed_s: float) -> float | None:
+    def _cost(self, compute_s: float) -> float | None:
         """What computing so long costs, were the machine to do nothing else."""
-        return None if self._price is None else round(self._price * computed_s / 3600, 6)
+        return None if self._price is None else round(self._price * compute_s / 3600, 6)
 
 
 def with_costs(row: Row, folder: Path) -> Row:
@@ -176,7 +177,7 @@ def with_costs(row: Row, folder: Path) -> Row:
     steps = (record_of(folder) or {}).get("run", {}).get("steps", [])
     return row.model_copy(
         update={
-            "computed_s": round(sum(step.get("duration_s", 0.0) for step in steps), 3),
+            "compute_s": round(sum(step.get("duration_s", 0.0) for step in steps), 3),
             "cpu_s": round(sum(step.get("cpu_s", 0.0) for step in steps), 3),
             "gpu_s": round(sum(step["duration_s"] for step in steps if step.get("machine", {}).get("gpu")), 3),
         }
@@ -206,7 +207,8 @@ def _csv(items: list[dict[str, Any]]) -> str:
     table = io.StringIO()
     writer = csv.DictWriter(table, CSV_COLUMNS, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
-    writer.writerows(item | {"failing": " ".join(item["failing"] or ())} for item in items)
+    rows = (item | {"failing": " ".join(item["failing"] or ())} for item in items)
+    writer.writerows({column: cell(value) for column, value in row.items()} for row in rows)
     return table.getvalue()
 
 
@@ -226,7 +228,7 @@ def _card(out: Path, row: Row) -> str:
     return (
         f"<article class={'failed' if row.failing else row.status}>"
         f"<a href='{folder}/report.html'>{picture}<h2>{name}</h2></a>"
-        f"<p>{row.status}{f', {row.seconds:.0f} s' if row.seconds else ''}"
+        f"<p>{row.status}{f', {row.wall_s:.0f} s' if row.wall_s else ''}"
         f" · <a href='{folder}/asset.glb'>asset.glb</a></p>{_verdict(row)}</article>"
     )
 

@@ -1,12 +1,12 @@
 """Whether a package is as it was made: every digest, every record, every signature; behind `dg4d verify`."""
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows.commands.endings import EXIT_BAD_INPUT, EXIT_MISSING
+from flows.inputs.json_text import loads
 from flows.packages.crate import CRATE, files_in, own_digest, rendered
 from flows.packages.credentials import CERTIFICATE, Signature, sidecar_of, signature_of
 from flows.packages.publish import FORMAT, RECORD, fact_of, record_of
@@ -82,7 +82,7 @@ def verify(folder: Path, anchors: Path | None = None) -> Verdict:
     trusted = _text(anchors) if anchors else ""
     try:
         checks = [*_files(folder, record), *_records(record), *_signatures(folder, record, trusted)]
-    except (KeyError, TypeError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
         checks = [Check(kind="file", name=RECORD, state="altered", detail=f"it has another form ({error!r})")]
     return Verdict(package=str(folder), checks=tuple(checks))
 
@@ -133,7 +133,7 @@ def _crate(path: Path) -> tuple[Any, Check]:
     """The crate as it is, and whether it is what was written."""
     try:
         text = path.read_text(encoding="utf-8")
-        document = json.loads(text)
+        document = loads(text)
         whole = text == rendered(document) and document["@graph"][0]["sha256"] == own_digest(document)
     except FileNotFoundError:
         return None, Check(kind="file", name=CRATE, state="missing")

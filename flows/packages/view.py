@@ -37,7 +37,11 @@ def view(folder: Path, open_browser: bool) -> Path:
     record = whole(folder)
     if ASSET not in record["files"]:
         raise BadInput(f"{folder} has no {ASSET}; only animated assets can be viewed")
-    page, text = folder / VIEWER, page_of(record, lambda name: (folder / name).read_bytes())
+    page = folder / VIEWER
+    try:
+        text = page_of(record, lambda name: (folder / name).read_bytes())
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise BadInput(f"{folder} cannot be viewed: its provenance has another form ({error!r})") from error
     if not page.is_file() or page.read_bytes() != text.encode():
         _write(page, text)
     if open_browser and _has_screen():

@@ -24,10 +24,11 @@ from flows.commands.options import knobs_of
 from flows.commands.terminal import console
 from flows.inputs.fetching import at_hand, without_secrets
 from flows.inputs.manifest import parse_changes
+from flows.inputs.naming import clean
 from flows.inputs.orders import Wish
 from flows.packages.publish import check_folder, is_current
 from flows.serving.roots import Roots
-from steps.contract import Frozen
+from steps.contract import LARGEST_SEED, Frozen
 from steps.profiles import profile, revise
 
 BEGUN = 3  # times, at most, is a run begun whose process dies
@@ -96,7 +97,13 @@ class Options(Frozen):
         description="of the files, from 1 to 240; empty: as the video, or the profile",
         json_schema_extra=_may_stay_empty,
     )
-    seed: int = Field(0, ge=0, title="Seed", description="another whole number gives another result of its kind")
+    seed: int = Field(
+        0,
+        ge=0,
+        le=LARGEST_SEED,
+        title="Seed",
+        description=f"from 0 to {LARGEST_SEED}; another whole number gives another result of its kind",
+    )
     commercial_only: bool = Field(
         False, title="Commercial use only", description="refuse pretrained weights whose license forbids selling"
     )
@@ -221,7 +228,7 @@ def benchmark(
     bank: Annotated[bool, Field(json_schema_extra=_title("True views as the prior"))] = False,
     workers: Workers = 1,
     options: Wanted = Options(),  # noqa: B008 - frozen
-) -> None:
+) -> State[None]:
     """Make an asset of every object of a data set and judge all of them against the truth.
 
     Args:
@@ -238,7 +245,9 @@ def benchmark(
     folder, place = roots.output(out), Path(roots.folder(dataset))
     pairs = [f"{knob}={json.dumps(value)}" for knob, value in _knobs(options, roots).items()]
     asked = (options.profile, pairs, options.seed, mesh, bank, limit or None, workers)
-    bench(place, folder, console(), *asked, allow=roots.check_files)
+    results = bench(place, folder, console(), *asked, allow=roots.check_files)
+    text = f"{len(results.objects) - len(results.failed)} of {len(results.objects)} objects have scores in {out}"
+    return Failed(message=text) if results.failed else Completed(message=text)
 
 
 def _name(source: str) -> str:
@@ -266,7 +275,7 @@ def _make(address: str, folder: Path, options: Options, roots: Roots, **files: P
     """Make an asset as `dg4d make` does: what is made already is left alone."""
     settings = revise(profile(options.profile), _knobs(options, roots))
     wish = Wish(
-        item=PurePosixPath(urlsplit(address).path).stem,
+        item=clean(PurePosixPath(urlsplit(address).path).stem) or "asset",
         profile=options.profile,
         settings=settings,
         seed=options.seed,

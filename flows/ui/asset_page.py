@@ -8,6 +8,7 @@ from prefect.artifacts import create_link_artifact, create_markdown_artifact, cr
 
 from flows.packages import acceptance
 from flows.ui import curves, pages
+from flows.ui.escaping import markdown
 from flows.ui.showing import show
 from steps.contract import ArtifactRef
 from steps.store import ArtifactStore
@@ -40,23 +41,28 @@ def show_asset(item: str, finished: Sequence["Finished"], package: ArtifactRef, 
         create_markdown_artifact,
         key=pages.key("asset", item),
         markdown=asset_page(item, finished, package, store),
-        description=f"{item}: everything on one page",
+        description=f"{markdown(item)}: everything on one page",
     )
-    show(create_table_artifact, key=pages.key("timings", item), table=timings(finished), description=f"Steps of {item}")
+    show(
+        create_table_artifact,
+        key=pages.key("timings", item),
+        table=timings(finished),
+        description=f"Steps of {markdown(item)}",
+    )
     verdict = acceptance.verdict_of((done.result for done in finished), store)
     if verdict is not None:
         show(
             create_table_artifact,
             key=pages.key("gates", item),
             table=gate_rows(verdict),
-            description=f"Metrics of {item} and their gates",
+            description=f"Metrics of {markdown(item)} and their gates",
         )
     for label, address in addresses(item, package).items():
         show(
             create_link_artifact,
             key=pages.key(label, item),
             link=address,
-            link_text=f"{label} of {item}",
+            link_text=f"{label} of {markdown(item)}",
             description=f"The {label}",
         )
 
@@ -64,7 +70,7 @@ def show_asset(item: str, finished: Sequence["Finished"], package: ArtifactRef, 
 def asset_page(item: str, finished: Sequence["Finished"], package: ArtifactRef, store: ArtifactStore) -> str:
     """Pictures, curves, gates, notes and steps of an asset as Markdown."""
     links = [f"[{label}]({address})" for label, address in addresses(item, package).items()]
-    lines = [f"# {item}", "", " · ".join([*links, f"`{package.digest}`"]), ""]
+    lines = [f"# {markdown(item)}", "", " · ".join([*links, f"`{package.digest}`"]), ""]
     first = {done.result.provenance.step: done.result.outputs for done in reversed(finished)}
     for (step, output), title in PICTURES.items():
         if output in first.get(step, {}) and (small := pages.thumbnail(first[step][output], store)):
@@ -77,7 +83,7 @@ def asset_page(item: str, finished: Sequence["Finished"], package: ArtifactRef, 
     if verdict is not None:
         lines += ["## Gates", "", *acceptance.markdown(verdict)]
     notes = dict.fromkeys(note for done in finished for note in done.result.provenance.notes)
-    lines += ["## Notes", "", *(f"- {note}" for note in notes), ""] if notes else []
+    lines += ["## Notes", "", *(f"- {markdown(note)}" for note in notes), ""] if notes else []
     rows = timings(finished)
     lines += ["## Steps", "", f"| {' | '.join(rows[0])} |", "|" + "---|" * len(rows[0])]
     lines += [f"| {' | '.join(row.values())} |" for row in rows]
@@ -99,8 +105,8 @@ def timings(finished: Sequence["Finished"]) -> list[dict[str, str]]:
         {
             "step": done.label,
             "state": "cached" if done.cached else "computed",
-            "seconds": f"{done.seconds:.1f}",
-            "computed in": f"{done.result.provenance.duration_s:.1f} s",
+            "wall_s": f"{done.wall_s:.1f}",
+            "compute_s": f"{done.result.provenance.duration_s:.1f}",
             "memory": f"{done.result.provenance.peak_memory_mb:.0f} MiB",
             "key": done.result.provenance.request_digest[7:19],
             "record": done.result.provenance.digest()[7:19],

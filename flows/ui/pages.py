@@ -14,6 +14,7 @@ import OpenImageIO as oiio
 from flows.engine.executors import StepError
 from flows.packages import acceptance
 from flows.packages.publish import readable
+from flows.ui.escaping import markdown
 from steps.contract import ArtifactRef, StepResult, StepSpec
 from steps.store import ArtifactMissing, ArtifactStore
 
@@ -54,16 +55,16 @@ def output_rows(result: StepResult, spec: StepSpec) -> list[dict[str, str]]:
 def step_page(label: str, item: str, result: StepResult, store: ArtifactStore) -> str:
     """Picture, notes, curves and facts of one finished step."""
     record = result.provenance
-    lines = [f"# {label}: {item}", ""]
+    lines = [f"# {label}: {markdown(item)}", ""]
     lines += [f"{image}\n" for image in pictures_of(result.outputs, store)]
-    lines += [f"> {note}\n" for note in (*record.notes, *record.run_notes)]
+    lines += [f"> {markdown(note)}\n" for note in (*record.notes, *record.run_notes)]
     for ref in result.outputs.values():
         if ref.media_type.endswith("curves+json"):
             lines += curve_table(json.loads(store.path(ref).read_text(encoding="utf-8")))
         if ref.media_type.endswith("gates+json"):
             lines += acceptance.markdown(json.loads(store.path(ref).read_text(encoding="utf-8")))
     rows = {
-        "seconds": f"{record.duration_s:.1f}",
+        "compute_s": f"{record.duration_s:.1f}",
         "peak memory": f"{record.peak_memory_mb:.0f} MiB",
         "backend": record.backend,
         "seed": record.seed,
@@ -82,7 +83,7 @@ def step_page(label: str, item: str, result: StepResult, store: ArtifactStore) -
 
 def failure_page(label: str, item: str, error: StepError, store: ArtifactStore) -> str:
     """The message of a step that failed, and the pictures that explain it."""
-    lines = [f"# {label}: {item}", "", f"**{type(error).__name__}**", "", error.message, ""]
+    lines = [f"# {label}: {markdown(item)}", "", f"**{type(error).__name__}**", "", markdown(error.message), ""]
     return "\n".join([*lines, *(f"{image}\n" for image in pictures_of(error.pictures, store))])
 
 

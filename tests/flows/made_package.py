@@ -98,7 +98,7 @@ def _steps(source: ArtifactRef, package: ArtifactRef, store: ArtifactStore, weig
             machine=MACHINE,
         )
         finished.append(
-            Finished(label=step, cached=False, seconds=1.3, result=StepResult(outputs={"out": out}, provenance=record))
+            Finished(label=step, cached=False, wall_s=1.3, result=StepResult(outputs={"out": out}, provenance=record))
         )
         given = out
     return finished

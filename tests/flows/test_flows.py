@@ -346,3 +346,15 @@ def test_the_report_says_what_the_gates_say(log: Path, tmp_path: Path) -> None:
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["acceptance"]["failing"] == ["silhouette"]
     assert "fit it &lt;again&gt;" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_parts_side_by_side_take_less_time_on_the_clock_than_to_compute(log: Path, tmp_path: Path) -> None:
+    settings = revise(PREVIEW, {"mesh.mode": "per_frame", "mesh.frames_per_task": 1})
+    (tmp_path / "a.png").write_text("side by side extract_mesh=sleep:1")
+    make(Wish(item="parts", picture=tmp_path / "a.png", settings=settings).order(home.store()), tmp_path / "out")
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    parts = [stage for stage in report["steps"] if stage["step"].startswith("extract_mesh")]
+    assert len(parts) == 5 and all(part["compute_s"] >= 1 for part in parts)
+    ends = [part["wall_s"] for part in parts]
+    assert ends[-1] > ends[0] + 1  # two at a time: the first ends long before the last
+    assert max(ends) <= report["wall_s"] < sum(ends)

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from flows.commands import batch as module
 from flows.commands.batch import batch, ready, tell
 from flows.engine import resources
 from flows.engine.executors import StepBadInput, StepCrashed, StepOutOfMemory
+from flows.engine.processes import locked
 from flows.inputs.manifest import items_of
 from flows.inputs.orders import Order, Wish
 from flows.packages.summary import NOT_ACCEPTED, Row, Tally, Writer
@@ -148,28 +150,111 @@ def test_the_server_shows_how_far_a_batch_is_and_a_table_that_can_be_read(place:
     assert "all are in summary.csv" in by_type["table"]["description"]
 
 
-def test_a_user_who_stops_a_batch_keeps_what_is_done(place: None, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_user_who_stops_a_batch_keeps_what_is_done(
+    place: None, tmp_path: Path, number: signal.Signals, status: int
+) -> None:
     (tmp_path / "in").mkdir()
     for name, words in {"a": "quick", "b": "fit_motion=sleep:300", "c": "never"}.items():
-        (tmp_path / "in" / f"{name}.png").write_text(picture(f"stopped {words}"))
+        (tmp_path / "in" / f"{name}.png").write_text(picture(f"stopped by {number.name} {words}"))
     log = tmp_path / "ran"
-    command = subprocess.Popen(
-        [sys.executable, "-m", "flows.cli", "batch", "in", "-o", "out"],
-        cwd=tmp_path,
-        env={**os.environ, "FAKE_LOG": str(log), "DG4D_EXECUTOR": "subprocess"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    command = start(tmp_path, "batch", "in", "-o", "out")
     wait_until(lambda: log.exists() and log.read_text().split().count("fit_motion") == 2)
-    command.send_signal(signal.SIGINT)
+    command.send_signal(number)
     _, trouble = command.communicate(timeout=120)
-    assert command.returncode == 130, trouble
+    assert command.returncode == status, trouble
     assert "the same command goes on" in trouble
     assert log.read_text().split().count("fit_motion") == 2  # what was stopped is not begun again
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert {row["item"]: row["status"] for row in summary["items"]} == {"a": "done", "b": "skipped", "c": "skipped"}
     assert (tmp_path / "out" / "a" / "asset.glb").is_file()
+    assert left_behind(tmp_path) == []
+
+
+def test_a_batch_goes_on_after_items_that_nothing_can_be_made_of(place: None, tmp_path: Path) -> None:
+    names = [b"a.png", b"caf\xe9.png", b"{0}{item}.png", b"x" * 251 + b".png", b"summary.csv.png", b"z.png"]
+    (tmp_path / "in").mkdir()
+    for name in names:
+        (tmp_path / "in" / os.fsdecode(name)).write_text(f"goes on {ascii(name)[:20]}")
+    command = start(tmp_path, "batch", "in", "-o", "out", "--workers", "2")
+    told, trouble = command.communicate(timeout=300)
+    assert (command.returncode, "Traceback" in told + trouble) == (1, False), trouble
+    items = json.loads((tmp_path / "out" / "summary.json").read_text())["items"]
+    assert {row["item"] for row in items if row["status"] == "done"} == {"a", "{0}{item}", "z"}
+    assert {row["kind"] for row in items if row["status"] == "failed"} == {"BadInput"}
+    assert len(items) == len(names)
+    made = {path.parent.name for path in (tmp_path / "out").glob("*/asset.glb")}
+    assert made == {"a", "{0}{item}", "z"}
+
+
+@pytest.mark.parametrize("step", ["fit_motion", "extract_mesh"])  # one alone, and several parts side by side
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_signal_ends_a_command_and_its_step_and_leaves_nothing_behind(
+    place: None, tmp_path: Path, number: signal.Signals, status: int, step: str
+) -> None:
+    (tmp_path / "a.png").write_text(f"ended by {number.name} {step}=sleep:300")
+    log = tmp_path / "ran"
+    command = start(tmp_path, "make", "a.png", "--set", "mesh.mode=per_frame", "-o", "out")
+    wait_until(lambda: log.exists() and step in log.read_text())
+    begun = time.monotonic()
+    command.send_signal(number)
+    _, trouble = command.communicate(timeout=60)
+    assert (command.returncode, "Traceback" in trouble) == (status, False), trouble
+    assert trouble.strip().endswith("dg4d: stopped; the same command goes on after the last finished step")
+    assert time.monotonic() - begun < 30
+    assert not (tmp_path / "out").exists()
+    assert left_behind(tmp_path) == []
+
+
+def test_a_command_that_is_to_survive_its_terminal_does(place: None, tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_text("nohup fit_motion=sleep:3")
+    log = tmp_path / "ran"
+    command = start(tmp_path, "make", "a.png", "-o", "out", survives=True)
+    wait_until(lambda: log.exists() and "fit_motion" in log.read_text())
+    command.send_signal(signal.SIGHUP)
+    _, trouble = command.communicate(timeout=120)
+    assert command.returncode == 0, trouble
+
+
+def start(folder: Path, *arguments: str, survives: bool = False) -> subprocess.Popen[str]:
+    """Begin a command in a folder, with steps in processes of their own and temporary files in the folder `tmp`."""
+    (folder / "tmp").mkdir()
+    deaf = ("sh", "-c", 'trap "" HUP; exec "$@"', "sh") if survives else ()  # as nohup does
+    return subprocess.Popen(
+        [*deaf, sys.executable, "-m", "flows.cli", *arguments],
+        cwd=folder,
+        env={
+            **os.environ, "FAKE_LOG": str(folder / "ran"), "DG4D_EXECUTOR": "subprocess", "TMPDIR": str(folder / "tmp"),
+        },
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )  # fmt: skip
+
+
+def left_behind(folder: Path) -> list[str]:
+    """What a command that ended has left: steps at work, temporary files, scratch folders, locks that are held."""
+    deadline = time.monotonic() + 10
+    while steps_of(folder) and time.monotonic() < deadline:  # what was killed takes a moment to go
+        time.sleep(0.1)
+    left = [f"process {pid}" for pid in steps_of(folder)]
+    left += [str(path) for path in (folder / "tmp").rglob("dg4d-*")]
+    left += [str(path) for path in (home.locks().parent / "scratch").glob("*")]
+    for lock in home.locks().rglob("*"):
+        with locked(lock) as free:
+            left += [] if free else [str(lock)]
+    return left
+
+
+def steps_of(folder: Path) -> list[int]:
+    """Processes whose environment names the log of this folder."""
+    mark = f"FAKE_LOG={folder / 'ran'}".encode()
+    found = []
+    for place in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            if mark in (place / "environ").read_bytes():
+                found.append(int(place.name))
+    return found
 
 
 def test_a_made_batch_needs_no_server_and_says_that_there_is_nothing_to_do(
@@ -230,15 +315,15 @@ def test_the_exit_status_says_how_a_batch_ended(
 
 def test_a_summary_has_times_and_costs_by_item_and_in_total(tmp_path: Path) -> None:
     rows = [
-        Row(item="a", status="done", computed_s=1800, cpu_s=3000.5, gpu_s=900, failing=["motion", "floaters"]),
-        Row(item="b", status="unchanged", computed_s=180, cpu_s=200),
+        Row(item="a", status="done", compute_s=1800, cpu_s=3000.5, gpu_s=900, failing=["motion", "floaters"]),
+        Row(item="b", status="unchanged", compute_s=180, cpu_s=200),
         Row(item="c", status="failed", message='a "bad", thing'),
     ]
     Writer(tmp_path, price_per_hour=2.0).write(rows, 12.34)
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["totals"] == {"computed_s": 1980, "cpu_s": 3200.5, "gpu_s": 900, "cost": 1.1}
+    assert summary["totals"] == {"compute_s": 1980, "cpu_s": 3200.5, "gpu_s": 900, "cost": 1.1}
     assert [item["cost"] for item in summary["items"]] == [1.0, 0.1, 0.0]
-    assert (summary["made"], summary["seconds"], summary["price_per_hour"]) == (2, 12.3, 2.0)
+    assert (summary["made"], summary["wall_s"], summary["price_per_hour"]) == (2, 12.3, 2.0)
     with (tmp_path / "summary.csv").open(newline="") as file:
         lines = list(csv.DictReader(file))
     assert [line["item"] for line in lines] == ["a", "b", "c"]
@@ -281,3 +366,19 @@ def test_a_line_says_how_far_a_batch_is_and_when_it_will_be_done(monkeypatch: py
         tally.settle(Row(item=f"{i}", status="failed" if i == 4 else "done"))
     monkeypatch.setattr(Tally, "seconds", property(lambda self: 600.0))
     assert tally.line() == "13 of 103 items, 1 failed, 60 an hour, about 90 min left"
+
+
+def test_formulas_in_a_summary_are_text_and_numbers_are_numbers(tmp_path: Path) -> None:
+    names = ["=cmd|calc!A1", "@SUM(1)", "+1", "-1", "plain"]
+    rows = [Row(item=name, source=name, status="failed", message=name, compute_s=1.5) for name in names]
+    Writer(tmp_path, price_per_hour=-3600.0).write(rows, 1.0)
+    with (tmp_path / "summary.csv").open(newline="") as file:
+        lines = list(csv.DictReader(file))
+    for line, name in zip(lines, names, strict=True):
+        expected = name if name == "plain" else f"'{name}"
+        assert (line["item"], line["source"], line["message"]) == (expected, expected, expected)
+        assert (float(line["cost"]), float(line["compute_s"])) == (-1.5, 1.5)
+    assert [item["item"] for item in json.loads((tmp_path / "summary.json").read_text())["items"]] == names
+    Writer(tmp_path).write([Row(item="<img src=x>", status="failed", message="<b>no</b>")], 1.0)
+    page = (tmp_path / "index.html").read_text()
+    assert "<img" not in page and "<b>" not in page and "&lt;b&gt;no" in page

@@ -11,10 +11,13 @@ from fake_steps import picture
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import ArtifactFilter, ArtifactFilterKey
 from rich.console import Console
+from typer.testing import CliRunner
 
 from dg4d_lib.errors import BadInput
+from flows import cli
 from flows.commands.benchmark import bench, put_truth, score
 from flows.engine import tasks
+from flows.engine.executors import StepError, StepMissing
 from flows.packages.scores import Results
 from flows.serving.server import Server
 from steps.store import ArtifactStore
@@ -180,3 +183,35 @@ def test_equal_truths_are_one_artifact_whatever_their_files_are_called(tmp_path:
     assert put_truth(find_truth(first), store) == put_truth(find_truth(second), store)
     (second / VIEWS[0] / "0.png").write_text(picture("another picture"))
     assert put_truth(find_truth(first), store) != put_truth(find_truth(second), store)
+
+
+def test_a_truth_that_cannot_be_judged_against_is_bad_input_and_no_table_is_written(tmp_path: Path) -> None:
+    thing(tmp_path / "data" / "newt", "walks too")
+    run(tmp_path / "data", tmp_path / "out")
+    asset = tmp_path / "out" / "assets" / "newt"
+    for words, error in (("bad:strange", BadInput), ("missing", StepMissing), ("crash", StepError)):
+        truth = thing(tmp_path / words.replace(":", "-"), f"score_asset={words} .")
+        with pytest.raises(error, match=r"strange|no cuda|division"):
+            score(asset, truth, Console(file=StringIO()), out=tmp_path / "scores.json")
+    assert not (tmp_path / "scores.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "status"),
+    [
+        ({"a": "fine", "b": "well"}, 0),
+        ({"a": "score_asset=bad:strange .", "b": "well"}, 1),
+        ({"a": "score_asset=bad:strange .", "b": "fit_motion=bad:crooked ."}, 65),
+        ({"a": "score_asset=bad:strange .", "b": "score_asset=missing ."}, 1),
+    ],
+)
+def test_the_exit_status_says_whether_every_object_has_scores(
+    tmp_path: Path, words: dict[str, str], status: int
+) -> None:
+    for name, said in words.items():
+        thing(tmp_path / "data" / name, said)
+    result = CliRunner().invoke(cli.app, ["bench", str(tmp_path / "data"), "-o", str(tmp_path / "out")])
+    assert result.exit_code == status, result.output
+    for name, said in words.items():
+        assert (f"failed: {name}: " in result.output) == ("=" in said)
+    assert ("| preview |" in result.output) == ("well" in words.values())

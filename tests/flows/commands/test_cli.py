@@ -175,3 +175,206 @@ def test_help_imports_neither_torch_nor_prefect_nor_the_steps() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+LONG = "x" * 251
+
+
+def named(name: bytes) -> str:
+    """A picture whose name has these bytes."""
+    Path(os.fsdecode(name)).write_text(os.fsdecode(b"a cat"))
+    return os.fsdecode(name)
+
+
+@pytest.mark.parametrize("command", ["make", "motions"])
+@pytest.mark.parametrize("options", [(), ("-o", "out")])
+def test_a_file_name_that_no_record_can_hold(command: str, options: tuple[str, ...]) -> None:
+    refused(dg4d(command, named(b"caf\xe9.png"), *options), "is not UTF-8")
+    refused(dg4d(command, named(f"{LONG}.png".encode()), *options), "251 bytes in UTF-8, and at most 230")
+    refused(dg4d(command, named("猫".encode() * 83 + b".png"), *options), "249 bytes in UTF-8")
+    refused(dg4d(command, f"{LONG}/cat.png", *options), "does not exist")
+    refused(dg4d(command, "x" * 256, *options), "File name too long")
+    refused(dg4d(command, "a/" * 2500, *options), "File name too long")
+
+
+def test_a_video_or_a_bank_of_such_a_name() -> None:
+    refused(dg4d("make", "cat.png", "--video", named(b"caf\xe9.mp4")), "is not UTF-8")
+    refused(dg4d("make", "cat.png", "--bank", "x" * 256), "File name too long")
+    refused(dg4d("make", "--text", "a f\udce9x"), "the text 'a f\\udce9x' is not UTF-8")
+
+
+def test_an_output_folder_whose_name_leaves_no_room() -> None:
+    for folder, says in ((LONG, "251 bytes"), ("x" * 256, "256 bytes"), ("a/" * 2500, "its path has")):
+        refused(dg4d("make", "cat.png", "-o", folder), says)
+
+
+def test_a_file_name_of_control_characters_is_not_shown_raw() -> None:
+    result = dg4d("make", named(b"\x1b[31mred\x07.txt\n") + "gone")
+    assert (result.exit_code, "\x1b" in result.output, "\x07" in result.output) == (65, False, False)
+    assert r"\x1b[31mred\x07.txt" in result.stderr
+
+
+def test_a_batch_goes_on_after_every_bad_name_and_row(place: Path) -> None:
+    Path("in").mkdir()
+    for name in (
+        b"caf\xe9.png",
+        b"caf\xe8.png",
+        f"{LONG}.png".encode(),
+        b"summary.json.png",
+        b"a\nb\x1b[1m.png",
+        b"z.png",
+    ):
+        (place / "in" / os.fsdecode(name)).touch()  # empty, so that none is made
+    result = dg4d("batch", "in", "-o", "out")
+    assert result.exit_code == 65, result.output
+    summary = json.loads(Path("out/summary.json").read_text())
+    told = {item["item"]: item["message"] for item in summary["items"]}
+    assert set(told) == {"caf", "caf-png", "caf-png-2", LONG, "summary.json", "ab[1m", "z"} - {"caf"}
+    assert "is not UTF-8" in told["caf-png"] and "is not UTF-8" in told["caf-png-2"]
+    assert "251 bytes" in told[LONG] and "every batch writes" in told["summary.json"]
+    assert "empty" in told["z"] and "empty" in told["ab[1m"]
+    assert "\x1b" not in result.output
+    assert "\\udce9" in Path("out/index.html").read_text() and "\\udce9" in Path("out/summary.csv").read_text()
+
+
+def test_a_row_that_breaks_what_nobody_thought_of_fails_alone(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(path: Path) -> None:
+        raise ZeroDivisionError(f"oh {path}")
+
+    monkeypatch.setattr("flows.inputs.sources.check_file", broken)
+    result = dg4d("batch", ".", "-o", "out")
+    assert (result.exit_code, "cat: failed ZeroDivisionError: oh" in result.output) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("--seed", "99999999999999999999999"), ("--seed", str(2**63)), ("--fps", "0"), ("--fps", "241"),
+        ("--fps", "0.5"), ("--fps", "nan"), ("--fps", "inf"), ("--fps", "-1"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("command", [("make", "cat.png"), ("batch", ".")])
+def test_numbers_out_of_range_are_wrong_usage(command: tuple[str, str], option: str, value: str) -> None:
+    result = dg4d(*command, option, value, "-o", "out")
+    assert (result.exit_code, option in result.stderr) == (2, True), result.output
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("render", ".", "-o", "out", "--azimuths=0,nan"), ("render", ".", "-o", "out", "--elevation=nan"),
+        ("compose", ".", "-o", "x.glb", "--spacing=nan"), ("batch", ".", "-o", "out", "--price-per-hour=nan"),
+        ("watch", ".", "-o", "out", "--rest=nan"),
+    ],
+)  # fmt: skip
+def test_nan_lies_in_no_range(arguments: tuple[str, ...]) -> None:
+    assert dg4d(*arguments).exit_code == 2
+
+
+DEEP = "[" * 5000 + "]" * 5000
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (f"mesh.grid={DEEP}", "nested more than 100 deep"),
+        (f"mesh.grid={DEEP[:-1]}", "mesh.grid = "),
+        ("mesh.grid=" + "9" * 5000, "5000 digits"),
+        ("mesh.max_faces=" + "9" * 40, "out of range"),
+        ("pack.fps=NaN", "NaN"), ("pack.fps=1e999", "too large"), ("pack.fps=0.5", "1 to 240"),
+        ("text.suffix=\"\\ud800\"", "half a character"), ('mesh={"grid": 3, "grid": 4}', "there twice"),
+    ],
+)  # fmt: skip
+def test_a_setting_that_no_file_can_hold(change: str, says: str) -> None:
+    result = dg4d("make", "cat.png", "--set", change, "-o", "out")
+    refused(result, says)
+    assert len(result.stderr) < 400
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"files": ' + DEEP + "}",
+        '{"files": {}, "steps": ' + DEEP + "}",
+        DEEP,
+        '{"files": {"\\ud800": 1}}',
+        '{"files": {}, "beside": 7}',
+        '{"files": {}, "steps": [1], "run": 7}',
+        '{"files": {"a": 1}, "steps": 7}',
+        "NaN",
+        "",
+        '{"files": {}, "x": ' + "9" * 5000 + "}",
+    ],
+)
+@pytest.mark.parametrize(
+    "command",
+    [("verify",), ("rebuild",), ("view", "--no-open"), ("score", "--truth", "cat.png"), ("compose", "-o", "x.glb")],
+)
+def test_a_record_that_is_nested_or_of_another_form(command: tuple[str, ...], text: str) -> None:
+    Path("asset").mkdir()
+    Path("asset/provenance.json").write_text(text)
+    result = dg4d(command[0], "asset", *command[1:])
+    assert result.exit_code == 65, result.output
+    assert "Traceback" not in result.output and "something broke" not in result.output
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        DEEP,
+        '{"items": ' + DEEP + "}",
+        '{"items": [{"package": "\\ud800"}]}',
+        '{"items": [{"package": "a\\u0000"}]}',
+        '{"items": [{"package": "' + LONG * 2 + '"}]}',
+    ],
+)
+def test_a_scene_file_that_no_system_can_hold(text: str) -> None:
+    Path("scene.json").write_text(text)
+    refused(dg4d("compose", "--scene", "scene.json", "-o", "x.glb"), "")
+
+
+def test_a_scene_of_another_suffix_is_refused_before_anything_is_loaded() -> None:
+    program = (
+        "import sys; sys.argv = ['dg4d', 'compose', 'asset', '-o', 'x.foo']\nfrom flows.cli import main\n"
+        "try: main()\nexcept SystemExit as end: print(end.code)\n"
+        "print([m for m in ('torch', 'numpy', 'prefect', 'steps.compose_scene') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["65", "[]"]
+    assert "a scene is written as .glb or .usdz" in done.stderr
+
+
+def test_a_data_set_with_nothing_in_it() -> None:
+    Path("empty/gt").mkdir(parents=True)
+    refused(dg4d("bench", "empty", "-o", "out"), "holds no objects")
+    refused(dg4d("bench", "nowhere", "-o", "out"), "is no data set")
+    Path("one/thing/input").mkdir(parents=True)
+    refused(dg4d("bench", "one", "-o", "out"), "has no input frames")
+
+
+@pytest.mark.parametrize(
+    ("code", "status", "says"),
+    [
+        (errno.EACCES, 65, "Permission denied: a; choose another place"), (errno.ENAMETOOLONG, 65, "choose another"),
+        (errno.ENOSPC, 65, "free some space"), (errno.EROFS, 65, "free some space"),
+        (errno.EPIPE, 1, "something broke"),
+    ],
+)  # fmt: skip
+def test_what_the_system_refuses_is_said_in_a_line(
+    monkeypatch: pytest.MonkeyPatch, code: int, status: int, says: str
+) -> None:
+    def refuse(path: Path) -> None:
+        raise OSError(code, os.strerror(code), "a")
+
+    monkeypatch.setattr("flows.packages.publish.check_folder_name", refuse)
+    refused(dg4d("make", "cat.png", "-o", "out"), says, status)
+
+
+@pytest.mark.parametrize(
+    "record",
+    [{}, {"recipe": 7, "run": {"names": 3}}, {"recipe": [], "run": []}, {"recipe": {"seed": 10**23}, "run": {}}],
+)
+def test_a_record_without_a_recipe_is_not_made_again(record: dict[str, object]) -> None:
+    Path("asset").mkdir()
+    Path("asset/provenance.json").write_text(json.dumps({"files": {}, **record}))
+    refused(dg4d("rebuild", "asset"), "")

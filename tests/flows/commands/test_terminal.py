@@ -1,9 +1,10 @@
 import io
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from flows.commands.terminal import BatchTable, StepBars, numbers, steps_shown, tell_rows
+from flows.commands.terminal import BatchTable, StepBars, console, numbers, steps_shown, tell_rows, tell_where
 from flows.engine.events import StepEvent, tell
 
 EVENT = StepEvent("newt", "fit_gaussians", "progress", done=114, total=250, values={"loss": 9.437, "reference": 12.57})
@@ -63,3 +64,26 @@ def test_an_item_that_is_tried_again_is_running_again():
     table.settle("a", "failed", "crashed")
     table(StepEvent("a", "fit_gaussians", "started"))
     assert table.status["a"] == "running"
+
+
+NASTY = "[/x] [bold]\x1b[31m\x07 fox"
+SHOWN = r"[/x] [bold]\x1b[31m\x07 fox"
+
+
+def test_names_and_messages_are_shown_letter_by_letter(capsys: pytest.CaptureFixture[str]) -> None:
+    console().print(f"{NASTY}: failed", markup=False)
+    assert capsys.readouterr().out == f"{SHOWN}: failed\n"
+
+    table = BatchTable([NASTY])
+    table.settle(NASTY, "failed", NASTY)
+    screen = io.StringIO()
+    terminal = Console(file=screen, width=200, force_terminal=True, color_system=None)
+    bars = StepBars(terminal)
+    with bars.progress:
+        bars(StepEvent("a", "fit_motion", "note", text=NASTY))
+    assert SHOWN in screen.getvalue()
+    terminal.print(table)
+    assert screen.getvalue().count(SHOWN) >= 3
+    tell_where(terminal, Path(NASTY), {"[a] name that is as long as that of its folder": 1})
+    assert screen.getvalue().count(SHOWN) >= 4 and "[a] name" in screen.getvalue()
+    assert "\x07" not in screen.getvalue() and "\x1b[31m" not in screen.getvalue()

@@ -9,7 +9,8 @@ from tiny_s3 import BUCKET, TinyS3
 
 from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
 from flows.inputs import sources
-from flows.inputs.manifest import Item, distinct, items_of, parse_changes
+from flows.inputs.manifest import Item, items_of, parse_changes
+from flows.inputs.naming import distinct
 
 
 def touch(folder: Path, *names: str) -> None:
@@ -127,10 +128,10 @@ def test_a_bad_row_is_a_bad_item_and_no_more(tmp_path: Path) -> None:
     ("name", "content", "says"),
     [
         ("m.csv", "file\nx.png\n", "unknown column 'file'"),
-        ("m.csv", "path,seed\n,1\n", "row 1: neither a path nor a text"),
+        ("m.csv", "path,seed,seed\na.png,1,2\n", "two columns 'seed'"),
         ("m.json", "{", "cannot be read"),
         ("m.json", '{"path": 1}', "list of rows"),
-        ("m.jsonl", '{"path": "a.png"}\n{', "cannot be read"),
+        ("m.jsonl", '{"path": "a.png"\n{', "cannot be read"),
         ("m.parquet", "PAR1", "cannot be read"),
         ("m.txt", "x", "neither a folder nor a manifest"),
         ("m.csv", "path\n", "holds no pictures"),
@@ -246,7 +247,7 @@ def test_without_pyarrow_a_parquet_manifest_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "m.parquet").write_bytes(b"PAR1")
-    monkeypatch.setattr("flows.inputs.manifest.find_spec", lambda name: None)
+    monkeypatch.setattr("flows.inputs.rows.find_spec", lambda name: None)
     with pytest.raises(BackendUnavailable, match=re.escape("pip install 'dg4d[parquet]'")):
         items(tmp_path / "m.parquet")
 

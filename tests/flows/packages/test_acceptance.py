@@ -78,7 +78,8 @@ def test_only_gates_that_fail_give_advice() -> None:
 
 def test_the_section_stands_in_the_report_and_only_where_there_is_a_verdict() -> None:
     bare = {
-        "item": "fox", "banner": "", "notes": [], "steps": [], "seconds": 1.0, "files": {}, "licenses": {},
+        "item": "fox", "banner": "", "notes": [], "steps": [], "wall_s": 1.0, "compute_s": 1.0, "files": {},
+        "licenses": {},
         "profile": "preview", "seed": 0, "source": "fox.png", "settings": {},
     }  # fmt: skip
     assert "Accepted: all 2 gates passed." in report.page({**bare, "acceptance": verdict()})

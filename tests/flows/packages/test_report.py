@@ -51,7 +51,7 @@ def finished(step: str, store: ArtifactStore, seconds: float, **outputs: Artifac
         peak_memory_mb=seconds * 10,
     )
     result = StepResult(outputs=outputs, provenance=record)
-    return Finished(label=step, cached=seconds > 5, seconds=seconds, result=result)
+    return Finished(label=step, cached=seconds > 5, wall_s=seconds, result=result)
 
 
 @pytest.fixture
@@ -101,6 +101,14 @@ def test_the_page_is_self_contained_and_escapes_what_it_is_given(store: Artifact
     assert {"preview.mp4", "contact_sheet.png", "asset.glb", "splats/", "provenance.json"} <= set(links.addresses)
     assert links.tags.count("polyline") == 1
     assert "5.4 MB" in page
+
+
+def test_time_on_the_clock_and_time_of_computing_are_two_numbers(store: ArtifactStore) -> None:
+    order, what = made(store)  # two steps, of 2 and 3 seconds
+    told = report.report_of(order, what.model_copy(update={"wall_s": 3.2}), FILES, store)
+    assert (told["wall_s"], told["compute_s"]) == (3.2, 5.0)
+    page = report.page(told)
+    assert "3.2 s on the clock for this run; 5.0 s of computing in all stages" in page
 
 
 def test_the_banner_is_honest(store: ArtifactStore) -> None:

@@ -63,7 +63,7 @@ def test_the_first_table_has_the_papers_columns_and_missing_is_no_number() -> No
     assert cells(text, "video", "PSNR, dB ↑")["PSNR, dB ↑"] == "22.00"
     assert cells(text, "its first frame at every view", "PSNR, dB ↑")["chamfer ↓"] == "-"
     assert "- lpips: `dg4d weights pull vgg16` gets it" in text
-    assert "- eel failed: it <slipped> away" in text
+    assert r"- eel failed: it \<slipped\> away" in text
     assert "Means over 2 objects" in text
 
 
@@ -110,3 +110,30 @@ def test_the_page_shows_films_side_by_side_and_escapes_what_others_wrote(
     for wrong in ("<three>", "<it>", "<slipped>"):
         assert wrong not in text
     assert "it &lt;slipped&gt; away" in text
+
+
+def test_objects_may_be_called_anything() -> None:
+    name = "=1|<img src=x>![](http://tracker)"
+    one = results(
+        objects=[ObjectScores(object=name, error="[a](http://b)"), ObjectScores(object="-1", rows={"video": ours(2.0)})]
+    )
+    assert "<img" not in page(one, {}) and "&lt;img src=x&gt;" in page(one, {})
+    assert r"- =1" not in markdown(
+        one
+    ) and r"\|\<img src=x\>!\[\](http\://tracker) failed: \[a\](http\://b)" in markdown(one)
+    assert {line["object"] for line in csv.DictReader(StringIO(csv_text(one)))} == {"'-1"}
+    assert all(float(line["psnr"]) for line in csv.DictReader(StringIO(csv_text(one))))
+
+
+def test_the_exit_code_says_whether_bad_input_is_to_blame_for_all() -> None:
+    good, bad, broken = (
+        ObjectScores(object="a", rows={"video": ours(2.0)}),
+        ObjectScores(object="b", error="x", kind="StepBadInput"),
+        ObjectScores(object="c", error="x", kind="StepCrashed"),
+    )
+    assert [results(objects=several).exit_code for several in ([good], [bad], [good, bad], [bad, broken])] == [
+        0,
+        65,
+        1,
+        1,
+    ]

@@ -1,6 +1,7 @@
 """Deployments on a real server: what a form asks for, what the server refuses, and runs by a worker."""
 
 import json
+import re
 import time
 from pathlib import Path
 from typing import Any, get_args
@@ -9,6 +10,7 @@ import pytest
 from fake_steps import picture
 from prefect.client.orchestration import SyncPrefectClient
 from prefect.exceptions import PrefectHTTPStatusError
+from pydantic import ValidationError
 from tiny_s3 import TinyS3
 from waiting import wait_until
 
@@ -56,7 +58,7 @@ def test_a_form_has_a_plain_field_for_everything_in_a_sensible_order(
         assert field["type"] in {"string", "integer", "number", "boolean", "array"}  # a choice of types is a riddle
         assert field.get("default", "") is not None
         bounds = [field[bound] for bound in ("minimum", "maximum") if field.get(bound)]
-        assert all(f"{bound:g}" in field["description"] for bound in bounds)
+        assert all({f"{bound:g}", str(bound)} & set(re.findall(r"\d+", field["description"])) for bound in bounds)
     assert form["properties"]["options"]["default"] == {
         "profile": "preview", "seed": 0, "commercial_only": False, "settings": [],
     }  # fmt: skip
@@ -67,6 +69,12 @@ def in_order(schema: dict[str, Any]) -> list[dict[str, Any]]:
     fields = list(schema["properties"].values())
     assert sorted(field["position"] for field in fields) == list(range(len(fields)))
     return sorted(fields, key=lambda field: int(field["position"]))
+
+
+@pytest.mark.parametrize("field", [{"seed": 2**63}, {"seed": -1}, {"fps": 0}, {"fps": 241}, {"fps": "nan"}])
+def test_numbers_out_of_range_are_no_form(field: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError):
+        deployments.PictureOptions.model_validate(field)
 
 
 def test_what_a_form_asks_for_reaches_the_knobs() -> None:

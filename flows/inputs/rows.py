@@ -1,0 +1,204 @@
+"""Rows of a manifest (CSV, JSON, JSON Lines, Parquet), each read for itself: a bad one spoils no other."""
+
+import csv
+import io
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from dg4d_lib.errors import BackendUnavailable, BadInput
+from flows.inputs.json_text import loads
+from flows.ui.escaping import quoted
+
+COLUMNS = (
+    "path", "text", "video", "name", "profile", "seed", "bank", "priority", "set",
+)  # and any dotted knob, as mesh.grid  # fmt: skip
+MANIFESTS = (".csv", ".json", ".jsonl", ".parquet")
+LARGEST_MANIFEST_BYTES = 256 * 2**20
+LARGEST_TABLE_BYTES = 2**30  # of a Parquet table when it is unpacked
+ROWS_AT_ONCE = 1024  # of Parquet, in which one long text may stand for many cells
+MOST_ROWS = 1_000_000
+NOT_UTF8 = "it holds bytes that are not UTF-8; save the manifest as UTF-8"
+
+_TOKEN = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"|[\[\]{},]', re.DOTALL)
+_SURROGATE = re.compile("[\ud800-\udfff]")
+
+
+class Row(NamedTuple):
+    """One row of a manifest.
+
+    Attributes:
+        place: its number, as messages and unnamed items have it: "row 3"; of JSON Lines the line.
+        cells: by column, without empty ones.
+        error: why it cannot be used; empty if nothing is known against it.
+    """
+
+    place: str
+    cells: dict[str, Any]
+    error: str = ""
+
+
+def read_rows(file: Path) -> list[Row]:
+    """Read the rows of a manifest.
+
+    Raises:
+        BadInput: it is no table at all, has columns that mean nothing, or is too large.
+        BackendUnavailable: reading Parquet is not installed.
+    """
+    try:
+        if (size := file.stat().st_size) > LARGEST_MANIFEST_BYTES:
+            raise BadInput(f"{file} has {size} bytes; a manifest has at most {LARGEST_MANIFEST_BYTES}: divide it")
+        rows = _table(file)
+    except (OSError, ValueError, csv.Error) as error:
+        raise BadInput(f"{file} cannot be read as a manifest: {error}") from error
+    if not rows:
+        raise BadInput(f"{file} holds no pictures or videos: it has no rows")
+    if len(rows) > MOST_ROWS:
+        raise BadInput(f"{file} has {len(rows)} rows; at most {MOST_ROWS} are read: divide it")
+    return rows
+
+
+def _table(file: Path) -> list[Row]:
+    kind = file.suffix.lower()
+    if kind == ".parquet":
+        return _parquet(file)
+    text = file.read_bytes().removeprefix(b"\xef\xbb\xbf").decode(errors="surrogateescape")
+    if kind == ".csv":
+        return _csv(text)
+    if kind == ".jsonl":
+        lines = enumerate(text.split("\n"), 1)
+        return _of_json((f"line {number}", line) for number, line in lines if line.strip())
+    return _of_json((f"row {number}", element) for number, element in enumerate(_elements(text), 1))
+
+
+def _csv(text: str) -> list[Row]:
+    reader = csv.reader(io.StringIO(text, newline=""))
+    columns = next(reader, [])
+    _check_columns(columns)
+    rows: list[Row] = []
+    while True:
+        place = f"row {len(rows) + 1}"
+        try:
+            cells = next(reader)
+        except StopIteration:
+            return rows
+        except csv.Error as error:
+            rows.append(Row(place, {}, f"it cannot be read: {error}"))
+            continue
+        if not cells:
+            continue
+        if len(cells) > len(columns):
+            rows.append(Row(place, {}, f"it has {len(cells)} cells, and there are {len(columns)} columns"))
+        elif any(map(_SURROGATE.search, cells)):
+            rows.append(Row(place, {}, NOT_UTF8))
+        else:
+            rows.append(_row(place, dict(zip(columns, cells, strict=False))))
+
+
+def _of_json(texts: Iterable[tuple[str, str]]) -> list[Row]:
+    """Rows of JSON objects, each of which is a text of its own.
+
+    Raises:
+        ValueError: none of them is one.
+    """
+    rows = [_object(place, text) for place, text in texts]
+    if rows and all(row.error and not row.cells for row in rows):
+        raise ValueError(f"{rows[0].place}: {rows[0].error}")
+    return rows
+
+
+def _object(place: str, text: str) -> Row:
+    if _SURROGATE.search(text):
+        return Row(place, {}, NOT_UTF8)
+    try:
+        value = loads(text)
+    except ValueError as error:
+        return Row(place, {}, f"it cannot be read: {error}")
+    if not isinstance(value, dict):
+        return Row(place, {}, 'it is no object in braces, as {"path": "fox.png"}')
+    if unknown := _unknown(value):
+        return Row(place, value, unknown)
+    return _row(place, value)
+
+
+def _elements(text: str) -> Iterator[str]:
+    """Divide a JSON list into the texts of its elements.
+
+    Raises:
+        ValueError: it is no list, or has no end.
+    """
+    text = text.strip()
+    if not text.startswith("["):
+        loads(text)
+        raise ValueError("it should hold a list of rows, each with at least a path or a text")
+    depth, start = 0, 1
+    for token in _TOKEN.finditer(text):
+        letter = token.group()[0]
+        depth += (letter in "[{") - (letter in "]}")
+        if depth == 0:
+            if (last := text[start : token.start()]).strip() or start > 1:
+                yield last
+            if text[token.end() :].strip():
+                raise ValueError("something follows the list")
+            return
+        if letter == "," and depth == 1:
+            yield text[start : token.start()]
+            start = token.end()
+    raise ValueError("the list has no end")
+
+
+def _parquet(file: Path) -> list[Row]:
+    if find_spec("pyarrow") is None:
+        raise BackendUnavailable(f"{file} is Parquet, which pyarrow reads: pip install 'dg4d[parquet]'; or give a .csv")
+    arrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
+    try:
+        with parquet.ParquetFile(file) as opened:
+            _check_columns(opened.schema_arrow.names)
+            content: list[dict[str, Any]] = []
+            size = 0
+            for batch in opened.iter_batches(ROWS_AT_ONCE):
+                size += batch.nbytes
+                if size > LARGEST_TABLE_BYTES or len(content) > MOST_ROWS:
+                    raise BadInput(
+                        f"{file} unpacks to more than {MOST_ROWS} rows or {LARGEST_TABLE_BYTES} bytes; divide it"
+                    )
+                content += batch.to_pylist()
+    except (arrow.ArrowException, NotImplementedError, ArithmeticError) as error:
+        raise ValueError(str(error)) from error
+    # Parquet written from data frames has NaN in the empty cells of columns of numbers
+    return [
+        _row(f"row {number}", {column: value for column, value in cells.items() if not _is_nan(value)})
+        for number, cells in enumerate(content, 1)
+    ]
+
+
+def _row(place: str, cells: dict[str, Any]) -> Row:
+    filled = {column: value for column, value in cells.items() if value is not None and value != ""}
+    error = "" if filled.get("path") or filled.get("text") else "neither a path nor a text"
+    return Row(place, filled, error)
+
+
+def _check_columns(columns: list[str]) -> None:
+    """Refuse columns that all rows have; raises BadInput."""
+    if unknown := _unknown(columns):
+        raise BadInput(f"the manifest has an {unknown}")
+    if twice := [column for column, count in Counter(columns).items() if count > 1]:
+        raise BadInput(f"the manifest has two columns {quoted(twice[0])}; leave one out")
+
+
+def _unknown(columns: Iterable[str]) -> str:
+    """What is wrong with the columns; empty if nothing is."""
+    unknown = sorted(column for column in columns if column not in COLUMNS and "." not in column)
+    if not unknown:
+        return ""
+    return (
+        f"unknown column {quoted(unknown[0])}; there are: {', '.join(COLUMNS)}, and any knob such as motion.iterations"
+    )
+
+
+def _is_nan(value: Any) -> bool:
+    return isinstance(value, float) and value != value  # noqa: PLR0124
