@@ -56,7 +56,7 @@ def main(options: list[str]) -> None:
     }.items():
         write(name, {package: every[package] for package in packages})
     write("tools", resolve("tools", TOOLS, ("tools",), options))
-    write_torch(every["torch"])
+    write_torch(every["torch"].split()[0].removeprefix("torch=="))
 
 
 def resolve(name: str, wanted: Iterable[str], known: Iterable[str], options: list[str]) -> Blocks:
@@ -92,19 +92,23 @@ def pins(blocks: Blocks) -> str:
 
 
 def write(name: str, blocks: Blocks, note: str = "") -> None:
-    """Write a lock, sorted by name."""
-    text = HEADER + note + "".join(block for _, block in sorted(blocks.items()))
-    (LOCKS / f"{name}.txt").write_text(text, encoding="utf-8")
+    """Write a lock, sorted by name, unless it has this text already: what is made of it stays as it is."""
+    path, text = LOCKS / f"{name}.txt", HEADER + note + "".join(block for _, block in sorted(blocks.items()))
+    if not path.exists() or path.read_text(encoding="utf-8") != text:
+        path.write_text(text, encoding="utf-8")
 
 
-def write_torch(block: str) -> None:
-    """Write the lock of torch's CPU build, unless it names this version already."""
-    version = re.match(r"torch==([^ +]+)", block)[1]  # type: ignore[index]
+def write_torch(version: str) -> None:
+    """Write the lock of torch's CPU build, unless it has this version already."""
     path = LOCKS / "torch.txt"
     if path.exists() and f"\ntorch=={version}+cpu " in path.read_text(encoding="utf-8"):
         return
     found = uv([f"torch=={version}+cpu"], "--no-deps", "--generate-hashes", "--default-index", TORCH_INDEX)
-    write("torch", parse(found), "# Not on PyPI: from https://download.pytorch.org/whl/cpu, which serves this package only.\n")
+    write(
+        "torch",
+        parse(found),
+        "# Not on PyPI: from https://download.pytorch.org/whl/cpu, which is asked for nothing else.\n",
+    )
 
 
 if __name__ == "__main__":

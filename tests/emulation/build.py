@@ -1,8 +1,8 @@
 """Compiles a GPU and gsplat's kernels for the processor: `python -m tests.emulation.build`, called by `make emulation`.
 
-The GPU is `device.cpp`. The kernels are those of the wheel that `deploy/locks/cuda.txt` names: what no C++ compiler reads of
-their sources is rewritten here, `emulation.h` gives the rest a meaning; only what the adapter calls is compiled.
-Everything lies in `out/emulation`.
+The GPU is `device.cpp`. The kernels are those of the wheel that `deploy/locks/cuda.txt` names: what no C++ compiler
+reads of their sources is rewritten here, `emulation.h` gives the rest a meaning; only what the adapter calls is
+compiled. Everything lies in `out/emulation`.
 """
 
 import argparse
