@@ -7,11 +7,14 @@ ARITHMETIC ?= fast
 EMULATION := $(BIN)/python -m tests.emulation.build --arithmetic $(ARITHMETIC)
 GPU_TESTS := $(BIN)/python -m pytest -p tests.emulation.plugin --arithmetic $(ARITHMETIC) -m gpu
 
-.PHONY: setup clients demo test check audit emulation examples clean
+TOOLS := out/tools
+UPGRADE ?=
+
+.PHONY: setup clients demo test check audit lock emulation examples clean
 
 setup: $(VENV)/.ready
 
-$(VENV)/.ready: pyproject.toml constraints.txt deploy/setup.sh
+$(VENV)/.ready: pyproject.toml deploy/setup.sh deploy/install.sh $(wildcard deploy/locks/*.txt)
 	PYTHON="$(PYTHON)" VENV="$(VENV)" TORCH_INDEX="$(TORCH_INDEX)" bash deploy/setup.sh
 	touch $@
 
@@ -34,12 +37,18 @@ check: setup
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 
-out/audit/bin/pip-audit: $(VENV)/.ready
-	$(BIN)/python -m venv out/audit && timeout 300 out/audit/bin/pip install -q pip-audit
+$(TOOLS)/.ready: deploy/locks/tools.txt deploy/install.sh
+	$(PYTHON) -m venv $(TOOLS) && VENV=$(TOOLS) timeout 300 bash deploy/install.sh tools
 	touch $@
 
-audit: setup out/audit/bin/pip-audit
-	timeout 300 out/audit/bin/pip-audit -r constraints.txt --no-deps --disable-pip -f json --progress-spinner off | $(BIN)/python deploy/audit.py
+# torch.txt names a build that the package index does not know; cuda.txt has the same version
+audit: setup $(TOOLS)/.ready
+	timeout 300 $(TOOLS)/bin/pip-audit $(foreach lock,steps flows cuda dev meshopt tools,-r deploy/locks/$(lock).txt) \
+		--no-deps --disable-pip -f json --progress-spinner off | $(BIN)/python deploy/audit.py
+
+# Resolve pyproject.toml into deploy/locks. Versions stay unless UPGRADE="--upgrade" or "--upgrade-package NAME".
+lock: $(TOOLS)/.ready
+	TORCH_INDEX="$(TORCH_INDEX)" $(TOOLS)/bin/python deploy/lock.py $(UPGRADE)
 
 # the tests marked gpu on an emulated one, with gsplat's own kernels; ARITHMETIC=noise rounds as badly as CUDA may
 emulation: setup

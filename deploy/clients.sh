@@ -11,7 +11,7 @@ if command -v npm >/dev/null; then
         lock="$folder/package-lock.json"
         [ -f "$lock" ] || continue
         cmp -s "$lock" "$folder/node_modules/.installed" && continue
-        if npm ci --prefix "$folder" --loglevel error >/dev/null; then
+        if npm ci --ignore-scripts --prefix "$folder" --loglevel error >/dev/null; then
             cp "$lock" "$folder/node_modules/.installed"
         else
             missing "npm could not install $folder"
@@ -29,5 +29,5 @@ if ! command -v chromium >/dev/null; then
 fi
 
 "$VENV/bin/python" -c 'import meshoptimizer' 2>/dev/null ||
-    "$VENV/bin/python" -m pip --disable-pip-version-check install --quiet -c constraints.txt 'meshoptimizer' ||
+    VENV="$VENV" bash deploy/install.sh meshopt ||
     missing "meshoptimizer could not be compiled (Debian: apt-get install g++)"

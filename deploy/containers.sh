@@ -2,14 +2,15 @@
 # Builds the images of deploy/images with docker, else with podman.
 #
 #   deploy/containers.sh build [cpu|cuda|flows ...] [-- ARGUMENT ...]   dg4d/NAME; default: cpu flows
-#   deploy/containers.sh base                                           python:3.11-slim-bookworm out of Debian's own
-#                                                                       packages, where no registry can be reached
+#   deploy/containers.sh base                                           dg4d/python, a base image out of Debian's own
+#                                                                       packages, where no registry can be reached;
+#                                                                       then build with -- --build-arg PYTHON=dg4d/python
 #
 # What follows `--` goes to the engine, for example --secret id=pip,src=pip.conf for a package index of your own.
 # $DG4D_ENGINE chooses the engine.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-base=docker.io/library/python:3.11-slim-bookworm
+base=dg4d/python
 
 engine() {
     if [ -n "${DG4D_ENGINE:-}" ]; then echo "$DG4D_ENGINE"; return; fi
@@ -54,5 +55,5 @@ base() {
 case "${1:-}" in
     build) shift; build "$@" ;;
     base) base ;;
-    *) sed -n '2,9s/^# \{0,1\}//p' "$0"; exit 2 ;;
+    *) sed -n '2,10s/^# \{0,1\}//p' "$0"; exit 2 ;;
 esac

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Makes the virtual environment: pinned packages, the CPU build of torch, the `dg4d` command, a new database for Prefect,
+# Makes the virtual environment: locked packages, the CPU build of torch, the `dg4d` command, a new database for Prefect,
 # and the two system libraries that pymeshlab needs.
 set -euo pipefail
-: "${PYTHON:=python3}" "${VENV:=.venv}" "${TORCH_INDEX:=https://download.pytorch.org/whl/cpu}"
+: "${PYTHON:=python3}" "${VENV:=.venv}" "${TORCH_INDEX=https://download.pytorch.org/whl/cpu}"
 
 "$PYTHON" - <<'PY' || exit 1
 import sys
@@ -11,14 +11,9 @@ if not (3, 11) <= sys.version_info[:2] < (3, 13):
 PY
 [ -x "$VENV/bin/python" ] || "$PYTHON" -m venv "$VENV" || {
     echo "Could not make a virtual environment. On Debian: apt-get install python3-venv" >&2; exit 1; }
-pip() { "$VENV/bin/python" -m pip --disable-pip-version-check "$@"; }
-
-# The CPU build by its full version: from a configured package source if one has it, else from PyTorch's own index.
-torch=$(grep '^torch==' constraints.txt)
-pip install --quiet "$torch+cpu" -c constraints.txt 2>/dev/null ||
-    pip install --quiet "$torch+cpu" -c constraints.txt --extra-index-url "$TORCH_INDEX"
-pip install --quiet --upgrade 'pip>=25.1' -c constraints.txt
-pip install --quiet -c constraints.txt --editable . --group dev
+export VENV TORCH_INDEX
+bash deploy/install.sh torch steps flows dev
+"$VENV/bin/python" -m pip --disable-pip-version-check install --quiet --no-deps --no-build-isolation --editable .
 "$VENV/bin/python" -m flows.serving.fresh
 
 # pymeshlab imports without these but then lacks its filters.

@@ -1,15 +1,15 @@
 # The steps on processors: dg4d_lib and steps, no Prefect. Built from the root of the project by deploy/containers.sh.
 # A package index of your own is a pip.conf, given as the secret `pip`; nothing of it stays in the image.
-ARG PYTHON=python:3.11-slim-bookworm
+ARG PYTHON=python:3.11.16-slim-bookworm@sha256:528257d48c1da0dcecc2e725d1ae34498d60c965f1241e39cd6a85a8859bdf84
 
 FROM ${PYTHON} AS packages
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 WORKDIR /src
-COPY constraints.txt deploy/images/steps.txt ./
+ENV PIP_NO_CACHE_DIR=1
+COPY deploy/install.sh deploy/
+COPY deploy/locks/steps.txt deploy/locks/torch.txt deploy/locks/
 RUN --mount=type=secret,id=pip,target=/etc/pip.conf \
-    python -m venv /opt/dg4d && \
-    /opt/dg4d/bin/pip install --no-cache-dir -c constraints.txt -r steps.txt \
-        ${TORCH_INDEX:+--extra-index-url "${TORCH_INDEX}"} "$(grep '^torch==' constraints.txt)+cpu"
+    python -m venv /opt/dg4d && VENV=/opt/dg4d bash deploy/install.sh torch steps
 
 FROM packages AS code
 COPY pyproject.toml README.md LICENSE ./
@@ -18,7 +18,7 @@ COPY dg4d_lib dg4d_lib
 COPY steps steps
 # the command `dg4d` needs flows, which are not here, and they its data
 RUN --mount=type=secret,id=pip,target=/etc/pip.conf \
-    /opt/dg4d/bin/pip install --no-cache-dir --no-deps --target /opt/code . && rm -r /opt/code/bin /opt/code/share
+    /opt/dg4d/bin/pip install --no-cache-dir --no-deps --no-build-isolation --target /opt/code . && rm -r /opt/code/bin /opt/code/share
 
 FROM ${PYTHON}
 # pymeshlab loads these two libraries; Debian keeps only their newest version, so none can be named

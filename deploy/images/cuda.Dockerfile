@@ -1,18 +1,18 @@
 # The steps on NVIDIA GPUs: as cpu.Dockerfile, with torch for CUDA 13, gsplat's kernels and the diffusion models.
 # The kernels are compiled here, for the GPUs of $ARCHITECTURES, so the image needs no compiler when it runs.
-ARG PYTHON=python:3.11-slim-bookworm
-ARG CUDA=nvidia/cuda:13.0.2-devel-ubuntu22.04
+ARG PYTHON=python:3.11.16-slim-bookworm@sha256:528257d48c1da0dcecc2e725d1ae34498d60c965f1241e39cd6a85a8859bdf84
+ARG CUDA=nvidia/cuda:13.0.3-devel-ubuntu22.04@sha256:3869b846a8cc495ce11c172d87cfc0da8874b910d14a9810bec6b6182e9ee9f8
 
 FROM ${CUDA} AS toolkit
 
 FROM ${PYTHON} AS packages
 ARG ARCHITECTURES="7.5 8.0 8.6 8.9 9.0 12.0"
 WORKDIR /src
-COPY constraints.txt deploy/images/steps.txt ./
+ENV PIP_NO_CACHE_DIR=1
+COPY deploy/install.sh deploy/
+COPY deploy/locks/steps.txt deploy/locks/cuda.txt deploy/locks/
 RUN --mount=type=secret,id=pip,target=/etc/pip.conf \
-    python -m venv /opt/dg4d && \
-    /opt/dg4d/bin/pip install --no-cache-dir -c constraints.txt -r steps.txt \
-        torch gsplat accelerate diffusers huggingface_hub transformers
+    python -m venv /opt/dg4d && VENV=/opt/dg4d bash deploy/install.sh steps cuda
 # hadolint ignore=DL3008
 RUN apt-get update && apt-get install -y --no-install-recommends g++ && rm -rf /var/lib/apt/lists/*
 COPY --from=toolkit /usr/local/cuda /usr/local/cuda
@@ -26,7 +26,7 @@ COPY dg4d_lib dg4d_lib
 COPY steps steps
 # the command `dg4d` needs flows, which are not here, and they its data
 RUN --mount=type=secret,id=pip,target=/etc/pip.conf \
-    /opt/dg4d/bin/pip install --no-cache-dir --no-deps --target /opt/code . && rm -r /opt/code/bin /opt/code/share
+    /opt/dg4d/bin/pip install --no-cache-dir --no-deps --no-build-isolation --target /opt/code . && rm -r /opt/code/bin /opt/code/share
 
 FROM ${PYTHON}
 # pymeshlab loads these two libraries; Debian keeps only their newest version, so none can be named

@@ -1,6 +1,7 @@
 """The project's files and syntax trees, as the tests of its shape see them."""
 
 import ast
+import re
 import subprocess
 from functools import cache
 from pathlib import Path, PurePosixPath
@@ -30,6 +31,12 @@ def modules(*folders: str) -> list[str]:
 def text(path: str) -> str:
     """The content of a file."""
     return (ROOT / path).read_text(encoding="utf-8")
+
+
+def pins() -> dict[str, str]:
+    """Return the version of every locked package by its canonical name, without the part that names a build."""
+    locks = (text(path) for path in files() if path.startswith("deploy/locks/") and not path.endswith("/tools.txt"))
+    return dict(re.findall(r"^([a-z0-9-]+)==([^ +]+)", "\n".join(locks), re.MULTILINE))
 
 
 @cache

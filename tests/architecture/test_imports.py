@@ -143,10 +143,6 @@ def test_what_is_declared_is_imported() -> None:
 
 
 def test_every_declared_distribution_is_pinned() -> None:
-    pins = {
-        canonicalize_name(line.partition("==")[0])
-        for line in repository.text("constraints.txt").splitlines()
-        if "==" in line
-    }
+    pins = set(repository.pins())
     groups = tomllib.loads(repository.text("pyproject.toml"))["dependency-groups"]
     assert declared() | {canonicalize_name(Requirement(line).name) for line in groups["dev"]} <= pins

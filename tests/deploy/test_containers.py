@@ -73,12 +73,25 @@ def test_an_image_has_nothing_that_hadolint_would_change(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", DOCKERFILES, ids=lambda path: path.name)
-def test_an_image_is_pinned_unprivileged_and_checked(path: Path) -> None:
+def test_an_image_is_locked_unprivileged_and_checked(path: Path) -> None:
     text = path.read_text()
-    assert "-c constraints.txt" in text
+    for locks in re.findall(r"bash deploy/install\.sh((?: [a-z]+)+)", text):
+        assert {f"deploy/locks/{lock}.txt" for lock in locks.split()} <= set(text.split())
+    assert "VENV=/opt/dg4d bash deploy/install.sh" in text
     assert re.findall(r"^USER (\S+)$", text, re.MULTILINE)[-1] == "10001"
     assert re.search(r"^HEALTHCHECK .*CMD", text, re.MULTILINE)
     assert "http" not in re.sub(r"https://download\.pytorch\.org|'http://127\.0\.0\.1[^']*'", "", text)
+
+
+def test_every_foreign_base_image_is_pinned_by_digest() -> None:
+    given, bases = set(), set()
+    for path in DOCKERFILES:
+        given |= set(re.findall(r"^ARG (\w+)=(\S+)$", path.read_text(), re.MULTILINE))
+        bases |= set(re.findall(r"^FROM (\S+)", path.read_text(), re.MULTILINE))
+    names = {name: value for name, value in given if f"${{{name}}}" in bases}
+    assert bases == {f"${{{name}}}" for name in names} | {"packages"}  # a stage of the same file
+    foreign = {value for value in names.values() if not value.startswith("dg4d/")}
+    assert len(foreign) == 2 and all(re.search(r":[\w.-]*\d[\w.-]*@sha256:[0-9a-f]{64}$", image) for image in foreign)
 
 
 def test_images_of_steps_have_every_dependency_but_those_of_the_command() -> None:
@@ -125,7 +138,7 @@ def test_a_base_image_is_made_of_what_debootstrap_made_and_leaves_nothing_behind
         [ROOT / "deploy" / "containers.sh", "base"], env=environment, capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stderr) == (0, "")
-    assert (tmp_path / "asked").read_text().split()[-1] == "docker.io/library/python:3.11-slim-bookworm"
+    assert (tmp_path / "asked").read_text().split()[-1] == "dg4d/python"
     assert {"./usr/bin/python", "./usr/bin/python3"} <= set((tmp_path / "given").read_text().split())
     assert list(scratch.iterdir()) == []
 

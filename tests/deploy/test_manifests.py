@@ -1,6 +1,8 @@
 """deploy/compose.yaml and deploy/k8s: valid by their schemas, confined, and without a secret in them."""
 
+import os
 import re
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,7 @@ PODS = {
     for document in MANIFESTS
     if "template" in document.get("spec", {})
 }
-SECRET = re.compile(r"PASSWORD|SECRET|AUTH|KEY")
+SECRET = re.compile(r"PASSWORD|SECRET|AUTH|KEY")  # in the name of a variable
 LINT = "{extends: default, rules: {line-length: {max: 130}, document-start: disable, braces: {max-spaces-inside: 1}}}"
 
 
@@ -69,7 +71,17 @@ def test_a_service_is_confined(name: str) -> None:
     assert service["read_only"] and service["security_opt"] == ["no-new-privileges:true"]
     assert {"cpus", "memory"} <= set(service["deploy"]["resources"]["limits"])
     assert service.get("user", "") != "root"
-    assert service["image"].startswith("dg4d/") or re.search(r":[\w.-]*\d[\w.-]*$", service["image"])
+
+
+def test_every_foreign_image_is_pinned_by_digest_and_its_version_is_told() -> None:
+    text = "\n".join(file.read_text(encoding="utf-8") for file in FILES)
+    images = re.findall(r"^( *#.*\n)? *image: (\S+)$", text, re.MULTILINE)
+    foreign = {(comment.strip(), image) for comment, image in images if not image.startswith("dg4d/")}
+    assert len(foreign) == 3 < len(images)  # the same in both places
+    for comment, image in foreign:
+        name, _, digest = image.partition("@")
+        assert re.fullmatch(r"sha256:[0-9a-f]{64}", digest)
+        assert re.fullmatch(rf"# {re.escape(name)}:[\w.-]*\d[\w.-]*", comment)
 
 
 @pytest.mark.parametrize("name", LASTING)
@@ -92,9 +104,65 @@ def test_a_worker_that_cannot_write_its_own_files_has_another_place_for_compiled
     assert worker["environment"]["NUMBA_CACHE_DIR"].startswith("/data/")
 
 
-def test_redis_answers_other_machines_without_its_image_saying_so() -> None:
-    for words in (SERVICES["redis"]["command"], PODS["redis"]["spec"]["containers"][0]["args"]):
-        assert words[words.index("--protected-mode") + 1] == "no"
+def redis_script(place: str) -> str:
+    """The shell script that starts Redis, as a shell gets it."""
+    if place == "compose":
+        assert SERVICES["redis"]["entrypoint"] == ["sh", "-c"]
+        (script,) = SERVICES["redis"]["command"]
+        return str(script).replace("$$", "$")
+    (container,) = PODS["redis"]["spec"]["containers"]
+    assert container["command"][:2] == ["sh", "-c"]
+    return str(container["command"][2])
+
+
+def start_redis(place: str, folder: Path, password: str) -> subprocess.CompletedProcess[str]:
+    """Run the script with a program in the place of Redis that writes down its arguments and its input."""
+    stand_in = folder / "redis-server"
+    stand_in.write_text(f'#!/bin/sh\necho "$@" > {folder}/arguments\ncat > {folder}/input\n')
+    stand_in.chmod(0o755)
+    environment = {"PATH": f"{folder}:{os.environ['PATH']}", "REDISCLI_AUTH": password}
+    command = ["sh", "-c", redis_script(place)]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("place", ["compose", "kubernetes"])
+def test_redis_gets_its_password_where_no_list_of_processes_shows_it(place: str, tmp_path: Path) -> None:
+    assert start_redis(place, tmp_path, "se cret").returncode == 0
+    arguments = (tmp_path / "arguments").read_text().split()
+    assert (tmp_path / "input").read_text() == 'requirepass "se cret"\n'
+    assert arguments[0] == "-" and "cret" not in " ".join(arguments)  # `-`: settings from standard input
+    assert arguments[arguments.index("--protected-mode") + 1] == "no"  # answers other machines, by password
+
+
+@pytest.mark.parametrize("place", ["compose", "kubernetes"])
+def test_redis_does_not_start_without_a_password(place: str, tmp_path: Path) -> None:
+    done = start_redis(place, tmp_path, "")
+    assert done.returncode != 0 and "a password for Redis is missing" in done.stderr
+    assert not (tmp_path / "input").exists()
+
+
+def test_redis_is_healthy_only_for_those_who_know_its_password() -> None:
+    (container,) = PODS["redis"]["spec"]["containers"]
+    checks = [container[name]["exec"]["command"] for name in ("readinessProbe", "livenessProbe")]
+    checks.append(SERVICES["redis"]["healthcheck"]["test"][1:])
+    assert all(check == ["redis-cli", "-e", "ping"] for check in checks)  # -e: an error is an exit status
+    assert "REDISCLI_AUTH" in SERVICES["redis"]["environment"]  # which redis-cli reads
+
+
+def test_the_server_knows_the_password_of_redis_and_no_run_does() -> None:
+    name = "PREFECT_REDIS_MESSAGING_PASSWORD"
+    assert SERVICES["server"]["environment"][name] == SERVICES["redis"]["environment"]["REDISCLI_AUTH"]
+    (server,), (redis,) = PODS["server"]["spec"]["containers"], PODS["redis"]["spec"]["containers"]
+    secrets = {variable["name"]: variable.get("valueFrom") for variable in (*server["env"], *redis["env"])}
+    assert secrets[name] == secrets["REDISCLI_AUTH"] == {"secretKeyRef": {"name": "dg4d-redis", "key": "password"}}
+    others = {file: service for file, service in SERVICES.items() if file not in {"server", "redis"}}
+    assert not [file for file, service in others.items() if name in service.get("environment", {})]
+
+
+def test_the_password_of_redis_has_the_name_that_prefect_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+    client = pytest.importorskip("prefect_redis.client", reason="prefect-redis is not installed: make setup")
+    monkeypatch.setenv("PREFECT_REDIS_MESSAGING_PASSWORD", "se cret")
+    assert client.RedisMessagingSettings().password == "se cret"
 
 
 def test_secrets_of_the_compose_file_come_from_outside_and_must_be_given() -> None:

@@ -1,8 +1,8 @@
 """Compiles a GPU and gsplat's kernels for the processor: `python -m tests.emulation.build`, called by `make emulation`.
 
-The GPU is `device.cpp`. The kernels are those of the wheel that `constraints.txt` names: what no C++ compiler reads of
-their sources is rewritten here, `emulation.h` gives the rest a meaning; only what the adapter calls is compiled.
-Everything lies in `out/emulation`.
+The GPU is `device.cpp`. The kernels are those of the wheel that `deploy/locks/cuda.txt` names: what no C++ compiler
+reads of their sources is rewritten here, `emulation.h` gives the rest a meaning; only what the adapter calls is
+compiled. Everything lies in `out/emulation`.
 """
 
 import argparse
@@ -23,6 +23,7 @@ from typing import NoReturn
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 OUT = ROOT / "out" / "emulation"
+LOCK = ROOT / "deploy" / "locks" / "cuda.txt"
 PACKAGES = OUT / "packages"  # the unpacked wheel
 SOURCES = OUT / "sources"  # rewritten
 TORCH = Path(str(distribution("torch").locate_file("torch")))
@@ -158,25 +159,32 @@ def kernel_options(arithmetic: str) -> list[str]:
 
 def everything(command: Sequence[str]) -> str:
     """A digest of what a library is made of."""
-    files = (Path(__file__), *(HERE / name for name in OURS), ROOT / "constraints.txt")
-    parts = [*(path.read_text() for path in files), distribution("torch").version, *command]
+    files = (Path(__file__), *(HERE / name for name in OURS))
+    parts = [*(path.read_text() for path in files), pinned_version(), distribution("torch").version, *command]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
+def pinned_version() -> str:
+    """Return the locked version of gsplat."""
+    pin = re.search(r"^gsplat==(\S+)", LOCK.read_text(), re.MULTILINE)
+    assert pin, f"{LOCK} does not lock gsplat"
+    return pin[1]
+
+
 def fetch() -> None:
-    """The pinned wheel, compared and unpacked."""
-    pin = re.search(r"^gsplat==(\S+)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
-    assert pin, "constraints.txt pins no gsplat"
-    wheel = OUT / f"gsplat-{pin[1]}-py3-none-any.whl"
+    """Download the locked wheel, compare its digest and unpack it."""
+    version = pinned_version()
+    wheel = OUT / f"gsplat-{version}-py3-none-any.whl"
     if not wheel.exists():
         say(f"fetching {wheel.name}")
         pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "download", "--quiet", "--no-deps"]
-        done = subprocess.run([*pip, f"gsplat=={pin[1]}", "--dest", str(OUT)], check=False)
+        only = ["--only-binary", ":all:", f"gsplat=={version}", "--dest", str(OUT)]
+        done = subprocess.run([*pip, *only], check=False)
         if done.returncode or not wheel.exists():
             lacking(f"pip could not fetch {wheel.name} (see above); it takes the network, or a package index")
     if hashlib.sha256(wheel.read_bytes()).hexdigest() != DIGEST:
         sys.exit(
-            f"emulation: {wheel} is not the wheel whose sources are known here. If constraints.txt names another "
+            f"emulation: {wheel} is not the wheel whose sources are known here. If {LOCK.name} names another "
             f"version, give its digest in {Path(__file__).name}; if not, delete the file"
         )
     shutil.rmtree(PACKAGES, ignore_errors=True)

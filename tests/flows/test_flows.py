@@ -350,7 +350,7 @@ def test_the_report_says_what_the_gates_say(log: Path, tmp_path: Path) -> None:
 
 def test_parts_side_by_side_take_less_time_on_the_clock_than_to_compute(log: Path, tmp_path: Path) -> None:
     settings = revise(PREVIEW, {"mesh.mode": "per_frame", "mesh.frames_per_task": 1})
-    (tmp_path / "a.png").write_text("side by side extract_mesh=sleep:1")
+    (tmp_path / "a.png").write_text(picture("side by side extract_mesh=sleep:1"))
     make(Wish(item="parts", picture=tmp_path / "a.png", settings=settings).order(home.store()), tmp_path / "out")
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     parts = [stage for stage in report["steps"] if stage["step"].startswith("extract_mesh")]

@@ -192,7 +192,7 @@ def test_a_batch_goes_on_after_items_that_nothing_can_be_made_of(place: None, tm
 def test_a_signal_ends_a_command_and_its_step_and_leaves_nothing_behind(
     place: None, tmp_path: Path, number: signal.Signals, status: int, step: str
 ) -> None:
-    (tmp_path / "a.png").write_text(f"ended by {number.name} {step}=sleep:300")
+    (tmp_path / "a.png").write_text(picture(f"ended by {number.name} {step}=sleep:300"))
     log = tmp_path / "ran"
     command = start(tmp_path, "make", "a.png", "--set", "mesh.mode=per_frame", "-o", "out")
     wait_until(lambda: log.exists() and step in log.read_text())
@@ -207,7 +207,7 @@ def test_a_signal_ends_a_command_and_its_step_and_leaves_nothing_behind(
 
 
 def test_a_command_that_is_to_survive_its_terminal_does(place: None, tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_text("nohup fit_motion=sleep:3")
+    (tmp_path / "a.png").write_text(picture("nohup fit_motion=sleep:3"))
     log = tmp_path / "ran"
     command = start(tmp_path, "make", "a.png", "-o", "out", survives=True)
     wait_until(lambda: log.exists() and "fit_motion" in log.read_text())

@@ -45,7 +45,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_a_home_on_a_full_disk_is_named_at_once_and_no_server_is_started(small_disk: Path, tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_text("a cat")
+    (tmp_path / "a.png").write_text(picture("a cat"))
     begun = time.monotonic()
     done = subprocess.run(
         [sys.executable, "-m", "flows.cli", "make", "a.png", "-o", "out"],

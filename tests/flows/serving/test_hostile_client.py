@@ -6,6 +6,7 @@ import urllib.request
 from pathlib import Path
 
 import pytest
+from fake_steps import picture
 from prefect.client.orchestration import SyncPrefectClient
 from tiny_s3 import TinyS3
 from waiting import wait_until
@@ -62,7 +63,7 @@ def test_a_page_on_another_port_gets_nothing_from_a_browser_that_is_signed_in(
 def test_a_person_signs_in_fills_in_a_form_cancels_the_run_and_opens_an_artifact(
     worker: tuple[TinyS3, Path], client: SyncPrefectClient, server: Server, artifact: str, tmp_path: Path
 ) -> None:
-    (tmp_path / "slow.png").write_bytes(b"\x89PNG\r\n\x1a\n" + f"{tmp_path} fit_gaussians=sleep:60".encode())
+    (tmp_path / "slow.png").write_text(picture(f"{tmp_path} fit_gaussians=sleep:60"))
     page = {
         "key": "hostile-browser",
         "type": "markdown",
