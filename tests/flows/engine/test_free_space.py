@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from fake_steps import picture
 
 from flows.engine.free_space import NEEDED_BYTES, require_free_space
 from steps.store import DiskFull
