@@ -175,7 +175,7 @@ def test_a_batch_goes_on_after_items_that_nothing_can_be_made_of(place: None, tm
     names = [b"a.png", b"caf\xe9.png", b"{0}{item}.png", b"x" * 251 + b".png", b"summary.csv.png", b"z.png"]
     (tmp_path / "in").mkdir()
     for name in names:
-        (tmp_path / "in" / os.fsdecode(name)).write_text(f"goes on {ascii(name)[:20]}")
+        (tmp_path / "in" / os.fsdecode(name)).write_text(picture(f"goes on {ascii(name)[:20]}"))
     command = start(tmp_path, "batch", "in", "-o", "out", "--workers", "2")
     told, trouble = command.communicate(timeout=300)
     assert (command.returncode, "Traceback" in told + trouble) == (1, False), trouble

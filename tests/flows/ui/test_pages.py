@@ -78,6 +78,18 @@ def fetched(address: str) -> tuple[str, bytes]:
         return answer.headers["content-type"], answer.read()
 
 
+def drawn_in_browser(server: Server, version: dict[str, Any], screenshot: Path) -> dict[str, Any]:
+    """Open the page of an asset in a browser that is signed in."""
+    asked = {
+        "login": server.login_address(server_address()),
+        "address": f"/artifacts/artifact/{version['id']}",
+        "wait": len(TITLES) + LOSSES,
+        "text": "Contact sheet",
+        "screenshot": str(screenshot),
+    }
+    return run_node("prefect.mjs", json.dumps(asked))
+
+
 def test_an_item_leaves_a_page_per_step_and_one_with_everything(place: Path) -> None:
     _, cached = make(order("pages", place, "paged"), place / "out")
     assert not cached
@@ -157,18 +169,7 @@ def test_a_step_that_failed_leaves_its_reason_and_its_last_good_state(place: Pat
 def test_a_browser_draws_every_picture_of_the_page(server: Server, place: Path) -> None:
     make(order("drawn", place, "drawn"), place / "out")
     (version,) = artifacts("drawn", "/artifacts/filter")["asset"]
-    seen = run_node(
-        "prefect.mjs",
-        json.dumps(
-            {
-                "login": server.login_address(server_address()),
-                "address": f"/artifacts/artifact/{version['id']}",
-                "wait": len(TITLES) + LOSSES,
-                "text": "Contact sheet",
-                "screenshot": str(place / "page.png"),
-            }
-        ),
-    )
+    seen = drawn_in_browser(server, version, place / "page.png")
     assert [shown["name"] for shown in seen["pictures"]] == [*TITLES, *["Losses of the fake"] * LOSSES]
     screen = np.asarray(Image.open(place / "page.png").convert("RGB")).astype(int)
     ink = [int(curves.INKS[0][at : at + 2], 16) for at in (1, 3, 5)]
@@ -219,7 +220,7 @@ def test_counts_are_read_with_all_their_digits() -> None:
     assert [curves.amount(value) for value in values] == said
 
 
-def test_an_item_may_be_called_anything_and_is_shown_letter_by_letter(place: Path) -> None:
+def test_an_item_may_be_called_anything_and_is_shown_letter_by_letter(server: Server, place: Path) -> None:
     name = "{0} {item} ![x](http:tracker) |b| <img src=x> *c*"
     make(order("nasty", place, name), place / "out")
     with get_client(sync_client=True) as client:
@@ -232,10 +233,6 @@ def test_an_item_may_be_called_anything_and_is_shown_letter_by_letter(place: Pat
         for text in (page["description"] or "", page["data"] if page["type"] == "markdown" else ""):
             assert not re.search(r"(?<!\\)(\]\(http|<img|\|b|\*c)", text), text
     (version,) = [page for page in found if page["key"].startswith("asset-")]
-    seen = run_node(
-        "prefect.mjs",
-        f'{{"address": "{server_address()}/artifacts/artifact/{version["id"]}", "wait": {len(TITLES) + LOSSES}, '
-        f'"text": "Contact sheet", "screenshot": "{place / "page.png"}"}}',
-    )
+    seen = drawn_in_browser(server, version, place / "page.png")
     assert name in seen["text"]
     assert [picture["name"] for picture in seen["pictures"]] == [*TITLES, *["Losses of the fake"] * LOSSES]
