@@ -1,0 +1,51 @@
+"""Shrinking of pictures that arrive in bands of rows, so that the full resolution is never in memory at once."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dg4d_lib.video.framing import antialiased, premultiplied, shrunk_size, straight
+
+
+class BandShrinker:
+    """Running sum of bands of rows; gives what `framing.shrink` gives, up to rounding of float32.
+
+    The triangle filter is separable: every band is filtered along its rows, and its rows are added with their weights
+    to the rows of the result. A picture that needs no shrinking keeps its values.
+    """
+
+    def __init__(self, height: int, width: int, longest: int) -> None:
+        self._height, self._size = height, shrunk_size(height, width, longest)
+        self._keeps_size = self._size == (height, width)
+        if self._keeps_size:
+            self._picture = torch.empty(height, width, 4)
+        else:
+            self._sum = torch.zeros(4, *self._size)
+            self._weight = torch.zeros(self._size[0])
+
+    def add(self, top: int, band: Float[Tensor, "rows w 4"]) -> None:
+        """Add the rows from `top` on, straight alpha; every row of the picture must be added once."""
+        rows = len(band)
+        if self._keeps_size:
+            self._picture[top : top + rows] = band
+            return
+        narrow = antialiased(premultiplied(band[None]), rows, self._size[1])[0]
+        first, weights = self._weights(top, rows)
+        reached = slice(first, first + len(weights))
+        self._sum[:, reached] += torch.einsum("or,crw->cow", weights, narrow)
+        self._weight[reached] += weights.sum(1)
+
+    def picture(self) -> Float[Tensor, "h w 4"]:
+        """Return the shrunken picture once every row was added."""
+        if self._keeps_size:
+            return self._picture
+        self._sum /= self._weight[:, None]
+        return straight(self._sum[None])[0]
+
+    def _weights(self, top: int, rows: int) -> tuple[int, Float[Tensor, "o rows"]]:
+        """Return the first row of the result that a band reaches, and the weights of the band's rows in each."""
+        scale = self._height / self._size[0]
+        centers = (torch.arange(self._size[0], dtype=torch.float64) + 0.5) * scale
+        reached = ((centers > top - scale) & (centers < top + rows + scale)).nonzero().flatten()
+        distance = torch.arange(top, top + rows, dtype=torch.float64) + 0.5 - centers[reached, None]
+        return int(reached[0]), (1 - distance.abs() / scale).clamp(min=0).float()
