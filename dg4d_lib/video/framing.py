@@ -94,7 +94,8 @@ def reframe(frames: Float[Tensor, "t h w 4"], crop: Crop, size: int) -> Float[Te
 
 def shrink(frames: Float[Tensor, "t h w 4"], longest: int) -> Float[Tensor, "t h2 w2 4"]:
     """Return the same frames with no side longer than `longest` pixels; smaller ones stay as they are."""
-    return resample(frames, *shrunk_size(*frames.shape[1:3], longest))
+    height, width = shrunk_size(frames.shape[1], frames.shape[2], longest)
+    return resample(frames, height, width)
 
 
 def shrunk_size(height: int, width: int, longest: int) -> tuple[int, int]:
@@ -109,13 +110,9 @@ def resample(frames: Float[Tensor, "t h w 4"], height: int, width: int) -> Float
     """Resample cut-outs, antialiased, weighted by alpha; equal size gives equal values."""
     if (height, width) == tuple(frames.shape[1:3]):
         return frames
-    return straight(antialiased(premultiplied(frames), height, width))
-
-
-def premultiplied(frames: Float[Tensor, "t h w 4"]) -> Float[Tensor, "t 4 h w"]:
-    """Return frames whose colors are multiplied by alpha, channels first."""
     alpha = frames[..., 3:]
-    return torch.cat([frames[..., :3] * alpha, alpha], -1).permute(0, 3, 1, 2)
+    weighted = torch.cat([frames[..., :3] * alpha, alpha], -1).permute(0, 3, 1, 2)
+    return straight(antialiased(weighted, height, width))
 
 
 def antialiased(frames: Float[Tensor, "t 4 h w"], height: int, width: int) -> Float[Tensor, "t 4 h2 w2"]:
