@@ -11,8 +11,9 @@ from waiting import start, wait_until
 
 from flows import cli, home
 from flows.catalog import convert_all
-from flows.commands.make import make, save_pictures
+from flows.commands.make import make, make_motions, save_pictures
 from flows.engine import tasks
+from flows.engine.events import StepEvent, listening
 from flows.engine.executors import StepBadInput, StepCrashed, StepDiverged, StepError, StepMissing, StepOutOfMemory
 from flows.engine.orphans import settle_orphans
 from flows.inputs.orders import Order, Wish
@@ -345,3 +346,21 @@ def test_the_report_says_what_the_gates_say(log: Path, tmp_path: Path) -> None:
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["acceptance"]["failing"] == ["silhouette"]
     assert "fit it &lt;again&gt;" in (tmp_path / "out" / "report.html").read_text()
+
+
+@pytest.mark.parametrize("command", ["make", "motions"])
+def test_the_cut_out_can_be_looked_at_while_the_next_step_runs(command: str, log: Path, tmp_path: Path) -> None:
+    wanted = order(f"guess {command}", tmp_path, item="fox/red", **{"driving.candidates": 2})
+    happened: list[tuple[str, str, bool]] = []
+
+    def listen(event: StepEvent) -> None:
+        happened.append((event.step, event.kind, bool(list(home.cutouts().glob("fox-red-*.png")))))
+        if event.kind == "remark":
+            assert event.text.startswith("This asset is a fake. Source, matte and cut-out: ")
+            assert Path(event.text.rpartition(": ")[2]).read_bytes().startswith(b"\x89PNG")
+
+    with listening(listen):
+        (make if command == "make" else make_motions)(wanted, tmp_path / "out")
+    assert happened.index(("prepare_subject", "remark", True)) < happened.index(("drive_video", "started", True))
+    for picture in home.cutouts().glob("fox-red-*.png"):
+        picture.unlink()

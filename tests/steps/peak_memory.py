@@ -1,6 +1,6 @@
 """Peak memory of the first step, measured in a process of its own: `python peak_memory.py FILE...` prints a line each.
 
-The kernel's high-water mark of resident memory (VmHWM) is set back before every file, so that one process measures many.
+The kernel's high-water mark of resident memory (VmHWM) is reset before every file: one process measures many.
 """
 
 import json
@@ -48,9 +48,18 @@ def measure(path: Path, settings: dict[str, object]) -> Peak:
     Path("/proc/self/clear_refs").write_text("5")
     start, outcome = time.monotonic(), "done"
     with tempfile.TemporaryDirectory() as folder:
-        outputs = {name: Path(folder) / name for name in ("subject", "footage", "picture")}
+        outputs = {name: Path(folder) / name for name in ("subject.png", "footage.zip", "picture.png")}
         try:
-            run(Job({"source": path}, outputs, SubjectSettings(**settings), 0, lambda *_: None, Path(folder)))
+            run(
+                Job(
+                    {"source": path},
+                    {name.partition(".")[0]: path for name, path in outputs.items()},
+                    SubjectSettings(**settings),
+                    0,
+                    lambda *_: None,
+                    Path(folder),
+                )
+            )
         except Exception as error:
             outcome = f"{type(error).__name__}: {error}"
     status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
