@@ -18,7 +18,7 @@ SIDE = 10_900  # pixels; its square is just below stills.MOST_PIXELS
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="VmHWM is Linux's")
 
 
-def grey_png(path: Path, side: int, interlaced: bool = False, depth: int = 8, color: int = 0) -> Path:
+def gray_png(path: Path, side: int, interlaced: bool = False, depth: int = 8, color: int = 0) -> Path:
     """Zeros, packed row by row without holding the picture."""
     channels = {0: 1, 2: 3, 6: 4}[color]
     packer, packed = zlib.compressobj(1), b""
@@ -81,10 +81,10 @@ def frames_in_a_zip(path: Path, frame: Path, count: int) -> Path:
 
 
 def test_large_files_of_every_kind_stay_below_two_gibibytes(tmp_path: Path) -> None:
-    grey = grey_png(tmp_path / "grey.png", SIDE)
+    gray = gray_png(tmp_path / "gray.png", SIDE)
     files = {
-        "grey PNG": grey,
-        "interlaced PNG of 16 bits": grey_png(tmp_path / "interlaced.png", SIDE, interlaced=True, depth=16, color=6),
+        "gray PNG": gray,
+        "interlaced PNG of 16 bits": gray_png(tmp_path / "interlaced.png", SIDE, interlaced=True, depth=16, color=6),
         "JPEG": still(tmp_path / "a.jpg", SIDE, 3, "uint8"),
         "progressive JPEG": still(tmp_path / "p.jpg", 6000, 3, "uint8", **{"jpeg:progressive": 1}),
         "tiled EXR": still(tmp_path / "t.exr", 4096, 4, "half", tile=64),
@@ -98,7 +98,7 @@ def test_large_files_of_every_kind_stay_below_two_gibibytes(tmp_path: Path) -> N
         "animated WebP": film(tmp_path / "w.webp", 2000, 2, "libwebp_anim", "bgra"),
         "video of the largest frames that are kept": film(tmp_path / "a.mp4", 1024, 32, "libx264", "yuv420p"),
         "video of large frames": film(tmp_path / "b.mp4", 4096, 4, "libx264", "yuv420p"),
-        "zip": frames_in_a_zip(tmp_path / "a.zip", grey_png(tmp_path / "frame.png", 5000), 4),
+        "zip": frames_in_a_zip(tmp_path / "a.zip", gray_png(tmp_path / "frame.png", 5000), 4),
     }
     peaks = dict(zip(files, peaks_of(list(files.values())), strict=True))
     assert {kind: peak.mib for kind, peak in peaks.items() if peak.mib > MOST_MIB} == {}
@@ -110,7 +110,7 @@ def test_large_files_of_every_kind_stay_below_two_gibibytes(tmp_path: Path) -> N
 
 
 def test_a_smaller_limit_refuses_what_the_default_decodes(tmp_path: Path) -> None:
-    picture = grey_png(tmp_path / "a.png", 6000, interlaced=True, depth=16, color=6)
+    picture = gray_png(tmp_path / "a.png", 6000, interlaced=True, depth=16, color=6)
     (refused,) = peaks_of([picture], max_decode_gb=0.125)
     (decoded,) = peaks_of([picture])
     assert "6000 x 6000 pixels and takes about 0." in refused.outcome
