@@ -15,7 +15,7 @@ import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError, PermissionDeniedError, UnauthenticatedError
 from obstore.store import S3Store
 
-from dg4d_lib.errors import BackendUnavailable
+from dg4d_lib.errors import BackendUnavailable, BadInput
 from steps.contract import ArtifactRef
 from steps.opening import ENDPOINTS, LOOPBACK
 from steps.store import (
@@ -122,16 +122,19 @@ class BucketStore(ArtifactStore):
         except FileNotFoundError:
             return None
 
-    def fetch(self, name: str, path: Path) -> None:
+    def fetch(self, name: str, path: Path, most_bytes: int) -> None:
         """Copy any file of the bucket to `path`, in parts.
 
         Raises:
+            BadInput: it has more than `most_bytes`; nothing is copied.
             FileNotFoundError: there is none of that name.
             DiskFull: there is no room at `path`.
             StoreUnreachable: the bucket does not answer.
         """
         with self._answering(), room_for(path.parent), path.open("wb") as target:
             reader = obstore.open_reader(self._bucket, name, buffer_size=READ_AHEAD)
+            if reader.size > most_bytes:
+                raise BadInput(f"{name} has {reader.size} bytes; at most {most_bytes} are read: shorten it")
             shutil.copyfileobj(cast(BinaryIO, reader), target, READ_AHEAD)
 
     def write(self, name: str, text: str) -> None:

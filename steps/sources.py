@@ -17,7 +17,7 @@ from dg4d_lib.video.shrinking import shrink_by_bands
 from steps.clips import MOST_DECODED, MOST_DECODING_S, MOST_FRAMES, Clip, KeptFrames, evenly_spaced, thinned_rate
 from steps.decode_limit import DecodeLimit
 from steps.decoder_errors import damage_is_bad_input
-from steps.media_types import ALLOWED, SNIFFED_BYTES, container_of, is_animated_png, is_frame_name, still_suffix
+from steps.media_types import ALLOWED, SNIFFED_BYTES, container_of, is_animated_png, is_frame_name, is_zip, still_suffix
 from steps.stills import read_still
 from steps.webp import AnimatedWebp, is_animated
 
@@ -75,7 +75,7 @@ def read_source(
 
 def _decode(path: Path, head: bytes, scratch: Path, max_frames: int, limit: DecodeLimit) -> Source:
     """Decode a file by its first bytes; what else it may be, further on, does not count."""
-    if head[:4] in (b"PK\3\4", b"PK\5\6"):
+    if is_zip(head):
         return _read_zip(path, scratch, max_frames, limit)
     if is_animated(head):
         return _read_webp(path, scratch, max_frames, limit)

@@ -59,6 +59,16 @@ class Truth(Frozen):
     mesh: Path | None = None
     bank: Path | None = None
 
+    @property
+    def pictures(self) -> tuple[Path, ...]:
+        """Frames of the input and of every view."""
+        return (*self.inputs, *(frame for view in self.views for frame in view.frames))
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Pictures, the mesh and the folder of the bank."""
+        return (*self.pictures, *(path for path in (self.mesh, self.bank) if path is not None))
+
 
 def find_truth(place: Path) -> Truth:
     """The ground truth of one object.

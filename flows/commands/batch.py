@@ -10,7 +10,7 @@ from flows import home
 from flows.commands import make, terminal
 from flows.commands.endings import EXIT_BAD_INPUT, EXIT_FAILED
 from flows.engine import resources
-from flows.inputs.manifest import Item, items_of, only_commercial
+from flows.inputs.manifest import Item, admitted, items_of, only_commercial
 from flows.inputs.orders import Order
 from flows.packages.publish import check_folder, check_writable, is_current
 from flows.packages.summary import BAD_INPUT, Row, Tally, Writer, judged
@@ -32,6 +32,7 @@ def batch(
     root: Path | None = None,
     price_per_hour: float | None = None,
     connect: Callable[[], None] | None = None,
+    allow: Callable[[Item], None] | None = None,
 ) -> list[Row]:
     """Make every item of `inputs` that is not made yet; what became of each, in the order in which they are made.
 
@@ -51,6 +52,7 @@ def batch(
         root: where a manifest's files are.
         price_per_hour: of the machine, in any currency, for the summary.
         connect: finds a Prefect server, when the first item needs one; default: as every command does.
+        allow: raises BadInput for an item that may not be made here; it becomes a failed one.
 
     Raises:
         BadInput: the batch as a whole cannot be used, or `out` cannot be written.
@@ -58,6 +60,7 @@ def batch(
         KeyboardInterrupt: the user stopped it; what is done stays, and the summary says what was not.
     """
     items = items_of(inputs, out, profile_name, changes or {}, seed, root)
+    items = admitted(items, allow) if allow else items
     items = only_commercial(items) if commercial_only else items
     resources.cpus(), resources.gpus()  # wrong numbers are refused before any work
     check_writable(out)

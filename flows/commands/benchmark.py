@@ -3,7 +3,7 @@
 import json
 import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,7 @@ from flows.packages.summary import Row, Tally
 from steps.archives import unpack
 from steps.catalog import PACKAGE, TRUTH
 from steps.contract import ArtifactRef
+from steps.media_types import check_arrays, check_still
 from steps.profiles import ScoreAssetSettings, profile, revise
 from steps.store import ArtifactStore, room_for, write_atomically
 from steps.truth import Truth, find_truth, find_truths
@@ -96,6 +97,7 @@ def bench(
     bank: bool = False,
     limit: int | None = None,
     workers: int = 1,
+    allow: Callable[[Iterable[Path]], None] | None = None,
 ) -> Results:
     """Make an asset of every object of a data set, judge all, and write what was found; what is done is left alone.
 
@@ -112,12 +114,17 @@ def bench(
         bank: every object's own bank of true views is its prior.
         limit: only so many objects, the first by name.
         workers: objects at a time.
+        allow: raises BadInput for files that may not be read here.
 
     Raises:
         BadInput: the data set or a setting cannot be used, or `out` cannot be written.
         BackendUnavailable: what the profile needs is not here.
     """
     truths = find_truths(dataset)[:limit]
+    for truth in truths:
+        if allow:
+            allow(truth.files)
+        check_truth(truth)
     knobs, settings = _settings(changes, mesh)
     if bank:
         knobs = {"prior.kind": "oracle", **knobs}
@@ -161,8 +168,26 @@ def write(results: Results, judged: "Judged", out: Path) -> None:
         write_atomically(out / name, text)
 
 
+def check_truth(truth: Truth) -> None:
+    """Refuse a ground truth with files that are no pictures, or a mesh that is no NumPy archive.
+
+    Raises:
+        BadInput: says which file.
+    """
+    for path in truth.pictures:
+        check_still(path)
+    if truth.mesh is not None:
+        check_arrays(truth.mesh)
+
+
 def put_truth(truth: Truth, store: ArtifactStore) -> ArtifactRef:
-    """Keep a ground truth in our own layout; equal pictures give equal bytes, whatever layout they had."""
+    """Keep a ground truth in our own layout; equal pictures give equal bytes, whatever layout they had.
+
+    Raises:
+        BadInput: a file is no picture, or the mesh no NumPy archive.
+        DiskFull: there is no room.
+    """
+    check_truth(truth)
     files = {f"input/{i:03d}{path.suffix.lower()}": path for i, path in enumerate(truth.inputs)}
     for view in truth.views:
         files |= {f"view_{view.name}/{i:03d}{path.suffix.lower()}": path for i, path in enumerate(view.frames)}

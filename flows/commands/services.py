@@ -22,6 +22,15 @@ def up(
     workers: Annotated[
         bool, typer.Option("--worker/--no-worker", help="whether this machine does what is asked of the server")
     ] = True,
+    sources: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--sources",
+            metavar="DIR",
+            help="folder that deployments may read, and write unless $DG4D_OUTPUTS says where, or s3://BUCKET/PREFIX; "
+            "may be repeated; default: $DG4D_SOURCES, else the current folder",
+        ),
+    ] = None,
 ) -> None:
     """Keep a server with deployments, and a worker, until `dg4d down`; prints the address of its pages.
 
@@ -32,6 +41,7 @@ def up(
         from dg4d_lib.rasterizer.choice import cuda_devices
         from flows import home
         from flows.commands.make import connect
+        from flows.serving import roots
         from flows.serving.pools import read_pools
         from flows.serving.workers import Worker
 
@@ -40,6 +50,11 @@ def up(
         if unknown := [name for name in chosen if name not in known]:
             raise BadInput(f"there is no pool {unknown[0]!r} in deploy/pools.yaml; there are: {', '.join(known)}")
         server = home.background_server()
+        variables = roots.environment(sources or ())
+        own = [Worker(name, server.folder) for name in chosen] if workers else []
+        for worker in own:
+            if sources and worker.is_there() and worker.sources != variables[roots.SOURCES]:
+                raise BadInput(f"the worker of {worker.pool} runs and reads {worker.sources}; `dg4d down` stops it")
         if "PREFECT_API_URL" not in os.environ:
             server.start()
             server.keep()
@@ -50,8 +65,9 @@ def up(
             typer.echo(name)
         api_url = os.environ["PREFECT_API_URL"]
         server.folder.mkdir(parents=True, exist_ok=True)
-        for name in chosen if workers else ():
-            Worker(name, server.folder).start(api_url)
+        for worker in own:
+            worker.start(api_url, variables)
+            typer.echo(f"{worker.pool} reads below {worker.sources}", err=True)
         typer.echo(api_url.removesuffix("/api"))
 
 
@@ -82,14 +98,16 @@ def watch(
 
         check_writable(out)
         connect()
+        from flows.serving.roots import granted
         from flows.serving.watching import Watcher, announce
 
         name = digest_of([str(folder.resolve()), str(out.resolve())]).removeprefix("sha256:")[:16]
         watcher = Watcher(folder, out, rest_s, home.background_server().folder / f"watched-{name}")
         typer.echo(f"watching {watcher.folder}")
-        while True:
-            if (digest := watcher.look(time.monotonic())) is not None:
-                announce(watcher.folder, watcher.out, digest)
-                watcher.told(digest)
-                typer.echo(f"told the server: {digest}")
-            time.sleep(LOOK_S)
+        with granted(watcher.folder, watcher.out):
+            while True:
+                if (digest := watcher.look(time.monotonic())) is not None:
+                    announce(watcher.folder, watcher.out, digest)
+                    watcher.told(digest)
+                    typer.echo(f"told the server: {digest}")
+                time.sleep(LOOK_S)

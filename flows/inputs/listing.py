@@ -100,7 +100,7 @@ def fetched(address: str, found: str, name: str) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="dg4d-object-") as folder:
         path = Path(folder) / name
         try:
-            _bucket(address).fetch(found, path)
+            _bucket(address).fetch(found, path, sources.LARGEST_FILE_BYTES)
         except FileNotFoundError as error:
             raise BadInput(f"{found} is not in {address} any more") from error
         yield path

@@ -3,7 +3,7 @@
 import csv
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
@@ -109,6 +109,18 @@ def items_of(
         raise BadInput(f"{given} holds no pictures or videos ({', '.join(sorted(listing.WANTED))})")
     common = Wish(item="", profile=profile_name, settings=settings, seed=seed)
     return [_item(name, file, given, common) for name, file in zip(_names(found), found, strict=True)]
+
+
+def admitted(items: list[Item], allow: Callable[[Item], None]) -> list[Item]:
+    """Return the same items; those for which `allow` raises BadInput become bad ones."""
+    found = []
+    for item in items:
+        try:
+            allow(item)
+            found.append(item)
+        except BadInput as error:
+            found.append(item.model_copy(update={"wish": None, "error": str(error)}))
+    return found
 
 
 def only_commercial(items: list[Item]) -> list[Item]:

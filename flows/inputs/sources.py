@@ -1,22 +1,25 @@
-"""What users hand in, checked at the door and put into the store: pictures, videos, frames, words, banks."""
+"""Admission of users' pictures, videos, frames, words and banks to the store: checked by content first."""
 
+import json
 import tempfile
 import zipfile
 from pathlib import Path
 
 from dg4d_lib.errors import BadInput
 from flows.engine.merging import add
+from steps.archives import stays_inside
 from steps.catalog import BANK, SOURCE, TEXT
 from steps.contract import ArtifactRef
+from steps.media_types import PICTURE_SUFFIXES, check_media, check_still
 from steps.store import ArtifactStore, room_for
 
-PICTURES = frozenset(
-    [".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".exr", ".hdr", ".jxl", ".jp2", ".psd", ".ppm", ".pgm"]
-)  # suffixes; what a file is, its content says
+PICTURES = frozenset(PICTURE_SUFFIXES)
 VIDEOS = frozenset([".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif"])
 ALWAYS_MOVING = VIDEOS - {".gif"}  # a GIF may be one picture
 LONGEST_TEXT = 1000  # characters
-LARGEST_FILE_BYTES = 8 * 2**30  # of a picture or a video, which is copied into the store before it is looked at
+LARGEST_FILE_BYTES = 8 * 2**30  # of a picture or a video, which is copied into the store before it is decoded
+LARGEST_BANK_JSON = 16 * 2**20  # bytes; one with 10,000 views has 1 MB
+BANK_JSON = "bank.json"
 
 
 def inside(folder: Path, name: str, what: str) -> Path:
@@ -44,7 +47,7 @@ def inside(folder: Path, name: str, what: str) -> Path:
 
 
 def check_file(path: Path) -> None:
-    """Refuse what cannot be a picture or a video, before any work.
+    """Refuse what is no picture, video or zip of frames, before any work.
 
     Raises:
         BadInput: says what it is and what to give.
@@ -62,11 +65,11 @@ def check_file(path: Path) -> None:
         raise BadInput(f"{path} is empty (0 bytes); give a picture or a video")
     if path.stat().st_size > LARGEST_FILE_BYTES:
         raise BadInput(f"{path} has {path.stat().st_size} bytes; at most {LARGEST_FILE_BYTES} are read: shorten it")
-    _check_readable(path)
+    check_media(path)
 
 
 def check_video(path: Path) -> None:
-    """Refuse what cannot be a video: a file as above, or a folder with at least two pictures.
+    """Refuse what is no video: a file as above, or a folder with at least two pictures.
 
     Raises:
         BadInput: says what it is and what to give.
@@ -80,17 +83,17 @@ def check_video(path: Path) -> None:
         )
     else:
         _check_files(path, frames)
+        for frame in frames:
+            check_still(frame)
 
 
 def check_bank(path: Path) -> None:
-    """Refuse a folder without `bank.json`.
+    """Refuse a folder without a `bank.json` that names pictures in it.
 
     Raises:
-        BadInput: says what is missing.
+        BadInput: says what is missing or wrong.
     """
-    if not (path / "bank.json").is_file():
-        raise BadInput(f"{path} is not a bank of true views: it has no file bank.json")
-    _check_files(path, _files_below(path))
+    _files_of_bank(path)
 
 
 def check_text(text: str) -> None:
@@ -111,11 +114,13 @@ def frames_of(folder: Path) -> list[Path]:
 
 
 def put_source(path: Path, store: ArtifactStore) -> ArtifactRef:
-    """Keep a checked picture, video, or folder of frames.
+    """Keep a picture, a video, or the pictures in a folder of frames; nothing else enters the store.
 
     Raises:
+        BadInput: it is none of these.
         DiskFull: there is no room.
     """
+    check_video(path)
     if path.is_dir():
         return _put_files(frames_of(path), path, SOURCE.media_type, store)
     return store.put(path, SOURCE.media_type)
@@ -136,16 +141,49 @@ def plain(text: str) -> str:
 
 
 def put_bank(path: Path, store: ArtifactStore) -> ArtifactRef:
-    """Keep a checked bank as a stored zip.
+    """Keep a bank as a stored zip: its `bank.json` and the pictures that it names, and nothing else of the folder.
 
     Raises:
+        BadInput: it is no bank.
         DiskFull: there is no room.
     """
-    return _put_files(_files_below(path), path, BANK.media_type, store)
+    return _put_files(_files_of_bank(path), path, BANK.media_type, store)
 
 
-def _files_below(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.rglob("*") if path.is_file())
+def _files_of_bank(folder: Path) -> list[Path]:
+    """Return `bank.json` and every picture that it names, by name.
+
+    Raises:
+        BadInput: one is missing, leads out of the folder, or is something else.
+    """
+    about = folder / BANK_JSON
+    if not about.is_file():
+        raise BadInput(f"{folder} is not a bank of true views: it has no file {BANK_JSON}")
+    _check_files(folder, [about])
+    names = _views_of_bank(about)
+    if outside := [name for name in names if not stays_inside(name)]:
+        raise BadInput(f"{about} names a picture outside of the bank: {outside[0]!r}")
+    sheets = {folder / name for name in names}
+    files = sorted({about, *sheets})
+    if missing := [file for file in files if not file.is_file()]:
+        raise BadInput(f"{about} names {missing[0].relative_to(folder)}, which is not there; copy the picture there")
+    _check_files(folder, files)
+    for sheet in sorted(sheets):
+        check_still(sheet)
+    return files
+
+
+def _views_of_bank(about: Path) -> list[str]:
+    """Return the files that a `bank.json` names."""
+    if about.stat().st_size > LARGEST_BANK_JSON:
+        raise BadInput(f"{about} has {about.stat().st_size} bytes; at most {LARGEST_BANK_JSON} are read")
+    try:
+        names = [str(view["file"]) for view in json.loads(about.read_text(encoding="utf-8"))["views"]]
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
+        raise BadInput(f"{about} does not describe the views of a bank: {error!r}") from error
+    if not names:
+        raise BadInput(f"{about} names no views; a bank has a picture per view")
+    return names
 
 
 def _check_files(folder: Path, files: list[Path]) -> None:
@@ -165,11 +203,3 @@ def _put_files(files: list[Path], folder: Path, media_type: str, store: Artifact
             for file in files:
                 add(archive, file.relative_to(folder).as_posix(), file.read_bytes())
         return store.put(path, media_type)
-
-
-def _check_readable(path: Path) -> None:
-    try:
-        with path.open("rb") as file:
-            file.read(1)
-    except OSError as error:
-        raise BadInput(f"{path} cannot be read: {error.strerror}") from error

@@ -1,6 +1,7 @@
-"""What a Prefect server runs by its name and a filled-in form: the same work as the commands, on any worker.
+"""Flows that a Prefect server runs by name with a filled-in form: the same work as the commands, on any worker.
 
-Paths are those of the machine on which the worker runs; `deploy/prefect.yaml` says where which flow is deployed.
+Paths are those of the worker's machine, below the roots that its user allows (flows/serving/roots.py);
+`deploy/prefect.yaml` lists the deployments.
 """
 
 import json
@@ -25,6 +26,7 @@ from flows.inputs.fetching import at_hand, without_secrets
 from flows.inputs.manifest import parse_changes
 from flows.inputs.orders import Wish
 from flows.packages.publish import check_folder, is_current
+from flows.serving.roots import Roots
 from steps.contract import Frozen
 from steps.profiles import profile, revise
 
@@ -145,8 +147,10 @@ def image_to_4d(
         options: as it stands it works on any machine
     """
     _refuse_to_die_again()
-    with at_hand(picture) as path:
-        _make(picture, Path(out), options, picture=path)
+    roots = Roots.of_this_process()
+    folder = roots.output(out)
+    with at_hand(roots.source(picture)) as path:
+        _make(picture, folder, options, roots, picture=path)
 
 
 @flow(name="video-to-4d", flow_run_name=lambda: _name("video"), persist_result=False)
@@ -164,8 +168,10 @@ def video_to_4d(
         options: as it stands it works on any machine
     """
     _refuse_to_die_again()
-    with at_hand(video) as path:
-        _make(video, Path(out), options, picture=path, video=path)
+    roots = Roots.of_this_process()
+    folder = roots.output(out)
+    with at_hand(roots.source(video)) as path:
+        _make(video, folder, options, roots, picture=path, video=path)
 
 
 @flow(name="catalog", flow_run_name="{inputs}", persist_result=False)
@@ -187,19 +193,22 @@ def catalog(
         options: where a line of a list says nothing else; as it stands it works on any machine
     """
     _refuse_to_die_again()
+    roots = Roots.of_this_process()
+    folder = roots.output(out)
     rows = batch(
-        inputs,
-        Path(out),
+        roots.inputs(inputs),
+        folder,
         console(),
         options.profile,
-        options.knobs(),
+        _knobs(options, roots),
         options.seed,
         workers,
         options.commercial_only,
         strict,
+        allow=roots.check_item,
     )
-    failed = tell(rows, Path(out), console())
-    text = f"{sum(row.made for row in rows)} of {len(rows)} items are in {out}"
+    failed = tell(rows, folder, console())
+    text = f"{sum(row.made for row in rows)} of {len(rows)} items are in {folder}"
     return Failed(message=text) if failed else Completed(message=text)
 
 
@@ -225,8 +234,11 @@ def benchmark(
         options: of every object
     """
     _refuse_to_die_again()
-    pairs = [f"{knob}={json.dumps(value)}" for knob, value in options.knobs().items()]
-    bench(Path(dataset), Path(out), console(), options.profile, pairs, options.seed, mesh, bank, limit or None, workers)
+    roots = Roots.of_this_process()
+    folder, place = roots.output(out), Path(roots.folder(dataset))
+    pairs = [f"{knob}={json.dumps(value)}" for knob, value in _knobs(options, roots).items()]
+    asked = (options.profile, pairs, options.seed, mesh, bank, limit or None, workers)
+    bench(place, folder, console(), *asked, allow=roots.check_files)
 
 
 def _name(source: str) -> str:
@@ -243,13 +255,20 @@ def _refuse_to_die_again() -> None:
         )
 
 
-def _make(address: str, folder: Path, options: Options, **files: Path) -> None:
-    """As `dg4d make` does: what is made already is left alone."""
-    connect()
+def _knobs(options: Options, roots: Roots) -> dict[str, Any]:
+    """Return every change to the profile; raises BadInput for weights that may not be read."""
+    knobs = options.knobs()
+    roots.check_knobs(knobs)
+    return knobs
+
+
+def _make(address: str, folder: Path, options: Options, roots: Roots, **files: Path) -> None:
+    """Make an asset as `dg4d make` does: what is made already is left alone."""
+    settings = revise(profile(options.profile), _knobs(options, roots))
     wish = Wish(
         item=PurePosixPath(urlsplit(address).path).stem,
         profile=options.profile,
-        settings=revise(profile(options.profile), options.knobs()),
+        settings=settings,
         seed=options.seed,
         commercial_only=options.commercial_only,
         **files,
@@ -258,4 +277,5 @@ def _make(address: str, folder: Path, options: Options, **files: Path) -> None:
     check_folder(folder)
     order = wish.order(home.store())
     if not is_current(folder, order.digest()):
+        connect()
         make(order, folder)

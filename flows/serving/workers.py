@@ -9,11 +9,14 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
 from flows.engine.processes import die_with_parent, locked, start_of
+from flows.serving.roots import SOURCES
 from flows.serving.server import LOOK_S, Server, leave
+from steps.store import write_atomically
 
 RESTART_S = 5.0  # between two starts of a worker
 GRACE_S = 10.0  # for a worker and its runs to end
@@ -42,10 +45,18 @@ class Worker:
         with locked(self._place("lock"), shared=True) as free:
             return not free
 
-    def start(self, api_url: str) -> None:
-        """Start it with the environment of this process, unless it runs."""
+    @property
+    def sources(self) -> str:
+        """Places that its runs may read, as `$DG4D_SOURCES` had them when it was started; empty: never started."""
+        place = self._place("sources")
+        return place.read_text(encoding="utf-8") if place.exists() else ""
+
+    def start(self, api_url: str, variables: Mapping[str, str] | None = None) -> None:
+        """Start it with the environment of this process and these variables, unless it runs."""
         if self.is_there():
             return
+        child = {**os.environ, **(variables or {})}
+        write_atomically(self._place("sources"), child.get(SOURCES, ""))
         with self.log.open("wb") as log:
             subprocess.run(
                 [sys.executable, "-m", "flows.serving.workers", self.pool, str(self.folder), api_url],
@@ -53,6 +64,7 @@ class Worker:
                 stdout=log,
                 stderr=log,
                 cwd=self.folder,
+                env=child,
                 start_new_session=True,
                 check=False,
             )

@@ -1,6 +1,7 @@
 """Steps that do next to nothing, under the names of the real ones; what happens is said in the source file.
 
-The source is text: words that name a step and what it should do there, for example "fit_motion=sleep:5".
+The source is text after the signature of a picture (`picture`): words that name a step and what it should do there,
+for example "fit_motion=sleep:5".
 Every run of a step is noted in the file $FAKE_LOG.
 """
 
@@ -33,6 +34,11 @@ STEPS = {
     name: spec.model_copy(update={"entry": f"fake_steps:{name}", "timeout_s": 60.0, "late_imports": ()})
     for name, spec in REAL.items()
 }
+
+
+def picture(words: object) -> str:
+    """Return the content of a file that is admitted as a picture (HDR has a header of text), with these words."""
+    return f"#?RADIANCE\n{words}"
 
 
 def draw_picture(job: Job) -> Facts:

@@ -28,7 +28,7 @@ MACHINE = {
     "image": "registry.example:5000/dg4d/cpu:1.2@sha256:" + "e" * 64,
 }
 WEIGHTS = {"svd/unet.safetensors": "sha256:" + "c" * 64}
-SOURCE = b"a picture"
+SOURCE = b"#?RADIANCE\na picture"
 STEPS = ("prepare_subject", "drive_video", "fit_gaussians", "pack_asset")
 
 

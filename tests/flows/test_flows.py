@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from fake_steps import picture
 from typer.testing import CliRunner, Result
 from waiting import start, wait_until
 
@@ -56,7 +57,7 @@ def ran(log: Path) -> list[str]:
 
 
 def order(words: str, folder: Path, *, name: str = "fake.png", item: str = "fake", **changes: object) -> Order:
-    (folder / name).write_text(words)
+    (folder / name).write_text(picture(words))
     return Wish(item=item, picture=folder / name, settings=revise(PREVIEW, dict(changes))).order(home.store())
 
 
@@ -185,7 +186,7 @@ def dg4d(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
 
 
 def test_a_killed_command_goes_on_where_it_was_and_gives_the_same_bytes(log: Path, tmp_path: Path) -> None:
-    (tmp_path / "x.png").write_text("kill fit_motion=sleep-once:60")
+    (tmp_path / "x.png").write_text(picture("kill fit_motion=sleep-once:60"))
     command = start("make", str(tmp_path / "x.png"), "-o", str(tmp_path / "out"))
     wait_until(lambda: log.exists() and "fit_motion" in log.read_text())
     command.send_signal(signal.SIGKILL)
@@ -204,7 +205,7 @@ def test_a_killed_command_goes_on_where_it_was_and_gives_the_same_bytes(log: Pat
 
 
 def test_two_commands_at_once_do_the_work_once(log: Path, tmp_path: Path) -> None:
-    (tmp_path / "x.png").write_text("both fit_gaussians=sleep:1")
+    (tmp_path / "x.png").write_text(picture("both fit_gaussians=sleep:1"))
     both = [start("make", str(tmp_path / "x.png"), "-o", str(tmp_path / out)) for out in ("a", "b")]
     for command in both:
         _, trouble = command.communicate()
@@ -215,14 +216,14 @@ def test_two_commands_at_once_do_the_work_once(log: Path, tmp_path: Path) -> Non
 
 def test_what_a_gate_does_not_let_pass_is_said_at_the_end(dg4d: Run, log: Path, tmp_path: Path) -> None:
     for words, told in (("torn again", True), ("fine again", False)):
-        (tmp_path / "x.png").write_text(words)
+        (tmp_path / "x.png").write_text(picture(words))
         done = dg4d("make", "x.png")
         assert done.exit_code == 0
         assert ("not accepted: silhouette; the report says what to do" in done.stdout) == told
 
 
 def test_a_command_with_nothing_to_do_says_so(dg4d: Run, log: Path, tmp_path: Path) -> None:
-    (tmp_path / "x.png").write_text("nothing")
+    (tmp_path / "x.png").write_text(picture("nothing"))
     assert "nothing to do" not in dg4d("make", "x.png").output
     ran(log)
     before = tree(tmp_path / "out" / "x")
@@ -236,7 +237,7 @@ def test_a_command_with_nothing_to_do_says_so(dg4d: Run, log: Path, tmp_path: Pa
 
 
 def test_motions_are_shown_without_an_asset_being_made(dg4d: Run, log: Path, tmp_path: Path) -> None:
-    (tmp_path / "x.png").write_text("choose")
+    (tmp_path / "x.png").write_text(picture("choose"))
     done = dg4d("motions", "x.png", "--candidates", "3")
     assert done.exit_code == 0, done.output
     assert ran(log) == EVERY_STEP[:2]
@@ -247,13 +248,13 @@ def test_motions_are_shown_without_an_asset_being_made(dg4d: Run, log: Path, tmp
 
 
 def test_a_video_has_its_motion_already(dg4d: Run, tmp_path: Path) -> None:
-    (tmp_path / "x.png").write_text("moving")
+    (tmp_path / "x.png").write_text(picture("moving"))
     done = dg4d("motions", "x.png")
     assert done.exit_code == 65 and "x.png" in done.stderr and "motion already" in done.stderr
 
 
 def test_a_pick_is_a_knob_of_the_driving_video(dg4d: Run, log: Path, tmp_path: Path) -> None:
-    (tmp_path / "x.png").write_text("pick")
+    (tmp_path / "x.png").write_text(picture("pick"))
     assert dg4d("make", "x.png", "--pick", "3", "-o", "picked").exit_code == 0
     ran(log)
     record = json.loads((tmp_path / "picked" / "provenance.json").read_text())
@@ -265,7 +266,7 @@ def test_a_pick_is_a_knob_of_the_driving_video(dg4d: Run, log: Path, tmp_path: P
 
 
 def test_bad_input_that_a_step_finds_is_one_message(dg4d: Run, tmp_path: Path) -> None:
-    (tmp_path / "x.png").write_text("prepare_subject=bad:ugly")
+    (tmp_path / "x.png").write_text(picture("prepare_subject=bad:ugly"))
     done = dg4d("make", "x.png", "-o", "out")
     assert done.exit_code == 65
     assert done.stderr == "dg4d: x.png: the picture is ugly\n"
@@ -273,18 +274,18 @@ def test_bad_input_that_a_step_finds_is_one_message(dg4d: Run, tmp_path: Path) -
 
 
 def test_a_fit_that_diverged_says_where_and_shows_the_last_good_state(dg4d: Run, tmp_path: Path) -> None:
-    (tmp_path / "x.png").write_text("fit_motion=diverge")
+    (tmp_path / "x.png").write_text(picture("fit_motion=diverge"))
     done = dg4d("make", "x.png", "-o", "out")
     assert done.exit_code == 65
     assert "iteration 7" in done.stderr
-    (picture,) = (word for word in done.stderr.split() if word.endswith(".png"))
-    assert Path(picture).is_file()
+    (saved,) = (word for word in done.stderr.split() if word.endswith(".png"))
+    assert Path(saved).is_file()
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(("word", "status"), [("missing", 69), ("full", 65), ("crash", 1)])
 def test_the_exit_status_of_the_command_follows_the_step(dg4d: Run, tmp_path: Path, word: str, status: int) -> None:
-    (tmp_path / "x.png").write_text(f"prepare_subject={word}")
+    (tmp_path / "x.png").write_text(picture(f"prepare_subject={word}"))
     assert dg4d("make", "x.png", "-o", "out").exit_code == status
     assert not (tmp_path / "out").exists()
 
@@ -292,7 +293,7 @@ def test_the_exit_status_of_the_command_follows_the_step(dg4d: Run, tmp_path: Pa
 def test_a_batch_makes_what_it_can_and_leaves_alone_what_is_made(dg4d: Run, tmp_path: Path, log: Path) -> None:
     (tmp_path / "in" / "deep").mkdir(parents=True)
     for name, words in {"a": "one", "deep/b": "two", "bad": "prepare_subject=bad:ugly"}.items():
-        (tmp_path / "in" / f"{name}.png").write_text(words)
+        (tmp_path / "in" / f"{name}.png").write_text(picture(words))
     done = dg4d("batch", "in", "-o", "out", "--workers", "2")
     assert done.exit_code == 1, done.output
     status = {row["item"]: row["status"] for row in json.loads((tmp_path / "out/summary.json").read_text())["items"]}
@@ -300,8 +301,8 @@ def test_a_batch_makes_what_it_can_and_leaves_alone_what_is_made(dg4d: Run, tmp_
     assert (tmp_path / "out/deep/b/asset.glb").exists()
     assert not (tmp_path / "out/bad").exists()
     ran(log)
-    (tmp_path / "in" / "bad.png").write_text("good")
-    (tmp_path / "in" / "a.png").write_text("one changed")
+    (tmp_path / "in" / "bad.png").write_text(picture("good"))
+    (tmp_path / "in" / "a.png").write_text(picture("one changed"))
     assert dg4d("batch", "in", "-o", "out").exit_code == 0
     assert sorted(ran(log)) == sorted(EVERY_STEP * 2)
     again = dg4d("batch", "in", "-o", "out")
@@ -362,5 +363,5 @@ def test_the_cut_out_can_be_looked_at_while_the_next_step_runs(command: str, log
     with listening(listen):
         (make if command == "make" else make_motions)(wanted, tmp_path / "out")
     assert happened.index(("prepare_subject", "remark", True)) < happened.index(("drive_video", "started", True))
-    for picture in home.cutouts().glob("fox-red-*.png"):
-        picture.unlink()
+    for saved in home.cutouts().glob("fox-red-*.png"):
+        saved.unlink()

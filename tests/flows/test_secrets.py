@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from fake_steps import picture
 from prefect.logging.handlers import APILogHandler
 from signing import identity
 
@@ -36,7 +37,7 @@ def place(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
 
 def left_by(words: str, place: Path) -> dict[str, bytes]:
     """Everything that is on disk after a run with these words: the package, records, artifacts, logs, the database."""
-    (place / "secret.png").write_text(words)
+    (place / "secret.png").write_text(picture(words))
     wish = Wish(item="secret", picture=place / "secret.png", settings=PREVIEW)
     try:
         make(wish.order(home.store()), place / "out")

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fake_steps import picture
 from prefect.client.orchestration import get_client
 from rich.console import Console
 from waiting import wait_until
@@ -44,7 +45,7 @@ def place(server: Server) -> Iterator[None]:
 
 def orders(folder: Path, *names: str) -> list[Order]:
     for name in names:
-        (folder / f"{name}.png").write_text(f"batch {name}")
+        (folder / f"{name}.png").write_text(picture(f"batch {name}"))
     wishes = [Wish(item=name, picture=folder / f"{name}.png", settings=PREVIEW) for name in names]
     return [wish.order(home.store()) for wish in wishes]
 
@@ -150,7 +151,7 @@ def test_the_server_shows_how_far_a_batch_is_and_a_table_that_can_be_read(place:
 def test_a_user_who_stops_a_batch_keeps_what_is_done(place: None, tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     for name, words in {"a": "quick", "b": "fit_motion=sleep:300", "c": "never"}.items():
-        (tmp_path / "in" / f"{name}.png").write_text(f"stopped {words}")
+        (tmp_path / "in" / f"{name}.png").write_text(picture(f"stopped {words}"))
     log = tmp_path / "ran"
     command = subprocess.Popen(
         [sys.executable, "-m", "flows.cli", "batch", "in", "-o", "out"],
@@ -176,7 +177,7 @@ def test_a_made_batch_needs_no_server_and_says_that_there_is_nothing_to_do(
 ) -> None:
     monkeypatch.setenv("DG4D_HOME", str(tmp_path / "home"))
     (tmp_path / "in").mkdir()
-    (tmp_path / "in" / "a.png").write_text("x")
+    (tmp_path / "in" / "a.png").write_text(picture("x"))
     monkeypatch.setattr(module, "is_current", lambda folder, digest: True)
 
     def no_server() -> None:
@@ -191,7 +192,7 @@ def test_a_hundred_items_are_found_unchanged_in_a_moment_each(tmp_path: Path, mo
     monkeypatch.delenv("DG4D_CODE_VERSION", raising=False)
     (tmp_path / "in").mkdir()
     for i in range(100):
-        (tmp_path / "in" / f"{i}.png").write_text(str(i))
+        (tmp_path / "in" / f"{i}.png").write_text(picture(str(i)))
         (tmp_path / "out" / f"{i}").mkdir(parents=True)
     found = items_of(tmp_path / "in", tmp_path / "out", "preview", {}, 0)
     ready(found[0], tmp_path / "out", strict=False)  # reads the source

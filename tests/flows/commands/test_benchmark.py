@@ -7,6 +7,7 @@ from io import StringIO
 from pathlib import Path
 
 import pytest
+from fake_steps import picture
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import ArtifactFilter, ArtifactFilterKey
 from rich.console import Console
@@ -49,7 +50,8 @@ def thing(folder: Path, words: str, pattern: str = "{:03d}.png") -> Path:
     for name in ("input", *VIEWS):
         (folder / name).mkdir(parents=True)
         for i in range(2):
-            (folder / name / pattern.format(i)).write_text(f"moving frame {i} of {name} {folder.name} {words} ")
+            content = picture(f"moving frame {i} of {name} {folder.name} {words} ")
+            (folder / name / pattern.format(i)).write_text(content)
     return folder
 
 
@@ -137,7 +139,8 @@ def test_true_views_are_the_prior_where_the_bank_is_asked_for(tmp_path: Path) ->
     with pytest.raises(BadInput, match=r"no bank of true views: newt"):
         run(tmp_path / "data", tmp_path / "out", bank=True)
     (folder / "bank").mkdir()
-    (folder / "bank" / "bank.json").write_text("{}")
+    (folder / "bank" / "bank.json").write_text('{"views": [{"file": "a.png"}]}')
+    (folder / "bank" / "a.png").write_text(picture("a view"))
     results = run(tmp_path / "data", tmp_path / "out", bank=True)
     assert results.settings["changes"] == {"prior.kind": "oracle"}
     record = json.loads((tmp_path / "out" / "assets" / "newt" / "provenance.json").read_text())
@@ -175,5 +178,5 @@ def test_equal_truths_are_one_artifact_whatever_their_files_are_called(tmp_path:
     store = ArtifactStore(tmp_path / "store")
     first, second = thing(tmp_path / "1" / "newt", "x"), thing(tmp_path / "2" / "newt", "x", "{}.png")
     assert put_truth(find_truth(first), store) == put_truth(find_truth(second), store)
-    (second / VIEWS[0] / "0.png").write_text("another picture")
+    (second / VIEWS[0] / "0.png").write_text(picture("another picture"))
     assert put_truth(find_truth(first), store) != put_truth(find_truth(second), store)

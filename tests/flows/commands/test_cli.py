@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from fake_steps import picture
 from typer.testing import CliRunner, Result
 
 from flows import cli
@@ -20,7 +21,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "cat.png").write_text("a cat")
+    (tmp_path / "cat.png").write_text(picture("a cat"))
 
     def no_server(*_: object) -> None:
         pytest.fail("bad input must be refused before a server is started")
@@ -69,7 +70,7 @@ def test_a_folder_in_which_nothing_may_be_written(place: Path, command: tuple[st
 def test_a_video_that_is_missing_or_has_one_frame() -> None:
     refused(dg4d("make", "cat.png", "--video", "run.mp4", "-o", "out"), "run.mp4 does not exist")
     Path("run").mkdir()
-    Path("run/000.png").write_text("x")
+    Path("run/000.png").write_text(picture("x"))
     refused(dg4d("make", "cat.png", "--video", "run", "-o", "out"), "holds 1 picture")
 
 
@@ -115,7 +116,8 @@ def test_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_bank_without_the_oracle_and_the_oracle_without_a_bank() -> None:
     Path("bank").mkdir()
-    Path("bank/bank.json").write_text("{}")
+    Path("bank/bank.json").write_text('{"views": [{"file": "a.png"}]}')
+    Path("bank/a.png").write_text(picture("a view"))
     refused(dg4d("make", "cat.png", "--bank", "bank", "-o", "out"), "prior.kind=oracle")
     refused(dg4d("make", "cat.png", "--set", "prior.kind=oracle", "-o", "out"), "--bank DIR")
 

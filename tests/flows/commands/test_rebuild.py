@@ -8,6 +8,7 @@ from pathlib import Path
 import fake_steps
 import numpy as np
 import pytest
+from fake_steps import picture
 from made_package import SOURCE, made_package, record_in
 from PIL import Image
 
@@ -59,7 +60,7 @@ def fakes(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 
 def order(words: str, folder: Path, name: str = "fake.png", **changes: object) -> Order:
-    (folder / name).write_text(words)
+    (folder / name).write_text(picture(words))
     return Wish(item="fake", picture=folder / name, settings=revise(PREVIEW, dict(changes)), seed=5).order(home.store())
 
 
@@ -180,7 +181,7 @@ def test_a_source_that_is_not_in_the_store_must_be_given_and_be_the_same(tmp_pat
     elsewhere = ArtifactStore(tmp_path / "elsewhere")
     with pytest.raises(BadInput, match="give it with --source"):
         order_again(record, elsewhere)
-    (tmp_path / "other.png").write_text("other")
+    (tmp_path / "other.png").write_text(picture("other"))
     with pytest.raises(BadInput, match="is not what this package was made from"):
         order_again(record, elsewhere, tmp_path / "other.png")
     (tmp_path / "same.png").write_bytes(SOURCE)

@@ -26,8 +26,13 @@ def dg4d(*arguments: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
+def children(pid_file: Path) -> list[str]:
+    """The processes that a guard started."""
+    return Path(f"/proc/{pid_file.read_text()}/task/{pid_file.read_text()}/children").read_text().split()
+
+
 def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop(folder: Path) -> None:
-    said = dg4d("up", "--pool", "process-cpu")
+    said = dg4d("up", "--pool", "process-cpu", "--sources", str(folder.parent))
     assert said.returncode == 0, said.stderr
     *deployments, address = said.stdout.split()
     assert deployments == ["image-to-4d/local", "video-to-4d/local", "benchmark/local", "catalog/local"]
@@ -37,6 +42,10 @@ def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop
         log = folder / "worker-process-cpu.log"
         wait_until(lambda: "started!" in log.read_text())
         assert running(folder)
+        environments = [Path(f"/proc/{pid}/environ") for pid in children(folder / "worker-process-cpu.pid")]
+        assert any(f"DG4D_SOURCES={folder.parent}\0" in environ.read_text() for environ in environments)
+        other = dg4d("up", "--pool", "process-cpu", "--sources", str(Path.cwd()))
+        assert other.returncode == 65 and f"reads {folder.parent}; `dg4d down` stops it" in other.stderr
     finally:
         stopped = dg4d("down")
     assert (stopped.returncode, stopped.stdout) == (0, "stopped\n")

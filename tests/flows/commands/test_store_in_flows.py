@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from fake_steps import picture
 from tiny_s3 import BUCKET, TinyS3
 
 from flows import home
@@ -55,7 +56,7 @@ def ran(log: Path) -> list[str]:
 
 
 def order(words: str, folder: Path) -> Order:
-    (folder / "fake.png").write_text(words)
+    (folder / "fake.png").write_text(picture(words))
     return Wish(item="fake", picture=folder / "fake.png", settings=revise(PREVIEW, {})).order(home.store())
 
 

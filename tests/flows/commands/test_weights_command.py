@@ -8,6 +8,7 @@ from pathlib import Path
 
 import huggingface_hub
 import pytest
+from fake_steps import picture
 from typer.testing import CliRunner, Result
 
 from dg4d_lib.weights.locate import digests
@@ -145,7 +146,7 @@ def test_pull_wants_names() -> None:
 
 
 def test_make_refuses_weights_that_forbid_commercial_use_before_it_looks_for_them(home: Path) -> None:
-    Path("cat.png").write_text("a cat")
+    Path("cat.png").write_text(picture("a cat"))
     arguments = ["make", "cat.png", "--set", "prior.kind=zero123", "-o", "out"]
     missing = dg4d(*arguments)
     assert missing.exit_code == 69
@@ -157,7 +158,7 @@ def test_make_refuses_weights_that_forbid_commercial_use_before_it_looks_for_the
 
 
 def test_a_batch_is_refused_as_a_whole_where_one_item_names_such_weights(home: Path) -> None:
-    Path("cat.png").write_text("a cat")
+    Path("cat.png").write_text(picture("a cat"))
     rows = [{"path": "cat.png"}, {"path": "cat.png", "prior.kind": "zero123"}]
     Path("items.json").write_text(json.dumps(rows))
     refused = dg4d("batch", "items.json", "-o", "out", "--commercial-only")
@@ -167,7 +168,7 @@ def test_a_batch_is_refused_as_a_whole_where_one_item_names_such_weights(home: P
 
 
 def test_words_and_a_picture_are_one_too_many_and_neither_is_one_too_few(home: Path) -> None:
-    Path("cat.png").write_text("a cat")
+    Path("cat.png").write_text(picture("a cat"))
     both = dg4d("make", "cat.png", "--text", "a cat", "--set", "text.weights=me/pictures")
     assert both.exit_code == 65
     assert "not both" in both.stderr

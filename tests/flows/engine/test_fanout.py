@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fake_steps import picture
 from postgresql import free_port, server_on_postgresql
 from prefect.client.orchestration import get_client
 from prefect.settings import PREFECT_API_URL, temporary_settings
@@ -40,7 +41,7 @@ def place(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
     (tmp_path / "in").mkdir()
     for name in ("one", "two"):
-        (tmp_path / "in" / f"{name}.png").write_text(f"{name} of {tmp_path} fit_motion=sleep:2")
+        (tmp_path / "in" / f"{name}.png").write_text(picture(f"{name} of {tmp_path} fit_motion=sleep:2"))
     return tmp_path
 
 
@@ -107,6 +108,7 @@ def test_two_workers_on_one_postgresql_server_make_an_item_each(place: Path) -> 
             patch.setenv("PREFECT_API_URL", api_url)
             registering.register(read_pools(), ["process-cpu"])
             own = {**os.environ, **environment(api_url), "PREFECT_HOME": str(place / "prefect")}
+            own["DG4D_SOURCES"] = str(place)  # a run has an empty folder of its own, whatever the folder of the worker
             worker = [sys.executable, "-m", "prefect", "worker", "start", "--pool", "process-cpu", "--limit", "1"]
             running += [
                 subprocess.Popen([*worker, "--name", name], env=own, cwd=place, stdout=subprocess.DEVNULL)

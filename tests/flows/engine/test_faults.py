@@ -12,6 +12,7 @@ from pathlib import Path
 
 import fake_steps
 import pytest
+from fake_steps import picture
 from postgresql import server_on_postgresql
 from prefect.client.orchestration import get_client
 from prefect.settings import PREFECT_API_URL, temporary_settings
@@ -74,7 +75,7 @@ def ran(log: Path) -> list[str]:
 
 
 def order(words: str, folder: Path) -> Order:
-    (folder / "fake.png").write_text(words)
+    (folder / "fake.png").write_text(picture(words))
     return Wish(item="fake", picture=folder / "fake.png", settings=PREVIEW).order(home.store())
 
 
@@ -104,7 +105,8 @@ def test_a_command_killed_in_every_stage_ends_with_the_bytes_of_an_undisturbed_o
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settle_orphans()
-    (tmp_path / "fake.png").write_text(" ".join(f"{step}=sleep-once:120" for step in EVERY_STEP))
+    words = " ".join(f"{step}=sleep-once:120" for step in EVERY_STEP)
+    (tmp_path / "fake.png").write_text(picture(words))
     for number, step in enumerate(EVERY_STEP):
         command = start("make", str(tmp_path / "fake.png"), "-o", str(tmp_path / "out"))
         wait_until((tmp_path / f"ran.{step}").exists)  # it sleeps there, and not the next time
@@ -113,7 +115,6 @@ def test_a_command_killed_in_every_stage_ends_with_the_bytes_of_an_undisturbed_o
         assert ran(log) == EVERY_STEP[max(0, number - 1) : number + 1], step
         assert not (tmp_path / "out").exists()
     assert settle_orphans() == 1  # every command settles the one before
-    words = (tmp_path / "fake.png").read_text()
     make(order(words, tmp_path), tmp_path / "out")
     assert ran(log) == EVERY_STEP[-1:]
     monkeypatch.delenv("DG4D_STORE")
@@ -126,7 +127,7 @@ def test_a_command_killed_in_every_stage_ends_with_the_bytes_of_an_undisturbed_o
 def test_two_batches_of_the_same_folder_at_once_do_the_work_once(log: Path, tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     for name in ("a", "b"):
-        (tmp_path / "in" / f"{name}.png").write_text(f"{name} fit_gaussians=sleep:0.5")
+        (tmp_path / "in" / f"{name}.png").write_text(picture(f"{name} fit_gaussians=sleep:0.5"))
     both = [start("batch", str(tmp_path / "in"), "-o", str(tmp_path / "out")) for _ in range(2)]
     for command in both:
         _, trouble = command.communicate()
@@ -193,7 +194,7 @@ def test_a_database_that_crashes_during_a_batch_and_comes_back_loses_and_doubles
     names = [str(number) for number in range(6)]
     (tmp_path / "in").mkdir()
     for name in names:
-        (tmp_path / "in" / f"{name}.png").write_text(f"{name} fit_motion=sleep:0.5")
+        (tmp_path / "in" / f"{name}.png").write_text(picture(f"{name} fit_motion=sleep:0.5"))
     with server_on_postgresql(tmp_path / "prefect") as (api_url, database):
 
         def crash() -> None:

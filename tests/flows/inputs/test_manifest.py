@@ -8,6 +8,7 @@ import pytest
 from tiny_s3 import BUCKET, TinyS3
 
 from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
+from flows.inputs import sources
 from flows.inputs.manifest import Item, distinct, items_of, parse_changes
 
 
@@ -295,6 +296,10 @@ def test_a_prefix_of_an_object_store_gives_its_pictures_which_are_fetched_in_the
         assert wish.picture is not None and wish.source_name == "a.mp4"
         assert wish.picture.read_bytes() == b"bytes of in/deep/a.mp4"
     assert not wish.picture.exists()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sources, "LARGEST_FILE_BYTES", 5)
+        with pytest.raises(BadInput, match="at most 5 are read"), found[1].here():
+            pass
     del bucket.objects["in/b.png"]
     with pytest.raises(BadInput, match=r"not in .* any more"), found[0].here():
         pass

@@ -1,6 +1,7 @@
 from pathlib import Path
 
 import pytest
+from fake_steps import picture
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.rasterizer import choice
@@ -19,8 +20,8 @@ def code(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DG4D_CODE_VERSION", "test")
 
 
-def wish(picture: Path, video: Path | None = None, bank: Path | None = None, **changes: object) -> Wish:
-    return Wish(item="x", picture=picture, video=video, bank=bank, settings=revise(PREVIEW, dict(changes)))
+def wish(path: Path, video: Path | None = None, bank: Path | None = None, **changes: object) -> Wish:
+    return Wish(item="x", picture=path, video=video, bank=bank, settings=revise(PREVIEW, dict(changes)))
 
 
 def order(wish: Wish, store: ArtifactStore) -> Order:
@@ -31,15 +32,15 @@ def order(wish: Wish, store: ArtifactStore) -> Order:
 def frames(folder: Path, count: int) -> Path:
     folder.mkdir(exist_ok=True)
     for i in range(count):
-        (folder / f"{i:03d}.png").write_bytes(bytes([i]))
+        (folder / f"{i:03d}.png").write_text(picture(i))
     (folder / "notes.txt").write_text("not a frame")
     return folder
 
 
 def test_names_do_not_count_but_content_settings_and_seed_do(tmp_path: Path, store: ArtifactStore) -> None:
-    (tmp_path / "a.png").write_bytes(b"picture")
-    (tmp_path / "b.png").write_bytes(b"picture")
-    (tmp_path / "c.png").write_bytes(b"another")
+    (tmp_path / "a.png").write_text(picture("picture"))
+    (tmp_path / "b.png").write_text(picture("picture"))
+    (tmp_path / "c.png").write_text(picture("another"))
     first = order(wish(tmp_path / "a.png"), store)
     assert order(wish(tmp_path / "b.png"), store).digest() == first.digest()
     assert first.model_copy(update={"item": "y", "profile": "p"}).digest() == first.digest()
@@ -53,7 +54,7 @@ def test_names_do_not_count_but_content_settings_and_seed_do(tmp_path: Path, sto
 
 
 def test_other_code_is_another_order(tmp_path: Path, store: ArtifactStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a.png").write_bytes(b"picture")
+    (tmp_path / "a.png").write_text(picture("picture"))
     one = order(wish(tmp_path / "a.png"), store)
     before = one.digest()
     monkeypatch.setenv("DG4D_CODE_VERSION", "other")
@@ -63,7 +64,7 @@ def test_other_code_is_another_order(tmp_path: Path, store: ArtifactStore, monke
 def test_another_backend_is_another_order(
     tmp_path: Path, store: ArtifactStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "a.png").write_bytes(b"picture")
+    (tmp_path / "a.png").write_text(picture("picture"))
     digests = []
     for lack in ("no GPU", ""):
         monkeypatch.setattr(choice, "what_gsplat_lacks", lambda lack=lack: lack)
@@ -72,7 +73,7 @@ def test_another_backend_is_another_order(
 
 
 def test_a_rasterizer_that_cannot_run_is_refused_before_any_work(tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_bytes(b"picture")
+    (tmp_path / "a.png").write_text(picture("picture"))
     with pytest.raises(BadInput, match="rasterizer = 'gpu'"):
         wish(tmp_path / "a.png", rasterizer="gpu")
     gsplat = wish(tmp_path / "a.png", rasterizer="cuda_gsplat")
@@ -85,7 +86,7 @@ def test_a_rasterizer_that_cannot_run_is_refused_before_any_work(tmp_path: Path)
 
 
 def test_a_folder_of_frames_is_a_video_and_equal_frames_are_equal_sources(tmp_path: Path, store: ArtifactStore) -> None:
-    (tmp_path / "a.png").write_bytes(b"picture")
+    (tmp_path / "a.png").write_text(picture("picture"))
     one = order(wish(tmp_path / "a.png", frames(tmp_path / "one", 3)), store)
     two = order(wish(tmp_path / "a.png", frames(tmp_path / "two", 3)), store)
     assert one.source == two.source
@@ -96,13 +97,13 @@ def test_a_folder_of_frames_is_a_video_and_equal_frames_are_equal_sources(tmp_pa
 
 @pytest.mark.parametrize(("name", "moving"), [("a.mp4", True), ("a.WEBM", True), ("a.gif", False), ("a.png", False)])
 def test_a_video_can_be_the_main_argument(tmp_path: Path, store: ArtifactStore, name: str, moving: bool) -> None:
-    (tmp_path / name).write_bytes(b"x")
+    (tmp_path / name).write_text(picture("x"))
     assert order(wish(tmp_path / name), store).moving == moving
 
 
 def test_what_cannot_work_is_refused_before_any_work(tmp_path: Path) -> None:
     good = tmp_path / "good.png"
-    good.write_bytes(b"x")
+    good.write_text(picture("x"))
     (tmp_path / "empty.png").touch()
     bank = frames(tmp_path / "bank", 1)
     cases = {
@@ -118,7 +119,7 @@ def test_what_cannot_work_is_refused_before_any_work(tmp_path: Path) -> None:
     for says, bad in cases.items():
         with pytest.raises(BadInput, match=says):
             bad.check()
-    (bank / "bank.json").write_text("{}")
+    (bank / "bank.json").write_text('{"views": [{"file": "000.png"}]}')
     wish(good, bank=bank, **{"prior.kind": "oracle"}).check()
     with pytest.raises(BadInput, match=r"prior\.kind=oracle"):
         wish(good, bank=bank).check()
@@ -156,12 +157,12 @@ def test_words_are_a_source_whatever_the_spaces_between_them(weights: Path, stor
 
 
 def test_a_file_that_holds_the_same_words_is_another_order(weights: Path, tmp_path: Path, store: ArtifactStore) -> None:
-    (tmp_path / "a.png").write_bytes(b"a red dragon")
-    assert order(wish(tmp_path / "a.png", **TEXT), store).digest() != order(words("a red dragon"), store).digest()
+    (tmp_path / "a.png").write_text("#?RADIANCE dragon")
+    assert order(wish(tmp_path / "a.png", **TEXT), store).digest() != order(words("#?RADIANCE dragon"), store).digest()
 
 
 def test_words_that_cannot_work_are_refused_before_any_work(weights: Path, tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_bytes(b"x")
+    (tmp_path / "a.png").write_text(picture("x"))
     cases = {
         "--text is empty": words(" "),
         "has 1001 characters": words("x" * 1001),
@@ -206,9 +207,9 @@ def test_other_weights_are_another_order_and_their_place_does_not_count(
 
 
 def test_weights_that_no_step_will_load_need_not_be_here(weights: Path, tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_bytes(b"x")
-    (tmp_path / "a.mp4").write_bytes(b"x")
-    (tmp_path / "a.gif").write_bytes(b"x")
+    (tmp_path / "a.png").write_text(picture("x"))
+    (tmp_path / "a.mp4").write_text(picture("x"))
+    (tmp_path / "a.gif").write_text(picture("x"))
     animated = {"driving.kind": "svd"}
     wish(tmp_path / "a.png", **{"text.weights": "not/here"}).check()
     wish(tmp_path / "a.mp4", **animated).check()
@@ -219,7 +220,7 @@ def test_weights_that_no_step_will_load_need_not_be_here(weights: Path, tmp_path
 
 
 def test_only_weights_that_allow_commercial_use_pass_where_that_is_asked_for(weights: Path, tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_bytes(b"x")
+    (tmp_path / "a.png").write_text(picture("x"))
 
     def strict(**changes: object) -> Wish:
         return wish(tmp_path / "a.png", **changes).model_copy(update={"commercial_only": True})
@@ -235,7 +236,7 @@ def test_only_weights_that_allow_commercial_use_pass_where_that_is_asked_for(wei
 
 
 def test_whether_licenses_mattered_is_part_of_the_order(tmp_path: Path, store: ArtifactStore) -> None:
-    (tmp_path / "a.png").write_bytes(b"x")
+    (tmp_path / "a.png").write_text(picture("x"))
     free = wish(tmp_path / "a.png")
     strict = free.model_copy(update={"commercial_only": True})
     assert order(strict, store).commercial_only

@@ -1,12 +1,14 @@
 """Deployments on a real server: what a form asks for, what the server refuses, and runs by a worker."""
 
 import json
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
 import pytest
+from fake_steps import picture
 from prefect.client.orchestration import SyncPrefectClient, get_client
 from prefect.exceptions import PrefectHTTPStatusError
 from prefect.settings import PREFECT_API_URL
@@ -17,6 +19,7 @@ from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows.packages.publish import whole
 from flows.serving import deployments, registering
 from flows.serving.pools import read_pools
+from flows.serving.roots import SOURCES
 from flows.serving.server import Server
 from flows.serving.watching import announce
 from flows.serving.workers import Worker, running
@@ -147,6 +150,7 @@ def worker(
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DG4D_EXECUTOR", "in_process")
         patch.setenv("FAKE_LOG", str(place / "ran"))
+        patch.setenv(SOURCES, f"{tmp_path_factory.getbasetemp()}{os.pathsep}s3://bucket/pictures")
         for name, value in objects.environment.items():
             patch.setenv(name, value)
         worker = Worker("process-cpu", server.folder)
@@ -180,7 +184,7 @@ def test_what_is_dropped_into_a_folder_is_converted_by_a_worker(
     worker: tuple[TinyS3, Path], client: SyncPrefectClient, tmp_path: Path
 ) -> None:
     (tmp_path / "in").mkdir()
-    (tmp_path / "in" / "dropped.png").write_text("dropped")
+    (tmp_path / "in" / "dropped.png").write_text(picture("dropped"))
     announce(tmp_path / "in", tmp_path / "out", "sha256:0")
     run = wait_until(lambda: ended(client, str(tmp_path / "out")))
     assert run.parameters["inputs"] == str(tmp_path / "in")
@@ -192,7 +196,7 @@ def test_what_is_dropped_into_a_folder_is_converted_by_a_worker(
 def test_a_run_whose_process_was_killed_goes_on_after_its_last_finished_step(
     worker: tuple[TinyS3, Path], client: SyncPrefectClient, tmp_path: Path
 ) -> None:
-    (tmp_path / "killed.png").write_text(f"{tmp_path} fit_gaussians=sleep:2 fit_motion=die-once")
+    (tmp_path / "killed.png").write_text(picture(f"{tmp_path} fit_gaussians=sleep:2 fit_motion=die-once"))
     _, log = worker
     before = len(log.read_text().split()) if log.exists() else 0
     run = ask(client, "image-to-4d", picture=str(tmp_path / "killed.png"), out=str(tmp_path / "out"))
@@ -213,7 +217,7 @@ def test_a_picture_of_an_object_store_is_fetched_and_converted(
     worker: tuple[TinyS3, Path], client: SyncPrefectClient, tmp_path: Path
 ) -> None:
     objects, _ = worker
-    objects.objects["pictures/a fox.png"] = f"a fox of {tmp_path}".encode(), time.time()
+    objects.objects["pictures/a fox.png"] = picture(f"a fox of {tmp_path}").encode(), time.time()
     run = ask(client, "image-to-4d", picture="s3://bucket/pictures/a fox.png", out=str(tmp_path / "fox"))
     assert run.state.is_completed(), run.state.message
     record = json.loads((tmp_path / "fox" / "provenance.json").read_text())
@@ -224,7 +228,10 @@ def test_a_picture_of_an_object_store_is_fetched_and_converted(
     assert not (tmp_path / "gone").exists()
 
 
-def test_the_name_of_a_run_tells_no_signature(client: SyncPrefectClient, tmp_path: Path) -> None:
+def test_the_name_of_a_run_tells_no_signature(
+    client: SyncPrefectClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(SOURCES, str(tmp_path))
     with pytest.raises(BadInput, match="cannot be fetched"):
         deployments.image_to_4d("http://user:word@127.0.0.1:1/fox.png?signature=key", str(tmp_path / "out"))
     (run,) = (run for run in client.read_flow_runs() if run.parameters.get("out") == str(tmp_path / "out"))

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fake_steps import picture
 from PIL import Image
 from prefect.client.orchestration import get_client
 from prefect.settings import PREFECT_API_URL
@@ -50,7 +51,7 @@ def place(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 
 def order(words: str, folder: Path, item: str) -> Order:
-    (folder / "fake.png").write_text(words)
+    (folder / "fake.png").write_text(picture(words))
     return Wish(item=item, picture=folder / "fake.png", settings=PREVIEW).order(home.store())
 
 
@@ -160,17 +161,17 @@ def test_a_browser_draws_every_picture_of_the_page(place: Path) -> None:
         f'{{"address": "{server_address()}/artifacts/artifact/{version["id"]}", "wait": {len(TITLES) + LOSSES}, '
         f'"text": "Contact sheet", "screenshot": "{place / "page.png"}"}}',
     )
-    assert [picture["name"] for picture in seen["pictures"]] == [*TITLES, *["Losses of the fake"] * LOSSES]
+    assert [shown["name"] for shown in seen["pictures"]] == [*TITLES, *["Losses of the fake"] * LOSSES]
     screen = np.asarray(Image.open(place / "page.png").convert("RGB")).astype(int)
     ink = [int(curves.INKS[0][at : at + 2], 16) for at in (1, 3, 5)]
-    for picture in seen["pictures"]:
-        left, top, width, height = (round(side) for side in picture["box"])
+    for shown in seen["pictures"]:
+        left, top, width, height = (round(side) for side in shown["box"])
         drawn = screen[top : top + height, left : left + width]
-        if picture["name"] in TITLES:  # every fake step makes the same
-            assert np.abs(drawn[height // 2, width // 2] - [100, 200, 90]).max() < 40, picture
+        if shown["name"] in TITLES:  # every fake step makes the same
+            assert np.abs(drawn[height // 2, width // 2] - [100, 200, 90]).max() < 40, shown
         else:
-            assert (np.abs(drawn - ink).max(-1) < 40).sum() > 100, picture
-            assert (drawn.min(-1) > 250).mean() > 0.5, picture
+            assert (np.abs(drawn - ink).max(-1) < 40).sum() > 100, shown
+            assert (drawn.min(-1) > 250).mean() > 0.5, shown
     assert "silhouette" in seen["text"] and "This asset is a fake." in seen["text"]
     assert {address.split("/")[4] for address in seen["links"] if "/dg4d/" in address} == {"artifacts", "viewer"}
 
