@@ -3,6 +3,7 @@
 import shutil
 import time
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -14,10 +15,12 @@ from torch import Tensor
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import SubjectSettings
 from dg4d_lib.video.shrinking import shrink_by_bands
+from steps.avif import read_avif
 from steps.clips import MOST_DECODED, MOST_DECODING_S, MOST_FRAMES, Clip, KeptFrames, evenly_spaced, thinned_rate
 from steps.decode_limit import DecodeLimit
 from steps.decoder_errors import damage_is_bad_input
 from steps.media_types import ALLOWED, SNIFFED_BYTES, container_of, is_animated_png, is_frame_name, is_zip, still_suffix
+from steps.stills import LARGEST_SIDE as STILL_SIDE
 from steps.stills import read_still
 from steps.webp import AnimatedWebp, is_animated
 
@@ -82,7 +85,8 @@ def _decode(path: Path, head: bytes, scratch: Path, max_frames: int, limit: Deco
     container = "apng" if is_animated_png(head) else container_of(head)
     if container:
         return _read_clip(path, container, max_frames, limit)
-    picture, has_alpha, _ = read_still(_link(path, still_suffix(head), scratch), "the picture", limit)
+    suffix = still_suffix(head)
+    picture, has_alpha, _ = _reader(suffix)(_link(path, suffix, scratch), "the picture", limit, STILL_SIDE)
     return _picture(picture[None], has_alpha)
 
 
@@ -232,9 +236,14 @@ def _zipped_picture(
         with target.open("wb") as file:
             file.write(head)
             shutil.copyfileobj(content, file)
-    picture = read_still(target, f"the frame {info.filename}", limit, longest)
+    picture = _reader(target.suffix)(target, f"the frame {info.filename}", limit, longest)
     target.unlink()
     return picture
+
+
+def _reader(suffix: str) -> Callable[..., tuple[Float[Tensor, "h w 4"], bool, tuple[int, int]]]:
+    """Return the function that decodes a still picture."""
+    return read_avif if suffix == ".avif" else read_still
 
 
 def _link(path: Path, suffix: str, scratch: Path) -> Path:

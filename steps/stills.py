@@ -88,9 +88,21 @@ def read_still(
         shrinker = BandShrinker(still.height, still.width, longest)
         for top, band in still.bands():
             shrinker.add(top, torch.from_numpy(band))
-    picture = still.upright(shrinker.picture())
-    size = (still.height, still.width) if still.is_turned else (still.width, still.height)
-    return picture, still.has_alpha, size
+    picture = upright(shrinker.picture(), still.orientation)
+    return picture, still.has_alpha, upright_size(still.width, still.height, still.orientation)
+
+
+def upright(picture: Float[Tensor, "h w 4"], orientation: int) -> Float[Tensor, "h2 w2 4"]:
+    """Undo EXIF's orientation; one that does not exist is 1."""
+    transpose, flip_rows, flip_columns = ORIENTATIONS.get(orientation, ORIENTATIONS[1])
+    picture = picture.transpose(0, 1) if transpose else picture
+    flipped = [axis for axis, flip in enumerate((flip_rows, flip_columns)) if flip]
+    return picture.flip(flipped).contiguous()
+
+
+def upright_size(width: int, height: int, orientation: int) -> tuple[int, int]:
+    """Return width and height after `upright`."""
+    return (height, width) if ORIENTATIONS.get(orientation, ORIENTATIONS[1])[0] else (width, height)
 
 
 @contextmanager
@@ -165,20 +177,9 @@ class Still:
             yield top, picture.clip(0, 1)
 
     @property
-    def is_turned(self) -> bool:
-        """True if width and height change places when the picture is upright."""
-        return self._orientation[0]
-
-    def upright(self, picture: Float[Tensor, "h w 4"]) -> Float[Tensor, "h2 w2 4"]:
-        """Undo the orientation of a camera."""
-        transpose, flip_rows, flip_columns = self._orientation
-        picture = picture.transpose(0, 1) if transpose else picture
-        flipped = [axis for axis, flip in enumerate((flip_rows, flip_columns)) if flip]
-        return picture.flip(flipped).contiguous()
-
-    @property
-    def _orientation(self) -> tuple[bool, bool, bool]:
-        return ORIENTATIONS.get(self._spec.get_int_attribute("Orientation", 1), ORIENTATIONS[1])
+    def orientation(self) -> int:
+        """EXIF's orientation, 1 to 8 where the file follows the standard."""
+        return int(self._spec.get_int_attribute("Orientation", 1))
 
     @property
     def _alpha_read(self) -> int:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from media_files import disc, save, save_clip, walk
+from PIL import Image
 
 from dg4d_lib.errors import BadInput
 from steps import decoder_errors
@@ -49,7 +50,9 @@ def webp(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return save_clip(path, walk(3), "libwebp_anim", "bgra", lossless="1").read_bytes()
 
 
-@pytest.fixture(scope="module", params=["png", "jpg", "jp2", "jxl", "tif", "exr", "psd", "gif", "apng", "mp4", "zip"])
+@pytest.fixture(
+    scope="module", params=["png", "jpg", "jp2", "jxl", "tif", "exr", "psd", "gif", "apng", "mp4", "zip", "avif"]
+)
 def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     path = tmp_path_factory.mktemp("made") / f"a.{request.param}"
     if request.param == "psd":
@@ -59,6 +62,9 @@ def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
             for i, frame in enumerate(walk(3)):
                 archive.writestr(f"{i}.png", save(path.with_name("frame.png"), frame).read_bytes())
+        return path.read_bytes()
+    if request.param == "avif":
+        Image.fromarray(disc()).save(path)
         return path.read_bytes()
     codecs = {"gif": ("gif", "rgb8"), "apng": ("apng", "rgba"), "mp4": ("libx264", "yuv420p")}
     if request.param in codecs:
