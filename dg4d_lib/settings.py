@@ -59,6 +59,9 @@ class SubjectSettings(Settings):
         0.2, ge=0, lt=0.9, description="share of the frame left free around a centered subject (paper's code)"
     )
     max_frames: int = Field(32, ge=2, le=512, description="frames taken from a video; longer ones are sampled evenly")
+    max_decode_gb: float = Field(
+        1.0, ge=0.125, le=256, description="GiB of memory for decoding the source, its decoded frames included; ours"
+    )
 
 
 class VideoModelSettings(Settings):

@@ -47,6 +47,11 @@ def failures() -> Path:
     return home() / "failures"
 
 
+def cutouts() -> Path:
+    """Return the folder of pictures that show source, matte and cut-out side by side."""
+    return home() / "cutouts"
+
+
 def background_server() -> Server:
     """The server that commands share unless PREFECT_API_URL names another."""
     make_private(home())

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import cast
 
 import av
-import numpy as np
 import torch
 from av.error import FFmpegError
 from av.video.codeccontext import VideoCodecContext
@@ -15,7 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.video.framing import shrink
+from dg4d_lib.video.framing import shrunk_size
+from dg4d_lib.video.shrinking import shrink_by_bands
+from steps.decode_limit import DecodeLimit
 from steps.stills import MOST_PIXELS, check_size
 
 LARGEST_SIDE = 1024  # pixels of a frame that is worked on
@@ -27,6 +28,7 @@ MOST_DECODED = 40_000_000_000  # pixels of all frames as they come: nine thousan
 MOST_DECODING_S = 900.0  # for reading a video once; only files that are made to take long need so much
 USUAL_FPS = 24.0  # assumed when a file does not tell
 SAME_RATE = 0.02  # relative difference up to which the rate in the header is believed over the time stamps
+HELD_FRAMES = 4  # that a decoder keeps at least: references, and those that wait for their turn
 ALPHA_DECODERS = {"vp9": "libvpx-vp9", "vp8": "libvpx"}  # the default ones drop the alpha plane of WebM
 
 
@@ -47,6 +49,35 @@ def work_side(count: int) -> int:
     return min(LARGEST_SIDE, math.isqrt(MOST_WORK // max(1, count)))
 
 
+class KeptFrames:
+    """Frames that are kept of a moving source, in one tensor.
+
+    Attributes:
+        side: longest side of a frame, pixels.
+        frames: straight RGBA in [0, 1]; empty until the first is added.
+    """
+
+    def __init__(self, indices: Sequence[int], what: str) -> None:
+        self._places, self._what = {index: place for place, index in enumerate(indices)}, what
+        self.side = work_side(len(indices))
+        self.frames: Float[Tensor, "t h w 4"] = torch.empty(0, 0, 0, 4)
+
+    def __contains__(self, index: int) -> bool:
+        return index in self._places
+
+    def add(self, index: int, frame: Float[Tensor, "h w 4"]) -> None:
+        """Put a frame in its place.
+
+        Raises:
+            BadInput: it has another size than those before.
+        """
+        if not len(self.frames):
+            self.frames = torch.zeros(len(self._places), *frame.shape)
+        if frame.shape != self.frames.shape[1:]:
+            raise BadInput(f"{self._what} changes its size on the way; export it again at one size")
+        self.frames[self._places[index]] = frame
+
+
 class Clip:
     """One video file.
 
@@ -56,8 +87,8 @@ class Clip:
         fps: frames per second.
     """
 
-    def __init__(self, path: Path, container: str, what: str = "the video") -> None:
-        self._path, self._container, self._what = path, container, what
+    def __init__(self, path: Path, container: str, limit: DecodeLimit, what: str = "the video") -> None:
+        self._path, self._container, self._limit, self._what = path, container, limit, what
         times = [frame.time for frame in self._frames()]
         self.count = len(times)
         if self.announced > 0 and self.count == 0:
@@ -67,16 +98,13 @@ class Clip:
         self.fps = self._rate(times)
 
     def read(self, indices: Sequence[int]) -> tuple[Float[Tensor, "t h w 4"], bool]:
-        """The frames of these ascending indices, and whether the codec carries alpha."""
-        wanted, side = set(indices), work_side(len(indices))
-        frames, has_alpha = [], False
+        """Return the frames of these ascending indices, and whether the codec carries alpha."""
+        kept, has_alpha = KeptFrames(indices, self._what), False
         for i, frame in enumerate(self._frames()):
-            if i in wanted:
+            if i in kept:
                 has_alpha = has_alpha or any(part.is_alpha for part in frame.format.components)
-                frames.append(_picture(frame, side, has_alpha))
-        if any(frame.shape != frames[0].shape for frame in frames):
-            raise BadInput(f"{self._what} changes its size on the way; export it again at one size")
-        return torch.stack(frames), has_alpha
+                kept.add(i, _picture(frame, kept.side, has_alpha))
+        return kept.frames, has_alpha
 
     def _frames(self) -> Iterator[av.VideoFrame]:
         try:
@@ -90,6 +118,7 @@ class Clip:
                     raise BadInput(f"{self._what} uses a codec that is not known here; export it as H.264 mp4")
                 if context.width and context.height:
                     check_size(context.width, context.height, self._what)
+                    self._require(context.width, context.height, context.pix_fmt)
                 self.announced = stream.frames
                 self._header_rate = float(stream.average_rate or 0)
                 name = ALPHA_DECODERS.get(context.name, "") if stream.metadata.get("alpha_mode") == "1" else ""
@@ -102,6 +131,11 @@ class Clip:
             raise BadInput(
                 f"{self._what} is cut off or broken ({error.strerror}); copy it again, or export it as H.264 mp4"
             ) from error
+
+    def _require(self, width: int, height: int, pixel_format: str | None) -> None:
+        """Refuse frames that are too large for the memory; most formats have 12 to 32 bits per pixel."""
+        bits = av.VideoFormat(pixel_format, width, height).padded_bits_per_pixel if pixel_format else 12
+        self._limit.require(HELD_FRAMES * width * height * bits / 8, f"a frame of {self._what}", width, height)
 
     def _bounded(self, frames: Iterable[av.VideoFrame]) -> Iterator[av.VideoFrame]:
         """The frames of one reading, for as long as number, size and time are within reason."""
@@ -130,11 +164,10 @@ class Clip:
 
 
 def _picture(frame: av.VideoFrame, side: int, has_alpha: bool) -> Float[Tensor, "h w 4"]:
-    """A frame as straight RGBA, upright, no side longer than `side`."""
+    """Return a frame as straight RGBA, upright, no side longer than `side`."""
     width, height = frame.width, frame.height
-    if not has_alpha and max(width, height) > side:  # the scaler does not know that alpha weighs colors
-        scale = side / max(width, height)
-        width, height = max(1, round(width * scale)), max(1, round(height * scale))
+    if not has_alpha:  # the scaler does not know that alpha weighs colors
+        height, width = shrunk_size(height, width, side)
     pixels = frame.reformat(width=width, height=height, format="rgba", interpolation="AREA").to_ndarray()
-    upright = np.ascontiguousarray(np.rot90(pixels, round(frame.rotation / 90)))
-    return shrink(torch.from_numpy(upright)[None].float() / 255, side)[0]
+    picture = shrink_by_bands(torch.from_numpy(pixels), side)
+    return torch.rot90(picture, round(frame.rotation / 90)).contiguous()

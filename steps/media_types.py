@@ -1,6 +1,7 @@
 """Recognition of pictures, videos and frames by their first bytes, never by their names. Imports no torch."""
 
 import codecs
+import lzma
 import re
 import struct
 import zipfile
@@ -47,14 +48,27 @@ CLIPS = (  # offset of a signature, the signature, FFmpeg's name of the containe
     (0, b"OggS", "ogg"),
     (0, b"\0\0\x01\xba", "mpeg"),
 )
-UNREADABLE_BRANDS = {b"heic": "HEIC", b"heix": "HEIC", b"mif1": "HEIC", b"avif": "AVIF", b"avis": "AVIF"}
+UNREADABLE_BRANDS = {b"heic": "HEIC", b"heix": "HEIC", b"mif1": "HEIC", b"avis": "animated AVIF"}
 PICTURE_SUFFIXES = {
-    ".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".exr", ".hdr", ".jxl", ".jp2", ".psd", ".ppm", ".pgm",
+    ".png", ".jpg", ".jpeg", ".webp", ".avif", ".tif", ".tiff", ".bmp", ".exr", ".hdr", ".jxl", ".jp2", ".psd", ".ppm",
+    ".pgm",
 }  # fmt: skip
 CLUTTER = {"Thumbs.db", "desktop.ini"}
 NPY = b"\x93NUMPY"
-ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError, EOFError, OSError, ValueError)
-ALLOWED = "pictures (PNG, JPEG, WebP, TIFF, BMP, EXR), videos (mp4, mov, webm, mkv, gif) and zips of numbered pictures"
+ZIP_ERRORS = (
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    MemoryError,
+    RuntimeError,
+    NotImplementedError,
+    EOFError,
+    OSError,
+    ValueError,
+)
+ALLOWED = (
+    "pictures (PNG, JPEG, WebP, AVIF, TIFF, BMP, EXR), videos (mp4, mov, webm, mkv, gif) and zips of numbered pictures"
+)
 
 
 def still_suffix(head: bytes) -> str:
@@ -65,6 +79,8 @@ def still_suffix(head: bytes) -> str:
     """
     if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
         return ".webp"
+    if is_avif(head):
+        return ".avif"
     text = is_text(head)
     for signature, suffix in STILLS:
         if head.startswith(signature) and _is_plausible(head, suffix, text):
@@ -79,6 +95,8 @@ def container_of(head: bytes) -> str:
     Raises:
         BadInput: a format that cannot be read here.
     """
+    if is_avif(head):
+        return ""
     if head[4:8] == b"ftyp" and head[8:12] in UNREADABLE_BRANDS:
         name = UNREADABLE_BRANDS[head[8:12]]
         raise BadInput(f"{name} pictures cannot be read here; export the picture as PNG or JPEG")
@@ -87,6 +105,15 @@ def container_of(head: bytes) -> str:
     if len(head) > 188 and {head[at] for at in range(0, min(len(head), 377), 188)} == {0x47}:
         return "mpegts"
     return next((name for at, signature, name in CLIPS if head[at : at + len(signature)] == signature), "")
+
+
+def is_avif(head: bytes) -> bool:
+    """Return whether these bytes begin a still AVIF: its brand is the major one, or a compatible one of plain HEIF."""
+    if head[4:8] != b"ftyp":
+        return False
+    brands = head[16 : min(len(head), int.from_bytes(head[:4], "big"))]
+    compatible = [brands[at : at + 4] for at in range(0, len(brands), 4)]
+    return head[8:12] == b"avif" or (head[8:12] == b"mif1" and b"avif" in compatible)
 
 
 def is_animated_png(head: bytes) -> bool:

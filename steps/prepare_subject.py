@@ -26,7 +26,7 @@ def run(job: Job) -> Facts:
     """
     settings: SubjectSettings = job.settings
     with TemporaryDirectory() as scratch:
-        source = read_source(job.inputs["source"], Path(scratch), settings.max_frames)
+        source = read_source(job.inputs["source"], Path(scratch), settings.max_frames, settings.max_decode_gb)
     job.progress(1, 3, {})
     cutouts, notes = prepare(source.frames, source.has_alpha, settings)
     job.progress(2, 3, {})

@@ -1,7 +1,9 @@
 """What users hand in: a picture, a video, or a zip of numbered pictures; told apart by content, never by name."""
 
-import re
+import shutil
+import time
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -11,16 +13,23 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.video.framing import shrink
-from steps.clips import LARGEST_SIDE, MOST_FRAMES, Clip, evenly_spaced, thinned_rate, work_side
+from dg4d_lib.settings import SubjectSettings
+from dg4d_lib.video.shrinking import shrink_by_bands
+from steps.avif import read_avif
+from steps.clips import MOST_DECODED, MOST_DECODING_S, MOST_FRAMES, Clip, KeptFrames, evenly_spaced, thinned_rate
+from steps.decode_limit import DecodeLimit
+from steps.decoder_errors import damage_is_bad_input
 from steps.media_types import ALLOWED, SNIFFED_BYTES, container_of, is_animated_png, is_frame_name, is_zip, still_suffix
-from steps.stills import decode_still, read_still
+from steps.stills import LARGEST_SIDE as STILL_SIDE
+from steps.stills import read_still
 from steps.webp import AnimatedWebp, is_animated
 
 FOLDER_FPS = 12.0  # pictures in a folder have no rate; drawn animation usually holds a drawing for two frames of 24
 STILL_FPS = 1.0  # of a picture; it is never played
 MOST_ENTRY_BYTES = 512 * 2**20  # of one unpacked picture of a zip
 NAMED_AT_MOST = 8  # missing frames that a message lists
+MOST_DIGITS = 18  # of the number of a frame; cameras write up to 17, a time stamp
+NAME_SHOWN = 40  # characters of a long name in a message
 
 
 @dataclass(frozen=True)
@@ -42,13 +51,16 @@ class Source:
     notes: tuple[str, ...] = ()
 
 
-def read_source(path: Path, scratch: Path, max_frames: int) -> Source:
-    """Decode whatever a user gave.
+def read_source(
+    path: Path, scratch: Path, max_frames: int, max_decode_gb: float = SubjectSettings().max_decode_gb
+) -> Source:
+    """Decode a user's file.
 
     Args:
         path: the file; its name does not matter.
         scratch: an existing folder for links and unpacked pictures.
         max_frames: frames that are kept of a video, evenly spaced, the first and the last among them; at least 2.
+        max_decode_gb: GiB of memory that may be used, the decoded frames included.
 
     Raises:
         BadInput: it is empty, broken, too small, too large, or nothing that can be read; says what to do.
@@ -59,14 +71,22 @@ def read_source(path: Path, scratch: Path, max_frames: int) -> Source:
         raise BadInput(f"the file is empty (0 bytes); give {ALLOWED}")
     with path.open("rb") as file:
         head = file.read(SNIFFED_BYTES)
+    limit = DecodeLimit(max_decode_gb)
+    with limit.enforced("the file"), damage_is_bad_input("the file"):
+        return _decode(path, head, scratch, max_frames, limit)
+
+
+def _decode(path: Path, head: bytes, scratch: Path, max_frames: int, limit: DecodeLimit) -> Source:
+    """Decode a file by its first bytes; what else it may be, further on, does not count."""
     if is_zip(head):
-        return _read_zip(path, scratch, max_frames)
+        return _read_zip(path, scratch, max_frames, limit)
     if is_animated(head):
-        return _read_webp(path, scratch, max_frames)
+        return _read_webp(path, scratch, max_frames, limit)
     container = "apng" if is_animated_png(head) else container_of(head)
     if container:
-        return _read_clip(path, container, max_frames)
-    picture, has_alpha = read_still(_link(path, still_suffix(head), scratch), "the picture")
+        return _read_clip(path, container, max_frames, limit)
+    suffix = still_suffix(head)
+    picture, has_alpha, _ = _reader(suffix)(_link(path, suffix, scratch), "the picture", limit, STILL_SIDE)
     return _picture(picture[None], has_alpha)
 
 
@@ -84,12 +104,12 @@ def _video(
 
 
 def _says_something(frames: Float[Tensor, "t h w 4"]) -> bool:
-    """Whether an alpha channel is more than decoration: some pixel is not opaque."""
+    """Return whether an alpha channel is more than decoration: some pixel is not opaque."""
     return bool((frames[..., 3] < 250 / 255).any())
 
 
-def _read_clip(path: Path, container: str, max_frames: int) -> Source:
-    clip = Clip(path, container)
+def _read_clip(path: Path, container: str, max_frames: int, limit: DecodeLimit) -> Source:
+    clip = Clip(path, container, limit)
     if clip.count < 2 and container in ("gif", "apng") and clip.count:
         return _picture(*clip.read([0]))
     _need_two(clip.count, "the video")
@@ -99,14 +119,16 @@ def _read_clip(path: Path, container: str, max_frames: int) -> Source:
     return _video(frames, has_alpha, clip.fps, clip.count, notes)
 
 
-def _read_webp(path: Path, scratch: Path, max_frames: int) -> Source:
-    clip = AnimatedWebp(path.read_bytes(), scratch)
-    wanted = evenly_spaced(len(clip), max_frames)
-    frames = [shrink(frame[None], work_side(len(wanted)))[0] for i, frame in enumerate(clip) if i in wanted]
-    if len(clip) == 1:
-        return _picture(frames[0][None], True)
-    _need_two(len(clip), "the WebP animation")
-    return _video(torch.stack(frames), True, clip.fps, len(clip))
+def _read_webp(path: Path, scratch: Path, max_frames: int, limit: DecodeLimit) -> Source:
+    limit.require_file(path, "the WebP animation")
+    clip = AnimatedWebp(path.read_bytes(), scratch, limit)
+    if len(clip) != 1:
+        _need_two(len(clip), "the WebP animation")
+    kept = KeptFrames(evenly_spaced(len(clip), max_frames), "the WebP animation")
+    for i, frame in enumerate(clip):
+        if i in kept:
+            kept.add(i, shrink_by_bands(torch.from_numpy(frame), kept.side))
+    return _picture(kept.frames, True) if len(clip) == 1 else _video(kept.frames, True, clip.fps, len(clip))
 
 
 def _need_two(count: int, what: str) -> None:
@@ -117,42 +139,54 @@ def _need_two(count: int, what: str) -> None:
         )
 
 
-def _read_zip(path: Path, scratch: Path, max_frames: int) -> Source:
+def _read_zip(path: Path, scratch: Path, max_frames: int, limit: DecodeLimit) -> Source:
     try:
         with zipfile.ZipFile(path) as archive:
             entries = _numbered(
                 [info for info in archive.infolist() if not info.is_dir() and is_frame_name(info.filename)]
             )
-            wanted = evenly_spaced(len(entries), max_frames)
-            side = min(LARGEST_SIDE, work_side(len(wanted)))
-            frames: list[Tensor] = []
-            size, any_alpha = None, False
-            for i, info in enumerate(entries):
-                picture, has_alpha = _zipped_picture(archive, info, scratch)
-                size = size or picture.shape
-                if picture.shape != size:
-                    raise BadInput(
-                        f"the frames have different sizes: {info.filename} is {picture.shape[1]} x {picture.shape[0]} "
-                        f"pixels, {entries[0].filename} is {size[1]} x {size[0]}; export all at one size"
-                    )
-                if i in wanted:
-                    frames.append(shrink(picture[None], side)[0])
-                    any_alpha = any_alpha or has_alpha
+            frames, any_alpha = _zipped_frames(archive, entries, scratch, max_frames, limit)
     except (zipfile.BadZipFile, RuntimeError, NotImplementedError, EOFError) as error:
         raise BadInput("the zip of frames is broken or encrypted; pack it again") from error
     note = f"A folder of frames has no frame rate; {FOLDER_FPS:g} per second are assumed."
-    return _video(torch.stack(frames), any_alpha, FOLDER_FPS, len(entries), (note,))
+    return _video(frames, any_alpha, FOLDER_FPS, len(entries), (note,))
+
+
+def _zipped_frames(
+    archive: zipfile.ZipFile, entries: list[zipfile.ZipInfo], scratch: Path, max_frames: int, limit: DecodeLimit
+) -> tuple[Float[Tensor, "t h w 4"], bool]:
+    """Decode every frame, so that none is broken, and keep some; whether one of these has alpha."""
+    kept, any_alpha = KeptFrames(evenly_spaced(len(entries), max_frames), "the folder of frames"), False
+    first, pixels, start = (0, 0), 0, time.monotonic()
+    for i, info in enumerate(entries):
+        picture, has_alpha, size = _zipped_picture(archive, info, scratch, limit, kept.side)
+        first = first if i else size
+        if size != first:
+            raise BadInput(
+                f"the frames have different sizes: {info.filename} is {size[0]} x {size[1]} "
+                f"pixels, {entries[0].filename} is {first[0]} x {first[1]}; export all at one size"
+            )
+        pixels += size[0] * size[1]
+        if pixels > MOST_DECODED or time.monotonic() - start > MOST_DECODING_S:
+            raise BadInput(
+                f"the folder of frames has more than {MOST_DECODED // 10**9} billion pixels in all, or takes more than "
+                f"{MOST_DECODING_S:g} s to read; leave some frames out, or export them smaller"
+            )
+        if i in kept:
+            kept.add(i, picture)
+            any_alpha = any_alpha or has_alpha
+    return kept.frames, any_alpha
 
 
 def _numbered(entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo]:
-    """Entries in the order of the number at the end of their names; of their names where none has a number."""
+    """Sort entries by the number at the end of their names; by name where none has a number."""
     _need_two(len(entries), "the folder of frames")
     if len(entries) > MOST_FRAMES:
         raise BadInput(
             f"the folder of frames has {len(entries)} pictures; at most {MOST_FRAMES} are read: leave some out"
         )
-    found = {info.filename: re.search(r"(\d+)$", Path(info.filename).stem) for info in entries}
-    if not any(found.values()):
+    found = {info.filename: _number_at_end(Path(info.filename).stem) for info in entries}
+    if all(number is None for number in found.values()):
         return sorted(entries, key=lambda info: info.filename)
     without = sorted(name for name, number in found.items() if number is None)
     if without:
@@ -161,8 +195,7 @@ def _numbered(entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo]:
         )
     by_number: dict[int, zipfile.ZipInfo] = {}
     for info in entries:
-        match = found[info.filename]
-        number = int(match.group(1)) if match else 0
+        number = found[info.filename] or 0
         if number in by_number:
             raise BadInput(
                 f"{by_number[number].filename} and {info.filename} have the same number; keep one sequence per folder"
@@ -179,23 +212,42 @@ def _numbered(entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo]:
     return [by_number[number] for number in sorted(by_number)]
 
 
+def _number_at_end(name: str) -> int | None:
+    digits = name[len(name.rstrip("0123456789")) :]
+    if len(digits) > MOST_DIGITS:
+        raise BadInput(
+            f"the number at the end of the frame's name {name[:NAME_SHOWN]}... has {len(digits)} digits; "
+            f"at most {MOST_DIGITS} are read: rename it"
+        )
+    return int(digits) if digits else None
+
+
 def _zipped_picture(
-    archive: zipfile.ZipFile, info: zipfile.ZipInfo, scratch: Path
-) -> tuple[Float[Tensor, "h w 4"], bool]:
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, scratch: Path, limit: DecodeLimit, longest: int
+) -> tuple[Float[Tensor, "h w 4"], bool, tuple[int, int]]:
+    """Unpack one frame into `scratch` and decode it as `read_still` does."""
     if info.file_size > MOST_ENTRY_BYTES:
         raise BadInput(f"{info.filename} unpacks to {info.file_size} bytes; at most {MOST_ENTRY_BYTES} are read")
-    content = archive.read(info)
-    if not content:
-        raise BadInput(f"the frame {info.filename} is empty (0 bytes); export it again")
-    target = scratch / f"frame{still_suffix(content[:SNIFFED_BYTES])}"
-    target.write_bytes(content)
-    picture = decode_still(target, f"the frame {info.filename}")
+    with archive.open(info) as content:
+        head = content.read(SNIFFED_BYTES)
+        if not head:
+            raise BadInput(f"the frame {info.filename} is empty (0 bytes); export it again")
+        target = scratch / f"frame{still_suffix(head)}"
+        with target.open("wb") as file:
+            file.write(head)
+            shutil.copyfileobj(content, file)
+    picture = _reader(target.suffix)(target, f"the frame {info.filename}", limit, longest)
     target.unlink()
     return picture
 
 
+def _reader(suffix: str) -> Callable[..., tuple[Float[Tensor, "h w 4"], bool, tuple[int, int]]]:
+    """Return the function that decodes a still picture."""
+    return read_avif if suffix == ".avif" else read_still
+
+
 def _link(path: Path, suffix: str, scratch: Path) -> Path:
-    """The same file under a name that tells its format."""
+    """Return a link to the file under a name that tells its format."""
     link = scratch / f"source{suffix}"
     link.unlink(missing_ok=True)
     link.symlink_to(path.resolve())

@@ -16,6 +16,8 @@ BORDER_DEGREE = 2  # of the polynomial that the border can support
 FLOODED_DEGREE = 4  # and the whole backdrop
 PLAIN_SHARE = 0.6  # of the ring that must agree with the model
 PLAIN_SPREAD = 6.0  # Lab units: above it the ring is no plain backdrop
+EVEN_SPREAD = 2.4  # Lab units: below are studio backdrops with noise of cameras and of JPEG, above also skies
+EVEN_SHARE = 0.9  # of the ring: above it, a backdrop may vary more
 TOLERANCE = (5.0, 14.0)  # Lab units: least and most difference that is still backdrop
 SPREADS = 4.0  # tolerance in spreads of the ring
 SHADOW_DROP = 35.0  # lightness by which a shadow may darken the backdrop
@@ -43,8 +45,13 @@ class Backdrop:
 
     @property
     def is_plain(self) -> bool:
-        """Whether the border is explained well enough to call everything like it backdrop."""
+        """True if the border is explained well enough to call everything like it backdrop."""
         return self.share >= PLAIN_SHARE and self.spread <= PLAIN_SPREAD
+
+    @property
+    def is_even(self) -> bool:
+        """True if the border is explained so well that the cut-out is more than a guess."""
+        return self.is_plain and (self.spread <= EVEN_SPREAD or self.share >= EVEN_SHARE)
 
     @property
     def tolerance(self) -> float:
@@ -68,7 +75,8 @@ def fit_backdrop(lab: Float[ndarray, "t h w 3"]) -> Backdrop:
     first = _fit(lab, border, BORDER_DEGREE, border)
     if not first.is_plain:
         return first
-    flooded = np.stack([_flood(difference, first) for difference in lab - first.color(*lab.shape[1:3])])
+    color = first.color(*lab.shape[1:3])
+    flooded = np.stack([_flood(frame - color, first) for frame in lab])
     if flooded.mean() < 0.3:
         return first
     refined = _fit(lab, flooded, FLOODED_DEGREE, border)
@@ -77,8 +85,8 @@ def fit_backdrop(lab: Float[ndarray, "t h w 3"]) -> Backdrop:
 
 def cut_out(lab: Float[ndarray, "t h w 3"], backdrop: Backdrop) -> Bool[ndarray, "t h w"]:
     """Everything the flood does not reach, without shadows and with its small holes filled."""
-    differences = lab - backdrop.color(*lab.shape[1:3])
-    return np.stack([_subject(difference, backdrop) for difference in differences])
+    color = backdrop.color(*lab.shape[1:3])
+    return np.stack([_subject(frame - color, backdrop) for frame in lab])
 
 
 def border_ring(height: int, width: int) -> Bool[ndarray, "h w"]:

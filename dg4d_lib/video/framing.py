@@ -93,22 +93,36 @@ def reframe(frames: Float[Tensor, "t h w 4"], crop: Crop, size: int) -> Float[Te
 
 
 def shrink(frames: Float[Tensor, "t h w 4"], longest: int) -> Float[Tensor, "t h2 w2 4"]:
-    """The same frames with no side longer than `longest` pixels; smaller ones stay as they are."""
-    height, width = frames.shape[1:3]
+    """Return the same frames with no side longer than `longest` pixels; smaller ones stay as they are."""
+    height, width = shrunk_size(frames.shape[1], frames.shape[2], longest)
+    return resample(frames, height, width)
+
+
+def shrunk_size(height: int, width: int, longest: int) -> tuple[int, int]:
+    """Return height and width in pixels after `shrink`."""
     if max(height, width) <= longest:
-        return frames
+        return height, width
     scale = longest / max(height, width)
-    return resample(frames, max(1, round(height * scale)), max(1, round(width * scale)))
+    return max(1, round(height * scale)), max(1, round(width * scale))
 
 
 def resample(frames: Float[Tensor, "t h w 4"], height: int, width: int) -> Float[Tensor, "t h2 w2 4"]:
-    """Cut-outs at another size, antialiased, weighted by alpha; equal size gives equal values."""
+    """Resample cut-outs, antialiased, weighted by alpha; equal size gives equal values."""
     if (height, width) == tuple(frames.shape[1:3]):
         return frames
     alpha = frames[..., 3:]
     weighted = torch.cat([frames[..., :3] * alpha, alpha], -1).permute(0, 3, 1, 2)
-    small = functional.interpolate(weighted, (height, width), mode="bilinear", antialias=True, align_corners=False)
-    small = small.permute(0, 2, 3, 1).clamp(0, 1)
+    return straight(antialiased(weighted, height, width))
+
+
+def antialiased(frames: Float[Tensor, "t 4 h w"], height: int, width: int) -> Float[Tensor, "t 4 h2 w2"]:
+    """Interpolate linearly with a triangle filter as wide as two pixels of the smaller picture."""
+    return functional.interpolate(frames, (height, width), mode="bilinear", antialias=True, align_corners=False)
+
+
+def straight(frames: Float[Tensor, "t 4 h w"]) -> Float[Tensor, "t h w 4"]:
+    """Return frames whose colors are divided by alpha, channels last, all in [0, 1]."""
+    small = frames.permute(0, 2, 3, 1).clamp(0, 1)
     color = small[..., :3] / small[..., 3:].clamp(min=1e-6)
     return torch.cat([color.clamp(0, 1), small[..., 3:]], -1).contiguous()
 

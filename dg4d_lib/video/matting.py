@@ -31,15 +31,15 @@ ADVICE = "give a PNG with a transparent background, or a picture of one subject 
 
 @dataclass(frozen=True)
 class Matte:
-    """Cut-outs and how they came about.
+    """Cut-outs and the model behind them.
 
     Attributes:
         frames: straight alpha; colors are freed from what shone through from behind.
-        method: which of the two ways told the subject.
+        method: model that told the subject; all but "backdrop" are guesses.
     """
 
     frames: Float[Tensor, "t h w 4"]
-    method: Literal["backdrop", "color models"]
+    method: Literal["backdrop", "uneven backdrop", "color models"]
 
 
 def matte(frames: Float[Tensor, "t h w 3"]) -> Matte:
@@ -63,10 +63,13 @@ def matte(frames: Float[Tensor, "t h w 3"]) -> Matte:
     _check(masks[0])
     scale = max(height, width) / max(masks.shape[1:])
     band = max(2, round(radius * max(1.0, scale)))
-    cutouts = torch.stack(
-        [_soften(frame, mask, band) for frame, mask in zip(frames, _enlarge(masks, height, width), strict=True)]
-    )
-    return Matte(_steady(cutouts, frames), "backdrop" if backdrop.is_plain else "color models")
+    cutouts = frames.new_empty(len(frames), height, width, 4)  # filled one by one: frames may take half a gigabyte
+    for cutout, frame, mask in zip(cutouts, frames, masks, strict=True):
+        cutout[:] = _soften(frame, _enlarge(mask[None], height, width)[0], band)
+    _steady(cutouts, frames)
+    if not backdrop.is_plain:
+        return Matte(cutouts, "color models")
+    return Matte(cutouts, "backdrop" if backdrop.is_even else "uneven backdrop")
 
 
 def matte_after(frames: Float[Tensor, "t h w 3"], first: Float[Tensor, "h w"]) -> Float[Tensor, "t h w 4"]:
@@ -95,15 +98,16 @@ def matte_after(frames: Float[Tensor, "t h w 3"], first: Float[Tensor, "h w"]) -
 
 
 def _lab(frames: Float[Tensor, "t h w 3"], longest: int) -> Float[ndarray, "t h2 w2 3"]:
-    """Frames in CIE Lab, shrunk to a longest side, with the noise of single pixels taken off."""
+    """Convert frames to CIE Lab, shrunk to a longest side, with the noise of single pixels taken off."""
     scale = longest / max(frames.shape[1:3])
-    small = frames.permute(0, 3, 1, 2)
-    if scale < 1:
-        size = [max(8, round(side * scale)) for side in frames.shape[1:3]]
-        small = functional.interpolate(small, size, mode="bilinear", antialias=True, align_corners=False)
-    pixels = small.permute(0, 2, 3, 1).cpu().numpy()
-    lab = np.stack([rgb2lab(frame) for frame in pixels])
-    return ndimage.gaussian_filter(lab, (0, 0.6, 0.6, 0)).astype(np.float32)
+    size = [max(8, round(side * scale)) for side in frames.shape[1:3]] if scale < 1 else list(frames.shape[1:3])
+    lab = np.empty((len(frames), *size, 3), np.float32)
+    for i, frame in enumerate(frames):
+        small = frame.permute(2, 0, 1)[None]
+        if scale < 1:
+            small = functional.interpolate(small, size, mode="bilinear", antialias=True, align_corners=False)
+        lab[i] = ndimage.gaussian_filter(rgb2lab(small[0].permute(1, 2, 0).cpu().numpy()), (0.6, 0.6, 0))
+    return lab
 
 
 def _compact(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
@@ -191,15 +195,14 @@ def _spread(image: Float[ndarray, "h w 3"], source: Bool[ndarray, "h w"], band: 
     return np.where((weight > 1e-3)[..., None], mean, image[nearest[0], nearest[1]])
 
 
-def _steady(cutouts: Float[Tensor, "t h w 4"], frames: Float[Tensor, "t h w 3"]) -> Float[Tensor, "t h w 4"]:
-    """The median of three frames' alpha wherever the picture itself stands still; what moves is left alone."""
-    if len(cutouts) < 3:
-        return cutouts
-    alpha = cutouts[..., 3]
-    still = (frames[1:] - frames[:-1]).abs().amax(-1) < STILL
-    before, after = torch.cat([still[:1], still]), torch.cat([still, still[-1:]])
-    earlier = torch.cat([alpha[:1], alpha[:-1]])
-    later = torch.cat([alpha[1:], alpha[-1:]])
-    middle = torch.stack([earlier, alpha, later]).median(0).values
-    steady = torch.where(before & after, middle, alpha)
-    return torch.cat([cutouts[..., :3], steady[..., None]], -1)
+def _steady(cutouts: Float[Tensor, "t h w 4"], frames: Float[Tensor, "t h w 3"]) -> None:
+    """Replace alpha by the median over three frames wherever the picture stands still; what moves is left alone."""
+    count = len(cutouts)
+    if count < 3:
+        return
+    alpha = cutouts[..., 3].clone()
+    still = [(frames[i + 1] - frames[i]).abs().amax(-1) < STILL for i in range(count - 1)]
+    for i in range(count):
+        before, after = still[max(0, i - 1)], still[min(i, count - 2)]
+        near = torch.stack([alpha[max(0, i - 1)], alpha[i], alpha[min(i + 1, count - 1)]])
+        cutouts[i, ..., 3] = torch.where(before & after, near.median(0).values, alpha[i])

@@ -12,6 +12,10 @@ OVERSAMPLING = 2  # times the size of the square: larger opaque frames are shrun
 SMALLEST_SUBJECT = 16  # pixels of its longest side; below there is nothing to reconstruct
 NOTES = {
     "backdrop": "The background was removed by its plain color; a PNG with transparency is cut more exactly.",
+    "uneven backdrop": (
+        "The background was removed by its color though it is uneven, which is a guess; "
+        "check subject.png, and give a PNG with transparency if the outline is wrong."
+    ),
     "color models": (
         "The background was removed by its colors, which is a guess on photographs; "
         "check subject.png, and give a PNG with transparency if the outline is wrong."

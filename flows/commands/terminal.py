@@ -67,7 +67,7 @@ def steps_shown(out: Console) -> Iterator[None]:
     """Show every step while the block runs: bars on a terminal, lines elsewhere."""
     if out.is_terminal:
         bars = StepBars(out)
-        with bars.progress, listening(bars):
+        with bars.progress, listening(bars), listening(Remarks(out)):
             yield
     else:
         with listening(StepLines(out)):
@@ -109,6 +109,19 @@ class StepBars:
                 pass
 
 
+class Remarks:
+    """Lines above bars and tables, which stay."""
+
+    def __init__(self, out: Console, with_item: bool = False) -> None:
+        self._out, self._with_item = out, with_item
+
+    def __call__(self, event: StepEvent) -> None:
+        """Print a remark."""
+        if event.kind == "remark":
+            name = f"{event.item}: {event.step}" if self._with_item else event.step
+            self._out.print(f"{name}: {event.text}", markup=False, soft_wrap=True)
+
+
 class StepLines:
     """A line when a step starts, every few seconds, and when it ends."""
 
@@ -130,7 +143,7 @@ class StepLines:
                     what = "started"
                 case "progress":
                     what = numbers(event)
-                case "note":
+                case "note" | "remark":
                     what = event.text
                 case "finished":
                     what = "cached" if event.cached else f"done in {event.seconds:.1f} s"
@@ -151,7 +164,7 @@ class BatchTable:
 
     def __call__(self, event: StepEvent) -> None:
         """Note what an item is doing."""
-        if event.item not in self.status:
+        if event.item not in self.status or event.kind == "remark":
             return
         self._since.setdefault(event.item, time.monotonic())
         self._took.pop(event.item, None)  # it may be tried again
@@ -191,7 +204,7 @@ def batch_shown(out: Console, items: list[str]) -> Iterator[BatchTable]:
     """Show a batch while the block runs: a live table on a terminal, lines elsewhere."""
     table = BatchTable(items)
     if out.is_terminal:
-        with Live(table, console=out, refresh_per_second=4), listening(table):
+        with Live(table, console=out, refresh_per_second=4), listening(table), listening(Remarks(out, with_item=True)):
             yield table
     else:
         with listening(StepLines(out, with_item=True)):

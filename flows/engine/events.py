@@ -14,13 +14,13 @@ class StepEvent:
         item: name of the asset.
         step: name of the step, with the part of the work it does where it was divided.
         kind: what happened; `finished` has `cached` and `seconds`, `progress` has `done`, `total` and `values`,
-            `note` has `text`.
+            `note` has `text`, and so has `remark`, which stays on the screen.
         cached: whether the result was there already.
     """
 
     item: str
     step: str
-    kind: Literal["started", "progress", "note", "finished", "failed"]
+    kind: Literal["started", "progress", "note", "remark", "finished", "failed"]
     done: int = 0
     total: int = 0
     values: dict[str, float] = field(default_factory=dict)

@@ -32,6 +32,7 @@ from flows.engine.caching import FileLocks, RequestPolicy
 from flows.engine.events import StepEvent, tell
 from flows.engine.executors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable, chosen, stop_all
 from flows.engine.leases import hold
+from flows.engine.remarks import remark
 from flows.ui import pages
 from flows.ui.curves import amount
 from flows.ui.escaping import markdown
@@ -251,6 +252,7 @@ class Steps:
         self.finished.append(Finished(label=label, cached=cached, wall_s=round(seconds, 3), result=result))
         for ref in result.outputs.values():
             self._makers[ref.digest] = state
+        remark(self.item, label, result)
         tell(StepEvent(self.item, label, "finished", seconds=seconds, cached=cached))
         return result.outputs
 

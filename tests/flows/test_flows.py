@@ -12,8 +12,9 @@ from waiting import start, wait_until
 
 from flows import cli, home
 from flows.catalog import convert_all
-from flows.commands.make import make, save_pictures
+from flows.commands.make import make, make_motions, save_pictures
 from flows.engine import tasks
+from flows.engine.events import StepEvent, listening
 from flows.engine.executors import StepBadInput, StepCrashed, StepDiverged, StepError, StepMissing, StepOutOfMemory
 from flows.engine.orphans import settle_orphans
 from flows.inputs.orders import Order, Wish
@@ -358,3 +359,21 @@ def test_parts_side_by_side_take_less_time_on_the_clock_than_to_compute(log: Pat
     ends = [part["wall_s"] for part in parts]
     assert ends[-1] > ends[0] + 1  # two at a time: the first ends long before the last
     assert max(ends) <= report["wall_s"] < sum(ends)
+
+
+@pytest.mark.parametrize("command", ["make", "motions"])
+def test_the_cut_out_can_be_looked_at_while_the_next_step_runs(command: str, log: Path, tmp_path: Path) -> None:
+    wanted = order(f"guess {command}", tmp_path, item="fox/red", **{"driving.candidates": 2})
+    happened: list[tuple[str, str, bool]] = []
+
+    def listen(event: StepEvent) -> None:
+        happened.append((event.step, event.kind, bool(list(home.cutouts().glob("fox-red-*.png")))))
+        if event.kind == "remark":
+            assert event.text.startswith("This asset is a fake. Source, matte and cut-out: ")
+            assert Path(event.text.rpartition(": ")[2]).read_bytes().startswith(b"\x89PNG")
+
+    with listening(listen):
+        (make if command == "make" else make_motions)(wanted, tmp_path / "out")
+    assert happened.index(("prepare_subject", "remark", True)) < happened.index(("drive_video", "started", True))
+    for saved in home.cutouts().glob("fox-red-*.png"):
+        saved.unlink()

@@ -124,3 +124,32 @@ def test_a_video_that_takes_too_long_is_given_up(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(clips, "MOST_DECODING_S", 0.0)
     with pytest.raises(BadInput, match="takes more than 0 s"):
         read(tmp_path, film(64, 4, "mp4"))
+
+
+def test_a_video_without_durations_gets_a_rate(tmp_path: Path) -> None:
+    content = patched(film(64, 4, "mp4"), b"stts", 12, struct.pack(">I", 0))
+    for box, at in ((b"mvhd", 20), (b"mdhd", 20), (b"tkhd", 24)):
+        content = patched(content, box, at, bytes(4))
+    source = read(tmp_path, content)
+    assert len(source.frames) >= 3  # FFmpeg takes one of the frames at the same moment for a repetition
+    assert 1 <= source.fps <= 240
+
+
+@pytest.mark.parametrize(("degrees", "matrix"), [(90, (0, 1, -1, 0)), (180, (-1, 0, 0, -1)), (270, (0, -1, 1, 0))])
+def test_the_rotation_of_a_phone_is_undone(degrees: int, matrix: tuple[int, ...], tmp_path: Path) -> None:
+    """The matrix of an mp4 turns clockwise; the stored upper left corner is dark."""
+    file = io.BytesIO()
+    with av.open(file, "w", format="mp4") as output:
+        stream = output.add_stream("libx264", rate=24)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        for _ in range(2):
+            stored = np.full((64, 96, 3), 255, np.uint8)
+            stored[:32, :48] = 0
+            output.mux(stream.encode(av.VideoFrame.from_ndarray(stored, format="rgb24")))
+        output.mux(stream.encode())
+    a, b, c, d = (value << 16 for value in matrix)
+    content = patched(file.getvalue(), b"tkhd", 44, struct.pack(">iiiiiiiii", a, b, 0, c, d, 0, 0, 0, 1 << 30))
+    frames = read(tmp_path, content).frames
+    upright = np.rot90(stored, -degrees // 90)
+    assert frames.shape[1:3] == upright.shape[:2]
+    assert np.abs(frames[0, ..., :3].numpy() - upright / 255).mean() < 0.05

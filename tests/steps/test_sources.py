@@ -320,6 +320,46 @@ def test_a_heic_picture_is_refused_by_name(tmp_path):
         read(tmp_path / "a.heic")
 
 
+def test_an_avif_keeps_color_and_alpha(tmp_path):
+    image = pytest.importorskip("PIL.Image", reason="Pillow writes AVIF")
+    image.fromarray(disc()).save(tmp_path / "a.avif", quality=100, subsampling="4:4:4")
+    assert_shows_disc(read(tmp_path / "a.avif"), 0.03)
+    image.fromarray(opaque(disc())).save(tmp_path / "a.avif", quality=100, subsampling="4:4:4")
+    assert_shows_disc(read(tmp_path / "a.avif"), 0.03, has_alpha=False)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_the_orientation_of_an_avif_is_undone_as_that_of_a_jpeg(tmp_path, orientation):
+    image = pytest.importorskip("PIL.Image", reason="Pillow writes AVIF")
+    stored = np.zeros((40, 64, 3), np.uint8)
+    stored[:20, :32], stored[:20, 32:], stored[20:, :32] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
+    exif = image.Exif()
+    exif[274] = orientation
+    image.fromarray(stored).save(tmp_path / "a.avif", quality=100, subsampling="4:4:4", exif=exif)
+    jpeg = read(save(tmp_path / "a.jpg", stored, Orientation=orientation))
+    avif = read(tmp_path / "a.avif")
+    assert avif.frames.shape == jpeg.frames.shape
+    assert (avif.frames - jpeg.frames).abs().mean() < 0.02  # JPEG blurs colors at edges; another turn gives 0.3
+
+
+def test_avif_frames_of_a_folder_are_read(tmp_path):
+    image = pytest.importorskip("PIL.Image", reason="Pillow writes AVIF")
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        for i, frame in enumerate(walk(3)):
+            image.fromarray(frame).save(tmp_path / "frame.avif")
+            archive.write(tmp_path / "frame.avif", f"{i}.avif")
+    source = read(tmp_path / "a.zip")
+    assert source.has_alpha and len(source.frames) == 3
+
+
+def test_an_avif_animation_is_refused_by_name(tmp_path):
+    image = pytest.importorskip("PIL.Image", reason="Pillow writes AVIF")
+    frames = [image.fromarray(frame) for frame in walk(3)]
+    frames[0].save(tmp_path / "a.avif", save_all=True, append_images=frames[1:])
+    with pytest.raises(BadInput, match="animated AVIF pictures cannot be read"):
+        read(tmp_path / "a.avif")
+
+
 def test_a_video_of_one_frame_is_refused(tmp_path):
     with pytest.raises(BadInput, match="only one frame"):
         read(save_clip(tmp_path / "a.mp4", walk(1), "libx264", "yuv420p"))

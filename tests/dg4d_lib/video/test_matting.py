@@ -218,3 +218,14 @@ def test_a_moving_subject_leaves_no_trail_when_the_first_frame_is_known():
     found = matte_after(frames, alphas[0])[..., 3]
     for alpha, known in zip(found, alphas, strict=True):
         assert iou(alpha, known) > 0.97
+
+
+def test_a_rocket_before_an_evening_sky_is_a_guess():
+    assert matte(torch.from_numpy(data.rocket().copy()).float()[None] / 255).method == "uneven backdrop"
+
+
+@pytest.mark.parametrize("backdrop", [white, gradient, noisy_grey])
+@pytest.mark.parametrize("cut", [0, 60])
+def test_plain_backdrops_are_no_guess(backdrop, cut):
+    truth = torch.cat([torch.zeros(cut, SIZE), ragged()[: SIZE - cut]])
+    assert matte(over(truth, texture(), backdrop())[None]).method == "backdrop"

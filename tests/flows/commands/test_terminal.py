@@ -4,7 +4,16 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from flows.commands.terminal import BatchTable, StepBars, console, numbers, steps_shown, tell_rows, tell_where
+from flows.commands.terminal import (
+    BatchTable,
+    StepBars,
+    batch_shown,
+    console,
+    numbers,
+    steps_shown,
+    tell_rows,
+    tell_where,
+)
 from flows.engine.events import StepEvent, tell
 
 EVENT = StepEvent("newt", "fit_gaussians", "progress", done=114, total=250, values={"loss": 9.437, "reference": 12.57})
@@ -87,3 +96,30 @@ def test_names_and_messages_are_shown_letter_by_letter(capsys: pytest.CaptureFix
     tell_where(terminal, Path(NASTY), {"[a] name that is as long as that of its folder": 1})
     assert screen.getvalue().count(SHOWN) >= 4 and "[a] name" in screen.getvalue()
     assert "\x07" not in screen.getvalue() and "\x1b[31m" not in screen.getvalue()
+
+
+def narrow(screen: io.StringIO, interactive: bool) -> Console:
+    return Console(
+        file=screen, width=40, force_terminal=interactive, color_system=None, soft_wrap=not interactive, highlight=False
+    )
+
+
+REMARK = StepEvent("newt", "prepare_subject", "remark", text="This is a guess. Source, matte and cut-out: /a/b.png")
+
+
+@pytest.mark.parametrize("interactive", [True, False])
+def test_a_remark_stays_on_the_screen_in_one_piece(interactive: bool):
+    screen = io.StringIO()
+    with steps_shown(narrow(screen, interactive)):
+        tell(REMARK)
+        tell(StepEvent("newt", "prepare_subject", "finished", seconds=1.0))
+    assert "prepare_subject: This is a guess. Source, matte and cut-out: /a/b.png\n" in screen.getvalue()
+
+
+@pytest.mark.parametrize("interactive", [True, False])
+def test_a_batch_shows_remarks_with_their_item(interactive: bool):
+    screen = io.StringIO()
+    with batch_shown(narrow(screen, interactive), ["newt"]) as table:
+        tell(REMARK)
+    assert f"newt: prepare_subject: {REMARK.text}\n" in screen.getvalue()
+    assert table.status["newt"] == "waiting"

@@ -1,0 +1,119 @@
+"""Peak memory of decoding and cutting out: below 2 GiB with all libraries, whatever the file says."""
+
+import struct
+import sys
+import zipfile
+import zlib
+from pathlib import Path
+
+import av
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from peak_memory import peaks_of
+
+MOST_MIB = 2048
+SIDE = 10_900  # pixels; its square is just below stills.MOST_PIXELS
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="VmHWM is Linux's")
+
+
+def gray_png(path: Path, side: int, interlaced: bool = False, depth: int = 8, color: int = 0) -> Path:
+    """Zeros, packed row by row without holding the picture."""
+    channels = {0: 1, 2: 3, 6: 4}[color]
+    packer, packed = zlib.compressobj(1), b""
+    passes = (
+        [(0, 0, 8, 8), (0, 4, 8, 8), (4, 0, 8, 4), (0, 2, 4, 4), (2, 0, 4, 2), (0, 1, 2, 2), (1, 0, 2, 1)]
+        if interlaced
+        else [(0, 0, 1, 1)]
+    )
+    for top, left, down, across in passes:
+        row = bytes(1 + -(-(side - left) // across) * channels * depth // 8)
+        for _ in range(-(-(side - top) // down)):
+            packed += packer.compress(row)
+    packed += packer.flush()
+    header = struct.pack(">IIBBBBB", side, side, depth, color, 0, 0, interlaced)
+    chunks = [(b"IHDR", header), (b"IDAT", packed), (b"IEND", b"")]
+    body = (struct.pack(">I", len(b)) + n + b + struct.pack(">I", zlib.crc32(n + b)) for n, b in chunks)
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(body))
+    return path
+
+
+def still(path: Path, side: int, channels: int, format_: str, tile: int = 0, **attributes: object) -> Path:
+    """A disc on white, written in bands."""
+    spec = oiio.ImageSpec(side, side, channels, format_)
+    spec.tile_width = spec.tile_height = tile
+    for name, value in attributes.items():
+        spec.attribute(name, value)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec), output.geterror()
+    rows = tile or 256
+    for top in range(0, side, rows):
+        band = np.full((min(rows, side - top), side, channels), 255, np.uint8)
+        band[:, side // 3 : side // 2] = 40
+        if tile:
+            written = output.write_tiles(0, side, top, top + len(band), 0, 1, band)
+        else:
+            written = output.write_scanlines(top, top + len(band), 0, band)
+        assert written, output.geterror()
+    output.close()
+    return path
+
+
+def film(path: Path, side: int, frames: int, codec: str, pixels: str) -> Path:
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, 10)
+        stream.width = stream.height = side
+        stream.pix_fmt = pixels
+        for i in range(frames):
+            picture = np.full((side, side, 4), 255, np.uint8)
+            picture[side // 3 : side // 2, side // 3 + i : side // 2 + i, :3] = 40
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgba")))
+        container.mux(stream.encode(None))
+    return path
+
+
+def frames_in_a_zip(path: Path, frame: Path, count: int) -> Path:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for i in range(count):
+            archive.write(frame, f"{i}.png")
+    return path
+
+
+def test_large_files_of_every_kind_stay_below_two_gibibytes(tmp_path: Path) -> None:
+    gray = gray_png(tmp_path / "gray.png", SIDE)
+    files = {
+        "gray PNG": gray,
+        "interlaced PNG of 16 bits": gray_png(tmp_path / "interlaced.png", SIDE, interlaced=True, depth=16, color=6),
+        "JPEG": still(tmp_path / "a.jpg", SIDE, 3, "uint8"),
+        "progressive JPEG": still(tmp_path / "p.jpg", 6000, 3, "uint8", **{"jpeg:progressive": 1}),
+        "tiled EXR": still(tmp_path / "t.exr", 4096, 4, "half", tile=64),
+        "EXR of 200 channels": still(tmp_path / "c.exr", 1024, 200, "half"),
+        "TIFF of one strip": still(tmp_path / "s.tif", 6000, 4, "uint16", **{"tiff:RowsPerStrip": 6000}),
+        "JPEG 2000": still(tmp_path / "a.jp2", 4000, 3, "uint8"),
+        "JPEG XL": still(tmp_path / "a.jxl", 4000, 3, "uint8", **{"jpegxl:effort": 1}),
+        "WebP": still(tmp_path / "a.webp", 4000, 4, "uint8"),
+        "GIF": film(tmp_path / "a.gif", 3000, 2, "gif", "rgb8"),
+        "APNG": film(tmp_path / "a.apng", 3000, 2, "apng", "rgba"),
+        "animated WebP": film(tmp_path / "w.webp", 2000, 2, "libwebp_anim", "bgra"),
+        "video of the largest frames that are kept": film(tmp_path / "a.mp4", 1024, 32, "libx264", "yuv420p"),
+        "video of large frames": film(tmp_path / "b.mp4", 4096, 4, "libx264", "yuv420p"),
+        "zip": frames_in_a_zip(tmp_path / "a.zip", gray_png(tmp_path / "frame.png", 5000), 4),
+    }
+    peaks = dict(zip(files, peaks_of(list(files.values())), strict=True))
+    assert {kind: peak.mib for kind, peak in peaks.items() if peak.mib > MOST_MIB} == {}
+    ended = {peak.outcome.partition(":")[0] for peak in peaks.values()}
+    assert ended <= {"done", "BadInput"}, peaks
+    assert {"JPEG", "tiled EXR", "JPEG 2000", "JPEG XL", "GIF", "video of large frames"} <= {
+        kind for kind, peak in peaks.items() if "max_decode_gb" not in peak.outcome
+    }
+
+
+def test_a_smaller_limit_refuses_what_the_default_decodes(tmp_path: Path) -> None:
+    picture = gray_png(tmp_path / "a.png", 6000, interlaced=True, depth=16, color=6)
+    (refused,) = peaks_of([picture], max_decode_gb=0.125)
+    (decoded,) = peaks_of([picture])
+    assert "6000 x 6000 pixels and takes about 0." in refused.outcome
+    assert "--set subject.max_decode_gb=" in refused.outcome
+    assert "fully transparent" in decoded.outcome
+    assert refused.mib + 200 < decoded.mib
