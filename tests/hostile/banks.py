@@ -59,8 +59,19 @@ def also(extra: Place) -> Place:
     return write
 
 
+def instead(sheet_: Place) -> Place:
+    """Return a writer of a bank in which something lies in the place of its picture."""
+
+    def write(path: Path) -> None:
+        bank(files={})(path)
+        sheet_(path / "view.png")
+
+    return write
+
+
 def _sparse(path: Path) -> None:
-    with (path / "huge.png").open("wb") as file:
+    with path.open("wb") as file:
+        file.write(sheet())
         file.truncate(9 * 2**30)
 
 
@@ -84,10 +95,10 @@ DOOR: dict[str, Place] = {
     "bank: empty": lambda path: path.mkdir(),
     "bank: bank.json is a folder": lambda path: (path / "bank.json").mkdir(parents=True),
     "bank: bank.json is a link out": lambda path: (path.mkdir(), (path / "bank.json").symlink_to("/etc/hostname")),
-    "bank: a link to a file outside": also(lambda path: (path / "key.png").symlink_to("/etc/hostname")),
-    "bank: a link to a folder outside": also(lambda path: (path / "etc").symlink_to("/etc")),
-    "bank: 9 GiB": also(_sparse),
     "bank: is a pipe": lambda path: os.mkfifo(path),
+    "bank: a sheet is a link out": instead(lambda path: path.symlink_to("/etc/hostname")),
+    "bank: a sheet is a pipe": instead(lambda path: os.mkfifo(path)),
+    "bank: a sheet of 9 GiB": instead(_sparse),
 }
 
 # refused when it is read
@@ -127,4 +138,7 @@ FOLDERS: dict[str, Place] = {
     "bank: sound": bank(),
     "bank: sound, with a pipe": also(lambda path: os.mkfifo(path / "pipe")),
     "bank: sound, hidden files": also(lambda path: _written(path / ".DS_Store", b"x")),
+    "bank: sound, a link to a file outside": also(lambda path: (path / "key.png").symlink_to("/etc/hostname")),
+    "bank: sound, a link to a folder outside": also(lambda path: (path / "etc").symlink_to("/etc")),
+    "bank: sound, 9 GiB that it does not name": also(lambda path: _sparse(path / "huge.png")),
 }

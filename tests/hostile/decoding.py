@@ -9,6 +9,7 @@ import os
 import resource
 import selectors
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -148,10 +149,83 @@ def read_as_bank(path: Path, scratch: Path) -> tuple[Kind, int]:
     return "done", len(read_bank(bank, scratch / "bank").cameras)
 
 
+def _read_as_manifest(suffix: str) -> Callable[[Path, Path], tuple[Kind, int]]:
+    def read(path: Path, scratch: Path) -> tuple[Kind, int]:
+        """Read the items of a manifest and check each of them."""
+        from dg4d_lib.errors import DG4DError
+        from flows.inputs.manifest import items_of
+
+        manifest = scratch / f"manifest{suffix}"
+        shutil.copyfile(path, manifest)
+        items = items_of(manifest, scratch / "out", "preview", {}, 0)
+        for item in items:
+            item.model_dump_json()
+            if item.wish is not None:
+                with contextlib.suppress(DG4DError):
+                    item.wish.check()
+        return "done", len(items)
+
+    return read
+
+
+def read_as_settings(path: Path, scratch: Path) -> tuple[Kind, int]:
+    """Read every line as an argument of `--set`, as a shell hands it over."""
+    from flows.inputs.manifest import parse_changes
+    from steps.profiles import profile, revise
+
+    pairs = [os.fsdecode(line) for line in path.read_bytes().split(b"\n")]
+    changes = parse_changes(pairs)
+    revise(profile("preview"), changes)
+    return "done", len(changes)
+
+
+def read_as_scene(path: Path, scratch: Path) -> tuple[Kind, int]:
+    """Read a scene file."""
+    from flows.commands.compose import read_scene
+
+    return "done", len(read_scene(path).items)
+
+
+def read_as_record(path: Path, scratch: Path) -> tuple[Kind, int]:
+    """Check a package whose record somebody else wrote, and ask for the order that it names."""
+    from flows.inputs.orders import order_again
+    from flows.packages.publish import RECORD, is_current, record_of
+    from flows.packages.verify import verify
+    from steps.store import ArtifactStore
+
+    shutil.copyfile(path, scratch / RECORD)
+    record = record_of(scratch)
+    is_current(scratch, "sha256:0")
+    checks = verify(scratch).checks
+    if record is not None:
+        order_again(record, ArtifactStore(scratch / "store"))
+    return "done", len(checks)
+
+
+def read_nothing(path: Path, scratch: Path) -> tuple[Kind, int]:
+    """Answer, once everything is imported."""
+    return "done", 0
+
+
+def crash(path: Path, scratch: Path) -> tuple[Kind, int]:
+    """End the process as a fault of a native library would."""
+    os.kill(os.getpid(), signal.SIGSEGV)
+    return "done", 0
+
+
 READERS: dict[str, Callable[[Path, Path], tuple[Kind, int]]] = {
     "source": read_as_source,
     "zip": read_as_zip,
     "bank": read_as_bank,
+    "csv": _read_as_manifest(".csv"),
+    "json": _read_as_manifest(".json"),
+    "jsonl": _read_as_manifest(".jsonl"),
+    "parquet": _read_as_manifest(".parquet"),
+    "settings": read_as_settings,
+    "scene": read_as_scene,
+    "record": read_as_record,
+    "nothing": read_nothing,
+    "crash": crash,
 }
 
 

@@ -141,6 +141,6 @@ PLACES: dict[str, Place] = {
     "place: a link to itself": _loop,
     "place: two links to each other": _two_loops,
     "place: a link to a folder": lambda path: path.symlink_to("."),
-    "place: below a file": lambda path: path.write_bytes(b""),
+    "place: an empty file": lambda path: path.write_bytes(b""),
     "place: 9 GiB": _huge,
 }
