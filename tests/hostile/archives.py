@@ -23,7 +23,9 @@ def frame(number: int, size: int = 64) -> bytes:
     return saved(Image.fromarray(disc(8 + 2 * number, size)), "PNG")
 
 
-def packed(entries: Mapping[str, bytes] | list[tuple[str, bytes]], kind: int = zipfile.ZIP_STORED, comment: bytes = b"") -> bytes:
+def packed(
+    entries: Mapping[str, bytes] | list[tuple[str, bytes]], kind: int = zipfile.ZIP_STORED, comment: bytes = b""
+) -> bytes:
     """Return a zip of these entries; a list may name one twice."""
     file = io.BytesIO()
     pairs = entries.items() if isinstance(entries, Mapping) else entries
@@ -96,6 +98,7 @@ ZIPS: dict[str, Make] = {
     "zip: cut at a half": lambda: cut(frames_zip(), 0.5),
     "zip: no directory": lambda: frames_zip()[: frames_zip().index(b"PK\1\2")],
     "zip: directory outside the file": lambda: frames_zip()[:-6] + b"\xff\xff\xff\x7f\0\0",
+    "zip: an entry outside the file": lambda: _misplaced(),
     "zip: 65,535 entries that are not there": lambda: frames_zip()[:-14] + b"\xff\xff\xff\xff" + frames_zip()[-10:],
     "zip: one frame": lambda: packed(numbered(1)),
     "zip: no picture": lambda: packed({"notes.txt": b"hello"}),
@@ -144,6 +147,14 @@ ZIPS: dict[str, Make] = {
     "zip: program in front": lambda: b"\x7fELF" + bytes(60) + frames_zip(),
     "zip: hidden files of a Mac": lambda: packed({**numbered(3), "__MACOSX/._0.png": b"x", ".DS_Store": b"x", "._1.png": b"x"}),
 }  # fmt: skip
+
+
+def _misplaced() -> bytes:
+    """Return a zip whose directory lies about its own place, so that entries begin before the file does."""
+    content = frames_zip()
+    at = len(content) - 6
+    (place,) = struct.unpack_from("<I", content, at)
+    return content[:at] + struct.pack("<I", place + 100_000 if place < 100 else place + 50) + content[at + 4 :]
 
 
 UNPACKED: dict[str, Make] = {

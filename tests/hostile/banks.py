@@ -40,7 +40,9 @@ def bank(document: Any = None, files: dict[str, bytes] | None = None) -> Place:
 
     def write(path: Path) -> None:
         path.mkdir()
-        content = document if isinstance(document, bytes) else json.dumps(about() if document is None else document).encode()
+        content = (
+            document if isinstance(document, bytes) else json.dumps(about() if document is None else document).encode()
+        )
         (path / "bank.json").write_bytes(content)
         for name, body in ({"view.png": sheet()} if files is None else files).items():
             (path / name).parent.mkdir(parents=True, exist_ok=True)

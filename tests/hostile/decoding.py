@@ -119,7 +119,11 @@ def read_as_source(path: Path, scratch: Path) -> tuple[Kind, int]:
     from steps.job import Job
     from steps.prepare_subject import run
 
-    outputs = {"subject": scratch / "subject.png", "footage": scratch / "footage.zip", "picture": scratch / "picture.png"}
+    outputs = {
+        "subject": scratch / "subject.png",
+        "footage": scratch / "footage.zip",
+        "picture": scratch / "picture.png",
+    }
     run(Job({"source": path}, outputs, SubjectSettings(size=SIZE), 0, lambda *_: None, scratch))
     if outputs["footage"].exists():
         with zipfile.ZipFile(outputs["footage"]) as footage:

@@ -75,7 +75,9 @@ def chunk(name: bytes, content: bytes, length: int | None = None, checksum: int 
     )
 
 
-def ihdr(width: int = SIZE, height: int = SIZE, depth: int = 8, color: int = 0, rest: tuple[int, ...] = (0, 0, 0)) -> bytes:
+def ihdr(
+    width: int = SIZE, height: int = SIZE, depth: int = 8, color: int = 0, rest: tuple[int, ...] = (0, 0, 0)
+) -> bytes:
     """Return the header chunk of a PNG."""
     return chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color, *rest))
 
@@ -147,7 +149,9 @@ def tiff(
     return head + struct.pack(f"{order}IH", 8, number) + entries + struct.pack(f"{order}I", next_ifd) + tail
 
 
-def gray_tags(width: int = SIZE, height: int = SIZE, **changes: int | tuple[int, int, int]) -> dict[int, int | tuple[int, int, int]]:
+def gray_tags(
+    width: int = SIZE, height: int = SIZE, **changes: int | tuple[int, int, int]
+) -> dict[int, int | tuple[int, int, int]]:
     """Return the tags of a gray TIFF of one strip; a change is `tN=value`, None takes a tag away."""
     tags: dict[int, int | tuple[int, int, int]] = {
         256: width, 257: height, 258: 8, 259: 1, 262: 1, 273: 300, 277: 1, 278: height, 279: width * height,
@@ -223,7 +227,9 @@ def webp_parts(content: bytes) -> list[tuple[bytes, bytes]]:
     return parts
 
 
-def webp_frame(width: int = SIZE, height: int = SIZE, left: int = 0, top: int = 0, ms: int = 100) -> tuple[bytes, bytes]:
+def webp_frame(
+    width: int = SIZE, height: int = SIZE, left: int = 0, top: int = 0, ms: int = 100
+) -> tuple[bytes, bytes]:
     """Return an ANMF chunk with the disc; what it says of its place may lie."""
     still = b"".join(
         name + struct.pack("<I", len(body)) + body + b"\0" * (len(body) % 2)
@@ -286,7 +292,9 @@ def heif(brand: bytes, kind: bytes, config: bytes, payload: bytes, width: int = 
 # BMP, PSD, PNM
 
 
-def bmp(width: int, height: int, depth: int = 24, compression: int = 0, data: bytes | None = None, palette: int = 0) -> bytes:
+def bmp(
+    width: int, height: int, depth: int = 24, compression: int = 0, data: bytes | None = None, palette: int = 0
+) -> bytes:
     """Return a BMP with the usual header of 40 bytes."""
     row = (abs(width) * depth + 31) // 32 * 4
     pixels = bytes(min(row * abs(height), 65_536)) if data is None else data

@@ -120,10 +120,18 @@ def _seeds(*some: dict[str, Callable[[], bytes]]) -> list[bytes]:
 
 def _json_values() -> SearchStrategy[Any]:
     """Return what JSON can say, and what Python's reader takes beyond that."""
-    words = st.one_of(st.text(max_size=20), st.sampled_from(["../x", "/etc/passwd", "a\0b", "\udce9", "=1+1", "9" * 5000, "[" * 3000]))
-    numbers = st.one_of(st.integers(), st.floats(), st.sampled_from([10**400, -1, 0, 2**63, 1e308, float("nan"), float("inf")]))
+    words = st.one_of(
+        st.text(max_size=20), st.sampled_from(["../x", "/etc/passwd", "a\0b", "\udce9", "=1+1", "9" * 5000, "[" * 3000])
+    )
+    numbers = st.one_of(
+        st.integers(), st.floats(), st.sampled_from([10**400, -1, 0, 2**63, 1e308, float("nan"), float("inf")])
+    )
     leaves = st.one_of(st.none(), st.booleans(), numbers, words)
-    return st.recursive(leaves, lambda inner: st.one_of(st.lists(inner, max_size=4), st.dictionaries(words, inner, max_size=4)), max_leaves=8)
+    return st.recursive(
+        leaves,
+        lambda inner: st.one_of(st.lists(inner, max_size=4), st.dictionaries(words, inner, max_size=4)),
+        max_leaves=8,
+    )
 
 
 def _dumped(value: Any) -> bytes:
@@ -133,7 +141,9 @@ def _dumped(value: Any) -> bytes:
 def _rows() -> SearchStrategy[list[dict[str, Any]]]:
     columns = st.sampled_from(["path", "text", "video", "name", "profile", "seed", "bank", "priority", "set", "mesh.grid", "prior.kind", "motion.iterations", "text.weights"])  # fmt: skip
     cells = st.one_of(_json_values(), st.sampled_from(["cat.png", "mesh.grid=64", "preview", "7", {"mesh.grid": 64}]))
-    return st.lists(st.dictionaries(columns, cells, max_size=5).map(lambda row: {"path": "cat.png"} | row), min_size=1, max_size=4)
+    return st.lists(
+        st.dictionaries(columns, cells, max_size=5).map(lambda row: {"path": "cat.png"} | row), min_size=1, max_size=4
+    )
 
 
 def _manifest_texts() -> SearchStrategy[bytes]:
@@ -147,7 +157,9 @@ def _manifest_texts() -> SearchStrategy[bytes]:
 
 
 def _pairs() -> SearchStrategy[bytes]:
-    knobs = st.sampled_from(["mesh.grid", "mesh", "prior.kind", "motion.iterations", "static.ladder", "pack.fps", "...", "driving.kind"])
+    knobs = st.sampled_from(
+        ["mesh.grid", "mesh", "prior.kind", "motion.iterations", "static.ladder", "pack.fps", "...", "driving.kind"]
+    )
     names = st.one_of(knobs, st.text(max_size=12), st.lists(st.text(max_size=4), max_size=5).map(".".join))
     deep = st.tuples(st.sampled_from(["[", '{"a":', '["']), st.integers(1, 20_000)).map(lambda pair: pair[0] * pair[1])
     values = st.one_of(_json_values().map(json.dumps), st.text(max_size=30), deep)
@@ -159,19 +171,31 @@ def _scenes() -> SearchStrategy[bytes]:
     keys = st.sampled_from(["package", "name", "position", "rotation_deg", "scale", "start_s", "speed", "loop"])
     item = st.dictionaries(keys, st.one_of(_json_values(), st.lists(st.floats(), min_size=3, max_size=3)), max_size=5)
     scene = st.lists(item.map(lambda one: {"package": "gem"} | one), max_size=3).flatmap(
-        lambda items: st.fixed_dictionaries({"items": st.just(items)}, optional={"fps": _json_values(), "duration_s": _json_values()})
+        lambda items: st.fixed_dictionaries(
+            {"items": st.just(items)}, optional={"fps": _json_values(), "duration_s": _json_values()}
+        )
     )
-    return st.one_of(scene.map(_dumped), mutated([make() for make in _small(documents.SCENES)]), _json_values().map(_dumped))
+    return st.one_of(
+        scene.map(_dumped), mutated([make() for make in _small(documents.SCENES)]), _json_values().map(_dumped)
+    )
 
 
 def _records() -> SearchStrategy[bytes]:
     sound = json.loads(documents.record()())
     keys = st.sampled_from(sorted(sound))
-    changed = st.dictionaries(keys, _json_values(), min_size=1, max_size=3).map(lambda changes: _dumped(sound | changes))
-    facts = st.dictionaries(st.text(max_size=10), st.fixed_dictionaries({"digest": _json_values(), "size_bytes": _json_values()}), max_size=3)
+    changed = st.dictionaries(keys, _json_values(), min_size=1, max_size=3).map(
+        lambda changes: _dumped(sound | changes)
+    )
+    facts = st.dictionaries(
+        st.text(max_size=10),
+        st.fixed_dictionaries({"digest": _json_values(), "size_bytes": _json_values()}),
+        max_size=3,
+    )
     step = st.fixed_dictionaries({"step": _json_values(), "digest": _json_values(), "outputs": _json_values()})
     deep = st.fixed_dictionaries({"files": facts, "steps": st.lists(step, max_size=2), "recipe": _json_values()})
-    return st.one_of(changed, deep.map(lambda part: _dumped(sound | part)), mutated([make() for make in _small(documents.RECORDS)]))
+    return st.one_of(
+        changed, deep.map(lambda part: _dumped(sound | part)), mutated([make() for make in _small(documents.RECORDS)])
+    )
 
 
 def _small(some: dict[str, Callable[[], bytes]]) -> list[Callable[[], bytes]]:
@@ -197,7 +221,9 @@ def _banks() -> SearchStrategy[bytes]:
         files = {path.name: path.read_bytes() for path in (Path(folder) / "bank").iterdir()}
     from tests.hostile.archives import packed
 
-    about = st.dictionaries(st.sampled_from(["frames", "tile", "tile_size", "views"]), _json_values(), min_size=1, max_size=2)
+    about = st.dictionaries(
+        st.sampled_from(["frames", "tile", "tile_size", "views"]), _json_values(), min_size=1, max_size=2
+    )
     changed = about.map(lambda some: packed(files | {"bank.json": _dumped(banks.about() | some)}))
     seen = st.dictionaries(st.sampled_from(["file", "azimuth", "elevation", "radius"]), _json_values(), min_size=1)
     viewed = seen.map(lambda some: packed(files | {"bank.json": _dumped(banks.about(views=[banks.view(**some)]))}))
@@ -298,7 +324,10 @@ def _saved(name: str, reader: str, content: bytes) -> str:
 
 def replay(path: Path) -> Outcome:
     """Read a saved input again."""
-    with tempfile.TemporaryDirectory(prefix="dg4d-fuzz-") as scratch, Decoder(Path(scratch) / "child", HANGS_S) as child:
+    with (
+        tempfile.TemporaryDirectory(prefix="dg4d-fuzz-") as scratch,
+        Decoder(Path(scratch) / "child", HANGS_S) as child,
+    ):
         return child.ask(path, path.name.split(".")[1])
 
 

@@ -112,7 +112,9 @@ def _written(
         return path.read_bytes()
 
 
-def exr(kind: str = "half", value: float | None = None, everywhere: bool = False, channels: int = 4, **attributes: object) -> bytes:
+def exr(
+    kind: str = "half", value: float | None = None, everywhere: bool = False, channels: int = 4, **attributes: object
+) -> bytes:
     """Encode the disc as OpenEXR, a quarter of it or all with another value, perhaps with channels that nobody asked for."""
     image = disc().astype(np.float32) / 255
     image[..., :3] *= image[..., 3:]
@@ -157,7 +159,9 @@ def _palette_png(entries: int, last: int) -> bytes:
     rows = np.full((SIZE, SIZE + 1), last, np.uint8)
     rows[:, 0] = 0
     rows[16:48, 17:49] = 0
-    colors = [ihdr(color=3), chunk(b"PLTE", bytes([40, 40, 40] + [255] * 3 * (entries - 1)))] if entries else [ihdr(color=3)]
+    colors = (
+        [ihdr(color=3), chunk(b"PLTE", bytes([40, 40, 40] + [255] * 3 * (entries - 1)))] if entries else [ihdr(color=3)]
+    )
     return png(*colors, chunk(b"IDAT", zlib.compress(rows.tobytes())))
 
 

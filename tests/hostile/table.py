@@ -36,7 +36,9 @@ PICTURE = Accepted("picture", 1)
 BROKEN = Refused("cut off or broken|cannot be read|is broken|broken or encrypted")
 SMALL = Refused("at least 32")
 LONG = Refused("crop it")
-LARGE = Refused("million are read|claims|may not exceed|exceeds|Maximum supported|invalid image width|invalid channel count|max_decode_gb")
+LARGE = Refused(
+    "million are read|claims|may not exceed|exceeds|Maximum supported|invalid image width|invalid channel count|max_decode_gb"
+)
 NO_SUBJECT = Refused("no subject|fully transparent|subject is|same everywhere|max_decode_gb")
 ONE_FRAME = Refused("only one frame")
 NO_FRAME = Refused("no frame")
@@ -365,6 +367,10 @@ FILES: dict[str, Accepted | Refused] = {
     "mpeg: pack header alone": BROKEN,
     "ts: packets of nothing": BROKEN,
     "ts: changes its size": CHANGES,
+    "mp4: title in Latin-1": video(4),
+    "mkv: title in Latin-1": video(4),
+    "avi: title in Latin-1": video(4),
+    "flv: key in Latin-1": video(4),
     "mp4: two frames": video(2),
     "mp4: no durations": video(3),
     "mp4: no movie duration": video(4),
@@ -397,6 +403,7 @@ FILES: dict[str, Accepted | Refused] = {
     "zip: cut at a half": BROKEN,
     "zip: no directory": BROKEN,
     "zip: directory outside the file": BROKEN,
+    "zip: an entry outside the file": BROKEN,
     "zip: 65,535 entries that are not there": video(2),
     "zip: one frame": ONE_FRAME,
     "zip: no picture": NO_FRAME,

@@ -55,7 +55,18 @@ def film(
     """Encode the walk with PyAV; from the second frame on, times are stretched."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "film"
-        _encode(path, container, codec, walk(count, max(width, height)), pixels, (width, height), fps, stretch, options, muxer)
+        _encode(
+            path,
+            container,
+            codec,
+            walk(count, max(width, height)),
+            pixels,
+            (width, height),
+            fps,
+            stretch,
+            options,
+            muxer,
+        )
         return path.read_bytes()
 
 
@@ -91,11 +102,26 @@ def sound(container: str, codec: str) -> bytes:
         stream = output.add_stream(codec, 48_000)
         layout = "mono"
         planar = stream.codec_context.format.name if stream.codec_context.format else "s16"
-        silence = av.AudioFrame.from_ndarray(np.zeros((1, 4096), np.float32 if "flt" in planar else np.int16), planar, layout)
+        silence = av.AudioFrame.from_ndarray(
+            np.zeros((1, 4096), np.float32 if "flt" in planar else np.int16), planar, layout
+        )
         silence.sample_rate = 48_000
         output.mux(stream.encode(silence))
         output.mux(stream.encode(None))
     return file.getvalue()
+
+
+def titled(container: str, codec: str = "libx264", pixels: str = "yuv420p") -> bytes:
+    """Return a video with a title of bytes that are no UTF-8, as old cameras and editors write them."""
+    file = io.BytesIO()
+    with av.open(file, "w", format=container) as output:
+        output.metadata["title"] = "caf. XXX"
+        stream = output.add_stream(codec, 10)
+        stream.width, stream.height, stream.pix_fmt = SIZE, SIZE, pixels
+        for picture in walk(4):
+            output.mux(stream.encode(av.VideoFrame.from_ndarray(opaque(picture), format="rgb24")))
+        output.mux(stream.encode(None))
+    return file.getvalue().replace(b"caf. XXX", b"caf\xe9 \xff\xfeX")
 
 
 def turned(degrees: int) -> bytes:
@@ -132,7 +158,9 @@ def _frames(codec: str, pixels: str, color: int, count: int = 4, container: str 
         stream = output.add_stream(codec, 10)
         stream.width, stream.height, stream.pix_fmt = SIZE, SIZE, pixels
         for _ in range(count):
-            output.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((SIZE, SIZE, 4), color, np.uint8), format="rgba")))
+            output.mux(
+                stream.encode(av.VideoFrame.from_ndarray(np.full((SIZE, SIZE, 4), color, np.uint8), format="rgba"))
+            )
         output.mux(stream.encode(None))
     return file.getvalue()
 
@@ -226,6 +254,10 @@ VIDEOS: dict[str, Make] = {
     "ts: packets of nothing": lambda: (b"G\x1f\xff\x10" + b"\xff" * 184) * 50,
     "ts: changes its size": _changed_size,
     # sound
+    "mp4: title in Latin-1": lambda: titled("mp4"),
+    "mkv: title in Latin-1": lambda: titled("matroska"),
+    "avi: title in Latin-1": lambda: titled("avi", "mjpeg", "yuvj420p"),
+    "flv: key in Latin-1": lambda: film("flv", "flv").replace(b"encoder", b"enc\xffder"),
     "mp4: two frames": lambda: film(count=2),
     "mp4: no durations": no_durations,
     "mp4: no movie duration": lambda: patched(film(), b"mvhd", 20, bytes(4)),
