@@ -47,7 +47,8 @@ def check(items: list[Item], made: int, says: str) -> list[Order]:
         assert len(row.message) < 3000 and "\n" not in row.message
     for one in [*orders, *rows]:
         one.model_dump_json()  # the summary and the server are given it
-        name = one.item
+        assert one.item
+    for name in (order.item for order in orders):
         assert (OUT / name).resolve().is_relative_to(OUT.resolve()) and Path(name) != Path(), name
         assert all(len(os.fsencode(part)) <= 255 for part in Path(name).parts), name
     assert not OUT.exists() or list(OUT.rglob("*")) == []
