@@ -41,7 +41,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
     monkeypatch.setattr(tempfile, "tempdir", str(found.temporary))
     monkeypatch.chdir(found.work)
     yield found
-    assert sorted(path.name for path in found.temporary.rglob("*")) == []
+    left = (path.name for path in found.temporary.rglob("*"))
+    assert sorted(name for name in left if not name.startswith("torchinductor_")) == []  # torch makes that one
 
 
 @pytest.fixture(scope="session")

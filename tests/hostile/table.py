@@ -897,7 +897,7 @@ RECORDS: dict[str, Refused] = {
     "record: no signatures": ALTERED,
     "record: signatures above": ALTERED,
     "record: signatures of numbers": ALTERED,
-    "record: not a number": ALTERED,
+    "record: not a number": Refused("no asset|altered"),
 }
 
 
