@@ -66,7 +66,7 @@ def test_a_bank_gets_what_the_table_says_at_the_door_or_in_the_step(name: str, p
         assert kind == "done", says
 
 
-@pytest.mark.parametrize("name", [case(name) for name in FOLDERS])
+@pytest.mark.parametrize("name", [case(name, "stored ") for name in FOLDERS])
 def test_a_bank_that_is_in_the_store_gets_the_same(name: str, place: Place, decoder: Decoder) -> None:
     path, expected = place.work / "bank", BANKS[name]
     FOLDERS[name](path)
