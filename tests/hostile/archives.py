@@ -179,6 +179,8 @@ UNPACKED: dict[str, Make] = {
     "unpack: wrong checksum": lambda: packed({"a": b"content"}).replace(b"content", b"CONTENT"),
     "unpack: deflate garbage": lambda: named([(b"a", b"\xff" * 99)], method=8),
     "unpack: LZMA garbage": lambda: named([(b"a", b"\xff" * 99)], method=14),
+    "unpack: bzip2 garbage": lambda: named([(b"a", b"\xff" * 99)], method=12),
+    "unpack: an entry outside the file": lambda: _misplaced(),
     # sound
     "unpack: empty": lambda: packed({}),
     "unpack: two files": lambda: packed({"b": b"x", "a/c": b"y"}, zipfile.ZIP_DEFLATED),

@@ -113,6 +113,7 @@ FOLDERS: dict[str, Place] = {
     "bank: no views": bank(about(views=[])),
     "bank: views are missing": bank(about(views=None)),
     "bank: frames are missing": bank(about(frames=None)),
+    "bank: frames are null": bank(about() | {"frames": None}),
     "bank: no frames": bank(about(frames=[])),
     "bank: frames are words": bank(about(frames="ab")),
     "bank: a tile of none": bank(about(tile=[0, 0])),

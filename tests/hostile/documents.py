@@ -87,6 +87,7 @@ RECORDS: dict[str, Make] = {
     "record: steps without names": record(steps=[{}]),
     "record: no recipe": record(recipe=None),
     "record: a recipe of words": record(recipe="soup"),
+    "record: a run of null": raw(record()().decode().replace('"run": {}', '"run": null')),
     "record: no signatures": record(signatures=None),
     "record: signatures above": record(signatures={"files": {"../evil": {"sidecar": "../evil.c2pa"}}}),
     "record: signatures of numbers": record(signatures={"files": {"a": 7}}),

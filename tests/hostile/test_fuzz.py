@@ -7,6 +7,7 @@ import pytest
 from tests.hostile.decoding import Decoder, Outcome
 from tests.hostile.fuzz import HANGS_S, TARGETS, fault, fuzz, repaired
 from tests.hostile.pictures import sound_png
+from tests.hostile.table import case
 
 SECONDS = 60.0  # of all targets together
 SEED = 0
@@ -19,7 +20,7 @@ def child(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Decoder]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", TARGETS)
+@pytest.mark.parametrize("name", [case(name, "fuzz ") for name in TARGETS])
 def test_readers_accept_or_refuse_whatever_they_are_given(name: str, child: Decoder) -> None:
     count = fuzz(name, child, SECONDS * TARGETS[name].share, SEED)
     print(f"{name}: {count} inputs from seed {SEED}")
