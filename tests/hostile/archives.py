@@ -92,13 +92,21 @@ def usdz(textures: int = 1) -> bytes:
     return packed(entries | {f"textures/color_{i}.png": sound_png() for i in range(textures)})
 
 
+def _misplaced() -> bytes:
+    """Return a zip whose directory lies about its own place, so that entries begin before the file does."""
+    content = frames_zip()
+    at = len(content) - 6
+    (place,) = struct.unpack_from("<I", content, at)
+    return content[:at] + struct.pack("<I", place + 100_000 if place < 100 else place + 50) + content[at + 4 :]
+
+
 ZIPS: dict[str, Make] = {
     "zip: empty": lambda: packed({}),
     "zip: magic alone": lambda: b"PK\3\4",
     "zip: cut at a half": lambda: cut(frames_zip(), 0.5),
     "zip: no directory": lambda: frames_zip()[: frames_zip().index(b"PK\1\2")],
     "zip: directory outside the file": lambda: frames_zip()[:-6] + b"\xff\xff\xff\x7f\0\0",
-    "zip: an entry outside the file": lambda: _misplaced(),
+    "zip: an entry outside the file": _misplaced,
     "zip: 65,535 entries that are not there": lambda: frames_zip()[:-14] + b"\xff\xff\xff\xff" + frames_zip()[-10:],
     "zip: one frame": lambda: packed(numbered(1)),
     "zip: no picture": lambda: packed({"notes.txt": b"hello"}),
@@ -122,7 +130,9 @@ ZIPS: dict[str, Make] = {
     "zip: LZMA garbage": lambda: named([(b"0.png", bytes(99)), (b"1.png", bytes(99))], method=14),
     "zip: deflate garbage": lambda: named([(b"0.png", b"\xff" * 99), (b"1.png", b"\xff" * 99)], method=8),
     "zip: bzip2 garbage": lambda: named([(b"0.png", b"\xff" * 99), (b"1.png", b"\xff" * 99)], method=12),
-    "zip: names that are no UTF-8": lambda: named([(b"\xff\xfe0.png", frame(0)), (b"\xff\xfe1.png", frame(1))], flags=0x800),
+    "zip: names that are no UTF-8": lambda: named(
+        [(b"\xff\xfe0.png", frame(0)), (b"\xff\xfe1.png", frame(1))], flags=0x800
+    ),
     "zip: entries that claim 4 GB": lambda: named([(b"0.png", frame(0)), (b"1.png", frame(1))], claimed=2**32 - 2),
     "zip: bomb of 256 MiB a frame": lambda: overlapping(2, 2**28),
     "zip: bomb of shared bodies": lambda: overlapping(2000, 2**24),
@@ -130,8 +140,12 @@ ZIPS: dict[str, Make] = {
     "zip: USDZ": usdz,
     "zip: USDZ of two textures": lambda: usdz(2),
     "zip: document": lambda: packed({"[Content_Types].xml": b"<Types/>", "word/media/image1.png": sound_png()}),
-    "zip: program of Java": lambda: packed({"META-INF/MANIFEST.MF": b"Main-Class: Evil", "Evil.class": b"\xca\xfe\xba\xbe"}),
-    "zip: book": lambda: packed({"mimetype": b"application/epub+zip", "cover.jpg": saved(Image.new("RGB", (64, 64)), "JPEG")}),
+    "zip: program of Java": lambda: packed(
+        {"META-INF/MANIFEST.MF": b"Main-Class: Evil", "Evil.class": b"\xca\xfe\xba\xbe"}
+    ),
+    "zip: book": lambda: packed(
+        {"mimetype": b"application/epub+zip", "cover.jpg": saved(Image.new("RGB", (64, 64)), "JPEG")}
+    ),
     "zip: a link in place of a frame": lambda: linked("1.png", "/etc/passwd", {"0.png": frame(0)}),
     "zip: a comment that looks like an end": lambda: packed(numbered(2), comment=b"PK\5\6" + b"x" * 65_000),
     # sound; nothing is ever written under a name of the zip
@@ -140,21 +154,17 @@ ZIPS: dict[str, Make] = {
     "zip: frames of drive C": lambda: packed({"C:\\0.png": frame(0), "C:\\1.png": frame(1)}),
     "zip: frames of letters": lambda: packed({"a.png": frame(0), "b.png": frame(1)}),
     "zip: frames of Arabic numbers": lambda: packed({"\u0661.png": frame(0), "\u0662.png": frame(1)}),
-    "zip: frames of JPEG called PNG": lambda: packed({f"{i}.png": saved(Image.fromarray(disc(8 + i)).convert("RGB"), "JPEG") for i in range(2)}),
+    "zip: frames of JPEG called PNG": lambda: packed(
+        {f"{i}.png": saved(Image.fromarray(disc(8 + i)).convert("RGB"), "JPEG") for i in range(2)}
+    ),
     "zip: deflated": lambda: packed(numbered(3), zipfile.ZIP_DEFLATED),
     "zip: LZMA": lambda: packed(numbered(3), zipfile.ZIP_LZMA),
     "zip: long comment": lambda: packed(numbered(2), comment=b"x" * 65_000),
     "zip: program in front": lambda: b"\x7fELF" + bytes(60) + frames_zip(),
-    "zip: hidden files of a Mac": lambda: packed({**numbered(3), "__MACOSX/._0.png": b"x", ".DS_Store": b"x", "._1.png": b"x"}),
-}  # fmt: skip
-
-
-def _misplaced() -> bytes:
-    """Return a zip whose directory lies about its own place, so that entries begin before the file does."""
-    content = frames_zip()
-    at = len(content) - 6
-    (place,) = struct.unpack_from("<I", content, at)
-    return content[:at] + struct.pack("<I", place + 100_000 if place < 100 else place + 50) + content[at + 4 :]
+    "zip: hidden files of a Mac": lambda: packed(
+        {**numbered(3), "__MACOSX/._0.png": b"x", ".DS_Store": b"x", "._1.png": b"x"}
+    ),
+}
 
 
 UNPACKED: dict[str, Make] = {
@@ -171,7 +181,9 @@ UNPACKED: dict[str, Make] = {
     "unpack: a file and a folder of one name": lambda: packed([("a", b"x"), ("a/b", b"y")]),
     "unpack: a name of 300 letters": lambda: packed({"a" * 300: b"x"}),
     "unpack: a path of 300 folders": lambda: packed({"a/" * 300 + "b": b"x"}),
-    "unpack: a name of half a character": lambda: named([("a\udce9".encode("utf-8", "surrogatepass"), b"x")], flags=0x800),
+    "unpack: a name of half a character": lambda: named(
+        [("a\udce9".encode("utf-8", "surrogatepass"), b"x")], flags=0x800
+    ),
     "unpack: encrypted": lambda: named([(b"a", b"x")], flags=1),
     "unpack: 70 GB that share a body": lambda: _claims(17),
     "unpack: bodies that overlap": lambda: overlapping(40, 2**20),
@@ -180,11 +192,11 @@ UNPACKED: dict[str, Make] = {
     "unpack: deflate garbage": lambda: named([(b"a", b"\xff" * 99)], method=8),
     "unpack: LZMA garbage": lambda: named([(b"a", b"\xff" * 99)], method=14),
     "unpack: bzip2 garbage": lambda: named([(b"a", b"\xff" * 99)], method=12),
-    "unpack: an entry outside the file": lambda: _misplaced(),
+    "unpack: an entry outside the file": _misplaced,
     # sound
     "unpack: empty": lambda: packed({}),
     "unpack: two files": lambda: packed({"b": b"x", "a/c": b"y"}, zipfile.ZIP_DEFLATED),
-}  # fmt: skip
+}
 
 
 def _claims(count: int) -> bytes:

@@ -97,9 +97,9 @@ DOOR: dict[str, Place] = {
     "bank: empty": lambda path: path.mkdir(),
     "bank: bank.json is a folder": lambda path: (path / "bank.json").mkdir(parents=True),
     "bank: bank.json is a link out": lambda path: (path.mkdir(), (path / "bank.json").symlink_to("/etc/hostname")),
-    "bank: is a pipe": lambda path: os.mkfifo(path),
+    "bank: is a pipe": os.mkfifo,
     "bank: a sheet is a link out": instead(lambda path: path.symlink_to("/etc/hostname")),
-    "bank: a sheet is a pipe": instead(lambda path: os.mkfifo(path)),
+    "bank: a sheet is a pipe": instead(os.mkfifo),
     "bank: a sheet of 9 GiB": instead(_sparse),
 }
 

@@ -35,6 +35,8 @@ MOST_S = 20.0  # of processor time for one input
 HANGS_S = 60.0
 LARGEST_SEED_FILE = 30_000  # bytes; mutations of larger files hit pixels, not headers
 AT_ONCE = 100  # inputs between two looks at the clock
+COLUMNS = ("path", "text", "video", "name", "profile", "seed", "bank", "priority", "set")
+KNOBS = ("mesh.grid", "prior.kind", "motion.iterations", "text.weights")
 EDGES = (0, 1, 2, 31, 32, 127, 128, 255, 256, 4095, 32_767, 32_768, 65_535, 2**24, 2**31 - 1, 2**31, 2**32 - 1)
 
 
@@ -139,7 +141,7 @@ def _dumped(value: Any) -> bytes:
 
 
 def _rows() -> SearchStrategy[list[dict[str, Any]]]:
-    columns = st.sampled_from(["path", "text", "video", "name", "profile", "seed", "bank", "priority", "set", "mesh.grid", "prior.kind", "motion.iterations", "text.weights"])  # fmt: skip
+    columns = st.sampled_from(COLUMNS + KNOBS)
     cells = st.one_of(_json_values(), st.sampled_from(["cat.png", "mesh.grid=64", "preview", "7", {"mesh.grid": 64}]))
     return st.lists(
         st.dictionaries(columns, cells, max_size=5).map(lambda row: {"path": "cat.png"} | row), min_size=1, max_size=4
@@ -149,7 +151,7 @@ def _rows() -> SearchStrategy[list[dict[str, Any]]]:
 def _manifest_texts() -> SearchStrategy[bytes]:
     whole = [make() for _, make in (manifests.WHOLE | manifests.ROWS | manifests.SOUND).values()]
     small = [content for content in whole if len(content) < 2000]
-    lines = st.lists(st.text(st.characters(codec="utf-8"), max_size=30), max_size=4).map(lambda cells: ",".join(cells))
+    lines = st.lists(st.text(st.characters(codec="utf-8"), max_size=30), max_size=4).map(",".join)
     table = st.lists(lines, max_size=5).map(lambda rows: "\n".join(["path,name,seed,set,mesh.grid", *rows]).encode())
     rows = _rows()
     by_line = rows.map(lambda some: b"\n".join(map(_dumped, some)))
@@ -331,6 +333,12 @@ def replay(path: Path) -> Outcome:
         return child.ask(path, path.name.split(".")[1])
 
 
+def say(text: str) -> None:
+    """Print a line at once."""
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
+
+
 def main() -> None:
     """Run the fuzzer by hand."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -342,19 +350,20 @@ def main() -> None:
     given_ = parser.parse_args()
     if given_.replay:
         outcome = replay(given_.replay)
-        sys.exit(fault(outcome, given_.replay.name.split(".")[1]) or print(outcome))
+        say(str(outcome))
+        sys.exit(1 if fault(outcome, given_.replay.name.split(".")[1]) else 0)
     names = given_.target or list(TARGETS)
     whole = sum(TARGETS[name].share for name in names)
-    print(f"seed {given_.seed}", flush=True)
+    say(f"seed {given_.seed}")
     failed = False
     with tempfile.TemporaryDirectory(prefix="dg4d-fuzz-") as scratch, Decoder(Path(scratch), HANGS_S) as child:
         for name in names:
             try:
                 seconds = 60 * given_.minutes * TARGETS[name].share / whole
-                print(f"{name}: {fuzz(name, child, seconds, given_.seed, given_.shrink)} inputs", flush=True)
+                say(f"{name}: {fuzz(name, child, seconds, given_.seed, given_.shrink)} inputs")
             except Found as found:
                 failed = True
-                print(f"{name}: {found}", flush=True)
+                say(f"{name}: {found}")
     sys.exit(1 if failed else 0)
 
 

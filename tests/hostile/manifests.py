@@ -23,7 +23,7 @@ def with_row(**cells: Any) -> Make:
 def raw_row(cell: str) -> Make:
     """Return a writer of a JSON manifest with a cell that Python would not write."""
     text = f'[{{"path": "cat.png", "name": "bad", {cell}}}, {{"path": "cat.png", "name": "good"}}]'
-    return lambda: text.encode()
+    return text.encode
 
 
 def table(header: str, *lines: str) -> Make:
@@ -64,7 +64,7 @@ WHOLE: dict[str, tuple[str, Make]] = {
     "manifest: too many cells": (".csv", table("path", "cat.png,red,green")),
     "manifest: neither path nor text": (".csv", table("path,seed", ",1")),
     "manifest: a column without a name": (".csv", table("path,", "cat.png,x")),
-}  # fmt: skip
+}
 
 # the first row cannot be made, the second one can
 ROWS: dict[str, tuple[str, Make]] = {
@@ -75,7 +75,12 @@ ROWS: dict[str, tuple[str, Make]] = {
     "row: set is deep": (".json", raw_row('"set": {"mesh.grid": ' + "[" * 900 + "]" * 900 + "}")),
     "row: set is deep, in words": (".json", with_row(set="mesh.grid=" + "[" * 5000)),
     "row: set is deep and whole, in words": (".json", with_row(set="mesh.grid=" + "[" * 5000 + "]" * 5000)),
-    "row: set is deep, CSV": (".csv", lambda: _csv(["path", "name", "set"], ["cat.png", "bad", "mesh.grid=" + '{"a":' * 5000], ["cat.png", "good", ""])),
+    "row: set is deep, CSV": (
+        ".csv",
+        lambda: _csv(
+            ["path", "name", "set"], ["cat.png", "bad", "mesh.grid=" + '{"a":' * 5000], ["cat.png", "good", ""]
+        ),
+    ),
     "row: set is a number of 5,000 digits": (".json", with_row(set="mesh.grid=" + "9" * 5000)),
     "row: set without an equals sign": (".json", with_row(set="mesh.grid")),
     "row: set of nothing": (".json", with_row(set="=7")),
@@ -120,7 +125,7 @@ ROWS: dict[str, tuple[str, Make]] = {
     "row: text of 5,000 letters": (".json", with_row(path="", text="a" * 5000, **{"text.weights": "some/pictures"})),
     "row: name of 300 letters": (".json", with_row(name="a" * 300)),
     "row: weights above": (".json", with_row(**{"prior.kind": "zero123", "prior.weights": "../../../etc"})),
-}  # fmt: skip
+}
 
 SOUND: dict[str, tuple[str, Make]] = {
     "sound: byte order mark": (".csv", lambda: b"\xef\xbb\xbfpath\ncat.png\n"),

@@ -39,7 +39,7 @@ NAMES: dict[str, bytes] = {
     "name: our record": b"provenance.json.png",
     "name: our summary": b"summary.csv.png",
     "name: our staging folder": b"incoming-1.png",
-}  # fmt: skip
+}
 
 # names that a manifest asks for, which need not be names of files
 WANTED: dict[str, str] = {

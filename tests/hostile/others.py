@@ -47,7 +47,7 @@ def _array() -> bytes:
     return file.getvalue()
 
 
-PDF = b"%PDF-1.4\n1 0 obj<</Type/Catalog/OpenAction<</S/JavaScript/JS(app.alert(1))>>>>endobj\ntrailer<</Root 1 0 R>>\n%%EOF\n"
+PDF = b"%PDF-1.4\n1 0 obj<</Type/Catalog/OpenAction<</S/JavaScript/JS(alert(1))>>>>endobj\ntrailer<</Root 1 0 R>>\n"
 SVG = b'<?xml version="1.0"?><!DOCTYPE svg [<!ENTITY x SYSTEM "file:///etc/passwd">]><svg><image href="http://127.0.0.1/"/>&x;</svg>'
 PLAYLIST = b"#EXTM3U\n#EXT-X-MEDIA-SEQUENCE:0\n#EXTINF:10.0,\nfile:///etc/passwd\n#EXT-X-ENDLIST\n"
 
@@ -69,11 +69,15 @@ OTHERS: dict[str, Make] = {
     "other: PDF and zip": lambda: PDF + frames_zip(),
     "other: page and zip": lambda: b"<html>" + frames_zip(),
     "other: PostScript": lambda: b"%!PS-Adobe-3.0 EPSF-3.0\n(/etc/passwd) (r) file\n",
-    "other: ImageMagick's language": lambda: b"push graphic-context\nviewbox 0 0 640 480\nfill 'url(https://127.0.0.1/\"|ls \"-la)'\n",
+    "other: ImageMagick's language": lambda: (
+        b"push graphic-context\nviewbox 0 0 640 480\nfill 'url(https://127.0.0.1/\"|ls \"-la)'\n"
+    ),
     "other: a database": database,
     "other: a playlist": lambda: PLAYLIST,
     "other: a list of FFmpeg": lambda: b"ffconcat version 1.0\nfile /etc/passwd\n",
-    "other: a session description": lambda: b"v=0\no=- 0 0 IN IP4 127.0.0.1\nm=video 5004 RTP/AVP 96\na=rtpmap:96 H264/90000\n",
+    "other: a session description": lambda: (
+        b"v=0\no=- 0 0 IN IP4 127.0.0.1\nm=video 5004 RTP/AVP 96\na=rtpmap:96 H264/90000\n"
+    ),
     "other: DASH": lambda: b'<?xml version="1.0"?><MPD><Period><BaseURL>file:///etc/passwd</BaseURL></Period></MPD>',
     "other: subtitles": lambda: b"1\n00:00:00,000 --> 00:00:01,000\nhello\n",
     "other: a pickle": lambda: pickle.dumps({"x": 1}),
@@ -83,7 +87,9 @@ OTHERS: dict[str, Make] = {
     "other: gzip of 32 MiB": lambda: gzip.compress(bytes(2**25), mtime=0),
     "other: 7z": lambda: b"7z\xbc\xaf\x27\x1c\0\x04" + bytes(100),
     "other: RAR": lambda: b"Rar!\x1a\x07\x01\0" + bytes(100),
-    "other: a sound": lambda: riff(b"WAVE", (b"fmt ", struct.pack("<HHIIHH", 1, 1, 8000, 16000, 2, 16)), (b"data", bytes(1000))),
+    "other: a sound": lambda: riff(
+        b"WAVE", (b"fmt ", struct.pack("<HHIIHH", 1, 1, 8000, 16000, 2, 16)), (b"data", bytes(1000))
+    ),
     "other: MP3": lambda: b"ID3\x04\0\0\0\0\0\0" + b"\xff\xfb\x90\0" * 100,
     "other: RIFF of nothing": lambda: riff(b"EVIL"),
     "other: a mesh": lambda: b"glTF" + struct.pack("<II", 2, 12),
@@ -100,7 +106,7 @@ OTHERS: dict[str, Make] = {
     "other: FITS": lambda: b"SIMPLE  =                    T" + b" " * 2850,
     "other: DPX": lambda: b"SDPX" + bytes(2048),
     "other: byte order mark alone": lambda: b"\xef\xbb\xbf",
-}  # fmt: skip
+}
 
 
 def _device(path: Path) -> None:
@@ -133,7 +139,7 @@ def _huge(path: Path) -> None:
 PLACES: dict[str, Place] = {
     "place: nothing there": lambda path: None,
     "place: a folder": lambda path: path.mkdir(),
-    "place: a pipe": lambda path: os.mkfifo(path),
+    "place: a pipe": os.mkfifo,
     "place: a socket": _socket,
     "place: a device": _device,
     "place: a link to a device": lambda path: path.symlink_to("/dev/zero"),

@@ -115,7 +115,7 @@ def _written(
 def exr(
     kind: str = "half", value: float | None = None, everywhere: bool = False, channels: int = 4, **attributes: object
 ) -> bytes:
-    """Encode the disc as OpenEXR, a quarter of it or all with another value, perhaps with channels that nobody asked for."""
+    """Encode the disc as OpenEXR, a quarter of it or all with another value, perhaps with more channels."""
     image = disc().astype(np.float32) / 255
     image[..., :3] *= image[..., 3:]
     if value is not None:
@@ -173,6 +173,17 @@ def _icc(space: str) -> bytes:
     return ImageCms.ImageCmsProfile(ImageCms.createProfile(space)).tobytes()
 
 
+def _interlaced() -> bytes:
+    """Return a gray PNG in Adam7 order."""
+    rows = gray_rows()
+    pixels = np.frombuffer(rows, np.uint8).reshape(SIZE, SIZE + 1)[:, 1:]
+    passes = ((0, 8, 0, 8), (0, 8, 4, 8), (4, 8, 0, 4), (0, 4, 2, 4), (2, 4, 0, 2), (0, 2, 1, 2), (1, 2, 0, 1))
+    data = b"".join(
+        b"".join(b"\0" + row.tobytes() for row in pixels[top::down, left::right]) for top, down, left, right in passes
+    )
+    return png(ihdr(rest=(0, 0, 1)), chunk(b"IDAT", zlib.compress(data)))
+
+
 PNGS: dict[str, Make] = {
     "png: signature alone": lambda: PNG_SIGNATURE,
     "png: cut within the header": lambda: noise_png()[:20],
@@ -228,7 +239,7 @@ PNGS: dict[str, Make] = {
     "png: 16 bits": lambda: saved(Image.fromarray(opaque(disc())[..., 1].astype(np.uint16) * 257), "PNG"),
     "png: palette": lambda: saved(subject("P"), "PNG"),
     "png: gray and alpha": lambda: saved(subject("LA"), "PNG"),
-    "png: interlaced": lambda: _interlaced(),
+    "png: interlaced": _interlaced,
     "png: profile of Lab, which is not of its mode": lambda: saved(subject(), "PNG", icc_profile=_icc("LAB")),
     "png: profile sRGB": lambda: saved(subject(), "PNG", icc_profile=_icc("sRGB")),
     "png: text of many languages": lambda: saved(subject(), "PNG", pnginfo=_text()),
@@ -243,17 +254,6 @@ def _dot(side: int) -> ndarray:
     picture = np.zeros((SIZE, SIZE, 4), np.uint8)
     picture[30 : 30 + side, 30 : 30 + side] = 255
     return picture
-
-
-def _interlaced() -> bytes:
-    """Return a gray PNG in Adam7 order."""
-    rows = gray_rows()
-    pixels = np.frombuffer(rows, np.uint8).reshape(SIZE, SIZE + 1)[:, 1:]
-    passes = ((0, 8, 0, 8), (0, 8, 4, 8), (4, 8, 0, 4), (0, 4, 2, 4), (2, 4, 0, 2), (0, 2, 1, 2), (1, 2, 0, 1))
-    data = b"".join(
-        b"".join(b"\0" + row.tobytes() for row in pixels[top::down, left::right]) for top, down, left, right in passes
-    )
-    return png(ihdr(rest=(0, 0, 1)), chunk(b"IDAT", zlib.compress(data)))
 
 
 def _text() -> PngImagePlugin.PngInfo:
@@ -336,10 +336,12 @@ JPEGS: dict[str, Make] = {
     "jpeg: gray": lambda: saved(subject("L"), "JPEG"),
     "jpeg: progressive": lambda: saved(subject(), "JPEG", progressive=True),
     "jpeg: restart markers": lambda: saved(subject(), "JPEG", restart_marker_blocks=1),
-    "jpeg: profile of CMYK in RGB": lambda: saved(subject(), "JPEG", icc_profile=b"\0\0\x02\x0cADBE\x02\x10\0\0prtrCMYK" + bytes(500)),
+    "jpeg: profile of CMYK in RGB": lambda: saved(
+        subject(), "JPEG", icc_profile=b"\0\0\x02\x0cADBE\x02\x10\0\0prtrCMYK" + bytes(500)
+    ),
     "jpeg: broken profile": lambda: saved(subject(), "JPEG", icc_profile=b"no profile at all"),
     **{f"jpeg: orientation {n}": functools.partial(oriented, n) for n in (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 65535)},
-}  # fmt: skip
+}
 
 
 # TIFF, GIF, WebP
@@ -351,6 +353,14 @@ def _float_tiff(value: float) -> bytes:
     return _written(".tif", image, "float")
 
 
+def _deflate_bomb() -> bytes:
+    """Return a gray TIFF of 100 million pixels in one strip of deflated zeros."""
+    packer = zlib.compressobj(9)
+    strip = b"".join([packer.compress(bytes(10_000 * 1000)) for _ in range(10)] + [packer.flush()])
+    tags = {256: 10_000, 257: 10_000, 258: 8, 259: 8, 262: 1, 273: 300, 277: 1, 278: 10_000, 279: len(strip)}
+    return tiff(tags, bytes(300 - (14 + 12 * len(tags))) + strip)
+
+
 TIFFS: dict[str, Make] = {
     "tiff: header alone": lambda: b"II*\0\x08\0\0\0",
     "tiff: directory outside the file": lambda: b"II*\0" + struct.pack("<I", HUGE) + bytes(100),
@@ -360,7 +370,9 @@ TIFFS: dict[str, Make] = {
     "tiff: 100,000 a side": lambda: gray_tiff(100_000, 100_000, t279=4096),
     "tiff: 60,000 channels": lambda: gray_tiff(t277=60_000),
     "tiff: no channels": lambda: gray_tiff(t277=0),
-    "tiff: a tile of a million a side": lambda: gray_tiff(t322=1_000_000, t323=1_000_000, t324=300, t325=1000, t273=None, t278=None, t279=None),
+    "tiff: a tile of a million a side": lambda: gray_tiff(
+        t322=1_000_000, t323=1_000_000, t324=300, t325=1000, t273=None, t278=None, t279=None
+    ),
     "tiff: two billion rows in a strip": lambda: gray_tiff(64, HUGE, t278=HUGE, t279=4096),
     "tiff: strips outside the file": lambda: gray_tiff(t273=HUGE),
     "tiff: strips without bytes": lambda: gray_tiff(t279=0),
@@ -372,8 +384,10 @@ TIFFS: dict[str, Make] = {
     "tiff: deflate garbage": lambda: gray_tiff(t259=8),
     "tiff: old JPEG": lambda: gray_tiff(t259=6, t513=300, t514=1000),
     "tiff: cut at a half": lambda: cut(saved(noise(), "TIFF"), 0.5),
-    "tiff: BigTIFF of a directory of 2^60 tags": lambda: b"II+\0\x08\0\0\0" + struct.pack("<QQ", 16, 2**60) + bytes(200),
-    "tiff: deflate bomb": lambda: _deflate_bomb(),
+    "tiff: BigTIFF of a directory of 2^60 tags": lambda: (
+        b"II+\0\x08\0\0\0" + struct.pack("<QQ", 16, 2**60) + bytes(200)
+    ),
+    "tiff: deflate bomb": _deflate_bomb,
     "tiff: 20 x 20": lambda: saved(noise(20), "TIFF"),
     # sound
     "tiff: a directory that follows itself": lambda: gray_tiff()[:118] + struct.pack("<I", 8) + gray_tiff()[122:],
@@ -393,15 +407,7 @@ TIFFS: dict[str, Make] = {
     "tiff: LZW": lambda: saved(subject("RGBA"), "TIFF", compression="tiff_lzw"),
     "tiff: JPEG": lambda: saved(subject(), "TIFF", compression="jpeg"),
     "tiff: palette": lambda: saved(subject("P"), "TIFF"),
-}  # fmt: skip
-
-
-def _deflate_bomb() -> bytes:
-    """Return a gray TIFF of 100 million pixels in one strip of deflated zeros."""
-    packer = zlib.compressobj(9)
-    strip = b"".join([packer.compress(bytes(10_000 * 1000)) for _ in range(10)] + [packer.flush()])
-    tags = {256: 10_000, 257: 10_000, 258: 8, 259: 8, 262: 1, 273: 300, 277: 1, 278: 10_000, 279: len(strip)}
-    return tiff(tags, bytes(300 - (14 + 12 * len(tags))) + strip)
+}
 
 
 GIFS: dict[str, Make] = {
@@ -453,13 +459,25 @@ WEBPS: dict[str, Make] = {
     "webp: lossy, cut at a half": lambda: cut(saved(noise(), "WEBP", quality=80), 0.5),
     "webp: animation cut at six tenths": lambda: cut(moving_webp(), 0.6),
     "webp: canvas of 16 million a side": lambda: riff(b"WEBP", vp8x(2**24, 2**24), (b"ANIM", bytes(6)), webp_frame()),
-    "webp: canvas of 6,000 a side": lambda: riff(b"WEBP", vp8x(6_000, 6_000), (b"ANIM", bytes(6)), webp_frame(), webp_frame()),
-    "webp: frame outside the canvas": lambda: riff(b"WEBP", vp8x(64, 64), (b"ANIM", bytes(6)), webp_frame(left=32), webp_frame()),
-    "webp: frame that is smaller than it says": lambda: riff(b"WEBP", vp8x(256, 256), (b"ANIM", bytes(6)), webp_frame(256, 256), webp_frame()),
-    "webp: frames without a picture": lambda: riff(b"WEBP", vp8x(64, 64), (b"ANIM", bytes(6)), *[(b"ANMF", webp_frame()[1][:16])] * 3),
+    "webp: canvas of 6,000 a side": lambda: riff(
+        b"WEBP", vp8x(6_000, 6_000), (b"ANIM", bytes(6)), webp_frame(), webp_frame()
+    ),
+    "webp: frame outside the canvas": lambda: riff(
+        b"WEBP", vp8x(64, 64), (b"ANIM", bytes(6)), webp_frame(left=32), webp_frame()
+    ),
+    "webp: frame that is smaller than it says": lambda: riff(
+        b"WEBP", vp8x(256, 256), (b"ANIM", bytes(6)), webp_frame(256, 256), webp_frame()
+    ),
+    "webp: frames without a picture": lambda: riff(
+        b"WEBP", vp8x(64, 64), (b"ANIM", bytes(6)), *[(b"ANMF", webp_frame()[1][:16])] * 3
+    ),
     "webp: frames of 3 bytes": lambda: riff(b"WEBP", vp8x(64, 64), (b"ANIM", bytes(6)), *[(b"ANMF", b"abc")] * 3),
-    "webp: 10,000 frames": lambda: riff(b"WEBP", vp8x(64, 64), (b"ANIM", bytes(6)), *[(b"ANMF", webp_frame()[1])] * 10_000),
-    "webp: header of 4 bytes": lambda: riff(b"WEBP", (b"VP8X", b"\x12\0\0\0"), (b"ANIM", bytes(6)), webp_frame(), webp_frame()),
+    "webp: 10,000 frames": lambda: riff(
+        b"WEBP", vp8x(64, 64), (b"ANIM", bytes(6)), *[(b"ANMF", webp_frame()[1])] * 10_000
+    ),
+    "webp: header of 4 bytes": lambda: riff(
+        b"WEBP", (b"VP8X", b"\x12\0\0\0"), (b"ANIM", bytes(6)), webp_frame(), webp_frame()
+    ),
     "webp: no header": lambda: riff(b"WEBP", webp_frame(), webp_frame()),
     "webp: lossless of 16,384 a side": lambda: _vp8l(16_384, 16_384),
     "webp: lossless of 8,000 a side, no pixels": lambda: _vp8l(8_000, 8_000),
@@ -470,8 +488,13 @@ WEBPS: dict[str, Make] = {
     "webp: a size that lies": lambda: sound_webp()[:4] + struct.pack("<I", 2**32 - 2) + sound_webp()[8:],
     "webp: two frames": lambda: animation("WEBP", 2, lossless=True),
     "webp: lossy with alpha": lambda: saved(subject("RGBA"), "WEBP", quality=80),
-    "webp: unknown chunks": lambda: riff(b"WEBP", vp8x(64, 64, 0), (b"EVIL", bytes(99)), *[p for p in webp_parts(saved(subject(), "WEBP", lossless=True)) if p[0] == b"VP8L"]),
-}  # fmt: skip
+    "webp: unknown chunks": lambda: riff(
+        b"WEBP",
+        vp8x(64, 64, 0),
+        (b"EVIL", bytes(99)),
+        *[p for p in webp_parts(saved(subject(), "WEBP", lossless=True)) if p[0] == b"VP8L"],
+    ),
+}
 
 
 # The others that OpenImageIO reads
@@ -495,7 +518,9 @@ OTHERS: dict[str, Make] = {
     "exr: all not a number": lambda: _written(".exr", np.full((SIZE, SIZE, 3), np.nan, np.float32), "float"),
     "exr: bomb of zeros": lambda: _zero_exr(4_000),
     "hdr: header alone": lambda: b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n",
-    "hdr: two billion a side": lambda: b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2147483647 +X 2147483647\n" + bytes(100),
+    "hdr: two billion a side": lambda: (
+        b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2147483647 +X 2147483647\n" + bytes(100)
+    ),
     "hdr: cut": lambda: cut(_written(".hdr", opaque(disc()).astype(np.float32) / 255, "float"), 0.4),
     "hdr: negative size": lambda: b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y -64 +X -64\n" + bytes(16_384),
     "ppm: two billion a side": lambda: b"P6 2147483647 2147483647 255\n" + bytes(100),
@@ -524,7 +549,9 @@ OTHERS: dict[str, Make] = {
     "exr: a quarter negative": lambda: exr("float", -1e30),
     "exr: 200 channels": lambda: exr("half", channels=200),
     "exr: depth alone": lambda: written(".exr", "float", ("Z",)),
-    "exr: luminance and alpha": lambda: _written(".exr", (disc().astype(np.float32) / 255)[..., [1, 3]], "half", ("Y", "A")),
+    "exr: luminance and alpha": lambda: _written(
+        ".exr", (disc().astype(np.float32) / 255)[..., [1, 3]], "half", ("Y", "A")
+    ),
     "exr: scan lines of one, zipped": lambda: exr("half", compression="zips"),
     "exr: lossy": lambda: exr("half", compression="dwaa"),
     "hdr: sound": lambda: _written(".hdr", opaque(disc()).astype(np.float32) / 255, "float"),
@@ -533,7 +560,7 @@ OTHERS: dict[str, Make] = {
     "psd: sound": psd,
     "jp2: sound": lambda: saved(subject(), "JPEG2000"),
     "jxl: sound": lambda: _written(".jxl", opaque(disc()).astype(np.float32) / 255, "uint8"),
-}  # fmt: skip
+}
 
 
 def _zero_exr(side: int) -> bytes:

@@ -8,18 +8,17 @@ from pathlib import Path
 import pytest
 
 from flows.commands.batch import ready
-from flows.inputs.orders import Order, Wish
 from flows.inputs.manifest import Item
+from flows.inputs.orders import Order, Wish
 from steps.profiles import profile
 from tests.hostile.archives import UNPACKED, ZIPS
 from tests.hostile.conftest import Place
 from tests.hostile.decoding import Decoder, Outcome
 from tests.hostile.others import OTHERS, PLACES
 from tests.hostile.pictures import PICTURES
-from tests.hostile.table import FILES, Accepted, Refused, case
+from tests.hostile.table import FILES, UNKNOWN, Accepted, Refused, case
 from tests.hostile.table import PLACES as SAID
 from tests.hostile.table import UNPACKED as EXTRACTED
-from tests.hostile.table import UNKNOWN
 from tests.hostile.videos import VIDEOS
 
 CASES = {**PICTURES, **VIDEOS, **ZIPS, **OTHERS}

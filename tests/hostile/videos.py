@@ -195,6 +195,30 @@ def outside_data() -> bytes:
     return content.replace(b"url \0\0\0\x01", b"alis\0\0\0\0", 1).replace(b"url ", b"rsrc", 1)
 
 
+def _blank_pixels() -> bytes:
+    content = film()
+    at = content.index(b"mdat")
+    (size,) = struct.unpack_from(">I", content, at - 4)
+    return content[: at + 4] + bytes(size - 8) + content[at - 4 + size :]
+
+
+@functools.cache
+def _coded() -> tuple[bytes, bytes]:
+    """Return the configuration box and the picture of an HEVC intra frame."""
+    content = film("mp4", "libx265", 1, options=(("x265-params", "log-level=none"),), muxer=())
+    at = content.index(b"hvcC") - 4
+    (size,) = struct.unpack_from(">I", content, at)
+    start = content.index(b"mdat") + 4
+    (length,) = struct.unpack_from(">I", content, start - 8)
+    return content[at : at + size], content[start : start + length - 8]
+
+
+def heic(width: int = SIZE, height: int = SIZE) -> bytes:
+    """Return a real HEIC picture."""
+    config, payload = _coded()
+    return heif(b"heic", b"hvc1", config, payload, width, height)
+
+
 VIDEOS: dict[str, Make] = {
     # mp4 and its kin
     "mp4: type alone": lambda: box(b"ftyp", b"isom", bytes(4), b"isom"),
@@ -217,10 +241,12 @@ VIDEOS: dict[str, Make] = {
     "mp4: unknown codec": lambda: film().replace(b"avc1\0\0\0\0\0\0", b"evil\0\0\0\0\0\0"),
     "mp4: encrypted": lambda: film().replace(b"avc1\0\0\0\0\0\0", b"encv\0\0\0\0\0\0"),
     "mp4: codec data of zeros": lambda: patched(film(), b"avcC", 4, bytes(16)),
-    "mp4: pixels of zeros": lambda: _blank_pixels(),
+    "mp4: pixels of zeros": _blank_pixels,
     "mp4: boxes 20,000 deep": lambda: nested(20_000),
     "mp4: boxes of no size": lambda: box(b"ftyp", b"isom", bytes(4)) + b"\0\0\0\x01moov" + bytes(8) + bytes(100),
-    "mp4: a box of 2^63 bytes": lambda: box(b"ftyp", b"isom", bytes(4)) + b"\0\0\0\x01moov\x7f" + b"\xff" * 7 + bytes(100),
+    "mp4: a box of 2^63 bytes": lambda: (
+        box(b"ftyp", b"isom", bytes(4)) + b"\0\0\0\x01moov\x7f" + b"\xff" * 7 + bytes(100)
+    ),
     "mp4: boxes of 7 bytes": lambda: box(b"ftyp", b"isom", bytes(4)) + b"\0\0\0\x07moov" * 100,
     "mp4: sound alone": lambda: sound("mp4", "aac"),
     "mp4: 20 x 20": lambda: film(width=20, height=20),
@@ -229,7 +255,7 @@ VIDEOS: dict[str, Make] = {
     "mp4: every offset shifted": lambda: box(b"free", bytes(100)) + film(),
     "mp4: HEIC with nothing in it": lambda: b"\0\0\0\x18ftypheic" + bytes(64),
     "mp4: AVIF with nothing in it": lambda: b"\0\0\0\x18ftypavif" + bytes(64),
-    "mp4: HEIC": lambda: heic(),
+    "mp4: HEIC": heic,
     "mp4: AVIF": lambda: saved(subject("RGBA"), "AVIF"),
     "mp4: moving AVIF": lambda: film("avif", "libsvtav1", options=(("preset", "12"),)),
     "mp4: HEIC of four billion a side": lambda: heic(2**32 - 1, 2**32 - 1),
@@ -284,31 +310,7 @@ VIDEOS: dict[str, Make] = {
     "mpeg: program stream": lambda: film("mpeg", "mpeg1video", fps=25),
     "ts: MPEG-2": lambda: film("mpegts", "mpeg2video", fps=25),
     "ts: begun in the middle": lambda: film("mpegts", "mpeg2video", 8, fps=25, options=(("g", "2"),))[188 * 3 :],
-}  # fmt: skip
-
-
-def _blank_pixels() -> bytes:
-    content = film()
-    at = content.index(b"mdat")
-    (size,) = struct.unpack_from(">I", content, at - 4)
-    return content[: at + 4] + bytes(size - 8) + content[at - 4 + size :]
-
-
-@functools.cache
-def _coded() -> tuple[bytes, bytes]:
-    """Return the configuration box and the picture of an HEVC intra frame."""
-    content = film("mp4", "libx265", 1, options=(("x265-params", "log-level=none"),), muxer=())
-    at = content.index(b"hvcC") - 4
-    (size,) = struct.unpack_from(">I", content, at)
-    start = content.index(b"mdat") + 4
-    (length,) = struct.unpack_from(">I", content, start - 8)
-    return content[at : at + size], content[start : start + length - 8]
-
-
-def heic(width: int = SIZE, height: int = SIZE) -> bytes:
-    """Return a real HEIC picture."""
-    config, payload = _coded()
-    return heif(b"heic", b"hvc1", config, payload, width, height)
+}
 
 
 __all__: Iterable[str] = ["VIDEOS", "film", "flipped", "full_box", "heic", "sound"]
