@@ -35,7 +35,8 @@ def checked(archive: zipfile.ZipFile, what: str) -> list[zipfile.ZipInfo]:
     Raises:
         BadInput: an entry leads outside or is a link, two have one name, or there is too much in it.
     """
-    entries = sorted((entry for entry in archive.infolist() if not entry.is_dir()), key=lambda entry: entry.filename)
+    files = (entry for entry in archive.infolist() if not entry.filename.endswith("/"))  # is_dir() needs a name
+    entries = sorted(files, key=lambda entry: entry.filename)
     if len(entries) > MOST_ENTRIES:
         raise BadInput(f"{what} has {len(entries)} entries; at most {MOST_ENTRIES} are unpacked")
     size = sum(entry.file_size for entry in entries)

@@ -130,6 +130,7 @@ ZIPS: dict[str, Make] = {
     "zip: LZMA garbage": lambda: named([(b"0.png", bytes(99)), (b"1.png", bytes(99))], method=14),
     "zip: deflate garbage": lambda: named([(b"0.png", b"\xff" * 99), (b"1.png", b"\xff" * 99)], method=8),
     "zip: bzip2 garbage": lambda: named([(b"0.png", b"\xff" * 99), (b"1.png", b"\xff" * 99)], method=12),
+    "zip: an entry without a name": lambda: named([(b"", b"x"), (b"0.png", frame(0)), (b"1.png", b"")]),
     "zip: names that are no UTF-8": lambda: named(
         [(b"\xff\xfe0.png", frame(0)), (b"\xff\xfe1.png", frame(1))], flags=0x800
     ),
@@ -191,6 +192,7 @@ UNPACKED: dict[str, Make] = {
     "unpack: wrong checksum": lambda: packed({"a": b"content"}).replace(b"content", b"CONTENT"),
     "unpack: deflate garbage": lambda: named([(b"a", b"\xff" * 99)], method=8),
     "unpack: LZMA garbage": lambda: named([(b"a", b"\xff" * 99)], method=14),
+    "unpack: an entry without a name": lambda: named([(b"", b"x"), (b"a", b"y")]),
     "unpack: bzip2 garbage": lambda: named([(b"a", b"\xff" * 99)], method=12),
     "unpack: an entry outside the file": _misplaced,
     # sound
