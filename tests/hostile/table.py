@@ -33,7 +33,7 @@ def video(frames: int) -> Accepted:
 
 
 PICTURE = Accepted("picture", 1)
-BROKEN = Refused("cut off or broken|cannot be read|is broken|broken or encrypted")
+BROKEN = Refused("cut off or broken|a broken|cannot be read|is broken|broken or encrypted")
 SMALL = Refused("at least 32")
 LONG = Refused("crop it")
 LARGE = Refused(
@@ -346,9 +346,11 @@ FILES: dict[str, Accepted | Refused] = {
     "mp4: all of one color": NO_SUBJECT,
     "mp4: every offset shifted": BROKEN,
     "mp4: HEIC with nothing in it": HEIC,
-    "mp4: AVIF with nothing in it": AVIF,
+    "mp4: AVIF with nothing in it": CLAIMS,
     "mp4: HEIC": HEIC,
-    "mp4: AVIF": AVIF,
+    "mp4: AVIF": PICTURE,
+    "mp4: AVIF cut at a half": CLAIMS,
+    "mp4: AVIF of four billion a side": Refused(f"{CLAIMS.says}|broken or too large|crop it"),
     "mp4: moving AVIF": AVIF,
     "mp4: HEIC of four billion a side": HEIC,
     "mov: data in another file": video(4),
@@ -943,9 +945,6 @@ OPEN: dict[str, str] = {
     **{f"bank: {name}": _BANK for name in _BANKS},
     **{f"stored bank: {name}": _BANK for name in (*_BANKS, *_STORED)},
     "fuzz banks": _BANK,
-    "read record: a recipe of words": "order_again takes any recipe for a mapping",
-    "read record: a run of null": "order_again takes any run for a mapping",
-    "fuzz records": "order_again takes any recipe for a mapping",
     "png: pixels before the header": "the size is read where a header should be, and named in its place",
     "png: Apple's own form": "the size is read where a header should be, and named in its place",
     "gif: cut within the first frame": "FFmpeg fills what is missing, and says nothing",

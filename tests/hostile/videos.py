@@ -34,6 +34,9 @@ Make = Callable[[], bytes]
 os.environ.setdefault("SVT_LOG", "0")  # the AV1 encoder prints its settings otherwise
 
 
+X265 = (("x265-params", "log-level=none:bframes=0"),)  # with B-frames, a film of one frame fails now and then
+
+
 def walk(count: int, size: int = SIZE) -> list[ndarray]:
     """Return RGBA frames of a disc that goes to the right."""
     return [disc(6 + 2 * i, size) for i in range(count)]
@@ -205,7 +208,7 @@ def _blank_pixels() -> bytes:
 @functools.cache
 def _coded() -> tuple[bytes, bytes]:
     """Return the configuration box and the picture of an HEVC intra frame."""
-    content = film("mp4", "libx265", 1, options=(("x265-params", "log-level=none"),), muxer=())
+    content = film("mp4", "libx265", 1, options=X265, muxer=())
     at = content.index(b"hvcC") - 4
     (size,) = struct.unpack_from(">I", content, at)
     start = content.index(b"mdat") + 4
@@ -217,6 +220,12 @@ def heic(width: int = SIZE, height: int = SIZE) -> bytes:
     """Return a real HEIC picture."""
     config, payload = _coded()
     return heif(b"heic", b"hvc1", config, payload, width, height)
+
+
+def _wide_avif() -> bytes:
+    content = saved(subject("RGBA"), "AVIF")
+    at = content.index(b"ispe") + 8
+    return content[:at] + b"\xff" * 8 + content[at + 8 :]
 
 
 VIDEOS: dict[str, Make] = {
@@ -257,6 +266,8 @@ VIDEOS: dict[str, Make] = {
     "mp4: AVIF with nothing in it": lambda: b"\0\0\0\x18ftypavif" + bytes(64),
     "mp4: HEIC": heic,
     "mp4: AVIF": lambda: saved(subject("RGBA"), "AVIF"),
+    "mp4: AVIF cut at a half": lambda: cut(saved(subject("RGBA"), "AVIF"), 0.5),
+    "mp4: AVIF of four billion a side": _wide_avif,
     "mp4: moving AVIF": lambda: film("avif", "libsvtav1", options=(("preset", "12"),)),
     "mp4: HEIC of four billion a side": lambda: heic(2**32 - 1, 2**32 - 1),
     "mov: data in another file": outside_data,
@@ -296,7 +307,7 @@ VIDEOS: dict[str, Make] = {
     "mp4: a frame every 1,000 s": lambda: film(fps=Fraction(1, 1000)),
     "mp4: 1,000 frames a second": lambda: film(fps=1000),
     "mp4: uneven sizes": lambda: film(pixels="yuv444p", width=65, height=47),
-    "mp4: 10 bits": lambda: film(codec="libx265", pixels="yuv420p10le", options=(("x265-params", "log-level=none"),)),
+    "mp4: 10 bits": lambda: film(codec="libx265", pixels="yuv420p10le", options=X265),
     "mp4: AV1": lambda: film(codec="libsvtav1", options=(("preset", "12"),)),
     "mp4: 40 frames": lambda: film(count=40),
     "mp4: zip behind": lambda: film() + frames_zip(),
