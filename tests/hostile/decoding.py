@@ -35,7 +35,7 @@ class Outcome:
     Attributes:
         kind: `done` is success of a reader that gives no frames; `broke` is an exception that no user should see.
         frames: of a picture or a video.
-        says: message of the refusal, or the traceback.
+        says: message of the refusal, or the end of the traceback.
         seconds: processor time.
         peak_mb: highest resident memory while it ran, MiB; 0 where it is not known.
         left: files that stayed in the folder for temporary files, or outputs of a refused file.
@@ -256,7 +256,8 @@ def _failure(error: BaseException) -> dict[str, Any]:
 
     if isinstance(error, DG4DError):
         return {"kind": "refused", "says": str(error)}
-    return {"kind": "broke", "says": "".join(traceback.format_exception(error))[-3000:]}
+    where = "".join(traceback.format_tb(error.__traceback__))[-2500:]
+    return {"kind": "broke", "says": f"{where}{type(error).__name__}: {str(error)[:500]}"}
 
 
 @contextlib.contextmanager
