@@ -76,6 +76,7 @@ RECORDS: dict[str, Make] = {
     "record: a file with a zero": record(files={"a\0b": _fact()}),
     "record: a file of 5,000 letters": record(files={"a" * 5000: _fact()}),
     "record: a file beside, above": record(beside=["../evil"]),
+    "record: a file beside, of 5,000 letters": record(beside=["9" * 5000]),
     "record: beside is a number": record(beside=7),
     "record: beside are numbers": record(beside=[7]),
     "record: facts are a number": record(files={"asset.glb": 7}),
