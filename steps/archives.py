@@ -1,9 +1,12 @@
 """Zips that somebody else may have written, unpacked so that nothing lands outside, and not without end."""
 
+import errno
+import lzma
 import re
 import shutil
 import stat
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 
@@ -11,6 +14,8 @@ from dg4d_lib.errors import BadInput
 
 MOST_ENTRIES = 100_000
 MOST_UNPACKED_BYTES = 64 * 2**30  # of all entries together; what they say of themselves is the most that is read
+BROKEN = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, NotImplementedError, RuntimeError, EOFError, ValueError)
+UNFIT_ERRNOS = {errno.EINVAL, errno.ENAMETOOLONG, errno.EEXIST, errno.ENOTDIR, errno.EISDIR}  # lying offsets, names
 UNFIT = re.compile(r"[\\\x00-\x1f]|^[A-Za-z]:")  # backslashes, control characters, drives
 
 
@@ -30,7 +35,8 @@ def checked(archive: zipfile.ZipFile, what: str) -> list[zipfile.ZipInfo]:
     Raises:
         BadInput: an entry leads outside or is a link, two have one name, or there is too much in it.
     """
-    entries = sorted((entry for entry in archive.infolist() if not entry.is_dir()), key=lambda entry: entry.filename)
+    files = (entry for entry in archive.infolist() if not entry.filename.endswith("/"))  # is_dir() needs a name
+    entries = sorted(files, key=lambda entry: entry.filename)
     if len(entries) > MOST_ENTRIES:
         raise BadInput(f"{what} has {len(entries)} entries; at most {MOST_ENTRIES} are unpacked")
     size = sum(entry.file_size for entry in entries)
@@ -68,6 +74,10 @@ def unpack(path: Path, folder: Path, what: str, wanted: Callable[[str], bool] = 
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with archive.open(entry) as source, target.open("wb") as file:
                     shutil.copyfileobj(source, file)
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
+    except BROKEN as error:
         raise BadInput(f"{what} is broken, encrypted, or no zip: {error}") from error
+    except OSError as error:
+        if error.errno not in UNFIT_ERRNOS and error.errno is not None:  # bzip2 damage has none
+            raise
+        raise BadInput(f"{what} is broken, or has a name that no file may have: {error.strerror or error}") from error
     return [entry.filename for entry in entries]
