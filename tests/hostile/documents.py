@@ -26,7 +26,7 @@ SCENES: dict[str, Make] = {
     "scene: null": raw("null"),
     "scene: no items": raw('{"items": []}'),
     "scene: 1,001 items": lambda: json.dumps({"items": [{"package": "gem"}] * 1001}).encode(),
-    "scene: an unknown key": scene(colour="red"),
+    "scene: an unknown key": scene(tint="red"),
     "scene: a package above": scene(package="../gem"),
     "scene: a package of the root": scene(package="/etc"),
     "scene: a package with a zero": scene(package="a\0b"),

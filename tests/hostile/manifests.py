@@ -60,7 +60,7 @@ WHOLE: dict[str, tuple[str, Make]] = {
     "manifest: Parquet whose footer lies": (".parquet", lambda: b"PAR1" + bytes(100) + b"\xff\xff\xff\x7fPAR1"),
     "manifest: a field of 200,000 letters": (".csv", lambda: b"path,name\ncat.png," + b"a" * 200_000),
     "manifest: a quote without end": (".csv", lambda: b'path,name\n"cat.png,' + b"a" * 140_000 + b"\na\na\n"),
-    "manifest: unknown column": (".csv", table("path,colour", "cat.png,red")),
+    "manifest: unknown column": (".csv", table("path,tint", "cat.png,red")),
     "manifest: too many cells": (".csv", table("path", "cat.png,red,green")),
     "manifest: neither path nor text": (".csv", table("path,seed", ",1")),
     "manifest: a column without a name": (".csv", table("path,", "cat.png,x")),

@@ -9,7 +9,7 @@ LONG = "9" * 5000
 
 OPTIONS: dict[str, list[str]] = {
     "make: nothing": ["make"],
-    "make: unknown option": ["make", "cat.png", "--colour", "red"],
+    "make: unknown option": ["make", "cat.png", "--tint", "red"],
     "make: two pictures": ["make", "cat.png", "cat.png"],
     "make: a picture that is gone": ["make", "dog.png"],
     "make: a folder": ["make", "pets"],

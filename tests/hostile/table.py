@@ -606,7 +606,7 @@ BANKS: dict[str, int | Refused] = {
 USAGE = 2
 COMMANDS: dict[str, Refused] = {
     "make: nothing": Refused("give a picture", USAGE),
-    "make: unknown option": Refused("--colour", USAGE),
+    "make: unknown option": Refused("--tint", USAGE),
     "make: two pictures": Refused("unexpected extra argument", USAGE),
     "make: a picture that is gone": Refused("dog.png does not exist"),
     "make: a folder": Refused("is a folder"),
@@ -754,7 +754,7 @@ MANIFESTS: dict[str, Batch | Refused] = {
     "manifest: Parquet whose footer lies": Refused("cannot be read as a manifest"),
     "manifest: a field of 200,000 letters": Batch(0, "field larger"),
     "manifest: a quote without end": Batch(0, "field larger|does not exist"),
-    "manifest: unknown column": Refused("colour"),
+    "manifest: unknown column": Refused("tint"),
     "manifest: too many cells": Batch(0, "3 cells"),
     "manifest: neither path nor text": Batch(0, "neither a path nor a text"),
     "manifest: a column without a name": Refused("unknown column"),
@@ -854,7 +854,7 @@ SCENES: dict[str, Refused] = {
     "scene: null": Refused("Scene|object|dictionary"),
     "scene: no items": Refused("items"),
     "scene: 1,001 items": Refused("items"),
-    "scene: an unknown key": Refused("colour"),
+    "scene: an unknown key": Refused("tint"),
     "scene: a package above": Refused("leads outside"),
     "scene: a package of the root": Refused("leads outside"),
     "scene: a package with a zero": Refused("package|no asset"),
