@@ -73,6 +73,7 @@ def make(
     ] = None,
     bank: Annotated[Path | None, typer.Option(help="folder of true views, for --set prior.kind=oracle")] = None,
     commercial_only: Commercial = False,
+    force: Annotated[bool, typer.Option("--force", help="replace the package of another asset in the folder")] = False,
     pick: Annotated[
         int | None, typer.Option(min=1, max=16, help="take this motion of those that `dg4d motions` shows")
     ] = None,
@@ -111,7 +112,7 @@ def make(
         )
         wish.check()
         folder = out or Path("out") / item
-        check_folder(folder)
+        check_folder(folder, item, force)
         order = wish.order(home.store())
         if is_current(folder, order.digest()):
             console.print("nothing to do: every step was already done")

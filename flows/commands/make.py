@@ -13,7 +13,7 @@ from flows import home
 from flows.engine.free_space import require_free_space
 from flows.inputs.orders import Order
 from flows.packages.credentials import Signer, configured
-from flows.packages.publish import Files, publish
+from flows.packages.publish import Files, is_current, publish, record_of
 from flows.serving.server import ServerUnavailable
 from steps.store import ArtifactMissing
 from steps.store import home as store_home
@@ -59,7 +59,8 @@ def connect() -> None:
 def make(order: Order, folder: Path) -> tuple[Files, bool]:
     """Run the flow of an order and put the package into `folder`, signed if a key is configured; keep it as a version.
 
-    What turns out to be damaged or gone on the way is made again.
+    What turns out to be damaged or gone on the way is made again. Another run that writes the same folder is waited
+    for; if it made the same package, there is nothing left to do.
 
     Returns:
         The files of the package, and whether every step had been done before.
@@ -69,13 +70,21 @@ def make(order: Order, folder: Path) -> tuple[Files, bool]:
         BadInput: the folder cannot be written, the disk is full, or the key cannot sign; it is as it was.
         BackendUnavailable: a key is configured, and signing is not installed.
     """
+    from flows.engine.events import StepEvent, tell
     from flows.engine.executors import StepLost
+    from flows.engine.output_lock import output_lock
+
+    def waiting() -> None:
+        tell(StepEvent(order.item, "output", "remark", text=f"waiting for another run that writes {folder}"))
 
     signer = configured()
-    try:
-        return _make(order, folder, signer)
-    except (ArtifactMissing, StepLost):  # it was dropped when it was found, and so was the result that named it
-        return _make(order, folder, signer)
+    with output_lock(folder, waiting) as waited:
+        if waited and is_current(folder, order.digest()):
+            return (record_of(folder) or {"files": {}})["files"], True
+        try:
+            return _make(order, folder, signer)
+        except (ArtifactMissing, StepLost):  # it was dropped when it was found, and so was the result that named it
+            return _make(order, folder, signer)
 
 
 def run(order: Order, refresh: bool = False) -> "Made":

@@ -74,13 +74,17 @@ def up(
 
 
 def down() -> None:
-    """Stop the server and the workers of this machine."""
+    """Stop the server and the workers of this machine; says which, and how many runs end with them."""
     with clear_ending():
         from flows import home
         from flows.serving.workers import running
 
         server = home.background_server()
-        stopped = [worker.stop() for worker in running(server.folder)]
+        stopped = []
+        for worker in running(server.folder):
+            runs = worker.runs()
+            typer.echo(f"ending worker {worker.pool}" + (f" and its {runs} run{'s' * (runs > 1)}" if runs else ""))
+            stopped.append(worker.stop())
         typer.echo("stopped" if server.stop() or stopped else "nothing was running")
 
 

@@ -23,8 +23,13 @@ Files = dict[str, dict[str, Any]]  # path within the package -> {"digest", "size
 Finish = Callable[[Path, Files], Files]
 
 
-def check_folder(folder: Path) -> None:
-    """Refuse a folder that cannot be written to, or that holds something else than a package.
+def check_folder(folder: Path, item: str = "", force: bool = False) -> None:
+    """Refuse a folder that cannot be written to, or that holds something else than a package of this item.
+
+    Args:
+        folder: where a package goes.
+        item: name of its asset; empty: of any.
+        force: a package of another item may be replaced.
 
     Raises:
         BadInput: says what is in the way and what to do.
@@ -32,7 +37,13 @@ def check_folder(folder: Path) -> None:
     check_folder_name(folder)
     if folder.exists() and not folder.is_dir():
         raise BadInput(f"{folder} is a file; choose a folder for the output with -o")
-    if folder.is_dir() and record_of(folder) is None:
+    record = record_of(folder) if folder.is_dir() else None
+    if record is not None and item and not force and record.get("item", item) != item:
+        raise BadInput(
+            f"{folder} holds the asset {record['item']!r}, and this run makes {item!r}; choose another folder with -o, "
+            "or replace it with --force"
+        )
+    if folder.is_dir() and record is None:
         others = sorted(p.name for p in folder.iterdir() if not p.name.startswith("."))
         if others:
             raise BadInput(

@@ -283,7 +283,7 @@ def _make(address: str, folder: Path, options: Options, roots: Roots, **files: P
         **files,
     )
     wish.check()
-    check_folder(folder)
+    check_folder(folder, wish.item)
     order = wish.order(home.store())
     if not is_current(folder, order.digest()):
         connect()

@@ -69,6 +69,13 @@ class Worker:
                 check=False,
             )
 
+    def runs(self) -> int:
+        """Return the number of runs that it executes at this moment."""
+        with suppress(OSError, ValueError):  # it may just be ending
+            guard = int(self._place("pid").read_text(encoding="ascii"))
+            return sum(len(_children(int(worker))) for worker in _children(guard))
+        return 0
+
     def stop(self) -> bool:
         """End it and the runs that it started; whether it was there."""
         if not self.is_there():

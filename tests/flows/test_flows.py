@@ -18,6 +18,7 @@ from flows.engine.events import StepEvent, listening
 from flows.engine.executors import StepBadInput, StepCrashed, StepDiverged, StepError, StepMissing, StepOutOfMemory
 from flows.engine.orphans import settle_orphans
 from flows.inputs.orders import Order, Wish
+from flows.packages.publish import whole
 from flows.packages.summary import NOT_ACCEPTED, Row, Tally
 from flows.serving.server import Server
 from steps.profiles import PREVIEW, revise
@@ -212,6 +213,29 @@ def test_two_commands_at_once_do_the_work_once(log: Path, tmp_path: Path) -> Non
         assert command.returncode == 0, trouble
     assert sorted(ran(log)) == sorted(EVERY_STEP)
     assert tree(tmp_path / "a", *RUN_FACTS) == tree(tmp_path / "b", *RUN_FACTS)
+
+
+def test_two_runs_into_one_folder_take_turns_and_the_second_finds_it_done(log: Path, tmp_path: Path) -> None:
+    (tmp_path / "x.png").write_text(picture("turns fit_gaussians=sleep:2"))
+    both = [start("make", str(tmp_path / "x.png"), "-o", str(tmp_path / "out")) for _ in range(2)]
+    said = [command.communicate()[0] for command in both]
+    assert [command.returncode for command in both] == [0, 0]
+    assert sorted(ran(log)) == sorted(EVERY_STEP)
+    assert sum("waiting for another run" in text for text in said) == 1
+    assert sum("nothing to do" in text for text in said) == 1
+    whole(tmp_path / "out")
+
+
+def test_a_package_of_another_asset_is_replaced_only_by_force(dg4d: Run, log: Path, tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        (tmp_path / f"{name}.png").write_text(picture(f"{name} by force"))
+    assert dg4d("make", "one.png", "-o", "same").exit_code == 0
+    before = tree(tmp_path / "same")
+    refused = dg4d("make", "two.png", "-o", "same")
+    assert refused.exit_code == 65 and "'one'" in refused.output and "--force" in refused.output
+    assert tree(tmp_path / "same") == before
+    assert dg4d("make", "two.png", "-o", "same", "--force").exit_code == 0
+    assert json.loads((tmp_path / "same" / "provenance.json").read_text())["item"] == "two"
 
 
 def test_what_a_gate_does_not_let_pass_is_said_at_the_end(dg4d: Run, log: Path, tmp_path: Path) -> None:

@@ -19,7 +19,9 @@ from flows.packages.publish import whole
 from flows.serving import deployments, registering
 from flows.serving.pools import read_pools
 from flows.serving.roots import SOURCES
+from flows.serving.server import Server
 from flows.serving.watching import announce
+from flows.serving.workers import Worker
 from steps.profiles import PREVIEW, PROFILES, revise
 
 FLOWS = ["image-to-4d", "video-to-4d", "catalog", "benchmark"]
@@ -169,6 +171,20 @@ def test_a_run_whose_process_was_killed_goes_on_after_its_last_finished_step(
     assert steps[:4] == ["prepare_subject", "drive_video", "fit_gaussians", "fit_motion"]
     assert steps[4:] == ["fit_motion", "extract_mesh", "refine_texture", "pack_asset", "check_asset"]
     whole(tmp_path / "out")
+
+
+def test_a_worker_knows_how_many_runs_would_end_with_it(
+    worker: tuple[TinyS3, Path], client: SyncPrefectClient, server: Server, tmp_path: Path
+) -> None:
+    (tmp_path / "counted.png").write_text(picture(f"{tmp_path} fit_gaussians=sleep:3"))
+    counted = Worker("process-cpu", server.folder)
+    assert counted.runs() == 0
+    deployment = client.read_deployment_by_name("image-to-4d/local")
+    parameters = {"picture": str(tmp_path / "counted.png"), "out": str(tmp_path / "out")}
+    client.create_flow_run_from_deployment(deployment.id, parameters=parameters)
+    wait_until(lambda: counted.runs() == 1)
+    wait_until(lambda: ended(client, parameters["out"]))
+    wait_until(lambda: counted.runs() == 0)
 
 
 def test_a_run_that_was_begun_too_often_fails(monkeypatch: pytest.MonkeyPatch) -> None:

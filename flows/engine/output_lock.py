@@ -1,0 +1,41 @@
+"""Lock on the output folder of a run: two runs never replace the same package at the same time."""
+
+import hashlib
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from flows import home
+from flows.engine.processes import locked
+from flows.engine.resources import Stopped, stopping
+
+POLL_S = 0.2  # between two attempts
+
+
+@contextmanager
+def output_lock(folder: Path, waiting: Callable[[], None]) -> Iterator[bool]:
+    """Hold the lock of an output folder while the block runs; the kernel frees it when the process ends.
+
+    Args:
+        folder: where a package goes; it need not exist.
+        waiting: called once if another run of this user holds the lock.
+
+    Yields:
+        Whether another run held the lock before.
+
+    Raises:
+        Stopped: the user stopped the command meanwhile.
+    """
+    name = hashlib.sha256(os.fsencode(folder.absolute().resolve())).hexdigest()
+    waited = False
+    while True:
+        with locked(home.locks() / f"output-{name}.lock") as free:
+            if free:
+                yield waited
+                return
+        if not waited:
+            waited = True
+            waiting()
+        if stopping.wait(POLL_S):
+            raise Stopped(f"stopped while another run writes {folder}")
