@@ -108,7 +108,7 @@ class Clip:
 
     def _frames(self) -> Iterator[av.VideoFrame]:
         try:
-            with av.open(str(self._path), format=self._container) as container:
+            with av.open(str(self._path), format=self._container, metadata_errors="replace") as container:
                 if not container.streams.video:
                     found = "holds only sound or other tracks" if len(container.streams) else "is cut off or broken"
                     raise BadInput(f"{self._what} {found}: there are no pictures in it; give another file")

@@ -6,6 +6,7 @@ import re
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterable
 from pathlib import Path
 
 from dg4d_lib.errors import BadInput
@@ -53,6 +54,7 @@ PICTURE_SUFFIXES = {
     ".png", ".jpg", ".jpeg", ".webp", ".avif", ".tif", ".tiff", ".bmp", ".exr", ".hdr", ".jxl", ".jp2", ".psd", ".ppm",
     ".pgm",
 }  # fmt: skip
+SCENE_SUFFIXES = {".usd", ".usda", ".usdc"}  # of the layers in a USDZ, which is a zip of a scene and its textures
 CLUTTER = {"Thumbs.db", "desktop.ini"}
 NPY = b"\x93NUMPY"
 ZIP_ERRORS = (
@@ -147,6 +149,31 @@ def is_frame_name(name: str) -> bool:
     return path.suffix.lower() in PICTURE_SUFFIXES and not path.name.startswith(".") and "__MACOSX" not in path.parts
 
 
+def check_no_scene(names: Iterable[str]) -> None:
+    """Refuse a zip that is a USDZ: its pictures are textures, not frames.
+
+    Raises:
+        BadInput: names the scene and says what to give.
+    """
+    scene = next((name for name in names if Path(name).suffix.lower() in SCENE_SUFFIXES), None)
+    if scene is not None:
+        raise BadInput(f"the zip is a 3D scene (USDZ, it holds {scene!r}), which is no source; give {ALLOWED}")
+
+
+def frame_suffix(name: str, head: bytes) -> str:
+    """Return the suffix of a frame in a zip, by its first bytes.
+
+    Raises:
+        BadInput: names the frame and says what it is.
+    """
+    if not head:
+        raise BadInput(f"the frame {name} is empty (0 bytes); export it again")
+    try:
+        return still_suffix(head)
+    except BadInput as error:
+        raise BadInput(f"the frame {name}: {error}") from error
+
+
 def check_head(head: bytes) -> None:
     """Refuse bytes that begin neither a picture, a video nor a zip.
 
@@ -205,24 +232,16 @@ def _check_zip(path: Path) -> None:
             entries = [info for info in archive.infolist() if not info.is_dir() and not _is_clutter(info.filename)]
             if len(entries) > MOST_ENTRIES:
                 raise BadInput(f"the zip holds {len(entries)} files; at most {MOST_ENTRIES} are looked at")
+            check_no_scene(info.filename for info in entries)
             for info in entries:
                 if not is_frame_name(info.filename):
                     raise BadInput(f"the zip holds {info.filename!r}, which is no frame; pack the pictures alone")
                 with archive.open(info) as file:
-                    _check_frame(info.filename, file.read(SNIFFED_BYTES))
+                    frame_suffix(info.filename, file.read(SNIFFED_BYTES))
     except ZIP_ERRORS as error:
         raise BadInput("the zip of frames is broken or encrypted; pack it again") from error
     if len(entries) < 2:
         raise BadInput(f"the zip holds {len(entries) or 'no'} picture{'s' * (len(entries) != 1)}; give two or more")
-
-
-def _check_frame(name: str, head: bytes) -> None:
-    if not head:
-        raise BadInput(f"the frame {name} is empty (0 bytes); export it again")
-    try:
-        still_suffix(head)
-    except BadInput as error:
-        raise BadInput(f"the frame {name}: {error}") from error
 
 
 def _begins(archive: zipfile.ZipFile, info: zipfile.ZipInfo, signature: bytes) -> bool:

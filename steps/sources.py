@@ -19,7 +19,18 @@ from steps.avif import read_avif
 from steps.clips import MOST_DECODED, MOST_DECODING_S, MOST_FRAMES, Clip, KeptFrames, evenly_spaced, thinned_rate
 from steps.decode_limit import DecodeLimit
 from steps.decoder_errors import damage_is_bad_input
-from steps.media_types import ALLOWED, SNIFFED_BYTES, container_of, is_animated_png, is_frame_name, is_zip, still_suffix
+from steps.gif import check_first_frame
+from steps.media_types import (
+    ALLOWED,
+    SNIFFED_BYTES,
+    check_no_scene,
+    container_of,
+    frame_suffix,
+    is_animated_png,
+    is_frame_name,
+    is_zip,
+    still_suffix,
+)
 from steps.stills import LARGEST_SIDE as STILL_SIDE
 from steps.stills import read_still
 from steps.webp import AnimatedWebp, is_animated
@@ -109,6 +120,8 @@ def _says_something(frames: Float[Tensor, "t h w 4"]) -> bool:
 
 
 def _read_clip(path: Path, container: str, max_frames: int, limit: DecodeLimit) -> Source:
+    if container == "gif":
+        check_first_frame(path)
     clip = Clip(path, container, limit)
     if clip.count < 2 and container in ("gif", "apng") and clip.count:
         return _picture(*clip.read([0]))
@@ -142,6 +155,7 @@ def _need_two(count: int, what: str) -> None:
 def _read_zip(path: Path, scratch: Path, max_frames: int, limit: DecodeLimit) -> Source:
     try:
         with zipfile.ZipFile(path) as archive:
+            check_no_scene(archive.namelist())
             entries = _numbered(
                 [info for info in archive.infolist() if not info.is_dir() and is_frame_name(info.filename)]
             )
@@ -230,9 +244,7 @@ def _zipped_picture(
         raise BadInput(f"{info.filename} unpacks to {info.file_size} bytes; at most {MOST_ENTRY_BYTES} are read")
     with archive.open(info) as content:
         head = content.read(SNIFFED_BYTES)
-        if not head:
-            raise BadInput(f"the frame {info.filename} is empty (0 bytes); export it again")
-        target = scratch / f"frame{still_suffix(head)}"
+        target = scratch / f"frame{frame_suffix(info.filename, head)}"
         with target.open("wb") as file:
             file.write(head)
             shutil.copyfileobj(content, file)

@@ -40,8 +40,10 @@ def read_header(path: Path, suffix: str) -> Header | None:
         return None
 
 
-def _png(head: bytes) -> Header:
-    """Read IHDR; rows of interlaced files are complete only at the end."""
+def _png(head: bytes) -> Header | None:
+    """Read IHDR, which must be the first chunk; rows of interlaced files are complete only at the end."""
+    if head[12:16] != b"IHDR":
+        return None
     width, height, depth, color, interlaced = struct.unpack_from(">IIBBxxB", head, 16)
     channels = {0: 1, 2: 3, 3: 4, 4: 2}.get(color, 4)
     return Header(width, height, channels * max(1, depth // 8) if interlaced else 0)

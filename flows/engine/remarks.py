@@ -1,16 +1,20 @@
 """Remarks on a result that a user should read before the rest of the run, with a picture to look at."""
 
+import os
 import re
+import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 from flows import home
 from flows.engine.events import StepEvent, tell
 from steps.contract import ArtifactRef, StepResult
-from steps.store import ArtifactMissing, StoreUnreachable
+from steps.store import ArtifactMissing, DiskFull, StoreUnreachable
 
 REMARKED = "prepare_subject"  # cuts subjects out, which may be a guess
 NAME_LENGTH = 80  # characters of an item in the name of a picture
 DIGITS = 12  # of a digest in it
+MOST_PICTURES = 200  # files that are kept, the newest; each shows what a user handed in
 
 
 def remark(item: str, label: str, result: StepResult) -> None:
@@ -24,13 +28,39 @@ def remark(item: str, label: str, result: StepResult) -> None:
 
 
 def _saved(item: str, ref: ArtifactRef) -> Path | None:
-    """Write a picture where people can open it by its name; None if that fails."""
+    """Write a picture where its owner can open it by its name; None if that fails."""
     name = re.sub(r"[^\w.-]+", "-", item)[:NAME_LENGTH]
     path = home.cutouts() / f"{name}-{ref.digest.rpartition(':')[2][:DIGITS]}.png"
     try:
-        if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            home.store().get(ref, path)
-    except (OSError, UnicodeError, ArtifactMissing, StoreUnreachable):
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if path.exists():
+            path.touch()  # the newest again
+        else:
+            _fetch(ref, path)
+    except (OSError, UnicodeError, ArtifactMissing, DiskFull, StoreUnreachable):
         return None
+    _prune(path.parent)
     return path
+
+
+def _fetch(ref: ArtifactRef, path: Path) -> None:
+    """Copy an artifact into a file that only its owner can read; a reader sees all of it or nothing."""
+    descriptor, name = tempfile.mkstemp(dir=path.parent)  # mode 0600
+    os.close(descriptor)
+    scratch = Path(name)
+    try:
+        home.store().get(ref, scratch)
+        scratch.replace(path)
+    finally:
+        scratch.unlink(missing_ok=True)
+
+
+def _prune(folder: Path) -> None:
+    """Remove all but the newest pictures; other processes may do the same at the same time."""
+    ages: list[tuple[int, Path]] = []
+    for path in folder.iterdir():
+        with suppress(OSError):
+            ages.append((path.stat().st_mtime_ns, path))
+    for _, path in sorted(ages, reverse=True)[MOST_PICTURES:]:
+        with suppress(OSError):
+            path.unlink()

@@ -51,6 +51,7 @@ OUTSIDE = Refused("outside its canvas")
 HEIC = Refused("HEIC")
 AVIF = Refused("AVIF")
 EMPTY = Refused("empty|0 bytes")
+USD = Refused("3D scene")
 UNKNOWN = Refused("not known here|text file|not a picture")
 CLAIMS = Refused(f"{BROKEN.says}|{LARGE.says}")  # whoever looks first: our check of the size, or the decoder
 STUMP = Refused(f"{BROKEN.says}|{UNKNOWN.says}")  # of the first bytes of a file, it is a matter of taste
@@ -438,8 +439,8 @@ FILES: dict[str, Accepted | Refused] = {
     "zip: bomb of 256 MiB a frame": Refused("not known|unpacks to|at most"),
     "zip: bomb of shared bodies": Refused("not known|unpacks to|broken|at most"),
     "zip: frames of 4,000 a side, zeros": NO_SUBJECT,
-    "zip: USDZ": Refused("USD|one frame"),
-    "zip: USDZ of two textures": Refused("USD"),
+    "zip: USDZ": USD,
+    "zip: USDZ of two textures": USD,
     "zip: document": ONE_FRAME,
     "zip: program of Java": NO_FRAME,
     "zip: book": ONE_FRAME,
@@ -948,18 +949,6 @@ OPEN: dict[str, str] = {
     "fuzz banks": _BANK,
     "record: a file beside, of 5,000 letters": "verify asks the file system for any name",
     "fuzz records": "verify asks the file system for any name",
-    "png: pixels before the header": "the size is read where a header should be, and named in its place",
-    "png: Apple's own form": "the size is read where a header should be, and named in its place",
-    "gif: cut within the first frame": "FFmpeg fills what is missing, and says nothing",
-    "mp4: title in Latin-1": "PyAV is not told to replace letters in titles that are no UTF-8",
-    "mkv: title in Latin-1": "PyAV is not told to replace letters in titles that are no UTF-8",
-    "avi: title in Latin-1": "PyAV is not told to replace letters in titles that are no UTF-8",
-    "flv: key in Latin-1": "PyAV is not told to replace letters in titles that are no UTF-8",
-    "zip: frames of text": "the frame is not named",
-    "zip: frames that are zips": "the frame is not named",
-    "zip: frames that are videos": "the frame is not named",
-    "zip: a link in place of a frame": "the frame is not named",
-    "zip: USDZ of two textures": "the textures of a scene are taken for frames",
 }
 
 

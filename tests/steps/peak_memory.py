@@ -1,18 +1,20 @@
-"""Peak memory of the first step, measured in a process of its own: `python peak_memory.py FILE...` prints a line each.
+"""Peak memory of the first step, in a process of its own: `python peak_memory.py SETTINGS FILE ...` prints lines.
 
 The kernel's high-water mark of resident memory (VmHWM) is reset before every file: one process measures many.
 """
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
+Settings = Mapping[str, object]
 
 
 @dataclass(frozen=True)
@@ -30,16 +32,24 @@ class Peak:
     seconds: float
 
 
-def peaks_of(files: Sequence[Path], **settings: object) -> list[Peak]:
-    """Prepare every file in one new process, with these settings of `SubjectSettings`."""
-    command = [sys.executable, __file__, json.dumps(settings), *map(str, files)]
-    child = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+def peaks_of(files: Sequence[tuple[Path, Settings]]) -> list[Peak]:
+    """Prepare every file in one new process, with its settings of `SubjectSettings`."""
+    requests = [text for path, settings in files for text in (json.dumps(settings), str(path))]
+    environment = os.environ | {"OMP_WAIT_POLICY": "PASSIVE"}  # threads that spin cost processor time
+    child = subprocess.run(
+        [sys.executable, __file__, *requests],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env=environment,
+        check=False,
+    )
     lines = child.stdout.splitlines()
     assert len(lines) == len(files), f"ended with {child.returncode} after {len(lines)} files: {child.stderr[-2000:]}"
     return [Peak(**json.loads(line)) for line in lines]
 
 
-def measure(path: Path, settings: dict[str, object]) -> Peak:
+def measure(path: Path, settings: Settings) -> Peak:
     """Prepare a file in this process."""
     from dg4d_lib.settings import SubjectSettings
     from steps.job import Job
@@ -68,6 +78,6 @@ def measure(path: Path, settings: dict[str, object]) -> Peak:
 
 if __name__ == "__main__":
     sys.path.insert(0, str(ROOT))
-    for name in sys.argv[2:]:
-        sys.stdout.write(json.dumps(asdict(measure(Path(name), json.loads(sys.argv[1])))) + "\n")
+    for settings, name in zip(sys.argv[1::2], sys.argv[2::2], strict=True):
+        sys.stdout.write(json.dumps(asdict(measure(Path(name), json.loads(settings)))) + "\n")
         sys.stdout.flush()

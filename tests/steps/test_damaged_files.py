@@ -3,6 +3,7 @@
 import io
 import struct
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -120,6 +121,18 @@ def test_headers_tell_the_size_that_was_written(width: int, height: int, suffix:
     path = save(tmp_path / f"a{suffix}", np.zeros((height, width, 3), np.uint8))
     header = read_header(path, suffix)
     assert header and (header.width, header.height) == (width, height)
+
+
+@pytest.mark.parametrize("first", [b"IDAT", b"CgBI"])
+def test_a_png_with_another_chunk_in_front_tells_no_size(first: bytes, tmp_path: Path) -> None:
+    content = save(tmp_path / "a.png", np.zeros((64, 64, 3), np.uint8)).read_bytes()
+    chunk = first + b"\x50\0\x20\x06"
+    (tmp_path / "a").write_bytes(
+        content[:8] + struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) + content[8:]
+    )
+    assert read_header(tmp_path / "a", ".png") is None
+    with pytest.raises(BadInput, match="cannot be read as a picture"):
+        read_source(tmp_path / "a", tmp_path, 4)
 
 
 def test_the_number_of_a_frame_may_not_have_a_thousand_digits(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from media_files import (
 
 from dg4d_lib.errors import BadInput
 from steps.clips import evenly_spaced, thinned_rate, work_side
+from steps.media_types import check_media
 from steps.sources import Source, read_source
 
 COLOR = torch.tensor((200, 60, 30)) / 255
@@ -183,6 +184,18 @@ def test_a_still_gif_is_a_picture(tmp_path):
     assert read(save_clip(tmp_path / "a.gif", walk(1), "gif", "rgb8")).kind == "picture"
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_gif_that_ends_anywhere_within_its_first_frame_is_refused(tmp_path, count):
+    whole = save_clip(tmp_path / "a.gif", walk(count), "gif", "rgb8").read_bytes()
+    second = whole.index(b"\0!\xf9", whole.index(b",")) + 1 if count > 1 else len(whole) - 1
+    for length in (*range(12, second, 7), second - 1):
+        (tmp_path / "a.gif").write_bytes(whole[:length])
+        with pytest.raises(BadInput, match="cut off or broken"):
+            read(tmp_path / "a.gif")
+    (tmp_path / "a.gif").write_bytes(whole[:second])
+    assert read(tmp_path / "a.gif").kind == "picture"
+
+
 def test_a_long_video_is_sampled_with_its_ends_and_its_duration(tmp_path):
     source = read(save_clip(tmp_path / "a.mkv", walk(11), "ffv1", "bgra"), max_frames=6)
     assert len(source.frames) == 6
@@ -253,8 +266,19 @@ def test_a_broken_frame_is_named(tmp_path):
     save_zip(tmp_path / "a.zip", {"0.png": disc()}, tmp_path)
     with zipfile.ZipFile(tmp_path / "a.zip", "a") as archive:
         archive.writestr("1.png", b"no picture at all")
-    with pytest.raises(BadInput, match="text file"):
+    with pytest.raises(BadInput, match=r"the frame 1\.png: the file is a text file"):
         read(tmp_path / "a.zip")
+
+
+@pytest.mark.parametrize("scene", ["scene.usdc", "scene.USDA", "deep/scene.usd"])
+def test_a_scene_is_no_folder_of_frames(tmp_path, scene):
+    save_zip(tmp_path / "a.zip", {"0.png": disc(), "1.png": disc()}, tmp_path)
+    with zipfile.ZipFile(tmp_path / "a.zip", "a") as archive:
+        archive.writestr(scene, b"PXR-USDC")
+    with pytest.raises(BadInput, match=rf"3D scene .*{scene}.*give pictures"):
+        read(tmp_path / "a.zip")
+    with pytest.raises(BadInput, match=rf"3D scene .*{scene}.*give pictures"):
+        check_media(tmp_path / "a.zip")
 
 
 # Bad input

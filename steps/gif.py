@@ -1,0 +1,59 @@
+"""Block structure of GIF files: FFmpeg fills the pixels that a truncated frame lacks, without an error."""
+
+from pathlib import Path
+from typing import BinaryIO
+
+from dg4d_lib.errors import BadInput
+
+SCREEN_BYTES = 13  # signature, version and logical screen descriptor
+IMAGE_BYTES = 9  # of an image descriptor behind its separator
+FLAGS = -1  # place of the flags in an image descriptor
+SCREEN_FLAGS = 10  # place of the flags in the screen descriptor
+EXTENSION, IMAGE = b"!", b","
+
+
+def check_first_frame(path: Path) -> None:
+    """Refuse a GIF that ends before the data of its first frame do.
+
+    Other damage is left to the decoder.
+
+    Raises:
+        BadInput: the file is cut off.
+    """
+    try:
+        with path.open("rb") as file:
+            _skip_first_frame(file)
+    except EOFError as error:
+        raise BadInput(
+            "the GIF is cut off or broken: it ends within its first frame; copy or export it again"
+        ) from error
+
+
+def _skip_first_frame(file: BinaryIO) -> None:
+    """Read until the first frame, or what stands in its place, has ended."""
+    _skip_palette(file, _read(file, SCREEN_BYTES)[SCREEN_FLAGS])
+    while (block := _read(file, 1)) == EXTENSION:
+        _read(file, 1)
+        _skip_data(file)
+    if block == IMAGE:
+        _skip_palette(file, _read(file, IMAGE_BYTES)[FLAGS])
+        _read(file, 1)  # LZW code size
+        _skip_data(file)
+
+
+def _skip_palette(file: BinaryIO, flags: int) -> None:
+    if flags & 0x80:
+        _read(file, 3 << (1 + (flags & 7)))
+
+
+def _skip_data(file: BinaryIO) -> None:
+    """Read sub-blocks of up to 255 bytes until the empty one."""
+    while size := _read(file, 1)[0]:
+        _read(file, size)
+
+
+def _read(file: BinaryIO, count: int) -> bytes:
+    content = file.read(count)
+    if len(content) < count:
+        raise EOFError
+    return content
