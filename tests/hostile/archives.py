@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from PIL import Image
 
 from tests.hostile.formats import cut, disc, saved, zeros_png
-from tests.hostile.pictures import frames_zip, sound_png
+from tests.hostile.samples import frames_zip, sound_png
 
 Make = Callable[[], bytes]
 

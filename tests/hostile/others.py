@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image
 
 from tests.hostile.formats import disc, opaque, riff, saved, subject
-from tests.hostile.pictures import frames_zip, sound_png
+from tests.hostile.samples import frames_zip, sound_png
 
 Make = Callable[[], bytes]
 Place = Callable[[Path], None]

@@ -16,7 +16,7 @@ from steps.store import ArtifactStore
 from tests.hostile.banks import DOOR, FOLDERS
 from tests.hostile.conftest import Place
 from tests.hostile.decoding import Decoder
-from tests.hostile.pictures import sound_png
+from tests.hostile.samples import sound_png
 from tests.hostile.table import BANKS, Refused, case
 
 CASES = {**DOOR, **FOLDERS}

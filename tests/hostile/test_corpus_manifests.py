@@ -14,7 +14,7 @@ from flows.packages.summary import Row
 from tests.hostile.conftest import Place
 from tests.hostile.manifests import ROWS, SOUND, WHOLE
 from tests.hostile.names import NAMES, WANTED
-from tests.hostile.pictures import sound_png
+from tests.hostile.samples import sound_png
 from tests.hostile.table import MADE, MANIFESTS, Refused, case
 from tests.hostile.table import NAMES as FILES_CALLED
 from tests.hostile.table import WANTED as ITEMS_CALLED

@@ -6,7 +6,7 @@ import pytest
 
 from tests.hostile.decoding import Decoder, Outcome
 from tests.hostile.fuzz import HANGS_S, TARGETS, fault, fuzz, repaired
-from tests.hostile.pictures import sound_png
+from tests.hostile.samples import sound_png
 from tests.hostile.table import case
 
 SECONDS = 60.0  # of all targets together

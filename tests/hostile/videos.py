@@ -28,7 +28,7 @@ from tests.hostile.formats import (
     saved,
     subject,
 )
-from tests.hostile.pictures import frames_zip
+from tests.hostile.samples import frames_zip
 
 Make = Callable[[], bytes]
 os.environ.setdefault("SVT_LOG", "0")  # the AV1 encoder prints its settings otherwise
