@@ -41,6 +41,12 @@ def picture(words: object) -> str:
     return f"#?RADIANCE\n{words}"
 
 
+def bank_json(*names: str) -> str:
+    """Return a `bank.json` of two frames whose sheets are `PNG`."""
+    views = [{"file": name, "azimuth": 0.0, "elevation": 0.0, "radius": 2.0} for name in names]
+    return json.dumps({"frames": [0, 1], "tile": [3, 4], "tile_size": 2, "views": views})
+
+
 def draw_picture(job: Job) -> Facts:
     words = _begin("draw_picture", job, job.inputs["text"].read_bytes())
     job.outputs["picture"].write_bytes(PNG + words)
