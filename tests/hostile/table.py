@@ -914,7 +914,8 @@ RECORDS: dict[str, Refused] = {
 
 # What the code does not get right yet, and why; a case that is mended must leave this list.
 OPEN: dict[str, str] = {
-    "store: refused by the step": "a source that only decoding refuses stays in the store until `dg4d store gc`",
+    "store: refused by the step": "a source that only decoding refuses stays until `dg4d store gc`: orders hold no "
+    "lease between admission and their run, so that nobody else can tell whether one still needs it",
     "png: pixels before the header": "the size is read where a header should be, and named in its place",
     "png: Apple's own form": "the size is read where a header should be, and named in its place",
     "gif: cut within the first frame": "FFmpeg fills what is missing, and says nothing",
