@@ -4,11 +4,11 @@ A bank is a folder, or a zip, with `bank.json` and one PNG per view, whose tiles
 """
 
 import struct
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-from pydantic_core import ErrorDetails, PydanticCustomError
 
 from dg4d_lib.errors import BadInput
 from steps.archives import can_exist, stays_inside
@@ -72,25 +72,21 @@ class BankIndex(_Strict):
         rows, columns = self.tile
         width, height = self.sheet_size
         if len(set(self.frames)) < len(self.frames):
-            raise PydanticCustomError("frames", "frames names a frame twice; every frame may be there once")
+            raise ValueError("frames names a frame twice; every frame may be there once")
         if len(self.frames) > rows * columns:
-            raise PydanticCustomError(
-                "frames",
-                "frames has {frames} entries and tile = [{rows}, {columns}] has room for {room}; at most one per tile "
-                "is allowed",
-                {"frames": len(self.frames), "rows": rows, "columns": columns, "room": rows * columns},
+            raise ValueError(
+                f"frames has {len(self.frames)} entries and tile = [{rows}, {columns}] has room for {rows * columns}; "
+                "at most one per tile is allowed"
             )
         if width * height > MOST_SHEET_PIXELS:
-            raise PydanticCustomError(
-                "tile",
-                "tile and tile_size make sheets of {width} x {height} pixels; at most {most} million are allowed",
-                {"width": width, "height": height, "most": MOST_SHEET_PIXELS // 1_000_000},
+            raise ValueError(
+                f"tile and tile_size make sheets of {width} x {height} pixels; at most "
+                f"{MOST_SHEET_PIXELS // 1_000_000} million are allowed"
             )
         if (pixels := len(self.views) * len(self.frames) * self.tile_size**2) > MOST_PIXELS:
-            raise PydanticCustomError(
-                "views",
-                "views and frames make {pixels} million pixels; at most {most} million are allowed",
-                {"pixels": pixels // 1_000_000, "most": MOST_PIXELS // 1_000_000},
+            raise ValueError(
+                f"views, frames and tile_size make {pixels // 1_000_000} million pixels; at most "
+                f"{MOST_PIXELS // 1_000_000} million are allowed"
             )
         return self
 
@@ -147,14 +143,14 @@ def _check_name(path: Path, field: str, name: str) -> None:
         raise BadInput(f"{path}: {field} is {_shown(name)}; sheets of a bank are PNG files, whose names end in .png")
 
 
-def _sentence(error: ErrorDetails) -> str:
+def _sentence(error: Mapping[str, Any]) -> str:
     """Say which field is wrong, what was given and what is allowed."""
-    where, reason = ".".join(map(str, error["loc"])), error["msg"].removeprefix("Input ")
-    if error["type"] in ("json_invalid", "frames", "tile", "views"):
-        return error["msg"]
+    where, reason = ".".join(map(str, error["loc"])), str(error["msg"])
+    if error["type"] in ("json_invalid", "value_error"):
+        return reason.removeprefix("Value error, ")
     if error["type"] == "missing":
         return f"{where} is missing"
-    return f"{where or 'the whole'} is {_shown(error['input'])}, and {reason}"
+    return f"{where or 'the whole'} is {_shown(error['input'])}, and {reason.removeprefix('Input ')}"
 
 
 def _shown(value: Any) -> str:
