@@ -2,6 +2,7 @@
 
 import errno
 import lzma
+import os
 import re
 import shutil
 import stat
@@ -16,6 +17,8 @@ MOST_ENTRIES = 100_000
 MOST_UNPACKED_BYTES = 64 * 2**30  # of all entries together; what they say of themselves is the most that is read
 BROKEN = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, NotImplementedError, RuntimeError, EOFError, ValueError)
 UNFIT_ERRNOS = {errno.EINVAL, errno.ENAMETOOLONG, errno.EEXIST, errno.ENOTDIR, errno.EISDIR}  # lying offsets, names
+LONGEST_PART_BYTES = 255  # of a file's name, on all common file systems
+LONGEST_NAME_BYTES = 1024  # with folders; Linux takes paths of 4095, and those of our folders come before
 UNFIT = re.compile(r"[\\\x00-\x1f]|^[A-Za-z]:")  # backslashes, control characters, drives
 
 
@@ -23,6 +26,12 @@ def stays_inside(name: str) -> bool:
     """Whether a name with slashes leads to a file in or below its folder, on every system."""
     parts = name.split("/")
     return bool(name) and not UNFIT.search(name) and not {"", ".", ".."} & set(parts)
+
+
+def can_exist(name: str) -> bool:
+    """Return whether a name with slashes is short enough for a file and its folders."""
+    size = len(os.fsencode(name))
+    return size <= LONGEST_NAME_BYTES and all(len(os.fsencode(part)) <= LONGEST_PART_BYTES for part in name.split("/"))
 
 
 def checked(archive: zipfile.ZipFile, what: str) -> list[zipfile.ZipInfo]:

@@ -1,12 +1,11 @@
 """The prior of a stage, from settings and files."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
@@ -31,7 +30,8 @@ from dg4d_lib.settings import (
 )
 from dg4d_lib.video.driving import over_white
 from dg4d_lib.weights.registry import weights_called
-from steps.archives import stays_inside, unpack
+from steps.archives import unpack
+from steps.banks import BANK_JSON, BankIndex, check_sheet, read_index
 from steps.job import Facts
 from steps.media import read_png
 from steps.weights import Opened, open_weights
@@ -129,30 +129,43 @@ def check_variant(settings: Zero123PriorSettings) -> None:
 
 
 def read_bank(path: Path, scratch: Path) -> Bank:
-    """The bank in a zip; see `read_bank_folder`.
+    """Read the bank in a zip; see `read_bank_folder`.
 
     Raises:
         BadInput: no bank.json in it, or a name that leads out of it.
     """
-    if "bank.json" not in unpack(path, scratch, "the bank"):
-        raise BadInput("the bank has no bank.json")
+    if BANK_JSON not in unpack(path, scratch, "the bank"):
+        raise BadInput(f"the bank has no {BANK_JSON}")
     return read_bank_folder(scratch)
 
 
 def read_bank_folder(folder: Path) -> Bank:
-    """The bank in a folder: bank.json and one sheet of tiles per view.
+    """Read the bank in a folder: `bank.json` (see `steps.banks.BankIndex`) and one sheet of tiles per view.
 
-    bank.json: {"frames": [...], "tile": [rows, columns], "tile_size": px, "views": [{"file", "azimuth", "elevation",
-    "radius"}]}, angles in degrees, positive elevation above.
+    Raises:
+        BadInput: `bank.json` or a sheet is missing, broken or of another form.
     """
-    about = json.loads((folder / "bank.json").read_text())
-    (rows, columns), size, frames = about["tile"], about["tile_size"], about["frames"]
-    cameras, sheets = [], []
-    for view in about["views"]:
-        if not stays_inside(view["file"]):
-            raise BadInput(f"bank.json names a sheet outside of the bank: {view['file']}")
-        cameras.append(OrbitCamera(view["elevation"], view["azimuth"], view["radius"], width=size, height=size))
-        sheet = (read_png(folder / view["file"]) * 255).round().to(torch.uint8)
-        tiles = sheet.reshape(rows, size, columns, size, 4).transpose(1, 2).reshape(rows * columns, size, size, 4)
-        sheets.append(tiles[: len(frames)])
-    return Bank(tuple(cameras), tuple(frames), torch.stack(sheets))
+    index = read_index(folder / BANK_JSON)
+    size, count = index.tile_size, len(index.frames)
+    cameras = tuple(
+        OrbitCamera(view.elevation, view.azimuth, view.radius, width=size, height=size) for view in index.views
+    )
+    tiles = torch.empty(len(cameras), count, size, size, 4, dtype=torch.uint8)
+    for row, view in enumerate(index.views):
+        tiles[row] = _tiles(folder / view.file, index)[:count]
+    return Bank(cameras, index.frames, tiles)
+
+
+def _tiles(path: Path, index: BankIndex) -> UInt8[Tensor, "n s s 4"]:
+    """Decode a sheet and cut it into its tiles, row by row."""
+    if not path.is_file():
+        raise BadInput(f"{BANK_JSON} names {path.name}, which is not in the bank")
+    check_sheet(path, index)
+    sheet = read_png(path)
+    if sheet.shape[-1] != 4:
+        raise BadInput(
+            f"the sheet {path.name} of the bank has {sheet.shape[-1]} channels; export it as PNG with color and alpha"
+        )
+    (rows, columns), size = index.tile, index.tile_size
+    pixels = sheet.mul_(255).round_().to(torch.uint8)
+    return pixels.reshape(rows, size, columns, size, 4).transpose(1, 2).reshape(rows * columns, size, size, 4)

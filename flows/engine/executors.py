@@ -21,7 +21,7 @@ from pydantic import ValidationError
 from dg4d_lib.errors import BackendUnavailable
 from flows.engine import forks, resources
 from flows.engine.containers import container
-from flows.engine.processes import locked
+from flows.engine.processes import locked, without_prefect
 from flows.home import store
 from steps.contract import (
     EXIT_BAD_INPUT,
@@ -152,7 +152,7 @@ def in_container(
                 stdin=subprocess.PIPE,  # open for as long as this process lives
                 stdout=subprocess.PIPE,
                 stderr=stderr,
-                env={**os.environ, **resources.environment()},
+                env={**without_prefect(), **resources.environment()},  # an engine may hand on what it has
                 pass_fds=resources.handles(),
                 start_new_session=True,
                 text=True,

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from flows import home
+from flows.engine import resources
 from flows.engine.processes import locked
-from flows.engine.resources import Stopped, stopping
 
 POLL_S = 0.2  # between two attempts
 
@@ -37,5 +37,5 @@ def output_lock(folder: Path, waiting: Callable[[], None]) -> Iterator[bool]:
         if not waited:
             waited = True
             waiting()
-        if stopping.wait(POLL_S):
-            raise Stopped(f"stopped while another run writes {folder}")
+        if resources.stopping.wait(POLL_S):
+            raise resources.Stopped(f"stopped while another run writes {folder}")

@@ -1,13 +1,12 @@
 """Admission of users' pictures, videos, frames, words and banks to the store: checked by content first."""
 
-import json
 import tempfile
 import zipfile
 from pathlib import Path
 
 from dg4d_lib.errors import BadInput
 from flows.engine.merging import add
-from steps.archives import stays_inside
+from steps.banks import BANK_JSON, check_sheet, read_index
 from steps.catalog import BANK, SOURCE, TEXT
 from steps.contract import ArtifactRef
 from steps.media_types import PICTURE_SUFFIXES, check_media, check_still
@@ -18,8 +17,6 @@ VIDEOS = frozenset([".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif"])
 ALWAYS_MOVING = VIDEOS - {".gif"}  # a GIF may be one picture
 LONGEST_TEXT = 1000  # characters
 LARGEST_FILE_BYTES = 8 * 2**30  # of a picture or a video, which is copied into the store before it is decoded
-LARGEST_BANK_JSON = 16 * 2**20  # bytes; one with 10,000 views has 1 MB
-BANK_JSON = "bank.json"
 
 
 def inside(folder: Path, name: str, what: str) -> Path:
@@ -88,7 +85,7 @@ def check_video(path: Path) -> None:
 
 
 def check_bank(path: Path) -> None:
-    """Refuse a folder without a `bank.json` that names pictures in it.
+    """Refuse a folder without a sound `bank.json`, or without the sheets that it names.
 
     Raises:
         BadInput: says what is missing or wrong.
@@ -160,30 +157,15 @@ def _files_of_bank(folder: Path) -> list[Path]:
     if not about.is_file():
         raise BadInput(f"{folder} is not a bank of true views: it has no file {BANK_JSON}")
     _check_files(folder, [about])
-    names = _views_of_bank(about)
-    if outside := [name for name in names if not stays_inside(name)]:
-        raise BadInput(f"{about} names a picture outside of the bank: {outside[0]!r}")
-    sheets = {folder / name for name in names}
+    index = read_index(about)
+    sheets = {folder / view.file for view in index.views}
     files = sorted({about, *sheets})
     if missing := [file for file in files if not file.is_file()]:
         raise BadInput(f"{about} names {missing[0].relative_to(folder)}, which is not there; copy the picture there")
     _check_files(folder, files)
     for sheet in sorted(sheets):
-        check_still(sheet)
+        check_sheet(sheet, index)
     return files
-
-
-def _views_of_bank(about: Path) -> list[str]:
-    """Return the files that a `bank.json` names."""
-    if about.stat().st_size > LARGEST_BANK_JSON:
-        raise BadInput(f"{about} has {about.stat().st_size} bytes; at most {LARGEST_BANK_JSON} are read")
-    try:
-        names = [str(view["file"]) for view in json.loads(about.read_text(encoding="utf-8"))["views"]]
-    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
-        raise BadInput(f"{about} does not describe the views of a bank: {error!r}") from error
-    if not names:
-        raise BadInput(f"{about} names no views; a bank has a picture per view")
-    return names
 
 
 def _check_files(folder: Path, files: list[Path]) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 from dg4d_lib.errors import BadInput
 from flows.inputs.json_text import loads
 from flows.inputs.naming import check_folder_name
-from steps.archives import stays_inside, unpack
+from steps.archives import can_exist, stays_inside, unpack
 from steps.store import remove_tree, room_for
 
 RECORD = "provenance.json"
@@ -74,14 +74,13 @@ def check_writable(folder: Path) -> None:
 def record_of(folder: Path) -> dict[str, Any] | None:
     """Return the provenance of the package in a folder.
 
-    None if there is no package, or its record cannot be used: names in it lead out of the folder, or it is nested too
-    deeply.
+    None if there is no package, or its record cannot be used: names in it lead out of the folder or are too long for a
+    file, or it is nested too deeply.
     """
     try:
         record = loads((folder / RECORD).read_text(encoding="utf-8"))
-        sound = isinstance(record["files"], dict) and all(
-            map(stays_inside, [*record["files"], *record.get("beside", ())])
-        )
+        names = [*record["files"], *record.get("beside", ())]
+        sound = isinstance(record["files"], dict) and all(stays_inside(name) and can_exist(name) for name in names)
         return record if sound else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
@@ -97,9 +96,9 @@ def is_current(folder: Path, order: str) -> bool:
         return False
     try:
         unchanged = all(fact_of(folder / name) == fact for name, fact in record["files"].items())
+        return unchanged and all((folder / name).is_file() for name in record.get("beside", ()))
     except OSError:
         return False
-    return unchanged and all((folder / name).is_file() for name in record.get("beside", ()))
 
 
 def whole(folder: Path) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Whether a package is as it was made: every digest, every record, every signature; behind `dg4d verify`."""
 
+import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -101,7 +102,7 @@ def _files(folder: Path, record: Mapping[str, Any]) -> Iterator[Check]:
     for name, fact in facts.items():
         yield _file(folder, name, fact)
     for name in sorted(beside - set(facts) - {RECORD}):
-        if not (folder / name).is_file():
+        if not os.path.isfile(folder / name):  # noqa: PTH113  # False for a path that is too long, without an error
             yield Check(kind="file", name=name, state="missing")
     ours = {*facts, *beside, *record["beside"]}
     for path in sorted(folder.rglob("*")):

@@ -7,7 +7,15 @@ from prefect.logging.handlers import APILogHandler
 from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
 
 from flows import home
+from flows.engine import resources
 from flows.serving.server import Server
+
+
+@pytest.fixture(autouse=True)
+def going_on() -> Iterator[None]:
+    """Let steps of later tests begin where a test stopped a run in this process."""
+    yield
+    resources.stopping.clear()
 
 
 @pytest.fixture(scope="session")

@@ -41,6 +41,12 @@ def picture(words: object) -> str:
     return f"#?RADIANCE\n{words}"
 
 
+def bank_json(*names: str) -> str:
+    """Return a `bank.json` of two frames whose sheets are `PNG`."""
+    views = [{"file": name, "azimuth": 0.0, "elevation": 0.0, "radius": 2.0} for name in names]
+    return json.dumps({"frames": [0, 1], "tile": [3, 4], "tile_size": 2, "views": views})
+
+
 def draw_picture(job: Job) -> Facts:
     words = _begin("draw_picture", job, job.inputs["text"].read_bytes())
     job.outputs["picture"].write_bytes(PNG + words)
@@ -179,10 +185,10 @@ def _obey(command: str, job: Job, step: str) -> None:
     match verb:
         case "log":
             logging.getLogger("dg4d_lib.fake").info(value)
+        case "missing" | "full":
+            raise {"missing": BackendUnavailable("no cuda here"), "full": OSError(28, "No space left on device")}[verb]
         case "bad":
             raise BadInput(f"the picture is {value}")
-        case "missing":
-            raise BackendUnavailable("no cuda here")
         case "diverge":
             (job.pictures / "last_good.png").write_bytes(PNG)
             raise FitDiverged(f"{step} diverged at iteration 7: the loss is nan")
@@ -204,8 +210,9 @@ def _obey(command: str, job: Job, step: str) -> None:
             used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
             resource.setrlimit(resource.RLIMIT_AS, (used + 2**26, resource.getrlimit(resource.RLIMIT_AS)[1]))
             bytearray(2**30)
-        case "full":
-            raise OSError(28, "No space left on device")
+        case "environment":
+            lines = (f"{name}={value}\n" for name, value in os.environ.items())
+            Path(os.environ["FAKE_LOG"]).with_suffix(".environment").write_text("".join(lines))
 
 
 def _curves(job: Job) -> None:

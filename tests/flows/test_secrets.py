@@ -1,10 +1,13 @@
 """What only the environment may know is in nothing that a run leaves behind, whether it ends well or badly."""
 
+import base64
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from fake_steps import picture
+from prefect.client.orchestration import get_client
 from prefect.logging.handlers import APILogHandler
 from signing import identity
 
@@ -13,6 +16,7 @@ from flows.commands.make import make
 from flows.engine import tasks
 from flows.engine.executors import StepCrashed
 from flows.inputs.orders import Wish
+from flows.serving.auth import basic
 from flows.serving.server import Server
 from steps.profiles import PREVIEW
 
@@ -59,3 +63,40 @@ def test_secrets_of_the_environment_are_nowhere(words: str, place: Path, capfd: 
         assert any(b"Test company" in content for content in found.values())  # it was signed with that key
     else:
         assert not (place / "out").exists()
+
+
+def forms(secret: str) -> tuple[bytes, ...]:
+    """Return the ways in which a secret NAME:PASSWORD may be written down."""
+    password = secret.partition(":")[2].encode()
+    return password, base64.b64encode(secret.encode()), base64.b64encode(password)
+
+
+def answers(server: Server) -> dict[str, bytes]:
+    """Return everything that the server shows to whoever is signed in."""
+    found = {}
+    with get_client(sync_client=True) as client:
+        for kind in ("artifacts", "logs", "flow_runs", "task_runs", "events", "deployments", "work_pools", "variables"):
+            found[kind] = client.request("POST", f"/{kind}/filter", json={}).content
+    for page in ("/", "/ui-settings", "/dg4d/login", "/api/admin/settings", "/api/health", "/openapi.json"):
+        asked = urllib.request.Request(
+            f"{server.address()}{page}", headers={"Authorization": basic(server.auth_string())}
+        )
+        with urllib.request.urlopen(asked) as answer:
+            found[page] = answer.read() + str(answer.headers).encode()
+    return found
+
+
+@pytest.mark.parametrize("words", ["fine fit_motion=environment", "fit_motion=environment fit_motion=crash"])
+def test_the_secret_of_the_server_is_in_its_file_alone(
+    words: str, place: Path, server: Server, capfd: pytest.CaptureFixture[str]
+) -> None:
+    found = left_by(words, place)
+    shown = answers(server)
+    assert b"prepare_subject" in shown["task_runs"] and b"asset" in shown["artifacts"]
+    environment = (place / "ran.environment").read_bytes()
+    assert b"FAKE_LOG=" in environment
+    printed = "".join(capfd.readouterr()).encode()
+    everything = {**found, **shown, "environment of a step": environment, "printed": printed}
+    secret = server.auth_string()
+    named = {name for name, content in everything.items() if any(form in content for form in forms(secret))}
+    assert named == {str(server.folder / "auth")}

@@ -25,8 +25,9 @@ from hypothesis.strategies import SearchStrategy
 from tests.hostile import banks, documents, manifests
 from tests.hostile.archives import UNPACKED, ZIPS
 from tests.hostile.decoding import Decoder, Outcome
+from tests.hostile.outcomes import Accepted
 from tests.hostile.pictures import PICTURES
-from tests.hostile.table import FILES, Accepted
+from tests.hostile.table_files import FILES
 from tests.hostile.videos import VIDEOS
 
 SAVED = Path(__file__).parents[2] / "out" / "fuzz"

@@ -16,8 +16,9 @@ from steps.store import ArtifactStore
 from tests.hostile.banks import DOOR, FOLDERS
 from tests.hostile.conftest import Place
 from tests.hostile.decoding import Decoder
+from tests.hostile.outcomes import Refused
 from tests.hostile.samples import sound_png
-from tests.hostile.table import BANKS, Refused, case
+from tests.hostile.table import BANKS
 
 CASES = {**DOOR, **FOLDERS}
 
@@ -41,7 +42,7 @@ def test_every_bank_is_in_the_table() -> None:
     assert set(CASES) == set(BANKS)
 
 
-@pytest.mark.parametrize("name", [case(name) for name in CASES])
+@pytest.mark.parametrize("name", CASES)
 def test_a_bank_gets_what_the_table_says_at_the_door_or_in_the_step(name: str, place: Place, decoder: Decoder) -> None:
     expected = BANKS[name]
     path = place.work / "bank"
@@ -66,7 +67,7 @@ def test_a_bank_gets_what_the_table_says_at_the_door_or_in_the_step(name: str, p
         assert kind == "done", says
 
 
-@pytest.mark.parametrize("name", [case(name, "stored ") for name in FOLDERS])
+@pytest.mark.parametrize("name", FOLDERS)
 def test_a_bank_that_is_in_the_store_gets_the_same(name: str, place: Place, decoder: Decoder) -> None:
     path, expected = place.work / "bank", BANKS[name]
     FOLDERS[name](path)

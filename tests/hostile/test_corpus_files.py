@@ -15,10 +15,11 @@ from tests.hostile.archives import UNPACKED, ZIPS
 from tests.hostile.conftest import Place
 from tests.hostile.decoding import Decoder, Outcome
 from tests.hostile.others import OTHERS, PLACES
+from tests.hostile.outcomes import UNKNOWN, Accepted, Refused
 from tests.hostile.pictures import PICTURES
-from tests.hostile.table import FILES, UNKNOWN, Accepted, Refused, case
 from tests.hostile.table import PLACES as SAID
 from tests.hostile.table import UNPACKED as EXTRACTED
+from tests.hostile.table_files import FILES
 from tests.hostile.videos import VIDEOS
 
 CASES = {**PICTURES, **VIDEOS, **ZIPS, **OTHERS}
@@ -51,14 +52,14 @@ def test_every_file_is_in_the_table() -> None:
     assert len(refused) >= 91 + 60 and len(FILES) - len(refused) >= 21
 
 
-@pytest.mark.parametrize("name", [case(name) for name in CASES])
+@pytest.mark.parametrize("name", CASES)
 def test_a_file_gets_what_the_table_says(name: str, decoder: Decoder, tmp_path: Path) -> None:
     path = tmp_path / "source"
     path.write_bytes(CASES[name]())
     check(decoder.ask(path), FILES[name])
 
 
-@pytest.mark.parametrize("name", [case(name) for name in UNPACKED])
+@pytest.mark.parametrize("name", UNPACKED)
 def test_a_zip_is_unpacked_within_its_folder_or_refused(name: str, decoder: Decoder, tmp_path: Path) -> None:
     path, expected = tmp_path / "zip", EXTRACTED[name]
     path.write_bytes(UNPACKED[name]())
@@ -69,7 +70,7 @@ def test_a_zip_is_unpacked_within_its_folder_or_refused(name: str, decoder: Deco
         assert (outcome.kind, outcome.frames) == ("done", expected), outcome.says
 
 
-@pytest.mark.parametrize("name", [case(name) for name in [*PLACES, *(n for n in CASES if FILES[n] == UNKNOWN)]])
+@pytest.mark.parametrize("name", [*PLACES, *(n for n in CASES if FILES[n] == UNKNOWN)])
 def test_what_is_no_source_never_enters_the_store(name: str, place: Place) -> None:
     path = place.work / "cat.png"
     if name in PLACES:

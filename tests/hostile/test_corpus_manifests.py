@@ -14,8 +14,9 @@ from flows.packages.summary import Row
 from tests.hostile.conftest import Place
 from tests.hostile.manifests import ROWS, SOUND, WHOLE
 from tests.hostile.names import NAMES, WANTED
+from tests.hostile.outcomes import Refused
 from tests.hostile.samples import sound_png
-from tests.hostile.table import MADE, MANIFESTS, Refused, case
+from tests.hostile.table import MADE, MANIFESTS
 from tests.hostile.table import NAMES as FILES_CALLED
 from tests.hostile.table import WANTED as ITEMS_CALLED
 
@@ -61,7 +62,7 @@ def test_every_manifest_is_in_the_table() -> None:
     assert len(CASES) >= 17 and len(NAMES) >= 14
 
 
-@pytest.mark.parametrize("name", [case(name) for name in CASES])
+@pytest.mark.parametrize("name", CASES)
 def test_a_manifest_gets_what_the_table_says(name: str, pictures: Place) -> None:
     (suffix, make), expected = CASES[name], MANIFESTS[name]
     file = pictures.work / "list" / f"manifest{suffix}"
@@ -77,7 +78,7 @@ def test_a_manifest_gets_what_the_table_says(name: str, pictures: Place) -> None
     check(items, expected.made, expected.says)
 
 
-@pytest.mark.parametrize("name", [case(name) for name in NAMES])
+@pytest.mark.parametrize("name", NAMES)
 def test_a_file_of_any_name_is_made_or_refused_in_a_sentence(name: str, pictures: Place) -> None:
     expected = FILES_CALLED.get(name, MADE)
     path = os.fsencode(pictures.work / "list") + b"/" + NAMES[name]
@@ -90,7 +91,7 @@ def test_a_file_of_any_name_is_made_or_refused_in_a_sentence(name: str, pictures
     check(items_of(pictures.work / "list", OUT, "preview", {}, 0), expected.made, expected.says)
 
 
-@pytest.mark.parametrize("name", [case(name) for name in WANTED])
+@pytest.mark.parametrize("name", WANTED)
 def test_an_item_of_any_name_is_made_below_the_output_or_refused(name: str, pictures: Place) -> None:
     import json
 

@@ -9,7 +9,8 @@ from typer.testing import CliRunner
 from flows import cli
 from tests.hostile.conftest import Place
 from tests.hostile.options import OPTIONS, SOUND
-from tests.hostile.table import COMMANDS, Refused, case
+from tests.hostile.outcomes import Refused
+from tests.hostile.table import COMMANDS
 
 
 class WorkBegins(BaseException):
@@ -35,7 +36,7 @@ def test_every_command_line_is_in_the_table() -> None:
     assert len(OPTIONS) >= 36
 
 
-@pytest.mark.parametrize("name", [case(name) for name in OPTIONS])
+@pytest.mark.parametrize("name", OPTIONS)
 def test_a_mistake_is_refused_before_any_work(name: str, no_work: Place) -> None:
     expected = COMMANDS[name]
     before = tree(no_work.work)
@@ -50,7 +51,7 @@ def test_a_mistake_is_refused_before_any_work(name: str, no_work: Place) -> None
     assert no_work.stored() == []
 
 
-@pytest.mark.parametrize("name", [case(name) for name in SOUND])
+@pytest.mark.parametrize("name", SOUND)
 def test_what_is_odd_and_right_begins(name: str) -> None:
     with pytest.raises(WorkBegins):
         CliRunner().invoke(cli.app, SOUND[name])

@@ -9,7 +9,7 @@ import pytest
 
 from dg4d_lib.errors import BadInput
 from steps import archives
-from steps.archives import stays_inside, unpack
+from steps.archives import can_exist, stays_inside, unpack
 
 Write = Callable[[zipfile.ZipFile], None]
 
@@ -115,3 +115,17 @@ def test_what_is_no_zip_is_said_so(tmp_path: Path) -> None:
 )
 def test_names_that_stay(name: str, stays: bool) -> None:
     assert stays_inside(name) is stays
+
+
+@pytest.mark.parametrize(
+    ("name", "can"),
+    [
+        ("a" * 255, True),
+        ("a" * 256, False),
+        ("\u00e9" * 128, False),
+        ("a/" * 511 + "a", True),
+        ("a/" * 512 + "a", False),
+    ],
+)
+def test_names_that_are_short_enough_for_a_file(name: str, can: bool) -> None:
+    assert can_exist(name) is can

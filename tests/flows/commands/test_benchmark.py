@@ -7,7 +7,7 @@ from io import StringIO
 from pathlib import Path
 
 import pytest
-from fake_steps import picture
+from fake_steps import PNG, bank_json, picture
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import ArtifactFilter, ArtifactFilterKey
 from rich.console import Console
@@ -142,8 +142,8 @@ def test_true_views_are_the_prior_where_the_bank_is_asked_for(tmp_path: Path) ->
     with pytest.raises(BadInput, match=r"no bank of true views: newt"):
         run(tmp_path / "data", tmp_path / "out", bank=True)
     (folder / "bank").mkdir()
-    (folder / "bank" / "bank.json").write_text('{"views": [{"file": "a.png"}]}')
-    (folder / "bank" / "a.png").write_text(picture("a view"))
+    (folder / "bank" / "bank.json").write_text(bank_json("a.png"))
+    (folder / "bank" / "a.png").write_bytes(PNG)
     results = run(tmp_path / "data", tmp_path / "out", bank=True)
     assert results.settings["changes"] == {"prior.kind": "oracle"}
     record = json.loads((tmp_path / "out" / "assets" / "newt" / "provenance.json").read_text())

@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from fake_steps import picture
+from fake_steps import PNG, bank_json, picture
 from typer.testing import CliRunner, Result
 
 from flows import cli
@@ -116,8 +116,8 @@ def test_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_bank_without_the_oracle_and_the_oracle_without_a_bank() -> None:
     Path("bank").mkdir()
-    Path("bank/bank.json").write_text('{"views": [{"file": "a.png"}]}')
-    Path("bank/a.png").write_text(picture("a view"))
+    Path("bank/bank.json").write_text(bank_json("a.png"))
+    Path("bank/a.png").write_bytes(PNG)
     refused(dg4d("make", "cat.png", "--bank", "bank", "-o", "out"), "prior.kind=oracle")
     refused(dg4d("make", "cat.png", "--set", "prior.kind=oracle", "-o", "out"), "--bank DIR")
 

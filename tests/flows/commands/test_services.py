@@ -31,7 +31,7 @@ def children(pid_file: Path) -> list[str]:
     return Path(f"/proc/{pid_file.read_text()}/task/{pid_file.read_text()}/children").read_text().split()
 
 
-def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop(folder: Path) -> None:
+def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop(server: Server, folder: Path) -> None:
     said = dg4d("up", "--pool", "process-cpu", "--sources", str(folder.parent))
     assert said.returncode == 0, said.stderr
     *deployments, address = said.stdout.split()
@@ -42,6 +42,7 @@ def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop
         log = folder / "worker-process-cpu.log"
         wait_until(lambda: "started!" in log.read_text())
         assert running(folder)
+        assert server.auth_string().partition(":")[2] not in said.stdout + said.stderr + log.read_text()
         environments = [Path(f"/proc/{pid}/environ") for pid in children(folder / "worker-process-cpu.pid")]
         assert any(f"DG4D_SOURCES={folder.parent}\0" in environ.read_text() for environ in environments)
         other = dg4d("up", "--pool", "process-cpu", "--sources", str(Path.cwd()))
@@ -51,6 +52,7 @@ def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop
     assert (stopped.returncode, stopped.stdout) == (0, "ending worker process-cpu\nstopped\n")
     assert running(folder) == []
     assert "stopped!" in log.read_text()  # it was not killed
+    assert server.auth_string().partition(":")[2] not in stopped.stderr + log.read_text()
     assert dg4d("down").stdout == "nothing was running\n"
 
 

@@ -1,7 +1,7 @@
 from pathlib import Path
 
 import pytest
-from fake_steps import picture
+from fake_steps import PNG, bank_json, picture
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.rasterizer import choice
@@ -119,7 +119,8 @@ def test_what_cannot_work_is_refused_before_any_work(tmp_path: Path) -> None:
     for says, bad in cases.items():
         with pytest.raises(BadInput, match=says):
             bad.check()
-    (bank / "bank.json").write_text('{"views": [{"file": "000.png"}]}')
+    (bank / "bank.json").write_text(bank_json("000.png"))
+    (bank / "000.png").write_bytes(PNG)
     wish(good, bank=bank, **{"prior.kind": "oracle"}).check()
     with pytest.raises(BadInput, match=r"prior\.kind=oracle"):
         wish(good, bank=bank).check()

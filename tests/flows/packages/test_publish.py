@@ -8,6 +8,7 @@ import pytest
 
 from dg4d_lib.errors import BadInput
 from flows.packages.publish import Files, check_folder, is_current, publish, record_of
+from flows.packages.verify import verify
 from steps.store import DiskFull
 
 
@@ -64,16 +65,32 @@ def test_a_package_without_its_report_is_not_current(package: Path, tmp_path: Pa
     assert not is_current(tmp_path / "out", "o1")
 
 
+@pytest.mark.parametrize("name", ["../mine.txt", "a" * 256, "a/" * 600 + "a"])
 @pytest.mark.parametrize("where", ["files", "beside"])
-def test_a_record_whose_names_lead_outside_is_none(package: Path, tmp_path: Path, where: str) -> None:
+def test_a_record_whose_names_lead_outside_or_cannot_exist_is_none(
+    package: Path, tmp_path: Path, where: str, name: str
+) -> None:
     out = tmp_path / "out"
     publish(package, out, finish)
     record = json.loads((out / "provenance.json").read_text())
-    record[where] = {"../mine.txt": {}}
+    record[where] = {name: {}}
     (out / "provenance.json").write_text(json.dumps(record))
     assert record_of(out) is None
     with pytest.raises(BadInput, match="holds other files"):
         check_folder(out)
+
+
+@pytest.mark.parametrize("where", ["files", "beside"])
+def test_a_name_that_is_too_long_with_its_folder_is_missing_or_altered(tmp_path: Path, where: str) -> None:
+    out = tmp_path.joinpath(*["f" * 200] * 17)
+    out.mkdir(parents=True)
+    name = "/".join(["n" * 200] * 4)
+    record = {"order": "o1", "format": 2, "files": {}, "beside": []}
+    record[where] = {name: {"digest": "", "size_bytes": 0}} if where == "files" else [name]
+    (out / "provenance.json").write_text(json.dumps(record))
+    assert record_of(out) is not None and not is_current(out, "o1")
+    faults = [(check.kind, check.name) for check in verify(out).checks if check.fault]
+    assert ("file", name) in faults or ("file", "provenance.json") in faults
 
 
 @pytest.mark.parametrize("damage", ["change", "delete", "truncate"])

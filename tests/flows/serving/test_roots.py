@@ -12,7 +12,7 @@ from threading import Thread
 from typing import Any
 
 import pytest
-from fake_steps import PNG
+from fake_steps import PNG, bank_json
 from waiting import wait_until
 
 from dg4d_lib.errors import BadInput
@@ -145,7 +145,7 @@ def test_what_a_pattern_or_a_folder_finds_by_links_is_a_failed_row(place: Path) 
 )
 def test_rows_of_a_list_name_nothing_elsewhere(place: Path, row: dict[str, str]) -> None:
     (place / "in" / "dir").symlink_to(place / "away")
-    (place / "away" / "bank.json").write_text('{"views": [{"file": "fox.png"}]}')
+    (place / "away" / "bank.json").write_text(bank_json("fox.png"))
     rows = [{key: value.format(place=place) for key, value in row.items()}]
     (place / "in" / "list.json").write_text(json.dumps(rows))
     assert deployments.catalog.fn(str(place / "in" / "list.json"), str(place / "in" / "out")).is_failed()
@@ -170,7 +170,7 @@ def test_links_of_a_data_set_that_lead_elsewhere_are_refused(place: Path, name: 
     for folder in ("input", "view_15", "bank"):
         (thing / folder).mkdir(parents=True)
         (thing / folder / "0.png").write_bytes(PNG)
-    (thing / "bank" / "bank.json").write_text('{"views": [{"file": "0.png"}]}')
+    (thing / "bank" / "bank.json").write_text(bank_json("0.png"))
     with zipfile.ZipFile(thing / "mesh.npz", "w") as archive:
         archive.writestr("a.npy", b"\x93NUMPY")
     (thing / name).rename(place / "away" / "moved")
