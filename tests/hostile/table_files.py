@@ -20,6 +20,7 @@ from tests.hostile.outcomes import (
     STUMP,
     TOO_MANY,
     UNKNOWN,
+    USD,
     Accepted,
     Refused,
     video,
