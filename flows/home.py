@@ -73,6 +73,8 @@ def make_private(folder: Path) -> None:
         raise BadInput(
             f"{folder} can be read by other users and belongs to one of them; set DG4D_HOME to a folder of your own"
         ) from error
+    if folder.stat().st_mode & OTHERS:
+        return  # a file system without permissions
     for path in folder.rglob("*"):
         with suppress(OSError):  # gone, or on a file system without permissions
             if not path.is_symlink():

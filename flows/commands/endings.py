@@ -1,4 +1,4 @@
-"""How a command ends: every error and every signal becomes one message and an exit status."""
+"""End of a command: every error and every signal becomes one message and an exit status."""
 
 import errno
 import signal

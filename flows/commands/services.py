@@ -1,6 +1,7 @@
 """Commands for background services: up, down, env, watch."""
 
 import os
+import shlex
 import time
 from pathlib import Path
 from typing import Annotated
@@ -98,7 +99,7 @@ def env() -> None:
         if (address := server.address()) is None:
             raise ServerUnavailable("No server runs; start one with `dg4d up`.")
         typer.echo(f"export PREFECT_API_URL={address}/api")
-        typer.echo(f"export PREFECT_API_AUTH_STRING={server.auth_string()}")
+        typer.echo(f"export PREFECT_API_AUTH_STRING={shlex.quote(server.auth_string())}")
 
 
 def watch(

@@ -67,7 +67,7 @@ class Finished(BaseModel):
 
 
 class Made(BaseModel):
-    """What a flow gives: the package, and how it came about.
+    """Result of a flow: the package, and the steps that made it.
 
     Attributes:
         package: a zip.

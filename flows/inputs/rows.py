@@ -191,7 +191,7 @@ def _check_columns(columns: list[str]) -> None:
 
 
 def _unknown(columns: Iterable[str]) -> str:
-    """What is wrong with the columns; empty if nothing is."""
+    """Describe what is wrong with the columns; empty if nothing is."""
     unknown = sorted(column for column in columns if column not in COLUMNS and "." not in column)
     if not unknown:
         return ""

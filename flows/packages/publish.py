@@ -202,7 +202,7 @@ def _publish(package: Path, folder: Path, finish: Finish, in_place: bool = False
 
 
 def _is_complete(record: dict[str, Any]) -> bool:
-    """Whether a record has the form that its readers count on."""
+    """Check that a record has the form that its readers count on."""
     try:
         steps = [*record.get("steps", ()), *record.get("run", {}).get("steps", ())]
         return (

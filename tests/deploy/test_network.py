@@ -39,7 +39,7 @@ Pod = dict[str, str]
 
 
 def selects(selector: dict[str, Any], labels: Pod) -> bool:
-    """Whether a label selector fits a pod; an empty one fits all."""
+    """Match a label selector with a pod; an empty one fits all."""
     assert set(selector) <= {"matchLabels", "matchExpressions"}
     for expression in selector.get("matchExpressions", []):
         assert expression["operator"] == "In"
@@ -49,7 +49,7 @@ def selects(selector: dict[str, Any], labels: Pod) -> bool:
 
 
 def fits(peer: dict[str, Any], other: Pod | str) -> bool:
-    """Whether a peer of a rule is a pod of the namespace, or an address outside of it."""
+    """Tell if a peer of a rule is a pod of the namespace, or an address outside of it."""
     if "ipBlock" in peer:
         if not isinstance(other, str):
             return False
@@ -62,7 +62,7 @@ def fits(peer: dict[str, Any], other: Pod | str) -> bool:
 
 
 def opens(direction: str, pod: Pod, other: Pod | str, port: int) -> bool:
-    """Whether the policies of a pod let traffic of a direction through."""
+    """Tell if the policies of a pod let traffic of a direction through."""
     kind, peers = {"in": ("ingress", "from"), "out": ("egress", "to")}[direction]
     mine = [policy for policy in POLICIES if selects(policy["podSelector"], pod)]
     if not any(kind.capitalize() in policy["policyTypes"] for policy in mine):

@@ -102,6 +102,7 @@ def test_a_session_expires_and_cannot_be_prolonged_or_moved_to_another_server() 
         ("POST", {"origin": "http://evil.example"}, True),
         ("POST", {"origin": "http://127.0.0.1:4200.evil.example"}, True),
         ("POST", {"origin": ""}, True),
+        ("POST", {"origin": "http://["}, True),
         ("POST", {"sec-fetch-site": "cross-site"}, True),
         ("DELETE", {"sec-fetch-site": "same-site"}, True),  # another port of this host
         ("WEBSOCKET", {"origin": "http://localhost:4200"}, True),
