@@ -23,6 +23,7 @@ STAGES = {
     "fit_gaussians": "static",
     "fit_motion": "dynamic",
     "extract_mesh": "mesh",
+    "join_meshes": "mesh",
     "refine_texture": "refinement",
     "pack_asset": "package",
 }

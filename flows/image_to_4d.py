@@ -8,7 +8,7 @@ from prefect.task_runners import ThreadPoolTaskRunner
 
 from dg4d_lib.settings import GeometricPriorSettings
 from flows import home
-from flows.engine.merging import frames_in, merged
+from flows.engine.merging import frames_in
 from flows.engine.tasks import Made, Steps
 from flows.ui.asset_page import show_asset
 from steps.contract import ArtifactRef
@@ -18,6 +18,7 @@ from steps.profiles import (
     ExtractMeshSettings,
     FitGaussiansSettings,
     FitMotionSettings,
+    JoinMeshesSettings,
     PackAssetSettings,
     PipelineSettings,
     RefineTextureSettings,
@@ -88,7 +89,7 @@ def finish(
 def extract(
     steps: Steps, gaussians: ArtifactRef, motion: ArtifactRef, frames: int, settings: PipelineSettings
 ) -> dict[str, ArtifactRef | None]:
-    """One mesh that moves; or a mesh per frame, in parts of a few frames each, where one is asked for or needed."""
+    """Extract one mesh that moves; or a mesh per frame, in parts of a few frames, where one is asked for or needed."""
     inputs: dict[str, ArtifactRef | None] = {"gaussians": gaussians, "motion": motion}
     whole = ExtractMeshSettings(rasterizer=settings.rasterizer, mesh=settings.mesh)
     if settings.mesh.mode != "per_frame":
@@ -101,8 +102,11 @@ def extract(
         whole.model_copy(update={"mesh": mesh, "first_frame": first, "end_frame": min(first + count, frames)})
         for first in range(0, frames, count)
     ]
-    done = steps.run_parts("extract_mesh", inputs, parts)
-    return {"meshes": merged([outputs["meshes"] for outputs in done], home.store())}
+    done = [outputs["meshes"] for outputs in steps.run_parts("extract_mesh", inputs, parts)]
+    if len(done) == 1:
+        return {"meshes": done[0]}
+    joined = steps.run("join_meshes", {f"part_{i:03d}": part for i, part in enumerate(done)}, JoinMeshesSettings())
+    return {"meshes": joined["meshes"]}
 
 
 def drive(settings: PipelineSettings) -> DriveVideoSettings:

@@ -104,6 +104,14 @@ STEPS: dict[str, StepSpec] = {
             outputs={"tracked": _optional(TRACKED), "meshes": _optional(MESHES), "picture": PNG},
         ),
         StepSpec(
+            name="join_meshes",
+            version="1",
+            entry="steps.join_meshes:run",
+            settings="steps.profiles:JoinMeshesSettings",
+            inputs={"part": MESHES.model_copy(update={"many": True})},
+            outputs={"meshes": MESHES},
+        ),
+        StepSpec(
             name="refine_texture",
             version="1",
             entry="steps.refine_texture:run",

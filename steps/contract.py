@@ -42,10 +42,11 @@ class Port(Frozen):
     media_type: str
     suffix: str = Field(description="of the file while a step works on it, for example .png")
     optional: bool = False
+    many: bool = Field(False, description="an input given once or more, as NAME_000, NAME_001, ...")
 
 
 class StepSpec(Frozen):
-    """What a step is called and what it eats; the code is not imported."""
+    """Name, inputs, outputs and settings class of a step; its code is not imported."""
 
     name: str
     version: str = Field(description="raised when the same request should give another result")
@@ -60,6 +61,13 @@ class StepSpec(Frozen):
     late_imports: tuple[str, ...] = Field(
         (), description="modules, and module:function that imports some, which its code needs only when it runs"
     )
+
+    def input_port(self, name: str) -> str:
+        """Return the name of the port that an input goes to; empty if there is none."""
+        port, _, number = name.rpartition("_")
+        if port in self.inputs and self.inputs[port].many and number.isdecimal():
+            return port
+        return name if name in self.inputs and not self.inputs[name].many else ""
 
 
 class StepRequest(Frozen):

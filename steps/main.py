@@ -299,9 +299,9 @@ def _checked_spec(request: StepRequest) -> StepSpec:
         raise BadInput(f"unknown step {request.step!r}; there are: {', '.join(specs)}")
     spec = specs[request.step]
     needed = {name for name, port in spec.inputs.items() if not port.optional}
-    if missing := sorted(needed - set(request.inputs)):
+    if missing := sorted(needed - {spec.input_port(name) for name in request.inputs}):
         raise BadInput(f"{spec.name} needs the input {', '.join(missing)}")
-    if unknown := sorted(set(request.inputs) - set(spec.inputs)):
+    if unknown := sorted(name for name in request.inputs if not spec.input_port(name)):
         raise BadInput(f"{spec.name} has no input {', '.join(unknown)}; it has: {', '.join(spec.inputs)}")
     return spec
 
@@ -318,7 +318,7 @@ def _checked_settings(request: StepRequest, spec: StepSpec) -> BaseModel:
 def _fetched_inputs(request: StepRequest, spec: StepSpec, store: ArtifactStore, scratch: Path) -> dict[str, Path]:
     folder = scratch / "in"
     folder.mkdir()
-    paths = {name: folder / f"{name}{spec.inputs[name].suffix}" for name in request.inputs}
+    paths = {name: folder / f"{name}{spec.inputs[spec.input_port(name)].suffix}" for name in request.inputs}
     for name, ref in request.inputs.items():
         store.get(ref, paths[name])
     return paths

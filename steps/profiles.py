@@ -82,6 +82,10 @@ class ExtractMeshSettings(Settings):
     end_frame: int = Field(0, ge=0, description="mode per_frame: one past the last; 0 is all frames")
 
 
+class JoinMeshesSettings(Settings):
+    """Settings of `join_meshes`, which has none."""
+
+
 class RefineTextureSettings(Settings):
     """What `refine_texture` reads."""
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from fake_steps import picture
+from prefect.client.orchestration import get_client
 from typer.testing import CliRunner, Result
 from waiting import start, wait_until
 
@@ -142,6 +143,22 @@ def test_a_mesh_per_frame_is_made_in_parts_and_joined(log: Path, tmp_path: Path)
     make(order("parts", tmp_path, **{**knobs, "mesh.frames_per_task": 5}), tmp_path / "five")
     assert ran(log).count("extract_mesh") == 1
     assert (tmp_path / "two" / "asset.glb").read_bytes() == (tmp_path / "five" / "asset.glb").read_bytes()
+
+
+def test_every_step_of_a_conversion_in_parts_is_linked_to_those_that_made_its_inputs(log: Path, tmp_path: Path) -> None:
+    make(order("linked", tmp_path, **{"mesh.mode": "per_frame", "mesh.frames_per_task": 2}), tmp_path / "out")
+    record = json.loads((tmp_path / "out" / "provenance.json").read_text())
+    maker, wanted = {record["recipe"]["source"]["digest"]: ""}, set()
+    for step, run in zip(record["steps"], record["run"]["steps"], strict=True):
+        wanted |= {(maker[digest], run["step"]) for digest in step["inputs"].values()}  # no input was made by nobody
+        maker |= dict.fromkeys(step["outputs"].values(), run["step"])
+    parts = {f"extract_mesh {number}/3" for number in (1, 2, 3)}
+    assert {(part, "join_meshes") for part in parts} | {("join_meshes", "refine_texture")} <= wanted
+    with get_client(sync_client=True) as client:
+        graph = client.request("GET", f"/flow_runs/{record['run']['flow_run']}/graph-v2").json()
+    names = {node: facts["label"].partition(":")[0] for node, facts in graph["nodes"]}
+    drawn = {(names[node], names[child["id"]]) for node, facts in graph["nodes"] for child in facts["children"]}
+    assert {edge for edge in wanted if edge[0]} <= drawn
 
 
 def test_every_frame_gets_a_mesh_where_one_cannot_follow(log: Path, tmp_path: Path) -> None:

@@ -1,0 +1,24 @@
+"""Meshes of single frames, extracted in parts, as one artifact."""
+
+import zipfile
+
+from dg4d_lib.errors import BadInput
+from steps.job import Facts, Job
+from steps.media import write_zip
+
+
+def run(job: Job) -> Facts:
+    """Write the entries of all parts in the order of their names; the order of the parts does not matter.
+
+    Raises:
+        BadInput: two parts have different meshes of one frame.
+    """
+    entries: dict[str, bytes] = {}
+    for path in job.inputs.values():
+        with zipfile.ZipFile(path) as archive:
+            for name in archive.namelist():
+                content = archive.read(name)
+                if entries.setdefault(name, content) != content:
+                    raise BadInput(f"Two parts have different entries {name}; extract the meshes again.")
+    write_zip(job.outputs["meshes"], sorted(entries.items()))
+    return Facts()
