@@ -27,6 +27,7 @@ Result = TypeVar("Result")
 LINE_EVERY_S = 10.0  # between two lines about one step, where there is no terminal
 WIDE = 130  # columns, from which all values of a step fit beside its bar
 ROWS_SHOWN = 30  # of a batch
+SHORT_S = 0.5  # waiting that is not worth a word
 COUNTED = 1  # totals up to this say nothing as a fraction
 
 
@@ -146,11 +147,17 @@ class StepLines:
                 case "note" | "remark":
                     what = event.text
                 case "finished":
-                    what = "cached" if event.cached else f"done in {event.seconds:.1f} s"
+                    what = "cached" if event.cached else _took(event)
                 case "failed":
                     what = f"failed after {event.seconds:.1f} s"
             name = f"{event.item}: {event.step}" if self._with_item else event.step
             self._out.print(f"{name}: {what}", markup=False)
+
+
+def _took(event: StepEvent) -> str:
+    """Return how long a step took, without the time in which it waited for its turn."""
+    waiting = f" after {event.waited_s:.1f} s of waiting" if event.waited_s >= SHORT_S else ""
+    return f"done in {event.seconds - event.waited_s:.1f} s{waiting}"
 
 
 class BatchTable:

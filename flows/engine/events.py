@@ -16,6 +16,7 @@ class StepEvent:
         kind: what happened; `finished` has `cached` and `seconds`, `progress` has `done`, `total` and `values`,
             `note` has `text`, and so has `remark`, which stays on the screen.
         cached: whether the result was there already.
+        waited_s: seconds of `seconds` in which the step waited for its turn.
     """
 
     item: str
@@ -25,6 +26,7 @@ class StepEvent:
     total: int = 0
     values: dict[str, float] = field(default_factory=dict)
     seconds: float = 0.0
+    waited_s: float = 0.0
     cached: bool = False
     text: str = ""
 

@@ -1,4 +1,4 @@
-"""What steps share on this machine: its GPUs, of which each has one step at a time, and turns on its processor.
+"""Slots of this machine: its GPUs, each for one step at a time, and turns on its processor; first come, first served.
 
 A slot is the lock of a file under `$DG4D_HOME/slots`, so that all commands of a user share them. The kernel frees it
 when the last process that holds it has ended: this one, and that of the step where it has one of its own.
@@ -8,21 +8,23 @@ import fcntl
 import functools
 import os
 import threading
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.rasterizer.choice import CUDA, cuda_devices
+from flows.engine.turns import first_ahead, ticket
 from steps.contract import StepRequest
 from steps.main import catalog
 from steps.store import home
 
 Resource = Literal["cpu", "gpu"]
 
-POLL_S = 0.1  # between two looks at slots that are taken
+POLL_S = 0.05  # between two looks at the queue and at slots that are taken
 CORES_PER_STEP = 4  # a step uses every core most of the time; on many it leaves gaps
 SHOWN_GPUS = "CUDA_VISIBLE_DEVICES"
 stopping = threading.Event()  # set when the user stops the command: nothing more is begun
@@ -40,6 +42,18 @@ class Slot(NamedTuple):
     handle: int
 
 
+class Turn(NamedTuple):
+    """Place of a step in the queue.
+
+    Attributes:
+        begun_ns: when its item was begun, in nanoseconds since the epoch; items that were begun earlier go first.
+        holder: what those who wait behind it are told.
+    """
+
+    begun_ns: int
+    holder: str
+
+
 class Stopped(Exception):
     """The user stopped the command while a step waited for its slot."""
 
@@ -52,12 +66,16 @@ def resource_of(request: StepRequest) -> Resource:
 
 
 @contextmanager
-def slot(resource: Resource, waiting: Callable[[str], None]) -> Iterator[None]:
+def slot(resource: Resource, waiting: Callable[[str], None], turn: Turn | None = None) -> Iterator[float]:
     """Hold a slot while the block runs.
 
     Args:
         resource: of which kind.
-        waiting: told what is waited for, if it is not free.
+        waiting: told what is waited for, and behind whom, if it is not free.
+        turn: place in the queue; default: behind everything that was begun before.
+
+    Yields:
+        Seconds of waiting.
 
     Raises:
         Stopped: the user stopped the command.
@@ -66,20 +84,26 @@ def slot(resource: Resource, waiting: Callable[[str], None]) -> Iterator[None]:
     folder = home() / "slots"
     folder.mkdir(parents=True, exist_ok=True)
     devices = gpus() if resource == "gpu" else tuple(map(str, range(cpus())))
-    told = False
-    while True:
-        if stopping.is_set():
-            raise Stopped(f"stopped while waiting for {_WORDS[resource]}")
-        handle, device = _free(folder, resource, devices)
-        if handle is not None:
-            break
-        if not told:
-            told = True
-            waiting(f"waiting for {_WORDS[resource]}")
-        stopping.wait(POLL_S)
+    turn = turn or Turn(time.time_ns(), "another step")
+    begun, told = time.monotonic(), False
+    with ticket(folder / f"queue-{resource}", *turn) as own:
+        while True:
+            if stopping.is_set():
+                raise Stopped(f"stopped while waiting for {_WORDS[resource]}")
+            ahead = first_ahead(own)
+            handle, device = (None, "") if ahead else _free(folder, resource, devices)
+            if handle is not None:
+                break
+            if not told:
+                told = True
+                behind = ahead or _holder(folder, resource, devices)
+                waiting(f"waiting for {_WORDS[resource]}" + (f", behind {behind}" if behind else ""))
+            stopping.wait(POLL_S)
+    os.truncate(handle, 0)
+    os.write(handle, turn.holder.encode(errors="replace"))
     token = _held.set(Slot(device if resource == "gpu" else "", handle))
     try:
-        yield
+        yield time.monotonic() - begun
     finally:
         _held.reset(token)
         os.close(handle)
@@ -129,8 +153,7 @@ def _devices() -> tuple[str, ...]:
 def _free(folder: Path, resource: Resource, devices: tuple[str, ...]) -> tuple[int | None, str]:
     """The lock of a slot that is free, and which it is."""
     for device in devices:
-        name = "".join(letter if letter.isalnum() else "-" for letter in device)
-        handle = os.open(folder / f"{resource}-{name}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        handle = os.open(_lock_file(folder, resource, device), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -138,6 +161,18 @@ def _free(folder: Path, resource: Resource, devices: tuple[str, ...]) -> tuple[i
         else:
             return handle, device
     return None, ""
+
+
+def _lock_file(folder: Path, resource: Resource, device: str) -> Path:
+    name = "".join(letter if letter.isalnum() else "-" for letter in device)
+    return folder / f"{resource}-{name}.lock"
+
+
+def _holder(folder: Path, resource: Resource, devices: tuple[str, ...]) -> str:
+    """Return who wrote itself into the first slot; empty if nobody did."""
+    with suppress(OSError, IndexError):
+        return _lock_file(folder, resource, devices[0]).read_text(encoding="utf-8", errors="replace")
+    return ""
 
 
 def _number(variable: str, otherwise: int, least: int) -> int:

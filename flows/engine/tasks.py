@@ -57,12 +57,14 @@ class Finished(BaseModel):
         label: the step, and the part of its work where it was divided.
         cached: whether the result was there already.
         wall_s: seconds from asking for it to having it; parts that run side by side share them.
+        waited_s: seconds of these in which it waited for its turn on the machine.
         result: what it gave.
     """
 
     label: str
     cached: bool
     wall_s: float
+    waited_s: float = 0.0
     result: StepResult
 
 
@@ -97,7 +99,9 @@ def run_step(request: StepRequest, item: str, label: str) -> dict[str, Any]:
         tell(StepEvent(item, label, "note", text=text))
 
     try:
-        with resources.slot(resources.resource_of(request), say):
+        turn = resources.Turn(_begun.get(item, time.time_ns()), f"{label} of {item}")
+        with resources.slot(resources.resource_of(request), say, turn) as waited_s:
+            _waited[item, label] = waited_s
             result = chosen()(spec, request, on_progress, say)
     except StepError as error:
         show(
@@ -177,6 +181,7 @@ class Steps:
         return time.monotonic() - self._begun
 
     def __enter__(self) -> Self:
+        _begun[self.item] = time.time_ns()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -184,6 +189,7 @@ class Steps:
         if stopped:
             stop_all()  # parts that run side by side would be waited for
         self._pages.finish(stopped=stopped)
+        _begun.pop(self.item, None)
 
     def run(self, step: str, inputs: dict[str, ArtifactRef | None], settings: BaseModel) -> dict[str, ArtifactRef]:
         """Run a step, or take what it gave before; its outputs by name. Inputs that are None are left out.
@@ -249,11 +255,14 @@ class Steps:
         cached = state.name == "Cached"
         if cached:
             hold(home.store(), self.item, (ref.digest for ref in result.outputs.values()))
-        self.finished.append(Finished(label=label, cached=cached, wall_s=round(seconds, 3), result=result))
+        waited_s = _waited.pop((self.item, label), 0.0)
+        self.finished.append(
+            Finished(label=label, cached=cached, wall_s=round(seconds, 3), waited_s=round(waited_s, 3), result=result)
+        )
         for ref in result.outputs.values():
             self._makers[ref.digest] = state
         remark(self.item, label, result)
-        tell(StepEvent(self.item, label, "finished", seconds=seconds, cached=cached))
+        tell(StepEvent(self.item, label, "finished", seconds=seconds, waited_s=waited_s, cached=cached))
         return result.outputs
 
 
@@ -262,6 +271,8 @@ def _note_end(ends: dict[str, float], label: str, _future: PrefectFuture[Any]) -
 
 
 _locks: dict[str, FileLocks] = {}
+_begun: dict[str, int] = {}  # when the items of this process were begun: they take turns in this order
+_waited: dict[tuple[str, str], float] = {}  # seconds that a step of an item waited for its turn
 
 
 def _task(step: str) -> Task[..., Any]:

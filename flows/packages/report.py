@@ -216,6 +216,7 @@ def _stage(done: Finished, store: ArtifactStore) -> dict[str, Any]:
         "step": done.label,
         "cached": done.cached,
         "wall_s": done.wall_s,
+        "waited_s": done.waited_s,
         "compute_s": record.duration_s,
         "peak_memory_mb": record.peak_memory_mb,
         "backend": record.backend,

@@ -106,6 +106,7 @@ def timings(finished: Sequence["Finished"]) -> list[dict[str, str]]:
             "step": done.label,
             "state": "cached" if done.cached else "computed",
             "wall_s": f"{done.wall_s:.1f}",
+            "waited_s": f"{done.waited_s:.1f}",
             "compute_s": f"{done.result.provenance.duration_s:.1f}",
             "memory": f"{done.result.provenance.peak_memory_mb:.0f} MiB",
             "key": done.result.provenance.request_digest[7:19],

@@ -11,7 +11,7 @@ import pytest
 
 from dg4d_lib.errors import BadInput
 from flows.engine import resources
-from flows.engine.resources import Resource, Stopped, resource_of, slot
+from flows.engine.resources import Resource, Stopped, Turn, resource_of, slot
 from steps.contract import StepRequest
 
 HOLDER = """
@@ -184,6 +184,52 @@ def test_a_step_that_waits_ends_when_the_user_stops_the_command(monkeypatch: pyt
         told.append(text)
         stopping.set()
 
-    with slot("gpu", silent), pytest.raises(Stopped), slot("gpu", stop):
+    fit = Turn(1, "fit_motion of newt")
+    with slot("gpu", silent, fit), pytest.raises(Stopped), slot("gpu", stop):
         pass
-    assert told == ["waiting for a GPU"]
+    assert told == ["waiting for a GPU, behind fit_motion of newt"]
+
+
+def test_turns_are_taken_in_the_order_in_which_items_were_begun_and_then_of_asking(tmp_path: Path) -> None:
+    served: list[str] = []
+    told: list[str] = []
+
+    def use(begun_ns: int, name: str) -> threading.Thread:
+        asked = threading.Event()
+
+        def work() -> None:
+            def waiting(text: str) -> None:
+                told.append(text)
+                asked.set()
+
+            with slot("cpu", waiting, Turn(begun_ns, name)) as waited_s:
+                served.append(name)
+                assert waited_s > 0.1
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        assert asked.wait(10)
+        return thread
+
+    with slot("cpu", silent, Turn(9, "the one at work")):
+        waiting = [use(begun_ns, name) for begun_ns, name in ((5, "b1"), (7, "c"), (5, "b2"), (3, "a"))]
+        time.sleep(0.2)
+    for thread in waiting:
+        thread.join(20)
+    assert served == ["a", "b1", "b2", "c"]
+    assert told[0].endswith("behind the one at work") and told[1].endswith("behind b1")
+    assert list((tmp_path / "home" / "slots" / "queue-cpu").iterdir()) == []
+
+
+def test_who_waited_and_was_killed_holds_up_nobody(tmp_path: Path) -> None:
+    waits = "import sys; from flows.engine.resources import *; print(flush=True)\n"
+    waits += "with slot('cpu', lambda text: print(text, flush=True), Turn(1, 'killed')): pass"
+    with slot("cpu", silent):
+        killed = subprocess.Popen([sys.executable, "-c", waits], stdout=subprocess.PIPE, text=True)
+        assert killed.stdout is not None
+        killed.stdout.readline(), killed.stdout.readline()  # it stands in the queue
+        killed.kill()
+        killed.wait()
+        killed.stdout.close()
+    with slot("cpu", silent) as waited_s:
+        assert waited_s < 5

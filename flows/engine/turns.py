@@ -1,0 +1,58 @@
+"""First-come-first-served queues between the processes of a user: files in order of age, locked by those who wait.
+
+A ticket is a file whose name sorts by the age of its item, then by its own; the lock of the file ends with its process.
+"""
+
+import itertools
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from flows.engine.processes import locked
+
+_numbers = itertools.count()
+
+
+@contextmanager
+def ticket(folder: Path, begun_ns: int, holder: str) -> Iterator[Path]:
+    """Stand in a queue as long as the block runs.
+
+    Args:
+        folder: of the queue; it is made.
+        begun_ns: when the work began that the holder is a part of, in nanoseconds since the epoch: earlier goes first.
+        holder: what others are told who wait behind.
+
+    Yields:
+        The ticket.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=folder, suffix=".new")
+    os.close(handle)
+    own = folder / f"{begun_ns:020d}-{time.time_ns():020d}-{os.getpid()}-{next(_numbers)}.ticket"
+    with locked(Path(name)):
+        Path(name).write_text(holder, encoding="utf-8", errors="replace")
+        Path(name).rename(own)  # seen by others when it is locked
+        try:
+            yield own
+        finally:
+            own.unlink(missing_ok=True)
+
+
+def first_ahead(own: Path) -> str | None:
+    """Return the holder of the first ticket of the queue that is older than `own`; None if there is none.
+
+    Tickets whose process has ended are removed.
+    """
+    for other in sorted(own.parent.glob("*.ticket")):
+        if other.name >= own.name:
+            return None
+        with locked(other, shared=True) as ended:
+            if not ended:
+                with suppress(OSError):  # it has just been served
+                    return other.read_text(encoding="utf-8") or other.stem
+        if ended:
+            other.unlink(missing_ok=True)
+    return None
