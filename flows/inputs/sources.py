@@ -62,7 +62,10 @@ def check_file(path: Path) -> None:
         raise BadInput(f"{path} is empty (0 bytes); give a picture or a video")
     if path.stat().st_size > LARGEST_FILE_BYTES:
         raise BadInput(f"{path} has {path.stat().st_size} bytes; at most {LARGEST_FILE_BYTES} are read: shorten it")
-    check_media(path)
+    try:
+        check_media(path)
+    except BadInput as error:
+        raise BadInput(f"{path}: {error}") from error
 
 
 def check_video(path: Path) -> None:

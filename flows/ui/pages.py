@@ -116,11 +116,13 @@ def thumbnail(ref: ArtifactRef, store: ArtifactStore, most_bytes: int = THUMBNAI
 @lru_cache(THUMBNAILS_KEPT)
 def _small(path: Path, most_bytes: int) -> bytes | None:
     """As `thumbnail`, of a file that never changes."""
-    picture = oiio.ImageBuf(str(path))
-    if not picture.read() or not picture.spec().width:
-        picture.geterror()  # it was taken note of
-        return None
     with tempfile.TemporaryDirectory(prefix="dg4d-page-") as folder:
+        named = Path(folder) / "picture.png"  # files of the store have no suffix, by which a reader is found
+        named.symlink_to(path)
+        picture = oiio.ImageBuf(str(named))
+        if not picture.read() or not picture.spec().width:
+            picture.geterror()  # it was taken note of
+            return None
         target = Path(folder) / "small.webp"
         small = picture
         for size in THUMBNAIL_SIZES:

@@ -34,7 +34,9 @@ COMMAND_ONLY = {
     "pyyaml",
     "rich",
     "sqlalchemy",
+    "starlette",
     "typer",
+    "uvicorn",
 }  # of the dependencies: what flows alone import
 LADDER = [{"until": 1.0, "size": 32}]
 SMALL = revise(
