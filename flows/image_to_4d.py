@@ -105,7 +105,7 @@ def extract(
     done = [outputs["meshes"] for outputs in steps.run_parts("extract_mesh", inputs, parts)]
     if len(done) == 1:
         return {"meshes": done[0]}
-    joined = steps.run("join_meshes", {f"part_{i:03d}": part for i, part in enumerate(done)}, JoinMeshesSettings())
+    joined = steps.run("join_meshes", {f"meshes_{i:03d}": part for i, part in enumerate(done)}, JoinMeshesSettings())
     return {"meshes": joined["meshes"]}
 
 

@@ -108,7 +108,7 @@ STEPS: dict[str, StepSpec] = {
             version="1",
             entry="steps.join_meshes:run",
             settings="steps.profiles:JoinMeshesSettings",
-            inputs={"part": MESHES.model_copy(update={"many": True})},
+            inputs={"meshes": MESHES.model_copy(update={"many": True})},
             outputs={"meshes": MESHES},
         ),
         StepSpec(

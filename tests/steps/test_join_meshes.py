@@ -16,11 +16,11 @@ def part(store: ArtifactStore, folder: Path, **entries: str) -> object:
     with zipfile.ZipFile(folder / "part.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in entries.items():
             archive.writestr(f"{name[1:]}.safetensors", content)
-    return store.put(folder / "part.zip", SPEC.inputs["part"].media_type)
+    return store.put(folder / "part.zip", SPEC.inputs["meshes"].media_type)
 
 
 def joined(store: ArtifactStore, *parts: object) -> zipfile.ZipFile:
-    inputs = {f"part_{i:03d}": each for i, each in enumerate(parts)}
+    inputs = {f"meshes_{i:03d}": each for i, each in enumerate(parts)}
     request = StepRequest(step=SPEC.name, version=request_version(SPEC), inputs=inputs, settings={}, seed=0)
     result, error = perform(request, store)
     if error is not None:
@@ -45,7 +45,8 @@ def test_parts_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("names", "says"), [([], "needs the input part"), (["part"], "part"), (["part_000", "whole"], "no input whole")]
+    ("names", "says"),
+    [([], "needs the input meshes"), (["meshes"], "meshes"), (["meshes_000", "whole"], "no input whole")],
 )
 def test_inputs_of_another_name_are_refused(tmp_path: Path, names: list[str], says: str) -> None:
     store = ArtifactStore(tmp_path / "store")
