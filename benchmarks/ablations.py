@@ -29,8 +29,8 @@ from benchmarks.objects.specimens import OBJECTS, Specimen, made, read
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from flows.inputs.manifest import parse_changes
+from steps.artifacts.ground_truth import find_truths
 from steps.profiles import PipelineSettings, revise
-from steps.truth import find_truths
 
 DIGITS = {"psnr": 2, "psnr_obj": 2, "iou": 3, "terr": 3, "flicker": 2}
 LESS_IS_BETTER = {"terr", "flicker"}

@@ -26,15 +26,15 @@ from torch.nn.functional import interpolate
 
 from dg4d_lib.asset_settings import GltfSettings, PackSettings
 from dg4d_lib.assets.animated import Asset4D, moved
-from dg4d_lib.assets.compact import Compact, write_compact
-from dg4d_lib.assets.glb import write_glb
-from dg4d_lib.assets.preview import write_preview, write_turntable
-from dg4d_lib.assets.rigged import rig_of, write_rigged_glb
-from dg4d_lib.assets.splats import write_splat_glb_frames, write_splats, write_spz_frames
-from dg4d_lib.assets.usd import write_usdz
-from dg4d_lib.assets.viewer_page import viewer_page
-from dg4d_lib.assets.webp import write_webp
-from dg4d_lib.assets.websplats import write_web_splats
+from dg4d_lib.assets.formats.compact import Compact, write_compact
+from dg4d_lib.assets.formats.glb import write_glb
+from dg4d_lib.assets.formats.rigged import rig_of, write_rigged_glb
+from dg4d_lib.assets.formats.splats import write_splat_glb_frames, write_splats, write_spz_frames
+from dg4d_lib.assets.formats.usd import write_usdz
+from dg4d_lib.assets.formats.websplats import write_web_splats
+from dg4d_lib.assets.rendering.preview import write_preview, write_turntable
+from dg4d_lib.assets.rendering.viewer_page import viewer_page
+from dg4d_lib.assets.rendering.webp import write_webp
 from dg4d_lib.deformation.hexplane import HexPlane
 from dg4d_lib.deformation.kinds import new_deformation
 from dg4d_lib.gaussians.cloud import Gaussians

@@ -19,9 +19,9 @@ from dg4d_lib.metrics.video import temporal_error
 from dg4d_lib.rasterizer.interface import choose_rasterizer
 from dg4d_lib.settings import MotionSettings, OraclePriorSettings, StaticSettings
 from dg4d_lib.video.driving import over_white
+from steps.artifacts.motions import new_deformation
 from steps.fit_gaussians import starting_cloud
-from steps.motions import new_deformation
-from steps.priors import oracle_prior
+from steps.fitting.priors import oracle_prior
 from steps.profiles import PipelineSettings
 
 RASTERIZE = choose_rasterizer("auto")

@@ -38,12 +38,12 @@ from dg4d_lib.metrics.gates import Gate, judge
 from dg4d_lib.rasterizer.interface import choose_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 from flows.packages.publish import whole
+from steps.artifacts.media import read_frames, read_png
+from steps.artifacts.packages import SUBJECT, read_manifest
+from steps.artifacts.rendering import read_states, read_surface, states_between
+from steps.artifacts.store import ArtifactStore, home
 from steps.check_asset import Parts, gather
 from steps.contract import ArtifactRef
-from steps.media import read_frames, read_png
-from steps.packages import SUBJECT, read_manifest
-from steps.render_asset import read_states, read_surface, states_between
-from steps.store import ArtifactStore, home
 
 FRAMES, SIZE, FPS = 12, 256, 12.0  # of our own shapes
 SOLID = 3.0  # logit of the opacity of their splats

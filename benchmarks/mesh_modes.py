@@ -18,20 +18,20 @@ from rich.table import Column, Table
 from torch import Tensor
 
 from dg4d_lib.assets.animated import moved
-from dg4d_lib.assets.compact import read_compact
-from dg4d_lib.assets.glb import read_glb
+from dg4d_lib.assets.formats.compact import read_compact
+from dg4d_lib.assets.formats.glb import read_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.mesh.density import density_field
-from dg4d_lib.mesh.extract import best_level
+from dg4d_lib.mesh.extraction.density import density_field
+from dg4d_lib.mesh.extraction.extract import best_level
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.metrics.image import iou, psnr
 from dg4d_lib.metrics.surface import chamfer
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
 from dg4d_lib.settings import MeshSettings
+from steps.artifacts.packages import ASSET, COMPACT
 from steps.extract_mesh import textured
-from steps.packages import ASSET, COMPACT
 
 AZIMUTHS_DEG = (0.0, 90.0)  # the input view, and the right side
 SIZE = 512  # pixels

@@ -1,4 +1,4 @@
-"""What cross-attention to one token costs, and without the attention (`dg4d_lib/diffusion/one_token.py`).
+"""What cross-attention to one token costs, and without the attention (`dg4d_lib/diffusion/single_token_attention.py`).
 
 Run with `python -m benchmarks.one_token` (a quarter of an hour, 8 GB; `--quick`: tiny networks, some seconds; `--json
 FILE` keeps the rows). U-Nets of the published sizes with random weights, float32, one thread, no GPU. Columns:
@@ -25,7 +25,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.paper_schedule import FULL, Sizes, picture_unet, video_unet
-from dg4d_lib.diffusion.one_token import shorten_attention
+from dg4d_lib.diffusion.single_token_attention import shorten_attention
 from dg4d_lib.guidance.zero123 import LATENT_CHANNELS, LATENT_SIZE
 
 

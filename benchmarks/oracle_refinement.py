@@ -34,9 +34,9 @@ from benchmarks.objects.drawing import Painted
 from benchmarks.objects.specimens import FPS, OBJECTS, SCORED_AZIMUTHS_DEG
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.video_model import karras_sigmas, start_index
-from dg4d_lib.mesh.bake import Texels, texels_of, vertex_normals
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.mesh.unwrap import unwrap
+from dg4d_lib.mesh.texturing.bake import Texels, texels_of, vertex_normals
+from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.mesh_rasterizer.texture import look_up, read
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.metrics.image import psnr

@@ -33,9 +33,9 @@ from diffusers.utils import logging
 from rich.table import Column, Table
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
-from dg4d_lib.diffusion.ledger import counted, counting_flops
-from dg4d_lib.diffusion.one_token import shorten_attention
+from dg4d_lib.diffusion.flop_counter import counted, counting_flops
 from dg4d_lib.diffusion.parts import Placement, dtype_on, frozen
+from dg4d_lib.diffusion.single_token_attention import shorten_attention
 from dg4d_lib.diffusion.video_model import GIB, VideoModel
 from dg4d_lib.fitting.motion import fit_motion
 from dg4d_lib.fitting.static import fit_gaussians
@@ -58,7 +58,7 @@ from dg4d_lib.texture.refine import Stretch, refine_textures
 from dg4d_lib.texture.refiner import VideoToVideo
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.svd import StableVideo
-from steps.motions import new_deformation
+from steps.artifacts.motions import new_deformation
 from steps.profiles import PipelineSettings, profile, revise
 
 FLOORS_S = {"video": 1.2, "static": 9.1, "dynamic": 12.8, "refinement": 21.7}  # the profile's video is 512 x 512

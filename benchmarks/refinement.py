@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.assets.glb import read_glb
+from dg4d_lib.assets.formats.glb import read_glb
 from dg4d_lib.settings import (
     ImageToImageSettings,
     RefinerSettings,
@@ -32,11 +32,11 @@ from dg4d_lib.settings import (
     Zero123PriorSettings,
 )
 from dg4d_lib.video.driving import DrivingVideo
-from steps.job import Job
-from steps.media import read_png, write_frames
-from steps.meshfiles import read_tracked, write_tracked
+from steps.artifacts.media import read_png, write_frames
+from steps.artifacts.meshes import read_tracked, write_tracked
 from steps.profiles import RefineTextureSettings
 from steps.refine_texture import run
+from steps.runtime.job import Job
 
 SKIPPED = (0.6, 0.7, 0.75, 0.8)  # shares of the noise levels; the paper's "noise level" is .7
 FRAME_TEXELS = 512  # of a side of the textures per frame

@@ -11,7 +11,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from examples.beetle import Beetle
 from examples.drawing import draw
 from examples.newt import Newt
-from steps.media import write_png
+from steps.artifacts.media import write_png
 
 FOLDER = Path(__file__).parent
 PICTURE_SIZE = 512  # pixels

@@ -257,7 +257,7 @@ def render(
 
         check_writable(out)
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-        from steps.render_asset import render_package
+        from steps.artifacts.rendering import render_package
 
         for folder in render_package(package, angles, elevation, size, frames, mesh, out):
             typer.echo(folder)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from dg4d_lib.errors import BadInput
 from flows.serving.server import SETTINGS, Server
-from steps.opening import open_store
-from steps.store import ArtifactStore, home
+from steps.artifacts.opening import open_store
+from steps.artifacts.store import ArtifactStore, home
 
 OTHERS = 0o077  # permissions of group and others
 CLIENT_SETTINGS = {

@@ -10,7 +10,7 @@ from flows import home
 from flows.engine.executors import StepBadInput
 from flows.engine.tasks import Steps
 from flows.image_to_4d import drive
-from steps.archives import unpack as unpack_zip
+from steps.artifacts.archives import unpack as unpack_zip
 from steps.contract import ArtifactRef
 from steps.profiles import PipelineSettings
 

@@ -11,21 +11,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dg4d_lib.assets.sheet import page
+from dg4d_lib.assets.rendering.sheet import page
 from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
 from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.fitting.losses import resized
-from dg4d_lib.mesh.check import checked, welded
+from dg4d_lib.mesh.extraction.check import checked, welded
 from dg4d_lib.metrics.gates import MESH, SPLATS, Evidence, Gate, Pictures, Turn, fidelity, judge
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
-from steps.archives import unpack
-from steps.job import Facts, Job
-from steps.media import read_frames, read_png, write_png
-from steps.packages import ASSET, COMPACT, MANIFEST, MESHES, read_manifest
-from steps.packages import SPLATS as SPLATS_FOLDER
+from steps.artifacts.archives import unpack
+from steps.artifacts.media import read_frames, read_png, write_png
+from steps.artifacts.packages import ASSET, COMPACT, MANIFEST, MESHES, read_manifest
+from steps.artifacts.packages import SPLATS as SPLATS_FOLDER
+from steps.artifacts.rendering import BATCH, States, Surface, drawn_mesh, mesh_at, read_states, read_surface
 from steps.profiles import CheckAssetSettings
-from steps.render_asset import BATCH, States, Surface, drawn_mesh, mesh_at, read_states, read_surface
+from steps.runtime.job import Facts, Job
 
 SIZE = 128  # pixels of the pictures; the bounds of the gates belong to it
 MOST_FRAMES = 32  # of the video, evenly spread

@@ -9,17 +9,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.assets.animated import moved
-from dg4d_lib.assets.compact import read_compact
-from dg4d_lib.assets.compose import Actor, Body, compose_glb, in_a_row, scene_duration
-from dg4d_lib.assets.preview import pictures_over, studio, write_film
-from dg4d_lib.assets.scene import Item, Scene
-from dg4d_lib.assets.usd import UsdPlacement, compose_usdz
+from dg4d_lib.assets.formats.compact import read_compact
+from dg4d_lib.assets.formats.usd import UsdPlacement, compose_usdz
+from dg4d_lib.assets.rendering.preview import pictures_over, studio, write_film
+from dg4d_lib.assets.scenes.compose import Actor, Body, compose_glb, in_a_row, scene_duration
+from dg4d_lib.assets.scenes.scene import Item, Scene
 from dg4d_lib.cameras.orbit import FOV_Y_DEG, RADIUS, OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.placing import joined, placed
 from dg4d_lib.rasterizer.interface import choose_rasterizer
-from steps.packages import ASSET, COMPACT, USD, read_manifest
+from steps.artifacts.packages import ASSET, COMPACT, USD, read_manifest
 
 FILM_SIZE = 384  # pixels of a side
 MOST_PICTURES = 300  # of a film; they are kept until it is written

@@ -108,7 +108,7 @@ class ProvenanceRecord(Frozen):
     duration_s: float = Field(ge=0)
     cpu_s: float = Field(0.0, ge=0, description="seconds of all cores, of the step's process and those it started")
     peak_memory_mb: float = Field(ge=0)
-    machine: dict[str, str] = Field({}, description="what computed it (steps/machine.py)")
+    machine: dict[str, str] = Field({}, description="what computed it (steps/runtime/environment_info.py)")
 
     def digest(self) -> str:
         """sha256 of the record without what belongs to one run only."""

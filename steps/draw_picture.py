@@ -6,9 +6,9 @@ from dg4d_lib.diffusion.parts import device_here
 from dg4d_lib.diffusion.text_to_image import draw_picture
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import TextSettings
-from steps.job import Facts, Job
-from steps.media import write_png
-from steps.weights import open_weights
+from steps.artifacts.media import write_png
+from steps.runtime.job import Facts, Job
+from steps.runtime.weights import open_weights
 
 
 def run(job: Job) -> Facts:

@@ -12,20 +12,20 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from dg4d_lib.assets.preview import write_film
-from dg4d_lib.assets.sheet import videos_sheet
+from dg4d_lib.assets.rendering.preview import write_film
+from dg4d_lib.assets.rendering.sheet import videos_sheet
 from dg4d_lib.diffusion.parts import device_here
 from dg4d_lib.diffusion.video_model import VideoModel
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import SvdSettings, WarpSettings
+from dg4d_lib.video.candidate_ranking import GOOD, WEIGHTS, Candidate, ranked, score
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.svd import StableVideo
-from dg4d_lib.video.tournament import GOOD, WEIGHTS, Candidate, ranked, score
 from dg4d_lib.video.warp import Warp, candidate
-from steps.job import Facts, Job
-from steps.media import read_frames, read_png, write_frames, write_png, write_zip
+from steps.artifacts.media import read_frames, read_png, write_frames, write_png, write_zip
 from steps.profiles import DriveVideoSettings
-from steps.weights import open_weights
+from steps.runtime.job import Facts, Job
+from steps.runtime.weights import open_weights
 
 TILE, COLUMNS = 160, 7  # pixels and moments of the sheets
 FILM = 256  # pixels of their films

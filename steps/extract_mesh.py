@@ -14,25 +14,25 @@ from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply
-from dg4d_lib.mesh.bake import bake, vertex_normals
-from dg4d_lib.mesh.check import MeshFacts, checked, welded
-from dg4d_lib.mesh.clean import clean
-from dg4d_lib.mesh.density import density_field
-from dg4d_lib.mesh.extract import best_level, surface, usable_level
-from dg4d_lib.mesh.register import FOLLOWS, register
+from dg4d_lib.mesh.extraction.check import MeshFacts, checked, welded
+from dg4d_lib.mesh.extraction.clean import clean
+from dg4d_lib.mesh.extraction.density import density_field
+from dg4d_lib.mesh.extraction.extract import best_level, surface, usable_level
 from dg4d_lib.mesh.render import render_mesh
-from dg4d_lib.mesh.rest import best_rest, since
-from dg4d_lib.mesh.ride import ride
-from dg4d_lib.mesh.snap import snap
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.mesh.unwrap import unwrap
+from dg4d_lib.mesh.texturing.bake import bake, vertex_normals
+from dg4d_lib.mesh.texturing.unwrap import unwrap
+from dg4d_lib.mesh.tracking.isosurface_projection import snap
+from dg4d_lib.mesh.tracking.nonrigid_registration import FOLLOWS, register
+from dg4d_lib.mesh.tracking.reference_frame import best_rest, since
+from dg4d_lib.mesh.tracking.skinning import ride
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
 from dg4d_lib.settings import MeshSettings
-from steps.job import Facts, Job
-from steps.media import write_png
-from steps.meshfiles import write_meshes, write_tracked
-from steps.motions import read_motion
+from steps.artifacts.media import write_png
+from steps.artifacts.meshes import write_meshes, write_tracked
+from steps.artifacts.motions import read_motion
 from steps.profiles import ExtractMeshSettings
+from steps.runtime.job import Facts, Job
 
 PICTURE_CAMERAS = [OrbitCamera(0, azimuth, width=256, height=256) for azimuth in (0.0, 75.0, 180.0, 285.0)]
 FPS_UNKNOWN = 1.0  # frames per second: motion has no clock; refine_texture, which sees the driving video, sets it

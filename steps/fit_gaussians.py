@@ -16,11 +16,11 @@ from dg4d_lib.gaussians.ply import write_ply
 from dg4d_lib.inflation.surface import inflate, sample_surface
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer, device_of
 from dg4d_lib.settings import GeometricPriorSettings, PriorSettings, StaticSettings
-from steps.job import Facts, Job
-from steps.media import read_png, write_curves, write_png
-from steps.priors import make_prior
+from steps.artifacts.media import read_png, write_curves, write_png
+from steps.fitting.priors import make_prior
+from steps.fitting.reconstruction import reconstruct_subject
 from steps.profiles import FitGaussiansSettings
-from steps.reconstruction import reconstruct_subject
+from steps.runtime.job import Facts, Job
 
 PICTURE_AZIMUTHS_DEG = (0.0, 45.0, 90.0, 180.0, -90.0, -45.0)
 PICTURE_SIZE = 192  # pixels

@@ -9,12 +9,12 @@ from dg4d_lib.fitting.losses import Diverged
 from dg4d_lib.fitting.motion import fit_motion
 from dg4d_lib.gaussians.ply import read_ply, write_ply
 from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
+from steps.artifacts.media import read_frames, write_png
+from steps.artifacts.motions import new_deformation, write_motion
 from steps.fit_gaussians import PICTURE_SIZE, Curves, picture_of
-from steps.job import Facts, Job
-from steps.media import read_frames, write_png
-from steps.motions import new_deformation, write_motion
-from steps.priors import make_prior
+from steps.fitting.priors import make_prior
 from steps.profiles import FitMotionSettings
+from steps.runtime.job import Facts, Job
 
 FINE_TUNED = "The Gaussians at rest were fitted to the whole video together with their motion."
 PICTURE_FRAMES = 6

@@ -3,8 +3,8 @@
 import zipfile
 
 from dg4d_lib.errors import BadInput
-from steps.job import Facts, Job
-from steps.media import write_zip
+from steps.artifacts.media import write_zip
+from steps.runtime.job import Facts, Job
 
 
 def run(job: Job) -> Facts:

@@ -37,8 +37,10 @@ from typing import Any, Literal, TextIO
 
 from pydantic import BaseModel, ValidationError
 
-from dg4d_lib.diffusion.ledger import counting_flops
+from dg4d_lib.diffusion.flop_counter import counting_flops
 from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
+from steps.artifacts.opening import open_store
+from steps.artifacts.store import NO_SPACE, ArtifactMissing, ArtifactStore, StoreUnreachable, write_atomically
 from steps.contract import (
     EXIT_BAD_INPUT,
     EXIT_DONE,
@@ -51,11 +53,9 @@ from steps.contract import (
     StepResult,
     StepSpec,
 )
-from steps.job import Facts, Job, Progress
-from steps.machine import machine
-from steps.opening import open_store
-from steps.store import NO_SPACE, ArtifactMissing, ArtifactStore, StoreUnreachable, write_atomically
-from steps.weights import require_same
+from steps.runtime.environment_info import machine
+from steps.runtime.job import Facts, Job, Progress
+from steps.runtime.weights import require_same
 
 EXIT_CRASHED = 1
 EXIT_DIVERGED = 70

@@ -13,32 +13,32 @@ import torch
 
 from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.assets.compact import Compact, write_compact
-from dg4d_lib.assets.glb import write_frames_glb, write_glb, write_mesh_glb
-from dg4d_lib.assets.preview import write_film, write_preview, write_turntable
+from dg4d_lib.assets.formats.compact import Compact, write_compact
+from dg4d_lib.assets.formats.glb import write_frames_glb, write_glb, write_mesh_glb
+from dg4d_lib.assets.formats.rigged import rig_of, write_rigged_glb
+from dg4d_lib.assets.formats.splats import write_splat_glb_frames, write_splats, write_spz_frames
+from dg4d_lib.assets.formats.usd import write_usdz
+from dg4d_lib.assets.formats.websplats import write_web_splats
+from dg4d_lib.assets.rendering.preview import write_film, write_preview, write_turntable
+from dg4d_lib.assets.rendering.sheet import contact_sheet
+from dg4d_lib.assets.rendering.webp import write_webp
 from dg4d_lib.assets.resample import moments, resampled, states
-from dg4d_lib.assets.rigged import rig_of, write_rigged_glb
-from dg4d_lib.assets.sheet import contact_sheet
-from dg4d_lib.assets.splats import write_splat_glb_frames, write_splats, write_spz_frames
-from dg4d_lib.assets.usd import write_usdz
-from dg4d_lib.assets.webp import write_webp
-from dg4d_lib.assets.websplats import write_web_splats
 from dg4d_lib.deformation.kinds import AnyDeformation
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply
-from dg4d_lib.mesh.simplify import simplified
+from dg4d_lib.mesh.extraction.simplify import simplified
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
 from dg4d_lib.settings import DeformationSettings
 from dg4d_lib.video.driving import DrivingVideo
-from steps import packages
-from steps.job import Facts, Job
-from steps.media import read_frames, write_png, write_zip
-from steps.meshfiles import read_meshes, read_tracked
-from steps.motions import read_fit
-from steps.packages import MANIFEST, Manifest
+from steps.artifacts import packages
+from steps.artifacts.media import read_frames, write_png, write_zip
+from steps.artifacts.meshes import read_meshes, read_tracked
+from steps.artifacts.motions import read_fit
+from steps.artifacts.packages import MANIFEST, Manifest
 from steps.profiles import PackAssetSettings
+from steps.runtime.job import Facts, Job
 
 Surface = Asset4D | list[TexturedMesh]
 Notes = Sequence[str]

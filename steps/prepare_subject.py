@@ -11,9 +11,9 @@ from dg4d_lib.settings import SubjectSettings
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.framing import reframe, whole_frame
 from dg4d_lib.video.subject import prepare
-from steps.job import Facts, Job
-from steps.media import write_frames, write_png
-from steps.sources import read_source
+from steps.artifacts.media import write_frames, write_png
+from steps.runtime.job import Facts, Job
+from steps.sources.reader import read_source
 
 TILE = 256  # pixels
 

@@ -16,11 +16,11 @@ from dg4d_lib.settings import IdentitySettings, ImageToImageSettings, VideoToVid
 from dg4d_lib.texture.refine import Refined, Stretch, refine_textures
 from dg4d_lib.texture.refiner import ImageToImage, Refiner, VideoToVideo
 from dg4d_lib.video.driving import DrivingVideo
-from steps.job import Facts, Job
-from steps.media import frame_rate, read_frames
-from steps.meshfiles import read_meshes, read_tracked, write_meshes, write_tracked
+from steps.artifacts.media import frame_rate, read_frames
+from steps.artifacts.meshes import read_meshes, read_tracked, write_meshes, write_tracked
 from steps.profiles import RefineTextureSettings
-from steps.weights import open_weights
+from steps.runtime.job import Facts, Job
+from steps.runtime.weights import open_weights
 
 
 def run(job: Job) -> Facts:

@@ -17,8 +17,8 @@ from torch.nn import functional as F
 
 from dg4d_lib.asset_settings import ScoreSettings
 from dg4d_lib.assets.animated import between
-from dg4d_lib.assets.glb import read_glb, read_mesh_glb
-from dg4d_lib.assets.preview import write_film
+from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb
+from dg4d_lib.assets.rendering.preview import write_film
 from dg4d_lib.diffusion.parts import device_here
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.metrics.clip import Clip, load_clip, similarity
@@ -28,14 +28,14 @@ from dg4d_lib.metrics.lpips import Lpips, load_lpips
 from dg4d_lib.metrics.ssim import ssim
 from dg4d_lib.metrics.surface import aligned, chamfer_of_points, sample_surface
 from dg4d_lib.metrics.video import flicker, motion_amount, temporal_error
-from steps.archives import unpack
-from steps.job import Facts, Job
-from steps.media import read_png, write_zip
-from steps.packages import ASSET, MESHES, read_manifest
+from steps.artifacts.archives import unpack
+from steps.artifacts.ground_truth import Truth, find_truth
+from steps.artifacts.media import read_png, write_zip
+from steps.artifacts.packages import ASSET, MESHES, read_manifest
+from steps.artifacts.rendering import render_package
 from steps.profiles import ScoreAssetSettings
-from steps.render_asset import render_package
-from steps.truth import Truth, find_truth
-from steps.weights import open_weights
+from steps.runtime.job import Facts, Job
+from steps.runtime.weights import open_weights
 
 COVERED = 0.5  # coverage from which a pixel belongs to the subject
 NEARLY_WHITE = 0.98  # opaque pictures: the subject has a channel below this

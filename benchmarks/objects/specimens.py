@@ -17,9 +17,9 @@ from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.video.driving import DrivingVideo
 from examples.drawing import Creature
 from examples.newt import Newt
-from steps.media import read_png
-from steps.priors import read_bank_folder
-from steps.truth import Truth
+from steps.artifacts.ground_truth import Truth
+from steps.artifacts.media import read_png
+from steps.fitting.priors import read_bank_folder
 
 OBJECTS: dict[str, Callable[[], Creature]] = {  # a walker, a flier, something soft, something stiff
     "newt": Newt,

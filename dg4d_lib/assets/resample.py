@@ -10,7 +10,7 @@ from dg4d_lib.assets.animated import Asset4D, between, moved
 from dg4d_lib.deformation.interface import Deformation, Displacement
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.mesh.ride import ride
+from dg4d_lib.mesh.tracking.skinning import ride
 
 MOST_STATES = 1000  # a GLB holds a morph target per state, and weights for all of them at every key
 STATES_AT_ONCE = 32  # bounds the memory

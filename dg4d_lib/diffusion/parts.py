@@ -22,7 +22,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from dg4d_lib.diffusion.ledger import counted
+from dg4d_lib.diffusion.flop_counter import counted
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.settings import Precision
 

@@ -7,7 +7,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 
-from dg4d_lib.diffusion.ledger import counted
+from dg4d_lib.diffusion.flop_counter import counted
 from dg4d_lib.diffusion.parts import Placement, frozen, read_tensors
 from dg4d_lib.errors import BadInput
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dg4d_lib.diffusion.ledger import counted
+from dg4d_lib.diffusion.flop_counter import counted
 from dg4d_lib.diffusion.parts import HALF, dtype_on, missing_packages
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.settings import TextSettings

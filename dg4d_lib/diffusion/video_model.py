@@ -19,7 +19,6 @@ from torch import Tensor, nn
 from torch.nn.functional import conv2d, interpolate, pad
 
 from dg4d_lib.diffusion.batching import MicroBatches
-from dg4d_lib.diffusion.one_token import shorten_attention
 from dg4d_lib.diffusion.parts import (
     CLIP_SIZE,
     Placement,
@@ -29,6 +28,7 @@ from dg4d_lib.diffusion.parts import (
     load_temporal_vae,
     normalized_for_clip,
 )
+from dg4d_lib.diffusion.single_token_attention import shorten_attention
 from dg4d_lib.settings import VideoModelSettings
 
 SIGMA_MAX, SIGMA_MIN, RHO = 700.0, 0.002, 7.0

@@ -11,7 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.guidance.distillation import Annealing, alphabars, score_distillation
+from dg4d_lib.diffusion.noise_schedule import alphabars
+from dg4d_lib.guidance.distillation import Annealing, score_distillation
 from dg4d_lib.guidance.interface import View
 
 LATENT_NUMBERS = 4 * 32 * 32  # of Zero-1-to-3; a pixel picture is weighted as if it had as many

@@ -6,7 +6,6 @@ x_t = sqrt(alphabar) z + sqrt(1 - alphabar) e;  grad = (1 - alphabar) (e_predict
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import torch
@@ -14,20 +13,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.diffusion.batching import MicroBatches
+from dg4d_lib.diffusion.noise_schedule import TRAIN_STEPS, alphabars
 
-TRAIN_STEPS = 1000
-BETA_START, BETA_END = 0.00085, 0.012  # scaled-linear
 NOISE_END = 0.02  # share of the schedule at which the paper's annealing ends
 LOWEST, HIGHEST = 20, 980  # timesteps
 
 PredictNoise = Callable[[Float[Tensor, "b c h w"], int], Float[Tensor, "b c h w"]]
-
-
-@cache
-def alphabars() -> Float[Tensor, " steps"]:
-    """Products of 1 - beta, float64, one per training step."""
-    betas = torch.linspace(BETA_START**0.5, BETA_END**0.5, TRAIN_STEPS, dtype=torch.float64).square()
-    return (1 - betas).cumprod(0)
 
 
 @dataclass(frozen=True)

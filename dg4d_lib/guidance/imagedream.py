@@ -22,6 +22,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.devices import sent
 from dg4d_lib.diffusion.batching import MicroBatches
+from dg4d_lib.diffusion.ddim import ddim_step, ddim_timesteps
 from dg4d_lib.diffusion.multiview import MultiViewShape, MultiViewUnet
 from dg4d_lib.diffusion.parts import (
     TRANSFORMERS_FILES,
@@ -34,7 +35,6 @@ from dg4d_lib.diffusion.parts import (
 )
 from dg4d_lib.diffusion.published import load_network
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.guidance.ddim import ddim_step, ddim_timesteps
 from dg4d_lib.guidance.distillation import Annealing, distill_in_pieces
 from dg4d_lib.guidance.interface import View
 from dg4d_lib.guidance.zero123 import LATENT_CHANNELS, LATENT_SIZE, SCHEDULE, clip_pixels, encoded

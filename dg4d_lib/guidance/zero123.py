@@ -19,7 +19,7 @@ from torch.nn import functional
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.devices import sent
 from dg4d_lib.diffusion.batching import MicroBatches
-from dg4d_lib.diffusion.one_token import shorten_attention
+from dg4d_lib.diffusion.noise_schedule import BETA_END, BETA_START, TRAIN_STEPS
 from dg4d_lib.diffusion.parts import (
     CLIP_SIZE,
     BetaSchedule,
@@ -32,8 +32,9 @@ from dg4d_lib.diffusion.parts import (
     read_linear,
     require_schedule,
 )
+from dg4d_lib.diffusion.single_token_attention import shorten_attention
 from dg4d_lib.errors import BadInput
-from dg4d_lib.guidance.distillation import BETA_END, BETA_START, TRAIN_STEPS, Annealing, distill_in_pieces
+from dg4d_lib.guidance.distillation import Annealing, distill_in_pieces
 from dg4d_lib.guidance.interface import View
 from dg4d_lib.settings import Precision, Zero123PriorSettings
 

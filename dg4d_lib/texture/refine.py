@@ -19,8 +19,8 @@ from torch.nn.functional import interpolate, normalize
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput, FitDiverged
-from dg4d_lib.mesh.bake import vertex_normals
 from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.mesh.texturing.bake import vertex_normals
 from dg4d_lib.mesh_rasterizer.texture import Lookup, look_up, read
 from dg4d_lib.mesh_rasterizer.zbuffer import Fragments, rasterize_mesh
 from dg4d_lib.mesh_rasterizer.zbuffer import interpolate as spread

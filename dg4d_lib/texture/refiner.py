@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.diffusion.ddim import ddim_step, ddim_timesteps, diffused
 from dg4d_lib.diffusion.video_model import VideoModel, karras_sigmas, start_index
-from dg4d_lib.guidance.ddim import ddim_step, ddim_timesteps, diffused
 from dg4d_lib.guidance.interface import View
 from dg4d_lib.guidance.zero123 import ConditionedZero123, encoded
 from dg4d_lib.settings import ImageToImageSettings, VideoToVideoSettings

@@ -21,14 +21,14 @@ from flows.packages import scores
 from flows.packages.publish import check_folder, check_writable, is_current, whole
 from flows.packages.scores import Results
 from flows.packages.summary import BAD_INPUT, Row, Tally
-from steps.archives import unpack
+from steps.artifacts.archives import unpack
+from steps.artifacts.ground_truth import Truth, find_truth, find_truths
+from steps.artifacts.store import ArtifactStore, room_for, write_atomically
 from steps.catalog import PACKAGE, TRUTH
 from steps.contract import ArtifactRef
-from steps.media_types import check_arrays, check_still
 from steps.profiles import ScoreAssetSettings, profile, revise
-from steps.store import ArtifactStore, room_for, write_atomically
-from steps.truth import Truth, find_truth, find_truths
-from steps.weights import without_paths
+from steps.runtime.weights import without_paths
+from steps.sources.media_types import check_arrays, check_still
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -53,7 +53,7 @@ def score(
 
     Args:
         package: its folder.
-        truth: a folder in a layout of steps/truth.py, or a picture, where nothing is known of other sides.
+        truth: a folder in a layout of steps/artifacts/ground_truth.py, or a picture, where other sides are unknown.
         console: where to show how far it is.
         mesh: judge the textured mesh instead of the splats.
         changes: "score.KNOB=VALUE", knobs of `ScoreSettings`.
@@ -110,7 +110,7 @@ def bench(
     OUT gets results.json, results.csv, table.md, index.html, films/ and the packages in assets/.
 
     Args:
-        dataset: a folder per object, in a layout of steps/truth.py.
+        dataset: a folder per object, in a layout of steps/artifacts/ground_truth.py.
         out: made if it is not there.
         console: where to show how far it is.
         profile_name: of the conversion.

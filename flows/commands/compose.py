@@ -6,10 +6,10 @@ from pathlib import Path, PurePath
 
 from pydantic import ValidationError
 
-from dg4d_lib.assets.scene import Item, Scene
+from dg4d_lib.assets.scenes.scene import Item, Scene
 from dg4d_lib.errors import BadInput
 from flows.packages.publish import check_writable, record_of, whole
-from steps.store import room_for
+from steps.artifacts.store import room_for
 
 SUFFIXES = (".glb", ".usdz")
 

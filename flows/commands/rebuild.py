@@ -14,10 +14,10 @@ from flows.commands.make import run as run_flow
 from flows.inputs.orders import Order
 from flows.packages.credentials import configured
 from flows.packages.publish import Files, fact_of, unpacked
+from steps.artifacts.artifact_diff import TOLERANCE, difference
+from steps.artifacts.store import ArtifactMissing
 from steps.contract import ArtifactRef, Frozen, StepResult
-from steps.likeness import TOLERANCE, difference
 from steps.main import catalog
-from steps.store import ArtifactMissing
 
 Outcome = Literal["identical", "within tolerance", "different", "not compared"]
 
@@ -28,8 +28,8 @@ class Likeness(Frozen):
     Attributes:
         kind: what sort of thing.
         name: of the step, or of the file in the package.
-        outcome: "within tolerance": no difference above `steps.likeness.TOLERANCE`; "not compared": other bytes, and
-            what was made first is not here, or nothing is known about its format.
+        outcome: "within tolerance": no difference above `steps.artifacts.artifact_diff.TOLERANCE`; "not compared":
+            other bytes, and the first result is not in the store, or its format is unknown.
         difference: the largest, as a share of the range of values; None where none was measured.
         detail: for people.
     """

@@ -33,7 +33,7 @@ def show(
 
         from dg4d_lib.weights.lock import read_lock
         from flows.commands import terminal
-        from steps.weights import weights_home
+        from steps.runtime.weights import weights_home
 
         about = Column("license, purpose, id of the hub", overflow="fold")
         table = Table("name", "here", "GB", "revision", "commercial", about, box=None, pad_edge=False)
@@ -59,7 +59,7 @@ def pull(names: Names) -> None:
         from dg4d_lib.weights.locate import given_folder
         from dg4d_lib.weights.pull import pull as get
         from dg4d_lib.weights.registry import weights_called
-        from steps.weights import license_of, weights_home
+        from steps.runtime.weights import license_of, weights_home
 
         for name in names:
             if given_folder(name) is not None:
@@ -80,7 +80,7 @@ def check(
         from dg4d_lib.weights.locate import find_weights, troubles, unpublished
         from dg4d_lib.weights.lock import read_lock
         from dg4d_lib.weights.registry import weights_called
-        from steps.weights import weights_home
+        from steps.runtime.weights import weights_home
 
         home = weights_home()
         locks = read_lock(home)
@@ -113,7 +113,7 @@ def check(
 def _all_of_them() -> list["Weights"]:
     from dg4d_lib.weights.lock import read_lock
     from dg4d_lib.weights.registry import KNOWN, weights_called
-    from steps.weights import weights_home
+    from steps.runtime.weights import weights_home
 
     pulled = {name: locked.license for name, locked in read_lock(weights_home()).items()}
     return [*KNOWN.values(), *(weights_called(name, card) for name, card in pulled.items() if name not in KNOWN)]
@@ -122,7 +122,7 @@ def _all_of_them() -> list["Weights"]:
 def _place(one: "Weights") -> Path | None:
     """Where weights lie, whole or not; None where they are not here."""
     from dg4d_lib.weights.locate import folder_name, in_hub_cache
-    from steps.weights import weights_home
+    from steps.runtime.weights import weights_home
 
     folder = weights_home() / folder_name(one)
     return folder if folder.exists() else in_hub_cache(one)
@@ -130,7 +130,7 @@ def _place(one: "Weights") -> Path | None:
 
 def _row(one: "Weights", locked: "Locked | None") -> list[str]:
     from dg4d_lib.weights.locate import MEMORY, troubles
-    from steps.weights import weights_home
+    from steps.runtime.weights import weights_home
 
     place = _place(one)
     here = "no"

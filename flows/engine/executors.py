@@ -23,6 +23,7 @@ from flows.engine import forks, resources
 from flows.engine.containers import container
 from flows.engine.processes import locked, without_prefect
 from flows.home import store
+from steps.artifacts.store import home, remove_tree
 from steps.contract import (
     EXIT_BAD_INPUT,
     EXIT_MISSING,
@@ -33,9 +34,8 @@ from steps.contract import (
     StepResult,
     StepSpec,
 )
-from steps.job import Progress
 from steps.main import EXIT_DIVERGED, notes_to, perform
-from steps.store import home, remove_tree
+from steps.runtime.job import Progress
 
 Say = Callable[[str], None]
 Execute = Callable[[StepSpec, StepRequest, Progress, Say], StepResult]
@@ -130,7 +130,7 @@ def in_subprocess(
             environment = {"TMPDIR": str(folder), **resources.environment()}
             begun = forks.fork(_arguments(folder), environment, stderr, resources.handles())
             if begun is None:
-                raise StepCrashed(spec.name, "the process that begins steps ended: python -m steps.fork_server")
+                raise StepCrashed(spec.name, "the process that begins steps ended: python -m steps.runtime.fork_server")
             return begun
 
         return _result_of(_Program(start, end=lambda: None), folder, spec, request, on_progress, say)

@@ -1,4 +1,4 @@
-"""Processes of steps, forked from one that has imported what they need (`steps/fork_server.py`)."""
+"""Processes of steps, forked from one that has imported what they need (`steps/runtime/fork_server.py`)."""
 
 import atexit
 import json
@@ -13,7 +13,7 @@ from concurrent.futures import Future
 from typing import IO, BinaryIO
 
 from flows.engine.processes import python, without_prefect
-from steps.fork_server import ORDER_BYTES
+from steps.runtime.fork_server import ORDER_BYTES
 
 SET_BY_IMPORTS = "OpenImageIO_ROOT"  # by a library, for its own programs
 ATTEMPTS = 2  # a server may have been killed since its last step
@@ -71,7 +71,7 @@ class ForkServer:
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             self._process = subprocess.Popen(
-                python("-m", "steps.fork_server", str(theirs.fileno())),
+                python("-m", "steps.runtime.fork_server", str(theirs.fileno())),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,

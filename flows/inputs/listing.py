@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 from dg4d_lib.errors import BadInput
 from flows.inputs import sources
 from flows.packages.publish import record_of
-from steps.archives import stays_inside
-from steps.opening import open_store
+from steps.artifacts.archives import stays_inside
+from steps.artifacts.opening import open_store
 
 if TYPE_CHECKING:
-    from steps.bucket import BucketStore
+    from steps.artifacts.bucket import BucketStore
 
 WANTED = sources.PICTURES | sources.VIDEOS
 WILD = frozenset("*?[")

@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 from flows.packages.publish import RECORD, Files
 from steps.contract import canonical, digest_of
-from steps.machine import packages
+from steps.runtime.environment_info import packages
 
 CRATE = "ro-crate-metadata.json"
 PROFILE = "https://w3id.org/ro/wfrun/process/0.5"

@@ -8,13 +8,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from dg4d_lib.assets.viewer_page import viewer_page
+from dg4d_lib.assets.rendering.viewer_page import viewer_page
 from dg4d_lib.errors import BadInput
 from flows.packages.publish import readable, whole
-from steps.store import room_for
+from steps.artifacts.store import room_for
 
 VIEWER = "viewer.html"
-# files of a package, as in steps/packages.py, whose import would bring torch
+# files of a package, as in steps/artifacts/packages.py, whose import would bring torch
 ASSET = "asset.glb"
 WEB_SPLATS = "splats/moving.websplats"
 SUBJECT = "input/subject.png"

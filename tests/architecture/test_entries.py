@@ -11,7 +11,7 @@ import repository
 from dg4d_lib.settings import Settings
 from steps.catalog import STEPS
 from steps.contract import StepSpec
-from steps.job import Facts, Job
+from steps.runtime.job import Facts, Job
 
 SPECS = pytest.mark.parametrize("spec", STEPS.values(), ids=STEPS)
 

@@ -23,7 +23,8 @@ HEAVY = {
 }  # fmt: skip
 LIGHT_MODULES = (
     "dg4d_lib", "dg4d_lib.settings", "dg4d_lib.weights.locate", "dg4d_lib.weights.pull",
-    "dg4d_lib.assets.viewer_page", "steps.contract", "steps.catalog", "steps.profiles", "steps.job", "steps.weights",
+    "dg4d_lib.assets.rendering.viewer_page", "steps.contract", "steps.catalog", "steps.profiles", "steps.runtime.job",
+    "steps.runtime.weights",
 )  # fmt: skip
 HELP_CPU_S = 1.0  # measured 0.25; the first start after an installation also compiles
 ATTEMPTS = 3  # a busy machine makes processor time longer, never shorter: the least of a few is the program's own
@@ -103,8 +104,8 @@ def test_only_the_process_that_cleans_meshes_imports_pymeshlab() -> None:
     places = [
         path for path in repository.modules(*repository.PACKAGES) for name, _ in imports_of(path) if name == "pymeshlab"
     ]
-    assert places == ["dg4d_lib/mesh/clean.py"]
-    assert "pymeshlab" not in imported_by("dg4d_lib.mesh.clean")
+    assert places == ["dg4d_lib/mesh/extraction/clean.py"]
+    assert "pymeshlab" not in imported_by("dg4d_lib.mesh.extraction.clean")
 
 
 def test_prefect_is_imported_by_flows_only() -> None:

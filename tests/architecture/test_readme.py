@@ -12,7 +12,7 @@ import flows.commands.endings
 from flows.inputs.manifest import parse_changes
 from flows.packages.publish import RECORD
 from flows.packages.report import BESIDE
-from steps import packages
+from steps.artifacts import packages
 from steps.profiles import PROFILES, profile, revise
 
 README = repository.text("README.md")
@@ -54,7 +54,7 @@ def uncovered(named: dict[str, str], files: tuple[str, ...]) -> list[str]:
     return [path for path in files if not covered(path)]
 
 
-TREE = named_in(repository.fenced(README, "## The tree"))
+TREE = named_in(repository.fenced(repository.text("ARCHITECTURE.md"), "## The tree"))
 
 
 def test_every_line_of_the_tree_names_something_on_disk() -> None:

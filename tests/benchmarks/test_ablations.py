@@ -13,7 +13,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.initialize import isotropic
 from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.rasterizer.interface import choose_rasterizer
-from steps.media import write_png
+from steps.artifacts.media import write_png
 
 SIZE, FRAMES = 32, 4
 CHANGES = {**QUICK, "static.points": 60, "static.iterations": 40, "motion.iterations": 30, "motion.plane_rate": 0.05}

@@ -5,8 +5,8 @@ from benchmarks import oracle_refinement
 from benchmarks.ablations import Variant
 from benchmarks.oracle_refinement import FLICKER, NOISE, VARIANTS, Model, Oracle, figures_of, refined
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.mesh.bake import texels_of
 from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.mesh.texturing.bake import texels_of
 from dg4d_lib.settings import TextureSettings
 from dg4d_lib.texture.refine import Refined
 

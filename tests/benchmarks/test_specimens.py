@@ -10,8 +10,8 @@ from benchmarks.objects.drawing import Painted
 from benchmarks.objects.specimens import OBJECTS, SCORED_AZIMUTHS_DEG, made, read
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
-from steps.media import read_png, write_png
-from steps.truth import Truth, View
+from steps.artifacts.ground_truth import Truth, View
+from steps.artifacts.media import read_png, write_png
 
 SIZE = 8  # of made-up pictures
 EVERY_OBJECT = pytest.mark.parametrize("name", OBJECTS)

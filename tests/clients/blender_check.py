@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.assets.glb import read_glb, read_mesh_glb
+from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh

@@ -9,8 +9,8 @@ import torch
 import trimesh
 
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.assets.glb import write_frames_glb, write_glb, write_mesh_glb
-from dg4d_lib.assets.usd import write_usdz
+from dg4d_lib.assets.formats.glb import write_frames_glb, write_glb, write_mesh_glb
+from dg4d_lib.assets.formats.usd import write_usdz
 from dg4d_lib.mesh.textured import TexturedMesh
 from tests.clients.blender_check import LEAST_IOU, compare, home, installed
 

@@ -13,7 +13,7 @@ from PIL import Image
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D, between
-from dg4d_lib.assets.glb import write_frames_glb, write_glb, write_mesh_glb
+from dg4d_lib.assets.formats.glb import write_frames_glb, write_glb, write_mesh_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh

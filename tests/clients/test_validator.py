@@ -12,7 +12,7 @@ import trimesh
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.assets.glb import write_frames_glb, write_glb, write_mesh_glb
+from dg4d_lib.assets.formats.glb import write_frames_glb, write_glb, write_mesh_glb
 from dg4d_lib.mesh.textured import TexturedMesh
 from tests.clients.node import run_node
 

@@ -18,10 +18,10 @@ from dg4d_lib.errors import BackendUnavailable
 from flows import home, image_to_4d
 from flows.engine.containers import container
 from flows.engine.executors import EXECUTORS, StepBadInput
+from steps.artifacts.media import write_png
 from steps.catalog import STEPS
 from steps.contract import ArtifactRef, StepRequest, StepResult
 from steps.main import request_version
-from steps.media import write_png
 from steps.profiles import PREVIEW, ExtractMeshSettings, FitGaussiansSettings, FitMotionSettings, revise
 
 ROOT = Path(__file__).parents[2]

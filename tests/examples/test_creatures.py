@@ -9,7 +9,7 @@ from dg4d_lib.video.framing import extent, lies_well
 from examples.drawing import draw
 from examples.newt import Newt
 from examples.shapes import Chain, ellipsoid, normals, skin, union
-from steps.media import read_png
+from steps.artifacts.media import read_png
 
 FOLDER = Path(__file__).parents[2] / "examples"
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dg4d_lib.assets.animated import moved
-from dg4d_lib.assets.compact import Compact, write_compact
+from dg4d_lib.assets.formats.compact import Compact, write_compact
 from dg4d_lib.deformation.kinds import new_deformation
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.settings import HexPlaneSettings

@@ -18,7 +18,7 @@ from pathlib import Path
 from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
 from flows.engine.merging import add
 from steps.catalog import STEPS as REAL
-from steps.job import Facts, Job
+from steps.runtime.job import Facts, Job
 
 
 def _png() -> bytes:

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from dg4d_lib.assets.glb import read_glb
+from dg4d_lib.assets.formats.glb import read_glb
 from dg4d_lib.gaussians.ply import read_ply
-from steps.media import read_png, write_png
+from steps.artifacts.media import read_png, write_png
 
 pytestmark = pytest.mark.slow
 

@@ -116,8 +116,8 @@ class Decoder:
 def read_as_source(path: Path, scratch: Path) -> tuple[Kind, int]:
     """Run the step that decodes a source and cuts out its subject."""
     from dg4d_lib.settings import SubjectSettings
-    from steps.job import Job
     from steps.prepare_subject import run
+    from steps.runtime.job import Job
 
     outputs = {
         "subject": scratch / "subject.png",
@@ -133,14 +133,14 @@ def read_as_source(path: Path, scratch: Path) -> tuple[Kind, int]:
 
 def read_as_zip(path: Path, scratch: Path) -> tuple[Kind, int]:
     """Unpack a zip that somebody else wrote."""
-    from steps.archives import unpack
+    from steps.artifacts.archives import unpack
 
     return "done", len(unpack(path, scratch, "the zip"))
 
 
 def read_as_bank(path: Path, scratch: Path) -> tuple[Kind, int]:
     """Read a bank of true views: a zip, or a folder that is packed first, as a command does."""
-    from steps.priors import read_bank
+    from steps.fitting.priors import read_bank
 
     bank = path
     if path.is_dir():
@@ -195,7 +195,7 @@ def read_as_record(path: Path, scratch: Path) -> tuple[Kind, int]:
     from flows.inputs.orders import order_again
     from flows.packages.publish import RECORD, is_current, record_of
     from flows.packages.verify import verify
-    from steps.store import ArtifactStore
+    from steps.artifacts.store import ArtifactStore
 
     shutil.copyfile(path, scratch / RECORD)
     record = record_of(scratch)
@@ -276,7 +276,7 @@ def _measured() -> Iterator[dict[str, float]]:
 def _serve(folder: Path, answers: IO[str]) -> None:
     import av.logging
 
-    for name in ("steps.prepare_subject", "steps.priors", "steps.archives"):
+    for name in ("steps.prepare_subject", "steps.fitting.priors", "steps.artifacts.archives"):
         __import__(name)
     av.logging.set_level(av.logging.PANIC)
     pages = int(Path("/proc/self/statm").read_text().split()[0])

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from dg4d_lib.errors import BadInput
-from steps import clips
-from steps.sources import Source, read_source
+from steps.sources import clips
+from steps.sources.reader import Source, read_source
 from tests.hostile.formats import gif
 from tests.hostile.videos import VIDEOS, film
 

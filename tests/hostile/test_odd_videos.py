@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from steps.sources import Source, read_source
+from steps.sources.reader import Source, read_source
 from tests.hostile.formats import opaque, patched
 from tests.hostile.videos import film, no_durations, walk
 

@@ -52,8 +52,8 @@ def peaks_of(files: Sequence[tuple[Path, Settings]]) -> list[Peak]:
 def measure(path: Path, settings: Settings) -> Peak:
     """Prepare a file in this process."""
     from dg4d_lib.settings import SubjectSettings
-    from steps.job import Job
     from steps.prepare_subject import run
+    from steps.runtime.job import Job
 
     Path("/proc/self/clear_refs").write_text("5")
     start, outcome = time.monotonic(), "done"

@@ -16,12 +16,12 @@ from dg4d_lib.geometry.harmonics import harmonics_of_color
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.settings import FramewiseSettings
 from dg4d_lib.video.driving import DrivingVideo
-from steps.job import Job
-from steps.media import write_frames, write_png
-from steps.meshfiles import write_meshes, write_tracked
-from steps.motions import write_motion
+from steps.artifacts.media import write_frames, write_png
+from steps.artifacts.meshes import write_meshes, write_tracked
+from steps.artifacts.motions import write_motion
 from steps.pack_asset import run
 from steps.profiles import PackAssetSettings
+from steps.runtime.job import Job
 
 FRAMES, FPS, REACH = 3, 24.0, 0.4
 BLUE = torch.tensor([0.2, 0.4, 0.8])

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from dg4d_lib.errors import BadInput
-from steps import archives
-from steps.archives import can_exist, stays_inside, unpack
+from steps.artifacts import archives
+from steps.artifacts.archives import can_exist, stays_inside, unpack
 
 Write = Callable[[zipfile.ZipFile], None]
 

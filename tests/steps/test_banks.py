@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from dg4d_lib.errors import BadInput
-from steps.banks import MOST_PIXELS, check_sheet, read_index
+from steps.sources.banks import MOST_PIXELS, check_sheet, read_index
 
 VIEW = {"file": "0.png", "azimuth": 0.0, "elevation": -20, "radius": 2}
 SOUND: dict[str, Any] = {"frames": [0, 2], "tile": [1, 2], "tile_size": 8, "views": [VIEW]}

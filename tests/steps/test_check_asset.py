@@ -17,13 +17,13 @@ from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.metrics.gates import Evidence, judge
 from dg4d_lib.rasterizer.interface import choose_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
+from steps.artifacts.media import read_png
+from steps.artifacts.rendering import states_between
 from steps.catalog import STEPS
 from steps.check_asset import Parts, gather, run, verdict
-from steps.job import Facts, Job
-from steps.media import read_png
 from steps.pack_asset import run as pack
 from steps.profiles import CheckAssetSettings
-from steps.render_asset import states_between
+from steps.runtime.job import Facts, Job
 
 NAMES = [
     "fidelity", "silhouette", "consistency", "flicker", "floaters", "flaws", "agreement", "sharpness", "motion",

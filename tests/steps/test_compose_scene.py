@@ -8,9 +8,9 @@ import pytest
 from pxr import Usd, UsdGeom
 from small_package import FPS, FRAMES, REACH, packed, tracked
 
-from dg4d_lib.assets.compose import Body
-from dg4d_lib.assets.scene import Item, Scene
-from dg4d_lib.assets.usd import write_usdz
+from dg4d_lib.assets.formats.usd import write_usdz
+from dg4d_lib.assets.scenes.compose import Body
+from dg4d_lib.assets.scenes.scene import Item, Scene
 from dg4d_lib.errors import BadInput
 from steps.compose_scene import Cast
 

@@ -13,11 +13,11 @@ from media_files import disc, save, save_clip, walk
 from PIL import Image
 
 from dg4d_lib.errors import BadInput
-from steps import decoder_errors
-from steps.decode_limit import GIB, DecodeLimit
-from steps.sources import read_source
-from steps.still_headers import read_header
-from steps.webp import AnimatedWebp, is_animated
+from steps.sources import decoder_errors
+from steps.sources.decode_limit import GIB, DecodeLimit
+from steps.sources.reader import read_source
+from steps.sources.still_headers import read_header
+from steps.sources.webp import AnimatedWebp, is_animated
 
 FLIPS = 150
 Made = tuple[str, bytes]

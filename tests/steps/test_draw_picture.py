@@ -4,12 +4,12 @@ import pytest
 from tiny_text_to_image import save_pipeline
 
 from dg4d_lib.settings import SubjectSettings, TextSettings
+from steps.artifacts.media import read_png
+from steps.artifacts.store import ArtifactStore
 from steps.catalog import STEPS
 from steps.contract import StepFailure, StepRequest, StepResult
 from steps.main import perform, request_version
-from steps.media import read_png
-from steps.store import ArtifactStore
-from steps.weights import identities, weights_in, without_paths
+from steps.runtime.weights import identities, weights_in, without_paths
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,10 @@ from tiny_svd import save_tiny_svd
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import SvdSettings, WarpSettings
 from dg4d_lib.video.driving import DrivingVideo
+from steps.artifacts.media import read_frames, read_png, write_frames, write_png
 from steps.drive_video import run
-from steps.job import Facts, Job
-from steps.media import read_frames, read_png, write_frames, write_png
 from steps.profiles import DriveVideoSettings
+from steps.runtime.job import Facts, Job
 
 PORTS = {"driving_video": "zip", "picture": "png", "candidates": "png", "ranking": "json", "films": "zip"}
 

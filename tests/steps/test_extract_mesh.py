@@ -12,13 +12,13 @@ from dg4d_lib.geometry.harmonics import harmonics_of_color
 from dg4d_lib.settings import FramewiseSettings, IdentitySettings, MeshSettings
 from dg4d_lib.video.driving import DrivingVideo
 from steps import extract_mesh
+from steps.artifacts.media import read_png, write_frames
+from steps.artifacts.meshes import read_meshes, read_tracked, write_meshes, write_tracked
+from steps.artifacts.motions import write_motion
 from steps.extract_mesh import run
-from steps.job import Facts, Job
-from steps.media import read_png, write_frames
-from steps.meshfiles import read_meshes, read_tracked, write_meshes, write_tracked
-from steps.motions import write_motion
 from steps.profiles import ExtractMeshSettings, RefineTextureSettings
 from steps.refine_texture import run as refine
+from steps.runtime.job import Facts, Job
 
 FRAMES = 3
 SHIFT = torch.tensor([0.1, -0.05, 0.2])

@@ -14,11 +14,11 @@ from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.guidance.interface import View
 from dg4d_lib.video.driving import DrivingVideo
 from steps import fit_gaussians, fit_motion
-from steps.job import Job
-from steps.media import read_png, write_frames, write_png
-from steps.motions import read_motion
-from steps.priors import read_bank
+from steps.artifacts.media import read_png, write_frames, write_png
+from steps.artifacts.motions import read_motion
+from steps.fitting.priors import read_bank
 from steps.profiles import PREVIEW, FitGaussiansSettings, FitMotionSettings, revise
+from steps.runtime.job import Job
 
 SMALL = revise(
     PREVIEW,

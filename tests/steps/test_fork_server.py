@@ -3,7 +3,7 @@ import sys
 
 LOOKS = """
 import sys, threading
-from steps import fork_server
+from steps.runtime import fork_server
 for entry in fork_server._wanted():
     fork_server._have(entry)
 import torch
@@ -24,6 +24,8 @@ def test_what_is_imported_before_forks_starts_no_thread_and_no_gpu_and_leaves_py
 
 
 def test_without_a_socket_it_ends_at_once() -> None:
-    done = subprocess.run([sys.executable, "-m", "steps.fork_server"], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-m", "steps.runtime.fork_server"], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 2
     assert "required: socket" in done.stderr

@@ -12,12 +12,12 @@ from PIL import Image
 from safetensors.numpy import save_file
 
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.assets.glb import write_glb
+from dg4d_lib.assets.formats.glb import write_glb
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import write_ply
 from dg4d_lib.mesh.textured import TexturedMesh
-from steps.likeness import TOLERANCE, difference
+from steps.artifacts.artifact_diff import TOLERANCE, difference
 
 
 def picture(path: Path, value: int) -> Path:

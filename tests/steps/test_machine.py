@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from steps.contract import is_digest
-from steps.machine import machine, packages
+from steps.runtime.environment_info import machine, packages
 
 
 def test_a_machine_is_told_by_facts_and_names_nobody() -> None:

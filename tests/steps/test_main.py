@@ -11,10 +11,10 @@ import pytest
 from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
 from dg4d_lib.settings import Settings
 from steps import main as host
+from steps.artifacts.store import ArtifactMissing, ArtifactStore
 from steps.catalog import STEPS
 from steps.contract import ArtifactRef, Port, StepFailure, StepRequest, StepResult, StepSpec
-from steps.job import Facts, Job
-from steps.store import ArtifactMissing, ArtifactStore
+from steps.runtime.job import Facts, Job
 
 TEXT = Port(media_type="text/plain", suffix=".txt")
 

@@ -7,7 +7,7 @@ import pytest
 from media_files import disc, save, save_clip, save_zip, walk
 
 from dg4d_lib.errors import BadInput
-from steps.media_types import check_arrays, check_media, check_still, is_text
+from steps.sources.media_types import check_arrays, check_media, check_still, is_text
 
 SECRETS = {
     "passwd": b"root:x:0:0:root:/root:/bin/bash\n",

@@ -7,7 +7,7 @@ import torch
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.textured import TexturedMesh
-from steps.meshfiles import read_meshes, read_tracked, write_meshes, write_tracked
+from steps.artifacts.meshes import read_meshes, read_tracked, write_meshes, write_tracked
 
 
 def some_mesh(seed: int = 0) -> TexturedMesh:

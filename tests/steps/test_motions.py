@@ -6,7 +6,7 @@ import torch
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.settings import FramewiseSettings, HexPlaneSettings, MlpSettings
-from steps.motions import new_deformation, read_motion, write_motion
+from steps.artifacts.motions import new_deformation, read_motion, write_motion
 
 SETTINGS = [HexPlaneSettings(spatial=4, temporal=3, features=2, hidden=4), MlpSettings(hidden=4), FramewiseSettings()]
 

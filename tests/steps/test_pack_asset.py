@@ -10,13 +10,13 @@ import small_package
 import torch
 from small_package import FPS, FRAMES, NOTE, REACH, cloud, gem, inputs, job, packed, tracked
 
-from dg4d_lib.assets.glb import read_glb, read_mesh_glb
-from dg4d_lib.assets.splats import read_splats
+from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb
+from dg4d_lib.assets.formats.splats import read_splats
 from dg4d_lib.errors import BadInput
-from steps.media import EPOCH, read_png
-from steps.meshfiles import write_tracked
+from steps.artifacts.media import EPOCH, read_png
+from steps.artifacts.meshes import write_tracked
+from steps.artifacts.packages import read_manifest
 from steps.pack_asset import run
-from steps.packages import read_manifest
 
 COMMON = {
     "asset.json", "asset.glb", "asset.usdz", "preview.mp4", "preview.webp", "turntable.mp4", "contact_sheet.png",

@@ -12,7 +12,7 @@ import OpenImageIO as oiio
 import pytest
 from peak_memory import peaks_of
 
-from steps.clips import MOST_WORK
+from steps.sources.clips import MOST_WORK
 
 MOST_MIB = 2048
 SIDE = 10_900  # pixels; its square is just below stills.MOST_PIXELS

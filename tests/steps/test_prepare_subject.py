@@ -7,9 +7,9 @@ from media_files import disc, opaque, save, save_clip, walk
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import SubjectSettings
 from dg4d_lib.video.framing import extent
-from steps.job import Facts, Job
-from steps.media import read_frames, read_png
+from steps.artifacts.media import read_frames, read_png
 from steps.prepare_subject import run
+from steps.runtime.job import Facts, Job
 
 
 def prepare(source: Path, out: Path, **settings: object) -> Facts:

@@ -16,8 +16,8 @@ from dg4d_lib.settings import (
     StaticSettings,
     Zero123PriorSettings,
 )
-from steps.media import write_png, write_zip
-from steps.priors import ChosenPrior, make_prior, oracle_prior, read_bank, read_bank_folder
+from steps.artifacts.media import write_png, write_zip
+from steps.fitting.priors import ChosenPrior, make_prior, oracle_prior, read_bank, read_bank_folder
 
 CUTOUTS = [torch.rand(64, 64, 4, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1)]
 

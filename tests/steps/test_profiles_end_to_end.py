@@ -16,10 +16,11 @@ from tiny_svd import save_tiny_svd
 from tiny_weights import write_zero123
 
 from dg4d_lib.weights.registry import KNOWN
+from steps.artifacts.packages import ABOUT, ASSET, MANIFEST, MESHES, RIGGED, SPLATS
+from steps.artifacts.store import ArtifactStore
 from steps.catalog import STEPS
 from steps.contract import ArtifactRef, ProvenanceRecord, StepRequest, StepResult
 from steps.main import perform, request_version
-from steps.packages import ABOUT, ASSET, MANIFEST, MESHES, RIGGED, SPLATS
 from steps.profiles import (
     PROFILES,
     DriveVideoSettings,
@@ -32,8 +33,7 @@ from steps.profiles import (
     profile,
     revise,
 )
-from steps.store import ArtifactStore
-from steps.weights import identities, weights_in
+from steps.runtime.weights import identities, weights_in
 
 FRAMES = 3
 LADDER = [{"until": 1.0, "size": 32}]

@@ -14,12 +14,12 @@ from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.rasterizer.interface import choose_rasterizer
 from dg4d_lib.settings import LgmSettings, StaticSettings
 from steps import fit_gaussians
+from steps.artifacts.media import read_png, write_png
 from steps.fit_gaussians import touched_up
-from steps.job import Facts, Job
-from steps.media import read_png, write_png
+from steps.fitting.reconstruction import NOTE, Reconstruction, reconstruct_subject
 from steps.profiles import PREVIEW, FitGaussiansSettings
-from steps.reconstruction import NOTE, Reconstruction, reconstruct_subject
-from steps.weights import open_weights, weights_in
+from steps.runtime.job import Facts, Job
+from steps.runtime.weights import open_weights, weights_in
 
 
 @pytest.fixture(scope="module")

@@ -11,11 +11,11 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.settings import ImageToImageSettings, RefinerSettings, VideoToVideoSettings
 from dg4d_lib.video.driving import DrivingVideo
-from steps.job import Facts, Job
-from steps.media import write_frames
-from steps.meshfiles import read_meshes, read_tracked, write_meshes, write_tracked
+from steps.artifacts.media import write_frames
+from steps.artifacts.meshes import read_meshes, read_tracked, write_meshes, write_tracked
 from steps.profiles import RefineTextureSettings
 from steps.refine_texture import run
+from steps.runtime.job import Facts, Job
 
 FRAMES = 3
 TEXTURE = {"iterations": 2, "size": 64}

@@ -10,8 +10,8 @@ from small_package import BLUE, FRAMES, REACH, packed
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
-from steps.media import read_png
-from steps.render_asset import render_package
+from steps.artifacts.media import read_png
+from steps.artifacts.rendering import render_package
 
 SIZE = 64
 

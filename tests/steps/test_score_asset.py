@@ -12,10 +12,10 @@ from small_package import packed, tracked
 
 from dg4d_lib.asset_settings import ScoreSettings
 from dg4d_lib.errors import BadInput
-from steps.job import Facts, Job
-from steps.media import read_png, write_png, write_zip
+from steps.artifacts.media import read_png, write_png, write_zip
+from steps.artifacts.rendering import render_package
 from steps.profiles import ScoreAssetSettings
-from steps.render_asset import render_package
+from steps.runtime.job import Facts, Job
 from steps.score_asset import run
 
 SIZE, COUNT = 64, 12

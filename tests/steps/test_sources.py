@@ -16,9 +16,9 @@ from media_files import (
 )
 
 from dg4d_lib.errors import BadInput
-from steps.clips import evenly_spaced, thinned_rate, work_side
-from steps.media_types import check_media
-from steps.sources import Source, read_source
+from steps.sources.clips import evenly_spaced, thinned_rate, work_side
+from steps.sources.media_types import check_media
+from steps.sources.reader import Source, read_source
 
 COLOR = torch.tensor((200, 60, 30)) / 255
 

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from steps import store as module
+from steps.artifacts import store as module
+from steps.artifacts.store import ArtifactMissing, ArtifactStore, DiskFull, home, write_atomically
 from steps.contract import ArtifactRef
-from steps.store import ArtifactMissing, ArtifactStore, DiskFull, home, write_atomically
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import pytest
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
-from steps.truth import CAMERA, find_truth, find_truths
+from steps.artifacts.ground_truth import CAMERA, find_truth, find_truths
 
 AZIMUTHS = (-75.0, 15.0, 105.0, 195.0)
 

@@ -4,10 +4,10 @@ import pytest
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.weights.lock import Locked, LockedFile, write_lock
+from steps.artifacts.store import ArtifactStore
 from steps.contract import StepRequest
 from steps.main import perform
-from steps.store import ArtifactStore
-from steps.weights import (
+from steps.runtime.weights import (
     identities,
     license_of,
     open_weights,

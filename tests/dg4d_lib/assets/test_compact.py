@@ -10,7 +10,7 @@ import torch
 from safetensors import safe_open
 
 from dg4d_lib.assets.animated import moved
-from dg4d_lib.assets.compact import TENSORS, Compact, read_compact, write_compact
+from dg4d_lib.assets.formats.compact import TENSORS, Compact, read_compact, write_compact
 from dg4d_lib.deformation.kinds import new_deformation
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.initialize import blob

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D, between
-from dg4d_lib.assets.compose import Actor, Body, compose_glb, in_a_row, scene_duration
-from dg4d_lib.assets.glb import write_frames_glb, write_glb, write_mesh_glb
-from dg4d_lib.assets.gltf import Document
-from dg4d_lib.assets.scene import Item
+from dg4d_lib.assets.formats.glb import write_frames_glb, write_glb, write_mesh_glb
+from dg4d_lib.assets.formats.gltf import Document
+from dg4d_lib.assets.scenes.compose import Actor, Body, compose_glb, in_a_row, scene_duration
+from dg4d_lib.assets.scenes.scene import Item
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.textured import TexturedMesh
 from tests.clients.node import run_node

@@ -15,7 +15,7 @@ from PIL import Image
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.assets.glb import read_glb, read_mesh_glb, write_frames_glb, write_glb, write_mesh_glb
+from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb, write_frames_glb, write_glb, write_mesh_glb
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.textured import TexturedMesh
 

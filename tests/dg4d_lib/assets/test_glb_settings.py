@@ -13,11 +13,11 @@ import trimesh
 from PIL import Image
 
 from dg4d_lib.asset_settings import GltfSettings
-from dg4d_lib.assets import gltf
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.assets.glb import read_glb, read_mesh_glb, write_frames_glb, write_glb, write_mesh_glb
-from dg4d_lib.assets.gltf import Parsed
-from dg4d_lib.assets.normals import SmoothNormals
+from dg4d_lib.assets.formats import gltf
+from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb, write_frames_glb, write_glb, write_mesh_glb
+from dg4d_lib.assets.formats.gltf import Parsed
+from dg4d_lib.assets.formats.normals import SmoothNormals
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.mesh.textured import TexturedMesh
 

@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 
-from dg4d_lib.assets.gltf import VERTEX_DATA, Document, Parsed
+from dg4d_lib.assets.formats.gltf import VERTEX_DATA, Document, Parsed
 from dg4d_lib.errors import BadInput
 
 

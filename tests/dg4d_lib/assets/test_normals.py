@@ -3,7 +3,7 @@
 import numpy as np
 import trimesh
 
-from dg4d_lib.assets.normals import SmoothNormals
+from dg4d_lib.assets.formats.normals import SmoothNormals
 
 
 def split_sphere() -> tuple[np.ndarray, np.ndarray]:

@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from dg4d_lib.asset_settings import PackSettings
-from dg4d_lib.assets import preview
-from dg4d_lib.assets.preview import studio, write_film, write_preview, write_turntable
+from dg4d_lib.assets.rendering import preview
+from dg4d_lib.assets.rendering.preview import studio, write_film, write_preview, write_turntable
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.errors import BackendUnavailable

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.assets.glb import write_glb
-from dg4d_lib.assets.rigged import rig_of, write_rigged_glb
+from dg4d_lib.assets.formats.glb import write_glb
+from dg4d_lib.assets.formats.rigged import rig_of, write_rigged_glb
 from dg4d_lib.errors import BadInput
-from dg4d_lib.mesh.rig import Rig, fit_rig
 from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.mesh.tracking.rig import Rig, fit_rig
 from tests.clients.node import run_node
 
 FPS = 6.0

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dg4d_lib.asset_settings import PackSettings
-from dg4d_lib.assets.sheet import PANEL, contact_sheet, videos_sheet
+from dg4d_lib.assets.rendering.sheet import PANEL, contact_sheet, videos_sheet
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer.reference import rasterize

@@ -9,8 +9,8 @@ import pygltflib
 import pytest
 import torch
 
-from dg4d_lib.assets.gltf import Parsed
-from dg4d_lib.assets.splat_glb import EXTENSION, read_splat_glb, write_splat_glb
+from dg4d_lib.assets.formats.gltf import Parsed
+from dg4d_lib.assets.formats.splat_glb import EXTENSION, read_splat_glb, write_splat_glb
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from tests.clients.node import run_node

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from dg4d_lib.assets.spz import write_spz
+from dg4d_lib.assets.formats.spz import write_spz
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import rotation_matrix

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dg4d_lib.assets.tracks import Span, cut
+from dg4d_lib.assets.formats.tracks import Span, cut
 
 
 @pytest.mark.parametrize(("frames", "longest"), [(1, 1), (5, 1), (5, 2), (6, 3), (300, 128)])

@@ -18,7 +18,7 @@ from usd_samples import FPS, FRAMES, HALF, ball, balls, cloud, colorful_ball, gr
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.assets.usd import UsdPlacement, compose_usdz, write_usdz
+from dg4d_lib.assets.formats.usd import UsdPlacement, compose_usdz, write_usdz
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.textured import TexturedMesh

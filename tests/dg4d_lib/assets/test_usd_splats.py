@@ -11,7 +11,7 @@ from pxr import Gf, Usd, UsdGeom, UsdVol
 from usd_samples import FPS, FRAMES, HALF, cloud, growing_ball
 
 from dg4d_lib.asset_settings import GltfSettings
-from dg4d_lib.assets.usd import write_usdz
+from dg4d_lib.assets.formats.usd import write_usdz
 from dg4d_lib.geometry.quaternion import rotation_matrix
 
 MOVING = "positions", "orientations", "scales"

@@ -16,9 +16,9 @@ import trimesh
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.assets.glb import write_glb
-from dg4d_lib.assets.gltf import Parsed
-from dg4d_lib.assets.viewer_page import viewer_page
+from dg4d_lib.assets.formats.glb import write_glb
+from dg4d_lib.assets.formats.gltf import Parsed
+from dg4d_lib.assets.rendering.viewer_page import viewer_page
 from dg4d_lib.mesh.textured import TexturedMesh
 
 NASTY = "</script><script>alert(1)</script><!-- @data@ @title@ & \"ümlaut\" 'π'"
@@ -130,5 +130,5 @@ def test_the_licenses_of_what_is_bundled_are_in_the_page() -> None:
 
 
 def test_making_a_page_loads_no_tensors() -> None:
-    code = "import dg4d_lib.assets.viewer_page, sys; sys.exit(bool({'torch', 'numpy'} & sys.modules.keys()))"
+    code = "import dg4d_lib.assets.rendering.viewer_page, sys; sys.exit(bool({'torch', 'numpy'} & sys.modules.keys()))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -12,16 +12,16 @@ from PIL import Image, ImageSequence
 from torch import Tensor
 
 from dg4d_lib.asset_settings import PackSettings
-from dg4d_lib.assets import webp
-from dg4d_lib.assets.preview import studio
-from dg4d_lib.assets.webp import write_webp
+from dg4d_lib.assets.rendering import webp
+from dg4d_lib.assets.rendering.preview import studio
+from dg4d_lib.assets.rendering.webp import write_webp
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer.interface import Rendering
 from dg4d_lib.rasterizer.reference import rasterize
-from steps.decode_limit import DecodeLimit
-from steps.webp import AnimatedWebp
+from steps.sources.decode_limit import DecodeLimit
+from steps.sources.webp import AnimatedWebp
 
 SETTINGS = PackSettings(preview_size=64)
 

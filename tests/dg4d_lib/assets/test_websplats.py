@@ -8,7 +8,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dg4d_lib.assets.websplats import POSITION_STEPS, ROTATION_STEP, SCALE_STEP, read_web_splats, write_web_splats
+from dg4d_lib.assets.formats.websplats import (
+    POSITION_STEPS,
+    ROTATION_STEP,
+    SCALE_STEP,
+    read_web_splats,
+    write_web_splats,
+)
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.harmonics import harmonics_of_color

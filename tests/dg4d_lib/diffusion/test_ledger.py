@@ -8,7 +8,7 @@ import torch
 from tiny_weights import TOKEN, tiny_unet, tiny_vae
 from torch.utils.flop_counter import FlopCounterMode
 
-from dg4d_lib.diffusion.ledger import counted, counting_flops
+from dg4d_lib.diffusion.flop_counter import counted, counting_flops
 
 plain = tiny_unet()
 

@@ -11,8 +11,8 @@ from tiny_svd import tiny_svd
 from tiny_weights import TOKEN, tiny_unet
 from torch.utils.flop_counter import FlopCounterMode
 
-from dg4d_lib.diffusion.ledger import counted, counting_flops
-from dg4d_lib.diffusion.one_token import OneToken, shorten_attention
+from dg4d_lib.diffusion.flop_counter import counted, counting_flops
+from dg4d_lib.diffusion.single_token_attention import OneToken, shorten_attention
 
 NETWORKS = ("pictures", "videos")
 BATCH = 3

@@ -9,7 +9,7 @@ from PIL import Image
 from tiny_svd import SCHEDULE, save_tiny_svd, tiny_svd
 
 from dg4d_lib.diffusion import batching, video_model
-from dg4d_lib.diffusion.one_token import OneToken
+from dg4d_lib.diffusion.single_token_attention import OneToken
 from dg4d_lib.diffusion.video_model import VideoModel, clean, karras_sigmas, start_index
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import VideoModelSettings

@@ -2,8 +2,9 @@ import pytest
 import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.diffusion.noise_schedule import alphabars
 from dg4d_lib.guidance.analytic import LATENT_NUMBERS, AnalyticPrior
-from dg4d_lib.guidance.distillation import Annealing, alphabars, annealed_timestep
+from dg4d_lib.guidance.distillation import Annealing, annealed_timestep
 from dg4d_lib.guidance.interface import GuidancePrior, View
 
 SIZE = 12

@@ -13,9 +13,10 @@ from safetensors.torch import load_file, save_file
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import random_orbit, turntable
 from dg4d_lib.diffusion.batching import MicroBatches
+from dg4d_lib.diffusion.ddim import ddim_timesteps
+from dg4d_lib.diffusion.noise_schedule import alphabars
 from dg4d_lib.errors import BadInput
-from dg4d_lib.guidance.ddim import ddim_timesteps
-from dg4d_lib.guidance.distillation import Annealing, alphabars
+from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.imagedream import Condition, ImageDream, ImageDreamPrior, camera_numbers
 from dg4d_lib.guidance.interface import GuidancePrior, View, ring_of
 from dg4d_lib.settings import ImageDreamPriorSettings

@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.batching import MicroBatches
-from dg4d_lib.diffusion.one_token import OneToken
+from dg4d_lib.diffusion.single_token_attention import OneToken
 from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.interface import GuidancePrior, View

@@ -7,8 +7,8 @@ from scipy import ndimage
 from torch.nn.functional import max_pool2d
 
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.mesh.bake import bake, texels_of, vertex_normals
-from dg4d_lib.mesh.unwrap import unwrap
+from dg4d_lib.mesh.texturing.bake import bake, texels_of, vertex_normals
+from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.rasterizer.interface import choose_rasterizer
 from dg4d_lib.settings import MeshSettings
 

@@ -9,8 +9,8 @@ import trimesh
 from skimage.measure import marching_cubes
 
 from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
-from dg4d_lib.mesh.check import checked
-from dg4d_lib.mesh.clean import clean, drop_small_components
+from dg4d_lib.mesh.extraction.check import checked
+from dg4d_lib.mesh.extraction.clean import clean, drop_small_components
 from dg4d_lib.settings import MeshSettings
 
 COARSE = MeshSettings(edge_length=0.08)
@@ -92,7 +92,7 @@ def test_pymeshlab_stays_out_of_the_calling_process() -> None:
     code = """if True:
         import sys
         import numpy as np
-        from dg4d_lib.mesh.clean import clean
+        from dg4d_lib.mesh.extraction.clean import clean
         from dg4d_lib.settings import MeshSettings
         corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
         clean(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32), MeshSettings(edge_length=0.2))

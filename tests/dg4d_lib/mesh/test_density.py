@@ -7,7 +7,7 @@ import torch
 
 from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.mesh.density import REACH, DensityField, density_field
+from dg4d_lib.mesh.extraction.density import REACH, DensityField, density_field
 from dg4d_lib.settings import MeshSettings
 
 SMALL = MeshSettings(grid=40)

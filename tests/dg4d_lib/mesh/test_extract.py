@@ -9,8 +9,8 @@ import trimesh
 
 from dg4d_lib.errors import FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.mesh.density import DensityField, density_field
-from dg4d_lib.mesh.extract import best_level, surface, usable_level
+from dg4d_lib.mesh.extraction.density import DensityField, density_field
+from dg4d_lib.mesh.extraction.extract import best_level, surface, usable_level
 from dg4d_lib.rasterizer.interface import choose_rasterizer
 from dg4d_lib.settings import MeshSettings
 

@@ -3,10 +3,10 @@ import trimesh
 
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import isotropic
-from dg4d_lib.mesh.density import density_field
-from dg4d_lib.mesh.extract import surface
-from dg4d_lib.mesh.outlines import agreement, outlines_of
-from dg4d_lib.mesh.register import FOLLOWS, register
+from dg4d_lib.mesh.extraction.density import density_field
+from dg4d_lib.mesh.extraction.extract import surface
+from dg4d_lib.mesh.extraction.outlines import agreement, outlines_of
+from dg4d_lib.mesh.tracking.nonrigid_registration import FOLLOWS, register
 from dg4d_lib.rasterizer.interface import choose_rasterizer
 from dg4d_lib.settings import MeshSettings
 

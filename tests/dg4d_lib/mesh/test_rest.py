@@ -4,7 +4,7 @@ import torch
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import isotropic
-from dg4d_lib.mesh.rest import best_rest, evenly, since
+from dg4d_lib.mesh.tracking.reference_frame import best_rest, evenly, since
 from dg4d_lib.rasterizer.interface import choose_rasterizer
 from dg4d_lib.settings import MeshSettings
 

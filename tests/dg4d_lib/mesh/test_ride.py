@@ -8,7 +8,7 @@ from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import multiply, rotation_matrix
-from dg4d_lib.mesh.ride import ride
+from dg4d_lib.mesh.tracking.skinning import ride
 
 
 def still(gaussians: Gaussians, times: int) -> Displacement:

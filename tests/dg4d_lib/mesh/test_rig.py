@@ -7,8 +7,8 @@ from scipy.optimize import minimize
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.geometry.quaternion import rotation_matrix
-from dg4d_lib.mesh import rig as module
-from dg4d_lib.mesh.rig import Rig, fit_rig, skinned
+from dg4d_lib.mesh.tracking import rig as module
+from dg4d_lib.mesh.tracking.rig import Rig, fit_rig, skinned
 
 FRAMES = 9
 

@@ -3,9 +3,9 @@ import trimesh
 
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import isotropic
-from dg4d_lib.mesh.density import density_field
-from dg4d_lib.mesh.extract import surface
-from dg4d_lib.mesh.snap import snap
+from dg4d_lib.mesh.extraction.density import density_field
+from dg4d_lib.mesh.extraction.extract import surface
+from dg4d_lib.mesh.tracking.isosurface_projection import snap
 from dg4d_lib.settings import MeshSettings
 
 SETTINGS = MeshSettings(grid=48)

@@ -9,7 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from dg4d_lib.errors import DG4DError
-from dg4d_lib.mesh.unwrap import taubin_smooth, unwrap
+from dg4d_lib.mesh.texturing.unwrap import taubin_smooth, unwrap
 
 Mesh = tuple[np.ndarray, np.ndarray]
 SIZE = 256
@@ -92,7 +92,7 @@ def test_xatlas_stays_out_of_the_calling_process() -> None:
     code = """if True:
         import sys
         import numpy as np
-        from dg4d_lib.mesh.unwrap import unwrap
+        from dg4d_lib.mesh.texturing.unwrap import unwrap
         corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
         unwrap(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32), 64)
         sys.exit("xatlas" in sys.modules)

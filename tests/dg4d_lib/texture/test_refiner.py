@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.diffusion.ddim import ddim_timesteps
 from dg4d_lib.diffusion.video_model import VideoModel
-from dg4d_lib.guidance.ddim import ddim_timesteps
 from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.interface import View
 from dg4d_lib.guidance.zero123 import Zero123, encoded

@@ -5,8 +5,8 @@ import torch
 from torch import Tensor
 
 from dg4d_lib.settings import WarpSettings
+from dg4d_lib.video.candidate_ranking import WEIGHTS, Candidate, Score, ranked, score
 from dg4d_lib.video.driving import DrivingVideo
-from dg4d_lib.video.tournament import WEIGHTS, Candidate, Score, ranked, score
 from dg4d_lib.video.warp import MOTIONS, Warp, candidate
 
 SIZE, FRAMES = 96, 14

@@ -20,8 +20,8 @@ from flows.engine import tasks
 from flows.engine.executors import StepError, StepMissing
 from flows.packages.scores import Results
 from flows.serving.server import Server
-from steps.store import ArtifactStore
-from steps.truth import find_truth
+from steps.artifacts.ground_truth import find_truth
+from steps.artifacts.store import ArtifactStore
 
 VIEWS = ("view_-75", "view_15")
 

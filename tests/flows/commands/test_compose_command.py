@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dg4d_lib.assets.compose import Body
+from dg4d_lib.assets.scenes.compose import Body
 from dg4d_lib.errors import BadInput
 from flows.commands.compose import compose, read_scene
 from flows.packages.publish import RECORD

@@ -21,9 +21,9 @@ from flows.inputs.orders import Order, Wish, order_again
 from flows.packages.publish import record_of
 from flows.packages.verify import verify
 from flows.serving.server import Server
-from steps.job import Facts, Job
+from steps.artifacts.store import ArtifactStore
 from steps.profiles import PREVIEW, revise
-from steps.store import ArtifactStore
+from steps.runtime.job import Facts, Job
 
 TINY = {
     "subject.size": 64,

@@ -11,9 +11,9 @@ from dg4d_lib.errors import BadInput
 from flows.commands.benchmark import put_truth
 from flows.inputs import sources
 from flows.inputs.sources import put_bank, put_source
-from steps import banks
-from steps.store import ArtifactStore
-from steps.truth import find_truth
+from steps.artifacts.ground_truth import find_truth
+from steps.artifacts.store import ArtifactStore
+from steps.sources import banks
 
 SECRET = b"root:x:0:0:root:/root:/bin/bash\n"
 

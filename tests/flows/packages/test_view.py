@@ -16,7 +16,7 @@ from flows.packages import view as module
 from flows.packages.publish import RECORD, Files, publish
 from flows.packages.verify import verify
 from flows.packages.view import VIEWER, facts_of, page_of, view
-from steps import packages
+from steps.artifacts import packages
 
 CONTENT = {"asset.json": b"{}", "asset.glb": b"glTF", "splats/moving.websplats": b"D4WS", "input/subject.png": b"png"}
 STEP = {"step": "fit_gaussians", "digest": "sha256:1", "backend": "cpu", "seed": 3, "weights": {}, "notes": ["a note"]}

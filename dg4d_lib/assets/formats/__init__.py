@@ -1,0 +1,1 @@
+"""Readers and writers of GLB, USDZ, SPZ and the other delivery formats."""

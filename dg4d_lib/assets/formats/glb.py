@@ -1,0 +1,358 @@
+"""Animated textured meshes as one file: core glTF 2.0, unless the settings ask for extensions.
+
+A tracked mesh becomes one mesh with a morph target per frame and weights that are one-hot at every frame; very long
+animations, and changing textures in core glTF, are cut into several nodes that share everything else. Meshes per frame
+become one node each, shown and hidden by its scale. Everything has a name. The baked color is the base color of a
+rough dielectric.
+"""
+
+import io
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from dg4d_lib.asset_settings import GltfSettings
+from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.assets.formats.gltf import Document, Parsed
+from dg4d_lib.assets.formats.shapes import Cube, Shape
+from dg4d_lib.assets.formats.surfaces import WEBP, Atlas, add_material, add_texture, pixels_of
+from dg4d_lib.assets.formats.tracks import Animation, Span, cut
+from dg4d_lib.errors import BadInput
+from dg4d_lib.mesh.textured import TexturedMesh
+
+DEFAULTS = GltfSettings()
+NAME = "subject"
+OFFSET_POINTER = "/materials/0/pbrMetallicRoughness/baseColorTexture/extensions/KHR_texture_transform/offset"
+MAX_POSES = 128  # of a node; players keep a weight of each in the 256 registers that every GPU has
+_FOREIGN = (KeyError, IndexError, TypeError, ValueError, ArithmeticError, OSError)  # what another form runs into
+
+
+def write_glb(asset: Asset4D, settings: GltfSettings = DEFAULTS) -> bytes:
+    """A GLB of a tracked mesh.
+
+    Raises:
+        BadInput: no triangles, no frames, an fps that is not positive, numbers that are not finite, parts that do not
+            fit each other, or a texture too large for its format.
+        BackendUnavailable: the package for compression is missing.
+    """
+    _check_asset(asset)
+    document = Document(asset.extras, compressed=settings.meshopt)
+    animation = Animation(document, asset.fps)
+    offsets, atlas = _floats(asset.offsets), None
+    if asset.textures is not None and settings.textures == "pointer":
+        atlas = Atlas.of(asset.textures, settings.atlas_size)
+        animation.point(OFFSET_POINTER, "texture offset", atlas.offsets())
+    materials = _add_materials(document, asset, atlas, settings)
+    cube = Cube.around([_floats(asset.mesh.vertices)], offsets) if settings.quantized else None
+    shape = _add_shape(document, NAME, asset.mesh, cube, atlas)
+    poses = [
+        shape.add_pose(_frame_name(frame), pose, normals=settings.moving_normals) for frame, pose in enumerate(offsets)
+    ]
+    nodes = []
+    spans = cut(len(poses), MAX_POSES if len(materials) == 1 else 1)
+    for span in spans:
+        primitive = _primitive(shape, materials[span.first if len(materials) > 1 else 0])
+        name = NAME if len(spans) == 1 else _frame_name(span.first)
+        nodes.append(_add_posed_node(document, name, span, {**primitive, "targets": [poses[i] for i in span.poses]}))
+        animation.morph(nodes[-1], name, span, settings.interpolation.upper())
+        if len(spans) > 1:
+            animation.show(nodes[-1], name, span)
+    animation.finish()
+    return _finish(document, nodes, cube)
+
+
+def write_frames_glb(
+    meshes: Sequence[TexturedMesh],
+    fps: float,
+    extras: dict[str, Any] | None = None,
+    settings: GltfSettings = DEFAULTS,
+) -> bytes:
+    """A GLB of unrelated meshes, one per frame, each shown at its time (scale 1) and hidden else (scale 0).
+
+    Raises:
+        BadInput: no meshes, a mesh without triangles, an fps that is not positive, numbers that are not finite, or a
+            texture too large for its format.
+        BackendUnavailable: a package for compression is missing.
+    """
+    if not meshes:
+        raise BadInput("an animated asset needs at least one mesh; given none")
+    _check_fps(fps)
+    for mesh in meshes:
+        _check(mesh)
+    document = Document(extras or {}, compressed=settings.meshopt)
+    cube = Cube.around([_floats(mesh.vertices) for mesh in meshes]) if settings.quantized else None
+    animation = Animation(document, fps)
+    nodes = []
+    for frame, mesh in enumerate(meshes):
+        name = f"frame_{frame:03d}"
+        nodes.append(document.add("nodes", name=name, mesh=_add_mesh(document, name, mesh, cube, settings)))
+        animation.show(nodes[-1], name, Span(frame, frame + 1, len(meshes)))
+    animation.finish()
+    return _finish(document, nodes, cube)
+
+
+def write_mesh_glb(mesh: TexturedMesh, settings: GltfSettings = DEFAULTS) -> bytes:
+    """A GLB of one still mesh.
+
+    Raises:
+        BadInput: no triangles, numbers that are not finite, or a texture too large for its format.
+        BackendUnavailable: a package for compression is missing.
+    """
+    _check(mesh)
+    document = Document({}, compressed=settings.meshopt)
+    cube = Cube.around([_floats(mesh.vertices)]) if settings.quantized else None
+    return _finish(
+        document, [document.add("nodes", name=NAME, mesh=_add_mesh(document, NAME, mesh, cube, settings))], cube
+    )
+
+
+def read_glb(content: bytes) -> Asset4D:
+    """Read a GLB of one mesh whose morph targets are its frames, as `write_glb` makes it with any settings.
+
+    Positions, texture coordinates and offsets come back exactly unless they were quantized, fps to six digits,
+    pictures as their format kept them. With changing textures, those of the first frame become the mesh's own.
+
+    Raises:
+        BadInput: it is broken or has another form; says what is missing.
+        BackendUnavailable: it is compressed, and the package that unpacks it is missing.
+    """
+    parsed = Parsed(content)
+    try:
+        nodes = _mesh_nodes(parsed)
+        primitives = [_primitive_of(parsed, node) for node in nodes]
+        if not all(primitive.get("targets") for primitive in primitives) or "animations" not in parsed.tree:
+            raise BadInput("this GLB has no morph targets with an animation; only animated tracked meshes can be read")
+        mesh = _read_mesh(parsed, nodes)
+        frames, fps = _read_frames(parsed, nodes)
+        scale, _ = _placement(parsed, nodes[0])
+        offsets = np.stack([parsed.accessor(target["POSITION"]) for target, _ in frames]) * np.float32(scale)
+        if offsets.shape[1:] != mesh.vertices.shape:
+            raise BadInput("the morph targets of this GLB do not have as many rows as the mesh has vertices")
+        textures = _read_textures(parsed, [material for _, material in frames])
+        extras = parsed.tree["asset"].get("extras", {})
+        return Asset4D(mesh, torch.from_numpy(offsets), fps, extras, textures)
+    except _FOREIGN as error:
+        raise BadInput(f"this GLB has not the form of an animated tracked mesh: {error!r}") from error
+
+
+def read_mesh_glb(content: bytes) -> TexturedMesh:
+    """Read the one mesh of a GLB, as `write_mesh_glb` makes it; morph targets are left aside.
+
+    Raises:
+        BadInput: it is broken or has another form.
+        BackendUnavailable: it is compressed, and the package that unpacks it is missing.
+    """
+    parsed = Parsed(content)
+    try:
+        return _read_mesh(parsed, _mesh_nodes(parsed))
+    except _FOREIGN as error:
+        raise BadInput(f"this GLB has not the form of one textured mesh: {error!r}") from error
+
+
+def _frame_name(frame: int) -> str:
+    return f"frame_{frame:03d}"
+
+
+def _check_asset(asset: Asset4D) -> None:
+    vertices = len(asset.mesh.vertices)
+    if len(asset.offsets) == 0:
+        raise BadInput("an animated asset needs at least one frame of offsets; given none")
+    _check(asset.mesh)
+    _check_fps(asset.fps)
+    if asset.offsets.shape[1] != vertices:
+        raise BadInput(f"the mesh has {vertices} vertices, and offsets for {asset.offsets.shape[1]}")
+    if not _finite(asset.offsets):
+        raise BadInput("the offsets of the mesh hold numbers that are not finite")
+    if asset.textures is not None and not _finite(asset.textures):
+        raise BadInput("the textures of the frames hold numbers that are not finite")
+
+
+def _check_fps(fps: float) -> None:
+    if not 0 < fps < float("inf"):
+        raise BadInput(f"frames per second must be positive; given {fps}")
+
+
+def _check(mesh: TexturedMesh) -> None:
+    if len(mesh.faces) == 0:
+        raise BadInput("a mesh without triangles cannot be written as GLB")
+    if mesh.texture.numel() == 0:
+        raise BadInput("a mesh needs a texture of at least one pixel")
+    if not all(_finite(values) for values in (mesh.vertices, mesh.uvs, mesh.texture)):
+        raise BadInput("the mesh holds numbers that are not finite")
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise BadInput(f"the triangles of the mesh name vertices beyond its {len(mesh.vertices)}")
+
+
+def _finite(values: Tensor) -> bool:
+    return all(math.isfinite(bound) for bound in torch.aminmax(values))  # in one pass: textures are large
+
+
+def _floats(values: Tensor) -> NDArray[np.float32]:
+    return np.ascontiguousarray(values.detach().cpu().numpy().astype("<f4"))
+
+
+def _add_materials(document: Document, asset: Asset4D, atlas: Atlas | None, settings: GltfSettings) -> list[int]:
+    """One for all frames, or one for each."""
+    if atlas is not None and asset.textures is not None:
+        pictures = {NAME: atlas.join(asset.textures)}
+    elif asset.textures is not None:
+        pictures = {_frame_name(frame): pixels_of(texture) for frame, texture in enumerate(asset.textures)}
+    else:
+        pictures = {NAME: pixels_of(asset.mesh.texture)}
+    return [
+        add_material(document, name, add_texture(document, name, pixels, settings), settings, atlas)
+        for name, pixels in pictures.items()
+    ]
+
+
+def _add_mesh(document: Document, name: str, mesh: TexturedMesh, cube: Cube | None, settings: GltfSettings) -> int:
+    """A mesh that does not move, with its material. Returns its number."""
+    texture = add_texture(document, name, pixels_of(mesh.texture), settings)
+    shape = _add_shape(document, name, mesh, cube)
+    primitive = _primitive(shape, add_material(document, name, texture, settings))
+    return document.add("meshes", name=name, primitives=[primitive])
+
+
+def _add_shape(
+    document: Document, name: str, mesh: TexturedMesh, cube: Cube | None, atlas: Atlas | None = None
+) -> Shape:
+    uvs = _floats(mesh.uvs) if atlas is None else atlas.inside(_floats(mesh.uvs))
+    return Shape(document, name, _floats(mesh.vertices), mesh.faces.cpu().numpy(), uvs, cube)
+
+
+def _primitive(shape: Shape, material: int) -> dict[str, Any]:
+    return {"attributes": shape.attributes, "indices": shape.indices, "material": material, "mode": 4}
+
+
+def _add_posed_node(document: Document, name: str, span: Span, primitive: dict[str, Any]) -> int:
+    """A node with the poses of a span, the first of them shown. Returns its number."""
+    mesh = document.add(
+        "meshes",
+        name=name,
+        primitives=[primitive],
+        weights=span.weights()[0].tolist(),
+        extras={"targetNames": [_frame_name(pose) for pose in span.poses]},
+    )
+    return document.add("nodes", name=name, mesh=mesh)
+
+
+def _finish(document: Document, nodes: list[int], cube: Cube | None) -> bytes:
+    """One root: the only node, or a parent of all; it carries the cube."""
+    root = nodes[0] if len(nodes) == 1 else document.add("nodes", name=NAME, children=nodes)
+    if cube is not None:
+        document.tree["nodes"][root] |= {**cube.placement(), "extras": {"largestError": cube.largest_error}}
+    document.tree["scene"] = document.add("scenes", name="asset", nodes=[root])
+    return document.to_bytes()
+
+
+def _mesh_nodes(parsed: Parsed) -> list[int]:
+    """The nodes that show the one mesh of a file."""
+    nodes = [number for number, node in enumerate(parsed.tree["nodes"]) if "mesh" in node]
+    shapes = []
+    for number in nodes:
+        primitives = parsed.tree["meshes"][parsed.tree["nodes"][number]["mesh"]]["primitives"]
+        shapes += [(primitive["attributes"], primitive["indices"]) for primitive in primitives]
+    if not nodes or any(shape != shapes[0] for shape in shapes) or len(shapes) > len(nodes):
+        raise BadInput(f"this GLB shows {len(shapes)} meshes; only one mesh with one material can be read")
+    return nodes
+
+
+def _primitive_of(parsed: Parsed, node: int) -> dict[str, Any]:
+    primitive: dict[str, Any] = parsed.tree["meshes"][parsed.tree["nodes"][node]["mesh"]]["primitives"][0]
+    return primitive
+
+
+def _read_mesh(parsed: Parsed, nodes: list[int]) -> TexturedMesh:
+    """The mesh at rest, with the texture of the first node."""
+    primitive = _primitive_of(parsed, nodes[0])
+    attributes, indices = primitive["attributes"], parsed.accessor(primitive["indices"])
+    if indices.dtype.kind != "u":
+        raise BadInput("the triangles of this GLB are not given by whole numbers")
+    scale, shift = _placement(parsed, nodes[0])
+    vertices = (parsed.accessor(attributes["POSITION"]) * scale + shift).astype(np.float32)
+    pixels, atlas = _read_picture(parsed, primitive["material"])
+    uvs = parsed.accessor(attributes["TEXCOORD_0"])
+    mesh = TexturedMesh(
+        torch.from_numpy(vertices),
+        torch.from_numpy(indices.astype(np.int64).reshape(-1, 3)),
+        torch.from_numpy(uvs.copy() if atlas is None else atlas.outside(uvs)),
+        _colors(pixels if atlas is None else atlas.split(pixels)[0]),
+    )
+    if len(mesh.uvs) != len(mesh.vertices) or not (mesh.faces < len(mesh.vertices)).all():
+        raise BadInput("the triangles or texture coordinates of this GLB do not fit its vertices")
+    return mesh
+
+
+def _placement(parsed: Parsed, node: int) -> tuple[float, NDArray[np.float64]]:
+    """The scale of a node in the world, and where its origin lies; a scale that shows and hides it counts as 1."""
+    tree, scale, shift = parsed.tree, 1.0, np.zeros(3)
+    targets = [channel["target"] for animation in tree.get("animations", []) for channel in animation["channels"]]
+    shown = {target["node"] for target in targets if target["path"] == "scale"}
+    parents = {child: number for number, item in enumerate(tree["nodes"]) for child in item.get("children", ())}
+    place: int | None = node
+    while place is not None:
+        item = tree["nodes"][place]
+        scales = [1.0] * 3 if place in shown else item.get("scale", [1.0] * 3)
+        if {"matrix", "rotation"} & item.keys() or len(set(scales)) > 1:
+            raise BadInput("the mesh of this GLB stands under a transform; apply the transform and export it again")
+        shift = shift * scales[0] + item.get("translation", np.zeros(3))
+        scale *= scales[0]
+        place = parents.get(place)
+    return scale, shift
+
+
+def _read_frames(parsed: Parsed, nodes: list[int]) -> tuple[list[tuple[dict[str, int], int]], float]:
+    """The morph target and the material of every frame, and the frames per second."""
+    (animation,) = parsed.tree["animations"]
+    tracks = {
+        channel["target"]["node"]: animation["samplers"][channel["sampler"]]
+        for channel in animation["channels"]
+        if channel["target"]["path"] == "weights"
+    }
+    times = [parsed.accessor(tracks[node]["input"])[:, 0] for node in nodes]
+    fps = float(f"{1 / (times[0][1] - times[0][0]):.6g}")
+    frames: dict[int, tuple[dict[str, int], int]] = {}
+    for node, seconds in zip(nodes, times, strict=True):
+        primitive = _primitive_of(parsed, node)
+        weights = parsed.accessor(tracks[node]["output"]).reshape(len(seconds), len(primitive["targets"]))
+        poses = weights.argmax(1)
+        if not np.array_equal(weights, np.eye(weights.shape[1])[poses]):
+            raise BadInput("the animation of this GLB does not show one morph target per key; use one written by dg4d")
+        for second, pose in zip(seconds[:-1], poses, strict=False):
+            frames[round(float(second * fps))] = (primitive["targets"][pose], primitive["material"])
+    if sorted(frames) != list(range(len(frames))):
+        raise BadInput("the animation of this GLB leaves frames out; use one written by dg4d")
+    return [frames[frame] for frame in range(len(frames))], fps
+
+
+def _read_textures(parsed: Parsed, materials: list[int]) -> Float[Tensor, "t h w 3"] | None:
+    """The textures of every frame, where they change."""
+    pixels, atlas = _read_picture(parsed, materials[0])
+    if atlas is not None:
+        return _colors(atlas.split(pixels))
+    if len(set(materials)) == 1:
+        return None
+    return _colors(np.stack([_read_picture(parsed, material)[0] for material in materials]))
+
+
+def _read_picture(parsed: Parsed, material: int) -> tuple[NDArray[np.uint8], Atlas | None]:
+    """The color of a material, and how frames lie in it."""
+    tree = parsed.tree
+    item = tree["materials"][material]
+    texture = tree["textures"][item["pbrMetallicRoughness"]["baseColorTexture"]["index"]]
+    source = texture.get("extensions", {}).get(WEBP, texture)["source"]
+    with Image.open(io.BytesIO(parsed.view(tree["images"][source]["bufferView"]))) as picture:
+        pixels = np.array(picture.convert("RGB"))
+    layout = item.get("extras", {}).get("atlas")
+    return pixels, None if layout is None else Atlas(**layout)
+
+
+def _colors(pixels: NDArray[np.uint8]) -> Float[Tensor, "*t h w 3"]:
+    return torch.from_numpy(pixels).float() / 255

@@ -1,0 +1,223 @@
+"""The GLB container: a tree of plain JSON in the words of the glTF 2.0 specification, and the bytes it points to."""
+
+import json
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dg4d_lib.assets.formats import meshopt
+from dg4d_lib.errors import BadInput
+
+VERTEX_DATA = 34962  # buffer view targets
+INDEX_DATA = 34963
+MAX_LENGTH = 2**32 - 1  # bytes of a GLB
+
+_MAGIC, _JSON, _BINARY = b"glTF", b"JSON", b"BIN\0"
+_ALIGNMENT = 4  # bytes; of vertices and of views
+_COMPONENTS: dict[int, np.dtype[Any]] = {
+    5120: np.dtype("i1"),
+    5121: np.dtype("u1"),
+    5122: np.dtype("<i2"),
+    5123: np.dtype("<u2"),
+    5125: np.dtype("<u4"),
+    5126: np.dtype("<f4"),
+}
+_COMPONENT_OF = {dtype: number for number, dtype in _COMPONENTS.items()}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_KIND_OF = {width: kind for kind, width in _WIDTHS.items()}
+
+
+class Document:
+    """A glTF document under construction; what is added later may refer to what was added before, by its number.
+
+    Attributes:
+        tree: the JSON.
+        binary: the bytes of the buffer; every view starts at a multiple of four.
+    """
+
+    def __init__(self, extras: dict[str, Any], *, compressed: bool = False) -> None:
+        """An empty document.
+
+        Args:
+            extras: JSON that says more about the file.
+            compressed: vertices and triangles are packed as EXT_meshopt_compression says.
+        """
+        self.tree: dict[str, Any] = {"asset": {"version": "2.0", "generator": "dg4d"}}
+        if extras:
+            self.tree["asset"]["extras"] = extras
+        self.binary = bytearray()
+        self._compressed = compressed
+        self._unpacked = 0  # bytes that the packed views have when they are unpacked
+
+    def add(self, collection: str, **item: Any) -> int:
+        """Append to `nodes`, `meshes`, ...; a property that is None is left out. Returns its number."""
+        items = self.tree.setdefault(collection, [])
+        items.append({key: value for key, value in item.items() if value is not None})
+        return len(items) - 1
+
+    def use(self, extension: str, *, required: bool = False) -> None:
+        """Announce an extension; required: readers that do not know it shall give up."""
+        for collection in ("extensionsUsed", "extensionsRequired") if required else ("extensionsUsed",):
+            names = self.tree.setdefault(collection, [])
+            if extension not in names:
+                names.append(extension)
+
+    def add_view(self, name: str, content: bytes, target: int | None = None, stride: int | None = None) -> int:
+        """Append bytes to the buffer. Returns the number of their view."""
+        start = len(self.binary)
+        self.binary += content + bytes(-len(content) % _ALIGNMENT)
+        place = {"buffer": 0, "byteOffset": start, "byteLength": len(content)}
+        return self.add("bufferViews", name=name, **place, byteStride=stride, target=target)
+
+    def add_view_of(self, other: "Parsed", index: int) -> int:
+        """Append a view of another file as it is, packed or not. Returns its number."""
+        view: dict[str, Any] = {**other.tree["bufferViews"][index]}
+        packed = view.get("extensions", {}).get(meshopt.EXTENSION)
+        content = other.stored(index)
+        place = {"buffer": 0, "byteOffset": len(self.binary)}
+        self.binary += content + bytes(-len(content) % _ALIGNMENT)
+        if packed is None:
+            return self.add("bufferViews", **{**view, **place})
+        view |= {"buffer": 1, "byteOffset": self._unpacked, "extensions": {meshopt.EXTENSION: {**packed, **place}}}
+        self._unpacked += view["byteLength"] + -view["byteLength"] % _ALIGNMENT
+        return self.add("bufferViews", **view)
+
+    def add_accessor(
+        self, name: str, values: NDArray[Any], target: int | None = None, *, normalized: bool = False
+    ) -> int:
+        """Append rows of numbers ("n" or "n k") with their true bounds. Returns the accessor's number.
+
+        Args:
+            name: of the accessor and its view.
+            values: in a type that glTF knows.
+            target: what the numbers are for; vertices are padded to whole words.
+            normalized: whole numbers stand for shares of the largest one.
+        """
+        rows = values.reshape(len(values), -1)
+        add = self._add_packed_view if self._compressed and target is not None else self._add_plain_view
+        return self.add(
+            "accessors",
+            name=name,
+            bufferView=add(name, rows, target),
+            componentType=_COMPONENT_OF[rows.dtype],
+            normalized=normalized or None,
+            count=len(rows),
+            type=_KIND_OF[rows.shape[1]],
+            min=rows.min(0).tolist(),
+            max=rows.max(0).tolist(),
+        )
+
+    def to_bytes(self) -> bytes:
+        """The finished GLB.
+
+        Raises:
+            BadInput: it would be larger than a GLB can be.
+        """
+        buffers: list[dict[str, Any]] = [{"byteLength": len(self.binary)}]
+        if self._unpacked:
+            buffers.append({"byteLength": self._unpacked, "extensions": {meshopt.EXTENSION: {"fallback": True}}})
+        text = json.dumps({**self.tree, "buffers": buffers}, separators=(",", ":"), allow_nan=False).encode()
+        text += b" " * (-len(text) % _ALIGNMENT)
+        chunks = b"".join(
+            struct.pack("<I", len(content)) + kind + content
+            for kind, content in ((_JSON, text), (_BINARY, bytes(self.binary)))
+        )
+        length = 12 + len(chunks)
+        if length > MAX_LENGTH:
+            raise BadInput(
+                f"this GLB would have {length / 2**30:.1f} GiB, and a GLB ends at 4: fewer frames or vertices, smaller "
+                "textures, pack.gltf.quantized or pack.gltf.meshopt make it smaller"
+            )
+        return _MAGIC + struct.pack("<II", 2, length) + chunks
+
+    def _add_plain_view(self, name: str, rows: NDArray[Any], target: int | None) -> int:
+        padded = _padded(rows) if target == VERTEX_DATA else rows
+        stride = padded[0].nbytes if padded.shape != rows.shape else None
+        return self.add_view(name, padded.tobytes(), target, stride)
+
+    def _add_packed_view(self, name: str, rows: NDArray[Any], target: int | None) -> int:
+        """A view of a buffer that is nowhere, and where its packed bytes are."""
+        self.use(meshopt.EXTENSION, required=True)
+        vertices = target == VERTEX_DATA
+        padded = _padded(rows) if vertices else rows
+        content = meshopt.pack_vertices(padded) if vertices else meshopt.pack_triangles(padded)
+        number = self.add_view(name, content)
+        view = self.tree["bufferViews"][number]
+        packed = {key: view[key] for key in ("buffer", "byteOffset", "byteLength")}
+        stride = padded[0].nbytes
+        packed |= {"byteStride": stride, "count": len(padded), "mode": "ATTRIBUTES" if vertices else "TRIANGLES"}
+        view |= {"buffer": 1, "byteOffset": self._unpacked, "byteLength": padded.nbytes, "target": target}
+        if vertices:
+            view["byteStride"] = stride
+        view["extensions"] = {meshopt.EXTENSION: packed}
+        self._unpacked += padded.nbytes + -padded.nbytes % _ALIGNMENT
+        return number
+
+
+class Parsed:
+    """A GLB that was read: its JSON and its buffer.
+
+    Raises:
+        BadInput: the container is broken.
+    """
+
+    def __init__(self, content: bytes) -> None:
+        if content[:4] != _MAGIC:
+            raise BadInput(f"this is no GLB: it must begin with {_MAGIC!r}, and begins with {content[:4]!r}")
+        try:
+            version, length = struct.unpack_from("<II", content, 4)
+            (text_length,) = struct.unpack_from("<I", content, 12)
+            self.tree: dict[str, Any] = json.loads(content[20 : 20 + text_length])
+            (binary_length,) = struct.unpack_from("<I", content, 20 + text_length)
+        except (struct.error, ValueError) as error:
+            raise BadInput(f"this GLB is broken: {error}") from error
+        start = 28 + text_length
+        if version != 2 or length != len(content) or start + binary_length > len(content):
+            raise BadInput(f"this GLB is broken: version {version}, {length} bytes announced, {len(content)} there")
+        self.binary = content[start : start + binary_length]
+
+    def view(self, index: int) -> bytes:
+        """The bytes of a buffer view, unpacked.
+
+        Raises:
+            BackendUnavailable: they are packed, and the package that unpacks them is missing.
+        """
+        view = self.tree["bufferViews"][index]
+        packed = view.get("extensions", {}).get(meshopt.EXTENSION)
+        if packed is None:
+            return self._bytes(view)
+        unpack = {"ATTRIBUTES": meshopt.unpack_vertices, "TRIANGLES": meshopt.unpack_triangles}[packed["mode"]]
+        return unpack(self._bytes(packed), packed["count"], packed["byteStride"])
+
+    def stored(self, index: int) -> bytes:
+        """The bytes of a buffer view as they are in the file, packed or not."""
+        view = self.tree["bufferViews"][index]
+        return self._bytes(view.get("extensions", {}).get(meshopt.EXTENSION, view))
+
+    def accessor(self, index: int) -> NDArray[Any]:
+        """Rows of numbers, "n k"; shares given by whole numbers come as float32."""
+        accessor = self.tree["accessors"][index]
+        dtype, width = _COMPONENTS[accessor["componentType"]], _WIDTHS[accessor["type"]]
+        stride = self.tree["bufferViews"][accessor["bufferView"]].get("byteStride", width * dtype.itemsize)
+        rows: NDArray[Any] = np.ndarray(
+            (accessor["count"], width),
+            dtype,
+            self.view(accessor["bufferView"]),
+            accessor.get("byteOffset", 0),
+            (stride, dtype.itemsize),
+        )
+        if not accessor.get("normalized"):
+            return rows
+        return np.maximum(rows / np.float32(np.iinfo(dtype).max), np.float32(-1))
+
+    def _bytes(self, place: dict[str, Any]) -> bytes:
+        start = place.get("byteOffset", 0)
+        return self.binary[start : start + place["byteLength"]]
+
+
+def _padded(rows: NDArray[Any]) -> NDArray[Any]:
+    """Rows that fill whole words, with zeros at the end."""
+    missing = -rows[0].nbytes % _ALIGNMENT // rows.itemsize
+    return np.pad(rows, ((0, 0), (0, missing))) if missing else rows

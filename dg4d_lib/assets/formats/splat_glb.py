@@ -1,0 +1,98 @@
+"""A moment of a splat sequence as glTF: points with the Khronos extension KHR_gaussian_splatting.
+
+A viewer that does not know the extension shows colored points. Axes and units are glTF's own, as the world's are.
+"""
+
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from dg4d_lib.assets.formats.gltf import VERTEX_DATA, Document, Parsed
+from dg4d_lib.errors import BadInput
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.ply import check_storable
+
+EXTENSION = "KHR_gaussian_splatting"
+POINTS = 0  # the mode of the primitive
+KERNEL = {
+    "kernel": "ellipse",
+    "colorSpace": "srgb_rec709_display",
+    "sortingMethod": "cameraDistance",
+    "projection": "perspective",
+}
+
+# Which text of the extension is followed: the ratified one (June 2026), or the release candidate of February 2026,
+# whose scales are logarithms. A file does not say which; readers of today expect the first.
+SplatGlbVersion = Literal["ratified", "rc1"]
+
+
+def write_splat_glb(gaussians: Gaussians, version: SplatGlbVersion = "ratified") -> bytes:
+    """A GLB of one cloud (no leading batch, color of degree 0); equal clouds give equal bytes.
+
+    Raises:
+        BadInput: no Gaussians, a batch, color of a higher degree, or numbers that are not finite.
+    """
+    check_storable(gaussians, "a splat GLB")
+    if len(gaussians) == 0:
+        raise BadInput("a splat GLB needs at least one Gaussian; given none")
+    scales = gaussians.scales if version == "ratified" else gaussians.log_scales
+    turned = torch.nn.functional.normalize(gaussians.quats, dim=-1).roll(-1, -1)  # xyzw
+    shown = torch.cat([_linear(gaussians.colors), gaussians.opacities[:, None]], 1)
+    columns = {
+        "POSITION": gaussians.means,
+        "COLOR_0": shown,
+        f"{EXTENSION}:ROTATION": turned,
+        f"{EXTENSION}:SCALE": scales,
+        f"{EXTENSION}:OPACITY": gaussians.opacities,
+        f"{EXTENSION}:SH_DEGREE_0_COEF_0": gaussians.harmonics[:, 0],
+    }
+    document = Document({})
+    document.use(EXTENSION)
+    attributes = {
+        name: document.add_accessor(name, values.detach().cpu().numpy().astype("<f4"), VERTEX_DATA)
+        for name, values in columns.items()
+    }
+    primitive = {"attributes": attributes, "mode": POINTS, "extensions": {EXTENSION: KERNEL}}
+    mesh = document.add("meshes", name="splats", primitives=[primitive])
+    node = document.add("nodes", name="splats", mesh=mesh)
+    document.tree["scene"] = document.add("scenes", name="asset", nodes=[node])
+    return document.to_bytes()
+
+
+def read_splat_glb(content: bytes, version: SplatGlbVersion = "ratified") -> Gaussians:
+    """Read the splats of a GLB with floats and colors of degree 0, as `write_splat_glb` makes it.
+
+    Positions and harmonics come back exactly; scales and opacities went through their functions and back, to 1e-6 of
+    themselves; rotations are of unit length.
+
+    Raises:
+        BadInput: it is broken or has another form.
+    """
+    parsed = Parsed(content)
+    try:
+        primitive = parsed.tree["meshes"][0]["primitives"][0]
+        if primitive["mode"] != POINTS or primitive["extensions"][EXTENSION]["kernel"] != KERNEL["kernel"]:
+            raise BadInput(f"this GLB holds no points with the kernel {KERNEL['kernel']!r} of {EXTENSION}")
+
+        def column(name: str) -> Float[torch.Tensor, "n k"]:
+            values: NDArray[Any] = parsed.accessor(primitive["attributes"][name])
+            return torch.from_numpy(values.astype(np.float32))
+
+        scales = column(f"{EXTENSION}:SCALE")
+        return Gaussians(
+            column("POSITION"),
+            scales.log() if version == "ratified" else scales,
+            column(f"{EXTENSION}:ROTATION").roll(1, -1),
+            column(f"{EXTENSION}:OPACITY")[:, 0].double().logit().float(),
+            column(f"{EXTENSION}:SH_DEGREE_0_COEF_0")[:, None],
+        )
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise BadInput(f"this GLB has not the form of splats by {EXTENSION}: {error!r}") from error
+
+
+def _linear(colors: Float[torch.Tensor, "n 3"]) -> Float[torch.Tensor, "n 3"]:
+    """Light of sRGB values: what glTF wants the colors of points to be."""
+    return torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)

@@ -1,0 +1,74 @@
+"""Moving splats as one file per frame: standard PLY, SPZ, or glTF."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from dg4d_lib.assets.formats.splat_glb import SplatGlbVersion, write_splat_glb
+from dg4d_lib.assets.formats.spz import write_spz
+from dg4d_lib.errors import BadInput
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.ply import read_ply, write_ply
+
+
+def write_splats(folder: Path, states: Gaussians) -> list[Path]:
+    """Write every state of a batch as FOLDER/NNN.ply; the folder must exist.
+
+    Raises:
+        BadInput: numbers that are not finite.
+        OSError: a file could not be written.
+    """
+    return _write(folder, states, "ply", write_ply)
+
+
+def write_spz_frames(folder: Path, states: Gaussians) -> list[Path]:
+    """Write every state of a batch as FOLDER/NNN.spz; the folder must exist.
+
+    Raises:
+        BadInput: numbers that are not finite, or centers thousands of units away.
+        OSError: a file could not be written.
+    """
+    return _write(folder, states, "spz", write_spz)
+
+
+def write_splat_glb_frames(folder: Path, states: Gaussians, version: SplatGlbVersion = "ratified") -> list[Path]:
+    """Write every state of a batch as FOLDER/NNN.glb, which holds splats; the folder must exist.
+
+    Raises:
+        BadInput: no Gaussians, or numbers that are not finite.
+        OSError: a file could not be written.
+    """
+    return _write(folder, states, "glb", lambda path, state: path.write_bytes(write_splat_glb(state, version)))
+
+
+def read_splats(folder: Path) -> Gaussians:
+    """Read what `write_splats` wrote, as a batch with one state per frame.
+
+    Raises:
+        BadInput: no frames, a gap in the numbering, a broken file, or frames that are not states of one cloud.
+    """
+    paths = sorted(folder.glob("*.ply"))
+    if not paths or [path.name for path in paths] != [f"{frame:03d}.ply" for frame in range(len(paths))]:
+        given = f"{paths[0].name} to {paths[-1].name}, {len(paths)} files" if paths else "none"
+        raise BadInput(f"{folder.name}/ must hold 000.ply, 001.ply, ... without gaps; given {given}")
+    clouds = [read_ply(path) for path in paths]
+    first = clouds[0]
+    for path, cloud in zip(paths, clouds, strict=True):
+        same = torch.equal(cloud.opacity_logits, first.opacity_logits) and torch.equal(cloud.harmonics, first.harmonics)
+        if not same:
+            raise BadInput(f"{path.name} is no state of the cloud in {paths[0].name}: opacity or color differ")
+    return Gaussians(
+        torch.stack([cloud.means for cloud in clouds]),
+        torch.stack([cloud.log_scales for cloud in clouds]),
+        torch.stack([cloud.quats for cloud in clouds]),
+        first.opacity_logits,
+        first.harmonics,
+    )
+
+
+def _write(folder: Path, states: Gaussians, suffix: str, write: Callable[[Path, Gaussians], object]) -> list[Path]:
+    paths = [folder / f"{frame:03d}.{suffix}" for frame in range(len(states.means))]
+    for frame, path in enumerate(paths):
+        write(path, states.at(frame))
+    return paths

@@ -1,0 +1,1 @@
+"""Preview films, contact sheets and the viewer page."""

@@ -1,0 +1,355 @@
+"""Several animated GLBs as one: placed, turned, scaled and timed in a scene.
+
+What the files hold (vertices, pictures, materials, extensions) is taken over as it is; a file that is used twice is
+stored once. Every asset hangs under a node of its name, and one animation, which lasts as long as the scene, moves
+all of them: players play one at a time. An asset shows its first frame until it starts, and its last key after it is
+done.
+"""
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from dg4d_lib.assets.formats.gltf import Document, Parsed
+from dg4d_lib.assets.formats.tracks import POINTER
+from dg4d_lib.assets.scenes.scene import Item
+from dg4d_lib.errors import BadInput
+
+ANIMATION = "scene"
+SHORTEST_S = 1e-4  # keys that lie closer to each other are one
+MOST_ROUNDS = 10_000  # of an animation that loops: each repeats its keys in the file
+Vector = Float[np.ndarray, " 3"]
+_FOREIGN = (KeyError, IndexError, TypeError, ValueError, ArithmeticError)  # what a file of another form runs into
+
+
+class Body:
+    """An animated GLB that can stand in a scene.
+
+    Attributes:
+        file: the GLB.
+        low: of the box that it never leaves, world units.
+        high: of that box.
+        foot: what it stands on: below the middle of the box, as low as its first frame reaches.
+        duration_s: of its animation; 0 if it has none.
+    """
+
+    def __init__(self, content: bytes) -> None:
+        """Read it.
+
+        Raises:
+            BadInput: it is no GLB, or has no mesh or a form that dg4d does not write.
+            BackendUnavailable: it is compressed, and the package that unpacks it is missing.
+        """
+        self.file = Parsed(content)
+        try:
+            poses = [pose for root in self.roots for pose in self._poses(root, np.eye(4))]
+            if not poses:
+                raise BadInput("this GLB shows no mesh; give an asset that `dg4d make` wrote")
+            self.low: Vector = np.min([pose.min(0) for pose in poses], axis=0)
+            self.high: Vector = np.max([pose.max(0) for pose in poses], axis=0)
+            middle = (self.low + self.high) / 2
+            self.foot: Vector = np.array((middle[0], poses[0][:, 1].min(), middle[2]))
+            self.duration_s = max((float(self.file.accessor(s["input"])[-1, 0]) for s in self._samplers), default=0.0)
+        except _FOREIGN as error:
+            raise BadInput(f"this GLB has not the form of an animated asset: {error!r}") from error
+
+    @property
+    def roots(self) -> list[int]:
+        """The nodes of its scene."""
+        tree = self.file.tree
+        return list(tree["scenes"][tree.get("scene", 0)]["nodes"])
+
+    @property
+    def animation(self) -> dict[str, Any]:
+        """Its only animation; without samplers and channels if there is none.
+
+        Raises:
+            BadInput: there are several.
+        """
+        animations = self.file.tree.get("animations", [])
+        if len(animations) > 1:
+            raise BadInput(f"this GLB has {len(animations)} animations; an asset has one")
+        return animations[0] if animations else {"samplers": [], "channels": []}
+
+    @property
+    def _samplers(self) -> list[dict[str, Any]]:
+        return list(self.animation["samplers"])
+
+    @cached_property
+    def _blinking(self) -> set[int]:
+        """Nodes that an animated scale shows and hides; they count as shown."""
+        targets = (channel["target"] for channel in self.animation["channels"])
+        return {target["node"] for target in targets if target["path"] == "scale"}
+
+    def _poses(self, number: int, above: Float[np.ndarray, "4 4"]) -> list[Float[np.ndarray, "v 3"]]:
+        """The vertices under a node in all their poses."""
+        node = self.file.tree["nodes"][number]
+        matrix = above @ _local_matrix(node, shown=number in self._blinking)
+        poses = [pose for child in node.get("children", ()) for pose in self._poses(child, matrix)]
+        if "mesh" in node:
+            for primitive in self.file.tree["meshes"][node["mesh"]]["primitives"]:
+                rest = self.file.accessor(primitive["attributes"]["POSITION"]).astype(np.float64)
+                targets = [self.file.accessor(target["POSITION"]) for target in primitive.get("targets", ())]
+                poses += [(rest + offsets) @ matrix[:3, :3].T + matrix[:3, 3] for offsets in targets or [np.zeros(3)]]
+        return poses
+
+
+@dataclass(frozen=True)
+class Actor:
+    """A body in a scene.
+
+    Attributes:
+        name: of its node; no other has it.
+        body: what stands there.
+        item: where and when.
+    """
+
+    name: str
+    body: Body
+    item: Item
+
+    @property
+    def turn(self) -> Rotation:
+        """How it is turned."""
+        return Rotation.from_euler("xyz", self.item.rotation_deg, degrees=True)
+
+    @property
+    def origin(self) -> Vector:
+        """Where the asset's own origin comes to lie, world units."""
+        return np.array(self.item.position) - self.turn.apply(self.body.foot) * self.item.scale
+
+    @property
+    def transform(self) -> Float[np.ndarray, "4 4"]:
+        """Asset to scene, acts on column vectors."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.turn.as_matrix() * self.item.scale
+        matrix[:3, 3] = self.origin
+        return matrix
+
+    @property
+    def end_s(self) -> float:
+        """When it has played once."""
+        return self.item.start_s + self.body.duration_s / self.item.speed
+
+    def seconds(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Times of the scene as times of its animation."""
+        played = (times_s - self.item.start_s).clip(0) * self.item.speed
+        if self.item.loop and self.body.duration_s > 0:
+            return played % self.body.duration_s
+        return played.clip(max=self.body.duration_s)
+
+
+def in_a_row(bodies: Sequence[Body], spacing: float) -> list[tuple[float, float, float]]:
+    """Positions of feet on the ground, side by side, with this much room between the boxes; the middle is at x = 0."""
+    widths = [float(body.high[0] - body.low[0]) for body in bodies]
+    starts = np.cumsum([0.0, *(width + spacing for width in widths)])
+    middle = (starts[-1] - spacing) / 2
+    return [(float(start + width / 2 - middle), 0.0, 0.0) for start, width in zip(starts, widths, strict=False)]
+
+
+def scene_duration(actors: Sequence[Actor], duration_s: float | None) -> float:
+    """Seconds of a scene: as asked for, or until every asset has played once.
+
+    Raises:
+        BadInput: an asset would start after the end.
+    """
+    length = max(actor.end_s for actor in actors) if duration_s is None else duration_s
+    for actor in actors:
+        if actor.body.duration_s > 0 and actor.item.start_s + SHORTEST_S >= length:
+            raise BadInput(f"{actor.name} starts at {actor.item.start_s} s, when the scene of {length} s is over")
+    return length
+
+
+def compose_glb(actors: Sequence[Actor], duration_s: float | None = None) -> bytes:
+    """A GLB of a scene.
+
+    Args:
+        actors: bodies with names of their own.
+        duration_s: of the animation; None: until every asset has played once.
+
+    Raises:
+        BadInput: no actors, one that starts after the end, or one of a form that dg4d does not write.
+    """
+    if not actors:
+        raise BadInput("a scene needs at least one asset; given none")
+    length = scene_duration(actors, duration_s)
+    document = Document({})
+    shared: dict[int, dict[tuple[str, int], int]] = {}
+    samplers: list[dict[str, Any]] = []
+    channels: list[dict[str, Any]] = []
+    nodes = []
+    for actor in actors:
+        transfer = _Transfer(document, actor, shared.setdefault(id(actor.body), {}))
+        try:
+            nodes.append(transfer.add_node())
+            _add_tracks(transfer, length, samplers, channels)
+        except _FOREIGN as error:
+            raise BadInput(f"{actor.name} has not the form of an animated asset: {error!r}") from error
+    if channels:
+        document.add("animations", name=ANIMATION, samplers=samplers, channels=channels)
+    document.tree["scene"] = document.add("scenes", name=ANIMATION, nodes=nodes)
+    return document.to_bytes()
+
+
+class _Transfer:
+    """Copies what an actor needs into a document: each thing once, data once for all actors with the same body."""
+
+    def __init__(self, document: Document, actor: Actor, shared: dict[tuple[str, int], int]) -> None:
+        self.document, self.actor = document, actor
+        self._file, self._shared = actor.body.file, shared
+        self._own: dict[tuple[str, int], int] = {}
+        required = self._file.tree.get("extensionsRequired", [])
+        for extension in self._file.tree.get("extensionsUsed", []):
+            document.use(extension, required=extension in required)
+
+    def add_node(self) -> int:
+        """The actor's node with everything below it. Returns its number."""
+        return self.document.add(
+            "nodes",
+            name=self.actor.name,
+            translation=self.actor.origin.tolist(),
+            rotation=self.actor.turn.as_quat(canonical=True).tolist(),
+            scale=[self.actor.item.scale] * 3,
+            children=[self.node(root) for root in self.actor.body.roots],
+            extras=self._file.tree["asset"].get("extras"),
+        )
+
+    def node(self, number: int) -> int:
+        """The copy of a node, with its children."""
+
+        def changed(node: dict[str, Any]) -> None:
+            if "mesh" in node:
+                node["mesh"] = self._copy("meshes", node["mesh"], self._change_mesh)
+            if "children" in node:
+                node["children"] = [self.node(child) for child in node["children"]]
+            if {"skin", "camera"} & node.keys():
+                raise BadInput(f"{self.actor.name} has a skin or a camera, which scenes do not take; use asset.glb")
+
+        return self._copy("nodes", number, changed)
+
+    def pointer(self, text: str) -> str:
+        """A path of KHR_animation_pointer in the words of the document."""
+        _, collection, number, rest = re.split(r"^/(\w+)/(\d+)", text)
+        return f"/{collection}/{self._own[collection, int(number)]}{rest}"
+
+    def _copy(self, collection: str, number: int, change: Callable[[dict[str, Any]], None]) -> int:
+        """The number of a thing of the actor's own, copied when it is first asked for."""
+        key = (collection, number)
+        if key not in self._own:
+            item = deepcopy(self._file.tree[collection][number])
+            change(item)
+            item["name"] = f"{self.actor.name} {item.get('name', number)}"
+            self._own[key] = self.document.add(collection, **item)
+        return self._own[key]
+
+    def _change_mesh(self, mesh: dict[str, Any]) -> None:
+        for primitive in mesh["primitives"]:
+            primitive["indices"] = self._data("accessors", primitive["indices"])
+            for attributes in (primitive["attributes"], *primitive.get("targets", ())):
+                attributes.update({name: self._data("accessors", number) for name, number in attributes.items()})
+            primitive["material"] = self._copy("materials", primitive["material"], self._change_material)
+
+    def _change_material(self, material: dict[str, Any]) -> None:
+        texture = material["pbrMetallicRoughness"]["baseColorTexture"]
+        texture["index"] = self._copy("textures", texture["index"], self._change_texture)
+
+    def _change_texture(self, texture: dict[str, Any]) -> None:
+        texture["sampler"] = self._data("samplers", texture["sampler"])
+        for holder in (texture, *texture.get("extensions", {}).values()):
+            holder["source"] = self._data("images", holder["source"])
+
+    def _data(self, collection: str, number: int) -> int:
+        """The number of something heavy, copied when a body of this file first asks for it."""
+        key = (collection, number)
+        if key not in self._shared:
+            item = {**self._file.tree[collection][number]}
+            if "bufferView" in item:
+                item["bufferView"] = self._view(item["bufferView"])
+            self._shared[key] = self.document.add(collection, **item)
+        return self._shared[key]
+
+    def _view(self, number: int) -> int:
+        key = ("bufferViews", number)
+        if key not in self._shared:
+            self._shared[key] = self.document.add_view_of(self._file, number)
+        return self._shared[key]
+
+
+def _add_tracks(
+    transfer: _Transfer, length: float, samplers: list[dict[str, Any]], channels: list[dict[str, Any]]
+) -> None:
+    """The animation of an actor at its times, as samplers and channels of the scene's."""
+    actor, document, animation = transfer.actor, transfer.document, transfer.actor.body.animation
+    inputs: dict[bytes, int] = {}
+    for channel in animation["channels"]:
+        sampler, target = animation["samplers"][channel["sampler"]], deepcopy(channel["target"])
+        if target["path"] == "pointer":
+            pointer = target["extensions"][POINTER]
+            pointer["pointer"] = transfer.pointer(pointer["pointer"])
+        else:
+            target["node"] = transfer.node(target["node"])
+        keys = actor.body.file.accessor(sampler["input"])[:, 0].astype(np.float64)
+        output = actor.body.file.accessor(sampler["output"])
+        rows = output.reshape(len(keys), -1)
+        times, values = _timed(actor, keys, rows, length, sampler.get("interpolation", "LINEAR"))
+        content = times.tobytes()
+        if content not in inputs:
+            inputs[content] = document.add_accessor(f"{actor.name} times", times)
+        name = actor.body.file.tree["accessors"][sampler["output"]].get("name", target["path"])
+        number = document.add_accessor(f"{actor.name} {name}", values.reshape(-1, output.shape[1]))
+        channels.append({"sampler": len(samplers), "target": target})
+        samplers.append({**sampler, "input": inputs[content], "output": number})
+
+
+def _timed(
+    actor: Actor, keys: NDArray[np.float64], rows: NDArray[Any], length: float, interpolation: str
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Keys and values of a track at an actor's times: from its start to the very end of the scene."""
+    if interpolation == "CUBICSPLINE":
+        raise BadInput(f"{actor.name} is animated by cubic splines, which scenes do not take")
+    period, speed = actor.body.duration_s, actor.item.speed
+    keys, rows = _from_to(keys, rows, period)
+    rounds = math.ceil((length - actor.item.start_s) * speed / period) if actor.item.loop else 1
+    if rounds > MOST_ROUNDS:
+        raise BadInput(f"{actor.name} would play {rounds} times, at most {MOST_ROUNDS} are allowed; lower its speed")
+    times = np.concatenate([actor.item.start_s + (keys + period * turn) / speed for turn in range(rounds)])
+    values = np.concatenate([rows] * rounds).astype(np.float64)
+    kept = np.append(np.diff(times) > SHORTEST_S, True)  # the end of a round is the beginning of the next
+    times, values = times[kept], values[kept]
+    inside = times < length - SHORTEST_S
+    after = int(inside.sum())
+    last = values[after - 1]
+    if interpolation == "LINEAR" and after < len(times):
+        share = (length - times[after - 1]) / (times[after] - times[after - 1])
+        last = last + min(share, 1.0) * (values[after] - last)
+    times, values = np.append(times[inside], length), np.append(values[inside], last[None], axis=0)
+    return times.astype("<f4"), values.astype("<f4")
+
+
+def _from_to(keys: NDArray[np.float64], rows: NDArray[Any], period: float) -> tuple[NDArray[np.float64], NDArray[Any]]:
+    """A track with keys at both ends of the animation, as players hold the first and the last value."""
+    if keys[0] > SHORTEST_S:
+        keys, rows = np.append(0.0, keys), np.append(rows[:1], rows, axis=0)
+    if keys[-1] < period - SHORTEST_S:
+        keys, rows = np.append(keys, period), np.append(rows, rows[-1:], axis=0)
+    return keys, rows
+
+
+def _local_matrix(node: dict[str, Any], shown: bool) -> Float[np.ndarray, "4 4"]:
+    """A node to its parent; shown: its own scale is 1."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    matrix = np.eye(4)
+    scale = np.ones(3) if shown else np.array(node.get("scale", (1.0, 1.0, 1.0)))
+    matrix[:3, :3] = Rotation.from_quat(node.get("rotation", (0.0, 0.0, 0.0, 1.0))).as_matrix() * scale
+    matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
+    return matrix

@@ -1,0 +1,1 @@
+"""UV maps and textures baked from Gaussians."""

@@ -1,0 +1,1 @@
+"""One topology over time: skinning, registration and rigging."""

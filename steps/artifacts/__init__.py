@@ -1,0 +1,1 @@
+"""Content-addressed store and the file formats that steps exchange."""

@@ -1,0 +1,85 @@
+"""The `tracked` and `meshes` artifacts: textured meshes in safetensors. Equal meshes give equal bytes."""
+
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load, save
+from torch import Tensor
+
+from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.errors import BadInput
+from dg4d_lib.mesh.textured import TexturedMesh
+from steps.artifacts.media import write_zip
+
+
+def write_tracked(path: Path, asset: Asset4D) -> None:
+    """Write a tracked mesh; textures are rounded to 8 bits."""
+    tensors = {**_tensors(asset.mesh), "offsets": asset.offsets.float().cpu().contiguous()}
+    if asset.textures is not None:
+        tensors["textures"] = _rounded(asset.textures)
+    about = json.dumps({"fps": asset.fps, "extras": asset.extras, "rest": asset.rest}, sort_keys=True)
+    path.write_bytes(save(tensors, {"tracked": about}))
+
+
+def read_tracked(path: Path) -> Asset4D:
+    """Read what `write_tracked` wrote.
+
+    Raises:
+        BadInput: the file is no tracked mesh.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            about = json.loads((file.metadata() or {})["tracked"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no dict)
+        textures = tensors["textures"].float() / 255 if "textures" in tensors else None
+        mesh, fps, rest = _mesh(tensors), float(about["fps"]), float(about["rest"])
+        return Asset4D(mesh, tensors["offsets"], fps, about["extras"], textures, rest)
+    except (SafetensorError, KeyError) as error:
+        raise BadInput(
+            f"{path.name} is no tracked mesh ({error}); give the `tracked` output of extract_mesh"
+        ) from error
+
+
+def write_meshes(path: Path, meshes: Mapping[int, TexturedMesh]) -> None:
+    """Write a mesh per frame, by the number of the frame."""
+    write_zip(path, [(f"{frame:03d}.safetensors", save(_tensors(mesh))) for frame, mesh in sorted(meshes.items())])
+
+
+def read_meshes(path: Path) -> list[TexturedMesh]:
+    """Read what `write_meshes` wrote, in the order of the frames.
+
+    Raises:
+        BadInput: the file holds no meshes, or frames are missing between them.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = sorted(name for name in archive.namelist() if name.endswith(".safetensors"))
+            meshes = [_mesh(load(archive.read(name))) for name in names]
+    except (zipfile.BadZipFile, SafetensorError, KeyError) as error:
+        raise BadInput(f"{path.name} holds no meshes ({error}); give the `meshes` output of extract_mesh") from error
+    frames = [int(Path(name).stem) for name in names]
+    if not frames or frames != list(range(frames[0], frames[0] + len(frames))):
+        raise BadInput(f"{path.name} should hold a mesh of every frame; it has frames {frames}: extract the mesh again")
+    return meshes
+
+
+def _tensors(mesh: TexturedMesh) -> dict[str, Tensor]:
+    tensors = {
+        "vertices": mesh.vertices.detach().cpu().float(),
+        "faces": mesh.faces.cpu().to(torch.int32),
+        "uvs": mesh.uvs.detach().cpu().float(),
+        "texture": _rounded(mesh.texture),
+    }
+    return {name: value.contiguous() for name, value in tensors.items()}
+
+
+def _mesh(tensors: Mapping[str, Tensor]) -> TexturedMesh:
+    return TexturedMesh(tensors["vertices"], tensors["faces"], tensors["uvs"], tensors["texture"].float() / 255)
+
+
+def _rounded(colors: Tensor) -> Tensor:
+    return (colors.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).contiguous()

@@ -1,0 +1,1 @@
+"""Priors and starting clouds that both fits share."""

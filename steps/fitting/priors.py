@@ -1,0 +1,171 @@
+"""The prior of a stage, from settings and files."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.diffusion.batching import MicroBatches
+from dg4d_lib.diffusion.parts import device_here
+from dg4d_lib.errors import BadInput
+from dg4d_lib.guidance.analytic import AnalyticPrior
+from dg4d_lib.guidance.distillation import Annealing
+from dg4d_lib.guidance.geometric import InflatedSurfaces
+from dg4d_lib.guidance.imagedream import ImageDream, ImageDreamPrior
+from dg4d_lib.guidance.interface import GuidancePrior
+from dg4d_lib.guidance.oracle import Bank, imperfect
+from dg4d_lib.guidance.zero123 import Zero123
+from dg4d_lib.settings import (
+    GeometricPriorSettings,
+    ImageDreamPriorSettings,
+    MotionSettings,
+    OraclePriorSettings,
+    PriorSettings,
+    StaticSettings,
+    Zero123PriorSettings,
+)
+from dg4d_lib.video.driving import over_white
+from dg4d_lib.weights.registry import weights_called
+from steps.artifacts.archives import unpack
+from steps.artifacts.media import read_png
+from steps.runtime.job import Facts
+from steps.runtime.weights import Opened, open_weights
+from steps.sources.banks import BANK_JSON, BankIndex, check_sheet, read_index
+
+GEOMETRIC_NOTE = "prior: inflation of the silhouette (no model); sides the picture does not show are guesses"
+ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
+
+
+@dataclass(frozen=True)
+class ChosenPrior:
+    """A prior, and what the record says about it.
+
+    Attributes:
+        prior: judges renders.
+        note: the sentence about it that the report shows.
+        opened: the weights it came from; None where there are none.
+        batches: what of it may run out of memory.
+    """
+
+    prior: GuidancePrior
+    note: str
+    opened: Opened | None = None
+    batches: MicroBatches | None = None
+
+    def facts(self, backend: str) -> Facts:
+        """What a step that used it can say of itself, after it did."""
+        halved = self.batches.notes() if self.batches else ()
+        weights, licenses = (self.opened.digests, self.opened.licenses) if self.opened else ({}, {})
+        return Facts(backend, weights, licenses, notes=(self.note,), run_notes=halved)
+
+
+def make_prior(
+    settings: PriorSettings,
+    cutouts: Sequence[Float[Tensor, "h w 4"]],
+    stage: StaticSettings | MotionSettings,
+    bank: Path | None,
+    scratch: Path,
+) -> ChosenPrior:
+    """The prior of a stage.
+
+    Args:
+        settings: which one.
+        cutouts: the subject at every frame (one in the static stage).
+        stage: says which timesteps its iterations use.
+        bank: file of true views, for the oracle.
+        scratch: a folder for unpacking.
+
+    Raises:
+        BadInput: the oracle without a bank; weights that are damaged, or not those of this prior.
+        BackendUnavailable: weights or packages that are not here.
+    """
+    noise = Annealing(stage.noise_start, stage.noise_end, uniform=stage.noise_draw == "uniform")
+    match settings:
+        case GeometricPriorSettings():
+            surfaces = InflatedSurfaces(cutouts, settings)
+            return ChosenPrior(AnalyticPrior(surfaces.clean, noise, settings.coverage_weight), GEOMETRIC_NOTE)
+        case OraclePriorSettings():
+            if bank is None:
+                raise BadInput("prior.kind = oracle needs true views: give --bank FOLDER (with a bank.json)")
+            return ChosenPrior(oracle_prior(read_bank(bank, scratch), settings, noise), ORACLE_NOTE)
+        case Zero123PriorSettings():
+            check_variant(settings)
+            opened = open_weights(settings.weights)
+            known = Zero123.load(opened.folder, settings, device_here()).conditioned_on(_pictures(cutouts), noise)
+            return ChosenPrior(known, f"prior: Zero-1-to-3, weights {settings.weights}", opened, known.batches)
+        case ImageDreamPriorSettings():
+            opened = open_weights(settings.weights)
+            model = ImageDream.load(opened.folder, settings.precision, device_here())
+            dream = ImageDreamPrior(model, model.conditioned_on(_pictures(cutouts)), noise, settings)
+            return ChosenPrior(dream, f"prior: ImageDream, weights {settings.weights}", opened, dream.batches)
+
+
+def oracle_prior(bank: Bank, settings: OraclePriorSettings, noise: Annealing) -> AnalyticPrior:
+    """A prior that knows the bank, or with imperfections something like it, always the same."""
+    known = imperfect(bank, settings, torch.Generator().manual_seed(0))
+    return AnalyticPrior(known.clean, noise, settings.coverage_weight, known.cameras, known.frames)
+
+
+def _pictures(cutouts: Sequence[Float[Tensor, "h w 4"]]) -> Float[Tensor, "t h w 3"]:
+    return over_white(torch.stack(list(cutouts)))
+
+
+def check_variant(settings: Zero123PriorSettings) -> None:
+    """Refuse weights that the registry knows to be of the other variant.
+
+    Raises:
+        BadInput: says how to set it right.
+    """
+    known = {"zero123-xl": "xl", "stable-zero123": "stable"}
+    name = weights_called(settings.weights).name
+    if known.get(name, settings.variant) != settings.variant:
+        raise BadInput(
+            f"prior.variant = {settings.variant} does not fit the weights {name}; set prior.variant={known[name]}"
+        )
+
+
+def read_bank(path: Path, scratch: Path) -> Bank:
+    """Read the bank in a zip; see `read_bank_folder`.
+
+    Raises:
+        BadInput: no bank.json in it, or a name that leads out of it.
+    """
+    if BANK_JSON not in unpack(path, scratch, "the bank"):
+        raise BadInput(f"the bank has no {BANK_JSON}")
+    return read_bank_folder(scratch)
+
+
+def read_bank_folder(folder: Path) -> Bank:
+    """Read the bank in a folder: `bank.json` (see `steps.sources.banks.BankIndex`) and one sheet of tiles per view.
+
+    Raises:
+        BadInput: `bank.json` or a sheet is missing, broken or of another form.
+    """
+    index = read_index(folder / BANK_JSON)
+    size, count = index.tile_size, len(index.frames)
+    cameras = tuple(
+        OrbitCamera(view.elevation, view.azimuth, view.radius, width=size, height=size) for view in index.views
+    )
+    tiles = torch.empty(len(cameras), count, size, size, 4, dtype=torch.uint8)
+    for row, view in enumerate(index.views):
+        tiles[row] = _tiles(folder / view.file, index)[:count]
+    return Bank(cameras, index.frames, tiles)
+
+
+def _tiles(path: Path, index: BankIndex) -> UInt8[Tensor, "n s s 4"]:
+    """Decode a sheet and cut it into its tiles, row by row."""
+    if not path.is_file():
+        raise BadInput(f"{BANK_JSON} names {path.name}, which is not in the bank")
+    check_sheet(path, index)
+    sheet = read_png(path)
+    if sheet.shape[-1] != 4:
+        raise BadInput(
+            f"the sheet {path.name} of the bank has {sheet.shape[-1]} channels; export it as PNG with color and alpha"
+        )
+    (rows, columns), size = index.tile, index.tile_size
+    pixels = sheet.mul_(255).round_().to(torch.uint8)
+    return pixels.reshape(rows, size, columns, size, 4).transpose(1, 2).reshape(rows * columns, size, size, 4)

@@ -1,0 +1,1 @@
+"""Job contract, entry point and environment of a running step."""

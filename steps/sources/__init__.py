@@ -1,0 +1,1 @@
+"""Readers of user files: pictures, videos, frame archives and view banks."""

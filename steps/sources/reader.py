@@ -1,0 +1,274 @@
+"""What users hand in: a picture, a video, or a zip of numbered pictures; told apart by content, never by name."""
+
+import shutil
+import time
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dg4d_lib.errors import BadInput
+from dg4d_lib.settings import SubjectSettings
+from dg4d_lib.video.shrinking import shrink_by_bands
+from steps.sources.avif import read_avif
+from steps.sources.clips import (
+    MOST_DECODED,
+    MOST_DECODING_S,
+    MOST_FRAMES,
+    Clip,
+    KeptFrames,
+    evenly_spaced,
+    thinned_rate,
+)
+from steps.sources.decode_limit import DecodeLimit
+from steps.sources.decoder_errors import damage_is_bad_input
+from steps.sources.gif import check_first_frame
+from steps.sources.media_types import (
+    ALLOWED,
+    SNIFFED_BYTES,
+    check_no_scene,
+    container_of,
+    frame_suffix,
+    is_animated_png,
+    is_frame_name,
+    is_zip,
+    still_suffix,
+)
+from steps.sources.stills import LARGEST_SIDE as STILL_SIDE
+from steps.sources.stills import read_still
+from steps.sources.webp import AnimatedWebp, is_animated
+
+FOLDER_FPS = 12.0  # pictures in a folder have no rate; drawn animation usually holds a drawing for two frames of 24
+STILL_FPS = 1.0  # of a picture; it is never played
+MOST_ENTRY_BYTES = 512 * 2**20  # of one unpacked picture of a zip
+NAMED_AT_MOST = 8  # missing frames that a message lists
+MOST_DIGITS = 18  # of the number of a frame; cameras write up to 17, a time stamp
+NAME_SHOWN = 40  # characters of a long name in a message
+
+
+@dataclass(frozen=True)
+class Source:
+    """A user's file, decoded.
+
+    Attributes:
+        frames: straight sRGB and alpha in [0, 1], upright; a picture is one frame.
+        has_alpha: whether the alpha says anything; without it, it is 1 everywhere.
+        fps: frames per second of what is left after sampling; the duration stays.
+        kind: what it was.
+        notes: sentences for the report: what was left out or assumed.
+    """
+
+    frames: Float[Tensor, "t h w 4"]
+    has_alpha: bool
+    fps: float
+    kind: Literal["picture", "video"]
+    notes: tuple[str, ...] = ()
+
+
+def read_source(
+    path: Path, scratch: Path, max_frames: int, max_decode_gb: float = SubjectSettings().max_decode_gb
+) -> Source:
+    """Decode a user's file.
+
+    Args:
+        path: the file; its name does not matter.
+        scratch: an existing folder for links and unpacked pictures.
+        max_frames: frames that are kept of a video, evenly spaced, the first and the last among them; at least 2.
+        max_decode_gb: GiB of memory that may be used, the decoded frames included.
+
+    Raises:
+        BadInput: it is empty, broken, too small, too large, or nothing that can be read; says what to do.
+    """
+    if not path.is_file():
+        raise BadInput(f"{path.name} is not a file; give {ALLOWED}")
+    if path.stat().st_size == 0:
+        raise BadInput(f"the file is empty (0 bytes); give {ALLOWED}")
+    with path.open("rb") as file:
+        head = file.read(SNIFFED_BYTES)
+    limit = DecodeLimit(max_decode_gb)
+    with limit.enforced("the file"), damage_is_bad_input("the file"):
+        return _decode(path, head, scratch, max_frames, limit)
+
+
+def _decode(path: Path, head: bytes, scratch: Path, max_frames: int, limit: DecodeLimit) -> Source:
+    """Decode a file by its first bytes; what else it may be, further on, does not count."""
+    if is_zip(head):
+        return _read_zip(path, scratch, max_frames, limit)
+    if is_animated(head):
+        return _read_webp(path, scratch, max_frames, limit)
+    container = "apng" if is_animated_png(head) else container_of(head)
+    if container:
+        return _read_clip(path, container, max_frames, limit)
+    suffix = still_suffix(head)
+    picture, has_alpha, _ = _reader(suffix)(_link(path, suffix, scratch), "the picture", limit, STILL_SIDE)
+    return _picture(picture[None], has_alpha)
+
+
+def _picture(frames: Float[Tensor, "1 h w 4"], has_alpha: bool, notes: tuple[str, ...] = ()) -> Source:
+    return Source(frames, has_alpha and _says_something(frames), STILL_FPS, "picture", notes)
+
+
+def _video(
+    frames: Float[Tensor, "t h w 4"], has_alpha: bool, fps: float, count: int, notes: tuple[str, ...] = ()
+) -> Source:
+    kept = frames.shape[0]
+    if kept < count:
+        notes = (*notes, f"{kept} of the video's {count} frames are used, evenly spaced; it lasts as long as before.")
+    return Source(frames, has_alpha and _says_something(frames), thinned_rate(fps, count, kept), "video", notes)
+
+
+def _says_something(frames: Float[Tensor, "t h w 4"]) -> bool:
+    """Return whether an alpha channel is more than decoration: some pixel is not opaque."""
+    return bool((frames[..., 3] < 250 / 255).any())
+
+
+def _read_clip(path: Path, container: str, max_frames: int, limit: DecodeLimit) -> Source:
+    if container == "gif":
+        check_first_frame(path)
+    clip = Clip(path, container, limit)
+    if clip.count < 2 and container in ("gif", "apng") and clip.count:
+        return _picture(*clip.read([0]))
+    _need_two(clip.count, "the video")
+    frames, has_alpha = clip.read(evenly_spaced(clip.count, max_frames))
+    lost = clip.announced - clip.count
+    notes = (f"The video promises {clip.announced} frames; {clip.count} can be read.",) if lost > 1 else ()
+    return _video(frames, has_alpha, clip.fps, clip.count, notes)
+
+
+def _read_webp(path: Path, scratch: Path, max_frames: int, limit: DecodeLimit) -> Source:
+    limit.require_file(path, "the WebP animation")
+    clip = AnimatedWebp(path.read_bytes(), scratch, limit)
+    if len(clip) != 1:
+        _need_two(len(clip), "the WebP animation")
+    kept = KeptFrames(evenly_spaced(len(clip), max_frames), "the WebP animation")
+    for i, frame in enumerate(clip):
+        if i in kept:
+            kept.add(i, shrink_by_bands(torch.from_numpy(frame), kept.side))
+    return _picture(kept.frames, True) if len(clip) == 1 else _video(kept.frames, True, clip.fps, len(clip))
+
+
+def _need_two(count: int, what: str) -> None:
+    if count < 2:
+        raise BadInput(
+            f"{what} has {'no frame' if count == 0 else 'only one frame'}; a video needs at least two: "
+            "give a longer one, or a picture"
+        )
+
+
+def _read_zip(path: Path, scratch: Path, max_frames: int, limit: DecodeLimit) -> Source:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            check_no_scene(archive.namelist())
+            entries = _numbered(
+                [info for info in archive.infolist() if not info.is_dir() and is_frame_name(info.filename)]
+            )
+            frames, any_alpha = _zipped_frames(archive, entries, scratch, max_frames, limit)
+    except (zipfile.BadZipFile, RuntimeError, NotImplementedError, EOFError) as error:
+        raise BadInput("the zip of frames is broken or encrypted; pack it again") from error
+    note = f"A folder of frames has no frame rate; {FOLDER_FPS:g} per second are assumed."
+    return _video(frames, any_alpha, FOLDER_FPS, len(entries), (note,))
+
+
+def _zipped_frames(
+    archive: zipfile.ZipFile, entries: list[zipfile.ZipInfo], scratch: Path, max_frames: int, limit: DecodeLimit
+) -> tuple[Float[Tensor, "t h w 4"], bool]:
+    """Decode every frame, so that none is broken, and keep some; whether one of these has alpha."""
+    kept, any_alpha = KeptFrames(evenly_spaced(len(entries), max_frames), "the folder of frames"), False
+    first, pixels, start = (0, 0), 0, time.monotonic()
+    for i, info in enumerate(entries):
+        picture, has_alpha, size = _zipped_picture(archive, info, scratch, limit, kept.side)
+        first = first if i else size
+        if size != first:
+            raise BadInput(
+                f"the frames have different sizes: {info.filename} is {size[0]} x {size[1]} "
+                f"pixels, {entries[0].filename} is {first[0]} x {first[1]}; export all at one size"
+            )
+        pixels += size[0] * size[1]
+        if pixels > MOST_DECODED or time.monotonic() - start > MOST_DECODING_S:
+            raise BadInput(
+                f"the folder of frames has more than {MOST_DECODED // 10**9} billion pixels in all, or takes more than "
+                f"{MOST_DECODING_S:g} s to read; leave some frames out, or export them smaller"
+            )
+        if i in kept:
+            kept.add(i, picture)
+            any_alpha = any_alpha or has_alpha
+    return kept.frames, any_alpha
+
+
+def _numbered(entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo]:
+    """Sort entries by the number at the end of their names; by name where none has a number."""
+    _need_two(len(entries), "the folder of frames")
+    if len(entries) > MOST_FRAMES:
+        raise BadInput(
+            f"the folder of frames has {len(entries)} pictures; at most {MOST_FRAMES} are read: leave some out"
+        )
+    found = {info.filename: _number_at_end(Path(info.filename).stem) for info in entries}
+    if all(number is None for number in found.values()):
+        return sorted(entries, key=lambda info: info.filename)
+    without = sorted(name for name, number in found.items() if number is None)
+    if without:
+        raise BadInput(
+            f"the frame {without[0]} has no number at the end of its name while others do; rename or remove it"
+        )
+    by_number: dict[int, zipfile.ZipInfo] = {}
+    for info in entries:
+        number = found[info.filename] or 0
+        if number in by_number:
+            raise BadInput(
+                f"{by_number[number].filename} and {info.filename} have the same number; keep one sequence per folder"
+            )
+        by_number[number] = info
+    first, last = min(by_number), max(by_number)
+    if last - first + 1 != len(by_number):
+        gaps = [number for number in range(first, min(last, first + 10**6)) if number not in by_number]
+        listed = ", ".join(f"{number}" for number in gaps[:NAMED_AT_MOST])
+        more = f" and {len(gaps) - NAMED_AT_MOST} more" if len(gaps) > NAMED_AT_MOST else ""
+        raise BadInput(
+            f"frames are missing between {first} and {last}: {listed}{more}; add them, or number without gaps"
+        )
+    return [by_number[number] for number in sorted(by_number)]
+
+
+def _number_at_end(name: str) -> int | None:
+    digits = name[len(name.rstrip("0123456789")) :]
+    if len(digits) > MOST_DIGITS:
+        raise BadInput(
+            f"the number at the end of the frame's name {name[:NAME_SHOWN]}... has {len(digits)} digits; "
+            f"at most {MOST_DIGITS} are read: rename it"
+        )
+    return int(digits) if digits else None
+
+
+def _zipped_picture(
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, scratch: Path, limit: DecodeLimit, longest: int
+) -> tuple[Float[Tensor, "h w 4"], bool, tuple[int, int]]:
+    """Unpack one frame into `scratch` and decode it as `read_still` does."""
+    if info.file_size > MOST_ENTRY_BYTES:
+        raise BadInput(f"{info.filename} unpacks to {info.file_size} bytes; at most {MOST_ENTRY_BYTES} are read")
+    with archive.open(info) as content:
+        head = content.read(SNIFFED_BYTES)
+        target = scratch / f"frame{frame_suffix(info.filename, head)}"
+        with target.open("wb") as file:
+            file.write(head)
+            shutil.copyfileobj(content, file)
+    picture = _reader(target.suffix)(target, f"the frame {info.filename}", limit, longest)
+    target.unlink()
+    return picture
+
+
+def _reader(suffix: str) -> Callable[..., tuple[Float[Tensor, "h w 4"], bool, tuple[int, int]]]:
+    """Return the function that decodes a still picture."""
+    return read_avif if suffix == ".avif" else read_still
+
+
+def _link(path: Path, suffix: str, scratch: Path) -> Path:
+    """Return a link to the file under a name that tells its format."""
+    link = scratch / f"source{suffix}"
+    link.unlink(missing_ok=True)
+    link.symlink_to(path.resolve())
+    return link
