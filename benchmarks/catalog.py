@@ -27,6 +27,7 @@ from typing import Any
 from PIL import Image, ImageDraw
 from prefect import flow
 from prefect.client.orchestration import get_client
+from prefect.settings import temporary_settings
 from rich.table import Table
 
 from benchmarks.measure import machine, new_console, parser_of, write_rows
@@ -34,14 +35,16 @@ from benchmarks.postgresql import Database, free_port
 from flows import home
 from flows.catalog import convert_all
 from flows.commands.batch import ready
-from flows.engine.tasks import Steps
-from flows.image_to_4d import drive
+from flows.engine.step_tasks import finished_steps, flow_settings, steps_of_flow
 from flows.inputs.manifest import Item, items_of
 from flows.inputs.orders import Order
 from flows.packages import summary
+from flows.packages.flow_result import StepRun
 from flows.packages.publish import RECORD, Files, publish
+from flows.pipeline import conversion_of
 from flows.serving.auth import auth_string
 from flows.serving.server import HOST, SETTINGS, answers
+from flows.tasks import drive_video, prepare_subject
 
 DATABASES = ("sqlite", "postgresql")
 STEPS = ("prepare_subject", "drive_video")
@@ -168,16 +171,18 @@ def work(order: Order, folder: Path) -> tuple[Any, bool]:
 
 def resize_and_pack(order: Order) -> tuple[Any, bool]:
     """A flow of two steps."""
+    done: list[StepRun] = []
 
     @flow(name="resize_and_pack", flow_run_name="{item}", persist_result=False)
     def two_steps(item: str) -> None:
-        with steps:
-            prepared = steps.run("prepare_subject", {"source": order.source}, order.settings.subject)
-            steps.run("drive_video", {"subject": prepared["subject"]}, drive(order.settings))
+        with steps_of_flow():
+            conversion = conversion_of(order)
+            drive_video(prepare_subject(order.source, conversion), conversion)
+            done.extend(finished_steps())
 
-    steps = Steps(order.item, order.seed)
-    two_steps(order.item)
-    return steps.finished[-1].result.outputs["driving_video"], all(done.cached for done in steps.finished)
+    with temporary_settings(flow_settings()):
+        two_steps(order.item)
+    return done[-1].result.outputs["driving_video"], all(step.cached for step in done)
 
 
 def completed(expected: int) -> Counter[str]:

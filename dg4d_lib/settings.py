@@ -387,7 +387,6 @@ class MeshSettings(Settings):
     texture_size: int = Field(1024, ge=64, le=8192, description="texels of a side")
     render_size: int = Field(512, ge=64, le=2048, description="pixels of the renders that are projected back")
     min_cosine: float = Field(0.5, gt=0, lt=1, description="texels seen at a flatter angle are not colored")
-    frames_per_task: int = Field(4, ge=1, le=128, description="mode per_frame: frames that one task extracts")
 
 
 class IdentitySettings(Settings):

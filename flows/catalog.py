@@ -18,7 +18,7 @@ from dg4d_lib.errors import DG4DError
 from flows.commands.make import make, save_pictures
 from flows.engine.executors import StepCrashed, StepError, StepOutOfMemory, StepTimedOut, StepUnreachable, stop_all
 from flows.engine.runners import item_runner
-from flows.engine.tasks import QUICK
+from flows.engine.step_tasks import flow_settings
 from flows.inputs.orders import Order
 from flows.packages.summary import Row, Tally, judged
 from flows.ui import pages
@@ -68,7 +68,7 @@ def convert_all(
 
     token = _body.set(rounds)
     try:
-        with temporary_settings(QUICK):
+        with temporary_settings(flow_settings()):
             catalog.with_options(task_runner=item_runner(workers))(title)
     finally:
         _body.reset(token)

@@ -11,14 +11,14 @@ from dg4d_lib.errors import BadInput
 from flows import home
 from flows.engine.executors import StepError
 from flows.engine.orphans import process_tag
-from flows.engine.tasks import QUICK, Steps
+from flows.engine.step_tasks import Conversion, flow_settings
 from flows.packages import scores
 from flows.packages.scores import ObjectScores, Results
+from flows.tasks import score_asset
 from flows.ui.escaping import markdown
 from steps.contract import ArtifactRef, Frozen
-from steps.profiles import ScoreAssetSettings
+from steps.profiles import PREVIEW, ScoreAssetSettings
 
-STEP = "score_asset"
 FVD = "fvd"
 
 
@@ -91,7 +91,7 @@ def benchmark(entries: list[Entry], settings: ScoreAssetSettings, title: str, ou
 
 def judge(entries: list[Entry], settings: ScoreAssetSettings, title: str, ours: str, seed: int = 0) -> Judged:
     """Run the flow."""
-    with temporary_settings(QUICK), tags(process_tag()):
+    with temporary_settings(flow_settings()), tags(process_tag()):
         return benchmark(entries, settings, title, ours, seed)
 
 
@@ -99,9 +99,9 @@ def _judge(
     entry: Entry, settings: ScoreAssetSettings, seed: int
 ) -> tuple[dict[str, ArtifactRef], dict[str, ArtifactRef]]:
     """What the naive guesses score, and what the asset does."""
-    with Steps(entry.name, seed) as steps:
-        guessed = steps.run(STEP, {"truth": entry.truth}, settings.model_copy(update={"mesh": False}))
-        return guessed, steps.run(STEP, {"truth": entry.truth, "package": entry.package}, settings)
+    conversion = Conversion(item=entry.name, settings=PREVIEW, seed=seed)  # score_asset has settings of its own
+    guessed = score_asset(entry.truth, settings.model_copy(update={"mesh": False}), conversion)
+    return guessed.outputs, score_asset(entry.truth, settings, conversion, entry.package).outputs
 
 
 def _read(ref: ArtifactRef) -> dict[str, Any]:

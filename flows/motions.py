@@ -8,27 +8,27 @@ from prefect import flow
 
 from flows import home
 from flows.engine.executors import StepBadInput
-from flows.engine.tasks import Steps
-from flows.image_to_4d import drive
+from flows.engine.step_tasks import steps_of_flow
+from flows.inputs.orders import Order
+from flows.pipeline import conversion_of
+from flows.tasks import drive_video, prepare_subject
 from steps.artifacts.archives import unpack as unpack_zip
 from steps.contract import ArtifactRef
-from steps.profiles import PipelineSettings
 
 
-@flow(name="motions", flow_run_name="{item}", persist_result=False)
-def motions(
-    source: ArtifactRef, settings: PipelineSettings, seed: int = 0, item: str = "asset"
-) -> dict[str, ArtifactRef]:
-    """Prepare the subject and hold the tournament of `drive_video`; its outputs by name.
+@flow(name="motions", flow_run_name="{order.item}", persist_result=False)
+def motions(order: Order) -> dict[str, ArtifactRef]:
+    """Prepare the subject and rank the candidates of `drive_video`; its outputs by name.
 
     Raises:
-        StepError: a step did not finish; says which and why.
+        StepError: a step did not finish.
     """
-    with Steps(item, seed) as steps:
-        prepared = steps.run("prepare_subject", {"source": source}, settings.subject)
-        if "footage" in prepared:
+    with steps_of_flow():
+        conversion = conversion_of(order)
+        subject = prepare_subject(order.source, conversion)
+        if subject.footage is not None:
             raise StepBadInput("prepare_subject", "this is a video and has its motion already; give a picture")
-        return steps.run("drive_video", {"subject": prepared["subject"]}, drive(settings))
+        return drive_video(subject, conversion).outputs
 
 
 def unpack(made: dict[str, ArtifactRef], folder: Path) -> dict[str, Any]:

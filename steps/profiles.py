@@ -115,6 +115,32 @@ class ScoreAssetSettings(Settings):
     score: ScoreSettings = ScoreSettings()
 
 
+def step_settings(step: str, settings: PipelineSettings, **values: Any) -> Settings:
+    """Return the settings of a step: the sections of the pipeline's settings that it reads, and values of this run."""
+    match step:
+        case "draw_picture":
+            return settings.text
+        case "prepare_subject":
+            return settings.subject
+        case "drive_video":
+            turn_deg = settings.prior.turn_deg if isinstance(settings.prior, GeometricPriorSettings) else 0.0
+            return DriveVideoSettings(driving=settings.driving, turn_deg=turn_deg)
+        case "join_meshes":
+            return JoinMeshesSettings()
+        case "refine_texture":
+            return RefineTextureSettings(refiner=settings.refiner)
+    models: dict[str, type[Settings]] = {
+        "fit_gaussians": FitGaussiansSettings,
+        "fit_motion": FitMotionSettings,
+        "extract_mesh": ExtractMeshSettings,
+        "pack_asset": PackAssetSettings,
+        "check_asset": CheckAssetSettings,
+    }
+    model = models[step]
+    sections = {name: getattr(settings, name) for name in model.model_fields if hasattr(settings, name)}
+    return model.model_validate(sections | values)
+
+
 def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSettings:
     """The same settings with some dotted keys changed, validated again.
 

@@ -14,14 +14,13 @@ from dg4d_lib.errors import BadInput, DG4DError
 from flows import home
 from flows.commands import terminal
 from flows.engine.executors import StepError, StepMissing
-from flows.engine.merging import add
 from flows.inputs.manifest import parse_changes
 from flows.inputs.orders import Order, Wish
 from flows.packages import scores
 from flows.packages.publish import check_folder, check_writable, is_current, whole
 from flows.packages.scores import Results
 from flows.packages.summary import BAD_INPUT, Row, Tally
-from steps.artifacts.archives import unpack
+from steps.artifacts.archives import add_entry, unpack
 from steps.artifacts.ground_truth import Truth, find_truth, find_truths
 from steps.artifacts.store import ArtifactStore, room_for, write_atomically
 from steps.catalog import PACKAGE, TRUTH
@@ -72,7 +71,7 @@ def score(
     from flows.commands.make import connect
 
     connect()
-    from flows.judge import STEP, Entry, judge
+    from flows.judge import Entry, judge
 
     entry = Entry(
         name=found.name,
@@ -85,7 +84,7 @@ def score(
     for one in judged.results.failed:
         if one.kind in BAD_INPUT:
             raise BadInput(f"{package} cannot be judged against {truth}: {one.error}")
-        raise (StepMissing if one.kind in MISSING else StepError)(STEP, one.error)
+        raise (StepMissing if one.kind in MISSING else StepError)("score_asset", one.error)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, _json(judged.results))
@@ -298,7 +297,7 @@ def _put(files: Mapping[str, Path], media_type: str, store: ArtifactStore) -> Ar
         path = Path(scratch) / "files.zip"
         with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
             for name, content in _contents(files):
-                add(archive, name, content)
+                add_entry(archive, name, content)
         return store.put(path, media_type)
 
 

@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Any
 from flows import home
 from flows.engine.free_space import require_free_space
 from flows.inputs.orders import Order
-from flows.packages.credentials import Signer, configured
-from flows.packages.publish import Files, is_current, publish, record_of
+from flows.packages.publish import Files, is_current, record_of
 from flows.serving.server import ServerUnavailable
 from steps.artifacts.store import ArtifactMissing
 from steps.artifacts.store import home as store_home
 
 if TYPE_CHECKING:
-    from flows.engine.tasks import Made
+    from flows.packages.flow_result import FlowResult
 
 ANSWER_S = 10.0  # for a server of the user's own
 
@@ -49,7 +48,7 @@ def connect() -> None:
         server = home.background_server()
         server.start()
         home.set_own_server(server, server.wait_for_address())
-        importlib.import_module("flows.image_to_4d")  # takes seconds, and so does the server
+        importlib.import_module("flows.pipeline")  # takes seconds, and so does the server
         server.wait()
     from flows.engine.orphans import settle_orphans
 
@@ -77,56 +76,50 @@ def make(order: Order, folder: Path) -> tuple[Files, bool]:
     def waiting() -> None:
         tell(StepEvent(order.item, "output", "remark", text=f"waiting for another run that writes {folder}"))
 
-    signer = configured()
     with output_lock(folder, waiting) as waited:
         if waited and is_current(folder, order.digest()):
-            return (record_of(folder) or {"files": {}})["files"], True
+            return _files_in(folder), True
         try:
-            return _make(order, folder, signer)
+            result = _make(order, folder)
         except (ArtifactMissing, StepLost):  # it was dropped when it was found, and so was the result that named it
-            return _make(order, folder, signer)
+            result = _make(order, folder)
+    return _files_in(folder), all(done.cached for done in result.steps)
 
 
-def run(order: Order, refresh: bool = False) -> "Made":
+def run(order: Order, folder: Path | None = None, refresh: bool = False, mesh_parts: int = 0) -> "FlowResult":
     """Run the flow of an order.
 
     Args:
-        order: what to make.
-        refresh: do every step, also those whose result is there already.
+        order: request of the conversion.
+        folder: output folder; None: the package stays in the store.
+        refresh: run every step, also those whose result exists.
+        mesh_parts: number of tasks that extract a mesh per frame; 0: one per slot of this machine.
 
     Raises:
         StepError: a step did not finish.
     """
     from prefect.settings import PREFECT_TASKS_REFRESH_CACHE
+    from prefect.task_runners import ThreadPoolTaskRunner
 
-    name = "text_to_4d" if order.drawn else "video_to_4d" if order.moving else "image_to_4d"
-    flow = getattr(importlib.import_module(f"flows.{name}"), name)
+    from flows import pipeline
+    from flows.engine.resources import slots
+
+    flow = pipeline.text_to_4d if order.drawn else pipeline.video_to_4d if order.moving else pipeline.image_to_4d
+    runner: Any = ThreadPoolTaskRunner(max_workers=slots())
     with _surroundings(order, {PREFECT_TASKS_REFRESH_CACHE: refresh}):
-        made: Made = flow(order.source, order.settings, order.seed, order.item, order.bank)
-    return made
+        return flow.with_options(task_runner=runner)(order, folder, mesh_parts)
 
 
-def deliver(order: Order, made: "Made", folder: Path, signer: Signer | None) -> Files:
-    """Put what a flow made into a folder; raises as `make` does."""
-    from flows.packages.report import complete
-
-    store = home.store()
-    return publish(
-        store.path(made.package),
-        folder,
-        lambda staging, files: complete(staging, files, order, made, store, signer),
-    )
-
-
-def _make(order: Order, folder: Path, signer: Signer | None) -> tuple[Files, bool]:
+def _make(order: Order, folder: Path) -> "FlowResult":
     from flows.engine.leases import running
-    from flows.packages.versions import keep_version
 
-    store = home.store()
-    with running(store, order.item):
-        made = run(order)
-        keep_version(store, order, made)
-        return deliver(order, made, folder, signer), all(done.cached for done in made.steps)
+    with running(home.store(), order.item):
+        return run(order, folder)
+
+
+def _files_in(folder: Path) -> Files:
+    files: Files = (record_of(folder) or {"files": {}})["files"]
+    return files
 
 
 def make_motions(order: Order, folder: Path) -> dict[str, Any]:
@@ -138,8 +131,8 @@ def make_motions(order: Order, folder: Path) -> dict[str, Any]:
     from flows.motions import motions, unpack
 
     with _surroundings(order):
-        made = motions(order.source, order.settings, order.seed, order.item)
-    return unpack(made, folder)
+        outputs = motions(order)
+    return unpack(outputs, folder)
 
 
 @contextmanager
@@ -149,9 +142,9 @@ def _surroundings(order: Order, settings: dict[Any, Any] | None = None) -> Itera
     from prefect.settings import temporary_settings
 
     from flows.engine.orphans import process_tag
-    from flows.engine.tasks import QUICK
+    from flows.engine.step_tasks import flow_settings
 
-    with temporary_settings({**QUICK, **(settings or {})}), tags(process_tag(), f"profile:{order.profile}"):
+    with temporary_settings({**flow_settings(), **(settings or {})}), tags(process_tag(), f"profile:{order.profile}"):
         yield
 
 

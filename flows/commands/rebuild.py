@@ -9,11 +9,11 @@ from typing import Any, Literal
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows import home
 from flows.commands.endings import EXIT_FAILED
-from flows.commands.make import deliver
 from flows.commands.make import run as run_flow
 from flows.inputs.orders import Order
 from flows.packages.credentials import configured
 from flows.packages.publish import Files, fact_of, unpacked
+from flows.packages.report import deliver
 from steps.artifacts.artifact_diff import TOLERANCE, difference
 from steps.artifacts.store import ArtifactMissing
 from steps.contract import ArtifactRef, Frozen, StepResult
@@ -90,10 +90,10 @@ def rebuild(folder: Path, record: Mapping[str, Any], order: Order, out: Path | N
         )
     first = dict(zip(labels, record["steps"], strict=True))
     machines = {run["step"]: run.get("machine", {}) for run in record["run"]["steps"]}
-    made = run_flow(order, refresh=True)
+    made = run_flow(order, refresh=True, mesh_parts=sum(label.startswith("extract_mesh ") for label in labels))
     again = {done.label: done.result for done in made.steps}
     if out is not None:
-        deliver(order, made, out, signer)
+        deliver(order, made, out, signer).keep()
     with TemporaryDirectory(prefix="dg4d-rebuild-") as scratch:
         new = Path(scratch) / "new"
         new.mkdir()

@@ -1,4 +1,4 @@
-"""When a step's result may be used again: strictly by the digest of its request, while its artifacts exist.
+"""Cache policy of steps: results are used again by the digest of their request, while their artifacts exist.
 
 Prefect's own policies hash arguments and source text and miss what matters; its lock files outlive their process.
 """
@@ -11,6 +11,7 @@ import json
 import os
 import threading
 import time
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +19,9 @@ from typing import Any
 
 from prefect.cache_policies import CachePolicy
 from prefect.context import TaskRunContext
-from pydantic import ValidationError
+from prefect.serializers import JSONSerializer
 
-from steps.artifacts.opening import open_store
+from flows import home
 from steps.artifacts.store import ArtifactStore, StoreUnreachable
 from steps.contract import StepRequest, StepResult
 
@@ -33,45 +34,56 @@ def record_key(request: StepRequest) -> str:
 
 
 def recorded(path: Path, store: ArtifactStore) -> StepResult | None:
-    """The result in a record that Prefect wrote, if it can be read and all its artifacts are there and sound.
+    """Return the result in a record that Prefect wrote, if it can be read and all its artifacts are there and sound.
 
     Raises:
         StoreUnreachable: the store does not answer.
     """
+    result = result_in(path)
+    return result if result and all(store.is_sound(ref) for ref in result.outputs.values()) else None
+
+
+def result_in(path: Path) -> StepResult | None:
+    """Return the result in a record that Prefect wrote; None if it cannot be read."""
     try:
-        result = StepResult.model_validate(json.loads(json.loads(path.read_text(encoding="utf-8"))["result"]))
-    except (OSError, ValueError, KeyError, TypeError, ValidationError):
+        content = json.loads(path.read_text(encoding="utf-8"))["result"]
+        result = JSONSerializer().loads(content.encode())
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, ImportError):  # pydantic's is a ValueError
         return None
-    return result if all(store.is_sound(ref) for ref in result.outputs.values()) else None
+    return result if isinstance(result, StepResult) else None
 
 
 @dataclass
 class RequestPolicy(CachePolicy):
-    """The key of a task that is called with `request=StepRequest(...)`; drops its record when that is broken."""
+    """Cache key of a task that runs a step: the digest of its request. Drops records that are broken.
 
-    records: Path = Path()
-    store: str = ""
+    Attributes:
+        request_for: returns the request, given the name of the task and its arguments.
+    """
+
+    request_for: Callable[[str, Mapping[str, Any]], StepRequest] | None = None
 
     def compute_key(
         self, task_ctx: TaskRunContext, inputs: dict[str, Any], flow_parameters: dict[str, Any], **_: Any
     ) -> str | None:
-        """The name of the request's record."""
-        key = record_key(inputs["request"])
-        record = self.records / key
+        """Return the name of the request's record."""
+        assert self.request_for is not None  # the base class has defaults, so this field needs one
+        key = record_key(self.request_for(task_ctx.task.name, inputs))
+        record = home.records() / key
         with suppress(StoreUnreachable):  # the record is good until the contrary is known
-            if record.exists() and recorded(record, open_store(self.store)) is None:
+            if record.exists() and recorded(record, home.store()) is None:
                 self._drop(record, key)
         return key
 
     def _drop(self, record: Path, key: str) -> None:
-        """Remove a broken record, unless somebody is writing it at this moment."""
+        """Remove a broken record, unless it is being written at this moment."""
         lock = self.lock_manager
         holder = f"heal-{threading.get_ident()}"
         if not isinstance(lock, FileLocks):
             record.unlink(missing_ok=True)
         elif lock.try_lock(key, holder):
             try:
-                if recorded(record, open_store(self.store)) is None:
+                if recorded(record, home.store()) is None:
                     record.unlink(missing_ok=True)
             finally:
                 lock.release_lock(key, holder)
@@ -81,11 +93,11 @@ class FileLocks:
     """Locks between the processes of one host, for Prefect's transactions; the kernel frees them with their process.
 
     Args:
-        folder: of the lock files; they stay, empty.
+        folder: returns the folder of the lock files; they stay, empty.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Callable[[], Path]) -> None:
+        self._folder = folder
         self._held: dict[str, tuple[str, int]] = {}
         self._mutex = threading.Lock()
 
@@ -97,7 +109,7 @@ class FileLocks:
         with self._mutex:
             if key in self._held:
                 return self._held[key][0] == holder
-            self.folder.mkdir(parents=True, exist_ok=True)
+            self._folder().mkdir(parents=True, exist_ok=True)
             handle = os.open(self._path(key), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -174,4 +186,4 @@ class FileLocks:
         return await asyncio.to_thread(self.wait_for_lock, key, timeout)
 
     def _path(self, key: str) -> Path:
-        return self.folder / (hashlib.sha256(key.encode()).hexdigest() + ".lock")
+        return self._folder() / (hashlib.sha256(key.encode()).hexdigest() + ".lock")

@@ -1,13 +1,12 @@
 """Removing from a store what no version and no run needs; behind `dg4d store gc`."""
 
-import json
 from collections import Counter
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 from flows.engine import leases
+from flows.engine.caching import result_in
 from flows.packages.versions import Version, versions
 from steps.artifacts.store import ArtifactStore, Entry
 
@@ -87,9 +86,6 @@ def _forget_results(records: Path, here: set[str], before: float) -> None:
 
 
 def _outputs(record: Path) -> set[str]:
-    """The artifacts that a result refers to; something that no store has where it cannot be read."""
-    try:
-        result: dict[str, Any] = json.loads(json.loads(record.read_text(encoding="utf-8"))["result"])
-        return {ref["digest"] for ref in result["outputs"].values()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return {"unreadable"}
+    """Return the artifacts that a result refers to; an artifact that no store has where the record is unreadable."""
+    result = result_in(record)
+    return {"unreadable"} if result is None else {ref.digest for ref in result.outputs.values()}

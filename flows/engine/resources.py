@@ -141,6 +141,15 @@ def cpus() -> int:
     return _number("DG4D_CPUS", max(1, len(os.sched_getaffinity(0)) // CORES_PER_STEP), least=1)
 
 
+def slots() -> int:
+    """Return how many steps may run on this machine at a time, on GPUs and processors together.
+
+    Raises:
+        BadInput: `$DG4D_GPUS` or `$DG4D_CPUS` is no number of slots.
+    """
+    return len(gpus()) + cpus()
+
+
 _held: ContextVar[Slot | None] = ContextVar("held", default=None)
 _WORDS: dict[Resource, str] = {"gpu": "a GPU", "cpu": "its turn on the processor"}
 

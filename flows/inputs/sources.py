@@ -5,7 +5,7 @@ import zipfile
 from pathlib import Path
 
 from dg4d_lib.errors import BadInput
-from flows.engine.merging import add
+from steps.artifacts.archives import add_entry
 from steps.artifacts.store import ArtifactStore, room_for
 from steps.catalog import BANK, SOURCE, TEXT
 from steps.contract import ArtifactRef
@@ -186,5 +186,5 @@ def _put_files(files: list[Path], folder: Path, media_type: str, store: Artifact
         path = Path(scratch) / "files.zip"
         with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
             for file in files:
-                add(archive, file.relative_to(folder).as_posix(), file.read_bytes())
+                add_entry(archive, file.relative_to(folder).as_posix(), file.read_bytes())
         return store.put(path, media_type)

@@ -6,6 +6,7 @@ import os
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -120,18 +121,25 @@ def whole(folder: Path) -> dict[str, Any]:
 
 
 def publish(package: Path, folder: Path, finish: Finish) -> Files:
-    """Unpack a package beside `folder`, finish it, and put it in the place of what is there.
+    """Replace the package in a folder for good; see `replace_package`."""
+    swap = replace_package(package, folder, finish)
+    swap.keep()
+    return swap.files
+
+
+def replace_package(package: Path, folder: Path, finish: Finish) -> "Swap":
+    """Unpack a package beside `folder`, finish it, and put it in the place of the package there.
 
     Files in `folder` that no package brought stay. If anything fails, `folder` is as it was.
 
     Args:
         package: the zip that `pack_asset` made.
-        folder: where the user wants it.
+        folder: output folder.
         finish: is given the unpacked folder and the facts of its files; adds what goes with the package, the record
-            above all, and gives the facts of the package's files as they are then.
+            above all, and returns the facts of the package's files as they are then.
 
     Returns:
-        What `finish` gave.
+        The finished swap; call `keep` or `undo` on it.
 
     Raises:
         DiskFull: there is no room.
@@ -153,6 +161,41 @@ def publish(package: Path, folder: Path, finish: Finish) -> Files:
     except BaseException:
         _tidy(missing)
         raise
+
+
+@dataclass(frozen=True)
+class Swap:
+    """Package that took the place of another one, which is kept beside it for the time being.
+
+    Attributes:
+        folder: output folder.
+        files: facts of the files of the new package.
+        before: folder with what was there; it does not exist if nothing was.
+        moved_in: files of the new package where it was moved in file by file; else None.
+    """
+
+    folder: Path
+    files: Files
+    before: Path
+    moved_in: tuple[Path, ...] | None = None
+
+    def keep(self) -> None:
+        """Remove the earlier package; files of the user move over from its folder."""
+        if self.before.exists():
+            _carry_over(_foreign(self.before) if self.moved_in is None else [], self.before, self.folder)
+
+    def undo(self) -> None:
+        """Restore the folder as it was."""
+        if self.moved_in is None:
+            remove_tree(self.folder)
+            if self.before.exists():
+                self.before.replace(self.folder)
+            return
+        for name in self.moved_in:
+            (self.folder / name).unlink(missing_ok=True)
+        for path in sorted(p for p in self.before.rglob("*") if p.is_file()):
+            path.replace(self.folder / path.relative_to(self.before))
+        remove_tree(self.before)
 
 
 def unpacked(package: Path, folder: Path) -> Files:
@@ -183,20 +226,22 @@ def readable(size_bytes: int) -> str:
     return f"{size_bytes / 1e6:.1f} MB" if size_bytes >= 100_000 else f"{size_bytes / 1e3:.1f} kB"
 
 
-def _publish(package: Path, folder: Path, finish: Finish, in_place: bool = False) -> Files:
+def _publish(package: Path, folder: Path, finish: Finish, in_place: bool = False) -> Swap:
+    if folder.exists() and not folder.is_dir():  # it may have come since the output was checked
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(folder))
     place = folder if in_place else folder.parent
     place.mkdir(parents=True, exist_ok=True)
     _recover(folder, place)
     staging = place / f".{folder.name}.incoming-{os.getpid()}"
+    before = staging.with_name(f".{folder.name}.outgoing-{os.getpid()}")
     remove_tree(staging)
     try:
         staging.mkdir()
         files = finish(staging, unpacked(package, staging))
         if in_place or _contains(folder, Path.cwd()):
-            _move_in(staging, folder)
-        else:
-            _swap(staging, folder)
-        return files
+            return Swap(folder, files, before, tuple(_move_in(staging, folder, before)))
+        _swap(staging, folder, before)
+        return Swap(folder, files, before)
     finally:
         remove_tree(staging)
 
@@ -226,20 +271,17 @@ def _fault(path: Path, fact: dict[str, Any]) -> str:
         return f"cannot be read ({error.strerror})"
 
 
-def _swap(staging: Path, folder: Path) -> None:
-    """Two renames; then the user's own files move over from the old folder."""
+def _swap(staging: Path, folder: Path, before: Path) -> None:
+    """Rename the old folder to `before` and the new one to `folder`."""
     if not folder.exists():
         staging.replace(folder)
         return
-    outgoing = folder.with_name(f".{folder.name}.outgoing-{os.getpid()}")
-    theirs = _foreign(folder)
-    folder.replace(outgoing)
+    folder.replace(before)
     try:
         staging.replace(folder)
     except OSError:
-        outgoing.replace(folder)
+        before.replace(folder)
         raise
-    _carry_over(theirs, outgoing, folder)
 
 
 def _carry_over(names: list[Path], outgoing: Path, folder: Path) -> None:
@@ -265,15 +307,21 @@ def _recover(folder: Path, place: Path) -> None:
             left.replace(folder)
 
 
-def _move_in(staging: Path, folder: Path) -> None:
-    """File by file, where the folder itself cannot be renamed; the record last, so that a half is known as one."""
-    before = _ours(folder)
-    fresh = sorted(p.relative_to(staging) for p in staging.rglob("*") if p.is_file())
-    for name in sorted(fresh, key=lambda n: n == Path(RECORD)):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (staging / name).replace(folder / name)
-    for left in before - {f.as_posix() for f in fresh}:
-        (folder / left).unlink(missing_ok=True)
+def _move_in(staging: Path, folder: Path, before: Path) -> list[Path]:
+    """Move the new files in one by one, where the folder cannot be renamed, and the old ones to `before`.
+
+    The record goes last, so that a half-finished swap is recognized as one.
+    """
+    new = sorted(p.relative_to(staging) for p in staging.rglob("*") if p.is_file())
+    new.sort(key=lambda name: name == Path(RECORD))
+    for name in [*sorted(Path(old) for old in _ours(folder) - {n.as_posix() for n in new}), *new]:
+        if (folder / name).exists():
+            (before / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).replace(before / name)
+        if (staging / name).exists():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (staging / name).replace(folder / name)
+    return new
 
 
 def _foreign(folder: Path) -> list[Path]:

@@ -8,12 +8,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from flows.engine.tasks import Finished, Made
+from flows import home
 from flows.inputs.orders import Order
 from flows.packages.acceptance import picture_of, section, verdict_of
 from flows.packages.crate import CRATE, crate_text
 from flows.packages.credentials import Claim, Signer, certificate, sidecar_of
-from flows.packages.publish import FORMAT, RECORD, Files, fact_of_bytes, readable
+from flows.packages.flow_result import FlowResult, StepRun
+from flows.packages.publish import FORMAT, RECORD, Files, Swap, fact_of_bytes, readable, replace_package
 from flows.packages.view import VIEWER, page_of
 from flows.ui.curves import HEIGHT, WIDTH, amount, drawing, inked, summary
 from steps.artifacts.store import ArtifactStore
@@ -24,16 +25,26 @@ GENERATIVE = ("draw_picture", "drive_video", "fit_gaussians", "fit_motion", "ref
 UNSIGNED: Mapping[str, Any] = MappingProxyType({})
 
 
+def deliver(order: Order, result: FlowResult, folder: Path, signer: Signer | None) -> Swap:
+    """Put the package of a conversion into a folder, with reports and record; see `replace_package`."""
+    store = home.store()
+    return replace_package(
+        store.path(result.package),
+        folder,
+        lambda staging, files: complete(staging, files, order, result, store, signer),
+    )
+
+
 def complete(
-    folder: Path, files: Files, order: Order, made: Made, store: ArtifactStore, signer: Signer | None
+    folder: Path, files: Files, order: Order, result: FlowResult, store: ArtifactStore, signer: Signer | None
 ) -> Files:
     """Sign the files of a package if there is a signer, and write what goes with them; their facts as they are then."""
     signatures = UNSIGNED
-    claim = Claim(_used_weights(made, *GENERATIVE), f"{banner(order, made)} Package {made.package.digest}.")
+    claim = Claim(_used_weights(result, *GENERATIVE), f"{banner(order, result)} Package {result.package.digest}.")
     if signer is not None:
         files, signed = signer.sign_package(folder, files, claim)
         signatures = {"certificate": certificate(), "subject": signer.subject, "files": signed}
-    for name, text in texts(order, made, files, store, folder, signatures).items():
+    for name, text in texts(order, result, files, store, folder, signatures).items():
         (folder / name).write_text(text, encoding="utf-8")
     if signer is not None:
         signer.sign_beside(folder / CRATE, claim)  # it holds the digest of every other file
@@ -42,33 +53,35 @@ def complete(
 
 def texts(
     order: Order,
-    made: Made,
+    result: FlowResult,
     files: Files,
     store: ArtifactStore,
     folder: Path,
     signatures: Mapping[str, Any] = UNSIGNED,
 ) -> dict[str, str]:
     """The texts that go with the package in a folder, by name of file."""
-    report = report_of(order, made, files, store)
-    record = provenance(order, made, files, signatures)
+    report = report_of(order, result, files, store)
+    record = provenance(order, result, files, signatures)
     written = json.dumps(record, indent=1, ensure_ascii=False, sort_keys=True) + "\n"
     beside = {
         VIEWER: page_of(json.loads(written), lambda name: (folder / name).read_bytes()),  # as `dg4d view` will see it
         "report.json": json.dumps(report, indent=1, ensure_ascii=False) + "\n",
-        "report.html": page(report, picture_of(_results(made), store)),
+        "report.html": page(report, picture_of(_results(result), store)),
         RECORD: written,
     }
     facts = {name: fact_of_bytes(text.encode()) for name, text in beside.items()}
-    return {**beside, CRATE: crate_text(record, facts, banner(order, made))}
+    return {**beside, CRATE: crate_text(record, facts, banner(order, result))}
 
 
-def provenance(order: Order, made: Made, files: Files, signatures: Mapping[str, Any] = UNSIGNED) -> dict[str, Any]:
+def provenance(
+    order: Order, result: FlowResult, files: Files, signatures: Mapping[str, Any] = UNSIGNED
+) -> dict[str, Any]:
     """Every step's record, every file's digest, and the recipe; what belongs to one run only stands under `run`.
 
     Signatures never come out twice the same: where there are any, `files` and `signatures` belong to one run as well.
     """
-    records = [done.result.provenance for done in made.steps]
-    outputs = [ref for done in made.steps for ref in done.result.outputs.values()]
+    records = [done.result.provenance for done in result.steps]
+    outputs = [ref for done in result.steps for ref in done.result.outputs.values()]
     artifacts = [ref for ref in (order.source, order.bank, *outputs) if ref is not None]
     return {
         "format": FORMAT,
@@ -79,8 +92,8 @@ def provenance(order: Order, made: Made, files: Files, signatures: Mapping[str, 
         "seed": order.seed,
         "commercial_only": order.commercial_only,
         "recipe": order.recipe(),
-        "licenses": licenses(made),
-        "package": made.package.digest,
+        "licenses": licenses(result),
+        "package": result.package.digest,
         "artifacts": {ref.digest: ref.model_dump(mode="json", exclude={"digest"}) for ref in artifacts},
         "files": files,
         "signatures": dict(signatures),
@@ -89,7 +102,7 @@ def provenance(order: Order, made: Made, files: Files, signatures: Mapping[str, 
             {"digest": record.digest(), **record.model_dump(mode="json", exclude=set(RUN_ONLY))} for record in records
         ],
         "run": {
-            "flow_run": made.flow_run,
+            "flow_run": result.flow_run,
             "names": {"source_name": order.source_name, "picture_name": order.picture_name},
             "steps": [
                 {
@@ -97,13 +110,13 @@ def provenance(order: Order, made: Made, files: Files, signatures: Mapping[str, 
                     "cached": done.cached,
                     **done.result.provenance.model_dump(mode="json", include=set(RUN_ONLY)),
                 }
-                for done in made.steps
+                for done in result.steps
             ],
         },
     }
 
 
-def report_of(order: Order, made: Made, files: Files, store: ArtifactStore) -> dict[str, Any]:
+def report_of(order: Order, result: FlowResult, files: Files, store: ArtifactStore) -> dict[str, Any]:
     """Stages, times, curves, notes and settings as JSON."""
     return {
         "item": order.item,
@@ -111,43 +124,43 @@ def report_of(order: Order, made: Made, files: Files, store: ArtifactStore) -> d
         "profile": order.profile,
         "seed": order.seed,
         "commercial_only": order.commercial_only,
-        "banner": banner(order, made),
-        "notes": notes(order, made),
-        "wall_s": round(made.wall_s, 1),
-        "compute_s": round(sum(done.result.provenance.duration_s for done in made.steps), 1),
-        "peak_memory_mb": max(done.result.provenance.peak_memory_mb for done in made.steps),
-        "acceptance": verdict_of(_results(made), store),
-        "steps": [_stage(done, store) for done in made.steps],
-        "licenses": licenses(made),
+        "banner": banner(order, result),
+        "notes": notes(order, result),
+        "wall_s": round(result.wall_s, 1),
+        "compute_s": round(sum(done.result.provenance.duration_s for done in result.steps), 1),
+        "peak_memory_mb": max(done.result.provenance.peak_memory_mb for done in result.steps),
+        "acceptance": verdict_of(_results(result), store),
+        "steps": [_stage(done, store) for done in result.steps],
+        "licenses": licenses(result),
         "files": {name: fact["size_bytes"] for name, fact in files.items()},
         "settings": order.settings.model_dump(mode="json"),
     }
 
 
-def banner(order: Order, made: Made) -> str:
+def banner(order: Order, result: FlowResult) -> str:
     """One honest sentence: what of this asset was seen and what was guessed."""
-    given = any("footage" in done.result.outputs for done in made.steps)
-    imagined = "the motion was made up by a model" if _used_weights(made, "drive_video") else "the motion was made up"
+    given = any("footage" in done.result.outputs for done in result.steps)
+    imagined = "the motion was made up by a model" if _used_weights(result, "drive_video") else "the motion was made up"
     motion = "the motion follows the video" if given else imagined
     if order.settings.prior.kind == "oracle":
         return f"Test of the optimization: the true views were known; {motion}."
     drawn = "the picture was drawn by a model; " if order.drawn else ""
-    weights = _used_weights(made, "fit_gaussians", "fit_motion")
+    weights = _used_weights(result, "fit_gaussians", "fit_motion")
     shape = "guessed by a model" if weights else "guessed without a model, from the outline of one picture"
     return f"{order.profile.capitalize()}: {drawn}{motion}; shape and the sides nobody saw were {shape}."
 
 
-def licenses(made: Made) -> dict[str, str]:
+def licenses(result: FlowResult) -> dict[str, str]:
     """The licenses that follow the asset, by what they are of; empty where no weights were used."""
-    return {name: terms for done in made.steps for name, terms in done.result.provenance.licenses.items()}
+    return {name: terms for done in result.steps for name, terms in done.result.provenance.licenses.items()}
 
 
-def notes(order: Order, made: Made) -> list[str]:
+def notes(order: Order, result: FlowResult) -> list[str]:
     """What the user should know, each sentence once."""
     own = []
     if order.picture_name:
         own.append(f"The subject is the first frame of {order.source_name}; {order.picture_name} only names the asset.")
-    records = [done.result.provenance for done in made.steps]
+    records = [done.result.provenance for done in result.steps]
     theirs = (note for record in records for note in (*record.notes, *record.run_notes))
     return list(dict.fromkeys([*own, *theirs]))
 
@@ -196,16 +209,16 @@ def curve(curves: dict[str, Any]) -> str:
     )
 
 
-def _results(made: Made) -> list[StepResult]:
-    return [done.result for done in made.steps]
+def _results(result: FlowResult) -> list[StepResult]:
+    return [done.result for done in result.steps]
 
 
-def _used_weights(made: Made, *steps: str) -> bool:
-    records = [done.result.provenance for done in made.steps]
+def _used_weights(result: FlowResult, *steps: str) -> bool:
+    records = [done.result.provenance for done in result.steps]
     return any(record.weights for record in records if record.step in steps)
 
 
-def _stage(done: Finished, store: ArtifactStore) -> dict[str, Any]:
+def _stage(done: StepRun, store: ArtifactStore) -> dict[str, Any]:
     record = done.result.provenance
     curves = [
         json.loads(store.path(ref).read_text(encoding="utf-8"))

@@ -3,18 +3,15 @@
 import hashlib
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
 
 from pydantic import ValidationError
 
 from dg4d_lib.errors import BadInput
 from flows.engine.leases import wait_for_collecting
 from flows.inputs.orders import Order
+from flows.packages.flow_result import FlowResult
 from steps.artifacts.store import ArtifactMissing, ArtifactStore
 from steps.contract import ArtifactRef, Digest, Frozen
-
-if TYPE_CHECKING:
-    from flows.engine.tasks import Made
 
 FOLDER = "versions"
 
@@ -77,7 +74,7 @@ class Version(Frozen):
         return found
 
 
-def keep_version(store: ArtifactStore, order: Order, made: "Made") -> Version:
+def keep_version(store: ArtifactStore, order: Order, result: FlowResult) -> Version:
     """Record that an order is finished; from now on nothing removes what it needs.
 
     Raises:
@@ -88,7 +85,7 @@ def keep_version(store: ArtifactStore, order: Order, made: "Made") -> Version:
     version = Version(
         item=order.item,
         order=order.digest(),
-        package=made.package,
+        package=result.package,
         finished=datetime.now(UTC).isoformat(timespec="seconds"),
         profile=order.profile,
         seed=order.seed,
@@ -101,7 +98,7 @@ def keep_version(store: ArtifactStore, order: Order, made: "Made") -> Version:
                 inputs=done.result.provenance.inputs,
                 outputs=done.result.provenance.outputs,
             )
-            for done in made.steps
+            for done in result.steps
         ),
     )
     store.write(version.name, version.model_dump_json(indent=1) + "\n")

@@ -1,20 +1,18 @@
-"""What the Prefect UI shows of a finished asset: a page with everything on it, two tables, and links to what it is."""
+"""Page of a finished asset in the Prefect UI: pictures, curves, gates, steps and links."""
 
 import json
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from prefect.artifacts import create_link_artifact, create_markdown_artifact, create_table_artifact
+from prefect.artifacts import create_markdown_artifact
 
 from flows.packages import acceptance
+from flows.packages.flow_result import StepRun
 from flows.ui import curves, pages
 from flows.ui.escaping import markdown
 from flows.ui.showing import show
 from steps.artifacts.store import ArtifactStore
 from steps.contract import ArtifactRef
-
-if TYPE_CHECKING:
-    from flows.engine.tasks import Finished
 
 PICTURES = {
     ("pack_asset", "sheet"): "Contact sheet",
@@ -28,8 +26,8 @@ PICTURES = {
 }
 
 
-def show_asset(item: str, finished: Sequence["Finished"], package: ArtifactRef, store: ArtifactStore) -> None:
-    """Make the page, the tables and the links of an asset; each is a new version under the same key as the last time.
+def show_asset(item: str, finished: Sequence[StepRun], package: ArtifactRef, store: ArtifactStore) -> None:
+    """Create the page of an asset, a new version under the same key as the last time.
 
     Args:
         item: name of the asset.
@@ -43,31 +41,9 @@ def show_asset(item: str, finished: Sequence["Finished"], package: ArtifactRef, 
         markdown=asset_page(item, finished, package, store),
         description=f"{markdown(item)}: everything on one page",
     )
-    show(
-        create_table_artifact,
-        key=pages.key("timings", item),
-        table=timings(finished),
-        description=f"Steps of {markdown(item)}",
-    )
-    verdict = acceptance.verdict_of((done.result for done in finished), store)
-    if verdict is not None:
-        show(
-            create_table_artifact,
-            key=pages.key("gates", item),
-            table=gate_rows(verdict),
-            description=f"Metrics of {markdown(item)} and their gates",
-        )
-    for label, address in addresses(item, package).items():
-        show(
-            create_link_artifact,
-            key=pages.key(label, item),
-            link=address,
-            link_text=f"{label} of {markdown(item)}",
-            description=f"The {label}",
-        )
 
 
-def asset_page(item: str, finished: Sequence["Finished"], package: ArtifactRef, store: ArtifactStore) -> str:
+def asset_page(item: str, finished: Sequence[StepRun], package: ArtifactRef, store: ArtifactStore) -> str:
     """Pictures, curves, gates, notes and steps of an asset as Markdown."""
     links = [f"[{label}]({address})" for label, address in addresses(item, package).items()]
     lines = [f"# {markdown(item)}", "", " · ".join([*links, f"`{package.digest}`"]), ""]
@@ -99,7 +75,7 @@ def addresses(item: str, package: ArtifactRef) -> dict[str, str]:
     }
 
 
-def timings(finished: Sequence["Finished"]) -> list[dict[str, str]]:
+def timings(finished: Sequence[StepRun]) -> list[dict[str, str]]:
     """A row per step: where its result came from, how long it took, and the digests that say what was done."""
     return [
         {
@@ -113,21 +89,6 @@ def timings(finished: Sequence["Finished"]) -> list[dict[str, str]]:
             "record": done.result.provenance.digest()[7:19],
         }
         for done in finished
-    ]
-
-
-def gate_rows(verdict: dict[str, Any]) -> list[dict[str, str]]:
-    """A row per gate: the metric, its bounds, and whether it lies within."""
-    return [
-        {
-            "gate": gate["name"],
-            "value": f"{gate['value']:.4g} {gate['unit']}".strip(),
-            "bounds": acceptance.bounds(gate),
-            "passed": "yes" if gate["passed"] else "no",
-            "of": gate["form"],
-            "meaning": gate["meaning"],
-        }
-        for gate in verdict["gates"]
     ]
 
 

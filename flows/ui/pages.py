@@ -16,7 +16,8 @@ from flows.packages import acceptance
 from flows.packages.publish import readable
 from flows.ui.escaping import markdown
 from steps.artifacts.store import ArtifactMissing, ArtifactStore
-from steps.contract import ArtifactRef, StepResult, StepSpec
+from steps.contract import ArtifactRef, StepResult
+from steps.main import catalog
 
 THUMBNAIL_SIZES = (960, 640, 320)  # pixels of the longer side
 WEBP_METHOD = 4  # libwebp's own; with OpenImageIO's, 6, alpha takes a hundred times as long
@@ -38,22 +39,8 @@ def address(name: str, ref: ArtifactRef, suffix: str, place: str = ARTIFACT_ADDR
     return f"{place}{ref.digest.removeprefix('sha256:')}/{ref.size_bytes}/{name}{suffix}"
 
 
-def output_rows(result: StepResult, spec: StepSpec) -> list[dict[str, str]]:
-    """A table of a step's outputs, each with the address of its file."""
-    return [
-        {
-            "output": name,
-            "kind": ref.media_type,
-            "size": readable(ref.size_bytes),
-            "digest": ref.digest[7:19],
-            "file": f"[{name}{spec.outputs[name].suffix}]({address(name, ref, spec.outputs[name].suffix)})",
-        }
-        for name, ref in result.outputs.items()
-    ]
-
-
 def step_page(label: str, item: str, result: StepResult, store: ArtifactStore) -> str:
-    """Picture, notes, curves and facts of one finished step."""
+    """Return the page of a finished step: pictures, notes, curves, facts, and links to its files."""
     record = result.provenance
     lines = [f"# {label}: {markdown(item)}", ""]
     lines += [f"{image}\n" for image in pictures_of(result.outputs, store)]
@@ -73,9 +60,11 @@ def step_page(label: str, item: str, result: StepResult, store: ArtifactStore) -
         "record": f"`{record.digest()[:19]}`",
     }
     lines += ["| fact | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items()), ""]
-    lines += ["| output | kind | size |", "|---|---|---|"]
+    lines += ["| output | kind | size | digest |", "|---|---|---|---|"]
+    suffixes = {name: port.suffix for name, port in catalog()[record.step].outputs.items()}
     lines += [
-        f"| {name} `{ref.digest[7:19]}` | {ref.media_type} | {readable(ref.size_bytes)} |"
+        f"| [{name}{suffixes[name]}]({address(name, ref, suffixes[name])}) | {ref.media_type} "
+        f"| {readable(ref.size_bytes)} | `{ref.digest[7:19]}` |"
         for name, ref in result.outputs.items()
     ]
     return "\n".join(lines) + "\n"

@@ -20,6 +20,7 @@ UNFIT_ERRNOS = {errno.EINVAL, errno.ENAMETOOLONG, errno.EEXIST, errno.ENOTDIR, e
 LONGEST_PART_BYTES = 255  # of a file's name, on all common file systems
 LONGEST_NAME_BYTES = 1024  # with folders; Linux takes paths of 4095, and those of our folders come before
 UNFIT = re.compile(r"[\\\x00-\x1f]|^[A-Za-z]:")  # backslashes, control characters, drives
+EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a zip can hold
 
 
 def stays_inside(name: str) -> bool:
@@ -90,3 +91,10 @@ def unpack(path: Path, folder: Path, what: str, wanted: Callable[[str], bool] = 
             raise
         raise BadInput(f"{what} is broken, or has a name that no file may have: {error.strerror or error}") from error
     return [entry.filename for entry in entries]
+
+
+def add_entry(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
+    """Add an entry without anything that depends on time or machine: equal entries give equal bytes."""
+    info = zipfile.ZipInfo(name, EPOCH)
+    info.external_attr = 0o644 << 16
+    archive.writestr(info, content)

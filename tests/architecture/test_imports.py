@@ -72,7 +72,7 @@ def test_a_heavy_import_would_be_noticed() -> None:
 
 
 def test_flows_import_prefect_and_no_tensors() -> None:
-    modules = imported_by("flows.image_to_4d")
+    modules = imported_by("flows.pipeline")
     assert "prefect" in modules
     assert not modules & {"torch", "numpy", "diffusers", "gsplat", "numba"}
 

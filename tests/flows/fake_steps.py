@@ -8,6 +8,7 @@ Every run of a step is noted in the file $FAKE_LOG.
 import json
 import logging
 import os
+import re
 import resource
 import signal
 import time
@@ -16,7 +17,7 @@ import zlib
 from pathlib import Path
 
 from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
-from flows.engine.merging import add
+from steps.artifacts.archives import add_entry
 from steps.catalog import STEPS as REAL
 from steps.runtime.job import Facts, Job
 
@@ -67,7 +68,8 @@ def prepare_subject(job: Job) -> Facts:
 def drive_video(job: Job) -> Facts:
     words = _begin("drive_video", job, job.inputs["subject"].read_bytes()[len(PNG) :])
     with zipfile.ZipFile(job.outputs["driving_video"], "w") as archive:
-        for i in range(5):
+        frames = re.search(rb"drive_video=frames:(\d+)", words)
+        for i in range(int(frames[1]) if frames else 5):
             archive.writestr(zipfile.ZipInfo(f"{i:03d}.png"), words)
     job.outputs["picture"].write_bytes(PNG)
     driving = job.settings.driving
@@ -105,7 +107,7 @@ def extract_mesh(job: Job) -> Facts:
     if settings.mesh.mode == "per_frame":
         with zipfile.ZipFile(job.outputs["meshes"], "w") as archive:
             for i in range(settings.first_frame, settings.end_frame):
-                add(archive, f"{i:03d}.safetensors", f"frame {i}".encode())
+                add_entry(archive, f"{i:03d}.safetensors", f"frame {i}".encode())
     elif settings.mesh.mode == "tracked" or b"flutters" not in words:
         job.outputs["tracked"].write_bytes(words)
     job.outputs["picture"].write_bytes(PNG)

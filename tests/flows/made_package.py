@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.engine.tasks import Finished, Made
 from flows.inputs.orders import Order
 from flows.packages.credentials import configured
+from flows.packages.flow_result import FlowResult, StepRun
 from flows.packages.publish import publish
 from flows.packages.report import complete
 from steps.artifacts.store import ArtifactStore
@@ -38,7 +38,7 @@ def made_package(folder: Path, *, weights: dict[str, str] | None = None, item: s
     source = store.put_bytes(SOURCE, "application/octet-stream")
     package = store.put_bytes(_zip(), "application/vnd.dg4d.package+zip")
     order = Order(item=item, source=source, profile="preview", settings=PREVIEW, seed=3, source_name="fox.png")
-    made = Made(package=package, steps=_steps(source, package, store, weights or {}), flow_run="run")
+    made = FlowResult(package=package, steps=_steps(source, package, store, weights or {}), flow_run="run")
     signer = configured()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DG4D_CODE_VERSION", "test")  # quicker than reading the source
@@ -76,7 +76,7 @@ def _zip() -> bytes:
     return content.getvalue()
 
 
-def _steps(source: ArtifactRef, package: ArtifactRef, store: ArtifactStore, weights: dict[str, str]) -> list[Finished]:
+def _steps(source: ArtifactRef, package: ArtifactRef, store: ArtifactStore, weights: dict[str, str]) -> list[StepRun]:
     finished, given = [], source
     for number, step in enumerate(STEPS):
         out = package if step == "pack_asset" else store.put_bytes(f"out of {step}".encode(), "image/png")
@@ -98,7 +98,7 @@ def _steps(source: ArtifactRef, package: ArtifactRef, store: ArtifactStore, weig
             machine=MACHINE,
         )
         finished.append(
-            Finished(label=step, cached=False, wall_s=1.3, result=StepResult(outputs={"out": out}, provenance=record))
+            StepRun(label=step, cached=False, wall_s=1.3, result=StepResult(outputs={"out": out}, provenance=record))
         )
         given = out
     return finished

@@ -10,10 +10,10 @@ from fake_steps import picture
 from prefect.client.orchestration import get_client
 from prefect.logging.handlers import APILogHandler
 from signing import identity
+from waiting import retry_after
 
 from flows import home
 from flows.commands.make import make
-from flows.engine import tasks
 from flows.engine.executors import StepCrashed
 from flows.inputs.orders import Wish
 from flows.serving.auth import basic
@@ -32,7 +32,7 @@ def place(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
     monkeypatch.setenv("DG4D_CODE_VERSION", "secrets")
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
     monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
-    monkeypatch.setattr(tasks, "RETRY_DELAY_S", 0.01)
+    retry_after(0.01, monkeypatch)
     for name in SECRETS:
         monkeypatch.setenv(name, MARKER)
     with identity(tmp_path / MARKER).configured():

@@ -7,6 +7,12 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
+import pytest
+from prefect import Task
+
+from flows import tasks
+from flows.engine.step_tasks import RETRIES
+
 Found = TypeVar("Found")
 
 EVERY_S = 0.1
@@ -22,6 +28,13 @@ def start(*arguments: str) -> "subprocess.Popen[str]":
         text=True,
         env={**os.environ, "DG4D_EXECUTOR": "subprocess"},
     )
+
+
+def retry_after(seconds: float, patch: pytest.MonkeyPatch) -> None:
+    """Retry the tasks of steps after so many seconds."""
+    for task in vars(tasks).values():
+        if isinstance(task, Task):
+            patch.setattr(task, "retry_delay_seconds", [seconds] * RETRIES)
 
 
 def wait_until(happens: Callable[[], Found]) -> Found:

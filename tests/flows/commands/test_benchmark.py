@@ -12,11 +12,11 @@ from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import ArtifactFilter, ArtifactFilterKey
 from rich.console import Console
 from typer.testing import CliRunner
+from waiting import retry_after
 
 from dg4d_lib.errors import BadInput
 from flows import cli
 from flows.commands.benchmark import bench, put_truth, score
-from flows.engine import tasks
 from flows.engine.executors import StepError, StepMissing
 from flows.packages.scores import Results
 from flows.serving.server import Server
@@ -33,7 +33,7 @@ def place(server: Server, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
         patch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
         patch.setenv("DG4D_CODE_VERSION", "test")
         patch.setenv("DG4D_EXECUTOR", "in_process")
-        patch.setattr(tasks, "RETRY_DELAY_S", 0.01)
+        retry_after(0.01, patch)
         patch.setattr("flows.commands.make.connect", lambda: None)  # this process is connected already
         yield
 

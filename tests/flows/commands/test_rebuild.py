@@ -11,12 +11,12 @@ import pytest
 from fake_steps import picture
 from made_package import SOURCE, made_package, record_in
 from PIL import Image
+from waiting import retry_after
 
 from dg4d_lib.errors import BadInput
 from flows import home
 from flows.commands.make import make
 from flows.commands.rebuild import Rebuilt, rebuild
-from flows.engine import tasks
 from flows.inputs.orders import Order, Wish, order_again
 from flows.packages.publish import record_of
 from flows.packages.verify import verify
@@ -55,7 +55,7 @@ def fakes(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     monkeypatch.setenv("DG4D_CODE_VERSION", "test")
     monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
     monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
-    monkeypatch.setattr(tasks, "RETRY_DELAY_S", 0.01)
+    retry_after(0.01, monkeypatch)
     return tmp_path / "ran"
 
 
@@ -104,14 +104,16 @@ def test_every_step_runs_again_and_gives_the_same(fakes: Path, tmp_path: Path) -
     assert verify(tmp_path / "again").exit_code == 0
 
 
-def test_words_and_meshes_per_frame_are_rebuilt_too(fakes: Path, tmp_path: Path) -> None:
-    settings = revise(
-        PREVIEW, {"text.weights": "somebody/pictures", "mesh.mode": "per_frame", "mesh.frames_per_task": 2}
-    )
+def test_words_and_meshes_per_frame_are_rebuilt_too(
+    fakes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = revise(PREVIEW, {"text.weights": "somebody/pictures", "mesh.mode": "per_frame"})
+    monkeypatch.setenv("DG4D_CPUS", "3")
     make(Wish(item="words", text="a red  fox", settings=settings).order(home.store()), tmp_path / "out")
     record = record_of(tmp_path / "out")
     assert record is not None
     assert record["recipe"]["text"] == "a red fox"
+    monkeypatch.setenv("DG4D_CPUS", "1")  # another machine, which divides the frames as the first one did
     found = outcomes(rebuild(tmp_path / "out", record, order_again(record, ArtifactStore(home.store().root))))
     assert set(found.values()) == {"identical"}
     assert {"draw_picture", "extract_mesh 1/3", "extract_mesh 3/3"} <= set(found)

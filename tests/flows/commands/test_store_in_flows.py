@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from fake_steps import picture
 from tiny_s3 import BUCKET, TinyS3
+from waiting import retry_after
 
 from flows import home
 from flows.commands.make import make
-from flows.engine import tasks
 from flows.engine.collecting import collect
 from flows.engine.executors import StepLost, StepUnreachable
 from flows.inputs.orders import Order, Wish
@@ -34,7 +34,7 @@ def log(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
     monkeypatch.setenv("DG4D_CODE_VERSION", "test")
     monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
     monkeypatch.setenv("DG4D_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr(tasks, "RETRY_DELAY_S", 0.01)
+    retry_after(0.01, monkeypatch)
     return tmp_path / "ran"
 
 
@@ -208,7 +208,7 @@ def test_a_step_that_lost_patience_with_the_bucket_is_tried_again(
     bucket: TinyS3, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("steps.artifacts.opening.PATIENCE_S", 0.1)
-    monkeypatch.setattr(tasks, "RETRY_DELAY_S", 3.0)
+    retry_after(3.0, monkeypatch)
     wanted = order("patience fit_motion=sleep-once:0.3", tmp_path)
     absence = threading.Thread(target=_absent, args=(bucket, log, "fit_motion", 2.0))
     absence.start()

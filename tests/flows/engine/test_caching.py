@@ -1,16 +1,18 @@
-import json
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from records import result_with, write_record
 
 from flows.engine.caching import FileLocks, RequestPolicy, record_key, recorded
 from steps.artifacts.store import ArtifactStore
-from steps.contract import ArtifactRef, ProvenanceRecord, StepRequest, StepResult
+from steps.contract import ArtifactRef, StepRequest, StepResult
 
 
 def request(**changes: Any) -> StepRequest:
@@ -20,31 +22,21 @@ def request(**changes: Any) -> StepRequest:
 
 
 def key(policy: RequestPolicy, wanted: StepRequest) -> str | None:
-    context: Any = None
-    return policy.compute_key(context, {"request": wanted, "item": "x", "label": "y"}, {})
+    context: Any = SimpleNamespace(task=SimpleNamespace(name="s"))
+    return policy.compute_key(context, {"request": wanted}, {})
+
+
+def given(_step: str, arguments: Mapping[str, Any]) -> StepRequest:
+    wanted: StepRequest = arguments["request"]
+    return wanted
 
 
 def result(store: ArtifactStore) -> StepResult:
-    ref = store.put_bytes(b"content", "a/b")
-    facts: dict[str, Any] = {"inputs": {}, "settings": {}, "seed": 0, "backend": "cpu", "duration_s": 0}
-    record = ProvenanceRecord(
-        step="s",
-        code_version="1",
-        request_digest=request().digest(),
-        outputs={"o": ref.digest},
-        peak_memory_mb=0,
-        **facts,
-    )
-    return StepResult(outputs={"o": ref}, provenance=record)
-
-
-def write_record(path: Path, value: StepResult) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"metadata": {}, "result": json.dumps(value.model_dump(mode="json"))}))
+    return result_with(store.put_bytes(b"content", "a/b"), request().digest())
 
 
 def test_the_key_follows_everything_a_step_depends_on_and_nothing_else() -> None:
-    policy = RequestPolicy()
+    policy = RequestPolicy(request_for=given)
     other = ArtifactRef(digest="sha256:" + "2" * 64, media_type="a/b", size_bytes=1)
     different = [
         request(step="t"),
@@ -62,9 +54,12 @@ def test_the_key_follows_everything_a_step_depends_on_and_nothing_else() -> None
 
 
 @pytest.mark.parametrize("damage", ["gone", "truncated", "torn", "foreign"])
-def test_a_broken_record_is_dropped_and_a_whole_one_stays(tmp_path: Path, damage: str) -> None:
+def test_a_broken_record_is_dropped_and_a_whole_one_stays(
+    tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path))
     store = ArtifactStore(tmp_path / "store")
-    policy = RequestPolicy(records=tmp_path / "results", store=store.root)
+    policy = RequestPolicy(request_for=given)
     record = tmp_path / "results" / record_key(request())
     value = result(store)
     write_record(record, value)
@@ -84,11 +79,13 @@ def test_a_broken_record_is_dropped_and_a_whole_one_stays(tmp_path: Path, damage
     assert not record.exists()
 
 
-def test_a_record_that_somebody_is_writing_is_left_alone(tmp_path: Path) -> None:
-    theirs, ours = FileLocks(tmp_path / "locks"), FileLocks(tmp_path / "locks")
-    policy = RequestPolicy(records=tmp_path, store=tmp_path / "store")
+def test_a_record_that_somebody_is_writing_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path))
+    theirs, ours = FileLocks(lambda: tmp_path / "locks"), FileLocks(lambda: tmp_path / "locks")
+    policy = RequestPolicy(request_for=given)
     policy.lock_manager = ours
-    record = tmp_path / record_key(request())
+    record = tmp_path / "results" / record_key(request())
+    record.parent.mkdir()
     record.write_text("half a rec")
     assert theirs.try_lock(record.name, "writer")
     key(policy, request())
@@ -99,7 +96,7 @@ def test_a_record_that_somebody_is_writing_is_left_alone(tmp_path: Path) -> None
 
 
 def test_a_lock_has_one_holder_at_a_time(tmp_path: Path) -> None:
-    one, two = FileLocks(tmp_path), FileLocks(tmp_path)
+    one, two = FileLocks(lambda: tmp_path), FileLocks(lambda: tmp_path)
     assert one.acquire_lock("k", "a")
     assert one.acquire_lock("k", "a")  # again is fine
     assert not one.acquire_lock("k", "b", acquire_timeout=0)
@@ -117,7 +114,7 @@ def test_a_lock_has_one_holder_at_a_time(tmp_path: Path) -> None:
 
 
 def test_threads_take_turns(tmp_path: Path) -> None:
-    locks = FileLocks(tmp_path)
+    locks = FileLocks(lambda: tmp_path)
     inside: list[int] = []
 
     def work(number: int) -> None:
@@ -139,12 +136,12 @@ def test_threads_take_turns(tmp_path: Path) -> None:
 def test_a_killed_holder_leaves_no_lock(tmp_path: Path) -> None:
     program = (
         "import sys, time; from pathlib import Path; from flows.engine.caching import FileLocks\n"
-        "FileLocks(Path(sys.argv[1])).acquire_lock('k', 'a'); print('held', flush=True); time.sleep(60)"
+        "FileLocks(lambda: Path(sys.argv[1])).acquire_lock('k', 'a'); print('held', flush=True); time.sleep(60)"
     )
     holder = subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     assert holder.stdout is not None
     assert holder.stdout.readline() == "held\n"
-    locks = FileLocks(tmp_path)
+    locks = FileLocks(lambda: tmp_path)
     assert not locks.acquire_lock("k", "b", acquire_timeout=0)
     holder.kill()
     holder.wait()

@@ -17,16 +17,17 @@ from postgresql import server_on_postgresql
 from prefect.client.orchestration import get_client
 from prefect.settings import PREFECT_API_URL, temporary_settings
 from rich.console import Console
-from waiting import start, wait_until
+from waiting import retry_after, start, wait_until
 
 from dg4d_lib.errors import BadInput
 from flows import home
 from flows.commands.batch import batch
 from flows.commands.make import make
-from flows.engine import leases, tasks
+from flows.engine import leases
 from flows.engine.collecting import collect
 from flows.engine.executors import StepBadInput, StepOutOfMemory, StepTimedOut
 from flows.engine.orphans import settle_orphans
+from flows.engine.step_tasks import RETRIES
 from flows.inputs.orders import Order, Wish
 from flows.packages.publish import whole
 from flows.packages.versions import faults, versions
@@ -38,6 +39,7 @@ EVERY_STEP = [
     "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "extract_mesh", "refine_texture", "pack_asset",
     "check_asset",
 ]  # fmt: skip
+STAGES = [EVERY_STEP[:1], EVERY_STEP[1:3], *([step] for step in EVERY_STEP[3:])]  # of steps that run side by side
 RUN_FACTS = ("report.json", "report.html", "provenance.json", "ro-crate-metadata.json")  # these say when and how long
 DAY_S = 86400.0
 AWAY_S = 3.0  # a database that starts anew
@@ -53,7 +55,7 @@ def log(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
     monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
     monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
-    monkeypatch.setattr(tasks, "RETRY_DELAY_S", 0.01)
+    retry_after(0.01, monkeypatch)
     return tmp_path / "ran"
 
 
@@ -105,22 +107,25 @@ def test_a_command_killed_in_every_stage_ends_with_the_bytes_of_an_undisturbed_o
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settle_orphans()
+    monkeypatch.setenv("DG4D_CPUS", "2")
     words = " ".join(f"{step}=sleep-once:120" for step in EVERY_STEP)
     (tmp_path / "fake.png").write_text(picture(words))
-    for number, step in enumerate(EVERY_STEP):
+    before: list[str] = []
+    for stage in STAGES:
         command = start("make", str(tmp_path / "fake.png"), "-o", str(tmp_path / "out"))
-        wait_until((tmp_path / f"ran.{step}").exists)  # it sleeps there, and not the next time
+        wait_until(lambda stage=stage: all((tmp_path / f"ran.{step}").exists() for step in stage))  # they sleep there
         command.send_signal(signal.SIGKILL)
         command.communicate()
-        assert ran(log) == EVERY_STEP[max(0, number - 1) : number + 1], step
+        assert sorted(ran(log)) == sorted(before + stage)
         assert not (tmp_path / "out").exists()
+        before = stage
     assert settle_orphans() == 1  # every command settles the one before
     make(order(words, tmp_path), tmp_path / "out")
     assert ran(log) == EVERY_STEP[-1:]
     monkeypatch.delenv("DG4D_STORE")
     monkeypatch.setenv("DG4D_HOME", str(tmp_path / "fresh"))  # where nothing is done yet
     make(order(words, tmp_path), tmp_path / "other")
-    assert ran(log) == EVERY_STEP
+    assert sorted(ran(log)) == sorted(EVERY_STEP)
     assert content(tmp_path / "out") == content(tmp_path / "other")
 
 
@@ -157,7 +162,7 @@ def test_a_server_killed_during_a_run_is_started_again_and_the_run_goes_on(
     killer = during("fit_motion", log, kill)
     make(order("server fit_motion=sleep-once:2", tmp_path), tmp_path / "out")
     killer.join()
-    assert ran(log) == EVERY_STEP
+    assert sorted(ran(log)) == sorted(EVERY_STEP)
     assert server.address() == address and answers(address, timeout_s=10)
     with get_client(sync_client=True) as client:
         (newest,) = client.read_flow_runs(limit=1, sort="START_TIME_DESC")  # type: ignore[arg-type]
@@ -184,7 +189,7 @@ def test_a_database_that_is_locked_for_a_while_delays_a_run_and_no_more(
     make(order("locked prepare_subject=sleep-once:0.5", tmp_path), tmp_path / "out")
     holder.join()
     assert time.monotonic() - began > locked_s
-    assert ran(log) == EVERY_STEP
+    assert sorted(ran(log)) == sorted(EVERY_STEP)
     whole(tmp_path / "out")
 
 
@@ -231,7 +236,7 @@ def test_a_full_disk_is_a_clear_message_and_with_more_room_the_run_goes_on(
     assert list((disk / "store" / "incoming").glob("*")) == []
     assert _mount("-o", "remount,size=64m", disk) == 0
     make(wanted, tmp_path / "out")
-    assert ran(log) == EVERY_STEP[len(done) - 1 :]
+    assert {*done, *ran(log)} == set(EVERY_STEP)
     assert is_whole()
 
 
@@ -241,7 +246,7 @@ def test_a_step_whose_memory_is_limited_is_tried_again_and_then_says_so(
     monkeypatch.setenv("DG4D_EXECUTOR", "subprocess")
     with pytest.raises(StepOutOfMemory, match="memory ran out: end other programs, or choose smaller settings"):
         make(order("prepare_subject=hoard", tmp_path), tmp_path / "out")
-    assert ran(log) == EVERY_STEP[:1] * (1 + tasks.RETRIES)
+    assert ran(log) == EVERY_STEP[:1] * (1 + RETRIES)
 
 
 def test_a_step_that_hangs_is_killed_and_the_next_run_begins_with_it(
@@ -256,16 +261,16 @@ def test_a_step_that_hangs_is_killed_and_the_next_run_begins_with_it(
         with pytest.raises(StepTimedOut, match="no result after 8 s, so it was stopped"):
             make(wanted, tmp_path / "out")
     assert time.monotonic() - began < 200
-    assert ran(log) == EVERY_STEP[:2]  # the same again would hang again
+    assert ran(log).count("drive_video") == 1  # the same again would hang again
     monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
     make(wanted, tmp_path / "out")
-    assert ran(log) == EVERY_STEP[1:]
+    assert "prepare_subject" not in (again := ran(log)) and "drive_video" in again
 
 
 @pytest.mark.parametrize("skew_s", [-400 * DAY_S, 400 * DAY_S])
 def test_results_are_used_whatever_the_clock_said_when_they_were_made(log: Path, tmp_path: Path, skew_s: float) -> None:
     make(order("skew", tmp_path), tmp_path / "one")
-    assert ran(log) == EVERY_STEP
+    assert sorted(ran(log)) == sorted(EVERY_STEP)
     for folder in (home.store().root, home.records()):
         for path in folder.rglob("*"):
             os.utime(path, times=(time.time() + skew_s,) * 2)

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from flows.engine.tasks import Finished, Made
 from flows.inputs.orders import Order
 from flows.packages import report
+from flows.packages.flow_result import FlowResult, StepRun
 from flows.packages.summary import Row, Writer
 from flows.ui.curves import HEIGHT, WIDTH
 from steps.artifacts.store import ArtifactStore
@@ -34,7 +34,7 @@ def store(tmp_path: Path) -> ArtifactStore:
     return ArtifactStore(tmp_path / "store")
 
 
-def finished(step: str, store: ArtifactStore, seconds: float, **outputs: ArtifactRef) -> Finished:
+def finished(step: str, store: ArtifactStore, seconds: float, **outputs: ArtifactRef) -> StepRun:
     record = ProvenanceRecord(
         step=step,
         code_version="1",
@@ -51,7 +51,7 @@ def finished(step: str, store: ArtifactStore, seconds: float, **outputs: Artifac
         peak_memory_mb=seconds * 10,
     )
     result = StepResult(outputs=outputs, provenance=record)
-    return Finished(label=step, cached=seconds > 5, wall_s=seconds, result=result)
+    return StepRun(label=step, cached=seconds > 5, wall_s=seconds, result=result)
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def unpacked(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def made(store: ArtifactStore, seconds: float = 2.0) -> tuple[Order, Made]:
+def made(store: ArtifactStore, seconds: float = 2.0) -> tuple[Order, FlowResult]:
     source = store.put_bytes(b"s", "application/octet-stream")
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
@@ -72,7 +72,7 @@ def made(store: ArtifactStore, seconds: float = 2.0) -> tuple[Order, Made]:
         item="<fox>", source=source, moving=False, profile="preview", settings=PREVIEW, seed=0, source_name="fox.png"
     )
     steps = [finished("fit_gaussians", store, seconds, curves=curves), finished("pack_asset", store, seconds + 1)]
-    return order, Made(package=package, steps=steps, flow_run=f"run {seconds}")
+    return order, FlowResult(package=package, steps=steps, flow_run=f"run {seconds}")
 
 
 class Links(HTMLParser):
@@ -121,7 +121,7 @@ def test_the_banner_is_honest(store: ArtifactStore) -> None:
     assert "true views were known" in report.banner(oracle, what)
 
 
-def with_weights(step: Finished, licenses: dict[str, str]) -> Finished:
+def with_weights(step: StepRun, licenses: dict[str, str]) -> StepRun:
     record = step.result.provenance.model_copy(
         update={"weights": {f"{name}/unet": "sha256:" + "c" * 64 for name in licenses}, "licenses": licenses}
     )

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from obstore.store import MemoryStore
+from records import result_with, write_record
 from typer.testing import CliRunner
 
 from dg4d_lib.errors import BadInput
@@ -251,8 +252,7 @@ def test_results_whose_artifacts_are_gone_go_too(tmp_path: Path) -> None:
     gone = ArtifactRef(digest="sha256:" + "1" * 64, media_type="a/b", size_bytes=1)
     results.mkdir()
     for name, ref in {"whole": kept, "broken": gone, "young": gone}.items():
-        value = json.dumps({"outputs": {"o": ref.model_dump()}})
-        (results / name).write_text(json.dumps({"result": value}))
+        write_record(results / name, result_with(ref))
     (results / "torn").write_text('{"res')
     for name in ("whole", "broken", "torn"):
         os.utime(results / name, (0, 0))

@@ -1,0 +1,24 @@
+"""Frames of a driving video, and their division among tasks."""
+
+import math
+import zipfile
+
+from flows.engine.step_tasks import Part
+from steps.artifacts.store import ArtifactStore
+from steps.contract import ArtifactRef
+
+
+def frames_in(frames: ArtifactRef, store: ArtifactStore) -> int:
+    """Return the number of frames of a `frames` artifact."""
+    with zipfile.ZipFile(store.path(frames)) as archive:
+        return sum(name.endswith(".png") for name in archive.namelist())
+
+
+def divided(frames: int, tasks: int) -> list[Part]:
+    """Divide frames into parts whose sizes differ by at most one; no more parts than frames."""
+    count = max(1, min(frames, tasks))
+    ends = [math.ceil(frames * number / count) for number in range(count + 1)]
+    return [
+        Part(number=number + 1, of=count, first_frame=ends[number], end_frame=ends[number + 1])
+        for number in range(count)
+    ]

@@ -1,0 +1,70 @@
+"""Tasks at the end of a conversion: the package into the output folder, the version into the store."""
+
+from pathlib import Path
+
+from prefect import task
+from prefect.cache_policies import NO_CACHE
+from prefect.transactions import Transaction, get_transaction
+
+from flows import home
+from flows.inputs.orders import Order
+from flows.packages import versions
+from flows.packages.credentials import configured
+from flows.packages.flow_result import FlowResult
+from flows.packages.publish import Swap
+from flows.packages.report import deliver
+from steps.contract import StepResult
+
+SWAP = "swap"  # key of the swap in the transaction
+
+
+@task(name="publish", task_run_name="publish: {order.item}", cache_policy=NO_CACHE, persist_result=False)
+def publish(package: StepResult, verdict: StepResult, order: Order, result: FlowResult, folder: Path) -> None:
+    """Write the reports, sign the files if a key is configured, and put the package into the output folder.
+
+    In a transaction the package that was there comes back if a later task of the transaction fails.
+
+    Args:
+        package: result of `pack_asset`.
+        verdict: result of `check_asset`.
+        order: request of the conversion.
+        result: of the conversion.
+        folder: output folder.
+
+    Raises:
+        BadInput: the folder cannot be written, the disk is full, or the key cannot sign; the folder is as it was.
+        BackendUnavailable: a key is configured, and signing is not installed.
+    """
+    swap = deliver(order, result, folder, configured())
+    transaction = get_transaction()
+    if transaction is None:
+        swap.keep()
+    else:
+        transaction.set(SWAP, swap)
+
+
+@publish.on_rollback
+def restore(transaction: Transaction) -> None:
+    """Put the earlier package back."""
+    swap: Swap | None = transaction.get(SWAP, None)
+    if swap is not None:
+        swap.undo()
+
+
+@publish.on_commit
+def discard(transaction: Transaction) -> None:
+    """Remove the earlier package."""
+    swap: Swap | None = transaction.get(SWAP, None)
+    if swap is not None:
+        swap.keep()
+
+
+@task(name="keep_version", task_run_name="keep_version: {order.item}", cache_policy=NO_CACHE, persist_result=False)
+def keep_version(order: Order, result: FlowResult) -> None:
+    """Record the version in the store; `dg4d store gc` keeps its artifacts from now on.
+
+    Raises:
+        ArtifactMissing: an artifact was removed meanwhile; the same order again makes it again.
+        StoreUnreachable: the store does not answer.
+    """
+    versions.keep_version(home.store(), order, result)

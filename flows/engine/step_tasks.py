@@ -1,0 +1,288 @@
+"""Execution of a pipeline step inside a Prefect task: request, cache key, retries, progress and artifacts."""
+
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from typing import Any, Self, TypeVar
+from uuid import UUID
+
+import httpx
+from prefect import runtime
+from prefect.artifacts import create_markdown_artifact, create_progress_artifact, update_progress_artifact
+from prefect.client.schemas.objects import State, TaskRun
+from prefect.exceptions import TerminationSignal
+from prefect.logging import get_run_logger
+from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, PREFECT_LOCAL_STORAGE_PATH
+from prefect.tasks import Task, exponential_backoff
+from prefect.transactions import IsolationLevel
+from pydantic import Field
+
+from dg4d_lib.settings import Settings
+from flows import home
+from flows.engine import resources
+from flows.engine.caching import FileLocks, RequestPolicy
+from flows.engine.events import StepEvent, tell
+from flows.engine.executors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable, chosen, stop_all
+from flows.engine.leases import hold
+from flows.engine.remarks import remark
+from flows.packages.flow_result import StepRun
+from flows.ui import pages
+from flows.ui.curves import amount
+from flows.ui.escaping import markdown
+from flows.ui.showing import revive, show
+from steps.artifacts.store import StoreUnreachable
+from steps.contract import LARGEST_SEED, ArtifactRef, Frozen, StepRequest, StepResult
+from steps.main import catalog, request_version
+from steps.profiles import PipelineSettings, step_settings
+from steps.runtime.weights import identities, weights_in
+
+PROGRESS_EVERY_S = 3.0  # between two updates of a progress artifact
+RETRIES = 2
+RETRY_DELAY_S = 2.0  # doubled with each retry
+CPU, GPU = "resource:cpu", "resource:gpu"  # tags; Prefect keeps a thread and a client for every set of tags
+
+Result = TypeVar("Result", bound=StepResult)
+
+
+class Conversion(Frozen):
+    """Values that all steps of one conversion share.
+
+    Attributes:
+        item: name of the asset.
+        settings: of the whole pipeline; a step reads its sections.
+        seed: of every step.
+        begun_ns: start of the conversion, nanoseconds since the epoch; earlier conversions go first on a machine.
+        mesh_parts: number of tasks that extract a mesh per frame; 0: one per slot of this machine.
+    """
+
+    item: str
+    settings: PipelineSettings
+    seed: int = Field(0, ge=0, le=LARGEST_SEED)
+    begun_ns: int = Field(default_factory=time.time_ns)
+    mesh_parts: int = 0
+
+    def with_mesh_mode(self, mode: str) -> Self:
+        """Return the same conversion with another `mesh.mode`."""
+        mesh = self.settings.mesh.model_copy(update={"mode": mode})
+        return self.model_copy(update={"settings": self.settings.model_copy(update={"mesh": mesh})})
+
+
+class Part(Frozen):
+    """Frames that one task of a divided step works on: from `first_frame` up to, not including, `end_frame`."""
+
+    number: int
+    of: int
+    first_frame: int
+    end_frame: int
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.of}"
+
+
+def request_for(step: str, arguments: Mapping[str, Any]) -> StepRequest:
+    """Return the request of a step, made from the arguments of its task.
+
+    Artifacts go to the input ports of their name: an `ArtifactRef` by the name of the argument, the outputs of an
+    earlier step by their own names; the results in a list go to a port that takes many, numbered. A `Part` and
+    every other value become settings of the step, unless its whole settings are among the arguments.
+    """
+    spec = catalog()[step]
+    inputs: dict[str, ArtifactRef] = {}
+    values: dict[str, Any] = {}
+    settings: Settings | None = None
+    conversion: Conversion = arguments["conversion"]
+    for name, value in arguments.items():
+        match value:
+            case Conversion() | None:
+                pass
+            case ArtifactRef():
+                inputs[name] = value
+            case StepResult():
+                inputs |= {port: ref for port, ref in value.outputs.items() if spec.input_port(port)}
+            case [StepResult(), *_]:
+                inputs |= {
+                    f"{port}_{number:03d}": ref
+                    for number, result in enumerate(value)
+                    for port, ref in result.outputs.items()
+                    if port in spec.inputs
+                }
+            case Settings():
+                settings = value
+            case Part():
+                values |= {"first_frame": value.first_frame, "end_frame": value.end_frame}
+            case _:
+                values[name] = value
+    settings = settings or step_settings(step, conversion.settings, **values)
+    tree = settings.model_dump(mode="json")
+    return StepRequest(
+        step=step,
+        version=request_version(spec),
+        inputs=inputs,
+        settings=tree,
+        seed=conversion.seed,
+        weights=identities(weights_in(tree)),
+    )
+
+
+def run_step(step: str, result_type: type[Result], **arguments: Any) -> Result:
+    """Run a step in the current task run, and show its progress and its outputs in the Prefect UI.
+
+    Args:
+        step: name in the catalog, and of the task.
+        result_type: of the result.
+        arguments: of the task, by name; see `request_for`.
+
+    Raises:
+        StepError: the step did not finish.
+    """
+    request, conversion = request_for(step, arguments), arguments["conversion"]
+    item, label = conversion.item, label_of(step, arguments)
+    progress = _Progress(item, label)
+    tell(StepEvent(item, label, "started"))
+
+    def on_progress(done: int, total: int, values: dict[str, float]) -> None:
+        tell(StepEvent(item, label, "progress", done=done, total=total, values=values))
+        progress.update(done, total, values)
+
+    def say(text: str) -> None:
+        tell(StepEvent(item, label, "note", text=text))
+
+    try:
+        turn = resources.Turn(conversion.begun_ns, f"{label} of {item}")
+        with resources.slot(resources.resource_of(request), say, turn) as waited_s:
+            _waited[runtime.task_run.id] = waited_s
+            result = chosen()(catalog()[step], request, on_progress, say)
+    except StepError as error:
+        _show_page(item, label, pages.failure_page(label, item, error, home.store()), f"{label} of {item} failed")
+        raise
+    progress.update(1, 1, {})
+    for note in (*result.provenance.notes, *result.provenance.run_notes):
+        get_run_logger().info(note)
+    _show_page(item, label, pages.step_page(label, item, result, home.store()), f"{label} of {item}")
+    return result_type.model_validate(result.model_dump())
+
+
+def label_of(step: str, arguments: Mapping[str, Any]) -> str:
+    """Return the name of a step, with the part of its frames where they were divided: `extract_mesh 1/3`."""
+    part = arguments.get("part")
+    return f"{step} {part}" if part else step
+
+
+def task_run_name() -> str:
+    """Return the name of the current task run: `extract_mesh 1/3: fox`."""
+    arguments = runtime.task_run.parameters
+    return f"{label_of(runtime.task_run.task_name, arguments)}: {arguments['conversion'].item}"
+
+
+def should_retry(_task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
+    """Return whether a failed task run may succeed now: memory may be free, the store back; a crash gets one retry.
+
+    A run that the user stopped is not retried.
+    """
+    error = state.result(raise_on_failure=False)
+    if resources.stopping.is_set():
+        return False
+    if isinstance(error, StepOutOfMemory | StepUnreachable | StoreUnreachable):
+        return True
+    return isinstance(error, StepCrashed | OSError) and run.run_count <= 1
+
+
+def note_end(task: Task[..., Any], run: TaskRun, state: State[Any]) -> None:
+    """Record the end of a task run, computed, cached or failed, and tell the listeners of this process."""
+    label, _, item = run.name.partition(": ")
+    seconds = (datetime.now(UTC) - run.start_time).total_seconds() if run.start_time else 0.0
+    waited_s = _waited.pop(str(run.id), 0.0)
+    if not state.is_completed():
+        tell(StepEvent(item, label, "failed", seconds=seconds))
+        return
+    result = state.result(raise_on_failure=False)
+    assert isinstance(result, StepResult) and run.flow_run_id  # tasks of steps return one, and run in flows
+    cached = state.name == "Cached"
+    if cached:
+        hold(home.store(), item, (ref.digest for ref in result.outputs.values()))
+    _finished[run.flow_run_id].append(
+        StepRun(label=label, cached=cached, wall_s=round(seconds, 3), waited_s=round(waited_s, 3), result=result)
+    )
+    remark(item, label, result)
+    tell(StepEvent(item, label, "finished", seconds=seconds, waited_s=waited_s, cached=cached))
+
+
+def finished_steps() -> list[StepRun]:
+    """Return the step runs of the current flow run so far, in the order of the catalog, parts by their numbers."""
+    order = {name: position for position, name in enumerate(catalog())}
+
+    def position(done: StepRun) -> tuple[int, int]:
+        step, _, part = done.label.partition(" ")
+        return order[step], int(part.partition("/")[0] or 0)
+
+    return sorted(_finished[UUID(runtime.flow_run.id)], key=position)
+
+
+@contextmanager
+def steps_of_flow() -> Iterator[None]:
+    """End the steps of the current flow run with it: at once if the user stops it."""
+    flow_run = UUID(runtime.flow_run.id)
+    try:
+        yield
+    except (KeyboardInterrupt, TerminationSignal):
+        stop_all()  # steps in other threads would be waited for
+        raise
+    finally:
+        _finished.pop(flow_run, None)
+
+
+def flow_settings() -> dict[Any, Any]:
+    """Return the settings of Prefect under which flows run: records of results under `$DG4D_HOME`, no heartbeat.
+
+    With a heartbeat every flow run waits a second at its end.
+    """
+    home.records().mkdir(parents=True, exist_ok=True)
+    return {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None, PREFECT_LOCAL_STORAGE_PATH: home.records()}
+
+
+_waited: dict[str, float] = {}  # seconds a task run waited for its turn, by its id
+_finished: defaultdict[UUID, list[StepRun]] = defaultdict(list)  # by flow run
+
+CACHED: dict[str, Any] = {
+    "task_run_name": task_run_name,
+    "cache_policy": RequestPolicy(request_for=request_for).configure(
+        isolation_level=IsolationLevel.SERIALIZABLE, lock_manager=FileLocks(home.locks)
+    ),
+    "persist_result": True,
+    "result_serializer": "json",
+    "retries": RETRIES,
+    "retry_delay_seconds": exponential_backoff(RETRY_DELAY_S),
+    "retry_condition_fn": should_retry,
+    "on_completion": [note_end],
+    "on_failure": [note_end],
+}  # options of every task that runs a step
+
+
+def _show_page(item: str, label: str, page: str, description: str) -> None:
+    show(create_markdown_artifact, key=pages.key(label, item), markdown=page, description=markdown(description))
+
+
+class _Progress:
+    """Progress artifact of a step, updated every few seconds."""
+
+    def __init__(self, item: str, label: str) -> None:
+        self._key, self._what = f"progress-{pages.key(label, item)}", f"{label} of {markdown(item)}"
+        self._artifact: Any = None
+        self._last = 0.0
+
+    def update(self, done: int, total: int, values: dict[str, float]) -> None:
+        now = time.monotonic()
+        if now - self._last < PROGRESS_EVERY_S and done < total:
+            return
+        self._last = now
+        text = ", ".join(
+            [f"{self._what}: {done}/{total}", *(f"{name} {amount(value)}" for name, value in values.items())]
+        )
+        revive()
+        with suppress(httpx.TransportError):  # the step goes on while the server is away
+            if self._artifact is None:
+                self._artifact = create_progress_artifact(100 * done / max(total, 1), key=self._key, description=text)
+            else:
+                update_progress_artifact(self._artifact, 100 * done / max(total, 1), description=text)

@@ -1,0 +1,127 @@
+"""Flows that turn a picture, a video or words into an animated 3D asset."""
+
+import time
+from pathlib import Path
+
+from prefect import flow, runtime, unmapped
+from prefect.transactions import transaction
+
+from flows import home
+from flows.engine import resources
+from flows.engine.executors import StepBadInput
+from flows.engine.frames import divided, frames_in
+from flows.engine.publishing import keep_version, publish
+from flows.engine.step_tasks import Conversion, finished_steps, steps_of_flow
+from flows.inputs.orders import Order
+from flows.packages.flow_result import FlowResult, notes_of
+from flows.tasks import (
+    DrivingVideo,
+    Gaussians,
+    Mesh,
+    Motion,
+    Subject,
+    check_asset,
+    draw_picture,
+    drive_video,
+    extract_mesh,
+    fit_gaussians,
+    fit_motion,
+    join_meshes,
+    pack_asset,
+    prepare_subject,
+    refine_texture,
+)
+from flows.ui.asset_page import show_asset
+
+
+@flow(name="image_to_4d", flow_run_name="{order.item}", persist_result=False)
+def image_to_4d(order: Order, folder: Path | None = None, mesh_parts: int = 0) -> FlowResult:
+    """Turn a picture into an animated 3D asset; a video keeps its motion.
+
+    Args:
+        order: source, settings and name of the asset.
+        folder: output folder of the package; None: the package stays in the store.
+        mesh_parts: number of tasks that extract a mesh per frame; 0: one per slot of this machine.
+
+    Raises:
+        StepError: a step did not finish.
+    """
+    with steps_of_flow():
+        conversion = conversion_of(order, mesh_parts)
+        subject = prepare_subject(order.source, conversion)
+        return animate(subject, order, conversion, folder)
+
+
+@flow(name="video_to_4d", flow_run_name="{order.item}", persist_result=False)
+def video_to_4d(order: Order, folder: Path | None = None, mesh_parts: int = 0) -> FlowResult:
+    """Turn a video into an animated 3D asset that moves as the video does.
+
+    Raises:
+        StepError: a step did not finish.
+    """
+    with steps_of_flow():
+        conversion = conversion_of(order, mesh_parts)
+        subject = prepare_subject(order.source, conversion)
+        if subject.footage is None:
+            raise StepBadInput(
+                "prepare_subject", "this is a single picture, not a video: a video has two frames or more"
+            )
+        return animate(subject, order, conversion, folder)
+
+
+@flow(name="text_to_4d", flow_run_name="{order.item}", persist_result=False)
+def text_to_4d(order: Order, folder: Path | None = None, mesh_parts: int = 0) -> FlowResult:
+    """Draw a picture from words and turn it into an animated 3D asset.
+
+    Raises:
+        StepError: a step did not finish.
+    """
+    with steps_of_flow():
+        conversion = conversion_of(order, mesh_parts)
+        picture = draw_picture(order.source, conversion)
+        subject = prepare_subject(picture.picture, conversion)
+        return animate(subject, order, conversion, folder)
+
+
+def conversion_of(order: Order, mesh_parts: int = 0) -> Conversion:
+    """Return the values that all steps of an order share."""
+    return Conversion(item=order.item, settings=order.settings, seed=order.seed, mesh_parts=mesh_parts)
+
+
+def animate(subject: Subject, order: Order, conversion: Conversion, folder: Path | None) -> FlowResult:
+    """Turn a subject into a package: driving video, static Gaussians, motion, mesh, texture, files, verdict."""
+    filming = drive_video.submit(subject, conversion)
+    gaussians = fit_gaussians(subject, conversion, order.bank)  # in this thread, beside the driving video
+    driving_video = filming.result()
+    motion = fit_motion(gaussians, driving_video, conversion, order.bank)
+    mesh = mesh_over_time(gaussians, motion, driving_video, conversion)
+    mesh = refine_texture(mesh, driving_video, conversion)
+    notes = notes_of(done.result for done in finished_steps())
+    package = pack_asset(subject, driving_video, gaussians, motion, mesh, notes, conversion)
+    verdict = check_asset(package, driving_video, subject, conversion)
+    result = FlowResult(
+        package=package.package,
+        steps=finished_steps(),
+        flow_run=str(runtime.flow_run.id),
+        wall_s=round((time.time_ns() - conversion.begun_ns) / 1e9, 3),
+    )
+    show_asset(order.item, result.steps, result.package, home.store())
+    if folder is not None:
+        with transaction():  # folder and version change together, or neither does
+            publish(package, verdict, order, result, folder)
+            keep_version(order, result)
+    return result
+
+
+def mesh_over_time(gaussians: Gaussians, motion: Motion, driving_video: DrivingVideo, conversion: Conversion) -> Mesh:
+    """Extract one mesh that follows the motion, or else a mesh per frame, its frames divided among the slots."""
+    mode = conversion.settings.mesh.mode
+    if mode != "per_frame":
+        mesh = extract_mesh(gaussians, motion, conversion)
+        if mesh.tracked is not None:
+            return mesh
+        conversion = conversion.with_mesh_mode("per_frame")
+    frames = frames_in(driving_video.frames, home.store())
+    parts = divided(frames, conversion.mesh_parts or resources.cpus())
+    meshes = extract_mesh.map(unmapped(gaussians), unmapped(motion), unmapped(conversion), parts).result()
+    return meshes[0] if len(meshes) == 1 else join_meshes(meshes, conversion)

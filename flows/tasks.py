@@ -1,0 +1,160 @@
+"""Tasks of the pipeline, one per step: typed, cached by the digest of their request, retried where that may help."""
+
+from prefect import task
+
+from flows.engine.step_tasks import CACHED, CPU, GPU, Conversion, Part, run_step
+from steps.contract import ArtifactRef, StepResult
+from steps.profiles import ScoreAssetSettings
+
+
+class Picture(StepResult):
+    """Picture that a model drew from words."""
+
+    @property
+    def picture(self) -> ArtifactRef:
+        """PNG."""
+        return self.outputs["picture"]
+
+
+class Subject(StepResult):
+    """Cut-out of the subject, and its footage where the source is a video."""
+
+    @property
+    def footage(self) -> ArtifactRef | None:
+        """Frames of the video, cut out."""
+        return self.outputs.get("footage")
+
+
+class DrivingVideo(StepResult):
+    """Driving video; with its contact sheet, ranking and films where it was chosen among candidates."""
+
+    @property
+    def frames(self) -> ArtifactRef:
+        """Frames with alpha, and their rate."""
+        return self.outputs["driving_video"]
+
+
+class Gaussians(StepResult):
+    """Static 3D Gaussians."""
+
+
+class Motion(StepResult):
+    """Deformation over time; with the Gaussians where they were fine-tuned together with it."""
+
+
+class Mesh(StepResult):
+    """Either one tracked mesh or a mesh per frame."""
+
+    @property
+    def tracked(self) -> ArtifactRef | None:
+        """One topology with offsets per frame; None if one mesh cannot follow the motion."""
+        return self.outputs.get("tracked")
+
+
+class Package(StepResult):
+    """Packaged 4D asset."""
+
+    @property
+    def package(self) -> ArtifactRef:
+        """Zip of all files."""
+        return self.outputs["package"]
+
+
+class Verdict(StepResult):
+    """Verdict of the quality gates."""
+
+
+class Scores(StepResult):
+    """Metrics of an asset against the ground truth."""
+
+
+@task(**CACHED, tags=[GPU])
+def draw_picture(text: ArtifactRef, conversion: Conversion) -> Picture:
+    """Draw a picture from words."""
+    return run_step("draw_picture", Picture, text=text, conversion=conversion)
+
+
+@task(**CACHED, tags=[CPU])
+def prepare_subject(source: ArtifactRef, conversion: Conversion) -> Subject:
+    """Read a picture or video, cut the subject out and center it."""
+    return run_step("prepare_subject", Subject, source=source, conversion=conversion)
+
+
+@task(**CACHED, tags=[GPU])
+def drive_video(subject: Subject, conversion: Conversion) -> DrivingVideo:
+    """Take the footage of the subject, or generate a video of it in motion."""
+    return run_step("drive_video", DrivingVideo, subject=subject, conversion=conversion)
+
+
+@task(**CACHED, tags=[GPU])
+def fit_gaussians(subject: Subject, conversion: Conversion, bank: ArtifactRef | None = None) -> Gaussians:
+    """Fit static 3D Gaussians to the picture (DreamGaussianHD)."""
+    return run_step("fit_gaussians", Gaussians, subject=subject, bank=bank, conversion=conversion)
+
+
+@task(**CACHED, tags=[GPU])
+def fit_motion(
+    gaussians: Gaussians, driving_video: DrivingVideo, conversion: Conversion, bank: ArtifactRef | None = None
+) -> Motion:
+    """Fit a HexPlane deformation to the driving video (paper, "Gaussian Deformation for Dynamic Generation")."""
+    return run_step(
+        "fit_motion", Motion, gaussians=gaussians, driving_video=driving_video, bank=bank, conversion=conversion
+    )
+
+
+@task(**CACHED, tags=[CPU])
+def extract_mesh(gaussians: Gaussians, motion: Motion, conversion: Conversion, part: Part | None = None) -> Mesh:
+    """Extract one mesh that follows the motion, or a mesh per frame of a part of the frames."""
+    return run_step("extract_mesh", Mesh, gaussians=gaussians, motion=motion, part=part, conversion=conversion)
+
+
+@task(**CACHED, tags=[CPU])
+def join_meshes(parts: list[Mesh], conversion: Conversion) -> Mesh:
+    """Join the meshes of all parts."""
+    return run_step("join_meshes", Mesh, parts=parts, conversion=conversion)
+
+
+@task(**CACHED, tags=[GPU])
+def refine_texture(mesh: Mesh, driving_video: DrivingVideo, conversion: Conversion) -> Mesh:
+    """Refine the textures with a video-to-video diffusion model."""
+    return run_step("refine_texture", Mesh, mesh=mesh, driving_video=driving_video, conversion=conversion)
+
+
+@task(**CACHED, tags=[CPU])
+def pack_asset(
+    subject: Subject,
+    driving_video: DrivingVideo,
+    gaussians: Gaussians,
+    motion: Motion,
+    mesh: Mesh,
+    notes: tuple[str, ...],
+    conversion: Conversion,
+) -> Package:
+    """Write every delivery format into one package."""
+    return run_step(
+        "pack_asset",
+        Package,
+        subject=subject,
+        driving_video=driving_video,
+        gaussians=gaussians,
+        motion=motion,
+        mesh=mesh,
+        notes=notes,
+        conversion=conversion,
+    )
+
+
+@task(**CACHED, tags=[CPU])
+def check_asset(package: Package, driving_video: DrivingVideo, subject: Subject, conversion: Conversion) -> Verdict:
+    """Compare the package with the driving video and judge it by the quality gates."""
+    return run_step(
+        "check_asset", Verdict, package=package, driving_video=driving_video, subject=subject, conversion=conversion
+    )
+
+
+@task(**CACHED, tags=[GPU])
+def score_asset(
+    truth: ArtifactRef, settings: ScoreAssetSettings, conversion: Conversion, package: ArtifactRef | None = None
+) -> Scores:
+    """Score an asset, or the naive baselines, against the ground truth."""
+    return run_step("score_asset", Scores, truth=truth, package=package, settings=settings, conversion=conversion)
