@@ -2,9 +2,11 @@
 
 import json
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_steps import picture
@@ -15,10 +17,12 @@ from waiting import retry_after, start, wait_until
 from flows import cli, home
 from flows.catalog import convert_all
 from flows.commands.make import make, make_motions, save_pictures
+from flows.engine import executors
 from flows.engine.events import StepEvent, listening
 from flows.engine.executors import StepBadInput, StepCrashed, StepDiverged, StepError, StepMissing, StepOutOfMemory
 from flows.engine.orphans import settle_orphans
 from flows.inputs.orders import Order, Wish
+from flows.packages import publish
 from flows.packages.publish import whole
 from flows.packages.summary import NOT_ACCEPTED, Row, Tally
 from flows.serving.server import Server
@@ -492,3 +496,27 @@ def test_the_cut_out_can_be_looked_at_while_the_next_step_runs(command: str, log
     assert happened.index(("prepare_subject", "remark", True)) < happened.index(("drive_video", "started", True))
     for saved in home.cutouts().glob("fox-red-*.png"):
         saved.unlink()
+
+
+def test_a_picture_passes_few_modules_on_its_way_to_the_steps_and_into_the_folder(
+    log: Path, dg4d: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    passed: set[str] = set()
+
+    def noting(work: Callable[..., Any]) -> Callable[..., Any]:
+        def noted(*arguments: Any, **options: Any) -> Any:
+            frame = sys._getframe()
+            while frame := frame.f_back:  # type: ignore[assignment]
+                passed.add(frame.f_globals["__name__"])
+            return work(*arguments, **options)
+
+        return noted
+
+    monkeypatch.setitem(executors.EXECUTORS, "in_process", noting(executors.in_process))
+    monkeypatch.setattr("flows.packages.publish._swap", noting(publish._swap))
+    monkeypatch.setattr("flows.packages.versions.wait_for_collecting", noting(lambda _: False))
+    (tmp_path / "x.png").write_text(picture("walk"))
+    assert dg4d("make", "x.png").exit_code == 0
+    ours = {module for module in passed if module.startswith("flows.")}
+    assert {"flows.cli", "flows.pipeline", "flows.tasks", "flows.packages.publish"} <= ours
+    assert len(ours) <= 15, sorted(ours)
