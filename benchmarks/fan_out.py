@@ -60,7 +60,7 @@ def main() -> None:
 def extracted(picture: Path, slots: int, frames: int) -> tuple[int, float]:
     """Convert a picture; return the number of parts of `extract_mesh` and the seconds they took together."""
     with tempfile.TemporaryDirectory(prefix="dg4d-fan-out-", ignore_cleanup_errors=True) as folder:
-        environment = {**os.environ, "DG4D_HOME": f"{folder}/home", "DG4D_CPUS": str(slots)}
+        environment = {**os.environ, "DG4D_HOME": f"{folder}/dg4d", "DG4D_CPUS": str(slots)}
         command = [sys.executable, "-m", "flows.cli"]
         knobs = [word for knob in (*SHORT, f"driving.frames={frames}") for word in ("--set", knob)]
         try:

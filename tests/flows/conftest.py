@@ -1,12 +1,16 @@
 """One Prefect server for all tests of a process: starting one takes seconds, and clients remember where it was."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+from conversions import Run
 from prefect.logging.handlers import APILogHandler
 from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
+from typer.testing import CliRunner
+from waiting import retry_after
 
-from flows import home
+from flows import cli, home
 from flows.engine import resources
 from flows.serving.server import Server
 
@@ -34,3 +38,31 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
         APILogHandler().flush()  # what is not sent yet would be tried again for a minute
     running.release()
     running.stop()
+
+
+@pytest.fixture(scope="module")
+def place(server: Server) -> Iterator[None]:
+    """Fake steps under the home folder of the server, for this process and those that it starts."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DG4D_HOME", str(server.folder.parent))
+        patch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
+        patch.setenv("DG4D_CODE_VERSION", "test")
+        patch.setenv("PYTHONPATH", str(Path(__file__).parent))
+        yield
+
+
+@pytest.fixture
+def log(place: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where fake steps say that they ran; steps run in this process, and nobody waits before trying again."""
+    monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
+    monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
+    retry_after(0.01, monkeypatch)
+    return tmp_path / "ran"
+
+
+@pytest.fixture
+def dg4d(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """The command in this process, which is connected already."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("flows.commands.make.connect", lambda: None)
+    return lambda *arguments: CliRunner().invoke(cli.app, arguments)

@@ -1,0 +1,34 @@
+"""Orders of fake steps, and what they did."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from fake_steps import picture
+from typer.testing import Result
+
+from flows import home
+from flows.inputs.orders import Order, Wish
+from steps.profiles import PREVIEW, revise
+
+Run = Callable[..., Result]  # the command `dg4d`, in this process
+EVERY_STEP = [
+    "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "extract_mesh", "refine_texture", "pack_asset",
+    "check_asset",
+]  # fmt: skip
+RUN_FACTS = ("report.json", "report.html", "provenance.json", "ro-crate-metadata.json")  # these say when and how long
+
+
+def ran(log: Path) -> list[str]:
+    steps = log.read_text().split() if log.exists() else []
+    log.unlink(missing_ok=True)
+    return steps
+
+
+def order(words: str, folder: Path, *, name: str = "fake.png", item: str = "fake", **changes: object) -> Order:
+    (folder / name).write_text(picture(words))
+    return Wish(item=item, picture=folder / name, settings=revise(PREVIEW, dict(changes))).order(home.store())
+
+
+def tree(folder: Path, *but: str) -> dict[str, bytes]:
+    files = (p for p in sorted(folder.rglob("*")) if p.is_file() and p.name not in but)
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in files}
