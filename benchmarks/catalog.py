@@ -35,13 +35,13 @@ from flows import home
 from flows.catalog import convert_all
 from flows.commands.batch import ready
 from flows.engine.tasks import Steps
-from flows.image_to_4d import drive
 from flows.inputs.manifest import Item, items_of
 from flows.inputs.orders import Order
 from flows.packages import summary
 from flows.packages.publish import RECORD, Files, publish
 from flows.serving.auth import auth_string
 from flows.serving.server import HOST, SETTINGS, answers
+from steps.profiles import step_settings
 
 DATABASES = ("sqlite", "postgresql")
 STEPS = ("prepare_subject", "drive_video")
@@ -172,8 +172,10 @@ def resize_and_pack(order: Order) -> tuple[Any, bool]:
     @flow(name="resize_and_pack", flow_run_name="{item}", persist_result=False)
     def two_steps(item: str) -> None:
         with steps:
-            prepared = steps.run("prepare_subject", {"source": order.source}, order.settings.subject)
-            steps.run("drive_video", {"subject": prepared["subject"]}, drive(order.settings))
+            prepared = steps.run(
+                "prepare_subject", {"source": order.source}, step_settings("prepare_subject", order.settings)
+            )
+            steps.run("drive_video", {"subject": prepared["subject"]}, step_settings("drive_video", order.settings))
 
     steps = Steps(order.item, order.seed)
     two_steps(order.item)

@@ -9,10 +9,9 @@ from prefect import flow
 from flows import home
 from flows.engine.executors import StepBadInput
 from flows.engine.tasks import Steps
-from flows.image_to_4d import drive
 from steps.artifacts.archives import unpack as unpack_zip
 from steps.contract import ArtifactRef
-from steps.profiles import PipelineSettings
+from steps.profiles import PipelineSettings, step_settings
 
 
 @flow(name="motions", flow_run_name="{item}", persist_result=False)
@@ -25,10 +24,10 @@ def motions(
         StepError: a step did not finish; says which and why.
     """
     with Steps(item, seed) as steps:
-        prepared = steps.run("prepare_subject", {"source": source}, settings.subject)
+        prepared = steps.run("prepare_subject", {"source": source}, step_settings("prepare_subject", settings))
         if "footage" in prepared:
             raise StepBadInput("prepare_subject", "this is a video and has its motion already; give a picture")
-        return steps.run("drive_video", {"subject": prepared["subject"]}, drive(settings))
+        return steps.run("drive_video", {"subject": prepared["subject"]}, step_settings("drive_video", settings))
 
 
 def unpack(made: dict[str, ArtifactRef], folder: Path) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from prefect import flow
 from flows.engine.tasks import Made, Steps
 from flows.image_to_4d import RUNNER, finish
 from steps.contract import ArtifactRef
-from steps.profiles import PipelineSettings
+from steps.profiles import PipelineSettings, step_settings
 
 
 @flow(
@@ -27,6 +27,6 @@ def text_to_4d(
         StepError: a step did not finish; says which and why.
     """
     with Steps(item, seed) as steps:
-        picture = steps.run("draw_picture", {"text": source}, settings.text)["picture"]
-        prepared = steps.run("prepare_subject", {"source": picture}, settings.subject)
+        picture = steps.run("draw_picture", {"text": source}, step_settings("draw_picture", settings))["picture"]
+        prepared = steps.run("prepare_subject", {"source": picture}, step_settings("prepare_subject", settings))
         return finish(steps, prepared, settings, bank)

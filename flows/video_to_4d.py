@@ -6,7 +6,7 @@ from flows.engine.executors import StepBadInput
 from flows.engine.tasks import Made, Steps
 from flows.image_to_4d import RUNNER, finish
 from steps.contract import ArtifactRef
-from steps.profiles import PipelineSettings
+from steps.profiles import PipelineSettings, step_settings
 
 
 @flow(
@@ -28,7 +28,7 @@ def video_to_4d(
         StepError: a step did not finish; says which and why.
     """
     with Steps(item, seed) as steps:
-        prepared = steps.run("prepare_subject", {"source": source}, settings.subject)
+        prepared = steps.run("prepare_subject", {"source": source}, step_settings("prepare_subject", settings))
         if "footage" not in prepared:
             raise StepBadInput(
                 "prepare_subject", "this is a single picture, not a video: a video has two frames or more"

@@ -23,7 +23,7 @@ from steps.profiles import PROFILES, PipelineSettings, profile, revise
 DEFINITIONS = {"dg4d_lib/settings.py", "dg4d_lib/asset_settings.py", "steps/profiles.py"}
 EVIDENT = {  # numbers whose names say everything
     "iterations", "features", "hidden", "frequencies", "max_faces", "prune_opacity",
-    "guidance_weight", "color_rate", "opacity_rate", "scale_rate", "rotation_rate",
+    "guidance_weight", "color_lr", "opacity_lr", "scale_lr", "rotation_lr",
 }  # fmt: skip
 BOUNDS = (annotated_types.Gt, annotated_types.Ge, annotated_types.Lt, annotated_types.Le, annotated_types.Interval)
 
@@ -44,7 +44,7 @@ def classes_by_name() -> Classes:
 
 
 def classes_in(annotation: object) -> tuple[type[BaseModel], ...]:
-    """The settings classes inside of an annotation such as `tuple[Rung, ...]` or a union."""
+    """The settings classes inside of an annotation such as `tuple[ResolutionStage, ...]` or a union."""
     if inspect.isclass(annotation) and issubclass(annotation, BaseModel):
         return (annotation,)
     return tuple(c for part in get_args(annotation) for c in classes_in(part))
