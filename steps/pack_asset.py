@@ -37,6 +37,7 @@ from steps.artifacts.media import read_frames, write_png, write_zip
 from steps.artifacts.meshes import read_meshes, read_tracked
 from steps.artifacts.motions import read_fit
 from steps.artifacts.packages import MANIFEST, Manifest
+from steps.profiles import PackNotes
 from steps.runtime.job import Facts, Job
 
 Surface = Asset4D | list[TexturedMesh]
@@ -234,6 +235,7 @@ def run(job: Job) -> Facts:
 def _contents(job: Job, scratch: Path) -> Contents:
     """Read the inputs, at the frame rate that is asked for."""
     pack: PackSettings = job.settings.pack
+    about: PackNotes = job.settings
     gaussians = read_ply(job.inputs["gaussians"])
     fit = read_fit(job.inputs["motion"])
     video = read_frames(job.inputs["driving_video"], scratch)
@@ -251,7 +253,7 @@ def _contents(job: Job, scratch: Path) -> Contents:
     return Contents(
         folder=scratch / "package",
         pack=pack,
-        notes=job.settings.notes,
+        notes=about.notes,
         surface=surface,
         gaussians=gaussians,
         deformation=fit.deformation,

@@ -25,7 +25,7 @@ from flows.serving.server import Server
 from steps.profiles import PREVIEW, revise
 
 EVERY_STEP = [
-    "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "extract_mesh", "refine_texture", "pack_asset",
+    "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "plan_mesh", "extract_mesh", "pack_asset",
     "check_asset",
 ]  # fmt: skip
 RUN_FACTS = ("report.json", "report.html", "provenance.json", "ro-crate-metadata.json")  # these say when and how long
@@ -87,7 +87,7 @@ def test_a_changed_knob_runs_its_step_and_what_follows(log: Path, tmp_path: Path
     make(order("knob", tmp_path), tmp_path / "out")
     ran(log)
     make(order("knob", tmp_path, **{"mesh.grid": 64}), tmp_path / "out")
-    assert ran(log) == ["extract_mesh"]  # its output did not change, so what follows was there already
+    assert ran(log) == ["plan_mesh", "extract_mesh"]  # their outputs did not change, so what follows was there already
 
 
 def test_gaussians_that_were_fine_tuned_take_the_place_of_the_others(log: Path, tmp_path: Path) -> None:
@@ -153,7 +153,7 @@ def test_every_step_of_a_conversion_in_parts_is_linked_to_those_that_made_its_in
         wanted |= {(maker[digest], run["step"]) for digest in step["inputs"].values()}  # no input was made by nobody
         maker |= dict.fromkeys(step["outputs"].values(), run["step"])
     parts = {f"extract_mesh {number}/3" for number in (1, 2, 3)}
-    assert {(part, "join_meshes") for part in parts} | {("join_meshes", "refine_texture")} <= wanted
+    assert {(part, "join_meshes") for part in parts} | {("join_meshes", "pack_asset")} <= wanted
     flow_run = record["run"]["flow_run"]
     wait_until(lambda: {edge for edge in wanted if edge[0]} <= drawn_edges(flow_run))  # the server notes runs later
 
@@ -168,9 +168,15 @@ def drawn_edges(flow_run: str) -> set[tuple[str, str]]:
 
 def test_every_frame_gets_a_mesh_where_one_cannot_follow(log: Path, tmp_path: Path) -> None:
     make(order("flutters", tmp_path, **{"mesh.mode": "auto", "mesh.frames_per_task": 3}), tmp_path / "out")
-    assert ran(log).count("extract_mesh") == 3  # once to see that it does not follow, then five frames in two parts
+    steps = ran(log)
+    assert (steps.count("plan_mesh"), steps.count("extract_mesh")) == (1, 2)  # five frames in two parts
     make(order("flutters", tmp_path, **{"mesh.mode": "tracked"}), tmp_path / "one")
     assert ran(log).count("extract_mesh") == 1
+
+
+def test_textures_are_refined_by_a_step_only_where_a_model_is_asked_for(log: Path, tmp_path: Path) -> None:
+    make(order("refined", tmp_path), tmp_path / "out")
+    assert "refine_texture" not in ran(log)
 
 
 @pytest.mark.parametrize(

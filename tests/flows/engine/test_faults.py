@@ -35,7 +35,7 @@ from steps.artifacts.store import ArtifactStore
 from steps.profiles import PREVIEW
 
 EVERY_STEP = [
-    "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "extract_mesh", "refine_texture", "pack_asset",
+    "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "plan_mesh", "extract_mesh", "pack_asset",
     "check_asset",
 ]  # fmt: skip
 RUN_FACTS = ("report.json", "report.html", "provenance.json", "ro-crate-metadata.json")  # these say when and how long
