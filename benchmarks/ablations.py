@@ -42,13 +42,13 @@ SMALL: dict[str, Any] = {  # the paper's schedule, scaled to seconds on a proces
     "prior.kind": "oracle",
     "static.iterations": 150,
     "static.views": 8,
-    "static.points": 2000,
+    "static.start.points": 2000,
     "motion.iterations": 100,
     "motion.views": 2,
-    "motion.plane_rate": 0.0128,
-    "motion.network_rate": 0.00128,
+    "motion.plane_lr": 0.0128,
+    "motion.network_lr": 0.00128,
 }
-QUICK: dict[str, Any] = {"static.iterations": 30, "static.points": 500, "motion.iterations": 10}
+QUICK: dict[str, Any] = {"static.iterations": 30, "static.start.points": 500, "motion.iterations": 10}
 IMPERFECT: dict[str, Any] = {"prior.blur": 1.0, "prior.color_gain": 0.2, "prior.pose_deg": 4.0, "prior.shift": 1.5}
 FINE: dict[str, Any] = {"deformation.scales": [1, 4]}
 TUNED: dict[str, Any] = {"motion.fine_tune": True}
@@ -161,7 +161,7 @@ ABLATIONS: dict[str, Ablation] = {
     ),
     "noise": Ablation(
         "in the dynamic stage T_max = 0.5 is better than 0.98",
-        {"T_max .5": Variant({"motion.noise_start": 0.5}), "T_max .98": Variant({"motion.noise_start": 0.98})},
+        {"T_max .5": Variant({"motion.t_max_start": 0.5}), "T_max .98": Variant({"motion.t_max_start": 0.98})},
         (Claim("T_max .5", "T_max .98", "psnr_obj"),),
         caveat="a denoiser that knows the picture does so at every timestep: T_max only weighs its gradient",
     ),
@@ -240,7 +240,7 @@ def settings_of(changes: Mapping[str, Any], size: int, frames: int) -> PipelineS
     sizes = {
         f"{stage}.{name}": value
         for stage in ("static", "motion")
-        for name, value in (("ladder", ladder), ("reference_size", size))
+        for name, value in (("resolution_schedule", ladder), ("reference_size", size))
     }
     wanted = {**SMALL, **sizes, "subject.max_frames": 1.0, **changes}
     counts = {key: max(2, round(wanted[key] * frames)) for key in SHARES if isinstance(wanted.get(key), float)}

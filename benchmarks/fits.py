@@ -17,7 +17,7 @@ from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.metrics.image import iou, psnr
 from dg4d_lib.metrics.video import temporal_error
 from dg4d_lib.rasterizer.interface import choose_rasterizer
-from dg4d_lib.settings import MotionSettings, OraclePriorSettings, StaticSettings
+from dg4d_lib.settings import FitSettings, LgmStartSettings, OraclePriorSettings
 from dg4d_lib.video.driving import over_white
 from steps.artifacts.motions import new_deformation
 from steps.fit_gaussians import starting_cloud
@@ -41,7 +41,9 @@ def static_fit(specimen: Specimen, settings: PipelineSettings, seed: int) -> Gau
     """The static stage, of the first frame."""
     generator = torch.Generator().manual_seed(seed)
     subject = specimen.cutouts[0]
-    start = starting_cloud(subject, settings.static, settings.prior, generator)
+    kind = settings.static.start
+    assert not isinstance(kind, LgmStartSettings), "these fits start without LGM"
+    start = starting_cloud(subject, kind, settings.prior, settings.subject.turn_deg, generator)
     prior = prior_of(specimen.bank, settings, settings.static)
     return fit_gaussians(start, subject, prior, RASTERIZE, settings.static, generator)
 
@@ -85,10 +87,10 @@ def score(specimen: Specimen, states: Sequence[Gaussians]) -> Figures:
     return Figures(*means)
 
 
-def prior_of(bank: Bank, settings: PipelineSettings, stage: StaticSettings | MotionSettings) -> AnalyticPrior:
+def prior_of(bank: Bank, settings: PipelineSettings, stage: FitSettings) -> AnalyticPrior:
     """The oracle, perfect or not, with the timesteps of a stage."""
     assert isinstance(settings.prior, OraclePriorSettings), "these fits are made with prior.kind = oracle"
-    noise = Annealing(stage.noise_start, stage.noise_end, uniform=stage.noise_draw == "uniform")
+    noise = Annealing(stage.t_max_start, stage.t_max_end, uniform=stage.noise_draw == "uniform")
     return oracle_prior(bank, settings.prior, noise)
 
 

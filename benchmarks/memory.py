@@ -52,7 +52,7 @@ def rows(sizes: Sizes, device: torch.device) -> Iterator[Row]:
     assert isinstance(prior_settings, Zero123PriorSettings) and isinstance(driving, SvdSettings)
 
     model = schedule.zero123(prior_settings)
-    prior = model.conditioned_on(torch.ones(1, SIZE, SIZE, 3), Annealing(settings.static.noise_start))
+    prior = model.conditioned_on(torch.ones(1, SIZE, SIZE, 3), Annealing(settings.static.t_max_start))
     yield Row("Zero-1-to-3", 0, peak_of(lambda: None)[1])
     pictures = torch.rand(VIEWS, SIZE, SIZE, 3, generator=seeded()).to(device).requires_grad_()
     views = [View(OrbitCamera(azimuth_deg=90.0 * i), 0) for i in range(VIEWS)]

@@ -179,7 +179,7 @@ def refined(model: Model, variant: Variant, settings: TextureSettings, seed: int
     """What the pipeline's loop makes of the blurred texture; the blurred texture itself without a noise level."""
     if not variant.changes:
         return Refined(model.blurred)
-    sigma = karras_sigmas(STEPS)[start_index(STEPS, variant.changes["skipped"])]
+    sigma = karras_sigmas(STEPS)[start_index(STEPS, 1 - variant.changes["skipped"])]
     front = [OrbitCamera(width=settings.size, height=settings.size)] * len(model.offsets)
     seen = model.draw([model.mesh.texture] * len(front), front)
     video = DrivingVideo(seen[..., :3], seen[..., 3:], FPS)

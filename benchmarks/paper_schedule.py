@@ -47,6 +47,7 @@ from dg4d_lib.guidance.zero123 import CAMERA_NUMBERS, LATENT_CHANNELS, Zero123
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
 from dg4d_lib.settings import (
+    BlobStartSettings,
     MotionSettings,
     Precision,
     StaticSettings,
@@ -59,6 +60,7 @@ from dg4d_lib.texture.refiner import VideoToVideo
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.svd import StableVideo
 from steps.artifacts.motions import new_deformation
+from steps.fit_gaussians import BLOB_RADIUS
 from steps.profiles import PipelineSettings, profile, revise
 
 FLOORS_S = {"video": 1.2, "static": 9.1, "dynamic": 12.8, "refinement": 21.7}  # the profile's video is 512 x 512
@@ -67,20 +69,20 @@ QUICK = {
     "driving.frames": 2,
     "driving.height": 64,
     "driving.width": 64,
-    "driving.model.steps": 2,
+    "driving.model.num_inference_steps": 2,
     "static.iterations": 2,
     "static.views": 2,
-    "static.points": 200,
+    "static.start.points": 200,
     "static.reference_size": 32,
-    "static.ladder": LADDER,
+    "static.resolution_schedule": LADDER,
     "motion.iterations": 2,
     "motion.views": 1,
     "motion.reference_size": 32,
-    "motion.ladder": LADDER,
+    "motion.resolution_schedule": LADDER,
     "mesh.texture_size": 64,
     "refiner.texture.iterations": 1,
     "refiner.texture.size": 64,
-    "refiner.model.steps": 4,
+    "refiner.model.num_inference_steps": 4,
 }
 
 
@@ -204,7 +206,8 @@ class Schedule:
 
     def fit(self, model: Zero123, subject: torch.Tensor, clock: Clock) -> Gaussians:
         static = self.settings.static
-        start = blob(static.points, static.blob_radius, seeded()).to(device_of("auto"))
+        assert isinstance(static.start, BlobStartSettings)
+        start = blob(static.start.points, BLOB_RADIUS, seeded()).to(device_of("auto"))
         prior = conditioned(model, subject[None], static, clock)
         return fit_gaussians(start, subject, prior, choose_rasterizer("auto"), static, seeded())
 
@@ -262,7 +265,7 @@ def conditioned(
 ) -> GuidancePrior:
     """The prior that knows some frames, watched by the clock."""
     over_white = cutouts[..., :3] * cutouts[..., 3:] + 1 - cutouts[..., 3:]
-    clock.watch(prior := model.conditioned_on(over_white, Annealing(stage.noise_start, stage.noise_end)), "loss")
+    clock.watch(prior := model.conditioned_on(over_white, Annealing(stage.t_max_start, stage.t_max_end)), "loss")
     return prior
 
 

@@ -9,7 +9,7 @@ too smooth, with .8 too noisy, .7 is best. What such models paint no stand-in kn
 that are as consistent, or as inconsistent, as theirs is measured by `benchmarks.oracle_refinement`.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -23,6 +23,7 @@ from torch.nn.functional import interpolate
 
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.glb import read_glb
+from dg4d_lib.mesh.textured import TrackedMesh
 from dg4d_lib.settings import (
     ImageToImageSettings,
     RefinerSettings,
@@ -34,7 +35,7 @@ from dg4d_lib.settings import (
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import read_png, write_frames
 from steps.artifacts.meshes import read_tracked, write_tracked
-from steps.profiles import RefineTextureSettings
+from steps.profiles import profile, step_settings
 from steps.refine_texture import run
 from steps.runtime.job import Job
 
@@ -56,7 +57,7 @@ def variants(texture: TextureSettings, svd: str, zero123: str) -> dict[str, Refi
     """Whole videos with several noise levels, and picture by picture."""
     model = VideoModelSettings(weights=svd)
     videos: dict[str, RefinerSettings] = {
-        f"video to video, {skipped:g} skipped": VideoToVideoSettings(texture=texture, model=model, skipped=skipped)
+        f"video to video, {skipped:g} skipped": VideoToVideoSettings(texture=texture, model=model, strength=1 - skipped)
         for skipped in SKIPPED
     }
     return {
@@ -65,7 +66,7 @@ def variants(texture: TextureSettings, svd: str, zero123: str) -> dict[str, Refi
     }
 
 
-def refined(asset: Asset4D, video: DrivingVideo, settings: RefinerSettings, seed: int) -> Asset4D:
+def refined(asset: Asset4D, video: DrivingVideo, settings: RefinerSettings, seed: int) -> TrackedMesh:
     """What the step makes of it.
 
     Raises:
@@ -73,11 +74,12 @@ def refined(asset: Asset4D, video: DrivingVideo, settings: RefinerSettings, seed
     """
     with TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        write_tracked(folder / "before", replace(asset, textures=None))
+        write_tracked(folder / "before", TrackedMesh(asset.mesh, asset.offsets))
         write_frames(folder / "video", video)
         inputs = {"tracked": folder / "before", "driving_video": folder / "video"}
         outputs = {"tracked": folder / "after"}
-        run(Job(inputs, outputs, RefineTextureSettings(refiner=settings), seed, lambda *_: None, folder))
+        chosen = profile("paper").model_copy(update={"refiner": settings})
+        run(Job(inputs, outputs, step_settings("refine_texture", chosen), seed, lambda *_: None, folder))
         return read_tracked(folder / "after")
 
 

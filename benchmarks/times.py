@@ -22,6 +22,7 @@ STAGES = {
     "drive_video": "video",
     "fit_gaussians": "static",
     "fit_motion": "dynamic",
+    "plan_mesh": "mesh",
     "extract_mesh": "mesh",
     "join_meshes": "mesh",
     "refine_texture": "refinement",

@@ -3,9 +3,9 @@
 The defaults are the paper's; profiles differ by name (steps/profiles.py). "Ours" marks a choice of this project.
 """
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -20,14 +20,18 @@ class Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class Rung(Settings):
-    """One rung of a resolution ladder."""
+class ResolutionStage(Settings):
+    """Stage of a resolution schedule."""
 
     until: Share = Field(description="used while progress is below this")
     size: int = Field(ge=16, le=2048, description="pixels of a guidance render")
 
 
-LADDER = (Rung(until=0.3, size=128), Rung(until=0.6, size=256), Rung(until=1.0, size=512))
+RESOLUTION_SCHEDULE = (
+    ResolutionStage(until=0.3, size=128),
+    ResolutionStage(until=0.6, size=256),
+    ResolutionStage(until=1.0, size=512),
+)
 
 
 class TextSettings(Settings):
@@ -35,8 +39,8 @@ class TextSettings(Settings):
 
     weights: str = Field("", description="an id of the Hugging Face hub, or a folder in diffusers' layout; empty: none")
     size: int = Field(512, ge=32, le=2048, multiple_of=8, description="pixels of the square picture")
-    steps: int = Field(30, ge=1, le=1000, description="of denoising")
-    guidance: float = Field(7.5, ge=0, le=100, description="classifier-free guidance")
+    num_inference_steps: int = Field(30, ge=1, le=1000, description="of denoising")
+    guidance_scale: float = Field(7.5, ge=0, le=100, description="classifier-free guidance")
     suffix: str = Field(
         ", the whole of it in the middle of the picture, plain white background",
         max_length=1000,
@@ -58,6 +62,9 @@ class SubjectSettings(Settings):
     border: float = Field(
         0.2, ge=0, lt=0.9, description="share of the frame left free around a centered subject (paper's code)"
     )
+    turn_deg: float = Field(
+        0.0, ge=-60, le=60, description="how far the subject's plane is turned away from the camera; a user's hint"
+    )
     max_frames: int = Field(32, ge=2, le=512, description="frames taken from a video; longer ones are sampled evenly")
     max_decode_gb: float = Field(
         1.0, ge=0.125, le=256, description="GiB of memory for decoding the source, its decoded frames included; ours"
@@ -72,12 +79,12 @@ class VideoModelSettings(Settings):
     )
     precision: Precision = Field("fp16", description="of the networks; without a GPU always fp32")
     low_memory: bool = Field(False, description="only the network that is at work is on the GPU; slower")
-    steps: int = Field(25, ge=2, le=200, description="noise levels of the whole schedule")
-    guidance_start: float = Field(1.0, ge=0, le=20, description="classifier-free guidance of the first frame")
-    guidance_end: float = Field(3.0, ge=0, le=20, description="and of the last, linear between")
+    num_inference_steps: int = Field(25, ge=2, le=200, description="noise levels of the whole schedule")
+    min_guidance_scale: float = Field(1.0, ge=0, le=20, description="classifier-free guidance of the first frame")
+    max_guidance_scale: float = Field(3.0, ge=0, le=20, description="and of the last, linear between")
     fps_id: int = Field(6, ge=0, le=30, description="what the network is told; 6 is playback at 7 frames per second")
-    motion_bucket: int = Field(127, ge=0, le=255, description="what the network is told: how much moves")
-    noise_augmentation: float = Field(
+    motion_bucket_id: int = Field(127, ge=0, le=255, description="what the network is told: how much moves")
+    noise_aug_strength: float = Field(
         0.02, ge=0, le=1, description="noise on the picture that is animated, pictures in [-1, 1]"
     )
     memory_gb: float = Field(
@@ -89,7 +96,7 @@ class VideoModelSettings(Settings):
     videos_at_once: int = Field(
         2, ge=1, le=64, description="videos in the network at a time; each counts twice, with and without the picture"
     )
-    frames_at_once: int = Field(14, ge=1, le=128, description="frames that are encoded or decoded at a time")
+    decode_chunk_size: int = Field(14, ge=1, le=128, description="frames that are encoded or decoded at a time")
 
 
 Candidates = Annotated[
@@ -136,9 +143,6 @@ class GeometricPriorSettings(Settings):
 
     kind: Literal["geometric"] = "geometric"
     size: int = Field(128, ge=32, le=512, description="pixels at which the surface is built")
-    turn_deg: float = Field(
-        0.0, ge=-60, le=60, description="how far the subject's plane is turned away from the camera; a user's hint"
-    )
     depth_sigma: float = Field(
         0.03,
         ge=0,
@@ -146,7 +150,6 @@ class GeometricPriorSettings(Settings):
         description="standard deviation of the guessed depth, world units: a view from the side is the average over it,"
         " soft along the direction in which depth shows",
     )
-    coverage_weight: NotNegative = Field(1.0, description="weight of alpha against color in the clean picture, ours")
 
 
 class Zero123PriorSettings(Settings):
@@ -200,7 +203,6 @@ class OraclePriorSettings(Settings):
     """Knows the true views; for tests and benchmarks."""
 
     kind: Literal["oracle"] = "oracle"
-    coverage_weight: NotNegative = Field(1.0, description="weight of alpha against color in the clean picture, ours")
     blur: float = Field(0.0, ge=0, le=64, description="imperfection: standard deviation of a blur, pixels of the bank")
     color_gain: float = Field(
         0.0, ge=0, le=2, description="imperfection: standard deviation of the logarithm of a gain per view and frame"
@@ -222,19 +224,63 @@ PriorSettings = Annotated[
 ]
 
 
-class LgmSettings(Settings):
-    """LGM makes Gaussians out of four views, which ImageDream makes out of the picture (public code)."""
+class BlobStartSettings(Settings):
+    """Random ball of Gaussians (DreamGaussian)."""
 
+    kind: Literal["blob"] = "blob"
+    points: int = Field(5000, ge=16, le=500000, description="Gaussians at the start")
+
+
+class SurfaceStartSettings(Settings):
+    """Points on the surface that the geometric prior inflates from the picture (ours)."""
+
+    kind: Literal["surface"] = "surface"
+    points: int = Field(5000, ge=16, le=500000, description="Gaussians at the start")
+
+
+class LgmStartSettings(Settings):
+    """Gaussians by LGM from four views that ImageDream makes; their means then move a tenth as fast (public code)."""
+
+    kind: Literal["lgm"] = "lgm"
     weights: str = Field("lgm", min_length=1, description="a name from `dg4d weights list`, a folder, or the file")
     views_weights: str = Field(
         "imagedream", min_length=1, description="of ImageDream: a name from `dg4d weights list`, a hub id, or a folder"
     )
     precision: Precision = Field("fp16", description="of the networks, on a GPU (public code: fp16)")
-    steps: int = Field(30, ge=1, le=500, description="of ImageDream's sampler (public code: 30)")
+    num_inference_steps: int = Field(30, ge=1, le=500, description="of ImageDream's sampler (public code: 30)")
     guidance_scale: float = Field(5.0, ge=0, le=100, description="classifier-free, of ImageDream (public code: 5)")
 
 
-class StaticSettings(Settings):
+StartSettings = Annotated[
+    BlobStartSettings | SurfaceStartSettings | LgmStartSettings,
+    Field(discriminator="kind"),
+]
+
+
+class FitSettings(Settings):
+    """Knobs that the static and the dynamic stage share."""
+
+    iterations: int
+    views: int
+    resolution_schedule: tuple[ResolutionStage, ...] = Field(RESOLUTION_SCHEDULE, min_length=1)
+    reference_size: int = Field(256, ge=32, le=1024, description="pixels of the reference view")
+    elevation_deg: float = Field(30.0, ge=0, le=80, description="random views lie within plus and minus this")
+    color_weight: NotNegative = Field(10000.0, description="reference view, times progress, mean squared error")
+    alpha_weight: NotNegative = Field(1000.0, description="reference view, times progress, mean squared error")
+    ssim_weight: NotNegative = Field(0.0, description="reference view, times progress, 1 - SSIM; not in the paper")
+    guidance_weight: NotNegative = 1.0
+    t_max_start: float = Field(gt=0.02, le=1, description="T_max at the start of the annealing")
+    t_max_end: Share = Field(0.02, description="and at its end (paper; the public code goes from 1 to 0, cut at 0.02)")
+    noise_draw: NoiseDraw = "annealed"
+    means_lr: Positive
+    means_lr_end: Positive
+    color_lr: Positive = 0.01
+    opacity_lr: Positive = 0.05
+    scale_lr: Positive = 0.005
+    rotation_lr: Positive = 0.005
+
+
+class StaticSettings(FitSettings):
     """The DreamGaussianHD loop."""
 
     iterations: int = Field(500, ge=0, le=20000, description="0 leaves the start as it is (public code, after LGM)")
@@ -242,46 +288,15 @@ class StaticSettings(Settings):
     background: Literal["white", "random"] = Field(
         "white", description="behind random views; random: black in half of the iterations (DreamGaussian)"
     )
-    ladder: tuple[Rung, ...] = Field(LADDER, min_length=1)
-    reference_size: int = Field(256, ge=32, le=1024, description="pixels of the reference view")
-    start: Literal["blob", "surface", "lgm"] = Field(
-        "blob",
-        description="blob: a random ball; surface: points on the prior's surface (ours); lgm: what LGM reconstructs, "
-        "whose means then move a tenth as fast (public code)",
-    )
-    lgm: LgmSettings | None = Field(None, description="there where start is lgm, and only there")
-    points: int = Field(5000, ge=16, le=500000, description="Gaussians at the start")
-    blob_radius: Positive = Field(0.5, description="world units")
-    elevation_deg: float = Field(30.0, ge=0, le=80, description="random views lie within plus and minus this")
-    radius_jitter: float = Field(0.5, ge=0, lt=1.5, description="random radius 2 +- this, world units")
-    color_weight: NotNegative = Field(10000.0, description="reference view, times progress, mean squared error")
-    alpha_weight: NotNegative = Field(1000.0, description="reference view, times progress, mean squared error")
-    ssim_weight: NotNegative = Field(0.0, description="reference view, times progress, 1 - SSIM; not in the paper")
-    guidance_weight: NotNegative = 1.0
-    noise_start: float = Field(0.98, gt=0.02, le=1, description="T_max at the start of the annealing")
-    noise_end: Share = Field(0.02, description="and at its end (paper; the public code goes from 1 to 0, cut at 0.02)")
-    noise_draw: NoiseDraw = "annealed"
-    mean_rate: Positive = Field(0.01, description="learning rate of the means at the start")
-    mean_rate_end: Positive = Field(0.0002, description="and at the end, log-linear")
-    color_rate: Positive = 0.01
-    opacity_rate: Positive = 0.05
-    scale_rate: Positive = 0.005
-    rotation_rate: Positive = 0.005
+    start: StartSettings = BlobStartSettings()
+    t_max_start: float = Field(0.98, gt=0.02, le=1, description="T_max at the start of the annealing (paper: 0.98)")
+    means_lr: Positive = Field(0.01, description="learning rate of the means at the start")
+    means_lr_end: Positive = Field(0.0002, description="and at the end, log-linear")
     densify_every: int = Field(100, ge=1, description="iterations between density controls (DreamGaussianHD: 100)")
     densify_gradient: Positive = Field(0.05, description="mean NDC gradient above which a Gaussian grows")
-    densify_scale: Positive = Field(0.05, description="world units: larger ones split, smaller ones are cloned")
     prune_opacity: float = Field(0.01, gt=0, lt=1)
     prune_scale: Positive = Field(0.05, description="world units; larger ones are removed after a split")
     max_points: int = Field(100000, ge=16, description="growth stops here")
-    reset_opacity_every: int = Field(700, ge=1, description="iterations (never reached within 500)")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _lgm_where_it_is_used(cls, given: Any) -> Any:
-        """Weights that nobody uses are not asked for."""
-        if not isinstance(given, dict):
-            return given
-        return {**given, "lgm": (given.get("lgm") or {}) if given.get("start") == "lgm" else None}
 
 
 Endpoint = Annotated[
@@ -338,7 +353,7 @@ class FramewiseSettings(Settings):
 DeformationSettings = Annotated[HexPlaneSettings | MlpSettings | FramewiseSettings, Field(discriminator="kind")]
 
 
-class MotionSettings(Settings):
+class MotionSettings(FitSettings):
     """The dynamic stage."""
 
     iterations: int = Field(200, ge=1, le=20000)
@@ -346,29 +361,16 @@ class MotionSettings(Settings):
     frames_per_iteration: int = Field(
         0, ge=0, le=512, description="frames drawn at random per iteration; 0 is all of them"
     )
-    ladder: tuple[Rung, ...] = Field(LADDER, min_length=1)
-    reference_size: int = Field(256, ge=32, le=1024, description="pixels of the reference view")
-    elevation_deg: float = Field(30.0, ge=0, le=80, description="random views lie within plus and minus this")
-    color_weight: NotNegative = Field(10000.0, description="reference views, times progress, mean squared error")
-    alpha_weight: NotNegative = Field(1000.0, description="reference views, times progress, mean squared error")
-    ssim_weight: NotNegative = Field(0.0, description="reference views, times progress, 1 - SSIM; not in the paper")
-    guidance_weight: NotNegative = 1.0
-    noise_start: float = Field(0.5, gt=0.02, le=1, description="T_max at the start of the annealing (paper: 0.5)")
-    noise_end: Share = Field(0.02, description="and at its end (paper; the public code goes from 1 to 0, cut at 0.02)")
-    noise_draw: NoiseDraw = "annealed"
-    network_rate: Positive = Field(6.4e-4, description="learning rate of networks")
-    plane_rate: Positive = Field(6.4e-3, description="learning rate of planes and frame-wise displacements")
+    t_max_start: float = Field(0.5, gt=0.02, le=1, description="T_max at the start of the annealing (paper: 0.5)")
+    network_lr: Positive = Field(6.4e-4, description="learning rate of networks")
+    plane_lr: Positive = Field(6.4e-3, description="learning rate of planes and frame-wise displacements")
     rigidity_weight: NotNegative = Field(0.0, description="local rigidity over time (Luiten et al. 2024)")
     fine_tune: bool = Field(
         False,
         description="the Gaussians at rest are optimized too, at the rates below (paper: frozen; public code: so)",
     )
-    mean_rate: Positive = Field(0.001, description="learning rate of the means at rest, at the start (public code)")
-    mean_rate_end: Positive = Field(2e-5, description="and at the end, log-linear (public code)")
-    color_rate: Positive = 0.01
-    opacity_rate: Positive = 0.05
-    scale_rate: Positive = 0.005
-    rotation_rate: Positive = 0.005
+    means_lr: Positive = Field(0.001, description="learning rate of the means at rest, at the start (public code)")
+    means_lr_end: Positive = Field(2e-5, description="and at the end, log-linear (public code)")
 
 
 class MeshSettings(Settings):
@@ -386,7 +388,6 @@ class MeshSettings(Settings):
     min_component: Share = Field(0.02, description="components with a smaller share of the faces are dropped")
     texture_size: int = Field(1024, ge=64, le=8192, description="texels of a side")
     render_size: int = Field(512, ge=64, le=2048, description="pixels of the renders that are projected back")
-    min_cosine: float = Field(0.5, gt=0, lt=1, description="texels seen at a flatter angle are not colored")
 
 
 class IdentitySettings(Settings):
@@ -399,7 +400,7 @@ class TextureSettings(Settings):
     """A texture follows better pictures (paper section 3.4)."""
 
     iterations: int = Field(50, ge=1, le=2000)
-    rate: Positive = Field(0.2, description="Adam's learning rate of the logits of the colors")
+    lr: Positive = Field(0.2, description="Adam's learning rate of the logits of the colors")
     size: int = Field(512, ge=64, le=1024, multiple_of=64, description="pixels of the pictures")
     min_cosine: Share = Field(0.5, description="the reference view says nothing where the surface is flatter")
     azimuth_step_deg: float = Field(
@@ -426,8 +427,8 @@ class VideoToVideoSettings(Settings):
     kind: Literal["video_to_video"] = "video_to_video"
     texture: TextureSettings = TextureSettings()
     model: VideoModelSettings = VideoModelSettings()
-    skipped: float = Field(
-        0.7, ge=0, lt=1, description="share of the noise levels that is skipped: 0.7 of 25 starts at sigma 1.273"
+    strength: float = Field(
+        0.3, gt=0, le=1, description="share of the noise levels that is used: 0.3 of 25 starts at sigma 1.273"
     )
 
 
@@ -437,9 +438,9 @@ class ImageToImageSettings(Settings):
     kind: Literal["image_to_image"] = "image_to_image"
     texture: TextureSettings = TextureSettings()
     prior: Zero123PriorSettings = Zero123PriorSettings()
-    steps: int = Field(50, ge=2, le=500, description="noise levels of the whole schedule, DDIM")
-    skipped_start: float = Field(0.5, ge=0, lt=1, description="share of them that is skipped in the first iteration")
-    skipped_end: float = Field(0.95, ge=0, lt=1, description="and in the last, linear between")
+    num_inference_steps: int = Field(50, ge=2, le=500, description="noise levels of the whole schedule, DDIM")
+    strength_start: float = Field(0.5, gt=0, le=1, description="share of them that is used in the first iteration")
+    strength_end: float = Field(0.05, gt=0, le=1, description="and in the last, linear between")
 
 
 RefinerSettings = Annotated[IdentitySettings | VideoToVideoSettings | ImageToImageSettings, Field(discriminator="kind")]

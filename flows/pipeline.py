@@ -28,10 +28,12 @@ from flows.tasks import (
     fit_motion,
     join_meshes,
     pack_asset,
+    plan_mesh,
     prepare_subject,
     refine_texture,
 )
 from flows.ui.asset_page import show_asset
+from steps.artifacts.mesh_plan import read_plan
 
 
 @flow(name="image_to_4d", flow_run_name="{order.item}", persist_result=False)
@@ -95,7 +97,8 @@ def animate(subject: Subject, order: Order, conversion: Conversion, folder: Path
     driving_video = filming.result()
     motion = fit_motion(gaussians, driving_video, conversion, order.bank)
     mesh = mesh_over_time(gaussians, motion, driving_video, conversion)
-    mesh = refine_texture(mesh, driving_video, conversion)
+    if order.settings.refiner.kind != "identity":
+        mesh = refine_texture(mesh, driving_video, conversion)
     notes = notes_of(done.result for done in finished_steps())
     package = pack_asset(subject, driving_video, gaussians, motion, mesh, notes, conversion)
     verdict = check_asset(package, driving_video, subject, conversion)
@@ -115,13 +118,11 @@ def animate(subject: Subject, order: Order, conversion: Conversion, folder: Path
 
 def mesh_over_time(gaussians: Gaussians, motion: Motion, driving_video: DrivingVideo, conversion: Conversion) -> Mesh:
     """Extract one mesh that follows the motion, or else a mesh per frame, its frames divided among the slots."""
-    mode = conversion.settings.mesh.mode
-    if mode != "per_frame":
-        mesh = extract_mesh(gaussians, motion, conversion)
-        if mesh.tracked is not None:
-            return mesh
-        conversion = conversion.with_mesh_mode("per_frame")
+    plan = plan_mesh(gaussians, motion, conversion)
+    if read_plan(home.store().path(plan.plan)).mode == "tracked":
+        return extract_mesh(gaussians, motion, plan, conversion)
     frames = frames_in(driving_video.frames, home.store())
     parts = divided(frames, conversion.mesh_parts or resources.cpus())
-    meshes = extract_mesh.map(unmapped(gaussians), unmapped(motion), unmapped(conversion), parts).result()
+    every = map(unmapped, (gaussians, motion, plan, conversion))
+    meshes = extract_mesh.map(*every, parts).result()
     return meshes[0] if len(meshes) == 1 else join_meshes(meshes, conversion)

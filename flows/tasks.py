@@ -42,13 +42,17 @@ class Motion(StepResult):
     """Deformation over time; with the Gaussians where they were fine-tuned together with it."""
 
 
-class Mesh(StepResult):
-    """Either one tracked mesh or a mesh per frame."""
+class Plan(StepResult):
+    """Kind of mesh that the motion gets, and the density of its surface."""
 
     @property
-    def tracked(self) -> ArtifactRef | None:
-        """One topology with offsets per frame; None if one mesh cannot follow the motion."""
-        return self.outputs.get("tracked")
+    def plan(self) -> ArtifactRef:
+        """JSON of `steps.artifacts.mesh_plan`."""
+        return self.outputs["plan"]
+
+
+class Mesh(StepResult):
+    """Either one tracked mesh or a mesh per frame."""
 
 
 class Package(StepResult):
@@ -103,9 +107,19 @@ def fit_motion(
 
 
 @task(**CACHED, tags=[CPU])
-def extract_mesh(gaussians: Gaussians, motion: Motion, conversion: Conversion, part: Part | None = None) -> Mesh:
+def plan_mesh(gaussians: Gaussians, motion: Motion, conversion: Conversion) -> Plan:
+    """Decide whether one mesh can follow the motion or every frame needs its own."""
+    return run_step("plan_mesh", Plan, gaussians=gaussians, motion=motion, conversion=conversion)
+
+
+@task(**CACHED, tags=[CPU])
+def extract_mesh(
+    gaussians: Gaussians, motion: Motion, plan: Plan, conversion: Conversion, part: Part | None = None
+) -> Mesh:
     """Extract one mesh that follows the motion, or a mesh per frame of a part of the frames."""
-    return run_step("extract_mesh", Mesh, gaussians=gaussians, motion=motion, part=part, conversion=conversion)
+    return run_step(
+        "extract_mesh", Mesh, gaussians=gaussians, motion=motion, plan=plan, part=part, conversion=conversion
+    )
 
 
 @task(**CACHED, tags=[CPU])

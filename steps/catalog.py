@@ -4,7 +4,8 @@ Artifacts between steps:
   frames      a stored zip of NNN.png (RGBA, straight alpha, square) and video.json {"fps": ...}
   gaussians   a standard 3DGS PLY (float32)
   motion      safetensors; metadata says the kind of deformation, its settings and the number of frames
-  tracked     safetensors of a tracked mesh: vertices, faces, uvs, texture (uint8), offsets; metadata fps
+  plan        JSON of steps/artifacts/mesh_plan.py: {"mode": "tracked" or "per_frame", "level": ..., ...}
+  tracked     safetensors of a tracked mesh: vertices, faces, uvs, texture (uint8), offsets
   meshes      a stored zip of NNN.safetensors, a textured mesh per frame
   ranking     JSON {"weights": {...}, "candidates": [{"number": ..., "name": ..., "total": ..., ...}]}, best first
   films       a stored zip of N.mp4, one per candidate
@@ -21,6 +22,7 @@ PNG = Port(media_type="image/png", suffix=".png")
 FRAMES = Port(media_type="application/vnd.dg4d.frames+zip", suffix=".zip")
 PLY = Port(media_type="application/vnd.dg4d.gaussians+ply", suffix=".ply")
 MOTION = Port(media_type="application/vnd.dg4d.motion+safetensors", suffix=".safetensors")
+PLAN = Port(media_type="application/vnd.dg4d.mesh-plan+json", suffix=".json")
 TRACKED = Port(media_type="application/vnd.dg4d.tracked+safetensors", suffix=".safetensors")
 MESHES = Port(media_type="application/vnd.dg4d.meshes+zip", suffix=".zip")
 CURVES = Port(media_type="application/vnd.dg4d.curves+json", suffix=".json")
@@ -46,7 +48,7 @@ STEPS: dict[str, StepSpec] = {
             name="draw_picture",
             version="1",
             entry="steps.draw_picture:run",
-            settings="dg4d_lib.settings:TextSettings",
+            sections=("text",),
             inputs={"text": TEXT},
             outputs={"picture": PNG},
             resource="gpu",
@@ -55,7 +57,7 @@ STEPS: dict[str, StepSpec] = {
             name="prepare_subject",
             version="1",
             entry="steps.prepare_subject:run",
-            settings="dg4d_lib.settings:SubjectSettings",
+            sections=("subject",),
             inputs={"source": SOURCE},
             outputs={"subject": PNG, "footage": _optional(FRAMES), "picture": PNG},
             timeout_s=2400,  # a decoder that hangs in one frame cannot be stopped from within
@@ -64,7 +66,7 @@ STEPS: dict[str, StepSpec] = {
             name="drive_video",
             version="1",
             entry="steps.drive_video:run",
-            settings="steps.profiles:DriveVideoSettings",
+            sections=("driving", "subject.turn_deg"),
             inputs={"subject": PNG, "footage": _optional(FRAMES)},
             outputs={
                 "driving_video": FRAMES,
@@ -80,7 +82,7 @@ STEPS: dict[str, StepSpec] = {
             name="fit_gaussians",
             version="1",
             entry="steps.fit_gaussians:run",
-            settings="steps.profiles:FitGaussiansSettings",
+            sections=("rasterizer", "subject.turn_deg", "prior", "static"),
             inputs={"subject": PNG, "bank": _optional(BANK)},
             outputs={"gaussians": PLY, "curves": CURVES, "picture": PNG},
             resource="gpu",
@@ -90,24 +92,32 @@ STEPS: dict[str, StepSpec] = {
             name="fit_motion",
             version="1",
             entry="steps.fit_motion:run",
-            settings="steps.profiles:FitMotionSettings",
+            sections=("rasterizer", "subject.turn_deg", "prior", "deformation", "motion"),
             inputs={"gaussians": PLY, "driving_video": FRAMES, "bank": _optional(BANK)},
             outputs={"motion": MOTION, "gaussians": _optional(PLY), "curves": CURVES, "picture": PNG},
             resource="gpu",
         ),
         StepSpec(
+            name="plan_mesh",
+            version="1",
+            entry="steps.plan_mesh:run",
+            sections=("rasterizer", "mesh"),
+            inputs={"gaussians": PLY, "motion": MOTION},
+            outputs={"plan": PLAN},
+        ),
+        StepSpec(
             name="extract_mesh",
             version="1",
             entry="steps.extract_mesh:run",
-            settings="steps.profiles:ExtractMeshSettings",
-            inputs={"gaussians": PLY, "motion": MOTION},
+            settings="steps.profiles:FrameRange",
+            sections=("rasterizer", "mesh"),
+            inputs={"gaussians": PLY, "motion": MOTION, "plan": PLAN},
             outputs={"tracked": _optional(TRACKED), "meshes": _optional(MESHES), "picture": PNG},
         ),
         StepSpec(
             name="join_meshes",
             version="1",
             entry="steps.join_meshes:run",
-            settings="steps.profiles:JoinMeshesSettings",
             inputs={"meshes": MESHES.model_copy(update={"many": True})},
             outputs={"meshes": MESHES},
         ),
@@ -115,7 +125,7 @@ STEPS: dict[str, StepSpec] = {
             name="refine_texture",
             version="1",
             entry="steps.refine_texture:run",
-            settings="steps.profiles:RefineTextureSettings",
+            sections=("refiner",),
             inputs={"tracked": _optional(TRACKED), "meshes": _optional(MESHES), "driving_video": FRAMES},
             outputs={"tracked": _optional(TRACKED), "meshes": _optional(MESHES)},
             resource="gpu",
@@ -124,7 +134,8 @@ STEPS: dict[str, StepSpec] = {
             name="pack_asset",
             version="1",
             entry="steps.pack_asset:run",
-            settings="steps.profiles:PackAssetSettings",
+            settings="steps.profiles:PackNotes",
+            sections=("rasterizer", "pack"),
             inputs={
                 "subject": PNG,
                 "driving_video": FRAMES,
@@ -139,7 +150,7 @@ STEPS: dict[str, StepSpec] = {
             name="check_asset",
             version="1",
             entry="steps.check_asset:run",
-            settings="steps.profiles:CheckAssetSettings",
+            sections=("rasterizer", "gates"),
             inputs={"package": PACKAGE, "driving_video": FRAMES, "subject": PNG},
             outputs={"gates": GATES, "picture": PNG},
         ),

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dg4d_lib.asset_settings import GateSettings
 from dg4d_lib.assets.rendering.sheet import page
 from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
 from dg4d_lib.cameras.viewpoints import turntable
@@ -24,7 +25,6 @@ from steps.artifacts.media import read_frames, read_png, write_png
 from steps.artifacts.packages import ASSET, COMPACT, MANIFEST, MESHES, read_manifest
 from steps.artifacts.packages import SPLATS as SPLATS_FOLDER
 from steps.artifacts.rendering import BATCH, States, Surface, drawn_mesh, mesh_at, read_states, read_surface
-from steps.profiles import CheckAssetSettings
 from steps.runtime.job import Facts, Job
 
 SIZE = 128  # pixels of the pictures; the bounds of the gates belong to it
@@ -58,18 +58,18 @@ def run(job: Job) -> Facts:
         BadInput: the package is broken.
         BackendUnavailable: the rasterizer cannot run here.
     """
-    settings: CheckAssetSettings = job.settings
+    bounds: GateSettings = job.settings.gates
     with TemporaryDirectory() as scratch:
         folder = Path(scratch)
         parts = read_parts(job.inputs["package"], folder / "package")
         video = read_frames(job.inputs["driving_video"], folder)
-    evidence = gather(parts, video, read_png(job.inputs["subject"]), choose_rasterizer(settings.rasterizer))
-    gates = judge(evidence, settings.gates)
+    evidence = gather(parts, video, read_png(job.inputs["subject"]), choose_rasterizer(job.settings.rasterizer))
+    gates = judge(evidence, bounds)
     job.outputs["gates"].write_text(json.dumps(verdict(gates), ensure_ascii=False, allow_nan=False), encoding="utf-8")
     write_png(job.outputs["picture"], picture(evidence, (_spread(len(video), MOST_FRAMES) / video.fps).tolist()))
     failing = [gate.name for gate in gates if not gate.passed]
     notes = (f"Not accepted: {', '.join(failing)}. The report says what to do.",) if failing else ()
-    return Facts(backend=f"{settings.rasterizer} rasterizer", notes=notes)
+    return Facts(backend=f"{job.settings.rasterizer} rasterizer", notes=notes)
 
 
 def read_parts(package: Path, folder: Path) -> Parts:

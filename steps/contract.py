@@ -51,7 +51,10 @@ class StepSpec(Frozen):
     name: str
     version: str = Field(description="raised when the same request should give another result")
     entry: str = Field(pattern=r"^[\w.]+:\w+$")
-    settings: str = Field(pattern=r"^[\w.]+:\w+$", description="module:class of its settings")
+    settings: str = Field(
+        "dg4d_lib.settings:Settings", pattern=r"^[\w.]+:\w+$", description="module:class of settings of its own"
+    )
+    sections: tuple[str, ...] = Field((), description="of PipelineSettings, beside its own: a field, or a dotted one")
     inputs: dict[str, Port]
     outputs: dict[str, Port]
     resource: Literal["cpu", "gpu"] = Field(

@@ -18,7 +18,7 @@ def run(job: Job) -> Facts:
         BadInput: no pipeline was named, or it cannot draw.
         BackendUnavailable: its weights, or the packages that run it, are not here.
     """
-    settings: TextSettings = job.settings
+    settings: TextSettings = job.settings.text
     if not settings.weights:
         raise BadInput("no text-to-image pipeline was named: --set text.weights=FOLDER, or an id of the hub")
     words = job.inputs["text"].read_text(encoding="utf-8")

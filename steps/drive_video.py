@@ -17,13 +17,12 @@ from dg4d_lib.assets.rendering.sheet import videos_sheet
 from dg4d_lib.diffusion.parts import device_here
 from dg4d_lib.diffusion.video_model import VideoModel
 from dg4d_lib.errors import BadInput
-from dg4d_lib.settings import SvdSettings, WarpSettings
+from dg4d_lib.settings import DrivingSettings, SvdSettings, WarpSettings
 from dg4d_lib.video.candidate_ranking import GOOD, WEIGHTS, Candidate, ranked, score
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.svd import StableVideo
 from dg4d_lib.video.warp import Warp, candidate
 from steps.artifacts.media import read_frames, read_png, write_frames, write_png, write_zip
-from steps.profiles import DriveVideoSettings
 from steps.runtime.job import Facts, Job
 from steps.runtime.weights import open_weights
 
@@ -52,12 +51,11 @@ def run(job: Job) -> Facts:
     subject = read_png(job.inputs["subject"])
     if "footage" in job.inputs:
         return _follow(job, subject)
-    settings: DriveVideoSettings = job.settings
-    driving = settings.driving
+    driving: DrivingSettings = job.settings.driving
     numbers = [driving.pick] if driving.pick else list(range(1, driving.candidates + 1))
     match driving:
         case WarpSettings():
-            motions, facts = list(_warps(driving, settings.turn_deg, subject, numbers)), Facts()
+            motions, facts = list(_warps(driving, job.settings.turn_deg, subject, numbers)), Facts()
             origin = "a warp of the picture ({}), without a learned model"
         case SvdSettings():
             motions, facts = _stable_videos(driving, subject, numbers, job.seed)

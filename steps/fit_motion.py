@@ -9,11 +9,11 @@ from dg4d_lib.fitting.losses import Diverged
 from dg4d_lib.fitting.motion import fit_motion
 from dg4d_lib.gaussians.ply import read_ply, write_ply
 from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
+from dg4d_lib.settings import DeformationSettings, MotionSettings, PriorSettings
 from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.motions import new_deformation, write_motion
-from steps.fit_gaussians import PICTURE_SIZE, Curves, picture_of
 from steps.fitting.priors import make_prior
-from steps.profiles import FitMotionSettings
+from steps.fitting.reporting import PICTURE_SIZE, Curves, picture_of, pictures_in_a_row
 from steps.runtime.job import Facts, Job
 
 FINE_TUNED = "The Gaussians at rest were fitted to the whole video together with their motion."
@@ -23,30 +23,32 @@ PICTURE_AZIMUTHS_DEG = (0.0, 90.0)
 
 def run(job: Job) -> Facts:
     """Fit, and show six moments from the front and from the side; `gaussians` come out where they were fine-tuned."""
-    settings: FitMotionSettings = job.settings
+    backend, turn_deg = job.settings.rasterizer, job.settings.turn_deg
+    prior: PriorSettings = job.settings.prior
+    kind: DeformationSettings = job.settings.deformation
+    settings: MotionSettings = job.settings.motion
     gaussians = read_ply(job.inputs["gaussians"])
     video = read_frames(job.inputs["driving_video"], job.pictures)
     generator = torch.Generator().manual_seed(job.seed)
-    rasterize = choose_rasterizer(settings.rasterizer)
+    rasterize = choose_rasterizer(backend)
     cutouts = list(torch.cat([video.frames, video.coverage], -1))
-    bank = job.inputs.get("bank")
-    chosen = make_prior(settings.prior, cutouts, settings.motion, bank, job.pictures)
-    deformation = new_deformation(settings.deformation, gaussians, len(video), generator)
-    device = device_of(settings.rasterizer)
+    chosen = make_prior(prior, cutouts, settings, job.inputs.get("bank"), job.pictures, turn_deg)
+    deformation = new_deformation(kind, gaussians, len(video), generator)
+    device = device_of(backend)
     deformation.to(device)
-    curves = Curves(settings.motion.iterations, job.progress)
+    curves = Curves(settings.iterations, job.progress)
     try:
         fitted = fit_motion(
-            gaussians.to(device), deformation, video, chosen.prior, rasterize, settings.motion, generator, curves.add
+            gaussians.to(device), deformation, video, chosen.prior, rasterize, settings, generator, curves.add
         )
     except Diverged as error:
         write_png(job.pictures / "last_good_state.png", picture_of(error.gaussians, rasterize))
         raise
     deformation.cpu()
     gaussians = fitted.to(torch.device("cpu"))
-    if settings.motion.fine_tune:
+    if settings.fine_tune:
         write_ply(job.outputs["gaussians"], gaussians)
-    write_motion(job.outputs["motion"], deformation, settings.deformation, len(video), len(gaussians))
+    write_motion(job.outputs["motion"], deformation, kind, len(video), len(gaussians))
     curves.write(job.outputs["curves"], "motion fit", [chosen.note])
     with torch.no_grad():
         moments = torch.linspace(0, 1, min(PICTURE_FRAMES, len(video)))
@@ -54,7 +56,7 @@ def run(job: Job) -> Facts:
         rows = []
         for azimuth in PICTURE_AZIMUTHS_DEG:
             camera = OrbitCamera(0, azimuth, width=PICTURE_SIZE, height=PICTURE_SIZE)
-            rows.append(torch.cat(list(rasterize(moved, [camera] * len(moments), torch.ones(3)).color), 1))
+            rows.append(pictures_in_a_row(moved, [camera] * len(moments), rasterize))
     write_png(job.outputs["picture"], torch.cat(rows))
-    facts = chosen.facts(f"{settings.rasterizer} rasterizer")
-    return replace(facts, notes=(*facts.notes, FINE_TUNED)) if settings.motion.fine_tune else facts
+    facts = chosen.facts(f"{backend} rasterizer")
+    return replace(facts, notes=(*facts.notes, FINE_TUNED)) if settings.fine_tune else facts

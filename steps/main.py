@@ -53,6 +53,7 @@ from steps.contract import (
     StepResult,
     StepSpec,
 )
+from steps.profiles import settings_class
 from steps.runtime.environment_info import machine
 from steps.runtime.job import Facts, Job, Progress
 from steps.runtime.weights import require_same
@@ -307,9 +308,8 @@ def _checked_spec(request: StepRequest) -> StepSpec:
 
 
 def _checked_settings(request: StepRequest, spec: StepSpec) -> BaseModel:
-    settings: type[BaseModel] = _named(spec.settings)
     try:
-        return settings.model_validate(request.settings)
+        return settings_class(spec).model_validate(request.settings)
     except ValidationError as error:
         lines = [f"{'.'.join(map(str, e['loc']))} = {e['input']!r}: {e['msg']}" for e in error.errors()]
         raise BadInput(f"settings of {spec.name} refused: {'; '.join(lines)}") from error

@@ -37,7 +37,7 @@ from steps.artifacts.media import read_frames, write_png, write_zip
 from steps.artifacts.meshes import read_meshes, read_tracked
 from steps.artifacts.motions import read_fit
 from steps.artifacts.packages import MANIFEST, Manifest
-from steps.profiles import PackAssetSettings
+from steps.profiles import PackNotes
 from steps.runtime.job import Facts, Job
 
 Surface = Asset4D | list[TexturedMesh]
@@ -52,7 +52,8 @@ class Contents:
 
     Attributes:
         folder: of the package.
-        settings: of the step.
+        pack: settings of the package.
+        notes: sentences that travel in the files.
         surface: the tracked mesh, or a mesh per state.
         gaussians: at rest.
         deformation: their motion.
@@ -65,7 +66,8 @@ class Contents:
     """
 
     folder: Path
-    settings: PackAssetSettings
+    pack: PackSettings
+    notes: tuple[str, ...]
     surface: Surface
     gaussians: Gaussians
     deformation: AnyDeformation
@@ -84,7 +86,7 @@ class Contents:
     @property
     def extras(self) -> dict[str, Any]:
         """What the files say about themselves."""
-        return {"generator": _generator(), "notes": list(self.settings.notes)}
+        return {"generator": _generator(), "notes": list(self.notes)}
 
     def place(self, name: str) -> Path:
         """Where a file of the package goes; its folder is made."""
@@ -94,7 +96,7 @@ class Contents:
 
     def write_meshes(self) -> Notes:
         """The animated mesh, and in the mode per_frame every frame's mesh beside it."""
-        gltf, surface = self.settings.pack.gltf, self.surface
+        gltf, surface = self.pack.gltf, self.surface
         if isinstance(surface, Asset4D):
             named = replace(surface, extras={**surface.extras, **self.extras})
             self.place(packages.ASSET).write_bytes(write_glb(named, gltf))
@@ -109,17 +111,17 @@ class Contents:
         surface, notes = self.surface, []
         if not isinstance(surface, Asset4D):
             return ()
-        for level, share in enumerate(self.settings.pack.lods, 1):
+        for level, share in enumerate(self.pack.lods, 1):
             mesh, offsets = simplified(surface.mesh, surface.offsets, max(1, round(share * len(surface.mesh.faces))))
             name = f"{packages.LEVELS}/{level}.glb"
             less = replace(surface, mesh=mesh, offsets=offsets, extras={**surface.extras, **self.extras})
-            self.place(name).write_bytes(write_glb(less, self.settings.pack.gltf))
+            self.place(name).write_bytes(write_glb(less, self.pack.gltf))
             notes.append(f"{name} has {len(mesh.faces)} of {len(surface.mesh.faces)} triangles")
         return notes
 
     def write_rig(self) -> Notes:
         """The tracked mesh on a skeleton, where one follows it."""
-        pack, surface = self.settings.pack, self.surface
+        pack, surface = self.pack, self.surface
         if not pack.rig or not isinstance(surface, Asset4D):
             return ()
         rig, note = rig_of(surface, pack.rig_bones, pack.rig_error)
@@ -130,14 +132,14 @@ class Contents:
 
     def write_usd(self) -> Notes:
         """Mesh and splats in one USDZ."""
-        if self.settings.pack.usd:
+        if self.pack.usd:
             path = self.place(packages.USD)
-            write_usdz(path, self.surface, self.fps, self.states, self.extras, self.settings.pack.gltf)
+            write_usdz(path, self.surface, self.fps, self.states, self.extras, self.pack.gltf)
         return ()
 
     def write_splats(self) -> Notes:
         """The cloud at every moment, in the formats that are asked for, and what plays in a browser."""
-        pack, states = self.settings.pack, self.states
+        pack, states = self.pack, self.states
         self.place(packages.WEB_SPLATS).write_bytes(write_web_splats(states, self.fps))
         folder = self.place(packages.WEB_SPLATS).parent
         if pack.splats:
@@ -171,15 +173,15 @@ class Contents:
     @property
     def _moving(self) -> tuple[Gaussians, AnyDeformation, int, float, Rasterizer, PackSettings]:
         video = self.video
-        return self.gaussians, self.deformation, len(video), video.fps, self.rasterizer, self.settings.pack
+        return self.gaussians, self.deformation, len(video), video.fps, self.rasterizer, self.pack
 
     def write_turntable(self) -> Notes:
         """The film in which it holds still and is turned."""
-        return write_turntable(self.place(packages.TURNTABLE), self.states.at(0), self.rasterizer, self.settings.pack)
+        return write_turntable(self.place(packages.TURNTABLE), self.states.at(0), self.rasterizer, self.pack)
 
     def write_sheet(self) -> Notes:
         """The contact sheet."""
-        sheet = contact_sheet(self.gaussians, self.deformation, self.video, self.rasterizer, self.settings.pack)
+        sheet = contact_sheet(self.gaussians, self.deformation, self.video, self.rasterizer, self.pack)
         write_png(self.place(packages.SHEET), sheet)
         return ()
 
@@ -222,26 +224,27 @@ def run(job: Job) -> Facts:
             vertices=tuple(len(mesh.vertices) for mesh in contents.meshes),
             triangles=tuple(len(mesh.faces) for mesh in contents.meshes),
             files={name: packages.about(name) for name in names},
-            notes=(*contents.settings.notes, *notes),
+            notes=(*contents.notes, *notes),
         )
         text = json.dumps(manifest.model_dump(mode="json"), indent=2, ensure_ascii=False) + "\n"
         files = [(name, (contents.folder / name).read_bytes()) for name in names]
         write_zip(job.outputs["package"], [(MANIFEST, text.encode()), *files])
-    return Facts(backend=f"{contents.settings.rasterizer} rasterizer", notes=tuple(notes))
+    return Facts(backend=f"{job.settings.rasterizer} rasterizer", notes=tuple(notes))
 
 
 def _contents(job: Job, scratch: Path) -> Contents:
     """Read the inputs, at the frame rate that is asked for."""
-    settings: PackAssetSettings = job.settings
+    pack: PackSettings = job.settings.pack
+    about: PackNotes = job.settings
     gaussians = read_ply(job.inputs["gaussians"])
     fit = read_fit(job.inputs["motion"])
     video = read_frames(job.inputs["driving_video"], scratch)
-    surface = _surface(job)
+    surface = _surface(job, video.fps)
     frames = len(surface.offsets) if isinstance(surface, Asset4D) else len(surface)
     _check_frames(len(video), {"motion": fit.frames, "mesh": frames})
-    fps = settings.pack.fps or video.fps
+    fps = pack.fps or video.fps
     if isinstance(surface, Asset4D):
-        surface = resampled(replace(surface, fps=video.fps), gaussians, fit.deformation, fit.frames, fps)
+        surface = resampled(surface, gaussians, fit.deformation, fit.frames, fps)
     elif fps != video.fps:
         raise BadInput(
             f"a mesh per frame has the frames of the driving video, {video.fps:g} a second; {fps:g} are asked for: "
@@ -249,7 +252,8 @@ def _contents(job: Job, scratch: Path) -> Contents:
         )
     return Contents(
         folder=scratch / "package",
-        settings=settings,
+        pack=pack,
+        notes=about.notes,
         surface=surface,
         gaussians=gaussians,
         deformation=fit.deformation,
@@ -257,17 +261,18 @@ def _contents(job: Job, scratch: Path) -> Contents:
         video=video,
         states=states(gaussians, fit.deformation, fit.frames, moments(fit.frames, video.fps, fps)),
         fps=fps,
-        rasterizer=choose_rasterizer(settings.rasterizer),
+        rasterizer=choose_rasterizer(job.settings.rasterizer),
         inputs=dict(job.inputs),
     )
 
 
-def _surface(job: Job) -> Surface:
-    """The tracked mesh, or a mesh per frame: whichever was given."""
+def _surface(job: Job, fps: float) -> Surface:
+    """Read the tracked mesh, which gets the frame rate of the driving video, or a mesh per frame."""
     given = [port for port in ("tracked", "meshes") if port in job.inputs]
     match given:
         case ["tracked"]:
-            return read_tracked(job.inputs["tracked"])
+            tracked = read_tracked(job.inputs["tracked"])
+            return Asset4D(tracked.mesh, tracked.offsets, fps, textures=tracked.textures, rest=tracked.rest)
         case ["meshes"]:
             return read_meshes(job.inputs["meshes"])
     raise BadInput(f"a package needs one kind of mesh, `tracked` or `meshes`; given {given or 'neither'}")

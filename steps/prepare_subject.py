@@ -24,7 +24,7 @@ def run(job: Job) -> Facts:
     Raises:
         BadInput: the file cannot be used; says why and what to do.
     """
-    settings: SubjectSettings = job.settings
+    settings: SubjectSettings = job.settings.subject
     with TemporaryDirectory() as scratch:
         source = read_source(job.inputs["source"], Path(scratch), settings.max_frames, settings.max_decode_gb)
     job.progress(1, 3, {})

@@ -1,8 +1,11 @@
-"""The settings of a whole pipeline, the named profiles, and the one way to change a knob."""
+"""Settings of the pipeline and of its steps, named profiles, and the one way to change a knob."""
 
+import functools
+import importlib
+from operator import attrgetter
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError, create_model, model_validator
 
 from dg4d_lib.asset_settings import GateSettings, PackSettings, ScoreSettings
 from dg4d_lib.errors import BadInput
@@ -17,16 +20,64 @@ from dg4d_lib.settings import (
     MotionSettings,
     PriorSettings,
     RefinerSettings,
-    Rung,
+    ResolutionStage,
     Settings,
     StaticSettings,
     SubjectSettings,
     TextSettings,
     WarpSettings,
 )
+from steps.catalog import STEPS
+from steps.contract import StepSpec
 
 LARGEST_WHOLE = 2**53  # of a knob; readers of JSON disagree about larger numbers
 SHOWN = 80  # letters of a value in a message
+CHANGED_KNOBS = {  # old name: new name, empty if the value is fixed now; removed with 1.0
+    "text.steps": "text.num_inference_steps",
+    "text.guidance": "text.guidance_scale",
+    **{
+        f"{section}.model.{old}": f"{section}.model.{new}"
+        for section in ("driving", "refiner")
+        for old, new in {
+            "steps": "num_inference_steps",
+            "guidance_start": "min_guidance_scale",
+            "guidance_end": "max_guidance_scale",
+            "motion_bucket": "motion_bucket_id",
+            "noise_augmentation": "noise_aug_strength",
+            "frames_at_once": "decode_chunk_size",
+        }.items()
+    },
+    "prior.turn_deg": "subject.turn_deg",
+    "prior.coverage_weight": "",
+    **{
+        f"{stage}.{old}": f"{stage}.{new}"
+        for stage in ("static", "motion")
+        for old, new in {
+            "ladder": "resolution_schedule",
+            "noise_start": "t_max_start",
+            "noise_end": "t_max_end",
+            "mean_rate": "means_lr",
+            "mean_rate_end": "means_lr_end",
+            **{f"{name}_rate": f"{name}_lr" for name in ("color", "opacity", "scale", "rotation")},
+        }.items()
+    },
+    "motion.network_rate": "motion.network_lr",
+    "motion.plane_rate": "motion.plane_lr",
+    "static.start": "static.start.kind",
+    "static.points": "static.start.points",
+    "static.lgm.steps": "static.start.num_inference_steps",
+    **{
+        f"static.lgm.{name}": f"static.start.{name}"
+        for name in ("weights", "views_weights", "precision", "guidance_scale")
+    },
+    **{f"static.{name}": "" for name in ("blob_radius", "radius_jitter", "densify_scale", "reset_opacity_every")},
+    "mesh.min_cosine": "",
+    "refiner.steps": "refiner.num_inference_steps",
+    "refiner.skipped": "refiner.strength (1 less the old value)",
+    "refiner.skipped_start": "refiner.strength_start (1 less the old value)",
+    "refiner.skipped_end": "refiner.strength_end (1 less the old value)",
+    "refiner.texture.rate": "refiner.texture.lr",
+}
 
 RasterizerName = Literal["auto", "reference", "cpu", "cuda_gsplat"]
 Backend = Annotated[RasterizerName, AfterValidator(backend_name)]  # never `auto`: a request says what will draw
@@ -48,97 +99,69 @@ class PipelineSettings(Settings):
     pack: PackSettings = PackSettings()
     gates: GateSettings = GateSettings()
 
-
-class DriveVideoSettings(Settings):
-    """What `drive_video` reads."""
-
-    driving: DrivingSettings
-    turn_deg: float = Field(0.0, ge=-60, le=60, description="how far the subject is turned; the geometric prior's hint")
-
-
-class FitGaussiansSettings(Settings):
-    """What `fit_gaussians` reads."""
-
-    rasterizer: Backend
-    prior: PriorSettings
-    static: StaticSettings
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_old_names(cls, given: Any) -> Any:
+        for old, new in CHANGED_KNOBS.items():
+            branch = given
+            for name in old.split("."):
+                branch = branch.get(name) if isinstance(branch, dict) else None
+            if branch is not None and not isinstance(branch, dict | Settings):
+                raise ValueError(_renamed(old, new))
+        return given
 
 
-class FitMotionSettings(Settings):
-    """What `fit_motion` reads."""
+class FrameRange(Settings):
+    """Frames of one task of `extract_mesh`, where every frame gets a mesh."""
 
-    rasterizer: Backend
-    prior: PriorSettings
-    deformation: DeformationSettings
-    motion: MotionSettings
+    first_frame: int = Field(0, ge=0, description="first frame of this task")
+    end_frame: int = Field(0, ge=0, description="one past the last; 0 is all frames")
 
 
-class ExtractMeshSettings(Settings):
-    """What `extract_mesh` reads."""
+class PackNotes(Settings):
+    """Sentences that travel in the files of a package."""
 
-    rasterizer: Backend
-    mesh: MeshSettings
-    first_frame: int = Field(0, ge=0, description="mode per_frame: first frame of this task")
-    end_frame: int = Field(0, ge=0, description="mode per_frame: one past the last; 0 is all frames")
-
-
-class JoinMeshesSettings(Settings):
-    """Settings of `join_meshes`, which has none."""
-
-
-class RefineTextureSettings(Settings):
-    """What `refine_texture` reads."""
-
-    refiner: RefinerSettings
-
-
-class PackAssetSettings(Settings):
-    """What `pack_asset` reads."""
-
-    rasterizer: Backend
-    pack: PackSettings
-    notes: tuple[str, ...] = Field((), description="sentences that travel in the files, say that no model was used")
-
-
-class CheckAssetSettings(Settings):
-    """What `check_asset` reads."""
-
-    rasterizer: Backend
-    gates: GateSettings
+    notes: tuple[str, ...] = Field((), description="for example that no model was used")
 
 
 class ScoreAssetSettings(Settings):
-    """What `score_asset` reads."""
+    """Settings of `score_asset`, which reads none of the pipeline's."""
 
     rasterizer: Backend
     mesh: bool = Field(False, description="the textured mesh is judged instead of the splats")
     score: ScoreSettings = ScoreSettings()
 
 
+def settings_class(spec: StepSpec) -> type[Settings]:
+    """Return the class of a step's settings: its own fields, and one for each section that it declares."""
+    return _settings_class(spec.name, spec.settings, spec.sections)
+
+
+@functools.cache
+def _settings_class(name: str, own: str, sections: tuple[str, ...]) -> type[Settings]:
+    module, _, attribute = own.partition(":")
+    base: type[Settings] = getattr(importlib.import_module(module), attribute)
+    fields: dict[str, Any] = {section.rpartition(".")[2]: (_annotation(section), ...) for section in sections}
+    return create_model(name, __base__=base, __doc__=f"Settings of `{name}`.", **fields) if fields else base
+
+
+def _annotation(section: str) -> Any:
+    """Return the type of a section, with its bounds; a request never says `auto` as its rasterizer."""
+    if section == "rasterizer":
+        return Backend
+    owner: Any = PipelineSettings
+    *path, last = section.split(".")
+    for name in path:
+        owner = owner.model_fields[name].annotation
+    field = owner.model_fields[last]
+    return Annotated[field.annotation, Field(discriminator=field.discriminator), *field.metadata]
+
+
 def step_settings(step: str, settings: PipelineSettings, **values: Any) -> Settings:
-    """Return the settings of a step: the sections of the pipeline's settings that it reads, and values of this run."""
-    match step:
-        case "draw_picture":
-            return settings.text
-        case "prepare_subject":
-            return settings.subject
-        case "drive_video":
-            turn_deg = settings.prior.turn_deg if isinstance(settings.prior, GeometricPriorSettings) else 0.0
-            return DriveVideoSettings(driving=settings.driving, turn_deg=turn_deg)
-        case "join_meshes":
-            return JoinMeshesSettings()
-        case "refine_texture":
-            return RefineTextureSettings(refiner=settings.refiner)
-    models: dict[str, type[Settings]] = {
-        "fit_gaussians": FitGaussiansSettings,
-        "fit_motion": FitMotionSettings,
-        "extract_mesh": ExtractMeshSettings,
-        "pack_asset": PackAssetSettings,
-        "check_asset": CheckAssetSettings,
-    }
-    model = models[step]
-    sections = {name: getattr(settings, name) for name in model.model_fields if hasattr(settings, name)}
-    return model.model_validate(sections | values)
+    """Make the settings of a step from the sections that it declares, and from values of the run such as `notes`."""
+    spec = STEPS[step]
+    sections = {section.rpartition(".")[2]: attrgetter(section)(settings) for section in spec.sections}
+    return settings_class(spec)(**sections, **values)
 
 
 def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSettings:
@@ -151,6 +174,8 @@ def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSetti
     """
     tree = settings.model_dump(mode="json")
     for key, value in changes.items():
+        if key in CHANGED_KNOBS and not isinstance(value, dict):
+            raise BadInput(_renamed(key, CHANGED_KNOBS[key]))
         if isinstance(value, int) and abs(value) > LARGEST_WHOLE:
             raise BadInput(f"{key} = {_shown(value)} is out of range; use at most {LARGEST_WHOLE}")
     for key, value in sorted(changes.items(), key=lambda change: not change[0].endswith(".kind")):
@@ -173,6 +198,10 @@ def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSetti
         raise BadInput("settings refused: " + "; ".join(lines)) from error
 
 
+def _renamed(old: str, new: str) -> str:
+    return f"the setting {old} is now {new}" if new else f"the setting {old} is gone: its value is fixed"
+
+
 def _shown(value: Any) -> str:
     """A value in a message, shortened."""
     text = repr(value)
@@ -187,7 +216,7 @@ def _with_defaults(tree: dict[str, Any]) -> dict[str, Any]:
         return tree
 
 
-PREVIEW_LADDER = [Rung(until=1.0, size=128).model_dump()]
+PREVIEW_SCHEDULE = [ResolutionStage(until=1.0, size=128).model_dump()]
 
 PREVIEW = revise(
     PipelineSettings(),
@@ -195,8 +224,8 @@ PREVIEW = revise(
         "subject.size": 256,
         "static.iterations": 250,
         "static.views": 4,
-        "static.ladder": PREVIEW_LADDER,
-        "static.start": "surface",
+        "static.resolution_schedule": PREVIEW_SCHEDULE,
+        "static.start.kind": "surface",
         "deformation.features": 16,
         "deformation.hidden": 32,
         "deformation.spatial": 64,
@@ -204,10 +233,10 @@ PREVIEW = revise(
         "motion.iterations": 250,
         "motion.views": 1,
         "motion.frames_per_iteration": 12,
-        "motion.plane_rate": 0.0256,
-        "motion.network_rate": 0.00256,
+        "motion.plane_lr": 0.0256,
+        "motion.network_lr": 0.00256,
         "motion.rigidity_weight": 1000.0,
-        "motion.ladder": PREVIEW_LADDER,
+        "motion.resolution_schedule": PREVIEW_SCHEDULE,
         "motion.reference_size": 256,
         "mesh.mode": "auto",
         "mesh.max_faces": 20000,
@@ -231,16 +260,16 @@ REFERENCE = revise(
     {
         "prior.weights": "stable-zero123",
         "prior.variant": "stable",
-        "static.start": "lgm",
+        "static.start.kind": "lgm",
         "static.iterations": 0,
-        "static.noise_start": 1.0,
-        "static.noise_end": 0.0,
+        "static.t_max_start": 1.0,
+        "static.t_max_end": 0.0,
         "deformation.temporal": 12,
         "deformation.half_side": 1.6,
         "deformation.endpoint": False,
         "motion.iterations": 500,
-        "motion.noise_start": 1.0,
-        "motion.noise_end": 0.0,
+        "motion.t_max_start": 1.0,
+        "motion.t_max_end": 0.0,
         "motion.fine_tune": True,
     },
 )

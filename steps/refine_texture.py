@@ -1,4 +1,4 @@
-"""Refine the texture, and give the mesh the clock of the driving video."""
+"""Better textures by diffusion models; the geometry stays as it is."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,16 +9,16 @@ import torch
 
 from dg4d_lib.diffusion.parts import device_here
 from dg4d_lib.diffusion.video_model import VideoModel
+from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.settings import IdentitySettings, ImageToImageSettings, VideoToVideoSettings
+from dg4d_lib.settings import IdentitySettings, ImageToImageSettings, RefinerSettings, VideoToVideoSettings
 from dg4d_lib.texture.refine import Refined, Stretch, refine_textures
 from dg4d_lib.texture.refiner import ImageToImage, Refiner, VideoToVideo
 from dg4d_lib.video.driving import DrivingVideo
-from steps.artifacts.media import frame_rate, read_frames
+from steps.artifacts.media import read_frames
 from steps.artifacts.meshes import read_meshes, read_tracked, write_meshes, write_tracked
-from steps.profiles import RefineTextureSettings
 from steps.runtime.job import Facts, Job
 from steps.runtime.weights import open_weights
 
@@ -26,18 +26,19 @@ from steps.runtime.weights import open_weights
 def run(job: Job) -> Facts:
     """Refine the mesh that moves, or every frame's own; all frames are seen as one video.
 
+    A flow leaves this step out where `refiner.kind` is `identity`.
+
     Raises:
         BadInput: meshes and driving video have different numbers of frames.
         BackendUnavailable: weights, or what loads them, are not here.
         FitDiverged: the loss left the finite numbers.
     """
     facts = Facts()
-    fps = frame_rate(job.inputs["driving_video"])
     if "tracked" in job.inputs:
-        asset = read_tracked(job.inputs["tracked"])
-        (its,), facts = _refined(job, [Stretch(asset.mesh, asset.offsets)])
-        mesh = replace(asset.mesh, texture=its.texture)
-        write_tracked(job.outputs["tracked"], replace(asset, mesh=mesh, fps=fps, textures=its.frames))
+        tracked = read_tracked(job.inputs["tracked"])
+        (its,), facts = _refined(job, [Stretch(tracked.mesh, tracked.offsets)])
+        mesh = replace(tracked.mesh, texture=its.texture)
+        write_tracked(job.outputs["tracked"], replace(tracked, mesh=mesh, textures=its.frames))
     if "meshes" in job.inputs:
         meshes = read_meshes(job.inputs["meshes"])
         refined, facts = _refined(job, [Stretch(mesh, torch.zeros(1, *mesh.vertices.shape)) for mesh in meshes])
@@ -48,10 +49,7 @@ def run(job: Job) -> Facts:
 
 def _refined(job: Job, stretches: Sequence[Stretch]) -> tuple[list[Refined], Facts]:
     """The textures of a motion, and how they were made."""
-    settings: RefineTextureSettings = job.settings
-    kind = settings.refiner
-    if isinstance(kind, IdentitySettings):
-        return [Refined(stretch.mesh.texture) for stretch in stretches], Facts()
+    kind: RefinerSettings = job.settings.refiner
     with TemporaryDirectory() as scratch:
         driving = read_frames(job.inputs["driving_video"], Path(scratch))
     device = device_here()
@@ -59,6 +57,8 @@ def _refined(job: Job, stretches: Sequence[Stretch]) -> tuple[list[Refined], Fac
     pictures = driving.over(driving.frames.new_ones(3))
     refiner: Refiner
     match kind:
+        case IdentitySettings():
+            raise BadInput("refiner.kind = identity leaves textures as they are; leave refine_texture out")
         case VideoToVideoSettings():
             opened = open_weights(kind.model.weights)
             model = VideoModel.load(opened.folder, kind.model, device)

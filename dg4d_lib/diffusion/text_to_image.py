@@ -50,13 +50,13 @@ def draw_picture(
         pipeline.to(device)
     pipeline.set_progress_bar_config(disable=True)
     options = {
-        "num_inference_steps": settings.steps,
-        "guidance_scale": settings.guidance,
+        "num_inference_steps": settings.num_inference_steps,
+        "guidance_scale": settings.guidance_scale,
         "height": settings.size,
         "width": settings.size,
         "generator": generator,
         "output_type": "np",
-        "callback_on_step_end": _after_step(settings.steps, progress),
+        "callback_on_step_end": _after_step(settings.num_inference_steps, progress),
     }
     known = inspect.signature(pipeline.__call__).parameters
     made = pipeline(text + settings.suffix, **{name: value for name, value in options.items() if name in known})

@@ -45,9 +45,9 @@ def karras_sigmas(steps: int) -> tuple[float, ...]:
     return (*((top + i / (steps - 1) * (bottom - top)) ** RHO for i in range(steps)), 0.0)
 
 
-def start_index(steps: int, skipped: float) -> int:
-    """The first noise level that is used if a share of them is skipped: 0.7 of 25 gives 17, whose sigma is 1.2732."""
-    return min(int(steps * skipped + 1e-9), steps - 1)
+def start_index(steps: int, strength: float) -> int:
+    """Return the first noise level if only this share of them is used: 0.3 of 25 gives 17, whose sigma is 1.2732."""
+    return min(int(steps * (1 - strength) + 1e-9), steps - 1)
 
 
 def clean(noisy: Float[Tensor, "*b"], velocity: Float[Tensor, "*b"], sigma: float) -> Float[Tensor, "*b"]:
@@ -94,7 +94,7 @@ class VideoModel:
         weights = [sum(value.nbytes for value in part.parameters()) / GIB for part in (unet, vae, image_encoder)]
         self._spare_gb = settings.memory_gb - OUTSIDE_GB - (max(weights) if settings.low_memory else sum(weights))
         self._videos = MicroBatches("videos of the video model", settings.videos_at_once)
-        self._frames = MicroBatches("frames of the video model", settings.frames_at_once)
+        self._frames = MicroBatches("frames of the video model", settings.decode_chunk_size)
         if not settings.low_memory:
             for part in (unet, vae, image_encoder):
                 part.to(device)
@@ -146,9 +146,9 @@ class VideoModel:
             eye = _for_clip(scaled.to(self.device, _wide(encoder.dtype)))
             embedding = encoder(eye.to(encoder.dtype)).image_embeds[:, None]
         noise = torch.cat([_normal(scaled.shape, generator, scaled.dtype) for generator in generators])
-        latents = self._mode(scaled + settings.noise_augmentation * noise.to(scaled))
+        latents = self._mode(scaled + settings.noise_aug_strength * noise.to(scaled))
         ids = torch.tensor(
-            [settings.fps_id, settings.motion_bucket, settings.noise_augmentation], dtype=self.unet.dtype
+            [settings.fps_id, settings.motion_bucket_id, settings.noise_aug_strength], dtype=self.unet.dtype
         )
         return Condition(embedding.expand(count, -1, -1), latents, ids.to(self.device).expand(count, -1))
 
@@ -176,8 +176,8 @@ class VideoModel:
     ) -> Float[Tensor, "b t c i j"]:
         """Latents at the first noise level, taken to the last by Euler's method.
 
-        Guidance goes from `guidance_start` in the first frame to `guidance_end` in the last; what it is guided away
-        from knows no picture.
+        Guidance goes from `min_guidance_scale` in the first frame to `max_guidance_scale` in the last; the
+        unconditional half knows no picture.
         """
         with self._awake(self.unet) as unet:
             for sigma, following in pairwise(sigmas):
@@ -207,7 +207,7 @@ class VideoModel:
             self._room(frames * UNET_GB, seen, self.shrinkage),
         )
         without, informed = torch.cat(velocities).to(latents).chunk(2)
-        guidance = torch.linspace(self.settings.guidance_start, self.settings.guidance_end, frames)
+        guidance = torch.linspace(self.settings.min_guidance_scale, self.settings.max_guidance_scale, frames)
         return without + guidance.to(latents)[:, None, None, None] * (informed - without)
 
     def _mode(self, pictures: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c i j"]:

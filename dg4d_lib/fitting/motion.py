@@ -21,7 +21,7 @@ from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MotionSettings
 from dg4d_lib.video.driving import DrivingVideo
 
-ADVICE = "lower the learning rates (motion.*_rate) or the weights"
+ADVICE = "lower the learning rates (motion.*_lr) or the weights"
 Report = Callable[[int, dict[str, float]], None]
 
 
@@ -71,7 +71,7 @@ def fit_motion(
     for step in range(1, settings.iterations + 1):
         progress = step / settings.iterations
         if settings.fine_tune:
-            adam.param_groups[0]["lr"] = log_linear(settings.mean_rate, settings.mean_rate_end, progress)
+            adam.param_groups[0]["lr"] = log_linear(settings.means_lr, settings.means_lr_end, progress)
         frames = choose_frames(len(video), settings.frames_per_iteration, generator)
         chosen = sent(frames, device)
         moved = deformation.displace(gaussians.means, times[chosen]).apply(gaussians)
@@ -88,7 +88,7 @@ def fit_motion(
         loss = progress * reference + deformation.roughness()
         guidance = torch.zeros((), device=device)
         if settings.views and settings.guidance_weight:
-            views, rows = moments(prior, frames, settings, size_of(settings.ladder, progress), generator)
+            views, rows = moments(prior, frames, settings, size_of(settings.resolution_schedule, progress), generator)
             if views:
                 states = moved.states(rows)
                 rendering = rasterize(states, [view.camera for view in views], white)
@@ -150,5 +150,5 @@ def _groups(deformation: Deformation, settings: MotionSettings) -> list[dict[str
     planes = deformation.planes()
     fast = {id(parameter) for parameter in planes}
     network = [parameter for parameter in deformation.parameters() if id(parameter) not in fast]
-    groups = [{"params": planes, "lr": settings.plane_rate}, {"params": network, "lr": settings.network_rate}]
+    groups = [{"params": planes, "lr": settings.plane_lr}, {"params": network, "lr": settings.network_lr}]
     return [group for group in groups if group["params"]]

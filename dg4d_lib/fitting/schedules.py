@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 
-from dg4d_lib.settings import Rung
+from dg4d_lib.settings import ResolutionStage
 
 
 def log_linear(start: float, end: float, progress: float) -> float:
@@ -11,6 +11,6 @@ def log_linear(start: float, end: float, progress: float) -> float:
     return math.exp(math.log(start) * (1 - progress) + math.log(end) * progress)
 
 
-def size_of(ladder: Sequence[Rung], progress: float) -> int:
-    """Pixels at this progress: the first rung that is not passed, else the last."""
-    return next((rung.size for rung in ladder if progress < rung.until), ladder[-1].size)
+def size_of(schedule: Sequence[ResolutionStage], progress: float) -> int:
+    """Pixels at this progress: the first stage that is not passed, else the last."""
+    return next((stage.size for stage in schedule if progress < stage.until), schedule[-1].size)

@@ -16,10 +16,13 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.growth import Grown, ScreenGradients, grow, prune, reset_opacity
 from dg4d_lib.guidance.interface import GuidancePrior, View, ring_of
 from dg4d_lib.rasterizer.interface import Rasterizer
-from dg4d_lib.settings import MotionSettings, StaticSettings
+from dg4d_lib.settings import FitSettings, StaticSettings
 
 Report = Callable[[int, dict[str, float]], None]
-ADVICE = "lower the learning rates (static.*_rate) or the weights"
+ADVICE = "lower the learning rates (static.*_lr) or the weights"
+RADIUS_JITTER = 0.5  # random views are at radius 2 +- this, world units (paper)
+SPLIT_SCALE = 0.05  # world units: larger Gaussians split, smaller ones are cloned (DreamGaussian)
+RESET_OPACITY_EVERY = 700  # iterations, never reached within 500 (DreamGaussian)
 FEWEST = 8  # Gaussians; with fewer there is no object left
 
 
@@ -89,7 +92,7 @@ def fit_gaussians(
     gradients = ScreenGradients.none(len(start), device)
     for step in range(1, settings.iterations + 1):
         progress = step / settings.iterations
-        cloud.adam.param_groups[0]["lr"] = log_linear(settings.mean_rate, settings.mean_rate_end, progress)
+        cloud.adam.param_groups[0]["lr"] = log_linear(settings.means_lr, settings.means_lr_end, progress)
         gaussians = cloud.gaussians
 
         offsets = [torch.zeros(1, len(gaussians), 2, device=device, requires_grad=True)]
@@ -101,7 +104,7 @@ def fit_gaussians(
         loss = progress * reference
         guidance = torch.zeros((), device=device)
         if settings.views and settings.guidance_weight:
-            size = size_of(settings.ladder, progress)
+            size = size_of(settings.resolution_schedule, progress)
             views = [View(c) for c in viewpoints(prior, settings, size, generator)]
             offsets.append(torch.zeros(len(views), len(gaussians), 2, device=device, requires_grad=True))
             behind = sent(background(settings, generator), device)
@@ -128,7 +131,7 @@ def fit_gaussians(
                     f"{settings.iterations}; lower static.prune_opacity or raise static.prune_scale",
                     gaussians.detach(),
                 )
-        if step % settings.reset_opacity_every == 0 and step < settings.iterations:
+        if step % RESET_OPACITY_EVERY == 0 and step < settings.iterations:
             cloud.parameters["opacity_logits"].data.copy_(reset_opacity(cloud.gaussians).opacity_logits)
         report(step, {**numbers, "Gaussians": len(cloud.gaussians)})
     return cloud.gaussians.detach()
@@ -140,14 +143,14 @@ def background(settings: StaticSettings, generator: torch.Generator) -> Float[Te
     return torch.zeros(3) if black else torch.tensor(WHITE)
 
 
-def rates(settings: StaticSettings | MotionSettings) -> dict[str, float]:
-    """Learning rate of every field of the cloud at the start of a stage; the means come first."""
+def rates(settings: FitSettings) -> dict[str, float]:
+    """Return the learning rate of every field of the cloud at the start of a stage; the means come first."""
     return {
-        "means": settings.mean_rate,
-        "harmonics": settings.color_rate,
-        "opacity_logits": settings.opacity_rate,
-        "log_scales": settings.scale_rate,
-        "quats": settings.rotation_rate,
+        "means": settings.means_lr,
+        "harmonics": settings.color_lr,
+        "opacity_logits": settings.opacity_lr,
+        "log_scales": settings.scale_lr,
+        "quats": settings.rotation_lr,
     }
 
 
@@ -160,7 +163,7 @@ def viewpoints(
             settings.views,
             size,
             elevation_deg=(-settings.elevation_deg, settings.elevation_deg),
-            radius=(RADIUS - settings.radius_jitter, RADIUS + settings.radius_jitter),
+            radius=(RADIUS - RADIUS_JITTER, RADIUS + RADIUS_JITTER),
             generator=generator,
             ring=ring_of(prior),
         )
@@ -175,6 +178,6 @@ def control_density(
     with torch.no_grad():
         room = settings.max_points - len(cloud.gaussians)
         pull = gradients.mean
-        grown = grow(cloud.gaussians, pull, settings.densify_gradient, settings.densify_scale, room, generator)
+        grown = grow(cloud.gaussians, pull, settings.densify_gradient, SPLIT_SCALE, room, generator)
         cloud.replace(grown)
         cloud.replace(prune(cloud.gaussians, settings.prune_opacity, settings.prune_scale))

@@ -26,7 +26,6 @@ class AnalyticPrior:
     Args:
         clean: color over white and coverage of every view, at its camera's size.
         noise: which timestep an iteration uses.
-        coverage_weight: of alpha against color.
         viewpoints: the only cameras `clean` knows; None is all.
         frames: the only frames `clean` knows; None is all.
     """
@@ -35,11 +34,10 @@ class AnalyticPrior:
         self,
         clean: CleanPictures,
         noise: Annealing,
-        coverage_weight: float,
         viewpoints: tuple[OrbitCamera, ...] | None = None,
         frames: tuple[int, ...] | None = None,
     ) -> None:
-        self.clean, self.noise, self.coverage_weight = clean, noise, coverage_weight
+        self.clean, self.noise = clean, noise
         self.viewpoints, self.frames = viewpoints, frames
 
     def loss(
@@ -63,8 +61,6 @@ class AnalyticPrior:
         return loss * (LATENT_NUMBERS / pixels)
 
     def _encode(self, images: Float[Tensor, "b h w 3"], coverage: Float[Tensor, "b h w 1"]) -> Float[Tensor, "b c h w"]:
-        """Pixels as they are diffused: color and weighted alpha in [-1, 1]."""
-        channels = [2 * images - 1]
-        if self.coverage_weight:
-            channels.append(self.coverage_weight**0.5 * (2 * coverage - 1))
+        """Return pixels as they are diffused: color and alpha in [-1, 1]."""
+        channels = [2 * images - 1, 2 * coverage - 1]
         return torch.cat([channel.permute(0, 3, 1, 2) for channel in channels], 1)

@@ -43,15 +43,15 @@ class Annealing:
         return int(torch.randint(LOWEST, highest + 1, (), generator=generator))
 
 
-def annealed_timestep(progress: float, noise_start: float, noise_end: float = NOISE_END) -> int:
-    """Linear from `noise_start` to `noise_end` of the schedule, and never outside of 20 to 980.
+def annealed_timestep(progress: float, t_max_start: float, t_max_end: float = NOISE_END) -> int:
+    """Linear from `t_max_start` to `t_max_end` of the schedule, and never outside of 20 to 980.
 
     Args:
         progress: share of the optimization that is done, in [0, 1].
-        noise_start: share of the schedule at progress 0.
-        noise_end: and at progress 1.
+        t_max_start: share of the schedule at progress 0.
+        t_max_end: and at progress 1.
     """
-    share = noise_start + (noise_end - noise_start) * progress
+    share = t_max_start + (t_max_end - t_max_start) * progress
     return min(max(round(TRAIN_STEPS * share), LOWEST), HIGHEST)
 
 

@@ -31,15 +31,18 @@ LARGE = 2  # times the surface's own resolution: larger pictures take one sample
 class InflatedSurfaces:
     """A surface per frame, each built when it is first asked for."""
 
-    def __init__(self, cutouts: Sequence[Float[Tensor, "h w 4"]], settings: GeometricPriorSettings) -> None:
+    def __init__(
+        self, cutouts: Sequence[Float[Tensor, "h w 4"]], settings: GeometricPriorSettings, turn_deg: float = 0.0
+    ) -> None:
         """Remember the pictures.
 
         Args:
             cutouts: one per frame: square, straight alpha, color and alpha in [0, 1].
-            settings: at how many pixels to build, and how far the subject is turned.
+            settings: at how many pixels to build.
+            turn_deg: how far the subject is turned.
         """
         self._cutouts = tuple(cutouts)
-        self._settings = settings
+        self._settings, self._turn_deg = settings, turn_deg
         self._surfaces: dict[int, InflatedSurface] = {}
 
     def surface(self, frame: int) -> InflatedSurface:
@@ -51,7 +54,7 @@ class InflatedSurfaces:
         if not 0 <= frame < len(self._cutouts):
             raise BadInput(f"frame {frame} was asked for; there are {len(self._cutouts)}, counted from 0")
         if frame not in self._surfaces:
-            self._surfaces[frame] = inflate(self._cutouts[frame], self._settings.size, self._settings.turn_deg)
+            self._surfaces[frame] = inflate(self._cutouts[frame], self._settings.size, self._turn_deg)
         return self._surfaces[frame]
 
     def clean(self, views: Sequence[View]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:

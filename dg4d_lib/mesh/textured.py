@@ -1,4 +1,4 @@
-"""A textured mesh as a value."""
+"""Textured meshes as values."""
 
 from dataclasses import dataclass
 
@@ -21,3 +21,20 @@ class TexturedMesh:
     faces: Int[Tensor, "f 3"]
     uvs: Float[Tensor, "v 2"]
     texture: Float[Tensor, "h w 3"]
+
+
+@dataclass(frozen=True)
+class TrackedMesh:
+    """One topology that moves; it has frames and no frame rate.
+
+    Attributes:
+        mesh: at rest.
+        offsets: what to add to the vertices at every frame, world units.
+        textures: the colors of every frame in [0, 1], where they change; None: always the mesh's own.
+        rest: the frame at which the moved mesh is the mesh at rest, but for what was corrected afterwards.
+    """
+
+    mesh: TexturedMesh
+    offsets: Float[Tensor, "t v 3"]
+    textures: Float[Tensor, "t h w 3"] | None = None
+    rest: float = 0.0

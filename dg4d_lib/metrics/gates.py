@@ -201,7 +201,7 @@ def judge(evidence: Evidence, settings: GateSettings) -> list[Gate]:
             settings.sharpness_most,
             "",
             "color gradients inside the subject, in units of the input picture's: low is blurred, high is noise",
-            "blurred: raise mesh.texture_size, mesh.render_size, static.iterations; noisy: lower static.color_rate",
+            "blurred: raise mesh.texture_size, mesh.render_size, static.iterations; noisy: lower static.color_lr",
         ),
         Gate(
             "motion",
@@ -210,7 +210,7 @@ def judge(evidence: Evidence, settings: GateSettings) -> list[Gate]:
             settings.motion_most,
             "",
             "how much changes from frame to frame, in units of the video's: near 0 is frozen, far above 1 explodes",
-            "raise motion.iterations if too little moves; lower motion.plane_rate or motion.network_rate if too much",
+            "raise motion.iterations if too little moves; lower motion.plane_lr or motion.network_lr if too much",
         ),
     ]
 

@@ -93,7 +93,7 @@ def refine_textures(
     starts = [texture.clamp(DARKEST, 1 - DARKEST).logit() for texture in textures]
     logits = [start.clone().requires_grad_() for start in starts]
     own = [colors for colors in added if colors is not None]
-    groups = [{"params": logits, "lr": settings.rate}, {"params": own, "lr": STEEPEST * settings.rate}]
+    groups = [{"params": logits, "lr": settings.lr}, {"params": own, "lr": STEEPEST * settings.lr}]
     adam = torch.optim.Adam(groups if own else groups[:1])
     for iteration in range(settings.iterations):
         colors = [logit.sigmoid() for logit in logits]
@@ -109,7 +109,7 @@ def refine_textures(
         loss = known + (seen - better).square().mean() + settings.frame_weight * sum(map(_restlessness, own))
         value = loss.item()
         if not math.isfinite(value):
-            raise FitDiverged(f"textures: the loss is {value} in iteration {iteration}; lower refiner.texture.rate")
+            raise FitDiverged(f"textures: the loss is {value} in iteration {iteration}; lower refiner.texture.lr")
         adam.zero_grad()
         loss.backward()
         adam.step()

@@ -46,12 +46,13 @@ class VideoToVideo:
         """Choose how much noise.
 
         Args:
-            settings: share of the schedule that is skipped.
+            settings: share of the schedule that is used.
             model: read from weights.
             picture: the input over white, in [0, 1].
         """
         self.model = model
-        self.sigmas = karras_sigmas(settings.model.steps)[start_index(settings.model.steps, settings.skipped) :]
+        steps = settings.model.num_inference_steps
+        self.sigmas = karras_sigmas(steps)[start_index(steps, settings.strength) :]
         self._picture = picture
 
     def refine(
@@ -88,8 +89,9 @@ class ImageToImage:
     ) -> Float[Tensor, "t h w 3"]:
         """The denoised pictures; they have the 256 pixels of Zero-1-to-3 and are enlarged."""
         settings, prior, scale = self.settings, self.prior, float(self.prior.vae.config.scaling_factor)
-        skipped = settings.skipped_start + progress * (settings.skipped_end - settings.skipped_start)
-        timesteps = ddim_timesteps(settings.steps)[start_index(settings.steps, skipped) :]
+        strength = settings.strength_start + progress * (settings.strength_end - settings.strength_start)
+        steps = settings.num_inference_steps
+        timesteps = ddim_timesteps(steps)[start_index(steps, strength) :]
         tokens = prior.tokens([View(camera, frame) for frame, camera in enumerate(cameras)])
         images = video.to(prior.vae.device)
 

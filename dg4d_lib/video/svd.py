@@ -66,7 +66,7 @@ class StableVideo:
         condition = model.look_at(canvas, generators)
         shape = model.blank(len(generators), settings.frames, *canvas.shape[:2])
         start = math.sqrt(SIGMA_MAX**2 + 1) * model.noise(shape, generators)
-        for latents in model.denoise(start, condition, karras_sigmas(settings.model.steps)):
+        for latents in model.denoise(start, condition, karras_sigmas(settings.model.num_inference_steps)):
             yield model.decode(latents)
 
     def _cut_out(self, frames: Float[Tensor, "t y x 3"], subject: Float[Tensor, "h w 4"]) -> DrivingVideo:

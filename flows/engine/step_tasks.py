@@ -5,7 +5,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 from uuid import UUID
 
 import httpx
@@ -62,11 +62,6 @@ class Conversion(Frozen):
     seed: int = Field(0, ge=0, le=LARGEST_SEED)
     begun_ns: int = Field(default_factory=time.time_ns)
     mesh_parts: int = 0
-
-    def with_mesh_mode(self, mode: str) -> Self:
-        """Return the same conversion with another `mesh.mode`."""
-        mesh = self.settings.mesh.model_copy(update={"mode": mode})
-        return self.model_copy(update={"settings": self.settings.model_copy(update={"mesh": mesh})})
 
 
 class Part(Frozen):

@@ -74,17 +74,13 @@ def write_frames(path: Path, video: DrivingVideo) -> None:
     write_zip(path, entries)
 
 
-def frame_rate(path: Path) -> float:
-    """Frames per second of what `write_frames` wrote, without decoding it."""
-    with zipfile.ZipFile(path) as archive:
-        return float(json.loads(archive.read("video.json"))["fps"])
-
-
 def read_frames(path: Path, scratch: Path) -> DrivingVideo:
     """Read what `write_frames` wrote; `scratch` is a folder for the unpacked pictures."""
     names = unpack(path, scratch, "the zip of frames", lambda name: name.endswith(".png"))
     stack = torch.stack([read_png(scratch / name) for name in names])
-    return DrivingVideo(stack[..., :3].contiguous(), stack[..., 3:].contiguous(), frame_rate(path))
+    with zipfile.ZipFile(path) as archive:
+        fps = float(json.loads(archive.read("video.json"))["fps"])
+    return DrivingVideo(stack[..., :3].contiguous(), stack[..., 3:].contiguous(), fps)
 
 
 def write_curves(

@@ -10,22 +10,20 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load, save
 from torch import Tensor
 
-from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.errors import BadInput
-from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
 from steps.artifacts.media import write_zip
 
 
-def write_tracked(path: Path, asset: Asset4D) -> None:
+def write_tracked(path: Path, tracked: TrackedMesh) -> None:
     """Write a tracked mesh; textures are rounded to 8 bits."""
-    tensors = {**_tensors(asset.mesh), "offsets": asset.offsets.float().cpu().contiguous()}
-    if asset.textures is not None:
-        tensors["textures"] = _rounded(asset.textures)
-    about = json.dumps({"fps": asset.fps, "extras": asset.extras, "rest": asset.rest}, sort_keys=True)
-    path.write_bytes(save(tensors, {"tracked": about}))
+    tensors = {**_tensors(tracked.mesh), "offsets": tracked.offsets.float().cpu().contiguous()}
+    if tracked.textures is not None:
+        tensors["textures"] = _rounded(tracked.textures)
+    path.write_bytes(save(tensors, {"tracked": json.dumps({"rest": tracked.rest})}))
 
 
-def read_tracked(path: Path) -> Asset4D:
+def read_tracked(path: Path) -> TrackedMesh:
     """Read what `write_tracked` wrote.
 
     Raises:
@@ -36,8 +34,7 @@ def read_tracked(path: Path) -> Asset4D:
             about = json.loads((file.metadata() or {})["tracked"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no dict)
         textures = tensors["textures"].float() / 255 if "textures" in tensors else None
-        mesh, fps, rest = _mesh(tensors), float(about["fps"]), float(about["rest"])
-        return Asset4D(mesh, tensors["offsets"], fps, about["extras"], textures, rest)
+        return TrackedMesh(_mesh(tensors), tensors["offsets"], textures, float(about["rest"]))
     except (SafetensorError, KeyError) as error:
         raise BadInput(
             f"{path.name} is no tracked mesh ({error}); give the `tracked` output of extract_mesh"

@@ -20,12 +20,11 @@ from dg4d_lib.guidance.interface import GuidancePrior
 from dg4d_lib.guidance.oracle import Bank, imperfect
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.settings import (
+    FitSettings,
     GeometricPriorSettings,
     ImageDreamPriorSettings,
-    MotionSettings,
     OraclePriorSettings,
     PriorSettings,
-    StaticSettings,
     Zero123PriorSettings,
 )
 from dg4d_lib.video.driving import over_white
@@ -66,11 +65,12 @@ class ChosenPrior:
 def make_prior(
     settings: PriorSettings,
     cutouts: Sequence[Float[Tensor, "h w 4"]],
-    stage: StaticSettings | MotionSettings,
+    stage: FitSettings,
     bank: Path | None,
     scratch: Path,
+    turn_deg: float = 0.0,
 ) -> ChosenPrior:
-    """The prior of a stage.
+    """Make the prior of a stage.
 
     Args:
         settings: which one.
@@ -78,16 +78,17 @@ def make_prior(
         stage: says which timesteps its iterations use.
         bank: file of true views, for the oracle.
         scratch: a folder for unpacking.
+        turn_deg: how far the subject is turned, for the geometric prior.
 
     Raises:
         BadInput: the oracle without a bank; weights that are damaged, or not those of this prior.
         BackendUnavailable: weights or packages that are not here.
     """
-    noise = Annealing(stage.noise_start, stage.noise_end, uniform=stage.noise_draw == "uniform")
+    noise = Annealing(stage.t_max_start, stage.t_max_end, uniform=stage.noise_draw == "uniform")
     match settings:
         case GeometricPriorSettings():
-            surfaces = InflatedSurfaces(cutouts, settings)
-            return ChosenPrior(AnalyticPrior(surfaces.clean, noise, settings.coverage_weight), GEOMETRIC_NOTE)
+            surfaces = InflatedSurfaces(cutouts, settings, turn_deg)
+            return ChosenPrior(AnalyticPrior(surfaces.clean, noise), GEOMETRIC_NOTE)
         case OraclePriorSettings():
             if bank is None:
                 raise BadInput("prior.kind = oracle needs true views: give --bank FOLDER (with a bank.json)")
@@ -107,7 +108,7 @@ def make_prior(
 def oracle_prior(bank: Bank, settings: OraclePriorSettings, noise: Annealing) -> AnalyticPrior:
     """A prior that knows the bank, or with imperfections something like it, always the same."""
     known = imperfect(bank, settings, torch.Generator().manual_seed(0))
-    return AnalyticPrior(known.clean, noise, settings.coverage_weight, known.cameras, known.frames)
+    return AnalyticPrior(known.clean, noise, known.cameras, known.frames)
 
 
 def _pictures(cutouts: Sequence[Float[Tensor, "h w 4"]]) -> Float[Tensor, "t h w 3"]:

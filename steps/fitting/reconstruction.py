@@ -11,7 +11,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.imagedream import ImageDream
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.reconstruction.lgm import load_lgm, reconstruct
-from dg4d_lib.settings import LgmSettings
+from dg4d_lib.settings import LgmStartSettings
 from dg4d_lib.video.driving import over_white
 from steps.runtime.job import Facts
 from steps.runtime.weights import Opened, open_weights
@@ -41,7 +41,7 @@ class Reconstruction:
 
 
 def reconstruct_subject(
-    subject: Float[Tensor, "h w 4"], settings: LgmSettings, rasterize: Rasterizer, generator: torch.Generator
+    subject: Float[Tensor, "h w 4"], settings: LgmStartSettings, rasterize: Rasterizer, generator: torch.Generator
 ) -> Reconstruction:
     """Reconstruct a cut-out, in the frame it has.
 
@@ -60,7 +60,7 @@ def reconstruct_subject(
     picture = over_white(subject)
     model = ImageDream.load(opened[0].folder, settings.precision, device)
     condition = model.conditioned_on(picture[None])
-    views = model.views(condition, generator, settings.steps, settings.guidance_scale).to(picture)
+    views = model.views(condition, generator, settings.num_inference_steps, settings.guidance_scale).to(picture)
     del model  # before the next one takes its memory
     lgm = load_lgm(opened[1].folder, Placement(device, dtype_on(device, settings.precision)))
     return Reconstruction(reconstruct(lgm, views, picture, rasterize), opened)

@@ -8,9 +8,9 @@ from typing import Any, get_type_hints
 import pytest
 import repository
 
-from dg4d_lib.settings import Settings
 from steps.catalog import STEPS
 from steps.contract import StepSpec
+from steps.profiles import settings_class
 from steps.runtime.job import Facts, Job
 
 SPECS = pytest.mark.parametrize("spec", STEPS.values(), ids=STEPS)
@@ -49,8 +49,20 @@ def test_the_entry_is_a_function_of_a_job(spec: StepSpec) -> None:
 
 
 @SPECS
-def test_the_settings_are_a_settings_class(spec: StepSpec) -> None:
-    assert issubclass(named(spec.settings), Settings)
+def test_the_settings_have_the_fields_that_the_code_reads_and_no_others(spec: StepSpec) -> None:
+    nodes = list(ast.walk(repository.tree(module_of(spec))))
+    names = {"job.settings"}  # and what it is assigned to as a whole
+    names |= {
+        ast.unparse(node.target) for node in nodes if isinstance(node, ast.AnnAssign) and _is_settings(node.value)
+    }
+    attributes = [node for node in nodes if isinstance(node, ast.Attribute)]
+    fields = set(settings_class(spec).model_fields)
+    assert {node.attr for node in attributes if _is_settings(node.value)} <= fields
+    assert fields <= {node.attr for node in attributes if ast.unparse(node.value) in names}
+
+
+def _is_settings(node: ast.AST | None) -> bool:
+    return node is not None and ast.unparse(node) == "job.settings"
 
 
 @SPECS

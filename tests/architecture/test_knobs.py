@@ -17,13 +17,14 @@ import dg4d_lib.asset_settings
 import dg4d_lib.settings
 import steps.profiles
 from dg4d_lib.errors import BadInput
-from dg4d_lib.settings import Settings
+from dg4d_lib.settings import MotionSettings, Settings, StaticSettings
+from steps.catalog import STEPS
 from steps.profiles import PROFILES, PipelineSettings, profile, revise
 
 DEFINITIONS = {"dg4d_lib/settings.py", "dg4d_lib/asset_settings.py", "steps/profiles.py"}
 EVIDENT = {  # numbers whose names say everything
     "iterations", "features", "hidden", "frequencies", "max_faces", "prune_opacity",
-    "guidance_weight", "color_rate", "opacity_rate", "scale_rate", "rotation_rate",
+    "guidance_weight", "color_lr", "opacity_lr", "scale_lr", "rotation_lr",
 }  # fmt: skip
 BOUNDS = (annotated_types.Gt, annotated_types.Ge, annotated_types.Lt, annotated_types.Le, annotated_types.Interval)
 
@@ -33,18 +34,20 @@ Classes = Mapping[str, tuple[type[BaseModel], ...]]
 def settings_classes() -> list[type[Settings]]:
     modules = (dg4d_lib.settings, dg4d_lib.asset_settings, steps.profiles)
     found = [value for module in modules for _, value in inspect.getmembers(module, inspect.isclass)]
-    return sorted({c for c in found if issubclass(c, Settings) and c is not Settings}, key=lambda c: c.__name__)
+    own = {c for c in found if issubclass(c, Settings) and c is not Settings}
+    return sorted(own - {base for c in own for base in c.__bases__}, key=lambda c: c.__name__)
 
 
 def classes_by_name() -> Classes:
     """What the names in annotations stand for: a class, or the members of a union."""
     names = {c.__name__: (c,) for c in settings_classes()}
     unions = {name: classes_in(value) for name, value in vars(dg4d_lib.settings).items() if name.endswith("Settings")}
-    return {**{name: members for name, members in unions.items() if members}, **names}
+    bases = {"FitSettings": (StaticSettings, MotionSettings)}
+    return {**{name: members for name, members in unions.items() if members}, **names, **bases}
 
 
 def classes_in(annotation: object) -> tuple[type[BaseModel], ...]:
-    """The settings classes inside of an annotation such as `tuple[Rung, ...]` or a union."""
+    """The settings classes inside of an annotation such as `tuple[ResolutionStage, ...]` or a union."""
     if inspect.isclass(annotation) and issubclass(annotation, BaseModel):
         return (annotation,)
     return tuple(c for part in get_args(annotation) for c in classes_in(part))
@@ -170,6 +173,10 @@ def numbers(annotation: object, metadata: list[Any]) -> Iterator[tuple[type, lis
 
 def test_every_knob_is_read() -> None:
     reads = fields_read(product(), classes_by_name())
+    owners = {name: type(value).__name__ for name, value in PipelineSettings()}
+    sections = {section for spec in STEPS.values() for section in spec.sections}  # test_entries: steps read them
+    reads |= {("PipelineSettings", section.partition(".")[0]) for section in sections}
+    reads |= {(owners[stage], knob) for stage, _, knob in (section.partition(".") for section in sections) if knob}
     unread = [f"{c}.{name}" for c, name, field in knobs() if not is_choice(field) and (c, name) not in reads]
     assert not unread, f"no code reads (from an annotated value): {', '.join(unread)}"
 

@@ -16,7 +16,13 @@ from dg4d_lib.rasterizer.interface import choose_rasterizer
 from steps.artifacts.media import write_png
 
 SIZE, FRAMES = 32, 4
-CHANGES = {**QUICK, "static.points": 60, "static.iterations": 40, "motion.iterations": 30, "motion.plane_rate": 0.05}
+CHANGES = {
+    **QUICK,
+    "static.start.points": 60,
+    "static.iterations": 40,
+    "motion.iterations": 30,
+    "motion.plane_lr": 0.05,
+}
 
 
 def ball(frame: int):
@@ -142,7 +148,7 @@ def called(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
 
 
 def test_a_data_set_is_fitted_and_scored_as_the_objects_are(dataset, specimen, monkeypatch, capsys):
-    settings = ["static.points=60", "static.iterations=10", "motion.iterations=5"]
+    settings = ["static.start.points=60", "static.iterations=10", "motion.iterations=5"]
     words = [*(f"--set={setting}" for setting in settings), "--objects=balls", "--seeds=1", f"--size={SIZE}"]
     rows = dataset / "rows.json"
     called(monkeypatch, "zero-start", "static", f"--data={dataset}", f"--json={rows}", *words)
@@ -150,7 +156,7 @@ def test_a_data_set_is_fitted_and_scored_as_the_objects_are(dataset, specimen, m
     assert f"zero-start: balls; 1 seeds, {FRAMES} frames" in printed and "Not decided" in printed
     found = {row["variant"]: row for row in json.loads(rows.read_text())["rows"]}
     assert set(found) == {"zero", "random", *ABLATIONS["static"].variants}
-    chosen = settings_of({"static.points": 60, "static.iterations": 10, "motion.iterations": 5}, SIZE, FRAMES)
+    chosen = settings_of({"static.start.points": 60, "static.iterations": 10, "motion.iterations": 5}, SIZE, FRAMES)
     direct = score(specimen, moving_fit(specimen, static_fit(specimen, chosen, 0), chosen, 0))
     assert found["zero"]["figures"]["psnr_obj"] == pytest.approx(direct.psnr_obj, abs=0.2)
     assert found["1 view, white"]["figures"]["terr"] is None

@@ -15,14 +15,14 @@ import pytest
 import torch
 
 from dg4d_lib.errors import BackendUnavailable
-from flows import home, image_to_4d
+from flows import home
 from flows.engine.containers import container
 from flows.engine.executors import EXECUTORS, StepBadInput
 from steps.artifacts.media import write_png
 from steps.catalog import STEPS
 from steps.contract import ArtifactRef, StepRequest, StepResult
 from steps.main import request_version
-from steps.profiles import PREVIEW, ExtractMeshSettings, FitGaussiansSettings, FitMotionSettings, revise
+from steps.profiles import PREVIEW, revise, step_settings
 
 ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "deploy" / "images"
@@ -47,12 +47,12 @@ SMALL = revise(
         "prior.size": 32,
         "static.iterations": 2,
         "static.views": 1,
-        "static.points": 300,
+        "static.start.points": 300,
         "static.reference_size": 32,
-        "static.ladder": LADDER,
+        "static.resolution_schedule": LADDER,
         "motion.iterations": 2,
         "motion.reference_size": 32,
-        "motion.ladder": LADDER,
+        "motion.resolution_schedule": LADDER,
         "mesh.grid": 32,
         "mesh.edge_length": 0.12,
         "mesh.texture_size": 64,
@@ -196,9 +196,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         patch.setenv("DG4D_HOME", str(folder / "home"))
         source = ArtifactRef(digest="sha256:" + "0" * 64, media_type="application/octet-stream", size_bytes=0)
         try:
-            found = container(
-                request("prepare_subject", {"source": source}, SMALL.subject), folder, home.store().address
-            )
+            found = container(request("prepare_subject", {"source": source}), folder, home.store().address)
         except BackendUnavailable as missing:
             pytest.skip(str(missing))
         trial = [found.engine, "run", "--rm", "--network", "none", "--entrypoint", "true", found.command[-1]]
@@ -208,8 +206,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield folder
 
 
-def request(step: str, inputs: dict[str, ArtifactRef], settings: object) -> StepRequest:
-    tree = settings.model_dump(mode="json")  # type: ignore[attr-defined]
+def request(step: str, inputs: dict[str, ArtifactRef]) -> StepRequest:
+    tree = step_settings(step, SMALL).model_dump(mode="json")
     return StepRequest(step=step, version=request_version(STEPS[step]), inputs=inputs, settings=tree, seed=1)
 
 
@@ -234,15 +232,10 @@ def test_a_step_gives_the_same_bytes_in_a_process_in_a_container_and_here(place:
     inside = ((rows / 0.7) ** 2 + (columns / 0.5) ** 2 < 1).float()
     write_png(place / "egg.png", torch.stack([inside * (rows + 1) / 2, inside * 0.4, inside * 0.8, inside], -1))
     source = home.store().put(place / "egg.png", "application/octet-stream")
-    subject = everywhere(request("prepare_subject", {"source": source}, SMALL.subject)).outputs["subject"]
-    driving = everywhere(request("drive_video", {"subject": subject}, image_to_4d.drive(SMALL))).outputs
-    settings = FitGaussiansSettings(rasterizer=SMALL.rasterizer, prior=SMALL.prior, static=SMALL.static)
-    fit = request("fit_gaussians", {"subject": subject}, settings)
-    gaussians = everywhere(fit).outputs["gaussians"]
-    both = {"gaussians": gaussians, "driving_video": driving["driving_video"]}
-    moving = FitMotionSettings(
-        rasterizer=SMALL.rasterizer, prior=SMALL.prior, deformation=SMALL.deformation, motion=SMALL.motion
-    )
-    motion = everywhere(request("fit_motion", both, moving)).outputs["motion"]
-    mesh = ExtractMeshSettings(rasterizer=SMALL.rasterizer, mesh=SMALL.mesh)
-    assert everywhere(request("extract_mesh", {"gaussians": gaussians, "motion": motion}, mesh)).outputs
+    subject = everywhere(request("prepare_subject", {"source": source})).outputs["subject"]
+    driving = everywhere(request("drive_video", {"subject": subject})).outputs["driving_video"]
+    gaussians = everywhere(request("fit_gaussians", {"subject": subject})).outputs["gaussians"]
+    both = {"gaussians": gaussians, "driving_video": driving}
+    cloud = {"gaussians": gaussians, "motion": everywhere(request("fit_motion", both)).outputs["motion"]}
+    plan = everywhere(request("plan_mesh", cloud)).outputs["plan"]
+    assert everywhere(request("extract_mesh", {**cloud, "plan": plan})).outputs

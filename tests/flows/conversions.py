@@ -12,7 +12,7 @@ from steps.profiles import PREVIEW, revise
 
 Run = Callable[..., Result]  # the command `dg4d`, in this process
 EVERY_STEP = [
-    "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "extract_mesh", "refine_texture", "pack_asset",
+    "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "plan_mesh", "extract_mesh", "pack_asset",
     "check_asset",
 ]  # fmt: skip
 RUN_FACTS = ("report.json", "report.html", "provenance.json", "ro-crate-metadata.json")  # these say when and how long

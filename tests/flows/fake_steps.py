@@ -18,6 +18,7 @@ from pathlib import Path
 
 from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
 from steps.artifacts.archives import add_entry
+from steps.artifacts.mesh_plan import MeshPlan, read_plan, write_plan
 from steps.catalog import STEPS as REAL
 from steps.runtime.job import Facts, Job
 
@@ -101,14 +102,23 @@ def fit_motion(job: Job) -> Facts:
     return Facts()
 
 
+def plan_mesh(job: Job) -> Facts:
+    words = _begin("plan_mesh", job, job.inputs["motion"].read_bytes())
+    mode = job.settings.mesh.mode
+    if mode == "auto":
+        mode = "per_frame" if b"flutters" in words else "tracked"
+    write_plan(job.outputs["plan"], MeshPlan(mode=mode, level=0.5))
+    return Facts()
+
+
 def extract_mesh(job: Job) -> Facts:
     words = _begin("extract_mesh", job, job.inputs["motion"].read_bytes())
     settings = job.settings
-    if settings.mesh.mode == "per_frame":
+    if read_plan(job.inputs["plan"]).mode == "per_frame":
         with zipfile.ZipFile(job.outputs["meshes"], "w") as archive:
             for i in range(settings.first_frame, settings.end_frame):
                 add_entry(archive, f"{i:03d}.safetensors", f"frame {i}".encode())
-    elif settings.mesh.mode == "tracked" or b"flutters" not in words:
+    else:
         job.outputs["tracked"].write_bytes(words)
     job.outputs["picture"].write_bytes(PNG)
     return Facts()

@@ -44,7 +44,7 @@ def test_the_run_graph_has_every_edge(log: Path, tmp_path: Path, monkeypatch: py
         wanted |= {(maker[digest], run["step"]) for digest in step["inputs"].values()}  # no input was made by nobody
         maker |= dict.fromkeys(step["outputs"].values(), run["step"])
     parts = {f"extract_mesh {number}/3" for number in (1, 2, 3)}
-    assert {(part, "join_meshes") for part in parts} | {("join_meshes", "refine_texture")} <= wanted
+    assert {(part, "join_meshes") for part in parts} | {("join_meshes", "pack_asset")} <= wanted
     wanted |= {("pack_asset", "publish"), ("check_asset", "publish")}
     flow_run = record["run"]["flow_run"]
     wait_until(lambda: {edge for edge in wanted if edge[0]} <= drawn_edges(flow_run))  # the server notes runs later
@@ -63,7 +63,8 @@ def test_every_frame_gets_a_mesh_where_one_cannot_follow(
 ) -> None:
     monkeypatch.setenv("DG4D_CPUS", "2")
     make(order("flutters", tmp_path, **{"mesh.mode": "auto"}), tmp_path / "out")
-    assert ran(log).count("extract_mesh") == 3  # once to see that it does not follow, then five frames in two parts
+    steps = ran(log)
+    assert (steps.count("plan_mesh"), steps.count("extract_mesh")) == (1, 2)  # five frames in two parts
     make(order("flutters", tmp_path, **{"mesh.mode": "tracked"}), tmp_path / "one")
     assert ran(log).count("extract_mesh") == 1
 
@@ -162,3 +163,8 @@ def test_a_picture_passes_few_modules_on_its_way_to_the_steps_and_into_the_folde
     ours = {module for module in passed if module.startswith("flows.")}
     assert {"flows.cli", "flows.pipeline", "flows.tasks", "flows.packages.publish"} <= ours
     assert len(ours) <= 15, sorted(ours)
+
+
+def test_textures_are_refined_by_a_step_only_where_a_model_is_asked_for(log: Path, tmp_path: Path) -> None:
+    make(order("refined", tmp_path), tmp_path / "out")
+    assert "refine_texture" not in ran(log)

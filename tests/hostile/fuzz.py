@@ -161,7 +161,16 @@ def _manifest_texts() -> SearchStrategy[bytes]:
 
 def _pairs() -> SearchStrategy[bytes]:
     knobs = st.sampled_from(
-        ["mesh.grid", "mesh", "prior.kind", "motion.iterations", "static.ladder", "pack.fps", "...", "driving.kind"]
+        [
+            "mesh.grid",
+            "mesh",
+            "prior.kind",
+            "motion.iterations",
+            "static.resolution_schedule",
+            "pack.fps",
+            "...",
+            "driving.kind",
+        ]
     )
     names = st.one_of(knobs, st.text(max_size=12), st.lists(st.text(max_size=4), max_size=5).map(".".join))
     deep = st.tuples(st.sampled_from(["[", '{"a":', '["']), st.integers(1, 20_000)).map(lambda pair: pair[0] * pair[1])

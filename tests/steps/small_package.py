@@ -8,19 +8,18 @@ import torch
 import trimesh
 
 from dg4d_lib.asset_settings import PackSettings
-from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import write_ply
 from dg4d_lib.geometry.harmonics import harmonics_of_color
-from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
 from dg4d_lib.settings import FramewiseSettings
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import write_frames, write_png
 from steps.artifacts.meshes import write_meshes, write_tracked
 from steps.artifacts.motions import write_motion
 from steps.pack_asset import run
-from steps.profiles import PackAssetSettings
+from steps.profiles import PREVIEW, step_settings
 from steps.runtime.job import Job
 
 FRAMES, FPS, REACH = 3, 24.0, 0.4
@@ -53,11 +52,11 @@ def gem(radius: float = 0.3) -> TexturedMesh:
     )
 
 
-def tracked(frames: int = FRAMES, fps: float = FPS) -> Asset4D:
+def tracked(frames: int = FRAMES) -> TrackedMesh:
     mesh = gem()
     offsets = torch.zeros(frames, len(mesh.vertices), 3)
     offsets[..., 0] = torch.linspace(0, REACH, frames)[:, None]
-    return Asset4D(mesh, offsets, fps)
+    return TrackedMesh(mesh, offsets)
 
 
 def inputs(folder: Path, mode: str = "tracked") -> dict[str, Path]:
@@ -83,10 +82,11 @@ def inputs(folder: Path, mode: str = "tracked") -> dict[str, Path]:
 def job(given: dict[str, Path], out: Path, **wanted: Any) -> Job:
     out.mkdir(parents=True, exist_ok=True)
     pack = PackSettings(preview_size=64, preview_turns=1, sheet_size=32, sheet_frames=2, **wanted)
+    settings = PREVIEW.model_copy(update={"rasterizer": "reference", "pack": pack})
     return Job(
         inputs=given,
         outputs={"package": out / "package.zip", "sheet": out / "sheet.png"},
-        settings=PackAssetSettings(rasterizer="reference", pack=pack, notes=(NOTE,)),
+        settings=step_settings("pack_asset", settings, notes=(NOTE,)),
         seed=0,
         progress=lambda done, total, values: None,
         pictures=out,

@@ -22,7 +22,7 @@ from steps.artifacts.rendering import states_between
 from steps.catalog import STEPS
 from steps.check_asset import Parts, gather, run, verdict
 from steps.pack_asset import run as pack
-from steps.profiles import CheckAssetSettings
+from steps.profiles import PREVIEW, step_settings
 from steps.runtime.job import Facts, Job
 
 NAMES = [
@@ -39,7 +39,10 @@ def checked(folder: Path, mode: str = "tracked", splats: bool = True, **bounds: 
         packing,
         inputs={"package": packing.outputs["package"], **given},
         outputs={"gates": folder / "gates.json", "picture": folder / "picture.png"},
-        settings=CheckAssetSettings(rasterizer="reference", gates=GateSettings(**bounds)),
+        settings=step_settings(
+            "check_asset",
+            PREVIEW.model_copy(update={"rasterizer": "reference", "gates": GateSettings(**bounds)}),
+        ),
     )
     return run(asking), asking
 

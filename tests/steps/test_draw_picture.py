@@ -9,6 +9,7 @@ from steps.artifacts.store import ArtifactStore
 from steps.catalog import STEPS
 from steps.contract import StepFailure, StepRequest, StepResult
 from steps.main import perform, request_version
+from steps.profiles import PREVIEW, step_settings
 from steps.runtime.weights import identities, weights_in, without_paths
 
 
@@ -28,7 +29,9 @@ def store(tmp_path: Path) -> ArtifactStore:
 
 
 def draw(weights: str, store: ArtifactStore, words: str = "a red dragon", seed: int = 0) -> StepResult | StepFailure:
-    tree = without_paths(TextSettings(weights=weights, size=64, steps=2).model_dump(mode="json"))
+    text = TextSettings(weights=weights, size=64, num_inference_steps=2)
+    settings = step_settings("draw_picture", PREVIEW.model_copy(update={"text": text}))
+    tree = without_paths(settings.model_dump(mode="json"))
     request = StepRequest(
         step="draw_picture",
         version=request_version(STEPS["draw_picture"]),
@@ -47,7 +50,7 @@ def test_words_become_a_picture_and_the_record_says_by_what(model: Path, store: 
     assert read_png(tmp_path / "picture.png").shape == (64, 64, 3)
     record = result.provenance
     assert {name.split("/")[1] for name in record.weights} >= {"unet", "vae", "text_encoder", "tokenizer", "scheduler"}
-    assert list(record.licenses) == [record.settings["weights"]]
+    assert list(record.licenses) == [record.settings["text"]["weights"]]
     assert "a red dragon" in record.notes[0]
     assert str(model.parent) not in record.model_dump_json()
 
@@ -79,7 +82,7 @@ def test_what_was_drawn_is_cut_out(store: ArtifactStore, tmp_path: Path) -> None
         step="prepare_subject",
         version=request_version(STEPS["prepare_subject"]),
         inputs={"source": picture},
-        settings=SubjectSettings(size=64, framing="keep").model_dump(mode="json"),
+        settings={"subject": SubjectSettings(size=64, framing="keep").model_dump(mode="json")},
         seed=0,
     )
     outcome = perform(request, store)[0]

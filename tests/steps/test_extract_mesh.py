@@ -9,15 +9,14 @@ from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import write_ply
 from dg4d_lib.geometry.harmonics import harmonics_of_color
-from dg4d_lib.settings import FramewiseSettings, IdentitySettings, MeshSettings
-from dg4d_lib.video.driving import DrivingVideo
-from steps import extract_mesh
-from steps.artifacts.media import read_png, write_frames
-from steps.artifacts.meshes import read_meshes, read_tracked, write_meshes, write_tracked
+from dg4d_lib.settings import FramewiseSettings, MeshSettings
+from steps import plan_mesh
+from steps.artifacts.media import read_png
+from steps.artifacts.mesh_plan import MeshPlan, read_plan, write_plan
+from steps.artifacts.meshes import read_meshes, read_tracked
 from steps.artifacts.motions import write_motion
 from steps.extract_mesh import run
-from steps.profiles import ExtractMeshSettings, RefineTextureSettings
-from steps.refine_texture import run as refine
+from steps.profiles import PREVIEW, step_settings
 from steps.runtime.job import Facts, Job
 
 FRAMES = 3
@@ -35,7 +34,10 @@ def ball() -> Gaussians:
 
 
 def extract(folder: Path, gaussians: Gaussians, mesh: MeshSettings = MESH, **frames: int) -> tuple[Job, Facts]:
-    """Run the step on a cloud that begins one SHIFT beside its canonical place, and goes on by one SHIFT a frame."""
+    """Plan and extract the mesh of a cloud that begins one SHIFT beside its canonical place and goes on by one a frame.
+
+    Facts are those of `extract_mesh`, with the notes of `plan_mesh` before its own.
+    """
     motion = Framewise(FRAMES, len(gaussians))
     with torch.no_grad():
         for parameter in motion.parameters():
@@ -43,15 +45,28 @@ def extract(folder: Path, gaussians: Gaussians, mesh: MeshSettings = MESH, **fra
     folder.mkdir(exist_ok=True)
     write_ply(folder / "gaussians.ply", gaussians)
     write_motion(folder / "motion", motion, FramewiseSettings(), FRAMES, len(gaussians))
+    settings = PREVIEW.model_copy(update={"mesh": mesh})
     job = Job(
         inputs={"gaussians": folder / "gaussians.ply", "motion": folder / "motion"},
-        outputs={"tracked": folder / "tracked", "meshes": folder / "meshes", "picture": folder / "picture.png"},
-        settings=ExtractMeshSettings(rasterizer="auto", mesh=mesh, **frames),
+        outputs={
+            "plan": folder / "plan",
+            "tracked": folder / "tracked",
+            "meshes": folder / "meshes",
+            "picture": folder / "picture.png",
+        },
+        settings=step_settings("plan_mesh", settings),
         seed=0,
         progress=lambda done, total, values: None,
         pictures=folder,
     )
-    return job, run(job)
+    planned = plan_mesh.run(job)
+    job = replace(
+        job,
+        inputs={**job.inputs, "plan": folder / "plan"},
+        settings=step_settings("extract_mesh", settings, **frames),
+    )
+    facts = run(job)
+    return job, replace(facts, notes=(*planned.notes, *facts.notes))
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +106,7 @@ def test_the_notes_say_what_kind_of_surface_it_is(tracked: tuple[Path, Facts]) -
 
 
 def test_the_frame_whose_surface_it_is_stays_with_the_mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(extract_mesh, "best_rest", lambda *arguments: (2, 1.0))
+    monkeypatch.setattr(plan_mesh, "best_rest", lambda *arguments: (2, 1.0))
     extract(tmp_path, ball())
     asset = read_tracked(tmp_path / "tracked")
     assert asset.rest == 2
@@ -104,18 +119,39 @@ def test_the_same_job_gives_the_same_bytes(tracked: tuple[Path, Facts], tmp_path
         assert (tmp_path / name).read_bytes() == (tracked[0] / name).read_bytes()
 
 
-@pytest.mark.parametrize(("followed", "outputs"), [(0.9, {"tracked", "picture"}), (0.8, {"picture"})])
-def test_in_auto_there_is_one_mesh_only_where_it_follows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, followed: float, outputs: set[str]
+@pytest.mark.parametrize(
+    ("mode", "followed", "expected"),
+    [
+        ("auto", 0.9, ("tracked", 1)),
+        ("auto", 0.8, ("per_frame", 0)),
+        ("tracked", 0.8, ("tracked", 1)),
+        ("per_frame", 0.0, ("per_frame", 0)),
+    ],
+)
+def test_the_plan_says_what_is_extracted_and_from_which_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str, followed: float, expected: tuple[str, int]
 ) -> None:
-    monkeypatch.setattr(extract_mesh, "best_rest", lambda *given: (1, followed))
-    job, facts = extract(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}))
-    assert {name for name, path in job.outputs.items() if path.exists()} == outputs
-    assert any("does not follow this motion (80.0% IoU" in note for note in facts.notes) == (followed == 0.8)
+    monkeypatch.setattr(plan_mesh, "best_rest", lambda *given: (1, followed))
+    job, facts = extract(tmp_path, ball(), MESH.model_copy(update={"mode": mode}))
+    plan = read_plan(tmp_path / "plan")
+    assert (plan.mode, plan.reference_frame) == expected
+    made = {"tracked": "tracked", "per_frame": "meshes"}[plan.mode]
+    assert {name for name, path in job.outputs.items() if path.exists()} == {"plan", made, "picture"}
+    refused = any("does not follow this motion (80.0% IoU" in note for note in facts.notes)
+    assert refused == (mode == "auto" and plan.mode == "per_frame")
     picture = read_png(job.outputs["picture"])[..., :3]
     assert picture.shape == (256, 1024, 3)
     blue = (picture[..., 2] - picture[..., 0] > 0.3).float().mean()
     assert 0.05 < blue < 0.5
+
+
+def test_a_plan_comes_back_with_every_bit_and_other_files_are_refused(tmp_path: Path) -> None:
+    plan = MeshPlan(mode="tracked", reference_frame=3, followed=0.1 + 0.2, level=0.5 * 2**0.25)
+    write_plan(tmp_path / "plan", plan)
+    assert read_plan(tmp_path / "plan") == plan
+    (tmp_path / "plan").write_bytes(b"PK")
+    with pytest.raises(BadInput, match="no plan of a mesh"):
+        read_plan(tmp_path / "plan")
 
 
 def test_a_mesh_per_frame_stands_where_the_cloud_is_then(tmp_path: Path) -> None:
@@ -135,30 +171,3 @@ def test_frames_that_the_motion_does_not_have_are_refused(tmp_path: Path) -> Non
 def test_an_empty_model_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FitDiverged, match="no surface"):
         extract(tmp_path, replace(ball(), opacity_logits=torch.full((300,), -20.0)))
-
-
-@pytest.mark.parametrize("mode", ["tracked", "meshes"])
-def test_refining_with_the_identity_keeps_the_mesh_and_sets_the_clock(
-    tracked: tuple[Path, Facts], tmp_path: Path, mode: str
-) -> None:
-    asset = read_tracked(tracked[0] / "tracked")
-    write_tracked(tmp_path / "given_tracked", asset)
-    write_meshes(tmp_path / "given_meshes", {0: asset.mesh, 1: asset.mesh})
-    write_frames(tmp_path / "video", DrivingVideo(torch.rand(FRAMES, 8, 8, 3), torch.ones(FRAMES, 8, 8, 1), 24.0))
-    job = Job(
-        inputs={mode: tmp_path / f"given_{mode}", "driving_video": tmp_path / "video"},
-        outputs={"tracked": tmp_path / "tracked", "meshes": tmp_path / "meshes"},
-        settings=RefineTextureSettings(refiner=IdentitySettings()),
-        seed=0,
-        progress=lambda done, total, values: None,
-        pictures=tmp_path,
-    )
-    refine(job)
-    if mode == "tracked":
-        refined = read_tracked(tmp_path / "tracked")
-        assert refined.fps == 24.0
-        assert torch.equal(refined.mesh.texture, asset.mesh.texture)
-        assert torch.equal(refined.offsets, asset.offsets)
-    else:
-        assert (tmp_path / "meshes").read_bytes() == (tmp_path / "given_meshes").read_bytes()
-        assert not (tmp_path / "tracked").exists()

@@ -17,7 +17,7 @@ from steps import fit_gaussians, fit_motion
 from steps.artifacts.media import read_png, write_frames, write_png
 from steps.artifacts.motions import read_motion
 from steps.fitting.priors import read_bank
-from steps.profiles import PREVIEW, FitGaussiansSettings, FitMotionSettings, revise
+from steps.profiles import PREVIEW, revise, step_settings
 from steps.runtime.job import Job
 
 SMALL = revise(
@@ -25,14 +25,14 @@ SMALL = revise(
     {
         "static.iterations": 3,
         "static.views": 2,
-        "static.points": 200,
+        "static.start.points": 200,
         "static.reference_size": 32,
         "static.prune_scale": 1.0,
         "motion.iterations": 2,
         "motion.reference_size": 32,
         "motion.frames_per_iteration": 0,
-        "static.ladder": [{"until": 1.0, "size": 32}],
-        "motion.ladder": [{"until": 1.0, "size": 32}],
+        "static.resolution_schedule": [{"until": 1.0, "size": 32}],
+        "motion.resolution_schedule": [{"until": 1.0, "size": 32}],
         "prior.size": 32,
     },
 )
@@ -62,8 +62,8 @@ def subject(tmp_path: Path) -> Path:
     return tmp_path / "subject.png"
 
 
-def fit_settings(settings=SMALL) -> FitGaussiansSettings:
-    return FitGaussiansSettings(rasterizer="auto", prior=settings.prior, static=settings.static)
+def fit_settings(settings=SMALL):
+    return step_settings("fit_gaussians", settings)
 
 
 def fitted(tmp_path: Path, subject: Path) -> Job:
@@ -86,9 +86,7 @@ def test_a_motion_comes_out_of_gaussians_and_a_video(tmp_path: Path, subject: Pa
     gaussians = fitted(tmp_path, subject).outputs["gaussians"]
     frames = torch.stack([disc(), disc(2), disc(4)])
     write_frames(tmp_path / "video.zip", DrivingVideo(frames[..., :3], frames[..., 3:], 5.0))
-    settings = FitMotionSettings(
-        rasterizer="auto", prior=SMALL.prior, deformation=SMALL.deformation, motion=SMALL.motion
-    )
+    settings = step_settings("fit_motion", SMALL)
     inputs = {"gaussians": gaussians, "driving_video": tmp_path / "video.zip"}
     (tmp_path / "moving").mkdir()
     work = job(tmp_path / "moving", settings, inputs, ["motion", "gaussians", "curves", "picture"])
@@ -113,9 +111,7 @@ def test_both_fits_run_with_a_trained_prior_and_say_so(tmp_path: Path, subject: 
     of_the_cloud = fit_gaussians.run(statics)
     frames = torch.stack([disc(), disc(2)])
     write_frames(tmp_path / "video.zip", DrivingVideo(frames[..., :3], frames[..., 3:], 5.0))
-    settings = FitMotionSettings(
-        rasterizer="auto", prior=trained.prior, deformation=trained.deformation, motion=trained.motion
-    )
+    settings = step_settings("fit_motion", trained)
     inputs = {"gaussians": statics.outputs["gaussians"], "driving_video": tmp_path / "video.zip"}
     work = job(tmp_path, settings, inputs, ["motion", "curves", "picture"])
     of_the_motion = fit_motion.run(work)

@@ -12,7 +12,6 @@ from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
 from dg4d_lib.settings import Settings
 from steps import main as host
 from steps.artifacts.store import ArtifactMissing, ArtifactStore
-from steps.catalog import STEPS
 from steps.contract import ArtifactRef, Port, StepFailure, StepRequest, StepResult, StepSpec
 from steps.runtime.job import Facts, Job
 
@@ -229,11 +228,6 @@ def test_a_step_ends_with_the_process_that_wanted_it(store: ArtifactStore, tmp_p
     done, result = run_alone(tmp_path, request_for(store).model_dump_json(), "--parent", "1")
     assert done.returncode == 1
     assert result is None
-
-
-def test_the_catalog_of_the_product_names_existing_settings() -> None:
-    for spec in STEPS.values():
-        assert issubclass(host._named(spec.settings), Settings)
 
 
 def test_processor_time_is_that_of_the_step_and_of_what_it_started() -> None:

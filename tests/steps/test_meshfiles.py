@@ -4,9 +4,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.errors import BadInput
-from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
 from steps.artifacts.meshes import read_meshes, read_tracked, write_meshes, write_tracked
 
 
@@ -27,17 +26,17 @@ def assert_same(first: TexturedMesh, second: TexturedMesh) -> None:
 
 
 def test_a_tracked_mesh_comes_back_as_it_was(tmp_path: Path) -> None:
-    asset = Asset4D(some_mesh(), torch.randn(3, 5, 3), 12.5, {"notes": ["a"], "n": 1}, rest=2)
+    asset = TrackedMesh(some_mesh(), torch.randn(3, 5, 3), rest=2)
     write_tracked(tmp_path / "a.safetensors", asset)
     back = read_tracked(tmp_path / "a.safetensors")
     assert_same(back.mesh, asset.mesh)
     assert torch.equal(back.offsets, asset.offsets)
-    assert (back.fps, back.extras, back.textures, back.rest) == (asset.fps, asset.extras, None, 2)
+    assert (back.textures, back.rest) == (None, 2)
 
 
 def test_a_texture_per_frame_comes_back_in_eight_bits(tmp_path: Path) -> None:
     textures = torch.stack([some_mesh(seed).texture for seed in range(3)])
-    write_tracked(tmp_path / "a", Asset4D(some_mesh(), torch.randn(3, 5, 3), 12.5, {}, textures))
+    write_tracked(tmp_path / "a", TrackedMesh(some_mesh(), torch.randn(3, 5, 3), textures))
     back = read_tracked(tmp_path / "a").textures
     assert back is not None and torch.equal(back, textures)
     assert (tmp_path / "a").stat().st_size < 4 * textures.numel()  # a byte per number
@@ -45,7 +44,7 @@ def test_a_texture_per_frame_comes_back_in_eight_bits(tmp_path: Path) -> None:
 
 def test_equal_meshes_give_equal_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
-        write_tracked(tmp_path / name, Asset4D(some_mesh(), torch.zeros(2, 5, 3), 7.0, {"b": 1, "a": 2}))
+        write_tracked(tmp_path / name, TrackedMesh(some_mesh(), torch.zeros(2, 5, 3)))
         write_meshes(tmp_path / f"{name}.zip", {0: some_mesh(), 1: some_mesh(1)})
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
     assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
@@ -84,5 +83,5 @@ def test_a_single_mesh_is_no_tracked_mesh(tmp_path: Path) -> None:
 
 def test_colors_outside_of_the_range_are_clipped(tmp_path: Path) -> None:
     bright = replace(some_mesh(), texture=torch.full((2, 2, 3), 1.5))
-    write_tracked(tmp_path / "a", Asset4D(bright, torch.zeros(1, 5, 3), 7.0))
+    write_tracked(tmp_path / "a", TrackedMesh(bright, torch.zeros(1, 5, 3)))
     assert (read_tracked(tmp_path / "a").mesh.texture == 1).all()

@@ -159,7 +159,6 @@ def test_a_mesh_of_another_motion_is_refused(tmp_path: Path) -> None:
 
 def test_the_driving_video_sets_the_frame_rate(tmp_path: Path) -> None:
     given = inputs(tmp_path / "inputs")
-    write_tracked(given["tracked"], tracked(fps=5.0))
     run(job(given, tmp_path / "out"))
     with zipfile.ZipFile(tmp_path / "out/package.zip") as archive:
         assert read_glb(archive.read("asset.glb")).fps == FPS

@@ -9,13 +9,16 @@ from dg4d_lib.settings import SubjectSettings
 from dg4d_lib.video.framing import extent
 from steps.artifacts.media import read_frames, read_png
 from steps.prepare_subject import run
+from steps.profiles import PREVIEW, step_settings
 from steps.runtime.job import Facts, Job
 
 
 def prepare(source: Path, out: Path, **settings: object) -> Facts:
     out.mkdir()
     outputs = {"subject": out / "subject.png", "footage": out / "footage.zip", "picture": out / "picture.png"}
-    return run(Job({"source": source}, outputs, SubjectSettings(size=64, **settings), 0, lambda *_: None, out))
+    subject = PREVIEW.model_copy(update={"subject": SubjectSettings(size=64, **settings)})
+    made = step_settings("prepare_subject", subject)
+    return run(Job({"source": source}, outputs, made, 0, lambda *_: None, out))
 
 
 def test_a_picture_becomes_a_square_cutout_and_no_footage(tmp_path):

@@ -51,7 +51,7 @@ def test_every_stage_has_its_own_timesteps(model: Path) -> None:
     static = judged(chosen(model, StaticSettings(), CUTOUTS[:1]))
     assert torch.equal(static, judged(chosen(model, StaticSettings(iterations=7), CUTOUTS[:1])))
     assert static != judged(chosen(model, MotionSettings(), CUTOUTS[:1]))
-    assert static != judged(chosen(model, StaticSettings(noise_end=0.3), CUTOUTS[:1]))
+    assert static != judged(chosen(model, StaticSettings(t_max_end=0.3), CUTOUTS[:1]))
     assert static != judged(chosen(model, StaticSettings(noise_draw="uniform"), CUTOUTS[:1]))
 
 

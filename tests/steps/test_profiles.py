@@ -1,55 +1,51 @@
 """Settings as requests carry them."""
 
-import pytest
+import re
 
+import pytest
+from pydantic import ValidationError
+
+from dg4d_lib.errors import BadInput
 from dg4d_lib.rasterizer import choice
 from dg4d_lib.settings import Zero123PriorSettings
-from steps.profiles import (
-    PREVIEW,
-    PROFILES,
-    ExtractMeshSettings,
-    FitGaussiansSettings,
-    FitMotionSettings,
-    PackAssetSettings,
-    profile,
-    revise,
-)
+from steps.profiles import CHANGED_KNOBS, PREVIEW, PROFILES, PipelineSettings, profile, revise, step_settings
 
 
 @pytest.mark.parametrize(("lack", "backend"), [("no GPU", "cpu"), ("", "cuda_gsplat")])
 def test_a_request_says_what_will_draw(lack: str, backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(choice, "what_gsplat_lacks", lambda: lack)
-    stages = {name: getattr(PREVIEW, name) for name in ("prior", "static", "deformation", "motion", "mesh", "pack")}
-    for kind in (FitGaussiansSettings, FitMotionSettings, ExtractMeshSettings, PackAssetSettings):
-        own = {name: stage for name, stage in stages.items() if name in kind.model_fields}
-        assert kind(rasterizer=PREVIEW.rasterizer, **own).model_dump(mode="json")["rasterizer"] == backend
-        assert kind(rasterizer="reference", **own).model_dump(mode="json")["rasterizer"] == "reference"
+    for step in ("fit_gaussians", "fit_motion", "plan_mesh", "extract_mesh", "pack_asset", "check_asset"):
+        for asked, draws in (("auto", backend), ("reference", "reference")):
+            made = step_settings(step, PREVIEW.model_copy(update={"rasterizer": asked}))
+            assert made.model_dump(mode="json")["rasterizer"] == draws
 
 
-PAPER = {"static.iterations": 500, "static.views": 16, "static.noise_start": 0.98, "static.noise_end": 0.02,
-         "motion.iterations": 200, "motion.views": 4, "motion.noise_start": 0.5, "motion.noise_end": 0.02,
-         "motion.frames_per_iteration": 0, "static.points": 5000, "deformation.temporal": 32, "deformation.spatial": 32,
-         "deformation.features": 32, "deformation.endpoint": True, "motion.fine_tune": False,
+PAPER = {"static.iterations": 500, "static.views": 16, "static.t_max_start": 0.98, "static.t_max_end": 0.02,
+         "motion.iterations": 200, "motion.views": 4, "motion.t_max_start": 0.5, "motion.t_max_end": 0.02,
+         "motion.frames_per_iteration": 0, "static.start.points": 5000,
+         "deformation.temporal": 32, "deformation.spatial": 32, "deformation.features": 32,
+         "deformation.endpoint": True, "motion.fine_tune": False,
          "prior.weights": "zero123-xl", "prior.variant": "xl", "prior.guidance_scale": 5.0,
          "driving.kind": "svd", "driving.frames": 14,
-         "refiner.kind": "video_to_video", "refiner.skipped": 0.7, "static.start": "blob",
+         "refiner.kind": "video_to_video", "refiner.strength": 0.3, "static.start.kind": "blob",
          "mesh.mode": "per_frame", "mesh.grid": 128, "mesh.texture_size": 1024}  # fmt: skip
 DIFFERENCES = {
     "paper": {},
     "video": {"subject.max_frames": 32, "motion.iterations": 500},
     "video-fast": {"subject.max_frames": 16, "motion.iterations": 500, "motion.views": 1},
-    "reference": {"motion.iterations": 500, "static.noise_start": 1.0, "static.noise_end": 0.0,
-                  "motion.noise_start": 1.0, "motion.noise_end": 0.0, "deformation.temporal": 12,
+    "reference": {"static.start.points": None, "motion.iterations": 500,
+                  "static.t_max_start": 1.0, "static.t_max_end": 0.0,
+                  "motion.t_max_start": 1.0, "motion.t_max_end": 0.0, "deformation.temporal": 12,
                   "motion.fine_tune": True, "deformation.endpoint": False, "deformation.half_side": 1.6,
                   "prior.weights": "stable-zero123", "prior.variant": "stable",
-                  "static.start": "lgm", "static.iterations": 0},
+                  "static.start.kind": "lgm", "static.iterations": 0},
 }  # fmt: skip
 
 
 def value_of(name: str, path: str) -> object:
     value: object = profile(name)
     for part in path.split("."):
-        value = getattr(value, part)
+        value = getattr(value, part, None)
     return value
 
 
@@ -75,3 +71,44 @@ def test_another_kind_is_chosen_before_its_knobs_are_set(turned: bool) -> None:
 def test_the_same_kind_again_changes_nothing() -> None:
     twelve = revise(profile("paper"), {"prior.memory_gb": 12})
     assert revise(twelve, {"prior.kind": "zero123"}) == twelve
+
+
+def test_a_step_gets_its_sections_and_values_of_the_run_and_nothing_else() -> None:
+    turned = revise(PREVIEW, {"subject.turn_deg": 12.5})
+    assert step_settings("drive_video", turned).model_dump() == {
+        "driving": turned.driving.model_dump(),
+        "turn_deg": 12.5,
+    }
+    assert step_settings("pack_asset", turned, notes=("so",)).model_dump()["notes"] == ("so",)
+    with pytest.raises(ValidationError, match="first_frame"):
+        step_settings("pack_asset", turned, first_frame=3)
+    with pytest.raises(ValidationError, match="less than or equal to 60"):
+        step_settings("drive_video", turned).model_validate({"driving": {"kind": "warp"}, "turn_deg": 61})
+    with pytest.raises(ValidationError, match="prior"):  # sections have no defaults: a request has them all
+        type(step_settings("fit_gaussians", turned)).model_validate({"rasterizer": "cpu"})
+
+
+@pytest.mark.parametrize(("old", "new"), CHANGED_KNOBS.items())
+def test_the_old_name_of_a_knob_is_refused_with_the_new_one(old: str, new: str) -> None:
+    with pytest.raises(BadInput, match=re.escape(f"the setting {old} is {f'now {new}' if new else 'gone'}")):
+        revise(PREVIEW, {old: 1})
+    *path, last = old.split(".")
+    tree: dict[str, object] = {last: 1}  # as in a record
+    for name in reversed(path):
+        tree = {name: tree}
+    with pytest.raises(ValidationError, match=re.escape(f"the setting {old} is")):
+        PipelineSettings.model_validate(tree)
+
+
+def test_new_names_are_knobs_of_some_profile() -> None:
+    svd_lgm = revise(profile("reference"), {})
+    image = revise(profile("paper"), {"refiner.kind": "image_to_image"})
+    for new in filter(None, CHANGED_KNOBS.values()):
+        path = new.split(" ")[0]
+        found = []
+        for settings in (PREVIEW, svd_lgm, image):
+            value: object = settings
+            for part in path.split("."):
+                value = getattr(value, part, None)
+            found.append(value)
+        assert any(value is not None for value in found), path

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import torch
 from media_files import save, save_zip, walk
-from pydantic import BaseModel
 from tiny_imagedream import write_imagedream, write_lgm
 from tiny_svd import save_tiny_svd
 from tiny_weights import write_zero123
@@ -21,18 +20,7 @@ from steps.artifacts.store import ArtifactStore
 from steps.catalog import STEPS
 from steps.contract import ArtifactRef, ProvenanceRecord, StepRequest, StepResult
 from steps.main import perform, request_version
-from steps.profiles import (
-    PROFILES,
-    DriveVideoSettings,
-    ExtractMeshSettings,
-    FitGaussiansSettings,
-    FitMotionSettings,
-    PackAssetSettings,
-    PipelineSettings,
-    RefineTextureSettings,
-    profile,
-    revise,
-)
+from steps.profiles import PROFILES, PipelineSettings, profile, revise, step_settings
 from steps.runtime.weights import identities, weights_in
 
 FRAMES = 3
@@ -42,13 +30,13 @@ TINY: dict[str, Any] = {
     "subject.max_frames": FRAMES,
     "static.iterations": 2,
     "static.views": 1,
-    "static.points": 300,
+    "static.start.points": 300,
     "static.reference_size": 32,
-    "static.ladder": LADDER,
+    "static.resolution_schedule": LADDER,
     "motion.iterations": 2,
     "motion.views": 1,
     "motion.reference_size": 32,
-    "motion.ladder": LADDER,
+    "motion.resolution_schedule": LADDER,
     "mesh.grid": 32,
     "mesh.edge_length": 0.06,
     "mesh.max_faces": 400,
@@ -57,10 +45,10 @@ TINY: dict[str, Any] = {
     "driving.frames": FRAMES,
     "driving.height": 64,
     "driving.width": 64,
-    "driving.model.steps": 2,
+    "driving.model.num_inference_steps": 2,
     "refiner.texture.iterations": 2,
     "refiner.texture.size": 64,
-    "refiner.model.steps": 4,
+    "refiner.model.num_inference_steps": 4,
     "pack.preview_size": 64,
     "pack.preview_turns": 1,
     "pack.sheet_size": 32,
@@ -90,12 +78,13 @@ class Run:
         changes = dict(TINY)
         if self.profile == "preview":  # its stages have no models
             changes = {key: value for key, value in TINY.items() if not key.startswith(OF_MODELS)}
-        if profile(self.profile).static.start == "lgm":
-            changes["static.lgm.steps"] = 2
+        if profile(self.profile).static.start.kind == "lgm":
+            changes["static.start.num_inference_steps"] = 2
+            del changes["static.start.points"]
         self.settings = revise(profile(self.profile), changes)
 
-    def step(self, name: str, inputs: Mapping[str, ArtifactRef | None], settings: BaseModel) -> dict[str, ArtifactRef]:
-        tree = settings.model_dump(mode="json")
+    def step(self, name: str, inputs: Mapping[str, ArtifactRef | None], **values: object) -> dict[str, ArtifactRef]:
+        tree = step_settings(name, self.settings, **values).model_dump(mode="json")
         request = StepRequest(
             step=name,
             version=request_version(STEPS[name]),
@@ -114,32 +103,21 @@ class Run:
 
     def make(self, source: ArtifactRef) -> Path:
         """The package of a source."""
-        settings, draws = self.settings, {"rasterizer": self.settings.rasterizer}
-        prepared = self.step("prepare_subject", {"source": source}, settings.subject)
+        prepared = self.step("prepare_subject", {"source": source})
         subject, footage = prepared["subject"], prepared.get("footage")
-        driven = self.step(
-            "drive_video", {"subject": subject, "footage": footage}, DriveVideoSettings(driving=settings.driving)
-        )
-        video = driven["driving_video"]
-        static = FitGaussiansSettings(prior=settings.prior, static=settings.static, **draws)
-        gaussians = self.step("fit_gaussians", {"subject": subject}, static)["gaussians"]
-        dynamic = FitMotionSettings(
-            prior=settings.prior, deformation=settings.deformation, motion=settings.motion, **draws
-        )
-        fitted = self.step("fit_motion", {"gaussians": gaussians, "driving_video": video}, dynamic)
-        assert ("gaussians" in fitted) == settings.motion.fine_tune
+        video = self.step("drive_video", {"subject": subject, "footage": footage})["driving_video"]
+        gaussians = self.step("fit_gaussians", {"subject": subject})["gaussians"]
+        fitted = self.step("fit_motion", {"gaussians": gaussians, "driving_video": video})
+        assert ("gaussians" in fitted) == self.settings.motion.fine_tune
         cloud = {"gaussians": fitted.get("gaussians", gaussians), "motion": fitted["motion"]}
-        extracted = self.step("extract_mesh", cloud, ExtractMeshSettings(mesh=settings.mesh, **draws))
-        surface = {port: extracted.get(port) for port in ("tracked", "meshes")}
-        refined = self.step(
-            "refine_texture", {**surface, "driving_video": video}, RefineTextureSettings(refiner=settings.refiner)
-        )
-        assert refined != {port: ref for port, ref in surface.items() if ref}
-        surface = {port: refined.get(port) for port in ("tracked", "meshes")}
+        surface = self.step("extract_mesh", {**cloud, "plan": self.step("plan_mesh", cloud)["plan"]})
+        del surface["picture"]
+        if self.settings.refiner.kind != "identity":
+            refined = self.step("refine_texture", {**surface, "driving_video": video})
+            assert refined.keys() == surface.keys() and refined != surface
+            surface = refined
         packed = self.step(
-            "pack_asset",
-            {"subject": subject, "driving_video": video, **cloud, **surface},
-            PackAssetSettings(pack=settings.pack, notes=self.notes(), **draws),
+            "pack_asset", {"subject": subject, "driving_video": video, **cloud, **surface}, notes=self.notes()
         )
         return self.store.path(packed["package"])
 

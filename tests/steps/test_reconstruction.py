@@ -12,22 +12,22 @@ from dg4d_lib.fitting import static
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.rasterizer.interface import choose_rasterizer
-from dg4d_lib.settings import LgmSettings, StaticSettings
+from dg4d_lib.settings import LgmStartSettings, StaticSettings
 from steps import fit_gaussians
 from steps.artifacts.media import read_png, write_png
 from steps.fit_gaussians import touched_up
 from steps.fitting.reconstruction import NOTE, Reconstruction, reconstruct_subject
-from steps.profiles import PREVIEW, FitGaussiansSettings
+from steps.profiles import PREVIEW, step_settings
 from steps.runtime.job import Facts, Job
 from steps.runtime.weights import open_weights, weights_in
 
 
 @pytest.fixture(scope="module")
-def lgm(tmp_path_factory: pytest.TempPathFactory) -> LgmSettings:
+def lgm(tmp_path_factory: pytest.TempPathFactory) -> LgmStartSettings:
     folder = tmp_path_factory.mktemp("weights")
     views = tiny_imagedream.write_imagedream(folder / "imagedream")
     weights = tiny_imagedream.write_lgm(folder / "lgm")
-    return LgmSettings(weights=str(weights), views_weights=str(views), precision="fp32", steps=2)
+    return LgmStartSettings(weights=str(weights), views_weights=str(views), precision="fp32", num_inference_steps=2)
 
 
 def subject() -> torch.Tensor:
@@ -37,17 +37,17 @@ def subject() -> torch.Tensor:
 
 
 def test_the_fit_starts_from_the_reconstruction_that_the_seed_decides(
-    lgm: LgmSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    lgm: LgmStartSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    changes = {"iterations": 0, "views": 0, "start": "lgm", "lgm": lgm.model_dump(), "reference_size": 32}
-    stage = StaticSettings.model_validate({**PREVIEW.static.model_dump(), **changes})
+    changes = {"iterations": 0, "views": 0, "start": lgm, "reference_size": 32}
+    stage = PREVIEW.static.model_copy(update=changes)
     given = []
     fit = static.fit_gaussians
     monkeypatch.setattr(fit_gaussians, "fit_gaussians", lambda *a: given.append(a) or fit(*a))
     write_png(tmp_path / "subject.png", subject())
     outputs = {name: tmp_path / name for name in ("gaussians", "curves", "picture.png")}
     outputs["picture"] = outputs.pop("picture.png")
-    settings = FitGaussiansSettings(rasterizer="cpu", prior=PREVIEW.prior, static=stage)
+    settings = step_settings("fit_gaussians", PREVIEW.model_copy(update={"rasterizer": "cpu", "static": stage}))
     inputs = {"subject": tmp_path / "subject.png"}
     facts = fit_gaussians.run(Job(inputs, outputs, settings, 1, lambda *_: None, tmp_path))
 
@@ -56,14 +56,14 @@ def test_the_fit_starts_from_the_reconstruction_that_the_seed_decides(
     expected = reconstruct_subject(exact, lgm, choose_rasterizer("cpu"), torch.Generator().manual_seed(1))
     assert torch.equal(start.means, expected.gaussians.means)
     assert torch.equal(read_ply(outputs["gaussians"]).means, start.means)
-    assert used.mean_rate == pytest.approx(0.1 * stage.mean_rate)
+    assert used.means_lr == pytest.approx(0.1 * stage.means_lr)
     assert NOTE in facts.notes
     assert NOTE in json.loads(outputs["curves"].read_text())["notes"]
     assert {Path(name).parent.name for name in facts.weights} >= {"unet", "vae", "lgm"}
     assert set(facts.licenses) == {lgm.weights, lgm.views_weights}
 
 
-def test_what_the_prior_brought_stays_in_the_record(lgm: LgmSettings) -> None:
+def test_what_the_prior_brought_stays_in_the_record(lgm: LgmStartSettings) -> None:
     opened = open_weights(lgm.weights), open_weights(lgm.views_weights)
     made = Reconstruction(blob(16, 0.5, torch.Generator()), opened)
     facts = made.added_to(Facts("cpu", {"prior": "sha256:1"}, {"prior": "free"}, ("a prior",)))
@@ -74,24 +74,24 @@ def test_what_the_prior_brought_stays_in_the_record(lgm: LgmSettings) -> None:
 
 def test_means_of_a_reconstruction_move_a_tenth_as_fast() -> None:
     slow = touched_up(StaticSettings())
-    assert (slow.mean_rate, slow.mean_rate_end) == pytest.approx((1e-3, 2e-5))
-    assert slow.color_rate == StaticSettings().color_rate
+    assert (slow.means_lr, slow.means_lr_end) == pytest.approx((1e-3, 2e-5))
+    assert slow.color_lr == StaticSettings().color_lr
 
 
 def test_weights_are_asked_for_only_where_they_are_used() -> None:
-    blob, start = StaticSettings(), StaticSettings(start="lgm")
+    blob, start = StaticSettings(), StaticSettings(start={"kind": "lgm"})
     assert list(weights_in(blob.model_dump())) == []
     assert list(weights_in(start.model_dump())) == ["lgm", "imagedream"]
     assert StaticSettings.model_validate(start.model_dump()) == start
-    assert StaticSettings.model_validate({**start.model_dump(), "start": "blob"}) == blob
 
 
-def test_a_knob_of_lgm_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(ValueError, match="speed"):
-        StaticSettings.model_validate({"start": "lgm", "lgm": {"speed": 3}})
+def test_a_start_has_its_own_knobs_and_no_others() -> None:
+    for kind, knob in (("lgm", "points"), ("blob", "weights"), ("lgm", "speed")):
+        with pytest.raises(ValueError, match=knob):
+            StaticSettings.model_validate({"start": {"kind": kind, knob: 3}})
 
 
-def test_weights_of_something_else_are_refused(lgm: LgmSettings) -> None:
+def test_weights_of_something_else_are_refused(lgm: LgmStartSettings) -> None:
     wrong = lgm.model_copy(update={"weights": lgm.views_weights})
     with pytest.raises(BadInput, match="model_fp16_fixrot"):
         reconstruct_subject(subject(), wrong, choose_rasterizer("cpu"), torch.Generator())

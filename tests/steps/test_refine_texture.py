@@ -6,14 +6,13 @@ import torch
 from tiny_svd import save_tiny_svd
 from tiny_weights import write_zero123
 
-from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.errors import BadInput
-from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.settings import ImageToImageSettings, RefinerSettings, VideoToVideoSettings
+from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
+from dg4d_lib.settings import IdentitySettings, ImageToImageSettings, RefinerSettings, VideoToVideoSettings
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import write_frames
 from steps.artifacts.meshes import read_meshes, read_tracked, write_meshes, write_tracked
-from steps.profiles import RefineTextureSettings
+from steps.profiles import PREVIEW, step_settings
 from steps.refine_texture import run
 from steps.runtime.job import Facts, Job
 
@@ -29,7 +28,7 @@ def folder(tmp_path: Path) -> Path:
     texture = torch.full((16, 16, 3), 128 / 255)
     mesh = TexturedMesh(corners, torch.tensor([[0, 3, 2], [0, 2, 1]], dtype=torch.int32), uvs, texture)
     offsets = torch.stack([torch.full((4, 3), 0.05 * frame) for frame in range(FRAMES)])
-    write_tracked(tmp_path / "tracked.in", Asset4D(mesh, offsets, 1.0, {}))
+    write_tracked(tmp_path / "tracked.in", TrackedMesh(mesh, offsets))
     write_meshes(
         tmp_path / "meshes.in", {i: replace(mesh, vertices=corners + offset) for i, offset in enumerate(offsets)}
     )
@@ -43,7 +42,7 @@ def refine(folder: Path, mode: str, refiner: RefinerSettings) -> Facts:
         Job(
             inputs={mode: folder / f"{mode}.in", "driving_video": folder / "video"},
             outputs={"tracked": folder / "tracked", "meshes": folder / "meshes"},
-            settings=RefineTextureSettings(refiner=refiner),
+            settings=step_settings("refine_texture", PREVIEW.model_copy(update={"refiner": refiner})),
             seed=0,
             progress=lambda done, total, values: None,
             pictures=folder,
@@ -53,7 +52,9 @@ def refine(folder: Path, mode: str, refiner: RefinerSettings) -> Facts:
 
 def video_to_video(folder: Path, **changes: object) -> VideoToVideoSettings:
     weights = save_tiny_svd(folder / "svd")
-    return VideoToVideoSettings(texture={**TEXTURE, **changes}, model={"weights": str(weights), "steps": 4})
+    return VideoToVideoSettings(
+        texture={**TEXTURE, **changes}, model={"weights": str(weights), "num_inference_steps": 4}
+    )
 
 
 @pytest.mark.parametrize("mode", ["tracked", "meshes"])
@@ -68,9 +69,7 @@ def test_video_diffusion_sees_all_frames_as_one_video(folder: Path, mode: str, m
     facts = refine(folder, mode, video_to_video(folder, refresh_every=2))
     assert seen == [FRAMES]
     if mode == "tracked":
-        asset = read_tracked(folder / "tracked")
-        textures = [asset.mesh.texture]
-        assert asset.fps == 24
+        textures = [read_tracked(folder / "tracked").mesh.texture]
     else:
         textures = [mesh.texture for mesh in read_meshes(folder / "meshes")]
         assert len(textures) == FRAMES
@@ -85,7 +84,7 @@ def test_every_frame_of_a_tracked_mesh_may_add_its_own(folder: Path) -> None:
     facts = refine(folder, "tracked", video_to_video(folder, frame_size=8))
     asset = read_tracked(folder / "tracked")
     assert asset.textures is not None and asset.textures.shape == (FRAMES, 8, 8, 3)
-    assert asset.mesh.texture.shape == (16, 16, 3) and asset.fps == 24
+    assert asset.mesh.texture.shape == (16, 16, 3)
     assert "from frame to frame" in facts.notes[1]
     facts = refine(folder, "meshes", video_to_video(folder, frame_size=8))  # there every frame has its own anyway
     assert len(facts.notes) == 1
@@ -93,11 +92,16 @@ def test_every_frame_of_a_tracked_mesh_may_add_its_own(folder: Path) -> None:
 
 def test_image_diffusion_is_the_alternative(folder: Path) -> None:
     prior = {"weights": str(write_zero123(folder / "zero123")), "precision": "fp32"}
-    settings = ImageToImageSettings(texture=TEXTURE, prior=prior, steps=4)
+    settings = ImageToImageSettings(texture=TEXTURE, prior=prior, num_inference_steps=4)
     facts = refine(folder, "tracked", settings)
     assert "picture by picture" in facts.notes[0] and any("unet" in name for name in facts.weights)
     red, green, _ = read_tracked(folder / "tracked").mesh.texture[4:12, 4:12].mean((0, 1))
     assert red > 0.53 and green < 0.47
+
+
+def test_the_identity_needs_no_step(folder: Path) -> None:
+    with pytest.raises(BadInput, match="leave refine_texture out"):
+        refine(folder, "tracked", IdentitySettings())
 
 
 def test_a_video_of_another_length_is_refused(folder: Path) -> None:

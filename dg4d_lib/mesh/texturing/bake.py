@@ -33,7 +33,8 @@ from dg4d_lib.settings import MeshSettings
 
 SHARPNESS = 2  # power in a view's weight of how far the cosine is above the least; views fade in and out without seams
 INPUT_WEIGHT = 200.0  # of the input view against another one: only there the colors come from a picture
-INPUT_FLATTER = 0.6  # of `min_cosine` in the input view: a stretched true color is better than a guessed one
+MIN_COSINE = 0.5  # texels seen at a flatter angle are not colored
+INPUT_FLATTER = 0.6  # of `MIN_COSINE` in the input view: a stretched true color is better than a guessed one
 OUTLINE = 2  # pixels: the band along outlines and along nearer surfaces that is not trusted
 LAST_RESORT = 1e-4  # weight of views that are too flat or on an outline: they count where nothing better is
 FLATTEST = 0.05  # cosine below which a view does not count at all
@@ -94,9 +95,9 @@ def bake(
     for start in range(0, len(cameras), VIEWS_AT_ONCE):
         batch = cameras[start : start + VIEWS_AT_ONCE]
         pictures = _look(batch, vertices, faces, gaussians, rasterize)
-        rules = [(settings.min_cosine, 1.0)] * len(batch)
+        rules = [(MIN_COSINE, 1.0)] * len(batch)
         if start == 0:
-            rules[0] = (INPUT_FLATTER * settings.min_cosine, INPUT_WEIGHT)
+            rules[0] = (INPUT_FLATTER * MIN_COSINE, INPUT_WEIGHT)
         run([partial(_add, texels, batch, pictures, rules, part, total) for part in _parts(len(total))])
     weight = torch.from_numpy(total[:, 3:])
     seen = weight[:, 0] > 0

@@ -10,7 +10,7 @@ from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.settings import TextSettings
 
 CPU = torch.device("cpu")
-QUICK = TextSettings(size=48, steps=3)
+QUICK = TextSettings(size=48, num_inference_steps=3)
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +33,8 @@ def test_equal_words_and_seeds_give_equal_pictures_and_others_do_not(model: Path
         draw(model, seed=1),
         draw(model, "a blue newt"),
         draw(model, suffix=" in the red"),
-        draw(model, steps=2),
-        draw(model, guidance=1.0),
+        draw(model, num_inference_steps=2),
+        draw(model, guidance_scale=1.0),
     ):
         assert not torch.equal(picture, other)
 

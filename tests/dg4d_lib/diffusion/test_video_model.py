@@ -17,7 +17,7 @@ from dg4d_lib.settings import VideoModelSettings
 CPU = torch.device("cpu")
 STEPS, FRAMES, SIDE = 3, 3, 32
 SCHEDULERS_OWN = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
-SETTINGS = VideoModelSettings(steps=STEPS, frames_at_once=2)
+SETTINGS = VideoModelSettings(num_inference_steps=STEPS, decode_chunk_size=2)
 
 
 def rng(seed: int) -> torch.Generator:
@@ -43,7 +43,7 @@ def generated(model: VideoModel, picture: torch.Tensor, *seeds: int) -> torch.Te
     generators = [rng(seed) for seed in seeds]
     condition = model.look_at(picture, generators)
     start = math.sqrt(700**2 + 1) * model.noise(model.blank(len(seeds), FRAMES, SIDE, SIDE), generators)
-    videos = model.denoise(start, condition, karras_sigmas(model.settings.steps))
+    videos = model.denoise(start, condition, karras_sigmas(model.settings.num_inference_steps))
     return torch.stack([model.decode(latents) for latents in videos])
 
 
@@ -59,17 +59,17 @@ def test_the_noise_levels_are_those_of_the_real_scheduler() -> None:
 
 
 @pytest.mark.parametrize(
-    ("skipped", "index", "sigma"), [(0.6, 15, 3.870), (0.7, 17, 1.2732), (0.75, 18, 0.678), (0.8, 20, 0.157)]
+    ("strength", "index", "sigma"), [(0.4, 15, 3.870), (0.3, 17, 1.2732), (0.25, 18, 0.678), (0.2, 20, 0.157)]
 )
-def test_the_skipped_share_gives_the_known_start(skipped: float, index: int, sigma: float) -> None:
-    assert start_index(25, skipped) == index
+def test_the_strength_gives_the_known_start(strength: float, index: int, sigma: float) -> None:
+    assert start_index(25, strength) == index
     assert karras_sigmas(25)[index] == pytest.approx(sigma, abs=5.1e-4)
 
 
-def test_eight_steps_are_left_of_25_when_seven_tenths_are_skipped() -> None:
+def test_eight_steps_are_left_of_25_at_the_paper_s_strength() -> None:
     sigmas = karras_sigmas(25)
     assert sigmas[0] == pytest.approx(700) and sigmas[24] == pytest.approx(0.002) and sigmas[25] == 0
-    assert len(sigmas[start_index(25, 0.7) :]) - 1 == 8
+    assert len(sigmas[start_index(25, 0.3) :]) - 1 == 8
 
 
 @pytest.mark.parametrize("sigma", [0.01, 1.0, 500.0])
@@ -92,7 +92,7 @@ def test_a_video_is_what_diffusers_makes_of_the_same_noise(model: VideoModel, pi
         num_frames=FRAMES,
         num_inference_steps=STEPS,
         fps=7,
-        decode_chunk_size=SETTINGS.frames_at_once,
+        decode_chunk_size=SETTINGS.decode_chunk_size,
         generator=rng(5),
         output_type="pt",
     ).frames[0]
@@ -137,7 +137,7 @@ def test_a_budget_says_how_much_goes_through_at_once(
     folder: Path, pixels: torch.Tensor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In float32, of what is left: two frames to the encoder, one to the decoder, three videos to the network."""
-    model = VideoModel.load(folder, VideoModelSettings(steps=STEPS, memory_gb=6, videos_at_once=9), CPU)
+    model = VideoModel.load(folder, VideoModelSettings(num_inference_steps=STEPS, memory_gb=6, videos_at_once=9), CPU)
     weights = [part.parameters() for part in (model.unet, model.vae, model.image_encoder)]
     taken = sum(4 * value.numel() for part in weights for value in part) / 2**30
     picture = 4 * SIDE**2 / 1e6

@@ -12,11 +12,11 @@ from dg4d_lib.guidance.analytic import AnalyticPrior
 from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.interface import View
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
-from dg4d_lib.settings import MotionSettings, Rung, StaticSettings
+from dg4d_lib.settings import MotionSettings, ResolutionStage, StaticSettings
 from dg4d_lib.video.driving import DrivingVideo
 
 SIZE, FRAMES, SLIDE = 32, 4, 0.3
-LADDER = (Rung(until=1.0, size=SIZE),)
+LADDER = (ResolutionStage(until=1.0, size=SIZE),)
 
 
 class KnownObject:
@@ -45,8 +45,8 @@ class KnownObject:
         )
         return picture.color, picture.alpha
 
-    def prior(self, noise_start: float) -> AnalyticPrior:
-        return AnalyticPrior(self.clean, Annealing(noise_start), coverage_weight=1.0)
+    def prior(self, t_max_start: float) -> AnalyticPrior:
+        return AnalyticPrior(self.clean, Annealing(t_max_start))
 
     def video(self) -> DrivingVideo:
         camera = OrbitCamera(width=SIZE, height=SIZE)
@@ -65,11 +65,18 @@ def known() -> KnownObject:
 
 @pytest.fixture
 def static_settings() -> StaticSettings:
-    return StaticSettings(iterations=150, views=4, ladder=LADDER, reference_size=SIZE, points=300, densify_every=50)
+    return StaticSettings(
+        iterations=150,
+        views=4,
+        resolution_schedule=LADDER,
+        reference_size=SIZE,
+        start={"kind": "blob", "points": 300},
+        densify_every=50,
+    )
 
 
 @pytest.fixture
 def motion_settings() -> MotionSettings:
     return MotionSettings(
-        iterations=120, views=1, ladder=LADDER, reference_size=SIZE, plane_rate=0.02, network_rate=0.005
+        iterations=120, views=1, resolution_schedule=LADDER, reference_size=SIZE, plane_lr=0.02, network_lr=0.005
     )

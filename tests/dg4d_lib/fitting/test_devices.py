@@ -106,7 +106,7 @@ def drawn_here_and_there(known) -> dict[str, tuple[torch.device, Rasterizer]]:
 def test_the_static_fit_on_a_gpu_ends_where_the_processor_ends(known, static_settings, drawn_here_and_there):
     """Density is controlled on the way; the sums of a GPU have no fixed order, so the losses agree, not the bytes."""
     settings = static_settings.model_copy(update={"iterations": 60, "densify_every": 25, "densify_gradient": 1e-4})
-    start, ends = blob(settings.points, 0.5, seed()), {}
+    start, ends = blob(settings.start.points, 0.5, seed()), {}
     for place, (device, rasterize) in drawn_here_and_there.items():
         losses: list[float] = []
         fitted = fit_gaussians(

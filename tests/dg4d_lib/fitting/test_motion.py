@@ -42,7 +42,7 @@ def test_fine_tuning_mends_colors_and_a_frozen_cloud_keeps_its_bits(known, motio
     truth, gray = known.gaussians, replace(known.gaussians, harmonics=torch.zeros(40, 1, 3))
     wrong = (gray.colors - truth.colors).abs().mean()
     for fine_tune in (False, True):
-        settings = motion_settings.model_copy(update={"fine_tune": fine_tune, "color_rate": 0.1, "iterations": 60})
+        settings = motion_settings.model_copy(update={"fine_tune": fine_tune, "color_lr": 0.1, "iterations": 60})
         losses: list[float] = []
         fitted = fit_motion(
             gray, make("hexplane", known), known.video(), known.prior(0.5), known.rasterize, settings, seed(),
@@ -69,7 +69,7 @@ def test_fine_tuning_learns_at_the_rates_of_the_public_code(known, motion_settin
         change = (getattr(fitted, name) - getattr(turned, name)).abs()
         assert change.median().item() == pytest.approx(rate, rel=0.01), name
         assert change.max() < 1.02 * rate, name
-    assert (settings.mean_rate, settings.mean_rate_end) == (1e-3, 2e-5)
+    assert (settings.means_lr, settings.means_lr_end) == (1e-3, 2e-5)
 
 
 def test_frames_of_an_iteration_are_spread_over_time():

@@ -21,7 +21,7 @@ def psnr_from_unseen_sides(known, gaussians) -> float:
 
 
 def test_score_distillation_with_the_true_views_recovers_the_object(known, static_settings):
-    start = blob(static_settings.points, 0.5, seed())
+    start = blob(static_settings.start.points, 0.5, seed())
     seen = []
     fitted = fit_gaussians(
         start,

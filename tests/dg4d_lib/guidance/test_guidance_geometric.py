@@ -48,10 +48,11 @@ def test_only_the_frames_that_are_asked_for_are_built_and_only_once():
         surfaces.surface(1)
 
 
-def test_the_turn_of_the_settings_is_used():
+def test_the_turn_of_the_subject_is_used():
     color, _ = InflatedSurfaces([disc(24)], SETTINGS).clean([View(OrbitCamera(0, 50, width=SIZE, height=SIZE))])
-    settings = GeometricPriorSettings(size=SIZE, turn_deg=40)
-    turned, _ = InflatedSurfaces([disc(24)], settings).clean([View(OrbitCamera(0, 50, width=SIZE, height=SIZE))])
+    turned, _ = InflatedSurfaces([disc(24)], SETTINGS, turn_deg=40).clean(
+        [View(OrbitCamera(0, 50, width=SIZE, height=SIZE))]
+    )
     assert (color - turned).abs().mean() > 0.01
 
 

@@ -70,7 +70,7 @@ def test_one_pass_is_what_the_formulas_say_with_the_same_noise() -> None:
     parts = tiny_svd()
     for part in (parts.unet, parts.vae, parts.image_encoder):
         part.double()
-    settings = VideoToVideoSettings(model=VideoModelSettings(frames_at_once=FRAMES))
+    settings = VideoToVideoSettings(model=VideoModelSettings(decode_chunk_size=FRAMES))
     model = VideoModel(parts.unet, parts.vae, parts.image_encoder, settings.model, CPU)
     refiner, picture = VideoToVideo(settings, model, video(2)[0]), video(2)[0]
     refined = refiner.refine(video(), CAMERAS, 0.5, rng(7))
@@ -117,7 +117,7 @@ def test_pictures_are_denoised_as_the_ddim_scheduler_does_it(
 
     frames = video(3).float()
     prior = zero123.conditioned_on(frames, Annealing(1.0))
-    settings = ImageToImageSettings(steps=20)
+    settings = ImageToImageSettings(num_inference_steps=20)
     refiner = ImageToImage(settings, prior)
     assert isinstance(refiner, Refiner)
     refined = refiner.refine(video().float(), CAMERAS, progress, rng(7))

@@ -9,7 +9,7 @@ from dg4d_lib.video.generator import VideoGenerator
 from dg4d_lib.video.svd import StableVideo
 
 SIZE, FRAMES = 48, 4
-SETTINGS = SvdSettings(frames=FRAMES, height=64, width=64, model=VideoModelSettings(steps=2))
+SETTINGS = SvdSettings(frames=FRAMES, height=64, width=64, model=VideoModelSettings(num_inference_steps=2))
 
 
 @pytest.fixture(scope="module")

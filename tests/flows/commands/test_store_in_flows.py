@@ -232,7 +232,7 @@ def test_a_bucket_that_stays_away_is_a_clear_error_and_the_next_run_goes_on(
     ran(log)
     bucket.start()
     make(wanted, tmp_path / "out")
-    assert ran(log)[:2] == ["fit_motion", "extract_mesh"]
+    assert ran(log)[:2] == ["fit_motion", "plan_mesh"]
 
 
 def _absent(bucket: TinyS3, log: Path, step: str, seconds: float) -> None:

@@ -36,7 +36,7 @@ from steps.artifacts.store import ArtifactStore
 from steps.profiles import PREVIEW
 
 EVERY_STEP = [
-    "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "extract_mesh", "refine_texture", "pack_asset",
+    "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "plan_mesh", "extract_mesh", "pack_asset",
     "check_asset",
 ]  # fmt: skip
 STAGES = [EVERY_STEP[:1], EVERY_STEP[1:3], *([step] for step in EVERY_STEP[3:])]  # of steps that run side by side

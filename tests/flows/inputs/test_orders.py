@@ -154,7 +154,7 @@ def test_words_are_a_source_whatever_the_spaces_between_them(weights: Path, stor
     assert one.source_name == '"a red dragon"'
     assert order(words(" a  red\ndragon "), store).digest() == one.digest()
     assert order(words("a red newt"), store).digest() != one.digest()
-    assert order(words("a red dragon", **{"text.steps": 3}), store).digest() != one.digest()
+    assert order(words("a red dragon", **{"text.num_inference_steps": 3}), store).digest() != one.digest()
 
 
 def test_a_file_that_holds_the_same_words_is_another_order(weights: Path, tmp_path: Path, store: ArtifactStore) -> None:

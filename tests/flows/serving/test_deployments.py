@@ -169,7 +169,7 @@ def test_a_run_whose_process_was_killed_goes_on_after_its_last_finished_step(
     assert run.state.is_completed() and run.run_count == 2
     steps = log.read_text().split()[before:]
     assert steps[:4] == ["prepare_subject", "drive_video", "fit_gaussians", "fit_motion"]
-    assert steps[4:] == ["fit_motion", "extract_mesh", "refine_texture", "pack_asset", "check_asset"]
+    assert steps[4:] == ["fit_motion", "plan_mesh", "extract_mesh", "pack_asset", "check_asset"]
     whole(tmp_path / "out")
 
 

@@ -33,7 +33,7 @@ from steps.profiles import PREVIEW
 from tests.clients.node import run_node
 
 EVERY_STEP = [
-    "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "extract_mesh", "refine_texture", "pack_asset",
+    "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "plan_mesh", "extract_mesh", "pack_asset",
     "check_asset",
 ]  # fmt: skip
 TITLES = [title for (step, _), title in PICTURES.items() if step in EVERY_STEP]

@@ -1,0 +1,35 @@
+"""The `plan` artifact: kind of mesh that a motion gets, and density of its surface. Imports no torch."""
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, ValidationError
+
+from dg4d_lib.errors import BadInput
+from steps.contract import Frozen
+
+
+class MeshPlan(Frozen):
+    """Decisions that `plan_mesh` makes and `extract_mesh` carries out."""
+
+    mode: Literal["tracked", "per_frame"]
+    reference_frame: int = Field(0, ge=0, description="frame whose surface is extracted (tracked) or sets the level")
+    followed: float = Field(1.0, description="IoU of outlines over the motion, of the best trial mesh; 1 without trial")
+    level: float = Field(description="density of the surface")
+
+
+def write_plan(path: Path, plan: MeshPlan) -> None:
+    """Write a plan as JSON; floats keep every bit."""
+    path.write_text(plan.model_dump_json(), encoding="utf-8")
+
+
+def read_plan(path: Path) -> MeshPlan:
+    """Read what `write_plan` wrote.
+
+    Raises:
+        BadInput: the file is no plan.
+    """
+    try:
+        return MeshPlan.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        raise BadInput(f"{path.name} is no plan of a mesh ({error}); give the `plan` output of plan_mesh") from error

@@ -1,0 +1,48 @@
+"""The kind of mesh that a motion gets, decided on coarse trial meshes before any mesh is extracted."""
+
+import torch
+
+from dg4d_lib.gaussians.ply import read_ply
+from dg4d_lib.mesh.extraction.density import density_field
+from dg4d_lib.mesh.extraction.extract import best_level
+from dg4d_lib.mesh.tracking.nonrigid_registration import FOLLOWS
+from dg4d_lib.mesh.tracking.reference_frame import best_rest
+from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.settings import MeshSettings
+from steps.artifacts.mesh_plan import MeshPlan, write_plan
+from steps.artifacts.motions import read_motion
+from steps.runtime.job import Facts, Job
+
+
+def run(job: Job) -> Facts:
+    """Choose one tracked mesh or a mesh per frame, the reference frame, and the level of the surface.
+
+    The level is the one whose outlines agree best with those of the Gaussians in the reference frame.
+
+    Raises:
+        FitDiverged: the cloud is empty.
+    """
+    settings: MeshSettings = job.settings.mesh
+    rasterize = choose_rasterizer(job.settings.rasterizer)
+    gaussians = read_ply(job.inputs["gaussians"])
+    deformation, frames = read_motion(job.inputs["motion"])
+    with torch.no_grad():
+        displacement = deformation.displace(gaussians.means, torch.linspace(0, 1, frames))
+    states = displacement.apply(gaussians)
+    mode, frame, followed, notes = settings.mode, 0, 1.0, []
+    if mode != "per_frame":
+        frame, followed = best_rest(states, displacement, rasterize, settings)
+    if mode == "auto":
+        mode = "tracked" if followed >= FOLLOWS else "per_frame"
+        if mode == "per_frame":
+            frame = 0
+            notes.append(
+                f"one mesh does not follow this motion ({followed:.1%} IoU on trial): every frame gets its own"
+            )
+    job.progress(1, 2, {})
+    rest = states.at(frame)
+    level, agreement = best_level(density_field(rest, settings), rest, rasterize, settings.density_threshold)
+    notes.append(f"surface at density {level:.3g}; its outlines agree with the Gaussians' to {agreement:.1%} (IoU)")
+    write_plan(job.outputs["plan"], MeshPlan(mode=mode, reference_frame=frame, followed=followed, level=level))
+    job.progress(2, 2, {})
+    return Facts(backend=f"{job.settings.rasterizer} rasterizer", notes=tuple(notes))
