@@ -48,7 +48,7 @@ SETTINGS = {
     # a slot that a killed run held is free again, also after the server was started anew
     "PREFECT_SERVER_CONCURRENCY_LEASE_STORAGE": "prefect.server.concurrency.lease_storage.filesystem",
     # and a run that was killed goes on then
-    "PREFECT_SERVER_EVENTS_CAUSAL_ORDERING": "flows.serving.ordering",
+    "PREFECT_SERVER_EVENTS_CAUSAL_ORDERING": "flows.prefect_compat",
 }
 
 
@@ -258,7 +258,6 @@ def _serve(listener: socket.socket, folder: Path, prefect_home: Path) -> subproc
         "PREFECT_HOME": str(prefect_home),
         "PREFECT_SERVER_API_AUTH_STRING": auth.auth_string(folder),
         "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": f"http://{HOST}:{port}",
-        "PREFECT__SERVER_FINAL": "1",
     }
     return subprocess.Popen(
         python("-m", "flows.serving.server_app", str(listener.fileno())),
