@@ -22,7 +22,7 @@ from typing import IO
 from urllib.parse import quote
 
 from flows.engine.processes import die_with_parent, locked, python, without_prefect
-from flows.serving import auth, fresh
+from flows.serving import auth, database_template
 
 HOST = "127.0.0.1"  # never another interface: the traffic is not encrypted
 LOGIN = "/dg4d/login"
@@ -250,7 +250,7 @@ def _watch(process: subprocess.Popen[bytes], folder: Path, idle_s: float) -> int
 
 def _serve(listener: socket.socket, folder: Path, prefect_home: Path) -> subprocess.Popen[bytes]:
     prefect_home.mkdir(mode=0o700, parents=True, exist_ok=True)
-    fresh.put(prefect_home)
+    database_template.copy_to(prefect_home)
     port = listener.getsockname()[1]
     environment = {
         **without_prefect(),
