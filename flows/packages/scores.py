@@ -10,7 +10,7 @@ from urllib.parse import quote
 
 from pydantic import BaseModel
 
-from flows.commands.endings import EXIT_BAD_INPUT, EXIT_FAILED
+from flows.exit_status import EXIT_BAD_INPUT, EXIT_FAILED
 from flows.packages.html_pages import render
 from flows.packages.summary import BAD_INPUT
 from flows.ui.escaping import cell

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from flows.commands.endings import EXIT_BAD_INPUT, EXIT_MISSING
+from flows.exit_status import EXIT_BAD_INPUT, EXIT_MISSING
 from flows.inputs.json_text import loads
 from flows.packages.crate import CRATE, files_in, own_digest, rendered
 from flows.packages.credentials import CERTIFICATE, Signature, sidecar_of, signature_of
