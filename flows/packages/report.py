@@ -10,10 +10,11 @@ from typing import Any
 
 from flows.engine.tasks import Finished, Made
 from flows.inputs.orders import Order
+from flows.inputs.signing_key import certificate
 from flows.packages import acceptance
 from flows.packages.acceptance import picture_of, verdict_of
 from flows.packages.crate import CRATE, crate_text
-from flows.packages.credentials import Claim, Signer, certificate, sidecar_of
+from flows.packages.credentials import Claim, Signer, sidecar_of
 from flows.packages.html_pages import render
 from flows.packages.publish import FORMAT, RECORD, Files, fact_of_bytes, readable
 from flows.packages.view import VIEWER, page_of
