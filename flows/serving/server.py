@@ -186,6 +186,11 @@ class Server:
         except (OSError, ValueError, KeyError, TypeError):
             return None
 
+    def is_used(self) -> bool:
+        """Return whether a command uses it."""
+        with locked(self.folder / "in-use") as unused:
+            return not unused
+
     def is_guarded(self) -> bool:
         """Whether its guard is there: it runs, or starts."""
         with locked(self.folder / "guard", shared=True) as free:
