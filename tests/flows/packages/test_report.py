@@ -1,6 +1,7 @@
 import io
 import json
 import re
+import tomllib
 import zipfile
 from html.parser import HTMLParser
 from pathlib import Path
@@ -233,3 +234,11 @@ def test_a_summary_counts_and_the_overview_links_what_is_there(tmp_path: Path) -
     assert Links(page).addresses.count("a%20b/preview.webp") == 1
     assert "&lt;ugly&gt;" in page
     assert page.index("z/y") < page.index("a b")
+
+
+def test_every_page_that_flows_read_is_part_of_the_installed_package() -> None:
+    root = Path(report.__file__).parents[2]
+    patterns = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    folders = {package: root / package.replace(".", "/") for package in patterns}
+    packaged = {path for package, names in patterns.items() for name in names for path in folders[package].glob(name)}
+    assert set((root / "flows").rglob("*.html")) <= packaged
