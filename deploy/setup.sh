@@ -14,7 +14,7 @@ PY
 export VENV TORCH_INDEX
 bash deploy/install.sh torch steps flows dev
 "$VENV/bin/python" -m pip --disable-pip-version-check install --quiet --no-deps --no-build-isolation --editable .
-"$VENV/bin/python" -m flows.serving.fresh
+"$VENV/bin/python" -m flows.serving.database_template
 
 # pymeshlab imports without these but then lacks its filters.
 filters() { "$VENV/bin/python" -c 'import pymeshlab; print(len(pymeshlab.filter_list()))' 2>/dev/null || echo 0; }

@@ -17,7 +17,7 @@ COPY deploy/pools.yaml deploy/prefect.yaml deploy/
 RUN --mount=type=secret,id=pip,target=/etc/pip.conf \
     PIP_NO_CACHE_DIR=1 VENV=/opt/dg4d bash deploy/install.sh flows && \
     pip install --no-cache-dir --no-deps --no-build-isolation . && \
-    python -m flows.serving.fresh && \
+    python -m flows.serving.database_template && \
     rm -rf /src/* /opt/code && \
     install --directory --owner 10001 --group 10001 /home/dg4d/data /data
 USER 10001

@@ -12,10 +12,17 @@ from typing import NoReturn
 
 import typer
 
-EXIT_FAILED = 1
-EXIT_BAD_INPUT = 65
-EXIT_MISSING = 69
-EXIT_HANGUP, EXIT_INTERRUPTED, EXIT_TERMINATED = 129, 130, 143  # 128 and the number of the signal, as shells have it
+from flows.exit_status import (
+    EXIT_BAD_INPUT,
+    EXIT_FAILED,
+    EXIT_HANGUP,
+    EXIT_INTERRUPTED,
+    EXIT_MISSING,
+    EXIT_TERMINATED,
+)
+
+__all__ = ["EXIT_BAD_INPUT", "EXIT_FAILED", "Terminated", "clear_ending"]
+
 UNREACHABLE = {errno.EACCES, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR}  # of paths that were given
 CODES = {signal.SIGHUP: EXIT_HANGUP, signal.SIGTERM: EXIT_TERMINATED}
 STOPPED = "stopped; the same command goes on after the last finished step"

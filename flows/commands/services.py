@@ -86,6 +86,8 @@ def down() -> None:
             runs = worker.runs()
             typer.echo(f"ending worker {worker.pool}" + (f" and its {runs} run{'s' * (runs > 1)}" if runs else ""))
             stopped.append(worker.stop())
+        if server.address() is not None and server.is_used():
+            typer.echo("ending the server, which a running command uses: the command will start it again")
         typer.echo("stopped" if server.stop() or stopped else "nothing was running")
 
 

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flows.commands.endings import EXIT_BAD_INPUT, clear_ending
+from flows.commands.endings import clear_ending
 from flows.commands.options import finite
+from flows.exit_status import EXIT_BAD_INPUT
 
 if TYPE_CHECKING:
     from flows.packages.versions import Version

@@ -4,19 +4,16 @@ Prefect's own policies hash arguments and source text and miss what matters; its
 """
 
 import asyncio
-import errno
-import fcntl
 import hashlib
 import json
-import os
 import threading
-import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
 from prefect.cache_policies import CachePolicy
 from prefect.context import TaskRunContext
 from prefect.serializers import JSONSerializer
@@ -81,7 +78,7 @@ class RequestPolicy(CachePolicy):
         holder = f"heal-{threading.get_ident()}"
         if not isinstance(lock, FileLocks):
             record.unlink(missing_ok=True)
-        elif lock.try_lock(key, holder):
+        elif lock.acquire_lock(key, holder, acquire_timeout=0):
             try:
                 if recorded(record, home.store()) is None:
                     record.unlink(missing_ok=True)
@@ -98,45 +95,21 @@ class FileLocks:
 
     def __init__(self, folder: Callable[[], Path]) -> None:
         self._folder = folder
-        self._held: dict[str, tuple[str, int]] = {}
-        self._mutex = threading.Lock()
+        self._held: dict[str, tuple[str, FileLock]] = {}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "FileLocks":
         return self  # a copied policy locks with the same locks
 
-    def try_lock(self, key: str, holder: str) -> bool:
-        """Take the lock if it is free; true also when this holder has it already."""
-        with self._mutex:
-            if key in self._held:
-                return self._held[key][0] == holder
-            self._folder().mkdir(parents=True, exist_ok=True)
-            handle = os.open(self._path(key), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                os.close(handle)
-                if error.errno in {errno.EWOULDBLOCK, errno.EAGAIN}:
-                    return False
-                raise
-            self._held[key] = (holder, handle)
-            return True
-
     def acquire_lock(
         self, key: str, holder: str, acquire_timeout: float | None = None, hold_timeout: float | None = None
     ) -> bool:
-        """Wait for the lock; false after `acquire_timeout` seconds. A lock is held until it is released."""
-        start = time.monotonic()
-        while not self.try_lock(key, holder):
-            if acquire_timeout is not None and time.monotonic() - start >= acquire_timeout:
+        """Wait for the lock; return false after `acquire_timeout` seconds. A lock is held until it is released."""
+        if not self.is_lock_holder(key, holder):
+            lock = self._waited_for(key, acquire_timeout)
+            if lock is None:
                 return False
-            time.sleep(POLL_S)
+            self._held[key] = (holder, lock)
         return True
-
-    async def aacquire_lock(
-        self, key: str, holder: str, acquire_timeout: float | None = None, hold_timeout: float | None = None
-    ) -> bool:
-        """As `acquire_lock`."""
-        return await asyncio.to_thread(self.acquire_lock, key, holder, acquire_timeout, hold_timeout)
 
     def release_lock(self, key: str, holder: str) -> None:
         """Give the lock back.
@@ -144,46 +117,37 @@ class FileLocks:
         Raises:
             ValueError: this holder does not have it.
         """
-        with self._mutex:
-            if self._held.get(key, ("", 0))[0] != holder:
-                raise ValueError(f"{holder} does not hold the lock of {key}")
-            os.close(self._held.pop(key)[1])
+        if not self.is_lock_holder(key, holder):
+            raise ValueError(f"{holder} does not hold the lock of {key}")
+        self._held.pop(key)[1].release()
 
     def is_locked(self, key: str) -> bool:
-        """Whether anybody holds the lock, in this process or another."""
-        with self._mutex:
-            if key in self._held:
-                return True
-            try:
-                handle = os.open(self._path(key), os.O_RDWR | os.O_CLOEXEC)
-            except FileNotFoundError:
-                return False
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                return True
-            else:
-                return False
-            finally:
-                os.close(handle)
+        """Return whether anybody holds the lock, in this process or another."""
+        return not self.wait_for_lock(key, 0)
 
     def is_lock_holder(self, key: str, holder: str) -> bool:
-        """Whether this holder has the lock."""
-        with self._mutex:
-            return self._held.get(key, ("", 0))[0] == holder
+        """Return whether this holder has the lock."""
+        return self._held.get(key, ("", None))[0] == holder
 
     def wait_for_lock(self, key: str, timeout: float | None = None) -> bool:
-        """Wait until nobody holds the lock; false after `timeout` seconds."""
-        start = time.monotonic()
-        while self.is_locked(key):
-            if timeout is not None and time.monotonic() - start >= timeout:
-                return False
-            time.sleep(POLL_S)
-        return True
+        """Wait until nobody holds the lock; return false after `timeout` seconds."""
+        if (lock := self._waited_for(key, timeout)) is not None:
+            lock.release()
+        return lock is not None
+
+    async def aacquire_lock(self, *arguments: Any, **named: Any) -> bool:
+        """Do the same as `acquire_lock`."""
+        return await asyncio.to_thread(self.acquire_lock, *arguments, **named)
 
     async def await_for_lock(self, key: str, timeout: float | None = None) -> bool:
-        """As `wait_for_lock`."""
+        """Do the same as `wait_for_lock`."""
         return await asyncio.to_thread(self.wait_for_lock, key, timeout)
 
-    def _path(self, key: str) -> Path:
-        return self._folder() / (hashlib.sha256(key.encode()).hexdigest() + ".lock")
+    def _waited_for(self, key: str, timeout: float | None) -> FileLock | None:
+        """Return the lock, held; None after `timeout` seconds."""
+        lock = FileLock(self._folder() / (hashlib.sha256(key.encode()).hexdigest() + ".lock"), thread_local=False)
+        try:
+            lock.acquire(timeout=-1 if timeout is None else timeout, poll_interval=POLL_S)
+        except Timeout:
+            return None
+        return lock

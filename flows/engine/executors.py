@@ -130,7 +130,9 @@ def in_subprocess(
             environment = {"TMPDIR": str(folder), **resources.environment()}
             begun = forks.fork(_arguments(folder), environment, stderr, resources.handles())
             if begun is None:
-                raise StepCrashed(spec.name, "the process that begins steps ended: python -m steps.runtime.fork_server")
+                raise StepCrashed(
+                    spec.name, "the fork server exited twice; run `python -m steps.runtime.fork_server 0` to see why"
+                )
             return begun
 
         return _result_of(_Program(start, end=lambda: None), folder, spec, request, on_progress, say)
@@ -247,7 +249,7 @@ def _watched(
     alarm.start()
     _running[process] = end
     try:
-        assert process.stdin is not None and process.stdout is not None  # they are pipes
+        assert process.stdout is not None  # it is a pipe
         for line in process.stdout:
             _relay(line, on_progress, say)
         status = process.wait()

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import PurePosixPath
 
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from dg4d_lib.errors import BadInput
 from flows.engine.processes import OWN_START, place, start_of
@@ -28,24 +28,42 @@ LONGEST_RUN_S = 7 * 24 * 3600.0  # of a run on another machine, whose end cannot
 _BEGAN = time.monotonic()
 
 
-class Lease(Frozen):
-    """What one process needs for one item.
+class Holder(Frozen):
+    """Process that works in a store.
 
     Attributes:
         host: the machine, or its container.
         pid: the process.
         start: when it began, in the ticks of its kernel.
+    """
+
+    host: str = Field(default_factory=place)
+    pid: int = Field(default_factory=os.getpid)
+    start: str = OWN_START
+
+    def is_gone(self, silent_s: float, patience_s: float) -> bool:
+        """Return whether it has ended; on another machine, whether it was silent for longer than the patience."""
+        return start_of(self.pid) != self.start if self.host == place() else silent_s > patience_s
+
+
+class Lease(Holder):
+    """What one process needs for one item.
+
+    Attributes:
         item: what is being made.
         age_s: how long the process had been at work when it wrote this.
         artifacts: results of earlier runs that it uses; those it makes are protected by their age.
     """
 
-    host: str
-    pid: int
-    start: str
     item: str
     age_s: float
     artifacts: tuple[Digest, ...]
+
+
+class Collecting(Holder):
+    """The process that removes what nobody needs."""
+
+    token: str
 
 
 @contextmanager
@@ -83,14 +101,7 @@ def hold(store: ArtifactStore, item: str, artifacts: Iterable[str]) -> None:
         needed = {*(known or ()), *artifacts}
         if needed == known:
             return
-        lease = Lease(
-            host=place(),
-            pid=os.getpid(),
-            start=OWN_START,
-            item=item,
-            age_s=time.monotonic() - _BEGAN,
-            artifacts=tuple(sorted(needed)),
-        )
+        lease = Lease(item=item, age_s=time.monotonic() - _BEGAN, artifacts=tuple(sorted(needed)))
         store.write(_name(item), lease.model_dump_json())
         _held[store.address, item] = needed
 
@@ -107,21 +118,12 @@ def needed(store: ArtifactStore, now: float) -> tuple[set[str], float]:
     since = now
     for entry in list(store.entries(FOLDER)):
         lease = _read(store, entry)
-        if lease is None or _is_over(lease, entry, now):
+        if lease is None or lease.is_gone(now - entry.modified, LONGEST_RUN_S):
             store.remove([entry.name])
             continue
         artifacts.update(lease.artifacts)
         since = min(since, entry.modified - lease.age_s)
     return artifacts, since
-
-
-class Collecting(Frozen):
-    """The process that removes what nobody needs."""
-
-    host: str
-    pid: int
-    start: str
-    token: str
 
 
 @contextmanager
@@ -132,8 +134,7 @@ def collecting(store: ArtifactStore) -> Iterator[Callable[[], None]]:
         BadInput: another one is at it.
         StoreUnreachable: the store does not answer.
     """
-    own = Collecting(host=place(), pid=os.getpid(), start=OWN_START, token=uuid.uuid4().hex)
-    text = own.model_dump_json()
+    text = Collecting(token=uuid.uuid4().hex).model_dump_json()
     while not store.create(LOCK, text) and store.read(LOCK) != text.encode():  # a repeated request may find its own
         if _is_collecting(store):
             raise BadInput(f"somebody else is removing things from {store.address} at the moment; try again later")
@@ -175,21 +176,12 @@ def _read(store: ArtifactStore, entry: Entry) -> Lease | None:
 
 
 def _is_collecting(store: ArtifactStore) -> bool:
-    """Whether the lock is held by somebody who is alive."""
-    content = store.read(LOCK)
-    if content is None:
+    """Return whether the lock is held by somebody who is alive."""
+    if (content := store.read(LOCK)) is None:
         return False
-    try:
-        holder = Collecting.model_validate_json(content)
-    except ValidationError:  # it is being written
-        holder = None
-    if holder is not None and holder.host == place():
-        return start_of(holder.pid) == holder.start
     written = next((entry.modified for entry in store.entries(PurePosixPath(LOCK).parent.as_posix())), None)
-    return written is not None and abs(store.now() - written) <= LOCK_S  # clocks may differ, either way
-
-
-def _is_over(lease: Lease, entry: Entry, now: float) -> bool:
-    if lease.host == place():
-        return start_of(lease.pid) != lease.start
-    return now - entry.modified > LONGEST_RUN_S
+    silent_s = 0.0 if written is None else abs(store.now() - written)  # clocks may differ, either way
+    try:
+        return not Collecting.model_validate_json(content).is_gone(silent_s, LOCK_S)
+    except ValidationError:  # it is being written
+        return silent_s <= LOCK_S

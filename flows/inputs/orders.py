@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.rasterizer.choice import backend_name, require_backend
 from flows.inputs import naming, sources
-from flows.packages.credentials import certificate
+from flows.inputs.signing_key import certificate
 from steps.artifacts.store import ArtifactStore
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen, digest_of
 from steps.main import catalog, request_version

@@ -1,7 +1,5 @@
 """What the gates say about an asset, for reports, summaries and the Prefect UI."""
 
-import base64
-import html
 import json
 from collections.abc import Iterable
 from pathlib import Path
@@ -40,29 +38,15 @@ def bounds(gate: dict[str, Any]) -> str:
     return f"at most {most:g}{unit}" if least is None else f"at least {least:g}{unit}"
 
 
-def section(verdict: dict[str, Any], picture: bytes | None) -> str:
-    """A verdict as HTML: a row per gate, what to do about those that fail, and the picture."""
-    rows = "".join(
-        f"<tr class={'passed' if gate['passed'] else 'missed'}><td>{'passed' if gate['passed'] else 'failed'}"
-        f"<td>{html.escape(gate['name'])}<td class=number>{gate['value']:.3g}{html.escape(_unit(gate))}"
-        f"<td>{html.escape(bounds(gate))}<td>{html.escape(gate['form'])}<td>{html.escape(gate['meaning'])}"
-        + ("" if gate["passed"] else f"<br><b>{html.escape(gate['advice'])}</b>")
-        for gate in verdict["gates"]
-    )
-    head = "<tr><th><th>gate<th>value<th>bounds<th>of<th>"
-    shown = ""
-    if picture is not None:
-        address = f"data:image/png;base64,{base64.b64encode(picture).decode()}"
-        shown = (
-            f'<details><summary>the worst moments</summary><img alt="input, splats, mesh" src="{address}"></details>'
-        )
-    return f"<p class=verdict>{html.escape(headline(verdict))}</p><table class=gates>{head}{rows}</table>{shown}"
+def value(gate: dict[str, Any]) -> str:
+    """Return the value of a gate with its unit."""
+    return f"{gate['value']:.3g} {gate['unit']}".strip()
 
 
 def markdown(verdict: dict[str, Any]) -> list[str]:
     """A verdict as lines of Markdown."""
     rows = [
-        f"| {'passed' if gate['passed'] else '**failed**'} | {gate['name']} | {gate['value']:.3g}{_unit(gate)} "
+        f"| {'passed' if gate['passed'] else '**failed**'} | {gate['name']} | {value(gate)} "
         f"| {bounds(gate)} | {gate['meaning'] if gate['passed'] else gate['advice']} |"
         for gate in verdict["gates"]
     ]
@@ -81,7 +65,3 @@ def _output(results: Iterable[StepResult], name: str, store: ArtifactStore) -> b
     """An output of the step that asked the gates."""
     refs = [result.outputs[name] for result in results if GATES in result.outputs]
     return store.path(refs[0]).read_bytes() if refs and store.has(refs[0]) else None
-
-
-def _unit(gate: dict[str, Any]) -> str:
-    return f" {gate['unit']}" if gate["unit"] else ""

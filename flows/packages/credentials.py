@@ -4,11 +4,8 @@ Pictures and films carry theirs inside; for formats that cannot, and for the cra
 file of the package, it lies beside as a file. Nothing is fetched from or sent to anybody: there are no time stamps.
 """
 
-import base64
-import hashlib
 import io
 import json
-import os
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.metadata import version
@@ -16,9 +13,9 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
+from flows.inputs.signing_key import CERTIFICATE, KEY, certificate, pem
 from flows.packages.publish import Files, fact_of
 
-KEY, CERTIFICATE = "DG4D_SIGNING_KEY", "DG4D_SIGNING_CERTIFICATE"
 EMBEDDED = {".mp4": "video/mp4", ".png": "image/png"}  # formats that carry credentials, and what they are called
 BESIDE = (".glb", ".usdz")  # a USDZ that carries some breaks the rule that every entry starts at a multiple of 64 bytes
 ANY_BYTES = "application/octet-stream"
@@ -173,9 +170,9 @@ def configured() -> Signer | None:
     _library()
     serialization: Any = import_module("cryptography.hazmat.primitives.serialization")
     x509: Any = import_module("cryptography.x509")
-    chain = _pem(CERTIFICATE)
+    chain = pem(CERTIFICATE)
     try:
-        key = serialization.load_pem_private_key(_pem(KEY), None)
+        key = serialization.load_pem_private_key(pem(KEY), None)
         own = x509.load_pem_x509_certificates(chain)[0]
     except (ValueError, TypeError) as error:
         raise BadInput(
@@ -191,26 +188,6 @@ def configured() -> Signer | None:
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
     return Signer(plain, chain, ALGORITHMS[kind], own.subject.rfc4514_string())
-
-
-def certificate() -> str | None:
-    """The sha256 of the configured certificate, which stands for who signs; None where nobody does.
-
-    Raises:
-        BadInput: only one of key and certificate is named, or the certificate cannot be read.
-    """
-    if not os.environ.get(KEY) and not os.environ.get(CERTIFICATE):
-        return None
-    _pem(KEY)
-    text = _pem(CERTIFICATE).decode("ascii", "replace")
-    body = text.partition("-----BEGIN CERTIFICATE-----")[2].partition("-----END CERTIFICATE-----")[0]
-    try:
-        content = base64.b64decode("".join(body.split()), validate=True)
-    except ValueError:
-        content = b""
-    if not content:
-        raise BadInput(f"${CERTIFICATE} names a file without a certificate in PEM: {os.environ[CERTIFICATE]}")
-    return f"sha256:{hashlib.sha256(content).hexdigest()}"
 
 
 def sidecar_of(name: str) -> str:
@@ -261,14 +238,3 @@ def _library() -> Any:
         return import_module("c2pa")
     except ImportError as error:
         raise BackendUnavailable("content credentials need c2pa-python: pip install 'dg4d[signing]'") from error
-
-
-def _pem(name: str) -> bytes:
-    """The file that an environment variable names."""
-    place = os.environ.get(name)
-    if not place:
-        raise BadInput(f"${KEY} and ${CERTIFICATE} go together, and ${name} is not set; set both, or neither")
-    try:
-        return Path(place).expanduser().read_bytes()
-    except OSError as error:
-        raise BadInput(f"${name} names {place}, which cannot be read: {error.strerror}") from error

@@ -1,6 +1,6 @@
 """What goes with a package: `report.json` and `report.html` for people, `provenance.json` for checking it."""
 
-import html
+import base64
 import json
 import math
 from collections.abc import Mapping
@@ -10,15 +10,18 @@ from typing import Any
 
 from flows import home
 from flows.inputs.orders import Order
-from flows.packages.acceptance import picture_of, section, verdict_of
+from flows.inputs.signing_key import certificate
+from flows.packages import acceptance
+from flows.packages.acceptance import picture_of, verdict_of
 from flows.packages.crate import CRATE, crate_text
-from flows.packages.credentials import Claim, Signer, certificate, sidecar_of
+from flows.packages.credentials import Claim, Signer, sidecar_of
 from flows.packages.flow_result import FlowResult, StepRun
+from flows.packages.html_pages import render
 from flows.packages.publish import FORMAT, RECORD, Files, Swap, fact_of_bytes, readable, replace_package
 from flows.packages.view import VIEWER, page_of
-from flows.ui.curves import HEIGHT, WIDTH, amount, drawing, inked, summary
+from flows.ui import curves
 from steps.artifacts.store import ArtifactStore
-from steps.contract import RUN_ONLY, StepResult, canonical
+from steps.contract import RUN_ONLY, StepResult
 
 BESIDE = ("report.json", "report.html", VIEWER, CRATE)
 GENERATIVE = ("draw_picture", "drive_video", "fit_gaussians", "fit_motion", "refine_texture")  # where they use weights
@@ -166,46 +169,29 @@ def notes(order: Order, result: FlowResult) -> list[str]:
 
 
 def page(report: dict[str, Any], shortcomings: bytes | None = None) -> str:
-    """The report as one page; the pictures are the package's own, beside it, but for that of its shortcomings (PNG)."""
-    files = report["files"]
-    parts = [
-        f"<h1>{_text(report['item'])}</h1>",
-        f"<p class=banner>{_text(report['banner'])}</p>",
-        f'<p><a href="{VIEWER}">look at it from all sides</a></p>',
-        _pictures(files),
-        "".join(f"<p class=note>{_text(note)}</p>" for note in report["notes"]),
-        *(["<h2>Acceptance</h2>", section(report["acceptance"], shortcomings)] if report["acceptance"] else []),
-        "<h2>Stages</h2>",
-        _stages(report),
-        "".join(_curves(stage) for stage in report["steps"] if stage["curves"]),
-        "<h2>Files</h2>",
-        _files(files),
-        "<h2>Licenses</h2>",
-        _licenses(report["licenses"]),
-        "<h2>Settings</h2>",
-        f"<p>profile <b>{_text(report['profile'])}</b>, seed <b>{report['seed']}</b>, source "
-        f"<b>{_text(report['source'])}</b></p>",
-        f"<details><summary>every knob</summary><pre>{_text(json.dumps(report['settings'], indent=1))}</pre></details>",
-        "<p class=small>The digest of every file and the record of every step are in "
-        '<a href="provenance.json">provenance.json</a>; the numbers of this page in '
-        '<a href="report.json">report.json</a>.</p>',
-    ]
-    return _PAGE.format(title=_text(report["item"]), body="\n".join(parts))
+    """Return the report as one page that shows the files of the package beside it.
 
-
-def curve(curves: dict[str, Any]) -> str:
-    """Losses over iterations as inline SVG; empty if there is nothing to draw."""
-    drawn = drawing(curves)
-    if not drawn:
-        return ""
-    legend = [
-        f'<span style="color:{ink}">&#9632; {_text(name)} {amount(points[-1])}</span>'
-        for ink, name, points in inked(curves)
-    ]
-    return (
-        f"<figure><figcaption>{_text(curves['title'])}</figcaption>"
-        f'<svg viewBox="-4 -4 {WIDTH + 8} {HEIGHT + 8}" role="img">{drawn}</svg>'
-        f"<p class=small>{summary(curves)}</p><p class=small>{' '.join(legend)}</p></figure>"
+    Args:
+        report: of `report_of`.
+        shortcomings: picture of the worst moments, PNG; it is embedded.
+    """
+    folders: dict[str, list[int]] = {}
+    for name, size in report["files"].items():
+        folder, slash, _ = name.partition("/")
+        if slash:
+            folders.setdefault(folder, []).append(size)
+    return render(
+        "report.html",
+        title=report["item"],
+        report=report,
+        viewer=VIEWER,
+        acceptance=acceptance,
+        shortcomings=base64.b64encode(shortcomings or b"").decode(),
+        arithmetic=arithmetic,
+        curves=curves,
+        readable=readable,
+        folders=folders,
+        settings=json.dumps(report["settings"], indent=1),
     )
 
 
@@ -220,7 +206,7 @@ def _used_weights(result: FlowResult, *steps: str) -> bool:
 
 def _stage(done: StepRun, store: ArtifactStore) -> dict[str, Any]:
     record = done.result.provenance
-    curves = [
+    drawn = [
         json.loads(store.path(ref).read_text(encoding="utf-8"))
         for ref in done.result.outputs.values()
         if ref.media_type.endswith("curves+json") and store.has(ref)
@@ -235,7 +221,7 @@ def _stage(done: StepRun, store: ArtifactStore) -> dict[str, Any]:
         "backend": record.backend,
         "notes": [*record.notes, *record.run_notes],
         "flops": record.flops,
-        "curves": curves,
+        "curves": drawn,
     }
 
 
@@ -248,89 +234,3 @@ def _scaled(count: float) -> str:
     """With the prefix of the unit."""
     power = min(max(int(math.log10(max(count, 1))) // 3, 2), 5)
     return f"{count / 1000**power:,.1f} {'..MGTP'[power]}"
-
-
-def _pictures(files: dict[str, int]) -> str:
-    shown = []
-    if "preview.mp4" in files:
-        shown.append('<video src="preview.mp4" autoplay loop muted playsinline controls></video>')
-    if "contact_sheet.png" in files:
-        shown.append('<img src="contact_sheet.png" alt="columns: moments; rows: angles">')
-    return f"<div class=pictures>{''.join(shown)}</div>"
-
-
-def _stages(report: dict[str, Any]) -> str:
-    longest = max((stage["compute_s"] for stage in report["steps"]), default=0) or 1
-    rows = "".join(
-        f"<tr><td>{_text(stage['step'])}<td class=number>{stage['compute_s']:.1f} s"
-        f"<td><div class=bar style='width:{120 * stage['compute_s'] / longest:.0f}px'></div>"
-        f"<td class=number>{stage['peak_memory_mb']:.0f} MiB<td>{_text(stage['backend'])}"
-        f"<td>{_text(arithmetic(stage['flops']))}"
-        f"<td>{'taken from before' if stage['cached'] else ''}"
-        for stage in report["steps"]
-    )
-    return (
-        "<table><tr><th>stage<th>computed in<th><th>peak memory<th>backend<th>networks<th>"
-        f"{rows}</table><p class=small>{report['wall_s']:.1f} s on the clock for this run; "
-        f"{report['compute_s']:.1f} s of computing in all stages, now or before, some side by side.</p>"
-    )
-
-
-def _curves(stage: dict[str, Any]) -> str:
-    return "".join(curve(curves) for curves in stage["curves"])
-
-
-def _files(files: dict[str, int]) -> str:
-    rows, folders = [], dict[str, list[int]]()
-    for name, size in files.items():
-        folder, slash, _ = name.partition("/")
-        if slash:
-            folders.setdefault(folder, []).append(size)
-        else:
-            rows.append(f'<tr><td><a href="{_text(name)}">{_text(name)}</a><td class=number>{readable(size)}')
-    rows += [
-        f'<tr><td><a href="{_text(name)}/">{_text(name)}/</a> ({len(sizes)} file{"s" * (len(sizes) != 1)})'
-        f"<td class=number>{readable(sum(sizes))}"
-        for name, sizes in folders.items()
-    ]
-    return f"<table>{''.join(rows)}</table>"
-
-
-def _licenses(terms: dict[str, str]) -> str:
-    if not terms:
-        return "<p>No weights were used: no license of a model follows this asset.</p>"
-    rows = "".join(f"<tr><td>{_text(name)}<td>{_text(its)}" for name, its in terms.items())
-    return f"<p>Weights were used; their licenses follow this asset.</p><table>{rows}</table>"
-
-
-def _text(value: object) -> str:
-    return html.escape(value if isinstance(value, str) else canonical(value))
-
-
-_PAGE = """<!doctype html>
-<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>
-:root {{ color-scheme: light dark; --line: #8884; --soft: #8881; }}
-body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 980px; margin: 2rem auto; padding: 0 1rem; }}
-h1 {{ margin: 0 0 .5rem; font-size: 1.6rem; }} h2 {{ margin: 2rem 0 .5rem; font-size: 1.1rem; }}
-.banner {{ border-left: 4px solid #d97706; background: #d9770618; padding: .6rem .9rem; border-radius: 4px; }}
-.note {{ border-left: 4px solid var(--line); padding: 0 .9rem; margin: .4rem 0; }}
-.pictures {{ display: flex; gap: 1rem; flex-wrap: wrap; align-items: flex-start; }}
-.pictures > * {{ flex: 1 1 320px; max-width: 100%; min-width: 0; border: 1px solid var(--line); border-radius: 6px;
-  background: repeating-conic-gradient(#fff 0 25%, #eee 0 50%) 0 0 / 20px 20px; }}
-table {{ border-collapse: collapse; }} td, th {{ padding: .2rem .8rem .2rem 0; text-align: left; }}
-td {{ border-top: 1px solid var(--line); }} .number {{ text-align: right; font-variant-numeric: tabular-nums; }}
-.bar {{ height: .7rem; background: #2563eb; border-radius: 2px; }}
-.verdict {{ font-weight: 600; }}
-.passed td:first-child {{ color: #059669; }} .missed td:first-child {{ color: #dc2626; }}
-.gates td {{ vertical-align: top; }} .gates td:nth-child(3), .gates td:nth-child(4) {{ white-space: nowrap; }}
-.small {{ font-size: .85rem; opacity: .75; margin: .2rem 0; }}
-figure {{ display: inline-block; width: min(440px, 100%); margin: 1rem 1rem 0 0; vertical-align: top; }}
-figcaption {{ font-weight: 600; }}
-svg {{ width: 100%; background: var(--soft); border-radius: 4px; }}
-pre {{ overflow: auto; background: var(--soft); padding: .8rem; border-radius: 4px; }}
-</style>
-{body}
-</html>
-"""

@@ -1,7 +1,6 @@
 """Scores of many objects as people read them: tables in the paper's form, CSV, a page with the films side by side."""
 
 import csv
-import html
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +10,8 @@ from urllib.parse import quote
 
 from pydantic import BaseModel
 
-from flows.commands.endings import EXIT_BAD_INPUT, EXIT_FAILED
+from flows.exit_status import EXIT_BAD_INPUT, EXIT_FAILED
+from flows.packages.html_pages import render
 from flows.packages.summary import BAD_INPUT
 from flows.ui.escaping import cell
 from flows.ui.escaping import markdown as escaped
@@ -213,19 +213,14 @@ def page(results: Results, films: Mapping[str, Mapping[str, Mapping[str, str]]])
         results: what to show.
         films: by object, by whose they are ("truth", "ours") and by view: where the film lies, relative to the page.
     """
-    shown = PAPER_METRICS | _present(results, METRICS)
-    heads = "".join(f"<th>{html.escape(metric.heading)}" for metric in shown.values())
-    rows = "".join(
-        f"<tr{' class=ours' if method == results.ours else ''}><td>{html.escape(called(method))}"
-        + "".join(f"<td class=number>{_cell(figures, name, results)}" for name in shown)
-        for method, figures in results.mean.items()
-    )
-    missing = "".join(f"<li><b>{html.escape(name)}</b>: {html.escape(why)}" for name, why in results.missing.items())
-    return _PAGE.format(
-        title=html.escape(results.title),
-        table=f"<table><tr><th>method{heads}{rows}</table>",
-        missing=f"<h2>Not computed</h2><ul>{missing}</ul>" if missing else "",
-        objects="\n".join(_section(one, results.ours, films.get(one.object, {})) for one in results.objects),
+    return render(
+        "scores.html",
+        title=results.title,
+        table=table(results),
+        ours=list(results.mean).index(results.ours) if results.ours in results.mean else None,
+        missing=results.missing,
+        objects=[_section(one, results.ours, films.get(one.object, {})) for one in results.objects],
+        quote=quote,
     )
 
 
@@ -234,28 +229,18 @@ def called(method: str) -> str:
     return GUESSES.get(method, method)
 
 
-def _section(one: ObjectScores, ours: str, films: Mapping[str, Mapping[str, str]]) -> str:
-    name = html.escape(one.object)
-    if one.error:
-        return f"<section><h2>{name}</h2><p class=failed>{html.escape(one.error)}</p></section>"
+def _section(one: ObjectScores, ours: str, films: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:
+    """Return what the page shows of an object."""
     figures = figures_of(one.rows.get(ours, {}))
-    facts = [f"{metric.heading} {figures[key]:.{metric.digits}f}" for key, metric in METRICS.items() if key in figures]
-    views = list(next(iter(films.values()), {}))
-    rows = "".join(
-        f"<tr><th>{whose}"
-        + "".join(
-            f'<td><video src="{quote(by_view[view])}" muted playsinline preload=auto></video>'
-            if view in by_view
-            else "<td>"
-            for view in views
-        )
-        for whose, by_view in films.items()
-    )
-    heads = "".join(f"<th>{html.escape(view.removeprefix('view_'))}{'°' * (view != 'input')}" for view in views)
-    return (
-        f"<section><h2>{name}</h2><p>{html.escape(' · '.join(facts))}</p>"
-        f"<div class=wide><table class=films><tr><th>{heads}{rows}</table></div></section>"
-    )
+    return {
+        "name": one.object,
+        "error": one.error,
+        "facts": [
+            f"{metric.heading} {figures[key]:.{metric.digits}f}" for key, metric in METRICS.items() if key in figures
+        ],
+        "views": list(next(iter(films.values()), {})),
+        "films": films,
+    }
 
 
 def _present(results: Results, metrics: Mapping[str, Metric]) -> dict[str, Metric]:
@@ -281,36 +266,3 @@ def _lines(metrics: Mapping[str, Metric], rows: Sequence[tuple[str, Figures]], r
 
 def _table_lines(heads: list[str], rows: list[list[str]]) -> list[str]:
     return [f"| {' | '.join(cells)} |" for cells in (heads, ["---"] * len(heads), *rows)]
-
-
-_PAGE = """<!doctype html>
-<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>
-:root {{ color-scheme: light dark; --line: #8884; }}
-body {{ font: 15px/1.5 system-ui, sans-serif; margin: 2rem; }}
-h1 {{ font-size: 1.6rem; margin: 0 0 1rem; }} h2 {{ font-size: 1.1rem; margin: 1.5rem 0 .3rem; }}
-table {{ border-collapse: collapse; }} th, td {{ padding: .2rem .8rem .2rem 0; text-align: left; }}
-td {{ border-top: 1px solid var(--line); }} .number {{ text-align: right; font-variant-numeric: tabular-nums; }}
-.ours {{ font-weight: 600; }} .failed {{ color: #dc2626; }}
-p {{ margin: .2rem 0; font-size: .85rem; }} .wide {{ overflow-x: auto; }}
-.films td {{ border: 0; padding: .1rem; }} .films th {{ font-weight: 400; font-size: .85rem; }}
-video {{ width: 192px; max-width: 30vw; display: block; border: 1px solid var(--line); border-radius: 4px; }}
-</style>
-<h1>{title}</h1>
-<div class=wide>{table}</div>
-{missing}
-{objects}
-<script>
-for (const section of document.querySelectorAll("section")) {{
-  const films = [...section.querySelectorAll("video")];
-  const restart = () => films.forEach(film => {{ film.currentTime = 0; film.play(); }});
-  const late = film => Math.abs(film.currentTime - films[0].currentTime) > 0.1;
-  const align = () => films.filter(late).forEach(film => {{ film.currentTime = films[0].currentTime; }});
-  if (films.length) Object.assign(films[0], {{ onended: restart, ontimeupdate: align }});
-  const ready = film => film.readyState > 3 || new Promise(done => film.oncanplaythrough = done);
-  Promise.all(films.map(ready)).then(restart);
-}}
-</script>
-</html>
-"""

@@ -1,12 +1,12 @@
 """What lies beside the packages of a batch: `summary.json` and `summary.csv` for programs, `index.html` for people."""
 
 import csv
-import html
 import io
 import json
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 from urllib.parse import quote
@@ -14,6 +14,7 @@ from urllib.parse import quote
 from pydantic import BaseModel
 
 from flows.packages.acceptance import failing_in
+from flows.packages.html_pages import render
 from flows.packages.publish import record_of
 from flows.ui.escaping import cell
 from steps.artifacts.store import write_atomically
@@ -200,7 +201,7 @@ def index(out: Path, rows: list[Row], counts: dict[str, int]) -> str:
     tally = ", ".join(f"{number} {status}" for status, number in counts.items() if number)
     if refused := sum(bool(row.failing) for row in rows):
         tally += f"; {refused} not accepted"
-    return _PAGE.format(tally=html.escape(tally), cards="\n".join(_card(out, row) for row in ordered))
+    return render("index.html", title=tally, rows=ordered, quote=quote, picture=partial(_picture, out))
 
 
 def _csv(items: list[dict[str, Any]]) -> str:
@@ -219,48 +220,6 @@ def _duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def _card(out: Path, row: Row) -> str:
-    folder, name = quote(row.item), html.escape(row.item)
-    if not row.made:
-        return f"<article class={row.status}><h2>{name}</h2><p>{html.escape(row.message)}</p></article>"
-    shown = next((file for file in ("preview.webp", "contact_sheet.png") if (out / row.item / file).is_file()), None)
-    picture = f'<img src="{folder}/{shown}" alt="" loading="lazy">' if shown else ""
-    return (
-        f"<article class={'failed' if row.failing else row.status}>"
-        f"<a href='{folder}/report.html'>{picture}<h2>{name}</h2></a>"
-        f"<p>{row.status}{f', {row.wall_s:.0f} s' if row.wall_s else ''}"
-        f" · <a href='{folder}/asset.glb'>asset.glb</a></p>{_verdict(row)}</article>"
-    )
-
-
-def _verdict(row: Row) -> str:
-    if row.failing is None:
-        return ""
-    return (
-        f"<p class=verdict>not accepted: {html.escape(', '.join(row.failing))}</p>"
-        if row.failing
-        else "<p>accepted</p>"
-    )
-
-
-_PAGE = """<!doctype html>
-<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{tally}</title>
-<style>
-:root {{ color-scheme: light dark; }}
-body {{ font: 15px/1.5 system-ui, sans-serif; margin: 2rem; }}
-main {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(240px, 1fr)); gap: 1rem; }}
-article {{ border: 1px solid #8884; border-radius: 8px; padding: .6rem; overflow-wrap: anywhere; }}
-h2 {{ font-size: 1rem; margin: .4rem 0 0; }} p {{ margin: .2rem 0 0; font-size: .85rem; }}
-article {{ content-visibility: auto; contain-intrinsic-size: auto 320px; }}
-img {{ width: 100%; aspect-ratio: 1; object-fit: contain; border-radius: 4px;
-  background: repeating-conic-gradient(#fff 0 25%, #eee 0 50%) 0 0 / 20px 20px; }}
-.failed {{ border-color: #dc2626; }} .failed h2, .verdict {{ color: #dc2626; }}
-.skipped {{ opacity: .6; }}
-</style>
-<h1>{tally}</h1>
-<main>
-{cards}
-</main>
-</html>
-"""
+def _picture(out: Path, item: str) -> str:
+    """Return the name of the picture of a package; empty if it has none."""
+    return next((name for name in ("preview.webp", "contact_sheet.png") if (out / item / name).is_file()), "")

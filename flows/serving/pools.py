@@ -1,9 +1,7 @@
-"""Work pools and deployments as `deploy/` describes them, checked: a server takes mistakes without a word."""
+"""Work pools and deployments as `deploy/` describes them."""
 
 import copy
-import re
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +14,6 @@ from steps.contract import Frozen
 SOURCE = Path(__file__).parents[2] / "deploy"
 DEPLOY = SOURCE if SOURCE.is_dir() else Path(sys.prefix) / "share" / "dg4d"  # of a source tree, or installed
 DEPLOYMENTS = DEPLOY / "prefect.yaml"
-VARIABLE = re.compile(r"\{\{\s*\$(\w+)\s*\}\}")  # of the environment, put in by `prefect deploy`
 
 Json = dict[str, Any]
 
@@ -49,7 +46,8 @@ class Pool(Frozen):
         """
         template = copy.deepcopy(default)
         known = template["variables"]["properties"]
-        _require_known(self.variables, known, f"a pool of type {self.type}")
+        if unknown := sorted(set(self.variables) - set(known)):
+            raise BadInput(f"a pool of type {self.type} has no variable {unknown[0]!r}; it has: {', '.join(known)}")
         for name, value in self.variables.items():
             known[name]["default"] = value
         for patch in self.job:
@@ -69,30 +67,9 @@ def read_pools(file: Path = DEPLOY / "pools.yaml") -> dict[str, Pool]:
         raise BadInput(f"{file}: {error}") from error
 
 
-def read_deployments(
-    pools: Mapping[str, Pool], defaults: Mapping[str, Json], environment: Mapping[str, str], file: Path = DEPLOYMENTS
-) -> list[Json]:
-    """The deployments of a `prefect.yaml`, none of which would go wrong later.
-
-    Args:
-        pools: that there are, or will be.
-        defaults: base job templates by kind of worker.
-        environment: of whoever registers them.
-        file: the `prefect.yaml`.
-
-    Raises:
-        BadInput: a pool, a variable of a job or one of the environment that does not exist.
-    """
+def read_deployments(file: Path = DEPLOYMENTS) -> list[Json]:
+    """Return the deployments of a `prefect.yaml`; raises BadInput if it cannot be read."""
     deployments: list[Json] = _read(file)["deployments"]
-    for deployment in deployments:
-        what = f"{file}: {deployment['entrypoint']} as {deployment['name']!r}"
-        place = deployment["work_pool"]
-        if place["name"] not in pools:
-            raise BadInput(f"{what}: there is no pool {place['name']!r}; there are: {', '.join(pools)}")
-        known = defaults[pools[place["name"]].type]["variables"]["properties"]
-        _require_known(place.get("job_variables", {}), known, f"{what}, pool {place['name']}")
-        if unset := sorted(name for name in VARIABLE.findall(str(deployment)) if not environment.get(name)):
-            raise BadInput(f"{what}: ${unset[0]} is not set; it would become an empty text")
     return deployments
 
 
@@ -104,11 +81,6 @@ def _read(file: Path) -> Json:
             f"{file} cannot be read: {error}; deployments are described in the source tree of dg4d"
         ) from error
     return content
-
-
-def _require_known(names: Mapping[str, Any], known: Mapping[str, Any], where: str) -> None:
-    if unknown := sorted(set(names) - set(known)):
-        raise BadInput(f"{where}: there is no job variable {unknown[0]!r}; there are: {', '.join(sorted(known))}")
 
 
 def _put_over(tree: Json, patch: Json) -> None:

@@ -1,6 +1,5 @@
 """Work pools, deployments and automations put on a Prefect server, again and again with the same result."""
 
-import os
 import subprocess
 from collections.abc import Mapping
 from datetime import timedelta
@@ -72,36 +71,26 @@ def register(pools: Mapping[str, Pool], chosen: list[str]) -> list[str]:
         The full names of the deployments.
 
     Raises:
-        BadInput: a pool or a deployment that cannot be; nothing was changed.
-        BackendUnavailable: the server did not take it.
+        BadInput: a pool that cannot be; nothing was changed.
+        BackendUnavailable: the server did not take the deployments.
     """
     with get_client(sync_client=True) as client:
         defaults = default_templates(client)
-        deployments = [
-            deployment
-            for deployment in read_deployments(pools, defaults, os.environ)
-            if deployment["work_pool"]["name"] in chosen
-        ]
         templates = {name: pools[name].template(defaults[pools[name].type]) for name in chosen}
         for name, template in templates.items():
             pool = pools[name]
-            client.create_work_pool(
-                WorkPoolCreate(
-                    name=name,
-                    type=pool.type,
-                    description=pool.description,
-                    base_job_template=template,
-                    concurrency_limit=pool.limit,
-                ),
-                overwrite=True,
+            wanted = WorkPoolCreate(
+                name=name,
+                type=pool.type,
+                description=pool.description,
+                base_job_template=template,
+                concurrency_limit=pool.limit,
             )
-        _deploy(sorted({deployment["name"] for deployment in deployments}))
+            client.create_work_pool(wanted, overwrite=True)
+        _deploy(sorted({one["name"] for one in read_deployments() if one["work_pool"]["name"] in chosen}))
         _automate(client)
-        there = {f"{client.read_flow(found.flow_id).name}/{found.name}" for found in client.read_deployments()}
-    wanted = [f"{deployment['tags'][0]}/{deployment['name']}" for deployment in deployments]
-    if missing := [name for name in wanted if name not in there]:
-        raise BackendUnavailable(f"the Prefect server did not take the deployments {', '.join(missing)}")
-    return wanted
+        there = (found for found in client.read_deployments() if found.work_pool_name in chosen)
+        return sorted(f"{client.read_flow(found.flow_id).name}/{found.name}" for found in there)
 
 
 def default_templates(client: SyncPrefectClient) -> dict[str, Json]:

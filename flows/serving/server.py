@@ -22,7 +22,7 @@ from typing import IO
 from urllib.parse import quote
 
 from flows.engine.processes import die_with_parent, locked, python, without_prefect
-from flows.serving import auth, fresh
+from flows.serving import auth, database_template
 
 HOST = "127.0.0.1"  # never another interface: the traffic is not encrypted
 LOGIN = "/dg4d/login"
@@ -48,7 +48,7 @@ SETTINGS = {
     # a slot that a killed run held is free again, also after the server was started anew
     "PREFECT_SERVER_CONCURRENCY_LEASE_STORAGE": "prefect.server.concurrency.lease_storage.filesystem",
     # and a run that was killed goes on then
-    "PREFECT_SERVER_EVENTS_CAUSAL_ORDERING": "flows.serving.ordering",
+    "PREFECT_SERVER_EVENTS_CAUSAL_ORDERING": "flows.prefect_compat",
 }
 
 
@@ -186,6 +186,11 @@ class Server:
         except (OSError, ValueError, KeyError, TypeError):
             return None
 
+    def is_used(self) -> bool:
+        """Return whether a command uses it."""
+        with locked(self.folder / "in-use") as unused:
+            return not unused
+
     def is_guarded(self) -> bool:
         """Whether its guard is there: it runs, or starts."""
         with locked(self.folder / "guard", shared=True) as free:
@@ -250,7 +255,7 @@ def _watch(process: subprocess.Popen[bytes], folder: Path, idle_s: float) -> int
 
 def _serve(listener: socket.socket, folder: Path, prefect_home: Path) -> subprocess.Popen[bytes]:
     prefect_home.mkdir(mode=0o700, parents=True, exist_ok=True)
-    fresh.put(prefect_home)
+    database_template.copy_to(prefect_home)
     port = listener.getsockname()[1]
     environment = {
         **without_prefect(),
@@ -258,7 +263,6 @@ def _serve(listener: socket.socket, folder: Path, prefect_home: Path) -> subproc
         "PREFECT_HOME": str(prefect_home),
         "PREFECT_SERVER_API_AUTH_STRING": auth.auth_string(folder),
         "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": f"http://{HOST}:{port}",
-        "PREFECT__SERVER_FINAL": "1",
     }
     return subprocess.Popen(
         python("-m", "flows.serving.server_app", str(listener.fileno())),

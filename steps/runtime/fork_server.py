@@ -2,13 +2,15 @@
 
 `python -m steps.runtime.fork_server SOCKET` reads orders from a socket (SOCK_SEQPACKET) that it inherits as a file
 descriptor. An order is `{"arguments": [...], "environment": {...}}`: arguments of `steps.main`, and variables that the
-step has beside those of this process. Descriptors come with it: standard input, output and error, and others that the
-step must hold open. Answers are `{"pid": 7}`, in the order of the orders, and later `{"pid": 7, "status": 0}`: an exit
-status, or the negative number of a signal. When the other end of the socket is
-closed this process ends.
+step has beside those of this process. Descriptors come with it: a socket for answers (SOCK_SEQPACKET), standard output
+and error, and others that the step must hold open. The answers are the number of the process, and later its exit
+status, or the negative number of a signal. When the other end of the first socket is closed this process ends.
 
-A step is a process group of its own, as it is when it is begun by `python -m steps.main`. Whoever asks should tell
-it to end with its parent, which is this process.
+A step is a process group of its own, as it is when it is begun by `python -m steps.main`. The client should have it end
+with its parent, which is this process.
+
+The standard library's forkserver imports the program's main module in every child, which is Prefect's engine in a
+worker (2.5 s), and its children outlive a client that is killed.
 """
 
 import argparse
@@ -28,6 +30,7 @@ from steps import main as step
 
 ORDER_BYTES = 2**16
 ORDER_HANDLES = 16
+ANSWER_BYTES = 32
 
 
 def main() -> int:
@@ -60,6 +63,7 @@ def _serve(control: socket.socket, wanted: Iterator[str]) -> list[str] | None:
         Arguments of a step in a fork; nothing here, when there will be no more orders.
     """
     coming = next(wanted, None)
+    running: dict[int, socket.socket] = {}
     ended, signaled = socket.socketpair()
     for end in (ended, signaled):
         end.setblocking(False)
@@ -77,24 +81,23 @@ def _serve(control: socket.socket, wanted: Iterator[str]) -> list[str] | None:
             if ended in ready:
                 with suppress(BlockingIOError):
                     ended.recv(ORDER_BYTES)
-                _tell_of_ended(control)
+                _answer_for_ended(running)
             if control in ready:
-                text, handles, _, _ = socket.recv_fds(control, ORDER_BYTES, ORDER_HANDLES)
-                if not text:
+                order, (*handles,), _, _ = socket.recv_fds(control, ORDER_BYTES, ORDER_HANDLES)
+                if not order:
                     return None
-                order = json.loads(text)
                 gc.freeze()  # what forks share stays shared
                 pid = os.fork()
                 if pid == 0:
                     signal.set_wakeup_fd(-1)
                     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-                    _become(order["environment"], handles)
-                    return list(order["arguments"])
+                    return _become(handles, **json.loads(order))
                 with suppress(OSError):  # it has ended
                     os.setpgid(pid, pid)  # here too, so that whoever hears its number can end the group
-                for handle in handles:
+                running[pid] = socket.socket(fileno=handles[0])
+                for handle in handles[1:]:
                     os.close(handle)
-                _tell(control, {"pid": pid})
+                _answer(running[pid], pid)
 
 
 def _have(entry: str) -> None:
@@ -105,25 +108,29 @@ def _have(entry: str) -> None:
         getattr(loaded, function)()
 
 
-def _become(environment: dict[str, str], handles: list[int]) -> None:
-    """Make this fork the process that was ordered."""
+def _become(handles: list[int], arguments: list[str], environment: dict[str, str]) -> list[str]:
+    """Make this fork the process that was ordered; return its arguments."""
     os.setpgid(0, 0)
     os.environ.update(environment)
     tempfile.tempdir = None  # as the environment says, not what an import found
-    for number, handle in enumerate(handles[:3]):
+    os.close(handles[0])
+    for number, handle in enumerate(handles[1:3], 1):
         os.dup2(handle, number)
         os.close(handle)
+    return arguments
 
 
-def _tell_of_ended(control: socket.socket) -> None:
+def _answer_for_ended(running: dict[int, socket.socket]) -> None:
     with suppress(ChildProcessError):
         while (gone := os.waitpid(-1, os.WNOHANG))[0]:
-            _tell(control, {"pid": gone[0], "status": os.waitstatus_to_exitcode(gone[1])})
+            if (answers := running.pop(gone[0], None)) is not None:
+                _answer(answers, os.waitstatus_to_exitcode(gone[1]))
+                answers.close()
 
 
-def _tell(control: socket.socket, answer: dict[str, int]) -> None:
-    with suppress(BrokenPipeError, ConnectionResetError):  # nobody listens any more: the next read says so
-        control.sendall(json.dumps(answer).encode())
+def _answer(answers: socket.socket, number: int) -> None:
+    with suppress(BrokenPipeError, ConnectionResetError):  # the client has lost interest, or has ended
+        answers.sendall(str(number).encode())
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ def changed(tmp_path: Path, old: str, new: str, file: Path = DEPLOYMENTS) -> Pat
 
 
 def test_every_flow_is_deployed_in_every_pool() -> None:
-    deployments = read_deployments(POOLS, rendering.default_templates(), {})
+    deployments = read_deployments()
     flows = {deployment["entrypoint"] for deployment in deployments}
     assert len(flows) == 4
     where = {(deployment["entrypoint"], deployment["work_pool"]["name"]) for deployment in deployments}
@@ -41,12 +41,12 @@ def test_every_flow_is_deployed_in_every_pool() -> None:
 
 
 def test_the_names_of_flows_are_their_tags() -> None:
-    for deployment in read_deployments(POOLS, rendering.default_templates(), {}):
+    for deployment in read_deployments():
         assert deployment["tags"] == [load_flow_from_entrypoint(deployment["entrypoint"]).name]
 
 
 def test_parameters_of_deployments_triggers_and_schedules_fit_their_flows() -> None:
-    for deployment in read_deployments(POOLS, rendering.default_templates(), {}):
+    for deployment in read_deployments():
         schema: dict[str, Any] = parameter_schema(load_flow_from_entrypoint(deployment["entrypoint"])).model_dump()
         for given in (deployment, *deployment.get("schedules", []), *deployment.get("triggers", [])):
             parameters = given.get("parameters", {})
@@ -54,27 +54,18 @@ def test_parameters_of_deployments_triggers_and_schedules_fit_their_flows() -> N
         assert not validate(deployment.get("parameters", {}), schema, raise_on_error=False, ignore_required=True)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "says"),
-    [
-        ("{name: process-gpu}", "{name: proces-gpu}", "no pool 'proces-gpu'"),
-        ("{name: docker-cpu}", "{name: docker-cpu, job_variables: {imge: x}}", "no job variable 'imge'"),
-        ("tags: [catalog]", 'tags: [catalog, "{{ $SOMEWHERE }}"]', r"\$SOMEWHERE is not set"),
-    ],
-)
-def test_a_mistake_in_a_deployment_is_found(tmp_path: Path, old: str, new: str, says: str) -> None:
-    with pytest.raises(BadInput, match=says):
-        read_deployments(POOLS, rendering.default_templates(), {"SOMEWHERE": ""}, changed(tmp_path, old, new))
-
-
-def test_a_variable_of_the_environment_may_stand_in_a_deployment(tmp_path: Path) -> None:
-    file = changed(tmp_path, "tags: [catalog]", 'tags: [catalog, "{{ $SOMEWHERE }}"]')
-    assert len(read_deployments(POOLS, rendering.default_templates(), {"SOMEWHERE": "here"}, file)) == 24
+def test_deployments_name_variables_that_their_pools_have_and_none_of_the_environment() -> None:
+    """Prefect takes a misspelt variable without a word, and an unset one of the environment for an empty text."""
+    for deployment in read_deployments():
+        place = deployment["work_pool"]
+        template = rendering.default_templates()[POOLS[place["name"]].type]
+        assert set(place.get("job_variables", {})) <= set(template["variables"]["properties"])
+        assert "$" not in str(deployment)
 
 
 def test_a_misspelt_variable_of_a_pool_is_found() -> None:
     pool = POOLS["docker-cpu"].model_copy(update={"variables": {"mem_limits": "8g"}})
-    with pytest.raises(BadInput, match="no job variable 'mem_limits'"):
+    with pytest.raises(BadInput, match="no variable 'mem_limits'"):
         pool.template(rendering.default_templates()["docker"])
 
 

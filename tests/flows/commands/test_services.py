@@ -35,7 +35,7 @@ def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop
     said = dg4d("up", "--pool", "process-cpu", "--sources", str(folder.parent))
     assert said.returncode == 0, said.stderr
     *deployments, address = said.stdout.split()
-    assert deployments == ["image-to-4d/local", "video-to-4d/local", "benchmark/local", "catalog/local"]
+    assert deployments == ["benchmark/local", "catalog/local", "image-to-4d/local", "video-to-4d/local"]
     assert address == os.environ["PREFECT_API_URL"].removesuffix("/api")
     try:
         wait_until(lambda: [worker.pool for worker in running(folder)] == ["process-cpu"])
@@ -54,6 +54,33 @@ def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop
     assert "stopped!" in log.read_text()  # it was not killed
     assert server.auth_string().partition(":")[2] not in stopped.stderr + log.read_text()
     assert dg4d("down").stdout == "nothing was running\n"
+
+
+GUARD = """
+import fcntl, json, os, sys, time
+lock, user = (open(f"{sys.argv[1]}/{name}", "a") for name in ("guard", "in-use"))
+fcntl.flock(lock, fcntl.LOCK_EX)
+if sys.argv[2] == "used":
+    fcntl.flock(user, fcntl.LOCK_SH)
+with open(f"{sys.argv[1]}/server.json", "w") as state:
+    json.dump({"guard": os.getpid(), "port": 1}, state)
+print("there", flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("use", ["used", "idle"])
+def test_a_server_that_a_command_uses_does_not_end_without_a_word(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, use: str
+) -> None:
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path))
+    (tmp_path / "server").mkdir()
+    command = [sys.executable, "-c", GUARD, str(tmp_path / "server"), use]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as guard:
+        assert guard.stdout is not None and guard.stdout.readline() == b"there\n"
+        said = dg4d("down").stdout.splitlines()
+    assert said[-1] == "stopped"
+    assert any("a running command uses" in line for line in said) == (use == "used")
 
 
 def test_a_pool_that_is_not_described_is_refused_before_anything_is_started(folder: Path) -> None:

@@ -87,7 +87,7 @@ def test_a_record_that_somebody_is_writing_is_left_alone(tmp_path: Path, monkeyp
     record = tmp_path / "results" / record_key(request())
     record.parent.mkdir()
     record.write_text("half a rec")
-    assert theirs.try_lock(record.name, "writer")
+    assert theirs.acquire_lock(record.name, "writer", acquire_timeout=0)
     key(policy, request())
     assert record.exists()
     theirs.release_lock(record.name, "writer")
@@ -136,7 +136,8 @@ def test_threads_take_turns(tmp_path: Path) -> None:
 def test_a_killed_holder_leaves_no_lock(tmp_path: Path) -> None:
     program = (
         "import sys, time; from pathlib import Path; from flows.engine.caching import FileLocks\n"
-        "FileLocks(lambda: Path(sys.argv[1])).acquire_lock('k', 'a'); print('held', flush=True); time.sleep(60)"
+        "locks = FileLocks(lambda: Path(sys.argv[1])); locks.acquire_lock('k', 'a')\n"
+        "print('held', flush=True); time.sleep(60)"
     )
     holder = subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     assert holder.stdout is not None

@@ -2,6 +2,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
@@ -34,7 +35,6 @@ def begun() -> Iterator[list[Fork]]:
     processes: list[Fork] = []
     yield processes
     for process in processes:
-        process.stdin.close()
         process.stdout.close()
 
 
@@ -58,10 +58,9 @@ def test_steps_run_side_by_side_and_each_has_its_own_status(place: Path, server:
     words = ["prepare_subject=sleep:1.5", "fine", "prepare_subject=bad:torn", "prepare_subject=die"]
     slow, *quick = [begin(server, begun, place, text) for text in words]
     assert [process.wait(20) for process in quick] == [0, 65, -signal.SIGKILL]
-    assert slow.poll() is None and not server.is_idle()
+    assert slow.poll() is None
     assert slow.wait(20) == 0 and slow.poll() == 0
     assert (place / "prepare_subject=sleep:1.5.out").exists()
-    assert server.is_idle()
 
 
 def test_a_step_is_a_process_group_of_its_own(place: Path, server: ForkServer, begun: list[Fork]) -> None:
@@ -79,7 +78,6 @@ def test_steps_end_with_their_server_and_the_server_begins_no_more(
     server.end()
     assert process.wait(20) == -signal.SIGKILL
     wait_until(lambda: not Path(f"/proc/{process.pid}/stat").exists())
-    assert server.has_ended()
     with (place / "stderr").open("ab") as stderr:
         assert server.fork([], {}, stderr, []) is None
 
@@ -121,14 +119,31 @@ def test_the_next_step_is_a_fork_of_the_same_process_and_one_for_another_environ
         raise AssertionError("no process was seen")
 
     forks.prepare()
-    (prepared,) = (each for each in forks._servers if each.environment == forks.base_environment())
     first = parent()
-    assert first == prepared._process.pid
+    assert first == forks._server().process.pid
     monkeypatch.setenv("OpenImageIO_ROOT", "as that library sets it when it is imported")
     assert parent() == first
     monkeypatch.setenv("DG4D_STORE", str(place / "elsewhere"))
     assert parent() != first
+    while begun:
+        begun.pop().stdout.close()
     wait_until(lambda: not Path(f"/proc/{first}/stat").exists())
+
+
+def test_a_step_goes_on_when_the_environment_changes_and_its_server_ends_with_it(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = fake_steps.STEPS["prepare_subject"]
+    server = forks._server().process
+    with ThreadPoolExecutor(1) as side:
+        step = side.submit(in_subprocess, spec, _request(place, "prepare_subject=sleep:1"), lambda *_: None)
+        wait_until((place / "log").exists)
+        monkeypatch.setenv("DG4D_STORE", str(place / "elsewhere"))
+        assert forks._server().process is not server
+        assert server.poll() is None
+        assert step.result(20).outputs
+    del step
+    wait_until(lambda: server.poll() is not None)
 
 
 def test_a_server_that_was_killed_is_followed_by_another(place: Path) -> None:
@@ -138,12 +153,9 @@ def test_a_server_that_was_killed_is_followed_by_another(place: Path) -> None:
         in_subprocess(spec, _request(place, words), lambda *_: None)
 
     run("fine")
-    (server,) = (each for each in forks._servers if each.environment == forks.base_environment())
-    server._process.kill()
+    forks._server().process.kill()
     run("fine too")
-    (server,) = (each for each in forks._servers if each.environment == forks.base_environment())
-
-    killed = server._process
+    killed = forks._server().process
     with pytest.raises(StepOutOfMemory):
         run(f"prepare_subject=kill:{killed.pid}")
 

@@ -66,24 +66,26 @@ def test_a_verdict_whose_file_is_gone_is_none(store: ArtifactStore) -> None:
     assert acceptance.verdict_of([result("check_asset", gates=gone)], store) is None
 
 
+BARE = {
+    "item": "fox", "banner": "", "notes": [], "steps": [], "wall_s": 1.0, "compute_s": 1.0, "files": {},
+    "licenses": {}, "profile": "preview", "seed": 0, "source": "fox.png", "settings": {}, "acceptance": None,
+}  # fmt: skip
+
+
 def test_only_gates_that_fail_give_advice() -> None:
-    page = acceptance.section(verdict("floaters"), b"png")
+    page = report.page({**BARE, "acceptance": verdict("floaters")}, b"png")
     assert page.count("try &lt;again&gt;") == 1
     assert page.count("how &lt;well&gt;") == 2
     assert "floaters failed, 1 of 2 gates passed" in page
     assert "data:image/png;base64,cG5n" in page
-    assert "again" not in acceptance.section(verdict(), None)
-    assert "<img" not in acceptance.section(verdict(), None)
+    accepted = report.page({**BARE, "acceptance": verdict()})
+    assert "Accepted: all 2 gates passed." in accepted
+    assert "again" not in accepted and "<img" not in accepted
 
 
-def test_the_section_stands_in_the_report_and_only_where_there_is_a_verdict() -> None:
-    bare = {
-        "item": "fox", "banner": "", "notes": [], "steps": [], "wall_s": 1.0, "compute_s": 1.0, "files": {},
-        "licenses": {},
-        "profile": "preview", "seed": 0, "source": "fox.png", "settings": {},
-    }  # fmt: skip
-    assert "Accepted: all 2 gates passed." in report.page({**bare, "acceptance": verdict()})
-    assert "Acceptance" not in report.page({**bare, "acceptance": None})
+def test_the_report_has_a_section_on_gates_only_where_there_is_a_verdict() -> None:
+    assert "<h2>Acceptance" in report.page({**BARE, "acceptance": verdict()})
+    assert "<h2>Acceptance" not in report.page(BARE)
 
 
 def test_markdown_has_a_row_per_gate() -> None:

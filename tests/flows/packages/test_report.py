@@ -1,16 +1,19 @@
 import io
 import json
 import re
+import tomllib
 import zipfile
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import pytest
+from jinja2 import UndefinedError
 
 from flows.inputs.orders import Order
 from flows.packages import report
 from flows.packages.flow_result import FlowResult, StepRun
+from flows.packages.html_pages import render
 from flows.packages.summary import Row, Writer
 from flows.ui.curves import HEIGHT, WIDTH
 from steps.artifacts.store import ArtifactStore
@@ -188,18 +191,31 @@ def test_provenance_differs_between_runs_only_under_run(store: ArtifactStore, un
     assert one["files"] == FILES
 
 
-def test_a_curve_goes_from_top_left_to_bottom_right_on_a_logarithmic_scale() -> None:
-    svg = report.curve(CURVES)
-    (points,) = re.findall(r'points="([^"]*)"', svg)
+@pytest.fixture
+def told(store: ArtifactStore) -> dict[str, Any]:
+    """A report of two steps, the first of which has a curve."""
+    return report.report_of(*made(store), FILES, store)
+
+
+def test_a_curve_goes_from_top_left_to_bottom_right_on_a_logarithmic_scale(told: dict[str, Any]) -> None:
+    page = report.page(told)
+    (points,) = re.findall(r'points="([^"]*)"', page)
     places = [tuple(map(float, pair.split(","))) for pair in points.split()]
     assert places == [(0, 0), (WIDTH / 2, HEIGHT / 2), (WIDTH, HEIGHT)]
-    assert "logarithmic" in svg
+    assert "logarithmic" in page
+    assert "static &lt;fit&gt;" in page
 
 
 @pytest.mark.parametrize("values", [[], [1.0], [float("nan"), float("nan")], [0.0, 0.0], [-1.0, 2.0]])
-def test_odd_curves_break_no_page(values: list[float]) -> None:
+def test_odd_curves_break_no_page(told: dict[str, Any], values: list[float]) -> None:
     curves: dict[str, Any] = {"title": "t", "x": list(range(len(values))), "series": {"a": values}, "notes": []}
-    assert "nan" not in report.curve(curves)
+    told["steps"][0]["curves"] = [curves]
+    assert not re.search(r"\bnan\b", report.page(told))
+
+
+def test_a_template_refuses_a_value_that_it_was_not_given() -> None:
+    with pytest.raises(UndefinedError, match="title"):
+        render("index.html", rows=[])
 
 
 def test_a_summary_counts_and_the_overview_links_what_is_there(tmp_path: Path) -> None:
@@ -218,3 +234,11 @@ def test_a_summary_counts_and_the_overview_links_what_is_there(tmp_path: Path) -
     assert Links(page).addresses.count("a%20b/preview.webp") == 1
     assert "&lt;ugly&gt;" in page
     assert page.index("z/y") < page.index("a b")
+
+
+def test_every_page_that_flows_read_is_part_of_the_installed_package() -> None:
+    root = Path(report.__file__).parents[2]
+    patterns = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    folders = {package: root / package.replace(".", "/") for package in patterns}
+    packaged = {path for package, names in patterns.items() for name in names for path in folders[package].glob(name)}
+    assert set((root / "flows").rglob("*.html")) <= packaged

@@ -93,7 +93,7 @@ def test_registering_again_changes_nothing(client: SyncPrefectClient) -> None:
 
     before = there()
     assert registering.register(read_pools(), ["process-cpu"]) == [
-        "image-to-4d/local", "video-to-4d/local", "benchmark/local", "catalog/local",
+        "benchmark/local", "catalog/local", "image-to-4d/local", "video-to-4d/local",
     ]  # fmt: skip
     assert there() == before
     assert {automation.name for automation in registering.AUTOMATIONS} <= set(before[1])

@@ -1,6 +1,6 @@
-"""A new database for Prefect's server, made once per installation: the migrations that lead to it take ten seconds.
+"""New database for Prefect's server, made once per installation: its migrations take seconds of every new home.
 
-`python -m flows.serving.fresh` makes it beside the interpreter, for every server that starts without a database.
+`python -m flows.serving.database_template` makes it beside the interpreter, for servers that start without a database.
 """
 
 import shutil
@@ -17,13 +17,13 @@ from flows.engine.processes import python, without_prefect
 NAME = "prefect.db"  # in PREFECT_HOME
 
 
-def place() -> Path:
-    """Where the new database of this Prefect is, if it was made."""
+def template() -> Path:
+    """Return where the new database of this Prefect is, if it was made."""
     return Path(sys.prefix) / "share" / "dg4d" / f"prefect-{version('prefect')}.db"
 
 
 def make(path: Path) -> None:
-    """Have Prefect make a new database, and put it there as one file.
+    """Have Prefect make a new database, and write it as one file.
 
     Raises:
         CalledProcessError: Prefect cannot.
@@ -39,13 +39,13 @@ def make(path: Path) -> None:
         whole.replace(path)
 
 
-def put(prefect_home: Path) -> None:
-    """Give a server that has no database a new one, if one was made; otherwise the server makes its own."""
-    if (prefect_home / NAME).exists() or not place().exists():
+def copy_to(prefect_home: Path) -> None:
+    """Give a server without a database a copy; without a template the server makes its own."""
+    if (prefect_home / NAME).exists() or not template().exists():
         return
     with tempfile.TemporaryDirectory(dir=prefect_home, prefix=".new-") as folder:
-        Path(shutil.copyfile(place(), Path(folder) / NAME)).replace(prefect_home / NAME)
+        Path(shutil.copyfile(template(), Path(folder) / NAME)).replace(prefect_home / NAME)
 
 
-if __name__ == "__main__" and not place().exists():
-    make(place())
+if __name__ == "__main__" and not template().exists():
+    make(template())

@@ -7,7 +7,7 @@ from alembic.config import Config
 from alembic.script import ScriptDirectory
 from prefect.server.database import orm_models
 
-from flows.serving import fresh
+from flows.serving import database_template
 
 
 def test_the_database_that_the_set_up_made_is_what_this_prefect_migrates_to() -> None:
@@ -16,7 +16,7 @@ def test_the_database_that_the_set_up_made_is_what_this_prefect_migrates_to() ->
     config.set_main_option("path_separator", "os")
     config.set_main_option("script_location", str(migrations))
     config.set_main_option("version_locations", str(migrations / "versions" / "sqlite"))
-    with closing(sqlite3.connect(f"file:{fresh.place()}?mode=ro", uri=True)) as database:
+    with closing(sqlite3.connect(f"file:{database_template.template()}?mode=ro", uri=True)) as database:
         assert database.execute("SELECT version_num FROM alembic_version").fetchall() == [
             (head,) for head in ScriptDirectory.from_config(config).get_heads()
         ]
@@ -26,22 +26,22 @@ def test_the_database_that_the_set_up_made_is_what_this_prefect_migrates_to() ->
 
 def test_a_server_without_a_database_begins_with_a_copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "new.db").write_bytes(b"new")
-    monkeypatch.setattr(fresh, "place", lambda: tmp_path / "new.db")
+    monkeypatch.setattr(database_template, "template", lambda: tmp_path / "new.db")
     home = tmp_path / "home"
     home.mkdir()
-    fresh.put(home)
-    assert [(path.name, path.read_bytes()) for path in home.iterdir()] == [(fresh.NAME, b"new")]
+    database_template.copy_to(home)
+    assert [(path.name, path.read_bytes()) for path in home.iterdir()] == [(database_template.NAME, b"new")]
 
 
 def test_a_database_that_is_there_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "new.db").write_bytes(b"new")
-    monkeypatch.setattr(fresh, "place", lambda: tmp_path / "new.db")
-    (tmp_path / fresh.NAME).write_bytes(b"old")
-    fresh.put(tmp_path)
-    assert (tmp_path / fresh.NAME).read_bytes() == b"old"
+    monkeypatch.setattr(database_template, "template", lambda: tmp_path / "new.db")
+    (tmp_path / database_template.NAME).write_bytes(b"old")
+    database_template.copy_to(tmp_path)
+    assert (tmp_path / database_template.NAME).read_bytes() == b"old"
 
 
 def test_where_none_was_made_the_server_makes_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fresh, "place", lambda: tmp_path / "missing.db")
-    fresh.put(tmp_path)
+    monkeypatch.setattr(database_template, "template", lambda: tmp_path / "missing.db")
+    database_template.copy_to(tmp_path)
     assert not list(tmp_path.iterdir())
