@@ -38,9 +38,10 @@ from flows.commands.batch import ready
 from flows.engine.step_tasks import finished_steps, flow_settings, steps_of_flow
 from flows.inputs.manifest import Item, items_of
 from flows.inputs.orders import Order
+from flows.inputs.package_record import RECORD
 from flows.packages import summary
 from flows.packages.flow_result import StepRun
-from flows.packages.publish import RECORD, Files, publish
+from flows.packages.publish import Files, publish
 from flows.pipeline import conversion_of
 from flows.serving.auth import auth_string
 from flows.serving.server import HOST, SETTINGS, answers

@@ -18,7 +18,7 @@ from pathlib import Path
 from rich.table import Table
 
 from benchmarks.measure import machine, new_console, parser_of, write_rows
-from flows.packages.publish import RECORD
+from flows.inputs.package_record import RECORD
 
 SHORT = ("static.iterations=30", "motion.iterations=30", "mesh.mode=per_frame")
 

@@ -23,7 +23,8 @@ from rich.table import Table
 
 from benchmarks.measure import machine, new_console, parser_of, write_rows
 from flows.inputs.orders import Wish
-from flows.packages.publish import RECORD, whole
+from flows.inputs.package_record import RECORD
+from flows.packages.publish import whole
 from flows.serving.server import Server
 from steps.artifacts.store import ArtifactStore
 from steps.contract import StepFailure, StepRequest

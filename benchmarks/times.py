@@ -15,7 +15,8 @@ from typing import Any
 from rich.table import Table
 
 from benchmarks.measure import new_console, parser_of, write_rows
-from flows.packages.publish import RECORD, whole
+from flows.inputs.package_record import RECORD
+from flows.packages.publish import whole
 
 STAGES = {
     "prepare_subject": "subject",

@@ -16,13 +16,14 @@ from prefect.settings import temporary_settings
 
 from dg4d_lib.errors import DG4DError
 from flows.commands.make import make, save_pictures
-from flows.engine.executors import StepCrashed, StepError, StepOutOfMemory, StepTimedOut, StepUnreachable, stop_all
+from flows.engine.executors import stop_all
 from flows.engine.runners import item_runner
 from flows.engine.step_tasks import flow_settings
+from flows.formatting.escaping import markdown
 from flows.inputs.orders import Order
 from flows.packages.summary import Row, Tally, judged
+from flows.step_errors import StepCrashed, StepError, StepOutOfMemory, StepTimedOut, StepUnreachable
 from flows.ui import pages
-from flows.ui.escaping import markdown
 from steps.artifacts.store import ArtifactMissing, StoreUnreachable
 
 Make = Callable[[Order, Path], tuple[Any, bool]]

@@ -88,8 +88,9 @@ def make(
         from flows.inputs.manifest import parse_changes
         from flows.inputs.naming import clean
         from flows.inputs.orders import Wish, name_of
+        from flows.inputs.package_record import record_of
         from flows.packages.acceptance import failing_in
-        from flows.packages.publish import check_folder, is_current, record_of
+        from flows.packages.publish import check_folder, is_current
         from steps.profiles import profile as named
         from steps.profiles import revise
 
@@ -293,7 +294,7 @@ def compose(
     with clear_ending():
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
         from flows.commands.compose import compose as compose_scene
-        from flows.ui.escaping import visible
+        from flows.formatting.escaping import visible
 
         for note in compose_scene(packages or [], out, scene, spacing, preview):
             typer.echo(visible(note), err=True)

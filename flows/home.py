@@ -6,7 +6,6 @@ from contextlib import suppress
 from pathlib import Path
 
 from dg4d_lib.errors import BadInput
-from flows.serving.server import SETTINGS, Server
 from steps.artifacts.opening import open_store
 from steps.artifacts.store import ArtifactStore, home
 
@@ -15,7 +14,7 @@ CLIENT_SETTINGS = {
     "DO_NOT_TRACK": "1",
     "PREFECT_CLIENT_SERVER_VERSION_CHECK_ENABLED": "false",
     "PREFECT_TELEMETRY_ENABLE_RESOURCE_METRICS": "false",
-    "PREFECT_SERVER_ANALYTICS_ENABLED": SETTINGS["PREFECT_SERVER_ANALYTICS_ENABLED"],
+    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
     "PREFECT_CLI_PROMPT": "false",
     "PREFECT_CLIENT_MAX_RETRIES": "7",  # four minutes: a database may be busy, a server begin again; 10: 34 minutes
     "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "CRITICAL",  # the command says what matters; the rest goes to the server
@@ -52,12 +51,6 @@ def cutouts() -> Path:
     return home() / "cutouts"
 
 
-def background_server() -> Server:
-    """The server that commands share unless PREFECT_API_URL names another."""
-    make_private(home())
-    return Server(home() / "server", home() / "prefect")
-
-
 def make_private(folder: Path) -> None:
     """Create a folder that only its owner can enter; close one that others can, with everything in it.
 
@@ -85,9 +78,3 @@ def set_environment(api_url: str) -> None:
     """Set what Prefect reads when it is imported: its server, its own folder, no telemetry. What the user set stays."""
     for name, value in {**CLIENT_SETTINGS, "PREFECT_HOME": str(home() / "prefect"), "PREFECT_API_URL": api_url}.items():
         os.environ.setdefault(name, value)
-
-
-def set_own_server(server: Server, address: str) -> None:
-    """As `set_environment`, for the background server, with its secret; a secret of another server does not count."""
-    os.environ["PREFECT_API_AUTH_STRING"] = server.auth_string()
-    set_environment(f"{address}/api")

@@ -9,13 +9,13 @@ from prefect.settings import temporary_settings
 
 from dg4d_lib.errors import BadInput
 from flows import home
-from flows.engine.executors import StepError
 from flows.engine.orphans import process_tag
 from flows.engine.step_tasks import Conversion, flow_settings
+from flows.formatting.escaping import markdown
 from flows.packages import scores
 from flows.packages.scores import ObjectScores, Results
+from flows.step_errors import StepError
 from flows.tasks import score_asset
-from flows.ui.escaping import markdown
 from steps.contract import ArtifactRef, Frozen
 from steps.profiles import PREVIEW, ScoreAssetSettings
 

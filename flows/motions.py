@@ -7,10 +7,10 @@ from typing import Any
 from prefect import flow
 
 from flows import home
-from flows.engine.executors import StepBadInput
 from flows.engine.step_tasks import steps_of_flow
 from flows.inputs.orders import Order
 from flows.pipeline import conversion_of
+from flows.step_errors import StepBadInput
 from flows.tasks import drive_video, prepare_subject
 from steps.artifacts.archives import unpack as unpack_zip
 from steps.contract import ArtifactRef

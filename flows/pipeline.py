@@ -8,12 +8,12 @@ from prefect.transactions import transaction
 
 from flows import home
 from flows.engine import resources
-from flows.engine.executors import StepBadInput
 from flows.engine.frames import divided, frames_in
 from flows.engine.publishing import keep_version, publish
 from flows.engine.step_tasks import Conversion, finished_steps, steps_of_flow
 from flows.inputs.orders import Order
 from flows.packages.flow_result import FlowResult, notes_of
+from flows.step_errors import StepBadInput
 from flows.tasks import (
     DrivingVideo,
     Gaussians,

@@ -10,12 +10,12 @@ from flows import home
 from flows.commands import make, terminal
 from flows.commands.endings import EXIT_BAD_INPUT, EXIT_FAILED
 from flows.engine import resources
+from flows.formatting.escaping import visible
 from flows.inputs import naming
 from flows.inputs.manifest import Item, admitted, items_of, only_commercial
 from flows.inputs.orders import Order
 from flows.packages.publish import check_folder, check_writable, is_current
 from flows.packages.summary import BAD_INPUT, Row, Tally, Writer, judged
-from flows.ui.escaping import visible
 
 if TYPE_CHECKING:
     from rich.console import Console

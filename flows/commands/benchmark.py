@@ -13,13 +13,13 @@ from dg4d_lib.asset_settings import ScoreSettings
 from dg4d_lib.errors import BadInput, DG4DError
 from flows import home
 from flows.commands import terminal
-from flows.engine.executors import StepError, StepMissing
 from flows.inputs.manifest import parse_changes
 from flows.inputs.orders import Order, Wish
 from flows.packages import scores
 from flows.packages.publish import check_folder, check_writable, is_current, whole
 from flows.packages.scores import Results
 from flows.packages.summary import BAD_INPUT, Row, Tally
+from flows.step_errors import StepError, StepMissing
 from steps.artifacts.archives import add_entry, unpack
 from steps.artifacts.ground_truth import Truth, find_truth, find_truths
 from steps.artifacts.store import ArtifactStore, room_for, write_atomically

@@ -8,7 +8,8 @@ from pydantic import ValidationError
 
 from dg4d_lib.assets.scenes.scene import Item, Scene
 from dg4d_lib.errors import BadInput
-from flows.packages.publish import check_writable, record_of, whole
+from flows.inputs.package_record import record_of
+from flows.packages.publish import check_writable, whole
 from steps.artifacts.store import room_for
 
 SUFFIXES = (".glb", ".usdz")

@@ -85,8 +85,8 @@ def _signals() -> Iterator[list[signal.Signals]]:
 
 def _verdict(error: Exception) -> tuple[str, int]:
     from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
-    from flows.engine.executors import StepBadInput, StepDiverged, StepError, StepMissing
     from flows.serving.server import ServerUnavailable
+    from flows.step_errors import StepBadInput, StepDiverged, StepError, StepMissing
     from steps.artifacts.store import NO_SPACE, ArtifactMissing
 
     text = error.message if isinstance(error, StepError) else str(error)
@@ -125,7 +125,7 @@ def _stop_steps() -> None:
 
 
 def _end(message: str, status: int) -> NoReturn:
-    from flows.ui.escaping import visible
+    from flows.formatting.escaping import visible
 
     with suppress(OSError):  # nobody may be there to read it
         typer.echo(f"dg4d: {visible(message)}", err=True)

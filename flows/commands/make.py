@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 from flows import home
 from flows.engine.free_space import require_free_space
 from flows.inputs.orders import Order
-from flows.packages.publish import Files, is_current, record_of
+from flows.inputs.package_record import record_of
+from flows.packages.publish import Files, is_current
+from flows.serving import background
 from flows.serving.server import ServerUnavailable
 from steps.artifacts.store import ArtifactMissing
 from steps.artifacts.store import home as store_home
@@ -26,7 +28,7 @@ ANSWER_S = 10.0  # for a server of the user's own
 def prepare(order: Order) -> None:
     """Begin what the first step of an order would wait for, unless every step was done before."""
     from flows.engine import executors
-    from flows.packages.versions import has_version
+    from flows.engine.versions import has_version
 
     if not has_version(home.store(), order):
         executors.prepare()
@@ -45,9 +47,9 @@ def connect() -> None:
         home.set_environment(own)
         _check(own)
     else:
-        server = home.background_server()
+        server = background.background_server()
         server.start()
-        home.set_own_server(server, server.wait_for_address())
+        background.set_own_server(server, server.wait_for_address())
         importlib.import_module("flows.pipeline")  # takes seconds, and so does the server
         server.wait()
     from flows.engine.orphans import settle_orphans
@@ -70,8 +72,8 @@ def make(order: Order, folder: Path) -> tuple[Files, bool]:
         BackendUnavailable: a key is configured, and signing is not installed.
     """
     from flows.engine.events import StepEvent, tell
-    from flows.engine.executors import StepLost
     from flows.engine.output_lock import output_lock
+    from flows.step_errors import StepLost
 
     def waiting() -> None:
         tell(StepEvent(order.item, "output", "remark", text=f"waiting for another run that writes {folder}"))

@@ -10,6 +10,7 @@ import typer
 
 from flows.commands.endings import clear_ending
 from flows.commands.options import finite
+from flows.serving import background
 
 LOOK_S = 1.0  # between two looks at a watched folder
 
@@ -41,7 +42,6 @@ def up(
     with clear_ending():
         from dg4d_lib.errors import BadInput
         from dg4d_lib.rasterizer.choice import cuda_devices
-        from flows import home
         from flows.commands.make import connect
         from flows.serving import roots
         from flows.serving.pools import read_pools
@@ -51,7 +51,7 @@ def up(
         chosen = pools or ["process-cpu", *(["process-gpu"] if cuda_devices() else [])]
         if unknown := [name for name in chosen if name not in known]:
             raise BadInput(f"there is no pool {unknown[0]!r} in deploy/pools.yaml; there are: {', '.join(known)}")
-        server = home.background_server()
+        server = background.background_server()
         variables = roots.environment(sources or ())
         own = [Worker(name, server.folder) for name in chosen] if workers else []
         for worker in own:
@@ -77,10 +77,9 @@ def up(
 def down() -> None:
     """Stop the server and the workers of this machine; says which, and how many runs end with them."""
     with clear_ending():
-        from flows import home
         from flows.serving.workers import running
 
-        server = home.background_server()
+        server = background.background_server()
         stopped = []
         for worker in running(server.folder):
             runs = worker.runs()
@@ -94,10 +93,9 @@ def down() -> None:
 def env() -> None:
     """Print the variables with which Prefect's own commands reach the server: eval "$(dg4d env)"."""
     with clear_ending():
-        from flows import home
         from flows.serving.server import ServerUnavailable
 
-        server = home.background_server()
+        server = background.background_server()
         if (address := server.address()) is None:
             raise ServerUnavailable("No server runs; start one with `dg4d up`.")
         typer.echo(f"export PREFECT_API_URL={address}/api")
@@ -113,7 +111,6 @@ def watch(
 ) -> None:
     """Have the deployment catalog/local convert what is dropped into a folder; goes on until it is stopped."""
     with clear_ending():
-        from flows import home
         from flows.commands.make import connect
         from flows.packages.publish import check_writable
         from steps.contract import digest_of
@@ -124,7 +121,7 @@ def watch(
         from flows.serving.watching import Watcher, announce
 
         name = digest_of([str(folder.resolve()), str(out.resolve())]).removeprefix("sha256:")[:16]
-        watcher = Watcher(folder, out, rest_s, home.background_server().folder / f"watched-{name}")
+        watcher = Watcher(folder, out, rest_s, background.background_server().folder / f"watched-{name}")
         typer.echo(f"watching {watcher.folder}")
         with granted(watcher.folder, watcher.out):
             while True:

@@ -11,7 +11,7 @@ from flows.commands.options import finite
 from flows.exit_status import EXIT_BAD_INPUT
 
 if TYPE_CHECKING:
-    from flows.packages.versions import Version
+    from flows.engine.versions import Version
     from steps.artifacts.store import ArtifactStore
 
 LEAST_DIGITS = 6  # of a digest, to be taken for one
@@ -32,8 +32,8 @@ def list_versions() -> None:
 
         from flows import home
         from flows.commands import terminal
-        from flows.packages.publish import readable
-        from flows.packages.versions import versions
+        from flows.engine.versions import versions
+        from flows.formatting.sizes import readable
 
         place = home.store()
         sizes = {entry.name: entry.size_bytes for entry in place.artifacts()}
@@ -68,7 +68,7 @@ def show(
     with clear_ending():
         from dg4d_lib.errors import BadInput
         from flows import home
-        from flows.packages.versions import versions
+        from flows.engine.versions import versions
 
         place = home.store()
         known = versions(place)
@@ -108,7 +108,7 @@ def gc(
     with clear_ending():
         from flows import home
         from flows.engine.collecting import collect
-        from flows.packages.publish import readable
+        from flows.formatting.sizes import readable
 
         place = home.store()
         gone = collect(place, home.records(), keep, dry_run, grace_hours * 3600)
@@ -126,7 +126,7 @@ def verify() -> None:
     """Read every artifact again: name those that are damaged, and those that versions need and are missing."""
     with clear_ending():
         from flows import home
-        from flows.packages.versions import faults, users, versions
+        from flows.engine.versions import faults, users, versions
 
         place = home.store()
         known = versions(place)
@@ -146,7 +146,7 @@ def verify() -> None:
 
 
 def _show_version(version: "Version", place: "ArtifactStore") -> None:
-    from flows.packages.publish import readable
+    from flows.formatting.sizes import readable
 
     sizes = {entry.name: entry.size_bytes for entry in place.artifacts()}
     _echo(f"{version.item}  version {version.order}")
@@ -162,8 +162,8 @@ def _show_version(version: "Version", place: "ArtifactStore") -> None:
 
 
 def _show_artifact(digest: str, size_bytes: int, known: list["Version"]) -> None:
-    from flows.packages.publish import readable
-    from flows.packages.versions import users
+    from flows.engine.versions import users
+    from flows.formatting.sizes import readable
 
     _echo(f"{digest}  {readable(size_bytes)}")
     for version, what in users(known).get(digest, []):
@@ -174,7 +174,7 @@ def _show_artifact(digest: str, size_bytes: int, known: list["Version"]) -> None
 
 def _echo(text: str) -> None:
     """Print a line with names in it that this process did not choose."""
-    from flows.ui.escaping import visible
+    from flows.formatting.escaping import visible
 
     typer.echo(visible(text))
 

@@ -15,9 +15,9 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 from rich.table import Table
 
 from flows.engine.events import StepEvent, listening
-from flows.packages.publish import readable
-from flows.ui.curves import amount
-from flows.ui.escaping import visible
+from flows.formatting.curves import amount
+from flows.formatting.escaping import visible
+from flows.formatting.sizes import readable
 
 if TYPE_CHECKING:
     from flows.inputs.orders import Order
@@ -47,7 +47,7 @@ class _Terminal(Console):
 def with_steps(order: "Order", out: Console, work: Callable[[], Result]) -> Result:
     """What `work` gives, which runs a flow of this order, with its steps on the terminal."""
     from flows.commands.make import connect, prepare, save_pictures
-    from flows.engine.executors import StepBadInput
+    from flows.step_errors import StepBadInput
 
     with out.status("starting") if out.is_terminal else nullcontext():
         prepare(order)

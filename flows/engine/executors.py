@@ -21,14 +21,24 @@ from pydantic import ValidationError
 from dg4d_lib.errors import BackendUnavailable
 from flows.engine import forks, resources
 from flows.engine.containers import container
-from flows.engine.processes import locked, without_prefect
 from flows.home import store
+from flows.processes import locked, without_prefect
+from flows.step_errors import (
+    StepBadInput,
+    StepCrashed,
+    StepDiverged,
+    StepError,
+    StepLost,
+    StepMissing,
+    StepOutOfMemory,
+    StepTimedOut,
+    StepUnreachable,
+)
 from steps.artifacts.store import home, remove_tree
 from steps.contract import (
     EXIT_BAD_INPUT,
     EXIT_MISSING,
     EXIT_OUT_OF_MEMORY,
-    ArtifactRef,
     StepFailure,
     StepRequest,
     StepResult,
@@ -43,52 +53,6 @@ Execute = Callable[[StepSpec, StepRequest, Progress, Say], StepResult]
 TAIL_BYTES = 4000  # of standard error, for the message of a crash
 IN_USE = "in-use"  # the locked file of a scratch folder
 KILL_GRACE_S = 5.0  # between asking a step to end and ending it
-
-
-class StepError(Exception):
-    """A step did not give a result.
-
-    Attributes:
-        step: its name.
-        message: why, for the user.
-        pictures: that explain it, in the store.
-    """
-
-    def __init__(self, step: str, message: str, pictures: dict[str, ArtifactRef] | None = None) -> None:
-        super().__init__(f"{step}: {message}")
-        self.step, self.message, self.pictures = step, message, pictures or {}
-
-
-class StepBadInput(StepError):
-    """What was given cannot be used; the same again will fail again."""
-
-
-class StepMissing(StepError):
-    """Something needed is not here: a library, a device, weights, an artifact."""
-
-
-class StepLost(StepMissing):
-    """An artifact that it needs is gone or damaged; what made it will make it again."""
-
-
-class StepUnreachable(StepMissing):
-    """The store does not answer at the moment."""
-
-
-class StepDiverged(StepError):
-    """An optimization left the finite numbers; `pictures` show the last good state."""
-
-
-class StepOutOfMemory(StepError):
-    """There was not enough memory; there may be when other work has ended."""
-
-
-class StepTimedOut(StepError):
-    """It took longer than its spec allows, and was killed."""
-
-
-class StepCrashed(StepError):
-    """Anything else."""
 
 
 _ERRORS: dict[str, type[StepError]] = {

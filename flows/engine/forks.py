@@ -11,7 +11,7 @@ import weakref
 from collections.abc import Sequence
 from typing import IO, BinaryIO
 
-from flows.engine.processes import python, without_prefect
+from flows.processes import python, without_prefect
 from steps.runtime.fork_server import ANSWER_BYTES
 
 SET_BY_IMPORTS = "OpenImageIO_ROOT"  # by a library, for its own programs

@@ -16,7 +16,7 @@ from pathlib import PurePosixPath
 from pydantic import Field, ValidationError
 
 from dg4d_lib.errors import BadInput
-from flows.engine.processes import OWN_START, place, start_of
+from flows.processes import OWN_START, place, start_of
 from steps.artifacts.store import ArtifactStore, Entry
 from steps.contract import Digest, Frozen
 

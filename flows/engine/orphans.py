@@ -7,7 +7,7 @@ from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterState, Fl
 from prefect.client.schemas.objects import StateType
 from prefect.states import Crashed
 
-from flows.engine.processes import place, start_of
+from flows.processes import place, start_of
 
 
 def process_tag() -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from flows import home
 from flows.engine import resources
-from flows.engine.processes import locked
+from flows.processes import locked
 
 POLL_S = 0.2  # between two attempts
 

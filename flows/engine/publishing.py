@@ -7,8 +7,8 @@ from prefect.cache_policies import NO_CACHE
 from prefect.transactions import Transaction, get_transaction
 
 from flows import home
+from flows.engine import versions
 from flows.inputs.orders import Order
-from flows.packages import versions
 from flows.packages.credentials import configured
 from flows.packages.flow_result import FlowResult
 from flows.packages.publish import Swap

@@ -24,13 +24,14 @@ from flows import home
 from flows.engine import resources
 from flows.engine.caching import FileLocks, RequestPolicy
 from flows.engine.events import StepEvent, tell
-from flows.engine.executors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable, chosen, stop_all
+from flows.engine.executors import chosen, stop_all
 from flows.engine.leases import hold
 from flows.engine.remarks import remark
+from flows.formatting.curves import amount
+from flows.formatting.escaping import markdown
 from flows.packages.flow_result import StepRun
+from flows.step_errors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable
 from flows.ui import pages
-from flows.ui.curves import amount
-from flows.ui.escaping import markdown
 from flows.ui.showing import revive, show
 from steps.artifacts.store import StoreUnreachable
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen, StepRequest, StepResult

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from flows.engine.processes import locked
+from flows.processes import locked
 
 _numbers = itertools.count()
 

@@ -4,7 +4,7 @@ import json
 import math
 from typing import Any
 
-from flows.ui.escaping import quoted
+from flows.formatting.escaping import quoted
 
 DEEPEST = 100  # brackets within brackets; a provenance record has about ten
 MOST_DIGITS = 100  # of a whole number; Python itself refuses more than 4300

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 from dg4d_lib.errors import BadInput
 from flows.inputs import sources
-from flows.packages.publish import record_of
+from flows.inputs.package_record import record_of
 from steps.artifacts.archives import stays_inside
 from steps.artifacts.opening import open_store
 

@@ -6,7 +6,7 @@ from collections import Counter
 from pathlib import Path, PurePosixPath
 
 from dg4d_lib.errors import BadInput
-from flows.ui.escaping import quoted, visible
+from flows.formatting.escaping import quoted, visible
 
 LONGEST_PART_BYTES = 230  # of one folder: file systems take 255, of which the names of scratch folders need up to 25
 LONGEST_NAME_BYTES = 1000  # of a name with its folders

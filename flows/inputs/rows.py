@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
+from flows.formatting.escaping import quoted
 from flows.inputs.json_text import loads
-from flows.ui.escaping import quoted
 
 COLUMNS = (
     "path", "text", "video", "name", "profile", "seed", "bank", "priority", "set",

@@ -12,7 +12,8 @@ from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import quote
 
-from flows.packages.publish import RECORD, Files
+from flows.inputs.package_record import RECORD
+from flows.packages.publish import Files
 from steps.contract import canonical, digest_of
 from steps.runtime.environment_info import packages
 

@@ -11,13 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from dg4d_lib.errors import BadInput
-from flows.inputs.json_text import loads
 from flows.inputs.naming import check_folder_name
-from steps.artifacts.archives import can_exist, stays_inside, unpack
+from flows.inputs.package_record import RECORD, record_of
+from steps.artifacts.archives import unpack
 from steps.artifacts.store import remove_tree, room_for
 
-RECORD = "provenance.json"
-FORMAT = 2  # of the record
 CANNOT_SWAP = {errno.EBUSY, errno.EXDEV, errno.EACCES, errno.EPERM, errno.EROFS, errno.EINVAL}
 
 Files = dict[str, dict[str, Any]]  # path within the package -> {"digest", "size_bytes"}
@@ -70,21 +68,6 @@ def check_writable(folder: Path) -> None:
         raise BadInput(
             f"the output folder {folder} cannot be written: {error.strerror} ({place}); choose another with -o"
         ) from error
-
-
-def record_of(folder: Path) -> dict[str, Any] | None:
-    """Return the provenance of the package in a folder.
-
-    None if there is no package, or its record cannot be used: names in it lead out of the folder or are too long for a
-    file, or it is nested too deeply.
-    """
-    try:
-        record = loads((folder / RECORD).read_text(encoding="utf-8"))
-        names = [*record["files"], *record.get("beside", ())]
-        sound = isinstance(record["files"], dict) and all(stays_inside(name) and can_exist(name) for name in names)
-        return record if sound else None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return None
 
 
 def is_current(folder: Path, order: str) -> bool:
@@ -219,11 +202,6 @@ def fact_of(path: Path) -> dict[str, Any]:
 def fact_of_bytes(content: bytes) -> dict[str, Any]:
     """As `fact_of`, of what a file will hold."""
     return {"digest": f"sha256:{hashlib.sha256(content).hexdigest()}", "size_bytes": len(content)}
-
-
-def readable(size_bytes: int) -> str:
-    """A size for people."""
-    return f"{size_bytes / 1e6:.1f} MB" if size_bytes >= 100_000 else f"{size_bytes / 1e3:.1f} kB"
 
 
 def _publish(package: Path, folder: Path, finish: Finish, in_place: bool = False) -> Swap:

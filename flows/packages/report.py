@@ -9,7 +9,10 @@ from types import MappingProxyType
 from typing import Any
 
 from flows import home
+from flows.formatting import curves
+from flows.formatting.sizes import readable
 from flows.inputs.orders import Order
+from flows.inputs.package_record import FORMAT, RECORD
 from flows.inputs.signing_key import certificate
 from flows.packages import acceptance
 from flows.packages.acceptance import picture_of, verdict_of
@@ -17,9 +20,8 @@ from flows.packages.crate import CRATE, crate_text
 from flows.packages.credentials import Claim, Signer, sidecar_of
 from flows.packages.flow_result import FlowResult, StepRun
 from flows.packages.html_pages import render
-from flows.packages.publish import FORMAT, RECORD, Files, Swap, fact_of_bytes, readable, replace_package
+from flows.packages.publish import Files, Swap, fact_of_bytes, replace_package
 from flows.packages.view import VIEWER, page_of
-from flows.ui import curves
 from steps.artifacts.store import ArtifactStore
 from steps.contract import RUN_ONLY, StepResult
 

@@ -11,10 +11,10 @@ from urllib.parse import quote
 from pydantic import BaseModel
 
 from flows.exit_status import EXIT_BAD_INPUT, EXIT_FAILED
+from flows.formatting.escaping import cell
+from flows.formatting.escaping import markdown as escaped
 from flows.packages.html_pages import render
 from flows.packages.summary import BAD_INPUT
-from flows.ui.escaping import cell
-from flows.ui.escaping import markdown as escaped
 
 Figures = dict[str, float]
 

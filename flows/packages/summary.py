@@ -13,10 +13,10 @@ from urllib.parse import quote
 
 from pydantic import BaseModel
 
+from flows.formatting.escaping import cell
+from flows.inputs.package_record import record_of
 from flows.packages.acceptance import failing_in
 from flows.packages.html_pages import render
-from flows.packages.publish import record_of
-from flows.ui.escaping import cell
 from steps.artifacts.store import write_atomically
 
 Status = Literal["done", "unchanged", "failed", "skipped"]

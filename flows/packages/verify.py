@@ -8,10 +8,11 @@ from typing import Any, Literal
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows.exit_status import EXIT_BAD_INPUT, EXIT_MISSING
 from flows.inputs.json_text import loads
+from flows.inputs.package_record import FORMAT, RECORD, record_of
 from flows.inputs.signing_key import CERTIFICATE
 from flows.packages.crate import CRATE, files_in, own_digest, rendered
 from flows.packages.credentials import Signature, sidecar_of, signature_of
-from flows.packages.publish import FORMAT, RECORD, fact_of, record_of
+from flows.packages.publish import fact_of
 from steps.contract import RUN_ONLY, Frozen, digest_of
 
 State = Literal["whole", "altered", "missing", "extra", "trusted", "untrusted", "invalid", "unsigned", "unchecked"]

@@ -10,7 +10,8 @@ from typing import Any
 
 from dg4d_lib.assets.rendering.viewer_page import viewer_page
 from dg4d_lib.errors import BadInput
-from flows.packages.publish import readable, whole
+from flows.formatting.sizes import readable
+from flows.packages.publish import whole
 from steps.artifacts.store import room_for
 
 VIEWER = "viewer.html"

@@ -12,7 +12,7 @@ from contextlib import closing
 from importlib.metadata import version
 from pathlib import Path
 
-from flows.engine.processes import python, without_prefect
+from flows.processes import python, without_prefect
 
 NAME = "prefect.db"  # in PREFECT_HOME
 

@@ -12,7 +12,7 @@ from prefect.events.schemas.automations import AutomationCore, EventTrigger, Pos
 from prefect.events.schemas.events import ResourceSpecification
 
 from dg4d_lib.errors import BackendUnavailable
-from flows.engine.processes import python
+from flows.processes import python
 from flows.serving.pools import DEPLOYMENTS, Json, Pool, read_deployments
 from flows.serving.workers import HEARTBEAT_S
 

@@ -16,10 +16,10 @@ from urllib.parse import unquote
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.weights.registry import KNOWN
-from flows import home
-from flows.engine.processes import locked
 from flows.inputs.listing import BUCKET, WILD
 from flows.inputs.manifest import Item
+from flows.processes import locked
+from flows.serving import background
 from steps.artifacts.store import home as home_folder
 from steps.contract import Frozen
 from steps.runtime.weights import weights_home, weights_in
@@ -189,7 +189,7 @@ def _granted() -> Iterator[Roots]:
 
 
 def _grants() -> Path:
-    return home.background_server().folder / "grants"
+    return background.background_server().folder / "grants"
 
 
 def _places(text: str) -> tuple[str, ...]:

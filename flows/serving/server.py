@@ -21,7 +21,7 @@ from types import FrameType
 from typing import IO
 from urllib.parse import quote
 
-from flows.engine.processes import die_with_parent, locked, python, without_prefect
+from flows.processes import die_with_parent, locked, python, without_prefect
 from flows.serving import auth, database_template
 
 HOST = "127.0.0.1"  # never another interface: the traffic is not encrypted

@@ -19,8 +19,8 @@ from flows import home, prefect_compat
 from flows.packages.view import page_of_package
 from flows.prefect_compat import add_first
 from flows.serving.access import SESSION, SignIn, protect
+from flows.serving.addresses import ARTIFACT_ADDRESS, VIEWER_ADDRESS
 from flows.serving.server import LOGIN
-from flows.ui.pages import ARTIFACT_ADDRESS, VIEWER_ADDRESS
 from steps.contract import ArtifactRef
 
 SHOWN = {".png": "image/png", ".json": "application/json"}  # what a browser shows; the rest is saved to disk

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from flows.engine.processes import die_with_parent, locked, python, start_of
+from flows.processes import die_with_parent, locked, python, start_of
 from flows.serving.roots import SOURCES
 from flows.serving.server import LOOK_S, Server, leave
 from steps.artifacts.store import write_atomically

@@ -6,10 +6,12 @@ from typing import Any
 
 from prefect.artifacts import create_markdown_artifact
 
+from flows.formatting import curves
+from flows.formatting.escaping import markdown
 from flows.packages import acceptance
 from flows.packages.flow_result import StepRun
-from flows.ui import curves, pages
-from flows.ui.escaping import markdown
+from flows.serving.addresses import VIEWER_ADDRESS
+from flows.ui import pages
 from flows.ui.showing import show
 from steps.artifacts.store import ArtifactStore
 from steps.contract import ArtifactRef
@@ -71,7 +73,7 @@ def addresses(item: str, package: ArtifactRef) -> dict[str, str]:
     name = pages.key("asset", item)
     return {
         "package": pages.address(name, package, ".zip"),
-        "viewer": pages.address(name, package, ".html", pages.VIEWER_ADDRESS),
+        "viewer": pages.address(name, package, ".html", VIEWER_ADDRESS),
     }
 
 

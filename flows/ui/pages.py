@@ -11,10 +11,11 @@ from typing import Any
 
 import OpenImageIO as oiio
 
-from flows.engine.executors import StepError
+from flows.formatting.escaping import markdown
+from flows.formatting.sizes import readable
 from flows.packages import acceptance
-from flows.packages.publish import readable
-from flows.ui.escaping import markdown
+from flows.serving.addresses import ARTIFACT_ADDRESS
+from flows.step_errors import StepError
 from steps.artifacts.store import ArtifactMissing, ArtifactStore
 from steps.contract import ArtifactRef, StepResult
 from steps.main import catalog
@@ -24,8 +25,6 @@ WEBP_METHOD = 4  # libwebp's own; with OpenImageIO's, 6, alpha takes a hundred t
 THUMBNAIL_BYTES = 30_000  # the server keeps pages in its database
 THUMBNAILS_KEPT = 32  # the page of an asset shows those of its steps again
 ROWS_OF_A_CURVE = 8
-ARTIFACT_ADDRESS = "/dg4d/artifacts/"  # of the background server
-VIEWER_ADDRESS = "/dg4d/viewer/"
 
 
 def key(label: str, item: str) -> str:

@@ -11,7 +11,7 @@ import httpx
 from prefect.logging import get_run_logger
 from prefect.settings import PREFECT_API_URL
 
-from flows import home
+from flows.serving import background
 from flows.serving.server import HOST, Server
 
 PATIENCE_S = 120.0  # as long as a server may take to start
@@ -86,7 +86,7 @@ def later(make: Callable[[], None]) -> None:
 
 def revive() -> None:
     """Start the background server again, at the address where this process knows it, unless it runs."""
-    server = home.background_server()
+    server = background.background_server()
     with suppress(OSError):
         port = (server.folder / "port").read_text(encoding="ascii").strip()
         if PREFECT_API_URL.value() == f"http://{HOST}:{port}/api" and server.address() is None:

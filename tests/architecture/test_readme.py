@@ -10,7 +10,7 @@ import repository
 import flows.cli
 import flows.commands.endings
 from flows.inputs.manifest import parse_changes
-from flows.packages.publish import RECORD
+from flows.inputs.package_record import RECORD
 from flows.packages.report import BESIDE
 from steps.artifacts import packages
 from steps.profiles import PROFILES, profile, revise

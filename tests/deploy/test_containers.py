@@ -17,7 +17,8 @@ import torch
 from dg4d_lib.errors import BackendUnavailable
 from flows import home
 from flows.engine.containers import container
-from flows.engine.executors import EXECUTORS, StepBadInput
+from flows.engine.executors import EXECUTORS
+from flows.step_errors import StepBadInput
 from steps.artifacts.media import write_png
 from steps.catalog import STEPS
 from steps.contract import ArtifactRef, StepRequest, StepResult

@@ -10,8 +10,9 @@ from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary
 from typer.testing import CliRunner
 from waiting import retry_after
 
-from flows import cli, home
+from flows import cli
 from flows.engine import resources
+from flows.serving import background
 from flows.serving.server import Server
 
 
@@ -27,7 +28,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """The product's own server, under a home folder of its own, which is `server.folder.parent`."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DG4D_HOME", str(tmp_path_factory.mktemp("home")))
-        running = home.background_server()
+        running = background.background_server()
         running.start()
     with (
         temporary_settings({PREFECT_API_URL: running.wait(), PREFECT_API_AUTH_STRING: running.auth_string()}),

@@ -13,12 +13,13 @@ from flows import home
 from flows.catalog import convert_all
 from flows.commands.make import make, make_motions, save_pictures
 from flows.engine.events import StepEvent, listening
-from flows.engine.executors import StepBadInput, StepCrashed, StepDiverged, StepError, StepMissing, StepOutOfMemory
 from flows.engine.orphans import settle_orphans
 from flows.inputs.orders import Wish
 from flows.packages.publish import whole
 from flows.packages.summary import NOT_ACCEPTED, Row, Tally
+from flows.serving import background
 from flows.serving.server import Server
+from flows.step_errors import StepBadInput, StepCrashed, StepDiverged, StepError, StepMissing, StepOutOfMemory
 from steps.profiles import PREVIEW, revise
 
 
@@ -267,7 +268,7 @@ def test_a_batch_makes_what_it_can_and_leaves_alone_what_is_made(dg4d: Run, tmp_
 
 
 def test_there_is_one_server(place: None, server: Server) -> None:
-    other = home.background_server()
+    other = background.background_server()
     other.start()
     assert other.wait() == server.wait() == f"{server.address()}/api"
     other.release()

@@ -14,10 +14,10 @@ from waiting import retry_after
 
 from flows import home
 from flows.commands.make import make
-from flows.engine.executors import StepCrashed
 from flows.inputs.orders import Wish
 from flows.serving.auth import basic
 from flows.serving.server import Server
+from flows.step_errors import StepCrashed
 from steps.profiles import PREVIEW
 
 MARKER = "c0ffee-and-nobody-else-knows"

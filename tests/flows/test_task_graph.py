@@ -157,7 +157,7 @@ def test_a_picture_passes_few_modules_on_its_way_to_the_steps_and_into_the_folde
 
     monkeypatch.setitem(executors.EXECUTORS, "in_process", noting(executors.in_process))
     monkeypatch.setattr("flows.packages.publish._swap", noting(publish._swap))
-    monkeypatch.setattr("flows.packages.versions.wait_for_collecting", noting(lambda _: False))
+    monkeypatch.setattr("flows.engine.versions.wait_for_collecting", noting(lambda _: False))
     (tmp_path / "x.png").write_text(picture("walk"))
     assert dg4d("make", "x.png").exit_code == 0
     ours = {module for module in passed if module.startswith("flows.")}

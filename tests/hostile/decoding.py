@@ -193,7 +193,8 @@ def read_as_scene(path: Path, scratch: Path) -> tuple[Kind, int]:
 def read_as_record(path: Path, scratch: Path) -> tuple[Kind, int]:
     """Check a package whose record somebody else wrote, and ask for the order that it names."""
     from flows.inputs.orders import order_again
-    from flows.packages.publish import RECORD, is_current, record_of
+    from flows.inputs.package_record import RECORD, record_of
+    from flows.packages.publish import is_current
     from flows.packages.verify import verify
     from steps.artifacts.store import ArtifactStore
 

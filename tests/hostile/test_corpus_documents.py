@@ -9,7 +9,8 @@ import pytest
 from dg4d_lib.errors import BadInput
 from flows.commands.compose import compose
 from flows.inputs.orders import order_again
-from flows.packages.publish import RECORD, check_folder, is_current, record_of, whole
+from flows.inputs.package_record import RECORD, record_of
+from flows.packages.publish import check_folder, is_current, whole
 from flows.packages.verify import verify
 from steps.artifacts.store import ArtifactStore
 from tests.hostile import table

@@ -24,12 +24,12 @@ from flows.catalog import ROWS_SHOWN, convert_all
 from flows.commands import batch as module
 from flows.commands.batch import batch, ready, tell
 from flows.engine import resources
-from flows.engine.executors import StepBadInput, StepCrashed, StepOutOfMemory
-from flows.engine.processes import locked
 from flows.inputs.manifest import items_of
 from flows.inputs.orders import Order, Wish
 from flows.packages.summary import NOT_ACCEPTED, Row, Tally, Writer
+from flows.processes import locked
 from flows.serving.server import Server
+from flows.step_errors import StepBadInput, StepCrashed, StepOutOfMemory
 from steps.profiles import PREVIEW
 
 QUIET = Console(quiet=True)

@@ -17,9 +17,9 @@ from waiting import retry_after
 from dg4d_lib.errors import BadInput
 from flows import cli
 from flows.commands.benchmark import bench, put_truth, score
-from flows.engine.executors import StepError, StepMissing
 from flows.packages.scores import Results
 from flows.serving.server import Server
+from flows.step_errors import StepError, StepMissing
 from steps.artifacts.ground_truth import find_truth
 from steps.artifacts.store import ArtifactStore
 

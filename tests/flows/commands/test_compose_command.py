@@ -10,7 +10,7 @@ import pytest
 from dg4d_lib.assets.scenes.compose import Body
 from dg4d_lib.errors import BadInput
 from flows.commands.compose import compose, read_scene
-from flows.packages.publish import RECORD
+from flows.inputs.package_record import RECORD
 from tests.steps.small_package import packed
 
 

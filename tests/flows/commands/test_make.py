@@ -8,8 +8,8 @@ from PIL import Image
 from flows import home
 from flows.commands.make import prepare
 from flows.engine import executors
+from flows.engine.versions import has_version, keep_version
 from flows.inputs.orders import Wish
-from flows.packages.versions import has_version, keep_version
 from steps.profiles import PREVIEW
 
 

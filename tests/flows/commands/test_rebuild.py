@@ -18,7 +18,7 @@ from flows import home
 from flows.commands.make import make
 from flows.commands.rebuild import Rebuilt, rebuild
 from flows.inputs.orders import Order, Wish, order_again
-from flows.packages.publish import record_of
+from flows.inputs.package_record import record_of
 from flows.packages.verify import verify
 from flows.serving.server import Server
 from steps.artifacts.store import ArtifactStore

@@ -15,11 +15,11 @@ from waiting import retry_after
 from flows import home
 from flows.commands.make import make
 from flows.engine.collecting import collect
-from flows.engine.executors import StepLost, StepUnreachable
+from flows.engine.versions import Version, faults, versions
 from flows.inputs.orders import Order, Wish
 from flows.packages.publish import whole
-from flows.packages.versions import Version, faults, versions
 from flows.serving.server import Server
+from flows.step_errors import StepLost, StepUnreachable
 from steps.artifacts.store import object_name
 from steps.profiles import PREVIEW, revise
 

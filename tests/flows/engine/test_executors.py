@@ -10,8 +10,8 @@ import pytest
 import stand_in_engine
 
 from flows.engine.containers import container
-from flows.engine.executors import (
-    Execute,
+from flows.engine.executors import Execute, chosen, in_container, in_process, in_subprocess
+from flows.step_errors import (
     StepBadInput,
     StepCrashed,
     StepDiverged,
@@ -19,10 +19,6 @@ from flows.engine.executors import (
     StepMissing,
     StepOutOfMemory,
     StepTimedOut,
-    chosen,
-    in_container,
-    in_process,
-    in_subprocess,
 )
 from steps.artifacts.store import ArtifactStore
 from steps.contract import StepRequest, StepSpec

@@ -25,13 +25,13 @@ from flows.commands.batch import batch
 from flows.commands.make import make
 from flows.engine import leases
 from flows.engine.collecting import collect
-from flows.engine.executors import StepBadInput, StepOutOfMemory, StepTimedOut
 from flows.engine.orphans import settle_orphans
 from flows.engine.step_tasks import RETRIES
+from flows.engine.versions import faults, versions
 from flows.inputs.orders import Order, Wish
 from flows.packages.publish import whole
-from flows.packages.versions import faults, versions
 from flows.serving.server import Server, answers
+from flows.step_errors import StepBadInput, StepOutOfMemory, StepTimedOut
 from steps.artifacts.store import ArtifactStore
 from steps.profiles import PREVIEW
 

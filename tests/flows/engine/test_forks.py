@@ -11,8 +11,9 @@ import pytest
 from waiting import wait_until
 
 from flows.engine import forks
-from flows.engine.executors import StepOutOfMemory, in_subprocess
+from flows.engine.executors import in_subprocess
 from flows.engine.forks import Fork, ForkServer
+from flows.step_errors import StepOutOfMemory
 from steps.artifacts.store import ArtifactStore
 from steps.contract import StepRequest
 from steps.main import request_version

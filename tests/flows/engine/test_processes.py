@@ -5,9 +5,9 @@ import sys
 
 import pytest
 
-from flows.engine.processes import OWN_START, place, start_of
+from flows.processes import OWN_START, place, start_of
 
-HOSTNAME_TOO = "import socket; from flows.engine.processes import place; print(socket.gethostname(), place())"
+HOSTNAME_TOO = "import socket; from flows.processes import place; print(socket.gethostname(), place())"
 
 
 def _said(*before: str) -> list[str]:

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from dg4d_lib.errors import BadInput
-from flows.packages.publish import Files, check_folder, is_current, publish, record_of
+from flows.inputs.package_record import record_of
+from flows.packages.publish import Files, check_folder, is_current, publish
 from flows.packages.verify import verify
 from steps.artifacts.store import DiskFull
 

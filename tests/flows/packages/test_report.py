@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 from jinja2 import UndefinedError
 
+from flows.formatting.curves import HEIGHT, WIDTH
 from flows.inputs.orders import Order
 from flows.packages import report
 from flows.packages.flow_result import FlowResult, StepRun
 from flows.packages.html_pages import render
 from flows.packages.summary import Row, Writer
-from flows.ui.curves import HEIGHT, WIDTH
 from steps.artifacts.store import ArtifactStore
 from steps.contract import ArtifactRef, ProvenanceRecord, StepResult
 from steps.profiles import PREVIEW, revise

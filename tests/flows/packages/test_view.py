@@ -12,8 +12,9 @@ from made_package import made_package
 from signing import identity
 
 from dg4d_lib.errors import BadInput
+from flows.inputs.package_record import RECORD
 from flows.packages import view as module
-from flows.packages.publish import RECORD, Files, publish
+from flows.packages.publish import Files, publish
 from flows.packages.verify import verify
 from flows.packages.view import VIEWER, facts_of, page_of, view
 from steps.artifacts import packages

@@ -11,7 +11,7 @@ from prefect.client.orchestration import get_client
 from starlette.datastructures import Headers
 
 from flows import home
-from flows.serving import access, server_app
+from flows.serving import access, background, server_app
 from flows.serving.auth import SESSION_S, Sessions, auth_string, basic, is_authorized
 from flows.serving.server import Server
 from steps.artifacts.store import ArtifactStore
@@ -204,7 +204,7 @@ def test_a_home_is_closed_to_others_also_one_of_an_earlier_version(
     (old / "link").symlink_to(tmp_path / "elsewhere")
     old.chmod(0o755)
     monkeypatch.setenv("DG4D_HOME", str(old))
-    home.background_server()
+    background.background_server()
     assert [stat.S_IMODE(path.stat().st_mode) for path in (old, old / "prefect", old / "prefect" / "prefect.db")] == [
         0o700, 0o700, 0o600,
     ]  # fmt: skip

@@ -5,7 +5,7 @@ import io
 
 import pytest
 
-from flows.ui.escaping import cell, markdown, visible
+from flows.formatting.escaping import cell, markdown, visible
 
 NASTY = (
     "![](http://tracker) | <img src=x onerror=alert(1)>\n# `a` *b* _c_ [d](e) ~~f~~ www.g.com h@i.com 1. -j \\ &amp;"

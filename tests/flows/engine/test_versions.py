@@ -17,7 +17,7 @@ from dg4d_lib.errors import BadInput
 from flows.commands.store import store as command
 from flows.engine import leases
 from flows.engine.collecting import collect
-from flows.packages.versions import StepDone, Version, faults, versions
+from flows.engine.versions import StepDone, Version, faults, versions
 from steps.artifacts.bucket import BucketStore
 from steps.artifacts.opening import open_store
 from steps.artifacts.store import ArtifactStore, object_name
@@ -187,7 +187,7 @@ def test_a_lock_of_another_machine_is_believed_as_long_as_it_gives_signs_of_life
 def test_a_version_that_is_recorded_while_things_are_removed_is_whole_or_not_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from flows.packages.versions import keep_version
+    from flows.engine.versions import keep_version
 
     store = ArtifactStore(tmp_path / "store")
     template = version(store, "cat", "one")

@@ -1,0 +1,25 @@
+"""Provenance record of a package in a folder, which others may have written."""
+
+from pathlib import Path
+from typing import Any
+
+from flows.inputs.json_text import loads
+from steps.artifacts.archives import can_exist, stays_inside
+
+RECORD = "provenance.json"
+FORMAT = 2  # of the record
+
+
+def record_of(folder: Path) -> dict[str, Any] | None:
+    """Return the provenance of the package in a folder.
+
+    None if there is no package, or its record cannot be used: names in it lead out of the folder or are too long for a
+    file, or it is nested too deeply.
+    """
+    try:
+        record = loads((folder / RECORD).read_text(encoding="utf-8"))
+        names = [*record["files"], *record.get("beside", ())]
+        sound = isinstance(record["files"], dict) and all(stays_inside(name) and can_exist(name) for name in names)
+        return record if sound else None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
