@@ -8,6 +8,7 @@ import torch
 import trimesh
 
 from dg4d_lib.asset_settings import PackSettings
+from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import write_ply
@@ -52,11 +53,17 @@ def gem(radius: float = 0.3) -> TexturedMesh:
     )
 
 
-def tracked(frames: int = FRAMES) -> TrackedMesh:
+def tracked(frames: int = FRAMES) -> Asset4D:
     mesh = gem()
     offsets = torch.zeros(frames, len(mesh.vertices), 3)
     offsets[..., 0] = torch.linspace(0, REACH, frames)[:, None]
-    return TrackedMesh(mesh, offsets)
+    return Asset4D(mesh, offsets, FPS)
+
+
+def extracted(frames: int = FRAMES) -> TrackedMesh:
+    """The same as an artifact, which has no frame rate."""
+    asset = tracked(frames)
+    return TrackedMesh(asset.mesh, asset.offsets)
 
 
 def inputs(folder: Path, mode: str = "tracked") -> dict[str, Path]:
@@ -72,7 +79,7 @@ def inputs(folder: Path, mode: str = "tracked") -> dict[str, Path]:
     write_motion(paths["motion"], motion(), FramewiseSettings(), FRAMES, 9)
     if mode == "tracked":
         paths["tracked"] = folder / "t.safetensors"
-        write_tracked(paths["tracked"], tracked())
+        write_tracked(paths["tracked"], extracted())
     else:
         paths["meshes"] = folder / "meshes.zip"
         write_meshes(paths["meshes"], {frame: gem(0.2 + 0.1 * frame) for frame in range(FRAMES)})

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import small_package
 import torch
-from small_package import FPS, FRAMES, NOTE, REACH, cloud, gem, inputs, job, packed, tracked
+from small_package import FPS, FRAMES, NOTE, REACH, cloud, extracted, gem, inputs, job, packed, tracked
 
 from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb
 from dg4d_lib.assets.formats.splats import read_splats
@@ -152,7 +152,7 @@ def test_progress_counts_up_to_its_total(tmp_path: Path) -> None:
 
 def test_a_mesh_of_another_motion_is_refused(tmp_path: Path) -> None:
     given = inputs(tmp_path / "inputs")
-    write_tracked(given["tracked"], tracked(frames=2))
+    write_tracked(given["tracked"], extracted(frames=2))
     with pytest.raises(BadInput, match="has 3 frames, but: mesh 2"):
         run(job(given, tmp_path / "out"))
 
@@ -167,7 +167,7 @@ def test_the_driving_video_sets_the_frame_rate(tmp_path: Path) -> None:
 def test_a_single_frame_stands_still_in_every_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(small_package, "FRAMES", 1)
     given = inputs(tmp_path / "inputs")
-    write_tracked(given["tracked"], tracked(frames=1))
+    write_tracked(given["tracked"], extracted(frames=1))
     run(job(given, tmp_path / "out"))
     with zipfile.ZipFile(tmp_path / "out/package.zip") as archive:
         names = set(archive.namelist())

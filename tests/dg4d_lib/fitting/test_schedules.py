@@ -1,7 +1,7 @@
 import pytest
 
 from dg4d_lib.fitting.schedules import log_linear, size_of
-from dg4d_lib.settings import LADDER
+from dg4d_lib.settings import RESOLUTION_SCHEDULE
 
 
 @pytest.mark.parametrize(("step", "rate"), [(1, 0.0099221), (100, 0.0045731), (250, 0.0014142), (500, 0.0002)])
@@ -12,5 +12,5 @@ def test_mean_rates_of_the_method(step: int, rate: float):
 @pytest.mark.parametrize(
     ("progress", "size"), [(0.0, 128), (0.29, 128), (0.3, 256), (0.59, 256), (0.6, 512), (1.0, 512)]
 )
-def test_the_ladder_of_the_method(progress: float, size: int):
-    assert size_of(LADDER, progress) == size
+def test_the_resolution_schedule_of_the_method(progress: float, size: int):
+    assert size_of(RESOLUTION_SCHEDULE, progress) == size
