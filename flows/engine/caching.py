@@ -145,7 +145,8 @@ class FileLocks:
 
     def _waited_for(self, key: str, timeout: float | None) -> FileLock | None:
         """Return the lock, held; None after `timeout` seconds."""
-        lock = FileLock(self._folder() / (hashlib.sha256(key.encode()).hexdigest() + ".lock"), thread_local=False)
+        path = self._folder() / (hashlib.sha256(key.encode()).hexdigest() + ".lock")
+        lock = FileLock(path, thread_local=False, fallback_to_soft=False)  # a soft lock outlives its process
         try:
             lock.acquire(timeout=-1 if timeout is None else timeout, poll_interval=POLL_S)
         except Timeout:

@@ -1,3 +1,4 @@
+import errno
 import subprocess
 import sys
 import threading
@@ -148,3 +149,15 @@ def test_a_killed_holder_leaves_no_lock(tmp_path: Path) -> None:
     holder.wait()
     holder.stdout.close()
     assert locks.acquire_lock("k", "b", acquire_timeout=0)
+
+
+def test_where_the_kernel_has_no_locks_none_is_taken_that_would_outlive_its_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def flock(handle: int, operation: int) -> None:
+        raise OSError(errno.ENOSYS, "no locks here")
+
+    monkeypatch.setattr("fcntl.flock", flock)
+    with pytest.raises((OSError, NotImplementedError)):
+        FileLocks(lambda: tmp_path).acquire_lock("k", "a")
+    assert not [path for path in tmp_path.iterdir() if path.read_bytes()]
