@@ -3,14 +3,13 @@
 import json
 from typing import Any, Literal
 
-from prefect import flow, tags
+from prefect import flow
 from prefect.artifacts import create_table_artifact
 from prefect.settings import temporary_settings
 
 from dg4d_lib.errors import BadInput
 from flows import home
 from flows.engine.executors import StepError
-from flows.engine.orphans import process_tag
 from flows.engine.tasks import QUICK, Steps
 from flows.packages import scores
 from flows.packages.scores import ObjectScores, Results
@@ -91,7 +90,7 @@ def benchmark(entries: list[Entry], settings: ScoreAssetSettings, title: str, ou
 
 def judge(entries: list[Entry], settings: ScoreAssetSettings, title: str, ours: str, seed: int = 0) -> Judged:
     """Run the flow."""
-    with temporary_settings(QUICK), tags(process_tag()):
+    with temporary_settings(QUICK):
         return benchmark(entries, settings, title, ours, seed)
 
 

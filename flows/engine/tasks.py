@@ -32,6 +32,7 @@ from flows.engine.caching import FileLocks, RequestPolicy
 from flows.engine.events import StepEvent, tell
 from flows.engine.executors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable, chosen, stop_all
 from flows.engine.leases import hold
+from flows.engine.orphans import claim_run
 from flows.engine.remarks import remark
 from flows.ui import pages
 from flows.ui.curves import amount
@@ -182,6 +183,7 @@ class Steps:
 
     def __enter__(self) -> Self:
         _begun[self.item] = time.time_ns()
+        claim_run()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:

@@ -17,6 +17,7 @@ from prefect.task_runners import ThreadPoolTaskRunner
 from waiting import wait_until
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
+from flows.engine.orphans import LABEL
 from flows.engine.runners import item_runner
 from flows.serving import registering
 from flows.serving.pools import read_pools
@@ -92,8 +93,9 @@ def test_a_dask_cluster_of_two_workers_makes_a_batch(
         json.loads((place / "out" / name / "provenance.json").read_text())["run"]["flow_run"] for name in ("one", "two")
     }
     with get_client(sync_client=True) as client:
-        tags = [next(tag for tag in client.read_flow_run(run).tags if tag.startswith("process:")) for run in makers]
-    assert len(set(tags)) == 2  # two processes made them
+        runs = [client.read_flow_run(run) for run in makers]
+    assert len({run.labels[LABEL] for run in runs}) == 2  # two processes made them
+    assert all(run.tags == ["preview"] for run in runs)
 
 
 @pytest.mark.slow
