@@ -48,7 +48,7 @@ class Judged(Frozen):
     films: dict[str, dict[Literal["truth", "ours"], ArtifactRef]]
 
 
-@flow(name="benchmark", flow_run_name="{title}", persist_result=False)
+@flow(name="score-assets", flow_run_name="{title}", persist_result=False)
 def benchmark(entries: list[Entry], settings: ScoreAssetSettings, title: str, ours: str, seed: int = 0) -> Judged:
     """Judge every asset, and the naive guesses beside it; an object that fails stops no other."""
     objects: list[ObjectScores] = []

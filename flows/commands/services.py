@@ -109,7 +109,7 @@ def watch(
         float, typer.Option("--rest", min=1, callback=finite, help="seconds without a change before its content counts")
     ] = 10.0,
 ) -> None:
-    """Have the deployment catalog/local convert what is dropped into a folder; goes on until it is stopped."""
+    """Have the deployment "Catalog to 4D" convert what is dropped into a folder; goes on until it is stopped."""
     with clear_ending():
         from flows import home
         from flows.commands.make import connect

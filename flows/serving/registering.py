@@ -98,10 +98,15 @@ def register(pools: Mapping[str, Pool], chosen: list[str]) -> list[str]:
         _deploy(sorted({deployment["name"] for deployment in deployments}))
         _automate(client)
         there = {f"{client.read_flow(found.flow_id).name}/{found.name}" for found in client.read_deployments()}
-    wanted = [f"{deployment['tags'][0]}/{deployment['name']}" for deployment in deployments]
+    wanted = [f"{_flow_of(deployment)}/{deployment['name']}" for deployment in deployments]
     if missing := [name for name in wanted if name not in there]:
         raise BackendUnavailable(f"the Prefect server did not take the deployments {', '.join(missing)}")
     return wanted
+
+
+def _flow_of(deployment: Json) -> str:
+    """Return the name of the flow of a deployment, which is that of its function with dashes."""
+    return str(deployment["entrypoint"]).rpartition(".")[2].replace("_", "-")
 
 
 def default_templates(client: SyncPrefectClient) -> dict[str, Json]:

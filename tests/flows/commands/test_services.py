@@ -34,8 +34,11 @@ def children(pid_file: Path) -> list[str]:
 def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop(server: Server, folder: Path) -> None:
     said = dg4d("up", "--pool", "process-cpu", "--sources", str(folder.parent))
     assert said.returncode == 0, said.stderr
-    *deployments, address = said.stdout.split()
-    assert deployments == ["image-to-4d/local", "video-to-4d/local", "benchmark/local", "catalog/local"]
+    *deployments, address = said.stdout.splitlines()
+    assert deployments == [
+        "picture-to-4d/Picture to 4D", "video-to-4d/Video to 4D", "benchmark/Benchmark",
+        "catalog-to-4d/Catalog to 4D", "item-to-4d/Item to 4D",
+    ]  # fmt: skip
     assert address == os.environ["PREFECT_API_URL"].removesuffix("/api")
     try:
         wait_until(lambda: [worker.pool for worker in running(folder)] == ["process-cpu"])
