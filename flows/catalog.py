@@ -25,7 +25,7 @@ from flows.engine.runners import item_runner, parse_where
 from flows.engine.tasks import QUICK
 from flows.inputs.manifest import Item
 from flows.inputs.orders import Order
-from flows.packages.delivery import forget_outcomes
+from flows.packages.delivery import forget_shared
 from flows.packages.summary import Row, Tally, judged
 from flows.ui.gallery import Gallery
 from steps.contract import ArtifactRef
@@ -118,7 +118,7 @@ def convert_all(
     place = parse_where(where)
     if place.kind == "deployment":
         work = item_deployment(place.address, workers).make
-        forget_outcomes(home.store())
+        forget_shared(home.store())
     gallery = Gallery(title, tally, out)
     with item_runner(place, workers) as runner:
         try:

@@ -20,6 +20,7 @@ from prefect.cache_policies import CachePolicy
 from prefect.context import TaskRunContext
 from pydantic import ValidationError
 
+from flows.engine.shared_results import fetch_result
 from steps.artifacts.opening import open_store
 from steps.artifacts.store import ArtifactStore, StoreUnreachable
 from steps.contract import StepRequest, StepResult
@@ -59,6 +60,7 @@ class RequestPolicy(CachePolicy):
         key = record_key(inputs["request"])
         record = self.records / key
         with suppress(StoreUnreachable):  # the record is good until the contrary is known
+            fetch_result(key, record)
             if record.exists() and recorded(record, open_store(self.store)) is None:
                 self._drop(record, key)
         return key

@@ -17,10 +17,10 @@ from prefect.client.schemas.filters import (
     FlowRunFilter,
     FlowRunFilterIdempotencyKey,
 )
-from prefect.client.schemas.objects import FlowRun
+from prefect.client.schemas.objects import FlowRun, State, WorkerStatus
 from prefect.deployments import run_deployment
 from prefect.exceptions import PrefectHTTPStatusError
-from prefect.states import Cancelled
+from prefect.states import Cancelled, Scheduled
 from prefect.types._datetime import now
 
 from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
@@ -43,6 +43,8 @@ STEP = "item"  # the name under which events of a waiting item are shown
 POLL_S = 1.0  # between two looks at a run
 POLLS_PER_S = 20  # of all waiting items of a catalog together
 MAY_HEAL = (StepCrashed, StepOutOfMemory, StepTimedOut, StepUnreachable, StoreUnreachable, ArtifactMissing)
+WORKER_LABEL = "prefect.worker.name"  # of a run that a worker took
+PENDING_S = 120.0  # between a worker that takes a run and the first word of the run; images may have to be pulled
 CRASHED_S = 60.0  # the server begins a crashed run again after ten seconds; then it never does
 
 
@@ -140,6 +142,9 @@ class ItemDeployment(NamedTuple):
                 raise resources.Stopped(f"stopped while {item} was made in {self.pool}")
             try:
                 run = client.read_flow_run(run.id)
+                if _is_stranded(client, run, self.pool):
+                    again: State[Any] = Scheduled(name="AwaitingRetry", message="its worker died before it began")
+                    client.set_flow_run_state(run.id, again, force=True)
             except (httpx.TransportError, PrefectHTTPStatusError):
                 continue  # the server may come back, and what it runs goes on
         return run
@@ -221,8 +226,21 @@ def _is_at_work(run: FlowRun) -> bool:
     """Return whether a run may still end well; a crashed one may be begun again by the server."""
     if run.state is None or not run.state.is_final():
         return True
-    age_s = (now("UTC") - run.state.timestamp).total_seconds()
-    return run.state.is_crashed() and age_s < CRASHED_S
+    return run.state.is_crashed() and _age_s(run) < CRASHED_S
+
+
+def _is_stranded(client: SyncPrefectClient, run: FlowRun, pool: str) -> bool:
+    """Return whether a worker took a run and died before the run began, which no heartbeat tells the server."""
+    if run.state is None or not run.state.is_pending() or _age_s(run) < PENDING_S:
+        return False
+    workers = client.read_workers_for_work_pool(pool)
+    online = {worker.name for worker in workers if worker.status is WorkerStatus.ONLINE}
+    return run.labels.get(WORKER_LABEL) not in online
+
+
+def _age_s(run: FlowRun) -> float:
+    """Return the seconds since a run got its state."""
+    return 0.0 if run.state is None else (now("UTC") - run.state.timestamp).total_seconds()
 
 
 def _has_package(run: FlowRun, store: ArtifactStore) -> bool:

@@ -1,8 +1,10 @@
 """Packages and outcomes of items that travel between machines through the store.
 
 items/RUN.json    the outcome of an item's flow run: its package, or why there is none
+results/KEY       what a step of such an item gave (flows/engine/shared_results.py)
 """
 
+import itertools
 import shutil
 import tempfile
 import zipfile
@@ -14,7 +16,7 @@ from flows.packages.publish import Files, publish, whole
 from steps.artifacts.store import ArtifactStore, room_for
 from steps.contract import ArtifactRef, Frozen
 
-FOLDER = "items"
+FOLDER, RESULTS = "items", "results"
 KEPT_S = 24 * 3600.0  # of an outcome; its package is not protected from `dg4d store gc` for longer either
 PACKED = "application/vnd.dg4d.published+zip"  # a published package, with record, reports and signatures
 FIRST_DATE = (1980, 1, 1, 0, 0, 0)  # of a zip entry: equal folders give equal bytes
@@ -92,10 +94,11 @@ def read_outcome(store: ArtifactStore, run: str) -> Outcome | None:
     return outcome if outcome.package is None or store.has(outcome.package) else None
 
 
-def forget_outcomes(store: ArtifactStore) -> None:
-    """Remove outcomes that are older than a day."""
+def forget_shared(store: ArtifactStore) -> None:
+    """Remove outcomes of items and shared results of steps that are older than a day."""
     now = store.now()
-    store.remove([entry.name for entry in store.entries(FOLDER) if now - entry.modified > KEPT_S])
+    entries = itertools.chain(store.entries(FOLDER), store.entries(RESULTS))
+    store.remove([entry.name for entry in entries if now - entry.modified > KEPT_S])
 
 
 def _name(run: str) -> str:

@@ -25,6 +25,7 @@ from flows.commands.options import knobs_of
 from flows.commands.terminal import console
 from flows.engine.item_runs import FLOW, failure, read_order
 from flows.engine.orphans import claim_run
+from flows.engine.shared_results import sharing_results
 from flows.inputs.fetching import at_hand, without_secrets
 from flows.inputs.manifest import parse_changes
 from flows.inputs.naming import clean
@@ -303,7 +304,7 @@ def _made_for_catalog(order: ArtifactRef, code: str, address: str) -> Outcome:
         wanted = read_order(order, code, store, address)
         Roots.of_this_process().check_weights(wanted.settings.model_dump(mode="json"))
         connect()
-        with tempfile.TemporaryDirectory(prefix="dg4d-item-") as scratch:
+        with sharing_results(store), tempfile.TemporaryDirectory(prefix="dg4d-item-") as scratch:
             folder = Path(scratch) / "package"
             _, cached = make(wanted, folder)
             return Outcome(package=pack(folder, store), cached=cached)
