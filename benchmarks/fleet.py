@@ -123,10 +123,10 @@ def main() -> None:
     parser.add_argument("--items", type=int, default=60)
     parser.add_argument("--seconds", type=float, default=6.0, help="that an item sleeps")
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--no-kill", action="store_true", help="leave the last pass out")
+    parser.add_argument("--kill", choices=("also", "never", "only"), default="also", help="the last pass")
     options = parser.parse_args()
-    passes = [(count, False) for count in options.workers]
-    passes += [] if options.no_kill else [(max(options.workers), True)]
+    passes = [(count, False) for count in options.workers if options.kill != "only"]
+    passes += [(max(options.workers), True)] if options.kill != "never" else []
     rows = []
     with (
         tempfile.TemporaryDirectory(prefix="dg4d-fleet-", ignore_cleanup_errors=True) as name,

@@ -100,13 +100,7 @@ class ItemDeployment(NamedTuple):
         with get_client(sync_client=True) as client:
             run = self._begin(client, order, ref, store)
             run = self._wait(client, run, order.item)
-        if run.state is not None and run.state.is_cancelled():
-            return Outcome(kind="Cancelled", message="its run was cancelled")
-        outcome = read_outcome(store, str(run.id))
-        if outcome is not None:
-            return outcome
-        message = str(run.state.message or run.state.name) if run.state else "nothing is known of its run"
-        return Outcome(kind="Crashed", message=message, may_heal=True)
+        return _outcome_of(run, store)
 
     def _begin(self, client: SyncPrefectClient, order: Order, ref: ArtifactRef, store: ArtifactStore) -> FlowRun:
         """Begin the run of an item, or return the one that was begun before and is at work or has its package."""
@@ -227,6 +221,17 @@ def _is_at_work(run: FlowRun) -> bool:
     if run.state is None or not run.state.is_final():
         return True
     return run.state.is_crashed() and _age_s(run) < CRASHED_S
+
+
+def _outcome_of(run: FlowRun, store: ArtifactStore) -> Outcome:
+    """Return what a run that has ended says, or what is known of one that could not say anything."""
+    if run.state is not None and run.state.is_cancelled():
+        return Outcome(kind="Cancelled", message="its run was cancelled")
+    outcome = read_outcome(store, str(run.id))
+    if outcome is not None:
+        return outcome
+    message = str(run.state.message or run.state.name) if run.state else "nothing is known of its run"
+    return Outcome(kind="Crashed", message=message, may_heal=True)
 
 
 def _is_stranded(client: SyncPrefectClient, run: FlowRun, pool: str) -> bool:
