@@ -36,7 +36,7 @@ from flows.serving.roots import Roots
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen
 from steps.profiles import profile, revise
 
-WHERE = r"^(local|dask|dask://\S+|deployment|deployment:\s*\S.*)$"
+WHERE = r"^(|local|dask|deployment(:[\w .-]+)?)$"  # a scheduler of Dask runs code here: only the worker's user names it
 BEGUN = 3  # times, at most, is a run begun whose process dies
 
 
@@ -192,7 +192,7 @@ def catalog_to_4d(
     inputs: Annotated[Text, Field(json_schema_extra=_title("Pictures and videos"))],
     out: Folder,
     workers: Workers = 1,
-    where: Annotated[str, Field(pattern=WHERE, json_schema_extra=_title("Items run on"))] = "local",
+    where: Annotated[str, Field(pattern=WHERE, json_schema_extra=_title("Items run on"))] = "",
     strict: Annotated[bool, Field(json_schema_extra=_title("Stop at a faulty asset"))] = False,
     options: WantedOfPictures = PictureOptions(),  # noqa: B008 - frozen
 ) -> State[None]:
@@ -204,7 +204,7 @@ def catalog_to_4d(
         out: on the worker's machine, as `/data/out`; open `index.html` there when it is done
         workers: from 1 to 64; more than one is quicker where there are cores, GPUs or machines for it
         where: `local` is this machine; `deployment:POOL` are the machines whose workers serve that pool, as `fleet`,
-            and share the store of this one
+            and share the store of this one; `dask` the cluster that this machine knows; empty: as `$DG4D_RUNNER` says
         strict: an asset that fails a gate ends the batch; else it is marked, and the next one begins
         options: where a line of a list says nothing else; as it stands it works on any machine
     """

@@ -9,6 +9,7 @@ from typing import Any, get_args
 import pytest
 from fake_steps import picture
 from prefect.client.orchestration import SyncPrefectClient
+from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterParentFlowRunId
 from prefect.exceptions import PrefectHTTPStatusError
 from pydantic import ValidationError
 from tiny_s3 import TinyS3
@@ -124,6 +125,15 @@ def test_a_server_goes_on_following_the_runs_that_it_followed_when_it_is_registe
     assert again is not None and again.description == one.description
 
 
+@pytest.mark.parametrize("where", ["dask://127.0.0.1:8786", "ray", "deployment:", "local "])
+def test_the_server_refuses_places_for_items_that_only_the_user_of_the_worker_may_name(
+    client: SyncPrefectClient, where: str
+) -> None:
+    catalog = client.read_deployment_by_name("catalog-to-4d/Catalog to 4D")
+    with pytest.raises(PrefectHTTPStatusError, match=r"409|422"):
+        client.create_flow_run_from_deployment(catalog.id, parameters={"inputs": "in", "out": "out", "where": where})
+
+
 @pytest.mark.parametrize(
     "options",
     [{"seed": -1}, {"texture": 63}, {"profile": "papre"}, {"triangles": "many"}, {"tecture": 64},
@@ -161,6 +171,14 @@ def test_what_is_dropped_into_a_folder_is_converted_by_a_worker(
     assert run.state.is_completed() and run.state.message == f"1 of 1 items are in {tmp_path / 'out'}"
     status = json.loads((tmp_path / "out" / "summary.json").read_text())["items"][0]["status"]
     assert status == "done"
+    (conversion,) = client.read_flow_runs(
+        flow_run_filter=FlowRunFilter(parent_flow_run_id=FlowRunFilterParentFlowRunId(any_=[run.id]))
+    )
+    assert (conversion.name, conversion.tags) == ("dropped", ["preview"])  # nothing lies between the two
+    wanted = {"artifacts": {"flow_run_id": {"any_": [str(run.id)]}}}
+    pages = client.request("POST", "/artifacts/filter", json=wanted).json()
+    assert [page["type"] for page in pages if page["type"] != "progress"] == ["markdown"]
+    assert any("[dropped](/artifacts/key/asset-dropped-" in str(page["data"]) for page in pages)
 
 
 def test_a_run_whose_process_was_killed_goes_on_after_its_last_finished_step(
