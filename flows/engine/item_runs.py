@@ -4,6 +4,7 @@ An item travels by reference: its order and source lie in the store, and so does
 """
 
 import itertools
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 from uuid import UUID
@@ -258,7 +259,8 @@ def _has_package(run: FlowRun, store: ArtifactStore) -> bool:
 def _give_up(client: SyncPrefectClient, run: FlowRun) -> None:
     """Cancel a run that no worker has begun; one that is at work goes on, and the same catalog finds it again."""
     if run.state is not None and run.state.is_scheduled():
-        client.set_flow_run_state(run.id, Cancelled(message="the catalog was stopped"))
+        with suppress(httpx.HTTPError, PrefectHTTPStatusError):  # the server is away; the run is found again
+            client.set_flow_run_state(run.id, Cancelled(message="the catalog was stopped"))
 
 
 def _require_another_place(client: SyncPrefectClient, pool: str) -> None:
