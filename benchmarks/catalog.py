@@ -153,8 +153,14 @@ def run(items: list[Item], out: Path, workers: int, what: str) -> float:
 
     writer, tally = summary.Writer(out), summary.Tally(len(items), settled)
     out.mkdir(exist_ok=True)
-    todo = (ready(item, out, strict=False) for item in items)
-    convert_all(todo, out, workers, f"{what}: {len(items)} items", tally, work=work)
+
+    @flow(name="catalog", flow_run_name=what, persist_result=False)
+    def catalog() -> None:
+        todo = (ready(item, out, strict=False) for item in items)
+        convert_all(todo, out, workers, f"{what}: {len(items)} items", tally, work=work)
+
+    with temporary_settings(flow_settings()):
+        catalog()
     writer.write(list(tally.rows.values()), tally.seconds)
     return sizes[-1] - sizes[len(sizes) // 10]
 

@@ -1,36 +1,91 @@
-"""Many orders in one parent run: a few at a time, each in a flow run of its own; a bad one stops no other."""
+"""Many orders in one run: a few at a time, each in a flow run of its own; a bad one stops no other."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextvars import ContextVar
+from contextlib import contextmanager
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
 from prefect import flow, task
-from prefect.artifacts import create_progress_artifact, create_table_artifact, update_progress_artifact
 from prefect.cache_policies import NO_CACHE
+from prefect.context import FlowRunContext
 from prefect.exceptions import TerminationSignal
 from prefect.futures import PrefectFuture
 from prefect.settings import temporary_settings
+from prefect.task_runners import TaskRunner
 
-from dg4d_lib.errors import DG4DError
+from flows import home
+from flows.commands.batch import CatalogRequest, ready
 from flows.commands.make import make, save_pictures
 from flows.engine.executors import stop_all
-from flows.engine.runners import item_runner
+from flows.engine.item_runs import failure, item_deployment
+from flows.engine.orphans import claim_run
+from flows.engine.runners import item_runner, parse_where
 from flows.engine.step_tasks import flow_settings
-from flows.formatting.escaping import markdown
+from flows.inputs.manifest import Item
 from flows.inputs.orders import Order
+from flows.packages.delivery import forget_shared
 from flows.packages.summary import Row, Tally, judged
-from flows.step_errors import StepCrashed, StepError, StepOutOfMemory, StepTimedOut, StepUnreachable
-from flows.ui import pages
-from steps.artifacts.store import ArtifactMissing, StoreUnreachable
+from flows.ui.gallery import Gallery
+from steps.contract import ArtifactRef
 
 Make = Callable[[Order, Path], tuple[Any, bool]]
+Allow = Callable[[Item], None]
 
-ROWS_SHOWN = 100  # of the table on the server, which keeps it in its database
-PAGE_EVERY_S = 3.0
-MAY_HEAL = (StepCrashed, StepOutOfMemory, StepTimedOut, StepUnreachable, StoreUnreachable, ArtifactMissing)
+ORDERS = "application/vnd.dg4d.orders+jsonl"
+
+
+@flow(name="catalog", flow_run_name="{title}", persist_result=False)
+def catalog(request: CatalogRequest, title: str) -> None:
+    """Make every item of a folder, a pattern, an object store or a manifest that is not made yet."""
+    claim_run()
+    convert_catalog(request, title)
+
+
+@flow(name="convert-orders", flow_run_name="{title}", persist_result=False)
+def convert_orders(orders: ArtifactRef, out: Path, workers: int, title: str) -> None:
+    """Make every order of a list in the store: JSON, one to a line."""
+    claim_run()
+    _convert_list(orders, out, workers, title)
+
+
+def run_catalog(request: CatalogRequest, title: str, tally: Tally, allow: Allow | None = None) -> None:
+    """Make a catalog within the current flow run, or in a run of its own where there is none.
+
+    Args:
+        request: the catalog.
+        title: of a run of its own.
+        tally: knows rows of items that need no making, and is told all others.
+        allow: raises BadInput for an item that may not be made here; such items are checked in the current run only.
+
+    Raises:
+        KeyboardInterrupt: the user stopped it; what is done stays, and `tally` knows it.
+    """
+    with temporary_settings(flow_settings()), _known(request.out, tally):
+        if FlowRunContext.get() is None:
+            catalog(request, title)
+        else:
+            convert_catalog(request, title, allow)
+
+
+def run_orders(orders: list[Order], out: Path, workers: int, title: str, tally: Tally) -> None:
+    """Make orders as `run_catalog` makes a catalog."""
+    lines = "".join(f"{order.model_dump_json()}\n" for order in orders)
+    listed = home.store().put_bytes(lines.encode(), ORDERS)
+    with temporary_settings(flow_settings()), _known(out, tally):
+        if FlowRunContext.get() is None:
+            convert_orders(listed, out, workers, title)
+        else:
+            _convert_list(listed, out, workers, title)
+
+
+def convert_catalog(request: CatalogRequest, title: str, allow: Allow | None = None) -> None:
+    """Make a catalog within the current flow run; see `run_catalog`."""
+    items = request.items(allow)
+    tally = _tallies.get(request.out) or Tally(len(items))
+    todo = (ready(item, request.out, request.strict) for item in items if item.name not in tally.rows)
+    convert_all(todo, request.out, request.workers, title, tally, request.strict, request.where)
 
 
 def convert_all(
@@ -40,52 +95,39 @@ def convert_all(
     title: str,
     tally: Tally,
     strict: bool = False,
+    where: str = "",
     work: Make = make,
 ) -> None:
-    """Run the batch, `workers` items at a time; what died is tried once more at the end.
+    """Make items within the current flow run, `workers` at a time; what died is tried once more at the end.
 
     Args:
         todo: what to make, or what became of an item that needs no making; read one item ahead.
         out: the folder of the packages.
         workers: items at a time.
-        title: of the run in the UI.
+        title: of the gallery in the UI.
         tally: told the row of every item; again, if it is tried again.
         strict: an item that a gate does not let pass counts as failed, and no other is begun after it.
-        work: makes an order into a folder, and says whether every step had been done before.
+        where: where items are made, as `flows.engine.runners.parse_where` reads it.
+        work: makes an order into a folder on this machine or in its cluster, and says whether every step had been done
+            before.
 
     Raises:
+        BadInput: `where` is no place for items.
         KeyboardInterrupt: the user stopped it; what is done stays, and `tally` knows it.
     """
-
-    def rounds() -> None:
-        page = _Page(title, tally)
+    place = parse_where(where)
+    if place.kind == "deployment":
+        work = item_deployment(place.address, workers).make
+        forget_shared(home.store())
+    gallery = Gallery(title, tally, out)
+    with item_runner(place, workers) as runner:
         try:
-            dead = list(_rounds(todo, out, workers, tally, strict, work, page, attempt=1))
-            list(_rounds(dead, out, workers, tally, strict, work, page, attempt=2))
+            for attempt in (1, 2):
+                todo = list(_rounds(todo, out, workers, tally, strict, work, gallery, runner, attempt))
         except (KeyboardInterrupt, TerminationSignal):  # Prefect's own for SIGTERM, while a flow runs
             stop_all()
             raise
-        page.finish()
-
-    token = _body.set(rounds)
-    try:
-        with temporary_settings(flow_settings()):
-            catalog.with_options(task_runner=item_runner(workers))(title)
-    finally:
-        _body.reset(token)
-
-
-@flow(name="catalog", flow_run_name="{title}", persist_result=False)
-def catalog(title: str) -> None:
-    """The run of a batch; holds nothing of it, for runners send it to their workers."""
-    _rounds_of_this_batch()
-
-
-_body: ContextVar[Callable[[], None]] = ContextVar("body")
-
-
-def _rounds_of_this_batch() -> None:
-    _body.get()()
+    gallery.finish()
 
 
 @task(name="convert", task_run_name="convert {item}", cache_policy=NO_CACHE, persist_result=False)
@@ -100,6 +142,28 @@ def convert(item: str, order: str, out: str, strict: bool, attempt: int, work: M
     return row.model_dump(mode="json"), may_heal
 
 
+_tallies: dict[Path, Tally] = {}
+
+
+@contextmanager
+def _known(out: Path, tally: Tally) -> Iterator[None]:
+    """Let the catalog of this process into `out` tell this tally while the block runs, and skip the rows it has.
+
+    A catalog is complete without: it would look at every item again.
+    """
+    _tallies[out] = tally
+    try:
+        yield
+    finally:
+        del _tallies[out]
+
+
+def _convert_list(orders: ArtifactRef, out: Path, workers: int, title: str) -> None:
+    lines = home.store().path(orders).read_bytes().splitlines()
+    todo = (Order.model_validate_json(line) for line in lines)
+    convert_all(todo, out, workers, title, _tallies.get(out) or Tally(len(lines)))
+
+
 def _rounds(
     todo: Iterable[Order | Row],
     out: Path,
@@ -107,7 +171,8 @@ def _rounds(
     tally: Tally,
     strict: bool,
     work: Make,
-    page: "_Page",
+    gallery: Gallery,
+    runner: TaskRunner[Any],
     attempt: int,
 ) -> Iterator[Order]:
     """Make everything in `todo`; gives those that died and may live next time."""
@@ -123,19 +188,27 @@ def _rounds(
             row = row.model_copy(update={"message": f"{row.message} (will be tried again at the end)"})
             yield order
         tally.settle(row)
-        page.update()
+        gallery.update()
 
     for one in todo:
         while len(running) >= workers or not finished.empty():
             yield from settled()
         if isinstance(one, Row):
             tally.settle(one)
-            page.update()
+            gallery.update()
         elif strict and tally.refused:
             reason = f"not begun: {tally.refused} was not accepted"
             tally.settle(Row(item=one.item, source=one.source_name, status="skipped", message=reason))
         else:
-            future = convert.submit(one.item, one.model_dump_json(), str(out), strict, attempt, work)
+            parameters = {
+                "item": one.item,
+                "order": one.model_dump_json(),
+                "out": str(out),
+                "strict": strict,
+                "attempt": attempt,
+                "work": work,
+            }
+            future: PrefectFuture[Any] = runner.submit(convert, parameters)
             running[future] = one
             future.add_done_callback(finished.put)
     while running:
@@ -146,51 +219,10 @@ def _converted(order: Order, folder: Path, strict: bool, work: Make) -> tuple[Ro
     row = Row(item=order.item, source=order.source_name, status="failed")
     try:
         _, cached = work(order, folder)
-    except (StepError, DG4DError) as error:
-        pictures = [str(path) for path in save_pictures(order, error)]
-        message = error.message if isinstance(error, StepError) else str(error)
-        told = {"message": message, "kind": type(error).__name__, "pictures": pictures}
-        return row.model_copy(update=told), isinstance(error, MAY_HEAL)
     except Exception as error:  # whatever it is, it is this item's own
-        return row.model_copy(update={"message": f"{type(error).__name__}: {error}", "kind": "Crashed"}), True
+        outcome = failure(error)
+        pictures = [str(path) for path in save_pictures(order, error)]
+        told = {"message": outcome.message, "kind": outcome.kind, "pictures": pictures}
+        return row.model_copy(update=told), outcome.may_heal
     done = row.model_copy(update={"status": "done", "message": "every step was already done" if cached else ""})
     return judged(done, folder, strict), False
-
-
-class _Page:
-    """How far the batch is, on the server: a bar with a line of numbers, and a table at the end."""
-
-    def __init__(self, title: str, tally: Tally) -> None:
-        self._name, self._tally = title.partition(":")[0], tally
-        self._key = pages.key("catalog", self._name)
-        self._bar: Any = create_progress_artifact(0.0, key=f"progress-{self._key}", description=self._text())
-        self._next = 0.0
-
-    def update(self) -> None:
-        """Show it, unless that was a moment ago."""
-        if time.monotonic() >= self._next:
-            update_progress_artifact(self._bar, 100 * self._tally.share, description=self._text())
-            self._next = time.monotonic() + PAGE_EVERY_S
-
-    def finish(self) -> None:
-        """Show the end, with a table: what failed and what is not accepted first, and not more than can be read."""
-        self._next = 0.0
-        self.update()
-        rows = sorted(self._tally.rows.values(), key=lambda row: (row.status != "failed", not row.failing))
-        shown = [_cells(row) for row in rows[:ROWS_SHOWN]]
-        more = f"; {ROWS_SHOWN} of {len(rows)} are shown, all are in summary.csv" if len(rows) > ROWS_SHOWN else ""
-        create_table_artifact(table=shown, key=self._key, description=f"{self._text()}{more}")
-
-    def _text(self) -> str:
-        return f"{markdown(self._name)}: {self._tally.line()}"
-
-
-def _cells(row: Row) -> dict[str, Any]:
-    """What a page has room for, the longest last."""
-    return {
-        "item": markdown(row.item),
-        "status": "not accepted" if row.failing else row.status,
-        "wall_s": row.wall_s,
-        "asset": f"[page](/artifacts/key/{pages.key('asset', row.item)})" if row.made else "",
-        "message": markdown(", ".join(row.failing or ()) or row.message),
-    }

@@ -192,7 +192,17 @@ def batch(
     texture: Texture = None,
     fps: Rate = None,
     seed: Seed = 0,
-    workers: Annotated[int, typer.Option(min=1, max=64, help="items at a time")] = 1,
+    workers: Annotated[
+        int | None, typer.Option(min=1, max=64, help="items at a time  [default: 1; 16 of a deployment]")
+    ] = None,
+    where: Annotated[
+        str,
+        typer.Option(
+            help="where items run: local, dask://HOST:PORT, or deployment:POOL, on all machines whose workers serve "
+            "that pool and share the store  [default: $DG4D_RUNNER, or local]",
+            show_default=False,
+        ),
+    ] = "",
     commercial_only: Commercial = False,
     strict: Annotated[
         bool, typer.Option("--strict", help="an asset that a gate does not let pass is a failure, and ends the batch")
@@ -225,14 +235,25 @@ def batch(
     with clear_ending():
         os.environ.update({name: str(n) for name, n in {"DG4D_GPUS": gpus, "DG4D_CPUS": cpus}.items() if n is not None})
         from flows.commands import terminal
+        from flows.commands.batch import CatalogRequest, default_workers, tell
         from flows.commands.batch import batch as make_all
-        from flows.commands.batch import tell
         from flows.inputs.manifest import parse_changes
 
         console = terminal.console()
-        wanted = parse_changes(changes or []) | knobs_of(triangles, texture, fps)
-        asked = (profile, wanted, seed, workers, commercial_only, strict, root, price_per_hour)
-        if status := tell(make_all(inputs, out, console, *asked), out, console):
+        request = CatalogRequest(
+            inputs=inputs,
+            out=out,
+            profile=profile,
+            changes=parse_changes(changes or []) | knobs_of(triangles, texture, fps),
+            seed=seed,
+            workers=workers or default_workers(where),
+            where=where,
+            commercial_only=commercial_only,
+            strict=strict,
+            root=root,
+            price_per_hour=price_per_hour,
+        )
+        if status := tell(make_all(request, console), out, console):
             raise typer.Exit(status)
 
 

@@ -3,13 +3,12 @@
 import json
 from typing import Any, Literal
 
-from prefect import flow, tags
+from prefect import flow
 from prefect.artifacts import create_table_artifact
 from prefect.settings import temporary_settings
 
 from dg4d_lib.errors import BadInput
 from flows import home
-from flows.engine.orphans import process_tag
 from flows.engine.step_tasks import Conversion, flow_settings
 from flows.formatting.escaping import markdown
 from flows.packages import scores
@@ -49,7 +48,7 @@ class Judged(Frozen):
     films: dict[str, dict[Literal["truth", "ours"], ArtifactRef]]
 
 
-@flow(name="benchmark", flow_run_name="{title}", persist_result=False)
+@flow(name="score-assets", flow_run_name="{title}", persist_result=False)
 def benchmark(entries: list[Entry], settings: ScoreAssetSettings, title: str, ours: str, seed: int = 0) -> Judged:
     """Judge every asset, and the naive guesses beside it; an object that fails stops no other."""
     objects: list[ObjectScores] = []
@@ -91,7 +90,7 @@ def benchmark(entries: list[Entry], settings: ScoreAssetSettings, title: str, ou
 
 def judge(entries: list[Entry], settings: ScoreAssetSettings, title: str, ours: str, seed: int = 0) -> Judged:
     """Run the flow."""
-    with temporary_settings(flow_settings()), tags(process_tag()):
+    with temporary_settings(flow_settings()):
         return benchmark(entries, settings, title, ours, seed)
 
 

@@ -22,7 +22,12 @@ def start_of(pid: int) -> str:
 
 
 def place() -> str:
-    """The machine, or the container, whose processes this one sees; containers may have the name of their host."""
+    """Return the identity of the machine, or container, whose processes this one sees.
+
+    It is `$DG4D_HOST_ID`, else host name and PID namespace: containers may share the name of their host.
+    """
+    if given := os.environ.get("DG4D_HOST_ID"):
+        return given
     try:
         return f"{socket.gethostname()}-{Path('/proc/self/ns/pid').stat().st_ino}"
     except OSError:  # no Linux

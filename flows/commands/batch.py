@@ -1,58 +1,88 @@
 """`dg4d batch`: many assets out of a folder, a pattern, an object store or a manifest; what is made is left alone."""
 
-import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from pydantic import Field
 
 from dg4d_lib.errors import DG4DError
 from flows import home
 from flows.commands import make, terminal
 from flows.commands.endings import EXIT_BAD_INPUT, EXIT_FAILED
 from flows.engine import resources
+from flows.engine.runners import parse_where
 from flows.formatting.escaping import visible
 from flows.inputs import naming
 from flows.inputs.manifest import Item, admitted, items_of, only_commercial
 from flows.inputs.orders import Order
 from flows.packages.publish import check_folder, check_writable, is_current
 from flows.packages.summary import BAD_INPUT, Row, Tally, Writer, judged
+from steps.contract import Frozen
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+ITEMS_IN_FLIGHT = 16  # of a deployment; its pool and its workers may allow fewer
+
+
+class CatalogRequest(Frozen):
+    """Request for a catalog: what to make, where it goes, where items run.
+
+    Attributes:
+        inputs: a folder, a pattern, s3://BUCKET/PREFIX, or a manifest.
+        out: folder of the packages; made if it is not there.
+        profile: of items that do not name one.
+        changes: of its knobs.
+        seed: of items that do not have one.
+        workers: items at a time.
+        where: where items run, as `flows.engine.runners.parse_where` reads it.
+        commercial_only: refuse weights whose license forbids commercial use.
+        strict: an asset that a gate does not let pass is a failure, and ends the batch.
+        root: where a manifest's files are; None: beside it.
+        price_per_hour: of the machine, in any currency, for the summary.
+    """
+
+    inputs: str
+    out: Path
+    profile: str = "preview"
+    changes: dict[str, Any] = Field({})
+    seed: int = 0
+    workers: int = 1
+    where: str = ""
+    commercial_only: bool = False
+    strict: bool = False
+    root: Path | None = None
+    price_per_hour: float | None = None
+
+    def items(self, allow: Callable[[Item], None] | None = None) -> list[Item]:
+        """Return the items by priority and name.
+
+        Args:
+            allow: raises BadInput for an item that may not be made here; it becomes a failed one.
+
+        Raises:
+            BadInput: the batch as a whole cannot be used.
+        """
+        items = items_of(self.inputs, self.out, self.profile, self.changes, self.seed, self.root)
+        items = admitted(items, allow) if allow else items
+        return only_commercial(items) if self.commercial_only else items
+
 
 def batch(
-    inputs: str,
-    out: Path,
+    request: CatalogRequest,
     console: "Console",
-    profile_name: str = "preview",
-    changes: Mapping[str, Any] | None = None,
-    seed: int = 0,
-    workers: int = 1,
-    commercial_only: bool = False,
-    strict: bool = False,
-    root: Path | None = None,
-    price_per_hour: float | None = None,
     connect: Callable[[], None] | None = None,
     allow: Callable[[Item], None] | None = None,
 ) -> list[Row]:
-    """Make every item of `inputs` that is not made yet; what became of each, in the order in which they are made.
+    """Make every item of a catalog that is not made yet; return a row for each, in the order in which they are made.
 
     OUT gets a folder per item, summary.json, summary.csv and index.html. Items are read and prepared one ahead of
     those at work, so that a batch of thousands begins at once.
 
     Args:
-        inputs: a folder, a pattern, s3://BUCKET/PREFIX, or a manifest.
-        out: made if it is not there.
-        console: where to show how far it is.
-        profile_name: of items that do not name one.
-        changes: of its knobs.
-        seed: of items that do not have one.
-        workers: items at a time.
-        commercial_only: refuse weights whose license forbids commercial use.
-        strict: an asset that a gate does not let pass is a failure, and ends the batch.
-        root: where a manifest's files are.
-        price_per_hour: of the machine, in any currency, for the summary.
+        request: the catalog.
+        console: where to show progress.
         connect: finds a Prefect server, when the first item needs one; default: as every command does.
         allow: raises BadInput for an item that may not be made here; it becomes a failed one.
 
@@ -61,13 +91,13 @@ def batch(
         BackendUnavailable: something that all of it needs is missing.
         KeyboardInterrupt: the user stopped it; what is done stays, and the summary says what was not.
     """
-    items = items_of(inputs, out, profile_name, changes or {}, seed, root)
-    items = admitted(items, allow) if allow else items
-    items = only_commercial(items) if commercial_only else items
+    out = request.out
+    parse_where(request.where)
+    items = request.items(allow)
     resources.cpus(), resources.gpus()  # wrong numbers are refused before any work
     check_writable(out)
     out.mkdir(parents=True, exist_ok=True)
-    writer = Writer(out, commercial_only, price_per_hour)
+    writer = Writer(out, request.commercial_only, request.price_per_hour)
     with terminal.batch_shown(console, [item.name for item in items]) as table:
 
         def show(row: Row) -> None:
@@ -78,12 +108,21 @@ def batch(
 
         tally = Tally(len(items), show)
         try:
-            _make_all(items, out, workers, f"{Path(inputs).name}: {len(items)} items", tally, strict, connect)
+            _make_all(request, items, tally, connect, allow)
         finally:
             stopped = (Row(item=item.name, status="skipped", message="not begun, or stopped") for item in items)
             rows = [tally.rows.get(row.item, row) for row in stopped]
             writer.write(rows, tally.seconds)
     return rows
+
+
+def default_workers(where: str) -> int:
+    """Return how many items are made at a time where nobody says: on this machine one, by a deployment more.
+
+    Raises:
+        BadInput: `where` is no place for items.
+    """
+    return ITEMS_IN_FLIGHT if parse_where(where).kind == "deployment" else 1
 
 
 def tell(rows: list[Row], out: Path, console: "Console") -> int:
@@ -104,24 +143,25 @@ def tell(rows: list[Row], out: Path, console: "Console") -> int:
 
 
 def _make_all(
+    request: CatalogRequest,
     items: list[Item],
-    out: Path,
-    workers: int,
-    title: str,
     tally: Tally,
-    strict: bool,
     connect: Callable[[], None] | None,
+    allow: Callable[[Item], None] | None,
 ) -> None:
-    todo = (ready(item, out, strict) for item in items)
-    for first in todo:
-        if isinstance(first, Row):  # no server is needed for these
+    """Settle the items before the first that has to be made, which takes no server; then run the catalog."""
+    for item in items:
+        first = ready(item, request.out, request.strict)
+        if isinstance(first, Row):
             tally.settle(first)
             continue
-        make.prepare(first)
+        if parse_where(request.where).kind == "local":
+            make.prepare(first)
         (connect or make.connect)()
-        from flows.catalog import convert_all
+        from flows.catalog import run_catalog
 
-        convert_all(itertools.chain([first], todo), out, workers, title, tally, strict)
+        run_catalog(request, f"{Path(request.inputs).name}: {len(items)} items", tally, allow)
+        return
 
 
 def ready(item: Item, out: Path, strict: bool) -> Order | Row:

@@ -235,7 +235,7 @@ def _wish(truth: Truth, bank: bool, **asked: Any) -> Wish:
 
 def _converted(orders: list[Order], folder: Path, workers: int, console: "Console", name: str) -> dict[str, Row]:
     """Make what is not made yet; what became of every object."""
-    from flows.catalog import convert_all
+    from flows.catalog import run_orders
 
     rows = {order.item: Row(item=order.item, status="unchanged") for order in orders}
     waiting = [order for order in orders if not is_current(folder / order.item, order.digest())]
@@ -249,7 +249,7 @@ def _converted(orders: list[Order], folder: Path, workers: int, console: "Consol
                 console.print(f"{row.item}: {row.status} {row.message}", markup=False)
 
         tally = Tally(len(waiting), show)
-        convert_all(waiting, folder, workers, f"{name}: {len(waiting)} objects", tally)
+        run_orders(waiting, folder, workers, f"{name}: {len(waiting)} objects", tally)
     return rows | tally.rows
 
 

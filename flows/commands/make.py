@@ -143,10 +143,9 @@ def _surroundings(order: Order, settings: dict[Any, Any] | None = None) -> Itera
     from prefect import tags
     from prefect.settings import temporary_settings
 
-    from flows.engine.orphans import process_tag
     from flows.engine.step_tasks import flow_settings
 
-    with temporary_settings({**flow_settings(), **(settings or {})}), tags(process_tag(), f"profile:{order.profile}"):
+    with temporary_settings({**flow_settings(), **(settings or {})}), tags(order.profile):
         yield
 
 

@@ -45,7 +45,7 @@ def up(
         from flows.commands.make import connect
         from flows.serving import roots
         from flows.serving.pools import read_pools
-        from flows.serving.workers import Worker
+        from flows.serving.workers import Worker, limit
 
         known = read_pools()
         chosen = pools or ["process-cpu", *(["process-gpu"] if cuda_devices() else [])]
@@ -53,6 +53,7 @@ def up(
             raise BadInput(f"there is no pool {unknown[0]!r} in deploy/pools.yaml; there are: {', '.join(known)}")
         server = background.background_server()
         variables = roots.environment(sources or ())
+        limits = {name: limit(known[name].per_worker) for name in chosen}
         own = [Worker(name, server.folder) for name in chosen] if workers else []
         for worker in own:
             if sources and worker.is_there() and worker.sources != variables[roots.SOURCES]:
@@ -68,7 +69,7 @@ def up(
         api_url = os.environ["PREFECT_API_URL"]
         server.folder.mkdir(parents=True, exist_ok=True)
         for worker in own:
-            worker.start(api_url, variables)
+            worker.start(api_url, {**variables, **limits[worker.pool]})
             typer.echo(f"{worker.pool} reads below {worker.sources}", err=True)
         address = api_url.removesuffix("/api")
         typer.echo(server.login_address(address) if server.is_at(api_url) else address)
@@ -109,7 +110,7 @@ def watch(
         float, typer.Option("--rest", min=1, callback=finite, help="seconds without a change before its content counts")
     ] = 10.0,
 ) -> None:
-    """Have the deployment catalog/local convert what is dropped into a folder; goes on until it is stopped."""
+    """Have the deployment "Catalog to 4D" convert what is dropped into a folder; goes on until it is stopped."""
     with clear_ending():
         from flows.commands.make import connect
         from flows.packages.publish import check_writable

@@ -19,6 +19,7 @@ from prefect.context import TaskRunContext
 from prefect.serializers import JSONSerializer
 
 from flows import home
+from flows.engine.shared_results import fetch_result
 from steps.artifacts.store import ArtifactStore, StoreUnreachable
 from steps.contract import StepRequest, StepResult
 
@@ -68,6 +69,7 @@ class RequestPolicy(CachePolicy):
         key = record_key(self.request_for(task_ctx.task.name, inputs))
         record = home.records() / key
         with suppress(StoreUnreachable):  # the record is good until the contrary is known
+            fetch_result(key, record)
             if record.exists() and recorded(record, home.store()) is None:
                 self._drop(record, key)
         return key

@@ -1,33 +1,58 @@
-"""Runs whose process was killed: nobody told the server, so the next command does."""
+"""Flow runs whose process was killed: nobody told the server, so the next command on the same machine does.
+
+A run that is at work carries the identity of its process in a label, which no page of the UI shows.
+"""
 
 import os
+from uuid import UUID
 
-from prefect.client.orchestration import get_client
+from prefect import runtime
+from prefect.client.orchestration import SyncPrefectClient, get_client
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterState, FlowRunFilterStateType
-from prefect.client.schemas.objects import StateType
+from prefect.client.schemas.objects import FlowRun, StateType
 from prefect.states import Crashed
 
 from flows.processes import place, start_of
 
+LABEL = "dg4d.process"  # of a flow run: machine, number of the process, its start
+PAGE = 200  # runs in one answer of the server
 
-def process_tag() -> str:
-    """A tag that names this process, and no other that has its number later."""
-    return _tag(os.getpid())
+
+def claim_run() -> None:
+    """Label the current flow run as executed by this process."""
+    run_id = runtime.flow_run.id
+    if run_id is not None:
+        with get_client(sync_client=True) as client:
+            client.update_flow_run_labels(UUID(run_id), {LABEL: process_identity()})
+
+
+def process_identity(pid: int | None = None) -> str:
+    """Return the identity of a process, this one by default; no later process with its number has the same."""
+    pid = pid or os.getpid()
+    return f"{place()}:{pid}:{start_of(pid)}"
 
 
 def settle_orphans() -> int:
-    """Mark running flow runs of this machine whose process is gone as crashed; how many there were."""
-    mine = process_tag().rpartition(":")[0].rpartition(":")[0] + ":"
-    running = FlowRunFilter(state=FlowRunFilterState(type=FlowRunFilterStateType(any_=[StateType.RUNNING])))
+    """Mark running flow runs of this machine whose process is gone as crashed; return their number."""
     settled = 0
     with get_client(sync_client=True) as client:
-        for run in client.read_flow_runs(flow_run_filter=running):
-            owner = next((tag for tag in run.tags if tag.startswith(mine)), None)
-            if owner is not None and _tag(int(owner.split(":")[-2])) != owner:
+        for run in _running(client):
+            if _is_orphan(str(run.labels.get(LABEL, ""))):
                 client.set_flow_run_state(run.id, Crashed(message="the process was killed"), force=True)
                 settled += 1
     return settled
 
 
-def _tag(pid: int) -> str:
-    return f"process:{place()}:{pid}:{start_of(pid)}"
+def _running(client: SyncPrefectClient) -> list[FlowRun]:
+    """Return every run that the server takes for running."""
+    wanted = FlowRunFilter(state=FlowRunFilterState(type=FlowRunFilterStateType(any_=[StateType.RUNNING])))
+    runs: list[FlowRun] = []
+    while page := client.read_flow_runs(flow_run_filter=wanted, limit=PAGE, offset=len(runs)):
+        runs += page
+    return runs
+
+
+def _is_orphan(identity: str) -> bool:
+    """Return whether a process belongs to this machine and has ended."""
+    machine, _, process = identity.rpartition(":")[0].rpartition(":")
+    return machine == place() and process.isdigit() and process_identity(int(process)) != identity

@@ -1,33 +1,69 @@
-"""Where the items of a batch are made: in threads of this process, or by the workers of a Dask cluster."""
+"""Choice of where the items of a catalog run: threads, a Dask cluster, or flow runs of a deployment."""
 
 import os
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 from prefect.task_runners import TaskRunner, ThreadPoolTaskRunner
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 
+VARIABLE = "DG4D_RUNNER"
+GRAMMAR = "local, dask://HOST:PORT, deployment, or deployment:POOL"
 
-def item_runner(workers: int) -> TaskRunner[Any]:
-    """What `$DG4D_RUNNER` names: nothing, or `dask://HOST:PORT` of a scheduler.
 
-    The workers of a cluster have to see the same `$DG4D_HOME` and output folder, and be started with one thread each.
+class Where(NamedTuple):
+    """Place where items run.
+
+    Attributes:
+        kind: threads of this process, workers of a Dask cluster, or workers of a work pool.
+        address: scheduler of the cluster, or name of the pool; empty: the only pool that takes items.
+    """
+
+    kind: Literal["local", "dask", "deployment"]
+    address: str = ""
+
+
+def parse_where(given: str = "") -> Where:
+    """Parse `local`, `dask`, `dask://HOST:PORT`, `deployment` or `deployment:POOL`.
 
     Args:
+        given: empty: what `$DG4D_RUNNER` says, else `local`; `dask` alone: the scheduler that `$DG4D_RUNNER` names.
+
+    Raises:
+        BadInput: it is something else.
+    """
+    preset = os.environ.get(VARIABLE, "")
+    text, source = (given, "--where") if given else (preset, f"${VARIABLE}")
+    if text == "dask" and preset.startswith("dask://"):
+        text = preset
+    if text in {"", "local"}:
+        return Where("local")
+    if text == "deployment":
+        return Where("deployment")
+    if text.startswith("deployment:") and (pool := text.removeprefix("deployment:").strip()):
+        return Where("deployment", pool)
+    if text.startswith("dask://") and (address := text.removeprefix("dask://")):
+        return Where("dask", address)
+    raise BadInput(f"{source} is {text!r}; items run where one of these says: {GRAMMAR}")
+
+
+def item_runner(where: Where, workers: int) -> TaskRunner[Any]:
+    """Return the task runner of the items of a catalog.
+
+    The workers of a Dask cluster have to see the same `$DG4D_HOME` and output folder, and be started with one thread
+    each. An item of a deployment has a thread here that waits for its run.
+
+    Args:
+        where: where the items run.
         workers: items at a time, of threads.
 
     Raises:
-        BadInput: it names something else.
         BackendUnavailable: prefect-dask is not installed.
     """
-    named = os.environ.get("DG4D_RUNNER", "")
-    if not named:
+    if where.kind != "dask":
         return ThreadPoolTaskRunner(max_workers=workers)
-    kind, _, address = named.partition("://")
-    if kind != "dask" or not address:
-        raise BadInput(f"$DG4D_RUNNER is {named!r}; leave it out, or name the scheduler of a cluster: dask://HOST:PORT")
     try:
         from prefect_dask.task_runners import DaskTaskRunner  # noqa: PLC0415 - an extra
     except ImportError as error:
-        raise BackendUnavailable("$DG4D_RUNNER needs prefect-dask: pip install 'dg4d[dask]'") from error
-    return DaskTaskRunner(address=f"tcp://{address}")
+        raise BackendUnavailable("a Dask cluster needs prefect-dask: pip install 'dg4d[dask]'") from error
+    return DaskTaskRunner(address=f"tcp://{where.address}")

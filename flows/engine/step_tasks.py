@@ -26,6 +26,7 @@ from flows.engine.caching import FileLocks, RequestPolicy
 from flows.engine.events import StepEvent, tell
 from flows.engine.executors import chosen, stop_all
 from flows.engine.leases import hold
+from flows.engine.orphans import claim_run
 from flows.engine.remarks import remark
 from flows.formatting.curves import amount
 from flows.formatting.escaping import markdown
@@ -218,8 +219,9 @@ def finished_steps() -> list[StepRun]:
 
 @contextmanager
 def steps_of_flow() -> Iterator[None]:
-    """End the steps of the current flow run with it: at once if the user stops it."""
+    """Label the current flow run with its process, and end its steps with it: at once if the user stops it."""
     flow_run = UUID(runtime.flow_run.id)
+    claim_run()
     try:
         yield
     except (KeyboardInterrupt, TerminationSignal):

@@ -5,6 +5,7 @@ Paths are those of the worker's machine, below the roots that its user allows (f
 """
 
 import json
+import tempfile
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
@@ -17,20 +18,25 @@ from pydantic import ConfigDict, Field
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.settings import Motion
 from flows import home
-from flows.commands.batch import batch, tell
+from flows.commands.batch import CatalogRequest, batch, tell
 from flows.commands.benchmark import bench
 from flows.commands.make import connect, make
 from flows.commands.options import knobs_of
 from flows.commands.terminal import console
+from flows.engine.item_runs import FLOW, failure, read_order
+from flows.engine.orphans import claim_run
+from flows.engine.shared_results import sharing_results
 from flows.inputs.fetching import at_hand, without_secrets
 from flows.inputs.manifest import parse_changes
 from flows.inputs.naming import clean
 from flows.inputs.orders import Wish
+from flows.packages.delivery import Outcome, pack, write_outcome
 from flows.packages.publish import check_folder, is_current
 from flows.serving.roots import Roots
-from steps.contract import LARGEST_SEED, Frozen
+from steps.contract import LARGEST_SEED, ArtifactRef, Frozen
 from steps.profiles import profile, revise
 
+WHERE = r"^(|local|dask|deployment(:[\w .-]+)?)$"  # a scheduler of Dask runs code here: only the worker's user names it
 BEGUN = 3  # times, at most, is a run begun whose process dies
 
 
@@ -139,8 +145,8 @@ Wanted = Annotated[Options, Field(json_schema_extra=_filled_in(Options()))]
 WantedOfPictures = Annotated[PictureOptions, Field(json_schema_extra=_filled_in(PictureOptions()))]
 
 
-@flow(name="image-to-4d", flow_run_name=lambda: _name("picture"), persist_result=False)
-def image_to_4d(
+@flow(name="picture-to-4d", flow_run_name=lambda: _name("picture"), persist_result=False)
+def picture_to_4d(
     picture: Annotated[Text, Field(json_schema_extra=_title("Picture"))],
     out: Folder,
     options: WantedOfPictures = PictureOptions(),  # noqa: B008 - frozen
@@ -153,7 +159,7 @@ def image_to_4d(
         out: on the worker's machine, as `/data/out/fox`; open `report.html` there when it is done
         options: as it stands it works on any machine
     """
-    _refuse_to_die_again()
+    _begin()
     roots = Roots.of_this_process()
     folder = roots.output(out)
     with at_hand(roots.source(picture)) as path:
@@ -174,18 +180,19 @@ def video_to_4d(
         out: on the worker's machine, as `/data/out/walk`; open `report.html` there when it is done
         options: as it stands it works on any machine
     """
-    _refuse_to_die_again()
+    _begin()
     roots = Roots.of_this_process()
     folder = roots.output(out)
     with at_hand(roots.source(video)) as path:
         _make(video, folder, options, roots, picture=path, video=path)
 
 
-@flow(name="catalog", flow_run_name="{inputs}", persist_result=False)
-def catalog(
+@flow(name="catalog-to-4d", flow_run_name=lambda: _name("inputs"), persist_result=False)
+def catalog_to_4d(
     inputs: Annotated[Text, Field(json_schema_extra=_title("Pictures and videos"))],
     out: Folder,
     workers: Workers = 1,
+    where: Annotated[str, Field(pattern=WHERE, json_schema_extra=_title("Items run on"))] = "",
     strict: Annotated[bool, Field(json_schema_extra=_title("Stop at a faulty asset"))] = False,
     options: WantedOfPictures = PictureOptions(),  # noqa: B008 - frozen
 ) -> State[None]:
@@ -195,28 +202,52 @@ def catalog(
         inputs: on the worker's machine a folder, as `/data/in`, a pattern, as `/data/in/**/*.png`, or a list, as
             `/data/in/list.csv`; or a place in an object store, as `s3://bucket/in/`
         out: on the worker's machine, as `/data/out`; open `index.html` there when it is done
-        workers: from 1 to 64; more than one is quicker where there are cores, or GPUs, for it
+        workers: from 1 to 64; more than one is quicker where there are cores, GPUs or machines for it
+        where: `local` is this machine; `deployment:POOL` are the machines whose workers serve that pool, as `fleet`,
+            and share the store of this one; `dask` the cluster that this machine knows; empty: as `$DG4D_RUNNER` says
         strict: an asset that fails a gate ends the batch; else it is marked, and the next one begins
         options: where a line of a list says nothing else; as it stands it works on any machine
     """
-    _refuse_to_die_again()
+    _begin()
     roots = Roots.of_this_process()
     folder = roots.output(out)
-    rows = batch(
-        roots.inputs(inputs),
-        folder,
-        console(),
-        options.profile,
-        _knobs(options, roots),
-        options.seed,
-        workers,
-        options.commercial_only,
-        strict,
-        allow=roots.check_item,
+    request = CatalogRequest(
+        inputs=roots.inputs(inputs),
+        out=folder,
+        profile=options.profile,
+        changes=_knobs(options, roots),
+        seed=options.seed,
+        workers=workers,
+        where=where,
+        commercial_only=options.commercial_only,
+        strict=strict,
     )
+    rows = batch(request, console(), allow=roots.check_item)
     failed = tell(rows, folder, console())
     text = f"{sum(row.made for row in rows)} of {len(rows)} items are in {folder}"
     return Failed(message=text) if failed else Completed(message=text)
+
+
+@flow(name=FLOW, flow_run_name="{item}", persist_result=False)
+def item_to_4d(
+    item: Annotated[Text, Field(json_schema_extra=_title("Item"))],
+    order: Annotated[ArtifactRef, Field(json_schema_extra=_title("Order"))],
+    code: Annotated[Text, Field(json_schema_extra=_title("Code"))],
+    store: Annotated[Text, Field(json_schema_extra=_title("Store"))],
+) -> State[None]:
+    """One item of a catalog becomes an asset in the store, from which the catalog fetches it.
+
+    Args:
+        item: name of the asset
+        order: what to make, in the store that catalog and worker share
+        code: digest of the steps of the catalog; a worker with others refuses the item
+        store: address of the catalog's store, for messages
+    """
+    outcome = _made_for_catalog(order, code, store)
+    write_outcome(home.store(), str(runtime.flow_run.id), outcome)
+    if outcome.package is None:
+        return Failed(message=f"{outcome.step}: {outcome.message}".removeprefix(": "))
+    return Completed(message="every step was already done" if outcome.cached else "done")
 
 
 @flow(name="benchmark", flow_run_name="{dataset}", persist_result=False)
@@ -240,7 +271,7 @@ def benchmark(
         workers: from 1 to 64; more than one is quicker where there are cores, or GPUs, for it
         options: of every object
     """
-    _refuse_to_die_again()
+    _begin()
     roots = Roots.of_this_process()
     folder, place = roots.output(out), Path(roots.folder(dataset))
     pairs = [f"{knob}={json.dumps(value)}" for knob, value in _knobs(options, roots).items()]
@@ -255,13 +286,30 @@ def _name(source: str) -> str:
     return without_secrets(runtime.flow_run.parameters[source])
 
 
-def _refuse_to_die_again() -> None:
-    """The server begins a run again whose process died; what kills it may be the run itself."""
+def _begin() -> None:
+    """Claim the run for this process; fail one that was begun too often, for it may be what kills its process."""
+    claim_run()
     if runtime.flow_run.run_count > BEGUN:
         raise BackendUnavailable(
             f"this run was begun {BEGUN} times and did not end: see whether something kills it, as a machine does that "
             "has too little memory; then ask for a new run, which goes on after the last finished step"
         )
+
+
+def _made_for_catalog(order: ArtifactRef, code: str, address: str) -> Outcome:
+    """Make an order of a catalog into the store; a failure is an outcome too."""
+    store = home.store()
+    try:
+        _begin()
+        wanted = read_order(order, code, store, address)
+        Roots.of_this_process().check_weights(wanted.settings.model_dump(mode="json"))
+        connect()
+        with sharing_results(store), tempfile.TemporaryDirectory(prefix="dg4d-item-") as scratch:
+            folder = Path(scratch) / "package"
+            _, cached = make(wanted, folder)
+            return Outcome(package=pack(folder, store), cached=cached)
+    except Exception as error:  # whatever it is, the catalog has to know
+        return failure(error)
 
 
 def _knobs(options: Options, roots: Roots) -> dict[str, Any]:

@@ -23,7 +23,8 @@ class Pool(Frozen):
 
     Attributes:
         type: the kind of its workers.
-        limit: runs at a time.
+        limit: runs at a time, of all workers together.
+        per_worker: runs at a time of one worker; None: as many as the pool allows.
         description: for people.
         variables: defaults of the job variables.
         job: each is put over the job that such a worker makes.
@@ -31,6 +32,7 @@ class Pool(Frozen):
 
     type: Literal["process", "docker", "kubernetes"]
     limit: int
+    per_worker: int | None = Field(None, ge=1)
     description: str
     variables: dict[str, Any] = Field({})
     job: tuple[dict[str, Any], ...] = ()

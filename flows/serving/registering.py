@@ -87,10 +87,19 @@ def register(pools: Mapping[str, Pool], chosen: list[str]) -> list[str]:
                 concurrency_limit=pool.limit,
             )
             client.create_work_pool(wanted, overwrite=True)
-        _deploy(sorted({one["name"] for one in read_deployments() if one["work_pool"]["name"] in chosen}))
+        deployments = [one for one in read_deployments() if one["work_pool"]["name"] in chosen]
+        _deploy(sorted({one["name"] for one in deployments}))
         _automate(client)
-        there = (found for found in client.read_deployments() if found.work_pool_name in chosen)
-        return sorted(f"{client.read_flow(found.flow_id).name}/{found.name}" for found in there)
+        there = {f"{client.read_flow(found.flow_id).name}/{found.name}" for found in client.read_deployments()}
+    names = [f"{_flow_of(one)}/{one['name']}" for one in deployments]
+    if missing := [name for name in names if name not in there]:
+        raise BackendUnavailable(f"the Prefect server did not take the deployments {', '.join(missing)}")
+    return names
+
+
+def _flow_of(deployment: Json) -> str:
+    """Return the name of the flow of a deployment, which is that of its function with dashes."""
+    return str(deployment["entrypoint"]).rpartition(".")[2].replace("_", "-")
 
 
 def default_templates(client: SyncPrefectClient) -> dict[str, Json]:

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
+from dg4d_lib.errors import BadInput
 from flows.processes import die_with_parent, locked, python, start_of
 from flows.serving.roots import SOURCES
 from flows.serving.server import LOOK_S, Server, leave
@@ -21,6 +22,7 @@ from steps.artifacts.store import write_atomically
 RESTART_S = 5.0  # between two starts of a worker
 GRACE_S = 10.0  # for a worker and its runs to end
 QUERY_S = 2.0  # between two looks at the pool; Prefect's own is 10
+LIMIT = "DG4D_WORKER_LIMIT"  # runs of a worker at a time
 HEARTBEAT_S = 30  # of runs; what misses three of them is dead
 
 
@@ -108,7 +110,7 @@ class Worker:
     def _run(self, api_url: str, server: Server | None) -> None:
         """Run a worker until it ends by itself, or the server of this machine does."""
         process = subprocess.Popen(
-            python("-m", "prefect", "worker", "start", "--pool", self.pool),
+            python("-m", "prefect", "worker", "start", "--pool", self.pool, *_limited()),
             env={**os.environ, **environment(api_url)},
             cwd=self.folder,
             start_new_session=True,
@@ -137,10 +139,28 @@ def environment(api_url: str) -> dict[str, str]:
     }
 
 
+def limit(per_worker: int | None) -> dict[str, str]:
+    """Return the variable that limits the runs of a worker: `$DG4D_WORKER_LIMIT`, else the limit of its pool, if any.
+
+    Raises:
+        BadInput: the variable is not a number of runs.
+    """
+    given = os.environ.get(LIMIT) or str(per_worker or "")
+    if given and not (given.isdecimal() and int(given) > 0):
+        raise BadInput(f"${LIMIT} is {given!r}; set it to the number of runs that this machine executes at a time")
+    return {LIMIT: given}
+
+
 def running(folder: Path) -> list[Worker]:
     """The workers of this machine, by their pools."""
     workers = [Worker(lock.stem.removeprefix("worker-"), folder) for lock in sorted(folder.glob("worker-*.lock"))]
     return [worker for worker in workers if worker.is_there()]
+
+
+def _limited() -> list[str]:
+    """Return the option of a worker that limits its runs."""
+    given = os.environ.get(LIMIT)
+    return ["--limit", given] if given else []
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

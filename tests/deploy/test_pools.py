@@ -1,5 +1,6 @@
 """Pools and deployments: what a worker makes of them, and mistakes that a server would take without a word."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from prefect.flows import load_flow_from_entrypoint
 from prefect.utilities.callables import parameter_schema
 from prefect.utilities.schema_tools.validation import validate
 
+import flows
 from dg4d_lib.errors import BadInput
 from flows.serving.pools import DEPLOYMENTS, Pool, read_deployments, read_pools
 
@@ -30,19 +32,35 @@ def changed(tmp_path: Path, old: str, new: str, file: Path = DEPLOYMENTS) -> Pat
     return path
 
 
-def test_every_flow_is_deployed_in_every_pool() -> None:
+def test_every_flow_is_deployed_in_every_pool_and_only_items_go_to_the_fleet() -> None:
     deployments = read_deployments()
-    flows = {deployment["entrypoint"] for deployment in deployments}
-    assert len(flows) == 4
-    where = {(deployment["entrypoint"], deployment["work_pool"]["name"]) for deployment in deployments}
-    assert where == {(flow, pool) for flow in flows for pool in POOLS}
-    for entrypoint in flows:
-        assert load_flow_from_entrypoint(entrypoint).name in {"image-to-4d", "video-to-4d", "catalog", "benchmark"}
+    flows = {deployment["entrypoint"].rpartition(".")[2] for deployment in deployments}
+    assert flows == {"picture_to_4d", "video_to_4d", "catalog_to_4d", "benchmark", "item_to_4d"}
+    where = {(one["entrypoint"].rpartition(".")[2], one["work_pool"]["name"]) for one in deployments}
+    assert where == {(flow, pool) for flow in flows for pool in set(POOLS) - {"fleet"}} | {("item_to_4d", "fleet")}
 
 
-def test_the_names_of_flows_are_their_tags() -> None:
+def test_a_deployment_is_known_by_its_name_alone_and_a_flow_by_its_function() -> None:
+    deployments = read_deployments()
+    names = [deployment["name"] for deployment in deployments]
+    assert len(set(names)) == len(names)
+    assert {"Picture to 4D", "Video to 4D", "Catalog to 4D", "Benchmark", "Item to 4D on a fleet"} <= set(names)
+    for deployment in deployments:
+        flow = load_flow_from_entrypoint(deployment["entrypoint"])
+        assert flow.name == deployment["entrypoint"].rpartition(".")[2].replace("_", "-")
+        assert deployment["tags"] == [flow.name.removesuffix("-to-4d")]
+
+
+def test_no_two_flows_have_one_name() -> None:
+    sources = (file.read_text(encoding="utf-8") for file in Path(flows.__file__).parent.rglob("*.py"))
+    names = [name for source in sources for name in re.findall(r"@flow\(\s*name=\"?([\w-]+)", source)]
+    assert len(names) >= 11 and len(set(names)) == len(names)
+
+
+def test_one_catalog_at_a_time_runs_in_a_pool() -> None:
     for deployment in read_deployments():
-        assert deployment["tags"] == [load_flow_from_entrypoint(deployment["entrypoint"]).name]
+        limited = deployment["entrypoint"].endswith(".catalog_to_4d")
+        assert (deployment.get("concurrency_limit", {}).get("limit") == 1) == limited
 
 
 def test_parameters_of_deployments_triggers_and_schedules_fit_their_flows() -> None:
@@ -52,15 +70,6 @@ def test_parameters_of_deployments_triggers_and_schedules_fit_their_flows() -> N
             parameters = given.get("parameters", {})
             assert set(parameters) <= set(schema["properties"])
         assert not validate(deployment.get("parameters", {}), schema, raise_on_error=False, ignore_required=True)
-
-
-def test_deployments_name_variables_that_their_pools_have_and_none_of_the_environment() -> None:
-    """Prefect takes a misspelt variable without a word, and an unset one of the environment for an empty text."""
-    for deployment in read_deployments():
-        place = deployment["work_pool"]
-        template = rendering.default_templates()[POOLS[place["name"]].type]
-        assert set(place.get("job_variables", {})) <= set(template["variables"]["properties"])
-        assert "$" not in str(deployment)
 
 
 def test_a_misspelt_variable_of_a_pool_is_found() -> None:

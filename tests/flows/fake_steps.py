@@ -188,15 +188,23 @@ def score_asset(job: Job) -> Facts:
 
 
 def _begin(step: str, job: Job, words: bytes) -> bytes:
-    """Note the run, then do what the words say for this step."""
+    """Note the run, then do what the words say for this step; with the word "named=X", note "step:X" at the end."""
     log = Path(os.environ["FAKE_LOG"])
-    with log.open("a") as file:
-        file.write(f"{step}\n")
-    for word in words.decode(errors="replace").split():
-        name, _, command = word.partition("=")
+    pairs = [word.partition("=")[::2] for word in words.decode(errors="replace").split()]
+    item = dict(pairs).get("named")
+    if item is None:
+        _note(log, step)
+    for name, command in pairs:
         if name == step:
             _obey(command, job, step)
+    if item is not None:
+        _note(log, f"{step}:{item}")
     return words
+
+
+def _note(log: Path, line: str) -> None:
+    with log.open("a") as file:
+        file.write(f"{line}\n")
 
 
 def _obey(command: str, job: Job, step: str) -> None:

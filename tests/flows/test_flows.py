@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from conversions import EVERY_STEP, RUN_FACTS, Run, order, ran, tree
 from fake_steps import picture
+from inside import inside_a_flow
 from waiting import start, wait_until
 
 from flows import home
@@ -278,7 +279,7 @@ def test_a_strict_batch_begins_nothing_after_an_item_that_is_not_accepted(log: P
     names = ("first", "torn", "last")
     orders = [order(f"strict {name}", tmp_path, name=f"{name}.png", item=name) for name in names]
     tally = Tally(3)
-    convert_all(orders, tmp_path / "out", 1, "strict", tally, strict=True)
+    inside_a_flow(convert_all, orders, tmp_path / "out", 1, "strict", tally, strict=True)
     rows = list(tally.rows.values())
     assert [(row.item, row.status, row.failing) for row in rows] == [
         ("first", "done", []),
@@ -290,10 +291,10 @@ def test_a_strict_batch_begins_nothing_after_an_item_that_is_not_accepted(log: P
     assert not (tmp_path / "out" / "last").exists()
     made_before = Row(item="torn", status="failed", kind=NOT_ACCEPTED, failing=["silhouette"])
     tally = Tally(2)
-    convert_all([made_before, orders[2]], tmp_path / "out", 1, "refused before", tally, strict=True)
+    inside_a_flow(convert_all, [made_before, orders[2]], tmp_path / "out", 1, "refused before", tally, strict=True)
     assert [row.status for row in tally.rows.values()] == ["failed", "skipped"]
     tally = Tally(3)
-    convert_all(orders, tmp_path / "out", 1, "lenient", tally)
+    inside_a_flow(convert_all, orders, tmp_path / "out", 1, "lenient", tally)
     rows = list(tally.rows.values())
     assert [(row.status, row.failing) for row in rows] == [("done", []), ("done", ["silhouette"]), ("done", [])]
 

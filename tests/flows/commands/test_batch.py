@@ -15,14 +15,15 @@ from typing import Any
 
 import pytest
 from fake_steps import picture
+from inside import inside_a_flow
 from prefect.client.orchestration import get_client
 from rich.console import Console
 from waiting import wait_until
 
 from flows import home
-from flows.catalog import ROWS_SHOWN, convert_all
+from flows.catalog import convert_all
 from flows.commands import batch as module
-from flows.commands.batch import batch, ready, tell
+from flows.commands.batch import CatalogRequest, batch, ready, tell
 from flows.engine import resources
 from flows.inputs.manifest import items_of
 from flows.inputs.orders import Order, Wish
@@ -30,6 +31,7 @@ from flows.packages.summary import NOT_ACCEPTED, Row, Tally, Writer
 from flows.processes import locked
 from flows.serving.server import Server
 from flows.step_errors import StepBadInput, StepCrashed, StepOutOfMemory
+from flows.ui.gallery import ROWS_SHOWN
 from steps.profiles import PREVIEW
 
 QUIET = Console(quiet=True)
@@ -68,7 +70,7 @@ def test_what_died_is_tried_once_more_at_the_end_and_bad_input_is_not(place: Non
 
     names = ("dies", "bad", "hopeless", "fine")
     tally = Tally(4)
-    convert_all(orders(tmp_path, *names), tmp_path, 1, "retries", tally, work=work)
+    inside_a_flow(convert_all, orders(tmp_path, *names), tmp_path, 1, "retries", tally, work=work)
     assert begun == [*names, "dies", "hopeless"]
     assert {row.item: (row.status, row.attempts) for row in tally.rows.values()} == {
         "dies": ("done", 2),
@@ -94,7 +96,7 @@ def test_items_are_prepared_one_ahead_of_those_at_work(place: None, tmp_path: Pa
             yield order
 
     tally = Tally(8)
-    convert_all(todo(), tmp_path, 2, "ahead", tally, work=work)
+    inside_a_flow(convert_all, todo(), tmp_path, 2, "ahead", tally, work=work)
     assert max(ahead) <= 3
     assert [row.status for row in tally.rows.values()] == ["done"] * 8
 
@@ -124,12 +126,12 @@ def test_meshing_of_one_item_overlaps_fitting_of_the_next_and_fits_never_overlap
         return None, False
 
     tally = Tally(2)
-    convert_all(orders(tmp_path, "first", "second"), tmp_path, 2, "overlap", tally, work=work)
+    inside_a_flow(convert_all, orders(tmp_path, "first", "second"), tmp_path, 2, "overlap", tally, work=work)
     assert [row.status for row in tally.rows.values()] == ["done", "done"]
     assert most == 1
 
 
-def test_the_server_shows_how_far_a_batch_is_and_a_table_that_can_be_read(place: None, tmp_path: Path) -> None:
+def test_the_server_shows_how_far_a_batch_is_and_a_page_that_can_be_read(place: None, tmp_path: Path) -> None:
     rows = [Row(item=f"{i:04d}", status="unchanged") for i in range(3 * ROWS_SHOWN)]
     (one,) = orders(tmp_path, "zebra")
 
@@ -137,17 +139,18 @@ def test_the_server_shows_how_far_a_batch_is_and_a_table_that_can_be_read(place:
         raise StepBadInput("prepare_subject", "ugly")
 
     tally = Tally(len(rows) + 1)
-    convert_all([*rows, one], tmp_path, 1, "many: 301 items", tally, work=work)
+    inside_a_flow(convert_all, [*rows, one], tmp_path, 1, "many: 301 items", tally, work=work)
     with get_client(sync_client=True) as client:
         wanted = {"artifacts": {"key": {"like_": "catalog-many-"}}, "limit": 10}
         pages: list[Any] = client.request("POST", "/artifacts/latest/filter", json=wanted).json()
     by_type = {page["type"]: page for page in pages}
-    table = json.loads(by_type["table"]["data"])
+    assert sorted(by_type) == ["markdown", "progress"]
+    table = [line for line in by_type["markdown"]["data"].splitlines() if line.startswith("| ")][1:]
     assert len(table) == ROWS_SHOWN
-    assert table[0]["item"] == "zebra"  # what failed comes first
+    assert table[0].split("|")[2:4] == [" zebra ", " failed "]  # what failed comes first
     assert by_type["progress"]["data"] == 100
     assert "301 of 301 items, 1 failed" in by_type["progress"]["description"]
-    assert "all are in summary.csv" in by_type["table"]["description"]
+    assert "all are in summary.csv" in by_type["markdown"]["data"]
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
@@ -268,7 +271,7 @@ def test_a_made_batch_needs_no_server_and_says_that_there_is_nothing_to_do(
     def no_server() -> None:
         pytest.fail("nothing is to be made")
 
-    rows = batch(str(tmp_path / "in"), tmp_path / "out", QUIET, connect=no_server)
+    rows = batch(CatalogRequest(inputs=str(tmp_path / "in"), out=tmp_path / "out"), QUIET, connect=no_server)
     assert [row.status for row in rows] == ["unchanged"]
 
 

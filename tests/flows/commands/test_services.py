@@ -9,6 +9,8 @@ import pytest
 from prefect.settings import PREFECT_API_URL
 from waiting import wait_until
 
+from dg4d_lib.errors import BadInput
+from flows.serving import workers
 from flows.serving.server import Server
 from flows.serving.workers import running
 
@@ -34,8 +36,11 @@ def children(pid_file: Path) -> list[str]:
 def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop(server: Server, folder: Path) -> None:
     said = dg4d("up", "--pool", "process-cpu", "--sources", str(folder.parent))
     assert said.returncode == 0, said.stderr
-    *deployments, address = said.stdout.split()
-    assert deployments == ["benchmark/local", "catalog/local", "image-to-4d/local", "video-to-4d/local"]
+    *deployments, address = said.stdout.splitlines()
+    assert deployments == [
+        "picture-to-4d/Picture to 4D", "video-to-4d/Video to 4D", "benchmark/Benchmark",
+        "catalog-to-4d/Catalog to 4D", "item-to-4d/Item to 4D",
+    ]  # fmt: skip
     assert address == os.environ["PREFECT_API_URL"].removesuffix("/api")
     try:
         wait_until(lambda: [worker.pool for worker in running(folder)] == ["process-cpu"])
@@ -88,6 +93,18 @@ def test_a_pool_that_is_not_described_is_refused_before_anything_is_started(fold
     assert said.returncode == 65
     assert "there is no pool 'process-cpo'" in said.stderr and "process-cpu" in said.stderr
     assert not folder.exists()
+
+
+@pytest.mark.parametrize(("given", "of_pool", "limit"), [("", None, ""), ("", 2, "2"), ("3", 2, "3"), ("3", None, "3")])
+def test_runs_of_a_worker_are_limited_by_its_pool_or_by_its_machine(
+    given: str, of_pool: int | None, limit: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DG4D_WORKER_LIMIT", given)
+    assert workers.limit(of_pool) == {"DG4D_WORKER_LIMIT": limit}
+    for wrong in ("0", "many", "-1", "1.5"):
+        monkeypatch.setenv("DG4D_WORKER_LIMIT", wrong)
+        with pytest.raises(BadInput, match="DG4D_WORKER_LIMIT"):
+            workers.limit(of_pool)
 
 
 def test_a_server_is_reached_from_this_machine_only(server: Server) -> None:

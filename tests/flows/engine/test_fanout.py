@@ -17,7 +17,8 @@ from prefect.task_runners import ThreadPoolTaskRunner
 from waiting import wait_until
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from flows.engine.runners import item_runner
+from flows.engine.orphans import LABEL
+from flows.engine.runners import Where, item_runner, parse_where
 from flows.serving import registering
 from flows.serving.pools import read_pools
 from flows.serving.server import Server
@@ -45,16 +46,38 @@ def place(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     return tmp_path
 
 
+@pytest.mark.parametrize(
+    ("given", "preset", "where"),
+    [
+        ("", "", Where("local")),
+        ("local", "dask://a:1", Where("local")),
+        ("", "dask://a:1", Where("dask", "a:1")),
+        ("dask", "dask://a:1", Where("dask", "a:1")),
+        ("dask://b:2", "dask://a:1", Where("dask", "b:2")),
+        ("deployment", "", Where("deployment")),
+        ("deployment:fleet", "", Where("deployment", "fleet")),
+        ("", "deployment: fleet", Where("deployment", "fleet")),
+    ],
+)
+def test_a_place_for_items_is_an_option_or_a_variable(
+    given: str, preset: str, where: Where, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DG4D_RUNNER", preset)
+    assert parse_where(given) == where
+
+
 def test_threads_make_the_items_unless_a_cluster_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert isinstance(item_runner(3), ThreadPoolTaskRunner)
-    for wrong in ("ray://127.0.0.1:1", "dask", "dask://"):
+    for kind in ("local", "deployment"):
+        assert isinstance(item_runner(parse_where(kind), 3), ThreadPoolTaskRunner)
+    for wrong in ("ray://127.0.0.1:1", "dask", "dask://", "deployment:", "Local"):
         monkeypatch.setenv("DG4D_RUNNER", wrong)
         with pytest.raises(BadInput, match="DG4D_RUNNER"):
-            item_runner(3)
-    monkeypatch.setenv("DG4D_RUNNER", "dask://127.0.0.1:1")
+            parse_where()
+        with pytest.raises(BadInput, match="--where"):
+            parse_where(wrong)
     monkeypatch.setitem(sys.modules, "prefect_dask.task_runners", None)
     with pytest.raises(BackendUnavailable, match="prefect-dask"):
-        item_runner(3)
+        item_runner(parse_where("dask://127.0.0.1:1"), 3)
 
 
 @pytest.fixture
@@ -92,8 +115,9 @@ def test_a_dask_cluster_of_two_workers_makes_a_batch(
         json.loads((place / "out" / name / "provenance.json").read_text())["run"]["flow_run"] for name in ("one", "two")
     }
     with get_client(sync_client=True) as client:
-        tags = [next(tag for tag in client.read_flow_run(run).tags if tag.startswith("process:")) for run in makers]
-    assert len(set(tags)) == 2  # two processes made them
+        runs = [client.read_flow_run(run) for run in makers]
+    assert len({run.labels[LABEL] for run in runs}) == 2  # two processes made them
+    assert all(run.tags == ["preview"] for run in runs)
 
 
 @pytest.mark.slow
@@ -116,7 +140,7 @@ def test_two_workers_on_one_postgresql_server_make_an_item_each(place: Path) -> 
             ]
             with get_client(sync_client=True) as client:
                 wait_until(lambda: len(client.read_workers_for_work_pool("process-cpu")) == 2)
-                deployment = client.read_deployment_by_name("image-to-4d/local")
+                deployment = client.read_deployment_by_name("picture-to-4d/Picture to 4D")
                 for name in ("one", "two"):
                     wanted = {"picture": str(place / "in" / f"{name}.png"), "out": str(place / "out" / name)}
                     client.create_flow_run_from_deployment(deployment.id, parameters=wanted)

@@ -21,7 +21,7 @@ from waiting import retry_after, start, wait_until
 
 from dg4d_lib.errors import BadInput
 from flows import home
-from flows.commands.batch import batch
+from flows.commands.batch import CatalogRequest, batch
 from flows.commands.make import make
 from flows.engine import leases
 from flows.engine.collecting import collect
@@ -210,7 +210,9 @@ def test_a_database_that_crashes_during_a_batch_and_comes_back_loses_and_doubles
         monkeypatch.setenv("PREFECT_API_URL", api_url)
         with temporary_settings({PREFECT_API_URL: api_url}):
             crasher = during("extract_mesh", log, crash)
-            rows = batch(str(tmp_path / "in"), tmp_path / "out", Console(quiet=True), workers=2)
+            rows = batch(
+                CatalogRequest(inputs=str(tmp_path / "in"), out=tmp_path / "out", workers=2), Console(quiet=True)
+            )
             crasher.join()
             with get_client(sync_client=True) as client:
                 runs = client.read_flow_runs()

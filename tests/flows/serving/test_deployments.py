@@ -9,6 +9,7 @@ from typing import Any, get_args
 import pytest
 from fake_steps import picture
 from prefect.client.orchestration import SyncPrefectClient
+from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterParentFlowRunId
 from prefect.exceptions import PrefectHTTPStatusError
 from pydantic import ValidationError
 from tiny_s3 import TinyS3
@@ -24,7 +25,13 @@ from flows.serving.watching import announce
 from flows.serving.workers import Worker
 from steps.profiles import PREVIEW, PROFILES, revise
 
-FLOWS = ["image-to-4d", "video-to-4d", "catalog", "benchmark"]
+NAMES = {
+    "picture-to-4d": "Picture to 4D",
+    "video-to-4d": "Video to 4D",
+    "benchmark": "Benchmark",
+    "catalog-to-4d": "Catalog to 4D",
+    "item-to-4d": "Item to 4D",
+}
 
 
 def test_the_form_offers_every_profile() -> None:
@@ -34,10 +41,10 @@ def test_the_form_offers_every_profile() -> None:
 @pytest.mark.parametrize(
     ("name", "titles"),
     [
-        ("image-to-4d", ["Picture", "Folder for what is made", "How it is made"]),
+        ("picture-to-4d", ["Picture", "Folder for what is made", "How it is made"]),
         ("video-to-4d", ["Video", "Folder for what is made", "How it is made"]),
-        ("catalog", ["Pictures and videos", "Folder for what is made", "Items at a time", "Stop at a faulty asset",
-                     "How it is made"]),
+        ("catalog-to-4d", ["Pictures and videos", "Folder for what is made", "Items at a time", "Items run on",
+                           "Stop at a faulty asset", "How it is made"]),
         ("benchmark", ["Data set", "Folder for what is made", "Objects at most", "Judge the meshes",
                        "True views as the prior", "Items at a time", "How it is made"]),
     ],
@@ -45,11 +52,11 @@ def test_the_form_offers_every_profile() -> None:
 def test_a_form_has_a_plain_field_for_everything_in_a_sensible_order(
     client: SyncPrefectClient, name: str, titles: list[str]
 ) -> None:
-    form = client.read_deployment_by_name(f"{name}/local").parameter_openapi_schema
+    form = client.read_deployment_by_name(f"{name}/{NAMES[name]}").parameter_openapi_schema
     assert form is not None
     assert [field["title"] for field in in_order(form)] == titles
     assert [field["title"] for field in in_order(form) if "default" not in field] == titles[:2]
-    pictures = name in {"image-to-4d", "catalog"}
+    pictures = name in {"picture-to-4d", "catalog-to-4d"}
     options = form["definitions"]["PictureOptions" if pictures else "Options"]
     assert [field["title"] for field in in_order(options)] == [
         "Profile", *(["Motion"] if pictures else []), "Triangles", "Texture size", "Frames per second", "Seed",
@@ -92,9 +99,7 @@ def test_registering_again_changes_nothing(client: SyncPrefectClient) -> None:
         return sorted(found, key=str), sorted(one.name for one in client.read_automations())
 
     before = there()
-    assert registering.register(read_pools(), ["process-cpu"]) == [
-        "benchmark/local", "catalog/local", "image-to-4d/local", "video-to-4d/local",
-    ]  # fmt: skip
+    assert registering.register(read_pools(), ["process-cpu"]) == [f"{flow}/{name}" for flow, name in NAMES.items()]
     assert there() == before
     assert {automation.name for automation in registering.AUTOMATIONS} <= set(before[1])
 
@@ -120,13 +125,22 @@ def test_a_server_goes_on_following_the_runs_that_it_followed_when_it_is_registe
     assert again is not None and again.description == one.description
 
 
+@pytest.mark.parametrize("where", ["dask://127.0.0.1:8786", "ray", "deployment:", "local "])
+def test_the_server_refuses_places_for_items_that_only_the_user_of_the_worker_may_name(
+    client: SyncPrefectClient, where: str
+) -> None:
+    catalog = client.read_deployment_by_name("catalog-to-4d/Catalog to 4D")
+    with pytest.raises(PrefectHTTPStatusError, match=r"409|422"):
+        client.create_flow_run_from_deployment(catalog.id, parameters={"inputs": "in", "out": "out", "where": where})
+
+
 @pytest.mark.parametrize(
     "options",
     [{"seed": -1}, {"texture": 63}, {"profile": "papre"}, {"triangles": "many"}, {"tecture": 64},
      {"motion": "swim"}, {"settings": ["motion.iterations"]}, {"settings": "seed=1"}],
 )  # fmt: skip
 def test_the_server_refuses_options_that_cannot_be(client: SyncPrefectClient, options: dict[str, Any]) -> None:
-    catalog = client.read_deployment_by_name("catalog/local")
+    catalog = client.read_deployment_by_name("catalog-to-4d/Catalog to 4D")
     wanted = {"inputs": "in", "out": "out", "options": options}
     with pytest.raises(PrefectHTTPStatusError, match=r"409|422"):
         client.create_flow_run_from_deployment(catalog.id, parameters=wanted)
@@ -134,7 +148,7 @@ def test_the_server_refuses_options_that_cannot_be(client: SyncPrefectClient, op
 
 def ask(client: SyncPrefectClient, name: str, **parameters: Any) -> Any:
     """Ask for a run as a form does; the run, once it is over."""
-    deployment = client.read_deployment_by_name(f"{name}/local")
+    deployment = client.read_deployment_by_name(f"{name}/{NAMES[name]}")
     client.create_flow_run_from_deployment(deployment.id, parameters=parameters)
     return wait_until(lambda: ended(client, parameters["out"]))
 
@@ -157,6 +171,14 @@ def test_what_is_dropped_into_a_folder_is_converted_by_a_worker(
     assert run.state.is_completed() and run.state.message == f"1 of 1 items are in {tmp_path / 'out'}"
     status = json.loads((tmp_path / "out" / "summary.json").read_text())["items"][0]["status"]
     assert status == "done"
+    (conversion,) = client.read_flow_runs(
+        flow_run_filter=FlowRunFilter(parent_flow_run_id=FlowRunFilterParentFlowRunId(any_=[run.id]))
+    )
+    assert (conversion.name, conversion.tags) == ("dropped", ["preview"])  # nothing lies between the two
+    wanted = {"artifacts": {"flow_run_id": {"any_": [str(run.id)]}}}
+    pages = client.request("POST", "/artifacts/filter", json=wanted).json()
+    assert [page["type"] for page in pages if page["type"] != "progress"] == ["markdown"]
+    assert any("[dropped](/artifacts/key/asset-dropped-" in str(page["data"]) for page in pages)
 
 
 def test_a_run_whose_process_was_killed_goes_on_after_its_last_finished_step(
@@ -165,7 +187,7 @@ def test_a_run_whose_process_was_killed_goes_on_after_its_last_finished_step(
     (tmp_path / "killed.png").write_text(picture(f"{tmp_path} fit_gaussians=sleep:2 fit_motion=die-once"))
     _, log = worker
     before = len(log.read_text().split()) if log.exists() else 0
-    run = ask(client, "image-to-4d", picture=str(tmp_path / "killed.png"), out=str(tmp_path / "out"))
+    run = ask(client, "picture-to-4d", picture=str(tmp_path / "killed.png"), out=str(tmp_path / "out"))
     assert run.state.is_completed() and run.run_count == 2
     steps = log.read_text().split()[before:]
     assert steps[:4] == ["prepare_subject", "drive_video", "fit_gaussians", "fit_motion"]
@@ -179,7 +201,7 @@ def test_a_worker_knows_how_many_runs_would_end_with_it(
     (tmp_path / "counted.png").write_text(picture(f"{tmp_path} fit_gaussians=sleep:3"))
     counted = Worker("process-cpu", server.folder)
     wait_until(lambda: counted.runs() == 0)  # the process of an earlier run may just be ending
-    deployment = client.read_deployment_by_name("image-to-4d/local")
+    deployment = client.read_deployment_by_name("picture-to-4d/Picture to 4D")
     parameters = {"picture": str(tmp_path / "counted.png"), "out": str(tmp_path / "out")}
     client.create_flow_run_from_deployment(deployment.id, parameters=parameters)
     wait_until(lambda: counted.runs() == 1)
@@ -190,7 +212,7 @@ def test_a_worker_knows_how_many_runs_would_end_with_it(
 def test_a_run_that_was_begun_too_often_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PREFECT__RUNTIME__FLOW_RUN__RUN_COUNT", str(deployments.BEGUN + 1))
     with pytest.raises(BackendUnavailable, match="begun 3 times"):
-        deployments.image_to_4d.fn("in.png", "out")
+        deployments.picture_to_4d.fn("in.png", "out")
 
 
 def test_a_picture_of_an_object_store_is_fetched_and_converted(
@@ -198,12 +220,12 @@ def test_a_picture_of_an_object_store_is_fetched_and_converted(
 ) -> None:
     objects, _ = worker
     objects.objects["pictures/a fox.png"] = picture(f"a fox of {tmp_path}").encode(), time.time()
-    run = ask(client, "image-to-4d", picture="s3://bucket/pictures/a fox.png", out=str(tmp_path / "fox"))
+    run = ask(client, "picture-to-4d", picture="s3://bucket/pictures/a fox.png", out=str(tmp_path / "fox"))
     assert run.state.is_completed(), run.state.message
     record = json.loads((tmp_path / "fox" / "provenance.json").read_text())
     assert record["item"] == "a fox"
     objects.objects.clear()
-    run = ask(client, "image-to-4d", picture="s3://bucket/pictures/a fox.png", out=str(tmp_path / "gone"))
+    run = ask(client, "picture-to-4d", picture="s3://bucket/pictures/a fox.png", out=str(tmp_path / "gone"))
     assert run.state.is_failed() and "a fox.png" in run.state.message
     assert not (tmp_path / "gone").exists()
 
@@ -213,6 +235,6 @@ def test_the_name_of_a_run_tells_no_signature(
 ) -> None:
     monkeypatch.setenv(SOURCES, str(tmp_path))
     with pytest.raises(BadInput, match="cannot be fetched"):
-        deployments.image_to_4d("http://user:word@127.0.0.1:1/fox.png?signature=key", str(tmp_path / "out"))
+        deployments.picture_to_4d("http://user:word@127.0.0.1:1/fox.png?signature=key", str(tmp_path / "out"))
     (run,) = (run for run in client.read_flow_runs() if run.parameters.get("out") == str(tmp_path / "out"))
     assert run.name == "http://127.0.0.1/fox.png"

@@ -38,7 +38,7 @@ def test_a_program_without_the_secret_cannot_have_a_worker_run_a_command(
     for path, body in (
         ("/api/flows/", {"name": "hostile"}),
         ("/api/deployments/", {"name": "hostile", "work_pool_name": "process-cpu", "pull_steps": [script]}),
-        (f"/api/deployments/{client.read_deployment_by_name('image-to-4d/local').id}/create_flow_run", {}),
+        (f"/api/deployments/{client.read_deployment_by_name('picture-to-4d/Picture to 4D').id}/create_flow_run", {}),
         ("/api/flow_runs/filter", {}),
     ):
         for sent in (headers, {"Content-Type": "application/json"}):
@@ -70,7 +70,7 @@ def test_a_person_signs_in_fills_in_a_form_cancels_the_run_and_opens_an_artifact
         "data": f"# Page\n\n![](http://tracker.example/x.png) [open the file]({artifact.replace('.png', '.bin')})",
     }
     made = client.request("POST", "/artifacts/", json=page).json()
-    deployment = client.read_deployment_by_name("image-to-4d/local")
+    deployment = client.read_deployment_by_name("picture-to-4d/Picture to 4D")
     seen = run_node(
         "prefect_run.mjs",
         json.dumps(

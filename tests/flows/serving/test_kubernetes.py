@@ -49,7 +49,7 @@ def busy(server: Server, tmp_path_factory: pytest.TempPathFactory) -> Iterator[C
     with pytest.MonkeyPatch.context() as patch, get_client(sync_client=True) as client:
         patch.setenv("PREFECT_API_URL", api_url)
         registering.register(read_pools(), ["kubernetes-cpu"])
-        deployment = client.read_deployment_by_name("image-to-4d/kubernetes")
+        deployment = client.read_deployment_by_name("picture-to-4d/Picture to 4D on Kubernetes")
         run = client.create_flow_run_from_deployment(deployment.id, parameters={"picture": "in.png", "out": "out"})
         with cluster(named("Role", "dg4d-worker")) as api:
             (place / "access").write_text(yaml.safe_dump(api.access), encoding="utf-8")

@@ -21,11 +21,11 @@ from waiting import retry_after, wait_until
 
 from flows import home
 from flows.commands.make import make
+from flows.formatting import curves, pages
 from flows.inputs.orders import Order, Wish
 from flows.serving.auth import basic
 from flows.serving.server import Server
 from flows.step_errors import StepDiverged
-from flows.ui import curves, pages
 from flows.ui.asset_page import PICTURES
 from steps.artifacts.store import ArtifactStore
 from steps.contract import ArtifactRef

@@ -1,0 +1,255 @@
+"""Items an hour of a catalog on one, two and three machines that share a store, and what a killed machine costs.
+
+Run with `python -m benchmarks.fleet` (`--items 60 --seconds 6 --workers 1 2 3 --json FILE`). Machines are workers with
+a home and an identity each, in processes of this machine; steps are the stand-ins of the tests, one of which sleeps, so
+that the figures tell what the fleet adds and not how many cores there are. The store is `$DG4D_TEST_S3` (with the usual
+AWS_* variables), else a folder. The last pass has all workers again, one of which is killed with everything that it
+runs when a third of the items is done, and never comes back: its runs go on elsewhere when the server has missed their
+heartbeats.
+
+Lost is an item without its package, done twice a step that two machines finished for one item.
+"""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.table import Table
+
+from benchmarks.measure import machine, new_console, parser_of, write_rows
+from flows.inputs.package_record import RECORD
+from flows.serving.server import Server
+from flows.serving.workers import environment
+
+FAKES = Path(__file__).parents[1] / "tests" / "flows"
+POOL = "fleet"
+START_S = 120.0
+LOOK_S = 0.5
+
+
+@dataclass(frozen=True)
+class Row:
+    """One catalog, made anew.
+
+    Attributes:
+        workers: machines.
+        killed: of them, in the middle.
+        items: of the catalog.
+        wall_s: from the start of the command to its end.
+        per_hour: items.
+        lost: items without a package.
+        twice: steps that were finished twice for one item.
+        shares: items that each machine finished.
+    """
+
+    workers: int
+    killed: int
+    items: int
+    wall_s: float
+    per_hour: float
+    lost: int
+    twice: int
+    shares: list[int]
+
+
+class Machine:
+    """A worker with a home and an identity of its own.
+
+    Args:
+        name: of the machine.
+        folder: of everything that is its own.
+        variables: of the environment, shared with others.
+    """
+
+    def __init__(self, name: str, folder: Path, variables: dict[str, str]) -> None:
+        self.name, self.log, self.killed = name, folder / "finished", False
+        folder.mkdir(parents=True)
+        self.environment = {
+            **variables,
+            "DG4D_HOME": str(folder / "home"),
+            "DG4D_HOST_ID": name,
+            "PREFECT_HOME": str(folder / "prefect"),
+            "FAKE_LOG": str(self.log),
+        }
+        self._output = (folder / "worker.log").open("wb")
+        self._worker = subprocess.Popen(
+            [sys.executable, "-m", "prefect", "worker", "start", "--pool", POOL, "--limit", "1", "--name", name],
+            env=self.environment,
+            cwd=folder,
+            stdout=self._output,
+            stderr=self._output,
+        )
+
+    @property
+    def steps(self) -> list[str]:
+        """Steps that it finished, as STEP:ITEM."""
+        return self.log.read_text(encoding="utf-8").split() if self.log.exists() else []
+
+    def sleeps(self) -> bool:
+        """Return whether it is in the middle of an item, at the step that sleeps."""
+        before = self.steps[-1:]
+        time.sleep(LOOK_S)
+        return before == self.steps[-1:] and bool(before) and before[0].startswith("fit_gaussians:")
+
+    def kill(self) -> None:
+        """End it as a loss of power does: the worker and all that it started, at once."""
+        for pid in [self._worker.pid, *descendants(self._worker.pid)]:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        self._worker.wait()
+        self.killed = True
+
+    def stop(self) -> None:
+        """End it, unless it was killed."""
+        self._worker.terminate()
+        try:
+            self._worker.wait(30)
+        except subprocess.TimeoutExpired:
+            self.kill()
+        self._output.close()
+
+
+def main() -> None:
+    parser = parser_of(__doc__)
+    parser.add_argument("--items", type=int, default=60)
+    parser.add_argument("--seconds", type=float, default=6.0, help="that an item sleeps")
+    parser.add_argument("--workers", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--kill", choices=("also", "never", "only"), default="also", help="the last pass")
+    options = parser.parse_args()
+    passes = [(count, False) for count in options.workers if options.kill != "only"]
+    passes += [(max(options.workers), True)] if options.kill != "never" else []
+    rows = []
+    with (
+        tempfile.TemporaryDirectory(prefix="dg4d-fleet-", ignore_cleanup_errors=True) as name,
+        serving(Path(name)) as variables,
+    ):
+        for number, (count, kill) in enumerate(passes):
+            rows.append(measured(Path(name) / f"{number}", variables, options.items, options.seconds, count, kill))
+            new_console().print(rows[-1])
+    console = new_console()
+    console.print(machine())
+    console.print(table(rows))
+    if options.json:
+        write_rows(options.json, rows)
+
+
+def measured(folder: Path, variables: dict[str, str], items: int, seconds: float, workers: int, kill: bool) -> Row:
+    """Make one catalog anew."""
+    draw_items(folder / "in", items, seconds)
+    store = f"{os.environ['DG4D_TEST_S3']}/{os.getpid()}-{folder.name}" if "DG4D_TEST_S3" in os.environ else ""
+    shared = {**variables, "DG4D_STORE": store or str(folder / "store"), "DG4D_CODE_VERSION": f"fleet-{folder.name}"}
+    machines = [Machine(f"machine-{i}", folder / f"machine-{i}", shared) for i in range(workers)]
+    own = {**shared, "DG4D_HOME": str(folder / "home"), "DG4D_HOST_ID": "catalog", "FAKE_LOG": str(folder / "none")}
+    begun = time.monotonic()
+    command = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "flows.cli", "batch", str(folder / "in"), "-o", str(folder / "out")),
+            *("--where", f"deployment:{POOL}", "--workers", str(2 * workers)),
+        ],
+        env=own,
+        stdout=(folder / "catalog.log").open("wb"),
+        stderr=subprocess.STDOUT,
+    )
+    try:
+        while command.poll() is None:
+            time.sleep(LOOK_S)
+            if kill and sum(map(finished, machines)) >= items / 3 and machines[-1].sleeps():
+                machines[-1].kill()
+                kill = False
+        wall_s = time.monotonic() - begun
+    finally:
+        command.kill()
+        for one in machines:
+            one.stop()
+    steps = Counter(step for one in machines for step in one.steps)
+    made = sum((folder / "out" / f"{i:03d}" / RECORD).is_file() for i in range(items))
+    return Row(
+        workers=workers,
+        killed=int(machines[-1].killed),
+        items=items,
+        wall_s=round(wall_s, 1),
+        per_hour=round(3600 * items / wall_s),
+        lost=items - made,
+        twice=sum(count - 1 for count in steps.values()),
+        shares=[finished(one) for one in machines],
+    )
+
+
+def finished(one: Machine) -> int:
+    """Return how many items a machine finished."""
+    return sum(step.startswith("check_asset:") for step in one.steps)
+
+
+def draw_items(folder: Path, count: int, seconds: float) -> None:
+    """Write sources that the stand-ins of steps obey."""
+    folder.mkdir(parents=True)
+    for i in range(count):
+        words = f"fit_motion=sleep:{seconds} named={i:03d} {folder}"
+        (folder / f"{i:03d}.png").write_text(f"#?RADIANCE\n{words}", encoding="utf-8")
+
+
+@contextmanager
+def serving(folder: Path) -> Iterator[dict[str, str]]:
+    """Start the product's server with the pool of fleets; gives the environment of its clients."""
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PREFECT_", "DG4D_"))}
+    server = Server(folder / "server", folder / "prefect")
+    with ExitStack() as running:
+        os.environ["DG4D_HOME"] = str(folder)
+        server.start()
+        running.callback(server.stop)
+        api_url = server.wait()
+        variables = {
+            **inherited,
+            **environment(api_url),
+            "PREFECT_API_AUTH_STRING": server.auth_string(),
+            "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "WARNING",
+            "DG4D_CATALOG": "fake_steps:STEPS",
+            "DG4D_EXECUTOR": "in_process",
+            "DG4D_CPUS": "2",
+            "PYTHONPATH": str(FAKES),
+        }
+        subprocess.run(
+            [sys.executable, "-c", REGISTER], env={**variables, "PREFECT_HOME": str(folder / "p")}, check=True
+        )
+        yield variables
+
+
+REGISTER = f"""
+from flows.serving.pools import read_pools
+from flows.serving.registering import register
+register(read_pools(), [{POOL!r}])
+"""
+
+
+def descendants(pid: int) -> list[int]:
+    """Return the processes that a process started, and those that these started."""
+    found: list[int] = []
+    for children in Path(f"/proc/{pid}/task").glob("*/children"):
+        with suppress(OSError):  # the thread has ended
+            for child in re.findall(r"\d+", children.read_text(encoding="ascii")):
+                found += [int(child), *descendants(int(child))]
+    return found
+
+
+def table(rows: list[Row]) -> Table:
+    """Return the rows as they are printed."""
+    shown = Table("machines", "killed", "items", "wall s", "items/hour", "lost", "done twice", "items by machine")
+    for row in rows:
+        shown.add_row(
+            str(row.workers), str(row.killed), str(row.items), f"{row.wall_s:.0f}", f"{row.per_hour:.0f}",
+            str(row.lost), str(row.twice), " ".join(map(str, row.shares)),
+        )  # fmt: skip
+    return shown
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,277 @@
+"""Items of a catalog as flow runs of a deployment: begun once, waited for, and found again after a catalog was killed.
+
+An item travels by reference: its order and source lie in the store, and so does what comes back.
+"""
+
+import itertools
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+from uuid import UUID
+
+import httpx
+from prefect import runtime
+from prefect.client.orchestration import SyncPrefectClient, get_client
+from prefect.client.schemas.filters import (
+    FlowFilter,
+    FlowFilterName,
+    FlowRunFilter,
+    FlowRunFilterIdempotencyKey,
+)
+from prefect.client.schemas.objects import FlowRun, State, WorkerStatus
+from prefect.deployments import run_deployment
+from prefect.exceptions import PrefectHTTPStatusError
+from prefect.states import Cancelled, Scheduled
+from prefect.types._datetime import now
+
+from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
+from flows import home
+from flows.engine import resources
+from flows.engine.events import StepEvent, tell
+from flows.engine.leases import hold, running
+from flows.engine.output_lock import output_lock
+from flows.inputs.orders import Order
+from flows.inputs.package_record import record_of
+from flows.packages.delivery import Outcome, deliver, read_outcome
+from flows.packages.publish import Files
+from flows.step_errors import StepCrashed, StepError, StepOutOfMemory, StepTimedOut, StepUnreachable
+from steps.artifacts.store import ArtifactMissing, ArtifactStore, StoreUnreachable
+from steps.contract import ArtifactRef, digest_of
+from steps.main import catalog, request_version
+
+FLOW = "item-to-4d"
+ORDER = "application/vnd.dg4d.order+json"
+STEP = "item"  # the name under which events of a waiting item are shown
+POLL_S = 1.0  # between two looks at a run
+POLLS_PER_S = 20  # of all waiting items of a catalog together
+MAY_HEAL = (StepCrashed, StepOutOfMemory, StepTimedOut, StepUnreachable, StoreUnreachable, ArtifactMissing)
+WORKER_LABEL = "prefect.worker.name"  # of a run that a worker took
+PENDING_S = 120.0  # between a worker that takes a run and the first word of the run; images may have to be pulled
+CRASHED_S = 60.0  # the server begins a crashed run again after ten seconds; then it never does
+
+
+class ItemFailed(DG4DError):
+    """An item that another machine could not make.
+
+    Attributes:
+        outcome: what that machine said.
+        step: that failed.
+        pictures: that explain the failure, in the store.
+    """
+
+    def __init__(self, outcome: Outcome) -> None:
+        super().__init__(outcome.message)
+        self.outcome, self.step, self.pictures = outcome, outcome.step or STEP, outcome.pictures
+
+
+class ItemDeployment(NamedTuple):
+    """Deployment that makes items.
+
+    Attributes:
+        name: the full one, FLOW/NAME.
+        pool: whose workers execute its runs.
+        poll_s: seconds between two looks at a run.
+    """
+
+    name: str
+    pool: str
+    poll_s: float = POLL_S
+
+    def make(self, order: Order, folder: Path) -> tuple[Files, bool]:
+        """Have a worker make an order, and put the package into `folder`, as `flows.commands.make.make` does here.
+
+        Raises:
+            ItemFailed: the worker could not make it, or died.
+            BadInput: the folder cannot be written.
+        """
+        store = home.store()
+        ref = store.put_bytes(order.model_dump_json().encode(), ORDER)
+        with running(store, order.item):
+            hold(store, order.item, [ref.digest, *(needed.digest for needed in (order.source, order.bank) if needed)])
+            outcome = self._outcome(order, ref, store)
+            if outcome.package is None:
+                raise ItemFailed(outcome)
+            with output_lock(folder, lambda: None):
+                files = deliver(outcome.package, folder, store)
+        if (record_of(folder) or {}).get("order") != order.digest():
+            note = "made with other weights, another rasterizer or another signing key than this machine has"
+            tell(StepEvent(order.item, STEP, "remark", text=note))
+        return files, outcome.cached
+
+    def _outcome(self, order: Order, ref: ArtifactRef, store: ArtifactStore) -> Outcome:
+        with get_client(sync_client=True) as client:
+            run = self._begin(client, order, ref, store)
+            run = self._wait(client, run, order.item)
+        return _outcome_of(run, store)
+
+    def _begin(self, client: SyncPrefectClient, order: Order, ref: ArtifactRef, store: ArtifactStore) -> FlowRun:
+        """Begin the run of an item, or return the one that was begun before and is at work or has its package."""
+        for number in itertools.count():
+            key = digest_of([order.digest(), ref.digest, self.name, number])
+            found = client.read_flow_runs(
+                flow_run_filter=FlowRunFilter(idempotency_key=FlowRunFilterIdempotencyKey(any_=[key]))
+            )
+            if not found:
+                break
+            if _is_at_work(found[0]) or _has_package(found[0], store):
+                return found[0]
+        parameters: dict[str, Any] = {
+            "item": order.item,
+            "order": ref.model_dump(mode="json"),
+            "code": code_version(),
+            "store": store.address,
+        }
+        begun = run_deployment(self.name, parameters=parameters, timeout=0, tags=[order.profile], idempotency_key=key)
+        assert isinstance(begun, FlowRun)
+        return begun
+
+    def _wait(self, client: SyncPrefectClient, run: FlowRun, item: str) -> FlowRun:
+        """Wait until a run has ended for good."""
+        said = ""
+        while _is_at_work(run):
+            name = run.state.name if run.state else ""
+            if name != said:
+                said = str(name)
+                tell(StepEvent(item, STEP, "note", text=f"{said.lower()} in {self.pool}"))
+            if resources.stopping.wait(self.poll_s):
+                _give_up(client, run)
+                raise resources.Stopped(f"stopped while {item} was made in {self.pool}")
+            try:
+                run = client.read_flow_run(run.id)
+                if _is_stranded(client, run, self.pool):
+                    again: State[Any] = Scheduled(name="AwaitingRetry", message="its worker died before it began")
+                    client.set_flow_run_state(run.id, again, force=True)
+            except (httpx.TransportError, PrefectHTTPStatusError):
+                continue  # the server may come back, and what it runs goes on
+        return run
+
+
+def item_deployment(pool: str, workers: int) -> ItemDeployment:
+    """Find the deployment that makes items in a pool.
+
+    Args:
+        pool: name of the pool; empty: the only one that has such a deployment.
+        workers: items at a time.
+
+    Raises:
+        BadInput: there is none, or several and none was named; or items would wait for the run that waits for them.
+    """
+    with get_client(sync_client=True) as client:
+        found = client.read_deployments(flow_filter=FlowFilter(name=FlowFilterName(any_=[FLOW])))
+        pools = {str(one.work_pool_name): one for one in found}
+        if (not pool and len(pools) != 1) or (pool and pool not in pools):
+            there = ", ".join(sorted(pools)) or "none"
+            raise BadInput(
+                f"--where deployment{f':{pool}' if pool else ''}: name a pool that takes items; there are: {there}; "
+                "`dg4d up --pool POOL` adds one"
+            )
+        chosen = pools[pool or next(iter(pools))]
+        _require_another_place(client, str(chosen.work_pool_name))
+    name = f"{FLOW}/{chosen.name}"
+    return ItemDeployment(name, str(chosen.work_pool_name), max(POLL_S, workers / POLLS_PER_S))
+
+
+def failure(error: Exception) -> Outcome:
+    """Return the outcome of an item that ended with an exception."""
+    if isinstance(error, ItemFailed):
+        return error.outcome
+    known = isinstance(error, StepError | DG4DError)
+    return Outcome(
+        kind=type(error).__name__ if known else "Crashed",
+        message=error.message if isinstance(error, StepError) else str(error) if known else _described(error),
+        step=getattr(error, "step", ""),
+        pictures=getattr(error, "pictures", {}),
+        may_heal=isinstance(error, MAY_HEAL) or not known,
+    )
+
+
+def code_version() -> str:
+    """Return a digest of the code of all steps, by which a worker of another version is recognized."""
+    return digest_of({name: request_version(spec) for name, spec in catalog().items()})
+
+
+def read_order(order: ArtifactRef, code: str, store: ArtifactStore, address: str) -> Order:
+    """Read an order that a catalog put into the store.
+
+    Args:
+        order: its reference.
+        code: the code of the catalog, by `code_version`.
+        store: of this machine.
+        address: of the catalog's store.
+
+    Raises:
+        BackendUnavailable: this machine has another version of the code, or another store.
+    """
+    if code != code_version():
+        raise BackendUnavailable(
+            "this worker runs another version of dg4d than the catalog; install the same on all machines"
+        )
+    if not store.has(order):
+        raise BackendUnavailable(
+            f"the order {order.digest} is not in the store of this worker, {store.address}; the catalog put it into "
+            f"{address}: set $DG4D_STORE of both to one store"
+        )
+    return Order.model_validate_json(store.path(order).read_bytes())
+
+
+def _described(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+def _is_at_work(run: FlowRun) -> bool:
+    """Return whether a run may still end well; a crashed one may be begun again by the server."""
+    if run.state is None or not run.state.is_final():
+        return True
+    return run.state.is_crashed() and _age_s(run) < CRASHED_S
+
+
+def _outcome_of(run: FlowRun, store: ArtifactStore) -> Outcome:
+    """Return what a run that has ended says, or what is known of one that could not say anything."""
+    if run.state is not None and run.state.is_cancelled():
+        return Outcome(kind="Cancelled", message="its run was cancelled")
+    outcome = read_outcome(store, str(run.id))
+    if outcome is not None:
+        return outcome
+    message = str(run.state.message or run.state.name) if run.state else "nothing is known of its run"
+    return Outcome(kind="Crashed", message=message, may_heal=True)
+
+
+def _is_stranded(client: SyncPrefectClient, run: FlowRun, pool: str) -> bool:
+    """Return whether a worker took a run and died before the run began, which no heartbeat tells the server."""
+    if run.state is None or not run.state.is_pending() or _age_s(run) < PENDING_S:
+        return False
+    workers = client.read_workers_for_work_pool(pool)
+    online = {worker.name for worker in workers if worker.status is WorkerStatus.ONLINE}
+    return run.labels.get(WORKER_LABEL) not in online
+
+
+def _age_s(run: FlowRun) -> float:
+    """Return the seconds since a run got its state."""
+    return 0.0 if run.state is None else (now("UTC") - run.state.timestamp).total_seconds()
+
+
+def _has_package(run: FlowRun, store: ArtifactStore) -> bool:
+    if run.state is None or not run.state.is_completed():
+        return False
+    outcome = read_outcome(store, str(run.id))
+    return outcome is not None and outcome.package is not None
+
+
+def _give_up(client: SyncPrefectClient, run: FlowRun) -> None:
+    """Cancel a run that no worker has begun; one that is at work goes on, and the same catalog finds it again."""
+    if run.state is not None and run.state.is_scheduled():
+        with suppress(httpx.HTTPError, PrefectHTTPStatusError):  # the server is away; the run is found again
+            client.set_flow_run_state(run.id, Cancelled(message="the catalog was stopped"))
+
+
+def _require_another_place(client: SyncPrefectClient, pool: str) -> None:
+    """Refuse a pool whose only place is taken by the run that would wait for its items."""
+    run_id = runtime.flow_run.id
+    own = client.read_flow_run(UUID(run_id)) if run_id else None
+    if own is None or own.work_pool_name != pool:
+        return
+    limit = client.read_work_pool(pool).concurrency_limit
+    if limit is not None and limit < 2:
+        raise BadInput(
+            f"the pool {pool} has one place, which this catalog takes: its items would wait for ever; name another pool"
+        )

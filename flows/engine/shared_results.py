@@ -1,0 +1,57 @@
+"""Results of steps in the store, so that machines that share it do no step twice.
+
+A machine keeps the results of its steps in its own home. When one dies in the middle of an item, the machine that takes
+the item over finds here what was finished.
+
+results/KEY    a record as Prefect keeps it, by the name of `record_key`
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from flows import home
+from flows.engine.events import StepEvent, listening
+from flows.packages.delivery import RESULTS
+from steps.artifacts.store import ArtifactStore, StoreUnreachable, write_atomically
+
+
+@contextmanager
+def sharing_results(store: ArtifactStore) -> Iterator[None]:
+    """Exchange the results of steps with other machines while the block runs."""
+    keys: set[str] = set()
+    _sharing.append((store, keys))
+
+    def put(event: StepEvent) -> None:
+        if event.kind == "finished":
+            with suppress(StoreUnreachable):  # another machine would do the step again, nothing worse
+                _put(store, keys)
+
+    try:
+        with listening(put):
+            yield
+    finally:
+        _sharing.remove((store, keys))
+
+
+def fetch_result(key: str, record: Path) -> None:
+    """Write the record of a result that another machine shares, unless there is one; note the key for sharing it."""
+    for store, keys in _sharing:
+        if record.exists():
+            return
+        content = store.read(f"{RESULTS}/{key}")
+        if content is None:
+            keys.add(key)
+        else:
+            record.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(record, content.decode())
+
+
+_sharing: list[tuple[ArtifactStore, set[str]]] = []
+
+
+def _put(store: ArtifactStore, keys: set[str]) -> None:
+    for key in sorted(keys):
+        with suppress(FileNotFoundError):  # a step beside this one, which is still at work
+            store.write(f"{RESULTS}/{key}", (home.records() / key).read_text(encoding="utf-8"))
+            keys.discard(key)
