@@ -26,10 +26,12 @@ from flows.inputs.orders import Wish
 from flows.inputs.package_record import RECORD
 from flows.packages.publish import whole
 from flows.serving.server import Server
-from steps.artifacts.store import ArtifactStore
 from steps.contract import StepFailure, StepRequest
-from steps.main import catalog, perform, prepare_process, request_version
 from steps.profiles import profile
+from steps.runtime.installed_code import catalog, request_version
+from steps.runtime.perform import perform
+from steps.runtime.process_setup import prepare_process
+from steps.store.artifact_store import ArtifactStore
 
 WAYS = ("steps", "first", "next")
 

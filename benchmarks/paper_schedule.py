@@ -34,6 +34,7 @@ from rich.table import Column, Table
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
 from dg4d_lib.diffusion.flop_counter import counted, counting_flops
+from dg4d_lib.diffusion.latents import LATENT_CHANNELS
 from dg4d_lib.diffusion.parts import Placement, dtype_on, frozen
 from dg4d_lib.diffusion.single_token_attention import shorten_attention
 from dg4d_lib.diffusion.video_model import GIB, VideoModel
@@ -43,7 +44,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.interface import GuidancePrior
-from dg4d_lib.guidance.zero123 import CAMERA_NUMBERS, LATENT_CHANNELS, Zero123
+from dg4d_lib.guidance.zero123 import CAMERA_NUMBERS, Zero123
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
 from dg4d_lib.settings import (
@@ -55,7 +56,7 @@ from dg4d_lib.settings import (
     VideoToVideoSettings,
     Zero123PriorSettings,
 )
-from dg4d_lib.texture.refine import Stretch, refine_textures
+from dg4d_lib.texture.refine import MeshClip, refine_textures
 from dg4d_lib.texture.refiner import VideoToVideo
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.svd import StableVideo
@@ -224,7 +225,7 @@ class Schedule:
         there = DrivingVideo(video.frames.to(self.device), video.coverage.to(self.device), video.fps)
         refiner = VideoToVideo(settings, model, there.over(there.frames.new_ones(3))[0])
         mesh = ball(self.settings.mesh.texture_size, self.device)
-        stretches = [Stretch(mesh, torch.zeros_like(mesh.vertices)[None])] * len(video)
+        stretches = [MeshClip(mesh, torch.zeros_like(mesh.vertices)[None])] * len(video)
         refine_textures(stretches, there, refiner, settings.texture, seeded())
 
     def zero123(self, settings: Zero123PriorSettings) -> Zero123:

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 
-def sent(value: Tensor, device: torch.device) -> Tensor:
+def to_device_async(value: Tensor, device: torch.device) -> Tensor:
     """The same numbers on a device, without waiting for what it still computes.
 
     An ordinary copy to a GPU waits for all that was asked of it before; one from pinned memory goes on by itself.

@@ -17,10 +17,10 @@ from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
 from dg4d_lib.mesh.texturing.bake import bake, vertex_normals
 from dg4d_lib.mesh.texturing.unwrap import unwrap
-from dg4d_lib.mesh.tracking.isosurface_projection import snap
-from dg4d_lib.mesh.tracking.nonrigid_registration import FOLLOWS, register
-from dg4d_lib.mesh.tracking.reference_frame import since
-from dg4d_lib.mesh.tracking.skinning import ride
+from dg4d_lib.mesh.tracking.isosurface_projection import project_to_isosurface
+from dg4d_lib.mesh.tracking.nonrigid_registration import FOLLOWS, register_nonrigid
+from dg4d_lib.mesh.tracking.reference_frame import relative_to_frame
+from dg4d_lib.mesh.tracking.skinning import skin_vertices
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
 from dg4d_lib.settings import MeshSettings
 from steps.artifacts.media import write_png
@@ -28,12 +28,12 @@ from steps.artifacts.mesh_plan import MeshPlan, read_plan
 from steps.artifacts.meshes import write_meshes, write_tracked
 from steps.artifacts.motions import read_motion
 from steps.profiles import FrameRange
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 
 PICTURE_CAMERAS = [OrbitCamera(0, azimuth, width=256, height=256) for azimuth in (0.0, 75.0, 180.0, 285.0)]
 
 
-def run(job: Job) -> Facts:
+def run(job: Job) -> StepReport:
     """Extract what the plan says: the tracked mesh, or the meshes of frames `first_frame` to `end_frame`.
 
     Raises:
@@ -75,7 +75,7 @@ def run(job: Job) -> Facts:
         notes = _soundness(meshes)
         mesh = meshes[first]
     write_png(job.outputs["picture"], _picture(mesh))
-    return Facts(backend=f"{job.settings.rasterizer} rasterizer, pymeshlab, xatlas", notes=tuple(notes))
+    return StepReport(backend=f"{job.settings.rasterizer} rasterizer, pymeshlab, xatlas", notes=tuple(notes))
 
 
 def textured(gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings) -> TexturedMesh:
@@ -92,9 +92,9 @@ def _tracked(
     rest = states.at(frame)
     vertices, faces = _cleaned_surface(rest, level, settings)
     mesh, copied = _colored(vertices, faces, rest, rasterize, settings)
-    carried = ride(vertices, rest, since(displacement, frame))
-    snapped = snap(vertices, carried, faces, states, level, settings)
-    offsets, agreed = register(vertices, snapped, faces, states, level, rasterize, settings)
+    carried = skin_vertices(vertices, rest, relative_to_frame(displacement, frame))
+    snapped = project_to_isosurface(vertices, carried, faces, states, level, settings)
+    offsets, agreed = register_nonrigid(vertices, snapped, faces, states, level, rasterize, settings)
     return TrackedMesh(mesh, offsets[:, copied], rest=frame), agreed
 
 

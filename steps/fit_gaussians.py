@@ -23,12 +23,12 @@ from steps.artifacts.media import read_png, write_png
 from steps.fitting.priors import make_prior
 from steps.fitting.reconstruction import reconstruct_subject
 from steps.fitting.reporting import Curves, picture_of
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 
 BLOB_RADIUS = 0.5  # world units
 
 
-def run(job: Job) -> Facts:
+def run(job: Job) -> StepReport:
     """Fit, and show the result from six sides."""
     prior: PriorSettings = job.settings.prior
     static: StaticSettings = job.settings.static

@@ -14,14 +14,14 @@ from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.motions import new_deformation, write_motion
 from steps.fitting.priors import make_prior
 from steps.fitting.reporting import PICTURE_SIZE, Curves, picture_of, pictures_in_a_row
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 
 FINE_TUNED = "The Gaussians at rest were fitted to the whole video together with their motion."
 PICTURE_FRAMES = 6
 PICTURE_AZIMUTHS_DEG = (0.0, 90.0)
 
 
-def run(job: Job) -> Facts:
+def run(job: Job) -> StepReport:
     """Fit, and show six moments from the front and from the side; `gaussians` come out where they were fine-tuned."""
     backend, turn_deg = job.settings.rasterizer, job.settings.turn_deg
     prior: PriorSettings = job.settings.prior

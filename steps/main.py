@@ -39,8 +39,6 @@ from pydantic import BaseModel, ValidationError
 
 from dg4d_lib.diffusion.flop_counter import counting_flops
 from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
-from steps.artifacts.opening import open_store
-from steps.artifacts.store import NO_SPACE, ArtifactMissing, ArtifactStore, StoreUnreachable, write_atomically
 from steps.contract import (
     EXIT_BAD_INPUT,
     EXIT_DONE,
@@ -54,9 +52,12 @@ from steps.contract import (
     StepSpec,
 )
 from steps.profiles import settings_class
-from steps.runtime.environment_info import machine
-from steps.runtime.job import Facts, Job, Progress
+from steps.runtime.environment_info import environment_info
+from steps.runtime.job import Job, Progress, StepReport
 from steps.runtime.weights import require_same
+from steps.store.artifact_store import ArtifactMissing, ArtifactStore, StoreUnreachable
+from steps.store.files import NO_SPACE, write_atomically
+from steps.store.opening import open_store
 
 EXIT_CRASHED = 1
 EXIT_DIVERGED = 70
@@ -267,7 +268,7 @@ def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scr
         pictures=scratch / "pictures",
     )
     (scratch / "out").mkdir()
-    run: Callable[[Job], Facts] = _named(spec.entry)
+    run: Callable[[Job], StepReport] = _named(spec.entry)
     with counting_flops() as flops:
         facts = run(job)
     outputs = _stored_outputs(job, spec, store)
@@ -289,7 +290,7 @@ def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scr
         duration_s=round(time.perf_counter() - start, 3),
         cpu_s=round(_cpu_seconds() - busy, 3),
         peak_memory_mb=round(peak_memory_mb(), 1),
-        machine=machine(),
+        machine=environment_info(),
     )
     return StepResult(outputs=outputs, provenance=record)
 

@@ -23,7 +23,7 @@ from dg4d_lib.assets.rendering.preview import write_film, write_preview, write_t
 from dg4d_lib.assets.rendering.sheet import contact_sheet
 from dg4d_lib.assets.rendering.webp import write_webp
 from dg4d_lib.assets.resample import moments, resampled, states
-from dg4d_lib.deformation.kinds import AnyDeformation
+from dg4d_lib.deformation.factory import AnyDeformation
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply
@@ -38,7 +38,7 @@ from steps.artifacts.meshes import read_meshes, read_tracked
 from steps.artifacts.motions import read_fit
 from steps.artifacts.packages import MANIFEST, Manifest
 from steps.profiles import PackNotes
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 
 Surface = Asset4D | list[TexturedMesh]
 Notes = Sequence[str]
@@ -186,7 +186,7 @@ class Contents:
         return ()
 
 
-def run(job: Job) -> Facts:
+def run(job: Job) -> StepReport:
     """Write the package and the contact sheet.
 
     Raises:
@@ -229,7 +229,7 @@ def run(job: Job) -> Facts:
         text = json.dumps(manifest.model_dump(mode="json"), indent=2, ensure_ascii=False) + "\n"
         files = [(name, (contents.folder / name).read_bytes()) for name in names]
         write_zip(job.outputs["package"], [(MANIFEST, text.encode()), *files])
-    return Facts(backend=f"{job.settings.rasterizer} rasterizer", notes=tuple(notes))
+    return StepReport(backend=f"{job.settings.rasterizer} rasterizer", notes=tuple(notes))
 
 
 def _contents(job: Job, scratch: Path) -> Contents:

@@ -6,15 +6,15 @@ from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import best_level
 from dg4d_lib.mesh.tracking.nonrigid_registration import FOLLOWS
-from dg4d_lib.mesh.tracking.reference_frame import best_rest
+from dg4d_lib.mesh.tracking.reference_frame import select_reference_frame
 from dg4d_lib.rasterizer.interface import choose_rasterizer
 from dg4d_lib.settings import MeshSettings
 from steps.artifacts.mesh_plan import MeshPlan, write_plan
 from steps.artifacts.motions import read_motion
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 
 
-def run(job: Job) -> Facts:
+def run(job: Job) -> StepReport:
     """Choose one tracked mesh or a mesh per frame, the reference frame, and the level of the surface.
 
     The level is the one whose outlines agree best with those of the Gaussians in the reference frame.
@@ -31,7 +31,7 @@ def run(job: Job) -> Facts:
     states = displacement.apply(gaussians)
     mode, frame, followed, notes = settings.mode, 0, 1.0, []
     if mode != "per_frame":
-        frame, followed = best_rest(states, displacement, rasterize, settings)
+        frame, followed = select_reference_frame(states, displacement, rasterize, settings)
     if mode == "auto":
         mode = "tracked" if followed >= FOLLOWS else "per_frame"
         if mode == "per_frame":
@@ -45,4 +45,4 @@ def run(job: Job) -> Facts:
     notes.append(f"surface at density {level:.3g}; its outlines agree with the Gaussians' to {agreement:.1%} (IoU)")
     write_plan(job.outputs["plan"], MeshPlan(mode=mode, reference_frame=frame, followed=followed, level=level))
     job.progress(2, 2, {})
-    return Facts(backend=f"{job.settings.rasterizer} rasterizer", notes=tuple(notes))
+    return StepReport(backend=f"{job.settings.rasterizer} rasterizer", notes=tuple(notes))

@@ -14,16 +14,16 @@ from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.settings import IdentitySettings, ImageToImageSettings, RefinerSettings, VideoToVideoSettings
-from dg4d_lib.texture.refine import Refined, Stretch, refine_textures
+from dg4d_lib.texture.refine import MeshClip, Refined, refine_textures
 from dg4d_lib.texture.refiner import ImageToImage, Refiner, VideoToVideo
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import read_frames
 from steps.artifacts.meshes import read_meshes, read_tracked, write_meshes, write_tracked
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 from steps.runtime.weights import open_weights
 
 
-def run(job: Job) -> Facts:
+def run(job: Job) -> StepReport:
     """Refine the mesh that moves, or every frame's own; all frames are seen as one video.
 
     A flow leaves this step out where `refiner.kind` is `identity`.
@@ -33,21 +33,21 @@ def run(job: Job) -> Facts:
         BackendUnavailable: weights, or what loads them, are not here.
         FitDiverged: the loss left the finite numbers.
     """
-    facts = Facts()
+    facts = StepReport()
     if "tracked" in job.inputs:
         tracked = read_tracked(job.inputs["tracked"])
-        (its,), facts = _refined(job, [Stretch(tracked.mesh, tracked.offsets)])
+        (its,), facts = _refined(job, [MeshClip(tracked.mesh, tracked.offsets)])
         mesh = replace(tracked.mesh, texture=its.texture)
         write_tracked(job.outputs["tracked"], replace(tracked, mesh=mesh, textures=its.frames))
     if "meshes" in job.inputs:
         meshes = read_meshes(job.inputs["meshes"])
-        refined, facts = _refined(job, [Stretch(mesh, torch.zeros(1, *mesh.vertices.shape)) for mesh in meshes])
+        refined, facts = _refined(job, [MeshClip(mesh, torch.zeros(1, *mesh.vertices.shape)) for mesh in meshes])
         better = [replace(mesh, texture=its.texture) for mesh, its in zip(meshes, refined, strict=True)]
         write_meshes(job.outputs["meshes"], dict(enumerate(better)))
     return facts
 
 
-def _refined(job: Job, stretches: Sequence[Stretch]) -> tuple[list[Refined], Facts]:
+def _refined(job: Job, stretches: Sequence[MeshClip]) -> tuple[list[Refined], StepReport]:
     """The textures of a motion, and how they were made."""
     kind: RefinerSettings = job.settings.refiner
     with TemporaryDirectory() as scratch:
@@ -71,13 +71,13 @@ def _refined(job: Job, stretches: Sequence[Stretch]) -> tuple[list[Refined], Fac
             refiner, halved = ImageToImage(kind, prior), prior.batches.notes
             how = "picture by picture, by image diffusion"
     generator = torch.Generator().manual_seed(job.seed)
-    there = [Stretch(_on(device, stretch.mesh), stretch.offsets.to(device)) for stretch in stretches]
+    there = [MeshClip(_on(device, stretch.mesh), stretch.offsets.to(device)) for stretch in stretches]
     refined = refine_textures(there, driving, refiner, kind.texture, generator, job.progress)
     often = "every iteration" if kind.texture.refresh_every == 1 else f"every {kind.texture.refresh_every} iterations"
     said = [f"Textures were refined {how}; {kind.texture.iterations} iterations, new targets {often}."]
     if any(its.frames is not None for its in refined):
         said.append("The texture changes from frame to frame: every frame adds colors of its own to the shared one.")
-    facts = Facts(f"{device.type} (diffusers)", opened.digests, opened.licenses, tuple(said), halved())
+    facts = StepReport(f"{device.type} (diffusers)", opened.digests, opened.licenses, tuple(said), halved())
     return [Refined(its.texture.cpu(), None if its.frames is None else its.frames.cpu()) for its in refined], facts
 
 

@@ -3,7 +3,7 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from dg4d_lib.diffusion.noise_schedule import TRAIN_STEPS, alphabars
+from dg4d_lib.diffusion.noise_schedule import TRAIN_STEPS, alphas_cumprod
 
 
 def ddim_timesteps(steps: int) -> tuple[int, ...]:
@@ -14,7 +14,7 @@ def ddim_timesteps(steps: int) -> tuple[int, ...]:
 
 def diffused(latents: Float[Tensor, "*b"], noise: Float[Tensor, "*b"], timestep: int) -> Float[Tensor, "*b"]:
     """Clean latents with the noise of a timestep."""
-    alphabar = float(alphabars()[timestep])
+    alphabar = float(alphas_cumprod()[timestep])
     return alphabar**0.5 * latents + (1 - alphabar) ** 0.5 * noise
 
 
@@ -22,6 +22,6 @@ def ddim_step(
     noisy: Float[Tensor, "*b"], believed: Float[Tensor, "*b"], timestep: int, following: int
 ) -> Float[Tensor, "*b"]:
     """From one timestep to the next, given the noise that the network believes in."""
-    alphabar = float(alphabars()[timestep])
+    alphabar = float(alphas_cumprod()[timestep])
     clean = (noisy - (1 - alphabar) ** 0.5 * believed) / alphabar**0.5
     return diffused(clean, believed, following)

@@ -18,12 +18,15 @@ def shorten_attention(unet: Any) -> Any:
     """
     processors = unet.attn_processors.items()
     unet.set_attn_processor(
-        {name: OneToken(ordinary) if name.endswith("attn2.processor") else ordinary for name, ordinary in processors}
+        {
+            name: SingleTokenProcessor(ordinary) if name.endswith("attn2.processor") else ordinary
+            for name, ordinary in processors
+        }
     )
     return unet
 
 
-class OneToken:
+class SingleTokenProcessor:
     """A processor of diffusers' `Attention`.
 
     Its shapes are not checked: it runs where networks are traced by a compiler.

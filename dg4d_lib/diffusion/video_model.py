@@ -19,15 +19,8 @@ from torch import Tensor, nn
 from torch.nn.functional import conv2d, interpolate, pad
 
 from dg4d_lib.diffusion.batching import MicroBatches
-from dg4d_lib.diffusion.parts import (
-    CLIP_SIZE,
-    Placement,
-    dtype_on,
-    load_image_encoder,
-    load_temporal_unet,
-    load_temporal_vae,
-    normalized_for_clip,
-)
+from dg4d_lib.diffusion.clip_images import CLIP_SIZE, normalize_for_clip
+from dg4d_lib.diffusion.parts import Placement, dtype_on, load_image_encoder, load_temporal_unet, load_temporal_vae
 from dg4d_lib.diffusion.single_token_attention import shorten_attention
 from dg4d_lib.settings import VideoModelSettings
 
@@ -50,7 +43,7 @@ def start_index(steps: int, strength: float) -> int:
     return min(int(steps * (1 - strength) + 1e-9), steps - 1)
 
 
-def clean(noisy: Float[Tensor, "*b"], velocity: Float[Tensor, "*b"], sigma: float) -> Float[Tensor, "*b"]:
+def predicted_original(noisy: Float[Tensor, "*b"], velocity: Float[Tensor, "*b"], sigma: float) -> Float[Tensor, "*b"]:
     """x0 out of x and the network's v."""
     return noisy / (1 + sigma**2) - velocity * sigma / math.sqrt(1 + sigma**2)
 
@@ -181,7 +174,9 @@ class VideoModel:
         """
         with self._awake(self.unet) as unet:
             for sigma, following in pairwise(sigmas):
-                slope = (latents - clean(latents, self._guided(unet, latents, condition, sigma), sigma)) / sigma
+                slope = (
+                    latents - predicted_original(latents, self._guided(unet, latents, condition, sigma), sigma)
+                ) / sigma
                 latents = latents + (following - sigma) * slope
         return latents
 
@@ -266,7 +261,7 @@ def _for_clip(pictures: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 s s"]:
     for axis in (3, 2):
         pictures = _blur(pictures, axis)
     small = interpolate(pictures, (CLIP_SIZE, CLIP_SIZE), mode="bicubic", align_corners=True)
-    return normalized_for_clip(small / 2 + 0.5)
+    return normalize_for_clip(small / 2 + 0.5)
 
 
 def _blur(pictures: Float[Tensor, "b 3 h w"], axis: int) -> Float[Tensor, "b 3 h w"]:

@@ -46,7 +46,7 @@ class ScreenGradients:
 
 
 @dataclass(frozen=True)
-class Grown:
+class DensifyResult:
     """A changed cloud, and where each of its Gaussians comes from.
 
     Attributes:
@@ -60,14 +60,14 @@ class Grown:
     fresh: Bool[Tensor, " m"]
 
 
-def grow(
+def densify(
     gaussians: Gaussians,
     pull: Float[Tensor, " n"],
     min_pull: float,
     max_scale: float,
     room: int,
     generator: torch.Generator,
-) -> Grown:
+) -> DensifyResult:
     """Clone small Gaussians and split large ones where the pull is strong.
 
     Args:
@@ -97,14 +97,14 @@ def grow(
     grown = Gaussians(
         means, log_scales, gaussians.quats[source], gaussians.opacity_logits[source], gaussians.harmonics[source]
     )
-    return Grown(grown, source, fresh)
+    return DensifyResult(grown, source, fresh)
 
 
-def prune(gaussians: Gaussians, min_opacity: float, max_scale: float) -> Grown:
+def prune(gaussians: Gaussians, min_opacity: float, max_scale: float) -> DensifyResult:
     """Remove what is almost invisible or too large."""
     source = ((gaussians.opacities >= min_opacity) & (gaussians.scales.amax(-1) <= max_scale)).nonzero()[:, 0]
     kept = Gaussians(**{name: value[source] for name, value in vars(gaussians).items()})
-    return Grown(kept, source, torch.zeros_like(source, dtype=torch.bool))
+    return DensifyResult(kept, source, torch.zeros_like(source, dtype=torch.bool))
 
 
 def reset_opacity(gaussians: Gaussians, ceiling: float = 0.01) -> Gaussians:

@@ -20,24 +20,17 @@ from torch.nn.functional import pad
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import turntable
-from dg4d_lib.devices import sent
+from dg4d_lib.devices import to_device_async
 from dg4d_lib.diffusion.batching import MicroBatches
-from dg4d_lib.diffusion.ddim import ddim_step, ddim_timesteps
-from dg4d_lib.diffusion.multiview import MultiViewShape, MultiViewUnet
-from dg4d_lib.diffusion.parts import (
-    TRANSFORMERS_FILES,
-    Placement,
-    dtype_on,
-    load_part,
-    load_vae,
-    require_schedule,
-    weights_file,
-)
+from dg4d_lib.diffusion.clip_images import clip_pixels
+from dg4d_lib.diffusion.latents import LATENT_CHANNELS, LATENT_SIZE, encode_images
+from dg4d_lib.diffusion.noise_schedule import SCHEDULE, ddim_step, ddim_timesteps, require_schedule
+from dg4d_lib.diffusion.parts import TRANSFORMERS_FILES, Placement, dtype_on, load_part, load_vae, weights_file
 from dg4d_lib.diffusion.published import load_network
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.guidance.distillation import Annealing, distill_in_pieces
+from dg4d_lib.guidance.imagedream_unet import MultiViewShape, MultiViewUnet
 from dg4d_lib.guidance.interface import View
-from dg4d_lib.guidance.zero123 import LATENT_CHANNELS, LATENT_SIZE, SCHEDULE, clip_pixels, encoded
 from dg4d_lib.settings import ImageDreamPriorSettings, Precision
 
 RING = 4  # views that are denoised together, 90 degrees of azimuth apart
@@ -65,7 +58,7 @@ class Condition:
 
     def rows(self, objects: Sequence[int]) -> "Condition":
         """Some of the objects, in this order."""
-        chosen = sent(torch.tensor(list(objects)), self.latents.device)
+        chosen = to_device_async(torch.tensor(list(objects)), self.latents.device)
         return Condition(**{part.name: getattr(self, part.name)[chosen] for part in fields(self)})
 
 
@@ -186,14 +179,14 @@ class ImageDream:
         )
         poses = torch.stack([torch.stack([camera_numbers(camera) for camera in ring]) for ring in rings])
         poses = pad(poses, (0, 0, 0, 1)).repeat(2, 1, 1)  # the picture itself has no camera
-        poses = sent(poses.to(like.dtype), like.device)
+        poses = to_device_async(poses.to(like.dtype), like.device)
         seen = torch.cat([latents.repeat(2, 1, 1, 1, 1).to(like), fronts[:, None]], 1)
         without, told = self.unet(seen, timestep, poses, text, features)[:, :-1].to(latents).chunk(2)
         return without + guidance * (told - without)
 
     def encode(self, pictures: Float[Tensor, "b h w 3"]) -> Float[Tensor, "b 4 32 32"]:
         """Scaled latents of pictures in [0, 1] (the mode, no sample), in their precision; with gradient."""
-        return self.vae.config.scaling_factor * encoded(self.vae, pictures.to(self.vae.device))
+        return self.vae.config.scaling_factor * encode_images(self.vae, pictures.to(self.vae.device))
 
     def _tokens(self, text: str) -> Float[Tensor, "1 l d"]:
         cut = self.tokenizer(
@@ -258,7 +251,9 @@ class ImageDreamPrior:
         cameras = [[view.camera for view in ring] for ring in rings]
         timestep = self.noise.timestep(progress, generator)
         shape = (len(rings), RING * LATENT_CHANNELS, LATENT_SIZE, LATENT_SIZE)
-        noise = sent(torch.randn(shape, dtype=images.dtype, generator=generator), self.condition.latents.device)
+        noise = to_device_async(
+            torch.randn(shape, dtype=images.dtype, generator=generator), self.condition.latents.device
+        )
 
         def encode(pixels: Float[Tensor, "p rows w 3"]) -> Float[Tensor, "p c 32 32"]:
             latents = self.model.encode(pixels.unflatten(1, (RING, -1)).flatten(0, 1))

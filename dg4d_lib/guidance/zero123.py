@@ -17,21 +17,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.devices import sent
+from dg4d_lib.devices import to_device_async
 from dg4d_lib.diffusion.batching import MicroBatches
-from dg4d_lib.diffusion.noise_schedule import BETA_END, BETA_START, TRAIN_STEPS
-from dg4d_lib.diffusion.parts import (
-    CLIP_SIZE,
-    BetaSchedule,
-    Placement,
-    dtype_on,
-    load_image_encoder,
-    load_unet,
-    load_vae,
-    normalized_for_clip,
-    read_linear,
-    require_schedule,
-)
+from dg4d_lib.diffusion.clip_images import CLIP_SIZE, normalize_for_clip
+from dg4d_lib.diffusion.noise_schedule import BETA_END, BETA_START, TRAIN_STEPS, BetaSchedule, require_schedule
+from dg4d_lib.diffusion.parts import Placement, dtype_on, load_image_encoder, load_unet, load_vae, read_linear
 from dg4d_lib.diffusion.single_token_attention import shorten_attention
 from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.distillation import Annealing, distill_in_pieces
@@ -176,7 +166,7 @@ class ConditionedZero123:
         """
         timestep = self.noise.timestep(progress, generator)
         shape = (len(images), LATENT_CHANNELS, LATENT_SIZE, LATENT_SIZE)
-        noise = sent(torch.randn(shape, dtype=images.dtype, generator=generator), self.vae.device)
+        noise = to_device_async(torch.randn(shape, dtype=images.dtype, generator=generator), self.vae.device)
         tokens, pictures = self.tokens(views), self.latents[self._rows(views)]
 
         def encode(pixels: Float[Tensor, "p h w 3"]) -> Float[Tensor, "p 4 32 32"]:
@@ -215,7 +205,7 @@ class ConditionedZero123:
         cameras = torch.stack([camera_numbers(view.camera, self.input_camera, told) for view in views])
         embeddings = self.embeddings[self._rows(views)]
         with torch.no_grad():
-            placed = sent(cameras.to(embeddings.dtype), embeddings.device)
+            placed = to_device_async(cameras.to(embeddings.dtype), embeddings.device)
             return self.camera_projection(torch.cat([embeddings, placed], -1))[:, None]
 
     def _rows(self, views: Sequence[View]) -> Int64[Tensor, " b"]:
@@ -223,7 +213,7 @@ class ConditionedZero123:
         known = len(self.embeddings)
         if wrong := [view.frame for view in views if not 0 <= view.frame < known]:
             raise BadInput(f"frame {wrong[0]} was asked for; there are {known}, counted from 0")
-        return sent(torch.tensor([view.frame for view in views]), self.embeddings.device)
+        return to_device_async(torch.tensor([view.frame for view in views]), self.embeddings.device)
 
 
 def camera_numbers(
@@ -261,4 +251,4 @@ def clip_pixels(images: Float[Tensor, "b h w 3"]) -> Float[Tensor, "b 3 224 224"
     """Pictures in [0, 1] as CLIP reads them."""
     planes = images.permute(0, 3, 1, 2)
     planes = functional.interpolate(planes, (CLIP_SIZE, CLIP_SIZE), mode="bicubic", antialias=True).clamp(0, 1)
-    return normalized_for_clip(planes)
+    return normalize_for_clip(planes)

@@ -20,7 +20,7 @@ EXIT_MISSING = 69  # of the child: something it needs is not here
 EXIT_REFUSED = 65  # of the child: the task has no solution
 
 
-def run_apart(module: str, task: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
+def run_in_subprocess(module: str, task: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
     """What `python -m MODULE`, which ends in `serve`, makes of the arrays.
 
     Args:

@@ -10,10 +10,11 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.diffusion.ddim import ddim_step, ddim_timesteps, diffused
+from dg4d_lib.diffusion.latents import encode_images
+from dg4d_lib.diffusion.noise_schedule import add_noise, ddim_step, ddim_timesteps
 from dg4d_lib.diffusion.video_model import VideoModel, karras_sigmas, start_index
 from dg4d_lib.guidance.interface import View
-from dg4d_lib.guidance.zero123 import ConditionedZero123, encoded
+from dg4d_lib.guidance.zero123 import ConditionedZero123
 from dg4d_lib.settings import ImageToImageSettings, VideoToVideoSettings
 
 
@@ -96,8 +97,8 @@ class ImageToImage:
         images = video.to(prior.vae.device)
 
         def denoised(piece: slice) -> Float[Tensor, "p h w 3"]:
-            latents = scale * encoded(prior.vae, images[piece])
-            latents = diffused(latents, noise[piece].to(latents), timesteps[0])
+            latents = scale * encode_images(prior.vae, images[piece])
+            latents = add_noise(latents, noise[piece].to(latents), timesteps[0])
             for timestep, following in pairwise((*timesteps, 0)):
                 believed = prior.believed_noise(latents, timestep, prior.latents[piece], tokens[piece])
                 latents = ddim_step(latents, believed, timestep, following)

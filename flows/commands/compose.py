@@ -10,7 +10,7 @@ from dg4d_lib.assets.scenes.scene import Item, Scene
 from dg4d_lib.errors import BadInput
 from flows.inputs.package_record import record_of
 from flows.packages.publish import check_writable, whole
-from steps.artifacts.store import room_for
+from steps.store.files import room_for
 
 SUFFIXES = (".glb", ".usdz")
 

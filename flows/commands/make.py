@@ -16,8 +16,8 @@ from flows.inputs.package_record import record_of
 from flows.packages.publish import Files, is_current
 from flows.serving import background
 from flows.serving.server import ServerUnavailable
-from steps.artifacts.store import ArtifactMissing
-from steps.artifacts.store import home as store_home
+from steps.store.artifact_store import ArtifactMissing
+from steps.store.files import home as store_home
 
 if TYPE_CHECKING:
     from flows.packages.flow_result import FlowResult

@@ -12,7 +12,7 @@ from flows.exit_status import EXIT_BAD_INPUT
 
 if TYPE_CHECKING:
     from flows.engine.versions import Version
-    from steps.artifacts.store import ArtifactStore
+    from steps.store.artifact_store import ArtifactStore
 
 LEAST_DIGITS = 6  # of a digest, to be taken for one
 SHOWN_DIGITS = 12

@@ -20,8 +20,8 @@ from prefect.serializers import JSONSerializer
 
 from flows import home
 from flows.engine.shared_results import fetch_result
-from steps.artifacts.store import ArtifactStore, StoreUnreachable
 from steps.contract import StepRequest, StepResult
+from steps.store.artifact_store import ArtifactStore, StoreUnreachable
 
 POLL_S = 0.1  # between two looks at a lock that another process holds
 

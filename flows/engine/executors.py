@@ -34,9 +34,9 @@ from flows.step_errors import (
     StepTimedOut,
     StepUnreachable,
 )
-from steps.artifacts.store import home, remove_tree
 from steps.contract import (
     EXIT_BAD_INPUT,
+    EXIT_DIVERGED,
     EXIT_MISSING,
     EXIT_OUT_OF_MEMORY,
     StepFailure,
@@ -44,8 +44,10 @@ from steps.contract import (
     StepResult,
     StepSpec,
 )
-from steps.main import EXIT_DIVERGED, notes_to, perform
 from steps.runtime.job import Progress
+from steps.runtime.messages import notes_to
+from steps.runtime.perform import perform
+from steps.store.files import home, remove_tree
 
 Say = Callable[[str], None]
 Execute = Callable[[StepSpec, StepRequest, Progress, Say], StepResult]

@@ -4,8 +4,8 @@ import math
 import zipfile
 
 from flows.engine.step_tasks import Part
-from steps.artifacts.store import ArtifactStore
 from steps.contract import ArtifactRef
+from steps.store.artifact_store import ArtifactStore
 
 
 def frames_in(frames: ArtifactRef, store: ArtifactStore) -> int:

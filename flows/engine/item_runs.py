@@ -35,9 +35,9 @@ from flows.inputs.package_record import record_of
 from flows.packages.delivery import Outcome, deliver, read_outcome
 from flows.packages.publish import Files
 from flows.step_errors import StepCrashed, StepError, StepOutOfMemory, StepTimedOut, StepUnreachable
-from steps.artifacts.store import ArtifactMissing, ArtifactStore, StoreUnreachable
 from steps.contract import ArtifactRef, digest_of
-from steps.main import catalog, request_version
+from steps.runtime.installed_code import catalog, request_version
+from steps.store.artifact_store import ArtifactMissing, ArtifactStore, StoreUnreachable
 
 FLOW = "item-to-4d"
 ORDER = "application/vnd.dg4d.order+json"

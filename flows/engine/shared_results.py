@@ -13,7 +13,8 @@ from pathlib import Path
 from flows import home
 from flows.engine.events import StepEvent, listening
 from flows.packages.delivery import RESULTS
-from steps.artifacts.store import ArtifactStore, StoreUnreachable, write_atomically
+from steps.store.artifact_store import ArtifactStore, StoreUnreachable
+from steps.store.files import write_atomically
 
 
 @contextmanager

@@ -34,11 +34,11 @@ from flows.packages.flow_result import StepRun
 from flows.step_errors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable
 from flows.ui import pages
 from flows.ui.showing import revive, show
-from steps.artifacts.store import StoreUnreachable
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen, StepRequest, StepResult
-from steps.main import catalog, request_version
 from steps.profiles import PipelineSettings, step_settings
+from steps.runtime.installed_code import catalog, request_version
 from steps.runtime.weights import identities, weights_in
+from steps.store.artifact_store import StoreUnreachable
 
 PROGRESS_EVERY_S = 3.0  # between two updates of a progress artifact
 RETRIES = 2

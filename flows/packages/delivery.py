@@ -13,8 +13,9 @@ from pathlib import Path
 from pydantic import Field, ValidationError
 
 from flows.packages.publish import Files, publish, whole
-from steps.artifacts.store import ArtifactStore, room_for
 from steps.contract import ArtifactRef, Frozen
+from steps.store.artifact_store import ArtifactStore
+from steps.store.files import room_for
 
 FOLDER, RESULTS = "items", "results"
 KEPT_S = 24 * 3600.0  # of an outcome; its package is not protected from `dg4d store gc` for longer either

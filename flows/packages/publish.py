@@ -14,7 +14,7 @@ from dg4d_lib.errors import BadInput
 from flows.inputs.naming import check_folder_name
 from flows.inputs.package_record import RECORD, record_of
 from steps.artifacts.archives import unpack
-from steps.artifacts.store import remove_tree, room_for
+from steps.store.files import remove_tree, room_for
 
 CANNOT_SWAP = {errno.EBUSY, errno.EXDEV, errno.EACCES, errno.EPERM, errno.EROFS, errno.EINVAL}
 

@@ -22,8 +22,8 @@ from flows.packages.flow_result import FlowResult, StepRun
 from flows.packages.html_pages import render
 from flows.packages.publish import Files, Swap, fact_of_bytes, replace_package
 from flows.packages.view import VIEWER, page_of
-from steps.artifacts.store import ArtifactStore
 from steps.contract import RUN_ONLY, StepResult
+from steps.store.artifact_store import ArtifactStore
 
 BESIDE = ("report.json", "report.html", VIEWER, CRATE)
 GENERATIVE = ("draw_picture", "drive_video", "fit_gaussians", "fit_motion", "refine_texture")  # where they use weights

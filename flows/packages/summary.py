@@ -17,7 +17,7 @@ from flows.formatting.escaping import cell
 from flows.inputs.package_record import record_of
 from flows.packages.acceptance import failing_in
 from flows.packages.html_pages import render
-from steps.artifacts.store import write_atomically
+from steps.store.files import write_atomically
 
 Status = Literal["done", "unchanged", "failed", "skipped"]
 NOT_ACCEPTED = "NotAccepted"  # the kind of failure of an item that was made, but fails a gate in a strict batch

@@ -12,7 +12,7 @@ from dg4d_lib.assets.rendering.viewer_page import viewer_page
 from dg4d_lib.errors import BadInput
 from flows.formatting.sizes import readable
 from flows.packages.publish import whole
-from steps.artifacts.store import room_for
+from steps.store.files import room_for
 
 VIEWER = "viewer.html"
 # files of a package, as in steps/artifacts/packages.py, whose import would bring torch

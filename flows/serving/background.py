@@ -4,7 +4,7 @@ import os
 
 from flows.home import make_private, set_environment
 from flows.serving.server import Server
-from steps.artifacts.store import home
+from steps.store.files import home
 
 
 def background_server() -> Server:

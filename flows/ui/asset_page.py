@@ -13,8 +13,8 @@ from flows.packages.flow_result import StepRun
 from flows.serving.addresses import VIEWER_ADDRESS
 from flows.ui import pages
 from flows.ui.showing import show
-from steps.artifacts.store import ArtifactStore
 from steps.contract import ArtifactRef
+from steps.store.artifact_store import ArtifactStore
 
 PICTURES = {
     ("pack_asset", "sheet"): "Contact sheet",

@@ -16,9 +16,9 @@ from flows.formatting.sizes import readable
 from flows.packages import acceptance
 from flows.serving.addresses import ARTIFACT_ADDRESS
 from flows.step_errors import StepError
-from steps.artifacts.store import ArtifactMissing, ArtifactStore
 from steps.contract import ArtifactRef, StepResult
-from steps.main import catalog
+from steps.runtime.installed_code import catalog
+from steps.store.artifact_store import ArtifactMissing, ArtifactStore
 
 THUMBNAIL_SIZES = (960, 640, 320)  # pixels of the longer side
 WEBP_METHOD = 4  # libwebp's own; with OpenImageIO's, 6, alpha takes a hundred times as long

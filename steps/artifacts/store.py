@@ -1,6 +1,6 @@
 """Where artifacts live: a file is kept once, under the sha256 of its content, and never changes.
 
-This is the folder on one machine; `steps/artifacts/bucket.py` has the same in an object store.
+This is the folder on one machine; `steps/store/bucket.py` has the same in an object store.
 
     sha256/ab/ab12...   artifacts, each under the digest of its content
     incoming/           artifacts that are being written, on this machine only

@@ -10,7 +10,7 @@ from typing import Any
 from steps.contract import digest_of
 
 
-def machine() -> dict[str, str]:
+def environment_info() -> dict[str, str]:
     """Facts about this process, for the record of a step; what does not exist here is left out."""
     facts = {
         "system": platform.platform(),

@@ -30,7 +30,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Facts:
+class StepReport:
     """What only the step can know, for the provenance record.
 
     Attributes:

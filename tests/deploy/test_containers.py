@@ -22,8 +22,8 @@ from flows.step_errors import StepBadInput
 from steps.artifacts.media import write_png
 from steps.catalog import STEPS
 from steps.contract import ArtifactRef, StepRequest, StepResult
-from steps.main import request_version
 from steps.profiles import PREVIEW, revise, step_settings
+from steps.runtime.installed_code import request_version
 
 ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "deploy" / "images"

@@ -19,8 +19,8 @@ from flows.engine import executors
 from flows.engine.events import StepEvent, listening
 from flows.inputs.orders import Wish
 from flows.packages import publish
-from steps.artifacts.store import StoreUnreachable
 from steps.profiles import PREVIEW, revise
+from steps.store.artifact_store import StoreUnreachable
 
 
 def test_a_mesh_per_frame_is_made_in_as_many_parts_as_the_machine_has_slots(

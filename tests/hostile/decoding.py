@@ -196,7 +196,7 @@ def read_as_record(path: Path, scratch: Path) -> tuple[Kind, int]:
     from flows.inputs.package_record import RECORD, record_of
     from flows.packages.publish import is_current
     from flows.packages.verify import verify
-    from steps.artifacts.store import ArtifactStore
+    from steps.store.artifact_store import ArtifactStore
 
     shutil.copyfile(path, scratch / RECORD)
     record = record_of(scratch)

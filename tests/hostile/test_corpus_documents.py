@@ -12,7 +12,7 @@ from flows.inputs.orders import order_again
 from flows.inputs.package_record import RECORD, record_of
 from flows.packages.publish import check_folder, is_current, whole
 from flows.packages.verify import verify
-from steps.artifacts.store import ArtifactStore
+from steps.store.artifact_store import ArtifactStore
 from tests.hostile import table
 from tests.hostile.conftest import Place
 from tests.hostile.documents import RECORDS, SCENES

@@ -11,9 +11,9 @@ import pytest
 from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
 from dg4d_lib.settings import Settings
 from steps import main as host
-from steps.artifacts.store import ArtifactMissing, ArtifactStore
 from steps.contract import ArtifactRef, Port, StepFailure, StepRequest, StepResult, StepSpec
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
+from steps.store.artifact_store import ArtifactMissing, ArtifactStore
 
 TEXT = Port(media_type="text/plain", suffix=".txt")
 
@@ -38,7 +38,7 @@ TROUBLES: dict[str, BaseException] = {
 }
 
 
-def shout(job: Job) -> Facts:
+def shout(job: Job) -> StepReport:
     """A step: upper case, some times over."""
     (job.pictures / "last.png").write_bytes(b"picture")
     if job.settings.trouble in TROUBLES:
@@ -49,7 +49,7 @@ def shout(job: Job) -> Facts:
     os.write(1, b"so does native code\n")
     if job.settings.trouble != "forgets":
         job.outputs["loud"].write_text(job.inputs["quiet"].read_text().upper() * job.settings.times)
-    return Facts(backend="voice", notes=("It was loud.",), licenses={"voice": "free"})
+    return StepReport(backend="voice", notes=("It was loud.",), licenses={"voice": "free"})
 
 
 CATALOG = {

@@ -10,10 +10,10 @@ from dg4d_lib.video.framing import extent
 from steps.artifacts.media import read_frames, read_png
 from steps.prepare_subject import run
 from steps.profiles import PREVIEW, step_settings
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 
 
-def prepare(source: Path, out: Path, **settings: object) -> Facts:
+def prepare(source: Path, out: Path, **settings: object) -> StepReport:
     out.mkdir()
     outputs = {"subject": out / "subject.png", "footage": out / "footage.zip", "picture": out / "picture.png"}
     subject = PREVIEW.model_copy(update={"subject": SubjectSettings(size=64, **settings)})

@@ -23,7 +23,7 @@ PASSES = 3  # the surface is looked for again from where the last pass came out
 SMOOTHING = 3  # rounds in which a vertex's way takes half of its neighbors'
 
 
-def snap(
+def project_to_isosurface(
     vertices: Float[Tensor, "v 3"],
     offsets: Float[Tensor, "t v 3"],
     faces: Int[Tensor, "f 3"],

@@ -31,7 +31,7 @@ STIFFNESS = (5.0,) * 2 + (2.0,) * 6 + (1.0,) * 8 + (0.5,) * 8  # of the smoothin
 FACING = 0.1  # world units that opposite normals add to a distance, halved: the far side of a sheet is not near
 
 
-def register(
+def register_nonrigid(
     vertices: Float[Tensor, "v 3"],
     offsets: Float[Tensor, "t v 3"],
     faces: Int[Tensor, "f 3"],

@@ -11,7 +11,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import best_level, surface
 from dg4d_lib.mesh.extraction.outlines import agreement, outlines_of
-from dg4d_lib.mesh.tracking.skinning import ride
+from dg4d_lib.mesh.tracking.skinning import skin_vertices
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
 
@@ -21,12 +21,12 @@ GRID = 64  # cells of the trial's density field
 GAIN = 0.005  # of intersection over union: less is no reason to leave the first frame
 
 
-def since(displacement: Displacement, frame: int) -> Displacement:
+def relative_to_frame(displacement: Displacement, frame: int) -> Displacement:
     """The same motion, told from where the cloud is at this frame."""
     return Displacement(**{name: value - value[frame] for name, value in vars(displacement).items()})
 
 
-def best_rest(
+def select_reference_frame(
     states: Gaussians, displacement: Displacement, rasterize: Rasterizer, settings: MeshSettings
 ) -> tuple[int, float]:
     """The frame whose surface, carried along, agrees best with the outlines of the Gaussians at all times.
@@ -44,23 +44,23 @@ def best_rest(
         FitDiverged: the cloud is empty.
     """
     frames = len(states.means)
-    moments = evenly(frames, MOMENTS)
+    moments = evenly_spaced(frames, MOMENTS)
     outlines = outlines_of(states, moments, rasterize)
     scores = {}
-    for frame in evenly(frames, CANDIDATES):
+    for frame in evenly_spaced(frames, CANDIDATES):
         rest = states.at(frame)
         field = density_field(rest, settings.model_copy(update={"grid": min(GRID, settings.grid)}))
         level, _ = best_level(field, rest, rasterize, settings.density_threshold)
         vertices, faces = (torch.from_numpy(array) for array in surface(field, level))
-        motion = since(displacement, frame)
+        motion = relative_to_frame(displacement, frame)
         some = Displacement(**{name: value[moments] for name, value in vars(motion).items()})
-        moved = vertices + ride(vertices, rest, some)
+        moved = vertices + skin_vertices(vertices, rest, some)
         scores[frame] = float(agreement(moved, faces, outlines).mean())
     best = max(scores, key=lambda frame: scores[frame])
     chosen = best if scores[best] > scores[0] + GAIN else 0
     return chosen, scores[chosen]
 
 
-def evenly(total: int, count: int) -> list[int]:
+def evenly_spaced(total: int, count: int) -> list[int]:
     """Up to `count` different numbers below `total`, the first and the last included."""
     return sorted({round(i * (total - 1) / max(min(count, total) - 1, 1)) for i in range(min(count, total))})

@@ -31,7 +31,9 @@ OWN_ROTATION = 0.5  # weight of the Gaussians' own rotations, per squared size o
 SWEEPS = 6  # of Jacobi; four by four needs five for full precision
 
 
-def ride(vertices: Float[Tensor, "v 3"], gaussians: Gaussians, displacement: Displacement) -> Float[Tensor, "t v 3"]:
+def skin_vertices(
+    vertices: Float[Tensor, "v 3"], gaussians: Gaussians, displacement: Displacement
+) -> Float[Tensor, "t v 3"]:
     """How far every vertex has gone at every time.
 
     Args:

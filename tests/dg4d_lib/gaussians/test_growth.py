@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.gaussians.growth import ScreenGradients, grow, prune, reset_opacity
+from dg4d_lib.gaussians.growth import ScreenGradients, densify, prune, reset_opacity
 from dg4d_lib.gaussians.initialize import isotropic
 
 
@@ -13,7 +13,7 @@ def cloud(scales: list[float], opacity: float = 0.5) -> Gaussians:
 
 
 def grown(scales: list[float], pull: list[float], room: int = 100):
-    return grow(cloud(scales), torch.tensor(pull), 0.05, 0.05, room, torch.Generator().manual_seed(0))
+    return densify(cloud(scales), torch.tensor(pull), 0.05, 0.05, room, torch.Generator().manual_seed(0))
 
 
 def test_nothing_grows_without_a_pull():

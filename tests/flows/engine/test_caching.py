@@ -12,8 +12,8 @@ import pytest
 from records import result_with, write_record
 
 from flows.engine.caching import FileLocks, RequestPolicy, record_key, recorded
-from steps.artifacts.store import ArtifactStore
 from steps.contract import ArtifactRef, StepRequest, StepResult
+from steps.store.artifact_store import ArtifactStore
 
 
 def request(**changes: Any) -> StepRequest:

@@ -20,9 +20,9 @@ from flows.step_errors import (
     StepOutOfMemory,
     StepTimedOut,
 )
-from steps.artifacts.store import ArtifactStore
 from steps.contract import StepRequest, StepSpec
-from steps.main import request_version
+from steps.runtime.installed_code import request_version
+from steps.store.artifact_store import ArtifactStore
 
 HERE = str(Path(__file__).parents[1])
 OUTSIDE = [in_subprocess, in_container]

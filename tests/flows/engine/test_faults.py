@@ -32,8 +32,8 @@ from flows.inputs.orders import Order, Wish
 from flows.packages.publish import whole
 from flows.serving.server import Server, answers
 from flows.step_errors import StepBadInput, StepOutOfMemory, StepTimedOut
-from steps.artifacts.store import ArtifactStore
 from steps.profiles import PREVIEW
+from steps.store.artifact_store import ArtifactStore
 
 EVERY_STEP = [
     "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "plan_mesh", "extract_mesh", "pack_asset",

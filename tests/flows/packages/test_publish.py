@@ -10,7 +10,7 @@ from dg4d_lib.errors import BadInput
 from flows.inputs.package_record import record_of
 from flows.packages.publish import Files, check_folder, is_current, publish
 from flows.packages.verify import verify
-from steps.artifacts.store import DiskFull
+from steps.store.files import DiskFull
 
 
 def zipped(path: Path, **entries: str) -> Path:

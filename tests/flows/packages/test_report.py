@@ -16,9 +16,9 @@ from flows.packages import report
 from flows.packages.flow_result import FlowResult, StepRun
 from flows.packages.html_pages import render
 from flows.packages.summary import Row, Writer
-from steps.artifacts.store import ArtifactStore
 from steps.contract import ArtifactRef, ProvenanceRecord, StepResult
 from steps.profiles import PREVIEW, revise
+from steps.store.artifact_store import ArtifactStore
 
 FILES = {
     name: {"digest": "sha256:" + "a" * 64, "size_bytes": size}
