@@ -22,12 +22,13 @@ from dg4d_lib.assets.formats.compact import read_compact
 from dg4d_lib.assets.formats.glb import read_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.images import color_over_white
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import best_level
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.metrics.image import iou, psnr
-from dg4d_lib.metrics.surface import chamfer
+from dg4d_lib.metrics.surface import chamfer_of_points, sample_surface
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
 from dg4d_lib.settings import MeshSettings
 from steps.artifacts.packages import ASSET, COMPACT
@@ -70,7 +71,8 @@ def of_package(folder: Path, count: int, rasterize: Rasterizer) -> list[Row]:
         tracked = replace(asset.mesh, vertices=asset.mesh.vertices + asset.offsets[frame])
         truth, generator = splats(states.at(i), rasterize), torch.Generator().manual_seed(frame)
         for mode, mesh in (("tracked", tracked), ("per_frame", extracted)):
-            apart = chamfer(mesh.vertices, mesh.faces, extracted.vertices, extracted.faces, POINTS, generator)
+            points = [sample_surface(each.vertices, each.faces, POINTS, generator) for each in (mesh, extracted)]
+            apart = chamfer_of_points(*points)
             rows.append(Row(folder.name, mode, 1, PER_WORLD_UNIT * apart, *look(mesh, truth)))
     return [mean_row(folder.name, [row for row in rows if row.mode == mode]) for mode in MODES]
 
@@ -90,7 +92,7 @@ def look(mesh: TexturedMesh, truth: tuple[Tensor, Tensor]) -> list[float]:
     """PSNR and overlap in the first view, then in the second."""
     color, coverage = render_mesh(mesh, cameras())
     seen = ((coverage > 0.5) | (truth[1] > 0.5)).float()
-    pairs = torch.stack([psnr(color * coverage + 1 - coverage, truth[0], seen), iou(coverage, truth[1])], 1)
+    pairs = torch.stack([psnr(color_over_white(color, coverage), truth[0], seen), iou(coverage, truth[1])], 1)
     return pairs.flatten().tolist()
 
 

@@ -1,4 +1,4 @@
-"""From one cut-out picture to static 3D Gaussians."""
+"""Step that fits static 3D Gaussians to one cut-out picture."""
 
 import torch
 from jaxtyping import Float
@@ -22,14 +22,14 @@ from dg4d_lib.settings import (
 from steps.artifacts.media import read_png, write_png
 from steps.fitting.priors import make_prior
 from steps.fitting.reconstruction import reconstruct_subject
-from steps.fitting.reporting import Curves, picture_of
+from steps.fitting.reporting import LossCurves, render_turnaround
 from steps.runtime.job import Job, StepReport
 
 BLOB_RADIUS = 0.5  # world units
 
 
 def run(job: Job) -> StepReport:
-    """Fit, and show the result from six sides."""
+    """Fit the Gaussians and render them from six sides."""
     prior: PriorSettings = job.settings.prior
     static: StaticSettings = job.settings.static
     backend, turn_deg = job.settings.rasterizer, job.settings.turn_deg
@@ -44,17 +44,17 @@ def run(job: Job) -> StepReport:
     else:
         start = starting_cloud(subject, static.start, prior, turn_deg, generator).to(device)
     chosen = make_prior(prior, [subject], static, job.inputs.get("bank"), job.pictures, turn_deg)
-    curves = Curves(static.iterations, job.progress)
+    curves = LossCurves(static.iterations, job.progress)
     try:
         gaussians = fit_gaussians(start, subject, chosen.prior, rasterize, static, generator, curves.add)
     except Diverged as error:
-        write_png(job.pictures / "last_good_state.png", picture_of(error.gaussians, rasterize))
+        write_png(job.pictures / "last_good_state.png", render_turnaround(error.gaussians, rasterize))
         raise
     facts = chosen.facts(f"{backend} rasterizer")
     facts = reconstruction.added_to(facts) if reconstruction else facts
     write_ply(job.outputs["gaussians"], gaussians)
     curves.write(job.outputs["curves"], "static fit", facts.notes)
-    write_png(job.outputs["picture"], picture_of(gaussians, rasterize))
+    write_png(job.outputs["picture"], render_turnaround(gaussians, rasterize))
     return facts
 
 

@@ -1,4 +1,4 @@
-"""From static Gaussians and a driving video to a deformation."""
+"""Step that fits a deformation of static Gaussians to a driving video."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from dg4d_lib.settings import DeformationSettings, MotionSettings, PriorSettings
 from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.motions import new_deformation, write_motion
 from steps.fitting.priors import make_prior
-from steps.fitting.reporting import PICTURE_SIZE, Curves, picture_of, pictures_in_a_row
+from steps.fitting.reporting import PICTURE_SIZE, LossCurves, pictures_in_a_row, render_turnaround
 from steps.runtime.job import Job, StepReport
 
 FINE_TUNED = "The Gaussians at rest were fitted to the whole video together with their motion."
@@ -22,7 +22,7 @@ PICTURE_AZIMUTHS_DEG = (0.0, 90.0)
 
 
 def run(job: Job) -> StepReport:
-    """Fit, and show six moments from the front and from the side; `gaussians` come out where they were fine-tuned."""
+    """Fit the deformation, with `fine_tune` also the Gaussians; render six timestamps from front and side."""
     backend, turn_deg = job.settings.rasterizer, job.settings.turn_deg
     prior: PriorSettings = job.settings.prior
     kind: DeformationSettings = job.settings.deformation
@@ -36,13 +36,13 @@ def run(job: Job) -> StepReport:
     deformation = new_deformation(kind, gaussians, len(video), generator)
     device = device_of(backend)
     deformation.to(device)
-    curves = Curves(settings.iterations, job.progress)
+    curves = LossCurves(settings.iterations, job.progress)
     try:
         fitted = fit_motion(
             gaussians.to(device), deformation, video, chosen.prior, rasterize, settings, generator, curves.add
         )
     except Diverged as error:
-        write_png(job.pictures / "last_good_state.png", picture_of(error.gaussians, rasterize))
+        write_png(job.pictures / "last_good_state.png", render_turnaround(error.gaussians, rasterize))
         raise
     deformation.cpu()
     gaussians = fitted.to(torch.device("cpu"))

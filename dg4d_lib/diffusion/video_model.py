@@ -1,4 +1,4 @@
-"""Stable Video Diffusion in its parts: look at a picture, encode, denoise and decode videos.
+"""Stable Video Diffusion in its parts: condition on a picture, encode, denoise and decode videos.
 
 The schedule is Karras et al. 2022; the network predicts v (Salimans and Ho 2022) of x = x0 + sigma e:
 x0 = x / (1 + sigma^2) - v sigma / sqrt(1 + sigma^2), and its input is x / sqrt(1 + sigma^2) at the time ln(sigma) / 4.
@@ -16,11 +16,17 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import conv2d, interpolate, pad
 
 from dg4d_lib.diffusion.batching import MicroBatches
-from dg4d_lib.diffusion.clip_images import CLIP_SIZE, normalize_for_clip
-from dg4d_lib.diffusion.parts import Placement, dtype_on, load_image_encoder, load_temporal_unet, load_temporal_vae
+from dg4d_lib.diffusion.clip_images import svd_clip_pixels
+from dg4d_lib.diffusion.latents import at_least_float32, to_images
+from dg4d_lib.diffusion.parts import (
+    Placement,
+    dtype_on,
+    load_image_encoder,
+    load_temporal_unet,
+    load_temporal_vae,
+)
 from dg4d_lib.diffusion.single_token_attention import shorten_attention
 from dg4d_lib.settings import VideoModelSettings
 
@@ -33,7 +39,7 @@ ENCODER_GB, DECODER_GB, UNET_GB = 0.66, 1.05, 0.15
 
 
 def karras_sigmas(steps: int) -> tuple[float, ...]:
-    """Noise levels from 700 down to 0.002 whose 1/7th powers are evenly spaced, and 0 after them: `steps` + 1."""
+    """Return `steps` noise levels from 700 to 0.002 whose 1/7th powers are evenly spaced, and a final 0."""
     top, bottom = SIGMA_MAX ** (1 / RHO), SIGMA_MIN ** (1 / RHO)
     return (*((top + i / (steps - 1) * (bottom - top)) ** RHO for i in range(steps)), 0.0)
 
@@ -44,13 +50,13 @@ def start_index(steps: int, strength: float) -> int:
 
 
 def predicted_original(noisy: Float[Tensor, "*b"], velocity: Float[Tensor, "*b"], sigma: float) -> Float[Tensor, "*b"]:
-    """x0 out of x and the network's v."""
+    """Return x0 from x and the network's v."""
     return noisy / (1 + sigma**2) - velocity * sigma / math.sqrt(1 + sigma**2)
 
 
 @dataclass(frozen=True)
 class Condition:
-    """What the network is told about b videos.
+    """Conditioning of b videos.
 
     Attributes:
         embedding: of the picture, by the image encoder.
@@ -127,7 +133,7 @@ class VideoModel:
 
     @torch.no_grad()
     def look_at(self, picture: Float[Tensor, "h w 3"], generators: Sequence[torch.Generator]) -> Condition:
-        """What the network is told about videos of this picture, one per generator.
+        """Return the conditioning of videos of this picture, one per generator.
 
         Args:
             picture: in [0, 1]; sides are multiples of `shrinkage`.
@@ -136,7 +142,7 @@ class VideoModel:
         settings, count = self.settings, len(generators)
         scaled = 2 * picture.movedim(-1, 0)[None] - 1
         with self._awake(self.image_encoder) as encoder:
-            eye = _for_clip(scaled.to(self.device, _wide(encoder.dtype)))
+            eye = svd_clip_pixels(scaled.to(self.device, at_least_float32(encoder.dtype)))
             embedding = encoder(eye.to(encoder.dtype)).image_embeds[:, None]
         noise = torch.cat([_normal(scaled.shape, generator, scaled.dtype) for generator in generators])
         latents = self._mode(scaled + settings.noise_aug_strength * noise.to(scaled))
@@ -147,12 +153,12 @@ class VideoModel:
 
     @torch.no_grad()
     def encode(self, video: Float[Tensor, "t h w 3"]) -> Float[Tensor, "t c i j"]:
-        """The scaled latents of pictures in [0, 1]: modes, no samples."""
+        """Return the scaled modes of the latents of images in [0, 1]."""
         return self._mode(2 * video.movedim(-1, 1) - 1) * float(self.vae.config.scaling_factor)
 
     @torch.no_grad()
     def decode(self, latents: Float[Tensor, "t c i j"]) -> Float[Tensor, "t h w 3"]:
-        """The pictures of scaled latents, in [0, 1], a few frames at a time."""
+        """Decode scaled latents to images in [0, 1], a few frames at a time."""
         with self._awake(self.vae) as vae:
             inside = (latents / vae.config.scaling_factor).to(self.device, _dtype(vae.decoder))
             pictures = self._frames.run(
@@ -161,13 +167,13 @@ class VideoModel:
                 self._room(DECODER_GB, inside, self.shrinkage),
             )
         decoded = torch.cat(pictures)
-        return (decoded.to(_wide(decoded.dtype)).movedim(1, -1) / 2 + 0.5).clamp(0, 1)
+        return to_images(decoded.to(at_least_float32(decoded.dtype)))
 
     @torch.no_grad()
     def denoise(
         self, latents: Float[Tensor, "b t c i j"], condition: Condition, sigmas: Sequence[float]
     ) -> Float[Tensor, "b t c i j"]:
-        """Latents at the first noise level, taken to the last by Euler's method.
+        """Denoise latents from the first noise level to the last by Euler's method.
 
         Guidance goes from `min_guidance_scale` in the first frame to `max_guidance_scale` in the last; the
         unconditional half knows no picture.
@@ -181,8 +187,8 @@ class VideoModel:
         return latents
 
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Float[Tensor, "b t c i j"]:
-        """Noise of standard deviation 1 for the latents of several videos, one generator each."""
-        dtype = _wide(self.unet.dtype)
+        """Draw standard normal noise for the latents of several videos, one generator each."""
+        dtype = at_least_float32(self.unet.dtype)
         return torch.cat([_normal((1, *shape[1:]), generator, dtype) for generator in generators]).to(self.device)
 
     def _guided(
@@ -190,7 +196,7 @@ class VideoModel:
     ) -> Float[Tensor, "b t c i j"]:
         """The network's v, guided towards the picture."""
         frames = latents.shape[1]
-        time = torch.tensor(0.25 * math.log(sigma), dtype=_wide(unet.dtype), device=self.device)
+        time = torch.tensor(0.25 * math.log(sigma), dtype=at_least_float32(unet.dtype), device=self.device)
         embedding = torch.cat([torch.zeros_like(condition.embedding), condition.embedding])
         pictures = torch.cat([torch.zeros_like(condition.latents), condition.latents])
         ids = torch.cat([condition.ids, condition.ids])
@@ -213,7 +219,7 @@ class VideoModel:
                 lambda part: vae.encode(seen[part]).latent_dist.mode(), len(seen), self._room(ENCODER_GB, seen)
             )
         modes = torch.cat(latents)
-        return modes.to(_wide(modes.dtype))
+        return modes.to(at_least_float32(modes.dtype))
 
     def _room(self, gb: float, inputs: Float[Tensor, "b *shape h w"], enlarged: int = 1) -> int:
         """For how many inputs at a time the budget has room.
@@ -243,33 +249,6 @@ def _dtype(part: nn.Module) -> torch.dtype:
     return next(part.parameters()).dtype
 
 
-def _wide(dtype: torch.dtype) -> torch.dtype:
-    return torch.promote_types(dtype, torch.float32)
-
-
 def _normal(shape: Sequence[int], generator: torch.Generator, dtype: torch.dtype) -> Tensor:
     """Drawn where the generator is, so that devices agree."""
     return torch.randn(tuple(shape), generator=generator, dtype=dtype, device=generator.device)
-
-
-def _for_clip(pictures: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 s s"]:
-    """Pictures in [-1, 1] as the image encoder was trained to see them: blurred, 224 pixels a side, normalized.
-
-    The blur's deviation is half of the shrinkage less one, cut off at about two deviations; resampling is bicubic and
-    keeps the centers of the corner pixels.
-    """
-    for axis in (3, 2):
-        pictures = _blur(pictures, axis)
-    small = interpolate(pictures, (CLIP_SIZE, CLIP_SIZE), mode="bicubic", align_corners=True)
-    return normalize_for_clip(small / 2 + 0.5)
-
-
-def _blur(pictures: Float[Tensor, "b 3 h w"], axis: int) -> Float[Tensor, "b 3 h w"]:
-    sigma = max((pictures.shape[axis] / CLIP_SIZE - 1) / 2, 0.001)
-    length = max(int(4 * sigma), 3) | 1
-    places = torch.arange(length, device=pictures.device, dtype=pictures.dtype) - length // 2
-    weights = torch.exp(-places.square() / (2 * sigma**2))
-    weights = (weights / weights.sum()).view((1, 1, -1, 1) if axis == 2 else (1, 1, 1, -1)).expand(3, 1, -1, -1)
-    margin = length // 2
-    around = (0, 0, margin, margin) if axis == 2 else (margin, margin, 0, 0)
-    return conv2d(pad(pictures, around, mode="reflect"), weights, groups=3)

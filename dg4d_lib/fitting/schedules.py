@@ -1,4 +1,4 @@
-"""How rates and sizes change while an optimization runs."""
+"""Schedules of learning rates and resolutions."""
 
 import math
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ from dg4d_lib.settings import ResolutionStage
 
 
 def log_linear(start: float, end: float, progress: float) -> float:
-    """From `start` to `end` in equal ratios; progress in [0, 1]."""
+    """Interpolate between `start` and `end` in equal ratios; progress in [0, 1]."""
     return math.exp(math.log(start) * (1 - progress) + math.log(end) * progress)
 
 

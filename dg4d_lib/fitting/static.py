@@ -52,7 +52,7 @@ class _Cloud:
             if state is not None:
                 for key in ("exp_avg", "exp_avg_sq"):
                     momentum = state[key][grown.source]
-                    momentum[grown.fresh] = 0
+                    momentum[grown.is_new] = 0
                     state[key] = momentum
                 self.adam.state[fresh] = state
             group["params"] = [fresh]

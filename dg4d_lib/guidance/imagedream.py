@@ -23,9 +23,16 @@ from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.devices import to_device_async
 from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.diffusion.clip_images import clip_pixels
-from dg4d_lib.diffusion.latents import LATENT_CHANNELS, LATENT_SIZE, encode_images
+from dg4d_lib.diffusion.latents import LATENT_CHANNELS, LATENT_SIZE, at_least_float32, decode_images, encode_images
 from dg4d_lib.diffusion.noise_schedule import SCHEDULE, ddim_step, ddim_timesteps, require_schedule
-from dg4d_lib.diffusion.parts import TRANSFORMERS_FILES, Placement, dtype_on, load_part, load_vae, weights_file
+from dg4d_lib.diffusion.parts import (
+    TRANSFORMERS_FILES,
+    Placement,
+    dtype_on,
+    load_part,
+    load_vae,
+    weights_file,
+)
 from dg4d_lib.diffusion.published import load_network
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.guidance.distillation import Annealing, distill_in_pieces
@@ -149,8 +156,8 @@ class ImageDream:
         for timestep, following in pairwise((*ddim_timesteps(steps), 0)):
             noise = self.predict_noise(latents, timestep, [cameras], condition, guidance)
             latents = ddim_step(latents, noise, timestep, following)
-        pictures = self.vae.decode(latents[0].to(self.vae.dtype) / self.vae.config.scaling_factor).sample
-        return (_wide(pictures) / 2 + 0.5).clamp(0, 1).permute(0, 2, 3, 1)
+        unscaled = latents[0].to(self.vae.dtype) / self.vae.config.scaling_factor
+        return decode_images(self.vae, unscaled, at_least_float32(self.vae.dtype))
 
     @torch.no_grad()
     def predict_noise(
@@ -283,8 +290,3 @@ def _is_ring(views: Sequence[View]) -> bool:
     turns = [(view.camera.azimuth_deg - first.camera.azimuth_deg) % 360 for view in views]
     even = all(math.isclose(turn, 360 / RING * i, abs_tol=1e-3) for i, turn in enumerate(turns))
     return len(views) == RING and same and even
-
-
-def _wide(tensor: Tensor) -> Tensor:
-    """In float32, unless it is wider."""
-    return tensor.to(torch.promote_types(tensor.dtype, torch.float32))

@@ -1,6 +1,6 @@
-"""Loss curves and pictures that both fitting steps write."""
+"""Loss curves and pictures that both fits report."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -11,21 +11,27 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer.interface import Rasterizer
 from steps.artifacts.media import write_curves
+from steps.runtime.job import Progress
 
 PICTURE_AZIMUTHS_DEG = (0.0, 45.0, 90.0, 180.0, -90.0, -45.0)
 PICTURE_SIZE = 192  # pixels
 
 
-class Curves:
-    """Losses of a fit: collected, handed on as progress, and written."""
+class LossCurves:
+    """Values that an optimization reports, passed on as progress and written as an artifact.
 
-    def __init__(self, total: int, progress: Callable[[int, int, dict[str, float]], None]) -> None:
+    Args:
+        total: number of iterations.
+        progress: callback of the job.
+    """
+
+    def __init__(self, total: int, progress: Progress) -> None:
         self.total, self.progress = total, progress
         self.iterations: list[int] = []
         self.series: dict[str, list[float]] = {}
 
     def add(self, iteration: int, values: dict[str, float]) -> None:
-        """Add the losses of one iteration."""
+        """Record the values of an iteration."""
         self.iterations.append(iteration)
         for name, value in values.items():
             self.series.setdefault(name, []).append(value)
@@ -36,8 +42,8 @@ class Curves:
         write_curves(path, title, self.iterations, self.series, notes)
 
 
-def picture_of(gaussians: Gaussians, rasterize: Rasterizer) -> Float[Tensor, "h w 3"]:
-    """Draw the cloud from six sides in a row, over white."""
+def render_turnaround(gaussians: Gaussians, rasterize: Rasterizer) -> Float[Tensor, "h w 3"]:
+    """Render the cloud from six sides in a row, over white."""
     return pictures_in_a_row(
         gaussians,
         [OrbitCamera(0, azimuth, width=PICTURE_SIZE, height=PICTURE_SIZE) for azimuth in PICTURE_AZIMUTHS_DEG],
@@ -48,6 +54,6 @@ def picture_of(gaussians: Gaussians, rasterize: Rasterizer) -> Float[Tensor, "h 
 def pictures_in_a_row(
     gaussians: Gaussians, cameras: Sequence[OrbitCamera], rasterize: Rasterizer
 ) -> Float[Tensor, "h w 3"]:
-    """Draw one state from several cameras, or one state per camera, over white."""
+    """Render one state from several cameras, or one state per camera, over white."""
     with torch.no_grad():
         return torch.cat(list(rasterize(gaussians, cameras, torch.ones(3)).color), 1).cpu()

@@ -10,10 +10,12 @@ A step is a process group of its own, as it is when it is begun by `python -m st
 with its parent, which is this process.
 
 The standard library's forkserver imports the program's main module in every child, which is Prefect's engine in a
-worker (2.5 s), and its children outlive a client that is killed.
+worker (2.5 s), and its children outlive a client that is killed. A step whose code cannot be imported prints the
+traceback to its own standard error.
 """
 
 import argparse
+import functools
 import gc
 import importlib
 import json
@@ -23,10 +25,9 @@ import signal
 import socket
 import sys
 import tempfile
-from collections.abc import Iterator
+import traceback
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-
-from steps import main as step
 
 ORDER_BYTES = 2**16
 ORDER_HANDLES = 16
@@ -34,35 +35,56 @@ ANSWER_BYTES = 32
 
 
 def main() -> int:
-    """Serve until the socket is closed; in a fork, do the step, and return its exit status."""
-    parser = argparse.ArgumentParser(prog="python -m steps.runtime.fork_server", description="Begin steps.")
-    parser.add_argument("socket", type=int, help="file descriptor of a socket that the program holds the other end of")
+    """Serve until the socket is closed; in a fork, perform the step and return its exit status."""
+    parser = argparse.ArgumentParser(prog="python -m steps.runtime.fork_server", description="Fork steps.")
+    parser.add_argument("socket", type=int, help="file descriptor of a socket whose other end the program holds")
     control = socket.socket(fileno=parser.parse_args().socket)
     control.set_inheritable(False)
-    step.prepare_process()
-    arguments = _serve(control, _wanted())
+    program = _load_program()
+    arguments = _serve(control, _late_imports())
     if arguments is None:
         return 0
-    status = step.main(arguments)
+    status = program(arguments)
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
-    os._exit(status)  # nothing is left to tidy, and to take apart what was imported takes up to a second
+    os._exit(status)  # freeing imported modules would take up to a second
 
 
-def _wanted() -> Iterator[str]:
-    """What steps would wait for, in the order in which they come to it: modules, and functions to call."""
-    for spec in step.catalog().values():
-        yield spec.entry.partition(":")[0]
-        yield from spec.late_imports
+def _load_program() -> Callable[[list[str]], int]:
+    """Import the program that performs steps; if that fails, return one that prints the traceback.
+
+    This process has no standard error that anybody reads, but every fork has.
+    """
+    try:
+        from steps.runtime import process_setup, program  # noqa: PLC0415 - errors must be caught
+
+        process_setup.prepare_process()
+    except Exception:
+        return functools.partial(_fail, traceback.format_exc())
+    return program.main
 
 
-def _serve(control: socket.socket, wanted: Iterator[str]) -> list[str] | None:
-    """Import what is wanted, and fork for every order; the first steps need not wait for what only later ones import.
+def _fail(reason: str, arguments: list[str]) -> int:
+    sys.stderr.write(reason)
+    return 1
+
+
+def _late_imports() -> Iterator[str]:
+    """Yield modules, and functions to call, that steps need, in the order of the steps."""
+    with suppress(Exception):  # the step will raise it again
+        from steps.runtime.installed_code import catalog  # noqa: PLC0415 - errors must be caught
+
+        for spec in catalog().values():
+            yield from (spec.entry.partition(":")[0], *spec.late_imports)
+
+
+def _serve(control: socket.socket, modules: Iterator[str]) -> list[str] | None:
+    """Import modules between orders and fork for every order, so that first steps do not wait for later ones' imports.
 
     Returns:
-        Arguments of a step in a fork; nothing here, when there will be no more orders.
+        Arguments of the step in a fork; None in this process, when there will be no more orders.
     """
-    coming = next(wanted, None)
+    coming = next(modules, None)
     running: dict[int, socket.socket] = {}
     ended, signaled = socket.socketpair()
     for end in (ended, signaled):
@@ -75,9 +97,9 @@ def _serve(control: socket.socket, wanted: Iterator[str]) -> list[str] | None:
         while True:
             ready = [key.fileobj for key, _ in events.select(0 if coming else None)]
             if coming and not ready:
-                with suppress(Exception):  # the step will say what is wrong
-                    _have(coming)
-                coming = next(wanted, None)
+                with suppress(Exception):  # the step will raise it again
+                    _preload(coming)
+                coming = next(modules, None)
             if ended in ready:
                 with suppress(BlockingIOError):
                     ended.recv(ORDER_BYTES)
@@ -100,8 +122,8 @@ def _serve(control: socket.socket, wanted: Iterator[str]) -> list[str] | None:
                 _answer(running[pid], pid)
 
 
-def _have(entry: str) -> None:
-    """Import a module; call a function of it, if one is named."""
+def _preload(entry: str) -> None:
+    """Import `module`, or import it and call its function for `module:function`."""
     module, _, function = entry.partition(":")
     loaded = importlib.import_module(module)
     if function:

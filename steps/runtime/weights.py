@@ -23,8 +23,8 @@ class Opened:
 
     Attributes:
         folder: where they lie.
-        digests: of every file, for `Facts.weights`.
-        licenses: for `Facts.licenses`.
+        digests: of every file, for `StepReport.weights`.
+        licenses: for `StepReport.licenses`.
     """
 
     folder: Path

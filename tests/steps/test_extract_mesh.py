@@ -106,7 +106,7 @@ def test_the_notes_say_what_kind_of_surface_it_is(tracked: tuple[Path, StepRepor
 
 
 def test_the_frame_whose_surface_it_is_stays_with_the_mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plan_mesh, "best_rest", lambda *arguments: (2, 1.0))
+    monkeypatch.setattr(plan_mesh, "select_reference_frame", lambda *arguments: (2, 1.0))
     extract(tmp_path, ball())
     asset = read_tracked(tmp_path / "tracked")
     assert asset.rest == 2
@@ -131,7 +131,7 @@ def test_the_same_job_gives_the_same_bytes(tracked: tuple[Path, StepReport], tmp
 def test_the_plan_says_what_is_extracted_and_from_which_frame(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str, followed: float, expected: tuple[str, int]
 ) -> None:
-    monkeypatch.setattr(plan_mesh, "best_rest", lambda *given: (1, followed))
+    monkeypatch.setattr(plan_mesh, "select_reference_frame", lambda *given: (1, followed))
     job, facts = extract(tmp_path, ball(), MESH.model_copy(update={"mode": mode}))
     plan = read_plan(tmp_path / "plan")
     assert (plan.mode, plan.reference_frame) == expected

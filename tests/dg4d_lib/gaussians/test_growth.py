@@ -19,13 +19,13 @@ def grown(scales: list[float], pull: list[float], room: int = 100):
 def test_nothing_grows_without_a_pull():
     result = grown([0.01, 0.1], [0.0, 0.01])
     assert result.source.tolist() == [0, 1]
-    assert not result.fresh.any()
+    assert not result.is_new.any()
 
 
 def test_small_gaussians_are_cloned_in_place():
     result = grown([0.01, 0.01], [1.0, 0.0])
     assert result.source.tolist() == [0, 1, 0]
-    assert result.fresh.tolist() == [False, False, True]
+    assert result.is_new.tolist() == [False, False, True]
     torch.testing.assert_close(result.gaussians.means[2], result.gaussians.means[0])
 
 

@@ -135,7 +135,7 @@ def test_pictures_are_denoised_as_the_ddim_scheduler_does_it(
     latents = scheduler.add_noise(scale * encode_images(prior.vae, video().float()), noise, timesteps[:1])
     tokens = prior.tokens([View(camera, frame) for frame, camera in enumerate(CAMERAS)])
     for timestep in timesteps:
-        believed = prior.believed_noise(latents, int(timestep), prior.latents, tokens)
+        believed = prior.predict_noise(latents, int(timestep), prior.latents, tokens)
         latents = scheduler.step(believed, timestep, latents).prev_sample
     decoded = (zero123.vae.decode(latents / scale).sample / 2 + 0.5).clamp(0, 1)
     expected = interpolate(decoded, (SIDE, SIDE), mode="bilinear", antialias=True).movedim(1, -1)

@@ -10,12 +10,10 @@ from steps.store.artifact_store import ArtifactStore
 from steps.store.files import home
 
 PATIENCE_S = 120.0  # a request that gets no answer is repeated for so long
-ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
-LOOPBACK = {"localhost", "127.0.0.1", "::1"}
 
 
 def open_store(address: str | Path | None = None, patience_s: float | None = None) -> ArtifactStore:
-    """The store at an address: a folder, or `s3://BUCKET/PREFIX` with the usual AWS_* variables.
+    """Open the store at an address: a folder, or `s3://BUCKET/PREFIX` with the usual AWS_* variables.
 
     Args:
         address: default: `$DG4D_STORE`, else the folder `store` under the home folder.
@@ -31,7 +29,7 @@ def open_store(address: str | Path | None = None, patience_s: float | None = Non
 
 @functools.cache
 def _opened(given: str, copies: Path, patience_s: float) -> ArtifactStore:
-    """One store of a kind in a process: it keeps connections, and remembers which files are sound."""
+    """Open a store once per process: it keeps connections, and remembers which files are sound."""
     if "://" not in given:
         return ArtifactStore(Path(given).expanduser())
     parts = urlsplit(given)
