@@ -41,9 +41,10 @@ from flows.packages.publish import whole
 from steps.artifacts.media import read_frames, read_png
 from steps.artifacts.packages import SUBJECT, read_manifest
 from steps.artifacts.rendering import read_states, read_surface, states_between
-from steps.artifacts.store import ArtifactStore, home
 from steps.check_asset import Parts, gather
 from steps.contract import ArtifactRef
+from steps.store.artifact_store import ArtifactStore
+from steps.store.files import home
 
 FRAMES, SIZE, FPS = 12, 256, 12.0  # of our own shapes
 SOLID = 3.0  # logit of the opacity of their splats

@@ -25,10 +25,12 @@ from benchmarks.measure import machine, new_console, parser_of, write_rows
 from flows.inputs.orders import Wish
 from flows.packages.publish import RECORD, whole
 from flows.serving.server import Server
-from steps.artifacts.store import ArtifactStore
 from steps.contract import StepFailure, StepRequest
-from steps.main import catalog, perform, prepare_process, request_version
 from steps.profiles import profile
+from steps.runtime.installed_code import catalog, request_version
+from steps.runtime.perform import perform
+from steps.runtime.process import prepare_process
+from steps.store.artifact_store import ArtifactStore
 
 WAYS = ("steps", "first", "next")
 

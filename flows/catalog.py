@@ -23,7 +23,7 @@ from flows.inputs.orders import Order
 from flows.packages.summary import Row, Tally, judged
 from flows.ui import pages
 from flows.ui.escaping import markdown
-from steps.artifacts.store import ArtifactMissing, StoreUnreachable
+from steps.store.artifact_store import ArtifactMissing, StoreUnreachable
 
 Make = Callable[[Order, Path], tuple[Any, bool]]
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from dg4d_lib.errors import BadInput
 from flows.serving.server import SETTINGS, Server
-from steps.artifacts.opening import open_store
-from steps.artifacts.store import ArtifactStore, home
+from steps.store.artifact_store import ArtifactStore
+from steps.store.files import home
+from steps.store.opening import open_store
 
 OTHERS = 0o077  # permissions of group and others
 CLIENT_SETTINGS = {

@@ -25,7 +25,7 @@ from steps.artifacts.packages import ASSET, COMPACT, MANIFEST, MESHES, read_mani
 from steps.artifacts.packages import SPLATS as SPLATS_FOLDER
 from steps.artifacts.rendering import BATCH, States, Surface, drawn_mesh, mesh_at, read_states, read_surface
 from steps.profiles import CheckAssetSettings
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 
 SIZE = 128  # pixels of the pictures; the bounds of the gates belong to it
 MOST_FRAMES = 32  # of the video, evenly spread
@@ -51,7 +51,7 @@ class Parts:
     frames: int
 
 
-def run(job: Job) -> Facts:
+def run(job: Job) -> StepReport:
     """Write the gates as JSON, and a picture of the worst moments beside the video's.
 
     Raises:
@@ -69,7 +69,7 @@ def run(job: Job) -> Facts:
     write_png(job.outputs["picture"], picture(evidence, (_spread(len(video), MOST_FRAMES) / video.fps).tolist()))
     failing = [gate.name for gate in gates if not gate.passed]
     notes = (f"Not accepted: {', '.join(failing)}. The report says what to do.",) if failing else ()
-    return Facts(backend=f"{settings.rasterizer} rasterizer", notes=notes)
+    return StepReport(backend=f"{settings.rasterizer} rasterizer", notes=notes)
 
 
 def read_parts(package: Path, folder: Path) -> Parts:

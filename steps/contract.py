@@ -1,4 +1,4 @@
-"""What crosses the boundary of a step: references, requests, results, records. Plain JSON; imports no torch."""
+"""Contract of a step: references, requests, results, records and exit statuses. Plain JSON; imports no torch."""
 
 import hashlib
 import json
@@ -8,12 +8,26 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 CONTRACT_VERSION = 1
-LARGEST_SEED = 2**63 - 1  # what every generator takes
+LARGEST_SEED = 2**63 - 1  # torch's generators take no larger one
+
+FailureKind = Literal["bad_input", "missing", "lost", "unreachable", "diverged", "out_of_memory", "crashed"]
 
 EXIT_DONE = 0
-EXIT_BAD_INPUT = 65  # the same again will fail again
-EXIT_MISSING = 69  # something needed is not here
+EXIT_CRASHED = 1
+EXIT_BAD_INPUT = 65  # the same request will fail again
+EXIT_MISSING = 69
+EXIT_DIVERGED = 70
+EXIT_UNREACHABLE = 75
 EXIT_OUT_OF_MEMORY = 137
+EXIT_STATUS: dict[FailureKind, int] = {
+    "bad_input": EXIT_BAD_INPUT,
+    "missing": EXIT_MISSING,
+    "lost": EXIT_MISSING,
+    "unreachable": EXIT_UNREACHABLE,
+    "diverged": EXIT_DIVERGED,
+    "out_of_memory": EXIT_OUT_OF_MEMORY,
+    "crashed": EXIT_CRASHED,
+}
 
 RUN_ONLY = frozenset(  # fields of a record that are no part of its digest
     ["started", "duration_s", "cpu_s", "peak_memory_mb", "flops", "run_notes", "machine"]
@@ -23,7 +37,7 @@ Digest = Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")]
 
 
 class Frozen(BaseModel):
-    """Frozen and closed."""
+    """Base of immutable models that refuse unknown fields."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -81,14 +95,14 @@ class StepRequest(Frozen):
     weights: dict[str, Digest] = Field({}, description="identity of the weights that the settings name, by name")
 
     def digest(self) -> str:
-        """sha256 of the canonical JSON; names of files and order of keys do not matter."""
+        """Return the SHA-256 of the canonical JSON; names of files and the order of keys do not matter."""
         return digest_of({"contract": CONTRACT_VERSION, **self.model_dump(mode="json")})
 
 
 class ProvenanceRecord(Frozen):
-    """Enough to make the outputs again, and to say why they differ.
+    """Record of a run: enough to make the outputs again, and to explain differences.
 
-    The fields in `RUN_ONLY` are facts about one run, which machines with less memory or speed do in another way.
+    The fields in `RUN_ONLY` belong to one run and differ between machines.
     """
 
     step: str
@@ -111,36 +125,36 @@ class ProvenanceRecord(Frozen):
     machine: dict[str, str] = Field({}, description="what computed it (steps/runtime/environment_info.py)")
 
     def digest(self) -> str:
-        """sha256 of the record without what belongs to one run only."""
+        """Return the SHA-256 of the record without the fields in `RUN_ONLY`."""
         return digest_of(self.model_dump(mode="json", exclude=set(RUN_ONLY)))
 
 
 class StepResult(Frozen):
-    """Where the outputs are, and the record."""
+    """References to the outputs, and the record of the run."""
 
     outputs: dict[str, ArtifactRef]
     provenance: ProvenanceRecord
 
 
 class StepFailure(Frozen):
-    """Why a step did not finish; written where the result would be."""
+    """Reason why a step did not finish; written in place of the result."""
 
     step: str
-    kind: Literal["bad_input", "missing", "lost", "unreachable", "diverged", "out_of_memory", "crashed"]
+    kind: FailureKind
     message: str
     pictures: dict[str, ArtifactRef] = {}
 
 
 def canonical(value: Any) -> str:
-    """JSON with sorted keys and no spaces; refuses what JSON does not know, and numbers that are not finite."""
+    """Return JSON with sorted keys and no spaces; refuse unknown types and numbers that are not finite."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
 def digest_of(value: Any) -> str:
-    """The name of a JSON value by its content."""
+    """Return the SHA-256 digest of the canonical JSON of a value."""
     return "sha256:" + hashlib.sha256(canonical(value).encode()).hexdigest()
 
 
 def is_digest(text: str) -> bool:
-    """Whether this is a full sha256 name."""
+    """Return True for a full SHA-256 digest."""
     return re.fullmatch(r"sha256:[0-9a-f]{64}", text) is not None

@@ -7,11 +7,11 @@ from dg4d_lib.diffusion.text_to_image import draw_picture
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import TextSettings
 from steps.artifacts.media import write_png
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 from steps.runtime.weights import open_weights
 
 
-def run(job: Job) -> Facts:
+def run(job: Job) -> StepReport:
     """Draw the words in `text`.
 
     Raises:
@@ -34,4 +34,6 @@ def run(job: Job) -> Facts:
     )
     write_png(job.outputs["picture"], picture)
     note = f"The picture was drawn by a model ({settings.weights}) from the words: {words}{settings.suffix}"
-    return Facts(backend=f"{device.type} (diffusers)", weights=opened.digests, licenses=opened.licenses, notes=(note,))
+    return StepReport(
+        backend=f"{device.type} (diffusers)", weights=opened.digests, licenses=opened.licenses, notes=(note,)
+    )

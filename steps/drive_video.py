@@ -24,7 +24,7 @@ from dg4d_lib.video.svd import StableVideo
 from dg4d_lib.video.warp import Warp, candidate
 from steps.artifacts.media import read_frames, read_png, write_frames, write_png, write_zip
 from steps.profiles import DriveVideoSettings
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 from steps.runtime.weights import open_weights
 
 TILE, COLUMNS = 160, 7  # pixels and moments of the sheets
@@ -42,7 +42,7 @@ class _Motion:
     notes: tuple[str, ...]
 
 
-def run(job: Job) -> Facts:
+def run(job: Job) -> StepReport:
     """Hand the footage through, or make motions and take the one that was picked, else the best.
 
     Raises:
@@ -57,7 +57,7 @@ def run(job: Job) -> Facts:
     numbers = [driving.pick] if driving.pick else list(range(1, driving.candidates + 1))
     match driving:
         case WarpSettings():
-            motions, facts = list(_warps(driving, settings.turn_deg, subject, numbers)), Facts()
+            motions, facts = list(_warps(driving, settings.turn_deg, subject, numbers)), StepReport()
             origin = "a warp of the picture ({}), without a learned model"
         case SvdSettings():
             motions, facts = _stable_videos(driving, subject, numbers, job.seed)
@@ -69,7 +69,7 @@ def run(job: Job) -> Facts:
     return replace(facts, notes=(made_up, *verdict, *taken.notes, *facts.notes))
 
 
-def _follow(job: Job, subject: Float[Tensor, "h w 4"]) -> Facts:
+def _follow(job: Job, subject: Float[Tensor, "h w 4"]) -> StepReport:
     """The footage as it is, and what its score gives cause to say."""
     with TemporaryDirectory() as scratch:
         footage = read_frames(job.inputs["footage"], Path(scratch))
@@ -83,7 +83,7 @@ def _follow(job: Job, subject: Float[Tensor, "h w 4"]) -> Facts:
     found = score(footage, subject)
     why = "; ".join(found.remarks) or f"its score is low in {found.weakest}"
     note = f"The footage may be hard to follow (score {found.total:.2f} of 1): {why}."
-    return Facts(backend="none: the footage is used as it is", notes=(note,) if found.total < GOOD else ())
+    return StepReport(backend="none: the footage is used as it is", notes=(note,) if found.total < GOOD else ())
 
 
 def _warps(
@@ -98,7 +98,7 @@ def _warps(
 
 def _stable_videos(
     settings: SvdSettings, subject: Float[Tensor, "h w 4"], numbers: list[int], seed: int
-) -> tuple[list[_Motion], Facts]:
+) -> tuple[list[_Motion], StepReport]:
     """Candidate k of a seed is candidate 1 of the seed plus k - 1."""
     opened = open_weights(settings.model.weights)
     device = device_here()
@@ -106,7 +106,7 @@ def _stable_videos(
     seeds = [seed + number - 1 for number in numbers]
     videos = maker.generate_all(subject, [torch.Generator().manual_seed(each) for each in seeds])
     motions = [_Motion(*made, ()) for made in zip(numbers, (f"seed {each}" for each in seeds), videos, strict=True)]
-    return motions, Facts(
+    return motions, StepReport(
         f"{device.type} (diffusers)", opened.digests, opened.licenses, maker.notes, maker.model.notes()
     )
 

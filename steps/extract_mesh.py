@@ -32,13 +32,13 @@ from steps.artifacts.media import write_png
 from steps.artifacts.meshes import write_meshes, write_tracked
 from steps.artifacts.motions import read_motion
 from steps.profiles import ExtractMeshSettings
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 
 PICTURE_CAMERAS = [OrbitCamera(0, azimuth, width=256, height=256) for azimuth in (0.0, 75.0, 180.0, 285.0)]
 FPS_UNKNOWN = 1.0  # frames per second: motion has no clock; refine_texture, which sees the driving video, sets it
 
 
-def run(job: Job) -> Facts:
+def run(job: Job) -> StepReport:
     """Extract; the level of the surface is the one that agrees best with the outlines of the Gaussians at rest.
 
     Raises:
@@ -57,7 +57,7 @@ def run(job: Job) -> Facts:
     if settings.mesh.mode == "auto" and followed < FOLLOWS:
         write_png(job.outputs["picture"], _picture_of_splats(rest, rasterize))
         note = f"one mesh does not follow this motion ({followed:.1%} IoU on trial): every frame gets its own"
-        return Facts(backend=f"{settings.rasterizer} rasterizer", notes=(note,))
+        return StepReport(backend=f"{settings.rasterizer} rasterizer", notes=(note,))
     level, agreement = best_level(density_field(rest, settings.mesh), rest, rasterize, settings.mesh.density_threshold)
     notes = [f"surface at density {level:.3g}; its outlines agree with the Gaussians' to {agreement:.1%} (IoU)"]
 
@@ -87,7 +87,7 @@ def run(job: Job) -> Facts:
         notes += _soundness(meshes)
         picture = _picture(meshes[settings.first_frame])
     write_png(job.outputs["picture"], picture)
-    return Facts(backend=f"{settings.rasterizer} rasterizer, pymeshlab, xatlas", notes=tuple(notes))
+    return StepReport(backend=f"{settings.rasterizer} rasterizer, pymeshlab, xatlas", notes=tuple(notes))
 
 
 def textured(gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings) -> TexturedMesh:

@@ -1,4 +1,4 @@
-"""From static Gaussians and a driving video to a deformation."""
+"""Step that fits a deformation of static Gaussians to a driving video."""
 
 from dataclasses import replace
 
@@ -11,18 +11,18 @@ from dg4d_lib.gaussians.ply import read_ply, write_ply
 from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
 from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.motions import new_deformation, write_motion
-from steps.fit_gaussians import PICTURE_SIZE, Curves, picture_of
 from steps.fitting.priors import make_prior
+from steps.fitting.reporting import PICTURE_SIZE, LossCurves, render_turnaround
 from steps.profiles import FitMotionSettings
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 
 FINE_TUNED = "The Gaussians at rest were fitted to the whole video together with their motion."
 PICTURE_FRAMES = 6
 PICTURE_AZIMUTHS_DEG = (0.0, 90.0)
 
 
-def run(job: Job) -> Facts:
-    """Fit, and show six moments from the front and from the side; `gaussians` come out where they were fine-tuned."""
+def run(job: Job) -> StepReport:
+    """Fit the deformation, with `fine_tune` also the Gaussians; render six timestamps from front and side."""
     settings: FitMotionSettings = job.settings
     gaussians = read_ply(job.inputs["gaussians"])
     video = read_frames(job.inputs["driving_video"], job.pictures)
@@ -34,13 +34,13 @@ def run(job: Job) -> Facts:
     deformation = new_deformation(settings.deformation, gaussians, len(video), generator)
     device = device_of(settings.rasterizer)
     deformation.to(device)
-    curves = Curves(settings.motion.iterations, job.progress)
+    curves = LossCurves(settings.motion.iterations, job.progress)
     try:
         fitted = fit_motion(
             gaussians.to(device), deformation, video, chosen.prior, rasterize, settings.motion, generator, curves.add
         )
     except Diverged as error:
-        write_png(job.pictures / "last_good_state.png", picture_of(error.gaussians, rasterize))
+        write_png(job.pictures / "last_good_state.png", render_turnaround(error.gaussians, rasterize))
         raise
     deformation.cpu()
     gaussians = fitted.to(torch.device("cpu"))

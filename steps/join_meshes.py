@@ -4,10 +4,10 @@ import zipfile
 
 from dg4d_lib.errors import BadInput
 from steps.artifacts.media import write_zip
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 
 
-def run(job: Job) -> Facts:
+def run(job: Job) -> StepReport:
     """Write the entries of all parts in the order of their names; the order of the parts does not matter.
 
     Raises:
@@ -21,4 +21,4 @@ def run(job: Job) -> Facts:
                 if entries.setdefault(name, content) != content:
                     raise BadInput(f"Two parts have different entries {name}; extract the meshes again.")
     write_zip(job.outputs["meshes"], sorted(entries.items()))
-    return Facts()
+    return StepReport()

@@ -38,7 +38,7 @@ from steps.artifacts.meshes import read_meshes, read_tracked
 from steps.artifacts.motions import read_fit
 from steps.artifacts.packages import MANIFEST, Manifest
 from steps.profiles import PackAssetSettings
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 
 Surface = Asset4D | list[TexturedMesh]
 Notes = Sequence[str]
@@ -184,7 +184,7 @@ class Contents:
         return ()
 
 
-def run(job: Job) -> Facts:
+def run(job: Job) -> StepReport:
     """Write the package and the contact sheet.
 
     Raises:
@@ -227,7 +227,7 @@ def run(job: Job) -> Facts:
         text = json.dumps(manifest.model_dump(mode="json"), indent=2, ensure_ascii=False) + "\n"
         files = [(name, (contents.folder / name).read_bytes()) for name in names]
         write_zip(job.outputs["package"], [(MANIFEST, text.encode()), *files])
-    return Facts(backend=f"{contents.settings.rasterizer} rasterizer", notes=tuple(notes))
+    return StepReport(backend=f"{contents.settings.rasterizer} rasterizer", notes=tuple(notes))
 
 
 def _contents(job: Job, scratch: Path) -> Contents:

@@ -12,13 +12,13 @@ from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.framing import reframe, whole_frame
 from dg4d_lib.video.subject import prepare
 from steps.artifacts.media import write_frames, write_png
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 from steps.sources.reader import read_source
 
 TILE = 256  # pixels
 
 
-def run(job: Job) -> Facts:
+def run(job: Job) -> StepReport:
     """Decode `source`, cut out and frame the subject; `footage` is written when the source moves.
 
     Raises:
@@ -36,7 +36,7 @@ def run(job: Job) -> Facts:
         write_frames(job.outputs["footage"], footage)
     write_png(job.outputs["picture"], picture_of(source.frames[0], cutouts[0]))
     job.progress(3, 3, {})
-    return Facts(notes=(*source.notes, *notes))
+    return StepReport(notes=(*source.notes, *notes))
 
 
 def picture_of(source: Float[Tensor, "h w 4"], cutout: Float[Tensor, "s s 4"]) -> Float[Tensor, "t w3 3"]:

@@ -19,11 +19,11 @@ from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import frame_rate, read_frames
 from steps.artifacts.meshes import read_meshes, read_tracked, write_meshes, write_tracked
 from steps.profiles import RefineTextureSettings
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 from steps.runtime.weights import open_weights
 
 
-def run(job: Job) -> Facts:
+def run(job: Job) -> StepReport:
     """Refine the mesh that moves, or every frame's own; all frames are seen as one video.
 
     Raises:
@@ -31,7 +31,7 @@ def run(job: Job) -> Facts:
         BackendUnavailable: weights, or what loads them, are not here.
         FitDiverged: the loss left the finite numbers.
     """
-    facts = Facts()
+    facts = StepReport()
     fps = frame_rate(job.inputs["driving_video"])
     if "tracked" in job.inputs:
         asset = read_tracked(job.inputs["tracked"])
@@ -46,12 +46,12 @@ def run(job: Job) -> Facts:
     return facts
 
 
-def _refined(job: Job, stretches: Sequence[Stretch]) -> tuple[list[Refined], Facts]:
+def _refined(job: Job, stretches: Sequence[Stretch]) -> tuple[list[Refined], StepReport]:
     """The textures of a motion, and how they were made."""
     settings: RefineTextureSettings = job.settings
     kind = settings.refiner
     if isinstance(kind, IdentitySettings):
-        return [Refined(stretch.mesh.texture) for stretch in stretches], Facts()
+        return [Refined(stretch.mesh.texture) for stretch in stretches], StepReport()
     with TemporaryDirectory() as scratch:
         driving = read_frames(job.inputs["driving_video"], Path(scratch))
     device = device_here()
@@ -77,7 +77,7 @@ def _refined(job: Job, stretches: Sequence[Stretch]) -> tuple[list[Refined], Fac
     said = [f"Textures were refined {how}; {kind.texture.iterations} iterations, new targets {often}."]
     if any(its.frames is not None for its in refined):
         said.append("The texture changes from frame to frame: every frame adds colors of its own to the shared one.")
-    facts = Facts(f"{device.type} (diffusers)", opened.digests, opened.licenses, tuple(said), halved())
+    facts = StepReport(f"{device.type} (diffusers)", opened.digests, opened.licenses, tuple(said), halved())
     return [Refined(its.texture.cpu(), None if its.frames is None else its.frames.cpu()) for its in refined], facts
 
 

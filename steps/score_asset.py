@@ -34,7 +34,7 @@ from steps.artifacts.media import read_png, write_zip
 from steps.artifacts.packages import ASSET, MESHES, read_manifest
 from steps.artifacts.rendering import render_package
 from steps.profiles import ScoreAssetSettings
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 from steps.runtime.weights import open_weights
 
 COVERED = 0.5  # coverage from which a pixel belongs to the subject
@@ -85,7 +85,7 @@ class Judges:
     digests: dict[str, str] = field(default_factory=dict)
 
 
-def run(job: Job) -> Facts:
+def run(job: Job) -> StepReport:
     """Write the scores of the package, or of the naive guesses where there is none, and a film of every view.
 
     Raises:
@@ -112,7 +112,7 @@ def run(job: Job) -> Facts:
             judges.missing["fvd_consistent4d"] = shortage
         _write_films(job.outputs["films"], films, scratch)
     job.outputs["scores"].write_text(json.dumps(_rounded({**report, "missing": judges.missing}), allow_nan=False))
-    return Facts(backend=f"{settings.rasterizer} rasterizer", weights=judges.digests)
+    return StepReport(backend=f"{settings.rasterizer} rasterizer", weights=judges.digests)
 
 
 def open_judges(settings: ScoreSettings) -> Judges:

@@ -23,12 +23,13 @@ from flows.packages.scores import Results
 from flows.packages.summary import BAD_INPUT, Row, Tally
 from steps.artifacts.archives import unpack
 from steps.artifacts.ground_truth import Truth, find_truth, find_truths
-from steps.artifacts.store import ArtifactStore, room_for, write_atomically
 from steps.catalog import PACKAGE, TRUTH
 from steps.contract import ArtifactRef
 from steps.profiles import ScoreAssetSettings, profile, revise
 from steps.runtime.weights import without_paths
 from steps.sources.media_types import check_arrays, check_still
+from steps.store.artifact_store import ArtifactStore
+from steps.store.files import room_for, write_atomically
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from dg4d_lib.assets.scenes.scene import Item, Scene
 from dg4d_lib.errors import BadInput
 from flows.packages.publish import check_writable, record_of, whole
-from steps.artifacts.store import room_for
+from steps.store.files import room_for
 
 SUFFIXES = (".glb", ".usdz")
 

@@ -80,7 +80,8 @@ def _verdict(error: Exception) -> tuple[str, int]:
     from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
     from flows.engine.executors import StepBadInput, StepDiverged, StepError, StepMissing
     from flows.serving.server import ServerUnavailable
-    from steps.artifacts.store import NO_SPACE, ArtifactMissing
+    from steps.store.artifact_store import ArtifactMissing
+    from steps.store.files import NO_SPACE
 
     text = error.message if isinstance(error, StepError) else str(error)
     match error:
@@ -99,7 +100,7 @@ def _verdict(error: Exception) -> tuple[str, int]:
 
 
 def _saved_traceback(error: Exception) -> str:
-    from steps.artifacts.store import home
+    from steps.store.files import home
 
     path = home() / "last-error.txt"
     try:

@@ -15,8 +15,8 @@ from flows.inputs.orders import Order
 from flows.packages.credentials import Signer, configured
 from flows.packages.publish import Files, is_current, publish, record_of
 from flows.serving.server import ServerUnavailable
-from steps.artifacts.store import ArtifactMissing
-from steps.artifacts.store import home as store_home
+from steps.store.artifact_store import ArtifactMissing
+from steps.store.files import home as store_home
 
 if TYPE_CHECKING:
     from flows.engine.tasks import Made

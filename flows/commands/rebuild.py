@@ -15,9 +15,9 @@ from flows.inputs.orders import Order
 from flows.packages.credentials import configured
 from flows.packages.publish import Files, fact_of, unpacked
 from steps.artifacts.artifact_diff import TOLERANCE, difference
-from steps.artifacts.store import ArtifactMissing
 from steps.contract import ArtifactRef, Frozen, StepResult
-from steps.main import catalog
+from steps.runtime.installed_code import catalog
+from steps.store.artifact_store import ArtifactMissing
 
 Outcome = Literal["identical", "within tolerance", "different", "not compared"]
 

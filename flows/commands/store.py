@@ -11,7 +11,7 @@ from flows.commands.options import finite
 
 if TYPE_CHECKING:
     from flows.packages.versions import Version
-    from steps.artifacts.store import ArtifactStore
+    from steps.store.artifact_store import ArtifactStore
 
 LEAST_DIGITS = 6  # of a digest, to be taken for one
 SHOWN_DIGITS = 12

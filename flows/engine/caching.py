@@ -20,9 +20,9 @@ from prefect.cache_policies import CachePolicy
 from prefect.context import TaskRunContext
 from pydantic import ValidationError
 
-from steps.artifacts.opening import open_store
-from steps.artifacts.store import ArtifactStore, StoreUnreachable
 from steps.contract import StepRequest, StepResult
+from steps.store.artifact_store import ArtifactStore, StoreUnreachable
+from steps.store.opening import open_store
 
 POLL_S = 0.1  # between two looks at a lock that another process holds
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from flows.engine import leases
 from flows.packages.versions import Version, versions
-from steps.artifacts.store import ArtifactStore, Entry
+from steps.store.artifact_store import ArtifactStore, Entry
 
 GRACE_S = 24 * 3600.0  # what is younger, or was young when the oldest run began, may be needed by somebody
 BATCH = 500  # artifacts that are removed before a sign of life

@@ -19,10 +19,10 @@ from urllib.parse import urlsplit
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.weights.locate import find_weights
 from flows.engine.resources import Resource, environment, resource_of
-from steps.artifacts.opening import ENDPOINTS, LOOPBACK
-from steps.artifacts.store import home
 from steps.contract import StepRequest
 from steps.runtime.weights import weights_home
+from steps.store.endpoints import ENDPOINTS, LOOPBACK
+from steps.store.files import home
 
 ENGINES = ("docker", "podman")
 IMAGES = {  # for steps that use a resource: which variable names the image, and what deploy/containers.sh calls it

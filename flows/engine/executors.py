@@ -23,9 +23,9 @@ from flows.engine import forks, resources
 from flows.engine.containers import container
 from flows.engine.processes import locked, without_prefect
 from flows.home import store
-from steps.artifacts.store import home, remove_tree
 from steps.contract import (
     EXIT_BAD_INPUT,
+    EXIT_DIVERGED,
     EXIT_MISSING,
     EXIT_OUT_OF_MEMORY,
     ArtifactRef,
@@ -34,8 +34,10 @@ from steps.contract import (
     StepResult,
     StepSpec,
 )
-from steps.main import EXIT_DIVERGED, notes_to, perform
 from steps.runtime.job import Progress
+from steps.runtime.messages import notes_to
+from steps.runtime.perform import perform
+from steps.store.files import home, remove_tree
 
 Say = Callable[[str], None]
 Execute = Callable[[StepSpec, StepRequest, Progress, Say], StepResult]

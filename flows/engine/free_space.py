@@ -3,7 +3,7 @@
 import shutil
 from pathlib import Path
 
-from steps.artifacts.store import DiskFull
+from steps.store.files import DiskFull
 
 NEEDED_BYTES = 64 * 2**20  # a database, its journal, logs and the records of a run
 

@@ -17,8 +17,8 @@ from pydantic import ValidationError
 
 from dg4d_lib.errors import BadInput
 from flows.engine.processes import OWN_START, place, start_of
-from steps.artifacts.store import ArtifactStore, Entry
 from steps.contract import Digest, Frozen
+from steps.store.artifact_store import ArtifactStore, Entry
 
 FOLDER = "running"
 LOCK = "collecting/lock.json"

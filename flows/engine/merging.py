@@ -2,8 +2,8 @@
 
 import zipfile
 
-from steps.artifacts.store import ArtifactStore
 from steps.contract import ArtifactRef
+from steps.store.artifact_store import ArtifactStore
 
 EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a zip can hold: equal entries give equal bytes
 

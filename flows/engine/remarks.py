@@ -8,8 +8,9 @@ from pathlib import Path
 
 from flows import home
 from flows.engine.events import StepEvent, tell
-from steps.artifacts.store import ArtifactMissing, DiskFull, StoreUnreachable
 from steps.contract import ArtifactRef, StepResult
+from steps.store.artifact_store import ArtifactMissing, StoreUnreachable
+from steps.store.files import DiskFull
 
 REMARKED = "prepare_subject"  # cuts subjects out, which may be a guess
 NAME_LENGTH = 80  # characters of an item in the name of a picture

@@ -18,9 +18,9 @@ from typing import Literal, NamedTuple
 from dg4d_lib.errors import BadInput
 from dg4d_lib.rasterizer.choice import CUDA, cuda_devices
 from flows.engine.turns import first_ahead, ticket
-from steps.artifacts.store import home
 from steps.contract import StepRequest
-from steps.main import catalog
+from steps.runtime.installed_code import catalog
+from steps.store.files import home
 
 Resource = Literal["cpu", "gpu"]
 

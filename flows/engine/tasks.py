@@ -37,10 +37,10 @@ from flows.ui import pages
 from flows.ui.curves import amount
 from flows.ui.escaping import markdown
 from flows.ui.showing import Beside, later, revive, show
-from steps.artifacts.store import StoreUnreachable
 from steps.contract import ArtifactRef, StepRequest, StepResult
-from steps.main import catalog, request_version
+from steps.runtime.installed_code import catalog, request_version
 from steps.runtime.weights import identities, weights_in
+from steps.store.artifact_store import StoreUnreachable
 
 STOPS = (KeyboardInterrupt, TerminationSignal)  # how a user stops a flow
 PROGRESS_PAGE_EVERY_S = 3.0

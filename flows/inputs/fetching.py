@@ -17,8 +17,8 @@ from urllib.parse import SplitResult, quote, unquote, urljoin, urlsplit
 from dg4d_lib.errors import BadInput
 from flows.inputs import hosts, listing
 from flows.inputs.sources import LARGEST_FILE_BYTES
-from steps.artifacts.store import NO_SPACE, room_for
 from steps.sources.media_types import SNIFFED_BYTES, check_head
+from steps.store.files import NO_SPACE, room_for
 
 ANSWER_S = 60.0  # for a web server to connect, and each time it is asked for more
 FETCH_S = 600.0  # for a whole file, with every redirect

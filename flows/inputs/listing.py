@@ -11,10 +11,10 @@ from dg4d_lib.errors import BadInput
 from flows.inputs import sources
 from flows.packages.publish import record_of
 from steps.artifacts.archives import stays_inside
-from steps.artifacts.opening import open_store
+from steps.store.opening import open_store
 
 if TYPE_CHECKING:
-    from steps.artifacts.bucket import BucketStore
+    from steps.store.bucket import BucketStore
 
 WANTED = sources.PICTURES | sources.VIDEOS
 WILD = frozenset("*?[")

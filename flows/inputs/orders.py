@@ -12,11 +12,11 @@ from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.rasterizer.choice import backend_name, require_backend
 from flows.inputs import naming, sources
 from flows.packages.credentials import certificate
-from steps.artifacts.store import ArtifactStore
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen, digest_of
-from steps.main import catalog, request_version
 from steps.profiles import PipelineSettings
+from steps.runtime.installed_code import catalog, request_version
 from steps.runtime.weights import identities, license_of, open_weights, weights_in, without_paths
+from steps.store.artifact_store import ArtifactStore
 
 LONGEST_NAME = 60  # characters of a name made out of words
 NAMES = {"item", "profile", "source_name", "picture_name"}  # of an order: for people, no part of its digest

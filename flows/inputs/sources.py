@@ -6,11 +6,12 @@ from pathlib import Path
 
 from dg4d_lib.errors import BadInput
 from flows.engine.merging import add
-from steps.artifacts.store import ArtifactStore, room_for
 from steps.catalog import BANK, SOURCE, TEXT
 from steps.contract import ArtifactRef
 from steps.sources.banks import BANK_JSON, check_sheet, read_index
 from steps.sources.media_types import PICTURE_SUFFIXES, check_media, check_still
+from steps.store.artifact_store import ArtifactStore
+from steps.store.files import room_for
 
 PICTURES = frozenset(PICTURE_SUFFIXES)
 VIDEOS = frozenset([".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif"])

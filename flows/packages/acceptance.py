@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from steps.artifacts.store import ArtifactStore
 from steps.contract import StepResult
+from steps.store.artifact_store import ArtifactStore
 
 GATES, PICTURE = "gates", "picture"  # outputs of check_asset
 

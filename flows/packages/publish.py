@@ -13,7 +13,7 @@ from dg4d_lib.errors import BadInput
 from flows.inputs.json_text import loads
 from flows.inputs.naming import check_folder_name
 from steps.artifacts.archives import can_exist, stays_inside, unpack
-from steps.artifacts.store import remove_tree, room_for
+from steps.store.files import remove_tree, room_for
 
 RECORD = "provenance.json"
 FORMAT = 2  # of the record

@@ -16,8 +16,8 @@ from flows.packages.credentials import Claim, Signer, certificate, sidecar_of
 from flows.packages.publish import FORMAT, RECORD, Files, fact_of_bytes, readable
 from flows.packages.view import VIEWER, page_of
 from flows.ui.curves import HEIGHT, WIDTH, amount, drawing, inked, summary
-from steps.artifacts.store import ArtifactStore
 from steps.contract import RUN_ONLY, StepResult, canonical
+from steps.store.artifact_store import ArtifactStore
 
 BESIDE = ("report.json", "report.html", VIEWER, CRATE)
 GENERATIVE = ("draw_picture", "drive_video", "fit_gaussians", "fit_motion", "refine_texture")  # where they use weights

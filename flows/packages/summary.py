@@ -16,7 +16,7 @@ from pydantic import BaseModel
 from flows.packages.acceptance import failing_in
 from flows.packages.publish import record_of
 from flows.ui.escaping import cell
-from steps.artifacts.store import write_atomically
+from steps.store.files import write_atomically
 
 Status = Literal["done", "unchanged", "failed", "skipped"]
 NOT_ACCEPTED = "NotAccepted"  # the kind of failure of an item that was made, but fails a gate in a strict batch

@@ -10,8 +10,8 @@ from pydantic import ValidationError
 from dg4d_lib.errors import BadInput
 from flows.engine.leases import wait_for_collecting
 from flows.inputs.orders import Order
-from steps.artifacts.store import ArtifactMissing, ArtifactStore
 from steps.contract import ArtifactRef, Digest, Frozen
+from steps.store.artifact_store import ArtifactMissing, ArtifactStore
 
 if TYPE_CHECKING:
     from flows.engine.tasks import Made

@@ -11,7 +11,7 @@ from typing import Any
 from dg4d_lib.assets.rendering.viewer_page import viewer_page
 from dg4d_lib.errors import BadInput
 from flows.packages.publish import readable, whole
-from steps.artifacts.store import room_for
+from steps.store.files import room_for
 
 VIEWER = "viewer.html"
 # files of a package, as in steps/artifacts/packages.py, whose import would bring torch

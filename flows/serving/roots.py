@@ -20,9 +20,9 @@ from flows import home
 from flows.engine.processes import locked
 from flows.inputs.listing import BUCKET, WILD
 from flows.inputs.manifest import Item
-from steps.artifacts.store import home as home_folder
 from steps.contract import Frozen
 from steps.runtime.weights import weights_home, weights_in
+from steps.store.files import home as home_folder
 
 SOURCES, OUTPUTS = "DG4D_SOURCES", "DG4D_OUTPUTS"
 SEPARATOR = re.compile(rf"{re.escape(os.pathsep)}(?!//)")  # not the one in s3://BUCKET

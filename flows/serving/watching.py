@@ -8,8 +8,8 @@ from prefect.client.orchestration import get_client
 from prefect.events import Event, Resource
 
 from dg4d_lib.errors import BadInput
-from steps.artifacts.store import write_atomically
 from steps.contract import digest_of
+from steps.store.files import write_atomically
 
 CHANGED = "dg4d.folder.changed"  # the event that the trigger in deploy/prefect.yaml waits for
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from flows.engine.processes import die_with_parent, locked, python, start_of
 from flows.serving.roots import SOURCES
 from flows.serving.server import LOOK_S, Server, leave
-from steps.artifacts.store import write_atomically
+from steps.store.files import write_atomically
 
 RESTART_S = 5.0  # between two starts of a worker
 GRACE_S = 10.0  # for a worker and its runs to end

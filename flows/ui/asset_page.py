@@ -10,8 +10,8 @@ from flows.packages import acceptance
 from flows.ui import curves, pages
 from flows.ui.escaping import markdown
 from flows.ui.showing import show
-from steps.artifacts.store import ArtifactStore
 from steps.contract import ArtifactRef
+from steps.store.artifact_store import ArtifactStore
 
 if TYPE_CHECKING:
     from flows.engine.tasks import Finished

@@ -15,8 +15,8 @@ from flows.engine.executors import StepError
 from flows.packages import acceptance
 from flows.packages.publish import readable
 from flows.ui.escaping import markdown
-from steps.artifacts.store import ArtifactMissing, ArtifactStore
 from steps.contract import ArtifactRef, StepResult, StepSpec
+from steps.store.artifact_store import ArtifactMissing, ArtifactStore
 
 THUMBNAIL_SIZES = (960, 640, 320)  # pixels of the longer side
 WEBP_METHOD = 4  # libwebp's own; with OpenImageIO's, 6, alpha takes a hundred times as long

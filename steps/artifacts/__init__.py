@@ -1,1 +1,1 @@
-"""Content-addressed store and the file formats that steps exchange."""
+"""File formats that steps exchange."""

@@ -1,1 +1,1 @@
-"""Priors and starting clouds that both fits share."""
+"""Priors, reconstruction and reports that both fits share."""

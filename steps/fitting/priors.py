@@ -32,7 +32,7 @@ from dg4d_lib.video.driving import over_white
 from dg4d_lib.weights.registry import weights_called
 from steps.artifacts.archives import unpack
 from steps.artifacts.media import read_png
-from steps.runtime.job import Facts
+from steps.runtime.job import StepReport
 from steps.runtime.weights import Opened, open_weights
 from steps.sources.banks import BANK_JSON, BankIndex, check_sheet, read_index
 
@@ -56,11 +56,11 @@ class ChosenPrior:
     opened: Opened | None = None
     batches: MicroBatches | None = None
 
-    def facts(self, backend: str) -> Facts:
+    def facts(self, backend: str) -> StepReport:
         """What a step that used it can say of itself, after it did."""
         halved = self.batches.notes() if self.batches else ()
         weights, licenses = (self.opened.digests, self.opened.licenses) if self.opened else ({}, {})
-        return Facts(backend, weights, licenses, notes=(self.note,), run_notes=halved)
+        return StepReport(backend, weights, licenses, notes=(self.note,), run_notes=halved)
 
 
 def make_prior(

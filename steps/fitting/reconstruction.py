@@ -13,7 +13,7 @@ from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.reconstruction.lgm import load_lgm, reconstruct
 from dg4d_lib.settings import LgmSettings
 from dg4d_lib.video.driving import over_white
-from steps.runtime.job import Facts
+from steps.runtime.job import StepReport
 from steps.runtime.weights import Opened, open_weights
 
 NOTE = "start: Gaussians reconstructed by LGM from four views that ImageDream made of the picture"
@@ -31,7 +31,7 @@ class Reconstruction:
     gaussians: Gaussians
     opened: tuple[Opened, ...]
 
-    def added_to(self, facts: Facts) -> Facts:
+    def added_to(self, facts: StepReport) -> StepReport:
         """The facts of a step that also used this."""
         weights, licenses = dict(facts.weights), dict(facts.licenses)
         for opened in self.opened:

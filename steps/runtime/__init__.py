@@ -1,1 +1,1 @@
-"""Job contract, entry point and environment of a running step."""
+"""Execution of steps: job interface, process set-up, fork server, environment and weights."""

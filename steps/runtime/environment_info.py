@@ -1,4 +1,4 @@
-"""What computed a step: processor, system, installed packages, container image. No name of a host, user or path."""
+"""Environment of a step: processor, system, installed packages, container image. No name of a host, user or path."""
 
 import functools
 import os
@@ -10,8 +10,8 @@ from typing import Any
 from steps.contract import digest_of
 
 
-def machine() -> dict[str, str]:
-    """Facts about this process, for the record of a step; what does not exist here is left out."""
+def environment_info() -> dict[str, str]:
+    """Return facts about this process for the record of a step, without those that do not exist here."""
     facts = {
         "system": platform.platform(),
         "processor": processor(),
@@ -26,14 +26,14 @@ def machine() -> dict[str, str]:
 
 @functools.cache
 def packages() -> list[str]:
-    """Every installed distribution as "name-version", sorted; told by the names of folders, without reading any."""
+    """Return every installed distribution as "name-version", sorted, from the names of folders alone."""
     folders = (Path(entry) for entry in sys.path)
     return sorted({found.stem for folder in folders if folder.is_dir() for found in folder.glob("*.dist-info")})
 
 
 @functools.cache
 def processor() -> str:
-    """The model of the processor, or at least its architecture."""
+    """Return the model of the processor, or its architecture."""
     try:
         about = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -43,11 +43,11 @@ def processor() -> str:
 
 
 def _cores() -> int:
-    """Those that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _gpu() -> str:
-    """The GPU that was used; asking does not wake one."""
+    """Return the GPU that this process used, without initializing CUDA."""
     torch: Any = sys.modules.get("torch")
     return str(torch.cuda.get_device_name()) if torch is not None and torch.cuda.is_initialized() else ""

@@ -1,17 +1,17 @@
 """Server that imports the libraries of all steps once and forks a process per step.
 
 `python -m steps.runtime.fork_server SOCKET` reads orders from a socket (SOCK_SEQPACKET) that it inherits as a file
-descriptor. An order is `{"arguments": [...], "environment": {...}}`: arguments of `steps.main`, and variables that the
-step has beside those of this process. Descriptors come with it: standard input, output and error, and others that the
-step must hold open. Answers are `{"pid": 7}`, in the order of the orders, and later `{"pid": 7, "status": 0}`: an exit
-status, or the negative number of a signal. When the other end of the socket is
-closed this process ends.
+descriptor. An order is `{"arguments": [...], "environment": {...}}`: the arguments of `steps.main`, and variables that
+the step has beside those of this process. Descriptors come with it: standard input, output and error, and others that
+the step must hold open. Answers are `{"pid": 7}`, in the order of the orders, and later `{"pid": 7, "status": 0}`: an
+exit status, or the negative number of a signal. This process ends when the other end of the socket is closed.
 
-A step is a process group of its own, as it is when it is begun by `python -m steps.main`. Whoever asks should tell
-it to end with its parent, which is this process.
+A step is a process group of its own, as with `python -m steps.main`. The caller should have it end with its parent,
+which is this process. A step whose code cannot be imported prints the traceback to its own standard error.
 """
 
 import argparse
+import functools
 import gc
 import importlib
 import json
@@ -21,45 +21,65 @@ import signal
 import socket
 import sys
 import tempfile
-from collections.abc import Iterator
+import traceback
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-
-from steps import main as step
 
 ORDER_BYTES = 2**16
 ORDER_HANDLES = 16
 
 
 def main() -> int:
-    """Serve until the socket is closed; in a fork, do the step, and return its exit status."""
-    parser = argparse.ArgumentParser(prog="python -m steps.runtime.fork_server", description="Begin steps.")
-    parser.add_argument("socket", type=int, help="file descriptor of a socket that the program holds the other end of")
+    """Serve until the socket is closed; in a fork, perform the step and return its exit status."""
+    parser = argparse.ArgumentParser(prog="python -m steps.runtime.fork_server", description="Fork steps.")
+    parser.add_argument("socket", type=int, help="file descriptor of a socket whose other end the program holds")
     control = socket.socket(fileno=parser.parse_args().socket)
     control.set_inheritable(False)
-    step.prepare_process()
-    arguments = _serve(control, _wanted())
+    program = _load_program()
+    arguments = _serve(control, _late_imports())
     if arguments is None:
         return 0
-    status = step.main(arguments)
+    status = program(arguments)
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
-    os._exit(status)  # nothing is left to tidy, and to take apart what was imported takes up to a second
+    os._exit(status)  # freeing imported modules would take up to a second
 
 
-def _wanted() -> Iterator[str]:
-    """What steps would wait for, in the order in which they come to it: modules, and functions to call."""
-    for spec in step.catalog().values():
-        yield spec.entry.partition(":")[0]
-        yield from spec.late_imports
+def _load_program() -> Callable[[list[str]], int]:
+    """Import the program that performs steps; if that fails, return one that prints the traceback.
+
+    This process has no standard error that anybody reads, but every fork has.
+    """
+    try:
+        from steps.runtime import process, program  # noqa: PLC0415 - errors must be caught
+
+        process.prepare_process()
+    except Exception:
+        return functools.partial(_fail, traceback.format_exc())
+    return program.main
 
 
-def _serve(control: socket.socket, wanted: Iterator[str]) -> list[str] | None:
-    """Import what is wanted, and fork for every order; the first steps need not wait for what only later ones import.
+def _fail(reason: str, arguments: list[str]) -> int:
+    sys.stderr.write(reason)
+    return 1
+
+
+def _late_imports() -> Iterator[str]:
+    """Yield modules, and functions to call, that steps need, in the order of the steps."""
+    with suppress(Exception):  # the step will raise it again
+        from steps.runtime.installed_code import catalog  # noqa: PLC0415 - errors must be caught
+
+        for spec in catalog().values():
+            yield from (spec.entry.partition(":")[0], *spec.late_imports)
+
+
+def _serve(control: socket.socket, modules: Iterator[str]) -> list[str] | None:
+    """Import modules between orders and fork for every order, so that first steps do not wait for later ones' imports.
 
     Returns:
-        Arguments of a step in a fork; nothing here, when there will be no more orders.
+        Arguments of the step in a fork; None in this process, when there will be no more orders.
     """
-    coming = next(wanted, None)
+    coming = next(modules, None)
     ended, signaled = socket.socketpair()
     for end in (ended, signaled):
         end.setblocking(False)
@@ -71,13 +91,13 @@ def _serve(control: socket.socket, wanted: Iterator[str]) -> list[str] | None:
         while True:
             ready = [key.fileobj for key, _ in events.select(0 if coming else None)]
             if coming and not ready:
-                with suppress(Exception):  # the step will say what is wrong
-                    _have(coming)
-                coming = next(wanted, None)
+                with suppress(Exception):  # the step will raise it again
+                    _preload(coming)
+                coming = next(modules, None)
             if ended in ready:
                 with suppress(BlockingIOError):
                     ended.recv(ORDER_BYTES)
-                _tell_of_ended(control)
+                _report_ended(control)
             if control in ready:
                 text, handles, _, _ = socket.recv_fds(control, ORDER_BYTES, ORDER_HANDLES)
                 if not text:
@@ -91,14 +111,14 @@ def _serve(control: socket.socket, wanted: Iterator[str]) -> list[str] | None:
                     _become(order["environment"], handles)
                     return list(order["arguments"])
                 with suppress(OSError):  # it has ended
-                    os.setpgid(pid, pid)  # here too, so that whoever hears its number can end the group
+                    os.setpgid(pid, pid)  # here too: the reader of its number may kill the group at once
                 for handle in handles:
                     os.close(handle)
-                _tell(control, {"pid": pid})
+                _answer(control, {"pid": pid})
 
 
-def _have(entry: str) -> None:
-    """Import a module; call a function of it, if one is named."""
+def _preload(entry: str) -> None:
+    """Import `module`, or import it and call its function for `module:function`."""
     module, _, function = entry.partition(":")
     loaded = importlib.import_module(module)
     if function:
@@ -106,23 +126,23 @@ def _have(entry: str) -> None:
 
 
 def _become(environment: dict[str, str], handles: list[int]) -> None:
-    """Make this fork the process that was ordered."""
+    """Give this fork the process group, environment and descriptors of its order."""
     os.setpgid(0, 0)
     os.environ.update(environment)
-    tempfile.tempdir = None  # as the environment says, not what an import found
+    tempfile.tempdir = None  # from the new environment
     for number, handle in enumerate(handles[:3]):
         os.dup2(handle, number)
         os.close(handle)
 
 
-def _tell_of_ended(control: socket.socket) -> None:
+def _report_ended(control: socket.socket) -> None:
     with suppress(ChildProcessError):
         while (gone := os.waitpid(-1, os.WNOHANG))[0]:
-            _tell(control, {"pid": gone[0], "status": os.waitstatus_to_exitcode(gone[1])})
+            _answer(control, {"pid": gone[0], "status": os.waitstatus_to_exitcode(gone[1])})
 
 
-def _tell(control: socket.socket, answer: dict[str, int]) -> None:
-    with suppress(BrokenPipeError, ConnectionResetError):  # nobody listens any more: the next read says so
+def _answer(control: socket.socket, answer: dict[str, int]) -> None:
+    with suppress(BrokenPipeError, ConnectionResetError):  # the caller has ended: the next read returns nothing
         control.sendall(json.dumps(answer).encode())
 
 

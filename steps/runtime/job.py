@@ -1,4 +1,4 @@
-"""What a step's code gets and gives back."""
+"""Input and report of a step's code."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -13,12 +13,12 @@ class Job:
     """One run of one step.
 
     Attributes:
-        inputs: the files that were given, by port; an optional input that was not given is absent.
-        outputs: where to write each output; an optional output may stay unwritten.
-        settings: an instance of the step's settings class.
-        seed: of every random generator the step makes.
-        progress: call with (done, total, values to show) as often as you like.
-        pictures: a folder for pictures that explain a failure; they survive it.
+        inputs: files by port; an optional input that was not given is absent.
+        outputs: paths to write by port; an optional output may stay unwritten.
+        settings: instance of the step's settings class.
+        seed: seed of every random generator of the step.
+        progress: callback (done, total, values to show); calls are cheap.
+        pictures: folder for pictures that explain a failure; they are kept.
     """
 
     inputs: Mapping[str, Path]
@@ -30,11 +30,11 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Facts:
-    """What only the step can know, for the provenance record.
+class StepReport:
+    """Facts that only the step knows, for the provenance record.
 
     Attributes:
-        backend: what computed, for example "cpu (numba)".
+        backend: rasterizer or library that computed, for example "cpu (numba)".
         weights: digest of every weights file, by name; empty where none were used.
         licenses: license of everything whose license follows the asset, by name.
         notes: sentences the user should read in the report.

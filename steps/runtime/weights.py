@@ -14,7 +14,7 @@ from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.weights.locate import MEMORY, call_by_content, digests, find_weights, given_folder, identity
 from dg4d_lib.weights.lock import read_lock
 from dg4d_lib.weights.registry import License, weights_called
-from steps.artifacts.store import home
+from steps.store.files import home
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,8 @@ class Opened:
 
     Attributes:
         folder: where they lie.
-        digests: of every file, for `Facts.weights`.
-        licenses: for `Facts.licenses`.
+        digests: of every file, for `StepReport.weights`.
+        licenses: for `StepReport.licenses`.
     """
 
     folder: Path

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from av.error import FFmpegError
 
 from dg4d_lib.errors import BadInput
-from steps.artifacts.store import NO_SPACE
+from steps.store.files import NO_SPACE
 
 DAMAGED = (  # raised by PyAV, OpenImageIO, Pillow, zipfile and the parsers here, for bytes that break the format
     FFmpegError, OSError, EOFError, SyntaxError, ValueError, LookupError, ArithmeticError, RuntimeError,

@@ -11,7 +11,7 @@ import repository
 from dg4d_lib.settings import Settings
 from steps.catalog import STEPS
 from steps.contract import StepSpec
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 
 SPECS = pytest.mark.parametrize("spec", STEPS.values(), ids=STEPS)
 
@@ -44,7 +44,7 @@ def test_the_entry_is_a_function_of_a_job(spec: StepSpec) -> None:
     function = named(spec.entry)
     assert inspect.isfunction(function)
     hints = get_type_hints(function)
-    assert hints.pop("return") is Facts
+    assert hints.pop("return") is StepReport
     assert list(hints.values()) == [Job]
 
 

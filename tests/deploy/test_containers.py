@@ -21,8 +21,8 @@ from flows.engine.executors import EXECUTORS, StepBadInput
 from steps.artifacts.media import write_png
 from steps.catalog import STEPS
 from steps.contract import ArtifactRef, StepRequest, StepResult
-from steps.main import request_version
 from steps.profiles import PREVIEW, ExtractMeshSettings, FitGaussiansSettings, FitMotionSettings, revise
+from steps.runtime.installed_code import request_version
 
 ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "deploy" / "images"

@@ -18,7 +18,7 @@ from pathlib import Path
 from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
 from flows.engine.merging import add
 from steps.catalog import STEPS as REAL
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 
 
 def _png() -> bytes:
@@ -48,23 +48,23 @@ def bank_json(*names: str) -> str:
     return json.dumps({"frames": [0, 1], "tile": [3, 4], "tile_size": 2, "views": views})
 
 
-def draw_picture(job: Job) -> Facts:
+def draw_picture(job: Job) -> StepReport:
     words = _begin("draw_picture", job, job.inputs["text"].read_bytes())
     job.outputs["picture"].write_bytes(PNG + words)
     weights = {"fake/unet.safetensors": "sha256:" + "e" * 64}
-    return Facts(weights=weights, licenses={"fake": "fake license: <free>"})
+    return StepReport(weights=weights, licenses={"fake": "fake license: <free>"})
 
 
-def prepare_subject(job: Job) -> Facts:
+def prepare_subject(job: Job) -> StepReport:
     words = _begin("prepare_subject", job, job.inputs["source"].read_bytes())
     job.outputs["subject"].write_bytes(PNG + words)  # what follows a picture is ignored by those who look at it
     job.outputs["picture"].write_bytes(PNG)
     if b"moving" in words:
         job.outputs["footage"].write_bytes(words)
-    return Facts(notes=("This asset is a fake.",))
+    return StepReport(notes=("This asset is a fake.",))
 
 
-def drive_video(job: Job) -> Facts:
+def drive_video(job: Job) -> StepReport:
     words = _begin("drive_video", job, job.inputs["subject"].read_bytes()[len(PNG) :])
     with zipfile.ZipFile(job.outputs["driving_video"], "w") as archive:
         for i in range(5):
@@ -78,28 +78,28 @@ def drive_video(job: Job) -> Facts:
         with zipfile.ZipFile(job.outputs["films"], "w") as archive:
             for row in rows:
                 archive.writestr(zipfile.ZipInfo(f"{row['number']}.mp4"), b"film")
-    return Facts()
+    return StepReport()
 
 
-def fit_gaussians(job: Job) -> Facts:
+def fit_gaussians(job: Job) -> StepReport:
     words = _begin("fit_gaussians", job, job.inputs["subject"].read_bytes()[len(PNG) :])
     for i in range(10):
         job.progress(i + 1, 10, {"loss": 1 / (i + 1)})
     job.outputs["gaussians"].write_bytes(words)
     _curves(job)
-    return Facts()
+    return StepReport()
 
 
-def fit_motion(job: Job) -> Facts:
+def fit_motion(job: Job) -> StepReport:
     words = _begin("fit_motion", job, job.inputs["gaussians"].read_bytes())
     job.outputs["motion"].write_bytes(b"motion of " + words)
     if job.settings.motion.fine_tune:
         job.outputs["gaussians"].write_bytes(b"better " + words)
     _curves(job)
-    return Facts()
+    return StepReport()
 
 
-def extract_mesh(job: Job) -> Facts:
+def extract_mesh(job: Job) -> StepReport:
     words = _begin("extract_mesh", job, job.inputs["motion"].read_bytes())
     settings = job.settings
     if settings.mesh.mode == "per_frame":
@@ -109,24 +109,24 @@ def extract_mesh(job: Job) -> Facts:
     elif settings.mesh.mode == "tracked" or b"flutters" not in words:
         job.outputs["tracked"].write_bytes(words)
     job.outputs["picture"].write_bytes(PNG)
-    return Facts()
+    return StepReport()
 
 
-def join_meshes(job: Job) -> Facts:
+def join_meshes(job: Job) -> StepReport:
     from steps.join_meshes import run  # the real one; it imports torch, which nothing else here does
 
     _begin("join_meshes", job, b"")
     return run(job)
 
 
-def refine_texture(job: Job) -> Facts:
+def refine_texture(job: Job) -> StepReport:
     name = "tracked" if "tracked" in job.inputs else "meshes"
     _begin("refine_texture", job, job.inputs[name].read_bytes())
     job.outputs[name].write_bytes(job.inputs[name].read_bytes())
-    return Facts()
+    return StepReport()
 
 
-def pack_asset(job: Job) -> Facts:
+def pack_asset(job: Job) -> StepReport:
     words = _begin("pack_asset", job, job.inputs["subject"].read_bytes()[len(PNG) :])
     name = "tracked" if "tracked" in job.inputs else "meshes"
     with zipfile.ZipFile(job.outputs["package"], "w") as archive:
@@ -135,10 +135,10 @@ def pack_asset(job: Job) -> Facts:
         archive.writestr(zipfile.ZipInfo("splats/000.ply"), b"0")
         archive.writestr(zipfile.ZipInfo("splats/001.ply"), str(job.seed).encode())
     job.outputs["sheet"].write_bytes(PNG)
-    return Facts()
+    return StepReport()
 
 
-def check_asset(job: Job) -> Facts:
+def check_asset(job: Job) -> StepReport:
     with zipfile.ZipFile(job.inputs["package"]) as archive:
         words = _begin("check_asset", job, archive.read("contact_sheet.png")[len(PNG) :])
     bad = b"torn" in words
@@ -154,10 +154,10 @@ def check_asset(job: Job) -> Facts:
     verdict = {"accepted": not bad, "failing": ["silhouette"] if bad else [], "gates": [gate]}
     job.outputs["gates"].write_text(json.dumps(verdict))
     job.outputs["picture"].write_bytes(PNG)
-    return Facts()
+    return StepReport()
 
 
-def score_asset(job: Job) -> Facts:
+def score_asset(job: Job) -> StepReport:
     with zipfile.ZipFile(job.inputs["truth"]) as archive:
         words = _begin("score_asset", job, archive.read("input/000.png"))
         views = sorted({name.split("/")[0] for name in archive.namelist() if name.startswith("view_")})
@@ -172,7 +172,7 @@ def score_asset(job: Job) -> Facts:
     with zipfile.ZipFile(job.outputs["films"], "w") as archive:
         for view in ("input", *views):
             archive.writestr(zipfile.ZipInfo(f"{view}.mp4"), b"film")
-    return Facts()
+    return StepReport()
 
 
 def _begin(step: str, job: Job, words: bytes) -> bytes:

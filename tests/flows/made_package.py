@@ -15,9 +15,9 @@ from flows.inputs.orders import Order
 from flows.packages.credentials import configured
 from flows.packages.publish import publish
 from flows.packages.report import complete
-from steps.artifacts.store import ArtifactStore
 from steps.contract import ArtifactRef, ProvenanceRecord, StepResult
 from steps.profiles import PREVIEW
+from steps.store.artifact_store import ArtifactStore
 
 MACHINE = {
     "system": "Linux",

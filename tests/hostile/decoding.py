@@ -195,7 +195,7 @@ def read_as_record(path: Path, scratch: Path) -> tuple[Kind, int]:
     from flows.inputs.orders import order_again
     from flows.packages.publish import RECORD, is_current, record_of
     from flows.packages.verify import verify
-    from steps.artifacts.store import ArtifactStore
+    from steps.store.artifact_store import ArtifactStore
 
     shutil.copyfile(path, scratch / RECORD)
     record = record_of(scratch)

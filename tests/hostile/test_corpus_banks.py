@@ -11,8 +11,8 @@ from flows.commands.batch import ready
 from flows.inputs.manifest import Item
 from flows.inputs.orders import Order, Wish
 from flows.packages.summary import Row
-from steps.artifacts.store import ArtifactStore
 from steps.profiles import profile, revise
+from steps.store.artifact_store import ArtifactStore
 from tests.hostile.banks import DOOR, FOLDERS
 from tests.hostile.conftest import Place
 from tests.hostile.decoding import Decoder

@@ -11,7 +11,7 @@ from flows.commands.compose import compose
 from flows.inputs.orders import order_again
 from flows.packages.publish import RECORD, check_folder, is_current, record_of, whole
 from flows.packages.verify import verify
-from steps.artifacts.store import ArtifactStore
+from steps.store.artifact_store import ArtifactStore
 from tests.hostile import table
 from tests.hostile.conftest import Place
 from tests.hostile.documents import RECORDS, SCENES

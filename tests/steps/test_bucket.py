@@ -12,10 +12,10 @@ from obstore.store import LocalStore, MemoryStore
 from tiny_s3 import BUCKET, TinyS3
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from steps.artifacts.bucket import BucketStore
-from steps.artifacts.opening import open_store
-from steps.artifacts.store import ArtifactMissing, ArtifactStore, StoreUnreachable, object_name
 from steps.contract import ArtifactRef
+from steps.store.artifact_store import ArtifactMissing, ArtifactStore, StoreUnreachable, object_name
+from steps.store.bucket import BucketStore
+from steps.store.opening import open_store
 
 REAL_S3 = os.environ.get("DG4D_TEST_S3")  # s3://BUCKET/PREFIX of a server that may be written to, with AWS_* variables
 NOTHING = ArtifactRef(digest="sha256:" + "0" * 64, media_type="a/b", size_bytes=1)
@@ -226,7 +226,7 @@ def test_two_processes_put_the_same_artifact_at_once(store: ArtifactStore, tmp_p
     if store.address == "memory":
         pytest.skip("another process cannot open it by its address")
     program = (
-        "import sys; from steps.artifacts.opening import open_store\n"
+        "import sys; from steps.store.opening import open_store\n"
         "print(open_store(sys.argv[1]).put_bytes(b'0123456789' * 100000, 'a/b').digest)"
     )
     command = [sys.executable, "-c", program, store.address]
@@ -240,7 +240,7 @@ def test_two_processes_put_the_same_artifact_at_once(store: ArtifactStore, tmp_p
 def test_without_the_library_folders_are_opened_and_buckets_say_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "steps.artifacts.bucket", None)
+    monkeypatch.setitem(sys.modules, "steps.store.bucket", None)
     assert open_store(tmp_path).root == tmp_path
     with pytest.raises(BackendUnavailable, match=r"dg4d\[s3\]"):
         open_store("s3://no-library/at-all")

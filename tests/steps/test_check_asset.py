@@ -23,14 +23,14 @@ from steps.catalog import STEPS
 from steps.check_asset import Parts, gather, run, verdict
 from steps.pack_asset import run as pack
 from steps.profiles import CheckAssetSettings
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 
 NAMES = [
     "fidelity", "silhouette", "consistency", "flicker", "floaters", "flaws", "agreement", "sharpness", "motion",
 ]  # fmt: skip
 
 
-def checked(folder: Path, mode: str = "tracked", splats: bool = True, **bounds: float) -> tuple[Facts, Job]:
+def checked(folder: Path, mode: str = "tracked", splats: bool = True, **bounds: float) -> tuple[StepReport, Job]:
     """Pack the small package and ask its gates."""
     packing = job(inputs(folder / "inputs", mode), folder / "out", splats=splats, rig=False, usd=False, spz=False)
     pack(packing)
@@ -45,7 +45,7 @@ def checked(folder: Path, mode: str = "tracked", splats: bool = True, **bounds: 
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[Facts, Job]:
+def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[StepReport, Job]:
     return checked(tmp_path_factory.mktemp("checked"))
 
 
@@ -53,7 +53,7 @@ def said(asking: Job) -> dict[str, dict[str, float]]:
     return {gate["name"]: gate for gate in json.loads(asking.outputs["gates"].read_text())["gates"]}
 
 
-def test_a_ball_in_front_of_a_full_blue_picture_is_not_accepted(done: tuple[Facts, Job]) -> None:
+def test_a_ball_in_front_of_a_full_blue_picture_is_not_accepted(done: tuple[StepReport, Job]) -> None:
     facts, asking = done
     answer = json.loads(asking.outputs["gates"].read_text())
     assert [gate["name"] for gate in answer["gates"]] == NAMES
@@ -63,19 +63,19 @@ def test_a_ball_in_front_of_a_full_blue_picture_is_not_accepted(done: tuple[Fact
     assert {gate["name"] for gate in answer["gates"] if not gate["passed"]} == set(answer["failing"])
 
 
-def test_the_picture_has_a_column_per_moment_and_five_rows(done: tuple[Facts, Job]) -> None:
+def test_the_picture_has_a_column_per_moment_and_five_rows(done: tuple[StepReport, Job]) -> None:
     shown = read_png(done[1].outputs["picture"])
     assert shown.shape[0] > 5 * 128
     assert shown.shape[1] > 3 * 128
     assert shown.std() > 0.05
 
 
-def test_the_ports_are_those_of_the_catalog(done: tuple[Facts, Job]) -> None:
+def test_the_ports_are_those_of_the_catalog(done: tuple[StepReport, Job]) -> None:
     assert set(done[1].inputs) == set(STEPS["check_asset"].inputs)
     assert set(done[1].outputs) == set(STEPS["check_asset"].outputs)
 
 
-def test_without_stored_splats_the_fitted_motion_is_judged_alike(done: tuple[Facts, Job], tmp_path: Path) -> None:
+def test_without_stored_splats_the_fitted_motion_is_judged_alike(done: tuple[StepReport, Job], tmp_path: Path) -> None:
     _, bare = checked(tmp_path, splats=False)
     for name, gate in said(bare).items():
         assert gate["value"] == pytest.approx(said(done[1])[name]["value"], abs=2e-3)
@@ -87,13 +87,13 @@ def test_a_mesh_per_frame_can_be_judged(tmp_path: Path) -> None:
     assert said(asking)["agreement"]["value"] < 0.9  # gems that grow where they are, and splats that slide
 
 
-def test_bounds_come_from_the_settings(done: tuple[Facts, Job], tmp_path: Path) -> None:
+def test_bounds_come_from_the_settings(done: tuple[StepReport, Job], tmp_path: Path) -> None:
     _, lenient = checked(tmp_path, silhouette_least=0, fidelity_least=0)
     changed = {name for name, gate in said(done[1]).items() if gate["passed"] != said(lenient)[name]["passed"]}
     assert changed == {"silhouette", "fidelity"}
 
 
-def test_equal_packages_give_equal_bytes(done: tuple[Facts, Job], tmp_path: Path) -> None:
+def test_equal_packages_give_equal_bytes(done: tuple[StepReport, Job], tmp_path: Path) -> None:
     _, again = checked(tmp_path)
     for name, path in done[1].outputs.items():
         assert path.read_bytes() == again.outputs[name].read_bytes()
@@ -162,7 +162,7 @@ def test_a_verdict_is_plain_json() -> None:
     assert all(round(gate["value"], 4) == gate["value"] for gate in answer["gates"])
 
 
-def test_a_file_that_is_no_package_is_refused(done: tuple[Facts, Job], tmp_path: Path) -> None:
+def test_a_file_that_is_no_package_is_refused(done: tuple[StepReport, Job], tmp_path: Path) -> None:
     asking = done[1]
     with pytest.raises(BadInput, match=r"asset\.json"):
         run(replace(asking, inputs={**asking.inputs, "package": asking.inputs["driving_video"]}))

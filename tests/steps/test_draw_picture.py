@@ -5,11 +5,12 @@ from tiny_text_to_image import save_pipeline
 
 from dg4d_lib.settings import SubjectSettings, TextSettings
 from steps.artifacts.media import read_png
-from steps.artifacts.store import ArtifactStore
 from steps.catalog import STEPS
 from steps.contract import StepFailure, StepRequest, StepResult
-from steps.main import perform, request_version
+from steps.runtime.installed_code import request_version
+from steps.runtime.perform import perform
 from steps.runtime.weights import identities, weights_in, without_paths
+from steps.store.artifact_store import ArtifactStore
 
 
 @pytest.fixture(scope="module")

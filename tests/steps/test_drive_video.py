@@ -13,12 +13,14 @@ from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import read_frames, read_png, write_frames, write_png
 from steps.drive_video import run
 from steps.profiles import DriveVideoSettings
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 
 PORTS = {"driving_video": "zip", "picture": "png", "candidates": "png", "ranking": "json", "films": "zip"}
 
 
-def drive(folder: Path, inputs: dict[str, Path], seed: int = 0, kind: type = WarpSettings, **driving: object) -> Facts:
+def drive(
+    folder: Path, inputs: dict[str, Path], seed: int = 0, kind: type = WarpSettings, **driving: object
+) -> StepReport:
     settings = DriveVideoSettings(driving=kind(**driving))
     outputs = {name: folder / f"{name}.{suffix}" for name, suffix in PORTS.items()}
     return run(Job(inputs, outputs, settings, seed, lambda *_: None, folder))

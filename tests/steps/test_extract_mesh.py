@@ -18,7 +18,7 @@ from steps.artifacts.motions import write_motion
 from steps.extract_mesh import run
 from steps.profiles import ExtractMeshSettings, RefineTextureSettings
 from steps.refine_texture import run as refine
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 
 FRAMES = 3
 SHIFT = torch.tensor([0.1, -0.05, 0.2])
@@ -34,7 +34,7 @@ def ball() -> Gaussians:
     return Gaussians(points, torch.full((300, 3), -2.8), quats, torch.full((300,), 3.0), harmonics_of_color(color))
 
 
-def extract(folder: Path, gaussians: Gaussians, mesh: MeshSettings = MESH, **frames: int) -> tuple[Job, Facts]:
+def extract(folder: Path, gaussians: Gaussians, mesh: MeshSettings = MESH, **frames: int) -> tuple[Job, StepReport]:
     """Run the step on a cloud that begins one SHIFT beside its canonical place, and goes on by one SHIFT a frame."""
     motion = Framewise(FRAMES, len(gaussians))
     with torch.no_grad():
@@ -55,12 +55,12 @@ def extract(folder: Path, gaussians: Gaussians, mesh: MeshSettings = MESH, **fra
 
 
 @pytest.fixture(scope="module")
-def tracked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Facts]:
+def tracked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StepReport]:
     folder = tmp_path_factory.mktemp("tracked")
     return folder, extract(folder, ball())[1]
 
 
-def test_the_mesh_is_that_of_the_first_frame_and_moves_with_the_cloud(tracked: tuple[Path, Facts]) -> None:
+def test_the_mesh_is_that_of_the_first_frame_and_moves_with_the_cloud(tracked: tuple[Path, StepReport]) -> None:
     asset = read_tracked(tracked[0] / "tracked")
     radii = (asset.mesh.vertices - SHIFT).norm(dim=-1)
     assert radii.mean() == pytest.approx(0.5, abs=0.04)  # half-transparent two standard deviations of 0.06 outside
@@ -73,12 +73,12 @@ def test_the_mesh_is_that_of_the_first_frame_and_moves_with_the_cloud(tracked: t
     torch.testing.assert_close(ways, expected.expand_as(ways), atol=1e-4, rtol=0)
 
 
-def test_the_texture_has_the_color_of_the_cloud(tracked: tuple[Path, Facts]) -> None:
+def test_the_texture_has_the_color_of_the_cloud(tracked: tuple[Path, StepReport]) -> None:
     texture = read_tracked(tracked[0] / "tracked").mesh.texture
     torch.testing.assert_close(texture.mean((0, 1)), torch.tensor([0.1, 0.2, 0.9]), atol=0.02, rtol=0)
 
 
-def test_the_picture_shows_it_and_the_notes_say_how_well_it_fits(tracked: tuple[Path, Facts]) -> None:
+def test_the_picture_shows_it_and_the_notes_say_how_well_it_fits(tracked: tuple[Path, StepReport]) -> None:
     picture = read_png(tracked[0] / "picture.png")
     assert picture.shape == (256, 4 * 256, 3)
     assert (picture.amin(-1) < 0.5).float().mean() > 0.05
@@ -86,7 +86,7 @@ def test_the_picture_shows_it_and_the_notes_say_how_well_it_fits(tracked: tuple[
     assert not (tracked[0] / "meshes").exists()
 
 
-def test_the_notes_say_what_kind_of_surface_it_is(tracked: tuple[Path, Facts]) -> None:
+def test_the_notes_say_what_kind_of_surface_it_is(tracked: tuple[Path, StepReport]) -> None:
     assert "at rest it is watertight, 1 component, 0 inverted" in tracked[1].notes
 
 
@@ -98,7 +98,7 @@ def test_the_frame_whose_surface_it_is_stays_with_the_mesh(tmp_path: Path, monke
     torch.testing.assert_close(asset.mesh.vertices.mean(0), 3 * SHIFT, atol=0.02, rtol=0)
 
 
-def test_the_same_job_gives_the_same_bytes(tracked: tuple[Path, Facts], tmp_path: Path) -> None:
+def test_the_same_job_gives_the_same_bytes(tracked: tuple[Path, StepReport], tmp_path: Path) -> None:
     extract(tmp_path, ball())
     for name in ("tracked", "picture.png"):
         assert (tmp_path / name).read_bytes() == (tracked[0] / name).read_bytes()
@@ -139,7 +139,7 @@ def test_an_empty_model_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("mode", ["tracked", "meshes"])
 def test_refining_with_the_identity_keeps_the_mesh_and_sets_the_clock(
-    tracked: tuple[Path, Facts], tmp_path: Path, mode: str
+    tracked: tuple[Path, StepReport], tmp_path: Path, mode: str
 ) -> None:
     asset = read_tracked(tracked[0] / "tracked")
     write_tracked(tmp_path / "given_tracked", asset)

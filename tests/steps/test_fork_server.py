@@ -4,8 +4,8 @@ import sys
 LOOKS = """
 import sys, threading
 from steps.runtime import fork_server
-for entry in fork_server._wanted():
-    fork_server._have(entry)
+for entry in fork_server._late_imports():
+    fork_server._preload(entry)
 import torch
 print(threading.active_count(), torch.cuda.is_initialized(), "pymeshlab" in sys.modules, "torch" in sys.modules)
 before = set(sys.modules)

@@ -4,10 +4,11 @@ from pathlib import Path
 import pytest
 
 from dg4d_lib.errors import BadInput
-from steps.artifacts.store import ArtifactStore
 from steps.catalog import STEPS
 from steps.contract import StepRequest
-from steps.main import perform, request_version
+from steps.runtime.installed_code import request_version
+from steps.runtime.perform import perform
+from steps.store.artifact_store import ArtifactStore
 
 SPEC = STEPS["join_meshes"]
 

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import pytest
 
 from steps.contract import is_digest
-from steps.runtime.environment_info import machine, packages
+from steps.runtime.environment_info import environment_info, packages
 
 
 def test_a_machine_is_told_by_facts_and_names_nobody() -> None:
-    facts = machine()
+    facts = environment_info()
     assert facts["python"] == platform.python_version()
     assert int(facts["cores"]) >= 1
     assert is_digest(facts["packages"])
@@ -27,15 +27,15 @@ def test_packages_are_those_that_are_installed() -> None:
 
 
 def test_an_image_is_named_where_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "image" not in machine()
+    assert "image" not in environment_info()
     monkeypatch.setenv("DG4D_IMAGE", "dg4d/cpu:1")
-    assert machine()["image"] == "dg4d/cpu:1"
+    assert environment_info()["image"] == "dg4d/cpu:1"
 
 
 def test_a_gpu_is_named_only_if_it_was_used(monkeypatch: pytest.MonkeyPatch) -> None:
     used = False
     cuda = SimpleNamespace(is_initialized=lambda: used, get_device_name=lambda: "Abacus GPU")
     monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(cuda=cuda))
-    assert "gpu" not in machine()
+    assert "gpu" not in environment_info()
     used = True
-    assert machine()["gpu"] == "Abacus GPU"
+    assert environment_info()["gpu"] == "Abacus GPU"

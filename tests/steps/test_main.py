@@ -10,11 +10,13 @@ import pytest
 
 from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
 from dg4d_lib.settings import Settings
-from steps import main as host
-from steps.artifacts.store import ArtifactMissing, ArtifactStore
 from steps.catalog import STEPS
 from steps.contract import ArtifactRef, Port, StepFailure, StepRequest, StepResult, StepSpec
-from steps.runtime.job import Facts, Job
+from steps.runtime import installed_code, program
+from steps.runtime.job import Job, StepReport
+from steps.runtime.perform import perform
+from steps.runtime.process import cpu_seconds
+from steps.store.artifact_store import ArtifactMissing, ArtifactStore
 
 TEXT = Port(media_type="text/plain", suffix=".txt")
 
@@ -39,7 +41,7 @@ TROUBLES: dict[str, BaseException] = {
 }
 
 
-def shout(job: Job) -> Facts:
+def shout(job: Job) -> StepReport:
     """A step: upper case, some times over."""
     (job.pictures / "last.png").write_bytes(b"picture")
     if job.settings.trouble in TROUBLES:
@@ -50,7 +52,7 @@ def shout(job: Job) -> Facts:
     os.write(1, b"so does native code\n")
     if job.settings.trouble != "forgets":
         job.outputs["loud"].write_text(job.inputs["quiet"].read_text().upper() * job.settings.times)
-    return Facts(backend="voice", notes=("It was loud.",), licenses={"voice": "free"})
+    return StepReport(backend="voice", notes=("It was loud.",), licenses={"voice": "free"})
 
 
 CATALOG = {
@@ -82,7 +84,7 @@ def request_for(store: ArtifactStore, **settings: Any) -> StepRequest:
 
 
 def failure(request: StepRequest, store: ArtifactStore) -> StepFailure:
-    outcome, _ = host.perform(request, store)
+    outcome, _ = perform(request, store)
     assert isinstance(outcome, StepFailure)
     return outcome
 
@@ -90,7 +92,7 @@ def failure(request: StepRequest, store: ArtifactStore) -> StepFailure:
 def test_a_request_becomes_outputs_and_a_record(store: ArtifactStore) -> None:
     request = request_for(store, times=2)
     seen: list[tuple[int, int]] = []
-    outcome, error = host.perform(request, store, lambda done, total, values: seen.append((done, total)))
+    outcome, error = perform(request, store, lambda done, total, values: seen.append((done, total)))
     assert isinstance(outcome, StepResult)
     assert error is None
     assert store.path(outcome.outputs["loud"]).read_text() == "HEYHEY"
@@ -168,23 +170,23 @@ def test_an_artifact_that_is_gone_is_missing(store: ArtifactStore) -> None:
 
 
 def test_the_version_of_a_request_follows_the_source() -> None:
-    version = host.request_version(CATALOG["shout"])
+    version = installed_code.request_version(CATALOG["shout"])
     assert version.startswith("3+")
     assert len(version) == 2 + 12
     other = CATALOG["shout"].model_copy(update={"entry": "test_store:anything"})
-    assert host.code_version(other) != host.code_version(CATALOG["shout"])
+    assert installed_code.code_version(other) != installed_code.code_version(CATALOG["shout"])
 
 
 def test_only_source_files_count_for_the_version_of_the_code() -> None:
     """Kernels that are compiled during a run lie beside the source and must not make another request of the next."""
-    names = [name for name, *_ in host._source_files()]
+    names = [name for name, *_ in installed_code._source_files()]
     assert "dg4d_lib/settings.py" in names
     assert all(name.endswith(".py") for name in names)
 
 
 def test_an_image_may_fix_the_version_of_its_code(store: ArtifactStore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DG4D_CODE_VERSION", "image-7")
-    outcome, _ = host.perform(request_for(store).model_copy(update={"version": "3+image-7"}), store)
+    outcome, _ = perform(request_for(store).model_copy(update={"version": "3+image-7"}), store)
     assert isinstance(outcome, StepResult)
     assert outcome.provenance.code_version.endswith("+image-7")
 
@@ -214,14 +216,14 @@ def test_the_exit_status_says_what_happened(store: ArtifactStore, tmp_path: Path
     (tmp_path / "request.json").write_text(request_for(store, trouble=trouble).model_dump_json())
     files = [str(tmp_path / "request.json"), str(tmp_path / "result.json")]
     progress = ["--store", str(store.root), "--progress", str(tmp_path / "progress")]
-    assert host.main([*files, *progress]) == status
+    assert program.main([*files, *progress]) == status
     assert StepFailure.model_validate_json((tmp_path / "result.json").read_text()).step == "shout"
 
 
 def test_a_request_that_is_no_json_is_bad_input(tmp_path: Path) -> None:
     (tmp_path / "request.json").write_text("{")
     files = [str(tmp_path / "request.json"), str(tmp_path / "result.json")]
-    assert host.main([*files, "--progress", str(tmp_path / "p")]) == 65
+    assert program.main([*files, "--progress", str(tmp_path / "p")]) == 65
     assert "not a StepRequest" in json.loads((tmp_path / "result.json").read_text())["message"]
 
 
@@ -233,17 +235,17 @@ def test_a_step_ends_with_the_process_that_wanted_it(store: ArtifactStore, tmp_p
 
 def test_the_catalog_of_the_product_names_existing_settings() -> None:
     for spec in STEPS.values():
-        assert issubclass(host._named(spec.settings), Settings)
+        assert issubclass(installed_code.load_object(spec.settings), Settings)
 
 
 def test_processor_time_is_that_of_the_step_and_of_what_it_started() -> None:
-    before = host._cpu_seconds()
+    before = cpu_seconds()
     spin = "import time\nwhile time.process_time() < 0.3: pass"
     subprocess.run([sys.executable, "-c", spin], check=True)
-    assert 0.3 <= host._cpu_seconds() - before < 3
+    assert 0.3 <= cpu_seconds() - before < 3
 
 
 def test_the_source_is_read_once_for_many_requests(monkeypatch: pytest.MonkeyPatch) -> None:
-    version = host.request_version(CATALOG["shout"])
-    monkeypatch.setattr(host, "_source_files", lambda: pytest.fail("it was read already"))
-    assert host.request_version(CATALOG["shout"]) == version
+    version = installed_code.request_version(CATALOG["shout"])
+    monkeypatch.setattr(installed_code, "_source_files", lambda: pytest.fail("it was read already"))
+    assert installed_code.request_version(CATALOG["shout"]) == version

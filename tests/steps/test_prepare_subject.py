@@ -9,10 +9,10 @@ from dg4d_lib.settings import SubjectSettings
 from dg4d_lib.video.framing import extent
 from steps.artifacts.media import read_frames, read_png
 from steps.prepare_subject import run
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 
 
-def prepare(source: Path, out: Path, **settings: object) -> Facts:
+def prepare(source: Path, out: Path, **settings: object) -> StepReport:
     out.mkdir()
     outputs = {"subject": out / "subject.png", "footage": out / "footage.zip", "picture": out / "picture.png"}
     return run(Job({"source": source}, outputs, SubjectSettings(size=64, **settings), 0, lambda *_: None, out))

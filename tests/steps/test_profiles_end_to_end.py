@@ -17,10 +17,8 @@ from tiny_weights import write_zero123
 
 from dg4d_lib.weights.registry import KNOWN
 from steps.artifacts.packages import ABOUT, ASSET, MANIFEST, MESHES, RIGGED, SPLATS
-from steps.artifacts.store import ArtifactStore
 from steps.catalog import STEPS
 from steps.contract import ArtifactRef, ProvenanceRecord, StepRequest, StepResult
-from steps.main import perform, request_version
 from steps.profiles import (
     PROFILES,
     DriveVideoSettings,
@@ -33,7 +31,10 @@ from steps.profiles import (
     profile,
     revise,
 )
+from steps.runtime.installed_code import request_version
+from steps.runtime.perform import perform
 from steps.runtime.weights import identities, weights_in
+from steps.store.artifact_store import ArtifactStore
 
 FRAMES = 3
 LADDER = [{"until": 1.0, "size": 32}]

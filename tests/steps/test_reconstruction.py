@@ -18,7 +18,7 @@ from steps.artifacts.media import read_png, write_png
 from steps.fit_gaussians import touched_up
 from steps.fitting.reconstruction import NOTE, Reconstruction, reconstruct_subject
 from steps.profiles import PREVIEW, FitGaussiansSettings
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 from steps.runtime.weights import open_weights, weights_in
 
 
@@ -66,7 +66,7 @@ def test_the_fit_starts_from_the_reconstruction_that_the_seed_decides(
 def test_what_the_prior_brought_stays_in_the_record(lgm: LgmSettings) -> None:
     opened = open_weights(lgm.weights), open_weights(lgm.views_weights)
     made = Reconstruction(blob(16, 0.5, torch.Generator()), opened)
-    facts = made.added_to(Facts("cpu", {"prior": "sha256:1"}, {"prior": "free"}, ("a prior",)))
+    facts = made.added_to(StepReport("cpu", {"prior": "sha256:1"}, {"prior": "free"}, ("a prior",)))
     assert facts.notes == ("a prior", NOTE)
     assert facts.weights["prior"] == "sha256:1"
     assert len(facts.licenses) == 3

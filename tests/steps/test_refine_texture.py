@@ -15,7 +15,7 @@ from steps.artifacts.media import write_frames
 from steps.artifacts.meshes import read_meshes, read_tracked, write_meshes, write_tracked
 from steps.profiles import RefineTextureSettings
 from steps.refine_texture import run
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 
 FRAMES = 3
 TEXTURE = {"iterations": 2, "size": 64}
@@ -38,7 +38,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def refine(folder: Path, mode: str, refiner: RefinerSettings) -> Facts:
+def refine(folder: Path, mode: str, refiner: RefinerSettings) -> StepReport:
     return run(
         Job(
             inputs={mode: folder / f"{mode}.in", "driving_video": folder / "video"},

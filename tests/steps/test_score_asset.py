@@ -15,7 +15,7 @@ from dg4d_lib.errors import BadInput
 from steps.artifacts.media import read_png, write_png, write_zip
 from steps.artifacts.rendering import render_package
 from steps.profiles import ScoreAssetSettings
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
 from steps.score_asset import run
 
 SIZE, COUNT = 64, 12
@@ -49,7 +49,7 @@ def zipped(folder: Path, out: Path) -> Path:
 
 def score(
     out: Path, truth: Path, package: Path | None = None, mesh: bool = False, **knobs: object
-) -> tuple[dict, Facts]:
+) -> tuple[dict, StepReport]:
     out.mkdir(parents=True, exist_ok=True)
     inputs = {"truth": zipped(truth, out / "truth.zip")}
     if package is not None:

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from steps.artifacts import store as module
-from steps.artifacts.store import ArtifactMissing, ArtifactStore, DiskFull, home, write_atomically
 from steps.contract import ArtifactRef
+from steps.store import artifact_store as module
+from steps.store.artifact_store import ArtifactMissing, ArtifactStore
+from steps.store.files import DiskFull, home, write_atomically
 
 
 @pytest.fixture

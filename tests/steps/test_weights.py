@@ -4,9 +4,8 @@ import pytest
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.weights.lock import Locked, LockedFile, write_lock
-from steps.artifacts.store import ArtifactStore
 from steps.contract import StepRequest
-from steps.main import perform
+from steps.runtime.perform import perform
 from steps.runtime.weights import (
     identities,
     license_of,
@@ -16,6 +15,7 @@ from steps.runtime.weights import (
     weights_in,
     without_paths,
 )
+from steps.store.artifact_store import ArtifactStore
 
 
 @pytest.fixture(autouse=True)

@@ -21,7 +21,7 @@ from flows.engine.executors import StepError, StepMissing
 from flows.packages.scores import Results
 from flows.serving.server import Server
 from steps.artifacts.ground_truth import find_truth
-from steps.artifacts.store import ArtifactStore
+from steps.store.artifact_store import ArtifactStore
 
 VIEWS = ("view_-75", "view_15")
 

@@ -11,7 +11,7 @@ from fake_steps import PNG, bank_json, picture
 from typer.testing import CliRunner, Result
 
 from flows import cli
-from steps.artifacts import store as store_module
+from steps.store import artifact_store as store_module
 
 
 @pytest.fixture(autouse=True)

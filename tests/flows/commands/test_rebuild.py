@@ -21,9 +21,9 @@ from flows.inputs.orders import Order, Wish, order_again
 from flows.packages.publish import record_of
 from flows.packages.verify import verify
 from flows.serving.server import Server
-from steps.artifacts.store import ArtifactStore
 from steps.profiles import PREVIEW, revise
-from steps.runtime.job import Facts, Job
+from steps.runtime.job import Job, StepReport
+from steps.store.artifact_store import ArtifactStore
 
 TINY = {
     "subject.size": 64,
@@ -74,10 +74,12 @@ def outcomes(rebuilt: Rebuilt) -> dict[str, str]:
     return {likeness.name: likeness.outcome for likeness in rebuilt.likenesses}
 
 
-def altered(step: Callable[[Job], Facts], port: str, change: Callable[[bytes], bytes]) -> Callable[[Job], Facts]:
+def altered(
+    step: Callable[[Job], StepReport], port: str, change: Callable[[bytes], bytes]
+) -> Callable[[Job], StepReport]:
     """A step whose output comes out otherwise."""
 
-    def run(job: Job) -> Facts:
+    def run(job: Job) -> StepReport:
         facts = step(job)
         job.outputs[port].write_bytes(change(job.outputs[port].read_bytes()))
         return facts

@@ -20,8 +20,8 @@ from flows.inputs.orders import Order, Wish
 from flows.packages.publish import whole
 from flows.packages.versions import Version, faults, versions
 from flows.serving.server import Server
-from steps.artifacts.store import object_name
 from steps.profiles import PREVIEW, revise
+from steps.store.artifact_store import object_name
 
 RUN_FACTS = ("report.json", "report.html", "provenance.json", "ro-crate-metadata.json")  # these say when and how long
 
@@ -207,7 +207,7 @@ def test_a_bucket_that_goes_away_for_a_while_delays_a_flow_and_no_more(
 def test_a_step_that_lost_patience_with_the_bucket_is_tried_again(
     bucket: TinyS3, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("steps.artifacts.opening.PATIENCE_S", 0.1)
+    monkeypatch.setattr("steps.store.opening.PATIENCE_S", 0.1)
     monkeypatch.setattr(tasks, "RETRY_DELAY_S", 3.0)
     wanted = order("patience fit_motion=sleep-once:0.3", tmp_path)
     absence = threading.Thread(target=_absent, args=(bucket, log, "fit_motion", 2.0))
@@ -221,7 +221,7 @@ def test_a_step_that_lost_patience_with_the_bucket_is_tried_again(
 def test_a_bucket_that_stays_away_is_a_clear_error_and_the_next_run_goes_on(
     bucket: TinyS3, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("steps.artifacts.opening.PATIENCE_S", 0.1)
+    monkeypatch.setattr("steps.store.opening.PATIENCE_S", 0.1)
     wanted = order("stays-away fit_motion=sleep-once:0.3", tmp_path)
     absence = threading.Thread(target=_absent, args=(bucket, log, "fit_motion", 0))
     absence.start()

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from flows.engine.caching import FileLocks, RequestPolicy, record_key, recorded
-from steps.artifacts.store import ArtifactStore
 from steps.contract import ArtifactRef, ProvenanceRecord, StepRequest, StepResult
+from steps.store.artifact_store import ArtifactStore
 
 
 def request(**changes: Any) -> StepRequest:

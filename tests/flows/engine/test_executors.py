@@ -24,9 +24,9 @@ from flows.engine.executors import (
     in_process,
     in_subprocess,
 )
-from steps.artifacts.store import ArtifactStore
 from steps.contract import StepRequest, StepSpec
-from steps.main import request_version
+from steps.runtime.installed_code import request_version
+from steps.store.artifact_store import ArtifactStore
 
 HERE = str(Path(__file__).parents[1])
 OUTSIDE = [in_subprocess, in_container]

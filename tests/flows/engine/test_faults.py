@@ -31,8 +31,8 @@ from flows.inputs.orders import Order, Wish
 from flows.packages.publish import whole
 from flows.packages.versions import faults, versions
 from flows.serving.server import Server, answers
-from steps.artifacts.store import ArtifactStore
 from steps.profiles import PREVIEW
+from steps.store.artifact_store import ArtifactStore
 
 EVERY_STEP = [
     "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "extract_mesh", "refine_texture", "pack_asset",

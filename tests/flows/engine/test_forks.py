@@ -12,9 +12,9 @@ from waiting import wait_until
 from flows.engine import forks
 from flows.engine.executors import StepOutOfMemory, in_subprocess
 from flows.engine.forks import Fork, ForkServer
-from steps.artifacts.store import ArtifactStore
 from steps.contract import StepRequest
-from steps.main import request_version
+from steps.runtime.installed_code import request_version
+from steps.store.artifact_store import ArtifactStore
 
 
 @pytest.fixture(autouse=True)

@@ -11,7 +11,7 @@ import pytest
 from fake_steps import picture
 
 from flows.engine.free_space import NEEDED_BYTES, require_free_space
-from steps.artifacts.store import DiskFull
+from steps.store.files import DiskFull
 
 
 @pytest.mark.parametrize(("free", "refused"), [(NEEDED_BYTES, False), (NEEDED_BYTES - 1, True), (0, True)])

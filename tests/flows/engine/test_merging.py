@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from flows.engine.merging import frames_in
-from steps.artifacts.store import ArtifactStore
+from steps.store.artifact_store import ArtifactStore
 
 
 @pytest.fixture

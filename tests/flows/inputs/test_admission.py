@@ -12,8 +12,8 @@ from flows.commands.benchmark import put_truth
 from flows.inputs import sources
 from flows.inputs.sources import put_bank, put_source
 from steps.artifacts.ground_truth import find_truth
-from steps.artifacts.store import ArtifactStore
 from steps.sources import banks
+from steps.store.artifact_store import ArtifactStore
 
 SECRET = b"root:x:0:0:root:/root:/bin/bash\n"
 

@@ -316,7 +316,7 @@ def test_objects_that_are_named_as_if_they_lay_outside_are_bad_items(bucket: Tin
 
 
 def test_an_object_store_that_does_not_answer_is_named(bucket: TinyS3, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("steps.artifacts.opening.PATIENCE_S", 0.2)
+    monkeypatch.setattr("steps.store.opening.PATIENCE_S", 0.2)
     bucket.stop()
     with pytest.raises(BackendUnavailable, match="does not answer"):
         items(f"s3://{BUCKET}/in2/")

@@ -6,8 +6,8 @@ from fake_steps import PNG, bank_json, picture
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.rasterizer import choice
 from flows.inputs.orders import Order, Wish, name_of
-from steps.artifacts.store import ArtifactStore
 from steps.profiles import PREVIEW, revise
+from steps.store.artifact_store import ArtifactStore
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ import pytest
 
 from flows.packages import acceptance, report
 from flows.packages.summary import NOT_ACCEPTED, Row, Writer, judged
-from steps.artifacts.store import ArtifactStore
 from steps.contract import ArtifactRef, ProvenanceRecord, StepResult
+from steps.store.artifact_store import ArtifactStore
 
 
 def gate(name: str, value: float, least: float | None, most: float | None, passed: bool) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import pytest
 from dg4d_lib.errors import BadInput
 from flows.packages.publish import Files, check_folder, is_current, publish, record_of
 from flows.packages.verify import verify
-from steps.artifacts.store import DiskFull
+from steps.store.files import DiskFull
 
 
 def zipped(path: Path, **entries: str) -> Path:

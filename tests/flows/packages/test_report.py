@@ -13,9 +13,9 @@ from flows.inputs.orders import Order
 from flows.packages import report
 from flows.packages.summary import Row, Writer
 from flows.ui.curves import HEIGHT, WIDTH
-from steps.artifacts.store import ArtifactStore
 from steps.contract import ArtifactRef, ProvenanceRecord, StepResult
 from steps.profiles import PREVIEW, revise
+from steps.store.artifact_store import ArtifactStore
 
 FILES = {
     name: {"digest": "sha256:" + "a" * 64, "size_bytes": size}

@@ -17,10 +17,10 @@ from flows.commands.store import store as command
 from flows.engine import leases
 from flows.engine.collecting import collect
 from flows.packages.versions import StepDone, Version, faults, versions
-from steps.artifacts.bucket import BucketStore
-from steps.artifacts.opening import open_store
-from steps.artifacts.store import ArtifactStore, object_name
 from steps.contract import ArtifactRef
+from steps.store.artifact_store import ArtifactStore, object_name
+from steps.store.bucket import BucketStore
+from steps.store.opening import open_store
 
 DAY = 24 * 3600.0
 LATER = 0.05  # seconds after which what was just written is old for these tests
@@ -129,7 +129,7 @@ def test_two_runs_of_one_item_share_a_lease(store: ArtifactStore) -> None:
 PROGRAM = """
 import sys, time
 from flows.engine import leases
-from steps.artifacts.opening import open_store
+from steps.store.opening import open_store
 store = open_store(sys.argv[1])
 with (leases.collecting(store) if sys.argv[2] == "collect" else leases.running(store, "cat")):
     if sys.argv[2] != "collect":

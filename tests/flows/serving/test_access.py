@@ -14,8 +14,8 @@ from flows import home
 from flows.serving import access, server_app
 from flows.serving.auth import SESSION_S, Sessions, auth_string, basic, is_authorized
 from flows.serving.server import Server
-from steps.artifacts.store import ArtifactStore
 from steps.contract import ArtifactRef
+from steps.store.artifact_store import ArtifactStore
 
 PNG = b"\x89PNG\r\n\x1a\n"
 OWN_PAGE = {"Sec-Fetch-Site": "same-origin"}

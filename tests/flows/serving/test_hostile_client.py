@@ -12,7 +12,7 @@ from tiny_s3 import TinyS3
 from waiting import wait_until
 
 from flows.serving.server import Server
-from steps.artifacts.store import ArtifactStore
+from steps.store.artifact_store import ArtifactStore
 from tests.clients.node import run_node
 
 PNG = Path(__file__).parents[3] / "examples" / "newt.png"

@@ -28,9 +28,9 @@ from flows.serving.auth import basic
 from flows.serving.server import Server
 from flows.ui import curves, pages
 from flows.ui.asset_page import PICTURES
-from steps.artifacts.store import ArtifactStore
 from steps.contract import ArtifactRef
 from steps.profiles import PREVIEW
+from steps.store.artifact_store import ArtifactStore
 from tests.clients.node import run_node
 
 EVERY_STEP = [

@@ -1,30 +1,28 @@
 """Where artifacts live: a file is kept once, under the sha256 of its content, and never changes.
 
-This is the folder on one machine; `steps/artifacts/bucket.py` has the same in an object store.
+This is the folder on one machine; `steps/store/bucket.py` has the same in an object store.
 
     sha256/ab/ab12...   artifacts, each under the digest of its content
     incoming/           artifacts that are being written, on this machine only
     anything else       small files by name, each written at once, of those who keep records about artifacts
 """
 
-import errno
 import hashlib
 import io
 import os
-import shutil
 import stat
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO, NamedTuple
 
-from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
+from dg4d_lib.errors import BackendUnavailable, DG4DError
 from steps.contract import ArtifactRef, is_digest
+from steps.store.files import room_for, write_atomically
 
 CHUNK = 1 << 20  # bytes read at a time
-NO_SPACE = {errno.ENOSPC, errno.EDQUOT}
 OBJECTS, INCOMING = "sha256", "incoming"
 
 
@@ -34,37 +32,6 @@ class ArtifactMissing(DG4DError):
 
 class StoreUnreachable(BackendUnavailable):
     """The store does not answer at the moment; the same again may work."""
-
-
-class DiskFull(BadInput):
-    """No room for a file; nothing half-written was left."""
-
-
-def home() -> Path:
-    """Where everything that outlives a command is kept: `$DG4D_HOME`, else the platform's user data folder."""
-    given = os.environ.get("DG4D_HOME")
-    if given:
-        return Path(given).expanduser().absolute()
-    data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
-    return Path(data) / "dg4d"
-
-
-@contextmanager
-def room_for(place: Path) -> Iterator[None]:
-    """Turn "no space left" into one clear sentence about `place`.
-
-    Raises:
-        DiskFull: the disk, or the user's share of it, is full.
-    """
-    try:
-        yield
-    except OSError as error:
-        if error.errno not in NO_SPACE:
-            raise
-        raise DiskFull(
-            f"the disk that holds {place} is full: free some space and run the same command again; "
-            "finished steps are kept and are not computed again"
-        ) from error
 
 
 class Entry(NamedTuple):
@@ -313,27 +280,3 @@ def _copy(source: BinaryIO, target: BinaryIO | None) -> tuple[str, int]:
             target.write(chunk)
         size += len(chunk)
     return f"sha256:{content.hexdigest()}", size
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Write a text file so that a reader sees the old content or the new one, never a part.
-
-    Raises:
-        DiskFull: there is no room; the old content stays.
-    """
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    with room_for(path.parent):
-        try:
-            with scratch.open("w", encoding="utf-8") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            scratch.replace(path)
-        finally:
-            with suppress(OSError):
-                scratch.unlink(missing_ok=True)
-
-
-def remove_tree(folder: Path) -> None:
-    """Remove a folder that may hold anything, or may be gone already."""
-    shutil.rmtree(folder, ignore_errors=True)

@@ -6,15 +6,14 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from steps.artifacts.store import ArtifactStore, home
+from steps.store.artifact_store import ArtifactStore
+from steps.store.files import home
 
 PATIENCE_S = 120.0  # a request that gets no answer is repeated for so long
-ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
-LOOPBACK = {"localhost", "127.0.0.1", "::1"}
 
 
 def open_store(address: str | Path | None = None, patience_s: float | None = None) -> ArtifactStore:
-    """The store at an address: a folder, or `s3://BUCKET/PREFIX` with the usual AWS_* variables.
+    """Open the store at an address: a folder, or `s3://BUCKET/PREFIX` with the usual AWS_* variables.
 
     Args:
         address: default: `$DG4D_STORE`, else the folder `store` under the home folder.
@@ -30,14 +29,14 @@ def open_store(address: str | Path | None = None, patience_s: float | None = Non
 
 @functools.cache
 def _opened(given: str, copies: Path, patience_s: float) -> ArtifactStore:
-    """One store of a kind in a process: it keeps connections, and remembers which files are sound."""
+    """Open a store once per process: it keeps connections, and remembers which files are sound."""
     if "://" not in given:
         return ArtifactStore(Path(given).expanduser())
     parts = urlsplit(given)
     if parts.scheme != "s3" or not parts.netloc:
         raise BadInput(f"the store {given!r} is neither a folder nor of the form s3://BUCKET/PREFIX; set $DG4D_STORE")
     try:
-        from steps.artifacts.bucket import open_bucket  # noqa: PLC0415 - an optional extra
+        from steps.store.bucket import open_bucket  # noqa: PLC0415 - an optional extra
     except ModuleNotFoundError as error:
         raise BackendUnavailable(f"{given} needs a library that is not installed: pip install 'dg4d[s3]'") from error
     return open_bucket(given, copies, patience_s)

@@ -16,8 +16,8 @@ from obstore.exceptions import AlreadyExistsError, BaseError, PermissionDeniedEr
 from obstore.store import S3Store
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from steps.artifacts.opening import ENDPOINTS, LOOPBACK
-from steps.artifacts.store import (
+from steps.contract import ArtifactRef
+from steps.store.artifact_store import (
     CHUNK,
     OBJECTS,
     ArtifactMissing,
@@ -25,9 +25,9 @@ from steps.artifacts.store import (
     Entry,
     StoreUnreachable,
     object_name,
-    room_for,
 )
-from steps.contract import ArtifactRef
+from steps.store.endpoints import ENDPOINTS, LOOPBACK
+from steps.store.files import room_for
 
 if TYPE_CHECKING:
     from obstore.store import ClientConfig, ObjectStore

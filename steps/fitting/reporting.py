@@ -1,0 +1,49 @@
+"""Loss curves and pictures that both fits report."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.rasterizer.interface import Rasterizer
+from steps.artifacts.media import write_curves
+from steps.runtime.job import Progress
+
+PICTURE_AZIMUTHS_DEG = (0.0, 45.0, 90.0, 180.0, -90.0, -45.0)
+PICTURE_SIZE = 192  # pixels
+
+
+class LossCurves:
+    """Values that an optimization reports, passed on as progress and written as an artifact.
+
+    Args:
+        total: number of iterations.
+        progress: callback of the job.
+    """
+
+    def __init__(self, total: int, progress: Progress) -> None:
+        self.total, self.progress = total, progress
+        self.iterations: list[int] = []
+        self.series: dict[str, list[float]] = {}
+
+    def add(self, iteration: int, values: dict[str, float]) -> None:
+        """Record the values of an iteration."""
+        self.iterations.append(iteration)
+        for name, value in values.items():
+            self.series.setdefault(name, []).append(value)
+        self.progress(iteration, self.total, values)
+
+    def write(self, path: Path, title: str, notes: Sequence[str]) -> None:
+        """Write the `curves` artifact."""
+        write_curves(path, title, self.iterations, self.series, notes)
+
+
+def render_turnaround(gaussians: Gaussians, rasterize: Rasterizer) -> Float[Tensor, "h w 3"]:
+    """Render the cloud from six sides in a row, over white."""
+    cameras = [OrbitCamera(0, azimuth, width=PICTURE_SIZE, height=PICTURE_SIZE) for azimuth in PICTURE_AZIMUTHS_DEG]
+    with torch.no_grad():
+        return torch.cat(list(rasterize(gaussians, cameras, torch.ones(3)).color), 1).cpu()

@@ -1,0 +1,69 @@
+"""Progress and notes of a running step, as JSON lines on its standard output."""
+
+import json
+import logging
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TextIO
+
+from steps.runtime.job import Progress
+
+PROGRESS_EVERY_S = 0.2
+
+
+def progress_file(path: Path | None) -> TextIO:
+    """Open the file for progress: `path`, or standard output, whose other users then write to standard error.
+
+    C++ libraries print to the file descriptor, so that it is redirected rather than `sys.stdout`.
+    """
+    if path is not None:
+        return path.open("a", encoding="utf-8")
+    sys.stdout.flush()
+    own = os.dup(1)
+    os.dup2(2, 1)
+    return os.fdopen(own, "w", encoding="utf-8")
+
+
+def progress_lines(file: TextIO) -> Progress:
+    """Return a progress callback that writes JSON lines, a few per second, and always the last."""
+    last = -PROGRESS_EVERY_S
+
+    def report(done: int, total: int, values: dict[str, float]) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last >= PROGRESS_EVERY_S or done >= total:
+            last = now
+            numbers = {name: float(value) for name, value in values.items()}
+            _write_line(file, {"done": int(done), "total": int(total), "values": numbers})
+
+    return report
+
+
+def note_lines(file: TextIO) -> Callable[[str], None]:
+    """Return a function that writes notes as JSON lines."""
+    return lambda text: _write_line(file, {"note": text})
+
+
+@contextmanager
+def notes_to(say: Callable[[str], None]) -> Iterator[None]:
+    """Pass log messages of the library to `say` while the block runs, for example that kernels are being compiled."""
+    handler = logging.Handler(logging.INFO)
+    handler.emit = lambda record: say(record.getMessage())  # type: ignore[method-assign]
+    logger = logging.getLogger("dg4d_lib")
+    level = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+
+
+def _write_line(file: TextIO, message: dict[str, Any]) -> None:
+    file.write(json.dumps(message) + "\n")
+    file.flush()

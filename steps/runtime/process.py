@@ -1,0 +1,76 @@
+"""Process of a step: memory allocator, thread settings, lifetime and resource usage."""
+
+import ctypes
+import faulthandler
+import os
+import resource
+import signal
+import sys
+import threading
+from contextlib import suppress
+from pathlib import Path
+
+from steps.contract import EXIT_CRASHED
+
+M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_MAX = -1, -2, -4  # parameters of glibc's mallopt
+PR_SET_PDEATHSIG = 1  # option of Linux's prctl
+
+
+def prepare_process() -> None:
+    """Set everything that must be set before torch is imported; have crashes of native code print a traceback."""
+    faulthandler.enable(all_threads=False)
+    signal.signal(signal.SIGABRT, signal.SIG_DFL)  # whoever aborts says why; a traceback would push that out of view
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # torch's threads would spin after every operation
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy's would spin too, and its matrices are small
+    if not sys.platform.startswith("linux"):
+        return
+    try:  # keep freed memory: large temporaries would be mapped and unmapped at every operation
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError):  # not glibc
+        return
+    mallopt(M_MMAP_MAX, 0)
+    mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+    mallopt(M_TOP_PAD, 256 * 2**20)
+
+
+def set_process_name(name: str) -> None:
+    """Set the name that `top` and `ps` show."""
+    with suppress(OSError):  # not Linux
+        Path("/proc/self/comm").write_text(name, encoding="ascii")
+
+
+def die_with(parent: str) -> None:
+    """End this process when its parent ends: a process id, or - for whoever keeps standard input open.
+
+    The other processes of a container end with its first, which is this one; it cannot see the process that started
+    the container.
+    """
+    if parent == "-":
+        threading.Thread(target=_end_with_input, daemon=True).start()
+        return
+    if sys.platform.startswith("linux"):
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != int(parent):  # it ended before the line above
+        sys.exit(EXIT_CRASHED)
+
+
+def _end_with_input() -> None:
+    while os.read(0, 1):
+        pass
+    os._exit(EXIT_CRASHED)
+
+
+def cpu_seconds() -> float:
+    """Return the CPU time of this process and of its children that have ended, in seconds of all cores."""
+    used = (resource.getrusage(whose) for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(times.ru_utime + times.ru_stime for times in used)
+
+
+def peak_memory_mb() -> float:
+    """Return the peak resident memory of this process, in MiB."""
+    try:  # of this program alone; getrusage also counts what the process was before exec
+        status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+        return int(status.split("VmHWM:")[1].split()[0]) / 1024
+    except (OSError, IndexError):  # not Linux
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)

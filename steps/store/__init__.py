@@ -1,0 +1,1 @@
+"""Content-addressed store: a folder, or a bucket of an S3-compatible object store."""

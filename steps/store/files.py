@@ -1,0 +1,67 @@
+"""Files on this machine: the home folder, writes that are whole, and one error for a full disk."""
+
+import errno
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from dg4d_lib.errors import BadInput
+
+NO_SPACE = {errno.ENOSPC, errno.EDQUOT}
+
+
+class DiskFull(BadInput):
+    """No room for a file; nothing half-written was left."""
+
+
+def home() -> Path:
+    """Where everything that outlives a command is kept: `$DG4D_HOME`, else the platform's user data folder."""
+    given = os.environ.get("DG4D_HOME")
+    if given:
+        return Path(given).expanduser().absolute()
+    data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
+    return Path(data) / "dg4d"
+
+
+@contextmanager
+def room_for(place: Path) -> Iterator[None]:
+    """Turn "no space left" into one clear sentence about `place`.
+
+    Raises:
+        DiskFull: the disk, or the user's share of it, is full.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in NO_SPACE:
+            raise
+        raise DiskFull(
+            f"the disk that holds {place} is full: free some space and run the same command again; "
+            "finished steps are kept and are not computed again"
+        ) from error
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write a text file so that a reader sees the old content or the new one, never a part.
+
+    Raises:
+        DiskFull: there is no room; the old content stays.
+    """
+    scratch = path.with_name(f".{path.name}.{os.getpid()}")
+    with room_for(path.parent):
+        try:
+            with scratch.open("w", encoding="utf-8") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            scratch.replace(path)
+        finally:
+            with suppress(OSError):
+                scratch.unlink(missing_ok=True)
+
+
+def remove_tree(folder: Path) -> None:
+    """Remove a folder that may hold anything, or may be gone already."""
+    shutil.rmtree(folder, ignore_errors=True)
