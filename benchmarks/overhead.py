@@ -29,7 +29,7 @@ from steps.contract import StepFailure, StepRequest
 from steps.profiles import profile
 from steps.runtime.installed_code import catalog, request_version
 from steps.runtime.perform import perform
-from steps.runtime.process import prepare_process
+from steps.runtime.process_setup import prepare_process
 from steps.store.artifact_store import ArtifactStore
 
 WAYS = ("steps", "first", "next")

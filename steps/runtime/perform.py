@@ -16,7 +16,7 @@ from steps.runtime.environment_info import environment_info
 from steps.runtime.failures import failure_kind, failure_message
 from steps.runtime.installed_code import catalog, code_version, load_object
 from steps.runtime.job import Job, Progress, StepReport
-from steps.runtime.process import cpu_seconds, peak_memory_mb
+from steps.runtime.process_setup import cpu_seconds, peak_memory_mb
 from steps.runtime.weights import require_same
 from steps.store.artifact_store import ArtifactStore, StoreUnreachable
 

@@ -12,7 +12,7 @@ from steps.contract import EXIT_DONE, EXIT_STATUS, StepFailure, StepRequest, Ste
 from steps.runtime.failures import failure_kind
 from steps.runtime.messages import note_lines, notes_to, progress_file, progress_lines
 from steps.runtime.perform import perform
-from steps.runtime.process import die_with, prepare_process, set_process_name
+from steps.runtime.process_setup import die_with, prepare_process, set_process_name
 from steps.store.files import write_atomically
 from steps.store.opening import open_store
 

@@ -15,7 +15,7 @@ from steps.contract import ArtifactRef, Port, StepFailure, StepRequest, StepResu
 from steps.runtime import installed_code, program
 from steps.runtime.job import Job, StepReport
 from steps.runtime.perform import perform
-from steps.runtime.process import cpu_seconds
+from steps.runtime.process_setup import cpu_seconds
 from steps.store.artifact_store import ArtifactMissing, ArtifactStore
 
 TEXT = Port(media_type="text/plain", suffix=".txt")
