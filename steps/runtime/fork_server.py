@@ -1,13 +1,13 @@
-"""Server that imports the libraries of all steps once and forks a process_setup per step.
+"""Server that imports the libraries of all steps once and forks a process per step.
 
 `python -m steps.runtime.fork_server SOCKET` reads orders from a socket (SOCK_SEQPACKET) that it inherits as a file
 descriptor. An order is `{"arguments": [...], "environment": {...}}`: the arguments of `steps.main`, and variables that
-the step has beside those of this process_setup. Descriptors come with it: standard input, output and error, and others that
+the step has beside those of this process. Descriptors come with it: standard input, output and error, and others that
 the step must hold open. Answers are `{"pid": 7}`, in the order of the orders, and later `{"pid": 7, "status": 0}`: an
-exit status, or the negative number of a signal. This process_setup ends when the other end of the socket is closed.
+exit status, or the negative number of a signal. This process ends when the other end of the socket is closed.
 
-A step is a process_setup group of its own, as with `python -m steps.main`. The caller should have it end with its parent,
-which is this process_setup. A step whose code cannot be imported prints the traceback to its own standard error.
+A step is a process group of its own, as with `python -m steps.main`. The caller should have it end with its parent,
+which is this process. A step whose code cannot be imported prints the traceback to its own standard error.
 """
 
 import argparse
@@ -48,7 +48,7 @@ def main() -> int:
 def _load_program() -> Callable[[list[str]], int]:
     """Import the program that performs steps; if that fails, return one that prints the traceback.
 
-    This process_setup has no standard error that anybody reads, but every fork has.
+    This process has no standard error that anybody reads, but every fork has.
     """
     try:
         from steps.runtime import process_setup, program  # noqa: PLC0415 - errors must be caught
@@ -77,7 +77,7 @@ def _serve(control: socket.socket, modules: Iterator[str]) -> list[str] | None:
     """Import modules between orders and fork for every order, so that first steps do not wait for later ones' imports.
 
     Returns:
-        Arguments of the step in a fork; None in this process_setup, when there will be no more orders.
+        Arguments of the step in a fork; None in this process, when there will be no more orders.
     """
     coming = next(modules, None)
     ended, signaled = socket.socketpair()
@@ -126,7 +126,7 @@ def _preload(entry: str) -> None:
 
 
 def _become(environment: dict[str, str], handles: list[int]) -> None:
-    """Give this fork the process_setup group, environment and descriptors of its order."""
+    """Give this fork the process group, environment and descriptors of its order."""
     os.setpgid(0, 0)
     os.environ.update(environment)
     tempfile.tempdir = None  # from the new environment
