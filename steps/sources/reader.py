@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -100,7 +99,7 @@ def _decode(path: Path, head: bytes, scratch: Path, max_frames: int, limit: Deco
     if is_zip(head):
         return _read_zip(path, scratch, max_frames, limit)
     if is_animated(head):
-        return _read_webp(path, scratch, max_frames, limit)
+        return _read_webp(path, max_frames, limit)
     container = "apng" if is_animated_png(head) else container_of(head)
     if container:
         return _read_clip(path, container, max_frames, limit)
@@ -140,15 +139,14 @@ def _read_clip(path: Path, container: str, max_frames: int, limit: DecodeLimit) 
     return _video(frames, has_alpha, clip.fps, clip.count, notes)
 
 
-def _read_webp(path: Path, scratch: Path, max_frames: int, limit: DecodeLimit) -> Source:
+def _read_webp(path: Path, max_frames: int, limit: DecodeLimit) -> Source:
     limit.require_file(path, "the WebP animation")
-    clip = AnimatedWebp(path.read_bytes(), scratch, limit)
-    if len(clip) != 1:
-        _need_two(len(clip), "the WebP animation")
-    kept = KeptFrames(evenly_spaced(len(clip), max_frames), "the WebP animation")
-    for i, frame in enumerate(clip):
-        if i in kept:
-            kept.add(i, shrink_by_bands(torch.from_numpy(frame), kept.side))
+    with path.open("rb") as file:
+        clip = AnimatedWebp(file, limit)
+        kept = KeptFrames(evenly_spaced(len(clip), max_frames), "the WebP animation")
+        for i, frame in enumerate(clip):
+            if i in kept:
+                kept.add(i, shrink_by_bands(frame, kept.side))
     return _picture(kept.frames, True) if len(clip) == 1 else _video(kept.frames, True, clip.fps, len(clip))
 
 
