@@ -14,11 +14,11 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.analytic import AnalyticPrior
 from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.oracle import Bank
+from dg4d_lib.images import over_white
 from dg4d_lib.metrics.image import iou, psnr
 from dg4d_lib.metrics.video import temporal_error
 from dg4d_lib.rasterizer.interface import choose_rasterizer
 from dg4d_lib.settings import MotionSettings, OraclePriorSettings, StaticSettings
-from dg4d_lib.video.driving import over_white
 from steps.artifacts.motions import new_deformation
 from steps.fit_gaussians import starting_cloud
 from steps.fitting.priors import oracle_prior

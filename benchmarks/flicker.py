@@ -18,6 +18,7 @@ from torch import Tensor
 from benchmarks.objects.drawing import Painted
 from benchmarks.objects.specimens import OBJECTS
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.images import color_over_white
 from dg4d_lib.metrics.video import flicker, temporal_error
 
 AZIMUTHS_DEG = (-75, 15, 105, 195)
@@ -54,7 +55,7 @@ def filmed(painted: Painted, azimuth_deg: float, frames: int, size: int) -> Film
     camera = OrbitCamera(azimuth_deg=azimuth_deg, width=size, height=size)
     cutouts = torch.cat([painted.draw(frame / frames, [camera]) for frame in range(frames)])
     coverage = cutouts[..., 3:]
-    return Film(cutouts[..., :3] * coverage + 1 - coverage, (coverage > 0.5).float())
+    return Film(color_over_white(cutouts[..., :3], coverage), (coverage > 0.5).float())
 
 
 def rows_of(name: str, frames: int, size: int) -> list[Row]:

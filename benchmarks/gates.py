@@ -32,6 +32,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.harmonics import color_of_harmonics, harmonics_of_color
+from dg4d_lib.images import resize_planes
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.metrics.gates import Gate, judge
@@ -218,7 +219,7 @@ def _refaced(sample: Sample, faces: Tensor) -> Sample:
 def _blurred(texture: Float[Tensor, "h w 3"], texels: int) -> Float[Tensor, "h w 3"]:
     """A texture that was saved much too small."""
     planes = texture.movedim(-1, 0)[None]
-    small = interpolate(planes, (texels, texels), mode="bilinear", antialias=True)
+    small = resize_planes(planes, (texels, texels))
     return interpolate(small, texture.shape[:2], mode="bilinear")[0].movedim(0, -1)
 
 

@@ -22,6 +22,7 @@ from dg4d_lib.assets.formats.compact import read_compact
 from dg4d_lib.assets.formats.glb import read_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.images import color_over_white
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import best_level
 from dg4d_lib.mesh.render import render_mesh
@@ -90,7 +91,7 @@ def look(mesh: TexturedMesh, truth: tuple[Tensor, Tensor]) -> list[float]:
     """PSNR and overlap in the first view, then in the second."""
     color, coverage = render_mesh(mesh, cameras())
     seen = ((coverage > 0.5) | (truth[1] > 0.5)).float()
-    pairs = torch.stack([psnr(color * coverage + 1 - coverage, truth[0], seen), iou(coverage, truth[1])], 1)
+    pairs = torch.stack([psnr(color_over_white(color, coverage), truth[0], seen), iou(coverage, truth[1])], 1)
     return pairs.flatten().tolist()
 
 

@@ -44,6 +44,7 @@ from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.interface import GuidancePrior
 from dg4d_lib.guidance.zero123 import CAMERA_NUMBERS, LATENT_CHANNELS, Zero123
+from dg4d_lib.images import over_white
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
 from dg4d_lib.settings import (
@@ -261,8 +262,9 @@ def conditioned(
     model: Zero123, cutouts: torch.Tensor, stage: StaticSettings | MotionSettings, clock: Clock
 ) -> GuidancePrior:
     """The prior that knows some frames, watched by the clock."""
-    over_white = cutouts[..., :3] * cutouts[..., 3:] + 1 - cutouts[..., 3:]
-    clock.watch(prior := model.conditioned_on(over_white, Annealing(stage.noise_start, stage.noise_end)), "loss")
+    clock.watch(
+        prior := model.conditioned_on(over_white(cutouts), Annealing(stage.noise_start, stage.noise_end)), "loss"
+    )
     return prior
 
 

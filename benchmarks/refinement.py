@@ -19,10 +19,10 @@ import torch  # isort: skip
 from jaxtyping import Float
 from rich.table import Column, Table
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.glb import read_glb
+from dg4d_lib.images import resize
 from dg4d_lib.settings import (
     ImageToImageSettings,
     RefinerSettings,
@@ -83,9 +83,7 @@ def refined(asset: Asset4D, video: DrivingVideo, settings: RefinerSettings, seed
 
 def measured(variant: str, before: Float[Tensor, "h w 3"], textures: Float[Tensor, "t i j 3"]) -> Row:
     """Flicker and sharpness of textures per frame."""
-    planes = before.movedim(-1, 0)[None]
-    small = interpolate(planes, textures.shape[1:3], mode="bilinear", antialias=True, align_corners=False)
-    start = small[0].movedim(0, -1)
+    start = resize(before[None], textures.shape[1:3])[0]
     touched = ((textures - start).abs() > NOTICEABLE).any(-1).any(0)
     changes = textures.diff(dim=0).abs().mean((0, -1))[touched]
     steps = [_steps(picture)[touched].mean() for picture in (textures, start[None])]

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.images import over_white
 from examples.beetle import Beetle
 from examples.drawing import draw
 from examples.newt import Newt
@@ -28,7 +29,7 @@ def main() -> None:
     write_png(FOLDER / "beetle.png", draw(Beetle(), 0.0, camera))
     small = OrbitCamera(width=VIDEO_SIZE, height=VIDEO_SIZE)
     cutouts = torch.stack([draw(newt, frame / FRAMES, small) for frame in range(FRAMES)])
-    write_mp4(FOLDER / "newt.mp4", cutouts[..., :3] * cutouts[..., 3:] + 1 - cutouts[..., 3:])
+    write_mp4(FOLDER / "newt.mp4", over_white(cutouts))
 
 
 def write_mp4(path: Path, frames: Float[Tensor, "t h w 3"]) -> None:

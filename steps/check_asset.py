@@ -15,6 +15,7 @@ from dg4d_lib.assets.rendering.sheet import page
 from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
 from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.fitting.losses import resized
+from dg4d_lib.images import color_over_white
 from dg4d_lib.mesh.extraction.check import checked, welded
 from dg4d_lib.metrics.gates import MESH, SPLATS, Evidence, Gate, Pictures, Turn, fidelity, judge
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
@@ -110,7 +111,7 @@ def gather(parts: Parts, video: DrivingVideo, cutout: Float[Tensor, "h w 4"], ra
     def triangles(positions: Float[Tensor, " b"], cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b s s 4"]:
         drawn = mesh(positions, cameras)
         color, coverage = drawn[..., :3], drawn[..., 3:]
-        return torch.cat([color * coverage + 1 - coverage, coverage], -1)
+        return torch.cat([color_over_white(color, coverage), coverage], -1)
 
     seen, around = {}, {}
     for form, draw in ((SPLATS, splats), (MESH, triangles)):

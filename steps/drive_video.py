@@ -10,13 +10,13 @@ from tempfile import TemporaryDirectory
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from dg4d_lib.assets.rendering.preview import write_film
 from dg4d_lib.assets.rendering.sheet import videos_sheet
 from dg4d_lib.diffusion.parts import device_here
 from dg4d_lib.diffusion.video_model import VideoModel
 from dg4d_lib.errors import BadInput
+from dg4d_lib.images import resize
 from dg4d_lib.settings import SvdSettings, WarpSettings
 from dg4d_lib.video.candidate_ranking import GOOD, WEIGHTS, Candidate, ranked, score
 from dg4d_lib.video.driving import DrivingVideo
@@ -134,8 +134,7 @@ def _write_films(path: Path, candidates: list[Candidate]) -> None:
     entries = []
     scratch = path.with_suffix(".mp4")
     for each in candidates:
-        planes = each.video.over(WHITE).movedim(-1, 1)
-        small = interpolate(planes, (FILM, FILM), mode="bilinear", antialias=True).movedim(1, -1).clamp(0, 1)
+        small = resize(each.video.over(WHITE), (FILM, FILM)).clamp(0, 1)
         write_film(scratch, small, each.video.fps)
         entries.append((f"{each.number}.mp4", scratch.read_bytes()))
     scratch.unlink()

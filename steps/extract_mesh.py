@@ -14,6 +14,7 @@ from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply
+from dg4d_lib.images import color_over_white
 from dg4d_lib.mesh.extraction.check import MeshFacts, checked, welded
 from dg4d_lib.mesh.extraction.clean import clean
 from dg4d_lib.mesh.extraction.density import density_field
@@ -152,7 +153,7 @@ def _facts(mesh: TexturedMesh) -> MeshFacts:
 def _picture(mesh: TexturedMesh) -> Float[Tensor, "h w 3"]:
     """Four views in a row, over white."""
     color, coverage = render_mesh(mesh, PICTURE_CAMERAS)
-    return torch.cat(list(color * coverage + 1 - coverage), 1)
+    return torch.cat(list(color_over_white(color, coverage)), 1)
 
 
 def _picture_of_splats(gaussians: Gaussians, rasterize: Rasterizer) -> Float[Tensor, "h w 3"]:

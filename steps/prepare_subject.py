@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dg4d_lib.images import over_white
 from dg4d_lib.settings import SubjectSettings
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.framing import reframe, whole_frame
@@ -42,5 +43,5 @@ def run(job: Job) -> StepReport:
 def picture_of(source: Float[Tensor, "h w 4"], cutout: Float[Tensor, "s s 4"]) -> Float[Tensor, "t w3 3"]:
     """The source, its matte and the cut-out side by side, over white."""
     tiles = [reframe(each[None], whole_frame(*each.shape[:2]), TILE)[0] for each in (source, cutout)]
-    given, cut = (tile[..., :3] * tile[..., 3:] + 1 - tile[..., 3:] for tile in tiles)
+    given, cut = map(over_white, tiles)
     return torch.cat([given, tiles[1][..., 3:].expand(TILE, TILE, 3), cut], 1)

@@ -21,6 +21,7 @@ from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb
 from dg4d_lib.assets.rendering.preview import write_film
 from dg4d_lib.diffusion.parts import device_here
 from dg4d_lib.errors import BackendUnavailable, BadInput
+from dg4d_lib.images import over_background
 from dg4d_lib.metrics.clip import Clip, load_clip, similarity
 from dg4d_lib.metrics.fvd import SHORTEST, fvd_consistent4d, load_i3d, logits
 from dg4d_lib.metrics.image import iou, psnr, resized
@@ -299,7 +300,7 @@ def _read(frames: Sequence[Path], size: int | None = None) -> Film:
         )
     cutouts = torch.stack([_cutout(picture) for picture in pictures])
     coverage = cutouts[..., 3:]
-    return Film(cutouts[..., :3] * coverage + (1 - coverage), coverage)
+    return Film(over_background(cutouts[..., :3], coverage, 1.0), coverage)
 
 
 def _cutout(picture: Float[Tensor, "h w c"]) -> Float[Tensor, "h w 4"]:

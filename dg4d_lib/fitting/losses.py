@@ -11,6 +11,7 @@ from torch.nn.utils import get_total_norm
 
 from dg4d_lib.errors import FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.images import resize_planes
 from dg4d_lib.metrics.ssim import ssim
 from dg4d_lib.rasterizer.interface import Rendering
 
@@ -25,7 +26,7 @@ def resized(cutouts: Float[Tensor, "t h w 4"], size: int) -> tuple[Float[Tensor,
     alpha = cutouts[..., 3:]
     both = torch.cat([cutouts[..., :3] * alpha, alpha], -1).permute(0, 3, 1, 2).contiguous()
     if both.shape[-1] != size or both.shape[-2] != size:
-        both = functional.interpolate(both, (size, size), mode="bilinear", antialias=True, align_corners=False)
+        both = resize_planes(both, (size, size))
     color, alpha = both[:, :3] + 1 - both[:, 3:], both[:, 3:].contiguous()
     return color.permute(0, 2, 3, 1), alpha.permute(0, 2, 3, 1)
 

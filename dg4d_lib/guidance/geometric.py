@@ -18,6 +18,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.interface import View
+from dg4d_lib.images import over_background
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import InflatedSurface, inflate
 from dg4d_lib.kernels.vectors import INLINE, KERNEL
@@ -72,8 +73,8 @@ class InflatedSurfaces:
         cameras = [view.camera for view in views]
         fine = max(camera.height for camera in cameras) > LARGE * self._settings.size
         color, coverage = render_surface(surfaces, cameras, supersample=1 if fine else 2)
-        over_white = color * coverage + (1 - coverage)
-        both = torch.cat([over_white.movedim(-1, 1), coverage.movedim(-1, 1)], 1).movedim(1, -1)  # plane by plane
+        white = over_background(color, coverage, 1.0)
+        both = torch.cat([white.movedim(-1, 1), coverage.movedim(-1, 1)], 1).movedim(1, -1)  # plane by plane
         if self._settings.depth_sigma:
             both = averaged_over_depth(both, cameras, self._settings.depth_sigma)
         return both[..., :3], both[..., 3:]

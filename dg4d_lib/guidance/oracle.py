@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float, UInt8
 from scipy.ndimage import gaussian_filter, shift
 from torch import Tensor
-from torch.nn import functional
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.interface import View
+from dg4d_lib.images import over_white, resize_planes
 from dg4d_lib.settings import OraclePriorSettings
 
 
@@ -47,10 +47,10 @@ class Bank:
             ) from None
         cutouts = self.pictures[rows, columns].float() / 255
         alpha = cutouts[..., 3:]
-        both = torch.cat([cutouts[..., :3] * alpha + 1 - alpha, alpha], -1).permute(0, 3, 1, 2)
+        both = torch.cat([over_white(cutouts), alpha], -1).permute(0, 3, 1, 2)
         size = (views[0].camera.height, views[0].camera.width)
         if both.shape[-2:] != size:
-            both = functional.interpolate(both, size, mode="bilinear", antialias=True, align_corners=False)
+            both = resize_planes(both, size)
         both = both.permute(0, 2, 3, 1)
         return both[..., :3], both[..., 3:]
 

@@ -13,10 +13,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
-from torch.nn.functional import interpolate, normalize
+from torch.nn.functional import normalize
 
 from dg4d_lib.cameras.orbit import FOV_Y_DEG, RADIUS
 from dg4d_lib.errors import BadInput
+from dg4d_lib.images import resize_planes
 from dg4d_lib.inflation.colors import back_colors, front_colors
 from dg4d_lib.inflation.heights import heights
 from dg4d_lib.inflation.mask import subject_mask
@@ -117,7 +118,7 @@ def resample(cutout: Float[Tensor, "h w 4"], size: int) -> Float[Tensor, "{size}
         return cutout
     alpha = cutout[..., 3:]
     planes = torch.cat([cutout[..., :3] * alpha, alpha], -1).permute(2, 0, 1)[None]
-    planes = interpolate(planes, (size, size), mode="bicubic", antialias=True)[0].permute(1, 2, 0)
+    planes = resize_planes(planes, (size, size), "bicubic")[0].permute(1, 2, 0)
     return torch.cat([planes[..., :3] / planes[..., 3:].clamp(min=1e-4), planes[..., 3:]], -1).clamp(0, 1)
 
 

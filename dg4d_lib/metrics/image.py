@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dg4d_lib.images import resize
+
 BEST_PSNR = 60.0  # dB; equal pictures have this instead of infinity, so that means stay finite
 
 
@@ -36,8 +38,5 @@ def iou(
 
 
 def resized(images: Float[Tensor, "b h w c"], size: int) -> Float[Tensor, "b size size c"]:
-    """Square pictures at another size, bicubic and without aliasing, within [0, 1]: as Pillow's `resize` does it."""
-    planes = torch.nn.functional.interpolate(
-        images.movedim(-1, 1), (size, size), mode="bicubic", antialias=True, align_corners=False
-    )
-    return planes.clamp(0, 1).movedim(1, -1)
+    """Resize square images, bicubic and clamped to [0, 1], as Pillow's `resize` does."""
+    return resize(images, (size, size), "bicubic").clamp(0, 1)

@@ -6,10 +6,10 @@ from dataclasses import replace
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.images import resize_planes
 from dg4d_lib.rasterizer.interface import Rasterizer
 
 COARSE_DEG, FINE_DEG = 5.0, 0.5  # steps of the search all around, and of the one around the best
@@ -29,7 +29,7 @@ def best_azimuth(gaussians: Gaussians, picture: Float[Tensor, "h w 3"], rasteriz
         rasterize: draws.
     """
     target = picture.permute(2, 0, 1)[None].to(gaussians.means)
-    target = functional.interpolate(target, (SIZE, SIZE), mode="bilinear", antialias=True, align_corners=False)
+    target = resize_planes(target, (SIZE, SIZE))
     target = target[0].permute(1, 2, 0)
     coarse = [-180 + COARSE_DEG * i for i in range(round(360 / COARSE_DEG))]
     near = _nearest(gaussians, target, coarse, rasterize)

@@ -15,10 +15,11 @@ from dataclasses import dataclass, fields
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import interpolate, normalize
+from torch.nn.functional import normalize
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput, FitDiverged
+from dg4d_lib.images import resize
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.bake import vertex_normals
 from dg4d_lib.mesh_rasterizer.texture import Lookup, look_up, read
@@ -88,7 +89,7 @@ def refine_textures(
     reference, drawn = _look(stretches, added, [front] * frames)
     facing = _facing(stretches, drawn, [front] * frames, settings.min_cosine)
     del drawn  # as large as the pictures
-    wanted = _resized(driving.over(driving.frames.new_ones(3)), (settings.size, settings.size))
+    wanted = resize(driving.over(driving.frames.new_ones(3)), (settings.size, settings.size))
     textures = [stretch.mesh.texture for stretch in stretches]
     starts = [texture.clamp(DARKEST, 1 - DARKEST).logit() for texture in textures]
     logits = [start.clone().requires_grad_() for start in starts]
@@ -139,7 +140,7 @@ def _summed(texture: Float[Tensor, "h w 3"], added: Float[Tensor, "t i j 3"] | N
     """The texture of every frame."""
     if added is None:
         return None
-    return (_resized(texture[None], added.shape[1:3]) + added.detach()).clamp(0, 1)
+    return (resize(texture[None], added.shape[1:3]) + added.detach()).clamp(0, 1)
 
 
 def _trajectory(frames: int, settings: TextureSettings, generator: torch.Generator) -> list[OrbitCamera]:
@@ -220,8 +221,3 @@ def _draw(
         picture[covered] = seen
         pictures.append(picture)
     return torch.cat(pictures)
-
-
-def _resized(pictures: Float[Tensor, "t h w 3"], size: Sequence[int]) -> Float[Tensor, "t i j 3"]:
-    planes = pictures.movedim(-1, 1)
-    return interpolate(planes, tuple(size), mode="bilinear", antialias=True, align_corners=False).movedim(1, -1)

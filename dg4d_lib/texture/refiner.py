@@ -7,13 +7,13 @@ from typing import Protocol, runtime_checkable
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.ddim import ddim_step, ddim_timesteps, diffused
 from dg4d_lib.diffusion.video_model import VideoModel, karras_sigmas, start_index
 from dg4d_lib.guidance.interface import View
 from dg4d_lib.guidance.zero123 import ConditionedZero123, encoded
+from dg4d_lib.images import resize
 from dg4d_lib.settings import ImageToImageSettings, VideoToVideoSettings
 
 
@@ -62,7 +62,7 @@ class VideoToVideo:
         generator: torch.Generator,
     ) -> Float[Tensor, "t h w 3"]:
         """The denoised video; viewpoints and progress do not matter."""
-        condition = self.model.look_at(_resized(self._picture[None], *video.shape[1:3])[0], [generator])
+        condition = self.model.look_at(resize(self._picture[None], video.shape[1:3])[0], [generator])
         latents = self.model.encode(video)[None]
         noisy = latents + self.sigmas[0] * self.model.noise(latents.shape, [generator])
         return self.model.decode(self.model.denoise(noisy, condition, self.sigmas)[0]).to(video)
@@ -100,12 +100,7 @@ class ImageToImage:
                 believed = prior.believed_noise(latents, timestep, prior.latents[piece], tokens[piece])
                 latents = ddim_step(latents, believed, timestep, following)
             decoded = prior.vae.decode((latents / scale).to(prior.vae.dtype)).sample.to(latents)
-            return _resized((decoded.movedim(1, -1) / 2 + 0.5).clamp(0, 1), *video.shape[1:3])
+            return resize((decoded.movedim(1, -1) / 2 + 0.5).clamp(0, 1), video.shape[1:3])
 
         noise = torch.randn((len(video), *prior.latents.shape[1:]), dtype=video.dtype, generator=generator)
         return torch.cat(prior.batches.run(denoised, len(images))).to(video)
-
-
-def _resized(pictures: Float[Tensor, "b h w 3"], height: int, width: int) -> Float[Tensor, "b i j 3"]:
-    planes = pictures.movedim(-1, 1)
-    return interpolate(planes, (height, width), mode="bilinear", antialias=True, align_corners=False).movedim(1, -1)

@@ -1,10 +1,12 @@
-"""The driving video: what the subject looks like over time from the input view."""
+"""Driving video: the subject over time from the input view."""
 
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from dg4d_lib.images import over_background
 
 
 @dataclass(frozen=True)
@@ -30,10 +32,5 @@ class DrivingVideo:
         return torch.linspace(0, 1, len(self), device=self.frames.device)
 
     def over(self, background: Float[Tensor, " 3"]) -> Float[Tensor, "t h w 3"]:
-        """The frames composited over one color."""
-        return self.frames * self.coverage + (1 - self.coverage) * background
-
-
-def over_white(cutouts: Float[Tensor, "*b h w 4"]) -> Float[Tensor, "*b h w 3"]:
-    """Straight cut-outs, composited over white."""
-    return cutouts[..., :3] * cutouts[..., 3:] + 1 - cutouts[..., 3:]
+        """Composite the frames over one color."""
+        return over_background(self.frames, self.coverage, background)

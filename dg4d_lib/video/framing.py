@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dg4d_lib.errors import BadInput
+from dg4d_lib.images import resize_planes
 
 VISIBLE = 0.05  # alpha above which a pixel belongs to the subject's extent: fainter is noise of compression
 OPAQUE = 0.9  # alpha from which a color is taken as the subject's own
@@ -112,12 +113,7 @@ def resample(frames: Float[Tensor, "t h w 4"], height: int, width: int) -> Float
         return frames
     alpha = frames[..., 3:]
     weighted = torch.cat([frames[..., :3] * alpha, alpha], -1).permute(0, 3, 1, 2)
-    return straight(antialiased(weighted, height, width))
-
-
-def antialiased(frames: Float[Tensor, "t 4 h w"], height: int, width: int) -> Float[Tensor, "t 4 h2 w2"]:
-    """Interpolate linearly with a triangle filter as wide as two pixels of the smaller picture."""
-    return functional.interpolate(frames, (height, width), mode="bilinear", antialias=True, align_corners=False)
+    return straight(resize_planes(weighted, (height, width)))
 
 
 def straight(frames: Float[Tensor, "t 4 h w"]) -> Float[Tensor, "t h w 4"]:

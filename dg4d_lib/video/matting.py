@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dg4d_lib.errors import BadInput
+from dg4d_lib.images import resize_planes
 from dg4d_lib.video.backdrop import border_ring, cut_out, fit_backdrop
 from dg4d_lib.video.saliency import segment
 
@@ -105,7 +106,7 @@ def _lab(frames: Float[Tensor, "t h w 3"], longest: int) -> Float[ndarray, "t h2
     for i, frame in enumerate(frames):
         small = frame.permute(2, 0, 1)[None]
         if scale < 1:
-            small = functional.interpolate(small, size, mode="bilinear", antialias=True, align_corners=False)
+            small = resize_planes(small, size)
         lab[i] = ndimage.gaussian_filter(rgb2lab(small[0].permute(1, 2, 0).cpu().numpy()), (0.6, 0.6, 0))
     return lab
 

@@ -4,7 +4,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from dg4d_lib.video.framing import antialiased, shrunk_size, straight
+from dg4d_lib.images import resize_planes
+from dg4d_lib.video.framing import shrunk_size, straight
 
 BAND_BYTES = 8 * 2**20  # of rows that are worked on at once, as float32
 
@@ -43,7 +44,7 @@ class BandShrinker:
             return
         weighted = band.permute(2, 0, 1).contiguous()
         weighted[:3] *= weighted[3]
-        narrow = antialiased(weighted[None], rows, self._size[1])[0]
+        narrow = resize_planes(weighted[None], (rows, self._size[1]))[0]
         first, weights = self._weights(top, rows)
         reached = slice(first, first + len(weights))
         self._sum[:, reached] += weights @ narrow

@@ -19,6 +19,7 @@ from dg4d_lib.guidance.imagedream import ImageDream, ImageDreamPrior
 from dg4d_lib.guidance.interface import GuidancePrior
 from dg4d_lib.guidance.oracle import Bank, imperfect
 from dg4d_lib.guidance.zero123 import Zero123
+from dg4d_lib.images import over_white
 from dg4d_lib.settings import (
     GeometricPriorSettings,
     ImageDreamPriorSettings,
@@ -28,7 +29,6 @@ from dg4d_lib.settings import (
     StaticSettings,
     Zero123PriorSettings,
 )
-from dg4d_lib.video.driving import over_white
 from dg4d_lib.weights.registry import weights_called
 from steps.artifacts.archives import unpack
 from steps.artifacts.media import read_png

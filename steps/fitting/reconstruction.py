@@ -9,10 +9,10 @@ from torch import Tensor
 from dg4d_lib.diffusion.parts import Placement, device_here, dtype_on
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.imagedream import ImageDream
+from dg4d_lib.images import over_white
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.reconstruction.lgm import load_lgm, reconstruct
 from dg4d_lib.settings import LgmSettings
-from dg4d_lib.video.driving import over_white
 from steps.runtime.job import StepReport
 from steps.runtime.weights import Opened, open_weights
 

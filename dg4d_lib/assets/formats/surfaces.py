@@ -16,11 +16,11 @@ from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.formats.gltf import Document
 from dg4d_lib.errors import BadInput
+from dg4d_lib.images import resize_planes
 
 TEXTURE_TRANSFORM = "KHR_texture_transform"
 WEBP = "EXT_texture_webp"
@@ -108,7 +108,7 @@ class Atlas:
         if texture.shape[:2] == (self.height, self.width):
             return texture
         channels = texture.movedim(-1, 0)[None].float()
-        small = interpolate(channels, size=(self.height, self.width), mode="bilinear", antialias=True)
+        small = resize_planes(channels, (self.height, self.width))
         return small[0].movedim(0, -1)
 
 

@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.animated import moved
@@ -16,6 +15,7 @@ from dg4d_lib.assets.rendering.preview import BATCH, pictures_over
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.images import resize
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 
@@ -107,5 +107,4 @@ def _part(states: Gaussians, wanted: Tensor) -> Gaussians:
 def _footage(video: DrivingVideo, frames: Tensor, size: int) -> Float[Tensor, "m size size 3"]:
     """Frames of the driving video over the panel, resampled to the size of a tile."""
     over = DrivingVideo(video.frames[frames], video.coverage[frames], video.fps).over(torch.tensor(PANEL))
-    small = interpolate(over.movedim(-1, 1), size=(size, size), mode="bilinear", antialias=True, align_corners=False)
-    return small.movedim(1, -1).clamp(0, 1)
+    return resize(over, (size, size)).clamp(0, 1)

@@ -1,0 +1,41 @@
+"""Antialiased resizing and alpha compositing of images."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+Filter = Literal["bilinear", "bicubic"]
+
+
+def resize(
+    images: Float[Tensor, "b h w c"], size: Sequence[int], mode: Filter = "bilinear"
+) -> Float[Tensor, "b i j c"]:
+    """Resize images to height and width, with a filter that is widened where they shrink, as Pillow's `resize`."""
+    return resize_planes(images.movedim(-1, 1), size, mode).movedim(1, -1)
+
+
+def resize_planes(
+    planes: Float[Tensor, "b c h w"], size: Sequence[int], mode: Filter = "bilinear"
+) -> Float[Tensor, "b c i j"]:
+    """Resize images whose channels come first, as `resize`; the bicubic filter may overshoot."""
+    return interpolate(planes, tuple(size), mode=mode, antialias=True, align_corners=False)
+
+
+def over_background(
+    color: Float[Tensor, "*b h w 3"], alpha: Float[Tensor, "*b h w 1"], background: Float[Tensor, " 3"] | float
+) -> Float[Tensor, "*b h w 3"]:
+    """Composite straight color over one background color."""
+    return color * alpha + (1 - alpha) * background
+
+
+def color_over_white(color: Float[Tensor, "*b h w 3"], alpha: Float[Tensor, "*b h w 1"]) -> Float[Tensor, "*b h w 3"]:
+    """Composite straight color over white; differs from `over_background` in rounding, on which digests depend."""
+    return color * alpha + 1 - alpha
+
+
+def over_white(cutouts: Float[Tensor, "*b h w 4"]) -> Float[Tensor, "*b h w 3"]:
+    """Composite straight cut-outs over white."""
+    return color_over_white(cutouts[..., :3], cutouts[..., 3:])
