@@ -22,10 +22,11 @@ from rich.table import Column, Table
 
 from benchmarks.paper_schedule import FULL, Clock, Schedule, Sizes, forget_peak, seeded
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.diffusion.latents import SIZE
 from dg4d_lib.diffusion.video_model import DECODER_GB, ENCODER_GB, GIB, UNET_GB
 from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.interface import View
-from dg4d_lib.guidance.zero123 import SIZE, VIEW_GB
+from dg4d_lib.guidance.zero123 import VIEW_GB
 from dg4d_lib.settings import SvdSettings, Zero123PriorSettings
 from steps.profiles import profile
 

@@ -25,8 +25,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.paper_schedule import FULL, Sizes, picture_unet, video_unet
+from dg4d_lib.diffusion.latents import LATENT_CHANNELS, LATENT_SIZE
 from dg4d_lib.diffusion.single_token_attention import shorten_attention
-from dg4d_lib.guidance.zero123 import LATENT_CHANNELS, LATENT_SIZE
 
 
 @dataclass(frozen=True)

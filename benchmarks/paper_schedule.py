@@ -34,6 +34,7 @@ from rich.table import Column, Table
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
 from dg4d_lib.diffusion.flop_counter import counted, counting_flops
+from dg4d_lib.diffusion.latents import LATENT_CHANNELS
 from dg4d_lib.diffusion.parts import Placement, dtype_on, frozen
 from dg4d_lib.diffusion.single_token_attention import shorten_attention
 from dg4d_lib.diffusion.video_model import GIB, VideoModel
@@ -43,7 +44,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.interface import GuidancePrior
-from dg4d_lib.guidance.zero123 import CAMERA_NUMBERS, LATENT_CHANNELS, Zero123
+from dg4d_lib.guidance.zero123 import CAMERA_NUMBERS, Zero123
 from dg4d_lib.images import over_white
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of

@@ -8,9 +8,9 @@ import torch
 from safetensors.torch import load_file, save_file
 from tiny_weights import tiny_vae, write_scheduler
 
-from dg4d_lib.diffusion.multiview import MultiViewShape, MultiViewUnet
+from dg4d_lib.guidance.imagedream_unet import MultiViewShape, MultiViewUnet
 from dg4d_lib.reconstruction.lgm import WEIGHTS_FILE, Lgm
-from dg4d_lib.reconstruction.unet import UnetShape
+from dg4d_lib.reconstruction.lgm_unet import UnetShape
 
 UNET_CONFIG: dict[str, Any] = {  # the keys of the published unet/config.json, and the two sizes it takes for granted
     "_class_name": "MultiViewUNetModel",

@@ -9,15 +9,12 @@
 Nothing of a folder is executed: classes come from diffusers and transformers, tensors from the files.
 """
 
-import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
@@ -29,8 +26,6 @@ from dg4d_lib.settings import Precision
 DTYPES: dict[Precision, torch.dtype] = {"fp16": torch.float16, "bf16": torch.bfloat16, "fp32": torch.float32}
 
 DIFFUSERS_FILE, TRANSFORMERS_FILES = "diffusion_pytorch_model", ("model", "pytorch_model")
-CLIP_SIZE = 224  # pixels of the pictures that image encoders see
-CLIP_MEAN, CLIP_DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 HALF = "fp16"  # the variant of a file whose tensors are stored in half precision
 UNREADABLE = (OSError, EOFError, ValueError, KeyError, TypeError, RuntimeError, SafetensorError, UnpicklingError)
 
@@ -50,17 +45,6 @@ class Placement:
     channels_last: bool = False
 
 
-@dataclass(frozen=True)
-class BetaSchedule:
-    """The noise that a model was trained with, and what it predicts, in diffusers' words."""
-
-    start: float
-    end: float
-    kind: str
-    steps: int
-    prediction: str
-
-
 def dtype_on(device: torch.device, precision: Precision) -> torch.dtype:
     """The numbers that networks compute with: what the settings say, and fp32 on a processor, which is slow in half."""
     return torch.float32 if device.type == "cpu" else DTYPES[precision]
@@ -69,12 +53,6 @@ def dtype_on(device: torch.device, precision: Precision) -> torch.dtype:
 def device_here() -> torch.device:
     """Where networks run: the first CUDA device, or the processor."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-
-
-def normalized_for_clip(planes: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-    """Colors in [0, 1] by the mean and deviation of CLIP's training pictures."""
-    mean, deviation = (planes.new_tensor(values)[:, None, None] for values in (CLIP_MEAN, CLIP_DEVIATION))
-    return (planes - mean) / deviation
 
 
 def load_vae(model: Path, placement: Placement) -> Any:
@@ -202,42 +180,6 @@ def read_linear(folder: Path, name: str, placement: Placement) -> nn.Linear:
     layer = nn.Linear(weight.shape[1], weight.shape[0], device="meta")
     layer.load_state_dict({"weight": weight.to(placement.dtype), "bias": bias.to(placement.dtype)}, assign=True)
     return frozen(layer, placement)
-
-
-def read_schedule(model: Path) -> BetaSchedule:
-    """What `model`/scheduler says about the noise.
-
-    Raises:
-        BadInput: there is no such file, or it is no scheduler's.
-    """
-    file = model / "scheduler" / "scheduler_config.json"
-    try:
-        about = json.loads(file.read_text(encoding="utf-8"))
-        return BetaSchedule(
-            start=float(about["beta_start"]),
-            end=float(about["beta_end"]),
-            kind=str(about["beta_schedule"]),
-            steps=int(about["num_train_timesteps"]),
-            prediction=str(about.get("prediction_type", "epsilon")),
-        )
-    except FileNotFoundError as error:
-        raise BadInput(f"{file} is missing; weights are expected in the layout of diffusers") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise BadInput(f"{file} is no scheduler of diffusion models: {error!r}") from error
-
-
-def require_schedule(model: Path, expected: BetaSchedule) -> None:
-    """Refuse a model that was trained with other noise, or to predict something else, than the caller assumes.
-
-    Raises:
-        BadInput: says what differs.
-    """
-    given = read_schedule(model)
-    same = math.isclose(given.start, expected.start, rel_tol=1e-6) and math.isclose(
-        given.end, expected.end, rel_tol=1e-6
-    )
-    if not same or (given.kind, given.steps, given.prediction) != (expected.kind, expected.steps, expected.prediction):
-        raise BadInput(f"the scheduler of {model} is {given}; this model has to have {expected}")
 
 
 def missing_packages(error: ImportError) -> BackendUnavailable:

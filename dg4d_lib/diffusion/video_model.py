@@ -16,17 +16,16 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import conv2d, interpolate, pad
 
 from dg4d_lib.diffusion.batching import MicroBatches
+from dg4d_lib.diffusion.clip_images import svd_clip_pixels
+from dg4d_lib.diffusion.latents import at_least_float32, to_images
 from dg4d_lib.diffusion.parts import (
-    CLIP_SIZE,
     Placement,
     dtype_on,
     load_image_encoder,
     load_temporal_unet,
     load_temporal_vae,
-    normalized_for_clip,
 )
 from dg4d_lib.diffusion.single_token_attention import shorten_attention
 from dg4d_lib.settings import VideoModelSettings
@@ -143,7 +142,7 @@ class VideoModel:
         settings, count = self.settings, len(generators)
         scaled = 2 * picture.movedim(-1, 0)[None] - 1
         with self._awake(self.image_encoder) as encoder:
-            eye = _for_clip(scaled.to(self.device, _wide(encoder.dtype)))
+            eye = svd_clip_pixels(scaled.to(self.device, at_least_float32(encoder.dtype)))
             embedding = encoder(eye.to(encoder.dtype)).image_embeds[:, None]
         noise = torch.cat([_normal(scaled.shape, generator, scaled.dtype) for generator in generators])
         latents = self._mode(scaled + settings.noise_augmentation * noise.to(scaled))
@@ -168,7 +167,7 @@ class VideoModel:
                 self._room(DECODER_GB, inside, self.shrinkage),
             )
         decoded = torch.cat(pictures)
-        return (decoded.to(_wide(decoded.dtype)).movedim(1, -1) / 2 + 0.5).clamp(0, 1)
+        return to_images(decoded.to(at_least_float32(decoded.dtype)))
 
     @torch.no_grad()
     def denoise(
@@ -187,7 +186,7 @@ class VideoModel:
 
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Float[Tensor, "b t c i j"]:
         """Noise of standard deviation 1 for the latents of several videos, one generator each."""
-        dtype = _wide(self.unet.dtype)
+        dtype = at_least_float32(self.unet.dtype)
         return torch.cat([_normal((1, *shape[1:]), generator, dtype) for generator in generators]).to(self.device)
 
     def _guided(
@@ -195,7 +194,7 @@ class VideoModel:
     ) -> Float[Tensor, "b t c i j"]:
         """The network's v, guided towards the picture."""
         frames = latents.shape[1]
-        time = torch.tensor(0.25 * math.log(sigma), dtype=_wide(unet.dtype), device=self.device)
+        time = torch.tensor(0.25 * math.log(sigma), dtype=at_least_float32(unet.dtype), device=self.device)
         embedding = torch.cat([torch.zeros_like(condition.embedding), condition.embedding])
         pictures = torch.cat([torch.zeros_like(condition.latents), condition.latents])
         ids = torch.cat([condition.ids, condition.ids])
@@ -218,7 +217,7 @@ class VideoModel:
                 lambda part: vae.encode(seen[part]).latent_dist.mode(), len(seen), self._room(ENCODER_GB, seen)
             )
         modes = torch.cat(latents)
-        return modes.to(_wide(modes.dtype))
+        return modes.to(at_least_float32(modes.dtype))
 
     def _room(self, gb: float, inputs: Float[Tensor, "b *shape h w"], enlarged: int = 1) -> int:
         """For how many inputs at a time the budget has room.
@@ -248,33 +247,6 @@ def _dtype(part: nn.Module) -> torch.dtype:
     return next(part.parameters()).dtype
 
 
-def _wide(dtype: torch.dtype) -> torch.dtype:
-    return torch.promote_types(dtype, torch.float32)
-
-
 def _normal(shape: Sequence[int], generator: torch.Generator, dtype: torch.dtype) -> Tensor:
     """Drawn where the generator is, so that devices agree."""
     return torch.randn(tuple(shape), generator=generator, dtype=dtype, device=generator.device)
-
-
-def _for_clip(pictures: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 s s"]:
-    """Pictures in [-1, 1] as the image encoder was trained to see them: blurred, 224 pixels a side, normalized.
-
-    The blur's deviation is half of the shrinkage less one, cut off at about two deviations; resampling is bicubic and
-    keeps the centers of the corner pixels.
-    """
-    for axis in (3, 2):
-        pictures = _blur(pictures, axis)
-    small = interpolate(pictures, (CLIP_SIZE, CLIP_SIZE), mode="bicubic", align_corners=True)
-    return normalized_for_clip(small / 2 + 0.5)
-
-
-def _blur(pictures: Float[Tensor, "b 3 h w"], axis: int) -> Float[Tensor, "b 3 h w"]:
-    sigma = max((pictures.shape[axis] / CLIP_SIZE - 1) / 2, 0.001)
-    length = max(int(4 * sigma), 3) | 1
-    places = torch.arange(length, device=pictures.device, dtype=pictures.dtype) - length // 2
-    weights = torch.exp(-places.square() / (2 * sigma**2))
-    weights = (weights / weights.sum()).view((1, 1, -1, 1) if axis == 2 else (1, 1, 1, -1)).expand(3, 1, -1, -1)
-    margin = length // 2
-    around = (0, 0, margin, margin) if axis == 2 else (margin, margin, 0, 0)
-    return conv2d(pad(pictures, around, mode="reflect"), weights, groups=3)

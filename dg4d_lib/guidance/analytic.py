@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.diffusion.noise_schedule import alphabars
+from dg4d_lib.diffusion.noise_schedule import alphas_cumprod
 from dg4d_lib.guidance.distillation import Annealing, score_distillation
 from dg4d_lib.guidance.interface import View
 
@@ -52,7 +52,7 @@ class AnalyticPrior:
     ) -> Float[Tensor, ""]:
         """How far the renders are from the known pictures, weighted as at this moment of the annealing."""
         timestep = self.noise.timestep(progress, generator)
-        alphabar = float(alphabars()[timestep])
+        alphabar = float(alphas_cumprod()[timestep])
         clean = self._encode(*self.clean(views)).to(images.device)
 
         def predict_noise(noisy: Float[Tensor, "b c h w"], _timestep: int) -> Float[Tensor, "b c h w"]:

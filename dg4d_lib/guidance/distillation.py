@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.diffusion.batching import MicroBatches
-from dg4d_lib.diffusion.noise_schedule import TRAIN_STEPS, alphabars
+from dg4d_lib.diffusion.noise_schedule import TRAIN_STEPS, add_noise, alphas_cumprod
 
 NOISE_END = 0.02  # share of the schedule at which the paper's annealing ends
 LOWEST, HIGHEST = 20, 980  # timesteps
@@ -57,7 +57,7 @@ def annealed_timestep(progress: float, noise_start: float, noise_end: float = NO
 
 def weight(timestep: int) -> float:
     """w(t) = 1 - alphabar(t): 0.0187 at 20, 0.326 at 250, 0.724 at 500, 0.994 at 980."""
-    return 1.0 - float(alphabars()[timestep])
+    return 1.0 - float(alphas_cumprod()[timestep])
 
 
 def score_distillation(
@@ -79,9 +79,8 @@ def distillation_loss(
         timestep: t, one for the batch.
         noise: e.
     """
-    alphabar = float(alphabars()[timestep])
     with torch.no_grad():
-        noisy = alphabar**0.5 * latents + (1 - alphabar) ** 0.5 * noise
+        noisy = add_noise(latents, noise, timestep)
         gradient = torch.nan_to_num(weight(timestep) * (predict_noise(noisy, timestep) - noise))
         target = latents - gradient
     return 0.5 * (latents - target).square().sum() / len(latents)

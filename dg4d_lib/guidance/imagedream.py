@@ -22,22 +22,22 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.devices import sent
 from dg4d_lib.diffusion.batching import MicroBatches
-from dg4d_lib.diffusion.ddim import ddim_step, ddim_timesteps
-from dg4d_lib.diffusion.multiview import MultiViewShape, MultiViewUnet
+from dg4d_lib.diffusion.clip_images import clip_pixels
+from dg4d_lib.diffusion.latents import LATENT_CHANNELS, LATENT_SIZE, at_least_float32, decode_images, encode_images
+from dg4d_lib.diffusion.noise_schedule import SCHEDULE, ddim_step, ddim_timesteps, require_schedule
 from dg4d_lib.diffusion.parts import (
     TRANSFORMERS_FILES,
     Placement,
     dtype_on,
     load_part,
     load_vae,
-    require_schedule,
     weights_file,
 )
 from dg4d_lib.diffusion.published import load_network
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.guidance.distillation import Annealing, distill_in_pieces
+from dg4d_lib.guidance.imagedream_unet import MultiViewShape, MultiViewUnet
 from dg4d_lib.guidance.interface import View
-from dg4d_lib.guidance.zero123 import LATENT_CHANNELS, LATENT_SIZE, SCHEDULE, clip_pixels, encoded
 from dg4d_lib.settings import ImageDreamPriorSettings, Precision
 
 RING = 4  # views that are denoised together, 90 degrees of azimuth apart
@@ -156,8 +156,8 @@ class ImageDream:
         for timestep, following in pairwise((*ddim_timesteps(steps), 0)):
             noise = self.predict_noise(latents, timestep, [cameras], condition, guidance)
             latents = ddim_step(latents, noise, timestep, following)
-        pictures = self.vae.decode(latents[0].to(self.vae.dtype) / self.vae.config.scaling_factor).sample
-        return (_wide(pictures) / 2 + 0.5).clamp(0, 1).permute(0, 2, 3, 1)
+        unscaled = latents[0].to(self.vae.dtype) / self.vae.config.scaling_factor
+        return decode_images(self.vae, unscaled, at_least_float32(self.vae.dtype))
 
     @torch.no_grad()
     def predict_noise(
@@ -193,7 +193,7 @@ class ImageDream:
 
     def encode(self, pictures: Float[Tensor, "b h w 3"]) -> Float[Tensor, "b 4 32 32"]:
         """Scaled latents of pictures in [0, 1] (the mode, no sample), in their precision; with gradient."""
-        return self.vae.config.scaling_factor * encoded(self.vae, pictures.to(self.vae.device))
+        return self.vae.config.scaling_factor * encode_images(self.vae, pictures.to(self.vae.device))
 
     def _tokens(self, text: str) -> Float[Tensor, "1 l d"]:
         cut = self.tokenizer(
@@ -288,8 +288,3 @@ def _is_ring(views: Sequence[View]) -> bool:
     turns = [(view.camera.azimuth_deg - first.camera.azimuth_deg) % 360 for view in views]
     even = all(math.isclose(turn, 360 / RING * i, abs_tol=1e-3) for i, turn in enumerate(turns))
     return len(views) == RING and same and even
-
-
-def _wide(tensor: Tensor) -> Tensor:
-    """In float32, unless it is wider."""
-    return tensor.to(torch.promote_types(tensor.dtype, torch.float32))

@@ -14,23 +14,20 @@ from typing import Any
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
-from torch.nn import functional
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.devices import sent
 from dg4d_lib.diffusion.batching import MicroBatches
-from dg4d_lib.diffusion.noise_schedule import BETA_END, BETA_START, TRAIN_STEPS
+from dg4d_lib.diffusion.clip_images import clip_pixels
+from dg4d_lib.diffusion.latents import LATENT_CHANNELS, LATENT_SIZE, SIZE, encode_images
+from dg4d_lib.diffusion.noise_schedule import SCHEDULE, require_schedule
 from dg4d_lib.diffusion.parts import (
-    CLIP_SIZE,
-    BetaSchedule,
     Placement,
     dtype_on,
     load_image_encoder,
     load_unet,
     load_vae,
-    normalized_for_clip,
     read_linear,
-    require_schedule,
 )
 from dg4d_lib.diffusion.single_token_attention import shorten_attention
 from dg4d_lib.errors import BadInput
@@ -38,9 +35,7 @@ from dg4d_lib.guidance.distillation import Annealing, distill_in_pieces
 from dg4d_lib.guidance.interface import View
 from dg4d_lib.settings import Precision, Zero123PriorSettings
 
-SIZE, LATENT_SIZE, LATENT_CHANNELS = 256, 32, 4  # pixels; latents of the VAE
 CAMERA_NUMBERS = 4
-SCHEDULE = BetaSchedule(BETA_START, BETA_END, "scaled_linear", TRAIN_STEPS, "epsilon")
 
 RESIDENT_GB = {"fp16": 5.0, "bf16": 5.0, "fp32": 8.0}  # weights (2.7 or 5.4), renders and what CUDA takes
 VIEW_GB = {"fp16": 0.5, "bf16": 0.5, "fp32": 1.0}  # what the VAE keeps for its gradient (.37 or .74), and workspace
@@ -116,7 +111,7 @@ class Zero123:
         def embed(piece: slice) -> tuple[Tensor, Tensor]:
             pictures = frames[piece].to(self.vae.device)
             clip = clip_pixels(pictures).to(self.image_encoder.dtype)
-            return self.image_encoder(clip).image_embeds, encoded(self.vae, pictures).to(self.unet.dtype)
+            return self.image_encoder(clip).image_embeds, encode_images(self.vae, pictures).to(self.unet.dtype)
 
         embeddings, latents = (torch.cat(parts) for parts in zip(*batches.run(embed, len(frames)), strict=True))
         return ConditionedZero123(
@@ -180,14 +175,14 @@ class ConditionedZero123:
         tokens, pictures = self.tokens(views), self.latents[self._rows(views)]
 
         def encode(pixels: Float[Tensor, "p h w 3"]) -> Float[Tensor, "p 4 32 32"]:
-            return self.vae.config.scaling_factor * encoded(self.vae, pixels.to(self.vae.device))
+            return self.vae.config.scaling_factor * encode_images(self.vae, pixels.to(self.vae.device))
 
         def predict_noise(noisy: Float[Tensor, "p 4 32 32"], timestep: int, piece: slice) -> Float[Tensor, "p 4 32 32"]:
-            return self.believed_noise(noisy, timestep, pictures[piece], tokens[piece])
+            return self.predict_noise(noisy, timestep, pictures[piece], tokens[piece])
 
         return distill_in_pieces(images, encode, predict_noise, timestep, noise, self.batches)
 
-    def believed_noise(
+    def predict_noise(
         self,
         noisy: Float[Tensor, "b 4 32 32"],
         timestep: int,
@@ -249,16 +244,3 @@ def camera_numbers(
     if input_elevation_deg is not None:
         last = math.radians(90 - input_elevation_deg)
     return torch.tensor([polar, math.sin(azimuth), math.cos(azimuth), last], dtype=torch.float64)
-
-
-def encoded(vae: Any, images: Float[Tensor, "b h w 3"]) -> Float[Tensor, "b 4 32 32"]:
-    """The mode of the VAE's latents of pictures in [0, 1], not scaled, in their precision; differentiable."""
-    planes = functional.interpolate(images.permute(0, 3, 1, 2), (SIZE, SIZE), mode="bilinear", antialias=True)
-    return vae.encode((2 * planes - 1).to(vae.dtype)).latent_dist.mode().to(images.dtype)
-
-
-def clip_pixels(images: Float[Tensor, "b h w 3"]) -> Float[Tensor, "b 3 224 224"]:
-    """Pictures in [0, 1] as CLIP reads them."""
-    planes = images.permute(0, 3, 1, 2)
-    planes = functional.interpolate(planes, (CLIP_SIZE, CLIP_SIZE), mode="bicubic", antialias=True).clamp(0, 1)
-    return normalized_for_clip(planes)

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dg4d_lib.diffusion.clip_images import normalize_for_clip
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.metrics.image import resized
 
-MEAN, DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)  # of CLIP's pictures
 PICTURES_AT_ONCE = 16
 
 
@@ -30,11 +30,10 @@ class Clip:
     def embed(self, images: Float[Tensor, "b h w 3"]) -> Float[Tensor, "b d"]:
         """Embeddings of length 1 of square pictures in [0, 1], which are resized to what the model sees."""
         size = self.model.config.vision_config.image_size
-        mean, deviation = (torch.tensor(values, device=self.device) for values in (MEAN, DEVIATION))
         found = []
         with torch.no_grad():
             for part in images.split(PICTURES_AT_ONCE):
-                planes = ((resized(part.to(self.device), size) - mean) / deviation).movedim(-1, 1)
+                planes = normalize_for_clip(resized(part.to(self.device), size).movedim(-1, 1))
                 embedded = self.model.get_image_features(pixel_values=planes.contiguous())
                 found.append(getattr(embedded, "pooler_output", embedded))  # a tensor before transformers 5
         return torch.nn.functional.normalize(torch.cat(found), dim=-1)

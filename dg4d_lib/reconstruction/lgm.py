@@ -23,7 +23,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.harmonics import harmonics_of_color
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.reconstruction.alignment import best_azimuth
-from dg4d_lib.reconstruction.unet import VIEWS, Unet, UnetShape
+from dg4d_lib.reconstruction.lgm_unet import VIEWS, Unet, UnetShape
 
 WEIGHTS_FILE = "model_fp16_fixrot.safetensors"
 LGM_RADIUS = 1.5  # of LGM's cameras

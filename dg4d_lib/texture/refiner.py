@@ -9,10 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.diffusion.ddim import ddim_step, ddim_timesteps, diffused
+from dg4d_lib.diffusion.latents import decode_images, encode_images
+from dg4d_lib.diffusion.noise_schedule import add_noise, ddim_step, ddim_timesteps
 from dg4d_lib.diffusion.video_model import VideoModel, karras_sigmas, start_index
 from dg4d_lib.guidance.interface import View
-from dg4d_lib.guidance.zero123 import ConditionedZero123, encoded
+from dg4d_lib.guidance.zero123 import ConditionedZero123
 from dg4d_lib.images import resize
 from dg4d_lib.settings import ImageToImageSettings, VideoToVideoSettings
 
@@ -91,16 +92,16 @@ class ImageToImage:
         skipped = settings.skipped_start + progress * (settings.skipped_end - settings.skipped_start)
         timesteps = ddim_timesteps(settings.steps)[start_index(settings.steps, skipped) :]
         tokens = prior.tokens([View(camera, frame) for frame, camera in enumerate(cameras)])
-        images = video.to(prior.vae.device)
+        renders = video.to(prior.vae.device)
 
         def denoised(piece: slice) -> Float[Tensor, "p h w 3"]:
-            latents = scale * encoded(prior.vae, images[piece])
-            latents = diffused(latents, noise[piece].to(latents), timesteps[0])
+            latents = scale * encode_images(prior.vae, renders[piece])
+            latents = add_noise(latents, noise[piece].to(latents), timesteps[0])
             for timestep, following in pairwise((*timesteps, 0)):
-                believed = prior.believed_noise(latents, timestep, prior.latents[piece], tokens[piece])
-                latents = ddim_step(latents, believed, timestep, following)
-            decoded = prior.vae.decode((latents / scale).to(prior.vae.dtype)).sample.to(latents)
-            return resize((decoded.movedim(1, -1) / 2 + 0.5).clamp(0, 1), video.shape[1:3])
+                noise_pred = prior.predict_noise(latents, timestep, prior.latents[piece], tokens[piece])
+                latents = ddim_step(latents, noise_pred, timestep, following)
+            images = decode_images(prior.vae, (latents / scale).to(prior.vae.dtype), latents.dtype)
+            return resize(images, video.shape[1:3])
 
         noise = torch.randn((len(video), *prior.latents.shape[1:]), dtype=video.dtype, generator=generator)
-        return torch.cat(prior.batches.run(denoised, len(images))).to(video)
+        return torch.cat(prior.batches.run(denoised, len(renders))).to(video)

@@ -7,7 +7,7 @@ import tiny_weights
 import torch
 from safetensors.torch import load_file, save_file
 
-from dg4d_lib.diffusion import parts
+from dg4d_lib.diffusion import noise_schedule, parts
 from dg4d_lib.diffusion.parts import Placement
 from dg4d_lib.errors import BackendUnavailable, BadInput
 
@@ -153,19 +153,19 @@ def test_a_pickle_that_would_run_code_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_model_with_another_schedule_is_refused(copy: Path) -> None:
-    expected = parts.read_schedule(copy)
-    assert expected == parts.BetaSchedule(0.00085, 0.012, "scaled_linear", 1000, "epsilon")
-    parts.require_schedule(copy, expected)
+    expected = noise_schedule.read_schedule(copy)
+    assert expected == noise_schedule.BetaSchedule(0.00085, 0.012, "scaled_linear", 1000, "epsilon")
+    noise_schedule.require_schedule(copy, expected)
     for change in ({"prediction_type": "v_prediction"}, {"beta_end": 0.02}, {"num_train_timesteps": 100}):
         tiny_weights.write_scheduler(copy / "scheduler", **change)
         with pytest.raises(BadInput, match=str(next(iter(change.values())))):
-            parts.require_schedule(copy, expected)
+            noise_schedule.require_schedule(copy, expected)
     (copy / "scheduler" / "scheduler_config.json").write_text(json.dumps({"beta_start": 0.1}))
     with pytest.raises(BadInput, match="no scheduler"):
-        parts.read_schedule(copy)
+        noise_schedule.read_schedule(copy)
     (copy / "scheduler" / "scheduler_config.json").unlink()
     with pytest.raises(BadInput, match="missing"):
-        parts.read_schedule(copy)
+        noise_schedule.read_schedule(copy)
 
 
 @pytest.mark.parametrize("name", LOADERS)

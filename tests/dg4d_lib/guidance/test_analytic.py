@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.diffusion.noise_schedule import alphabars
+from dg4d_lib.diffusion.noise_schedule import alphas_cumprod
 from dg4d_lib.guidance.analytic import LATENT_NUMBERS, AnalyticPrior
 from dg4d_lib.guidance.distillation import Annealing, annealed_timestep
 from dg4d_lib.guidance.interface import GuidancePrior, View
@@ -30,7 +30,7 @@ def test_the_gradient_is_the_closed_form_and_the_noise_cancels(progress: float):
     coverage = torch.full((3, SIZE, SIZE, 1), 0.5, requires_grad=True)
     prior(0.5).loss(images, coverage, VIEWS, progress, torch.Generator().manual_seed(0)).backward()
     color, alpha = known_pictures()
-    a = float(alphabars()[annealed_timestep(progress, 0.98)])
+    a = float(alphas_cumprod()[annealed_timestep(progress, 0.98)])
     scale = (a * (1 - a)) ** 0.5 * LATENT_NUMBERS / (3 * SIZE * SIZE) / 3
     torch.testing.assert_close(images.grad, scale * 4 * (images.detach() - color), atol=2e-4, rtol=1e-3)
     torch.testing.assert_close(coverage.grad, 0.5 * scale * 4 * (coverage.detach() - alpha), atol=2e-4, rtol=1e-3)

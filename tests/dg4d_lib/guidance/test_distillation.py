@@ -2,9 +2,9 @@ import pytest
 import torch
 
 from dg4d_lib.diffusion.batching import MicroBatches
+from dg4d_lib.diffusion.noise_schedule import alphas_cumprod
 from dg4d_lib.guidance.distillation import (
     Annealing,
-    alphabars,
     annealed_timestep,
     distill_in_pieces,
     distillation_loss,
@@ -96,7 +96,7 @@ def test_the_gradient_is_the_weighted_difference_of_noises(timestep: int):
 
     score_distillation(latents, predict, timestep, torch.Generator().manual_seed(7)).backward()
     noise = torch.empty_like(latents).normal_(generator=torch.Generator().manual_seed(7))
-    alphabar = alphabars()[timestep].float()
+    alphabar = alphas_cumprod()[timestep].float()
     torch.testing.assert_close(seen[0][0], alphabar.sqrt() * latents.detach() + (1 - alphabar).sqrt() * noise)
     assert seen[0][1] == timestep
     torch.testing.assert_close(latents.grad, weight(timestep) * (0.25 - noise) / 2, atol=1e-6, rtol=1e-5)

@@ -13,8 +13,7 @@ from safetensors.torch import load_file, save_file
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import random_orbit, turntable
 from dg4d_lib.diffusion.batching import MicroBatches
-from dg4d_lib.diffusion.ddim import ddim_timesteps
-from dg4d_lib.diffusion.noise_schedule import alphabars
+from dg4d_lib.diffusion.noise_schedule import alphas_cumprod, ddim_timesteps
 from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.imagedream import Condition, ImageDream, ImageDreamPrior, camera_numbers
@@ -210,7 +209,7 @@ def test_loss_and_gradient_are_those_of_the_formulas_in_double_precision(folder:
     condition, images = exact.conditioned_on(pictures(2).double()), pictures(8, 48).double()
     loss, gradient = judged(prior(exact, condition), images)
 
-    alphabar = alphabars()[500]
+    alphabar = alphas_cumprod()[500]
     e = torch.randn(2, 16, 32, 32, generator=seeded(), dtype=torch.float64).reshape(2, 4, 4, 32, 32)
     expected = torch.zeros(8, 48, 48, 3).double()
     total = 0.0

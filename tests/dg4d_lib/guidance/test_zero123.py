@@ -13,11 +13,12 @@ from torch.nn import functional
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.batching import MicroBatches
+from dg4d_lib.diffusion.clip_images import clip_pixels
 from dg4d_lib.diffusion.single_token_attention import OneToken
 from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.interface import GuidancePrior, View
-from dg4d_lib.guidance.zero123 import ConditionedZero123, Zero123, camera_numbers, clip_pixels
+from dg4d_lib.guidance.zero123 import ConditionedZero123, Zero123, camera_numbers
 from dg4d_lib.settings import Zero123PriorSettings
 
 CPU = torch.device("cpu")

@@ -24,7 +24,7 @@ from dg4d_lib.reconstruction.lgm import (
     shape_of,
     visible,
 )
-from dg4d_lib.reconstruction.unet import UnetShape
+from dg4d_lib.reconstruction.lgm_unet import UnetShape
 
 TINY = UnetShape((32, 32, 64), (False, True, True), (64, 32), (True, False))
 CPU = Placement(torch.device("cpu"), torch.float32)

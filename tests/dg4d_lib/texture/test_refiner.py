@@ -10,11 +10,12 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.diffusion.ddim import ddim_timesteps
+from dg4d_lib.diffusion.latents import encode_images
+from dg4d_lib.diffusion.noise_schedule import ddim_timesteps
 from dg4d_lib.diffusion.video_model import VideoModel
 from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.interface import View
-from dg4d_lib.guidance.zero123 import Zero123, encoded
+from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.settings import ImageToImageSettings, VideoModelSettings, VideoToVideoSettings, Zero123PriorSettings
 from dg4d_lib.texture.refiner import ImageToImage, Refiner, VideoToVideo
 
@@ -131,10 +132,10 @@ def test_pictures_are_denoised_as_the_ddim_scheduler_does_it(
     assert len(timesteps) == steps_left
     scale = zero123.vae.config.scaling_factor
     noise = torch.randn((FRAMES, 4, 32, 32), generator=rng(7))
-    latents = scheduler.add_noise(scale * encoded(prior.vae, video().float()), noise, timesteps[:1])
+    latents = scheduler.add_noise(scale * encode_images(prior.vae, video().float()), noise, timesteps[:1])
     tokens = prior.tokens([View(camera, frame) for frame, camera in enumerate(CAMERAS)])
     for timestep in timesteps:
-        believed = prior.believed_noise(latents, int(timestep), prior.latents, tokens)
+        believed = prior.predict_noise(latents, int(timestep), prior.latents, tokens)
         latents = scheduler.step(believed, timestep, latents).prev_sample
     decoded = (zero123.vae.decode(latents / scale).sample / 2 + 0.5).clamp(0, 1)
     expected = interpolate(decoded, (SIDE, SIDE), mode="bilinear", antialias=True).movedim(1, -1)

@@ -4,7 +4,7 @@ import pytest
 import tiny_imagedream
 import torch
 
-from dg4d_lib.diffusion.multiview import MultiViewShape, MultiViewUnet
+from dg4d_lib.guidance.imagedream_unet import MultiViewShape, MultiViewUnet
 
 STABLE_DIFFUSION_2 = 865_910_724  # parameters of its U-Net
 PUBLISHED = {  # unet/config.json of ashawkey/imagedream-ipmv-diffusers
