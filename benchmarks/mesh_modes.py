@@ -28,7 +28,7 @@ from dg4d_lib.mesh.extraction.extract import best_level
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.metrics.image import iou, psnr
-from dg4d_lib.metrics.surface import chamfer
+from dg4d_lib.metrics.surface import chamfer_of_points, sample_surface
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
 from dg4d_lib.settings import MeshSettings
 from steps.artifacts.packages import ASSET, COMPACT
@@ -71,7 +71,8 @@ def of_package(folder: Path, count: int, rasterize: Rasterizer) -> list[Row]:
         tracked = replace(asset.mesh, vertices=asset.mesh.vertices + asset.offsets[frame])
         truth, generator = splats(states.at(i), rasterize), torch.Generator().manual_seed(frame)
         for mode, mesh in (("tracked", tracked), ("per_frame", extracted)):
-            apart = chamfer(mesh.vertices, mesh.faces, extracted.vertices, extracted.faces, POINTS, generator)
+            points = [sample_surface(each.vertices, each.faces, POINTS, generator) for each in (mesh, extracted)]
+            apart = chamfer_of_points(*points)
             rows.append(Row(folder.name, mode, 1, PER_WORLD_UNIT * apart, *look(mesh, truth)))
     return [mean_row(folder.name, [row for row in rows if row.mode == mode]) for mode in MODES]
 

@@ -9,37 +9,12 @@ from torch import Tensor
 from dg4d_lib.errors import BadInput
 
 
-def chamfer(
-    a_vertices: Float[Tensor, "v 3"],
-    a_faces: Int[Tensor, "f 3"],
-    b_vertices: Float[Tensor, "w 3"],
-    b_faces: Int[Tensor, "g 3"],
-    samples: int,
-    generator: torch.Generator,
-) -> float:
-    """The mean distance from points of either surface to the nearest point of the other, in the vertices' units.
-
-    Points are spread evenly over the area. They are points, not the surfaces: even equal surfaces are about half a
-    spacing apart, 0.5 sqrt(area / samples).
-
-    Args:
-        a_vertices: of one surface.
-        a_faces: its triangles.
-        b_vertices: of the other.
-        b_faces: its triangles.
-        samples: points on each.
-        generator: draws them; of the processor.
-
-    Raises:
-        BadInput: a surface without area.
-    """
-    return chamfer_of_points(
-        sample_surface(a_vertices, a_faces, samples, generator), sample_surface(b_vertices, b_faces, samples, generator)
-    )
-
-
 def chamfer_of_points(a: Float[Tensor, "n 3"], b: Float[Tensor, "m 3"]) -> float:
-    """The mean distance from either crowd of points to the nearest of the other: the mean of both ways."""
+    """Return the mean distance from points of either cloud to the nearest of the other, averaged over both directions.
+
+    Points are not the surfaces they are sampled from: two samples of one surface are about half a spacing apart,
+    0.5 sqrt(area / samples).
+    """
     there, _ = cKDTree(b.numpy()).query(a.numpy())
     back, _ = cKDTree(a.numpy()).query(b.numpy())
     return float(np.mean(there) + np.mean(back)) / 2

@@ -33,11 +33,6 @@ class UnetShape:
     up_channels: tuple[int, ...] = (1024, 1024, 512, 256, 128)
     up_attention: tuple[bool, ...] = (True, True, True, False, False)
 
-    @property
-    def shrinks(self) -> int:
-        """Pixels of the input per pixel of the output, along a side."""
-        return 2 ** (len(self.down_channels) - len(self.up_channels))
-
 
 class Unet(nn.Module):
     """Features of four views to features of four views.

@@ -3,14 +3,12 @@
 A viewer that does not know the extension shows colored points. Axes and units are glTF's own, as the world's are.
 """
 
-from typing import Any, Literal
+from typing import Literal
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.typing import NDArray
 
-from dg4d_lib.assets.formats.gltf import VERTEX_DATA, Document, Parsed
+from dg4d_lib.assets.formats.gltf import VERTEX_DATA, Document
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import check_storable
@@ -60,37 +58,6 @@ def write_splat_glb(gaussians: Gaussians, version: SplatGlbVersion = "ratified")
     node = document.add("nodes", name="splats", mesh=mesh)
     document.tree["scene"] = document.add("scenes", name="asset", nodes=[node])
     return document.to_bytes()
-
-
-def read_splat_glb(content: bytes, version: SplatGlbVersion = "ratified") -> Gaussians:
-    """Read the splats of a GLB with floats and colors of degree 0, as `write_splat_glb` makes it.
-
-    Positions and harmonics come back exactly; scales and opacities went through their functions and back, to 1e-6 of
-    themselves; rotations are of unit length.
-
-    Raises:
-        BadInput: it is broken or has another form.
-    """
-    parsed = Parsed(content)
-    try:
-        primitive = parsed.tree["meshes"][0]["primitives"][0]
-        if primitive["mode"] != POINTS or primitive["extensions"][EXTENSION]["kernel"] != KERNEL["kernel"]:
-            raise BadInput(f"this GLB holds no points with the kernel {KERNEL['kernel']!r} of {EXTENSION}")
-
-        def column(name: str) -> Float[torch.Tensor, "n k"]:
-            values: NDArray[Any] = parsed.accessor(primitive["attributes"][name])
-            return torch.from_numpy(values.astype(np.float32))
-
-        scales = column(f"{EXTENSION}:SCALE")
-        return Gaussians(
-            column("POSITION"),
-            scales.log() if version == "ratified" else scales,
-            column(f"{EXTENSION}:ROTATION").roll(1, -1),
-            column(f"{EXTENSION}:OPACITY")[:, 0].double().logit().float(),
-            column(f"{EXTENSION}:SH_DEGREE_0_COEF_0")[:, None],
-        )
-    except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise BadInput(f"this GLB has not the form of splats by {EXTENSION}: {error!r}") from error
 
 
 def _linear(colors: Float[torch.Tensor, "n 3"]) -> Float[torch.Tensor, "n 3"]:

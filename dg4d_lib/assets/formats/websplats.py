@@ -19,13 +19,12 @@ import zlib
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
 
 MAGIC = b"D4WS"
 VERSION = 2
@@ -33,8 +32,6 @@ POSITION_STEPS = 4096  # along the longest side of the box; a place is off by 1/
 ROTATION_STEP = 1 / 32  # radians; a rotation is off by 1.6 degrees at most, .9 on average
 SCALE_STEP = 1 / 16  # of the logarithm; a scale is off by 3 percent at most
 MORTON_BITS = POSITION_STEPS.bit_length()  # per axis
-
-_FOREIGN = (KeyError, TypeError, ValueError, struct.error, zlib.error)
 
 
 def write_web_splats(states: Gaussians, fps: float) -> bytes:
@@ -82,39 +79,6 @@ def write_web_splats(states: Gaussians, fps: float) -> bytes:
     return MAGIC + struct.pack("<I", len(text)) + text + packer.compress(b"".join(planes)) + packer.flush()
 
 
-def read_web_splats(content: bytes) -> tuple[Gaussians, float]:
-    """The states and frames per second of what `write_web_splats` wrote, in the order and precision of the file.
-
-    Raises:
-        BadInput: it is broken or something else.
-    """
-    if content[:4] != MAGIC:
-        raise BadInput(f"these are no splats for the web: they must begin with {MAGIC!r}; given {content[:4]!r}")
-    try:
-        (length,) = struct.unpack_from("<I", content, 4)
-        header = json.loads(content[8 : 8 + length])
-        if header["version"] != VERSION:
-            raise BadInput(f"splats for the web of version {header['version']} cannot be read, only {VERSION}")
-        planes = np.frombuffer(zlib.decompress(content[8 + length :]), "u1")
-        count, frames = header["count"], header["frames"]
-        paint, moving = np.split(planes, [4 * count])
-        places, turns, sizes = (_unpacked(part, frames, count) for part in np.split(moving, 3))
-        colors = torch.from_numpy(paint.reshape(4, count).T / 255).float()
-        means = torch.tensor(header["corner"]).double() + header["position_step"] * places
-        return (
-            Gaussians(
-                means.float(),
-                (header["scale_step"] * sizes).float(),
-                _quats(header["rotation_step"] * turns).float(),
-                colors[:, 3].clamp(0.5 / 255, 1 - 0.5 / 255).logit(),
-                harmonics_of_color(colors[:, :3]),
-            ),
-            float(header["fps"]),
-        )
-    except _FOREIGN as error:
-        raise BadInput(f"these splats for the web are broken: {error!r}") from error
-
-
 def _steps(values: Float[Tensor, "t n 3"]) -> Int[NDArray[np.int16], "t n 3"]:
     limits = np.iinfo(np.int16)
     return values.round().clamp(limits.min, limits.max).numpy().astype("<i2")
@@ -128,12 +92,6 @@ def _rotation_vectors(quats: Float[Tensor, "t n 4"]) -> Float[Tensor, "t n 3"]:
     axes, sines = quats[..., 1:], quats[..., 1:].norm(dim=-1, keepdim=True)
     angles = 2 * torch.atan2(sines, quats[..., :1])
     return axes * torch.where(sines > 0, angles / sines.clamp_min(torch.finfo(sines.dtype).tiny), 2.0)
-
-
-def _quats(vectors: Float[Tensor, "t n 3"]) -> Float[Tensor, "t n 4"]:
-    """wxyz of rotation vectors."""
-    half = vectors.norm(dim=-1, keepdim=True) / 2
-    return torch.cat([half.cos(), torch.sinc(half / torch.pi) * vectors / 2], -1)
 
 
 def _morton(places: Int[NDArray[np.int16], "n 3"]) -> Int[NDArray[np.int64], " n"]:
@@ -150,11 +108,3 @@ def _packed(field: Int[NDArray[np.int16], "t n 3"]) -> bytes:
     values = np.diff(values, axis=2, prepend=np.zeros_like(values[..., :1]))
     zigzag = ((values << 1) ^ (values >> 15)).astype("<u2")
     return (zigzag & 255).astype("u1").tobytes() + (zigzag >> 8).astype("u1").tobytes()
-
-
-def _unpacked(part: UInt8[NDArray[np.uint8], " m"], frames: int, count: int) -> Float[Tensor, "t n 3"]:
-    low, high = part.astype(np.uint16).reshape(2, frames, 3, count)
-    zigzag = low | high << 8
-    values = ((zigzag >> 1) ^ -(zigzag & 1)).astype(np.int16)
-    field = values.cumsum(2, dtype=np.int16).cumsum(0, dtype=np.int16)
-    return torch.from_numpy(field.transpose(0, 2, 1).astype(np.float64))

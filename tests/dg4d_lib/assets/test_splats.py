@@ -6,9 +6,9 @@ import gsply
 import numpy as np
 import pytest
 import torch
+from splat_readers import read_splat_glb
 
 from dg4d_lib.assets.animated import moved
-from dg4d_lib.assets.formats.splat_glb import read_splat_glb
 from dg4d_lib.assets.formats.splats import read_splats, write_splat_glb_frames, write_splats, write_spz_frames
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.errors import BadInput

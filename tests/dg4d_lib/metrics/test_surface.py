@@ -8,7 +8,7 @@ import trimesh
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.metrics.surface import aligned, chamfer, chamfer_of_points, sample_surface
+from dg4d_lib.metrics.surface import aligned, chamfer_of_points, sample_surface
 
 SQUARE = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), torch.tensor([[0, 1, 2], [0, 2, 3]])
 SAMPLES = 20_000
@@ -24,34 +24,39 @@ def sphere(radius: float) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(ball.vertices).float(), torch.from_numpy(ball.faces)
 
 
+def chamfer(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor], samples: int = SAMPLES) -> float:
+    generator = seed()
+    return chamfer_of_points(sample_surface(*a, samples, generator), sample_surface(*b, samples, generator))
+
+
 def test_a_plane_and_its_shifted_copy_are_the_shift_apart() -> None:
     vertices, faces = SQUARE
     shifted = vertices + torch.tensor([0.0, 0.0, 0.3])
-    assert chamfer(vertices, faces, shifted, faces, SAMPLES, seed()) == pytest.approx(0.3, abs=SPACING**2)
+    assert chamfer((vertices, faces), (shifted, faces)) == pytest.approx(0.3, abs=SPACING**2)
 
 
 def test_spheres_are_the_difference_of_their_radii_apart() -> None:
     """Nearest points are sampled ones, a little aside: about spacing squared over twice the distance too far."""
-    found = chamfer(*sphere(0.5), *sphere(0.8), SAMPLES, seed())
+    found = chamfer(sphere(0.5), sphere(0.8))
     area = 4 * math.pi * 0.65**2
     assert found == pytest.approx(0.3, abs=area / SAMPLES / 0.3)
 
 
 def test_equal_surfaces_are_half_a_spacing_apart() -> None:
     """The mean distance to the nearest of randomly spread points (Clark and Evans 1954); the border adds a little."""
-    assert chamfer(*SQUARE, *SQUARE, SAMPLES, seed()) == pytest.approx(SPACING / 2, rel=0.03)
+    assert chamfer(SQUARE, SQUARE) == pytest.approx(SPACING / 2, rel=0.03)
 
 
 def test_what_one_surface_lacks_counts_from_that_side_alone() -> None:
     """A square at height 1 above one of two: one side is 1 away, of the other one half is 0 away and one half 1."""
     vertices, faces = SQUARE
     both = torch.cat([vertices, vertices + torch.tensor([0.0, 0.0, 1.0])]), torch.cat([faces, faces + 4])
-    found = chamfer(vertices, faces, *both, SAMPLES, seed())
+    found = chamfer((vertices, faces), both)
     assert found == pytest.approx((0 + 0.5) / 2, abs=SPACING)
 
 
 def test_the_order_of_the_surfaces_does_not_matter() -> None:
-    near, far = chamfer(*sphere(0.5), *sphere(0.6), 2000, seed()), chamfer(*sphere(0.6), *sphere(0.5), 2000, seed())
+    near, far = chamfer(sphere(0.5), sphere(0.6), 2000), chamfer(sphere(0.6), sphere(0.5), 2000)
     assert near == pytest.approx(far, rel=0.01)
 
 
@@ -75,7 +80,7 @@ def test_points_depend_on_the_generator_alone() -> None:
 def test_a_surface_without_area_is_refused(count: int) -> None:
     faces = torch.zeros(count, 3, dtype=torch.long)
     with pytest.raises(BadInput, match=f"a surface of {count} triangles has no area"):
-        chamfer(*SQUARE, SQUARE[0], faces, 9, seed())
+        sample_surface(SQUARE[0], faces, 9, seed())
 
 
 def test_a_triangle_without_weight_gets_no_points() -> None:

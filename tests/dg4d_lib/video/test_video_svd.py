@@ -5,7 +5,6 @@ from torch import Tensor
 
 from dg4d_lib.diffusion.video_model import Condition, VideoModel
 from dg4d_lib.settings import SvdSettings, VideoModelSettings
-from dg4d_lib.video.generator import VideoGenerator
 from dg4d_lib.video.svd import StableVideo
 
 SIZE, FRAMES = 48, 4
@@ -49,9 +48,8 @@ def rng(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def test_it_is_a_video_generator_of_the_wanted_length_and_size(model: VideoModel, subject: Tensor) -> None:
+def test_the_video_has_the_wanted_length_and_size_and_follows_the_generator(model: VideoModel, subject: Tensor) -> None:
     maker = StableVideo(SETTINGS, model)
-    assert isinstance(maker, VideoGenerator)
     video = maker.generate(subject, rng(3))
     assert video.frames.shape == (FRAMES, SIZE, SIZE, 3) and video.fps == 7
     assert torch.equal(video.frames, maker.generate(subject, rng(3)).frames)

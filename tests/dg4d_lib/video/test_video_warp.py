@@ -6,7 +6,6 @@ import torch
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import WarpSettings
-from dg4d_lib.video.generator import VideoGenerator
 from dg4d_lib.video.limbs import waving_limbs
 from dg4d_lib.video.motions import bounce, breathe, lean, squash
 from dg4d_lib.video.puppet import Puppet
@@ -209,10 +208,6 @@ def test_an_empty_picture_is_refused():
 def test_the_same_request_gives_the_same_bytes():
     first, second = (video(FIGURE, "wave", frames=3)[0] for _ in range(2))
     assert torch.equal(first.frames, second.frames) and torch.equal(first.coverage, second.coverage)
-
-
-def test_it_is_a_video_generator():
-    assert isinstance(Warp(WarpSettings()), VideoGenerator)
 
 
 def test_a_rigid_sheet_follows_a_rotation_exactly():
