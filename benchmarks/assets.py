@@ -35,8 +35,8 @@ from dg4d_lib.assets.formats.websplats import write_web_splats
 from dg4d_lib.assets.rendering.preview import write_preview, write_turntable
 from dg4d_lib.assets.rendering.viewer_page import viewer_page
 from dg4d_lib.assets.rendering.webp import write_webp
+from dg4d_lib.deformation.factory import new_deformation
 from dg4d_lib.deformation.hexplane import HexPlane
-from dg4d_lib.deformation.kinds import new_deformation
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.harmonics import harmonics_of_color
 from dg4d_lib.mesh.textured import TexturedMesh

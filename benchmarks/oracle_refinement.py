@@ -41,7 +41,7 @@ from dg4d_lib.mesh_rasterizer.texture import look_up, read
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.metrics.image import psnr
 from dg4d_lib.settings import TextureSettings
-from dg4d_lib.texture.refine import Refined, Stretch, refine_textures
+from dg4d_lib.texture.refine import MeshClip, Refined, refine_textures
 from dg4d_lib.video.driving import DrivingVideo
 
 SKIPPED = (0.6, 0.7, 0.75, 0.8)  # shares of the noise levels; the paper's "noise level" is .7
@@ -183,7 +183,7 @@ def refined(model: Model, variant: Variant, settings: TextureSettings, seed: int
     front = [OrbitCamera(width=settings.size, height=settings.size)] * len(model.offsets)
     seen = model.draw([model.mesh.texture] * len(front), front)
     video = DrivingVideo(seen[..., :3], seen[..., 3:], FPS)
-    stretch = Stretch(replace(model.mesh, texture=model.blurred), model.offsets)
+    stretch = MeshClip(replace(model.mesh, texture=model.blurred), model.offsets)
     oracle = Oracle(model, sigma, whole_videos=not variant.per_frame)
     return refine_textures([stretch], video, oracle, settings, torch.Generator().manual_seed(seed))[0]
 

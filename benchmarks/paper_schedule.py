@@ -56,7 +56,7 @@ from dg4d_lib.settings import (
     VideoToVideoSettings,
     Zero123PriorSettings,
 )
-from dg4d_lib.texture.refine import Stretch, refine_textures
+from dg4d_lib.texture.refine import MeshClip, refine_textures
 from dg4d_lib.texture.refiner import VideoToVideo
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.svd import StableVideo
@@ -223,7 +223,7 @@ class Schedule:
         there = DrivingVideo(video.frames.to(self.device), video.coverage.to(self.device), video.fps)
         refiner = VideoToVideo(settings, model, there.over(there.frames.new_ones(3))[0])
         mesh = ball(self.settings.mesh.texture_size, self.device)
-        stretches = [Stretch(mesh, torch.zeros_like(mesh.vertices)[None])] * len(video)
+        stretches = [MeshClip(mesh, torch.zeros_like(mesh.vertices)[None])] * len(video)
         refine_textures(stretches, there, refiner, settings.texture, seeded())
 
     def zero123(self, settings: Zero123PriorSettings) -> Zero123:

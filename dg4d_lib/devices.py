@@ -1,13 +1,13 @@
-"""Between the processor and a GPU, which computes behind its back: whoever waits for it leaves it without work."""
+"""Asynchronous host-to-device copies."""
 
 import torch
 from torch import Tensor
 
 
-def sent(value: Tensor, device: torch.device) -> Tensor:
-    """The same numbers on a device, without waiting for what it still computes.
+def to_device_async(value: Tensor, device: torch.device) -> Tensor:
+    """Copy a tensor to a device without waiting for the kernels that are queued there.
 
-    An ordinary copy to a GPU waits for all that was asked of it before; one from pinned memory goes on by itself.
+    A copy from pageable memory synchronizes with the GPU, one from pinned memory does not.
     """
     if device.type == "cuda" and value.device.type == "cpu":
         return value.detach().pin_memory().to(device, non_blocking=True)

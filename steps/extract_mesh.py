@@ -23,10 +23,10 @@ from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.bake import bake, vertex_normals
 from dg4d_lib.mesh.texturing.unwrap import unwrap
-from dg4d_lib.mesh.tracking.isosurface_projection import snap
-from dg4d_lib.mesh.tracking.nonrigid_registration import FOLLOWS, register
-from dg4d_lib.mesh.tracking.reference_frame import best_rest, since
-from dg4d_lib.mesh.tracking.skinning import ride
+from dg4d_lib.mesh.tracking.isosurface_projection import project_to_isosurface
+from dg4d_lib.mesh.tracking.nonrigid_registration import FOLLOWS, register_nonrigid
+from dg4d_lib.mesh.tracking.reference_frame import relative_to_frame, select_reference_frame
+from dg4d_lib.mesh.tracking.skinning import skin_vertices
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
 from dg4d_lib.settings import MeshSettings
 from steps.artifacts.media import write_png
@@ -53,7 +53,7 @@ def run(job: Job) -> StepReport:
         displacement = deformation.displace(gaussians.means, torch.linspace(0, 1, frames))
     states = displacement.apply(gaussians)
     one = settings.mesh.mode != "per_frame"
-    frame, followed = best_rest(states, displacement, rasterize, settings.mesh) if one else (0, 1.0)
+    frame, followed = select_reference_frame(states, displacement, rasterize, settings.mesh) if one else (0, 1.0)
     rest = states.at(frame)
     if settings.mesh.mode == "auto" and followed < FOLLOWS:
         write_png(job.outputs["picture"], _picture_of_splats(rest, rasterize))
@@ -107,14 +107,14 @@ def _tracked(
 ) -> tuple[TexturedMesh, Float[Tensor, "t v 3"], Float[Tensor, " t"]]:
     """The mesh of the cloud as it is at one frame, what to add to its vertices at every frame, and how well that does.
 
-    The last is the agreement of outlines (`register`).
+    The last is the agreement of outlines (`register_nonrigid`).
     """
     rest = states.at(frame)
     vertices, faces = _cleaned_surface(rest, level, settings)
     mesh, copied = _colored(vertices, faces, rest, rasterize, settings)
-    carried = ride(vertices, rest, since(displacement, frame))
-    snapped = snap(vertices, carried, faces, states, level, settings)
-    offsets, agreed = register(vertices, snapped, faces, states, level, rasterize, settings)
+    carried = skin_vertices(vertices, rest, relative_to_frame(displacement, frame))
+    snapped = project_to_isosurface(vertices, carried, faces, states, level, settings)
+    offsets, agreed = register_nonrigid(vertices, snapped, faces, states, level, rasterize, settings)
     return mesh, offsets[:, copied], agreed
 
 

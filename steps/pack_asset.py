@@ -23,7 +23,7 @@ from dg4d_lib.assets.rendering.preview import write_film, write_preview, write_t
 from dg4d_lib.assets.rendering.sheet import contact_sheet
 from dg4d_lib.assets.rendering.webp import write_webp
 from dg4d_lib.assets.resample import moments, resampled, states
-from dg4d_lib.deformation.kinds import AnyDeformation
+from dg4d_lib.deformation.factory import AnyDeformation
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply

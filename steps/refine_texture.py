@@ -13,7 +13,7 @@ from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.settings import IdentitySettings, ImageToImageSettings, VideoToVideoSettings
-from dg4d_lib.texture.refine import Refined, Stretch, refine_textures
+from dg4d_lib.texture.refine import MeshClip, Refined, refine_textures
 from dg4d_lib.texture.refiner import ImageToImage, Refiner, VideoToVideo
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import frame_rate, read_frames
@@ -35,18 +35,18 @@ def run(job: Job) -> StepReport:
     fps = frame_rate(job.inputs["driving_video"])
     if "tracked" in job.inputs:
         asset = read_tracked(job.inputs["tracked"])
-        (its,), facts = _refined(job, [Stretch(asset.mesh, asset.offsets)])
+        (its,), facts = _refined(job, [MeshClip(asset.mesh, asset.offsets)])
         mesh = replace(asset.mesh, texture=its.texture)
         write_tracked(job.outputs["tracked"], replace(asset, mesh=mesh, fps=fps, textures=its.frames))
     if "meshes" in job.inputs:
         meshes = read_meshes(job.inputs["meshes"])
-        refined, facts = _refined(job, [Stretch(mesh, torch.zeros(1, *mesh.vertices.shape)) for mesh in meshes])
+        refined, facts = _refined(job, [MeshClip(mesh, torch.zeros(1, *mesh.vertices.shape)) for mesh in meshes])
         better = [replace(mesh, texture=its.texture) for mesh, its in zip(meshes, refined, strict=True)]
         write_meshes(job.outputs["meshes"], dict(enumerate(better)))
     return facts
 
 
-def _refined(job: Job, stretches: Sequence[Stretch]) -> tuple[list[Refined], StepReport]:
+def _refined(job: Job, stretches: Sequence[MeshClip]) -> tuple[list[Refined], StepReport]:
     """The textures of a motion, and how they were made."""
     settings: RefineTextureSettings = job.settings
     kind = settings.refiner
@@ -71,7 +71,7 @@ def _refined(job: Job, stretches: Sequence[Stretch]) -> tuple[list[Refined], Ste
             refiner, halved = ImageToImage(kind, prior), prior.batches.notes
             how = "picture by picture, by image diffusion"
     generator = torch.Generator().manual_seed(job.seed)
-    there = [Stretch(_on(device, stretch.mesh), stretch.offsets.to(device)) for stretch in stretches]
+    there = [MeshClip(_on(device, stretch.mesh), stretch.offsets.to(device)) for stretch in stretches]
     refined = refine_textures(there, driving, refiner, kind.texture, generator, job.progress)
     often = "every iteration" if kind.texture.refresh_every == 1 else f"every {kind.texture.refresh_every} iterations"
     said = [f"Textures were refined {how}; {kind.texture.iterations} iterations, new targets {often}."]

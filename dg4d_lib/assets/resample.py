@@ -10,7 +10,7 @@ from dg4d_lib.assets.animated import Asset4D, between, moved
 from dg4d_lib.deformation.interface import Deformation, Displacement
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.mesh.tracking.skinning import ride
+from dg4d_lib.mesh.tracking.skinning import skin_vertices
 
 MOST_STATES = 1000  # a GLB holds a morph target per state, and weights for all of them at every key
 STATES_AT_ONCE = 32  # bounds the memory
@@ -95,4 +95,4 @@ def _carried(
     rest = moved(gaussians, deformation, frames, positions.new_tensor([asset.rest])).at(0)
     there = states(gaussians, deformation, frames, positions)
     since_rest = Displacement(there.means - rest.means, there.log_scales - rest.log_scales, there.quats - rest.quats)
-    return ride(asset.mesh.vertices, rest, since_rest)
+    return skin_vertices(asset.mesh.vertices, rest, since_rest)

@@ -1,6 +1,6 @@
-"""How much arithmetic networks do: counted once per shape of their inputs, and added up at every call.
+"""Floating-point operations of networks: measured once per input shape and added up at every call.
 
-Steps are counted from outside (`steps/main.py`), before torch may be imported: it is imported where networks are.
+torch is imported with the first network, because `counting_flops` is entered before (`steps/runtime/perform.py`).
 """
 
 from collections.abc import Callable, Hashable, Iterator
@@ -14,7 +14,7 @@ _OPEN: ContextVar[dict[str, int] | None] = ContextVar("flops", default=None)
 
 @contextmanager
 def counting_flops() -> Iterator[dict[str, int]]:
-    """Count what networks do while the block runs: floating-point operations, by the name of their class.
+    """Count the floating-point operations of networks in the block, by the name of their class.
 
     A multiplication and an addition are two. Only matrix products, convolutions and attention count, as
     `torch.utils.flop_counter` has it; the rest is less than a hundredth of a diffusion network.
@@ -28,11 +28,10 @@ def counting_flops() -> Iterator[dict[str, int]]:
 
 
 def counted(network: Any) -> Any:
-    """The same network, whose calls are from now on entered where flops are being counted.
+    """Return the network with its calls counted inside `counting_flops`.
 
-    Of a VAE, which is never called as a whole, its encoder and its decoder are counted under its name. Where inputs
-    have a gradient, the way back to them is entered too: with frozen weights, that of a matrix product or a convolution
-    costs as much as the way there.
+    Encoder and decoder of a VAE, which is never called as a whole, are counted under its name. Where inputs have a
+    gradient, the backward pass is counted too: with frozen weights it costs as much as the forward pass.
     """
     name = type(network).__name__
     for part in (network.encoder, network.decoder) if hasattr(network, "encode") else (network,):
@@ -41,7 +40,7 @@ def counted(network: Any) -> Any:
 
 
 def _counting(name: str, forward: Callable[..., Any]) -> Callable[..., Any]:
-    """`forward`, entered under a name."""
+    """Return `forward`, counted under a name."""
     import torch  # noqa: PLC0415 - see above
     from torch.utils.flop_counter import FlopCounterMode  # noqa: PLC0415
 
@@ -55,14 +54,14 @@ def _counting(name: str, forward: Callable[..., Any]) -> Callable[..., Any]:
             return forward(*positional, **named)
         tensors = [value for value in (*positional, *named.values()) if isinstance(value, torch.Tensor)]
         shapes = tuple(value.shape for value in tensors)
-        if shapes not in of_one_call:  # a call of its own: the counter does not bear gradients
+        if shapes not in of_one_call:  # a separate call, because the counter does not work with gradients
             apart = {key: _detached(value) for key, value in named.items()}
             with torch.no_grad(), FlopCounterMode(display=False) as counter:
                 forward(*map(_detached, positional), **apart)
             of_one_call[shapes] = counter.get_total_flops()
         made = forward(*positional, **named)
-        there_and_back = torch.is_grad_enabled() and any(value.requires_grad for value in tensors)
-        flops[name] = flops.get(name, 0) + of_one_call[shapes] * (2 if there_and_back else 1)
+        has_backward = torch.is_grad_enabled() and any(value.requires_grad for value in tensors)
+        flops[name] = flops.get(name, 0) + of_one_call[shapes] * (2 if has_backward else 1)
         return made
 
     return count

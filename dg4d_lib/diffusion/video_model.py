@@ -1,4 +1,4 @@
-"""Stable Video Diffusion in its parts: look at a picture, encode, denoise and decode videos.
+"""Stable Video Diffusion in its parts: condition on a picture, encode, denoise and decode videos.
 
 The schedule is Karras et al. 2022; the network predicts v (Salimans and Ho 2022) of x = x0 + sigma e:
 x0 = x / (1 + sigma^2) - v sigma / sqrt(1 + sigma^2), and its input is x / sqrt(1 + sigma^2) at the time ln(sigma) / 4.
@@ -39,24 +39,24 @@ ENCODER_GB, DECODER_GB, UNET_GB = 0.66, 1.05, 0.15
 
 
 def karras_sigmas(steps: int) -> tuple[float, ...]:
-    """Noise levels from 700 down to 0.002 whose 1/7th powers are evenly spaced, and 0 after them: `steps` + 1."""
+    """Return `steps` noise levels from 700 to 0.002 whose 1/7th powers are evenly spaced, and a final 0."""
     top, bottom = SIGMA_MAX ** (1 / RHO), SIGMA_MIN ** (1 / RHO)
     return (*((top + i / (steps - 1) * (bottom - top)) ** RHO for i in range(steps)), 0.0)
 
 
 def start_index(steps: int, skipped: float) -> int:
-    """The first noise level that is used if a share of them is skipped: 0.7 of 25 gives 17, whose sigma is 1.2732."""
+    """Return the first noise level that is used if a share is skipped: 0.7 of 25 gives 17, whose sigma is 1.2732."""
     return min(int(steps * skipped + 1e-9), steps - 1)
 
 
-def clean(noisy: Float[Tensor, "*b"], velocity: Float[Tensor, "*b"], sigma: float) -> Float[Tensor, "*b"]:
-    """x0 out of x and the network's v."""
+def predicted_original(noisy: Float[Tensor, "*b"], velocity: Float[Tensor, "*b"], sigma: float) -> Float[Tensor, "*b"]:
+    """Return x0 from x and the network's v."""
     return noisy / (1 + sigma**2) - velocity * sigma / math.sqrt(1 + sigma**2)
 
 
 @dataclass(frozen=True)
 class Condition:
-    """What the network is told about b videos.
+    """Conditioning of b videos.
 
     Attributes:
         embedding: of the picture, by the image encoder.
@@ -133,7 +133,7 @@ class VideoModel:
 
     @torch.no_grad()
     def look_at(self, picture: Float[Tensor, "h w 3"], generators: Sequence[torch.Generator]) -> Condition:
-        """What the network is told about videos of this picture, one per generator.
+        """Return the conditioning of videos of this picture, one per generator.
 
         Args:
             picture: in [0, 1]; sides are multiples of `shrinkage`.
@@ -153,12 +153,12 @@ class VideoModel:
 
     @torch.no_grad()
     def encode(self, video: Float[Tensor, "t h w 3"]) -> Float[Tensor, "t c i j"]:
-        """The scaled latents of pictures in [0, 1]: modes, no samples."""
+        """Return the scaled modes of the latents of images in [0, 1]."""
         return self._mode(2 * video.movedim(-1, 1) - 1) * float(self.vae.config.scaling_factor)
 
     @torch.no_grad()
     def decode(self, latents: Float[Tensor, "t c i j"]) -> Float[Tensor, "t h w 3"]:
-        """The pictures of scaled latents, in [0, 1], a few frames at a time."""
+        """Decode scaled latents to images in [0, 1], a few frames at a time."""
         with self._awake(self.vae) as vae:
             inside = (latents / vae.config.scaling_factor).to(self.device, _dtype(vae.decoder))
             pictures = self._frames.run(
@@ -173,19 +173,21 @@ class VideoModel:
     def denoise(
         self, latents: Float[Tensor, "b t c i j"], condition: Condition, sigmas: Sequence[float]
     ) -> Float[Tensor, "b t c i j"]:
-        """Latents at the first noise level, taken to the last by Euler's method.
+        """Denoise latents from the first noise level to the last by Euler's method.
 
         Guidance goes from `guidance_start` in the first frame to `guidance_end` in the last; what it is guided away
         from knows no picture.
         """
         with self._awake(self.unet) as unet:
             for sigma, following in pairwise(sigmas):
-                slope = (latents - clean(latents, self._guided(unet, latents, condition, sigma), sigma)) / sigma
+                slope = (
+                    latents - predicted_original(latents, self._guided(unet, latents, condition, sigma), sigma)
+                ) / sigma
                 latents = latents + (following - sigma) * slope
         return latents
 
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Float[Tensor, "b t c i j"]:
-        """Noise of standard deviation 1 for the latents of several videos, one generator each."""
+        """Draw standard normal noise for the latents of several videos, one generator each."""
         dtype = at_least_float32(self.unet.dtype)
         return torch.cat([_normal((1, *shape[1:]), generator, dtype) for generator in generators]).to(self.device)
 

@@ -11,9 +11,9 @@ from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.cameras.viewpoints import random_orbit
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.deformation.rigidity import neighborhoods, rigidity
-from dg4d_lib.devices import sent
+from dg4d_lib.devices import to_device_async
 from dg4d_lib.fitting.losses import WHITE, finite_numbers, reference_loss, resized
-from dg4d_lib.fitting.schedules import log_linear, size_of
+from dg4d_lib.fitting.schedules import log_linear, size_at
 from dg4d_lib.fitting.static import rates
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.interface import GuidancePrior, View, ring_of
@@ -73,7 +73,7 @@ def fit_motion(
         if settings.fine_tune:
             adam.param_groups[0]["lr"] = log_linear(settings.mean_rate, settings.mean_rate_end, progress)
         frames = choose_frames(len(video), settings.frames_per_iteration, generator)
-        chosen = sent(frames, device)
+        chosen = to_device_async(frames, device)
         moved = deformation.displace(gaussians.means, times[chosen]).apply(gaussians)
 
         rendering = rasterize(moved, [camera] * len(frames), white)
@@ -88,7 +88,7 @@ def fit_motion(
         loss = progress * reference + deformation.roughness()
         guidance = torch.zeros((), device=device)
         if settings.views and settings.guidance_weight:
-            views, rows = moments(prior, frames, settings, size_of(settings.ladder, progress), generator)
+            views, rows = moments(prior, frames, settings, size_at(settings.ladder, progress), generator)
             if views:
                 states = moved.states(rows)
                 rendering = rasterize(states, [view.camera for view in views], white)

@@ -9,11 +9,11 @@ from torch import Tensor, nn
 
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.cameras.viewpoints import random_orbit
-from dg4d_lib.devices import sent
+from dg4d_lib.devices import to_device_async
 from dg4d_lib.fitting.losses import WHITE, Diverged, finite_numbers, reference_loss, resized
-from dg4d_lib.fitting.schedules import log_linear, size_of
+from dg4d_lib.fitting.schedules import log_linear, size_at
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.gaussians.growth import Grown, ScreenGradients, grow, prune, reset_opacity
+from dg4d_lib.gaussians.growth import DensifyResult, ScreenGradients, densify, prune, reset_opacity
 from dg4d_lib.guidance.interface import GuidancePrior, View, ring_of
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MotionSettings, StaticSettings
@@ -40,7 +40,7 @@ class _Cloud:
     def gaussians(self) -> Gaussians:
         return Gaussians(**self.parameters)
 
-    def replace(self, grown: Grown) -> None:
+    def replace(self, grown: DensifyResult) -> None:
         """Take over a changed cloud; survivors keep their momentum, fresh Gaussians start without."""
         for group in self.adam.param_groups:
             name = group["name"]
@@ -49,7 +49,7 @@ class _Cloud:
             if state is not None:
                 for key in ("exp_avg", "exp_avg_sq"):
                     momentum = state[key][grown.source]
-                    momentum[grown.fresh] = 0
+                    momentum[grown.is_new] = 0
                     state[key] = momentum
                 self.adam.state[fresh] = state
             group["params"] = [fresh]
@@ -101,10 +101,10 @@ def fit_gaussians(
         loss = progress * reference
         guidance = torch.zeros((), device=device)
         if settings.views and settings.guidance_weight:
-            size = size_of(settings.ladder, progress)
+            size = size_at(settings.ladder, progress)
             views = [View(c) for c in viewpoints(prior, settings, size, generator)]
             offsets.append(torch.zeros(len(views), len(gaussians), 2, device=device, requires_grad=True))
-            behind = sent(background(settings, generator), device)
+            behind = to_device_async(background(settings, generator), device)
             rendering = rasterize(gaussians, [view.camera for view in views], behind, offsets[1])
             seen.append((rendering.visible, size))
             guidance = prior.loss(rendering.color, rendering.alpha, views, progress, generator)
@@ -175,6 +175,6 @@ def control_density(
     with torch.no_grad():
         room = settings.max_points - len(cloud.gaussians)
         pull = gradients.mean
-        grown = grow(cloud.gaussians, pull, settings.densify_gradient, settings.densify_scale, room, generator)
+        grown = densify(cloud.gaussians, pull, settings.densify_gradient, settings.densify_scale, room, generator)
         cloud.replace(grown)
         cloud.replace(prune(cloud.gaussians, settings.prune_opacity, settings.prune_scale))

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dg4d_lib.devices import sent
+from dg4d_lib.devices import to_device_async
 from dg4d_lib.geometry.harmonics import color_of_harmonics
 from dg4d_lib.geometry.quaternion import rotation_matrix
 
@@ -70,7 +70,7 @@ class Gaussians:
         chosen = torch.as_tensor(rows, dtype=torch.long)
         if chosen.tolist() == list(range(len(self.means))):
             return self
-        chosen = sent(chosen, self.means.device)
+        chosen = to_device_async(chosen, self.means.device)
         return replace(self, means=self.means[chosen], log_scales=self.log_scales[chosen], quats=self.quats[chosen])
 
     def at(self, frame: int) -> "Gaussians":

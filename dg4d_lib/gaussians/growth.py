@@ -1,7 +1,4 @@
-"""Density control: where the picture asks for more Gaussians there will be more, where nothing is seen fewer.
-
-Functions on values (Kerbl et al. 2023, section 5; thresholds of DreamGaussianHD).
-"""
+"""Adaptive density control (Kerbl et al. 2023, section 5; thresholds of DreamGaussianHD)."""
 
 import math
 from dataclasses import dataclass
@@ -19,11 +16,11 @@ SPLIT_SHRINK = 1.6
 
 @dataclass
 class ScreenGradients:
-    """How much the loss pulls at the projected centers, in NDC units, averaged over the views that saw them.
+    """Gradients of the loss with respect to projected centers, in NDC, averaged over the views that saw them.
 
     Attributes:
         total: sum of the gradients' norms.
-        views: how many views saw each Gaussian.
+        views: number of views that saw each Gaussian.
     """
 
     total: Float[Tensor, " n"]
@@ -31,64 +28,64 @@ class ScreenGradients:
 
     @staticmethod
     def none(count: int, device: torch.device | None = None) -> "ScreenGradients":
-        """Nothing seen yet."""
+        """Return gradients before the first view."""
         return ScreenGradients(torch.zeros(count, device=device), torch.zeros(count, device=device))
 
     def add(self, pixel_gradients: Float[Tensor, "b n 2"], visible: Bool[Tensor, "b n"], size: int) -> None:
-        """Gather the views of one rendering; gradients per pixel become per NDC by half the size."""
+        """Add the views of one rendering; half the size converts gradients per pixel to NDC."""
         self.total += (pixel_gradients.norm(dim=-1) * (size / 2) * visible).sum(0)
         self.views += visible.sum(0)
 
     @property
     def mean(self) -> Float[Tensor, " n"]:
-        """Zero where no view saw the Gaussian."""
+        """Mean norm per Gaussian; zero where no view saw it."""
         return self.total / self.views.clamp(min=1)
 
 
 @dataclass(frozen=True)
-class Grown:
-    """A changed cloud, and where each of its Gaussians comes from.
+class DensifyResult:
+    """A changed cloud, and the origin of each of its Gaussians.
 
     Attributes:
         gaussians: the cloud.
         source: index into the old cloud.
-        fresh: whether it is new, so that the optimizer starts it without momentum.
+        is_new: true for Gaussians that the optimizer starts without momentum.
     """
 
     gaussians: Gaussians
     source: Int[Tensor, " m"]
-    fresh: Bool[Tensor, " m"]
+    is_new: Bool[Tensor, " m"]
 
 
-def grow(
+def densify(
     gaussians: Gaussians,
-    pull: Float[Tensor, " n"],
-    min_pull: float,
+    grad2d: Float[Tensor, " n"],
+    min_grad2d: float,
     max_scale: float,
     room: int,
     generator: torch.Generator,
-) -> Grown:
-    """Clone small Gaussians and split large ones where the pull is strong.
+) -> DensifyResult:
+    """Clone small Gaussians and split large ones where the gradient is large.
 
     Args:
         gaussians: the cloud.
-        pull: mean screen gradient, NDC.
-        min_pull: below it nothing grows.
+        grad2d: mean screen gradient, NDC.
+        min_grad2d: threshold for growth.
         max_scale: world units; larger Gaussians are split in two, smaller ones cloned.
-        room: how many may be added; the strongest pulls go first.
-        generator: where the halves of a split land.
+        room: number of Gaussians that may be added; the largest gradients go first.
+        generator: of the positions of split halves.
     """
-    wanted = pull >= min_pull
+    wanted = grad2d >= min_grad2d
     if int(wanted.sum()) > room:
         strongest = torch.zeros_like(wanted)
-        strongest[pull.argsort(descending=True, stable=True)[: max(room, 0)]] = True
+        strongest[grad2d.argsort(descending=True, stable=True)[: max(room, 0)]] = True
         wanted &= strongest
     large = gaussians.scales.amax(-1) > max_scale
-    everything = torch.arange(len(gaussians), device=pull.device)
+    everything = torch.arange(len(gaussians), device=grad2d.device)
     kept, cloned, split = everything[~(wanted & large)], everything[wanted & ~large], everything[wanted & large]
     halves = split.repeat(SPLIT_INTO)
     source = torch.cat([kept, cloned, halves])
-    fresh = torch.arange(len(source), device=pull.device) >= len(kept)
+    is_new = torch.arange(len(source), device=grad2d.device) >= len(kept)
     means, log_scales = gaussians.means[source].clone(), gaussians.log_scales[source].clone()
     if len(halves):
         local = torch.randn(len(halves), 3, generator=generator).to(means) * gaussians.scales[halves]
@@ -97,17 +94,17 @@ def grow(
     grown = Gaussians(
         means, log_scales, gaussians.quats[source], gaussians.opacity_logits[source], gaussians.harmonics[source]
     )
-    return Grown(grown, source, fresh)
+    return DensifyResult(grown, source, is_new)
 
 
-def prune(gaussians: Gaussians, min_opacity: float, max_scale: float) -> Grown:
-    """Remove what is almost invisible or too large."""
+def prune(gaussians: Gaussians, min_opacity: float, max_scale: float) -> DensifyResult:
+    """Remove Gaussians that are almost transparent or too large."""
     source = ((gaussians.opacities >= min_opacity) & (gaussians.scales.amax(-1) <= max_scale)).nonzero()[:, 0]
     kept = Gaussians(**{name: value[source] for name, value in vars(gaussians).items()})
-    return Grown(kept, source, torch.zeros_like(source, dtype=torch.bool))
+    return DensifyResult(kept, source, torch.zeros_like(source, dtype=torch.bool))
 
 
 def reset_opacity(gaussians: Gaussians, ceiling: float = 0.01) -> Gaussians:
-    """No opacity above `ceiling`: what is needed comes back, what is not can be pruned."""
+    """Clamp opacities to `ceiling`, so that unneeded Gaussians stay transparent and are pruned."""
     logit = torch.logit(torch.tensor(ceiling))
     return Gaussians(**{**vars(gaussians), "opacity_logits": gaussians.opacity_logits.clamp(max=float(logit))})

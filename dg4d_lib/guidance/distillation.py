@@ -23,7 +23,7 @@ PredictNoise = Callable[[Float[Tensor, "b c h w"], int], Float[Tensor, "b c h w"
 
 @dataclass(frozen=True)
 class Annealing:
-    """Which timestep an iteration uses: one for its whole batch.
+    """Schedule of the timestep of an iteration, one for its whole batch.
 
     Attributes:
         start: T_max at the beginning, share of the schedule; the paper's is 0.98, and 0.5 in the dynamic stage.
@@ -36,7 +36,7 @@ class Annealing:
     uniform: bool = False
 
     def timestep(self, progress: float, generator: torch.Generator) -> int:
-        """The timestep at a progress in [0, 1]; the generator is touched only by uniform draws."""
+        """Return the timestep at a progress in [0, 1]; only uniform draws use the generator."""
         highest = annealed_timestep(progress, self.start, self.end)
         if not self.uniform:
             return highest
@@ -44,7 +44,7 @@ class Annealing:
 
 
 def annealed_timestep(progress: float, noise_start: float, noise_end: float = NOISE_END) -> int:
-    """Linear from `noise_start` to `noise_end` of the schedule, and never outside of 20 to 980.
+    """Interpolate from `noise_start` to `noise_end` of the schedule, within 20 to 980.
 
     Args:
         progress: share of the optimization that is done, in [0, 1].
@@ -55,15 +55,15 @@ def annealed_timestep(progress: float, noise_start: float, noise_end: float = NO
     return min(max(round(TRAIN_STEPS * share), LOWEST), HIGHEST)
 
 
-def weight(timestep: int) -> float:
-    """w(t) = 1 - alphabar(t): 0.0187 at 20, 0.326 at 250, 0.724 at 500, 0.994 at 980."""
+def sds_weight(timestep: int) -> float:
+    """Return w(t) = 1 - alphabar(t): 0.0187 at 20, 0.326 at 250, 0.724 at 500, 0.994 at 980."""
     return 1.0 - float(alphas_cumprod()[timestep])
 
 
 def score_distillation(
     latents: Float[Tensor, "b c h w"], predict_noise: PredictNoise, timestep: int, generator: torch.Generator
 ) -> Float[Tensor, ""]:
-    """The distillation loss with noise from a generator; see `distillation_loss`."""
+    """Return `distillation_loss` with noise from a generator."""
     noise = torch.randn(latents.shape, dtype=latents.dtype, generator=generator).to(latents.device)
     return distillation_loss(latents, predict_noise, timestep, noise)
 
@@ -71,17 +71,17 @@ def score_distillation(
 def distillation_loss(
     latents: Float[Tensor, "b c h w"], predict_noise: PredictNoise, timestep: int, noise: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, ""]:
-    """The distillation loss, divided by the number of images.
+    """Return the distillation loss, divided by the number of images.
 
     Args:
         latents: z, with gradient.
-        predict_noise: (x_t, t) -> the noise it believes in; called without gradient.
+        predict_noise: (x_t, t) -> predicted noise; called without gradient.
         timestep: t, one for the batch.
         noise: e.
     """
     with torch.no_grad():
         noisy = add_noise(latents, noise, timestep)
-        gradient = torch.nan_to_num(weight(timestep) * (predict_noise(noisy, timestep) - noise))
+        gradient = torch.nan_to_num(sds_weight(timestep) * (predict_noise(noisy, timestep) - noise))
         target = latents - gradient
     return 0.5 * (latents - target).square().sum() / len(latents)
 
@@ -94,7 +94,7 @@ def distill_in_pieces(
     noise: Float[Tensor, "b c u v"],
     batches: MicroBatches,
 ) -> Float[Tensor, ""]:
-    """`distillation_loss` of encoded images, in micro-batches, whatever their size the same loss and gradient.
+    """Return `distillation_loss` of encoded images, computed in micro-batches of any size with the same result.
 
     The gradient of an image depends on no other image. So each piece is encoded, judged and differentiated at once:
     only one piece's activations of the encoder are held at a time, and no forward pass is done twice (checkpoints, or
@@ -104,7 +104,7 @@ def distill_in_pieces(
     Args:
         images: renders in [0, 1]; where they lie, the loss and the gradient lie.
         encode: pictures to latents, with gradient.
-        predict_noise: (x_t, t, which of the images) -> the noise it believes in.
+        predict_noise: (x_t, t, slice of the images) -> predicted noise.
         timestep: t, one for the batch.
         noise: e.
         batches: how many images go through at once.
@@ -124,7 +124,7 @@ def distill_in_pieces(
 
 
 class _Differentiated(torch.autograd.Function):
-    """A number whose gradient with respect to some images is known."""
+    """Scalar with a precomputed gradient with respect to images."""
 
     @staticmethod
     def forward(context: Any, images: Tensor, loss: Tensor, gradient: Tensor) -> Tensor:

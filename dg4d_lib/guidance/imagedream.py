@@ -20,7 +20,7 @@ from torch.nn.functional import pad
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import turntable
-from dg4d_lib.devices import sent
+from dg4d_lib.devices import to_device_async
 from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.diffusion.clip_images import clip_pixels
 from dg4d_lib.diffusion.latents import LATENT_CHANNELS, LATENT_SIZE, at_least_float32, decode_images, encode_images
@@ -65,7 +65,7 @@ class Condition:
 
     def rows(self, objects: Sequence[int]) -> "Condition":
         """Some of the objects, in this order."""
-        chosen = sent(torch.tensor(list(objects)), self.latents.device)
+        chosen = to_device_async(torch.tensor(list(objects)), self.latents.device)
         return Condition(**{part.name: getattr(self, part.name)[chosen] for part in fields(self)})
 
 
@@ -186,7 +186,7 @@ class ImageDream:
         )
         poses = torch.stack([torch.stack([camera_numbers(camera) for camera in ring]) for ring in rings])
         poses = pad(poses, (0, 0, 0, 1)).repeat(2, 1, 1)  # the picture itself has no camera
-        poses = sent(poses.to(like.dtype), like.device)
+        poses = to_device_async(poses.to(like.dtype), like.device)
         seen = torch.cat([latents.repeat(2, 1, 1, 1, 1).to(like), fronts[:, None]], 1)
         without, told = self.unet(seen, timestep, poses, text, features)[:, :-1].to(latents).chunk(2)
         return without + guidance * (told - without)
@@ -258,7 +258,9 @@ class ImageDreamPrior:
         cameras = [[view.camera for view in ring] for ring in rings]
         timestep = self.noise.timestep(progress, generator)
         shape = (len(rings), RING * LATENT_CHANNELS, LATENT_SIZE, LATENT_SIZE)
-        noise = sent(torch.randn(shape, dtype=images.dtype, generator=generator), self.condition.latents.device)
+        noise = to_device_async(
+            torch.randn(shape, dtype=images.dtype, generator=generator), self.condition.latents.device
+        )
 
         def encode(pixels: Float[Tensor, "p rows w 3"]) -> Float[Tensor, "p c 32 32"]:
             latents = self.model.encode(pixels.unflatten(1, (RING, -1)).flatten(0, 1))

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.devices import sent
+from dg4d_lib.devices import to_device_async
 from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.diffusion.clip_images import clip_pixels
 from dg4d_lib.diffusion.latents import LATENT_CHANNELS, LATENT_SIZE, SIZE, encode_images
@@ -171,7 +171,7 @@ class ConditionedZero123:
         """
         timestep = self.noise.timestep(progress, generator)
         shape = (len(images), LATENT_CHANNELS, LATENT_SIZE, LATENT_SIZE)
-        noise = sent(torch.randn(shape, dtype=images.dtype, generator=generator), self.vae.device)
+        noise = to_device_async(torch.randn(shape, dtype=images.dtype, generator=generator), self.vae.device)
         tokens, pictures = self.tokens(views), self.latents[self._rows(views)]
 
         def encode(pixels: Float[Tensor, "p h w 3"]) -> Float[Tensor, "p 4 32 32"]:
@@ -210,7 +210,7 @@ class ConditionedZero123:
         cameras = torch.stack([camera_numbers(view.camera, self.input_camera, told) for view in views])
         embeddings = self.embeddings[self._rows(views)]
         with torch.no_grad():
-            placed = sent(cameras.to(embeddings.dtype), embeddings.device)
+            placed = to_device_async(cameras.to(embeddings.dtype), embeddings.device)
             return self.camera_projection(torch.cat([embeddings, placed], -1))[:, None]
 
     def _rows(self, views: Sequence[View]) -> Int64[Tensor, " b"]:
@@ -218,7 +218,7 @@ class ConditionedZero123:
         known = len(self.embeddings)
         if wrong := [view.frame for view in views if not 0 <= view.frame < known]:
             raise BadInput(f"frame {wrong[0]} was asked for; there are {known}, counted from 0")
-        return sent(torch.tensor([view.frame for view in views]), self.embeddings.device)
+        return to_device_async(torch.tensor([view.frame for view in views]), self.embeddings.device)
 
 
 def camera_numbers(

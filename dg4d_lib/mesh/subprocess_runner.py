@@ -1,4 +1,4 @@
-"""Work that must not share a process with ours: arrays go out to a module that runs as a program, arrays come back."""
+"""Functions on arrays that run in a process of their own, because their libraries may crash or leak."""
 
 import os
 import signal
@@ -16,21 +16,21 @@ from dg4d_lib.errors import BackendUnavailable, DG4DError
 
 Arrays = dict[str, NDArray[Any]]
 
-EXIT_MISSING = 69  # of the child: something it needs is not here
-EXIT_REFUSED = 65  # of the child: the task has no solution
+EXIT_MISSING = 69  # the child needs something that is not installed
+EXIT_REFUSED = 65  # the task has no solution
 
 
-def run_apart(module: str, task: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
-    """What `python -m MODULE`, which ends in `serve`, makes of the arrays.
+def run_in_subprocess(module: str, task: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
+    """Run `python -m MODULE`, which calls `serve`, on arrays and return its results.
 
     Args:
         module: full name.
-        task: what it does, for messages: "clean the mesh".
+        task: verb phrase for messages, such as "clean the mesh".
         arrays: by name.
 
     Raises:
-        BackendUnavailable: the child said that something is missing.
-        DG4DError: it said that the task cannot be done, or died.
+        BackendUnavailable: the child needs something that is not installed.
+        DG4DError: the child refused the task, or died.
     """
     with tempfile.TemporaryDirectory(prefix="dg4d-mesh-") as folder:
         given, made = Path(folder) / "given.npz", Path(folder) / "made.npz"
@@ -42,15 +42,15 @@ def run_apart(module: str, task: str, arrays: Mapping[str, NDArray[Any]]) -> Arr
         if child.returncode == EXIT_REFUSED:
             raise DG4DError(child.stderr.strip())
         if child.returncode != 0 or not made.exists():
-            raise DG4DError(_obituary(child, task))
+            raise DG4DError(_death_message(child, task))
         with np.load(made) as results:
             return dict(results)
 
 
 def serve(work: Callable[[Arrays], Arrays]) -> None:
-    """Be the child: read the arrays, do the work, write the results, and leave without tidying up.
+    """Read the arrays, do the work, write the results and exit: the main function of the child.
 
-    Destructors of the libraries that run here are not to be trusted (see `unwrap`), so none is called.
+    No destructor is called, because those of the libraries that run here may crash (see `unwrap`).
     """
     given, made = sys.argv[1:]
     status, message = 0, ""
@@ -72,7 +72,7 @@ def _write(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     np.savez(path, allow_pickle=False, **dict(arrays))
 
 
-def _obituary(child: subprocess.CompletedProcess[str], task: str) -> str:
+def _death_message(child: subprocess.CompletedProcess[str], task: str) -> str:
     code = child.returncode
     how = f"was stopped by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
     last = "; ".join(child.stderr.strip().splitlines()[-3:]) or "it said nothing"

@@ -34,7 +34,7 @@ STEEPEST = 1 / 4  # slope of a color over its logit, at most: colors learn at so
 
 
 @dataclass(frozen=True)
-class Stretch:
+class MeshClip:
     """Consecutive frames of one mesh with one texture: a tracked mesh is one stretch, a mesh per frame many.
 
     Attributes:
@@ -60,7 +60,7 @@ class Refined:
 
 
 def refine_textures(
-    stretches: Sequence[Stretch],
+    stretches: Sequence[MeshClip],
     driving: DrivingVideo,
     refiner: Refiner,
     settings: TextureSettings,
@@ -120,7 +120,7 @@ def refine_textures(
     return [Refined(texture, _summed(texture, colors)) for texture, colors in zip(shared, added, strict=True)]
 
 
-def _nothing_added(stretch: Stretch, size: int) -> Float[Tensor, "t i j 3"] | None:
+def _nothing_added(stretch: MeshClip, size: int) -> Float[Tensor, "t i j 3"] | None:
     """Where what every frame adds is kept: black, no larger than the texture; None where there is nothing to add."""
     frames, texture = len(stretch.offsets), stretch.mesh.texture
     if not size or frames == 1:
@@ -161,7 +161,7 @@ class _Look:
 
 
 def _look(
-    stretches: Sequence[Stretch],
+    stretches: Sequence[MeshClip],
     added: Sequence[Float[Tensor, "_ _ _ 3"] | None],
     cameras: Sequence[OrbitCamera],
 ) -> tuple[list[_Look], list[Fragments]]:
@@ -187,7 +187,7 @@ def _look(
 
 
 def _facing(
-    stretches: Sequence[Stretch], drawn: Sequence[Fragments], cameras: Sequence[OrbitCamera], min_cosine: float
+    stretches: Sequence[MeshClip], drawn: Sequence[Fragments], cameras: Sequence[OrbitCamera], min_cosine: float
 ) -> Bool[Tensor, "t h w 1"]:
     """Which pixels of every frame see the surface at a better cosine."""
     places = torch.stack([camera.position() for camera in cameras])[:, None, None]

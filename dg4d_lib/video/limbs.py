@@ -44,7 +44,7 @@ class Limb:
     thickness: float
 
 
-class Waver:
+class LimbAnimator:
     """Turns the ends of limbs about their roots; the rest of the puppet stays or follows."""
 
     def __init__(self, puppet: Puppet, limbs: list[Limb]) -> None:

@@ -13,7 +13,7 @@ from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import inflate
 from dg4d_lib.settings import Motion, WarpSettings
 from dg4d_lib.video.driving import DrivingVideo
-from dg4d_lib.video.limbs import WAVE_DEG, Waver, waving_limbs
+from dg4d_lib.video.limbs import WAVE_DEG, LimbAnimator, waving_limbs
 from dg4d_lib.video.motions import BEND_DEG, JUMP, SWAY_DEG, bounce, breathe, jump_height, lean
 from dg4d_lib.video.puppet import Puppet
 
@@ -83,7 +83,7 @@ class Warp:
         if motion == "wave":
             limbs = waving_limbs(puppet)
             if limbs:
-                waver = Waver(puppet, limbs)
+                waver = LimbAnimator(puppet, limbs)
                 return lambda phase: waver.draw(math.radians(WAVE_DEG) * strength * math.sin(2 * math.pi * phase))
             self.notes += ("nothing sticks out that could wave, so the subject bends instead",)
             motion = "bend"

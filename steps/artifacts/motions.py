@@ -11,9 +11,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from dg4d_lib.deformation import kinds
+from dg4d_lib.deformation import factory
+from dg4d_lib.deformation.factory import AnyDeformation, from_state_dict, tensors_of
 from dg4d_lib.deformation.interface import Deformation
-from dg4d_lib.deformation.kinds import AnyDeformation, restored, tensors_of
 from dg4d_lib.errors import BadInput
 from dg4d_lib.fitting.motion import bounds_of
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -24,7 +24,7 @@ def new_deformation(
     settings: DeformationSettings, gaussians: Gaussians, frames: int, generator: torch.Generator | None
 ) -> AnyDeformation:
     """A deformation of this kind for these Gaussians, the identity at the start."""
-    return kinds.new_deformation(settings, bounds_of(gaussians), frames, len(gaussians), generator)
+    return factory.new_deformation(settings, bounds_of(gaussians), frames, len(gaussians), generator)
 
 
 def write_motion(
@@ -69,4 +69,4 @@ def read_fit(path: Path) -> Fit:
     except (SafetensorError, KeyError) as error:
         raise BadInput(f"{path.name} is no motion ({error}); give the `motion` output of fit_motion") from error
     settings: DeformationSettings = TypeAdapter(DeformationSettings).validate_python(about["settings"])
-    return Fit(restored(settings, tensors, about["frames"], about["gaussians"]), settings, about["frames"])
+    return Fit(from_state_dict(settings, tensors, about["frames"], about["gaussians"]), settings, about["frames"])

@@ -10,7 +10,7 @@ import torch
 
 from dg4d_lib.assets.animated import moved
 from dg4d_lib.assets.formats.compact import Compact, write_compact
-from dg4d_lib.deformation.kinds import new_deformation
+from dg4d_lib.deformation.factory import new_deformation
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.settings import HexPlaneSettings
 from examples.load_compact import states

@@ -17,7 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from dg4d_lib.deformation.kinds import AnyDeformation, last_moment, restored, tensors_of
+from dg4d_lib.deformation.factory import AnyDeformation, from_state_dict, last_moment, tensors_of
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import check_storable
@@ -101,7 +101,7 @@ def read_compact(path: Path) -> Compact:
             for prefix in (GAUSSIANS, DEFORMATION)
         }
         gaussians = Gaussians(**parts[GAUSSIANS])
-        deformation = restored(settings, parts[DEFORMATION], about["frames"], len(gaussians))
+        deformation = from_state_dict(settings, parts[DEFORMATION], about["frames"], len(gaussians))
         return Compact(gaussians, deformation, settings, about["frames"], about["fps"])
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, ValidationError, RuntimeError) as error:
         raise BadInput(f"{path.name} is no compact asset: {error}") from error

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
 from dg4d_lib.mesh.extraction.check import outward
-from dg4d_lib.mesh.subprocess_runner import Arrays, run_apart, serve
+from dg4d_lib.mesh.subprocess_runner import Arrays, run_in_subprocess, serve
 from dg4d_lib.settings import MeshSettings
 
 MERGE = 1e-4  # box units: vertices closer than this become one
@@ -68,7 +68,7 @@ def clean(
         "edge_length": np.array(length),
         "max_faces": np.array(settings.max_faces),
     }
-    cleaned = run_apart("dg4d_lib.mesh.extraction.clean", "clean the mesh", arrays)
+    cleaned = run_in_subprocess("dg4d_lib.mesh.extraction.clean", "clean the mesh", arrays)
     vertices, faces = drop_small_components(cleaned["vertices"], cleaned["faces"], settings.min_component)
     if len(faces) == 0:
         raise DG4DError("mesh cleaning left no faces; raise mesh.grid or lower mesh.edge_length")

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import coo_array, diags_array
 
 from dg4d_lib.errors import BackendUnavailable, DG4DError
-from dg4d_lib.mesh.subprocess_runner import Arrays, run_apart, serve
+from dg4d_lib.mesh.subprocess_runner import Arrays, run_in_subprocess, serve
 
 PADDING = 2  # texels between charts, at least
 SMOOTHING = 20  # Taubin steps; xatlas' time grows with roughness, so the charts are cut on a smooth copy
@@ -44,7 +44,7 @@ def unwrap(
     """
     smooth = taubin_smooth(vertices, faces).astype(np.float32)
     arrays = {"vertices": smooth, "faces": faces.astype(np.uint32), "size": np.array(size)}
-    flat = run_apart("dg4d_lib.mesh.texturing.unwrap", "unwrap the mesh", arrays)
+    flat = run_in_subprocess("dg4d_lib.mesh.texturing.unwrap", "unwrap the mesh", arrays)
     return flat["copied"], flat["corners"], flat["uvs"]
 
 

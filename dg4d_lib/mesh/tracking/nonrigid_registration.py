@@ -1,9 +1,8 @@
-"""Carried vertices pulled onto the surface of their moment, where carrying failed.
+"""Non-rigid registration with the surface of a frame, where skinning failed.
 
-Gaussians that make a wing at one moment may make a body at another; a mesh that rides them crumples. At such moments it
-is registered with the surface that the Gaussians have then: in small steps every vertex goes to the place nearest to
-it, and to the places that have it as their nearest, and steps are smoothed, less and less, as in the non-rigid
-iterative closest points of Amberg et al. (2007).
+Gaussians that form a wing in one frame may form the body in another, and a mesh skinned to them crumples. In such
+frames it is registered with the surface of the Gaussians by non-rigid iterative closest points (Amberg et al. 2007):
+every vertex moves towards its nearest point and those whose nearest vertex it is, and steps are smoothed less and less.
 """
 
 from functools import partial
@@ -26,12 +25,12 @@ from dg4d_lib.mesh.texturing.bake import vertex_normals
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
 
-FOLLOWS = 0.85  # agreement of outlines from which a moment is left as it is
-STIFFNESS = (5.0,) * 2 + (2.0,) * 6 + (1.0,) * 8 + (0.5,) * 8  # of the smoothing of steps, one after the other
-FACING = 0.1  # world units that opposite normals add to a distance, halved: the far side of a sheet is not near
+FOLLOWS = 0.85  # agreement of outlines from which a frame is left unchanged
+STIFFNESS = (5.0,) * 2 + (2.0,) * 6 + (1.0,) * 8 + (0.5,) * 8  # smoothing of successive steps
+FACING = 0.1  # half the distance that opposite normals add, world units: the far side of a sheet is not near
 
 
-def register(
+def register_nonrigid(
     vertices: Float[Tensor, "v 3"],
     offsets: Float[Tensor, "t v 3"],
     faces: Int[Tensor, "f 3"],
@@ -40,11 +39,11 @@ def register(
     rasterize: Rasterizer,
     settings: MeshSettings,
 ) -> tuple[Float[Tensor, "t v 3"], Float[Tensor, " t"]]:
-    """The offsets, better ones at moments at which the mesh had other outlines than the Gaussians.
+    """Return better offsets for frames in which the mesh has other outlines than the Gaussians.
 
     Args:
-        vertices: at rest, not split at seams.
-        offsets: where they are carried at every frame.
+        vertices: in the reference frame, not split at seams.
+        offsets: of the skinned vertices at every frame.
         faces: counter-clockwise seen from outside.
         states: the cloud at every frame (fields "t n 3").
         level: density of the surface.
@@ -52,7 +51,7 @@ def register(
         settings: of the mesh.
 
     Returns:
-        The offsets, and how far the outlines agree at every frame with these, in [0, 1]: never less than before.
+        The offsets, and the agreement of outlines at every frame with them, in [0, 1]: never less than before.
     """
     outlines = outlines_of(states, range(len(offsets)), rasterize)
     followed = agreement(vertices + offsets, faces, outlines)
@@ -63,34 +62,36 @@ def register(
     smooth = {stiffness: splu(csc_array(still + stiffness * uneven)) for stiffness in set(STIFFNESS)}
     registered = offsets.clone()
 
-    def pull(frame: int) -> None:
+    def register_frame(frame: int) -> None:
         field = density_field(states.at(frame), settings)
         target = drop_small_components(*surface(field, usable_level(field, level)), settings.min_component)
         places, theirs = (torch.from_numpy(array) for array in target)
-        aims = _with_normals(places, theirs)
-        tree = cKDTree(aims)
+        targets = _with_normals(places, theirs)
+        tree = cKDTree(targets)
         moved = vertices + offsets[frame]
         for stiffness in STIFFNESS:
-            step = smooth[stiffness].solve(_ways(_with_normals(moved, faces), aims, tree))
+            step = smooth[stiffness].solve(_steps(_with_normals(moved, faces), targets, tree))
             moved = moved + torch.from_numpy(step.astype(np.float32))
             now = agreement(moved[None], faces, outlines[frame, None])[0]
             if now > followed[frame]:
                 followed[frame], registered[frame] = now, moved - vertices
 
-    run([partial(pull, frame) for frame in astray])
+    run([partial(register_frame, frame) for frame in astray])
     return registered, followed
 
 
-def _ways(points: Float[np.ndarray, "v 6"], aims: Float[np.ndarray, "w 6"], tree: cKDTree) -> Float[np.ndarray, "v 3"]:
-    """How far to go: to the nearest aim; half of that and half to the aims that have this point as their nearest."""
-    ways = aims[tree.query(points)[1], :3] - points[:, :3]
-    nearest = cKDTree(points).query(aims)[1]
+def _steps(
+    points: Float[np.ndarray, "v 6"], targets: Float[np.ndarray, "w 6"], tree: cKDTree
+) -> Float[np.ndarray, "v 3"]:
+    """Return steps to the nearest target, averaged with those to the targets whose nearest point this is."""
+    steps = targets[tree.query(points)[1], :3] - points[:, :3]
+    nearest = cKDTree(points).query(targets)[1]
     count = np.bincount(nearest, minlength=len(points))
     wanted = count > 0
     for axis in range(3):
-        pull = np.bincount(nearest, aims[:, axis], len(points))[wanted] / count[wanted] - points[wanted, axis]
-        ways[wanted, axis] = 0.5 * (ways[wanted, axis] + pull)
-    return ways
+        pull = np.bincount(nearest, targets[:, axis], len(points))[wanted] / count[wanted] - points[wanted, axis]
+        steps[wanted, axis] = 0.5 * (steps[wanted, axis] + pull)
+    return steps
 
 
 def _with_normals(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> Float[np.ndarray, "v 6"]:
@@ -98,7 +99,7 @@ def _with_normals(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> 
 
 
 def _laplacian(faces: Int[Tensor, "f 3"], count: int) -> csc_array:
-    """What a value at a vertex has above those of its neighbors, in all."""
+    """Return the graph Laplacian of a mesh."""
     ends = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).long().numpy().T
     edges = coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(count, count)).tocsr()
     joined = ((edges + edges.T) > 0).astype(np.float64)

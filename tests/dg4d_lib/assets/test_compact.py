@@ -11,7 +11,7 @@ from safetensors import safe_open
 
 from dg4d_lib.assets.animated import moved
 from dg4d_lib.assets.formats.compact import TENSORS, Compact, read_compact, write_compact
-from dg4d_lib.deformation.kinds import new_deformation
+from dg4d_lib.deformation.factory import new_deformation
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.settings import DeformationSettings, FramewiseSettings, HexPlaneSettings, MlpSettings

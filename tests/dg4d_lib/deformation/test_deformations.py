@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from dg4d_lib.deformation import hexplane
+from dg4d_lib.deformation.factory import new_deformation
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.deformation.hexplane import HexPlane, plane_features, time_lines
 from dg4d_lib.deformation.interface import Deformation
-from dg4d_lib.deformation.kinds import new_deformation
 from dg4d_lib.deformation.mlp import Mlp
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.initialize import blob

@@ -9,8 +9,8 @@ from PIL import Image
 from tiny_svd import SCHEDULE, save_tiny_svd, tiny_svd
 
 from dg4d_lib.diffusion import batching, video_model
-from dg4d_lib.diffusion.single_token_attention import OneToken
-from dg4d_lib.diffusion.video_model import VideoModel, clean, karras_sigmas, start_index
+from dg4d_lib.diffusion.single_token_attention import SingleTokenProcessor
+from dg4d_lib.diffusion.video_model import VideoModel, karras_sigmas, predicted_original, start_index
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import VideoModelSettings
 
@@ -78,7 +78,7 @@ def test_the_clean_video_comes_out_of_the_true_velocity(sigma: float) -> None:
     x0, noise = torch.randn(2, 5, generator=rng(0), dtype=torch.float64)
     angle = math.atan(sigma)
     velocity = math.cos(angle) * noise - math.sin(angle) * x0
-    torch.testing.assert_close(clean(x0 + sigma * noise, velocity, sigma), x0, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(predicted_original(x0 + sigma * noise, velocity, sigma), x0, rtol=1e-9, atol=1e-9)
 
 
 @SCHEDULERS_OWN
@@ -177,7 +177,7 @@ def test_in_half_precision_the_encoder_alone_is_wider_and_its_weights_are_never_
 
 def test_the_one_token_is_not_attended_to_at_length(model: VideoModel) -> None:
     processors = model.unet.attn_processors
-    shortened = {name for name, processor in processors.items() if isinstance(processor, OneToken)}
+    shortened = {name for name, processor in processors.items() if isinstance(processor, SingleTokenProcessor)}
     assert shortened == {name for name in processors if ".attn2." in name}
     assert any("temporal_transformer_blocks" in name for name in shortened)
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.gaussians.growth import ScreenGradients, grow, prune, reset_opacity
+from dg4d_lib.gaussians.growth import ScreenGradients, densify, prune, reset_opacity
 from dg4d_lib.gaussians.initialize import isotropic
 
 
@@ -13,19 +13,19 @@ def cloud(scales: list[float], opacity: float = 0.5) -> Gaussians:
 
 
 def grown(scales: list[float], pull: list[float], room: int = 100):
-    return grow(cloud(scales), torch.tensor(pull), 0.05, 0.05, room, torch.Generator().manual_seed(0))
+    return densify(cloud(scales), torch.tensor(pull), 0.05, 0.05, room, torch.Generator().manual_seed(0))
 
 
 def test_nothing_grows_without_a_pull():
     result = grown([0.01, 0.1], [0.0, 0.01])
     assert result.source.tolist() == [0, 1]
-    assert not result.fresh.any()
+    assert not result.is_new.any()
 
 
 def test_small_gaussians_are_cloned_in_place():
     result = grown([0.01, 0.01], [1.0, 0.0])
     assert result.source.tolist() == [0, 1, 0]
-    assert result.fresh.tolist() == [False, False, True]
+    assert result.is_new.tolist() == [False, False, True]
     torch.testing.assert_close(result.gaussians.means[2], result.gaussians.means[0])
 
 

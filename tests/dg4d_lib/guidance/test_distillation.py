@@ -9,13 +9,13 @@ from dg4d_lib.guidance.distillation import (
     distill_in_pieces,
     distillation_loss,
     score_distillation,
-    weight,
+    sds_weight,
 )
 
 
 @pytest.mark.parametrize(("timestep", "expected"), [(20, 0.0187), (250, 0.326), (500, 0.724), (980, 0.994)])
 def test_weights_of_the_method(timestep: int, expected: float):
-    assert weight(timestep) == pytest.approx(expected, rel=0.01)
+    assert sds_weight(timestep) == pytest.approx(expected, rel=0.01)
 
 
 def test_the_annealing_goes_from_its_start_to_two_percent():
@@ -28,7 +28,7 @@ def test_the_annealing_goes_from_its_start_to_two_percent():
 @pytest.mark.parametrize(("timestep", "expected"), [(20, 0.0187), (250, 0.326), (500, 0.724), (980, 0.994)])
 def test_weights_to_the_digits_that_are_written_down(timestep: int, expected: float):
     digits = len(str(expected)) - 2
-    assert round(weight(timestep), digits) == expected
+    assert round(sds_weight(timestep), digits) == expected
 
 
 @pytest.mark.parametrize(("start", "iterations"), [(0.98, 500), (0.5, 200)])
@@ -99,7 +99,7 @@ def test_the_gradient_is_the_weighted_difference_of_noises(timestep: int):
     alphabar = alphas_cumprod()[timestep].float()
     torch.testing.assert_close(seen[0][0], alphabar.sqrt() * latents.detach() + (1 - alphabar).sqrt() * noise)
     assert seen[0][1] == timestep
-    torch.testing.assert_close(latents.grad, weight(timestep) * (0.25 - noise) / 2, atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(latents.grad, sds_weight(timestep) * (0.25 - noise) / 2, atol=1e-6, rtol=1e-5)
 
 
 def test_no_gradient_flows_through_the_denoiser():

@@ -14,7 +14,7 @@ from torch.nn import functional
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.diffusion.clip_images import clip_pixels
-from dg4d_lib.diffusion.single_token_attention import OneToken
+from dg4d_lib.diffusion.single_token_attention import SingleTokenProcessor
 from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.interface import GuidancePrior, View
@@ -310,7 +310,7 @@ def test_networks_of_something_else_are_refused(model: Path, tmp_path: Path) -> 
 
 def test_the_one_token_is_not_attended_to_at_length(networks: Zero123) -> None:
     processors = networks.unet.attn_processors
-    shortened = {name for name, processor in processors.items() if isinstance(processor, OneToken)}
+    shortened = {name for name, processor in processors.items() if isinstance(processor, SingleTokenProcessor)}
     assert shortened == {name for name in processors if ".attn2." in name} != set()
 
 

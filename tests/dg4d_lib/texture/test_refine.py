@@ -12,7 +12,7 @@ from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh_rasterizer.texture import bilinear, look_up, read
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.settings import TextureSettings
-from dg4d_lib.texture.refine import Stretch, refine_textures
+from dg4d_lib.texture.refine import MeshClip, refine_textures
 from dg4d_lib.video.driving import DrivingVideo
 
 SIZE, FRAMES = 64, 3
@@ -102,9 +102,9 @@ def error(texture: Tensor, truth: Tensor) -> float:
     return float((bilinear(texture, places) - bilinear(truth, places)).abs().mean())
 
 
-def tracked(texture: Tensor) -> list[Stretch]:
+def tracked(texture: Tensor) -> list[MeshClip]:
     mesh = box(texture)
-    return [Stretch(mesh, torch.stack([shift(mesh, frame) for frame in range(FRAMES)]))]
+    return [MeshClip(mesh, torch.stack([shift(mesh, frame) for frame in range(FRAMES)]))]
 
 
 def test_a_refiner_that_knows_the_truth_gives_a_tracked_mesh_its_texture() -> None:
@@ -120,7 +120,7 @@ def test_it_gives_every_frame_of_its_own_mesh_its_own_texture() -> None:
     truths = [painted(frame) for frame in range(FRAMES)]
     meshes = [moved(box(truth), frame) for frame, truth in enumerate(truths)]
     start = torch.full((32, 128, 3), 0.5)
-    stretches = [Stretch(moved(box(start), frame), torch.zeros(1, 16, 3)) for frame in range(FRAMES)]
+    stretches = [MeshClip(moved(box(start), frame), torch.zeros(1, 16, 3)) for frame in range(FRAMES)]
     refined = refine_textures(stretches, driving_of(meshes), Oracle(meshes), SETTINGS, rng())
     textures = [each.texture for each in refined]
     for texture, truth in zip(textures, truths, strict=True):
@@ -161,7 +161,7 @@ def test_what_frames_add_is_what_its_weight_leaves_of_it() -> None:
     frames = colors[:, None, None, None].expand(FRAMES, SIZE, SIZE, 3)
     video = DrivingVideo(frames, torch.ones(FRAMES, SIZE, SIZE, 1), 7.0)
     settings = SETTINGS.model_copy(update={"iterations": 150, "frame_size": 8, "frame_weight": weight})
-    (refined,) = refine_textures([Stretch(board, torch.zeros(FRAMES, 4, 3))], video, Satisfied(), settings, rng())
+    (refined,) = refine_textures([MeshClip(board, torch.zeros(FRAMES, 4, 3))], video, Satisfied(), settings, rng())
 
     drawn = rasterize_mesh(board.vertices, board.faces, [OrbitCamera(width=SIZE, height=SIZE)])
     seen = float((drawn.faces >= 0).double().mean())
@@ -208,7 +208,7 @@ def test_texels_that_nothing_shows_stay_bit_for_bit() -> None:
     truth = TexturedMesh(front.vertices, front.faces, front.uvs, 1 - start)
     settings = SETTINGS.model_copy(update={"iterations": 3, "azimuth_step_deg": 0.0})
     (refined,) = refine_textures(
-        [Stretch(front, torch.zeros(1, 4, 3))], driving_of([truth]), Satisfied(), settings, rng()
+        [MeshClip(front, torch.zeros(1, 4, 3))], driving_of([truth]), Satisfied(), settings, rng()
     )
     assert torch.equal(refined.texture[32:], start[32:])
     assert (refined.texture[4:20, 4:28] - start[4:20, 4:28]).abs().mean() > 0.05
@@ -222,7 +222,7 @@ def test_the_input_view_does_not_color_what_it_sees_from_the_side() -> None:
     turn = torch.tensor([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
     turned = TexturedMesh(mesh.vertices @ turn.T, mesh.faces, mesh.uvs, start)
     red = DrivingVideo(torch.tensor([1.0, 0, 0]).expand(1, SIZE, SIZE, 3), torch.ones(1, SIZE, SIZE, 1), 7.0)
-    stretches = [Stretch(turned, torch.zeros(1, 16, 3))]
+    stretches = [MeshClip(turned, torch.zeros(1, 16, 3))]
     settings = SETTINGS.model_copy(update={"iterations": 3, "min_cosine": 0.6})
     (refined,) = refine_textures(stretches, red, Satisfied(), settings, rng())
     change = (refined.texture - start).abs().mean(-1).mean(0).reshape(4, 32).mean(1)

@@ -4,7 +4,7 @@ import torch
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import isotropic
-from dg4d_lib.mesh.tracking.reference_frame import best_rest, evenly, since
+from dg4d_lib.mesh.tracking.reference_frame import evenly_spaced, relative_to_frame, select_reference_frame
 from dg4d_lib.rasterizer.interface import choose_rasterizer
 from dg4d_lib.settings import MeshSettings
 
@@ -13,12 +13,12 @@ from dg4d_lib.settings import MeshSettings
     ("total", "count", "expected"), [(14, 3, [0, 6, 13]), (2, 6, [0, 1]), (1, 6, [0]), (6, 6, [0, 1, 2, 3, 4, 5])]
 )
 def test_even_choices_hold_both_ends(total: int, count: int, expected: list[int]):
-    assert evenly(total, count) == expected
+    assert evenly_spaced(total, count) == expected
 
 
 def test_a_motion_told_from_a_frame_is_zero_there():
     values = torch.randn(4, 5, 10, generator=torch.Generator().manual_seed(0))
-    motion = since(Displacement(values[..., :3], values[..., 3:6], values[..., 6:]), 2)
+    motion = relative_to_frame(Displacement(values[..., :3], values[..., 3:6], values[..., 6:]), 2)
     assert not motion.means[2].any() and not motion.quats[2].any() and not motion.log_scales[2].any()
     torch.testing.assert_close(motion.means[3], values[3, :, :3] - values[2, :, :3])
 
@@ -40,6 +40,6 @@ def test_two_legs_that_part_are_taken_apart_where_they_are_apart(
     motion = Displacement(gaps[:, None, None] * sides, zeros, torch.zeros(4, 600, 4))
     states = motion.apply(legs)
     assert isinstance(states, Gaussians)
-    frame, agreement = best_rest(states, motion, choose_rasterizer("cpu"), MeshSettings(grid=64))
+    frame, agreement = select_reference_frame(states, motion, choose_rasterizer("cpu"), MeshSettings(grid=64))
     assert (frame > 0) == expected_last
     assert agreement > 0.8

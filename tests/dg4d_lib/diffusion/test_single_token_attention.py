@@ -12,7 +12,7 @@ from tiny_weights import TOKEN, tiny_unet
 from torch.utils.flop_counter import FlopCounterMode
 
 from dg4d_lib.diffusion.flop_counter import counted, counting_flops
-from dg4d_lib.diffusion.single_token_attention import OneToken, shorten_attention
+from dg4d_lib.diffusion.single_token_attention import SingleTokenProcessor, shorten_attention
 
 NETWORKS = ("pictures", "videos")
 BATCH = 3
@@ -90,14 +90,14 @@ def test_layers_of_any_settings_answer_the_same(settings: dict[str, Any], pixels
     attn = layer(**settings)
     queries, tokens = drawn(BATCH, *pixels), drawn(BATCH, 1, 6, seed=1)
     expected = attn(queries, tokens)
-    attn.set_processor(OneToken(attn.processor))
+    attn.set_processor(SingleTokenProcessor(attn.processor))
     found = attn(queries, tokens)
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_a_mask_training_and_self_attention_take_the_ordinary_way() -> None:
     attn, asked = layer(), []
-    attn.set_processor(OneToken(lambda _, queries, *told: asked.append(told) or queries))
+    attn.set_processor(SingleTokenProcessor(lambda _, queries, *told: asked.append(told) or queries))
     queries, tokens, mask = drawn(BATCH, 7, 8), drawn(BATCH, 1, 6), torch.zeros(BATCH, 1)
     attn(queries, tokens)
     assert not asked
@@ -109,7 +109,7 @@ def test_a_mask_training_and_self_attention_take_the_ordinary_way() -> None:
 
 def test_what_is_left_is_one_value_and_one_output_per_row() -> None:
     attn = layer()
-    attn.set_processor(OneToken(attn.processor))
+    attn.set_processor(SingleTokenProcessor(attn.processor))
     with FlopCounterMode(display=False) as flops:
         attn(drawn(BATCH, 7, 8), drawn(BATCH, 1, 6))
     assert flops.get_total_flops() == 2 * BATCH * (6 * 10 + 10 * 8)
@@ -133,7 +133,7 @@ def test_only_attention_to_tokens_is_shortened_and_files_stay_as_they_are(name: 
     for file in (tmp_path / "before").iterdir():
         assert file.read_bytes() == (tmp_path / "after" / file.name).read_bytes()
     for place, processor in unet.attn_processors.items():
-        assert isinstance(processor, OneToken) == (".attn2." in place)
+        assert isinstance(processor, SingleTokenProcessor) == (".attn2." in place)
 
 
 @pytest.mark.parametrize("name", NETWORKS)

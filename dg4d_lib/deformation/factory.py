@@ -1,4 +1,4 @@
-"""The kinds of deformation: made new, or out of their tensors."""
+"""Factory of deformations: new, or from their state."""
 
 from collections.abc import Mapping
 
@@ -21,7 +21,7 @@ def new_deformation(
     count: int,
     generator: torch.Generator | None = None,
 ) -> AnyDeformation:
-    """A deformation of this kind; the identity at the start unless its settings say otherwise.
+    """Create a deformation; it is the identity unless its settings say otherwise.
 
     Args:
         settings: its kind and sizes.
@@ -43,12 +43,14 @@ def new_deformation(
 
 
 def tensors_of(deformation: AnyDeformation) -> dict[str, Tensor]:
-    """Everything that makes a fitted deformation, by name."""
+    """Return the tensors of a fitted deformation by name."""
     return {name: value.detach().cpu().contiguous() for name, value in sorted(deformation.state_dict().items())}
 
 
-def restored(settings: DeformationSettings, tensors: Mapping[str, Tensor], frames: int, count: int) -> AnyDeformation:
-    """The deformation that `tensors_of` took apart, without gradients.
+def from_state_dict(
+    settings: DeformationSettings, tensors: Mapping[str, Tensor], frames: int, count: int
+) -> AnyDeformation:
+    """Create a deformation from the result of `tensors_of`, without gradients.
 
     Raises:
         RuntimeError: a tensor is missing, is of another shape or belongs to nothing.
@@ -59,6 +61,6 @@ def restored(settings: DeformationSettings, tensors: Mapping[str, Tensor], frame
 
 
 def last_moment(settings: DeformationSettings, frames: int) -> float:
-    """Where the last frame lies on the deformation's axis of time, which goes from 0 to 1."""
+    """Return the time of the last frame on the deformation's axis from 0 to 1."""
     open_ended = not isinstance(settings, FramewiseSettings) and not settings.endpoint
     return (frames - 1) / frames if open_ended else 1.0

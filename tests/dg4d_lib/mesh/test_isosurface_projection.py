@@ -5,7 +5,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import isotropic
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import surface
-from dg4d_lib.mesh.tracking.isosurface_projection import snap
+from dg4d_lib.mesh.tracking.isosurface_projection import project_to_isosurface
 from dg4d_lib.settings import MeshSettings
 
 SETTINGS = MeshSettings(grid=48)
@@ -30,7 +30,7 @@ def test_vertices_that_stayed_behind_reach_the_surface_of_their_moment():
     )
     vertices, faces = (torch.from_numpy(a) for a in surface(density_field(rest, SETTINGS), LEVEL))
     nothing = torch.zeros(2, len(vertices), 3)
-    snapped = vertices + snap(vertices, nothing, faces, states, LEVEL, SETTINGS)
+    snapped = vertices + project_to_isosurface(vertices, nothing, faces, states, LEVEL, SETTINGS)
     assert (snapped[0] - vertices).norm(dim=-1).max() < 0.02  # it was on the surface, and is drawn in a little
     grown_by = snapped[1].norm(dim=-1).mean() / snapped[0].norm(dim=-1).mean()
     assert abs(grown_by - 1.06) < 0.01
@@ -44,4 +44,4 @@ def test_a_vertex_without_a_surface_near_stays():
     )
     vertices, faces = (torch.from_numpy(a) for a in surface(density_field(cloud, SETTINGS), LEVEL))
     nothing = torch.zeros(1, len(vertices), 3)
-    assert torch.equal(snap(vertices, nothing, faces, states, LEVEL, SETTINGS), nothing)
+    assert torch.equal(project_to_isosurface(vertices, nothing, faces, states, LEVEL, SETTINGS), nothing)

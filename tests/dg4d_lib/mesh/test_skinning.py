@@ -8,7 +8,7 @@ from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import multiply, rotation_matrix
-from dg4d_lib.mesh.tracking.skinning import ride
+from dg4d_lib.mesh.tracking.skinning import skin_vertices
 
 
 def still(gaussians: Gaussians, times: int) -> Displacement:
@@ -39,7 +39,7 @@ def turned(gaussians: Gaussians, quat: torch.Tensor) -> Displacement:
 def test_a_shift_of_all_gaussians_shifts_every_vertex(gaussians: Gaussians, vertices: torch.Tensor) -> None:
     shift = torch.tensor([[0.1, -0.2, 0.3], [0.0, 0.5, 0.0]])
     displacement = replace(still(gaussians, 2), means=shift[:, None].expand(2, 300, 3))
-    offsets = ride(vertices, gaussians, displacement)
+    offsets = skin_vertices(vertices, gaussians, displacement)
     torch.testing.assert_close(offsets, shift[:, None].expand(2, 200, 3), atol=1e-6, rtol=0)
 
 
@@ -49,18 +49,18 @@ def test_a_turn_of_all_gaussians_turns_every_vertex(
 ) -> None:
     half = math.radians(degrees) / 2
     quat = torch.tensor([math.cos(half), 0.6 * math.sin(half), 0.0, 0.8 * math.sin(half)])
-    offsets = ride(vertices, gaussians, turned(gaussians, quat))
+    offsets = skin_vertices(vertices, gaussians, turned(gaussians, quat))
     torch.testing.assert_close(vertices + offsets[0], vertices @ rotation_matrix(quat).T, atol=1e-5, rtol=0)
 
 
 def test_nothing_moves_where_no_gaussian_does(gaussians: Gaussians, vertices: torch.Tensor) -> None:
-    assert ride(vertices, gaussians, still(gaussians, 3)).abs().max() < 1e-7
+    assert skin_vertices(vertices, gaussians, still(gaussians, 3)).abs().max() < 1e-7
 
 
 def test_a_single_gaussian_carries_with_its_own_rotation(gaussians: Gaussians, vertices: torch.Tensor) -> None:
     one = Gaussians(**{name: value[:1] for name, value in vars(gaussians).items()})
     quat = torch.tensor([math.cos(0.4), 0.0, math.sin(0.4), 0.0])
-    offsets = ride(vertices, one, turned(one, quat))
+    offsets = skin_vertices(vertices, one, turned(one, quat))
     torch.testing.assert_close(vertices + offsets[0], vertices @ rotation_matrix(quat).T, atol=1e-5, rtol=0)
 
 
@@ -73,7 +73,7 @@ def test_a_smooth_bend_is_followed(gaussians: Gaussians, vertices: torch.Tensor)
     displacement = replace(still(gaussians, 1), means=(bent(gaussians.means) - gaussians.means)[None])
     vertices = 0.7 * vertices  # inside of the cloud
     moved = bent(vertices) - vertices
-    error = (ride(vertices, gaussians, displacement)[0] - moved).norm(dim=-1)
+    error = (skin_vertices(vertices, gaussians, displacement)[0] - moved).norm(dim=-1)
     nearest = torch.cdist(vertices, gaussians.means).argmin(-1)
     error_of_the_nearest = (displacement.means[0, nearest] - moved).norm(dim=-1)
     assert error.mean() < 0.6 * error_of_the_nearest.mean()
@@ -92,7 +92,7 @@ def test_two_parts_that_touch_and_part_take_their_own_surface_along() -> None:
     )
     apart = replace(still(cloud, 2), means=torch.stack([0 * means, torch.where(left[:, None], -0.5, 0.5) + 0 * means]))
     vertices = 0.3 * torch.rand(300, 3, generator=generator) - 0.15
-    offsets = ride(vertices, cloud, apart)[1]
+    offsets = skin_vertices(vertices, cloud, apart)[1]
     torch.testing.assert_close(offsets.abs(), torch.full_like(offsets, 0.5), atol=0.02, rtol=0)
     clearly_left, clearly_right = vertices[:, 0] < -0.05, vertices[:, 0] > 0.05
     assert (offsets[clearly_left] < 0).all()
@@ -104,7 +104,7 @@ def test_invisible_gaussians_carry_nothing(gaussians: Gaussians, vertices: torch
     means = torch.where(torch.arange(300)[:, None] < 150, 0.0, 5.0)
     faint = replace(gaussians, opacity_logits=logits)
     displacement = replace(still(gaussians, 1), means=means.expand(300, 3)[None])
-    assert ride(vertices, faint, displacement).abs().max() < 1e-6
+    assert skin_vertices(vertices, faint, displacement).abs().max() < 1e-6
 
 
 def test_order_of_the_gaussians_does_not_matter(gaussians: Gaussians, vertices: torch.Tensor) -> None:
@@ -113,10 +113,12 @@ def test_order_of_the_gaussians_does_not_matter(gaussians: Gaussians, vertices: 
     order = torch.randperm(300, generator=generator)
     other = Gaussians(**{name: value[order] for name, value in vars(gaussians).items()})
     mixed = Displacement(**{name: value[:, order] for name, value in vars(displacement).items()})
-    torch.testing.assert_close(ride(vertices, gaussians, displacement), ride(vertices, other, mixed), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        skin_vertices(vertices, gaussians, displacement), skin_vertices(vertices, other, mixed), atol=1e-6, rtol=0
+    )
 
 
 def test_an_empty_cloud_is_refused(gaussians: Gaussians, vertices: torch.Tensor) -> None:
     empty = Gaussians(**{name: value[:0] for name, value in vars(gaussians).items()})
     with pytest.raises(BadInput, match="not empty"):
-        ride(vertices, empty, still(empty, 1))
+        skin_vertices(vertices, empty, still(empty, 1))
