@@ -91,7 +91,7 @@ def test_the_notes_say_what_kind_of_surface_it_is(tracked: tuple[Path, StepRepor
 
 
 def test_the_frame_whose_surface_it_is_stays_with_the_mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(extract_mesh, "best_rest", lambda *arguments: (2, 1.0))
+    monkeypatch.setattr(extract_mesh, "select_reference_frame", lambda *arguments: (2, 1.0))
     extract(tmp_path, ball())
     asset = read_tracked(tmp_path / "tracked")
     assert asset.rest == 2
@@ -108,7 +108,7 @@ def test_the_same_job_gives_the_same_bytes(tracked: tuple[Path, StepReport], tmp
 def test_in_auto_there_is_one_mesh_only_where_it_follows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, followed: float, outputs: set[str]
 ) -> None:
-    monkeypatch.setattr(extract_mesh, "best_rest", lambda *given: (1, followed))
+    monkeypatch.setattr(extract_mesh, "select_reference_frame", lambda *given: (1, followed))
     job, facts = extract(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}))
     assert {name for name, path in job.outputs.items() if path.exists()} == outputs
     assert any("does not follow this motion (80.0% IoU" in note for note in facts.notes) == (followed == 0.8)

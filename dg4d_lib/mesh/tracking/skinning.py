@@ -49,7 +49,7 @@ def skin_vertices(
     """
     if gaussians.means.dim() != 2 or len(gaussians) == 0:
         raise BadInput(
-            f"skinning needs one state of a cloud that is not empty; given means of shape {tuple(gaussians.means.shape)}"
+            f"skinning needs one state of a cloud that is not empty; given shape {tuple(gaussians.means.shape)}"
         )
     points = vertices.double().cpu()
     rest = gaussians.to(torch.device("cpu")).to(torch.float64)
