@@ -216,6 +216,7 @@ def page(results: Results, films: Mapping[str, Mapping[str, Mapping[str, str]]])
     return render(
         "scores.html",
         title=results.title,
+        metrics=(PAPER_METRICS | _present(results, METRICS)).values(),
         table=table(results),
         ours=list(results.mean).index(results.ours) if results.ours in results.mean else None,
         missing=results.missing,

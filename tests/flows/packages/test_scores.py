@@ -112,6 +112,13 @@ def test_the_page_shows_films_side_by_side_and_escapes_what_others_wrote(
     assert "it &lt;slipped&gt; away" in text
 
 
+def test_a_page_without_any_scores_says_why() -> None:
+    nothing = [ObjectScores(object="eel", error="it slipped away")]
+    text = page(results(objects=nothing, mean={}), {})
+    assert "it slipped away" in text
+    assert "<th>method<th>LPIPS" in text
+
+
 def test_objects_may_be_called_anything() -> None:
     name = "=1|<img src=x>![](http://tracker)"
     one = results(
