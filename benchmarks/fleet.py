@@ -71,7 +71,7 @@ class Machine:
     """
 
     def __init__(self, name: str, folder: Path, variables: dict[str, str]) -> None:
-        self.name, self.log, self.killed = name, folder / "finished", False
+        self.name, self.log = name, folder / "finished"
         folder.mkdir(parents=True)
         self.environment = {
             **variables,
@@ -106,7 +106,6 @@ class Machine:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         self._worker.wait()
-        self.killed = True
 
     def stop(self) -> None:
         """End it, unless it was killed."""
@@ -149,7 +148,7 @@ def measured(folder: Path, variables: dict[str, str], items: int, seconds: float
     shared = {**variables, "DG4D_STORE": store or str(folder / "store"), "DG4D_CODE_VERSION": f"fleet-{folder.name}"}
     machines = [Machine(f"machine-{i}", folder / f"machine-{i}", shared) for i in range(workers)]
     own = {**shared, "DG4D_HOME": str(folder / "home"), "DG4D_HOST_ID": "catalog", "FAKE_LOG": str(folder / "none")}
-    begun = time.monotonic()
+    begun, killed = time.monotonic(), 0
     command = subprocess.Popen(
         [
             *(sys.executable, "-m", "flows.cli", "batch", str(folder / "in"), "-o", str(folder / "out")),
@@ -162,9 +161,9 @@ def measured(folder: Path, variables: dict[str, str], items: int, seconds: float
     try:
         while command.poll() is None:
             time.sleep(LOOK_S)
-            if kill and sum(map(finished, machines)) >= items / 3 and machines[-1].sleeps():
+            if kill > killed and sum(map(finished, machines)) >= items / 3 and machines[-1].sleeps():
                 machines[-1].kill()
-                kill = False
+                killed = 1
         wall_s = time.monotonic() - begun
     finally:
         command.kill()
@@ -174,7 +173,7 @@ def measured(folder: Path, variables: dict[str, str], items: int, seconds: float
     made = sum((folder / "out" / f"{i:03d}" / RECORD).is_file() for i in range(items))
     return Row(
         workers=workers,
-        killed=int(machines[-1].killed),
+        killed=killed,
         items=items,
         wall_s=round(wall_s, 1),
         per_hour=round(3600 * items / wall_s),

@@ -68,6 +68,7 @@ def finished(machines: list[Machine]) -> Counter[str]:
     return Counter(step for machine in machines for step in machine.steps)
 
 
+@pytest.mark.slow
 def test_machines_share_a_catalog_and_a_machine_and_a_catalog_that_are_killed_cost_no_item_and_no_step(
     shared: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
