@@ -136,7 +136,10 @@ class ShapePriorNetwork(nn.Module):
         return functional.silu(x)
 
     def rays(
-        self, decoded: Float[Tensor, "b f 64 64"], planes: Float[Tensor, "b p 128 128"], pixels: Sequence[Int[Tensor, " _"]]
+        self,
+        decoded: Float[Tensor, "b f 64 64"],
+        planes: Float[Tensor, "b p 128 128"],
+        pixels: Sequence[Int[Tensor, " _"]],
     ) -> tuple[Float[Tensor, "n 64"], Float[Tensor, "n 8 3"], Float[Tensor, "n 1"]]:
         """Return occupancy logits, colors in [0, 1] and the colors' scale of some rays.
 
@@ -211,7 +214,10 @@ def coordinates(alpha: Float[Tensor, "b h w"]) -> Float[Tensor, "b 4 h w"]:
 def save_network(network: ShapePriorNetwork, path: Path) -> None:
     """Write the weights as float16 safetensors, with the sizes in the header."""
     tensors = {name: value.detach().half().contiguous() for name, value in network.state_dict().items()}
-    sizes = {name: " ".join(map(str, value if isinstance(value, tuple) else (value,))) for name, value in asdict(network.config).items()}
+    sizes = {
+        name: " ".join(map(str, value if isinstance(value, tuple) else (value,)))
+        for name, value in asdict(network.config).items()
+    }
     save_file(tensors, path, {"format": FORMAT, **sizes})
 
 
@@ -229,7 +235,7 @@ def load_network(path: Path) -> ShapePriorNetwork:
         blocks = tuple(map(int, header["blocks"].split()))
         config = ShapePriorConfig(widths, blocks, int(header["layers"]), int(header["head"]))  # type: ignore[arg-type]
         network = ShapePriorNetwork(config)
-        network.load_state_dict({name: file.get_tensor(name).float() for name in file.keys()})
+        network.load_state_dict({name: file.get_tensor(name).float() for name in file.keys()})  # noqa: SIM118
     return network.eval().to(memory_format=torch.channels_last)
 
 

@@ -24,9 +24,7 @@ def _panel(draw: ImageDraw.ImageDraw, left: int, top: int, name: str, points: li
     span = max(high - low, 1e-9)
     box = (left + MARGIN, top + MARGIN, left + WIDTH - 12, top + HEIGHT - MARGIN)
     draw.rectangle(box, outline="gray")
-    line = [
-        (box[0] + x / most * (box[2] - box[0]), box[3] - (y - low) / span * (box[3] - box[1])) for x, y in points
-    ]
+    line = [(box[0] + x / most * (box[2] - box[0]), box[3] - (y - low) / span * (box[3] - box[1])) for x, y in points]
     draw.line(line, fill="blue", width=2)
     draw.text((box[0], top + 12), f"{name}: {low:.4g} to {high:.4g}, now {values[-1]:.4g}", fill="black")
     draw.text((box[2] - 90, box[3] + 6), f"{most:.0f} samples", fill="black")

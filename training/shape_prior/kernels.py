@@ -27,7 +27,6 @@ from training.shape_prior.texture import (
 )
 
 OPTIONS = {"cache": True, "fastmath": {"nsz", "contract", "reassoc", "arcp"}, "error_model": "numpy", "nogil": True}
-INLINE = {**OPTIONS, "inline": "always"}
 EMPTY = 1.0  # of the field where no solid is near
 MARGIN = 0.045  # world units around a solid in which its distance is known, at least
 MOST_SOLIDS = 128  # bits of the two words that say which solids are near a ray
@@ -63,7 +62,7 @@ def distance(kind, row, x, y, z):
                 qu *= row[19] / row[17]
         qv = abs(v) - row[18] + rounding
         outside = math.sqrt(max(qu, 0.0) ** 2 + max(qv, 0.0) ** 2 + max(qw, 0.0) ** 2)
-        return outside + min(max(qu, max(qv, qw)), 0.0) - rounding
+        return outside + min(max(qu, qv, qw), 0.0) - rounding
     if kind == TORUS:
         ring = math.sqrt(u * u + w * w) - row[15]
         return math.sqrt(ring * ring + v * v) - row[16]
@@ -80,7 +79,7 @@ def _ellipsoid(u, v, w, a, b, c):
     u, v, w = u / a, v / b, w / c
     reach = math.sqrt(u * u + v * v + w * w)
     steep = math.sqrt((u / a) ** 2 + (v / b) ** 2 + (w / c) ** 2) + 1e-9
-    return max(reach * (reach - 1) / steep, -min(a, min(b, c)))
+    return max(reach * (reach - 1) / steep, -min(a, b, c))
 
 
 @njit(**OPTIONS)
@@ -449,7 +448,7 @@ def _noise(x, y, z):
 @no_type_check
 def _cell(x, y, z):
     """Distance to the nearest of jittered points, one in each unit cell."""
-    i, j, k = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
+    i, j, k = math.floor(x), math.floor(y), math.floor(z)
     least = 9.0
     for a in range(i - 1, i + 2):
         for b in range(j - 1, j + 2):

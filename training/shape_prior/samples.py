@@ -12,7 +12,7 @@ from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV
 from training.shape_prior.chance import Chance
 from training.shape_prior.families import FAMILIES
 from training.shape_prior.kernels import INTERVALS, MOST_SOLIDS, cross, fill, shade
-from training.shape_prior.solids import CONE, Matrix, PLATE, Shape, Solid, Vector, packed, rotation, scaled, thickened
+from training.shape_prior.solids import Matrix, Shape, Solid, Vector, packed, rotation, scaled, thickened
 from training.shape_prior.texture import lighting, palette
 
 THINNEST = 0.016  # half size of a solid, world units: a ray cannot step over it
@@ -110,7 +110,21 @@ def _seen(chance: Chance, shape: Shape, name: str, style: str, size: int) -> Sam
         return None
     materials, light = palette(chance, style), lighting(chance)
     colors, parts = np.zeros((*depths.shape, 3), np.float32), np.empty((size, size), np.int16)
-    shade(labels, numbers, materials, light, pose.inverse(extent), field, near, counts, depths, coverage, nearest, colors, parts)
+    shade(
+        labels,
+        numbers,
+        materials,
+        light,
+        pose.inverse(extent),
+        field,
+        near,
+        counts,
+        depths,
+        coverage,
+        nearest,
+        colors,
+        parts,
+    )
     picture = _picture(chance, colors[:, :, 0], coverage, depths[:, :, 0], parts)
     pixels = np.flatnonzero(counts)
     normal = pose.turn[:, 0]

@@ -5,10 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import UInt8
 from PIL import Image
 
-from dg4d_lib.shape_prior.frustum import SIZE
 from training.shape_prior.families import FAMILIES
 from training.shape_prior.samples import Sample, make_sample
 

@@ -108,7 +108,9 @@ def _material(
     row[8] = chance.between(0, 6)
     row[9] = chance.pick((0.5, 1.5, 6.0))
     row[10] = float(chance.happens(0.6))
-    axis = chance.pick((np.array([0.0, 0, 1]), np.array([0.0, 1, 0]), np.array([1.0, 0, 0]), None), (0.4, 0.3, 0.1, 0.2))
+    axis = chance.pick(
+        (np.array([0.0, 0, 1]), np.array([0.0, 1, 0]), np.array([1.0, 0, 0]), None), (0.4, 0.3, 0.1, 0.2)
+    )
     row[11:14] = axis if axis is not None else chance.generator.normal(0, 0.6, 3)
     row[14] = chance.between(0.0, 0.5) if pattern == STRIPES else chance.between(0.25, 0.6)
     if pattern == BELLY:

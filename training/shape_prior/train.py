@@ -1,6 +1,6 @@
 """Training of the shape prior: resumable, deterministic for a seed and a thread count.
 
-    python -m training.shape_prior.train out/shape_prior --samples 600000
+python -m training.shape_prior.train out/shape_prior --samples 600000
 """
 
 import argparse
@@ -25,6 +25,7 @@ from dg4d_lib.shape_prior.network import ShapePriorConfig, ShapePriorNetwork, sa
 from training.shape_prior.batches import Batch, batches, make_batch
 from training.shape_prior.curves import draw_curves
 from training.shape_prior.losses import training_losses, validation_figures
+from training.shape_prior.muon import Muon
 
 VALIDATION_SEED = 1_000_003  # no training run uses it
 CHECKPOINT, WEIGHTS, CURVES = "checkpoint.pt", "network.safetensors", "curves"
@@ -74,19 +75,20 @@ class Run:
         torch.manual_seed(plan.seed)
         self.network = ShapePriorNetwork(config).to(memory_format=torch.channels_last)
         self.average = deepcopy(self.network).eval()
-        self.optimizer = make_optimizer(self.network, plan)
+        self.optimizers = make_optimizers(self.network, plan)
         self.shown = 0
         self.curve: list[dict[str, float]] = []
 
     def step(self, batch: Batch) -> dict[str, float]:
         """Show one batch; return its losses."""
-        for group in self.optimizer.param_groups:
+        for group in (group for optimizer in self.optimizers for group in optimizer.param_groups):
             group["lr"] = self.plan.lr_at(self.shown)
         losses = training_losses(self.network, batch)
-        self.optimizer.zero_grad(set_to_none=True)
+        self.network.zero_grad(set_to_none=True)
         losses.total().backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        self.optimizer.step()
+        for optimizer in self.optimizers:
+            optimizer.step()
         self.shown += len(batch.picture)
         steps = self.shown / self.plan.batch
         weight = 1 - min(self.plan.ema, (1 + steps) / (10 + steps))
@@ -101,7 +103,7 @@ class Run:
             "config": asdict(self.network.config),
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
+            "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
             "shown": self.shown,
             "curve": self.curve,
         }
@@ -117,7 +119,8 @@ class Run:
         run = cls(Plan(**{**state["plan"], "samples": plan.samples}), _config(state["config"]))
         run.network.load_state_dict(state["network"])
         run.average.load_state_dict(state["average"])
-        run.optimizer.load_state_dict(state["optimizer"])
+        for optimizer, value in zip(run.optimizers, state["optimizers"], strict=True):
+            optimizer.load_state_dict(value)
         run.shown, run.curve = state["shown"], state["curve"]
         return run
 
@@ -131,16 +134,21 @@ class Run:
         return sorted(set(own) - set(fitting))
 
 
-def make_optimizer(network: ShapePriorNetwork, plan: Plan) -> torch.optim.Optimizer:
-    """Return AdamW; vectors and biases do not decay."""
-    matrices = [value for value in network.parameters() if value.ndim > 1]
+def make_optimizers(network: ShapePriorNetwork, plan: Plan) -> list[torch.optim.Optimizer]:
+    """Return Muon for the matrices and convolutions inside the network, and AdamW for everything else."""
+    ends = ("stem.", "places", "plane.", "head.")
+    named = [(name, value) for name, value in network.named_parameters() if value.ndim > 1]
+    outer = [value for name, value in named if name.startswith(ends)]
+    inner = [value for name, value in named if not name.startswith(ends)]
     vectors = [value for value in network.parameters() if value.ndim <= 1]
-    groups = [{"params": matrices, "weight_decay": plan.weight_decay}, {"params": vectors, "weight_decay": 0.0}]
-    return torch.optim.AdamW(groups, lr=plan.lr, betas=(0.9, 0.99), foreach=True)
+    groups = [{"params": outer, "weight_decay": plan.weight_decay}, {"params": vectors, "weight_decay": 0.0}]
+    adam = torch.optim.AdamW(groups, lr=plan.lr, betas=(0.9, 0.99), foreach=True)
+    return [Muon(inner, lr=plan.lr, weight_decay=plan.weight_decay), adam]
 
 
 def train(
-    run: Run, folder: Path, *, workers: int = 1, every: int = 16_000, save_s: float = 180.0, console: Console | None = None
+    run: Run, folder: Path, *, workers: int = 1, every: int = 16_000, save_s: float = 180.0,
+    console: Console | None = None,
 ) -> None:  # fmt: skip
     """Train until all samples were shown.
 
@@ -167,7 +175,9 @@ def train(
             last = run.shown + plan.batch > plan.samples
             if run.shown % every < plan.batch or last:
                 rate = (run.shown - first) / (time.monotonic() - begun)
-                run.curve.append({"shown": run.shown, "rate": rate, **sums.take(), **validation_figures(run.average, held_out)})
+                run.curve.append(
+                    {"shown": run.shown, "rate": rate, **sums.take(), **validation_figures(run.average, held_out)}
+                )
                 _log.info("%s", json.dumps({name: round(value, 4) for name, value in run.curve[-1].items()}))
                 (folder / f"{CURVES}.json").write_text(json.dumps(run.curve, indent=1), encoding="utf-8")
                 draw_curves(run.curve).save(folder / f"{CURVES}.png")
@@ -237,7 +247,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _config(state: dict[str, Any]) -> ShapePriorConfig:
-    return ShapePriorConfig(**{name: tuple(value) if isinstance(value, list) else value for name, value in state.items()})
+    return ShapePriorConfig(
+        **{name: tuple(value) if isinstance(value, list) else value for name, value in state.items()}
+    )
 
 
 if __name__ == "__main__":

@@ -28,20 +28,42 @@ def person(chance: Chance, shape: Shape) -> None:
     shape.cone(hip, chest, width * waist * 0.85, width * chance.between(0.8, 1.05), MAIN, flat)
     shape.ellipsoid(hip, (width * 0.9 * waist, width * 0.7, width * flat * 0.9), material=SECOND)
     _legs(chance, shape, width, leg, thick, skin)
-    hands = _arms(chance, shape, shoulder * 0.9, width, torso * (1.0 if not chibi else chance.between(0.8, 1.1)), thick * 0.85, skin)
+    hands = _arms(
+        chance,
+        shape,
+        shoulder * 0.9,
+        width,
+        torso * (1.0 if not chibi else chance.between(0.8, 1.1)),
+        thick * 0.85,
+        skin,
+    )
     _head(chance, shape, shoulder, size, chibi, skin, animal)
     _clothes(chance, shape, width, torso, leg, flat)
     if chance.happens(0.3):
         held(chance, shape, chance.pick(hands), chance.between(0.25, 0.6))
     if chance.happens(0.07):
         start = len(shape.solids)
-        wing(chance, shape, np.array([0.3 * width, 0.8 * torso, -width * flat]), chance.between(0.3, 0.8), chance.between(0.15, 0.35), chance.between(0.1, 1.2), chance.between(0.2, 0.9), SECOND, chance.pick(("feather", "bat", "leaf")))
+        wing(
+            chance,
+            shape,
+            np.array([0.3 * width, 0.8 * torso, -width * flat]),
+            chance.between(0.3, 0.8),
+            chance.between(0.15, 0.35),
+            chance.between(0.1, 1.2),
+            chance.between(0.2, 0.9),
+            SECOND,
+            chance.pick(("feather", "bat", "leaf")),
+        )
         shape.mirror(start)
 
 
 def _legs(chance: Chance, shape: Shape, width: float, leg: float, thick: float, skin: int) -> None:
     pose = chance.pick(("stand", "walk", "run", "sit", "wide"), (5, 3, 2, 1, 1))
-    stride = {"stand": 0.05, "walk": 0.4, "run": 0.9, "sit": 0.1, "wide": 0.1}[pose] * chance.between(0.5, 1.2) * chance.sign()
+    stride = (
+        {"stand": 0.05, "walk": 0.4, "run": 0.9, "sit": 0.1, "wide": 0.1}[pose]
+        * chance.between(0.5, 1.2)
+        * chance.sign()
+    )
     upper = chance.pick((SECOND, MAIN, skin))
     lower = chance.pick((upper, skin, SECOND), (3, 1, 1))
     feet: tuple[Foot, ...] = ("boot", "boot", "paw", "block", "none")
@@ -53,7 +75,18 @@ def _legs(chance: Chance, shape: Shape, width: float, leg: float, thick: float, 
         swing = stride * sign
         bend = max(0.0, -swing) * 1.2 + (1.2 if pose == "run" and swing < 0 else 0.1 * chance.between(0, 1))
         swings = [1.5, chance.between(-0.1, 0.3)] if pose == "sit" else [swing, swing - bend]
-        limb(shape, (sign * width * 0.5, 0, 0), [leg * 0.5, leg * 0.5], [thick * fatter, thick, thick * chance.between(0.75, 1.1)], swings, sign * spread, (upper, lower), foot, thick * chance.between(0.7, 1.6), shoe)
+        limb(
+            shape,
+            (sign * width * 0.5, 0, 0),
+            [leg * 0.5, leg * 0.5],
+            [thick * fatter, thick, thick * chance.between(0.75, 1.1)],
+            swings,
+            sign * spread,
+            (upper, lower),
+            foot,
+            thick * chance.between(0.7, 1.6),
+            shoe,
+        )
 
 
 def _arms(
@@ -78,13 +111,23 @@ def _arms(
         elif pose == "fold":
             swing, bend, lean = 0.2 + 0.2 * swing, 1.0 + 0.6 * bend, 0.15
         start = shoulder + [sign * (width + 0.2 * thick), 0, 0]
-        hand = limb(shape, start, [arm * 0.48, arm * 0.45], [thick * 1.15, thick, thick * 0.8], [swing, swing + bend], sign * lean, (sleeve, forearm))
+        hand = limb(
+            shape,
+            start,
+            [arm * 0.48, arm * 0.45],
+            [thick * 1.15, thick, thick * 0.8],
+            [swing, swing + bend],
+            sign * lean,
+            (sleeve, forearm),
+        )
         grip = thick * chance.between(0.9, 1.5)
         shape.ellipsoid(hand, (grip * 0.85, grip * 1.1, grip), material=chance.pick((skin, ACCENT), (4, 1)))
         hands.append(hand)
     if chance.happens(0.15):
         for sign in (-1.0, 1.0):
-            shape.ellipsoid(shoulder + [sign * width * 1.1, 0.3 * thick, 0], thick * chance.between(1.5, 2.2), material=METAL)
+            shape.ellipsoid(
+                shoulder + [sign * width * 1.1, 0.3 * thick, 0], thick * chance.between(1.5, 2.2), material=METAL
+            )
     return hands
 
 
@@ -99,21 +142,33 @@ def _head(chance: Chance, shape: Shape, shoulder: Vector, size: float, chibi: bo
     if animal:
         ears(chance, shape, head, float(radii[1]), turn)
         end = head + turn @ (radii * [0, -0.25, 1.05 + chance.between(0, 0.5)])
-        shape.cone(head + turn @ (radii * [0, -0.25, 0.6]), end, size * 0.4, size * 0.25, chance.pick((MAIN, SECOND, WHITE)))
+        shape.cone(
+            head + turn @ (radii * [0, -0.25, 0.6]), end, size * 0.4, size * 0.25, chance.pick((MAIN, SECOND, WHITE))
+        )
         shape.ellipsoid(end + turn @ np.array([0, 0.05, 0.2]) * size, size * 0.14, material=DARK, operation=PAINT)
     else:
         if chance.happens(0.6):
-            shape.ellipsoid(head + turn @ (radii * [0, -0.12, 1.0]), size * np.array([0.12, 0.14, 0.16]), turn.T, skin, blend=0.02)
+            shape.ellipsoid(
+                head + turn @ (radii * [0, -0.12, 1.0]), size * np.array([0.12, 0.14, 0.16]), turn.T, skin, blend=0.02
+            )
         if chance.happens(0.6):
             for sign in (-1, 1):
-                shape.ellipsoid(head + turn @ (radii * [sign * 1.0, -0.05, 0]), size * np.array([0.12, 0.22, 0.16]), turn.T, skin, blend=0.01)
+                shape.ellipsoid(
+                    head + turn @ (radii * [sign * 1.0, -0.05, 0]),
+                    size * np.array([0.12, 0.22, 0.16]),
+                    turn.T,
+                    skin,
+                    blend=0.01,
+                )
     if chance.happens(0.7):
         mouth(chance, shape, head, radii, turn)
     hooded = chance.happens(0.08)
     if not animal and chance.happens(0.8):
         hair(chance, shape, head, radii, turn, HAIR)
     if chance.happens(0.12) and not animal:
-        shape.ellipsoid(head + turn @ (radii * [0, -0.75, 0.55]), radii * [0.65, chance.between(0.4, 1.0), 0.45], turn.T, HAIR)
+        shape.ellipsoid(
+            head + turn @ (radii * [0, -0.75, 0.55]), radii * [0.65, chance.between(0.4, 1.0), 0.45], turn.T, HAIR
+        )
     if hooded:
         shape.ellipsoid(head + turn @ (radii * [0, 0.05, -0.2]), radii * 1.18, turn.T, MAIN, blend=0.0)
     elif chance.happens(0.3):
@@ -125,20 +180,46 @@ def _clothes(chance: Chance, shape: Shape, width: float, torso: float, leg: floa
         length, flare = leg * chance.between(0.3, 1.0), chance.between(1.1, 1.9)
         material = chance.pick((MAIN, SECOND))
         half = (length + 0.3 * torso) / 2
-        shape.cylinder((0, 0.3 * torso - half, 0), width * (0.85 + flare) / 2, half, material=material, rounding=0.03, taper=(0.85 - flare) / (0.85 + flare), flat=max(flat, 0.7))
+        shape.cylinder(
+            (0, 0.3 * torso - half, 0),
+            width * (0.85 + flare) / 2,
+            half,
+            material=material,
+            rounding=0.03,
+            taper=(0.85 - flare) / (0.85 + flare),
+            flat=max(flat, 0.7),
+        )
     if chance.happens(0.4):
-        shape.cylinder((0, 0.2 * torso, 0), width * 1.5, 0.03 + 0.02 * chance.between(0, 1), material=chance.pick((ACCENT, DARK)), operation=PAINT)
+        shape.cylinder(
+            (0, 0.2 * torso, 0),
+            width * 1.5,
+            0.03 + 0.02 * chance.between(0, 1),
+            material=chance.pick((ACCENT, DARK)),
+            operation=PAINT,
+        )
     if chance.happens(0.18):
         drop, spread = torso + leg * chance.between(0.2, 0.9), chance.between(1.0, 1.7)
         corners = [(-width * 0.8, 0.0), (width * 0.8, 0.0), (width * spread, -drop), (-width * spread, -drop)]
-        shape.plate((0, torso * 0.92, -width * flat - 0.04), corners, 0.018, turned(0, chance.between(0.0, 0.25)), ACCENT, blend=0.02)
+        shape.plate(
+            (0, torso * 0.92, -width * flat - 0.04),
+            corners,
+            0.018,
+            turned(0, chance.between(0.0, 0.25)),
+            ACCENT,
+            blend=0.02,
+        )
     if chance.happens(0.15):
         half = (width * chance.between(0.5, 0.95), torso * chance.between(0.25, 0.4), chance.between(0.04, 0.14))
         shape.box((0, torso * 0.55, -width * flat - half[2]), half, material=ACCENT, rounding=0.04, blend=0.01)
     if chance.happens(0.2):
         shape.torus((0, torso * 0.97, 0), width * 0.55, width * 0.22, material=ACCENT, blend=0.01)
     if chance.happens(0.25):
-        shape.box((0, torso * 0.5, width * flat), (chance.between(0.02, 0.5) * width, torso, width * 0.5), material=chance.pick((WHITE, SECOND)), operation=PAINT)
+        shape.box(
+            (0, torso * 0.5, width * flat),
+            (chance.between(0.02, 0.5) * width, torso, width * 0.5),
+            material=chance.pick((WHITE, SECOND)),
+            operation=PAINT,
+        )
     if chance.happens(0.2):
         for i in range(3):
             shape.ellipsoid((0, torso * (0.35 + 0.2 * i), width * flat), 0.022, material=DARK, operation=PAINT)
@@ -157,7 +238,9 @@ def robot(chance: Chance, shape: Shape) -> None:
     elif style == "barrel":
         shape.cylinder(middle, float(half[0]), float(half[1]), material=MAIN, rounding=hard, taper=chance.normal(0.2))
     else:
-        shape.box(middle, half, material=MAIN, rounding=hard, taper=chance.between(0.1, 0.4) if style == "wedge" else 0.0)
+        shape.box(
+            middle, half, material=MAIN, rounding=hard, taper=chance.between(0.1, 0.4) if style == "wedge" else 0.0
+        )
     _plating(chance, shape, middle, half, hard)
     for sign in (-1.0, 1.0):
         shape.ellipsoid((sign * half[0] * 0.6, -0.02, 0), torso * 0.18, material=DARK)
@@ -167,24 +250,38 @@ def robot(chance: Chance, shape: Shape) -> None:
     if chance.happens(0.2):
         held(chance, shape, chance.pick(hands), 0.4)
     if chance.happens(0.35):
-        shape.box((0, torso * 0.6, -half[2] - 0.05), (half[0] * chance.between(0.4, 0.9), torso * chance.between(0.2, 0.4), 0.08), material=SECOND, rounding=hard)
+        shape.box(
+            (0, torso * 0.6, -half[2] - 0.05),
+            (half[0] * chance.between(0.4, 0.9), torso * chance.between(0.2, 0.4), 0.08),
+            material=SECOND,
+            rounding=hard,
+        )
         for sign in (-1, 1):
             shape.cylinder((sign * half[0] * 0.5, torso * 0.35, -half[2] - 0.12), 0.05, 0.1, material=METAL, taper=-0.2)
 
 
 def _plating(chance: Chance, shape: Shape, middle: Vector, half: Vector, hard: float) -> None:
     if chance.happens(0.5):
-        shape.box(middle + [0, 0.2 * half[1], half[2]], half * [0.6, 0.45, 0.15], material=chance.pick((SECOND, DARK, METAL)), rounding=hard)
+        shape.box(
+            middle + [0, 0.2 * half[1], half[2]],
+            half * [0.6, 0.45, 0.15],
+            material=chance.pick((SECOND, DARK, METAL)),
+            rounding=hard,
+        )
     if chance.happens(0.5):
         for sign in (-1, 1):
             kind = chance.pick((GLOW, ACCENT, DARK))
-            shape.ellipsoid(middle + [sign * half[0] * 0.35, 0.25 * half[1], half[2]], 0.035, material=kind, operation=PAINT)
+            shape.ellipsoid(
+                middle + [sign * half[0] * 0.35, 0.25 * half[1], half[2]], 0.035, material=kind, operation=PAINT
+            )
     if chance.happens(0.4):
         shape.box(middle - [0, 0.7 * half[1], 0], half * [1.5, 0.08, 1.5], material=ACCENT, operation=PAINT)
     for _ in range(chance.integer(0, 4)):
         start = len(shape.solids)
         place = middle + half * [chance.between(0.3, 1.0), chance.between(-0.9, 0.9), chance.between(-1, 1)]
-        shape.box(place, half * chance.between(0.1, 0.35), material=chance.pick((SECOND, METAL, ACCENT, DARK)), rounding=hard)
+        shape.box(
+            place, half * chance.between(0.1, 0.35), material=chance.pick((SECOND, METAL, ACCENT, DARK)), rounding=hard
+        )
         shape.mirror(start)
 
 
@@ -205,12 +302,23 @@ def _robot_legs(chance: Chance, shape: Shape, half: Vector, torso: float, hard: 
             step = turn @ np.array([0, -leg * 0.5, 0])
             wide = thick * (1.2 - 0.3 * i)
             if boxy:
-                shape.box(point + step / 2, (wide, leg * 0.25, wide * chance.between(0.8, 1.3)), turn.T, (MAIN, SECOND)[i], hard)
+                shape.box(
+                    point + step / 2,
+                    (wide, leg * 0.25, wide * chance.between(0.8, 1.3)),
+                    turn.T,
+                    (MAIN, SECOND)[i],
+                    hard,
+                )
             else:
                 shape.cone(point, point + step, wide, wide * 0.8, (MAIN, METAL)[i])
             point = point + step
             shape.cylinder(point, thick * 0.9, thick * 1.1, turned(0, 0, math.pi / 2), DARK)
-        shape.box(point + [0, -0.03, 0.3 * thick], (thick * 1.5, 0.04, thick * chance.between(1.8, 2.8)), material=chance.pick((SECOND, METAL)), rounding=hard)
+        shape.box(
+            point + [0, -0.03, 0.3 * thick],
+            (thick * 1.5, 0.04, thick * chance.between(1.8, 2.8)),
+            material=chance.pick((SECOND, METAL)),
+            rounding=hard,
+        )
 
 
 def _robot_arms(chance: Chance, shape: Shape, half: Vector, torso: float, hard: float) -> list[Vector]:
@@ -222,10 +330,20 @@ def _robot_arms(chance: Chance, shape: Shape, half: Vector, torso: float, hard: 
         swing, bend = draws[0] if together else draws[i]
         start = np.array([sign * (half[0] + thick), torso * 0.8, 0])
         shape.ellipsoid(start, thick * chance.between(1.2, 1.9), material=chance.pick((METAL, SECOND)))
-        hand = limb(shape, start, [arm * 0.45, arm * 0.45], [thick, thick * 0.8, thick * 0.9], [swing, swing + bend], sign * lean, (METAL, MAIN))
+        hand = limb(
+            shape,
+            start,
+            [arm * 0.45, arm * 0.45],
+            [thick, thick * 0.8, thick * 0.9],
+            [swing, swing + bend],
+            sign * lean,
+            (METAL, MAIN),
+        )
         if heavy:
             turn = rotation(0, -(swing + bend))
-            shape.box(hand - turn @ np.array([0, -arm * 0.2, 0]), (thick * 1.4, arm * 0.25, thick * 1.4), turn.T, MAIN, hard)
+            shape.box(
+                hand - turn @ np.array([0, -arm * 0.2, 0]), (thick * 1.4, arm * 0.25, thick * 1.4), turn.T, MAIN, hard
+            )
         for finger in (-0.6, 0.6):
             tip = hand + np.array([math.sin(finger) * thick, -0.4 * thick, 1.4 * thick])
             shape.cone(hand, tip, thick * 0.6, thick * 0.3, DARK)
@@ -255,9 +373,21 @@ def _robot_head(chance: Chance, shape: Shape, base: Vector, size: float, hard: f
         shape.cylinder(front, size * 0.25, size * 0.12, turned(0, math.pi / 2) @ turn.T, light)
     else:
         for sign in (-1, 1):
-            shape.ellipsoid(front + turn @ np.array([sign * half[0] * 0.5, 0, 0]), size * 0.15, turn.T, light, operation=chance.pick((0, PAINT)))
+            shape.ellipsoid(
+                front + turn @ np.array([sign * half[0] * 0.5, 0, 0]),
+                size * 0.15,
+                turn.T,
+                light,
+                operation=chance.pick((0, PAINT)),
+            )
     if chance.happens(0.5):
         start = len(shape.solids)
         root = head + [half[0] * 0.7, half[1], 0]
-        shape.cone(root, root + np.array([chance.between(0, 0.4), chance.between(0.3, 1.0), chance.normal(0.2)]) * size, 0.018, 0.014, METAL)
+        shape.cone(
+            root,
+            root + np.array([chance.between(0, 0.4), chance.between(0.3, 1.0), chance.normal(0.2)]) * size,
+            0.018,
+            0.014,
+            METAL,
+        )
         shape.mirror(start)

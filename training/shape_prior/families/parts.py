@@ -13,9 +13,7 @@ from training.shape_prior.texture import ACCENT, DARK, GLOW, IRIS, MAIN, METAL, 
 Foot = Literal["none", "paw", "boot", "hoof", "claw", "block"]
 
 
-def curve(
-    start: Point, yaw: float, pitch: float, length: float, bends: Sequence[tuple[float, float]]
-) -> list[Vector]:
+def curve(start: Point, yaw: float, pitch: float, length: float, bends: Sequence[tuple[float, float]]) -> list[Vector]:
     """Return points of a polyline that begins along +z turned by yaw and raised by pitch.
 
     Args:
@@ -73,7 +71,9 @@ def limb(
 def add_foot(shape: Shape, ankle: Vector, foot: Foot, size: float, radius: float, material: int) -> None:
     """Add a foot that points forwards."""
     if foot == "paw":
-        shape.ellipsoid(ankle + [0, -0.2 * radius, 0.4 * size], (radius * 1.2, radius * 0.8, size + radius * 0.5), material=material)
+        shape.ellipsoid(
+            ankle + [0, -0.2 * radius, 0.4 * size], (radius * 1.2, radius * 0.8, size + radius * 0.5), material=material
+        )
     elif foot == "boot":
         shape.cone(ankle, ankle + [0, -0.4 * radius, size * 1.5], radius * 1.15, radius * 0.9, material)
     elif foot == "hoof":
@@ -142,7 +142,9 @@ def ears(chance: Chance, shape: Shape, center: Vector, radius: float, turn: Matr
         tip = (chance.between(0.3, 0.9), chance.between(1.8, 2.8), chance.between(-0.8, 0.1))
         shape.cone(at(0.4, 0.8, 0), at(*tip), 0.22 * h, 0.16 * h, inner, flat=0.5)
     elif kind == "horns":
-        points = curve(at(0.45, 0.75, 0.1), 1.0, 1.0, chance.between(0.6, 1.6) * h, [(chance.normal(0.7), chance.normal(0.5))] * 3)
+        points = curve(
+            at(0.45, 0.75, 0.1), 1.0, 1.0, chance.between(0.6, 1.6) * h, [(chance.normal(0.7), chance.normal(0.5))] * 3
+        )
         shape.tube(points, taper(0.2 * h, 0.04 * h, 4), chance.pick((WHITE, DARK, ACCENT)))
     elif kind == "antlers":
         points = curve(at(0.3, 0.85, 0), 0.9, 1.0, chance.between(1.2, 2.2) * h, [(0.3, 0.1)] * 3)
@@ -153,7 +155,18 @@ def ears(chance: Chance, shape: Shape, center: Vector, radius: float, turn: Matr
         local = turn.T @ (solid.center - center)
         mirrored = turn @ (local * [-1, 1, 1])
         axes = ((solid.axes @ turn) * [-1, 1, 1]) @ turn.T
-        shape.solids.append(type(solid)(solid.kind, solid.operation, solid.material, center + mirrored, axes, solid.half, solid.parameters, solid.blend))
+        shape.solids.append(
+            type(solid)(
+                solid.kind,
+                solid.operation,
+                solid.material,
+                center + mirrored,
+                axes,
+                solid.half,
+                solid.parameters,
+                solid.blend,
+            )
+        )
 
 
 def tail(chance: Chance, shape: Shape, start: Point, thickness: float, longest: float) -> None:
@@ -162,7 +175,11 @@ def tail(chance: Chance, shape: Shape, start: Point, thickness: float, longest: 
     if kind == "none":
         return
     if kind == "stub":
-        shape.ellipsoid(np.asarray(start) + [0, 0.3 * thickness, -0.5 * thickness], thickness * chance.between(0.5, 1.0), material=SECOND)
+        shape.ellipsoid(
+            np.asarray(start) + [0, 0.3 * thickness, -0.5 * thickness],
+            thickness * chance.between(0.5, 1.0),
+            material=SECOND,
+        )
         return
     count = chance.integer(3, 5)
     wag = chance.normal(0.35) if chance.happens(0.6) else 0.0
@@ -192,15 +209,31 @@ def hat(chance: Chance, shape: Shape, top: Vector, radius: float, turn: Matrix) 
         if kind == "witch":
             middle = at(chance.normal(0.1), chance.between(0.6, 1.0), chance.normal(0.15))
             shape.cone(at(0, -0.2, 0), middle, 0.85 * r, 0.4 * r, m)
-            shape.cone(middle, at(chance.normal(0.4), chance.between(1.2, 2.0), chance.normal(0.5)), 0.4 * r, 0.05 * r, m)
+            shape.cone(
+                middle, at(chance.normal(0.4), chance.between(1.2, 2.0), chance.normal(0.5)), 0.4 * r, 0.05 * r, m
+            )
         else:
-            shape.cylinder(at(0, 0.15, 0), 0.85 * r, (0.8 if kind == "cylinder" else 0.4) * r, turn.T, m, taper=chance.between(-0.2, 0.15))
+            shape.cylinder(
+                at(0, 0.15, 0),
+                0.85 * r,
+                (0.8 if kind == "cylinder" else 0.4) * r,
+                turn.T,
+                m,
+                taper=chance.between(-0.2, 0.15),
+            )
         shape.cylinder(at(0, -0.1, 0), 0.9 * r, 0.14 * r, turn.T, chance.pick((ACCENT, SECOND, DARK)), blend=0.0)
     elif kind == "cap":
         shape.shell(at(0, -0.45, 0), 1.08 * r, 0.05 * r, 0.35, turn.T, m)
         shape.ellipsoid(at(0, -0.05, 0.95), (0.65 * r, 0.06 * r, 0.6 * r), turn.T, m)
     elif kind == "helmet":
-        shape.shell(at(0, -0.55, -0.05), np.array([1.12, 1.15, 1.15]) * r, 0.06 * r, chance.between(-0.3, 0.3), turn.T, chance.pick((METAL, m)))
+        shape.shell(
+            at(0, -0.55, -0.05),
+            np.array([1.12, 1.15, 1.15]) * r,
+            0.06 * r,
+            chance.between(-0.3, 0.3),
+            turn.T,
+            chance.pick((METAL, m)),
+        )
         if chance.happens(0.5):
             corners = [(-0.9 * r, 0.0), (0.9 * r, 0.0), (0.5 * r, 0.6 * r), (-0.8 * r, 0.5 * r)]
             shape.plate(at(0, 0.3, 0), corners, 0.06 * r, turned(math.pi / 2) @ turn.T, ACCENT)
@@ -215,7 +248,9 @@ def hat(chance: Chance, shape: Shape, top: Vector, radius: float, turn: Matrix) 
         shape.ellipsoid(at(0, 0.75, 0), 0.25 * r, material=ACCENT)
     else:
         for sign in (-1, 1):
-            shape.ellipsoid(at(0.4 * sign, 0.1, 0.1), (0.4 * r, 0.28 * r, 0.12 * r), turned(0, 0, 0.4 * sign) @ turn.T, ACCENT)
+            shape.ellipsoid(
+                at(0.4 * sign, 0.1, 0.1), (0.4 * r, 0.28 * r, 0.12 * r), turned(0, 0, 0.4 * sign) @ turn.T, ACCENT
+            )
 
 
 def hair(chance: Chance, shape: Shape, center: Vector, radii: Vector, turn: Matrix, material: int) -> None:
@@ -231,7 +266,13 @@ def hair(chance: Chance, shape: Shape, center: Vector, radii: Vector, turn: Matr
     shape.ellipsoid(at(0, 0.1, -0.35), radii * [1.0, 0.9, 0.75], turn.T, material, blend=0.01)
     if chance.happens(0.5):
         for sign in (-1, 1):
-            shape.ellipsoid(at(0.5 * sign, 0.65, 0.62), radii * [0.5, 0.22, 0.3], turned(0, 0, -0.5 * sign) @ turn.T, material, blend=0.01)
+            shape.ellipsoid(
+                at(0.5 * sign, 0.65, 0.62),
+                radii * [0.5, 0.22, 0.3],
+                turned(0, 0, -0.5 * sign) @ turn.T,
+                material,
+                blend=0.01,
+            )
     if style == "long":
         length = chance.between(0.5, 1.8)
         shape.ellipsoid(at(0, -0.4 * length, -0.6), radii * [0.95, 0.8 + 0.5 * length, 0.4], turn.T, material)
@@ -239,7 +280,9 @@ def hair(chance: Chance, shape: Shape, center: Vector, radii: Vector, turn: Matr
         shape.ellipsoid(at(0, chance.between(0.4, 1.1), -0.9), 0.4 * r, material=material)
     elif style == "tails":
         for sign in (-1, 1):
-            shape.cone(at(sign, 0.3, -0.3), at(1.3 * sign, chance.between(-1.6, -0.3), -0.4), 0.3 * r, 0.12 * r, material)
+            shape.cone(
+                at(sign, 0.3, -0.3), at(1.3 * sign, chance.between(-1.6, -0.3), -0.4), 0.3 * r, 0.12 * r, material
+            )
     elif style == "spiky":
         for _ in range(7):
             way = np.array([chance.normal(0.6), chance.between(0.4, 1.0), chance.normal(0.6, -0.2)])
@@ -248,7 +291,9 @@ def hair(chance: Chance, shape: Shape, center: Vector, radii: Vector, turn: Matr
     elif style == "mohawk":
         for i in range(5):
             angle = -0.5 + 0.45 * i
-            shape.ellipsoid(at(0, 1.05 * math.cos(angle), -1.05 * math.sin(angle)), (0.12 * r, 0.3 * r, 0.3 * r), turn.T, material)
+            shape.ellipsoid(
+                at(0, 1.05 * math.cos(angle), -1.05 * math.sin(angle)), (0.12 * r, 0.3 * r, 0.3 * r), turn.T, material
+            )
     elif style == "afro":
         shape.ellipsoid(at(0, 0.4, -0.25), radii * chance.between(1.15, 1.4), turn.T, material, blend=0.0)
 
@@ -261,8 +306,16 @@ def held(chance: Chance, shape: Shape, hand: Vector, reach: float) -> None:
     across = np.cross(way, [1.0, 0, 0])
     across /= max(1e-6, float(np.linalg.norm(across)))
     if kind == "staff":
-        shape.cone(hand - way * reach * chance.between(0.2, 0.9), hand + way * reach * chance.between(0.4, 1.1), 0.022, 0.022, WOOD)
-        shape.ellipsoid(shape.solids[-1].center + way * float(shape.solids[-1].half[1]), chance.between(0.04, 0.12), material=GLOW)
+        shape.cone(
+            hand - way * reach * chance.between(0.2, 0.9),
+            hand + way * reach * chance.between(0.4, 1.1),
+            0.022,
+            0.022,
+            WOOD,
+        )
+        shape.ellipsoid(
+            shape.solids[-1].center + way * float(shape.solids[-1].half[1]), chance.between(0.04, 0.12), material=GLOW
+        )
     elif kind == "sword":
         frame = np.stack([across, way, np.cross(across, way)])
         length, width = reach * chance.between(0.4, 1.1), chance.between(0.03, 0.08)
@@ -272,10 +325,19 @@ def held(chance: Chance, shape: Shape, hand: Vector, reach: float) -> None:
         shape.cone(hand + way * 0.06 - across * 0.08, hand + way * 0.06 + across * 0.08, 0.02, 0.02, ACCENT)
     elif kind == "shield":
         turn = turned(chance.normal(0.4), math.pi / 2 + chance.normal(0.15))
-        shape.cylinder(hand + [0, 0, 0.06], chance.between(0.12, 0.28), 0.02, turn, chance.pick((METAL, SECOND, WOOD)), flat=chance.between(0.8, 1.3))
+        shape.cylinder(
+            hand + [0, 0, 0.06],
+            chance.between(0.12, 0.28),
+            0.02,
+            turn,
+            chance.pick((METAL, SECOND, WOOD)),
+            flat=chance.between(0.8, 1.3),
+        )
         shape.ellipsoid(hand + [0, 0, 0.08], 0.06, material=ACCENT)
     elif kind == "ball":
-        shape.ellipsoid(hand + [0, 0, 0.05], chance.between(0.05, 0.2), material=chance.pick((ACCENT, GLOW, SECOND)), blend=0.0)
+        shape.ellipsoid(
+            hand + [0, 0, 0.05], chance.between(0.05, 0.2), material=chance.pick((ACCENT, GLOW, SECOND)), blend=0.0
+        )
     elif kind == "bag":
         size = np.array([chance.between(0.04, 0.1), chance.between(0.08, 0.16), chance.between(0.08, 0.18)])
         shape.box(hand - [0, size[1] + 0.08, 0], size, material=ACCENT, rounding=0.03, blend=0.0)
@@ -292,7 +354,9 @@ def held(chance: Chance, shape: Shape, hand: Vector, reach: float) -> None:
         top = hand + np.array([0, reach, 0])
         shape.cone(hand - [0, 0.4 * reach, 0], top, 0.016, 0.016, WOOD)
         w, h = chance.between(0.2, 0.5), chance.between(0.15, 0.3)
-        shape.plate(top, [(0, 0), (w, -0.1 * h), (w, -h), (0, -h)], 0.012, turned(chance.between(-3, 3)), ACCENT, blend=0.0)
+        shape.plate(
+            top, [(0, 0), (w, -0.1 * h), (w, -h), (0, -h)], 0.012, turned(chance.between(-3, 3)), ACCENT, blend=0.0
+        )
     else:
         shape.cone(hand, hand + [0, 0, reach * chance.between(0.3, 0.7)], 0.03, 0.025, METAL)
         shape.box(hand + [0, 0, 0.05], (0.025, 0.05, 0.1), material=DARK, rounding=0.01)
@@ -339,7 +403,9 @@ def wing(
     shape.cone(root, elbow, 0.035, 0.028, MAIN)
     if style == "bat":
         for share in (0.1, 0.55, 0.9):
-            shape.cone(elbow, joint + tip_out * far * (1 - share * 0.6) + tip_back * chord * share * 0.7, 0.02, 0.014, MAIN)
+            shape.cone(
+                elbow, joint + tip_out * far * (1 - share * 0.6) + tip_back * chord * share * 0.7, 0.02, 0.014, MAIN
+            )
 
 
 def plates_along(

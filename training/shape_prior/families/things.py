@@ -22,12 +22,25 @@ def car(chance: Chance, shape: Shape) -> None:
     cabin = chance.between(0.08, 0.22)
     place, share = chance.between(-0.35, 0.5) * long, chance.between(0.25, 0.6)
     if chance.happens(0.85):
-        shape.box((0, high + cabin * 0.85, place), (wide * 0.9, cabin, long * share), material=MAIN, rounding=rounding, taper=-chance.between(0, 0.3))
+        shape.box(
+            (0, high + cabin * 0.85, place),
+            (wide * 0.9, cabin, long * share),
+            material=MAIN,
+            rounding=rounding,
+            taper=-chance.between(0, 0.3),
+        )
         window = chance.pick((DARK, GLOW, WHITE))
-        shape.box((0, high + cabin, place), (wide * 2, cabin * 0.55, long * share * 0.75), material=window, operation=PAINT)
+        shape.box(
+            (0, high + cabin, place), (wide * 2, cabin * 0.55, long * share * 0.75), material=window, operation=PAINT
+        )
         shape.box((0, high + cabin, place), (wide * 0.7, cabin * 0.55, long * 3), material=window, operation=PAINT)
     if chance.happens(0.3):
-        shape.box((0, high * 1.6, -0.35 * long), (wide * 1.02, high * chance.between(0.8, 2), long * 0.6), material=SECOND, rounding=0.01)
+        shape.box(
+            (0, high * 1.6, -0.35 * long),
+            (wide * 1.02, high * chance.between(0.8, 2), long * 0.6),
+            material=SECOND,
+            rounding=0.01,
+        )
     radius, axles = chance.between(0.07, 0.17), chance.pick((2, 2, 2, 3))
     for z in np.linspace(-0.68, 0.68, axles) * long:
         for sign in (-1, 1):
@@ -51,7 +64,13 @@ def aircraft(chance: Chance, shape: Shape) -> None:
     turn = FORWARD if kind != "rocket" else np.eye(3)
     axis = turn[1]
     shape.cone(-axis * long, axis * long * 0.6, radius * chance.between(0.4, 1.0), radius, MAIN)
-    shape.cone(axis * long * 0.5, axis * long * chance.between(0.8, 1.2), radius, radius * chance.between(0.1, 0.6), chance.pick((MAIN, ACCENT)))
+    shape.cone(
+        axis * long * 0.5,
+        axis * long * chance.between(0.8, 1.2),
+        radius,
+        radius * chance.between(0.1, 0.6),
+        chance.pick((MAIN, ACCENT)),
+    )
     start = len(shape.solids)
     if kind == "rocket":
         for i in range(chance.integer(3, 4)):
@@ -66,7 +85,9 @@ def aircraft(chance: Chance, shape: Shape) -> None:
         sweep = chance.between(0, 0.4)
         level = np.stack([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
         shape.plate(wing_at, [(0, 0), (span, sweep), (span, sweep + chord * 0.5), (0, chord)], 0.018, level, SECOND)
-        shape.plate((0, 0, -long * 0.8), [(0, 0), (span * 0.4, 0.1), (span * 0.4, 0.2), (0, 0.18)], 0.016, level, SECOND)
+        shape.plate(
+            (0, 0, -long * 0.8), [(0, 0), (span * 0.4, 0.1), (span * 0.4, 0.2), (0, 0.18)], 0.016, level, SECOND
+        )
         if chance.happens(0.4):
             shape.cone(wing_at + [span * 0.4, -0.05, 0.1], wing_at + [span * 0.4, -0.05, -0.15], 0.05, 0.04, METAL)
         shape.mirror(start)
@@ -78,8 +99,18 @@ def aircraft(chance: Chance, shape: Shape) -> None:
         shape.cone((0, 0, 0), (0, radius * 1.7, 0), 0.03, 0.03, METAL)
         shape.cone((0.6 * radius, -1.4 * radius, -0.3), (0.6 * radius, -1.4 * radius, 0.3), 0.02, 0.02, METAL)
         shape.mirror(len(shape.solids) - 1)
-    shape.plate((0, radius * 0.6, -long * 0.75), [(0, 0), (0.0, 0.25), (0.14, 0.28), (0.2, 0.0)], 0.016, turned(math.pi / 2), ACCENT)
-    shape.ellipsoid((0, radius * 0.8, long * 0.35), (radius * 0.6, radius * 0.5, radius * 1.2), material=chance.pick((GLOW, DARK, WHITE)))
+    shape.plate(
+        (0, radius * 0.6, -long * 0.75),
+        [(0, 0), (0.0, 0.25), (0.14, 0.28), (0.2, 0.0)],
+        0.016,
+        turned(math.pi / 2),
+        ACCENT,
+    )
+    shape.ellipsoid(
+        (0, radius * 0.8, long * 0.35),
+        (radius * 0.6, radius * 0.5, radius * 1.2),
+        material=chance.pick((GLOW, DARK, WHITE)),
+    )
 
 
 def boat(chance: Chance, shape: Shape) -> None:
@@ -91,7 +122,13 @@ def boat(chance: Chance, shape: Shape) -> None:
         top = chance.between(0.4, 0.8)
         shape.cone((0, 0, 0), (0, top, 0), 0.022, 0.018, WOOD)
         turn = turned(math.pi / 2 + chance.normal(0.4))
-        shape.plate((0, 0.12, 0), [(0, 0), (0.35, 0.02), (0.05, top - 0.15), (0, top - 0.15)], 0.014, turn, chance.pick((WHITE, ACCENT)))
+        shape.plate(
+            (0, 0.12, 0),
+            [(0, 0), (0.35, 0.02), (0.05, top - 0.15), (0, top - 0.15)],
+            0.014,
+            turn,
+            chance.pick((WHITE, ACCENT)),
+        )
     else:
         shape.box((0, 0.1, -0.1), (wide * 0.6, 0.1, long * 0.35), material=SECOND)
         shape.cylinder((0, 0.25, -0.1), 0.05, 0.12, material=ACCENT)
@@ -114,11 +151,23 @@ def seat(chance: Chance, shape: Shape) -> None:
         splay = chance.between(0, 0.12)
         for x in (-1, 1):
             for z in (-1, 1):
-                shape.cone((x * (wide - thick), leg, z * (deep - thick)), (x * (wide - thick + splay), 0, z * (deep - thick + splay)), thick, thick * 0.8, material)
+                shape.cone(
+                    (x * (wide - thick), leg, z * (deep - thick)),
+                    (x * (wide - thick + splay), 0, z * (deep - thick + splay)),
+                    thick,
+                    thick * 0.8,
+                    material,
+                )
     if chance.happens(0.6):
         tall = chance.between(0.15, 0.5)
         if chance.happens(0.5):
-            shape.box((0, leg + tall, -deep + slab), (wide, tall, max(slab * 0.8, 0.02)), turned(0, -chance.between(0, 0.2)), SECOND, chance.pick((0.01, 0.05)))
+            shape.box(
+                (0, leg + tall, -deep + slab),
+                (wide, tall, max(slab * 0.8, 0.02)),
+                turned(0, -chance.between(0, 0.2)),
+                SECOND,
+                chance.pick((0.01, 0.05)),
+            )
         else:
             for x in np.linspace(-0.9, 0.9, chance.integer(2, 5)) * wide:
                 shape.cone((x, leg, -deep * 0.9), (x, leg + 2 * tall, -deep), 0.022, 0.022, material)
@@ -152,18 +201,34 @@ def chest(chance: Chance, shape: Shape) -> None:
     edge = chance.between(0.025, 0.06)
     if chance.happens(0.6):
         for sign in (-1, 1):
-            shape.box((sign * wide * chance.between(0.6, 0.95), 0, 0), (edge, high * 1.04, deep * 1.04), material=trim, rounding=0.01)
+            shape.box(
+                (sign * wide * chance.between(0.6, 0.95), 0, 0),
+                (edge, high * 1.04, deep * 1.04),
+                material=trim,
+                rounding=0.01,
+            )
         shape.box((0, high * 0.9, 0), (wide * 1.03, edge, deep * 1.03), material=trim, rounding=0.01)
     for _ in range(chance.integer(0, 3)):
         y, half = chance.between(-0.6, 0.6) * high, chance.between(0.05, 0.3) * high
-        shape.box((0, y, deep), (wide * 0.85, half, 0.02), material=chance.pick((SECOND, DARK)), operation=chance.pick((0, PAINT)))
+        shape.box(
+            (0, y, deep),
+            (wide * 0.85, half, 0.02),
+            material=chance.pick((SECOND, DARK)),
+            operation=chance.pick((0, PAINT)),
+        )
         shape.ellipsoid((0, y, deep + 0.02), 0.03, material=trim)
     if chance.happens(0.4):
         shape.box((0, high * 0.8, deep), (0.06, 0.08, 0.04), material=ACCENT)
     if chance.happens(0.3):
         for x in (-1, 1):
             for z in (-1, 1):
-                shape.cone((x * wide * 0.85, -high, z * deep * 0.85), (x * wide * 0.85, -high - 0.1, z * deep * 0.85), 0.04, 0.03, trim)
+                shape.cone(
+                    (x * wide * 0.85, -high, z * deep * 0.85),
+                    (x * wide * 0.85, -high - 0.1, z * deep * 0.85),
+                    0.04,
+                    0.03,
+                    trim,
+                )
     if chance.happens(0.15):
         shape.torus((0, high + 0.1, 0), wide * 0.5, 0.025, FORWARD, trim)
 
@@ -187,13 +252,22 @@ def vessel(chance: Chance, shape: Shape) -> None:
             shape.torus((0, y + half, 0), radius, min(half, 0.05), material=material)
         y += 2 * half * chance.between(0.75, 1.0)
     if chance.happens(0.35):
-        shape.cone((0, y + 0.05, 0), (0, y - chance.between(0.05, 0.3), 0), chance.between(0.05, 0.2), 0.04, DARK, operation=CARVE)
+        shape.cone(
+            (0, y + 0.05, 0),
+            (0, y - chance.between(0.05, 0.3), 0),
+            chance.between(0.05, 0.2),
+            0.04,
+            DARK,
+            operation=CARVE,
+        )
     if chance.happens(0.35):
         shape.symmetric = True
         radius = chance.between(0.08, 0.16)
         shape.torus((0, y * 0.5, -0.2 - radius * 0.5), radius, 0.028, turned(0, 0, math.pi / 2), MAIN)
         if chance.happens(0.5):
-            shape.tube(curve((0, y * 0.4, 0.15), 0, 0.6, chance.between(0.2, 0.4), [(0, 0.4)] * 2), [0.06, 0.045, 0.03], MAIN)
+            shape.tube(
+                curve((0, y * 0.4, 0.15), 0, 0.6, chance.between(0.2, 0.4), [(0, 0.4)] * 2), [0.06, 0.045, 0.03], MAIN
+            )
     if chance.happens(0.2):
         shape.shell((0, y + 0.1, 0), (0.3, 0.3, 0.3), 0.02, 0.1, material=GLOW)
 
@@ -212,7 +286,9 @@ def building(chance: Chance, shape: Shape) -> None:
         shape.plate((0, high, 0), corners, deep * eave, np.eye(3), SECOND)
     shape.box((chance.normal(0.2) * wide, -high * 0.6, deep), (0.06, high * 0.4, 0.3), material=DARK, operation=PAINT)
     for x in (-0.55, 0.55):
-        shape.box((x * wide, high * 0.3, 0), (0.06, 0.07, 2), material=chance.pick((GLOW, WHITE, DARK)), operation=PAINT)
+        shape.box(
+            (x * wide, high * 0.3, 0), (0.06, 0.07, 2), material=chance.pick((GLOW, WHITE, DARK)), operation=PAINT
+        )
         shape.box((0, high * 0.3, x * deep), (2, 0.07, 0.06), material=chance.pick((GLOW, DARK)), operation=PAINT)
     if chance.happens(0.4):
         shape.box((wide * 0.5, high + 0.3, 0), (0.06, 0.18, 0.06), material=ACCENT)
@@ -239,19 +315,33 @@ def plant(chance: Chance, shape: Shape) -> None:
             shape.tube(trunk, taper(chance.between(0.05, 0.1), 0.03, 4), WOOD)
         if chance.happens(0.6):
             for _ in range(chance.integer(3, 7)):
-                shape.ellipsoid(trunk[-1] + chance.generator.normal(0, 0.14, 3), chance.between(0.1, 0.26), material=LEAF)
+                shape.ellipsoid(
+                    trunk[-1] + chance.generator.normal(0, 0.14, 3), chance.between(0.1, 0.26), material=LEAF
+                )
         else:
             for _ in range(chance.integer(6, 12)):
                 yaw, rise = chance.between(0, 6.3), chance.between(0.0, 1.3)
                 start = len(shape.solids)
-                wing(chance, shape, np.zeros(3), chance.between(0.25, 0.5), chance.between(0.08, 0.16), rise, 0, LEAF, "leaf")
+                wing(
+                    chance,
+                    shape,
+                    np.zeros(3),
+                    chance.between(0.25, 0.5),
+                    chance.between(0.08, 0.16),
+                    rise,
+                    0,
+                    LEAF,
+                    "leaf",
+                )
                 shape.move(start, turned(yaw).T, trunk[-1] if kind == "tree" else (0, 0, 0))
     elif kind == "fir":
         shape.cone((0, 0, 0), (0, high, 0), 0.06, 0.03, WOOD)
         levels = chance.integer(2, 4)
         for i in range(levels):
             y = high * (0.3 + 0.7 * i / levels)
-            shape.cone((0, y, 0), (0, y + 0.4 * high, 0), 0.3 * high * (1.25 - i / levels) + 0.04, 0.03, LEAF, blend=0.0)
+            shape.cone(
+                (0, y, 0), (0, y + 0.4 * high, 0), 0.3 * high * (1.25 - i / levels) + 0.04, 0.03, LEAF, blend=0.0
+            )
     elif kind == "flower":
         stem = curve((0, 0, 0), 0, math.pi / 2, high, [(0, chance.normal(0.12))] * 3)
         shape.tube(stem, [0.025] * 4, LEAF)
@@ -271,11 +361,21 @@ def plant(chance: Chance, shape: Shape) -> None:
         shape.cone((0, 0, 0), (0, high, 0), 0.12, 0.11, LEAF)
         for sign in (-1, 1):
             y = high * chance.between(0.3, 0.6)
-            shape.tube([(0, y, 0), (sign * 0.24, y, 0), (sign * 0.26, y + chance.between(0.1, 0.3), 0)], [0.06, 0.06, 0.055], LEAF)
+            shape.tube(
+                [(0, y, 0), (sign * 0.24, y, 0), (sign * 0.26, y + chance.between(0.1, 0.3), 0)],
+                [0.06, 0.06, 0.055],
+                LEAF,
+            )
         shape.symmetric = True
     else:
         shape.cone((0, 0, 0), (0, high * 0.6, 0), chance.between(0.06, 0.12), 0.06, WHITE)
-        shape.shell((0, high * 0.5, 0), (chance.between(0.2, 0.4), chance.between(0.15, 0.35), chance.between(0.2, 0.4)), 0.05, 0.05, material=MAIN)
+        shape.shell(
+            (0, high * 0.5, 0),
+            (chance.between(0.2, 0.4), chance.between(0.15, 0.35), chance.between(0.2, 0.4)),
+            0.05,
+            0.05,
+            material=MAIN,
+        )
 
 
 def tool(chance: Chance, shape: Shape) -> None:
@@ -325,19 +425,35 @@ def food(chance: Chance, shape: Shape) -> None:
         y = 0.0
         for i in range(chance.integer(2, 6)):
             half = chance.between(0.03, 0.12)
-            shape.cylinder((0, y + half, 0), radius * chance.between(0.85, 1.1), half, material=(MAIN, SECOND, ACCENT, WHITE)[i % 4], rounding=0.03)
+            shape.cylinder(
+                (0, y + half, 0),
+                radius * chance.between(0.85, 1.1),
+                half,
+                material=(MAIN, SECOND, ACCENT, WHITE)[i % 4],
+                rounding=0.03,
+            )
             y += 2 * half
         shape.ellipsoid((0, y, 0), (radius, chance.between(0.05, 0.25), radius), material=MAIN)
     elif kind == "fruit":
         shape.ellipsoid((0, 0, 0), radius * np.array([1, chance.between(0.7, 1.4), 1]))
         shape.cone((0, radius * 0.9, 0), (0.03, radius * 1.4, 0), 0.03, 0.025, WOOD)
-        shape.plate((0, radius * 1.2, 0), [(0, 0), (0.12, 0.08), (0.25, 0.05), (0.12, -0.06)], 0.014, turned(chance.between(0, 6)), LEAF)
+        shape.plate(
+            (0, radius * 1.2, 0),
+            [(0, 0), (0.12, 0.08), (0.25, 0.05), (0.12, -0.06)],
+            0.014,
+            turned(chance.between(0, 6)),
+            LEAF,
+        )
     elif kind == "cone":
         shape.cone((0, 0, 0), (0, -0.6, 0), 0.2, 0.03, WOOD)
         for i in range(chance.integer(1, 3)):
-            shape.ellipsoid((chance.normal(0.02), 0.1 + 0.2 * i, 0), 0.22 - 0.04 * i, material=(MAIN, SECOND, ACCENT)[i])
+            shape.ellipsoid(
+                (chance.normal(0.02), 0.1 + 0.2 * i, 0), 0.22 - 0.04 * i, material=(MAIN, SECOND, ACCENT)[i]
+            )
     else:
-        shape.torus((0, 0, 0), radius, radius * chance.between(0.3, 0.5), turned(0, chance.pick((0.0, math.pi / 2))), MAIN)
+        shape.torus(
+            (0, 0, 0), radius, radius * chance.between(0.3, 0.5), turned(0, chance.pick((0.0, math.pi / 2))), MAIN
+        )
     if chance.happens(0.25):
         shape.symmetric = True
         eyes(chance, shape, np.array([0, 0.1, 0]), np.full(3, radius), np.eye(3), 0.9, 0.18)
@@ -355,7 +471,11 @@ def composition(chance: Chance, shape: Shape) -> None:
         alone = chance.happens(0.4) or not shape.symmetric
         if alone and shape.symmetric:
             place[0] = 0.0
-        turn = turned(0, chance.normal(0.7)) if alone else turned(chance.normal(0.8), chance.normal(0.8), chance.normal(0.8))
+        turn = (
+            turned(0, chance.normal(0.7))
+            if alone
+            else turned(chance.normal(0.8), chance.normal(0.8), chance.normal(0.8))
+        )
         material = chance.pick((MAIN, SECOND, ACCENT, METAL))
         kind = chance.pick(("solid", "limb", "wheel"))
         if kind == "solid":
