@@ -95,13 +95,13 @@ class ShapePriorNetwork(nn.Module):
         self.outward = nn.ModuleList(_stage(widths[i], self.config.blocks[i]) for i in range(3))
         self.modulate = nn.ModuleList(nn.Linear(widths[3], 2 * widths[i]) for i in range(3))
         self.refine = nn.ModuleList(nn.Linear(widths[0] + 8, self.config.head) for _ in range(4))
-        self.head = nn.Sequential(nn.SiLU(), nn.Linear(self.config.head, BINS + 3 * KNOTS + 1))
+        self.head = nn.Linear(self.config.head, BINS + 4 * KNOTS + 1)
         self.plane = nn.Linear(widths[3], PLANE_NUMBERS)
         with torch.no_grad():
-            self.head[1].bias[:BINS] = -1.5  # about a fifth of the cells behind a subject's pixels are inside it
-        for layer in self.modulate:
-            nn.init.zeros_(layer.weight)
-            nn.init.zeros_(layer.bias)
+            self.head.bias[:BINS] = -1.5  # about a fifth of the cells behind a subject's pixels are inside it
+            self.head.bias[-KNOTS - 1 : -1] = 1.0  # hidden surfaces begin with the color of their pixel
+            for value in self.modulate.parameters():
+                value.zero_()
 
     def encode(self, picture: Float[Tensor, "b 4 128 128"]) -> Features:
         """Encode pictures with premultiplied color and alpha in [0, 1]."""
@@ -150,14 +150,19 @@ class ShapePriorNetwork(nn.Module):
                 row and odd column, of odd row and even column, of odd row and odd column. The rays are in their order.
         """
         coarse = decoded.permute(0, 2, 3, 1).flatten(0, 2)
-        hidden = []
+        hidden, pixel = [], []
         for refine, chosen in zip(self.refine, pixels, strict=True):
             batch, row, column = chosen // SIZE**2, chosen // SIZE % SIZE, chosen % SIZE
             cell = (batch * (SIZE // 2) + row // 2) * (SIZE // 2) + column // 2
             own = planes[batch, :, row, column]
             hidden.append(refine(torch.cat([coarse[cell], own], -1)))
-        occupancy, colors, scale = self.head(torch.cat(hidden)).split((BINS, 3 * KNOTS, 1), -1)
-        return occupancy, colors.unflatten(-1, (KNOTS, 3)).sigmoid(), functional.softplus(scale - 2) + 0.01
+            pixel.append((own[:, :3] / own[:, 3:4].clamp(min=VISIBLE)).clamp(0, 1))
+        numbers = self.head(functional.silu(torch.cat(hidden)))
+        occupancy, other, keep, scale = numbers.split((BINS, 3 * KNOTS, KNOTS, 1), -1)
+        colors = torch.lerp(
+            other.unflatten(-1, (KNOTS, 3)).sigmoid(), torch.cat(pixel)[:, None], keep.sigmoid()[..., None]
+        )
+        return occupancy, colors, functional.softplus(scale - 2) + 0.01
 
     def mirror(
         self, code: Float[Tensor, "b c"]
@@ -211,6 +216,12 @@ def coordinates(alpha: Float[Tensor, "b h w"]) -> Float[Tensor, "b 4 h w"]:
     return torch.stack([*across, *down], 1)
 
 
+def channels_last(network: ShapePriorNetwork) -> ShapePriorNetwork:
+    """Return the network with its convolutions in the order that processors run fastest."""
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return network
+
+
 def save_network(network: ShapePriorNetwork, path: Path) -> None:
     """Write the weights as float16 safetensors, with the sizes in the header."""
     tensors = {name: value.detach().half().contiguous() for name, value in network.state_dict().items()}
@@ -236,7 +247,7 @@ def load_network(path: Path) -> ShapePriorNetwork:
         config = ShapePriorConfig(widths, blocks, int(header["layers"]), int(header["head"]))  # type: ignore[arg-type]
         network = ShapePriorNetwork(config)
         network.load_state_dict({name: file.get_tensor(name).float() for name in file.keys()})  # noqa: SIM118
-    return network.eval().to(memory_format=torch.channels_last)
+    return channels_last(network.eval())
 
 
 def _stage(width: int, blocks: int) -> nn.Sequential:

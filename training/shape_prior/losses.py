@@ -11,7 +11,7 @@ from dg4d_lib.shape_prior.frustum import KNOTS
 from dg4d_lib.shape_prior.network import ShapePriorNetwork
 from training.shape_prior.batches import Batch
 
-COLOR_WEIGHT = 0.05
+COLOR_WEIGHT = 0.1
 MOMENT_WEIGHT = 0.1
 POINT_WEIGHT = 0.5
 SYMMETRY_WEIGHT = 0.02
@@ -70,7 +70,8 @@ def validation_figures(network: ShapePriorNetwork, held_out: list[Batch]) -> dic
         Occupancy loss; intersection over union of matter, mean over samples and per family; mean absolute error of
         hidden colors; mean angle between mirror planes in degrees.
     """
-    losses, overlaps, families, color, angles = [], [], [], [], []
+    families: list[str] = []
+    losses, overlaps, color, angles = [], [], [], []
     for batch in held_out:
         features = network.encode(batch.picture.float() / 255)
         logits, knots, _ = network.rays(network.decode(features), features.picture, batch.pixels)

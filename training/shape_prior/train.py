@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import nn
 
-from dg4d_lib.shape_prior.network import ShapePriorConfig, ShapePriorNetwork, save_network
+from dg4d_lib.shape_prior.network import ShapePriorConfig, ShapePriorNetwork, channels_last, save_network
 from training.shape_prior.batches import Batch, batches, make_batch
 from training.shape_prior.curves import draw_curves
 from training.shape_prior.losses import training_losses, validation_figures
@@ -73,7 +73,7 @@ class Run:
     def __init__(self, plan: Plan, config: ShapePriorConfig) -> None:
         self.plan = plan
         torch.manual_seed(plan.seed)
-        self.network = ShapePriorNetwork(config).to(memory_format=torch.channels_last)
+        self.network = channels_last(ShapePriorNetwork(config))
         self.average = deepcopy(self.network).eval()
         self.optimizers = make_optimizers(self.network, plan)
         self.shown = 0
@@ -247,9 +247,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _config(state: dict[str, Any]) -> ShapePriorConfig:
-    return ShapePriorConfig(
-        **{name: tuple(value) if isinstance(value, list) else value for name, value in state.items()}
-    )
+    return ShapePriorConfig(tuple(state["widths"]), tuple(state["blocks"]), state["layers"], state["head"])
 
 
 if __name__ == "__main__":

@@ -209,8 +209,8 @@ def _clothes(chance: Chance, shape: Shape, width: float, torso: float, leg: floa
             blend=0.02,
         )
     if chance.happens(0.15):
-        half = (width * chance.between(0.5, 0.95), torso * chance.between(0.25, 0.4), chance.between(0.04, 0.14))
-        shape.box((0, torso * 0.55, -width * flat - half[2]), half, material=ACCENT, rounding=0.04, blend=0.01)
+        pack = (width * chance.between(0.5, 0.95), torso * chance.between(0.25, 0.4), chance.between(0.04, 0.14))
+        shape.box((0, torso * 0.55, -width * flat - pack[2]), pack, material=ACCENT, rounding=0.04, blend=0.01)
     if chance.happens(0.2):
         shape.torus((0, torso * 0.97, 0), width * 0.55, width * 0.22, material=ACCENT, blend=0.01)
     if chance.happens(0.25):
@@ -287,7 +287,7 @@ def _plating(chance: Chance, shape: Shape, middle: Vector, half: Vector, hard: f
 
 def _robot_legs(chance: Chance, shape: Shape, half: Vector, torso: float, hard: float) -> None:
     if chance.happens(0.12):
-        for sign in (-1, 1):
+        for sign in (-1.0, 1.0):
             shape.box((sign * half[0], -0.15, 0), (0.08, 0.1, half[2] * 1.6), material=DARK, rounding=0.08)
         return
     leg, thick = torso * chance.between(0.7, 1.7), torso * chance.between(0.1, 0.25)

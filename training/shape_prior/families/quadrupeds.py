@@ -227,21 +227,21 @@ def lizard(chance: Chance, shape: Shape) -> None:
     )
     shell = chance.happens(0.25)
     if shell:
-        size = np.array(
+        dome = np.array(
             [width * chance.between(1.6, 2.4), width * chance.between(0.9, 1.8), length * chance.between(0.45, 0.6)]
         )
-        shape.shell((0, 0, 0), size, 0.03, -0.1, material=SECOND, blend=0.01)
-        shape.ellipsoid((0, 0, 0), size * [0.98, 0.35, 0.98], material=ACCENT, blend=0.01)
+        shape.shell((0, 0, 0), dome, 0.03, -0.1, material=SECOND, blend=0.01)
+        shape.ellipsoid((0, 0, 0), dome * [0.98, 0.35, 0.98], material=ACCENT, blend=0.01)
     lean, gait = chance.between(0.4, 1.3), chance.between(0.1, 0.8)
     leg = chance.between(0.14, 0.35) * (1.3 if shell else 1.0)
     foot: Foot = chance.pick(("claw", "paw"))
     for base, order in ((spine[0], 1), (spine[-1], -1)):
         for sign in (-1.0, 1.0):
             swing = gait * sign * order + chance.normal(0.1)
-            start = base * [1, 1, 0.75] + [sign * width * (0.9 if not shell else 1.5), -0.2 * width, 0]
+            root = base * [1, 1, 0.75] + [sign * width * (0.9 if not shell else 1.5), -0.2 * width, 0]
             limb(
                 shape,
-                start,
+                root,
                 [leg * 0.5, leg * 0.5],
                 [width * 0.4, width * 0.32, width * 0.28],
                 [swing, -0.3 * swing],
@@ -251,20 +251,20 @@ def lizard(chance: Chance, shape: Shape) -> None:
                 0.05,
                 chance.pick((MAIN, SECOND)),
             )
-    size = width * chance.between(0.8, 1.3)
+    skull = width * chance.between(0.8, 1.3)
     rise = chance.between(-0.1, 0.8)
     neck = chance.between(0.05, 0.35)
-    head = spine[-1] + (neck + size * 0.5) * np.array([0.3 * math.sin(bend), math.sin(rise), math.cos(rise)])
-    shape.cone(spine[-1], head, width * 0.75, size * 0.8)
+    head = spine[-1] + (neck + skull * 0.5) * np.array([0.3 * math.sin(bend), math.sin(rise), math.cos(rise)])
+    shape.cone(spine[-1], head, width * 0.75, skull * 0.8)
     turn = rotation(bend * 0.5 + chance.normal(0.2), chance.between(-0.2, 0.3))
-    radii = size * np.array([1.0, chance.between(0.65, 0.95), chance.between(1.0, 1.3)])
+    radii = skull * np.array([1.0, chance.between(0.65, 0.95), chance.between(1.0, 1.3)])
     shape.ellipsoid(head, radii, turn.T)
-    snout = size * chance.between(0.3, 2.0)
+    snout = skull * chance.between(0.3, 2.0)
     shape.cone(
         head,
-        head + turn @ np.array([0, -0.15 * size, size + snout]),
-        size * 0.75,
-        size * 0.45,
+        head + turn @ np.array([0, -0.15 * skull, skull + snout]),
+        skull * 0.75,
+        skull * 0.45,
         MAIN,
         0.7,
         side=(0, 1, 0),

@@ -463,7 +463,6 @@ def composition(chance: Chance, shape: Shape) -> None:
     """Add a random heap of solids, most often with a mirror plane, sometimes with a face: what no family covers."""
     shape.blend = chance.pick((0.0, 0.03, 0.1))
     shape.symmetric = chance.happens(0.8)
-    makers = (shape.ellipsoid, shape.box)
     for _ in range(chance.integer(2, 7)):
         start = len(shape.solids)
         size = np.exp(chance.generator.normal(-1.8, 0.55, 3)).clip(0.03, 0.5)
@@ -479,7 +478,10 @@ def composition(chance: Chance, shape: Shape) -> None:
         material = chance.pick((MAIN, SECOND, ACCENT, METAL))
         kind = chance.pick(("solid", "limb", "wheel"))
         if kind == "solid":
-            chance.pick(makers)(place, size, turn, material)
+            if chance.happens(0.5):
+                shape.ellipsoid(place, size, turn, material)
+            else:
+                shape.box(place, size, turn, material)
         elif kind == "limb":
             end = place + chance.generator.normal(0, 0.35, 3) * [0 if alone and shape.symmetric else 1, 1, 1]
             shape.tube(points_between(place, end, 3), [float(size[0]), float(size[1]), float(size[2]) * 0.6], material)
