@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch.nn.functional import binary_cross_entropy
 
 from dg4d_lib.shape_prior.network import ShapePriorConfig, load_network
 from training.shape_prior import train as training
 from training.shape_prior.batches import batches, make_batch
-from training.shape_prior.losses import color_at, validation_figures
+from training.shape_prior.losses import color_at
 from training.shape_prior.muon import orthogonalized
 
 TINY = ShapePriorConfig(widths=(8, 16, 32, 32), blocks=(1, 1, 1), layers=1, head=32)
@@ -32,17 +33,18 @@ def plan(samples: int, **others: float) -> training.Plan:
 
 
 def test_a_tiny_network_learns(tmp_path: Path) -> None:
-    run = training.Run(plan(320, ema=0.9), TINY)
-    held_out = [make_batch(training.VALIDATION_SEED, number, 4, 1024) for number in range(2)]
-    untrained = validation_figures(run.average, held_out)
-    training.train(run, tmp_path, workers=0, every=160)
+    run = training.Run(plan(480, ema=0.9, lr=0.01), TINY)
+    training.train(run, tmp_path, workers=0, every=240)
     curve = json.loads((tmp_path / "curves.json").read_text())
-    assert [row["shown"] for row in curve] == [160, 320]
-    assert curve[-1]["bce"] < 0.75 * untrained["bce"]  # 0.65 here; a constant per depth reaches 0.85
+    assert [row["shown"] for row in curve] == [240, 480]
+    held_out = [make_batch(training.VALIDATION_SEED, number, 4, 1024) for number in range(2)]
+    matter = torch.cat([batch.occupancy for batch in held_out]).float() / 255
+    same_for_every_ray = binary_cross_entropy(matter.mean(0).expand_as(matter), matter).item()
+    assert curve[-1]["bce"] < 0.95 * same_for_every_ray
     assert curve[-1]["iou"] > 0.2
     assert (tmp_path / "curves.png").stat().st_size > 1000
     assert (tmp_path / training.WEIGHTS).stat().st_size < 1 << 20
-    assert isinstance(load_network(tmp_path / training.WEIGHTS).config.widths, tuple)
+    assert load_network(tmp_path / training.WEIGHTS).config == TINY
 
 
 def test_a_run_that_was_stopped_gives_the_same_weights(tmp_path: Path) -> None:

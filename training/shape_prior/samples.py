@@ -162,8 +162,8 @@ def _pose(chance: Chance, solids: list[Solid]) -> Pose:
     framing = chance.pick(("center", "orbit", "keep", "cropped"), (0.45, 0.37, 0.15, 0.03))
     deep = DEEPEST / float(np.abs(points[:, 2]).max())
     if framing == "orbit":
-        scale = min(deep, chance.between(0.6, 0.82) / float(np.linalg.norm(points, axis=1).max()))
-        shift = chance.generator.normal(0, 0.03, 3)
+        scale = min(deep, chance.between(0.5, 0.82) / float(np.linalg.norm(points, axis=1).max()))
+        shift = np.array([chance.normal(0.05), chance.normal(0.08), chance.normal(0.05)])
         return Pose(turn, scale, shift - scale * middle)
     span = {"center": CENTERED_SPAN, "keep": chance.between(0.4, 0.95), "cropped": chance.between(1.0, 1.3)}[framing]
     scale, shift = framed(points, span, deep)

@@ -236,6 +236,7 @@ def crawler(chance: Chance, shape: Shape) -> None:
     points = curve((0, 0, -0.5), 0, 0, chance.between(1.2, 2.2), bends)
     radius = chance.between(0.05, 0.13)
     if kind == "caterpillar":
+        shape.tube(points, [radius * 0.7] * (count + 1), SECOND)
         for i, point in enumerate(points):
             shape.ellipsoid(point, radius * chance.between(1.0, 1.2), material=(MAIN, SECOND)[i % 2])
     else:
