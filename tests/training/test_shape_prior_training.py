@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -62,6 +63,13 @@ def test_a_run_that_was_stopped_gives_the_same_weights(tmp_path: Path) -> None:
         assert torch.equal(value, resumed.network.state_dict()[name]), name
     for name, value in whole.average.state_dict().items():
         assert torch.equal(value, resumed.average.state_dict()[name]), name
+
+
+def test_a_run_that_is_asked_to_stop_saves_where_it_stands(tmp_path: Path) -> None:
+    stop = Event()
+    stop.set()
+    training.train(training.Run(plan(32, held_out=1), TINY), tmp_path, workers=0, stop=stop)
+    assert training.Run.load(tmp_path, plan(32)).shown == 4
 
 
 def test_workers_make_the_same_batches() -> None:

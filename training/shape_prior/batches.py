@@ -1,5 +1,6 @@
 """Batches of made-up samples, by number: the same seed and number give the same batch in any process."""
 
+import signal
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -108,6 +109,7 @@ def batches(seed: int, first: int, count: int, size: int, rays: int, workers: in
 
 
 def _single_thread() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the trainer ends its workers
     torch.set_num_threads(1)
 
 

@@ -8,12 +8,14 @@ import ctypes
 import json
 import logging
 import os
+import signal
 import sys
 import time
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import torch
@@ -148,7 +150,7 @@ def make_optimizers(network: ShapePriorNetwork, plan: Plan) -> list[torch.optim.
 
 def train(
     run: Run, folder: Path, *, workers: int = 1, every: int = 16_000, save_s: float = 180.0,
-    console: Console | None = None,
+    console: Console | None = None, stop: Event | None = None,
 ) -> None:  # fmt: skip
     """Train until all samples were shown.
 
@@ -159,6 +161,7 @@ def train(
         every: samples between two validations.
         save_s: seconds between two checkpoints.
         console: where progress is shown.
+        stop: when set, the run is saved after the step in hand and ends.
     """
     plan = run.plan
     folder.mkdir(parents=True, exist_ok=True)
@@ -172,7 +175,7 @@ def train(
         for batch in stream:
             sums.add(run.step(batch))
             progress.update(task, completed=run.shown)
-            last = run.shown + plan.batch > plan.samples
+            last, stopped = run.shown + plan.batch > plan.samples, stop is not None and stop.is_set()
             if run.shown % every < plan.batch or last:
                 rate = (run.shown - first) / (time.monotonic() - begun)
                 run.curve.append(
@@ -181,9 +184,11 @@ def train(
                 _log.info("%s", json.dumps({name: round(value, 4) for name, value in run.curve[-1].items()}))
                 (folder / f"{CURVES}.json").write_text(json.dumps(run.curve, indent=1), encoding="utf-8")
                 draw_curves(run.curve).save(folder / f"{CURVES}.png")
-            if last or time.monotonic() - saved > save_s:
+            if last or stopped or time.monotonic() - saved > save_s:
                 run.save(folder)
                 saved = time.monotonic()
+            if stopped:
+                break
 
 
 class Means:
@@ -243,7 +248,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             _log.info("warm start; new: %s", run.warm_start(given.warm_start))
     parameters = sum(value.numel() for value in run.network.parameters())
     _log.info("%.2f million parameters, pid %d", parameters / 1e6, os.getpid())
-    train(run, given.folder, workers=given.workers, every=given.every, console=Console(stderr=True))
+    stop = Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    train(run, given.folder, workers=given.workers, every=given.every, console=Console(stderr=True), stop=stop)
 
 
 def _config(state: dict[str, Any]) -> ShapePriorConfig:
