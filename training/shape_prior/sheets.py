@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from dg4d_lib.shape_prior.frustum import SIZE
 from training.shape_prior.families import FAMILIES
 from training.shape_prior.samples import Sample, make_sample
 
@@ -42,6 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--rows", type=int, default=8)
     parser.add_argument("--columns", type=int, default=12)
+    parser.add_argument("--tile", type=int, default=SIZE, help="pixels of a side of every tile")
     parser.add_argument("--layers", action="store_true", help="four tiles for every shape, not its picture alone")
     given = parser.parse_args(arguments)
     names = list(FAMILIES) if given.family == "each" else [given.family] * given.rows
@@ -49,7 +51,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for row, name in enumerate(names):
         made = [make_sample(given.seed, row * given.columns + i, name) for i in range(given.columns)]
         rows.append([tile for sample in made for tile in (tiles_of(sample) if given.layers else tiles_of(sample)[:1])])
-    sheet(rows).save(given.output)
+    whole = sheet(rows)
+    size = (whole.width * given.tile // SIZE, whole.height * given.tile // SIZE)
+    whole.resize(size, Image.Resampling.LANCZOS).save(given.output)
 
 
 if __name__ == "__main__":
