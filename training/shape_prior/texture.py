@@ -93,7 +93,7 @@ def _color(chance: Chance, hue: float, lively: float) -> Float64[np.ndarray, "3"
 
 
 def _fur(chance: Chance) -> Float64[np.ndarray, "3"]:
-    """Return a color of real animals: white, grey, black, or brown to orange."""
+    """Return a color of real animals: white, gray, black, or brown to orange."""
     if chance.happens(0.4):
         return np.full(3, chance.pick((0.05, 0.2, 0.5, 0.75, 0.95)) + chance.normal(0.03)).clip(0, 1)
     return np.array(colorsys.hsv_to_rgb(chance.between(0.03, 0.13), chance.between(0.2, 0.85), chance.between(0.15, 1)))
