@@ -4,7 +4,6 @@ A U-Net whose coarsest level is a small transformer. Every pixel is a ray of the
 gives the probability that a depth lies inside the subject. Probabilities near one half are its uncertainty.
 """
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -94,7 +93,7 @@ class ShapePriorNetwork(nn.Module):
         self.up = nn.ModuleList(nn.Conv2d(widths[i + 1], widths[i], 1) for i in range(3))
         self.outward = nn.ModuleList(_stage(widths[i], self.config.blocks[i]) for i in range(3))
         self.modulate = nn.ModuleList(nn.Linear(widths[3], 2 * widths[i]) for i in range(3))
-        self.refine = nn.ModuleList(nn.Linear(widths[0] + 8, self.config.head) for _ in range(4))
+        self.refine = nn.Linear(widths[0] + 8, self.config.head)
         self.head = nn.Linear(self.config.head, BINS + 4 * KNOTS + 1)
         self.plane = nn.Linear(widths[3], PLANE_NUMBERS)
         with torch.no_grad():
@@ -136,32 +135,27 @@ class ShapePriorNetwork(nn.Module):
         return functional.silu(x)
 
     def rays(
-        self,
-        decoded: Float[Tensor, "b f 64 64"],
-        planes: Float[Tensor, "b p 128 128"],
-        pixels: Sequence[Int[Tensor, " _"]],
+        self, decoded: Float[Tensor, "b f 64 64"], planes: Float[Tensor, "b p 128 128"], pixels: Int[Tensor, " n"]
     ) -> tuple[Float[Tensor, "n 64"], Float[Tensor, "n 8 3"], Float[Tensor, "n 1"]]:
         """Return occupancy logits, colors in [0, 1] and the colors' scale of some rays.
 
         Args:
-            decoded: of `decode`.
+            decoded: of `decode`; linear between its pixels.
             planes: `Features.picture`.
-            pixels: four lists of flat indices into batch, row and column: pixels of even row and even column, of even
-                row and odd column, of odd row and even column, of odd row and odd column. The rays are in their order.
+            pixels: flat indices into batch, row and column.
         """
-        coarse = decoded.permute(0, 2, 3, 1).flatten(0, 2)
-        hidden, pixel = [], []
-        for refine, chosen in zip(self.refine, pixels, strict=True):
-            batch, row, column = chosen // SIZE**2, chosen // SIZE % SIZE, chosen % SIZE
-            cell = (batch * (SIZE // 2) + row // 2) * (SIZE // 2) + column // 2
-            own = planes[batch, :, row, column]
-            hidden.append(refine(torch.cat([coarse[cell], own], -1)))
-            pixel.append((own[:, :3] / own[:, 3:4].clamp(min=VISIBLE)).clamp(0, 1))
-        numbers = self.head(functional.silu(torch.cat(hidden)))
+        batch, row, column = pixels // SIZE**2, pixels // SIZE % SIZE, pixels % SIZE
+        cells = decoded.permute(0, 2, 3, 1).flatten(0, 2)
+        found = torch.zeros((), device=decoded.device)
+        for y, y_share in _neighbors(row):
+            for x, x_share in _neighbors(column):
+                share = (y_share * x_share)[:, None]
+                found = found + share * cells[(batch * (SIZE // 2) + y) * (SIZE // 2) + x]
+        own = planes[batch, :, row, column]
+        numbers = self.head(functional.silu(self.refine(torch.cat([found, own], -1))))
         occupancy, other, keep, scale = numbers.split((BINS, 3 * KNOTS, KNOTS, 1), -1)
-        colors = torch.lerp(
-            other.unflatten(-1, (KNOTS, 3)).sigmoid(), torch.cat(pixel)[:, None], keep.sigmoid()[..., None]
-        )
+        pixel = (own[:, :3] / own[:, 3:4].clamp(min=VISIBLE)).clamp(0, 1)
+        colors = torch.lerp(other.unflatten(-1, (KNOTS, 3)).sigmoid(), pixel[:, None], keep.sigmoid()[..., None])
         return occupancy, colors, functional.softplus(scale - 2) + 0.01
 
     def mirror(
@@ -185,12 +179,9 @@ class ShapePriorNetwork(nn.Module):
             code: instead of the pictures' own codes; see `decode`.
         """
         features = self.encode(picture)
-        batch = len(picture)
-        order = torch.arange(batch * SIZE**2, device=picture.device).view(batch, SIZE // 2, 2, SIZE // 2, 2)
-        pixels = [order[:, :, row, :, column].flatten() for row in (0, 1) for column in (0, 1)]
+        pixels = torch.arange(len(picture) * SIZE**2, device=picture.device)
         found = self.rays(self.decode(features, code), features.picture, pixels)
-        back = torch.cat(pixels).argsort()
-        occupancy, colors, scale = (part[back].unflatten(0, (batch, SIZE, SIZE)) for part in found)
+        occupancy, colors, scale = (part.unflatten(0, (-1, SIZE, SIZE)) for part in found)
         moment, point, symmetric = self.mirror(features.code if code is None else code)
         return ShapePrediction(
             occupancy.permute(0, 3, 1, 2), colors.permute(0, 3, 4, 1, 2), scale.permute(0, 3, 1, 2),
@@ -214,6 +205,14 @@ def coordinates(alpha: Float[Tensor, "b h w"]) -> Float[Tensor, "b 4 h w"]:
     across = [plane[:, None, :].expand(batch, height, width) for plane in (x, x_inside)]
     down = [plane[:, :, None].expand(batch, height, width) for plane in (y, y_inside)]
     return torch.stack([*across, *down], 1)
+
+
+def _neighbors(place: Int[Tensor, " n"]) -> list[tuple[Int[Tensor, " n"], Float[Tensor, " n"]]]:
+    """Return the two pixels of the half-size grid around a pixel, with their shares in linear interpolation."""
+    own, odd = place // 2, place % 2
+    other = (own + 2 * odd - 1).clamp(0, SIZE // 2 - 1)
+    near = torch.full(place.shape, 0.75, device=place.device)
+    return [(own, near), (other, 1 - near)]
 
 
 def channels_last(network: ShapePriorNetwork) -> ShapePriorNetwork:

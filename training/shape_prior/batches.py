@@ -25,9 +25,9 @@ class Batch:
 
     Attributes:
         picture: premultiplied color and alpha, 0 to 255.
-        pixels: flat indices into batch, row and column, in four lists; see `ShapePriorNetwork.rays`.
+        pixels: flat indices into batch, row and column of those rays.
         occupancy: share of every cell of those rays that lies in matter, 0 to 255.
-        ray: for every surface that the picture does not show, the position of its ray in the four lists together.
+        ray: for every surface that the picture does not show, the position of its ray in `pixels`.
         depth: of those surfaces, 0 at `NEAR`, 1 at `FAR`.
         color: of those surfaces, 0 to 255.
         plane: unit normal and offset of the mirror plane, zeros if there is none.
@@ -36,7 +36,7 @@ class Batch:
     """
 
     picture: UInt8[Tensor, "b 4 128 128"]
-    pixels: tuple[Int[Tensor, " _"], Int[Tensor, " _"], Int[Tensor, " _"], Int[Tensor, " _"]]
+    pixels: Int[Tensor, " n"]
     occupancy: UInt8[Tensor, "n 64"]
     ray: Int[Tensor, " m"]
     depth: Float[Tensor, " m"]
@@ -64,20 +64,16 @@ def join_samples(samples: list[Sample], rays: int, generator: np.random.Generato
     chosen = [np.sort(generator.permutation(len(sample.pixels))[:rays]) for sample in samples]
     pairs = list(zip(samples, chosen, strict=True))
     flat = np.concatenate([i * SIZE**2 + s.pixels[use].astype(np.int64) for i, (s, use) in enumerate(pairs)])
-    corner = flat // SIZE % 2 * 2 + flat % 2
-    order = np.argsort(corner, kind="stable")
-    counts = np.concatenate([s.counts[use] for s, use in pairs])[order]
-    depths = np.concatenate([s.depths[use] for s, use in pairs])[order].astype(np.float32) / 65535
-    colors = np.concatenate([s.colors[use] for s, use in pairs])[order]
-    occupancy = soft_occupancy(depths, counts, np.empty((len(order), BINS), np.float32))
+    counts = np.concatenate([s.counts[use] for s, use in pairs])
+    depths = np.concatenate([s.depths[use] for s, use in pairs]).astype(np.float32) / 65535
+    colors = np.concatenate([s.colors[use] for s, use in pairs])
+    occupancy = soft_occupancy(depths, counts, np.empty((len(flat), BINS), np.float32))
     hidden = np.arange(depths.shape[1])[None] < counts[:, None]
     hidden[:, 0] = False
     ray, crossing = np.nonzero(hidden)
-    flat, ends = flat[order], np.cumsum(np.bincount(corner, minlength=4))[:-1]
-    first, second, third, fourth = (torch.from_numpy(part) for part in np.split(flat, ends))
     return Batch(
         picture=torch.from_numpy(np.stack([s.picture for s in samples]).transpose(0, 3, 1, 2).copy()),
-        pixels=(first, second, third, fourth),
+        pixels=torch.from_numpy(flat),
         occupancy=torch.from_numpy((occupancy * 255 + 0.5).clip(0, 255).astype(np.uint8)),
         ray=torch.from_numpy(ray),
         depth=torch.from_numpy(depths[ray, crossing]),

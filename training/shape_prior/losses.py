@@ -77,7 +77,7 @@ def validation_figures(network: ShapePriorNetwork, held_out: list[Batch]) -> dic
         logits, knots, _ = network.rays(network.decode(features), features.picture, batch.pixels)
         truth = batch.occupancy.float() / 255
         losses.append(functional.binary_cross_entropy_with_logits(logits, truth).item())
-        owner = torch.cat(list(batch.pixels)) // batch.picture[0, 0].numel()
+        owner = batch.pixels // batch.picture[0, 0].numel()
         overlaps += _overlaps(logits > 0, truth > 0.5, owner, len(batch.picture))
         families += batch.families
         color.append((color_at(knots[batch.ray], batch.depth) - batch.color.float() / 255).abs().mean().item())

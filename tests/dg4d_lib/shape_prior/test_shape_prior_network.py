@@ -41,19 +41,27 @@ def test_every_ray_gets_occupancy_colors_and_a_scale(network: ShapePriorNetwork,
 
 def test_chosen_rays_are_the_same_as_in_the_whole_picture(network: ShapePriorNetwork, picture: torch.Tensor) -> None:
     places = [(0, 31, 42), (1, 64, 64), (1, 55, 41), (0, 80, 69)]
-    pixels = [torch.tensor([], dtype=torch.long)] * 4
-    order = []
-    for batch, row, column in places:
-        corner = row % 2 * 2 + column % 2
-        pixels[corner] = torch.cat([pixels[corner], torch.tensor([(batch * SIZE + row) * SIZE + column])])
-        order.append((corner, batch, row, column))
+    pixels = torch.tensor([(batch * SIZE + row) * SIZE + column for batch, row, column in places])
     features = network.encode(picture)
     occupancy, colors, scale = network.rays(network.decode(features), features.picture, pixels)
     whole = network(picture)
-    for i, (_, batch, row, column) in enumerate(sorted(order, key=lambda place: place[0])):
+    for i, (batch, row, column) in enumerate(places):
         torch.testing.assert_close(occupancy[i], whole.occupancy[batch, :, row, column])
         torch.testing.assert_close(colors[i], whole.colors[batch, :, :, row, column])
         torch.testing.assert_close(scale[i], whole.color_scale[batch, :, row, column])
+
+
+def test_rays_read_features_as_linear_interpolation_does(network: ShapePriorNetwork, picture: torch.Tensor) -> None:
+    decoded = torch.rand(2, TINY.widths[0], SIZE // 2, SIZE // 2)
+    planes = torch.zeros(2, 8, SIZE, SIZE)
+    network.refine.weight.data = torch.eye(TINY.head, TINY.widths[0] + 8)
+    network.refine.bias.data.zero_()
+    network.head.weight.data = torch.eye(*network.head.weight.shape)
+    network.head.bias.data.zero_()
+    found, _, _ = network.rays(decoded, planes, torch.arange(2 * SIZE**2))
+    expected = torch.nn.functional.interpolate(decoded, scale_factor=2, mode="bilinear", align_corners=False)
+    expected = torch.nn.functional.silu(expected).permute(0, 2, 3, 1).flatten(0, 2)
+    torch.testing.assert_close(found[:, : TINY.widths[0]], expected)
 
 
 def test_frames_can_share_the_code_of_their_subject(network: ShapePriorNetwork, picture: torch.Tensor) -> None:
