@@ -1,11 +1,13 @@
 """Batches of made-up samples, by number: the same seed and number give the same batch in any process."""
 
+import os
 import signal
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, fields
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
+from threading import Thread
 
 import numpy as np
 import torch
@@ -90,7 +92,7 @@ def batches(seed: int, first: int, count: int, size: int, rays: int, workers: in
     if not workers:
         yield from (make_batch(seed, number, size, rays) for number in numbers)
         return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_single_thread) as pool:
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_prepare_worker) as pool:
         waiting: deque[Future[dict[str, object]]] = deque()
         try:
             for number in numbers:
@@ -104,9 +106,18 @@ def batches(seed: int, first: int, count: int, size: int, rays: int, workers: in
                 future.cancel()
 
 
-def _single_thread() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the trainer ends its workers
+def _prepare_worker() -> None:
+    """Use one thread, leave interrupts to the trainer, and end when it is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _packed(seed: int, number: int, size: int, rays: int) -> dict[str, object]:

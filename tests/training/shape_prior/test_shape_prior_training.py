@@ -1,6 +1,9 @@
 """Training: it learns, goes on where it stopped, and gives the same weights again."""
 
 import json
+import subprocess
+import sys
+import time
 from pathlib import Path
 from threading import Event
 
@@ -80,6 +83,29 @@ def test_workers_make_the_same_batches() -> None:
         assert torch.equal(one.picture, two.picture)
         assert torch.equal(one.occupancy, two.occupancy)
         assert torch.equal(one.pixels, two.pixels)
+
+
+@pytest.mark.slow
+def test_workers_end_with_a_trainer_that_is_killed() -> None:
+    code = """
+import multiprocessing, sys
+from training.shape_prior.batches import batches
+if __name__ == "__main__":
+    made = batches(1, 0, 100, 1, 16, workers=1)
+    next(made)
+    print(multiprocessing.active_children()[0].pid, flush=True)
+    sys.stdin.read()
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as trainer:
+        assert trainer.stdout is not None
+        worker = int(trainer.stdout.readline())
+        trainer.kill()
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{worker}").exists()
 
 
 def test_a_warm_start_takes_what_fits(tmp_path: Path) -> None:
