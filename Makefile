@@ -8,9 +8,10 @@ EMULATION := $(BIN)/python -m tests.emulation.build --arithmetic $(ARITHMETIC)
 GPU_TESTS := $(BIN)/python -m pytest -p tests.emulation.plugin --arithmetic $(ARITHMETIC) -m gpu
 
 TOOLS := out/tools
+SHAPE_PRIOR ?=
 UPGRADE ?=
 
-.PHONY: setup clients demo test check audit lock emulation examples clean
+.PHONY: setup clients demo test check audit lock emulation examples shape-prior clean
 
 setup: $(VENV)/.ready
 
@@ -56,6 +57,10 @@ emulation: setup
 
 examples: setup
 	$(BIN)/python -m examples.make_examples
+
+# train the network of `prior.kind=learned`; run it again to resume, SHAPE_PRIOR="--samples 800000" trains longer
+shape-prior: setup
+	$(BIN)/python -m training.shape_prior.train out/shape_prior $(SHAPE_PRIOR)
 
 clean:
 	rm -rf $(VENV) out

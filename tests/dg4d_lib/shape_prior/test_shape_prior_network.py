@@ -1,0 +1,104 @@
+"""Network of the shape prior: shapes, weights files, rays one by one and all at once."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from dg4d_lib.errors import BadInput
+from dg4d_lib.shape_prior.frustum import BINS, KNOTS, SIZE
+from dg4d_lib.shape_prior.network import ShapePriorConfig, ShapePriorNetwork, coordinates, load_network, save_network
+
+TINY = ShapePriorConfig(widths=(8, 16, 32, 32), blocks=(1, 1, 1), layers=1, head=32)
+
+
+@pytest.fixture
+def network() -> ShapePriorNetwork:
+    torch.manual_seed(0)
+    made = ShapePriorNetwork(TINY)
+    for parameter in made.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    return made.eval()
+
+
+@pytest.fixture
+def picture() -> torch.Tensor:
+    torch.manual_seed(1)
+    alpha = torch.zeros(2, 1, SIZE, SIZE)
+    alpha[:, :, 30:90, 40:70] = 1
+    return torch.cat([torch.rand(2, 3, SIZE, SIZE) * alpha, alpha], 1)
+
+
+def test_every_ray_gets_occupancy_colors_and_a_scale(network: ShapePriorNetwork, picture: torch.Tensor) -> None:
+    found = network(picture)
+    assert found.occupancy.shape == (2, BINS, SIZE, SIZE)
+    assert found.colors.shape == (2, KNOTS, 3, SIZE, SIZE)
+    assert ((found.colors >= 0) & (found.colors <= 1)).all()
+    assert (found.color_scale > 0).all()
+    assert torch.equal(found.mirror_moment, found.mirror_moment.transpose(1, 2))
+
+
+def test_chosen_rays_are_the_same_as_in_the_whole_picture(network: ShapePriorNetwork, picture: torch.Tensor) -> None:
+    places = [(0, 31, 42), (1, 64, 64), (1, 55, 41), (0, 80, 69)]
+    pixels = torch.tensor([(batch * SIZE + row) * SIZE + column for batch, row, column in places])
+    features = network.encode(picture)
+    occupancy, colors, scale = network.rays(network.decode(features), features.picture, pixels)
+    whole = network(picture)
+    for i, (batch, row, column) in enumerate(places):
+        torch.testing.assert_close(occupancy[i], whole.occupancy[batch, :, row, column])
+        torch.testing.assert_close(colors[i], whole.colors[batch, :, :, row, column])
+        torch.testing.assert_close(scale[i], whole.color_scale[batch, :, row, column])
+
+
+def test_rays_read_features_as_linear_interpolation_does(network: ShapePriorNetwork, picture: torch.Tensor) -> None:
+    decoded = torch.rand(2, TINY.widths[0], SIZE // 2, SIZE // 2)
+    planes = torch.zeros(2, 8, SIZE, SIZE)
+    network.refine.weight.data = torch.eye(TINY.head, TINY.widths[0] + 8)
+    network.refine.bias.data.zero_()
+    network.head.weight.data = torch.eye(*network.head.weight.shape)
+    network.head.bias.data.zero_()
+    found, _, _ = network.rays(decoded, planes, torch.arange(2 * SIZE**2))
+    expected = torch.nn.functional.interpolate(decoded, scale_factor=2, mode="bilinear", align_corners=False)
+    expected = torch.nn.functional.silu(expected).permute(0, 2, 3, 1).flatten(0, 2)
+    torch.testing.assert_close(found[:, : TINY.widths[0]], expected)
+
+
+def test_frames_can_share_the_code_of_their_subject(network: ShapePriorNetwork, picture: torch.Tensor) -> None:
+    code = network.encode(picture).code.mean(0, keepdim=True).expand(2, -1)
+    shared = network(picture, code)
+    assert torch.equal(shared.mirror_moment[0], shared.mirror_moment[1])
+    assert not torch.equal(shared.occupancy[0], shared.occupancy[1])
+    assert not torch.allclose(shared.occupancy, network(picture).occupancy)
+
+
+def test_coordinates_inside_the_subject_run_from_minus_one_to_one() -> None:
+    alpha = torch.zeros(1, SIZE, SIZE)
+    alpha[0, 20:60, 50:111] = 1
+    x, x_inside, y, y_inside = coordinates(alpha)[0]
+    assert x[0, 0] == pytest.approx(-1 + 1 / SIZE)
+    assert y[-1, 0] == pytest.approx(1 - 1 / SIZE)
+    assert (x_inside[0, 50], x_inside[0, 110]) == (-1, 1)
+    assert (y_inside[20, 0], y_inside[59, 0]) == (-1, 1)
+
+
+def test_an_empty_picture_gives_finite_numbers(network: ShapePriorNetwork) -> None:
+    assert network(torch.zeros(1, 4, SIZE, SIZE)).occupancy.isfinite().all()
+
+
+def test_weights_survive_their_file(network: ShapePriorNetwork, picture: torch.Tensor, tmp_path: Path) -> None:
+    save_network(network, tmp_path / "n.safetensors")
+    again = load_network(tmp_path / "n.safetensors")
+    assert again.config == TINY
+    # float16 keeps eleven bits
+    torch.testing.assert_close(again(picture).occupancy, network(picture).occupancy, rtol=0.02, atol=0.02)
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    save_file({"a": torch.zeros(1)}, tmp_path / "n.safetensors", {"format": "other"})
+    with pytest.raises(BadInput, match="format 'other' is not"):
+        load_network(tmp_path / "n.safetensors")
+
+
+def test_the_shipped_size_is_at_most_eight_megabytes() -> None:
+    assert 2 * sum(value.numel() for value in ShapePriorNetwork().parameters()) <= 8e6

@@ -1,0 +1,137 @@
+"""Training: it learns, goes on where it stopped, and gives the same weights again."""
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import binary_cross_entropy
+
+from dg4d_lib.shape_prior.network import ShapePriorConfig, load_network
+from training.shape_prior import train as training
+from training.shape_prior.batches import batches, make_batch
+from training.shape_prior.losses import color_at
+from training.shape_prior.muon import orthogonalized
+
+TINY = ShapePriorConfig(widths=(8, 16, 32, 32), blocks=(1, 1, 1), layers=1, head=32)
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> object:
+    """The order of sums depends on the number of threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def plan(samples: int, **others: float) -> training.Plan:
+    return training.Plan(
+        **{"samples": samples, "batch": 4, "rays": 256, "warmup": 64, "lr": 4e-3, "held_out": 2, **others}
+    )  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_a_tiny_network_learns(tmp_path: Path) -> None:
+    run = training.Run(plan(480, ema=0.9, lr=0.01), TINY)
+    training.train(run, tmp_path, workers=0, every=240)
+    curve = json.loads((tmp_path / "curves.json").read_text())
+    assert [row["shown"] for row in curve] == [240, 480]
+    held_out = [make_batch(training.VALIDATION_SEED, number, 4, 1024) for number in range(2)]
+    matter = torch.cat([batch.occupancy for batch in held_out]).float() / 255
+    same_for_every_ray = binary_cross_entropy(matter.mean(0).expand_as(matter), matter).item()
+    assert curve[-1]["bce"] < 0.95 * same_for_every_ray
+    assert curve[-1]["iou"] > 0.2
+    assert (tmp_path / "curves.png").stat().st_size > 1000
+    assert (tmp_path / training.WEIGHTS).stat().st_size < 1 << 20
+    assert load_network(tmp_path / training.WEIGHTS).config == TINY
+
+
+def test_a_run_that_was_stopped_gives_the_same_weights(tmp_path: Path) -> None:
+    whole = training.Run(plan(32), TINY)
+    training.train(whole, tmp_path / "whole", workers=0, every=16)
+    part = training.Run(plan(32), TINY)
+    for number in range(4):
+        part.step(make_batch(1, number, 4, 256))
+    (tmp_path / "parts").mkdir()
+    part.save(tmp_path / "parts")
+    resumed = training.Run.load(tmp_path / "parts", plan(32))
+    assert resumed.shown == 16
+    training.train(resumed, tmp_path / "parts", workers=0, every=16)
+    for name, value in whole.network.state_dict().items():
+        assert torch.equal(value, resumed.network.state_dict()[name]), name
+    for name, value in whole.average.state_dict().items():
+        assert torch.equal(value, resumed.average.state_dict()[name]), name
+
+
+def test_a_run_that_is_asked_to_stop_saves_where_it_stands(tmp_path: Path) -> None:
+    stop = Event()
+    stop.set()
+    training.train(training.Run(plan(32, held_out=1), TINY), tmp_path, workers=0, stop=stop)
+    assert training.Run.load(tmp_path, plan(32)).shown == 4
+
+
+def test_workers_make_the_same_batches() -> None:
+    here = list(batches(3, 5, 2, 2, 64, workers=0))
+    there = list(batches(3, 5, 2, 2, 64, workers=1))
+    for one, two in zip(here, there, strict=True):
+        assert torch.equal(one.picture, two.picture)
+        assert torch.equal(one.occupancy, two.occupancy)
+        assert torch.equal(one.pixels, two.pixels)
+
+
+@pytest.mark.slow
+def test_workers_end_with_a_trainer_that_is_killed() -> None:
+    code = """
+import multiprocessing, sys
+from training.shape_prior.batches import batches
+if __name__ == "__main__":
+    made = batches(1, 0, 100, 1, 16, workers=1)
+    next(made)
+    print(multiprocessing.active_children()[0].pid, flush=True)
+    sys.stdin.read()
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as trainer:
+        assert trainer.stdout is not None
+        worker = int(trainer.stdout.readline())
+        trainer.kill()
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{worker}").exists()
+
+
+def test_a_warm_start_takes_what_fits(tmp_path: Path) -> None:
+    first = training.Run(plan(32), TINY)
+    first.save(tmp_path)
+    wider = training.Run(plan(32), ShapePriorConfig(widths=(8, 16, 32, 64), blocks=(1, 1, 1), layers=1, head=32))
+    left_out = wider.warm_start(tmp_path / training.CHECKPOINT)
+    assert torch.equal(wider.network.stem.weight, first.average.stem.weight)
+    assert "places" in left_out
+    assert "stem.weight" not in left_out
+
+
+def test_the_rate_rises_stays_and_falls() -> None:
+    rates = [plan(1000, cooldown=0.3).lr_at(shown) for shown in (0, 60, 500, 850, 1000)]
+    assert rates == pytest.approx([4e-3 * 4 / 64, 4e-3, 4e-3, 2e-3, 0])
+
+
+def test_orthogonalized_matrices_have_singular_values_near_one() -> None:
+    matrix = torch.randn(24, 80, generator=torch.Generator().manual_seed(0))
+    for given in (matrix, matrix.T):
+        values = torch.linalg.svdvals(orthogonalized(given))
+        assert values.min() > 0.6  # the quintic iteration of Muon ends between 0.7 and 1.2
+        assert values.max() < 1.3
+
+
+def test_hidden_colors_are_linear_between_knots() -> None:
+    knots = torch.arange(8.0)[None, :, None].expand(4, 8, 3)
+    depth = torch.tensor([0.0, 0.5, 0.93, 1.0])
+    assert np.allclose(color_at(knots, depth)[:, 0], depth * 7, atol=1e-5)

@@ -1,0 +1,1 @@
+"""Training of the shape prior on creatures and things that a program makes up."""

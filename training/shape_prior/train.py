@@ -1,0 +1,262 @@
+"""Training of the shape prior: resumable, deterministic for a seed and a thread count.
+
+python -m training.shape_prior.train out/shape_prior --samples 600000
+"""
+
+import argparse
+import ctypes
+import json
+import logging
+import os
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import nn
+
+from dg4d_lib.shape_prior.network import ShapePriorConfig, ShapePriorNetwork, channels_last, save_network
+from training.shape_prior.batches import Batch, batches, make_batch
+from training.shape_prior.curves import draw_curves
+from training.shape_prior.losses import training_losses, validation_figures
+from training.shape_prior.muon import Muon
+
+VALIDATION_SEED = 1_000_003  # no training run uses it
+CHECKPOINT, WEIGHTS, CURVES = "checkpoint.pt", "network.safetensors", "curves"
+M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3  # of glibc's mallopt
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Settings of a training run; a run that goes on may change `samples` alone.
+
+    Attributes:
+        samples: made-up shapes that are shown, each once.
+        batch: samples of a step.
+        rays: of each sample that are supervised.
+        lr: peak learning rate.
+        weight_decay: of AdamW.
+        warmup: samples over which the rate rises.
+        cooldown: share of all samples over which it falls to zero at the end.
+        ema: weight of the past in the averaged network that is validated and shipped.
+        seed: of the shapes and of the initial weights.
+        held_out: batches for validation.
+    """
+
+    samples: int = 500_000
+    batch: int = 16
+    rays: int = 1024
+    lr: float = 1.5e-3
+    weight_decay: float = 0.02
+    warmup: int = 8_000
+    cooldown: float = 0.3
+    ema: float = 0.999
+    seed: int = 1
+    held_out: int = 16
+
+    def lr_at(self, shown: int) -> float:
+        """Return the learning rate after a number of samples."""
+        left = (self.samples - shown) / (self.cooldown * self.samples)
+        return self.lr * min(1.0, (shown + self.batch) / self.warmup, max(0.0, left))
+
+
+class Run:
+    """State of one training run: networks, optimizer, samples shown, figures."""
+
+    def __init__(self, plan: Plan, config: ShapePriorConfig) -> None:
+        self.plan = plan
+        torch.manual_seed(plan.seed)
+        self.network = channels_last(ShapePriorNetwork(config))
+        self.average = deepcopy(self.network).eval()
+        self.optimizers = make_optimizers(self.network, plan)
+        self.shown = 0
+        self.curve: list[dict[str, float]] = []
+
+    def step(self, batch: Batch) -> dict[str, float]:
+        """Show one batch; return its losses."""
+        for group in (group for optimizer in self.optimizers for group in optimizer.param_groups):
+            group["lr"] = self.plan.lr_at(self.shown)
+        losses = training_losses(self.network, batch)
+        self.network.zero_grad(set_to_none=True)
+        losses.total().backward()
+        nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        for optimizer in self.optimizers:
+            optimizer.step()
+        self.shown += len(batch.picture)
+        steps = self.shown / self.plan.batch
+        weight = 1 - min(self.plan.ema, (1 + steps) / (10 + steps))
+        with torch.no_grad():
+            torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), weight)
+        return {name: float(value.detach()) for name, value in vars(losses).items()}
+
+    def save(self, folder: Path) -> None:
+        """Write the checkpoint and the averaged weights, each in one move."""
+        state = {
+            "plan": asdict(self.plan),
+            "config": asdict(self.network.config),
+            "network": self.network.state_dict(),
+            "average": self.average.state_dict(),
+            "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
+            "shown": self.shown,
+            "curve": self.curve,
+        }
+        torch.save(state, folder / f"{CHECKPOINT}.new")
+        (folder / f"{CHECKPOINT}.new").replace(folder / CHECKPOINT)
+        save_network(self.average, folder / f"{WEIGHTS}.new")
+        (folder / f"{WEIGHTS}.new").replace(folder / WEIGHTS)
+
+    @classmethod
+    def load(cls, folder: Path, plan: Plan) -> "Run":
+        """Return the run of a checkpoint; its plan holds, but for the number of samples."""
+        state = torch.load(folder / CHECKPOINT, weights_only=True)
+        run = cls(Plan(**{**state["plan"], "samples": plan.samples}), _config(state["config"]))
+        run.network.load_state_dict(state["network"])
+        run.average.load_state_dict(state["average"])
+        for optimizer, value in zip(run.optimizers, state["optimizers"], strict=True):
+            optimizer.load_state_dict(value)
+        run.shown, run.curve = state["shown"], state["curve"]
+        return run
+
+    def warm_start(self, checkpoint: Path) -> list[str]:
+        """Take the averaged weights of another run where names and shapes agree; return the names left out."""
+        other = torch.load(checkpoint, weights_only=True)["average"]
+        own = self.network.state_dict()
+        fitting = {name: value for name, value in other.items() if name in own and own[name].shape == value.shape}
+        for network in (self.network, self.average):
+            network.load_state_dict({**own, **fitting})
+        return sorted(set(own) - set(fitting))
+
+
+def make_optimizers(network: ShapePriorNetwork, plan: Plan) -> list[torch.optim.Optimizer]:
+    """Return Muon for the matrices and convolutions inside the network, and AdamW for everything else."""
+    ends = ("stem.", "places", "plane.", "head.")
+    named = [(name, value) for name, value in network.named_parameters() if value.ndim > 1]
+    outer = [value for name, value in named if name.startswith(ends)]
+    inner = [value for name, value in named if not name.startswith(ends)]
+    vectors = [value for value in network.parameters() if value.ndim <= 1]
+    groups = [{"params": outer, "weight_decay": plan.weight_decay}, {"params": vectors, "weight_decay": 0.0}]
+    adam = torch.optim.AdamW(groups, lr=plan.lr, betas=(0.9, 0.99), foreach=True)
+    return [Muon(inner, lr=plan.lr, weight_decay=plan.weight_decay), adam]
+
+
+def train(
+    run: Run, folder: Path, *, workers: int = 1, every: int = 16_000, save_s: float = 180.0,
+    console: Console | None = None, stop: Event | None = None,
+) -> None:  # fmt: skip
+    """Train until all samples were shown.
+
+    Args:
+        run: where it stands; changed.
+        folder: for checkpoint, weights and curves.
+        workers: processes that make shapes; 0 makes them here.
+        every: samples between two validations.
+        save_s: seconds between two checkpoints.
+        console: where progress is shown.
+        stop: when set, the run is saved after the step in hand and ends.
+    """
+    plan = run.plan
+    folder.mkdir(parents=True, exist_ok=True)
+    held_out = [make_batch(VALIDATION_SEED, number, plan.batch, 1024) for number in range(plan.held_out)]
+    left = (plan.samples - run.shown) // plan.batch
+    stream = batches(plan.seed, run.shown // plan.batch, left, plan.batch, plan.rays, workers)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    saved, begun, first, sums = time.monotonic(), time.monotonic(), run.shown, Means()
+    with Progress(*columns, console=console, disable=console is None or not console.is_terminal) as progress:
+        task = progress.add_task("samples", total=plan.samples, completed=run.shown)
+        for batch in stream:
+            sums.add(run.step(batch))
+            progress.update(task, completed=run.shown)
+            last, stopped = run.shown + plan.batch > plan.samples, stop is not None and stop.is_set()
+            if run.shown % every < plan.batch or last:
+                rate = (run.shown - first) / (time.monotonic() - begun)
+                run.curve.append(
+                    {"shown": run.shown, "rate": rate, **sums.take(), **validation_figures(run.average, held_out)}
+                )
+                _log.info("%s", json.dumps({name: round(value, 4) for name, value in run.curve[-1].items()}))
+                (folder / f"{CURVES}.json").write_text(json.dumps(run.curve, indent=1), encoding="utf-8")
+                draw_curves(run.curve).save(folder / f"{CURVES}.png")
+            if last or stopped or time.monotonic() - saved > save_s:
+                run.save(folder)
+                saved = time.monotonic()
+            if stopped:
+                break
+
+
+class Means:
+    """Running means of named numbers."""
+
+    def __init__(self) -> None:
+        self._sums: dict[str, float] = {}
+        self._count = 0
+
+    def add(self, values: dict[str, float]) -> None:
+        """Add one number per name."""
+        self._count += 1
+        for name, value in values.items():
+            self._sums[name] = self._sums.get(name, 0.0) + value
+
+    def take(self) -> dict[str, float]:
+        """Return the means since the last call."""
+        means = {f"train_{name}": value / max(1, self._count) for name, value in self._sums.items()}
+        self._sums, self._count = {}, 0
+        return means
+
+
+def keep_freed_memory() -> None:
+    """Have glibc reuse the memory of large tensors: returning it to the system costs a third of a step."""
+    if not sys.platform.startswith("linux"):
+        return
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        for option, value in ((M_MMAP_THRESHOLD, 1 << 30), (M_TRIM_THRESHOLD, (1 << 31) - 1), (M_TOP_PAD, 1 << 28)):
+            mallopt(option, value)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Train the shape prior, or go on where a run in the folder stopped."""
+    parser = argparse.ArgumentParser(prog="python -m training.shape_prior.train", description=main.__doc__)
+    parser.add_argument("folder", type=Path, help="checkpoint, weights and curves; a checkpoint in it is resumed")
+    for name, value in asdict(Plan()).items():
+        parser.add_argument(f"--{name.replace('_', '-')}", type=type(value), default=value)
+    parser.add_argument("--widths", type=int, nargs=4, default=ShapePriorConfig.widths)
+    parser.add_argument("--layers", type=int, default=ShapePriorConfig.layers)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=1, help="processes that make shapes")
+    parser.add_argument("--every", type=int, default=16_000, help="samples between two validations")
+    parser.add_argument("--warm-start", type=Path, help="checkpoint of another run to begin with")
+    given = parser.parse_args(arguments)
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", stream=sys.stderr)
+    keep_freed_memory()
+    torch.set_num_threads(given.threads)
+    plan = Plan(**{name: getattr(given, name) for name in asdict(Plan())})
+    given.folder.mkdir(parents=True, exist_ok=True)
+    if (given.folder / CHECKPOINT).exists():
+        run = Run.load(given.folder, plan)
+        _log.info("resumed at %d of %d samples", run.shown, plan.samples)
+    else:
+        run = Run(plan, ShapePriorConfig(widths=tuple(given.widths), layers=given.layers))
+        if given.warm_start:
+            _log.info("warm start; new: %s", run.warm_start(given.warm_start))
+    parameters = sum(value.numel() for value in run.network.parameters())
+    _log.info("%.2f million parameters, pid %d", parameters / 1e6, os.getpid())
+    stop = Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    train(run, given.folder, workers=given.workers, every=given.every, console=Console(stderr=True), stop=stop)
+
+
+def _config(state: dict[str, Any]) -> ShapePriorConfig:
+    return ShapePriorConfig(tuple(state["widths"]), tuple(state["blocks"]), state["layers"], state["head"])
+
+
+if __name__ == "__main__":
+    main()
