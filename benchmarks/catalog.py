@@ -34,7 +34,7 @@ from benchmarks.measure import machine, new_console, parser_of, write_rows
 from benchmarks.postgresql import Database, free_port
 from flows import home
 from flows.catalog import convert_all
-from flows.commands.batch import ready
+from flows.catalog_request import ready
 from flows.engine.step_tasks import finished_steps, flow_settings, steps_of_flow
 from flows.inputs.manifest import Item, items_of
 from flows.inputs.orders import Order

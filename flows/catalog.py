@@ -16,8 +16,8 @@ from prefect.settings import temporary_settings
 from prefect.task_runners import TaskRunner
 
 from flows import home
-from flows.commands.batch import CatalogRequest, ready
-from flows.commands.make import make, save_pictures
+from flows.catalog_request import CatalogRequest, ready
+from flows.convert import make, save_pictures
 from flows.engine.executors import stop_all
 from flows.engine.item_runs import failure, item_deployment
 from flows.engine.orphans import claim_run

@@ -145,7 +145,7 @@ def motions(
     with clear_ending():
         from flows import home
         from flows.commands import terminal
-        from flows.commands.make import make_motions
+        from flows.convert import make_motions
         from flows.inputs.manifest import parse_changes
         from flows.inputs.naming import clean
         from flows.inputs.orders import Wish
@@ -234,9 +234,10 @@ def batch(
     """
     with clear_ending():
         os.environ.update({name: str(n) for name, n in {"DG4D_GPUS": gpus, "DG4D_CPUS": cpus}.items() if n is not None})
+        from flows.catalog_request import CatalogRequest, default_workers
         from flows.commands import terminal
-        from flows.commands.batch import CatalogRequest, default_workers, tell
         from flows.commands.batch import batch as make_all
+        from flows.commands.batch import tell
         from flows.inputs.manifest import parse_changes
 
         console = terminal.console()
@@ -337,7 +338,7 @@ def main() -> None:
 def _made(order: "Order", folder: Path, console: "Console") -> dict[str, dict[str, int]]:
     """Run the flow of an order with its steps on the terminal; the files of the package."""
     from flows.commands import terminal
-    from flows.commands.make import make
+    from flows.convert import make
 
     files, cached = terminal.with_steps(order, console, lambda: make(order, folder))
     if cached:

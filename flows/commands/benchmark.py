@@ -69,7 +69,7 @@ def score(
     record = whole(package)
     if out is not None:
         check_writable(out.parent)
-    from flows.commands.make import connect
+    from flows.convert import connect
 
     connect()
     from flows.judge import Entry, judge
@@ -144,7 +144,7 @@ def bench(
     for wish in wishes:
         wish.check()
         check_folder(out / ASSETS / wish.item)
-    from flows.commands.make import connect
+    from flows.convert import connect
 
     connect()
     rows = _converted([wish.order(home.store()) for wish in wishes], out / ASSETS, workers, console, dataset.name)

@@ -42,7 +42,7 @@ def up(
     with clear_ending():
         from dg4d_lib.errors import BadInput
         from dg4d_lib.rasterizer.choice import cuda_devices
-        from flows.commands.make import connect
+        from flows.convert import connect
         from flows.serving import roots
         from flows.serving.pools import read_pools
         from flows.serving.workers import Worker, limit
@@ -112,7 +112,7 @@ def watch(
 ) -> None:
     """Have the deployment "Catalog to 4D" convert what is dropped into a folder; goes on until it is stopped."""
     with clear_ending():
-        from flows.commands.make import connect
+        from flows.convert import connect
         from flows.packages.publish import check_writable
         from steps.contract import digest_of
 

@@ -46,7 +46,7 @@ class _Terminal(Console):
 
 def with_steps(order: "Order", out: Console, work: Callable[[], Result]) -> Result:
     """What `work` gives, which runs a flow of this order, with its steps on the terminal."""
-    from flows.commands.make import connect, prepare, save_pictures
+    from flows.convert import connect, prepare, save_pictures
     from flows.step_errors import StepBadInput
 
     with out.status("starting") if out.is_terminal else nullcontext():

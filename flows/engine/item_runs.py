@@ -78,7 +78,7 @@ class ItemDeployment(NamedTuple):
     poll_s: float = POLL_S
 
     def make(self, order: Order, folder: Path) -> tuple[Files, bool]:
-        """Have a worker make an order, and put the package into `folder`, as `flows.commands.make.make` does here.
+        """Have a worker make an order, and put the package into `folder`, as `flows.convert.make` does here.
 
         Raises:
             ItemFailed: the worker could not make it, or died.

@@ -65,5 +65,5 @@ def log(place: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def dg4d(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     """The command in this process, which is connected already."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("flows.commands.make.connect", lambda: None)
+    monkeypatch.setattr("flows.convert.connect", lambda: None)
     return lambda *arguments: CliRunner().invoke(cli.app, arguments)

@@ -12,7 +12,7 @@ from waiting import start, wait_until
 
 from flows import home
 from flows.catalog import convert_all
-from flows.commands.make import make, make_motions, save_pictures
+from flows.convert import make, make_motions, save_pictures
 from flows.engine.events import StepEvent, listening
 from flows.engine.orphans import settle_orphans
 from flows.inputs.orders import Wish

@@ -13,7 +13,7 @@ from signing import identity
 from waiting import retry_after
 
 from flows import home
-from flows.commands.make import make
+from flows.convert import make
 from flows.inputs.orders import Wish
 from flows.serving.auth import basic
 from flows.serving.server import Server

@@ -14,7 +14,7 @@ from prefect.client.orchestration import get_client
 from waiting import wait_until
 
 from flows import home
-from flows.commands.make import make
+from flows.convert import make
 from flows.engine import executors
 from flows.engine.events import StepEvent, listening
 from flows.inputs.orders import Wish

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from flows.commands.batch import ready
+from flows.catalog_request import ready
 from flows.inputs.manifest import Item
 from flows.inputs.orders import Order, Wish
 from flows.packages.summary import Row

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dg4d_lib.errors import DG4DError
-from flows.commands.batch import ready
+from flows.catalog_request import ready
 from flows.inputs.manifest import Item, items_of
 from flows.inputs.orders import Order
 from flows.packages.summary import Row

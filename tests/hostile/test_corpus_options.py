@@ -22,7 +22,7 @@ def no_work(furnished: Place, monkeypatch: pytest.MonkeyPatch) -> Place:
     def begin(*_: object, **__: object) -> None:
         raise WorkBegins
 
-    monkeypatch.setattr("flows.commands.make.connect", begin)
+    monkeypatch.setattr("flows.convert.connect", begin)
     monkeypatch.setenv("DG4D_CODE_VERSION", "test")  # quicker than reading the source
     return furnished
 

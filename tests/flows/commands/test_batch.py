@@ -22,8 +22,9 @@ from waiting import wait_until
 
 from flows import home
 from flows.catalog import convert_all
+from flows.catalog_request import CatalogRequest, ready
 from flows.commands import batch as module
-from flows.commands.batch import CatalogRequest, batch, ready, tell
+from flows.commands.batch import batch, tell
 from flows.engine import resources
 from flows.inputs.manifest import items_of
 from flows.inputs.orders import Order, Wish

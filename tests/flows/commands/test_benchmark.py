@@ -34,7 +34,7 @@ def place(server: Server, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
         patch.setenv("DG4D_CODE_VERSION", "test")
         patch.setenv("DG4D_EXECUTOR", "in_process")
         retry_after(0.01, patch)
-        patch.setattr("flows.commands.make.connect", lambda: None)  # this process is connected already
+        patch.setattr("flows.convert.connect", lambda: None)  # this process is connected already
         yield
 
 

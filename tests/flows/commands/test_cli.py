@@ -26,7 +26,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     def no_server(*_: object) -> None:
         pytest.fail("bad input must be refused before a server is started")
 
-    monkeypatch.setattr("flows.commands.make.connect", no_server)
+    monkeypatch.setattr("flows.convert.connect", no_server)
     return tmp_path
 
 

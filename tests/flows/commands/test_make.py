@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from flows import home
-from flows.commands.make import prepare
+from flows.convert import prepare
 from flows.engine import executors
 from flows.engine.versions import has_version, keep_version
 from flows.inputs.orders import Wish

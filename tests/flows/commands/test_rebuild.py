@@ -15,8 +15,8 @@ from waiting import retry_after
 
 from dg4d_lib.errors import BadInput
 from flows import home
-from flows.commands.make import make
 from flows.commands.rebuild import Rebuilt, rebuild
+from flows.convert import make
 from flows.inputs.orders import Order, Wish, order_again
 from flows.inputs.package_record import record_of
 from flows.packages.verify import verify

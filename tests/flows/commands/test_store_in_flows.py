@@ -13,7 +13,7 @@ from tiny_s3 import BUCKET, TinyS3
 from waiting import retry_after
 
 from flows import home
-from flows.commands.make import make
+from flows.convert import make
 from flows.engine.collecting import collect
 from flows.engine.versions import Version, faults, versions
 from flows.inputs.orders import Order, Wish

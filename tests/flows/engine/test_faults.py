@@ -21,8 +21,9 @@ from waiting import retry_after, start, wait_until
 
 from dg4d_lib.errors import BadInput
 from flows import home
-from flows.commands.batch import CatalogRequest, batch
-from flows.commands.make import make
+from flows.catalog_request import CatalogRequest
+from flows.commands.batch import batch
+from flows.convert import make
 from flows.engine import leases
 from flows.engine.collecting import collect
 from flows.engine.orphans import settle_orphans

@@ -7,7 +7,7 @@ import pytest
 from fake_steps import picture
 
 from flows import home
-from flows.commands.make import make
+from flows.convert import make
 from flows.engine.caching import record_key
 from flows.engine.shared_results import fetch_result, sharing_results
 from flows.inputs.orders import Order, Wish

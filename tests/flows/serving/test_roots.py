@@ -17,8 +17,8 @@ from waiting import wait_until
 
 from dg4d_lib.errors import BadInput
 from flows import home
+from flows.deployments import Options, PictureOptions
 from flows.serving import deployments, roots
-from flows.serving.deployments import Options, PictureOptions
 from flows.serving.roots import OUTPUTS, SOURCES, Roots, granted
 
 SECRET = "root:x:0:0:root:/root:/bin/bash\n"
@@ -36,7 +36,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     def no_server(*_: object) -> None:
         pytest.fail("a server is asked for what must be refused before")
 
-    for module in ("flows.serving.deployments.connect", "flows.commands.make.connect"):
+    for module in ("flows.deployments.connect", "flows.convert.connect"):
         monkeypatch.setattr(module, no_server)
     for folder in ("in", "in2", "away"):
         (tmp_path / folder).mkdir()
@@ -307,7 +307,7 @@ def test_what_a_killed_watcher_granted_ends_with_it(place: Path) -> None:
 
 
 def test_the_command_grants_what_it_watches(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flows.commands.make.connect", lambda: None)
+    monkeypatch.setattr("flows.convert.connect", lambda: None)
     seen: list[Roots] = []
 
     def look(*_: object) -> None:

@@ -20,7 +20,7 @@ from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL
 from waiting import retry_after, wait_until
 
 from flows import home
-from flows.commands.make import make
+from flows.convert import make
 from flows.formatting import curves, pages
 from flows.inputs.orders import Order, Wish
 from flows.serving.auth import basic

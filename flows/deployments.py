@@ -18,11 +18,12 @@ from pydantic import ConfigDict, Field
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.settings import Motion
 from flows import home
-from flows.commands.batch import CatalogRequest, batch, tell
+from flows.catalog_request import CatalogRequest
+from flows.commands.batch import batch, tell
 from flows.commands.benchmark import bench
-from flows.commands.make import connect, make
 from flows.commands.options import knobs_of
 from flows.commands.terminal import console
+from flows.convert import connect, make
 from flows.engine.item_runs import FLOW, failure, read_order
 from flows.engine.orphans import claim_run
 from flows.engine.shared_results import sharing_results
