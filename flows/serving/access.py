@@ -21,9 +21,10 @@ SESSION = "/dg4d/session"
 READING = frozenset(["GET", "HEAD", "OPTIONS"])
 OWN_SITES = frozenset(["same-origin", "none"])  # Sec-Fetch-Site of our own pages, and of a typed address
 HEADERS = {
-    # Prefect's pages load nothing from elsewhere (they would report what is clicked), nor do pictures in artifacts
+    # Prefect's pages load nothing from elsewhere (they would report what is clicked), nor do pictures in artifacts;
+    # without 'unsafe-eval' the drawing library of their run graph draws nothing
     "Content-Security-Policy": (
-        "default-src 'self'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'; style-src 'self' 'unsafe-inline'; "
+        "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
         "img-src 'self' data: blob:; font-src 'self' data:; worker-src 'self' blob:; object-src 'none'; "
         "base-uri 'self'; form-action 'self'; frame-ancestors 'none'"
     ),

@@ -29,6 +29,8 @@ ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "deploy" / "images"
 DOCKERFILES = sorted(IMAGES.glob("*.Dockerfile"))
 COMMAND_ONLY = {
+    "filelock",
+    "jinja2",
     "fastapi",
     "httpx",
     "prefect",

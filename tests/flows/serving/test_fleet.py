@@ -9,12 +9,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from conversions import EVERY_STEP
 from fake_steps import picture
+from prefect.client.orchestration import get_client
+from prefect.client.schemas.filters import FlowFilter, FlowFilterName
 from prefect.settings import PREFECT_API_URL
 from tiny_s3 import TinyS3
 from waiting import wait_until
 
 from benchmarks.fleet import POOL, Machine
+from flows.engine.item_runs import FLOW
 from flows.engine.orphans import settle_orphans
 from flows.packages.publish import whole
 from flows.serving import registering
@@ -23,10 +27,6 @@ from flows.serving.server import Server
 from flows.serving.workers import environment
 
 ITEMS = 9
-STEPS = [
-    "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "extract_mesh", "refine_texture", "pack_asset",
-    "check_asset",
-]  # fmt: skip
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def shared(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
         **environment(api_url),
         **objects.environment,
         "DG4D_STORE": "s3://bucket/store",
-        "DG4D_CATALOG": "fake_steps:STEPS",
+        "DG4D_CATALOG": "fake_steps:EVERY_STEP",
         "DG4D_CODE_VERSION": tmp_path.name,
         "DG4D_EXECUTOR": "in_process",
         "DG4D_CPUS": "2",
@@ -54,7 +54,7 @@ def shared(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
 def begin(folder: Path, shared: dict[str, str]) -> "subprocess.Popen[str]":
     """Begin the command, on a machine without a worker."""
     own = {"DG4D_HOME": str(folder / "home"), "DG4D_HOST_ID": "catalog", "FAKE_LOG": str(folder / "none")}
-    inputs = [str(folder / "in"), "-o", str(folder / "out"), "--where", f"deployment:{POOL}", "--workers", "5"]
+    inputs = [str(folder / "in"), "-o", str(folder / "out"), "--where", f"deployment:{POOL}", "--workers", str(ITEMS)]
     return subprocess.Popen(
         [sys.executable, "-m", "flows.cli", "batch", *inputs],
         env={**shared, **own},
@@ -68,6 +68,13 @@ def finished(machines: list[Machine]) -> Counter[str]:
     return Counter(step for machine in machines for step in machine.steps)
 
 
+def item_runs() -> int:
+    """Return the number of items that were begun."""
+    with get_client(sync_client=True) as client:
+        runs = client.read_flow_runs(flow_filter=FlowFilter(name=FlowFilterName(any_=[FLOW])))
+    return len(runs)
+
+
 @pytest.mark.slow
 def test_machines_share_a_catalog_and_a_machine_and_a_catalog_that_are_killed_cost_no_item_and_no_step(
     shared: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -79,7 +86,7 @@ def test_machines_share_a_catalog_and_a_machine_and_a_catalog_that_are_killed_co
     machines = [Machine(name, tmp_path / name, shared) for name in ("one", "two", "three")]
     command = begin(tmp_path, shared)
     try:
-        wait_until(lambda: finished(machines).total() > len(STEPS))
+        wait_until(lambda: item_runs() == ITEMS and finished(machines).total() > len(EVERY_STEP))
         command.kill()  # what it asked for goes on
         command.communicate()
         wait_until(machines[2].sleeps)
@@ -93,7 +100,7 @@ def test_machines_share_a_catalog_and_a_machine_and_a_catalog_that_are_killed_co
         for machine in machines:
             machine.stop()
     assert command.returncode == 0, said
-    assert finished(machines) == {f"{step}:{i}": 1 for step in STEPS for i in range(ITEMS)}
+    assert finished(machines) == {f"{step}:{i}": 1 for step in EVERY_STEP for i in range(ITEMS)}
     for i in range(ITEMS):
         whole(tmp_path / "out" / str(i))
     rows = {row["item"]: row for row in json.loads((tmp_path / "out" / "summary.json").read_text())["items"]}
