@@ -13,21 +13,22 @@ if TYPE_CHECKING:
 
 weights = typer.Typer(
     name="weights",
-    help="Trained weights: what there is, what it costs, what its license allows.",
+    help="List, download and verify pretrained weights.",
     no_args_is_help=True,
 )
 
 NOT_COMPARED = "there is nothing to compare it with"
-Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="a name of the list, or an id of the hub")]
+Names = Annotated[
+    list[str],
+    typer.Argument(metavar="NAME...", help="a name from `dg4d weights list`, or an id of the Hugging Face hub"),
+]
 
 
 @weights.command("list")
 def show(
-    files: Annotated[
-        bool, typer.Option("--files", help="and every file that was pulled, or will be if known: sha256, bytes, name")
-    ] = False,
+    files: Annotated[bool, typer.Option("--files", help="also list every file: SHA-256, bytes, name")] = False,
 ) -> None:
-    """Show all weights that profiles name, and those that were pulled besides: license, size, whether they are here."""
+    """List known and pulled weights with license, size and state."""
     with clear_ending():
         from rich.table import Column, Table
 
@@ -53,7 +54,10 @@ def show(
 
 @weights.command()
 def pull(names: Names) -> None:
-    """Download weights, and write down revision and digests of what came; what is here already is left alone."""
+    """Download weights and record their revision and digests.
+
+    Weights that are present are skipped.
+    """
     with clear_ending():
         from dg4d_lib.errors import BadInput
         from dg4d_lib.weights.locate import given_folder
@@ -72,9 +76,9 @@ def pull(names: Names) -> None:
 
 @weights.command()
 def check(
-    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="default: all here")] = None,
+    names: Annotated[list[str] | None, typer.Argument(metavar="NAME...", help="default: all that are present")] = None,
 ) -> None:
-    """Read every file again and compare it with what was pulled, else with what is known to be published."""
+    """Verify every file against recorded or published digests."""
     with clear_ending():
         from dg4d_lib.errors import BackendUnavailable
         from dg4d_lib.weights.locate import find_weights, troubles, unpublished
