@@ -243,7 +243,7 @@ def require_schedule(model: Path, expected: BetaSchedule) -> None:
 def missing_packages(error: ImportError) -> BackendUnavailable:
     """What to raise where diffusers or transformers cannot be imported."""
     return BackendUnavailable(
-        f"diffusion models need packages that are not here ({error}): pip install 'dg4d[diffusion]'"
+        f"diffusion models need packages that are not installed ({error}); run `make setup CUDA=1`"
     )
 
 

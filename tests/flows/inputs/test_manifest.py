@@ -255,7 +255,7 @@ def test_without_pyarrow_a_parquet_manifest_says_what_to_install(
 ) -> None:
     (tmp_path / "m.parquet").write_bytes(b"PAR1")
     monkeypatch.setattr("flows.inputs.rows.find_spec", lambda name: None)
-    with pytest.raises(BackendUnavailable, match=re.escape("pip install 'dg4d[parquet]'")):
+    with pytest.raises(BackendUnavailable, match="run `make setup`"):
         items(tmp_path / "m.parquet")
 
 
