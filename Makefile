@@ -40,6 +40,7 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
+	$(BIN)/python -m pytest -q -n 0 tests/architecture/test_readme.py
 
 $(TOOLS)/.ready: deploy/locks/tools.txt deploy/install.sh
 	$(PYTHON) -m venv $(TOOLS) && VENV=$(TOOLS) timeout 300 bash deploy/install.sh tools
@@ -62,7 +63,7 @@ $(DOCS)/.ready: deploy/locks/docs.txt deploy/install.sh
 docs: setup $(DOCS)/.ready
 	$(BIN)/python docs/generate.py
 	$(BIN)/python docs/assemble.py out/pages
-	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict --quiet --config-file docs/mkdocs.yml
+	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict --config-file docs/mkdocs.yml
 
 # the tests marked gpu on an emulated one, with gsplat's own kernels; ARITHMETIC=noise rounds as badly as CUDA may
 emulation: setup

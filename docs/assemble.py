@@ -27,6 +27,7 @@ def main(target: Path) -> None:
         place = target / ("index.md" if page == "README.md" else page)
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_text(_converted(page, target), encoding="utf-8")
+    shutil.copyfile(ROOT / "docs" / "site.css", target / "docs" / "site.css")
 
 
 def _converted(page: str, target: Path) -> str:

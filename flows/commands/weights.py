@@ -1,5 +1,6 @@
 """`dg4d weights`: which weights there are, getting them, checking them."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -30,23 +31,20 @@ def show(
 ) -> None:
     """List known and pulled weights with license, size and state."""
     with clear_ending():
-        from rich.table import Column, Table
-
         from dg4d_lib.weights.lock import read_lock
-        from flows.commands import terminal
+        from flows.ui.escaping import visible
         from steps.runtime.weights import weights_home
 
-        about = Column("license, purpose, id of the hub", overflow="fold")
-        table = Table("name", "here", "GB", "revision", "commercial", about, box=None, pad_edge=False)
         locks = read_lock(weights_home())
-        for one in _all_of_them():
-            table.add_row(*_row(one, locks.get(one.name)))
-            table.add_row("", "", "", "", "", one.purpose, style="dim")
-            table.add_row("", "", "", "", "", one.hub_id, style="dim", end_section=True)
-        out = terminal.console()
-        out.print(table)
-        out.print(f"kept in {weights_home()}; a setting may name a folder instead", markup=False)
-        out.print("revision and digests are written down by the first pull, and compared from then on")
+        rows = [(one, _row(one, locks.get(one.name))) for one in _all_of_them()]
+        width = max(len(one.name) for one, _ in rows)
+        typer.echo(_columns(("name", "here", "GB", "revision", "commercial"), width))
+        for one, (*columns, license_text) in rows:
+            typer.echo(_columns(columns, width))
+            for text in (license_text, one.purpose, one.hub_id):  # below the row, so that no name is broken
+                typer.echo(f"    {visible(text)}")
+        typer.echo(f"folder: {weights_home()}; a setting may name another folder instead")
+        typer.echo("the first pull records revision and digests; later uses are compared with them")
         for one in _all_of_them() if files else ():
             for path, sha256, size in _files_of(one, locks.get(one.name)):
                 typer.echo(f"{sha256}  {size:>12}  {one.name}/{path}")
@@ -130,6 +128,12 @@ def _place(one: "Weights") -> Path | None:
 
     folder = weights_home() / folder_name(one)
     return folder if folder.exists() else in_hub_cache(one)
+
+
+def _columns(texts: Sequence[str], width: int) -> str:
+    """Return a line of the list; names have `width` letters."""
+    name, here, size, revision, commercial = texts
+    return f"{name:<{width}}  {here:<7}  {size:<5}  {revision:<10}  {commercial}".rstrip()
 
 
 def _row(one: "Weights", locked: "Locked | None") -> list[str]:
