@@ -1,32 +1,37 @@
-# Two commands: `make demo` and `make test`. Both set the project up first.
+# `make demo` and `make test` set the project up first. `make setup CUDA=1` installs for an NVIDIA GPU.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# CUDA=1 installs torch for CUDA, gsplat and the diffusion models. An environment keeps its build; CUDA=0 returns to the CPU.
+CUDA ?= $(if $(wildcard $(VENV)/.ready-cuda),1,0)
+READY := $(VENV)/.ready$(if $(filter 1,$(CUDA)),-cuda)
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 ARITHMETIC ?= fast
 EMULATION := $(BIN)/python -m tests.emulation.build --arithmetic $(ARITHMETIC)
 GPU_TESTS := $(BIN)/python -m pytest -p tests.emulation.plugin --arithmetic $(ARITHMETIC) -m gpu
 
 TOOLS := out/tools
+DOCS := out/docs
 SHAPE_PRIOR ?=
 UPGRADE ?=
 
-.PHONY: setup clients demo test check audit lock emulation examples shape-prior clean
+.PHONY: setup clients demo test check audit lock docs emulation examples shape-prior clean
 
-setup: $(VENV)/.ready
+setup: $(READY)
 
-$(VENV)/.ready: pyproject.toml deploy/setup.sh deploy/install.sh $(wildcard deploy/locks/*.txt)
-	PYTHON="$(PYTHON)" VENV="$(VENV)" TORCH_INDEX="$(TORCH_INDEX)" bash deploy/setup.sh
+$(READY): pyproject.toml deploy/setup.sh deploy/install.sh $(wildcard deploy/locks/*.txt)
+	PYTHON="$(PYTHON)" VENV="$(VENV)" TORCH_INDEX="$(TORCH_INDEX)" CUDA="$(CUDA)" bash deploy/setup.sh
+	rm -f $(VENV)/.ready $(VENV)/.ready-cuda
 	touch $@
 
 demo: setup
 	$(BIN)/dg4d make examples/newt.png -o out/demo
 
-# other people's readers of our files, for tests; without node or Chromium those tests are skipped, with the reason
+# Third-party readers of our files, for tests. Without Node.js or Chromium these tests are skipped with the reason.
 clients: setup
 	bash deploy/clients.sh
 
-# weaknesses become known without a change of ours: they are told, and hold nothing back
+# Audit findings are reported but do not fail the build: they appear without a change of ours.
 test: setup clients check
 	-$(MAKE) --no-print-directory audit
 	$(BIN)/python -m pytest -n 2 --dist loadscope --jaxtyping-packages=dg4d_lib,beartype.beartype\(conf=beartype.BeartypeConf\(is_pep484_tower=True\)\)
@@ -36,6 +41,7 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
+	$(BIN)/python -m pytest -q -n 0 tests/architecture/test_readme.py
 
 $(TOOLS)/.ready: deploy/locks/tools.txt deploy/install.sh
 	$(PYTHON) -m venv $(TOOLS) && VENV=$(TOOLS) timeout 300 bash deploy/install.sh tools
@@ -43,12 +49,22 @@ $(TOOLS)/.ready: deploy/locks/tools.txt deploy/install.sh
 
 # torch.txt names a build that the package index does not know; cuda.txt has the same version
 audit: setup $(TOOLS)/.ready
-	timeout 300 $(TOOLS)/bin/pip-audit $(foreach lock,steps flows cuda dev meshopt tools,-r deploy/locks/$(lock).txt) \
+	timeout 300 $(TOOLS)/bin/pip-audit $(foreach lock,steps flows cuda dev meshopt tools docs,-r deploy/locks/$(lock).txt) \
 		--no-deps --disable-pip -f json --progress-spinner off | $(BIN)/python deploy/audit.py
 
 # Resolve pyproject.toml into deploy/locks. Versions stay unless UPGRADE="--upgrade" or "--upgrade-package NAME".
 lock: $(TOOLS)/.ready
 	TORCH_INDEX="$(TORCH_INDEX)" $(TOOLS)/bin/python deploy/lock.py $(UPGRADE)
+
+$(DOCS)/.ready: deploy/locks/docs.txt deploy/install.sh
+	$(PYTHON) -m venv $(DOCS) && VENV=$(DOCS) timeout 600 bash deploy/install.sh docs
+	touch $@
+
+# Write the pages that come from the program, then the site into out/site. Warnings and broken links are errors.
+docs: setup $(DOCS)/.ready
+	$(BIN)/python docs/generate.py
+	$(BIN)/python docs/assemble.py out/pages
+	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict --config-file docs/mkdocs.yml
 
 # the tests marked gpu on an emulated one, with gsplat's own kernels; ARITHMETIC=noise rounds as badly as CUDA may
 emulation: setup

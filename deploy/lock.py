@@ -56,6 +56,7 @@ def main(options: list[str]) -> None:
     }.items():
         write(name, {package: every[package] for package in packages})
     write("tools", resolve("tools", TOOLS, ("tools",), options))
+    write("docs", resolve("docs", project["dependency-groups"]["docs"], ("docs",), options))
     write_torch(every["torch"].split()[0].removeprefix("torch=="))
 
 

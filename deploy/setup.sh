@@ -1,8 +1,9 @@
 #!/usr/bin/env bash
-# Makes the virtual environment: locked packages, the CPU build of torch, the `dg4d` command, a new database for Prefect,
-# and the two system libraries that pymeshlab needs.
+# Creates the virtual environment: locked packages, the `dg4d` command, a new database for Prefect, and the two system
+# libraries that pymeshlab needs. CUDA=1 installs torch for CUDA, gsplat and the diffusion models instead of torch's CPU
+# build.
 set -euo pipefail
-: "${PYTHON:=python3}" "${VENV:=.venv}" "${TORCH_INDEX=https://download.pytorch.org/whl/cpu}"
+: "${PYTHON:=python3}" "${VENV:=.venv}" "${TORCH_INDEX=https://download.pytorch.org/whl/cpu}" "${CUDA:=0}"
 
 "$PYTHON" - <<'PY' || exit 1
 import sys
@@ -12,7 +13,16 @@ PY
 [ -x "$VENV/bin/python" ] || "$PYTHON" -m venv "$VENV" || {
     echo "Could not make a virtual environment. On Debian: apt-get install python3-venv" >&2; exit 1; }
 export VENV TORCH_INDEX
-bash deploy/install.sh torch steps flows dev
+if [ "$CUDA" = 1 ]; then
+    # pip takes torch 2.x+cpu for torch 2.x and would keep it
+    if "$VENV/bin/python" -c 'import importlib.metadata as m, sys; sys.exit(not m.version("torch").endswith("+cpu"))' 2>/dev/null
+    then
+        "$VENV/bin/python" -m pip --disable-pip-version-check uninstall --quiet --yes torch
+    fi
+    bash deploy/install.sh cuda steps flows dev
+else
+    bash deploy/install.sh torch steps flows dev
+fi
 "$VENV/bin/python" -m pip --disable-pip-version-check install --quiet --no-deps --no-build-isolation --editable .
 "$VENV/bin/python" -m flows.serving.database_template
 
@@ -25,4 +35,12 @@ if [ "$(filters)" -lt 281 ]; then
     [ "$(filters)" -ge 281 ] || {
         echo "pymeshlab cannot load its filters: the system libraries libGL.so.1 and libOpenGL.so.0 are missing." >&2
         echo "On Debian or Ubuntu: sudo apt-get install libgl1 libopengl0" >&2; exit 1; }
+fi
+
+if [ "$CUDA" = 1 ]; then
+    lacks=$("$VENV/bin/python" -c 'from dg4d_lib.rasterizer.choice import what_gsplat_lacks; print(what_gsplat_lacks())')
+    [ -z "$lacks" ] || echo "The GPU cannot be used yet: $lacks" >&2
+    command -v nvcc >/dev/null || [ -x "${CUDA_HOME:-/usr/local/cuda}/bin/nvcc" ] || {
+        echo "gsplat compiles its kernels at first use and needs nvcc (CUDA toolkit 13.0) and g++." >&2
+        echo "Neither the PATH nor \$CUDA_HOME has nvcc: https://developer.nvidia.com/cuda-downloads" >&2; }
 fi

@@ -262,22 +262,26 @@ class FitSettings(Settings):
 
     iterations: int
     views: int
-    resolution_schedule: tuple[ResolutionStage, ...] = Field(RESOLUTION_SCHEDULE, min_length=1)
+    resolution_schedule: tuple[ResolutionStage, ...] = Field(
+        RESOLUTION_SCHEDULE, min_length=1, description="pixels of guidance renders by progress of the optimization"
+    )
     reference_size: int = Field(256, ge=32, le=1024, description="pixels of the reference view")
     elevation_deg: float = Field(30.0, ge=0, le=80, description="random views lie within plus and minus this")
     color_weight: NotNegative = Field(10000.0, description="reference view, times progress, mean squared error")
     alpha_weight: NotNegative = Field(1000.0, description="reference view, times progress, mean squared error")
     ssim_weight: NotNegative = Field(0.0, description="reference view, times progress, 1 - SSIM; not in the paper")
-    guidance_weight: NotNegative = 1.0
+    guidance_weight: NotNegative = Field(1.0, description="weight of the prior's loss")
     t_max_start: float = Field(gt=0.02, le=1, description="T_max at the start of the annealing")
     t_max_end: Share = Field(0.02, description="and at its end (paper; the public code goes from 1 to 0, cut at 0.02)")
-    noise_draw: NoiseDraw = "annealed"
+    noise_draw: NoiseDraw = Field(
+        "annealed", description="timestep of an iteration; annealed: T_max itself; uniform: drawn below it"
+    )
     means_lr: Positive
     means_lr_end: Positive
-    color_lr: Positive = 0.01
-    opacity_lr: Positive = 0.05
-    scale_lr: Positive = 0.005
-    rotation_lr: Positive = 0.005
+    color_lr: Positive = Field(0.01, description="learning rate of the colors")
+    opacity_lr: Positive = Field(0.05, description="learning rate of the opacity logits")
+    scale_lr: Positive = Field(0.005, description="learning rate of the log scales")
+    rotation_lr: Positive = Field(0.005, description="learning rate of the quaternions")
 
 
 class StaticSettings(FitSettings):
@@ -294,7 +298,7 @@ class StaticSettings(FitSettings):
     means_lr_end: Positive = Field(0.0002, description="and at the end, log-linear")
     densify_every: int = Field(100, ge=1, description="iterations between density controls (DreamGaussianHD: 100)")
     densify_gradient: Positive = Field(0.05, description="mean NDC gradient above which a Gaussian grows")
-    prune_opacity: float = Field(0.01, gt=0, lt=1)
+    prune_opacity: float = Field(0.01, gt=0, lt=1, description="Gaussians with a lower opacity are removed")
     prune_scale: Positive = Field(0.05, description="world units; larger ones are removed after a split")
     max_points: int = Field(100000, ge=16, description="growth stops here")
 
@@ -311,8 +315,8 @@ class HexPlaneSettings(Settings):
     kind: Literal["hexplane"] = "hexplane"
     spatial: int = Field(32, ge=2, le=512, description="cells of a spatial axis")
     temporal: int = Field(32, ge=2, le=512, description="cells of the time axis")
-    features: int = Field(32, ge=1, le=128)
-    hidden: int = Field(64, ge=1, le=512)
+    features: int = Field(32, ge=1, le=128, description="channels of a plane")
+    hidden: int = Field(64, ge=1, le=512, description="hidden units of the network")
     half_side: NotNegative = Field(
         0.0,
         description="of the box that the planes cover around the origin, world units (public code: 1.6); "
@@ -334,8 +338,8 @@ class MlpSettings(Settings):
     """Ablation: positional encoding of place and time, one network."""
 
     kind: Literal["mlp"] = "mlp"
-    frequencies: int = Field(6, ge=1, le=16)
-    hidden: int = Field(64, ge=1, le=512)
+    frequencies: int = Field(6, ge=1, le=16, description="of the positional encoding")
+    hidden: int = Field(64, ge=1, le=512, description="hidden units of the network")
     endpoint: Endpoint = True
 
 
@@ -356,7 +360,7 @@ DeformationSettings = Annotated[HexPlaneSettings | MlpSettings | FramewiseSettin
 class MotionSettings(FitSettings):
     """The dynamic stage."""
 
-    iterations: int = Field(200, ge=1, le=20000)
+    iterations: int = Field(200, ge=1, le=20000, description="of the motion fit (paper: 200)")
     views: int = Field(4, ge=0, le=64, description="random views per frame and iteration (paper: 4, fast: 1)")
     frames_per_iteration: int = Field(
         0, ge=0, le=512, description="frames drawn at random per iteration; 0 is all of them"
@@ -399,7 +403,7 @@ class IdentitySettings(Settings):
 class TextureSettings(Settings):
     """A texture follows better pictures (paper section 3.4)."""
 
-    iterations: int = Field(50, ge=1, le=2000)
+    iterations: int = Field(50, ge=1, le=2000, description="of texture refinement (paper: 50)")
     lr: Positive = Field(0.2, description="Adam's learning rate of the logits of the colors")
     size: int = Field(512, ge=64, le=1024, multiple_of=64, description="pixels of the pictures")
     min_cosine: Share = Field(0.5, description="the reference view says nothing where the surface is flatter")

@@ -1,8 +1,8 @@
-"""The `dg4d` command: the only place that sees a user's paths.
+"""The `dg4d` command line, the only module that receives paths from users.
 
-Exit status: 0 done · 1 an item of a batch failed, or something broke · 2 wrong usage · 65 bad input, or no room ·
-69 something needed is missing · 130 interrupted, 129 by SIGHUP, 143 by SIGTERM.
-Only what a command needs is imported, when it needs it.
+Exit codes: 0 done · 1 an item of a batch failed, or an internal error · 2 wrong usage · 65 bad input, or no space ·
+69 a library or server is missing · 130 interrupted, 129 by SIGHUP, 143 by SIGTERM.
+Commands import their modules when they run, so that `--help` and completion are fast.
 """
 
 import io
@@ -19,6 +19,7 @@ from flows.commands.checking import bench, rebuild, score, verify
 from flows.commands.endings import clear_ending
 from flows.commands.options import Changes, Commercial, Profile, Rate, Seed, Texture, Triangles, finite, knobs_of
 from flows.commands.services import down, env, up, watch
+from flows.commands.settings import settings as list_settings
 from flows.commands.store import store
 from flows.commands.weights import weights
 
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 app = typer.Typer(
     name="dg4d",
     no_args_is_help=True,
-    add_completion=False,
+    rich_markup_mode=None,  # plain text: tables of rich break identifiers and show a type for every flag
     pretty_exceptions_enable=False,
 )
 
@@ -47,20 +48,26 @@ def _say_version(wanted: bool) -> None:
 @app.callback()
 def dg4d(
     version: Annotated[
-        bool, typer.Option("--version", help="say which version this is", callback=_say_version, is_eager=True)
+        bool, typer.Option("--version", help="print the version", callback=_say_version, is_eager=True)
     ] = False,
 ) -> None:
-    """Pictures and videos become animated, textured 3D assets."""
+    """Convert pictures and videos to animated, textured 3D assets."""
 
 
 @app.command()
 def make(
-    picture: Annotated[Path | None, typer.Argument(help="a picture, or a video", show_default=False)] = None,
+    picture: Annotated[
+        Path | None, typer.Argument(metavar="PICTURE", help="a picture or a video", show_default=False)
+    ] = None,
     text: Annotated[
-        str, typer.Option(help="words instead of a picture; --set text.weights names the model that draws them")
+        str,
+        typer.Option(
+            metavar="WORDS", help="a prompt instead of a picture; --set text.weights=NAME is the text-to-image model"
+        ),
     ] = "",
     video: Annotated[
-        Path | None, typer.Option(help="a video or a folder of frames to follow; PICTURE then only names the asset")
+        Path | None,
+        typer.Option(metavar="PATH", help="driving video or folder of frames; PICTURE then only names the asset"),
     ] = None,
     profile: Profile = "preview",
     changes: Changes = None,
@@ -69,16 +76,19 @@ def make(
     fps: Rate = None,
     seed: Seed = 0,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="folder of the package  [default: out/<name>]")
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="output folder  [default: out/NAME]")
     ] = None,
-    bank: Annotated[Path | None, typer.Option(help="folder of true views, for --set prior.kind=oracle")] = None,
+    bank: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="ground-truth views, for --set prior.kind=oracle")
+    ] = None,
     commercial_only: Commercial = False,
-    force: Annotated[bool, typer.Option("--force", help="replace the package of another asset in the folder")] = False,
-    pick: Annotated[
-        int | None, typer.Option(min=1, max=16, help="take this motion of those that `dg4d motions` shows")
-    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="replace another asset in the output folder")] = False,
+    pick: Annotated[int | None, typer.Option(min=1, max=16, metavar="K", help="use motion K of `dg4d motions`")] = None,
 ) -> None:
-    """Make one animated asset."""
+    """Make one animated asset.
+
+    Motions without a driving video, for --set driving.motion=NAME: sway, bend, breathe, bounce, wave, turn.
+    """
     if picture is None and not text:
         raise typer.BadParameter("give a picture, a video, or --text WORDS")
     with clear_ending():
@@ -96,7 +106,7 @@ def make(
 
         console = terminal.console()
         if pick and video:
-            raise BadInput("--pick takes one of the motions that are made up; with --video the video is followed")
+            raise BadInput("--pick chooses a generated motion and cannot be combined with --video")
         short = knobs_of(triangles, texture, fps) | ({"driving.pick": pick} if pick else {})
         settings = revise(named(profile), parse_changes(changes or []) | short)
         item = (clean(picture.stem) or "asset") if picture else name_of(text)
@@ -131,17 +141,20 @@ def make(
 
 @app.command()
 def motions(
-    picture: Annotated[Path, typer.Argument(help="a picture")],
+    picture: Annotated[Path, typer.Argument(metavar="PICTURE", help="a picture")],
     profile: Profile = "preview",
     changes: Changes = None,
     seed: Seed = 0,
     commercial_only: Commercial = False,
-    candidates: Annotated[int, typer.Option(min=2, max=16, help="how many motions")] = 6,
+    candidates: Annotated[int, typer.Option(min=2, max=16, metavar="N", help="number of motions")] = 6,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="folder of sheet and films  [default: out/<name>-motions]")
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="output folder  [default: out/NAME-motions]")
     ] = None,
 ) -> None:
-    """Show the motions that a picture could make, the best first; `dg4d make PICTURE --pick K` takes number K."""
+    """Generate and rank several motions of a picture.
+
+    `dg4d make PICTURE --pick K` uses motion K.
+    """
     with clear_ending():
         from flows import home
         from flows.commands import terminal
@@ -181,11 +194,12 @@ def batch(
     inputs: Annotated[
         str,
         typer.Argument(
-            help="a folder of pictures and videos, a pattern ('photos/**/*.png', in quotes), s3://BUCKET/PREFIX, or a "
-            "manifest (.csv, .json, .jsonl, .parquet)"
+            metavar="INPUTS",
+            help="a folder, a quoted pattern such as 'photos/**/*.png', s3://BUCKET/PREFIX, or a manifest (.csv, "
+            ".json, .jsonl, .parquet)",
         ),
     ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="DIR/<item>/ is a package each")],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="output folder; each item gets DIR/ITEM")],
     profile: Profile = "preview",
     changes: Changes = None,
     triangles: Triangles = None,
@@ -205,17 +219,18 @@ def batch(
     ] = "",
     commercial_only: Commercial = False,
     strict: Annotated[
-        bool, typer.Option("--strict", help="an asset that a gate does not let pass is a failure, and ends the batch")
+        bool, typer.Option("--strict", help="treat an asset that fails a quality gate as a failed item, and stop")
     ] = False,
     root: Annotated[
-        Path | None, typer.Option(help="where a manifest's files are, and must stay  [default: beside it]")
+        Path | None,
+        typer.Option(metavar="DIR", help="folder that contains a manifest's files  [default: the manifest's folder]"),
     ] = None,
     gpus: Annotated[
-        int | None, typer.Option(min=0, help="use the first so many, a step on each  [default: all]")
+        int | None, typer.Option(min=0, metavar="N", help="number of GPUs to use, one step on each  [default: all]")
     ] = None,
     cpus: Annotated[
         int | None,
-        typer.Option(min=1, help="steps that compute on the processor at a time  [default: one per 4 cores]"),
+        typer.Option(min=1, metavar="N", help="CPU steps at a time  [default: one per 4 cores]"),
     ] = None,
     price_per_hour: Annotated[
         float | None,
@@ -223,14 +238,16 @@ def batch(
             min=0,
             callback=finite,
             envvar="DG4D_PRICE_PER_HOUR",
-            help="of this machine; the summary has costs",
+            metavar="PRICE",
+            help="price of this machine; adds costs to the summary",
         ),
     ] = None,
 ) -> None:
-    """Make many assets; those that are made already are left alone, and a bad one stops no other.
+    """Make many assets.
 
-    A manifest has a row per item: path or text, and if you like video, name, profile, seed, bank, priority (higher
-    first), set ("a.b=c; d.e=f"), or any knob as a column of its own.
+    Finished items are skipped; a failed item does not stop the others. A manifest has one row per item with these
+    columns: path or text, and optionally video, name, profile, seed, bank, priority (higher first), set ("a.b=c;
+    d.e=f"), or any setting by its name.
     """
     with clear_ending():
         os.environ.update({name: str(n) for name, n in {"DG4D_GPUS": gpus, "DG4D_CPUS": cpus}.items() if n is not None})
@@ -260,15 +277,19 @@ def batch(
 
 @app.command()
 def render(
-    package: Annotated[Path, typer.Argument(help="the folder of a package")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="OUT/view_<azimuth>/NNN.png")],
-    azimuths: Annotated[str, typer.Option(help="degrees, separated by commas, for example --azimuths=0,-75,15")] = "0",
-    elevation: Annotated[float, typer.Option(min=-90, max=90, callback=finite, help="degrees")] = 0.0,
-    size: Annotated[int, typer.Option(min=16, max=4096, help="pixels")] = 256,
-    frames: Annotated[int | None, typer.Option(min=1, help="moments  [default: every frame]")] = None,
-    mesh: Annotated[bool, typer.Option("--mesh", help="the textured mesh instead of the splats")] = False,
+    package: Annotated[Path, typer.Argument(metavar="PACKAGE", help="folder of an asset")],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="writes DIR/view_AZIMUTH/NNN.png")],
+    azimuths: Annotated[
+        str, typer.Option(metavar="LIST", help="degrees, separated by commas: --azimuths=0,-75,15")
+    ] = "0",
+    elevation: Annotated[float, typer.Option(min=-90, max=90, metavar="DEG", callback=finite, help="degrees")] = 0.0,
+    size: Annotated[int, typer.Option(min=16, max=4096, metavar="N", help="pixels")] = 256,
+    frames: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="number of timestamps  [default: every frame]")
+    ] = None,
+    mesh: Annotated[bool, typer.Option("--mesh", help="render the textured mesh instead of the splats")] = False,
 ) -> None:
-    """Render an asset from any side as RGBA pictures."""
+    """Render an asset from given azimuths as RGBA pictures."""
     with clear_ending():
         try:
             angles = [float(angle) for angle in azimuths.split(",")]
@@ -288,10 +309,10 @@ def render(
 
 @app.command()
 def view(
-    package: Annotated[Path, typer.Argument(help="the folder of a package")],
+    package: Annotated[Path, typer.Argument(metavar="PACKAGE", help="folder of an asset")],
     show: Annotated[bool, typer.Option("--open/--no-open", help="open the page in a browser")] = True,
 ) -> None:
-    """Check a package and show the page that plays it; prints where the page is."""
+    """Verify a package, open its viewer and print the page's path."""
     with clear_ending():
         from flows.packages.view import view as check_and_show
 
@@ -300,19 +321,23 @@ def view(
 
 @app.command()
 def compose(
-    out: Annotated[Path, typer.Option("-o", "--out", help="the scene, a file ending in .glb or .usdz")],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="output file, .glb or .usdz")],
     packages: Annotated[
-        list[Path] | None, typer.Argument(help="folders of packages, from left to right", show_default=False)
+        list[Path] | None,
+        typer.Argument(metavar="PACKAGE...", help="folders of assets, from left to right", show_default=False),
     ] = None,
     scene: Annotated[
-        Path | None, typer.Option(help="a scene file (JSON): which packages stand where, and when")
+        Path | None, typer.Option(metavar="FILE", help="JSON file with positions and start times of the assets")
     ] = None,
     spacing: Annotated[
-        float, typer.Option(min=0, max=1000, callback=finite, help="world units between neighbors in a row")
+        float, typer.Option(min=0, max=1000, metavar="X", callback=finite, help="world units between neighbors")
     ] = 0.25,
-    preview: Annotated[bool, typer.Option("--preview", help="also a film, beside the scene")] = False,
+    preview: Annotated[bool, typer.Option("--preview", help="also render a video of the scene")] = False,
 ) -> None:
-    """Put several assets into one animated scene: side by side, or as a scene file says."""
+    """Combine several assets in one animated scene.
+
+    They stand side by side, or as a scene file places them.
+    """
     with clear_ending():
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
         from flows.commands.compose import compose as compose_scene
@@ -325,6 +350,7 @@ def compose(
 
 for command in (score, bench, verify, rebuild, up, down, env, watch):
     app.command()(command)
+app.command("settings")(list_settings)
 
 
 def main() -> None:

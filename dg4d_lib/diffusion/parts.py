@@ -185,7 +185,7 @@ def read_linear(folder: Path, name: str, placement: Placement) -> nn.Linear:
 def missing_packages(error: ImportError) -> BackendUnavailable:
     """What to raise where diffusers or transformers cannot be imported."""
     return BackendUnavailable(
-        f"diffusion models need packages that are not here ({error}): pip install 'dg4d[diffusion]'"
+        f"diffusion models need packages that are not installed ({error}); run `make setup CUDA=1`"
     )
 
 

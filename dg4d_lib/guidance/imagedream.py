@@ -101,7 +101,9 @@ class ImageDream:
             from transformers import CLIPTextModel, CLIPTokenizer, CLIPVisionModel  # noqa: PLC0415 - takes seconds
             from transformers.utils.logging import disable_progress_bar  # noqa: PLC0415
         except ImportError as error:
-            raise BackendUnavailable(f"ImageDream needs: pip install 'dg4d[diffusion]' ({error})") from error
+            raise BackendUnavailable(
+                f"ImageDream needs packages that are not installed ({error}); run `make setup CUDA=1`"
+            ) from error
         disable_progress_bar()
         placement = Placement(device, dtype_on(device, precision), channels_last=device.type == "cuda")
         require_schedule(model, SCHEDULE)

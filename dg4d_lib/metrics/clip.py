@@ -55,7 +55,7 @@ def load_clip(folder: Path, device: torch.device) -> Clip:
         from transformers import CLIPModel  # noqa: PLC0415 - takes seconds
         from transformers.utils.logging import disable_progress_bar  # noqa: PLC0415
     except ImportError as error:
-        raise BackendUnavailable(f"CLIP needs transformers ({error}): pip install 'dg4d[diffusion]'") from error
+        raise BackendUnavailable(f"CLIP needs transformers ({error}); run `make setup`") from error
     disable_progress_bar()
     try:
         model = CLIPModel.from_pretrained(folder, local_files_only=True)

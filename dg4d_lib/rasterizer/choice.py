@@ -30,13 +30,13 @@ def require_backend(name: str) -> None:
 def what_gsplat_lacks() -> str:
     """What keeps gsplat from drawing here, and what mends it; empty where nothing is known to."""
     if find_spec("gsplat") is None:
-        return "gsplat is not installed (pip install 'gsplat>=1.5.3')"
+        return "gsplat is not installed (run `make setup CUDA=1`)"
     try:
         build = version("torch").partition("+")[2]
     except PackageNotFoundError:
         return "torch is not installed"
     if build == "cpu":
-        return "torch is its build for processors (install the one for CUDA, see https://pytorch.org/get-started)"
+        return "torch is its CPU build (run `make setup CUDA=1`)"
     if not cuda_devices():
         return "the CUDA driver shows no device (it takes an NVIDIA GPU, its driver, and no empty CUDA_VISIBLE_DEVICES)"
     return ""

@@ -31,7 +31,7 @@ def pull(weights: Weights, home: Path) -> Locked:
         import huggingface_hub as hub  # noqa: PLC0415 - part of an extra
     except ModuleNotFoundError as error:
         raise BackendUnavailable(
-            "downloading weights needs the package huggingface_hub: pip install 'dg4d[diffusion]'"
+            "downloading weights needs the package huggingface_hub; run `make setup CUDA=1`"
         ) from error
     before = read_lock(home).get(weights.name)
     folder = home / folder_name(weights)

@@ -1,4 +1,4 @@
-"""Commands that judge and check what is made: score, bench, verify, rebuild."""
+"""Commands for evaluation and verification: score, bench, verify, rebuild."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,15 +14,17 @@ if TYPE_CHECKING:
 
 
 def score(
-    asset: Annotated[Path, typer.Argument(help="the folder of a package")],
-    truth: Annotated[Path, typer.Option(help="pictures from known sides, meshes if there are; or one picture")],
-    mesh: Annotated[bool, typer.Option("--mesh", help="the textured mesh instead of the splats")] = False,
+    asset: Annotated[Path, typer.Argument(metavar="PACKAGE", help="folder of an asset")],
+    truth: Annotated[Path, typer.Option(metavar="PATH", help="ground-truth views and meshes, or one picture")],
+    mesh: Annotated[bool, typer.Option("--mesh", help="score the textured mesh instead of the splats")] = False,
     changes: Annotated[
-        list[str] | None, typer.Option("--set", metavar="score.KNOB=VALUE", help="change a knob; may be repeated")
+        list[str] | None, typer.Option("--set", metavar="score.NAME=VALUE", help="change a setting; may be repeated")
     ] = None,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="also write the results here, as JSON")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="FILE", help="also write the results as JSON")
+    ] = None,
 ) -> None:
-    """Judge an asset against the truth, beside what costs nothing: the input repeated, the first frame held."""
+    """Score an asset and two trivial baselines against ground truth."""
     with clear_ending():
         from flows.commands import terminal
         from flows.commands.benchmark import score as judge_one
@@ -34,17 +36,20 @@ def score(
 
 
 def bench(
-    dataset: Annotated[Path, typer.Argument(help="a folder per object, with pictures from known sides")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="results, films, and packages in DIR/assets")],
+    dataset: Annotated[Path, typer.Argument(metavar="DATASET", help="a folder per object, with ground-truth views")],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="output folder; assets in DIR/assets")],
     profile: Profile = "preview",
     changes: Changes = None,
     seed: Seed = 0,
-    mesh: Annotated[bool, typer.Option("--mesh", help="judge the textured meshes instead of the splats")] = False,
-    bank: Annotated[bool, typer.Option("--bank", help="every object's true views are its prior")] = False,
-    limit: Annotated[int | None, typer.Option(min=1, help="only so many objects, the first by name")] = None,
-    workers: Annotated[int, typer.Option(min=1, max=64, help="objects at a time")] = 1,
+    mesh: Annotated[bool, typer.Option("--mesh", help="score the textured meshes instead of the splats")] = False,
+    bank: Annotated[bool, typer.Option("--bank", help="use each object's ground-truth views as the prior")] = False,
+    limit: Annotated[int | None, typer.Option(min=1, metavar="N", help="first N objects by name only")] = None,
+    workers: Annotated[int, typer.Option(min=1, max=64, metavar="N", help="objects converted at a time")] = 1,
 ) -> None:
-    """Make an asset of every object of a data set and judge it: the paper's table, as JSON, CSV and a page."""
+    """Convert and score every object of a data set.
+
+    Writes the paper's table as JSON, CSV and HTML.
+    """
     with clear_ending():
         from flows.commands import terminal
         from flows.commands.benchmark import bench as judge_all
@@ -62,14 +67,17 @@ def bench(
 
 
 def verify(
-    package: Annotated[Path, typer.Argument(help="the folder of a package")],
+    package: Annotated[Path, typer.Argument(metavar="PACKAGE", help="folder of an asset")],
     trust: Annotated[
         Path | None,
-        typer.Option(help="certificates (PEM) of who vouches for signers; then all must be signed"),
+        typer.Option(metavar="PEM", help="trusted CA certificates; requires every file to be signed"),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="for machines")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
-    """Check every digest and signature of a package; says what was altered, is missing or was added."""
+    """Verify every digest and signature of a package.
+
+    Lists altered, missing and added files.
+    """
     with clear_ending():
         from flows.packages.verify import verify as check
 
@@ -77,15 +85,15 @@ def verify(
 
 
 def rebuild(
-    package: Annotated[Path, typer.Argument(help="the folder of a package")],
+    package: Annotated[Path, typer.Argument(metavar="PACKAGE", help="folder of an asset")],
     source: Annotated[
-        Path | None, typer.Option(help="the picture, video or folder of frames, where the store does not have it")
+        Path | None, typer.Option(metavar="PATH", help="source file, if the store no longer has it")
     ] = None,
-    bank: Annotated[Path | None, typer.Option(help="the folder of true views, likewise")] = None,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="keep the new package here")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="for machines")] = False,
+    bank: Annotated[Path | None, typer.Option(metavar="DIR", help="ground-truth views, likewise")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", metavar="DIR", help="keep the new package in DIR")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
-    """Make a package again from its record, every step anew, and compare step by step."""
+    """Make a package again from its record and compare every step."""
     with clear_ending():
         from flows import home
         from flows.commands import terminal

@@ -13,26 +13,64 @@ def finite(value: float | None) -> float | None:
     return value
 
 
-Profile = Annotated[str, typer.Option(help="named settings to start from")]
+PROFILES = ("preview", "paper", "video", "video-fast", "reference", "quality")  # as in steps/profiles.py; see SEED_MAX
+MOTIONS = ("sway", "bend", "breathe", "bounce", "wave", "turn")  # as in dg4d_lib/settings.py, likewise
+
+
+def complete_profile(incomplete: str) -> list[str]:
+    """Return the profiles that begin with what was typed, for shell completion."""
+    return [name for name in PROFILES if name.startswith(incomplete)]
+
+
+def complete_setting(incomplete: str) -> list[str]:
+    """Return the settings that begin with what was typed, for shell completion."""
+    from flows.inputs.setting_reference import all_settings
+
+    return sorted({f"{one.name}=" for one in all_settings() if one.name.startswith(incomplete)})
+
+
+Profile = Annotated[
+    str,
+    typer.Option(metavar="NAME", help=f"preset: {', '.join(PROFILES)}", autocompletion=complete_profile),
+]
 Changes = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KNOB=VALUE", help="change a knob; may be repeated")
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="change a setting; may be repeated. `dg4d settings` lists them",
+        autocompletion=complete_setting,
+    ),
 ]
 Commercial = Annotated[
     bool, typer.Option("--commercial-only", help="refuse weights whose license forbids commercial use")
 ]
-LARGEST_SEED = 2**63 - 1  # as in steps/contract.py, whose import would bring pydantic
-Seed = Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="of everything random; equal seeds give equal bytes")]
-Triangles = Annotated[int | None, typer.Option(help="of the mesh, at most; short for --set mesh.max_faces=")]
-Texture = Annotated[int | None, typer.Option("--texture", help="texels of a side; short for --set mesh.texture_size=")]
+SEED_MAX = 2**63 - 1  # as in steps/contract.py, whose import would load pydantic and slow down --help
+Seed = Annotated[
+    int,
+    typer.Option(min=0, max=SEED_MAX, metavar="N", help="seed of all random numbers; equal seeds give equal bytes"),
+]
+Triangles = Annotated[
+    int | None, typer.Option(metavar="N", help="maximum number of triangles; short for --set mesh.max_faces=N")
+]
+Texture = Annotated[
+    int | None,
+    typer.Option("--texture", metavar="N", help="texels per side of the texture; short for --set mesh.texture_size=N"),
+]
 Rate = Annotated[
     float | None,
     typer.Option(
-        "--fps", min=1, max=240, callback=finite, help="frames per second of the files; short for --set pack.fps="
+        "--fps",
+        min=1,
+        max=240,
+        metavar="N",
+        callback=finite,
+        help="frames per second of the output; short for --set pack.fps=N",
     ),
 ]
 
 
 def knobs_of(triangles: int | None, texture: int | None, fps: float | None) -> dict[str, Any]:
-    """The knobs behind options that are short for them."""
+    """Return the settings that these options abbreviate."""
     given = {"mesh.max_faces": triangles, "mesh.texture_size": texture, "pack.fps": fps}
     return {knob: value for knob, value in given.items() if value is not None}

@@ -19,25 +19,26 @@ def up(
     pools: Annotated[
         list[str] | None,
         typer.Option(
-            "--pool", help="of deploy/pools.yaml; may be repeated  [default: process-cpu, -gpu if there is one]"
+            "--pool",
+            metavar="NAME",
+            help="work pool of deploy/pools.yaml; may be repeated  [default: process-cpu, and process-gpu with a GPU]",
         ),
     ] = None,
-    workers: Annotated[
-        bool, typer.Option("--worker/--no-worker", help="whether this machine does what is asked of the server")
-    ] = True,
+    workers: Annotated[bool, typer.Option("--worker/--no-worker", help="start a worker on this machine")] = True,
     sources: Annotated[
         list[str] | None,
         typer.Option(
             "--sources",
             metavar="DIR",
-            help="folder that deployments may read, and write unless $DG4D_OUTPUTS says where, or s3://BUCKET/PREFIX; "
-            "may be repeated; default: $DG4D_SOURCES, else the current folder",
+            help="folder or s3://BUCKET/PREFIX that deployments may read, and write unless $DG4D_OUTPUTS is set; may "
+            "be repeated  [default: $DG4D_SOURCES, else the current folder]",
         ),
     ] = None,
 ) -> None:
-    """Keep a server with deployments, and a worker, until `dg4d down`; prints the address of its pages.
+    """Start a Prefect server with deployments and a worker.
 
-    What is there already stays. With $PREFECT_API_URL, pools and deployments are put on that server.
+    Prints the address that signs a browser in. Server and worker run until `dg4d down`. With $PREFECT_API_URL set,
+    pools and deployments are registered on that server.
     """
     with clear_ending():
         from dg4d_lib.errors import BadInput
@@ -76,7 +77,7 @@ def up(
 
 
 def down() -> None:
-    """Stop the server and the workers of this machine; says which, and how many runs end with them."""
+    """Stop the server and the workers of this machine."""
     with clear_ending():
         from flows.serving.workers import running
 
@@ -92,7 +93,10 @@ def down() -> None:
 
 
 def env() -> None:
-    """Print the variables with which Prefect's own commands reach the server: eval "$(dg4d env)"."""
+    """Print the environment variables that Prefect's commands need.
+
+    Use: eval "$(dg4d env)"
+    """
     with clear_ending():
         from flows.serving.server import ServerUnavailable
 
@@ -104,13 +108,21 @@ def env() -> None:
 
 
 def watch(
-    folder: Annotated[Path, typer.Argument(help="where people drop pictures, videos or a manifest")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="OUT/<item>/ is a package each")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="folder into which pictures, videos or a manifest are dropped")
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="output folder; each item gets DIR/ITEM")],
     rest_s: Annotated[
-        float, typer.Option("--rest", min=1, callback=finite, help="seconds without a change before its content counts")
+        float,
+        typer.Option(
+            "--rest", min=1, metavar="S", callback=finite, help="seconds without a change before conversion starts"
+        ),
     ] = 10.0,
 ) -> None:
-    """Have the deployment "Catalog to 4D" convert what is dropped into a folder; goes on until it is stopped."""
+    """Convert the files that are dropped into a folder.
+
+    Uses the deployment "Catalog to 4D", and runs until it is stopped.
+    """
     with clear_ending():
         from flows.convert import connect
         from flows.packages.publish import check_writable

@@ -19,14 +19,14 @@ SHOWN_DIGITS = 12
 
 store = typer.Typer(
     name="store",
-    help="Everything that was made, version by version, and the files it was made of.",
+    help="List, show, verify and collect versions and artifacts.",
     no_args_is_help=True,
 )
 
 
 @store.command("ls")
 def list_versions() -> None:
-    """Show every item with its versions, the newest first: what they take alone, and with all they were made of."""
+    """List items and versions, newest first, with their disk space."""
     with clear_ending():
         from rich.table import Column, Table
 
@@ -62,9 +62,9 @@ def list_versions() -> None:
 
 @store.command()
 def show(
-    name: Annotated[str, typer.Argument(metavar="ITEM|DIGEST", help="an item, or the first digits of a digest")],
+    name: Annotated[str, typer.Argument(metavar="ITEM|DIGEST", help="an item, or a prefix of a digest")],
 ) -> None:
-    """Show the versions of an item; one version with its steps and files; or who refers to an artifact."""
+    """Show an item, a version, or the references to an artifact."""
     with clear_ending():
         from dg4d_lib.errors import BadInput
         from flows import home
@@ -97,14 +97,17 @@ def show(
 @store.command()
 def gc(
     keep: Annotated[
-        int | None, typer.Option(min=1, help="of each item keep so many of the newest versions  [default: all]")
+        int | None, typer.Option(min=1, metavar="N", help="versions to keep per item, newest first  [default: all]")
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="only say what would be removed")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="list the artifacts without removing them")] = False,
     grace_hours: Annotated[
-        float, typer.Option(min=0, callback=finite, help="what is younger stays, for it may be in use")
+        float, typer.Option(min=0, callback=finite, metavar="H", help="keep artifacts younger than this many hours")
     ] = 24.0,
 ) -> None:
-    """Remove what no version and no running command needs; it may run at any time."""
+    """Remove artifacts that nothing refers to.
+
+    Artifacts of kept versions and of running commands stay, so it is safe at any time.
+    """
     with clear_ending():
         from flows import home
         from flows.engine.collecting import collect
@@ -123,7 +126,7 @@ def gc(
 
 @store.command()
 def verify() -> None:
-    """Read every artifact again: name those that are damaged, and those that versions need and are missing."""
+    """Verify every artifact; list damaged and missing ones."""
     with clear_ending():
         from flows import home
         from flows.engine.versions import faults, users, versions

@@ -1,5 +1,6 @@
 """`dg4d weights`: which weights there are, getting them, checking them."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,39 +14,37 @@ if TYPE_CHECKING:
 
 weights = typer.Typer(
     name="weights",
-    help="Trained weights: what there is, what it costs, what its license allows.",
+    help="List, download and verify pretrained weights.",
     no_args_is_help=True,
 )
 
 NOT_COMPARED = "there is nothing to compare it with"
-Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="a name of the list, or an id of the hub")]
+Names = Annotated[
+    list[str],
+    typer.Argument(metavar="NAME...", help="a name from `dg4d weights list`, or an id of the Hugging Face hub"),
+]
 
 
 @weights.command("list")
 def show(
-    files: Annotated[
-        bool, typer.Option("--files", help="and every file that was pulled, or will be if known: sha256, bytes, name")
-    ] = False,
+    files: Annotated[bool, typer.Option("--files", help="also list every file: SHA-256, bytes, name")] = False,
 ) -> None:
-    """Show all weights that profiles name, and those that were pulled besides: license, size, whether they are here."""
+    """List known and pulled weights with license, size and state."""
     with clear_ending():
-        from rich.table import Column, Table
-
         from dg4d_lib.weights.lock import read_lock
-        from flows.commands import terminal
+        from flows.formatting.escaping import visible
         from steps.runtime.weights import weights_home
 
-        about = Column("license, purpose, id of the hub", overflow="fold")
-        table = Table("name", "here", "GB", "revision", "commercial", about, box=None, pad_edge=False)
         locks = read_lock(weights_home())
-        for one in _all_of_them():
-            table.add_row(*_row(one, locks.get(one.name)))
-            table.add_row("", "", "", "", "", one.purpose, style="dim")
-            table.add_row("", "", "", "", "", one.hub_id, style="dim", end_section=True)
-        out = terminal.console()
-        out.print(table)
-        out.print(f"kept in {weights_home()}; a setting may name a folder instead", markup=False)
-        out.print("revision and digests are written down by the first pull, and compared from then on")
+        rows = [(one, _row(one, locks.get(one.name))) for one in _all_of_them()]
+        width = max(len(one.name) for one, _ in rows)
+        typer.echo(_columns(("name", "here", "GB", "revision", "commercial"), width))
+        for one, (*columns, license_text) in rows:
+            typer.echo(_columns(columns, width))
+            for text in (license_text, one.purpose, one.hub_id):  # below the row, so that no name is broken
+                typer.echo(f"    {visible(text)}")
+        typer.echo(f"folder: {weights_home()}; a setting may name another folder instead")
+        typer.echo("the first pull records revision and digests; later uses are compared with them")
         for one in _all_of_them() if files else ():
             for path, sha256, size in _files_of(one, locks.get(one.name)):
                 typer.echo(f"{sha256}  {size:>12}  {one.name}/{path}")
@@ -53,7 +52,10 @@ def show(
 
 @weights.command()
 def pull(names: Names) -> None:
-    """Download weights, and write down revision and digests of what came; what is here already is left alone."""
+    """Download weights and record their revision and digests.
+
+    Weights that are present are skipped.
+    """
     with clear_ending():
         from dg4d_lib.errors import BadInput
         from dg4d_lib.weights.locate import given_folder
@@ -72,9 +74,9 @@ def pull(names: Names) -> None:
 
 @weights.command()
 def check(
-    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="default: all here")] = None,
+    names: Annotated[list[str] | None, typer.Argument(metavar="NAME...", help="default: all that are present")] = None,
 ) -> None:
-    """Read every file again and compare it with what was pulled, else with what is known to be published."""
+    """Verify every file against recorded or published digests."""
     with clear_ending():
         from dg4d_lib.errors import BackendUnavailable
         from dg4d_lib.weights.locate import find_weights, troubles, unpublished
@@ -126,6 +128,12 @@ def _place(one: "Weights") -> Path | None:
 
     folder = weights_home() / folder_name(one)
     return folder if folder.exists() else in_hub_cache(one)
+
+
+def _columns(texts: Sequence[str], width: int) -> str:
+    """Return a line of the list; names have `width` letters."""
+    name, here, size, revision, commercial = texts
+    return f"{name:<{width}}  {here:<7}  {size:<5}  {revision:<10}  {commercial}".rstrip()
 
 
 def _row(one: "Weights", locked: "Locked | None") -> list[str]:

@@ -14,6 +14,7 @@ from flows.inputs.json_text import UnfitJSON, loads
 from flows.inputs.naming import check_path, clean, distinct
 from flows.inputs.orders import Wish, name_of
 from flows.inputs.rows import MANIFESTS, Row, read_rows
+from flows.inputs.setting_reference import check_names
 from steps.contract import LARGEST_SEED, Frozen
 from steps.profiles import PipelineSettings, profile, revise
 
@@ -143,7 +144,7 @@ def parse_changes(pairs: list[str]) -> dict[str, Any]:
     """Turn `knob=value` pairs into changes; values are JSON where they can be, else text.
 
     Raises:
-        BadInput: a pair without "=".
+        BadInput: a pair without "=", or a name that no setting has.
     """
     changes = {}
     for pair in pairs:
@@ -153,6 +154,7 @@ def parse_changes(pairs: list[str]) -> dict[str, Any]:
                 f"a setting is written knob=value, for example motion.iterations=200; this was {quoted(pair)}"
             )
         changes[key.strip()] = _value(key.strip(), value.strip())
+    check_names(changes)
     return dict(sorted(changes.items(), key=lambda pair: not pair[0].endswith(".kind")))  # a kind resets its knobs
 
 
@@ -270,6 +272,7 @@ def _knobs(cells: Mapping[str, Any]) -> dict[str, Any]:
     columns = {
         knob: _value(knob, value) if isinstance(value, str) else value for knob, value in cells.items() if "." in knob
     }
+    check_names({**own, **columns})
     return {**own, **columns}
 
 

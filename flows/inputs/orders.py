@@ -62,7 +62,7 @@ class Wish(Frozen):
             raise BadInput(f"the seed {self.seed} is out of range; use 0 to {LARGEST_SEED}")
         require_backend(self.settings.rasterizer)
         if (self.settings.pack.lods or self.settings.pack.gltf.meshopt) and not find_spec("meshoptimizer"):
-            raise BackendUnavailable("pack.lods and pack.gltf.meshopt need meshoptimizer: pip install 'dg4d[meshopt]'")
+            raise BackendUnavailable("pack.lods and pack.gltf.meshopt need meshoptimizer: `deploy/install.sh meshopt`")
         self._check_source()
         if self.bank is not None:
             sources.check_bank(self.bank)

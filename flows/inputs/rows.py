@@ -153,7 +153,7 @@ def _elements(text: str) -> Iterator[str]:
 
 def _parquet(file: Path) -> list[Row]:
     if find_spec("pyarrow") is None:
-        raise BackendUnavailable(f"{file} is Parquet, which pyarrow reads: pip install 'dg4d[parquet]'; or give a .csv")
+        raise BackendUnavailable(f"{file} is Parquet, which needs pyarrow; run `make setup`, or give a .csv")
     arrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
     try:
         with parquet.ParquetFile(file) as opened:

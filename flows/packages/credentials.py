@@ -237,4 +237,4 @@ def _library() -> Any:
     try:
         return import_module("c2pa")
     except ImportError as error:
-        raise BackendUnavailable("content credentials need c2pa-python: pip install 'dg4d[signing]'") from error
+        raise BackendUnavailable("content credentials need c2pa-python; run `make setup`") from error

@@ -35,7 +35,11 @@ def text(path: str) -> str:
 
 def pins() -> dict[str, str]:
     """Return the version of every locked package by its canonical name, without the part that names a build."""
-    locks = (text(path) for path in files() if path.startswith("deploy/locks/") and not path.endswith("/tools.txt"))
+    locks = (
+        text(path)
+        for path in files()
+        if path.startswith("deploy/locks/") and not path.endswith(("/tools.txt", "/docs.txt"))
+    )
     return dict(re.findall(r"^([a-z0-9-]+)==([^ +]+)", "\n".join(locks), re.MULTILINE))
 
 

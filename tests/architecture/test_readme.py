@@ -1,6 +1,7 @@
-"""What the documents say is so: the tree, the commands, the files of a package, the version."""
+"""Documents against the program: tree, commands, settings, files of a package, version."""
 
 import re
+import runpy
 import tomllib
 from pathlib import PurePosixPath
 
@@ -16,6 +17,8 @@ from steps.artifacts import packages
 from steps.profiles import PROFILES, profile, revise
 
 README = repository.text("README.md")
+USAGE = repository.text("docs/usage.md")
+README_LINES = 150
 DOCUMENTS = [path for path in repository.files() if path.endswith(".md")]
 FOLDED = ("tests/", "dg4d_lib/assets/viewer/src/")  # folders whose one line stands for everything in them
 LINE = re.compile(r"( *)(\S+)(?: {2,}(\S.*))?")
@@ -76,15 +79,15 @@ def test_a_tree_that_is_not_true_would_be_noticed() -> None:
     assert uncovered(named, files) == ["a/new.py", "c.py"]
 
 
-def test_the_two_commands_are_in_the_makefile() -> None:
+def test_the_commands_of_make_in_documents_are_in_the_makefile() -> None:
     targets = set(re.findall(r"^([\w-]+):", repository.text("Makefile"), re.MULTILINE))
-    commands = re.findall(r"^make (\w+)", repository.fenced(README, "## Two commands"), re.MULTILINE)
-    assert commands == ["demo", "test"]
+    commands = re.findall(r"^make (\w+)", repository.fenced(README, "## Install"), re.MULTILINE)
+    assert commands == ["demo"]
     mentioned = set(re.findall(r"`make ([\w-]+)", "".join(repository.text(path) for path in DOCUMENTS)))
     assert {*commands, *mentioned} <= targets
 
 
-def test_ci_runs_the_readmes_test_command_and_nothing_else() -> None:
+def test_ci_runs_make_test_and_nothing_else() -> None:
     lines = [
         line for line in repository.text(".ci/run").splitlines() if line and not line.startswith(("#", "set ", "cd "))
     ]
@@ -103,15 +106,43 @@ def test_every_command_has_an_example_and_every_example_is_a_command() -> None:
     commands |= {
         str(group.typer_instance.info.name) for group in flows.cli.app.registered_groups if group.typer_instance
     }
-    mentioned = set(re.findall(r"(?:^|[` ])dg4d ([a-z]+)", README, re.MULTILINE))
+    commands |= {str(command.name) for command in flows.cli.app.registered_commands if command.name}
+    commands -= {"list_settings"}
+    mentioned = set(re.findall(r"(?:^|[` ])dg4d ([a-z]+)", USAGE, re.MULTILINE))
     assert mentioned == commands
+    assert set(re.findall(r"(?:^|`)dg4d ([a-z]+)", README, re.MULTILINE)) <= commands | {"converts"}
 
 
-@pytest.mark.parametrize("path", DOCUMENTS)
+@pytest.mark.parametrize("path", [path for path in DOCUMENTS if path not in {"docs/cli.md", "docs/settings.md"}])
 def test_every_setting_in_a_document_can_be_set(path: str) -> None:
     pairs = re.findall(r"--set ([^\s`]+=[^\s`]+)", repository.text(path))
     for pair in pairs:
         revise(profile("preview"), parse_changes([pair]))
+
+
+def test_the_readme_is_short() -> None:
+    assert len(README.splitlines()) <= README_LINES
+
+
+@pytest.mark.parametrize("page", ["cli.md", "settings.md"])
+def test_generated_pages_are_up_to_date(page: str) -> None:
+    generated = runpy.run_path(str(repository.ROOT / "docs" / "generate.py"))["pages"]()
+    assert generated[page] == repository.text(f"docs/{page}"), "run `make docs`"
+
+
+@pytest.mark.parametrize("path", ["README.md", *(path for path in DOCUMENTS if path.startswith("docs/"))])
+def test_numbers_have_a_leading_zero(path: str) -> None:
+    assert not re.findall(r"(?<![\w.\])`/])\.\d+\b", repository.text(path))
+
+
+def test_every_page_is_in_the_navigation_of_the_site() -> None:
+    navigation = repository.text("docs/mkdocs.yml").split("\nnav:\n")[1]
+    assert not [path for path in DOCUMENTS if path.startswith("docs/") and f" {path}\n" not in navigation]
+
+
+def test_the_pictures_of_the_documents_are_small() -> None:
+    sizes = {path: (repository.ROOT / path).stat().st_size for path in repository.files() if "docs/images/" in path}
+    assert sizes and max(sizes.values()) <= 1_500_000
 
 
 def test_every_profile_is_explained() -> None:
@@ -120,14 +151,14 @@ def test_every_profile_is_explained() -> None:
 
 def test_the_exit_codes_are_those_of_the_command() -> None:
     codes = {value for name, value in vars(flows.commands.endings).items() if name.startswith("EXIT_")}
-    section = README.split("\n## Exit codes\n", 1)[1].split("\n## ", 1)[0]
+    section = USAGE.split("\n## Exit codes\n", 1)[1].split("\n## ", 1)[0]
     assert set(map(int, re.findall(r"^\| (\d+) \|", section, re.MULTILINE))) == {0, 2, *codes}
 
 
 def test_every_file_of_a_package_is_explained() -> None:
     names = [value for name, value in vars(packages).items() if name.isupper() and isinstance(value, str)]
     assert len(names) > 5
-    assert not [name for name in (*names, RECORD, *BESIDE) if f"`{name}" not in README]
+    assert not [name for name in (*names, RECORD, *BESIDE) if f"`{name}" not in repository.text("docs/package.md")]
 
 
 def test_every_environment_variable_is_explained() -> None:

@@ -17,11 +17,18 @@ import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
+from setuptools import find_namespace_packages
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"
 LOCKS = {path.stem: path.read_text(encoding="utf-8") for path in sorted((DEPLOY / "locks").iterdir())}
-TOGETHER = [("steps", "torch"), ("steps", "cuda"), ("steps", "torch", "flows"), ("steps", "torch", "flows", "dev")]
+TOGETHER = [
+    ("steps", "torch"),
+    ("steps", "cuda"),
+    ("steps", "torch", "flows"),
+    ("steps", "torch", "flows", "dev"),
+    ("cuda", "steps", "flows", "dev"),
+]
 NODE_LOCKS = [ROOT / folder / "package-lock.json" for folder in ("tests/clients", "dg4d_lib/assets/viewer")]
 
 
@@ -68,7 +75,7 @@ def test_locks_fulfill_the_bounds_of_the_project() -> None:
     assert len(wanted) > 50
     for requirement in map(Requirement, wanted):
         name = canonicalize_name(requirement.name)
-        locks = [lock for lock in LOCKS if lock != "tools" and name in PACKAGES[lock]]
+        locks = [lock for lock in LOCKS if lock not in {"tools", "docs"} and name in PACKAGES[lock]]
         assert locks, f"no lock has {name}"
         for lock in locks:
             assert requirement.specifier.contains(version(lock, name), prereleases=True), (lock, name)
@@ -76,7 +83,7 @@ def test_locks_fulfill_the_bounds_of_the_project() -> None:
 
 def test_a_package_is_the_same_in_every_lock_that_has_it() -> None:
     first: dict[str, tuple[str, list[str]]] = {}
-    for lock in LOCKS.keys() - {"tools", "torch"}:
+    for lock in LOCKS.keys() - {"tools", "docs", "torch"}:
         for name, (requirement, hashes) in PACKAGES[lock].items():
             assert first.setdefault(name, (str(requirement), hashes)) == (str(requirement), hashes)
     assert version("torch", "torch").public == str(version("cuda", "torch"))  # audits see the latter only
@@ -154,6 +161,67 @@ def test_a_wheel_is_installed_only_with_the_bytes_that_its_lock_names(
     assert (done.returncode == 0) is (says is None), done.stderr
     assert (target / "lock_example.py").exists() is (says is None)
     assert says is None or says in done.stderr
+
+
+def dry_run(*variables: str, existing: tuple[str, ...] = (), folder: Path) -> str:
+    """Return what `make setup` would run, in an environment with these files."""
+    (folder / "environment").mkdir(exist_ok=True)
+    for name in existing:
+        (folder / "environment" / name).touch()
+    command = ["make", "-n", "-B", "setup", f"VENV={folder / 'environment'}", *variables]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+
+
+def test_setup_installs_for_cpus_unless_told_otherwise_and_an_environment_keeps_its_build(tmp_path: Path) -> None:
+    assert 'CUDA="0"' in dry_run(folder=tmp_path)
+    assert 'CUDA="1"' in dry_run("CUDA=1", folder=tmp_path)
+    assert 'CUDA="1"' in dry_run(existing=(".ready-cuda",), folder=tmp_path)
+    assert 'CUDA="0"' in dry_run("CUDA=0", existing=(".ready-cuda",), folder=tmp_path)
+
+
+def run_setup(folder: Path, cuda: str, torch: str) -> list[str]:
+    """Run setup.sh with an interpreter that only writes down its arguments; return the calls of pip and install.sh."""
+    (folder / "deploy").mkdir()
+    (folder / "bin").mkdir()
+    log = folder / "calls"
+    shutil.copy(DEPLOY / "setup.sh", folder / "deploy")
+    (folder / "deploy" / "install.sh").write_text(f'echo "install.sh $*" >> {log}\n')
+    fake = folder / "bin" / "python"
+    fake.write_text(
+        "#!/bin/sh\n"
+        'case "$*" in\n'
+        f"  *m.version*) case {torch} in *+cpu) exit 0;; *) exit 1;; esac;;\n"
+        "  *filter_list*) echo 281;;\n"
+        f'  *pip*) echo "$*" >> {log};;\n'
+        "esac\n"
+    )
+    fake.chmod(0o755)
+    environment = {**os.environ, "VENV": str(folder), "PYTHON": sys.executable, "CUDA": cuda}
+    subprocess.run(["bash", "deploy/setup.sh"], cwd=folder, env=environment, capture_output=True, check=True)
+    return log.read_text().splitlines()
+
+
+@pytest.mark.parametrize(
+    ("cuda", "torch", "locks", "replaced"),
+    [
+        ("0", "2.13.0+cpu", "torch steps flows dev", False),
+        ("1", "2.13.0+cpu", "cuda steps flows dev", True),
+        ("1", "2.13.0", "cuda steps flows dev", False),
+    ],
+)
+def test_setup_for_cuda_replaces_the_cpu_build_of_torch(
+    tmp_path: Path, cuda: str, torch: str, locks: str, replaced: bool
+) -> None:
+    calls = run_setup(tmp_path, cuda, torch)
+    assert f"install.sh {locks}" in calls
+    assert any("uninstall" in call and call.endswith(" torch") for call in calls) is replaced
+
+
+def test_every_folder_with_data_is_a_package() -> None:
+    settings = PROJECT["tool"]["setuptools"]
+    found = find_namespace_packages(str(ROOT), **settings["packages"]["find"])
+    assert set(settings["package-data"]) <= set(found)
+    assert not [name for name in found if "node_modules" in name or name.endswith(".src")]
 
 
 def test_an_unknown_lock_is_refused_with_those_that_there_are() -> None:

@@ -152,7 +152,7 @@ COMMANDS: dict[str, Refused] = {
     "set: unknown knob": Refused("mesh.grit"),
     "set: unknown stage": Refused("mush"),
     "set: a stage": Refused("mesh = 7"),
-    "set: below a value": Refused("it is a value"),
+    "set: below a value": Refused("did you mean mesh.grid"),
     "set: dots": Refused("unknown setting"),
     "set: a private name": Refused("unknown setting"),
     "set: out of range": Refused("greater than or equal to 1"),

@@ -67,7 +67,7 @@ def _library() -> ModuleType:
         import meshoptimizer  # noqa: PLC0415 (an optional package)
     except ImportError as error:
         raise BackendUnavailable(
-            f"{EXTENSION} needs the package meshoptimizer: pip install 'dg4d[meshopt]', "
+            f"{EXTENSION} needs the package meshoptimizer; run `deploy/install.sh meshopt`, "
             "or write without pack.gltf.meshopt"
         ) from error
     return meshoptimizer

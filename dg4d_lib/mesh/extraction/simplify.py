@@ -52,7 +52,7 @@ def simplified(
         meshoptimizer: Any = import_module("meshoptimizer")  # an optional package, whose types are not to be trusted
     except ImportError as error:
         raise BackendUnavailable(
-            "levels of detail need the package meshoptimizer: pip install 'dg4d[meshopt]', or leave pack.lods empty"
+            "levels of detail need the package meshoptimizer; run `deploy/install.sh meshopt`, or leave pack.lods empty"
         ) from error
     vertices = np.ascontiguousarray(mesh.vertices.numpy(force=True), np.float32)
     indices = mesh.faces.numpy(force=True).astype(np.uint32).ravel()

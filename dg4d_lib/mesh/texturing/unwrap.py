@@ -71,7 +71,7 @@ def _unwrap_here(arrays: Arrays) -> Arrays:
     try:
         xatlas: Any = import_module("xatlas")
     except ImportError as error:
-        raise BackendUnavailable(f"xatlas cannot be imported ({error}); pip install xatlas") from error
+        raise BackendUnavailable(f"xatlas cannot be imported ({error}); run `make setup`") from error
     vertices, faces, size = arrays["vertices"], arrays["faces"], int(arrays["size"])
     chart, pack = xatlas.ChartOptions(), xatlas.PackOptions()
     pack.resolution, pack.padding, pack.bilinear = size, 2 * PADDING, True

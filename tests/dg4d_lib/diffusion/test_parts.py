@@ -172,7 +172,7 @@ def test_a_model_with_another_schedule_is_refused(copy: Path) -> None:
 def test_missing_packages_are_named(name: str, whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for package in ("diffusers", "transformers"):
         monkeypatch.setitem(__import__("sys").modules, package, None)
-    with pytest.raises(BackendUnavailable, match=r"pip install 'dg4d\[diffusion\]'"):
+    with pytest.raises(BackendUnavailable, match="run `make setup CUDA=1`"):
         LOADERS[name](whole, FP32)
 
 

@@ -108,5 +108,5 @@ def test_what_is_no_pipeline_of_pictures_is_refused(model: Path, tmp_path: Path)
 
 def test_without_diffusers_the_extra_is_named(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "diffusers", None)
-    with pytest.raises(BackendUnavailable, match=r"pip install 'dg4d\[diffusion\]'"):
+    with pytest.raises(BackendUnavailable, match="run `make setup CUDA=1`"):
         draw(model)

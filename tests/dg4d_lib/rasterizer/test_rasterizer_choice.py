@@ -54,8 +54,8 @@ def test_auto_is_gsplat_where_everything_is_there(machine):
 @pytest.mark.parametrize(
     ("here", "lack"),
     [
-        ({"gsplat": False, "driver": Driver(1)}, "pip install 'gsplat>=1.5.3'"),
-        ({"torch_version": "2.13.0+cpu", "driver": Driver(1)}, "build for processors"),
+        ({"gsplat": False, "driver": Driver(1)}, "make setup CUDA=1"),
+        ({"torch_version": "2.13.0+cpu", "driver": Driver(1)}, "torch is its CPU build"),
         ({}, "shows no device"),
         ({"driver": Driver(0)}, "shows no device"),
         ({"driver": Driver(1, status=100)}, "shows no device"),

@@ -83,7 +83,7 @@ def test_threads_make_the_items_unless_a_cluster_is_named(monkeypatch: pytest.Mo
 @pytest.fixture
 def cluster(place: Path) -> Iterator[str]:
     """The address of a scheduler with two workers, each a process with one thread."""
-    pytest.importorskip("prefect_dask", reason="prefect-dask is not installed: pip install 'dg4d[dask]'")
+    pytest.importorskip("prefect_dask", reason="prefect-dask is not installed; run `make setup`")
     port = free_port()
     api = {**os.environ, "PREFECT_API_URL": str(PREFECT_API_URL.value())}
     commands = [["scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]]

@@ -152,10 +152,17 @@ def test_an_empty_or_missing_folder_is_refused(tmp_path: Path) -> None:
 
 def test_values_are_json_where_they_can_be_and_kinds_come_first() -> None:
     changes = parse_changes(
-        ["prior.size=64", "a.b=[1, 2]", "pack.splats=false", "mesh.mode=per_frame", "prior.kind=geometric"]
+        [
+            "prior.size=64",
+            "deformation.scales=[1, 2]",
+            "pack.splats=false",
+            "mesh.mode=per_frame",
+            "prior.kind=geometric",
+        ]
     )
     assert changes == {
-        "prior.kind": "geometric", "prior.size": 64, "a.b": [1, 2], "pack.splats": False, "mesh.mode": "per_frame",
+        "prior.kind": "geometric", "prior.size": 64, "deformation.scales": [1, 2], "pack.splats": False,
+        "mesh.mode": "per_frame",
     }  # fmt: skip
     assert next(iter(changes)) == "prior.kind"
     with pytest.raises(BadInput, match="knob=value"):
@@ -248,7 +255,7 @@ def test_without_pyarrow_a_parquet_manifest_says_what_to_install(
 ) -> None:
     (tmp_path / "m.parquet").write_bytes(b"PAR1")
     monkeypatch.setattr("flows.inputs.rows.find_spec", lambda name: None)
-    with pytest.raises(BackendUnavailable, match=re.escape("pip install 'dg4d[parquet]'")):
+    with pytest.raises(BackendUnavailable, match="run `make setup`"):
         items(tmp_path / "m.parquet")
 
 

@@ -1,0 +1,115 @@
+"""Pictures of the documentation: an animated WebP of a package, and a screenshot of its run in the Prefect UI.
+
+    dg4d make examples/newt.png -o out/demo
+    python docs/make_pictures.py out/demo [--screenshot]
+
+The screenshot needs the server of that run, Node.js and Chromium; with --screenshot nothing else is made.
+"""
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from dg4d_lib.assets.formats.normals import SmoothNormals
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.mesh.render import render_mesh
+from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
+from dg4d_lib.rasterizer.interface import choose_rasterizer
+from flows import home
+from flows.commands.make import connect
+from steps.artifacts.packages import read_manifest
+from steps.artifacts.rendering import mesh_at, read_states, read_surface
+
+IMAGES = Path(__file__).parent / "images"
+SIZE = 256  # pixels of a panel: input picture, lit mesh, splats
+FPS, SWAY_DEG, LOOPS = 12, 35.0, 2
+QUALITY = 72
+LIGHT = (-0.4, -0.6, -0.7)  # direction towards the light, in the camera axes (x right, y down, z forward)
+AMBIENT, DIFFUSE = 0.5, 0.7
+
+
+def main(arguments: list[str]) -> None:
+    """Write the animation of a package and, where its server runs, the screenshot."""
+    package = Path(arguments[0])
+    IMAGES.mkdir(exist_ok=True)
+    if "--screenshot" not in arguments:
+        write_animation(package, IMAGES / "demo.webp")
+    write_screenshot(package, IMAGES / "prefect.png")
+
+
+def write_animation(package: Path, path: Path) -> None:
+    """Write input picture, lit mesh and splats side by side while the camera sways."""
+    manifest = read_manifest(package)
+    states, surface = read_states(package, manifest), read_surface(package, manifest)
+    draw = choose_rasterizer("auto")
+    subject = _over_white(Image.open(package / "input" / "subject.png").resize((SIZE, SIZE), Image.Resampling.LANCZOS))
+    count = round(LOOPS * manifest.frames / manifest.fps * FPS)
+    pictures = []
+    for k in range(count):
+        position = torch.tensor([k * LOOPS * manifest.frames / count % manifest.frames], dtype=torch.float64)
+        camera = OrbitCamera(8.0, SWAY_DEG * math.sin(2 * math.pi * k / count), width=SIZE, height=SIZE)
+        splats = draw(states(position), [camera], torch.ones(3)).color[0]
+        mesh = lit(mesh_at(surface, position[0]), camera)
+        panels = [np.asarray(subject), _bytes(mesh), _bytes(splats)]
+        pictures.append(Image.fromarray(np.concatenate(panels, axis=1)))
+    pictures[0].save(
+        path, save_all=True, append_images=pictures[1:], duration=round(1000 / FPS), loop=0, quality=QUALITY, method=6
+    )
+
+
+def lit(mesh: TexturedMesh, camera: OrbitCamera) -> Float[Tensor, "h w 3"]:
+    """Return a mesh over white, with smooth normals, one distant light and ambient light."""
+    color, alpha = render_mesh(mesh, [camera])
+    vertices, faces = mesh.vertices.numpy(), mesh.faces.numpy()
+    normals = torch.from_numpy(SmoothNormals(vertices, faces)(vertices))
+    fragments = rasterize_mesh(mesh.vertices, mesh.faces, [camera])
+    seen = torch.nn.functional.normalize(interpolate(fragments, mesh.faces, normals), dim=-1)
+    axes = camera.world_to_camera()[:3, :3].to(seen)
+    light = torch.nn.functional.normalize(torch.tensor(LIGHT), dim=0)
+    cosine = ((seen @ axes.T) * light).sum(-1, keepdim=True).clamp_min(0)
+    return (color * (AMBIENT + DIFFUSE * cosine) * alpha + 1 - alpha)[0].clamp(0, 1)
+
+
+def write_screenshot(package: Path, path: Path) -> None:
+    """Photograph the page of the flow run that made a package."""
+    server = home.background_server()
+    if (address := server.address()) is None:
+        sys.exit("the server of the run has ended; start it with `dg4d up --no-worker` and run this again")
+    connect()
+    from prefect import get_client
+    from prefect.client.schemas.sorting import FlowRunSort
+
+    item = json.loads((package / "provenance.json").read_text(encoding="utf-8"))["item"]
+    with get_client(sync_client=True) as client:
+        runs = client.read_flow_runs(sort=FlowRunSort.START_TIME_DESC, limit=50)
+    run = next(one for one in runs if one.state_type == "COMPLETED" and item in one.name)
+    script = Path(__file__).with_name("photograph.mjs")
+    wanted = {
+        "login": server.login_address(address),
+        "address": f"/v2/runs/flow-run/{run.id}",
+        "text": run.name,
+        "tab": "Task Runs",
+        "screenshot": str(path),
+    }
+    subprocess.run(["node", str(script), json.dumps(wanted)], check=True)
+
+
+def _over_white(picture: Image.Image) -> Image.Image:
+    return Image.alpha_composite(Image.new("RGBA", picture.size, "white"), picture.convert("RGBA")).convert("RGB")
+
+
+def _bytes(picture: Float[Tensor, "h w 3"]) -> np.ndarray:
+    return (picture.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,71 @@
+"""Reference of settings: complete, true, and a help for misspelt names."""
+
+import json
+
+import pytest
+
+from dg4d_lib.errors import BadInput
+from flows.inputs.manifest import parse_changes
+from flows.inputs.setting_reference import Setting, all_settings, as_json, check_names, find_settings, value_in
+from steps.profiles import PROFILES, PipelineSettings, profile, revise
+
+SETTINGS = [one for one in all_settings() if not one.name.startswith("score.")]
+
+
+def test_every_setting_has_a_meaning_and_a_range() -> None:
+    assert [one.name for one in all_settings() if not one.meaning or not one.allowed] == []
+
+
+@pytest.mark.parametrize("one", SETTINGS, ids=lambda one: f"{one.name}[{one.only_with}]")
+def test_every_setting_can_be_set_to_its_default(one: Setting) -> None:
+    choice, _, kind = one.only_with.partition("=")
+    settings = revise(PipelineSettings(), {choice: kind} if choice else {})
+    assert revise(settings, {one.name: json.loads(one.default)}) == settings
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_every_value_of_a_profile_is_in_the_reference(name: str) -> None:
+    chosen = profile(name)
+    listed = {one.name for one in SETTINGS if value_in(chosen, one)}
+
+    def leaves(tree: object, path: str) -> set[str]:
+        if isinstance(tree, dict):
+            return {leaf for key, value in tree.items() for leaf in leaves(value, f"{path}.{key}".lstrip("."))}
+        return {path}
+
+    assert leaves(chosen.model_dump(mode="json"), "") == listed
+
+
+@pytest.mark.parametrize(
+    ("given", "nearest"),
+    [
+        ("motion.iteration", "did you mean motion.iterations?"),
+        ("mtion.iterations", "did you mean motion.iterations?"),
+        ("prior.wieghts", "did you mean prior.weights?"),
+        ("iterations", "iterations?"),
+        ("max_faces", "did you mean mesh.max_faces?"),
+        ("qqq", "`dg4d settings` lists the names"),
+    ],
+)
+def test_a_misspelt_setting_gets_the_nearest_name_and_no_list(given: str, nearest: str) -> None:
+    with pytest.raises(BadInput) as caught:
+        parse_changes([f"{given}=1"])
+    assert nearest in str(caught.value) and len(str(caught.value)) < 150
+
+
+def test_old_names_pass_to_the_message_that_explains_them() -> None:
+    check_names(["motion.ladder", "prior", "static.start"])
+    with pytest.raises(BadInput, match=r"motion\.ladder is now motion\.resolution_schedule"):
+        revise(profile("preview"), parse_changes(["motion.ladder=3"]))
+
+
+def test_a_section_lists_its_settings_and_a_name_one_per_kind() -> None:
+    assert {one.name.split(".")[0] for one in find_settings("mesh")} == {"mesh"}
+    assert [one.only_with for one in find_settings("prior.weights")] == ["prior.kind=zero123", "prior.kind=imagedream"]
+
+
+def test_bounds_are_those_of_the_models() -> None:
+    (one,) = find_settings("motion.t_max_start")
+    assert one.allowed == "number, above 0.02, at most 1"
+    assert find_settings("pack.lods")[0].allowed == "list: each number, above 0, below 1, at most 8 long"
+    assert as_json((1, "a")) == '[1,"a"]'
