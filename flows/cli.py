@@ -207,13 +207,15 @@ def batch(
     fps: Rate = None,
     seed: Seed = 0,
     workers: Annotated[
-        int | None, typer.Option(min=1, max=64, help="items at a time  [default: 1; 16 of a deployment]")
+        int | None,
+        typer.Option(min=1, max=64, metavar="N", help="items converted at a time  [default: 1; 16 of a deployment]"),
     ] = None,
     where: Annotated[
         str,
         typer.Option(
-            help="where items run: local, dask://HOST:PORT, or deployment:POOL, on all machines whose workers serve "
-            "that pool and share the store  [default: $DG4D_RUNNER, or local]",
+            metavar="PLACE",
+            help="local, dask://HOST:PORT, or deployment:POOL, on all machines whose workers serve that pool and share "
+            "the store  [default: $DG4D_RUNNER, or local]",
             show_default=False,
         ),
     ] = "",

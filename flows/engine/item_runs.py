@@ -5,6 +5,7 @@ An item travels by reference: its order and source lie in the store, and so does
 
 import itertools
 from contextlib import suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 from uuid import UUID
@@ -22,7 +23,6 @@ from prefect.client.schemas.objects import FlowRun, State, WorkerStatus
 from prefect.deployments import run_deployment
 from prefect.exceptions import PrefectHTTPStatusError
 from prefect.states import Cancelled, Scheduled
-from prefect.types._datetime import now
 
 from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
 from flows import home
@@ -247,7 +247,7 @@ def _is_stranded(client: SyncPrefectClient, run: FlowRun, pool: str) -> bool:
 
 def _age_s(run: FlowRun) -> float:
     """Return the seconds since a run got its state."""
-    return 0.0 if run.state is None else (now("UTC") - run.state.timestamp).total_seconds()
+    return 0.0 if run.state is None else (datetime.now(UTC) - run.state.timestamp).total_seconds()
 
 
 def _has_package(run: FlowRun, store: ArtifactStore) -> bool:

@@ -115,8 +115,8 @@ class Decoder:
 
 def read_as_source(path: Path, scratch: Path) -> tuple[Kind, int]:
     """Run the step that decodes a source and cuts out its subject."""
-    from dg4d_lib.settings import SubjectSettings
     from steps.prepare_subject import run
+    from steps.profiles import PREVIEW, revise, step_settings
     from steps.runtime.job import Job
 
     outputs = {
@@ -124,7 +124,8 @@ def read_as_source(path: Path, scratch: Path) -> tuple[Kind, int]:
         "footage": scratch / "footage.zip",
         "picture": scratch / "picture.png",
     }
-    run(Job({"source": path}, outputs, SubjectSettings(size=SIZE), 0, lambda *_: None, scratch))
+    settings = step_settings("prepare_subject", revise(PREVIEW, {"subject.size": SIZE}))
+    run(Job({"source": path}, outputs, settings, 0, lambda *_: None, scratch))
     if outputs["footage"].exists():
         with zipfile.ZipFile(outputs["footage"]) as footage:
             return "video", sum(name.endswith(".png") for name in footage.namelist())

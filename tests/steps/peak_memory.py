@@ -51,8 +51,8 @@ def peaks_of(files: Sequence[tuple[Path, Settings]]) -> list[Peak]:
 
 def measure(path: Path, settings: Settings) -> Peak:
     """Prepare a file in this process."""
-    from dg4d_lib.settings import SubjectSettings
     from steps.prepare_subject import run
+    from steps.profiles import PREVIEW, revise, step_settings
     from steps.runtime.job import Job
 
     Path("/proc/self/clear_refs").write_text("5")
@@ -64,7 +64,7 @@ def measure(path: Path, settings: Settings) -> Peak:
                 Job(
                     {"source": path},
                     {name.partition(".")[0]: path for name, path in outputs.items()},
-                    SubjectSettings(**settings),
+                    step_settings("prepare_subject", revise(PREVIEW, {f"subject.{k}": v for k, v in settings.items()})),
                     0,
                     lambda *_: None,
                     Path(folder),

@@ -21,11 +21,14 @@ from flows.step_errors import (
     StepTimedOut,
 )
 from steps.contract import StepRequest, StepSpec
+from steps.profiles import PREVIEW, step_settings
 from steps.runtime.installed_code import request_version
 from steps.store.artifact_store import ArtifactStore
 
 HERE = str(Path(__file__).parents[1])
 OUTSIDE = [in_subprocess, in_container]
+
+SETTINGS = step_settings("prepare_subject", PREVIEW).model_dump(mode="json")
 
 
 @pytest.fixture(autouse=True)
@@ -43,7 +46,7 @@ def ask(place: Path, words: str) -> tuple[StepSpec, StepRequest]:
     spec = fake_steps.STEPS["prepare_subject"]
     source = ArtifactStore(place / "home" / "store").put_bytes(words.encode(), "application/octet-stream")
     return spec, StepRequest(
-        step=spec.name, version=request_version(spec), inputs={"source": source}, settings={}, seed=0
+        step=spec.name, version=request_version(spec), inputs={"source": source}, settings=SETTINGS, seed=0
     )
 
 

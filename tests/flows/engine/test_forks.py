@@ -15,8 +15,11 @@ from flows.engine.executors import in_subprocess
 from flows.engine.forks import Fork, ForkServer
 from flows.step_errors import StepOutOfMemory
 from steps.contract import StepRequest
+from steps.profiles import PREVIEW, step_settings
 from steps.runtime.installed_code import request_version
 from steps.store.artifact_store import ArtifactStore
+
+SETTINGS = step_settings("prepare_subject", PREVIEW).model_dump(mode="json")
 
 
 @pytest.fixture(autouse=True)
@@ -164,4 +167,6 @@ def test_a_server_that_was_killed_is_followed_by_another(place: Path) -> None:
 def _request(place: Path, words: str) -> StepRequest:
     spec = fake_steps.STEPS["prepare_subject"]
     source = ArtifactStore(place / "store").put_bytes(words.encode(), "application/octet-stream")
-    return StepRequest(step=spec.name, version=request_version(spec), inputs={"source": source}, settings={}, seed=0)
+    return StepRequest(
+        step=spec.name, version=request_version(spec), inputs={"source": source}, settings=SETTINGS, seed=0
+    )

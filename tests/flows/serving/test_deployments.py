@@ -16,8 +16,9 @@ from tiny_s3 import TinyS3
 from waiting import wait_until
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
+from flows import deployments
 from flows.packages.publish import whole
-from flows.serving import deployments, registering
+from flows.serving import registering
 from flows.serving.pools import read_pools
 from flows.serving.roots import SOURCES
 from flows.serving.server import Server

@@ -16,9 +16,9 @@ from fake_steps import PNG, bank_json
 from waiting import wait_until
 
 from dg4d_lib.errors import BadInput
-from flows import home
+from flows import deployments, home
 from flows.deployments import Options, PictureOptions
-from flows.serving import deployments, roots
+from flows.serving import roots
 from flows.serving.roots import OUTPUTS, SOURCES, Roots, granted
 
 SECRET = "root:x:0:0:root:/root:/bin/bash\n"

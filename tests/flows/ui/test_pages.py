@@ -21,11 +21,12 @@ from waiting import retry_after, wait_until
 
 from flows import home
 from flows.convert import make
-from flows.formatting import curves, pages
+from flows.formatting import curves
 from flows.inputs.orders import Order, Wish
 from flows.serving.auth import basic
 from flows.serving.server import Server
 from flows.step_errors import StepDiverged
+from flows.ui import pages
 from flows.ui.asset_page import PICTURES
 from steps.contract import ArtifactRef
 from steps.profiles import PREVIEW
