@@ -65,5 +65,5 @@ def item_runner(where: Where, workers: int) -> TaskRunner[Any]:
     try:
         from prefect_dask.task_runners import DaskTaskRunner  # noqa: PLC0415 - an extra
     except ImportError as error:
-        raise BackendUnavailable("a Dask cluster needs prefect-dask: pip install 'dg4d[dask]'") from error
+        raise BackendUnavailable("a Dask cluster needs prefect-dask; run `make setup`") from error
     return DaskTaskRunner(address=f"tcp://{where.address}")

@@ -38,5 +38,5 @@ def _opened(given: str, copies: Path, patience_s: float) -> ArtifactStore:
     try:
         from steps.store.bucket import open_bucket  # noqa: PLC0415 - an optional extra
     except ModuleNotFoundError as error:
-        raise BackendUnavailable(f"{given} needs a library that is not installed: pip install 'dg4d[s3]'") from error
+        raise BackendUnavailable(f"{given} needs obstore, which is not installed; run `make setup`") from error
     return open_bucket(given, copies, patience_s)
