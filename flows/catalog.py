@@ -21,10 +21,11 @@ from flows.convert import make, save_pictures
 from flows.engine.executors import stop_all
 from flows.engine.item_runs import failure, item_deployment
 from flows.engine.orphans import claim_run
-from flows.engine.runners import item_runner, parse_where
+from flows.engine.runners import item_runner
 from flows.engine.step_tasks import flow_settings
 from flows.inputs.manifest import Item
 from flows.inputs.orders import Order
+from flows.inputs.places import parse_where
 from flows.packages.delivery import forget_shared
 from flows.packages.summary import Row, Tally, judged
 from flows.ui.gallery import Gallery

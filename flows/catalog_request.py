@@ -8,11 +8,11 @@ from pydantic import Field
 
 from dg4d_lib.errors import DG4DError
 from flows import home
-from flows.engine.runners import parse_where
 from flows.formatting.escaping import visible
 from flows.inputs import naming
 from flows.inputs.manifest import Item, admitted, items_of, only_commercial
 from flows.inputs.orders import Order
+from flows.inputs.places import parse_where
 from flows.packages.publish import check_folder, is_current
 from flows.packages.summary import Row, judged
 from steps.contract import Frozen

@@ -9,8 +9,8 @@ from flows.catalog_request import CatalogRequest, ready
 from flows.commands import terminal
 from flows.commands.endings import EXIT_BAD_INPUT, EXIT_FAILED
 from flows.engine import resources
-from flows.engine.runners import parse_where
 from flows.inputs.manifest import Item
+from flows.inputs.places import parse_where
 from flows.packages.publish import check_writable
 from flows.packages.summary import BAD_INPUT, Row, Tally, Writer
 

@@ -10,7 +10,6 @@ import typer
 
 from flows.commands.endings import clear_ending
 from flows.commands.options import finite
-from flows.serving import background
 
 LOOK_S = 1.0  # between two looks at a watched folder
 
@@ -44,7 +43,7 @@ def up(
         from dg4d_lib.errors import BadInput
         from dg4d_lib.rasterizer.choice import cuda_devices
         from flows.convert import connect
-        from flows.serving import roots
+        from flows.serving import background, roots
         from flows.serving.pools import read_pools
         from flows.serving.workers import Worker, limit
 
@@ -79,6 +78,7 @@ def up(
 def down() -> None:
     """Stop the server and the workers of this machine."""
     with clear_ending():
+        from flows.serving import background
         from flows.serving.workers import running
 
         server = background.background_server()
@@ -98,6 +98,7 @@ def env() -> None:
     Use: eval "$(dg4d env)"
     """
     with clear_ending():
+        from flows.serving import background
         from flows.serving.server import ServerUnavailable
 
         server = background.background_server()
@@ -126,6 +127,7 @@ def watch(
     with clear_ending():
         from flows.convert import connect
         from flows.packages.publish import check_writable
+        from flows.serving import background
         from steps.contract import digest_of
 
         check_writable(out)

@@ -23,7 +23,6 @@ from waiting import wait_until
 from flows import home
 from flows.catalog import convert_all
 from flows.catalog_request import CatalogRequest, ready
-from flows.commands import batch as module
 from flows.commands.batch import batch, tell
 from flows.engine import resources
 from flows.inputs.manifest import items_of
@@ -267,7 +266,7 @@ def test_a_made_batch_needs_no_server_and_says_that_there_is_nothing_to_do(
     monkeypatch.setenv("DG4D_HOME", str(tmp_path / "home"))
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "a.png").write_text(picture("x"))
-    monkeypatch.setattr(module, "is_current", lambda folder, digest: True)
+    monkeypatch.setattr("flows.catalog_request.is_current", lambda folder, digest: True)
 
     def no_server() -> None:
         pytest.fail("nothing is to be made")

@@ -66,7 +66,7 @@ def test_a_benchmark_makes_judges_and_writes_everything_and_a_second_one_does_no
     tmp_path: Path, log: Path
 ) -> None:
     for name in ("a", "b", "c"):
-        thing(tmp_path / "data" / name, f"seen in {name}")
+        thing(tmp_path / "data" / name, f"seen in {name} fit_motion=sleep:0.1")
     out = tmp_path / "out"
     results = run(tmp_path / "data", out, limit=2)
     assert [one.object for one in results.objects] == ["a", "b"]

@@ -93,7 +93,7 @@ def test_every_step_runs_again_and_gives_the_same(fakes: Path, tmp_path: Path) -
     ran = fakes.read_text()
     fakes.unlink()
     rebuilt = again(tmp_path / "out", tmp_path / "again")
-    assert fakes.read_text() == ran
+    assert sorted(fakes.read_text().split()) == sorted(ran.split())
     assert set(outcomes(rebuilt).values()) == {"identical"}
     assert len(rebuilt.likenesses) == len(ran.split()) + 4  # files
     assert rebuilt.circumstances == ()

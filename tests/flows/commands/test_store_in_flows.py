@@ -130,7 +130,7 @@ def test_what_is_damaged_while_a_flow_runs_is_made_again(log: Path, tmp_path: Pa
         while not log.exists() or "fit_motion" not in log.read_text():
             time.sleep(0.02)
         subject = json.loads(next(home.records().glob("prepare_subject-*")).read_text())["result"]
-        damage(json.loads(subject)["outputs"]["subject"]["digest"], "flipped")
+        damage(json.loads(subject)["data"]["outputs"]["subject"]["digest"], "flipped")
 
     spoiler = threading.Thread(target=spoil)
     spoiler.start()

@@ -18,7 +18,8 @@ from waiting import wait_until
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows.engine.orphans import LABEL
-from flows.engine.runners import Where, item_runner, parse_where
+from flows.engine.runners import item_runner
+from flows.inputs.places import Where, parse_where
 from flows.serving import registering
 from flows.serving.pools import read_pools
 from flows.serving.server import Server
