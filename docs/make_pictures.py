@@ -24,8 +24,8 @@ from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
 from dg4d_lib.rasterizer.interface import choose_rasterizer
-from flows import home
-from flows.commands.make import connect
+from flows.convert import connect
+from flows.serving import background
 from steps.artifacts.packages import read_manifest
 from steps.artifacts.rendering import mesh_at, read_states, read_surface
 
@@ -81,7 +81,7 @@ def lit(mesh: TexturedMesh, camera: OrbitCamera) -> Float[Tensor, "h w 3"]:
 
 def write_screenshot(package: Path, path: Path) -> None:
     """Photograph the page of the flow run that made a package."""
-    server = home.background_server()
+    server = background.background_server()
     if (address := server.address()) is None:
         sys.exit("the server of the run has ended; start it with `dg4d up --no-worker` and run this again")
     connect()
