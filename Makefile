@@ -49,7 +49,7 @@ $(TOOLS)/.ready: deploy/locks/tools.txt deploy/install.sh
 
 # torch.txt names a build that the package index does not know; cuda.txt has the same version
 audit: setup $(TOOLS)/.ready
-	timeout 300 $(TOOLS)/bin/pip-audit $(foreach lock,steps flows cuda dev meshopt tools docs,-r deploy/locks/$(lock).txt) \
+	timeout 300 $(TOOLS)/bin/pip-audit $(foreach lock,steps flows cuda dev meshopt tools,-r deploy/locks/$(lock).txt) \
 		--no-deps --disable-pip -f json --progress-spinner off | $(BIN)/python deploy/audit.py
 
 # Resolve pyproject.toml into deploy/locks. Versions stay unless UPGRADE="--upgrade" or "--upgrade-package NAME".

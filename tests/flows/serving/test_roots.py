@@ -52,10 +52,10 @@ def test_a_password_file_is_neither_read_from_elsewhere_nor_stored_from_a_root(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(BadInput, match=rf"/etc/passwd lies outside .* read: {place}/in; .* set DG4D_SOURCES"):
-        deployments.image_to_4d.fn("/etc/passwd", str(place / "in" / "out"))
+        deployments.picture_to_4d.fn("/etc/passwd", str(place / "in" / "out"))
     monkeypatch.setenv(SOURCES, f"/etc{os.pathsep}{place}/in")
     with pytest.raises(BadInput, match="the file is a text file, whatever its name says; give pictures"):
-        deployments.image_to_4d.fn("/etc/passwd", str(place / "in" / "out"))
+        deployments.picture_to_4d.fn("/etc/passwd", str(place / "in" / "out"))
     with pytest.raises(BadInput, match="the file is a text file"):
         deployments.video_to_4d.fn("/etc/passwd", str(place / "in" / "out"))
     assert stored() == []
@@ -71,7 +71,7 @@ def test_a_server_of_this_machine_gets_no_request(place: Path) -> None:
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
         Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
-        for flow in (deployments.image_to_4d, deployments.video_to_4d):
+        for flow in (deployments.picture_to_4d, deployments.video_to_4d):
             with pytest.raises(BadInput, match="private network"):
                 flow.fn(f"http://127.0.0.1:{server.server_port}/x.png", str(place / "in" / "out"))
         server.shutdown()
@@ -95,7 +95,7 @@ def test_a_source_that_lies_elsewhere_is_refused(place: Path, given: str) -> Non
     (place / "in" / "dir").symlink_to(place / "away")
     (place / "in" / "circle").symlink_to(place / "in" / "circle")
     out = str(place / "in" / "out")
-    for flow in (deployments.image_to_4d, deployments.video_to_4d, deployments.catalog, deployments.benchmark):
+    for flow in (deployments.picture_to_4d, deployments.video_to_4d, deployments.catalog_to_4d, deployments.benchmark):
         refused(lambda flow=flow: flow.fn(given.format(place=place), out))  # type: ignore[misc]
 
 
@@ -115,7 +115,7 @@ def test_a_pattern_that_leads_elsewhere_is_refused(place: Path, given: str) -> N
     for link in (place / "dir[1]", place / "in" / "dir[2]"):
         link.symlink_to(place / "away")
     refused(
-        lambda: deployments.catalog.fn(given.format(place=place), str(place / "in" / "out")),
+        lambda: deployments.catalog_to_4d.fn(given.format(place=place), str(place / "in" / "out")),
         r"lies outside|leads back by '\.\.'",
     )
 
@@ -125,7 +125,7 @@ def test_what_a_pattern_or_a_folder_finds_by_links_is_a_failed_row(place: Path) 
     (place / "in" / "dir").symlink_to(place / "away")
     (place / "in" / "link.png").symlink_to(place / "away" / "fox.png")
     for inputs in (f"{place}/in/*.png", f"{place}/in/*/*.png", f"{place}/in"):
-        state = deployments.catalog.fn(inputs, str(place / "in" / "out"))
+        state = deployments.catalog_to_4d.fn(inputs, str(place / "in" / "out"))
         assert state.is_failed()
         (row,) = json.loads((place / "in" / "out" / "summary.json").read_text())["items"]
         assert row["status"] == "failed" and "leads out of the folder" in row["message"]
@@ -148,7 +148,7 @@ def test_rows_of_a_list_name_nothing_elsewhere(place: Path, row: dict[str, str])
     (place / "away" / "bank.json").write_text(bank_json("fox.png"))
     rows = [{key: value.format(place=place) for key, value in row.items()}]
     (place / "in" / "list.json").write_text(json.dumps(rows))
-    assert deployments.catalog.fn(str(place / "in" / "list.json"), str(place / "in" / "out")).is_failed()
+    assert deployments.catalog_to_4d.fn(str(place / "in" / "list.json"), str(place / "in" / "out")).is_failed()
     (found,) = json.loads((place / "in" / "out" / "summary.json").read_text())["items"]
     assert found["status"] == "failed"
     assert "lies outside" in found["message"] or "leads out of the folder" in found["message"]
@@ -159,7 +159,7 @@ def test_a_list_that_a_link_leads_to_speaks_of_files_beside_itself(place: Path) 
     (place / "in" / "list.json").write_text(json.dumps([{"path": "gone.png"}]))
     (place / "away" / "list.json").symlink_to(place / "in" / "list.json")
     (place / "away" / "gone.png").write_bytes(PNG)
-    assert deployments.catalog.fn("away/list.json", str(place / "in" / "out")).is_failed()
+    assert deployments.catalog_to_4d.fn("away/list.json", str(place / "in" / "out")).is_failed()
     (found,) = json.loads((place / "in" / "out" / "summary.json").read_text())["items"]
     assert "in/gone.png does not exist" in found["message"]
 
@@ -190,15 +190,18 @@ SETTINGS = [
 ]
 
 
+ELSEWHERE = "the folder of weights .* lies outside|unknown setting"  # refused before a file is looked at
+
+
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_folders_of_weights_elsewhere_are_refused(place: Path, setting: str) -> None:
     settings = (setting.format(place=place),)
     inside, out = str(place / "in" / "fox.png"), str(place / "in" / "out")
     options, of_pictures = Options(settings=settings), PictureOptions(settings=settings)
-    refused(lambda: deployments.image_to_4d.fn(inside, out, of_pictures), "the folder of weights .* lies outside")
-    refused(lambda: deployments.video_to_4d.fn(inside, out, options), "the folder of weights .* lies outside")
-    refused(lambda: deployments.catalog.fn(str(place / "in"), out, options=of_pictures), "the folder of weights")
-    refused(lambda: deployments.benchmark.fn(str(place / "in"), out, options=options), "the folder of weights")
+    refused(lambda: deployments.picture_to_4d.fn(inside, out, of_pictures), ELSEWHERE)
+    refused(lambda: deployments.video_to_4d.fn(inside, out, options), ELSEWHERE)
+    refused(lambda: deployments.catalog_to_4d.fn(str(place / "in"), out, options=of_pictures), ELSEWHERE)
+    refused(lambda: deployments.benchmark.fn(str(place / "in"), out, options=options), ELSEWHERE)
     assert not (place / "home" / "weights").exists()  # no link was made there, and no digest was taken
 
 
@@ -214,8 +217,8 @@ def test_weights_by_name_in_a_root_and_in_the_folder_of_weights_may_be_named(pla
 def test_an_output_elsewhere_is_refused(place: Path, out: str) -> None:
     (place / "in" / "dir").symlink_to(place / "away")
     inside, chosen = str(place / "in" / "fox.png"), out.format(place=place)
-    calls = [(deployments.image_to_4d, inside), (deployments.video_to_4d, inside)]
-    calls += [(deployments.catalog, str(place / "in")), (deployments.benchmark, str(place / "in"))]
+    calls = [(deployments.picture_to_4d, inside), (deployments.video_to_4d, inside)]
+    calls += [(deployments.catalog_to_4d, str(place / "in")), (deployments.benchmark, str(place / "in"))]
     for flow, given in calls:
         refused(lambda flow=flow, given=given: flow.fn(given, chosen), r"may write: .* set DG4D_OUTPUTS")  # type: ignore[misc]
 
