@@ -96,7 +96,9 @@ def reframe(frames: Float[Tensor, "t h w 4"], crop: Crop, size: int) -> Float[Te
 def shrink(frames: Float[Tensor, "t h w 4"], longest: int) -> Float[Tensor, "t h2 w2 4"]:
     """Return the same frames with no side longer than `longest` pixels; smaller ones stay as they are."""
     height, width = shrunk_size(frames.shape[1], frames.shape[2], longest)
-    return resample(frames, height, width)
+    if (height, width) == tuple(frames.shape[1:3]):
+        return frames
+    return torch.cat([resample(frame[None], height, width) for frame in frames])  # all at once: twice the memory
 
 
 def shrunk_size(height: int, width: int, longest: int) -> tuple[int, int]:
