@@ -120,7 +120,7 @@ def test_more_than_seams_allow_is_not_a_failure(ball: TexturedMesh) -> None:
 
 def test_without_the_library_it_says_what_to_install(ball: TexturedMesh, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "meshoptimizer", None)
-    with pytest.raises(BackendUnavailable, match="install.sh meshopt"):
+    with pytest.raises(BackendUnavailable, match=r"install\.sh meshopt"):
         simplified(ball, bent(ball), 500)
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from fake_steps import picture
+from prefect import flow
 from records import record_of, result_with
 
 from flows import home
@@ -50,6 +51,18 @@ def test_a_machine_takes_over_what_another_finished(
     assert make_on("second") == again
     assert len(list((tmp_path / "second" / "results").iterdir())) == STEPS
     assert len(list(home.store().entries(RESULTS))) == (STEPS if shares else 0)
+
+
+def test_a_conversion_within_another_flow_keeps_its_records_under_home(log: Path, tmp_path: Path) -> None:
+    (tmp_path / "fox.png").write_text(picture("within"))
+
+    @flow(persist_result=False)
+    def outer() -> None:
+        make(Wish(item="fox", picture=tmp_path / "fox.png", settings=PREVIEW).order(home.store()), tmp_path / "out")
+
+    before = set(home.records().iterdir()) if home.records().exists() else set()
+    outer()
+    assert len(set(home.records().iterdir()) - before) == STEPS
 
 
 def test_a_result_is_fetched_only_by_a_process_that_shares(log: Path, tmp_path: Path) -> None:
