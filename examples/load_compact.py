@@ -44,5 +44,5 @@ def read(plane: Array, place: tuple[Array, Array]) -> Array:
 
 
 def linear(t: dict[str, Array], name: str, rows: Array) -> Array:
-    """A layer of the network."""
+    """Apply a layer of the network."""
     return rows @ t[f"deformation.{name}.weight"].T + t[f"deformation.{name}.bias"]
