@@ -31,14 +31,14 @@ from dg4d_lib.assets.formats.glb import write_glb
 from dg4d_lib.assets.formats.rigged import rig_of, write_rigged_glb
 from dg4d_lib.assets.formats.splats import write_splat_glb_frames, write_splats, write_spz_frames
 from dg4d_lib.assets.formats.usd import write_usdz
-from dg4d_lib.assets.formats.websplats import write_web_splats
+from dg4d_lib.assets.formats.web_splats import write_web_splats
 from dg4d_lib.assets.rendering.preview import write_preview, write_turntable
 from dg4d_lib.assets.rendering.viewer_page import viewer_page
 from dg4d_lib.assets.rendering.webp import write_webp
 from dg4d_lib.deformation.factory import new_deformation
 from dg4d_lib.deformation.hexplane import HexPlane
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import harmonics_of_color
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import choose_rasterizer
 from dg4d_lib.settings import HexPlaneSettings

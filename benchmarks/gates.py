@@ -31,7 +31,7 @@ from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import color_of_harmonics, harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import color_of_harmonics, harmonics_of_color
 from dg4d_lib.images import resize_planes
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh

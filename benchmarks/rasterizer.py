@@ -32,8 +32,8 @@ from benchmarks.peers import WHITE, blended_pairs, gsplat_torch
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
-from dg4d_lib.kernels.vectors import LANES, LONG, Vectors
+from dg4d_lib.geometry.spherical_harmonics import harmonics_of_color
+from dg4d_lib.kernels.simd import LANES, LONG, Vectors
 from dg4d_lib.kernels.workers import Scratch
 from dg4d_lib.rasterizer.cpu import packed
 from dg4d_lib.rasterizer.cpu_bins import TILE, bin_by_tile

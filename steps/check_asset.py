@@ -17,7 +17,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
 from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.fitting.losses import resized
 from dg4d_lib.images import color_over_white
-from dg4d_lib.mesh.extraction.check import checked, welded
+from dg4d_lib.mesh.extraction.topology import checked, welded
 from dg4d_lib.metrics.gates import MESH, SPLATS, Evidence, Gate, Pictures, Turn, fidelity, judge
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
 from dg4d_lib.video.driving import DrivingVideo

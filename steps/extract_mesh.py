@@ -10,10 +10,10 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.images import color_over_white
-from dg4d_lib.mesh.extraction.check import MeshFacts, checked, welded
 from dg4d_lib.mesh.extraction.clean import clean
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import surface, usable_level
+from dg4d_lib.mesh.extraction.topology import MeshFacts, checked, welded
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
 from dg4d_lib.mesh.texturing.bake import bake, vertex_normals

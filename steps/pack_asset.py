@@ -18,7 +18,7 @@ from dg4d_lib.assets.formats.glb import write_frames_glb, write_glb, write_mesh_
 from dg4d_lib.assets.formats.rigged import rig_of, write_rigged_glb
 from dg4d_lib.assets.formats.splats import write_splat_glb_frames, write_splats, write_spz_frames
 from dg4d_lib.assets.formats.usd import write_usdz
-from dg4d_lib.assets.formats.websplats import write_web_splats
+from dg4d_lib.assets.formats.web_splats import write_web_splats
 from dg4d_lib.assets.rendering.preview import write_film, write_preview, write_turntable
 from dg4d_lib.assets.rendering.sheet import contact_sheet
 from dg4d_lib.assets.rendering.webp import write_webp

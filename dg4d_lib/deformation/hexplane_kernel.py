@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from dg4d_lib.kernels.vectors import FLOAT, INT, KERNEL, LANES, LONG, Value, Vectors, pointers
+from dg4d_lib.kernels.simd import FLOAT, INT, KERNEL, LANES, LONG, Value, Vectors, pointers
 from dg4d_lib.kernels.workers import ranges, run
 
 SPATIAL_AXES = ((0, 1), (0, 2), (1, 2))  # xy, xz, yz: the axis along the columns and that along the rows

@@ -13,7 +13,7 @@ from numba import njit
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from dg4d_lib.kernels.vectors import KERNEL
+from dg4d_lib.kernels.simd import KERNEL
 from dg4d_lib.kernels.workers import ranges, run
 
 BLOCKS = 4  # of Gaussians, each with sums of its own

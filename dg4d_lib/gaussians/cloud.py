@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dg4d_lib.devices import to_device_async
-from dg4d_lib.geometry.harmonics import color_of_harmonics
 from dg4d_lib.geometry.quaternion import rotation_matrix
+from dg4d_lib.geometry.spherical_harmonics import color_of_harmonics
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from dg4d_lib.guidance.interface import View
 from dg4d_lib.images import over_background
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import InflatedSurface, inflate
-from dg4d_lib.kernels.vectors import INLINE, KERNEL
+from dg4d_lib.kernels.simd import INLINE, KERNEL
 from dg4d_lib.kernels.workers import run
 from dg4d_lib.settings import GeometricPriorSettings
 

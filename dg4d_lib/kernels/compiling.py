@@ -60,7 +60,7 @@ class _Stamped:
         """The digest that must be the same for machine code to be used."""
         own = super().get_source_stamp()  # type: ignore[misc]
         source = Path(self._py_file)
-        if f"{__package__}.vectors" not in source.read_text(encoding="utf-8"):
+        if f"{__package__}.simd" not in source.read_text(encoding="utf-8"):
             return own  # it stands alone: as Numba would have it, whether this module is imported or not
         return own, _digest(source.parent), _digest(_HERE)
 

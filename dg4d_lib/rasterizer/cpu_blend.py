@@ -12,7 +12,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from dg4d_lib.kernels.vectors import FLOAT, FLOATS, INT, INTS, LANES, LONG, Value, Vectors, pointers
+from dg4d_lib.kernels.simd import FLOAT, FLOATS, INT, INTS, LANES, LONG, Value, Vectors, pointers
 from dg4d_lib.rasterizer.cpu_bins import TILE
 from dg4d_lib.rasterizer.cpu_project import (
     BLUE,

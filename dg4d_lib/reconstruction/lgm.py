@@ -20,7 +20,7 @@ from dg4d_lib.diffusion.parts import Placement
 from dg4d_lib.diffusion.published import load_network
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import harmonics_of_color
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.reconstruction.alignment import best_azimuth
 from dg4d_lib.reconstruction.lgm_unet import VIEWS, Unet, UnetShape

@@ -9,8 +9,8 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from dg4d_lib.inflation.heights import outline_distance
+from dg4d_lib.video.arap import RigidSheet
 from dg4d_lib.video.puppet import Body, Puppet
-from dg4d_lib.video.rigidity import RigidSheet
 
 WAVE_DEG = 24.0
 CORE = 0.55  # of the greatest inscribed radius: what a disc of this size can reach is body

@@ -14,8 +14,8 @@ from dg4d_lib.inflation.surface import inflate
 from dg4d_lib.settings import Motion, WarpSettings
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.limbs import WAVE_DEG, LimbAnimator, waving_limbs
-from dg4d_lib.video.motions import BEND_DEG, JUMP, SWAY_DEG, bounce, breathe, jump_height, lean
 from dg4d_lib.video.puppet import Puppet
+from dg4d_lib.video.puppet_motions import BEND_DEG, JUMP, SWAY_DEG, bounce, breathe, jump_height, lean
 
 TURN_DEG = 20.0
 TURN_SIZE = 256  # pixels at which the surface that turns is built, at most

@@ -10,7 +10,7 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.video.shrinking import BAND_BYTES, BandShrinker
+from dg4d_lib.video.downscaling import BAND_BYTES, BandShrinker
 from steps.sources.decode_limit import DecodeLimit
 from steps.sources.stills import LARGEST_SIDE, check_size, upright, upright_size
 

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
+from dg4d_lib.video.downscaling import shrink_by_bands
 from dg4d_lib.video.framing import shrunk_size
-from dg4d_lib.video.shrinking import shrink_by_bands
 from steps.sources.decode_limit import DecodeLimit
 from steps.sources.stills import MOST_PIXELS, check_size
 

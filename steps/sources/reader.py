@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import SubjectSettings
-from dg4d_lib.video.shrinking import shrink_by_bands
+from dg4d_lib.video.downscaling import shrink_by_bands
 from steps.sources.avif import read_avif
 from steps.sources.clips import (
     MOST_DECODED,

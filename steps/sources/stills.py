@@ -12,7 +12,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.video.shrinking import BAND_BYTES, BandShrinker
+from dg4d_lib.video.downscaling import BAND_BYTES, BandShrinker
 from steps.sources.decode_limit import DecodeLimit
 from steps.sources.still_headers import read_header
 

@@ -18,12 +18,12 @@ from PIL import Image
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D, between
 from dg4d_lib.assets.formats.glb import write_frames_glb, write_glb
-from dg4d_lib.assets.formats.websplats import write_web_splats
+from dg4d_lib.assets.formats.web_splats import write_web_splats
 from dg4d_lib.assets.rendering.preview import write_film
 from dg4d_lib.assets.rendering.viewer_page import viewer_page
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import harmonics_of_color
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import choose_rasterizer

@@ -12,7 +12,7 @@ from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import write_ply
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import harmonics_of_color
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
 from dg4d_lib.settings import FramewiseSettings
 from dg4d_lib.video.driving import DrivingVideo

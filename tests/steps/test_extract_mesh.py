@@ -8,7 +8,7 @@ from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import write_ply
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import harmonics_of_color
 from dg4d_lib.settings import FramewiseSettings, MeshSettings
 from steps import plan_mesh
 from steps.artifacts.media import read_png

@@ -21,8 +21,8 @@ from torch import Tensor
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.gltf import Document, Parsed
-from dg4d_lib.assets.formats.shapes import Cube, Shape
-from dg4d_lib.assets.formats.surfaces import WEBP, Atlas, add_material, add_texture, pixels_of
+from dg4d_lib.assets.formats.materials import WEBP, Atlas, add_material, add_texture, pixels_of
+from dg4d_lib.assets.formats.primitives import Cube, Shape
 from dg4d_lib.assets.formats.tracks import Animation, Span, cut
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.textured import TexturedMesh

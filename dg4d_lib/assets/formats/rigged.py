@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.gltf import VERTEX_DATA, Document
-from dg4d_lib.assets.formats.shapes import Shape
-from dg4d_lib.assets.formats.surfaces import add_material, add_texture, pixels_of
+from dg4d_lib.assets.formats.materials import add_material, add_texture, pixels_of
+from dg4d_lib.assets.formats.primitives import Shape
 from dg4d_lib.errors import BadInput
 from dg4d_lib.geometry.quaternion import multiply, rotation_matrix
 from dg4d_lib.mesh.tracking.rig import Rig, fit_rig

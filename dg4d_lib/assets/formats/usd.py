@@ -36,8 +36,8 @@ from torch import Tensor
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.assets.formats.materials import picture_file, pixels_of
 from dg4d_lib.assets.formats.normals import SmoothNormals
-from dg4d_lib.assets.formats.surfaces import picture_file, pixels_of
 from dg4d_lib.assets.formats.usdz import UsdzPackage, write_usdz_package
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians

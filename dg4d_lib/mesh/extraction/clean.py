@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
-from dg4d_lib.mesh.extraction.check import outward
+from dg4d_lib.mesh.extraction.topology import outward
 from dg4d_lib.mesh.subprocess_runner import Arrays, run_in_subprocess, serve
 from dg4d_lib.settings import MeshSettings
 

@@ -10,7 +10,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import DensityField
-from dg4d_lib.mesh.extraction.outlines import SOLID
+from dg4d_lib.mesh.extraction.silhouettes import SOLID
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 

@@ -26,7 +26,7 @@ from dg4d_lib.cameras.viewpoints import baking_views
 from dg4d_lib.errors import DG4DError
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.kernels.workers import run
-from dg4d_lib.mesh.extraction.outlines import SOLID
+from dg4d_lib.mesh.extraction.silhouettes import SOLID
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings

@@ -20,7 +20,7 @@ from dg4d_lib.kernels.workers import run
 from dg4d_lib.mesh.extraction.clean import drop_small_components
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import surface, usable_level
-from dg4d_lib.mesh.extraction.outlines import agreement, outlines_of
+from dg4d_lib.mesh.extraction.silhouettes import agreement, outlines_of
 from dg4d_lib.mesh.texturing.bake import vertex_normals
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings

@@ -10,7 +10,7 @@ from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import best_level, surface
-from dg4d_lib.mesh.extraction.outlines import agreement, outlines_of
+from dg4d_lib.mesh.extraction.silhouettes import agreement, outlines_of
 from dg4d_lib.mesh.tracking.skinning import skin_vertices
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings

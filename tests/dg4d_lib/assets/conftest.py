@@ -5,7 +5,7 @@ import torch
 
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import harmonics_of_color
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from dg4d_lib.assets.formats.gltf import Parsed
 from dg4d_lib.assets.formats.splat_glb import EXTENSION, KERNEL, POINTS, SplatGlbVersion
-from dg4d_lib.assets.formats.websplats import MAGIC, VERSION
+from dg4d_lib.assets.formats.web_splats import MAGIC, VERSION
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import harmonics_of_color
 
 
 def read_splat_glb(content: bytes, version: SplatGlbVersion = "ratified") -> Gaussians:

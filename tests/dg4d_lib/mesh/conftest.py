@@ -9,7 +9,7 @@ import torch
 from skimage.measure import marching_cubes
 
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import harmonics_of_color
 
 Cloud = Callable[..., Gaussians]
 

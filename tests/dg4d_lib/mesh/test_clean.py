@@ -9,8 +9,8 @@ import trimesh
 from skimage.measure import marching_cubes
 
 from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
-from dg4d_lib.mesh.extraction.check import checked
 from dg4d_lib.mesh.extraction.clean import clean, drop_small_components
+from dg4d_lib.mesh.extraction.topology import checked
 from dg4d_lib.settings import MeshSettings
 
 COARSE = MeshSettings(edge_length=0.08)

@@ -5,7 +5,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import isotropic
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import surface
-from dg4d_lib.mesh.extraction.outlines import agreement, outlines_of
+from dg4d_lib.mesh.extraction.silhouettes import agreement, outlines_of
 from dg4d_lib.mesh.tracking.nonrigid_registration import FOLLOWS, register_nonrigid
 from dg4d_lib.rasterizer.interface import choose_rasterizer
 from dg4d_lib.settings import MeshSettings

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.mesh.extraction.check import checked, welded
 from dg4d_lib.mesh.extraction.simplify import simplified
+from dg4d_lib.mesh.extraction.topology import checked, welded
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.unwrap import unwrap

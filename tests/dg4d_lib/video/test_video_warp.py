@@ -6,10 +6,10 @@ import torch
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import WarpSettings
+from dg4d_lib.video.arap import RigidSheet
 from dg4d_lib.video.limbs import waving_limbs
-from dg4d_lib.video.motions import bounce, breathe, lean, squash
 from dg4d_lib.video.puppet import Puppet
-from dg4d_lib.video.rigidity import RigidSheet
+from dg4d_lib.video.puppet_motions import bounce, breathe, lean, squash
 from dg4d_lib.video.warp import Warp
 
 SIZE = 96

@@ -6,7 +6,7 @@ import pytest
 import torch
 from splat_readers import read_web_splats
 
-from dg4d_lib.assets.formats.websplats import (
+from dg4d_lib.assets.formats.web_splats import (
     POSITION_STEPS,
     ROTATION_STEP,
     SCALE_STEP,
@@ -14,8 +14,8 @@ from dg4d_lib.assets.formats.websplats import (
 )
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
 from dg4d_lib.geometry.quaternion import rotation_matrix
+from dg4d_lib.geometry.spherical_harmonics import harmonics_of_color
 
 
 def cloud(frames: int = 6, count: int = 50, seed: int = 0) -> Gaussians:

@@ -1,6 +1,6 @@
 import torch
 
-from dg4d_lib.geometry.harmonics import color_of_harmonics, harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import color_of_harmonics, harmonics_of_color
 
 
 def test_colors_survive_the_round_trip():

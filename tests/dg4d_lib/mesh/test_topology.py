@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from dg4d_lib.mesh.extraction.check import MeshFacts, checked, outward, welded
+from dg4d_lib.mesh.extraction.topology import MeshFacts, checked, outward, welded
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
 TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)

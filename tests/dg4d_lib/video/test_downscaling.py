@@ -1,8 +1,8 @@
 import pytest
 import torch
 
+from dg4d_lib.video.downscaling import BandShrinker
 from dg4d_lib.video.framing import shrink
-from dg4d_lib.video.shrinking import BandShrinker
 
 
 def in_bands(picture: torch.Tensor, longest: int, rows: int) -> torch.Tensor:
