@@ -22,7 +22,7 @@ from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.images import resize
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.bake import vertex_normals
-from dg4d_lib.mesh_rasterizer.texture import Lookup, look_up, read
+from dg4d_lib.mesh_rasterizer.texture import TextureLookup, build_lookup, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import Fragments, rasterize_mesh
 from dg4d_lib.mesh_rasterizer.zbuffer import interpolate as spread
 from dg4d_lib.settings import TextureSettings
@@ -47,7 +47,7 @@ class MeshClip:
 
 
 @dataclass(frozen=True)
-class Refined:
+class RefinedTextures:
     """The colors of a stretch, in [0, 1].
 
     Attributes:
@@ -66,7 +66,7 @@ def refine_textures(
     settings: TextureSettings,
     generator: torch.Generator,
     progress: Callable[[int, int, dict[str, float]], None] = lambda done, total, values: None,
-) -> list[Refined]:
+) -> list[RefinedTextures]:
     """The textures of every stretch after the refinement.
 
     Args:
@@ -117,7 +117,7 @@ def refine_textures(
         progress(iteration + 1, settings.iterations, {"loss": value})
     ends = zip(textures, starts, (logit.detach() for logit in logits), strict=True)
     shared = [torch.where(logit == start, texture, logit.sigmoid()) for texture, start, logit in ends]
-    return [Refined(texture, _summed(texture, colors)) for texture, colors in zip(shared, added, strict=True)]
+    return [RefinedTextures(texture, _summed(texture, colors)) for texture, colors in zip(shared, added, strict=True)]
 
 
 def _nothing_added(stretch: MeshClip, size: int) -> Float[Tensor, "t i j 3"] | None:
@@ -156,8 +156,8 @@ def _trajectory(frames: int, settings: TextureSettings, generator: torch.Generat
 class _Look:
     """Where the pixels of a stretch look: into the shared texture, and frame by frame into what its frames add."""
 
-    shared: Lookup
-    own: tuple[Lookup, ...]
+    shared: TextureLookup
+    own: tuple[TextureLookup, ...]
 
 
 def _look(
@@ -172,12 +172,12 @@ def _look(
         mine = cameras[first : first + len(moved)]
         first += len(moved)
         fragments = rasterize_mesh(moved, mesh.faces, mine)
-        shared = look_up(moved, mesh.faces, mesh.uvs, mesh.texture.shape[:2], mine, fragments)
+        shared = build_lookup(moved, mesh.faces, mesh.uvs, mesh.texture.shape[:2], mine, fragments)
         own = (
             []
             if colors is None
             else [
-                look_up(moved[i], mesh.faces, mesh.uvs, colors.shape[1:3], mine[i : i + 1], _of_view(fragments, i))
+                build_lookup(moved[i], mesh.faces, mesh.uvs, colors.shape[1:3], mine[i : i + 1], _of_view(fragments, i))
                 for i in range(len(moved))
             ]
         )
@@ -214,9 +214,9 @@ def _draw(
     """All frames over white; differentiable in the textures and in what is added to them."""
     pictures = []
     for texture, colors, look in zip(textures, added, looks, strict=True):
-        covered, seen = look.shared.covered, read(texture, look.shared)
+        covered, seen = look.shared.covered, sample_texture(texture, look.shared)
         if colors is not None:
-            seen = seen + torch.cat([read(frame, own) for frame, own in zip(colors, look.own, strict=True)])
+            seen = seen + torch.cat([sample_texture(frame, own) for frame, own in zip(colors, look.own, strict=True)])
         picture = texture.new_ones((*covered.shape, 3))
         picture[covered] = seen
         pictures.append(picture)

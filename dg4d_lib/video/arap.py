@@ -8,7 +8,7 @@ from scipy.sparse.linalg import splu
 ITERATIONS = 15
 
 
-class RigidSheet:
+class ArapMesh:
     """A mesh some of whose nodes are led; the others follow with as little stretching as possible."""
 
     def __init__(

@@ -30,11 +30,11 @@ LIVELY = 0.05  # mean change of the subject against the first frame that earns 6
 TOUCHED = 0.05  # share of the border, more than in the input, that costs all of `whole`
 CALM, RESTLESS = 1.0, 1.9  # ratios of second to first differences: smooth motion, and noise
 DARK = 0.4  # of the input's brightness, below which a subject is lost
-GOOD = 0.7  # totals below are worth a warning
+MIN_GOOD_TOTAL = 0.7  # totals below are worth a warning
 
 
 @dataclass(frozen=True)
-class Score:
+class VideoScore:
     """How good a driving video is; see the module for the five numbers, all in [0, 1].
 
     Attributes:
@@ -73,7 +73,7 @@ class Candidate:
     number: int
     name: str
     video: DrivingVideo
-    score: Score
+    score: VideoScore
 
     def row(self) -> dict[str, object]:
         """A line of the ranked table."""
@@ -88,19 +88,19 @@ class Candidate:
         }
 
 
-def ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
+def rank_candidates(candidates: Sequence[Candidate]) -> list[Candidate]:
     """The best first; equal ones in the order of their numbers."""
     return sorted(candidates, key=lambda candidate: (-candidate.score.total, candidate.number))
 
 
-def score(video: DrivingVideo, subject: Float[Tensor, "h w 4"]) -> Score:
+def score_video(video: DrivingVideo, subject: Float[Tensor, "h w 4"]) -> VideoScore:
     """Judge a video of a subject.
 
     Args:
         video: of two frames or more.
         subject: straight alpha, in [0, 1], of the video's size: what the first frame should show.
     """
-    cutouts = _small(torch.cat([video.frames * video.coverage, video.coverage], -1).float(), SIZE)
+    cutouts = _small(torch.cat([video.frames * video.alpha, video.alpha], -1).float(), SIZE)
     truth = _small(torch.cat([subject[..., :3] * subject[..., 3:], subject[..., 3:]], -1)[None].float(), SIZE)
     pictures, expected = _over_white(cutouts), _over_white(truth)
     shown, repeated = _shown(cutouts, truth), _repeated(pictures)
@@ -120,7 +120,7 @@ def score(video: DrivingVideo, subject: Float[Tensor, "h w 4"]) -> Score:
         (motion < 0.3, "hardly anything moves"),
         (steady < 0.4, "it flickers"),
     ]
-    return Score(alive, whole, identity, motion, steady, tuple(text for wrong, text in remarks if wrong))
+    return VideoScore(alive, whole, identity, motion, steady, tuple(text for wrong, text in remarks if wrong))
 
 
 def _small(pictures: Float[Tensor, "t h w c"], size: int) -> Float[Tensor, "t s s c"]:

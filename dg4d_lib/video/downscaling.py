@@ -5,22 +5,24 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from dg4d_lib.images import resize_planes
-from dg4d_lib.video.framing import shrunk_size, straight
+from dg4d_lib.video.framing import downscaled_size, unpremultiply
 
 BAND_BYTES = 8 * 2**20  # of rows that are worked on at once, as float32
 
 
-def shrink_by_bands(picture: Float[Tensor, "h w 4"] | UInt8[Tensor, "h w 4"], longest: int) -> Float[Tensor, "h2 w2 4"]:
+def downscale_in_bands(
+    picture: Float[Tensor, "h w 4"] | UInt8[Tensor, "h w 4"], longest: int
+) -> Float[Tensor, "h2 w2 4"]:
     """Shrink a picture in memory without copies of its full size; bytes become numbers in [0, 1]."""
     height, width = picture.shape[:2]
-    shrinker, rows = BandShrinker(height, width, longest), max(1, BAND_BYTES // (16 * width))
+    shrinker, rows = BandDownscaler(height, width, longest), max(1, BAND_BYTES // (16 * width))
     for top in range(0, height, rows):
         band = picture[top : top + rows]
         shrinker.add(top, band.float() / 255 if band.dtype == torch.uint8 else band)
     return shrinker.picture()
 
 
-class BandShrinker:
+class BandDownscaler:
     """Running sum of bands of rows; gives what `framing.shrink` gives, up to rounding of float32.
 
     The triangle filter is separable: every band is filtered along its rows, and its rows are added with their weights
@@ -28,7 +30,7 @@ class BandShrinker:
     """
 
     def __init__(self, height: int, width: int, longest: int) -> None:
-        self._height, self._size = height, shrunk_size(height, width, longest)
+        self._height, self._size = height, downscaled_size(height, width, longest)
         self._keeps_size = self._size == (height, width)
         if self._keeps_size:
             self._picture = torch.empty(height, width, 4)
@@ -56,7 +58,7 @@ class BandShrinker:
             return self._picture
         picture = torch.empty(*self._size, 4)
         for row, weight in enumerate(self._weight):
-            picture[row] = straight(self._sum[None, :, row : row + 1] / weight)[0, 0]
+            picture[row] = unpremultiply(self._sum[None, :, row : row + 1] / weight)[0, 0]
         return picture
 
     def _weights(self, top: int, rows: int) -> tuple[int, Float[Tensor, "o rows"]]:

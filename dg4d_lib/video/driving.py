@@ -14,13 +14,13 @@ class DrivingVideo:
     """Cut-out frames.
 
     Attributes:
-        frames: straight color in [0, 1] (undefined where coverage is 0).
-        coverage: alpha in [0, 1].
+        frames: straight color in [0, 1] (undefined where alpha is 0).
+        alpha: alpha in [0, 1].
         fps: frames per second.
     """
 
     frames: Float[Tensor, "t h w 3"]
-    coverage: Float[Tensor, "t h w 1"]
+    alpha: Float[Tensor, "t h w 1"]
     fps: float
 
     def __len__(self) -> int:
@@ -33,4 +33,4 @@ class DrivingVideo:
 
     def over(self, background: Float[Tensor, " 3"]) -> Float[Tensor, "t h w 3"]:
         """Composite the frames over one color."""
-        return over_background(self.frames, self.coverage, background)
+        return over_background(self.frames, self.alpha, background)

@@ -37,7 +37,7 @@ class Crop:
     side: int
 
 
-def extent(alpha: Float[Tensor, "t h w"]) -> tuple[int, int, int, int]:
+def bounding_box(alpha: Float[Tensor, "t h w"]) -> tuple[int, int, int, int]:
     """Left, top, right and bottom (one past the last pixel) of everything that is visible in any frame.
 
     Raises:
@@ -50,13 +50,13 @@ def extent(alpha: Float[Tensor, "t h w"]) -> tuple[int, int, int, int]:
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
-def whole_frame(height: int, width: int) -> Crop:
+def crop_whole_frame(height: int, width: int) -> Crop:
     """The smallest square around a picture; the picture is in its middle."""
     side = max(height, width)
     return Crop((width - side) // 2, (height - side) // 2, side)
 
 
-def around_subject(alpha: Float[Tensor, "t h w"], border: float) -> Crop:
+def crop_around_subject(alpha: Float[Tensor, "t h w"], border: float) -> Crop:
     """The square in which the subject, over all frames, is centered and spans 1 - border of the side.
 
     Args:
@@ -66,15 +66,15 @@ def around_subject(alpha: Float[Tensor, "t h w"], border: float) -> Crop:
     Raises:
         BadInput: nothing is visible.
     """
-    left, top, right, bottom = extent(alpha)
+    left, top, right, bottom = bounding_box(alpha)
     side = max(1, round(max(right - left, bottom - top) / (1 - border)))
     return Crop(round((left + right - side) / 2), round((top + bottom - side) / 2), side)
 
 
-def lies_well(alpha: Float[Tensor, "t h w"]) -> bool:
+def is_well_framed(alpha: Float[Tensor, "t h w"]) -> bool:
     """Whether a square frame can stay as it is: the subject is inside, clear of the edge, and not tiny."""
     height, width = alpha.shape[1:]
-    left, top, right, bottom = extent(alpha)
+    left, top, right, bottom = bounding_box(alpha)
     margin = max(1, round(CLEAR_OF_EDGE * height))
     inside = min(left, top, width - right, height - bottom) >= margin
     return height == width and inside and max(right - left, bottom - top) >= FULL_ENOUGH * height
@@ -93,14 +93,14 @@ def reframe(frames: Float[Tensor, "t h w 4"], crop: Crop, size: int) -> Float[Te
     return torch.stack(framed)
 
 
-def shrink(frames: Float[Tensor, "t h w 4"], longest: int) -> Float[Tensor, "t h2 w2 4"]:
+def downscale(frames: Float[Tensor, "t h w 4"], longest: int) -> Float[Tensor, "t h2 w2 4"]:
     """Return the same frames with no side longer than `longest` pixels; smaller ones stay as they are."""
-    height, width = shrunk_size(frames.shape[1], frames.shape[2], longest)
+    height, width = downscaled_size(frames.shape[1], frames.shape[2], longest)
     return resample(frames, height, width)
 
 
-def shrunk_size(height: int, width: int, longest: int) -> tuple[int, int]:
-    """Return height and width in pixels after `shrink`."""
+def downscaled_size(height: int, width: int, longest: int) -> tuple[int, int]:
+    """Return height and width in pixels after `downscale`."""
     if max(height, width) <= longest:
         return height, width
     scale = longest / max(height, width)
@@ -113,10 +113,10 @@ def resample(frames: Float[Tensor, "t h w 4"], height: int, width: int) -> Float
         return frames
     alpha = frames[..., 3:]
     weighted = torch.cat([frames[..., :3] * alpha, alpha], -1).permute(0, 3, 1, 2)
-    return straight(resize_planes(weighted, (height, width)))
+    return unpremultiply(resize_planes(weighted, (height, width)))
 
 
-def straight(frames: Float[Tensor, "t 4 h w"]) -> Float[Tensor, "t h w 4"]:
+def unpremultiply(frames: Float[Tensor, "t 4 h w"]) -> Float[Tensor, "t h w 4"]:
     """Return frames whose colors are divided by alpha, channels last, all in [0, 1]."""
     small = frames.permute(0, 2, 3, 1).clamp(0, 1)
     color = small[..., :3] / small[..., 3:].clamp(min=1e-6)

@@ -9,8 +9,8 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from dg4d_lib.inflation.heights import outline_distance
-from dg4d_lib.video.arap import RigidSheet
-from dg4d_lib.video.puppet import Body, Puppet
+from dg4d_lib.video.arap import ArapMesh
+from dg4d_lib.video.puppet import Puppet, SubjectBounds
 
 WAVE_DEG = 24.0
 CORE = 0.55  # of the greatest inscribed radius: what a disc of this size can reach is body
@@ -66,10 +66,10 @@ class LimbAnimator:
         held |= _untouched_parts(np.concatenate(self._tips), edges, len(nodes))
         held[np.concatenate(self._tips)] = False
         self._held = np.flatnonzero(held)
-        self._sheet = RigidSheet(nodes, edges, np.concatenate([self._held, *self._tips]))
+        self._sheet = ArapMesh(nodes, edges, np.concatenate([self._held, *self._tips]))
 
     def draw(self, angle: float) -> Float64[np.ndarray, "h w 4"]:
-        """The puppet with its limbs raised by this angle in radians; they pass in front of the body."""
+        """The puppet with its limbs raised by this angle in radians; they pass in front of the bounds."""
         nodes = self._puppet.nodes
         targets = [nodes[self._held]]
         for limb, tip in zip(self._limbs, self._tips, strict=True):
@@ -81,14 +81,14 @@ class LimbAnimator:
 
 def waving_limbs(puppet: Puppet) -> list[Limb]:
     """The one or two parts that wave best: long, high up, at the sides; none where nothing sticks out."""
-    body = puppet.body
+    bounds = puppet.bounds
 
     def score(limb: Limb) -> float:
         raised = 1.6 if limb.tip[1] < limb.root[1] else 1.0
-        central = 0.5 if abs(limb.tip[0] - body.middle) <= 0.15 * body.width else 1.0
-        return limb.length / body.height * raised * central
+        central = 0.5 if abs(limb.tip[0] - bounds.middle) <= 0.15 * bounds.width else 1.0
+        return limb.length / bounds.height * raised * central
 
-    able = sorted((limb for limb in find_limbs(puppet) if _may_wave(limb, body)), key=score, reverse=True)[:MOST]
+    able = sorted((limb for limb in find_limbs(puppet) if _may_wave(limb, bounds)), key=score, reverse=True)[:MOST]
     return [limb for limb in able if score(limb) >= MUCH_WORSE * score(able[0])]
 
 
@@ -114,10 +114,10 @@ def find_limbs(puppet: Puppet) -> list[Limb]:
     return limbs
 
 
-def _may_wave(limb: Limb, body: Body) -> bool:
+def _may_wave(limb: Limb, bounds: SubjectBounds) -> bool:
     return bool(
-        limb.root[1] < body.top + LOWEST_ROOT * body.height
-        and limb.tip[1] < body.top + LOWEST_TIP * body.height
+        limb.root[1] < bounds.top + LOWEST_ROOT * bounds.height
+        and limb.tip[1] < bounds.top + LOWEST_TIP * bounds.height
         and limb.length > SLENDER * limb.thickness
     )
 

@@ -73,7 +73,7 @@ def matte(frames: Float[Tensor, "t h w 3"]) -> Matte:
     return Matte(cutouts, "backdrop" if backdrop.is_even else "uneven backdrop")
 
 
-def matte_after(frames: Float[Tensor, "t h w 3"], first: Float[Tensor, "h w"]) -> Float[Tensor, "t h w 4"]:
+def matte_from_first_alpha(frames: Float[Tensor, "t h w 3"], first: Float[Tensor, "h w"]) -> Float[Tensor, "t h w 4"]:
     """Cut out frames of which the alpha of the first is known, so that alpha does not flicker.
 
     Mattes of single frames are uncertain along the outline. Where a pixel keeps its color from one frame to the next,

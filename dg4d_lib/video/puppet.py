@@ -28,7 +28,7 @@ FOOT = 0.08  # of the height: the lowest part, whose middle the subject stands o
 
 
 @dataclass(frozen=True)
-class Body:
+class SubjectBounds:
     """Where the subject stands in its picture, pixels, x to the right and y down.
 
     Attributes:
@@ -65,7 +65,7 @@ class Puppet:
 
     Attributes:
         mask: the subject's pixels.
-        body: where it stands.
+        bounds: where it stands.
         nodes: x and y at rest, pixels.
         triangles: indices into the nodes; the two halves of cell i are i and i + half of their number.
         cell: pixels between nodes.
@@ -79,7 +79,7 @@ class Puppet:
         """
         alpha = picture[..., 3:]
         self.mask, _ = subject_mask(picture[..., 3])
-        self.body = _measure(self.mask)
+        self.bounds = _measure(self.mask)
         self.cell = max(SMALLEST_CELL, picture.shape[0] // CELLS)
         self.nodes, self.triangles = _lay_grid(picture[..., 3] > FAINT, self.cell)
         premultiplied = np.concatenate([picture[..., :3] * alpha, alpha], -1)
@@ -144,11 +144,11 @@ class Puppet:
         return (area <= 0) | (stretch > TORN).any(1) | (stretch < 1 / TORN).any(1)
 
 
-def _measure(mask: Bool[np.ndarray, "h w"]) -> Body:
+def _measure(mask: Bool[np.ndarray, "h w"]) -> SubjectBounds:
     rows, columns = np.nonzero(mask)
     top, bottom = float(rows.min()), float(rows.max() + 1)
     feet = columns[rows >= bottom - max(FOOT * (bottom - top), 1)]
-    return Body(
+    return SubjectBounds(
         left=float(columns.min()),
         right=float(columns.max() + 1),
         top=top,

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Float64
 
-from dg4d_lib.video.puppet import Body
+from dg4d_lib.video.puppet import SubjectBounds
 
 Nodes = Float64[np.ndarray, "n 2"]
 
@@ -21,59 +21,59 @@ CROUCH = 0.12  # of the height
 STRETCH = 0.5625  # of the jump
 
 
-def lean(nodes: Nodes, body: Body, phase: float, degrees: float) -> Nodes:
+def lean(nodes: Nodes, bounds: SubjectBounds, phase: float, degrees: float) -> Nodes:
     """Bend to the right and to the left like a beam held at the feet; its length is kept.
 
     Args:
         nodes: at rest, pixels.
-        body: whose feet are held.
+        bounds: whose feet are held.
         phase: in turns.
         degrees: greatest angle at the top.
     """
-    above = np.maximum(body.bottom - nodes[:, 1], 0)
-    below = np.maximum(nodes[:, 1] - body.bottom, 0)
-    angle = math.radians(degrees) * math.sin(2 * math.pi * phase) * above / body.height
+    above = np.maximum(bounds.bottom - nodes[:, 1], 0)
+    below = np.maximum(nodes[:, 1] - bounds.bottom, 0)
+    angle = math.radians(degrees) * math.sin(2 * math.pi * phase) * above / bounds.height
     half = angle / 2
     spine_x = above * np.sin(half) * np.sinc(half / math.pi)
     spine_y = above * np.sinc(angle / math.pi)
-    beside = nodes[:, 0] - body.foot
+    beside = nodes[:, 0] - bounds.foot
     return np.stack(
-        [body.foot + spine_x + beside * np.cos(angle), body.bottom - spine_y + below + beside * np.sin(angle)], -1
+        [bounds.foot + spine_x + beside * np.cos(angle), bounds.bottom - spine_y + below + beside * np.sin(angle)], -1
     )
 
 
-def breathe(nodes: Nodes, body: Body, phase: float, strength: float) -> Nodes:
+def breathe(nodes: Nodes, bounds: SubjectBounds, phase: float, strength: float) -> Nodes:
     """Rise and sink a little, the chest most."""
     breath = strength * math.sin(2 * math.pi * phase)
-    level = (body.bottom - nodes[:, 1]) / body.height
+    level = (bounds.bottom - nodes[:, 1]) / bounds.height
     chest = np.exp(-(((level - CHEST_HEIGHT) / CHEST_SPREAD) ** 2))
-    places = squash(nodes, body, BREATH * breath)
-    places[:, 0] = body.middle + (places[:, 0] - body.middle) * (1 + CHEST * breath * chest)
+    places = squash(nodes, bounds, BREATH * breath)
+    places[:, 0] = bounds.middle + (places[:, 0] - bounds.middle) * (1 + CHEST * breath * chest)
     return places
 
 
-def bounce(nodes: Nodes, body: Body, phase: float, strength: float) -> Nodes:
+def bounce(nodes: Nodes, bounds: SubjectBounds, phase: float, strength: float) -> Nodes:
     """Crouch, jump, land: one hop a loop."""
-    jump = jump_height(body, strength)
+    jump = jump_height(bounds, strength)
     lift = 0.0
     if phase < 0.25:
         change = -CROUCH * strength * math.sin(4 * math.pi * phase)
     elif phase < 0.75:
         flight = 2 * phase - 0.5
-        lift = 4 * flight * (1 - flight) * jump * body.height
+        lift = 4 * flight * (1 - flight) * jump * bounds.height
         change = STRETCH * jump * math.cos(2 * math.pi * flight) * math.sqrt(math.sin(math.pi * flight))
     else:
         landing = 4 * phase - 3
         change = -CROUCH * strength * math.sin(math.pi * landing) * (1 - 0.35 * landing)
-    return squash(nodes, body, change) - np.array([0, lift])
+    return squash(nodes, bounds, change) - np.array([0, lift])
 
 
-def jump_height(body: Body, strength: float) -> float:
-    """How high `bounce` goes, as a share of the body's height; little where the picture has no room above."""
-    return max(LEAST_JUMP, min(JUMP * strength, ROOM_USED * body.top / body.height))
+def jump_height(bounds: SubjectBounds, strength: float) -> float:
+    """How high `bounce` goes, as a share of the subject's height; little where the picture has no room above."""
+    return max(LEAST_JUMP, min(JUMP * strength, ROOM_USED * bounds.top / bounds.height))
 
 
-def squash(nodes: Nodes, body: Body, change: float) -> Nodes:
+def squash(nodes: Nodes, bounds: SubjectBounds, change: float) -> Nodes:
     """Taller by this share above the feet and slimmer to match."""
-    foot = np.array([body.foot, body.bottom])
+    foot = np.array([bounds.foot, bounds.bottom])
     return foot + (nodes - foot) * np.array([(1 + change) ** -0.9, 1 + change])

@@ -74,7 +74,7 @@ class Segmentation:
 
 def segment(lab: Float[ndarray, "t h w 3"]) -> Segmentation:
     """Tell the subject from the background, with one pair of color models for all frames."""
-    guess = np.stack([first_guess(frame) for frame in lab])
+    guess = np.stack([estimate_saliency(frame) for frame in lab])
     likelihood = guess
     colors = lab.reshape(-1, 3).astype(np.float64)
     odds = np.zeros(len(colors))
@@ -87,7 +87,7 @@ def segment(lab: Float[ndarray, "t h w 3"]) -> Segmentation:
     return Segmentation(likelihood, _separation(odds, likelihood.reshape(-1) > 0.5))
 
 
-def first_guess(lab: Float[ndarray, "h w 3"]) -> Float[ndarray, "h w"]:
+def estimate_saliency(lab: Float[ndarray, "h w 3"]) -> Float[ndarray, "h w"]:
     """How much every pixel stands out from what is connected to the border, in [0, 1]."""
     labels = np.unique(slic(lab, SUPERPIXELS, COMPACTNESS, convert2lab=False, channel_axis=-1), return_inverse=True)[1]
     labels = labels.reshape(lab.shape[:2])

@@ -5,7 +5,15 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import SubjectSettings
-from dg4d_lib.video.framing import VISIBLE, around_subject, extent, lies_well, reframe, shrink, whole_frame
+from dg4d_lib.video.framing import (
+    VISIBLE,
+    bounding_box,
+    crop_around_subject,
+    crop_whole_frame,
+    downscale,
+    is_well_framed,
+    reframe,
+)
 from dg4d_lib.video.matting import matte
 
 OVERSAMPLING = 2  # times the size of the square: larger opaque frames are shrunk before they are cut out
@@ -23,7 +31,7 @@ NOTES = {
 }
 
 
-def prepare(
+def prepare_subject(
     frames: Float[Tensor, "t h w 4"], has_alpha: bool, settings: SubjectSettings
 ) -> tuple[Float[Tensor, "t s s 4"], tuple[str, ...]]:
     """Cut out, frame and resample the subject, the same way in all frames.
@@ -42,20 +50,20 @@ def prepare(
     notes: tuple[str, ...] = ()
     given = has_alpha
     if not has_alpha:
-        found = matte(shrink(frames, OVERSAMPLING * settings.size)[..., :3])
+        found = matte(downscale(frames, OVERSAMPLING * settings.size)[..., :3])
         frames, notes = found.frames, (NOTES[found.method],)
     alpha = frames[..., 3]
-    extent(alpha)  # refuses what shows nothing at all
+    bounding_box(alpha)  # refuses what shows nothing at all
     if not (alpha[0] > VISIBLE).any():
         raise BadInput("the first frame shows no subject; cut the video so that it begins when the subject is there")
-    left, top, right, bottom = extent(alpha[:1])
+    left, top, right, bottom = bounding_box(alpha[:1])
     if max(right - left, bottom - top) < SMALLEST_SUBJECT:
         raise BadInput(
             f"the subject is {right - left} x {bottom - top} pixels; its longest side must have at least "
             f"{SMALLEST_SUBJECT}: give a larger or closer picture"
         )
-    keep = settings.framing == "keep" or (settings.framing == "auto" and given and lies_well(alpha))
-    crop = whole_frame(*alpha.shape[1:]) if keep else around_subject(alpha, settings.border)
+    keep = settings.framing == "keep" or (settings.framing == "auto" and given and is_well_framed(alpha))
+    crop = crop_whole_frame(*alpha.shape[1:]) if keep else crop_around_subject(alpha, settings.border)
     if not (alpha <= VISIBLE).any():
         notes = (*notes, "The picture is filled completely: there is no outline to build a shape from.")
     return reframe(frames, crop, settings.size), notes

@@ -13,7 +13,7 @@ from dg4d_lib.images import over_white
 from dg4d_lib.settings import SvdSettings
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.framing import resample
-from dg4d_lib.video.matting import matte_after
+from dg4d_lib.video.matting import matte_from_first_alpha
 
 UNTOLD = "In a generated video the subject could not be told from the background; it keeps the outline of the input."
 
@@ -75,7 +75,7 @@ class StableVideo:
         opaque = torch.cat([frames, torch.ones_like(frames[..., :1])], -1).to(subject)
         colors = resample(opaque, *subject.shape[:2])[..., :3]
         try:
-            cutouts = matte_after(colors, subject[..., 3])
+            cutouts = matte_from_first_alpha(colors, subject[..., 3])
         except BadInput:
             self.notes = (*dict.fromkeys((*self.notes, UNTOLD)),)
             cutouts = torch.cat([colors, subject[..., 3:].expand(len(colors), -1, -1, -1)], -1)

@@ -25,7 +25,7 @@ WEAKER = 0.6  # times the strength: candidates beyond the number of motions
 SMALL_JUMP = 0.5  # of the wanted height: below, the user is told
 
 
-def candidate(settings: WarpSettings, number: int) -> WarpSettings:
+def candidate_settings(settings: WarpSettings, number: int) -> WarpSettings:
     """The settings of one of several motions: the first is the chosen one, then come the others, then weaker ones.
 
     Args:
@@ -76,8 +76,8 @@ class Warp:
     def _choose(self, puppet: Puppet) -> Callable[[float], Float64[np.ndarray, "h w 4"]]:
         """The puppet's picture by phase."""
         motion, strength = self.settings.motion, self.settings.strength
-        nodes, body = puppet.nodes, puppet.body
-        if body.cropped and motion not in FOR_BUSTS:
+        nodes, bounds = puppet.nodes, puppet.bounds
+        if bounds.cropped and motion not in FOR_BUSTS:
             self.notes += (f"the picture's lower border cuts the subject off, so it sways instead of '{motion}'",)
             motion = "sway"
         if motion == "wave":
@@ -88,18 +88,18 @@ class Warp:
             self.notes += ("nothing sticks out that could wave, so the subject bends instead",)
             motion = "bend"
         if motion == "bounce":
-            if jump_height(body, strength) < SMALL_JUMP * JUMP * strength:
+            if jump_height(bounds, strength) < SMALL_JUMP * JUMP * strength:
                 self.notes += ("there is little room above the subject, so it jumps less high",)
-            return lambda phase: puppet.draw(bounce(nodes, body, phase, strength))
+            return lambda phase: puppet.draw(bounce(nodes, bounds, phase, strength))
         if motion == "breathe":
-            return lambda phase: puppet.draw(breathe(nodes, body, phase, strength))
+            return lambda phase: puppet.draw(breathe(nodes, bounds, phase, strength))
         degrees = strength * (BEND_DEG if motion == "bend" else SWAY_DEG)
-        return lambda phase: puppet.draw(lean(nodes, body, phase, degrees))
+        return lambda phase: puppet.draw(lean(nodes, bounds, phase, degrees))
 
     def _turn(self, subject: Float[Tensor, "h w 4"]) -> DrivingVideo:
         height, width = subject.shape[:2]
         surface = inflate(subject, min(height, TURN_SIZE), self.turn_deg)
         angles = [TURN_DEG * self.settings.strength * math.sin(2 * math.pi * phase) for phase in self._phases()]
         cameras = [OrbitCamera(azimuth_deg=angle, width=width, height=height) for angle in angles]
-        color, coverage = render_surface(surface, cameras)
-        return DrivingVideo(color.to(subject), coverage.to(subject), self.settings.fps)
+        color, alpha = render_surface(surface, cameras)
+        return DrivingVideo(color.to(subject), alpha.to(subject), self.settings.fps)

@@ -1,4 +1,4 @@
-"""How far meshes have the outlines of the Gaussians."""
+"""Silhouettes of meshes and Gaussians, and their intersection over union."""
 
 from collections.abc import Sequence
 
@@ -11,38 +11,46 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 
-SIZE = 128  # pixels of an outline
-VIEWS = ((0.0, 2.0), (75.0, 1.0))  # azimuth in degrees and weight: an eye compares at the input view
-SOLID = 0.5  # alpha from which a pixel belongs to the subject
+SIZE = 128  # pixels of a silhouette
+VIEWS = ((0.0, 2.0), (75.0, 1.0))  # azimuth in degrees and weight; people compare at the input view, so it counts twice
+ALPHA_THRESHOLD = 0.5  # alpha above which a pixel belongs to the subject
 
 
-def outlines_of(states: Gaussians, moments: Sequence[int], rasterize: Rasterizer) -> Bool[Tensor, "m k h w"]:
-    """What the Gaussians cover at some moments, seen from k sides.
+def render_silhouettes(states: Gaussians, frames: Sequence[int], rasterize: Rasterizer) -> Bool[Tensor, "m k h w"]:
+    """Render silhouettes of the Gaussians at m frames from k views.
 
     Args:
         states: the cloud at every frame (fields "t n 3").
-        moments: frames.
+        frames: indices of the frames to render.
         rasterize: the splatting backend.
     """
-    some = states.states(moments)
+    selected = states.states(frames)
     black = torch.zeros(3, device=states.means.device)
     with torch.no_grad():
-        views = [rasterize(some, cameras, black).alpha[..., 0] > SOLID for cameras in _cameras(len(moments))]
+        views = [
+            rasterize(selected, cameras, black).alpha[..., 0] > ALPHA_THRESHOLD for cameras in _cameras(len(frames))
+        ]
     return torch.stack(views, 1)
 
 
-def agreement(
-    vertices: Float[Tensor, "m v 3"], faces: Int[Tensor, "f 3"], outlines: Bool[Tensor, "m k h w"]
+def silhouette_iou(
+    vertices: Float[Tensor, "m v 3"], faces: Int[Tensor, "f 3"], silhouettes: Bool[Tensor, "m k h w"]
 ) -> Float[Tensor, " m"]:
-    """Intersection over union of what a mesh covers at m moments with the outlines, a mean over views, in [0, 1]."""
+    """Return the intersection over union of a mesh's silhouettes with given ones, weighted mean over views, in [0, 1].
+
+    Args:
+        vertices: of the mesh at m frames, world units.
+        faces: indices into the vertices.
+        silhouettes: output of `render_silhouettes` for these frames.
+    """
     total = torch.zeros(len(vertices))
     for view, cameras in enumerate(_cameras(len(vertices))):
-        drawn = rasterize_mesh(vertices, faces, cameras).faces >= 0
-        truth = outlines[:, view]
-        shared, either = (mask.flatten(1).sum(1) for mask in (drawn & truth, drawn | truth))
-        total += VIEWS[view][1] * (shared / either.clamp(min=1)).cpu()
+        rendered = rasterize_mesh(vertices, faces, cameras).faces >= 0
+        expected = silhouettes[:, view]
+        intersection, union = (mask.flatten(1).sum(1) for mask in (rendered & expected, rendered | expected))
+        total += VIEWS[view][1] * (intersection / union.clamp(min=1)).cpu()
     return total / sum(weight for _, weight in VIEWS)
 
 
-def _cameras(moments: int) -> list[list[OrbitCamera]]:
-    return [[OrbitCamera(0, azimuth, width=SIZE, height=SIZE)] * moments for azimuth, _ in VIEWS]
+def _cameras(frames: int) -> list[list[OrbitCamera]]:
+    return [[OrbitCamera(0, azimuth, width=SIZE, height=SIZE)] * frames for azimuth, _ in VIEWS]

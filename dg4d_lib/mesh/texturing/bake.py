@@ -25,8 +25,8 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import baking_views
 from dg4d_lib.errors import DG4DError
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.kernels.workers import run
-from dg4d_lib.mesh.extraction.silhouettes import SOLID
+from dg4d_lib.kernels.workers import run_parallel
+from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
@@ -62,7 +62,7 @@ class Texels:
     normals: Float[Tensor, "p 3"]
 
 
-def bake(
+def bake_texture(
     vertices: Float[Tensor, "v 3"],
     normals: Float[Tensor, "v 3"],
     faces: Int[Tensor, "f 3"],
@@ -85,7 +85,7 @@ def bake(
     Returns:
         Colors in [0, 1] of every texel; texels outside of all charts go on from those beside them.
     """
-    texels = texels_of(vertices, normals, faces, uvs, settings.texture_size)
+    texels = locate_texels(vertices, normals, faces, uvs, settings.texture_size)
     size = settings.texture_size
     if len(texels.rows) == 0:  # all triangles are smaller than a texel
         return torch.full((size, size, 3), 0.5)
@@ -98,7 +98,7 @@ def bake(
         rules = [(MIN_COSINE, 1.0)] * len(batch)
         if start == 0:
             rules[0] = (INPUT_FLATTER * MIN_COSINE, INPUT_WEIGHT)
-        run([partial(_add, texels, batch, pictures, rules, part, total) for part in _parts(len(total))])
+        run_parallel([partial(_add, texels, batch, pictures, rules, part, total) for part in _parts(len(total))])
     weight = torch.from_numpy(total[:, 3:])
     seen = weight[:, 0] > 0
     colors = torch.where(seen[:, None], torch.from_numpy(total[:, :3]) / weight.clamp_min(1e-30), 0.5)
@@ -114,7 +114,7 @@ def vertex_normals(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) ->
     return normalize(total, dim=-1)
 
 
-def texels_of(
+def locate_texels(
     vertices: Float[Tensor, "v 3"],
     normals: Float[Tensor, "v 3"],
     faces: Int[Tensor, "f 3"],
@@ -151,7 +151,7 @@ def _add(
     """Add what some of the texels see to their sums; for every camera its least cosine and its weight."""
     places, normals = texels.positions[part].numpy(), texels.normals[part].numpy()
     for view, (camera, rule) in enumerate(zip(cameras, rules, strict=True)):
-        pose = camera.world_to_camera().numpy(), camera.position().numpy(), camera.focal
+        pose = camera.viewmat().numpy(), camera.position().numpy(), camera.focal
         shown = (picture[view].numpy() for picture in pictures)
         _gather(places, normals, *pose, *shown, *rule, total[part])
 
@@ -175,7 +175,7 @@ def _look(
     alpha = picture.alpha[..., 0]
     depth = rasterize_mesh(vertices, faces, cameras).depth
     depth = torch.where(depth > 0, depth, torch.full_like(depth, torch.inf))
-    grade = (alpha > SOLID).to(torch.uint8) + (_lowest(alpha) > SOLID).to(torch.uint8)
+    grade = (alpha > ALPHA_THRESHOLD).to(torch.uint8) + (_lowest(alpha) > ALPHA_THRESHOLD).to(torch.uint8)
     return straight, grade, depth, _lowest(depth)
 
 

@@ -16,16 +16,16 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.kernels.workers import run
+from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.clean import drop_small_components
 from dg4d_lib.mesh.extraction.density import density_field
-from dg4d_lib.mesh.extraction.extract import surface, usable_level
-from dg4d_lib.mesh.extraction.silhouettes import agreement, outlines_of
+from dg4d_lib.mesh.extraction.extract import extract_surface, usable_level
+from dg4d_lib.mesh.extraction.silhouettes import render_silhouettes, silhouette_iou
 from dg4d_lib.mesh.texturing.bake import vertex_normals
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
 
-FOLLOWS = 0.85  # agreement of outlines from which a frame is left unchanged
+MIN_IOU = 0.85  # agreement of outlines from which a frame is left unchanged
 STIFFNESS = (5.0,) * 2 + (2.0,) * 6 + (1.0,) * 8 + (0.5,) * 8  # smoothing of successive steps
 FACING = 0.1  # half the distance that opposite normals add, world units: the far side of a sheet is not near
 
@@ -53,9 +53,9 @@ def register_nonrigid(
     Returns:
         The offsets, and the agreement of outlines at every frame with them, in [0, 1]: never less than before.
     """
-    outlines = outlines_of(states, range(len(offsets)), rasterize)
-    followed = agreement(vertices + offsets, faces, outlines)
-    astray = torch.nonzero(followed < FOLLOWS)[:, 0].tolist()
+    outlines = render_silhouettes(states, range(len(offsets)), rasterize)
+    followed = silhouette_iou(vertices + offsets, faces, outlines)
+    astray = torch.nonzero(followed < MIN_IOU)[:, 0].tolist()
     if not astray:
         return offsets, followed
     still, uneven = eye_array(len(vertices)), _laplacian(faces, len(vertices))
@@ -64,7 +64,7 @@ def register_nonrigid(
 
     def register_frame(frame: int) -> None:
         field = density_field(states.at(frame), settings)
-        target = drop_small_components(*surface(field, usable_level(field, level)), settings.min_component)
+        target = drop_small_components(*extract_surface(field, usable_level(field, level)), settings.min_component)
         places, theirs = (torch.from_numpy(array) for array in target)
         targets = _with_normals(places, theirs)
         tree = cKDTree(targets)
@@ -72,11 +72,11 @@ def register_nonrigid(
         for stiffness in STIFFNESS:
             step = smooth[stiffness].solve(_steps(_with_normals(moved, faces), targets, tree))
             moved = moved + torch.from_numpy(step.astype(np.float32))
-            now = agreement(moved[None], faces, outlines[frame, None])[0]
+            now = silhouette_iou(moved[None], faces, outlines[frame, None])[0]
             if now > followed[frame]:
                 followed[frame], registered[frame] = now, moved - vertices
 
-    run([partial(register_frame, frame) for frame in astray])
+    run_parallel([partial(register_frame, frame) for frame in astray])
     return registered, followed
 
 

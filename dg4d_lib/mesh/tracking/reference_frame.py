@@ -9,8 +9,8 @@ import torch
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import density_field
-from dg4d_lib.mesh.extraction.extract import best_level, surface
-from dg4d_lib.mesh.extraction.silhouettes import agreement, outlines_of
+from dg4d_lib.mesh.extraction.extract import extract_surface, select_level
+from dg4d_lib.mesh.extraction.silhouettes import render_silhouettes, silhouette_iou
 from dg4d_lib.mesh.tracking.skinning import skin_vertices
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
@@ -45,17 +45,17 @@ def select_reference_frame(
     """
     frames = len(states.means)
     compared = evenly_spaced(frames, COMPARED)
-    outlines = outlines_of(states, compared, rasterize)
+    outlines = render_silhouettes(states, compared, rasterize)
     scores = {}
     for frame in evenly_spaced(frames, CANDIDATES):
         rest = states.at(frame)
         field = density_field(rest, settings.model_copy(update={"grid": min(GRID, settings.grid)}))
-        level, _ = best_level(field, rest, rasterize, settings.density_threshold)
-        vertices, faces = (torch.from_numpy(array) for array in surface(field, level))
+        level, _ = select_level(field, rest, rasterize, settings.density_threshold)
+        vertices, faces = (torch.from_numpy(array) for array in extract_surface(field, level))
         motion = relative_to_frame(displacement, frame)
         some = Displacement(**{name: value[compared] for name, value in vars(motion).items()})
         moved = vertices + skin_vertices(vertices, rest, some)
-        scores[frame] = float(agreement(moved, faces, outlines).mean())
+        scores[frame] = float(silhouette_iou(moved, faces, outlines).mean())
     best = max(scores, key=lambda frame: scores[frame])
     chosen = best if scores[best] > scores[0] + GAIN else 0
     return chosen, scores[chosen]

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.geometry.quaternion import rotation_matrix
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
 
 INFLUENCES = 4  # bones of a vertex: what every player supports
 GROWTH = 1.4  # from one number of bones to the next that is tried
@@ -39,45 +39,45 @@ Array = NDArray[np.float64]
 class Rig:
     """Bones and the vertices that follow them: linear-blend skinning.
 
-    A bone b takes a point x at rest to R(quats[t, b]) (x - rest[b]) + places[t, b] at frame t; a vertex goes where its
+    A bone b takes a point x at rest to R(quats[t, b]) (x - rest_positions[b]) + positions[t, b] at frame t; a vertex goes where its
     bones take it, by weight.
 
     Attributes:
-        rest: where the joints are at rest, world units.
+        rest_positions: where the joints are at rest, world units.
         parents: of every bone, -1 for the root; a parent comes before its children.
         quats: how far every bone has turned from rest, in the world, wxyz, unit, without jumps of sign.
-        places: where every joint is, world units.
+        positions: where every joint is, world units.
         bones: that a vertex follows; 0 where the weight is 0.
         weights: not negative, sum 1, the largest first.
-        motion: how much there is to follow: root mean square of the vertices' distances to their mean places.
+        motion_rms: how much there is to follow: root mean square of the vertices' distances to their mean places.
         rms: distance between skin and given motion, root mean square over all vertices and frames, world units.
-        largest: of these distances, world units.
+        max_distance: of these distances, world units.
     """
 
-    rest: Float[Tensor, "b 3"]
+    rest_positions: Float[Tensor, "b 3"]
     parents: Int[Tensor, " b"]
     quats: Float[Tensor, "t b 4"]
-    places: Float[Tensor, "t b 3"]
+    positions: Float[Tensor, "t b 3"]
     bones: Int[Tensor, "v 4"]
     weights: Float[Tensor, "v 4"]
-    motion: float
+    motion_rms: float
     rms: float = 0.0
-    largest: float = 0.0
+    max_distance: float = 0.0
 
     @property
     def error(self) -> float:
         """The part of the motion that the rig misses: 0 is exact, 1 is as bad as no motion."""
-        return self.rms / self.motion if self.motion > 0 else 0.0
+        return self.rms / self.motion_rms if self.motion_rms > 0 else 0.0
 
 
-def fit_rig(vertices: Float[Tensor, "v 3"], offsets: Float[Tensor, "t v 3"], error: float, most_bones: int) -> Rig:
+def fit_rig(vertices: Float[Tensor, "v 3"], offsets: Float[Tensor, "t v 3"], error: float, max_bones: int) -> Rig:
     """The smallest rig found that follows a motion; vertices at the same place get the same weights.
 
     Args:
         vertices: at rest, world units.
         offsets: what to add to them at every frame, world units; vertices at the same place move alike.
         error: part of the motion (`Rig.error`) that may be missed; bones are added until it is reached.
-        most_bones: they are not added beyond this number, and the rig is returned as it is.
+        max_bones: they are not added beyond this number, and the rig is returned as it is.
 
     Raises:
         BadInput: no vertices, no frames, or numbers that are not finite.
@@ -90,7 +90,7 @@ def fit_rig(vertices: Float[Tensor, "v 3"], offsets: Float[Tensor, "t v 3"], err
     rest, moved = given[firsts] - origin, np.ascontiguousarray(motion[:, firsts].swapaxes(0, 1))
     amount = float(np.sqrt(np.square(motion - motion.mean(0)).sum(-1).mean()))
     goal = max(error * amount, EXACT * float(np.ptp(rest, axis=0).max()))
-    maps, weights = _fewest(rest, moved, goal, most_bones)
+    maps, weights = _fewest(rest, moved, goal, max_bones)
     order, parents, joints = _skeleton(rest, weights)
     turns = maps[order, :, :, :3] + np.eye(3)
     places = (turns @ joints[:, None, :, None])[..., 0] + maps[order, :, :, 3]
@@ -102,16 +102,16 @@ def fit_rig(vertices: Float[Tensor, "v 3"], offsets: Float[Tensor, "t v 3"], err
         torch.from_numpy(places.swapaxes(0, 1) + origin).to(vertices),
         torch.from_numpy(bones),
         torch.from_numpy(shares).to(vertices),
-        motion=amount,
+        motion_rms=amount,
     )
-    misses = (skinned(rig, vertices.double()) - offsets.double()).norm(dim=-1)
-    return replace(rig, rms=float(misses.square().mean().sqrt()), largest=float(misses.max()))
+    misses = (rig_offsets(rig, vertices.double()) - offsets.double()).norm(dim=-1)
+    return replace(rig, rms=float(misses.square().mean().sqrt()), max_distance=float(misses.max()))
 
 
-def skinned(rig: Rig, vertices: Float[Tensor, "v 3"]) -> Float[Tensor, "t v 3"]:
+def rig_offsets(rig: Rig, vertices: Float[Tensor, "v 3"]) -> Float[Tensor, "t v 3"]:
     """What the rig adds to vertices at rest at every frame, world units."""
     turns, rest, places, weights = (
-        x.to(vertices) for x in (rotation_matrix(rig.quats), rig.rest, rig.places, rig.weights)
+        x.to(vertices) for x in (quat_to_rotmat(rig.quats), rig.rest_positions, rig.positions, rig.weights)
     )
     moves = turns - torch.eye(3).to(vertices)
     shifts = places - rest - (moves @ rest[..., None])[..., 0]

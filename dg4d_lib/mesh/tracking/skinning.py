@@ -19,8 +19,8 @@ from torch import Tensor
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.quaternion import rotation_matrix
-from dg4d_lib.kernels.workers import run
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
+from dg4d_lib.kernels.workers import run_parallel
 
 NEIGHBORS = 24  # Gaussians per vertex
 FAINT = 0.005  # opacity below which the motion of a Gaussian is not visible and has no weight
@@ -56,14 +56,14 @@ def skin_vertices(
     moved = (rest.means + displacement.means.double().cpu()).numpy()
     bones, weights = (part.numpy() for part in _skinning_weights(points, rest))
     _drop_parting_bones(bones, weights, points.numpy(), rest.means.numpy(), moved)
-    back = rotation_matrix(rest.quats).mT
+    back = quat_to_rotmat(rest.quats).mT
     offsets = np.empty((len(moved), len(points), 3))
 
     def move(time: int) -> None:
-        turns = rotation_matrix(rest.quats + displacement.quats[time].double().cpu()) @ back
+        turns = quat_to_rotmat(rest.quats + displacement.quats[time].double().cpu()) @ back
         _move(bones, weights, points.numpy(), rest.means.numpy(), moved[time], turns.numpy(), offsets[time])
 
-    run([partial(move, time) for time in range(len(offsets))])
+    run_parallel([partial(move, time) for time in range(len(offsets))])
     return torch.from_numpy(offsets).to(vertices)
 
 
@@ -77,7 +77,7 @@ def _skinning_weights(points: Float[Tensor, "v 3"], rest: Gaussians) -> tuple[In
     distance, nearest = (torch.from_numpy(np.asarray(a)) for a in found)
     bones = shown[nearest]
     reach = distance[:, -1:].clamp_min(1e-9)
-    axes = rotation_matrix(rest.quats)[bones]
+    axes = quat_to_rotmat(rest.quats)[bones]
     scales = rest.scales[bones].maximum(THINNEST * reach[..., None])
     arms = points[:, None] - rest.means[bones]
     local = (arms[..., None, :] @ axes)[..., 0, :] / scales

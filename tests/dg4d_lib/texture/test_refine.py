@@ -9,7 +9,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.mesh_rasterizer.texture import bilinear, look_up, read
+from dg4d_lib.mesh_rasterizer.texture import build_lookup, sample_bilinear, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.settings import TextureSettings
 from dg4d_lib.texture.refine import MeshClip, refine_textures
@@ -46,9 +46,9 @@ def shown(meshes: Sequence[TexturedMesh], cameras: Sequence[OrbitCamera]) -> Ten
     pictures = []
     for mesh, camera in zip(meshes, cameras, strict=True):
         fragments = rasterize_mesh(mesh.vertices, mesh.faces, [camera])
-        lookup = look_up(mesh.vertices, mesh.faces, mesh.uvs, mesh.texture.shape[:2], [camera], fragments)
+        lookup = build_lookup(mesh.vertices, mesh.faces, mesh.uvs, mesh.texture.shape[:2], [camera], fragments)
         picture = torch.ones(*lookup.covered.shape, 3)
-        picture[lookup.covered] = read(mesh.texture, lookup)
+        picture[lookup.covered] = sample_texture(mesh.texture, lookup)
         pictures.append(picture[0])
     return torch.stack(pictures)
 
@@ -99,7 +99,7 @@ def error(texture: Tensor, truth: Tensor) -> float:
     """Mean over the texels that the sides show."""
     inside = torch.linspace(0.1, 0.9, 20)
     places = torch.stack([torch.stack([(side + u) / 4, v]) for side in range(4) for u in inside for v in inside])
-    return float((bilinear(texture, places) - bilinear(truth, places)).abs().mean())
+    return float((sample_bilinear(texture, places) - sample_bilinear(truth, places)).abs().mean())
 
 
 def tracked(texture: Tensor) -> list[MeshClip]:
