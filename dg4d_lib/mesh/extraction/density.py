@@ -67,7 +67,7 @@ def density_field(gaussians: Gaussians, settings: MeshSettings) -> DensityField:
             f"{settings.min_opacity}; the model is empty, fit it again"
         )
     if not all(bool(t.isfinite().all()) for t in (means, scales, axes)):
-        raise FitDiverged("no surface: some Gaussians have parameters that are NaN or infinite; fit the model again")
+        raise FitDiverged("no surface: some Gaussians are not finite (NaN or infinity); fit the model again")
 
     low, high = means.amin(0), means.amax(0)
     center = (low + high) / 2

@@ -44,7 +44,7 @@ def simplify_mesh(
     if triangles < 1:
         raise BadInput(f"a level of detail needs at least 1 triangle; {triangles} requested: raise pack.lods")
     if not bool(mesh.vertices.isfinite().all()) or not bool(offsets.isfinite().all()):
-        raise BadInput("the mesh holds NaN or infinite numbers and cannot be simplified; extract it again")
+        raise BadInput("the mesh holds numbers that are not finite and cannot be simplified; extract it again")
     if len(mesh.faces) <= triangles:
         return mesh, offsets
     try:

@@ -111,7 +111,7 @@ def fake_pymeshlab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_missing_filters_name_the_system_libraries(sphere: Mesh, fake_pymeshlab: Path) -> None:
     fake_pymeshlab.write_text("def filter_list(): return ['meshing_close_holes']")
-    with pytest.raises(BackendUnavailable, match=r"no filter .* and 10 others.*libgl1 libopengl0"):
+    with pytest.raises(BackendUnavailable, match=r"lacks the filter .* and 10 other required ones.*libgl1 libopengl0"):
         clean(*sphere, COARSE)
 
 

@@ -180,7 +180,7 @@ def test_convex_weights_are_the_best_there_are() -> None:
     for _ in range(20):
         arms, goal = generator.normal(size=(6, 4)), generator.normal(size=6)
         gram, given = arms.T @ arms, arms.T @ goal
-        found = module._convex(gram[None], given[None])[0]
+        found = module._convex_weights(gram[None], given[None])[0]
         sought = minimize(
             lambda w, gram=gram, given=given: w @ gram @ w - 2 * w @ given,
             np.full(4, 0.25),

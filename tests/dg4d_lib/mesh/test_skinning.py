@@ -120,5 +120,5 @@ def test_order_of_the_gaussians_does_not_matter(gaussians: Gaussians, vertices: 
 
 def test_an_empty_cloud_is_refused(gaussians: Gaussians, vertices: torch.Tensor) -> None:
     empty = Gaussians(**{name: value[:0] for name, value in vars(gaussians).items()})
-    with pytest.raises(BadInput, match="not empty"):
+    with pytest.raises(BadInput, match="non-empty"):
         skin_vertices(vertices, empty, still(empty, 1))
