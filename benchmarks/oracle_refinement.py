@@ -185,15 +185,15 @@ def refined(model: Model, variant: Variant, settings: TextureSettings, seed: int
     front = [OrbitCamera(width=settings.size, height=settings.size)] * len(model.offsets)
     seen = model.draw([model.mesh.texture] * len(front), front)
     video = DrivingVideo(seen[..., :3], seen[..., 3:], FPS)
-    stretch = MeshClip(replace(model.mesh, texture=model.blurred), model.offsets)
+    clip = MeshClip(replace(model.mesh, texture=model.blurred), model.offsets)
     oracle = Oracle(model, sigma, whole_videos=not variant.per_frame)
-    return refine_textures([stretch], video, oracle, settings, torch.Generator().manual_seed(seed))[0]
+    return refine_textures([clip], video, oracle, settings, torch.Generator().manual_seed(seed))[0]
 
 
 def figures_of(model: Model, made: RefinedTextures, size: int) -> Figures:
     """Against the true texture."""
     count = len(model.offsets)
-    textures = [made.texture] * count if made.frames is None else list(made.frames)
+    textures = [made.texture] * count if made.frame_textures is None else list(made.frame_textures)
     colors = torch.stack(textures)[:, model.texels.rows, model.texels.columns]
     marks = []
     for azimuth in SCORED_AZIMUTHS_DEG:

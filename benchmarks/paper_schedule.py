@@ -226,8 +226,8 @@ class Schedule:
         there = DrivingVideo(video.frames.to(self.device), video.alpha.to(self.device), video.fps)
         refiner = VideoToVideo(settings, model, there.over(there.frames.new_ones(3))[0])
         mesh = ball(self.settings.mesh.texture_size, self.device)
-        stretches = [MeshClip(mesh, torch.zeros_like(mesh.vertices)[None])] * len(video)
-        refine_textures(stretches, there, refiner, settings.texture, seeded())
+        clips = [MeshClip(mesh, torch.zeros_like(mesh.vertices)[None])] * len(video)
+        refine_textures(clips, there, refiner, settings.texture, seeded())
 
     def zero123(self, settings: Zero123PriorSettings) -> Zero123:
         sizes = self.sizes
