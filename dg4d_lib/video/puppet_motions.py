@@ -1,4 +1,4 @@
-"""Motions that are formulas: where the nodes of a puppet go. All are loops, at rest at phase 0."""
+"""Closed-form looping motions of a puppet's nodes; phase 0 is the rest pose."""
 
 import math
 
@@ -9,26 +9,27 @@ from dg4d_lib.video.puppet import SubjectBounds
 
 Nodes = Float64[np.ndarray, "n 2"]
 
-SWAY_DEG = 9.0  # at the top
-BEND_DEG = 18.0
-BREATH = 0.0225  # of the height
-CHEST = 0.0585  # of the width
-CHEST_HEIGHT, CHEST_SPREAD = 0.6, 0.28  # of the height, above the feet
-JUMP = 0.16  # of the height
-LEAST_JUMP = 0.03  # of the height, even without room above
-ROOM_USED = 0.8  # of the free margin above
-CROUCH = 0.12  # of the height
-STRETCH = 0.5625  # of the jump
+# Lengths are relative to the height of the subject unless noted.
+SWAY_DEG = 9.0  # maximum angle at the top, degrees
+BEND_DEG = 18.0  # maximum angle at the top, degrees
+BREATH = 0.0225  # vertical amplitude
+CHEST = 0.0585  # horizontal amplitude, relative to the width
+CHEST_HEIGHT, CHEST_SPREAD = 0.6, 0.28  # center above the feet and standard deviation
+JUMP = 0.16  # height of the jump
+MIN_JUMP = 0.03  # height of the jump without room above
+ROOM_USED = 0.8  # share of the free margin above that a jump uses
+CROUCH = 0.12  # compression before and after the jump
+STRETCH = 0.5625  # elongation in flight, relative to the jump
 
 
 def lean(nodes: Nodes, bounds: SubjectBounds, phase: float, degrees: float) -> Nodes:
-    """Bend to the right and to the left like a beam held at the feet; its length is kept.
+    """Bend to the right and to the left like a beam clamped at the feet, with constant length.
 
     Args:
-        nodes: at rest, pixels.
-        bounds: whose feet are held.
-        phase: in turns.
-        degrees: greatest angle at the top.
+        nodes: rest positions, pixels.
+        bounds: of the subject; the feet stay in place.
+        phase: position in the loop, in [0, 1).
+        degrees: maximum angle at the top.
     """
     above = np.maximum(bounds.bottom - nodes[:, 1], 0)
     below = np.maximum(nodes[:, 1] - bounds.bottom, 0)
@@ -43,17 +44,17 @@ def lean(nodes: Nodes, bounds: SubjectBounds, phase: float, degrees: float) -> N
 
 
 def breathe(nodes: Nodes, bounds: SubjectBounds, phase: float, strength: float) -> Nodes:
-    """Rise and sink a little, the chest most."""
+    """Rise, sink and widen slightly, most at the chest."""
     breath = strength * math.sin(2 * math.pi * phase)
     level = (bounds.bottom - nodes[:, 1]) / bounds.height
     chest = np.exp(-(((level - CHEST_HEIGHT) / CHEST_SPREAD) ** 2))
-    places = squash(nodes, bounds, BREATH * breath)
-    places[:, 0] = bounds.middle + (places[:, 0] - bounds.middle) * (1 + CHEST * breath * chest)
-    return places
+    positions = squash(nodes, bounds, BREATH * breath)
+    positions[:, 0] = bounds.middle + (positions[:, 0] - bounds.middle) * (1 + CHEST * breath * chest)
+    return positions
 
 
 def bounce(nodes: Nodes, bounds: SubjectBounds, phase: float, strength: float) -> Nodes:
-    """Crouch, jump, land: one hop a loop."""
+    """Crouch, jump and land once per loop."""
     jump = jump_height(bounds, strength)
     lift = 0.0
     if phase < 0.25:
@@ -69,11 +70,11 @@ def bounce(nodes: Nodes, bounds: SubjectBounds, phase: float, strength: float) -
 
 
 def jump_height(bounds: SubjectBounds, strength: float) -> float:
-    """How high `bounce` goes, as a share of the subject's height; little where the picture has no room above."""
-    return max(LEAST_JUMP, min(JUMP * strength, ROOM_USED * bounds.top / bounds.height))
+    """Return the height of the jump in subject heights, limited by the free margin above the subject."""
+    return max(MIN_JUMP, min(JUMP * strength, ROOM_USED * bounds.top / bounds.height))
 
 
 def squash(nodes: Nodes, bounds: SubjectBounds, change: float) -> Nodes:
-    """Taller by this share above the feet and slimmer to match."""
+    """Stretch vertically by this share, measured from the feet, and shrink horizontally to match."""
     foot = np.array([bounds.foot, bounds.bottom])
     return foot + (nodes - foot) * np.array([(1 + change) ** -0.9, 1 + change])

@@ -67,7 +67,7 @@ BROKEN = {
     frozen: "hardly anything moves",
     black: "frames are dark or empty",
     empty: "frames are dark or empty",
-    flickering: "it flickers",
+    flickering: "the video flickers",
     cropped: "the subject leaves the frame",
     swelling: "the subject changes its size",
     another: "the subject does not look like the input",

@@ -220,10 +220,10 @@ def test_a_rigid_sheet_follows_a_rotation_exactly():
             np.stack([index[:-1].ravel(), index[1:].ravel()], -1),
         ]
     )
-    led = np.flatnonzero(nodes[:, 0] < 2)
+    handles = np.flatnonzero(nodes[:, 0] < 2)
     c, s = math.cos(0.5), math.sin(0.5)
     turned = nodes @ np.array([[c, s], [-s, c]])
-    sheet = ArapMesh(nodes, edges, led)
+    sheet = ArapMesh(nodes, edges, handles)
     start = np.abs(nodes - turned).max()
-    assert np.abs(sheet.pose(turned[led]) - turned).max() < 0.1 * start
-    np.testing.assert_allclose(sheet.pose(nodes[led]), nodes, atol=1e-9)
+    assert np.abs(sheet.pose(turned[handles]) - turned).max() < 0.1 * start
+    np.testing.assert_allclose(sheet.pose(nodes[handles]), nodes, atol=1e-9)
