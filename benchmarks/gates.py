@@ -31,7 +31,7 @@ from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import color_of_harmonics, harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh, sh_to_rgb
 from dg4d_lib.images import resize_planes
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
@@ -134,7 +134,7 @@ def own(name: str) -> Sample:
         log_scales=(SPREAD * edge).log().expand(FRAMES, len(ways), 3),
         quats=torch.tensor([1.0, 0, 0, 0]).expand(FRAMES, len(ways), 4),
         opacity_logits=torch.full((len(ways),), SOLID),
-        harmonics=harmonics_of_color(colors),
+        harmonics=rgb_to_sh(colors),
     )
     blank = TexturedMesh(places[0], faces, torch.zeros(len(ways), 2), torch.zeros(1, 1, 3))
     surface = Asset4D(*_painted(blank, places - places[0], colors), FPS)
@@ -186,7 +186,7 @@ def _noise(*shape: int) -> Tensor:
 
 def _recolored(sample: Sample, change: Callable[[Tensor], Tensor]) -> Sample:
     """Splats and mesh with other colors."""
-    colors = harmonics_of_color(change(color_of_harmonics(sample.states.harmonics)).clamp(0, 1))
+    colors = rgb_to_sh(change(sh_to_rgb(sample.states.harmonics)).clamp(0, 1))
     states = replace(sample.states, harmonics=colors)
     return replace(_retextured(sample, change), states=states)
 

@@ -17,14 +17,14 @@ import torch  # isort: skip
 from rich.table import Column, Table
 from torch import Tensor
 
-from dg4d_lib.assets.animated import moved
+from dg4d_lib.assets.animated import pose_gaussians
 from dg4d_lib.assets.formats.compact import read_compact
 from dg4d_lib.assets.formats.glb import read_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.images import color_over_white
 from dg4d_lib.mesh.extraction.density import density_field
-from dg4d_lib.mesh.extraction.extract import best_level
+from dg4d_lib.mesh.extraction.extract import select_level
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.metrics.image import iou, psnr
@@ -61,10 +61,10 @@ def of_package(folder: Path, count: int, rasterize: Rasterizer) -> list[Row]:
     asset = read_glb((folder / ASSET).read_bytes())
     fit = read_compact(folder / COMPACT)
     gaussians, deformation, frames = fit.gaussians, fit.deformation, fit.frames
-    first = moved(gaussians, deformation, frames, torch.zeros(1)).at(0)
-    level, _ = best_level(density_field(first, SETTINGS), first, rasterize, SETTINGS.density_threshold)
+    first = pose_gaussians(gaussians, deformation, frames, torch.zeros(1)).at(0)
+    level, _ = select_level(density_field(first, SETTINGS), first, rasterize, SETTINGS.density_threshold)
     chosen = [i * frames // count for i in range(count)]
-    states = moved(gaussians, deformation, frames, torch.tensor(chosen, dtype=torch.float32))
+    states = pose_gaussians(gaussians, deformation, frames, torch.tensor(chosen, dtype=torch.float32))
     rows = []
     for i, frame in enumerate(chosen):
         extracted = textured(states.at(i), level, rasterize, SETTINGS)

@@ -219,15 +219,15 @@ class Schedule:
             self.settings.deformation, gaussians.to(torch.device("cpu")), len(video), seeded()
         )
         deformation.to(gaussians.means.device)
-        prior = conditioned(model, torch.cat([video.frames, video.coverage], -1), dynamic, clock)
+        prior = conditioned(model, torch.cat([video.frames, video.alpha], -1), dynamic, clock)
         fit_motion(gaussians, deformation, video, prior, choose_rasterizer("auto"), dynamic, seeded())
 
     def refine(self, settings: VideoToVideoSettings, model: VideoModel, video: DrivingVideo) -> None:
-        there = DrivingVideo(video.frames.to(self.device), video.coverage.to(self.device), video.fps)
+        there = DrivingVideo(video.frames.to(self.device), video.alpha.to(self.device), video.fps)
         refiner = VideoToVideo(settings, model, there.over(there.frames.new_ones(3))[0])
         mesh = ball(self.settings.mesh.texture_size, self.device)
-        stretches = [MeshClip(mesh, torch.zeros_like(mesh.vertices)[None])] * len(video)
-        refine_textures(stretches, there, refiner, settings.texture, seeded())
+        clips = [MeshClip(mesh, torch.zeros_like(mesh.vertices)[None])] * len(video)
+        refine_textures(clips, there, refiner, settings.texture, seeded())
 
     def zero123(self, settings: Zero123PriorSettings) -> Zero123:
         sizes = self.sizes

@@ -32,8 +32,8 @@ from benchmarks.peers import WHITE, blended_pairs, gsplat_torch
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
-from dg4d_lib.kernels.vectors import LANES, LONG, Vectors
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
+from dg4d_lib.kernels.simd import LANES, LONG, SimdBuilder
 from dg4d_lib.kernels.workers import Scratch
 from dg4d_lib.rasterizer.cpu import packed
 from dg4d_lib.rasterizer.cpu_bins import TILE, bin_by_tile
@@ -82,7 +82,7 @@ def bumpy_ball(count: int, states: int = 0) -> Gaussians:
     if states:
         phase = torch.linspace(0, 6, states)[:, None, None]
         fields = {name: value + 0.05 * torch.sin(phase + 4 * value) for name, value in fields.items()}
-    cloud = Gaussians(**fields, opacity_logits=opacities.logit(), harmonics=harmonics_of_color(colors))
+    cloud = Gaussians(**fields, opacity_logits=opacities.logit(), harmonics=rgb_to_sh(colors))
     return Gaussians(**{name: value.requires_grad_() for name, value in vars(cloud).items()})
 
 
@@ -201,7 +201,7 @@ def _chains(typing_context, turns):
     """Twelve sums, each multiplied and added to `turns` times; gives a number that depends on all."""
 
     def generate(context, builder, signature, arguments):
-        e = Vectors(builder)
+        e = SimdBuilder(builder)
         # all sums end near 1: numbers close to zero are slow on some processors
         factor, term = e.constant(0.999), e.constant([1e-3 * (1 + lane / LANES) for lane in range(LANES)])
         start = [e.constant(chain) for chain in range(_CHAINS)]

@@ -73,7 +73,7 @@ def lit(mesh: TexturedMesh, camera: OrbitCamera) -> Float[Tensor, "h w 3"]:
     normals = torch.from_numpy(SmoothNormals(vertices, faces)(vertices))
     fragments = rasterize_mesh(mesh.vertices, mesh.faces, [camera])
     seen = torch.nn.functional.normalize(interpolate(fragments, mesh.faces, normals), dim=-1)
-    axes = camera.world_to_camera()[:3, :3].to(seen)
+    axes = camera.viewmat()[:3, :3].to(seen)
     light = torch.nn.functional.normalize(torch.tensor(LIGHT), dim=0)
     cosine = ((seen @ axes.T) * light).sum(-1, keepdim=True).clamp_min(0)
     return (color * (AMBIENT + DIFFUSE * cosine) * alpha + 1 - alpha)[0].clamp(0, 1)

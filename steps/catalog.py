@@ -76,7 +76,7 @@ STEPS: dict[str, StepSpec] = {
                 "films": _optional(FILMS),
             },
             resource="gpu",
-            late_imports=("dg4d_lib.kernels.compiling:load",),
+            late_imports=("dg4d_lib.kernels.compiling:preload_numba",),
         ),
         StepSpec(
             name="fit_gaussians",

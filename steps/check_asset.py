@@ -12,12 +12,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.asset_settings import GateSettings
-from dg4d_lib.assets.rendering.sheet import page
-from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
+from dg4d_lib.assets.rendering.sheet import draw_tiles
+from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.fitting.losses import resized
 from dg4d_lib.images import color_over_white
-from dg4d_lib.mesh.extraction.check import checked, welded
+from dg4d_lib.mesh.extraction.topology import check_topology, weld_vertices
 from dg4d_lib.metrics.gates import MESH, SPLATS, Evidence, Gate, Pictures, Turn, fidelity, judge
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
@@ -110,8 +110,8 @@ def gather(parts: Parts, video: DrivingVideo, cutout: Float[Tensor, "h w 4"], ra
 
     def triangles(positions: Float[Tensor, " b"], cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b s s 4"]:
         drawn = mesh(positions, cameras)
-        color, coverage = drawn[..., :3], drawn[..., 3:]
-        return torch.cat([color_over_white(color, coverage), coverage], -1)
+        color, alpha = drawn[..., :3], drawn[..., 3:]
+        return torch.cat([color_over_white(color, alpha), alpha], -1)
 
     seen, around = {}, {}
     for form, draw in ((SPLATS, splats), (MESH, triangles)):
@@ -120,10 +120,10 @@ def gather(parts: Parts, video: DrivingVideo, cutout: Float[Tensor, "h w 4"], ra
     turn = _drawn(splats, positions[:1].repeat(TURN), ring)
     return Evidence(
         picture=_resized(cutout[None]),
-        video=_resized(torch.cat([video.frames, video.coverage], -1)[frames.long()]),
+        video=_resized(torch.cat([video.frames, video.alpha], -1)[frames.long()]),
         seen=seen,
         around=around,
-        turn=Turn(turn[..., 3:4], turn[..., 4:], world_to_camera(ring), front.focal),
+        turn=Turn(turn[..., 3:4], turn[..., 4:], viewmats(ring), front.focal),
         flaws=max(_flaws(parts.surface, moment) for moment in moments),
     )
 
@@ -169,7 +169,7 @@ def picture(evidence: Evidence, seconds: Sequence[float]) -> Float[Tensor, "h w 
         rows[form] = pictures.color[columns]
         rows[f"{form} off by"] = 1 - (pictures.color - evidence.video.color)[columns].abs()
     headings = [f"{seconds[column]:.2f} s: {scores[column]:.1f} dB" for column in columns]
-    return page(torch.stack(list(rows.values())), list(rows), headings)
+    return draw_tiles(torch.stack(list(rows.values())), list(rows), headings)
 
 
 def _spread(count: int, most: int) -> Float[Tensor, " n"]:
@@ -195,6 +195,6 @@ def _resized(cutouts: Float[Tensor, "b h w 4"]) -> Pictures:
 def _flaws(surface: Surface, position: Float[Tensor, ""]) -> float:
     """What is broken about the mesh of a moment: edges and triangles per triangle, and the share of inverted pieces."""
     mesh = mesh_at(surface, position)
-    facts = checked(*welded(mesh.vertices.numpy(), mesh.faces.numpy()))
-    broken = facts.boundary + facts.crowded + facts.twisted + facts.flat
-    return broken / max(1, facts.triangles) + facts.inverted / max(1, facts.components)
+    facts = check_topology(*weld_vertices(mesh.vertices.numpy(), mesh.faces.numpy()))
+    broken = facts.boundary_edges + facts.nonmanifold_edges + facts.inconsistent_edges + facts.degenerate_faces
+    return broken / max(1, facts.triangles) + facts.inverted_components / max(1, facts.components)

@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dg4d_lib.assets.animated import moved
+from dg4d_lib.assets.animated import pose_gaussians
 from dg4d_lib.assets.formats.compact import read_compact
 from dg4d_lib.assets.formats.usd import UsdPlacement, compose_usdz
-from dg4d_lib.assets.rendering.preview import pictures_over, studio, write_film
-from dg4d_lib.assets.scenes.compose import Actor, Body, compose_glb, in_a_row, scene_duration
-from dg4d_lib.assets.scenes.scene import Item, Scene
+from dg4d_lib.assets.rendering.preview import render_over, studio_background, write_mp4
+from dg4d_lib.assets.scenes.compose import Actor, AnimatedGlb, compose_glb, line_up, scene_duration
+from dg4d_lib.assets.scenes.scene import Scene, SceneItem
 from dg4d_lib.cameras.orbit import FOV_Y_DEG, RADIUS, OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -32,7 +32,7 @@ BATCH = 8  # pictures of one rasterizer call, bounds the memory
 class Cast:
     """The packages of a scene, each read once."""
 
-    def __init__(self, folders: Sequence[Path], items: Sequence[Item], names: Sequence[str]) -> None:
+    def __init__(self, folders: Sequence[Path], items: Sequence[SceneItem], names: Sequence[str]) -> None:
         """Read the bodies.
 
         Args:
@@ -52,9 +52,9 @@ class Cast:
 
     def in_a_row(self, spacing: float) -> None:
         """Put them side by side on the ground, whatever positions they have."""
-        positions = in_a_row([actor.body for actor in self.actors], spacing)
+        positions = line_up([actor.glb for actor in self.actors], spacing)
         self.actors = [
-            Actor(actor.name, actor.body, actor.item.model_copy(update={"position": position}))
+            Actor(actor.name, actor.glb, actor.item.model_copy(update={"position": position}))
             for actor, position in zip(self.actors, positions, strict=True)
         ]
 
@@ -125,7 +125,7 @@ class Cast:
         center, radius = self._ball()
         scale = FILLED * RADIUS * math.sin(math.radians(FOV_Y_DEG / 2)) / radius
         upright = torch.tensor((1.0, 0.0, 0.0, 0.0))
-        background, pictures = studio(FILM_SIZE), []
+        background, pictures = studio_background(FILM_SIZE), []
         for start in range(0, count, BATCH):
             moments = torch.arange(start, min(start + BATCH, count), dtype=torch.float64)
             states = joined(
@@ -143,15 +143,15 @@ class Cast:
                 )
                 for moment in moments.tolist()
             ]
-            pictures.append(pictures_over(background, placed(states, upright, scale, -scale * center), cameras, draw))
+            pictures.append(render_over(background, placed(states, upright, scale, -scale * center), cameras, draw))
             progress(start + len(moments), count)
-        write_film(path, torch.cat(pictures), scene.fps)
+        write_mp4(path, torch.cat(pictures), scene.fps)
 
     def _ball(self) -> tuple[Float[Tensor, " 3"], float]:
         """Center and radius of a ball around the boxes of all actors."""
         boxes = []
         for actor in self.actors:
-            low, high = (torch.from_numpy(corner) for corner in (actor.body.low, actor.body.high))
+            low, high = (torch.from_numpy(corner) for corner in (actor.glb.low, actor.glb.high))
             corners = torch.cartesian_prod(*torch.stack((low, high), 1))
             matrix = torch.from_numpy(actor.transform)
             boxes.append(corners @ matrix[:3, :3].mT + matrix[:3, 3])
@@ -171,14 +171,14 @@ class _Cloud:
         """Its states at times of the scene, where the actor stands."""
         played = torch.from_numpy(actor.seconds(times_s.numpy()))
         fit, positions = self.fit, (played * self.fps).clamp(max=self.fit.frames)
-        states = moved(fit.gaussians, fit.deformation, fit.frames, positions)
+        states = pose_gaussians(fit.gaussians, fit.deformation, fit.frames, positions)
         quat = torch.from_numpy(actor.turn.as_quat(canonical=True))[[3, 0, 1, 2]]
         return placed(states, quat, actor.item.scale, torch.from_numpy(actor.origin))
 
 
-def _body(folder: Path) -> Body:
+def _body(folder: Path) -> AnimatedGlb:
     try:
-        return Body((folder / ASSET).read_bytes())
+        return AnimatedGlb((folder / ASSET).read_bytes())
     except OSError as error:
         raise BadInput(f"{folder} is not complete: {ASSET} cannot be read ({error.strerror}); make it again") from error
     except BadInput as error:

@@ -11,17 +11,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dg4d_lib.assets.rendering.preview import write_film
-from dg4d_lib.assets.rendering.sheet import videos_sheet
+from dg4d_lib.assets.rendering.preview import write_mp4
+from dg4d_lib.assets.rendering.sheet import draw_video_sheet
 from dg4d_lib.diffusion.parts import device_here
 from dg4d_lib.diffusion.video_model import VideoModel
 from dg4d_lib.errors import BadInput
 from dg4d_lib.images import resize
 from dg4d_lib.settings import DrivingSettings, SvdSettings, WarpSettings
-from dg4d_lib.video.candidate_ranking import GOOD, WEIGHTS, Candidate, ranked, score
+from dg4d_lib.video.candidate_ranking import MIN_GOOD_TOTAL, WEIGHTS, Candidate, rank_candidates, score_video
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.svd import StableVideo
-from dg4d_lib.video.warp import Warp, candidate
+from dg4d_lib.video.warp import Warp, candidate_settings
 from steps.artifacts.media import read_frames, read_png, write_frames, write_png, write_zip
 from steps.runtime.job import Job, StepReport
 from steps.runtime.weights import open_weights
@@ -62,7 +62,7 @@ def run(job: Job) -> StepReport:
             origin = "Stable Video Diffusion ({})"
     taken, verdict = _tournament(job, subject, motions) if len(motions) > 1 else (motions[0], ())
     write_frames(job.outputs["driving_video"], taken.video)
-    write_png(job.outputs["picture"], videos_sheet([taken.video], [taken.name], TILE, COLUMNS))
+    write_png(job.outputs["picture"], draw_video_sheet([taken.video], [taken.name], TILE, COLUMNS))
     made_up = f"The motion is made up by {origin.format(taken.name)}."
     return replace(facts, notes=(made_up, *verdict, *taken.notes, *facts.notes))
 
@@ -77,18 +77,20 @@ def _follow(job: Job, subject: Float[Tensor, "h w 4"]) -> StepReport:
         sizes = [f"{shape[1]} x {shape[0]}" for shape in (footage.frames.shape[1:3], subject.shape[:2])]
         raise BadInput(f"the footage is {sizes[0]} pixels and the subject {sizes[1]}; prepare both together")
     copyfile(job.inputs["footage"], job.outputs["driving_video"])
-    write_png(job.outputs["picture"], videos_sheet([footage], ["footage"], TILE, COLUMNS))
-    found = score(footage, subject)
+    write_png(job.outputs["picture"], draw_video_sheet([footage], ["footage"], TILE, COLUMNS))
+    found = score_video(footage, subject)
     why = "; ".join(found.remarks) or f"its score is low in {found.weakest}"
     note = f"The footage may be hard to follow (score {found.total:.2f} of 1): {why}."
-    return StepReport(backend="none: the footage is used as it is", notes=(note,) if found.total < GOOD else ())
+    return StepReport(
+        backend="none: the footage is used as it is", notes=(note,) if found.total < MIN_GOOD_TOTAL else ()
+    )
 
 
 def _warps(
     settings: WarpSettings, turn_deg: float, subject: Float[Tensor, "h w 4"], numbers: list[int]
 ) -> Iterator[_Motion]:
     for number in numbers:
-        mine = candidate(settings, number)
+        mine = candidate_settings(settings, number)
         warp = Warp(mine, turn_deg)
         video = warp.generate(subject, torch.Generator())
         yield _Motion(number, mine.motion, video, warp.notes)
@@ -113,11 +115,11 @@ def _tournament(job: Job, subject: Float[Tensor, "h w 4"], motions: list[_Motion
     """The best motion, and a sentence; writes the sheet, the ranking and the films."""
     judged = []
     for done, motion in enumerate(motions, 1):
-        judged.append(Candidate(motion.number, motion.name, motion.video, score(motion.video, subject)))
+        judged.append(Candidate(motion.number, motion.name, motion.video, score_video(motion.video, subject)))
         job.progress(done, len(motions), {"total": judged[-1].score.total})
-    order = ranked(judged)
+    order = rank_candidates(judged)
     names = [f"{each.number} {each.name}: {each.score.total:.2f}" for each in order]
-    write_png(job.outputs["candidates"], videos_sheet([each.video for each in order], names, TILE, COLUMNS))
+    write_png(job.outputs["candidates"], draw_video_sheet([each.video for each in order], names, TILE, COLUMNS))
     table = {"weights": WEIGHTS, "taken": order[0].number, "candidates": [each.row() for each in order]}
     job.outputs["ranking"].write_text(json.dumps(table, indent=2), encoding="utf-8")
     _write_films(job.outputs["films"], judged)
@@ -133,7 +135,7 @@ def _write_films(path: Path, candidates: list[Candidate]) -> None:
     scratch = path.with_suffix(".mp4")
     for each in candidates:
         small = resize(each.video.over(WHITE), (FILM, FILM)).clamp(0, 1)
-        write_film(scratch, small, each.video.fps)
+        write_mp4(scratch, small, each.video.fps)
         entries.append((f"{each.number}.mp4", scratch.read_bytes()))
     scratch.unlink()
     write_zip(path, entries)

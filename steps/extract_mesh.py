@@ -10,16 +10,16 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.images import color_over_white
-from dg4d_lib.mesh.extraction.check import MeshFacts, checked, welded
 from dg4d_lib.mesh.extraction.clean import clean
 from dg4d_lib.mesh.extraction.density import density_field
-from dg4d_lib.mesh.extraction.extract import surface, usable_level
+from dg4d_lib.mesh.extraction.extract import extract_surface, usable_level
+from dg4d_lib.mesh.extraction.topology import MeshTopology, check_topology, weld_vertices
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
-from dg4d_lib.mesh.texturing.bake import bake, vertex_normals
+from dg4d_lib.mesh.texturing.bake import bake_texture, vertex_normals
 from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.mesh.tracking.isosurface_projection import project_to_isosurface
-from dg4d_lib.mesh.tracking.nonrigid_registration import FOLLOWS, register_nonrigid
+from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU, register_nonrigid
 from dg4d_lib.mesh.tracking.reference_frame import relative_to_frame
 from dg4d_lib.mesh.tracking.skinning import skin_vertices
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
@@ -62,7 +62,7 @@ def run(job: Job) -> StepReport:
             f"({plan.followed:.1%} IoU on trial)",
             f"its outlines agree with the Gaussians' to {agreed.mean():.1%} (IoU), to {agreed.min():.1%} at worst",
         ]
-        if agreed.mean() < FOLLOWS:
+        if agreed.mean() < MIN_IOU:
             notes.append("one mesh follows this motion poorly: --set mesh.mode=per_frame gives a mesh per frame")
     else:
         first, end = frames_of_task.first_frame, frames_of_task.end_frame or frames
@@ -96,14 +96,14 @@ def _tracked(
     carried = skin_vertices(vertices, rest, relative_to_frame(displacement, frame))
     snapped = project_to_isosurface(vertices, carried, faces, states, level, settings)
     offsets, agreed = register_nonrigid(vertices, snapped, faces, states, level, rasterize, settings)
-    return TrackedMesh(mesh, offsets[:, copied], rest=frame), agreed
+    return TrackedMesh(mesh, offsets[:, copied], reference_frame=frame), agreed
 
 
 def _cleaned_surface(
     gaussians: Gaussians, level: float, settings: MeshSettings
 ) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
     field = density_field(gaussians, settings)
-    vertices, faces = clean(*surface(field, usable_level(field, level)), settings, field.unit)
+    vertices, faces = clean(*extract_surface(field, usable_level(field, level)), settings, field.unit)
     return torch.from_numpy(vertices), torch.from_numpy(faces)
 
 
@@ -117,21 +117,21 @@ def _colored(
     """Unwrapped and baked; and the old vertex of every new one."""
     copied, corners, uvs = (torch.from_numpy(a) for a in unwrap(vertices.numpy(), faces.numpy(), settings.texture_size))
     normals = vertex_normals(vertices, faces)[copied]
-    texture = bake(vertices[copied], normals, corners, uvs, gaussians, rasterize, settings)
+    texture = bake_texture(vertices[copied], normals, corners, uvs, gaussians, rasterize, settings)
     return TexturedMesh(vertices[copied], corners, uvs, texture), copied
 
 
 def _soundness(meshes: dict[int, TexturedMesh]) -> list[str]:
     facts = {frame: _facts(mesh) for frame, mesh in meshes.items()}
-    flawed = [f"the mesh of frame {frame} is {its}" for frame, its in facts.items() if not its.sound]
+    flawed = [f"the mesh of frame {frame} is {its}" for frame, its in facts.items() if not its.valid]
     return [f"{len(facts) - len(flawed)} of {len(facts)} meshes from frame {min(facts)} on bound solids", *flawed]
 
 
-def _facts(mesh: TexturedMesh) -> MeshFacts:
-    return checked(*welded(mesh.vertices.numpy(), mesh.faces.numpy()))
+def _facts(mesh: TexturedMesh) -> MeshTopology:
+    return check_topology(*weld_vertices(mesh.vertices.numpy(), mesh.faces.numpy()))
 
 
 def _picture(mesh: TexturedMesh) -> Float[Tensor, "h w 3"]:
     """Four views in a row, over white."""
-    color, coverage = render_mesh(mesh, PICTURE_CAMERAS)
-    return torch.cat(list(color_over_white(color, coverage)), 1)
+    color, alpha = render_mesh(mesh, PICTURE_CAMERAS)
+    return torch.cat(list(color_over_white(color, alpha)), 1)

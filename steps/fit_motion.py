@@ -31,7 +31,7 @@ def run(job: Job) -> StepReport:
     video = read_frames(job.inputs["driving_video"], job.pictures)
     generator = torch.Generator().manual_seed(job.seed)
     rasterize = choose_rasterizer(backend)
-    cutouts = list(torch.cat([video.frames, video.coverage], -1))
+    cutouts = list(torch.cat([video.frames, video.alpha], -1))
     chosen = make_prior(prior, cutouts, settings, job.inputs.get("bank"), job.pictures, turn_deg)
     deformation = new_deformation(kind, gaussians, len(video), generator)
     device = device_of(backend)

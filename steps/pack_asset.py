@@ -13,21 +13,21 @@ import torch
 
 from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.assets.formats.compact import Compact, write_compact
+from dg4d_lib.assets.formats.compact import CompactAsset, write_compact
 from dg4d_lib.assets.formats.glb import write_frames_glb, write_glb, write_mesh_glb
-from dg4d_lib.assets.formats.rigged import rig_of, write_rigged_glb
+from dg4d_lib.assets.formats.rigged import fit_asset_rig, write_rigged_glb
 from dg4d_lib.assets.formats.splats import write_splat_glb_frames, write_splats, write_spz_frames
 from dg4d_lib.assets.formats.usd import write_usdz
-from dg4d_lib.assets.formats.websplats import write_web_splats
-from dg4d_lib.assets.rendering.preview import write_film, write_preview, write_turntable
-from dg4d_lib.assets.rendering.sheet import contact_sheet
+from dg4d_lib.assets.formats.web_splats import write_web_splats
+from dg4d_lib.assets.rendering.preview import write_mp4, write_preview, write_turntable
+from dg4d_lib.assets.rendering.sheet import draw_contact_sheet
 from dg4d_lib.assets.rendering.webp import write_webp
-from dg4d_lib.assets.resample import moments, resampled, states
+from dg4d_lib.assets.resample import pose_gaussians_in_chunks, resample_asset, resampled_positions
 from dg4d_lib.deformation.factory import AnyDeformation
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply
-from dg4d_lib.mesh.extraction.simplify import simplified
+from dg4d_lib.mesh.extraction.simplify import simplify_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
 from dg4d_lib.settings import DeformationSettings
@@ -112,7 +112,7 @@ class Contents:
         if not isinstance(surface, Asset4D):
             return ()
         for level, share in enumerate(self.pack.lods, 1):
-            mesh, offsets = simplified(surface.mesh, surface.offsets, max(1, round(share * len(surface.mesh.faces))))
+            mesh, offsets = simplify_mesh(surface.mesh, surface.offsets, max(1, round(share * len(surface.mesh.faces))))
             name = f"{packages.LEVELS}/{level}.glb"
             less = replace(surface, mesh=mesh, offsets=offsets, extras={**surface.extras, **self.extras})
             self.place(name).write_bytes(write_glb(less, self.pack.gltf))
@@ -124,7 +124,7 @@ class Contents:
         pack, surface = self.pack, self.surface
         if not pack.rig or not isinstance(surface, Asset4D):
             return ()
-        rig, note = rig_of(surface, pack.rig_bones, pack.rig_error)
+        rig, note = fit_asset_rig(surface, pack.rig_bones, pack.rig_error)
         if rig is not None:
             named = replace(surface, extras={**surface.extras, **self.extras})
             self.place(packages.RIGGED).write_bytes(write_rigged_glb(named, rig, pack.gltf))
@@ -155,10 +155,10 @@ class Contents:
         for name, port in ((packages.GAUSSIANS, "gaussians"), (packages.SUBJECT, "subject")):
             self.place(name).write_bytes(self.inputs[port].read_bytes())
         video = self.video
-        exact = Compact(self.gaussians, self.deformation, self.fitted, len(video), video.fps)
+        exact = CompactAsset(self.gaussians, self.deformation, self.fitted, len(video), video.fps)
         write_compact(self.place(packages.COMPACT), exact)
         even = video.frames.shape[1] // 2 * 2  # pixels; films of odd sizes do not play everywhere
-        write_film(self.place(packages.DRIVING), video.over(torch.ones(3))[:, :even, :even], video.fps)
+        write_mp4(self.place(packages.DRIVING), video.over(torch.ones(3))[:, :even, :even], video.fps)
         return ()
 
     def write_preview(self) -> Notes:
@@ -181,7 +181,7 @@ class Contents:
 
     def write_sheet(self) -> Notes:
         """The contact sheet."""
-        sheet = contact_sheet(self.gaussians, self.deformation, self.video, self.rasterizer, self.pack)
+        sheet = draw_contact_sheet(self.gaussians, self.deformation, self.video, self.rasterizer, self.pack)
         write_png(self.place(packages.SHEET), sheet)
         return ()
 
@@ -244,7 +244,7 @@ def _contents(job: Job, scratch: Path) -> Contents:
     _check_frames(len(video), {"motion": fit.frames, "mesh": frames})
     fps = pack.fps or video.fps
     if isinstance(surface, Asset4D):
-        surface = resampled(surface, gaussians, fit.deformation, fit.frames, fps)
+        surface = resample_asset(surface, gaussians, fit.deformation, fit.frames, fps)
     elif fps != video.fps:
         raise BadInput(
             f"a mesh per frame has the frames of the driving video, {video.fps:g} a second; {fps:g} are asked for: "
@@ -259,7 +259,9 @@ def _contents(job: Job, scratch: Path) -> Contents:
         deformation=fit.deformation,
         fitted=fit.settings,
         video=video,
-        states=states(gaussians, fit.deformation, fit.frames, moments(fit.frames, video.fps, fps)),
+        states=pose_gaussians_in_chunks(
+            gaussians, fit.deformation, fit.frames, resampled_positions(fit.frames, video.fps, fps)
+        ),
         fps=fps,
         rasterizer=choose_rasterizer(job.settings.rasterizer),
         inputs=dict(job.inputs),
@@ -272,7 +274,9 @@ def _surface(job: Job, fps: float) -> Surface:
     match given:
         case ["tracked"]:
             tracked = read_tracked(job.inputs["tracked"])
-            return Asset4D(tracked.mesh, tracked.offsets, fps, textures=tracked.textures, rest=tracked.rest)
+            return Asset4D(
+                tracked.mesh, tracked.offsets, fps, textures=tracked.textures, reference_frame=tracked.reference_frame
+            )
         case ["meshes"]:
             return read_meshes(job.inputs["meshes"])
     raise BadInput(f"a package needs one kind of mesh, `tracked` or `meshes`; given {given or 'neither'}")

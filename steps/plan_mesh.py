@@ -4,8 +4,8 @@ import torch
 
 from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.mesh.extraction.density import density_field
-from dg4d_lib.mesh.extraction.extract import best_level
-from dg4d_lib.mesh.tracking.nonrigid_registration import FOLLOWS
+from dg4d_lib.mesh.extraction.extract import select_level
+from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU
 from dg4d_lib.mesh.tracking.reference_frame import select_reference_frame
 from dg4d_lib.rasterizer.interface import choose_rasterizer
 from dg4d_lib.settings import MeshSettings
@@ -33,7 +33,7 @@ def run(job: Job) -> StepReport:
     if mode != "per_frame":
         frame, followed = select_reference_frame(states, displacement, rasterize, settings)
     if mode == "auto":
-        mode = "tracked" if followed >= FOLLOWS else "per_frame"
+        mode = "tracked" if followed >= MIN_IOU else "per_frame"
         if mode == "per_frame":
             frame = 0
             notes.append(
@@ -41,7 +41,7 @@ def run(job: Job) -> StepReport:
             )
     job.progress(1, 2, {})
     rest = states.at(frame)
-    level, agreement = best_level(density_field(rest, settings), rest, rasterize, settings.density_threshold)
+    level, agreement = select_level(density_field(rest, settings), rest, rasterize, settings.density_threshold)
     notes.append(f"surface at density {level:.3g}; its outlines agree with the Gaussians' to {agreement:.1%} (IoU)")
     write_plan(job.outputs["plan"], MeshPlan(mode=mode, reference_frame=frame, followed=followed, level=level))
     job.progress(2, 2, {})

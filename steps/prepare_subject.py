@@ -10,8 +10,8 @@ from torch import Tensor
 from dg4d_lib.images import over_white
 from dg4d_lib.settings import SubjectSettings
 from dg4d_lib.video.driving import DrivingVideo
-from dg4d_lib.video.framing import reframe, whole_frame
-from dg4d_lib.video.subject import prepare
+from dg4d_lib.video.framing import crop_whole_frame, reframe
+from dg4d_lib.video.subject import prepare_subject
 from steps.artifacts.media import write_frames, write_png
 from steps.runtime.job import Job, StepReport
 from steps.sources.reader import read_source
@@ -29,7 +29,7 @@ def run(job: Job) -> StepReport:
     with TemporaryDirectory() as scratch:
         source = read_source(job.inputs["source"], Path(scratch), settings.max_frames, settings.max_decode_gb)
     job.progress(1, 3, {})
-    cutouts, notes = prepare(source.frames, source.has_alpha, settings)
+    cutouts, notes = prepare_subject(source.frames, source.has_alpha, settings)
     job.progress(2, 3, {})
     write_png(job.outputs["subject"], cutouts[0])
     if source.kind == "video":
@@ -42,6 +42,6 @@ def run(job: Job) -> StepReport:
 
 def picture_of(source: Float[Tensor, "h w 4"], cutout: Float[Tensor, "s s 4"]) -> Float[Tensor, "t w3 3"]:
     """The source, its matte and the cut-out side by side, over white."""
-    tiles = [reframe(each[None], whole_frame(*each.shape[:2]), TILE)[0] for each in (source, cutout)]
+    tiles = [reframe(each[None], crop_whole_frame(*each.shape[:2]), TILE)[0] for each in (source, cutout)]
     given, cut = map(over_white, tiles)
     return torch.cat([given, tiles[1][..., 3:].expand(TILE, TILE, 3), cut], 1)

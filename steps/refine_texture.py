@@ -14,7 +14,7 @@ from dg4d_lib.guidance.distillation import Annealing
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.settings import IdentitySettings, ImageToImageSettings, RefinerSettings, VideoToVideoSettings
-from dg4d_lib.texture.refine import MeshClip, Refined, refine_textures
+from dg4d_lib.texture.refine import MeshClip, RefinedTextures, refine_textures
 from dg4d_lib.texture.refiner import ImageToImage, Refiner, VideoToVideo
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import read_frames
@@ -38,7 +38,7 @@ def run(job: Job) -> StepReport:
         tracked = read_tracked(job.inputs["tracked"])
         (its,), facts = _refined(job, [MeshClip(tracked.mesh, tracked.offsets)])
         mesh = replace(tracked.mesh, texture=its.texture)
-        write_tracked(job.outputs["tracked"], replace(tracked, mesh=mesh, textures=its.frames))
+        write_tracked(job.outputs["tracked"], replace(tracked, mesh=mesh, textures=its.frame_textures))
     if "meshes" in job.inputs:
         meshes = read_meshes(job.inputs["meshes"])
         refined, facts = _refined(job, [MeshClip(mesh, torch.zeros(1, *mesh.vertices.shape)) for mesh in meshes])
@@ -47,13 +47,13 @@ def run(job: Job) -> StepReport:
     return facts
 
 
-def _refined(job: Job, stretches: Sequence[MeshClip]) -> tuple[list[Refined], StepReport]:
+def _refined(job: Job, clips: Sequence[MeshClip]) -> tuple[list[RefinedTextures], StepReport]:
     """The textures of a motion, and how they were made."""
     kind: RefinerSettings = job.settings.refiner
     with TemporaryDirectory() as scratch:
         driving = read_frames(job.inputs["driving_video"], Path(scratch))
     device = device_here()
-    driving = DrivingVideo(driving.frames.to(device), driving.coverage.to(device), driving.fps)
+    driving = DrivingVideo(driving.frames.to(device), driving.alpha.to(device), driving.fps)
     pictures = driving.over(driving.frames.new_ones(3))
     refiner: Refiner
     match kind:
@@ -71,14 +71,17 @@ def _refined(job: Job, stretches: Sequence[MeshClip]) -> tuple[list[Refined], St
             refiner, halved = ImageToImage(kind, prior), prior.batches.notes
             how = "picture by picture, by image diffusion"
     generator = torch.Generator().manual_seed(job.seed)
-    there = [MeshClip(_on(device, stretch.mesh), stretch.offsets.to(device)) for stretch in stretches]
+    there = [MeshClip(_on(device, clip.mesh), clip.offsets.to(device)) for clip in clips]
     refined = refine_textures(there, driving, refiner, kind.texture, generator, job.progress)
     often = "every iteration" if kind.texture.refresh_every == 1 else f"every {kind.texture.refresh_every} iterations"
     said = [f"Textures were refined {how}; {kind.texture.iterations} iterations, new targets {often}."]
-    if any(its.frames is not None for its in refined):
+    if any(its.frame_textures is not None for its in refined):
         said.append("The texture changes from frame to frame: every frame adds colors of its own to the shared one.")
     facts = StepReport(f"{device.type} (diffusers)", opened.digests, opened.licenses, tuple(said), halved())
-    return [Refined(its.texture.cpu(), None if its.frames is None else its.frames.cpu()) for its in refined], facts
+    return [
+        RefinedTextures(its.texture.cpu(), None if its.frame_textures is None else its.frame_textures.cpu())
+        for its in refined
+    ], facts
 
 
 def _on(device: torch.device, mesh: TexturedMesh) -> TexturedMesh:

@@ -16,9 +16,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from dg4d_lib.asset_settings import ScoreSettings
-from dg4d_lib.assets.animated import between
+from dg4d_lib.assets.animated import interpolate_frames
 from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb
-from dg4d_lib.assets.rendering.preview import write_film
+from dg4d_lib.assets.rendering.preview import write_mp4
 from dg4d_lib.diffusion.parts import device_here
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.images import over_background
@@ -277,7 +277,9 @@ def _meshes(package: Path, count: int) -> list[tuple[Tensor, Tensor]]:
         read = [read_mesh_glb(_content(package, name)) for name in frames]
         return [(mesh.vertices, mesh.faces) for mesh in read]
     asset = read_glb(_content(package, ASSET))
-    return [(asset.mesh.vertices + offsets, asset.mesh.faces) for offsets in between(asset.offsets, positions)]
+    return [
+        (asset.mesh.vertices + offsets, asset.mesh.faces) for offsets in interpolate_frames(asset.offsets, positions)
+    ]
 
 
 def _content(package: Path, name: str) -> bytes:
@@ -320,7 +322,7 @@ def _write_films(path: Path, films: Mapping[str, Film], scratch: Path) -> None:
     for name, film in films.items():
         size = min(FILM_SIZE, film.color.shape[1]) // 2 * 2
         small = F.interpolate(film.color.movedim(-1, 1), (size, size), mode="area").movedim(1, -1)
-        write_film(scratch / "film.mp4", small.contiguous(), FILM_FPS)
+        write_mp4(scratch / "film.mp4", small.contiguous(), FILM_FPS)
         entries.append((f"{name}.mp4", (scratch / "film.mp4").read_bytes()))
     write_zip(path, entries)
 

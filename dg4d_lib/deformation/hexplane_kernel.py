@@ -18,8 +18,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from dg4d_lib.kernels.vectors import FLOAT, INT, KERNEL, LANES, LONG, Value, Vectors, pointers
-from dg4d_lib.kernels.workers import ranges, run
+from dg4d_lib.kernels.simd import FLOAT, INT, KERNEL, LANES, LONG, SimdBuilder, Value, pointers
+from dg4d_lib.kernels.workers import run_parallel, split_range
 
 SPATIAL_AXES = ((0, 1), (0, 2), (1, 2))  # xy, xz, yz: the axis along the columns and that along the rows
 BLOCKS = 4  # of points, each with sums of its own in backward
@@ -55,8 +55,8 @@ class _Features(torch.autograd.Function):
         cells, shares = _places(coordinates, planes.shape[-1])
         features = torch.empty(lines.shape[1], len(coordinates), plane_buffer.shape[-1])
         arrays = [tensor.numpy() for tensor in (cells, shares, plane_buffer, line_buffer)]
-        parts = ranges(len(coordinates), torch.get_num_threads())
-        run([partial(_read, *arrays, features.numpy(), *part) for part in parts])
+        parts = split_range(len(coordinates), torch.get_num_threads())
+        run_parallel([partial(_read, *arrays, features.numpy(), *part) for part in parts])
         ctx.arrays, ctx.channels = arrays, channels
         ctx.slope = (coordinates.abs() < 1) * (planes.shape[-1] - 1) / 2  # of the shares in the coordinates
         return features[..., :channels]
@@ -68,10 +68,10 @@ class _Features(torch.autograd.Function):
         buffers = ctx.arrays[2:]
         gradient = _padded(incoming).numpy()
         blocks = max(1, min(BLOCKS, BLOCK_BYTES // sum(buffer.nbytes for buffer in buffers)))
-        parts = ranges(gradient.shape[1], blocks)
+        parts = split_range(gradient.shape[1], blocks)
         found = [np.zeros((len(parts), *buffer.shape), np.float32) for buffer in buffers]
         of_shares = np.empty((3, *gradient.shape[1:]), np.float32) if ctx.needs_input_grad[0] else None
-        run(
+        run_parallel(
             [
                 partial(_write_back, *ctx.arrays, gradient, *(array[i] for array in found), of_shares, *part, channel)
                 for i, part in enumerate(parts)
@@ -127,7 +127,7 @@ def _read_point(typing_context, cells, shares, planes, lines, features, point, c
     signature = types.void(cells, shares, planes, lines, features, *scalars)
 
     def generate(context, builder, signature, arguments):
-        e = Vectors(builder)
+        e = SimdBuilder(builder)
         data = pointers(context, builder, signature, arguments)
         corner = _Corner(e, data, arguments[5:])
         first, second, third = corner.spatial()
@@ -159,7 +159,7 @@ def _write_back_point(
     axes = () if isinstance(grad_shares, types.NoneType) else range(3)
 
     def generate(context, builder, signature, arguments):
-        e = Vectors(builder)
+        e = SimdBuilder(builder)
         data = pointers(context, builder, signature, arguments)
         corner = _Corner(e, data, arguments[8:])
         first, second, third = corner.spatial()
@@ -198,7 +198,7 @@ def _write_back_point(
 class _Corner:
     """Where one point reads, and with which weights."""
 
-    def __init__(self, e: Vectors, data: Sequence[Value], scalars: Sequence[Value]) -> None:
+    def __init__(self, e: SimdBuilder, data: Sequence[Value], scalars: Sequence[Value]) -> None:
         self.e, self.planes, self.lines = e, data[2], data[3]
         self.point, self.channel, self.size, self.times, self.channels, self.points = scalars
         builder = e.builder

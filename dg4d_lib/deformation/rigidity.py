@@ -7,7 +7,7 @@ from torch import Tensor
 
 from dg4d_lib.deformation.rigidity_kernel import strain
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.quaternion import rotation_matrix
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
 
 NEIGHBORS = 20
 FALLOFF = 2000.0  # per world unit squared, of the weights exp(-FALLOFF d^2)
@@ -34,7 +34,7 @@ def rigidity(moved: Gaussians, indices: Int[Tensor, "n k"], weights: Float[Tenso
     steps = len(moved.means) - 1
     if steps < 1:
         return moved.means.new_zeros(())
-    turns = rotation_matrix(moved.quats)
+    turns = quat_to_rotmat(moved.quats)
     on_cpu = moved.means.device.type == "cpu" and moved.means.dtype == torch.float32
     total = (strain if on_cpu else plain_strain)(moved.means, turns, indices, weights)
     return total / (steps * indices.numel())

@@ -13,8 +13,8 @@ from numba import njit
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from dg4d_lib.kernels.vectors import KERNEL
-from dg4d_lib.kernels.workers import ranges, run
+from dg4d_lib.kernels.simd import KERNEL
+from dg4d_lib.kernels.workers import run_parallel, split_range
 
 BLOCKS = 4  # of Gaussians, each with sums of its own
 TINY = np.float32(1e-20)  # squared distance under which there is no direction
@@ -46,11 +46,13 @@ class _Strain(torch.autograd.Function):
         places = means.detach().permute(1, 2, 0).contiguous().numpy()
         frames = turns.detach().permute(1, 2, 3, 0).contiguous().numpy()
         fixed = (places, frames, indices.numpy(), weights.numpy())
-        parts = ranges(len(places), BLOCKS)
+        parts = split_range(len(places), BLOCKS)
         sums = np.zeros(len(parts))
         grad_places = np.zeros((len(parts), *places.shape), np.float32)
         grad_frames = np.zeros_like(frames)
-        run([partial(_pairs, *fixed, grad_places[i], grad_frames, sums[i : i + 1], *p) for i, p in enumerate(parts)])
+        run_parallel(
+            [partial(_pairs, *fixed, grad_places[i], grad_frames, sums[i : i + 1], *p) for i, p in enumerate(parts)]
+        )
         ctx.gradients = torch.from_numpy(grad_places.sum(0)), torch.from_numpy(grad_frames)
         return means.new_tensor(sums.sum())
 

@@ -57,7 +57,7 @@ def fit_motion(
     """
     camera = replace(input_camera or OrbitCamera(), width=settings.reference_size, height=settings.reference_size)
     device = gaussians.means.device
-    pictures = resized(torch.cat([video.frames, video.coverage], -1).to(device), settings.reference_size)
+    pictures = resized(torch.cat([video.frames, video.alpha], -1).to(device), settings.reference_size)
     color, alpha = (picture.permute(0, 3, 1, 2) for picture in pictures)  # so that chosen ones lie plane by plane too
     times = video.times.to(device)
     white = torch.tensor(WHITE, device=device)

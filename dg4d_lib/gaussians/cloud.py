@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dg4d_lib.devices import to_device_async
-from dg4d_lib.geometry.harmonics import color_of_harmonics
-from dg4d_lib.geometry.quaternion import rotation_matrix
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
+from dg4d_lib.geometry.spherical_harmonics import sh_to_rgb
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,12 @@ class Gaussians:
     @property
     def colors(self) -> Float[Tensor, "n 3"]:
         """Colors in [0, 1]."""
-        return color_of_harmonics(self.harmonics)
+        return sh_to_rgb(self.harmonics)
 
     @property
     def covariances(self) -> Float[Tensor, "*b n 3 3"]:
         """R S S^T R^T, world units squared."""
-        half = rotation_matrix(self.quats) * self.scales[..., None, :]
+        half = quat_to_rotmat(self.quats) * self.scales[..., None, :]
         return half @ half.mT
 
     def detach(self) -> "Gaussians":

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.quaternion import rotation_matrix
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
 
 SPLIT_INTO = 2
 SPLIT_SHRINK = 1.6
@@ -89,7 +89,7 @@ def densify(
     means, log_scales = gaussians.means[source].clone(), gaussians.log_scales[source].clone()
     if len(halves):
         local = torch.randn(len(halves), 3, generator=generator).to(means) * gaussians.scales[halves]
-        means[-len(halves) :] += (rotation_matrix(gaussians.quats[halves]) @ local[..., None])[..., 0]
+        means[-len(halves) :] += (quat_to_rotmat(gaussians.quats[halves]) @ local[..., None])[..., 0]
         log_scales[-len(halves) :] -= math.log(SPLIT_SHRINK)
     grown = Gaussians(
         means, log_scales, gaussians.quats[source], gaussians.opacity_logits[source], gaussians.harmonics[source]

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 
 BLOB_OPACITY = 0.1
 SURFACE_OPACITY = 0.9
@@ -54,5 +54,5 @@ def isotropic(
         scales.log()[:, None].repeat(1, 3),
         means.new_tensor((1.0, 0.0, 0.0, 0.0)).repeat(count, 1),
         means.new_full((count,), math.log(opacity / (1 - opacity))),
-        harmonics_of_color(colors),
+        rgb_to_sh(colors),
     )

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.quaternion import multiply
+from dg4d_lib.geometry.quaternion import quat_multiply
 
 
 def placed(
@@ -31,12 +31,12 @@ def placed(
     turn = quat.to(gaussians.means)
     points = torch.cat((torch.zeros_like(gaussians.means[..., :1]), gaussians.means), -1)
     back = turn * turn.new_tensor((1, -1, -1, -1))
-    turned = multiply(multiply(turn.expand_as(points), points), back.expand_as(points))[..., 1:]
+    turned = quat_multiply(quat_multiply(turn.expand_as(points), points), back.expand_as(points))[..., 1:]
     return replace(
         gaussians,
         means=scale * turned + translation.to(turned),
         log_scales=gaussians.log_scales + torch.tensor(scale).log().to(turned),
-        quats=multiply(turn.expand_as(gaussians.quats), gaussians.quats),
+        quats=quat_multiply(turn.expand_as(gaussians.quats), gaussians.quats),
     )
 
 

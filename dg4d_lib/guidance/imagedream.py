@@ -281,7 +281,7 @@ class ImageDreamPrior:
 def camera_numbers(camera: OrbitCamera) -> Float[Tensor, "16"]:
     """The camera as ImageDream is told: camera to world by rows, OpenGL axes, z up, at radius 1; float64."""
     turned = OrbitCamera(camera.elevation_deg, camera.azimuth_deg + FRONT_DEG, radius=1.0)
-    pose = turned.world_to_camera().inverse() @ torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64).diag()
+    pose = turned.viewmat().inverse() @ torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64).diag()
     right, up, front, last = pose
     return torch.cat([right, -front, up, last])
 

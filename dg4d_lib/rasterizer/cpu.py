@@ -21,7 +21,7 @@ from torch.nn.functional import logsigmoid
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.kernels.workers import Scratch, ranges, recycled, run
+from dg4d_lib.kernels.workers import Scratch, empty_recycled, run_parallel, split_range
 from dg4d_lib.rasterizer.cpu_bins import TILE, bin_by_tile
 from dg4d_lib.rasterizer.cpu_blend import PLANE
 from dg4d_lib.rasterizer.cpu_project import CAMERA, RECORD, project, unproject
@@ -66,7 +66,7 @@ def rasterize(
 
 def packed(camera: OrbitCamera) -> Float[Array, " c"]:
     """A camera as the kernels read it."""
-    pose = camera.world_to_camera().numpy()
+    pose = camera.viewmat().numpy()
     tan_x, tan_y = camera.tan_half_fov
     lens = (camera.focal, camera.width / 2, camera.height / 2, FRUSTUM_MARGIN * tan_x, FRUSTUM_MARGIN * tan_y)
     packed = np.array([*pose[:3, :3].flat, *pose[:3, 3], *lens], np.float32)
@@ -137,14 +137,14 @@ class _Pictures:
         pictures = [torch.empty(len(self.cameras), planes, *self.size) for planes in (3, 1, 1)]
         planes = [picture.numpy() for picture in pictures]
         if self.by_view:
-            run([partial(self._draw_view, clouds, planes, view) for view in self.views])
+            run_parallel([partial(self._draw_view, clouds, planes, view) for view in self.views])
         else:
             threads = torch.get_num_threads()
-            parts = ranges(len(clouds), threads)
-            run([partial(self._project, clouds, view, *part) for view in self.views for part in parts])
-            run([partial(self._bin, view) for view in self.views])
-            parts = ranges(self.tiles, 4 * threads)
-            run([partial(self._blend, planes, view, *part) for view in self.views for part in parts])
+            parts = split_range(len(clouds), threads)
+            run_parallel([partial(self._project, clouds, view, *part) for view in self.views for part in parts])
+            run_parallel([partial(self._bin, view) for view in self.views])
+            parts = split_range(self.tiles, 4 * threads)
+            run_parallel([partial(self._blend, planes, view, *part) for view in self.views for part in parts])
         return pictures
 
     def _draw_view(self, clouds: _Clouds, planes: list[Array], view: int) -> None:
@@ -180,10 +180,10 @@ class _Gradients:
     def __post_init__(self) -> None:
         clouds = self.clouds
         self.means, self.quats, self.log_scales, self.log_opacities, self.harmonics = (
-            recycled(value.shape)
+            empty_recycled(value.shape)
             for value in (clouds.means, clouds.quats, clouds.scales, clouds.log_opacities, clouds.harmonics)
         )
-        self.centers = recycled((len(self.pictures.cameras), len(clouds), 2))
+        self.centers = empty_recycled((len(self.pictures.cameras), len(clouds), 2))
 
     def collect(self) -> None:
         """Fill the gradients, some views at a time to bound the memory; the views are summed in their order."""
@@ -191,8 +191,8 @@ class _Gradients:
         for first in pictures.views[:: 2 * threads]:
             group, scratch = pictures.views[first : first + 2 * threads], Scratch()
             moments = self._blend_group(group, scratch)
-            parts = ranges(len(self.clouds), threads)
-            run([partial(self._unproject, group, moments, *part) for part in parts])
+            parts = split_range(len(self.clouds), threads)
+            run_parallel([partial(self._unproject, group, moments, *part) for part in parts])
 
     def _blend_group(self, group: range, scratch: Scratch) -> list[Array]:
         """Moments of the Gaussians, for each view.
@@ -206,12 +206,12 @@ class _Gradients:
             _, entries = pictures.bins[view]
             slots = scratch.empty(entries.shape, np.uint32)
             rows = scratch.empty((own_rows(entries, count, slots), RECORD))
-            parts = ranges(pictures.tiles, 1 if pictures.by_view else 4 * torch.get_num_threads())
+            parts = split_range(pictures.tiles, 1 if pictures.by_view else 4 * torch.get_num_threads())
             blends += [partial(self._blend, view, slots, rows, *part) for part in parts]
             sums.append(partial(gather, entries, slots, count, rows))
             moments.append(rows)
-        run(blends)
-        run(sums)
+        run_parallel(blends)
+        run_parallel(sums)
         return moments
 
     def _blend(self, view: int, slots: Array, moments: Array, first: int, last: int) -> None:

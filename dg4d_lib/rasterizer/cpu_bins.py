@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from dg4d_lib.kernels.vectors import INLINE, KERNEL
+from dg4d_lib.kernels.simd import INLINE, KERNEL
 from dg4d_lib.kernels.workers import Scratch
 from dg4d_lib.rasterizer.cpu_project import CENTER_X, CENTER_Y, EXTENT_X, EXTENT_Y
 

@@ -12,7 +12,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from dg4d_lib.kernels.vectors import FLOAT, FLOATS, INT, INTS, LANES, LONG, Value, Vectors, pointers
+from dg4d_lib.kernels.simd import FLOAT, FLOATS, INT, INTS, LANES, LONG, SimdBuilder, Value, pointers
 from dg4d_lib.rasterizer.cpu_bins import TILE
 from dg4d_lib.rasterizer.cpu_project import (
     BLUE,
@@ -59,7 +59,7 @@ def cover(typing_context, records, g, left, top, places, us, vs, length):  # noq
     signature = types.int64(records, types.int64, types.float32, types.float32, places, us, vs, types.int64)
 
     def generate(context, builder, signature, arguments):
-        e = Vectors(builder)
+        e = SimdBuilder(builder)
         data = pointers(context, builder, signature, arguments)
         record, base = data[0], builder.mul(arguments[1], _long(RECORD))
 
@@ -142,7 +142,7 @@ def blend_list(typing_context, state, places, us, vs, masks, start, end, records
     signature = types.int64(state, places, us, vs, masks, types.int64, types.int64, records, types.int64)
 
     def generate(context, builder, signature, arguments):
-        e = Vectors(builder)
+        e = SimdBuilder(builder)
         data = pointers(context, builder, signature, arguments)
         pixels, splat = data[0], _Splat(e, data[7], arguments[8])
 
@@ -188,7 +188,7 @@ def blend_list_backward(typing_context, state, places, us, vs, start, end, recor
     )
 
     def generate(context, builder, signature, arguments):
-        e = Vectors(builder)
+        e = SimdBuilder(builder)
         data = pointers(context, builder, signature, arguments)
         pixels, splat, own_place = data[0], _Splat(e, data[6], arguments[7]), e.splat(arguments[9])
 
@@ -233,7 +233,7 @@ def blend_list_backward(typing_context, state, places, us, vs, start, end, recor
 class _Splat:
     """One record, spread over the lanes."""
 
-    def __init__(self, e: Vectors, records: Value, g: Value) -> None:
+    def __init__(self, e: SimdBuilder, records: Value, g: Value) -> None:
         builder = e.builder
         base = builder.mul(g, _long(RECORD))
 

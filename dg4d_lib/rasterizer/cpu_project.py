@@ -12,8 +12,8 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from dg4d_lib.geometry.harmonics import C0
-from dg4d_lib.kernels.vectors import INLINE, KERNEL
+from dg4d_lib.geometry.spherical_harmonics import C0
+from dg4d_lib.kernels.simd import INLINE, KERNEL
 from dg4d_lib.rasterizer.interface import BLUR, MIN_ALPHA, NEAR
 
 # A record is what blending needs of one Gaussian: 16 floats, one cache line.

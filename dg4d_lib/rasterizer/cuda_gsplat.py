@@ -27,7 +27,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.utils.cpp_extension import get_default_build_root
 
-from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
+from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.devices import to_device_async
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -70,7 +70,7 @@ def rasterize(
     caught: list[Tensor] = []
     if screen_offsets is not None:
         means = _ScreenGradient.apply(means, screen_offsets, caught)
-    poses, lenses = to_device_async(world_to_camera(cameras).float(), DEVICE), to_device_async(_lenses(cameras), DEVICE)
+    poses, lenses = to_device_async(viewmats(cameras).float(), DEVICE), to_device_async(_lenses(cameras), DEVICE)
     backgrounds = to_device_async(background.detach().float(), DEVICE).expand(len(cameras), 3)
     if moving:  # a batch of clouds with one camera each
         opacities, colors = opacities.expand(len(cameras), -1), colors.expand(len(cameras), -1, -1)

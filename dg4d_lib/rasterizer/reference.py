@@ -15,7 +15,7 @@ from torch.utils.checkpoint import checkpoint
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.quaternion import rotation_matrix
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
 from dg4d_lib.rasterizer.interface import (
     BLUR,
     FRUSTUM_MARGIN,
@@ -76,7 +76,7 @@ class _Splats:
 
 
 def _project(gaussians: Gaussians, camera: OrbitCamera) -> _Splats:
-    pose = camera.world_to_camera().to(gaussians.means)
+    pose = camera.viewmat().to(gaussians.means)
     rotation, translation = pose[:3, :3], pose[:3, 3]
     x, y, z = (gaussians.means @ rotation.T + translation).unbind(-1)
     focal, (tan_x, tan_y) = camera.focal, camera.tan_half_fov
@@ -87,7 +87,7 @@ def _project(gaussians: Gaussians, camera: OrbitCamera) -> _Splats:
     jacobian = focal * torch.stack(
         (1 / z, zero, -clamped_x / z**2, zero, 1 / z, -clamped_y / z**2), -1
     ).unflatten(-1, (2, 3))  # fmt: skip
-    half = jacobian @ rotation @ (rotation_matrix(gaussians.quats) * gaussians.scales[:, None, :])
+    half = jacobian @ rotation @ (quat_to_rotmat(gaussians.quats) * gaussians.scales[:, None, :])
     covariances = half @ half.mT + BLUR * torch.eye(2).to(half)
     return _Splats(centers, covariances, z, gaussians.opacities, gaussians.colors)
 

@@ -20,7 +20,7 @@ from dg4d_lib.diffusion.parts import Placement
 from dg4d_lib.diffusion.published import load_network
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.reconstruction.alignment import best_azimuth
 from dg4d_lib.reconstruction.lgm_unet import VIEWS, Unet, UnetShape
@@ -75,7 +75,7 @@ def ray_embedding(cameras: list[OrbitCamera]) -> Float[Tensor, "v 6 h w"]:
     seen = functional.normalize(torch.stack([right, down, torch.ones_like(right)], -1), dim=-1)
     embeddings = []
     for camera in cameras:
-        directions = seen @ camera.world_to_camera()[:3, :3]  # the transpose of a rotation takes the camera's axes back
+        directions = seen @ camera.viewmat()[:3, :3]  # the transpose of a rotation takes the camera's axes back
         origins = camera.position().expand_as(directions)
         embeddings.append(torch.cat([torch.linalg.cross(origins, directions), directions], -1))
     return torch.stack(embeddings).permute(0, 3, 1, 2)
@@ -89,7 +89,7 @@ def gaussians_of(raw: Float[Tensor, "n 14"]) -> Gaussians:
         (0.1 * functional.softplus(scales)).clamp(min=SMALLEST).log() + math.log(WORLD_SCALE),
         functional.normalize(quats, dim=-1),
         opacity_logits[:, 0],
-        harmonics_of_color(0.5 * colors.tanh() + 0.5),
+        rgb_to_sh(0.5 * colors.tanh() + 0.5),
     )
 
 

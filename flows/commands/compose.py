@@ -6,7 +6,7 @@ from pathlib import Path, PurePath
 
 from pydantic import ValidationError
 
-from dg4d_lib.assets.scenes.scene import Item, Scene
+from dg4d_lib.assets.scenes.scene import Scene, SceneItem
 from dg4d_lib.errors import BadInput
 from flows.inputs.package_record import record_of
 from flows.packages.publish import check_writable, whole
@@ -49,7 +49,7 @@ def compose(
         plan = read_scene(scene)
         folders = [scene.parent / item.package for item in plan.items]
     else:
-        plan = Scene(items=tuple(Item(package=str(folder)) for folder in packages))
+        plan = Scene(items=tuple(SceneItem(package=str(folder)) for folder in packages))
         folders = list(packages)
     for folder in dict.fromkeys(folders):
         whole(folder)
@@ -98,7 +98,7 @@ def _check_out(out: Path) -> None:
     check_writable(out.parent)
 
 
-def _names(folders: Sequence[Path], items: Sequence[Item]) -> list[str]:
+def _names(folders: Sequence[Path], items: Sequence[SceneItem]) -> list[str]:
     """A name of its own for every item: the given one or that of its folder, with a number if it is taken."""
     wanted = [item.name or folder.resolve().name for folder, item in zip(folders, items, strict=True)]
     names: list[str] = []

@@ -16,7 +16,7 @@ from PIL import Image, ImageSequence
 from safetensors import SafetensorError
 from safetensors.numpy import load
 
-from dg4d_lib.assets.formats.gltf import Parsed
+from dg4d_lib.assets.formats.gltf import GlbReader
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.ply import read_ply
 
@@ -125,7 +125,7 @@ def _tensors(path: Path) -> Arrays:
 
 def _asset(path: Path) -> Arrays:
     """The rows of numbers of a GLB, all of one type together, and its pictures; places in the file do not count."""
-    parsed = Parsed(path.read_bytes())
+    parsed = GlbReader(path.read_bytes())
     rows = [parsed.accessor(i) for i in range(len(parsed.tree.get("accessors", ())))]
     types = dict.fromkeys((values.dtype, values.shape[1]) for values in rows)
     arrays: Arrays = {

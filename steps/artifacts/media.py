@@ -66,7 +66,7 @@ def write_frames(path: Path, video: DrivingVideo) -> None:
     """A driving video as RGBA pictures in a zip."""
     scratch = path.with_suffix(".png")
     entries = []
-    for i, cutout in enumerate(torch.cat([video.frames, video.coverage], -1)):
+    for i, cutout in enumerate(torch.cat([video.frames, video.alpha], -1)):
         write_png(scratch, cutout)
         entries.append((f"{i:03d}.png", scratch.read_bytes()))
     scratch.unlink()

@@ -20,7 +20,7 @@ def write_tracked(path: Path, tracked: TrackedMesh) -> None:
     tensors = {**_tensors(tracked.mesh), "offsets": tracked.offsets.float().cpu().contiguous()}
     if tracked.textures is not None:
         tensors["textures"] = _rounded(tracked.textures)
-    path.write_bytes(save(tensors, {"tracked": json.dumps({"rest": tracked.rest})}))
+    path.write_bytes(save(tensors, {"tracked": json.dumps({"rest": tracked.reference_frame})}))
 
 
 def read_tracked(path: Path) -> TrackedMesh:

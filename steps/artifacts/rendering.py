@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dg4d_lib.assets.animated import Asset4D, between, moved
+from dg4d_lib.assets.animated import Asset4D, interpolate_frames, pose_gaussians
 from dg4d_lib.assets.formats.compact import read_compact
 from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb
 from dg4d_lib.assets.formats.splats import read_splats
@@ -94,15 +94,17 @@ def read_states(folder: Path, manifest: Manifest) -> States:
         _check_frames(SPLATS, len(stored.means), manifest)
         return partial(states_between, stored)
     fit = read_compact(folder / COMPACT)
-    return lambda positions: moved(fit.gaussians, fit.deformation, fit.frames, positions * fit.frames / manifest.frames)
+    return lambda positions: pose_gaussians(
+        fit.gaussians, fit.deformation, fit.frames, positions * fit.frames / manifest.frames
+    )
 
 
 def states_between(states: Gaussians, positions: Float[Tensor, " b"]) -> Gaussians:
     """States of a cloud given per frame, linear between frames."""
     return Gaussians(
-        between(states.means, positions),
-        between(states.log_scales, positions),
-        between(states.quats, positions),
+        interpolate_frames(states.means, positions),
+        interpolate_frames(states.log_scales, positions),
+        interpolate_frames(states.quats, positions),
         states.opacity_logits,
         states.harmonics,
     )
@@ -125,7 +127,7 @@ def drawn_mesh(surface: Surface) -> Draw:
     """Draws the moved mesh as a player shows it: linear between frames, or each frame's own mesh until the next."""
     if isinstance(surface, Asset4D) and surface.textures is None:
         return lambda positions, cameras: torch.cat(
-            render_mesh(surface.mesh, cameras, between(surface.offsets, positions)), -1
+            render_mesh(surface.mesh, cameras, interpolate_frames(surface.offsets, positions)), -1
         )
 
     def draw(positions: Float[Tensor, " b"], cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b h w 4"]:
@@ -142,7 +144,9 @@ def mesh_at(surface: Surface, position: Float[Tensor, ""]) -> TexturedMesh:
         return surface[frame]
     texture = surface.mesh.texture if surface.textures is None else surface.textures[frame % len(surface.textures)]
     return replace(
-        surface.mesh, vertices=surface.mesh.vertices + between(surface.offsets, position[None])[0], texture=texture
+        surface.mesh,
+        vertices=surface.mesh.vertices + interpolate_frames(surface.offsets, position[None])[0],
+        texture=texture,
     )
 
 

@@ -10,7 +10,7 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.video.shrinking import BAND_BYTES, BandShrinker
+from dg4d_lib.video.downscaling import BAND_BYTES, BandDownscaler
 from steps.sources.decode_limit import DecodeLimit
 from steps.sources.stills import LARGEST_SIDE, check_size, upright, upright_size
 
@@ -41,7 +41,7 @@ def read_avif(
 
 def _in_bands(image: Image.Image, longest: int) -> Float[Tensor, "h2 w2 4"]:
     width, height = image.size
-    shrinker, rows = BandShrinker(height, width, longest), max(1, BAND_BYTES // (16 * width))
+    shrinker, rows = BandDownscaler(height, width, longest), max(1, BAND_BYTES // (16 * width))
     for top in range(0, height, rows):
         band = image.crop((0, top, width, min(height, top + rows))).convert("RGBA")
         shrinker.add(top, torch.from_numpy(np.array(band)).float() / 255)

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.video.framing import shrunk_size
-from dg4d_lib.video.shrinking import shrink_by_bands
+from dg4d_lib.video.downscaling import downscale_in_bands
+from dg4d_lib.video.framing import downscaled_size
 from steps.sources.decode_limit import DecodeLimit
 from steps.sources.stills import MOST_PIXELS, check_size
 
@@ -167,7 +167,7 @@ def _picture(frame: av.VideoFrame, side: int, has_alpha: bool) -> Float[Tensor, 
     """Return a frame as straight RGBA, upright, no side longer than `side`."""
     width, height = frame.width, frame.height
     if not has_alpha:  # the scaler does not know that alpha weighs colors
-        height, width = shrunk_size(height, width, side)
+        height, width = downscaled_size(height, width, side)
     pixels = frame.reformat(width=width, height=height, format="rgba", interpolation="AREA").to_ndarray()
-    picture = shrink_by_bands(torch.from_numpy(pixels), side)
+    picture = downscale_in_bands(torch.from_numpy(pixels), side)
     return torch.rot90(picture, round(frame.rotation / 90)).contiguous()

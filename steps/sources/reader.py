@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import SubjectSettings
-from dg4d_lib.video.shrinking import shrink_by_bands
+from dg4d_lib.video.downscaling import downscale_in_bands
 from steps.sources.avif import read_avif
 from steps.sources.clips import (
     MOST_DECODED,
@@ -146,7 +146,7 @@ def _read_webp(path: Path, max_frames: int, limit: DecodeLimit) -> Source:
         kept = KeptFrames(evenly_spaced(len(clip), max_frames), "the WebP animation")
         for i, frame in enumerate(clip):
             if i in kept:
-                kept.add(i, shrink_by_bands(frame, kept.side))
+                kept.add(i, downscale_in_bands(frame, kept.side))
     return _picture(kept.frames, True) if len(clip) == 1 else _video(kept.frames, True, clip.fps, len(clip))
 
 

@@ -12,7 +12,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.video.shrinking import BAND_BYTES, BandShrinker
+from dg4d_lib.video.downscaling import BAND_BYTES, BandDownscaler
 from steps.sources.decode_limit import DecodeLimit
 from steps.sources.still_headers import read_header
 
@@ -85,7 +85,7 @@ def read_still(
         BadInput: it cannot be read, or its size is out of range.
     """
     with open_still(path, what, limit) as still:
-        shrinker = BandShrinker(still.height, still.width, longest)
+        shrinker = BandDownscaler(still.height, still.width, longest)
         for top, band in still.bands():
             shrinker.add(top, torch.from_numpy(band))
     picture = upright(shrinker.picture(), still.orientation)

@@ -113,7 +113,7 @@ def sliding(frames: int) -> Gaussians:
 
 def seen(parts: Parts, video: DrivingVideo | None = None) -> Evidence:
     footage = video or DrivingVideo(torch.zeros(FRAMES, 32, 32, 3), torch.ones(FRAMES, 32, 32, 1), 24.0)
-    cutout = torch.cat([footage.frames, footage.coverage], -1)[0]
+    cutout = torch.cat([footage.frames, footage.alpha], -1)[0]
     return gather(parts, footage, cutout, choose_rasterizer("reference"))
 
 

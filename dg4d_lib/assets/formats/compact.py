@@ -43,7 +43,7 @@ TENSORS = {
 
 
 @dataclass(frozen=True)
-class Compact:
+class CompactAsset:
     """What a file holds.
 
     Attributes:
@@ -61,7 +61,7 @@ class Compact:
     fps: float
 
 
-def write_compact(path: Path, asset: Compact) -> None:
+def write_compact(path: Path, asset: CompactAsset) -> None:
     """Write one file; equal assets give equal bytes.
 
     Raises:
@@ -83,7 +83,7 @@ def write_compact(path: Path, asset: Compact) -> None:
     path.write_bytes(save(tensors, {KEY: json.dumps(about, sort_keys=True)}))
 
 
-def read_compact(path: Path) -> Compact:
+def read_compact(path: Path) -> CompactAsset:
     """Read what `write_compact` wrote: everything comes back exactly.
 
     Raises:
@@ -102,6 +102,6 @@ def read_compact(path: Path) -> Compact:
         }
         gaussians = Gaussians(**parts[GAUSSIANS])
         deformation = from_state_dict(settings, parts[DEFORMATION], about["frames"], len(gaussians))
-        return Compact(gaussians, deformation, settings, about["frames"], about["fps"])
+        return CompactAsset(gaussians, deformation, settings, about["frames"], about["fps"])
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, ValidationError, RuntimeError) as error:
         raise BadInput(f"{path.name} is no compact asset: {error}") from error

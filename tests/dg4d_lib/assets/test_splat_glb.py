@@ -10,7 +10,7 @@ import pytest
 import torch
 from splat_readers import read_splat_glb
 
-from dg4d_lib.assets.formats.gltf import Parsed
+from dg4d_lib.assets.formats.gltf import GlbReader
 from dg4d_lib.assets.formats.splat_glb import EXTENSION, write_splat_glb
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -28,7 +28,7 @@ def cloud(count: int = 40) -> Gaussians:
 
 
 def column(content: bytes, name: str) -> Any:
-    parsed = Parsed(content)
+    parsed = GlbReader(content)
     return parsed.accessor(parsed.tree["meshes"][0]["primitives"][0]["attributes"][name])
 
 

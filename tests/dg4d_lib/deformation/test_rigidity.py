@@ -5,13 +5,13 @@ from dg4d_lib.deformation.rigidity import neighborhoods, plain_strain, rigidity
 from dg4d_lib.deformation.rigidity_kernel import strain
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import blob
-from dg4d_lib.geometry.quaternion import multiply, rotation_matrix
+from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
 
 
 def two_states(turn: torch.Tensor, shift: float, stretch: float = 1.0) -> Gaussians:
     cloud = blob(100, 0.05, torch.Generator().manual_seed(0))
-    moved = stretch * (cloud.means @ rotation_matrix(turn).T) + shift
-    quats = multiply(turn.expand(100, 4), cloud.quats)
+    moved = stretch * (cloud.means @ quat_to_rotmat(turn).T) + shift
+    quats = quat_multiply(turn.expand(100, 4), cloud.quats)
     return Gaussians(
         torch.stack([cloud.means, moved]),
         cloud.log_scales.expand(2, -1, -1),
@@ -37,7 +37,7 @@ def pairs(times: int) -> tuple[torch.Tensor, ...]:
     means = torch.rand(300, 3, generator=generator, dtype=torch.float64)
     moved = means + 0.1 * torch.rand(times, 300, 3, generator=generator, dtype=torch.float64)
     quats = torch.randn(times, 300, 4, generator=generator, dtype=torch.float64)
-    return moved, rotation_matrix(quats), *neighborhoods(means, 7)
+    return moved, quat_to_rotmat(quats), *neighborhoods(means, 7)
 
 
 @pytest.mark.parametrize("times", [2, 3, 16, 17])

@@ -55,7 +55,7 @@ class KnownObject:
 
     def subject(self) -> torch.Tensor:
         video = self.video()
-        return torch.cat([video.frames[0], video.coverage[0]], -1)
+        return torch.cat([video.frames[0], video.alpha[0]], -1)
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.placing import joined, placed
-from dg4d_lib.geometry.quaternion import rotation_matrix
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
 from dg4d_lib.rasterizer.reference import rasterize
 
 STILL, HERE = torch.tensor([1.0, 0.0, 0.0, 0.0]), torch.zeros(3)
@@ -32,7 +32,7 @@ def random_cloud(count: int = 12, states: int = 1) -> Gaussians:
 def test_a_placed_cloud_has_the_moved_means_and_covariances() -> None:
     cloud, quat = random_cloud(states=2).to(torch.float64), torch.tensor([0.5, -0.5, 0.1, 0.7], dtype=torch.float64)
     quat = quat / quat.norm()
-    turn, shift = rotation_matrix(quat), torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    turn, shift = quat_to_rotmat(quat), torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
     moved = placed(cloud, quat, 1.5, shift)
     torch.testing.assert_close(moved.means, 1.5 * cloud.means @ turn.mT + shift)
     torch.testing.assert_close(moved.covariances, 2.25 * turn @ cloud.covariances @ turn.mT)

@@ -103,7 +103,7 @@ def test_the_blur_is_the_normalized_gaussian_of_the_places_inside():
     images = torch.rand(3, 30, 30, 2, generator=torch.Generator().manual_seed(0))
     places = torch.arange(30.0, dtype=torch.float64)
     for camera, image, found in zip(cameras, images, averaged_over_depth(images, cameras, 0.15), strict=True):
-        depth = camera.world_to_camera()[:2, 2].abs() * 0.15 * camera.focal / camera.radius
+        depth = camera.viewmat()[:2, 2].abs() * 0.15 * camera.focal / camera.radius
         weights = [(-((places[:, None] - places) ** 2) / (2 * max(float(d), 1e-3) ** 2)).exp() for d in depth]
         across, down = (each / each.sum(1, keepdim=True) for each in weights)
         expected = torch.einsum("ij,jlc,kl->ikc", down, image.double(), across)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from dg4d_lib.asset_settings import GateSettings
-from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
+from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.metrics.gates import (
     MESH,
@@ -56,7 +56,7 @@ def ball_turn(radius: float = 0.5, count: int = 24) -> Turn:
     return Turn(
         hit[None, ..., None].expand(everywhere).contiguous(),
         depth[None, ..., None].expand(everywhere).contiguous(),
-        world_to_camera(cameras),
+        viewmats(cameras),
         focal,
     )
 

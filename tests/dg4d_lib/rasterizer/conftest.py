@@ -9,7 +9,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.rasterizer.interface import Rasterizer, Rendering, choose_rasterizer
 
 COLORFUL = torch.tensor([0.9, 0.1, 0.4])
@@ -48,7 +48,7 @@ def blobs() -> Callable[..., Gaussians]:
             torch.full((n, 3), scale).double().log(),
             torch.tensor([[1.0, 0.0, 0.0, 0.0]]).double().repeat(n, 1),
             torch.full((n,), opacity).double().logit(),
-            harmonics_of_color(rgb),
+            rgb_to_sh(rgb),
         )
 
     return make
