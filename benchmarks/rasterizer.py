@@ -40,7 +40,7 @@ from dg4d_lib.rasterizer.cpu_bins import TILE, bin_by_tile
 from dg4d_lib.rasterizer.cpu_blend import PLANE
 from dg4d_lib.rasterizer.cpu_project import RECORD, WHITEN_A, WHITEN_B, WHITEN_C, project, unproject
 from dg4d_lib.rasterizer.cpu_tiles import blend, blend_backward, gather, own_rows
-from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
+from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 
 COUNTS, SIZES, VIEWS = (5_000, 20_000, 100_000), (128, 256, 512), (1, 16, 56)
 QUICK_COUNTS, QUICK_SIZES, QUICK_VIEWS = (5_000, 20_000), (128, 256), (1, 16)
@@ -109,7 +109,7 @@ def _backward(cloud: Gaussians, pictures: Sequence[Tensor]) -> None:
 
 def cell(count: int, size: int, views: Sequence[int], rounds: int) -> tuple[dict[str, Times], list[str]]:
     """Times per view of everything that draws this many Gaussians at this size, and the names of missing peers."""
-    fast, plain = choose_rasterizer("cpu"), choose_rasterizer("reference")
+    fast, plain = get_rasterizer("cpu"), get_rasterizer("reference")
     cloud, several, missing = bumpy_ball(count), views[1], []
     functions: dict[str, Callable[[], object]] = {}
     views_drawn: dict[str, float] = {}

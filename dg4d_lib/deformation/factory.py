@@ -34,15 +34,15 @@ def new_deformation(
         case HexPlaneSettings():
             wide = torch.tensor([[-settings.half_side] * 3, [settings.half_side] * 3])
             covered = wide if settings.half_side else bounds
-            return HexPlane(settings, covered, generator, last_moment(settings, frames))
+            return HexPlane(settings, covered, generator, last_time(settings, frames))
         case MlpSettings():
-            return Mlp(settings, bounds, generator, last_moment(settings, frames))
+            return Mlp(settings, bounds, generator, last_time(settings, frames))
         case FramewiseSettings():
             radius = float((bounds[1] - bounds[0]).max()) / 2 if settings.start == "scattered" else 0.0
             return Framewise(frames, count, radius, generator)
 
 
-def tensors_of(deformation: AnyDeformation) -> dict[str, Tensor]:
+def deformation_tensors(deformation: AnyDeformation) -> dict[str, Tensor]:
     """Return the tensors of a fitted deformation by name."""
     return {name: value.detach().cpu().contiguous() for name, value in sorted(deformation.state_dict().items())}
 
@@ -50,7 +50,7 @@ def tensors_of(deformation: AnyDeformation) -> dict[str, Tensor]:
 def from_state_dict(
     settings: DeformationSettings, tensors: Mapping[str, Tensor], frames: int, count: int
 ) -> AnyDeformation:
-    """Create a deformation from the result of `tensors_of`, without gradients.
+    """Create a deformation from the result of `deformation_tensors`, without gradients.
 
     Raises:
         RuntimeError: a tensor is missing, is of another shape or belongs to nothing.
@@ -60,7 +60,7 @@ def from_state_dict(
     return deformation.requires_grad_(False)
 
 
-def last_moment(settings: DeformationSettings, frames: int) -> float:
+def last_time(settings: DeformationSettings, frames: int) -> float:
     """Return the time of the last frame on the deformation's axis from 0 to 1."""
     open_ended = not isinstance(settings, FramewiseSettings) and not settings.endpoint
     return (frames - 1) / frames if open_ended else 1.0

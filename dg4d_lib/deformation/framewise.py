@@ -43,10 +43,10 @@ class Framewise(nn.Module):
         rows = self.table[left] * (1 - share) + self.table[(left + 1).clamp(max=last)] * share
         return Displacement(rows[..., :3], rows[..., 3:6], rows[..., 6:])
 
-    def planes(self) -> list[nn.Parameter]:
+    def grid_parameters(self) -> list[nn.Parameter]:
         """The parameters that learn at the rate of planes: all."""
         return [self.table]
 
-    def roughness(self) -> Float[Tensor, ""]:
+    def regularization_loss(self) -> Float[Tensor, ""]:
         """A table has no regularizer: zero."""
         return self.table.new_zeros(())

@@ -101,11 +101,11 @@ class HexPlane(nn.Module):
         displacement: Displacement = self.heads(self.trunk, torch.cat(features, -1))
         return displacement
 
-    def planes(self) -> list[nn.Parameter]:
+    def grid_parameters(self) -> list[nn.Parameter]:
         """The parameters that learn at the rate of planes."""
         return [*self.space, *self.time]
 
-    def roughness(self) -> Float[Tensor, ""]:
+    def regularization_loss(self) -> Float[Tensor, ""]:
         """Variation in space, second differences in time, distance of time planes from one; all off by default."""
         s = self.settings
         total = self.bounds.new_zeros(())

@@ -47,10 +47,10 @@ class Deformation(Protocol):
         """Everything that is fitted."""
         ...
 
-    def planes(self) -> list[nn.Parameter]:
+    def grid_parameters(self) -> list[nn.Parameter]:
         """Those of the parameters that learn fast: tables and planes, not networks."""
         ...
 
-    def roughness(self) -> Float[Tensor, ""]:
+    def regularization_loss(self) -> Float[Tensor, ""]:
         """The weighted sum of the model's own regularizers; zero where none is switched on."""
         ...

@@ -48,11 +48,11 @@ class Mlp(nn.Module):
         displacement: Displacement = self.heads(self.second, functional.relu(self.first(encoded)))
         return displacement
 
-    def planes(self) -> list[nn.Parameter]:
+    def grid_parameters(self) -> list[nn.Parameter]:
         """None: everything is network."""
         return []
 
-    def roughness(self) -> Float[Tensor, ""]:
+    def regularization_loss(self) -> Float[Tensor, ""]:
         """A network of this size has no regularizer: zero."""
         return self.bounds.new_zeros(())
 

@@ -18,7 +18,9 @@ from dg4d_lib.rasterizer.interface import Rendering
 WHITE = (1.0, 1.0, 1.0)
 
 
-def resized(cutouts: Float[Tensor, "t h w 4"], size: int) -> tuple[Float[Tensor, "t s s 3"], Float[Tensor, "t s s 1"]]:
+def resize_cutouts(
+    cutouts: Float[Tensor, "t h w 4"], size: int
+) -> tuple[Float[Tensor, "t s s 3"], Float[Tensor, "t s s 1"]]:
     """Color over white and alpha of cut-outs at another size, resampled with premultiplied alpha, antialiased.
 
     In memory they lie plane by plane, as renderings do: what compares the two reads both in one order.
@@ -48,7 +50,7 @@ def reference_loss(
     return loss + ssim_weight * (1 - ssim(rendering.color, color).mean()) if ssim_weight else loss
 
 
-def finite_numbers(
+def check_finite(
     stage: str,
     losses: Mapping[str, Tensor],
     slopes: Iterable[Tensor | None],

@@ -11,6 +11,6 @@ def log_linear(start: float, end: float, progress: float) -> float:
     return math.exp(math.log(start) * (1 - progress) + math.log(end) * progress)
 
 
-def size_at(schedule: Sequence[ResolutionStage], progress: float) -> int:
+def resolution_at(schedule: Sequence[ResolutionStage], progress: float) -> int:
     """Pixels at this progress: the first stage that is not passed, else the last."""
     return next((stage.size for stage in schedule if progress < stage.until), schedule[-1].size)

@@ -10,11 +10,11 @@ from torch import Tensor, nn
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.cameras.viewpoints import random_orbit
 from dg4d_lib.devices import to_device_async
-from dg4d_lib.fitting.losses import WHITE, Diverged, finite_numbers, reference_loss, resized
-from dg4d_lib.fitting.schedules import log_linear, size_at
+from dg4d_lib.fitting.losses import WHITE, Diverged, check_finite, reference_loss, resize_cutouts
+from dg4d_lib.fitting.schedules import log_linear, resolution_at
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.gaussians.growth import DensifyResult, ScreenGradients, densify, prune, reset_opacity
-from dg4d_lib.guidance.interface import GuidancePrior, View, ring_of
+from dg4d_lib.gaussians.density_control import DensifyResult, Grad2dStats, densify, prune, reset_opacity
+from dg4d_lib.guidance.interface import GuidancePrior, GuidanceView, ring_size
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import FitSettings, StaticSettings
 
@@ -86,10 +86,10 @@ def fit_gaussians(
     """
     camera = replace(input_camera or OrbitCamera(), width=settings.reference_size, height=settings.reference_size)
     device = start.means.device
-    color, alpha = resized(subject[None].to(device), settings.reference_size)
+    color, alpha = resize_cutouts(subject[None].to(device), settings.reference_size)
     white = torch.tensor(WHITE, device=device)
-    cloud = _Cloud.of(start, rates(settings))
-    gradients = ScreenGradients.none(len(start), device)
+    cloud = _Cloud.of(start, learning_rates(settings))
+    gradients = Grad2dStats.zeros(len(start), device)
     for step in range(1, settings.iterations + 1):
         progress = step / settings.iterations
         cloud.adam.param_groups[0]["lr"] = log_linear(settings.means_lr, settings.means_lr_end, progress)
@@ -104,8 +104,8 @@ def fit_gaussians(
         loss = progress * reference
         guidance = torch.zeros((), device=device)
         if settings.views and settings.guidance_weight:
-            size = size_at(settings.resolution_schedule, progress)
-            views = [View(c) for c in viewpoints(prior, settings, size, generator)]
+            size = resolution_at(settings.resolution_schedule, progress)
+            views = [GuidanceView(c) for c in sample_cameras(prior, settings, size, generator)]
             offsets.append(torch.zeros(len(views), len(gaussians), 2, device=device, requires_grad=True))
             behind = to_device_async(background(settings, generator), device)
             rendering = rasterize(gaussians, [view.camera for view in views], behind, offsets[1])
@@ -117,14 +117,14 @@ def fit_gaussians(
         losses = {"loss": loss, "reference": reference, "guidance": guidance}
         slopes = [parameter.grad for parameter in cloud.parameters.values()]
         moment = f"iteration {step} of {settings.iterations}"
-        numbers = finite_numbers("fit_gaussians", losses, slopes, moment, ADVICE, gaussians)
+        numbers = check_finite("fit_gaussians", losses, slopes, moment, ADVICE, gaussians)
         for offset, (visible, size) in zip(offsets, seen, strict=True):
             if offset.grad is not None:
                 gradients.add(offset.grad, visible, size)
         cloud.adam.step()
         if step % settings.densify_every == 0 and step < settings.iterations:
             control_density(cloud, gradients, settings, generator)
-            gradients = ScreenGradients.none(len(cloud.gaussians), device)
+            gradients = Grad2dStats.zeros(len(cloud.gaussians), device)
             if len(cloud.gaussians) < FEWEST:
                 raise Diverged(
                     f"fit_gaussians: {len(cloud.gaussians)} Gaussians are left at iteration {step} of "
@@ -143,7 +143,7 @@ def background(settings: StaticSettings, generator: torch.Generator) -> Float[Te
     return torch.zeros(3) if black else torch.tensor(WHITE)
 
 
-def rates(settings: FitSettings) -> dict[str, float]:
+def learning_rates(settings: FitSettings) -> dict[str, float]:
     """Return the learning rate of every field of the cloud at the start of a stage; the means come first."""
     return {
         "means": settings.means_lr,
@@ -154,7 +154,7 @@ def rates(settings: FitSettings) -> dict[str, float]:
     }
 
 
-def viewpoints(
+def sample_cameras(
     prior: GuidancePrior, settings: StaticSettings, size: int, generator: torch.Generator
 ) -> list[OrbitCamera]:
     """The random views of one iteration: all around, or out of those the prior knows."""
@@ -165,14 +165,14 @@ def viewpoints(
             elevation_deg=(-settings.elevation_deg, settings.elevation_deg),
             radius=(RADIUS - RADIUS_JITTER, RADIUS + RADIUS_JITTER),
             generator=generator,
-            ring=ring_of(prior),
+            ring=ring_size(prior),
         )
     choice = torch.randint(len(prior.viewpoints), (settings.views,), generator=generator).tolist()
     return [replace(prior.viewpoints[i], width=size, height=size) for i in choice]
 
 
 def control_density(
-    cloud: _Cloud, gradients: ScreenGradients, settings: StaticSettings, generator: torch.Generator
+    cloud: _Cloud, gradients: Grad2dStats, settings: StaticSettings, generator: torch.Generator
 ) -> None:
     """Grow where the views pull, then remove what is faint or too large."""
     with torch.no_grad():

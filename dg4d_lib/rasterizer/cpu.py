@@ -26,7 +26,7 @@ from dg4d_lib.rasterizer.cpu_bins import TILE, bin_by_tile
 from dg4d_lib.rasterizer.cpu_blend import PLANE
 from dg4d_lib.rasterizer.cpu_project import CAMERA, RECORD, project, unproject
 from dg4d_lib.rasterizer.cpu_tiles import blend, blend_backward, gather, own_rows
-from dg4d_lib.rasterizer.interface import FRUSTUM_MARGIN, Rendering, require_finite, shared_size, state_per_camera
+from dg4d_lib.rasterizer.interface import FRUSTUM_MARGIN, Rendering, has_state_per_camera, require_finite, shared_size
 
 Array = NDArray[Any]
 
@@ -35,9 +35,9 @@ def rasterize(
     gaussians: Gaussians,
     cameras: Sequence[OrbitCamera],
     background: Float[Tensor, " 3"],
-    screen_offsets: Float[Tensor, "b n 2"] | None = None,
+    means2d_offsets: Float[Tensor, "b n 2"] | None = None,
 ) -> Rendering:
-    """Render every camera's picture; differentiable once, in the Gaussians and `screen_offsets` (taken to be zero).
+    """Render every camera's picture; differentiable once, in the Gaussians and `means2d_offsets` (taken to be zero).
 
     Computed in float32; pictures and gradients come back in the precision of the Gaussians. Gaussians whose size
     overflows are not drawn. For the arguments see `Rasterizer`.
@@ -47,7 +47,7 @@ def rasterize(
             with numbers that are not finite, or tensors that are not in the processor's memory.
     """
     height, width = shared_size(cameras)
-    state_per_camera(gaussians, cameras)
+    has_state_per_camera(gaussians, cameras)
     require_finite(gaussians)
     if gaussians.means.device.type != "cpu":
         raise BadInput(f"rasterizer 'cpu' needs tensors on the cpu; given {gaussians.means.device}; move them there")
@@ -55,7 +55,7 @@ def rasterize(
     inputs = (gaussians.means, gaussians.quats, gaussians.log_scales, log_opacities, gaussians.harmonics)
     color, alpha, depth, visible = _Rasterize.apply(
         *(value.float() for value in inputs),
-        None if screen_offsets is None else screen_offsets.float(),
+        None if means2d_offsets is None else means2d_offsets.float(),
         np.stack([packed(camera) for camera in cameras]),
         background.detach().float().contiguous().numpy(),
         (height, width),

@@ -32,7 +32,7 @@ from dg4d_lib.devices import to_device_async
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer import reference
-from dg4d_lib.rasterizer.interface import BLUR, NEAR, Rendering, require_finite, shared_size, state_per_camera
+from dg4d_lib.rasterizer.interface import BLUR, NEAR, Rendering, has_state_per_camera, require_finite, shared_size
 
 DEVICE = torch.device("cuda")
 WARP = 32  # lanes
@@ -45,9 +45,9 @@ def rasterize(
     gaussians: Gaussians,
     cameras: Sequence[OrbitCamera],
     background: Float[Tensor, " 3"],
-    screen_offsets: Float[Tensor, "b n 2"] | None = None,
+    means2d_offsets: Float[Tensor, "b n 2"] | None = None,
 ) -> Rendering:
-    """Render every camera's picture in one call of gsplat; differentiable once; `screen_offsets` are taken to be zero.
+    """Render every camera's picture in one call of gsplat; differentiable once; `means2d_offsets` are taken to be zero.
 
     Drawn on the GPU; pictures and gradients come back where the Gaussians are, in their precision. For the arguments
     see `Rasterizer`.
@@ -58,18 +58,18 @@ def rasterize(
         BackendUnavailable: gsplat could not compile its kernels.
     """
     height, width = shared_size(cameras)
-    moving = state_per_camera(gaussians, cameras)
+    moving = has_state_per_camera(gaussians, cameras)
     require_finite(gaussians)
     if len(gaussians) == 0:  # gsplat divides by their number
-        return reference.rasterize(gaussians, cameras, background, screen_offsets)
+        return reference.rasterize(gaussians, cameras, background, means2d_offsets)
     if moving and len(cameras) > 1 and len(gaussians) < WARP:
-        return _one_by_one(gaussians, cameras, background, screen_offsets)
+        return _one_by_one(gaussians, cameras, background, means2d_offsets)
     _require_kernels()
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
     means, quats, scales, opacities, colors = (value.to(DEVICE, torch.float32) for value in fields)
     caught: list[Tensor] = []
-    if screen_offsets is not None:
-        means = _ScreenGradient.apply(means, screen_offsets, caught)
+    if means2d_offsets is not None:
+        means = _ScreenGradient.apply(means, means2d_offsets, caught)
     poses, lenses = to_device_async(world_to_camera(cameras).float(), DEVICE), to_device_async(_lenses(cameras), DEVICE)
     backgrounds = to_device_async(background.detach().float(), DEVICE).expand(len(cameras), 3)
     if moving:  # a batch of clouds with one camera each
@@ -79,7 +79,7 @@ def rasterize(
         means, quats, scales, opacities, colors, poses, lenses, width, height,
         near_plane=NEAR, eps2d=BLUR, backgrounds=backgrounds, render_mode="RGB+D", packed=False,
     )  # fmt: skip
-    if screen_offsets is not None and info["means2d"].requires_grad:
+    if means2d_offsets is not None and info["means2d"].requires_grad:
         info["means2d"].register_hook(caught.append)
     views = (len(cameras), height, width)
     color, depth = pictures.reshape(*views, 4).to(gaussians.means).split((3, 1), -1)
@@ -113,12 +113,12 @@ def _one_by_one(
     gaussians: Gaussians,
     cameras: Sequence[OrbitCamera],
     background: Float[Tensor, " 3"],
-    screen_offsets: Float[Tensor, "b n 2"] | None,
+    means2d_offsets: Float[Tensor, "b n 2"] | None,
 ) -> Rendering:
     """Every state in a call of its own: gsplat sums gradients in a warp by a Gaussian's number, whatever its state."""
     views = []
     for view, camera in enumerate(cameras):
-        offsets = None if screen_offsets is None else screen_offsets[view : view + 1]
+        offsets = None if means2d_offsets is None else means2d_offsets[view : view + 1]
         views.append(vars(rasterize(gaussians.at(view), [camera], background, offsets)).values())
     return Rendering(*(torch.cat(parts) for parts in zip(*views, strict=True)))
 
@@ -134,7 +134,7 @@ def _lenses(cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b 3 3"]:
 
 
 class _ScreenGradient(torch.autograd.Function):
-    """The identity on the means; gives `screen_offsets` the gradient that was caught at the projected centers.
+    """The identity on the means; gives `means2d_offsets` the gradient that was caught at the projected centers.
 
     These exist inside of gsplat only. In backward they come before the means, so their gradient is there by then.
     """

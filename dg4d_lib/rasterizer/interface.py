@@ -18,7 +18,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.rasterizer.choice import CUDA, backend_name, require_backend
+from dg4d_lib.rasterizer.backends import CUDA, backend_name, require_backend
 
 BLUR = 0.3  # pixels squared, the low-pass filter
 MAX_ALPHA = 0.999
@@ -55,7 +55,7 @@ class Rasterizer(Protocol):
         gaussians: Gaussians,
         cameras: Sequence[OrbitCamera],
         background: Float[Tensor, " 3"],
-        screen_offsets: Float[Tensor, "b n 2"] | None = None,
+        means2d_offsets: Float[Tensor, "b n 2"] | None = None,
     ) -> Rendering:
         """Render every camera's picture, differentiable in the Gaussians.
 
@@ -63,7 +63,7 @@ class Rasterizer(Protocol):
             gaussians: one cloud for all cameras (fields "n 3"), or one state per camera (fields "b n 3").
             cameras: b cameras of one width and height.
             background: color behind everything.
-            screen_offsets: zeros that are added to the projected centers, in pixels; their gradient is what density
+            means2d_offsets: zeros that are added to the projected centers, in pixels; their gradient is what density
                 control reads. Backends may assume that they are zero.
 
         Raises:
@@ -80,7 +80,7 @@ _BACKENDS = {
 }
 
 
-def choose_rasterizer(name: str) -> Rasterizer:
+def get_rasterizer(name: str) -> Rasterizer:
     """The backend of this name, or the one that `auto` stands for here.
 
     Raises:
@@ -103,7 +103,7 @@ def choose_rasterizer(name: str) -> Rasterizer:
     return backend
 
 
-def device_of(name: str) -> torch.device:
+def preferred_device(name: str) -> torch.device:
     """Where Gaussians should lie that this backend draws often; elsewhere they are moved for every call, or refused."""
     return torch.device("cuda" if backend_name(name) == CUDA else "cpu")
 
@@ -120,7 +120,7 @@ def shared_size(cameras: Sequence[OrbitCamera]) -> tuple[int, int]:
     return sizes.pop()
 
 
-def state_per_camera(gaussians: Gaussians, cameras: Sequence[OrbitCamera]) -> bool:
+def has_state_per_camera(gaussians: Gaussians, cameras: Sequence[OrbitCamera]) -> bool:
     """Whether the cloud has a state of its own for every camera, rather than one for all.
 
     Raises:

@@ -25,9 +25,9 @@ from dg4d_lib.rasterizer.interface import (
     MIN_TRANSMITTANCE,
     NEAR,
     Rendering,
+    has_state_per_camera,
     require_finite,
     shared_size,
-    state_per_camera,
 )
 
 _PAIRS_AT_ONCE = 1 << 18  # pixels times Gaussians of one chunk: what stays in the cache
@@ -37,7 +37,7 @@ def rasterize(
     gaussians: Gaussians,
     cameras: Sequence[OrbitCamera],
     background: Float[Tensor, " 3"],
-    screen_offsets: Float[Tensor, "b n 2"] | None = None,
+    means2d_offsets: Float[Tensor, "b n 2"] | None = None,
 ) -> Rendering:
     """Render every camera's picture in the precision of the Gaussians, float32 or float64.
 
@@ -48,14 +48,14 @@ def rasterize(
             Gaussians with numbers that are not finite.
     """
     height, width = shared_size(cameras)
-    moving = state_per_camera(gaussians, cameras)
+    moving = has_state_per_camera(gaussians, cameras)
     require_finite(gaussians)
     background = background.to(gaussians.means)
     views = []
     for view, camera in enumerate(cameras):
         splats = _project(gaussians.at(view) if moving else gaussians, camera)
-        if screen_offsets is not None:
-            splats.centers = splats.centers + screen_offsets[view].to(splats.centers)
+        if means2d_offsets is not None:
+            splats.centers = splats.centers + means2d_offsets[view].to(splats.centers)
         views.append(_picture(splats, background, height, width))
     color, alpha, depth, visible = (torch.stack(parts) for parts in zip(*views, strict=True))
     return Rendering(color, alpha, depth, visible)

@@ -8,14 +8,14 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.weights.lock import Locked, read_lock, write_json
-from dg4d_lib.weights.registry import KNOWN, Weights, weights_called
+from dg4d_lib.weights.lock import LockEntry, read_lock, write_json
+from dg4d_lib.weights.registry import KNOWN, Weights, lookup_weights
 
-TENSORS = frozenset([".safetensors", ".bin", ".pth", ".pt"])  # suffixes
-READ = TENSORS | {".json", ".txt", ".model"}  # suffixes of what loading reads
-NO_TENSORS = f"has no tensors ({', '.join(sorted(TENSORS))})"
-MEMORY = "digests.json"  # digests of large files, so that they are read once and not at every run
-BY_CONTENT = "@"  # between a folder's name and the first digits of its identity
+TENSOR_SUFFIXES = frozenset([".safetensors", ".bin", ".pth", ".pt"])  # suffixes
+READABLE_SUFFIXES = TENSOR_SUFFIXES | {".json", ".txt", ".model"}  # suffixes of what loading reads
+NO_TENSORS = f"has no tensors ({', '.join(sorted(TENSOR_SUFFIXES))})"
+DIGEST_CACHE = "digests.json"  # digests of large files, so that they are read once and not at every run
+CONTENT_MARK = "@"  # between a folder's name and the first digits of its identity
 CHUNK = 1 << 22  # bytes read at a time
 
 
@@ -33,20 +33,20 @@ def find_weights(name_or_folder: str | Path, home: Path | None = None) -> Path:
     name = str(name_or_folder)
     if (path := given_folder(name_or_folder)) is not None:
         return path
-    if BY_CONTENT in name:
+    if CONTENT_MARK in name:
         return _called_by_content(name, home)
-    weights = weights_called(name)
+    weights = lookup_weights(name)
     if home is not None and (folder := home / folder_name(weights)).exists():
         locked = read_lock(home).get(weights.name)
-        if wrong := troubles(folder, weights, locked, home / MEMORY):
+        if wrong := find_problems(folder, weights, locked, home / DIGEST_CACHE):
             first = " ".join(next(iter(wrong.items()))) + ", and more" * (len(wrong) > 1)
             raise BackendUnavailable(
                 f"weights {name} in {folder} are not whole: {first}; "
                 f"`dg4d weights check {name}` lists what is wrong, `dg4d weights pull {name}` gets it again"
             )
         return folder
-    cached = in_hub_cache(weights)
-    if cached is not None and not troubles(cached, weights):
+    cached = hub_cache_snapshot(weights)
+    if cached is not None and not find_problems(cached, weights):
         return cached
     raise BackendUnavailable(f"weights {name} are not on this machine: `dg4d weights pull {name}` gets them")
 
@@ -65,7 +65,7 @@ def given_folder(name_or_folder: str | Path) -> Path | None:
         return path.absolute()
     if isinstance(name_or_folder, Path) or path.is_absolute() or name.startswith(".") or name.count("/") > 1:
         raise BadInput(f"weights {name}: there is no such folder")
-    if "/" not in name and BY_CONTENT not in name:
+    if "/" not in name and CONTENT_MARK not in name:
         raise BadInput(
             f"unknown weights {name!r}; give a folder, an id of the Hugging Face hub (owner/name), or one of: "
             f"{', '.join(KNOWN)}"
@@ -78,13 +78,13 @@ def folder_name(weights: Weights) -> str:
     return weights.name.replace("/", "--")
 
 
-def call_by_content(folder: Path, home: Path) -> str:
+def content_name(folder: Path, home: Path) -> str:
     """A name for a user's folder that says its content and not its place; `home` remembers the place.
 
     Equal folders have equal names on every machine, so nothing that is made with them depends on where they lie.
     """
     home.mkdir(parents=True, exist_ok=True)
-    name = f"{folder.stem}{BY_CONTENT}{identity(digests(folder, memory=home / MEMORY)).removeprefix('sha256:')[:12]}"
+    name = f"{folder.stem}{CONTENT_MARK}{identity(digests(folder, memory=home / DIGEST_CACHE)).removeprefix('sha256:')[:12]}"
     link = home / name
     if not link.is_symlink() or link.readlink() != folder:
         scratch = home / f".{name}.{os.getpid()}"
@@ -94,8 +94,8 @@ def call_by_content(folder: Path, home: Path) -> str:
     return name
 
 
-def troubles(
-    folder: Path, weights: Weights, locked: Locked | None = None, memory: Path | None = None
+def find_problems(
+    folder: Path, weights: Weights, locked: LockEntry | None = None, memory: Path | None = None
 ) -> dict[str, str]:
     """What keeps weights from being whole: for a file or a part, what is wrong with it; nothing where they are whole.
 
@@ -120,7 +120,7 @@ def troubles(
     return wrong | dict.fromkeys(sorted(other), "is not the file that was pulled: its sha256 differs")
 
 
-def unpublished(folder: Path, weights: Weights, memory: Path | None = None) -> dict[str, str]:
+def find_unpublished(folder: Path, weights: Weights, memory: Path | None = None) -> dict[str, str]:
     """Files that are not what was published, and how so; files of which nothing is known, or that are not here, pass.
 
     Args:
@@ -156,7 +156,7 @@ def identity(files: dict[str, str]) -> str:
     return "sha256:" + hashlib.sha256(listing.encode()).hexdigest()
 
 
-def in_hub_cache(weights: Weights) -> Path | None:
+def hub_cache_snapshot(weights: Weights) -> Path | None:
     """What other programs downloaded: the snapshot of the pinned commit, else the newest; None where there is none."""
     if find_spec("huggingface_hub") is None:
         return None
@@ -183,7 +183,12 @@ def _files(folder: Path, parts: tuple[str, ...]) -> Iterator[Path]:
     for path in folder.rglob("*"):
         inside = path.relative_to(folder)
         wanted = not parts or inside.parts[0] in parts or inside.name == "model_index.json"
-        if wanted and path.suffix in READ and path.is_file() and not any(p.startswith(".") for p in inside.parts):
+        if (
+            wanted
+            and path.suffix in READABLE_SUFFIXES
+            and path.is_file()
+            and not any(p.startswith(".") for p in inside.parts)
+        ):
             yield path
 
 
@@ -191,11 +196,11 @@ def _lacking(folder: Path, parts: tuple[str, ...]) -> dict[str, str]:
     """Parts that are not there, models without tensors, and shards that an index names in vain."""
     lacking = {part: "is missing" for part in parts if not (folder / part).exists()}
     files = list(_files(folder, parts))
-    if not any(path.suffix in TENSORS for path in files):
+    if not any(path.suffix in TENSOR_SUFFIXES for path in files):
         lacking[folder.name] = NO_TENSORS
     for path in files:
         here = {other.name for other in files if other.parent == path.parent}
-        if path.name == "config.json" and not any(Path(name).suffix in TENSORS for name in here):
+        if path.name == "config.json" and not any(Path(name).suffix in TENSOR_SUFFIXES for name in here):
             lacking[path.parent.name] = NO_TENSORS
         if path.name.endswith(".index.json"):
             shards = set(json.loads(path.read_text(encoding="utf-8")).get("weight_map", {}).values())

@@ -23,7 +23,7 @@ class LockedFile(BaseModel):
     size: int
 
 
-class Locked(BaseModel):
+class LockEntry(BaseModel):
     """One set of weights as it was pulled.
 
     Attributes:
@@ -40,7 +40,7 @@ class Locked(BaseModel):
     files: dict[str, LockedFile]
 
 
-def read_lock(home: Path) -> dict[str, Locked]:
+def read_lock(home: Path) -> dict[str, LockEntry]:
     """Everything that was pulled into the folder `home`, by name; nothing where there is no lock.
 
     Raises:
@@ -49,14 +49,14 @@ def read_lock(home: Path) -> dict[str, Locked]:
     path = home / LOCK
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))
-        return {name: Locked.model_validate(entry) for name, entry in entries.items()}
+        return {name: LockEntry.model_validate(entry) for name, entry in entries.items()}
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, AttributeError, ValidationError) as error:
         raise BadInput(f"{path} cannot be read ({error}); delete it and pull the weights again") from error
 
 
-def write_lock(home: Path, name: str, locked: Locked) -> None:
+def write_lock(home: Path, name: str, locked: LockEntry) -> None:
     """Remember what was pulled under a name, in place of what was there."""
     entries = {**read_lock(home), name: locked}
     write_json(home / LOCK, {key: entries[key].model_dump() for key in sorted(entries)})

@@ -6,15 +6,22 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
 from dg4d_lib.errors import BackendUnavailable
-from dg4d_lib.weights.locate import MEMORY, READ, TENSORS, digests, folder_name, troubles
-from dg4d_lib.weights.lock import Locked, LockedFile, read_lock, write_lock
+from dg4d_lib.weights.locate import (
+    DIGEST_CACHE,
+    READABLE_SUFFIXES,
+    TENSOR_SUFFIXES,
+    digests,
+    find_problems,
+    folder_name,
+)
+from dg4d_lib.weights.lock import LockedFile, LockEntry, read_lock, write_lock
 from dg4d_lib.weights.registry import Weights
 
 HALF = ".fp16"  # in the names of files in half precision
 FORMATS = ((True, ".safetensors"), (False, ".safetensors"), (True, ".bin"), (False, ".bin"))  # wanted most first
 
 
-def pull(weights: Weights, home: Path) -> Locked:
+def pull(weights: Weights, home: Path) -> LockEntry:
     """Download what is needed of some weights; goes on where it was stopped, and leaves alone what is here already.
 
     The revision is the lock's, else the registry's, else the newest.
@@ -35,7 +42,7 @@ def pull(weights: Weights, home: Path) -> Locked:
         ) from error
     before = read_lock(home).get(weights.name)
     folder = home / folder_name(weights)
-    for name in troubles(folder, weights, before, home / MEMORY) if before else ():
+    for name in find_problems(folder, weights, before, home / DIGEST_CACHE) if before else ():
         (folder / name).unlink(missing_ok=True)  # the download alone may take it for whole
     try:
         info = hub.HfApi().model_info(
@@ -52,8 +59,8 @@ def pull(weights: Weights, home: Path) -> Locked:
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise
         raise BackendUnavailable(_refusal(weights, error)) from error
-    have = {name: digest for name, digest in digests(folder, memory=home / MEMORY).items() if name in chosen}
-    wrong = {name: "did not come" for name in chosen if name not in have} | troubles(folder, weights)
+    have = {name: digest for name, digest in digests(folder, memory=home / DIGEST_CACHE).items() if name in chosen}
+    wrong = {name: "did not come" for name in chosen if name not in have} | find_problems(folder, weights)
     for name in [name for name, digest in have.items() if published.get(name, digest) != digest]:
         wrong[name] = "is damaged"
         (folder / name).unlink()
@@ -64,7 +71,7 @@ def pull(weights: Weights, home: Path) -> Locked:
         )
     files = {name: LockedFile(sha256=have[name], size=(folder / name).stat().st_size) for name in chosen}
     card = str(getattr(info.card_data, "license", None) or "")
-    locked = Locked(hub_id=weights.hub_id, revision=info.sha or "", license=card, files=files)
+    locked = LockEntry(hub_id=weights.hub_id, revision=info.sha or "", license=card, files=files)
     write_lock(home, weights.name, locked)
     return locked
 
@@ -80,10 +87,10 @@ def needed(names: Iterable[str], parts: tuple[str, ...] = ()) -> list[str]:
     for name in everything:
         path = PurePosixPath(name)
         hidden = any(part.startswith(".") for part in path.parts)
-        whole = "model_index.json" in everything and len(path.parts) == 1 and path.suffix in TENSORS
+        whole = "model_index.json" in everything and len(path.parts) == 1 and path.suffix in TENSOR_SUFFIXES
         other = ".non_ema." in name or path.name.startswith("openvino")
         wanted = path.parts[0] in parts or path.name == "model_index.json" if parts else not whole
-        if wanted and path.suffix in READ and not hidden and not other:
+        if wanted and path.suffix in READABLE_SUFFIXES and not hidden and not other:
             folders[path.parent].append(name)
     return sorted(name for files in folders.values() for name in _one_format(files))
 
@@ -94,7 +101,7 @@ def _one_format(files: list[str]) -> list[str]:
     def fits(name: str, half: bool, suffix: str) -> bool:
         return suffix in name and (HALF in name) == half
 
-    tensors = [name for name in files if PurePosixPath(name).suffix in TENSORS]
+    tensors = [name for name in files if PurePosixPath(name).suffix in TENSOR_SUFFIXES]
     for half, suffix in FORMATS:
         if any(fits(name, half, suffix) for name in tensors):
             held = {name for name in files if name in tensors or ".index." in name}  # an index lists the shards

@@ -72,7 +72,7 @@ STABILITY_COMMUNITY = License(
     '"Powered by Stability AI" in sight; above, it takes an enterprise license (https://stability.ai/license)',
 )
 
-ON_CARDS: dict[str, Commercial] = {
+CARD_LICENSES: dict[str, Commercial] = {
     **dict.fromkeys(("apache-2.0", "mit", "bsd-3-clause", "cc0-1.0", "cc-by-4.0"), "yes"),
     **dict.fromkeys(("openrail", "openrail++", "creativeml-openrail-m", "bigscience-openrail-m"), "conditions"),
     **dict.fromkeys(("cc-by-nc-4.0", "cc-by-nc-sa-4.0", "cc-by-nc-nd-4.0"), "no"),
@@ -241,7 +241,7 @@ KNOWN: dict[str, Weights] = {
 }
 
 
-def weights_called(name: str, card: str = "") -> Weights:
+def lookup_weights(name: str, card: str = "") -> Weights:
     """The weights of a name or a hub id.
 
     Args:
@@ -250,7 +250,7 @@ def weights_called(name: str, card: str = "") -> Weights:
             weights by copying them: whose name holds the name of weights that forbid commercial use has their license.
     """
     by_id = {weights.hub_id.lower(): weights for weights in KNOWN.values()}
-    commercial = ON_CARDS.get(card, "unverified")
+    commercial = CARD_LICENSES.get(card, "unverified")
     theirs = License(card or "unknown license", commercial, TERMS[commercial])
     for weights in KNOWN.values():
         if weights.license.commercial == "no" and weights.name in name.lower():

@@ -6,7 +6,7 @@ from dg4d_lib.errors import FitDiverged
 from dg4d_lib.fitting.losses import Diverged
 from dg4d_lib.fitting.static import background, fit_gaussians
 from dg4d_lib.gaussians.initialize import blob
-from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.interface import GuidanceView
 
 
 def seed(number: int = 0) -> torch.Generator:
@@ -14,7 +14,7 @@ def seed(number: int = 0) -> torch.Generator:
 
 
 def psnr_from_unseen_sides(known, gaussians) -> float:
-    views = [View(c) for c in random_orbit(8, 32, elevation_deg=(-30, 30), radius=(2, 2), generator=seed(99))]
+    views = [GuidanceView(c) for c in random_orbit(8, 32, elevation_deg=(-30, 30), radius=(2, 2), generator=seed(99))]
     with torch.no_grad():
         color = known.rasterize(gaussians, [view.camera for view in views], torch.ones(3)).color
     return float(-10 * (color - known.clean(views)[0]).square().mean().log10())

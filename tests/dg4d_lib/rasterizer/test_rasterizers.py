@@ -233,7 +233,7 @@ def test_the_screen_gradient_is_what_a_shift_of_the_picture_gives(rasterize, blo
     """A blob far from thresholds: per pixel along x, the sum of alpha times x grows by the sum of alpha."""
     picture, leaves = drawn(rasterize, blobs([(0, 0, 0)], scale=0.05, opacity=0.8), [FRONT], torch.float32)
     columns = torch.arange(33) + 0.5
-    (gradient,) = torch.autograd.grad((picture.alpha[..., 0] * columns).sum(), leaves["screen_offsets"])
+    (gradient,) = torch.autograd.grad((picture.alpha[..., 0] * columns).sum(), leaves["means2d_offsets"])
     # alpha below 1/255 is cut off, a share of 1/255 / 0.8 of all of it
     torch.testing.assert_close(gradient[0, 0], torch.stack((picture.alpha.sum(), torch.zeros(()))), atol=0.2, rtol=0.05)
 

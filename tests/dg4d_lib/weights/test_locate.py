@@ -8,8 +8,8 @@ import pytest
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.weights import locate
-from dg4d_lib.weights.locate import call_by_content, digests, find_weights, identity, troubles
-from dg4d_lib.weights.lock import LOCK, Locked, LockedFile, read_lock, write_lock
+from dg4d_lib.weights.locate import content_name, digests, find_problems, find_weights, identity
+from dg4d_lib.weights.lock import LOCK, LockedFile, LockEntry, read_lock, write_lock
 from dg4d_lib.weights.registry import KNOWN
 
 PARTS = KNOWN["svd"].parts
@@ -37,11 +37,11 @@ def fill(folder: Path, parts: tuple[str, ...] = PARTS) -> Path:
     return folder
 
 
-def locked(folder: Path) -> Locked:
+def locked(folder: Path) -> LockEntry:
     files = {
         name: LockedFile(sha256=digest, size=(folder / name).stat().st_size) for name, digest in digests(folder).items()
     }
-    return Locked(hub_id=KNOWN["svd"].hub_id, revision="c" * 40, files=files)
+    return LockEntry(hub_id=KNOWN["svd"].hub_id, revision="c" * 40, files=files)
 
 
 def pulled(home: Path) -> Path:
@@ -116,17 +116,17 @@ def test_damage_is_one_clear_message(change: str, home: Path) -> None:
 
 def test_without_a_lock_missing_parts_tensors_and_shards_are_told(tmp_path: Path) -> None:
     folder = fill(tmp_path / "svd")
-    assert troubles(folder, KNOWN["svd"]) == {}
+    assert find_problems(folder, KNOWN["svd"]) == {}
     (folder / "unet" / "diffusion_pytorch_model.safetensors").unlink()
-    assert list(troubles(folder, KNOWN["svd"])) == ["unet"]
+    assert list(find_problems(folder, KNOWN["svd"])) == ["unet"]
     index = {"weight_map": {"x": "model-00001-of-00002.safetensors", "y": "model-00002-of-00002.safetensors"}}
     (folder / "unet" / "model.safetensors.index.json").write_text(json.dumps(index))
     (folder / "unet" / "model-00001-of-00002.safetensors").touch()
-    assert troubles(folder, KNOWN["svd"]) == {"unet/model-00002-of-00002.safetensors": "is missing"}
+    assert find_problems(folder, KNOWN["svd"]) == {"unet/model-00002-of-00002.safetensors": "is missing"}
     (folder / "unet" / "model-00002-of-00002.safetensors").touch()
     (folder / "vae").rename(folder / "vea")
-    assert list(troubles(folder, KNOWN["svd"])) == ["vae"]
-    assert "has no tensors" in troubles(tmp_path / "empty", KNOWN["lgm"])["empty"]
+    assert list(find_problems(folder, KNOWN["svd"])) == ["vae"]
+    assert "has no tensors" in find_problems(tmp_path / "empty", KNOWN["lgm"])["empty"]
 
 
 def test_the_hub_cache_is_used_as_other_programs_left_it(no_hub_cache: Path, home: Path) -> None:
@@ -188,20 +188,20 @@ def test_the_identity_is_of_content_and_not_of_place(tmp_path: Path) -> None:
 
 def test_a_users_folder_is_called_by_its_content_wherever_it_lies(tmp_path: Path, home: Path) -> None:
     one, two = fill(tmp_path / "one" / "mine"), fill(tmp_path / "two" / "mine")
-    name = call_by_content(one, home)
+    name = content_name(one, home)
     assert name.startswith("mine@")
     assert str(tmp_path) not in name
-    assert call_by_content(two, home) == name
+    assert content_name(two, home) == name
     assert find_weights(name, home) == two
-    assert call_by_content(one, home) == name
+    assert content_name(one, home) == name
     assert find_weights(name, home) == one
     (one / "vae" / "config.json").write_text("{} ")
-    assert call_by_content(one, home) != name
+    assert content_name(one, home) != name
 
 
 def test_a_users_folder_that_is_gone_is_asked_for_once_more(tmp_path: Path, home: Path) -> None:
     folder = fill(tmp_path / "mine")
-    name = call_by_content(folder, home)
+    name = content_name(folder, home)
     folder.rename(tmp_path / "elsewhere")
     with pytest.raises(BackendUnavailable, match="name the folder once more"):
         find_weights(name, home)
@@ -210,7 +210,7 @@ def test_a_users_folder_that_is_gone_is_asked_for_once_more(tmp_path: Path, home
 def test_a_single_file_is_called_by_its_content_too(tmp_path: Path, home: Path) -> None:
     file = tmp_path / "lgm.safetensors"
     file.write_bytes(b"tensors")
-    assert find_weights(call_by_content(file, home), home) == file
+    assert find_weights(content_name(file, home), home) == file
 
 
 def test_the_lock_keeps_what_else_was_pulled(home: Path) -> None:

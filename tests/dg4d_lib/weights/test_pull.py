@@ -12,7 +12,7 @@ from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.weights.locate import digests, find_weights
 from dg4d_lib.weights.lock import read_lock
 from dg4d_lib.weights.pull import needed, pull
-from dg4d_lib.weights.registry import KNOWN, weights_called
+from dg4d_lib.weights.registry import KNOWN, lookup_weights
 
 SVD = replace(KNOWN["svd"], revision=None, published={})
 REPOSITORY = {
@@ -188,7 +188,7 @@ def test_a_pin_of_the_registry_is_what_is_asked_for(hub: Hub, tmp_path: Path) ->
 
 
 def test_weights_that_only_the_user_knows_come_whole_but_once(hub: Hub, tmp_path: Path) -> None:
-    pull(weights_called("somebody/pictures"), tmp_path)
+    pull(lookup_weights("somebody/pictures"), tmp_path)
     assert set(hub.downloaded) == set(WANTED)  # not svd.safetensors, which holds all parts once more
     assert find_weights("somebody/pictures", tmp_path) == tmp_path / "somebody--pictures"
 

@@ -14,7 +14,7 @@ def backend_name(name: str) -> str:
     """The backend that this name stands for here: `auto` is gsplat where nothing keeps it from drawing, else `cpu`."""
     if name != "auto":
         return name
-    return PROCESSOR if what_gsplat_lacks() else CUDA
+    return PROCESSOR if gsplat_unavailable_reason() else CUDA
 
 
 def require_backend(name: str) -> None:
@@ -23,11 +23,11 @@ def require_backend(name: str) -> None:
     Raises:
         BackendUnavailable: says what is missing and what gets it.
     """
-    if backend_name(name) == CUDA and (lack := what_gsplat_lacks()):
+    if backend_name(name) == CUDA and (lack := gsplat_unavailable_reason()):
         raise BackendUnavailable(f"rasterizer {CUDA!r} cannot run here: {lack}; or choose rasterizer={PROCESSOR}")
 
 
-def what_gsplat_lacks() -> str:
+def gsplat_unavailable_reason() -> str:
     """What keeps gsplat from drawing here, and what mends it; empty where nothing is known to."""
     if find_spec("gsplat") is None:
         return "gsplat is not installed (run `make setup CUDA=1`)"
@@ -37,12 +37,12 @@ def what_gsplat_lacks() -> str:
         return "torch is not installed"
     if build == "cpu":
         return "torch is its CPU build (run `make setup CUDA=1`)"
-    if not cuda_devices():
+    if not cuda_device_count():
         return "the CUDA driver shows no device (it takes an NVIDIA GPU, its driver, and no empty CUDA_VISIBLE_DEVICES)"
     return ""
 
 
-def cuda_devices() -> int:
+def cuda_device_count() -> int:
     """How many GPUs the CUDA driver shows to this process; 0 where there is no driver."""
     try:
         driver = ctypes.CDLL(CUDA_DRIVER)

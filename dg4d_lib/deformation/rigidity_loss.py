@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from dg4d_lib.deformation.rigidity_kernel import strain
+from dg4d_lib.deformation.rigidity_loss_kernel import rigidity_sum
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import rotation_matrix
 
@@ -23,7 +23,7 @@ def neighborhoods(
     return indices[:, 1:].long().to(means.device), torch.exp(-FALLOFF * distances[:, 1:].to(means).square())
 
 
-def rigidity(moved: Gaussians, indices: Int[Tensor, "n k"], weights: Float[Tensor, "n k"]) -> Float[Tensor, ""]:
+def rigidity_loss(moved: Gaussians, indices: Int[Tensor, "n k"], weights: Float[Tensor, "n k"]) -> Float[Tensor, ""]:
     """Mean weighted distance of neighbors from where the Gaussian's own rotation carries them from frame to frame.
 
     Args:
@@ -36,17 +36,17 @@ def rigidity(moved: Gaussians, indices: Int[Tensor, "n k"], weights: Float[Tenso
         return moved.means.new_zeros(())
     turns = rotation_matrix(moved.quats)
     on_cpu = moved.means.device.type == "cpu" and moved.means.dtype == torch.float32
-    total = (strain if on_cpu else plain_strain)(moved.means, turns, indices, weights)
+    total = (rigidity_sum if on_cpu else rigidity_sum_reference)(moved.means, turns, indices, weights)
     return total / (steps * indices.numel())
 
 
-def plain_strain(
+def rigidity_sum_reference(
     means: Float[Tensor, "t n 3"],
     turns: Float[Tensor, "t n 3 3"],
     indices: Int[Tensor, "n k"],
     weights: Float[Tensor, "n k"],
 ) -> Float[Tensor, ""]:
-    """The definition of `strain`, and what runs on other devices and precisions."""
+    """The definition of `rigidity_sum`, and what runs on other devices and precisions."""
     edges = means[:, indices] - means[:, :, None]
     local = torch.einsum("tnij,tnki->tnkj", turns, edges)
     return (weights * local.diff(dim=0).norm(dim=-1)).sum()

@@ -12,7 +12,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import multiply
 
 
-def placed(
+def transform(
     gaussians: Gaussians, quat: Float[Tensor, " 4"], scale: float, translation: Float[Tensor, " 3"]
 ) -> Gaussians:
     """A cloud that is scaled, turned and moved, in this order; one state or a batch of them.
@@ -40,7 +40,7 @@ def placed(
     )
 
 
-def joined(clouds: Sequence[Gaussians]) -> Gaussians:
+def concatenate(clouds: Sequence[Gaussians]) -> Gaussians:
     """All Gaussians of several clouds with as many states each."""
     return Gaussians(
         torch.cat([cloud.means for cloud in clouds], -2),

@@ -15,7 +15,7 @@ SPLIT_SHRINK = 1.6
 
 
 @dataclass
-class ScreenGradients:
+class Grad2dStats:
     """Gradients of the loss with respect to projected centers, in NDC, averaged over the views that saw them.
 
     Attributes:
@@ -27,9 +27,9 @@ class ScreenGradients:
     views: Float[Tensor, " n"]
 
     @staticmethod
-    def none(count: int, device: torch.device | None = None) -> "ScreenGradients":
+    def zeros(count: int, device: torch.device | None = None) -> "Grad2dStats":
         """Return gradients before the first view."""
-        return ScreenGradients(torch.zeros(count, device=device), torch.zeros(count, device=device))
+        return Grad2dStats(torch.zeros(count, device=device), torch.zeros(count, device=device))
 
     def add(self, pixel_gradients: Float[Tensor, "b n 2"], visible: Bool[Tensor, "b n"], size: int) -> None:
         """Add the views of one rendering; half the size converts gradients per pixel to NDC."""

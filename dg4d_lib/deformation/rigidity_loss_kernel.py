@@ -20,7 +20,7 @@ BLOCKS = 4  # of Gaussians, each with sums of its own
 TINY = np.float32(1e-20)  # squared distance under which there is no direction
 
 
-def strain(
+def rigidity_sum(
     means: Float[Tensor, "t n 3"],
     turns: Float[Tensor, "t n 3 3"],
     indices: Int[Tensor, "n k"],
@@ -34,11 +34,11 @@ def strain(
         indices: neighbors of every Gaussian.
         weights: of the pairs.
     """
-    total: Tensor = _Strain.apply(means, turns, indices, weights)
+    total: Tensor = _RigiditySum.apply(means, turns, indices, weights)
     return total
 
 
-class _Strain(torch.autograd.Function):
+class _RigiditySum(torch.autograd.Function):
     """The bridge to autograd: the gradient is found with the sum, and waits until it is asked for."""
 
     @staticmethod
