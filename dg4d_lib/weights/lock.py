@@ -1,7 +1,7 @@
-"""What was pulled: revision, license, and the digest of every file. Later uses are compared with it.
+"""Lock file of pulled weights: revision, license and the digest of every file.
 
-`weights.lock.json` lies in the folder of all weights. Trust on first use: what the first pull got is right from then
-on; copy the file to other machines to have the same there.
+`weights.lock.json` is in the weights folder. Trust on first use: the first pull records digests, later uses are
+compared with them. Copy the file to other machines to pull the same files there.
 """
 
 import json
@@ -16,7 +16,7 @@ LOCK = "weights.lock.json"
 
 
 class LockedFile(BaseModel):
-    """One file: its sha256 as 64 hexadecimal digits, and its size in bytes."""
+    """Digest (sha256, 64 hexadecimal digits) and size in bytes of one file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     sha256: str
@@ -24,13 +24,13 @@ class LockedFile(BaseModel):
 
 
 class LockEntry(BaseModel):
-    """One set of weights as it was pulled.
+    """Record of one pull.
 
     Attributes:
         hub_id: owner and repository.
-        revision: the commit of the hub.
-        license: what the model card calls it, for example "openrail++"; empty where it says nothing.
-        files: by their path within the folder.
+        revision: commit on the hub.
+        license: id on the model card, for example "openrail++"; empty if the card has none.
+        files: by their path in the folder.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -41,7 +41,7 @@ class LockEntry(BaseModel):
 
 
 def read_lock(home: Path) -> dict[str, LockEntry]:
-    """Everything that was pulled into the folder `home`, by name; nothing where there is no lock.
+    """Read the lock of the weights folder `home`, by name; empty if there is no lock file.
 
     Raises:
         BadInput: the lock cannot be read.
@@ -57,13 +57,13 @@ def read_lock(home: Path) -> dict[str, LockEntry]:
 
 
 def write_lock(home: Path, name: str, locked: LockEntry) -> None:
-    """Remember what was pulled under a name, in place of what was there."""
+    """Record a pull under a name, in place of an older record."""
     entries = {**read_lock(home), name: locked}
     write_json(home / LOCK, {key: entries[key].model_dump() for key in sorted(entries)})
 
 
 def write_json(path: Path, content: object) -> None:
-    """Write a JSON file so that a reader sees the old content or the new one, never a part."""
+    """Write a JSON file atomically: a reader sees the old content or the new one."""
     scratch = path.with_name(f".{path.name}.{os.getpid()}")
     scratch.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n", encoding="utf-8")
     scratch.replace(path)

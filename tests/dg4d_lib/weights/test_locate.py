@@ -108,7 +108,7 @@ def test_damage_is_one_clear_message(change: str, home: Path) -> None:
         case "drop a part":
             (folder / "scheduler" / "scheduler_config.json").unlink()
     with pytest.raises(
-        BackendUnavailable, match=r"not whole: .*`dg4d weights check svd`.*`dg4d weights pull svd`"
+        BackendUnavailable, match=r"incomplete or changed: .*`dg4d weights check svd`.*`dg4d weights pull svd`"
     ) as told:
         find_weights("svd", home)
     assert len(str(told.value).splitlines()) == 1
@@ -164,19 +164,19 @@ def test_an_unchanged_file_is_read_once(tmp_path: Path, monkeypatch: pytest.Monk
     read: list[Path] = []
     honest = locate._sha256
     monkeypatch.setattr(locate, "_sha256", lambda path: read.append(path) or honest(path))
-    first = digests(folder, memory=memory)
+    first = digests(folder, cache=memory)
     assert len(read) == 7
-    assert digests(folder, memory=memory) == first
+    assert digests(folder, cache=memory) == first
     assert len(read) == 7
     file = folder / "unet" / "diffusion_pytorch_model.safetensors"
     file.write_bytes(b"more than before")
-    assert digests(folder, memory=memory) != first
+    assert digests(folder, cache=memory) != first
     assert read[7:] == [file]
     os.utime(file, ns=(1, 1))
-    digests(folder, memory=memory)
+    digests(folder, cache=memory)
     assert read[8:] == [file]
     memory.write_text("not json")
-    assert len(digests(folder, memory=memory)) == 7
+    assert len(digests(folder, cache=memory)) == 7
 
 
 def test_the_identity_is_of_content_and_not_of_place(tmp_path: Path) -> None:

@@ -143,7 +143,7 @@ def test_what_the_hub_lists_is_refused_where_something_else_was_published(hub: H
 
 def test_a_download_without_a_file_is_refused(hub: Hub, tmp_path: Path) -> None:
     del hub.files["vae/config.json"]
-    with pytest.raises(BackendUnavailable, match=r"vae/config\.json did not come"):
+    with pytest.raises(BackendUnavailable, match=r"vae/config\.json was not downloaded"):
         pull(SVD, tmp_path)
 
 
@@ -158,7 +158,7 @@ def test_a_repository_without_what_is_needed_is_refused(hub: Hub, tmp_path: Path
         (OSError("Name or service not known\nand more"), "connect this machine to the network"),
         (OfflineModeIsEnabled("offline"), "name the folder instead"),
         (type("GatedRepoError", (Exception,), {})("403"), "accept its license there"),
-        (type("RevisionNotFoundError", (Exception,), {})("404"), "the revision is gone"),
+        (type("RevisionNotFoundError", (Exception,), {})("404"), "the pinned revision no longer exists"),
     ],
 )
 def test_without_the_hub_there_is_one_clear_message(error: Exception, says: str, hub: Hub, tmp_path: Path) -> None:

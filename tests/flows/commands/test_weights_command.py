@@ -93,7 +93,7 @@ def test_check_reads_every_file_again(home: Path) -> None:
     os.utime(file, ns=times)  # as a disk that forgets does
     bad = dg4d("weights", "check")
     assert bad.exit_code == 69
-    assert f"lgm: {LGM} is not the file that was pulled" in bad.stdout
+    assert f"lgm: {LGM} differs from the pulled file" in bad.stdout
     assert "`dg4d weights pull lgm`" in bad.stderr
 
 
@@ -111,7 +111,7 @@ def test_weights_that_were_copied_are_compared_with_what_was_published(
     (home / "lgm" / LGM).write_bytes(b"tensors")
     other = dg4d("weights", "check")
     assert other.exit_code == 69
-    assert f"lgm: {LGM} is not the file that was published at revision 1c28a2fd3b" in other.stdout
+    assert f"lgm: {LGM} differs from the published file at revision 1c28a2fd3b" in other.stdout
     told = replace(KNOWN["lgm"], published={LGM: hashlib.sha256(b"tensors").hexdigest(), "more": "0" * 64})
     monkeypatch.setitem(KNOWN, "lgm", told)
     assert "lgm: complete; it was not pulled by this command: 1 of its files is as published" in check()
