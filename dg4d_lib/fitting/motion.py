@@ -1,4 +1,4 @@
-"""The dynamic stage: a deformation fitted to the driving video and to a prior at every moment (paper section 3.2)."""
+"""Dynamic stage: optimization of the deformation on the driving video and a guidance prior (paper section 3.2)."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -36,36 +36,38 @@ def fit_motion(
     report: Report = lambda iteration, values: None,
     input_camera: OrbitCamera | None = None,
 ) -> Gaussians:
-    """Fit `deformation` in place, and with `settings.fine_tune` the Gaussians at rest with it.
+    """Fit `deformation` in place, and with `settings.fine_tune` the canonical Gaussians too.
 
     Args:
-        gaussians: the canonical cloud; the fit runs on its device. Neither it nor its density changes.
-        deformation: what is fitted, the identity at the start; on the same device.
-        video: what the input camera sees.
-        prior: judges every frame from random views.
-        rasterize: draws.
-        settings: every number of the stage.
-        generator: the source of all randomness.
+        gaussians: the canonical cloud, which is not modified; the fit runs on its device.
+        deformation: the model to fit, on the same device; the identity at the start.
+        video: driving video of the input camera.
+        prior: scores random views of every frame.
+        rasterize: rasterizer.
+        settings: of the stage.
+        generator: source of all randomness.
         report: called after every iteration with (iterations done, named losses).
-        input_camera: where the video was taken from; the default is azimuth and elevation 0.
+        input_camera: camera of the video; the default is azimuth and elevation 0.
 
     Returns:
-        The cloud that `deformation` moves: the one that was given, or with `settings.fine_tune` a better one.
+        The canonical cloud of `deformation`: the given one, or with `settings.fine_tune` its optimized copy.
 
     Raises:
         FitDiverged: the loss became non-finite.
     """
     camera = replace(input_camera or OrbitCamera(), width=settings.reference_size, height=settings.reference_size)
     device = gaussians.means.device
-    pictures = resize_cutouts(torch.cat([video.frames, video.coverage], -1).to(device), settings.reference_size)
-    color, alpha = (picture.permute(0, 3, 1, 2) for picture in pictures)  # so that chosen ones lie plane by plane too
+    references = resize_cutouts(torch.cat([video.frames, video.coverage], -1).to(device), settings.reference_size)
+    color, alpha = (images.permute(0, 3, 1, 2) for images in references)  # indexing keeps channels first in memory
     times = video.times.to(device)
     white = torch.tensor(WHITE, device=device)
     gaussians, groups = gaussians.detach(), _groups(deformation, settings)
     if settings.fine_tune:
         gaussians = Gaussians(**{name: nn.Parameter(value.clone()) for name, value in vars(gaussians).items()})
-        of_cloud = [{"params": getattr(gaussians, name), "lr": rate} for name, rate in learning_rates(settings).items()]
-        groups = [*of_cloud, *groups]
+        cloud_groups = [
+            {"params": getattr(gaussians, name), "lr": rate} for name, rate in learning_rates(settings).items()
+        ]
+        groups = [*cloud_groups, *groups]
     adam = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15, fused=True)
     neighbors = neighborhoods(gaussians.means) if settings.rigidity_weight else None
     for step in range(1, settings.iterations + 1):
@@ -101,16 +103,16 @@ def fit_motion(
         adam.zero_grad(set_to_none=True)
         loss.backward()
         losses = {"loss": loss, "reference": reference, "guidance": guidance}
-        slopes = [parameter.grad for group in adam.param_groups for parameter in group["params"]]
-        moment = f"iteration {step} of {settings.iterations}"
-        numbers = check_finite("fit_motion", losses, slopes, moment, ADVICE, gaussians)
+        gradients = [parameter.grad for group in adam.param_groups for parameter in group["params"]]
+        iteration = f"iteration {step} of {settings.iterations}"
+        numbers = check_finite("fit_motion", losses, gradients, iteration, ADVICE, gaussians)
         adam.step()
         report(step, numbers)
     return gaussians.detach()
 
 
 def sample_frames(total: int, count: int, generator: torch.Generator) -> Int[Tensor, " k"]:
-    """The frames of one iteration in order: all, or `count` different ones, one from each equal stretch of time."""
+    """Draw the frames of one iteration, in order: all, or one from each of `count` equal intervals of time."""
     if not count or count >= total:
         return torch.arange(total)
     edges = torch.linspace(0, total, count + 1, dtype=torch.float64)
@@ -121,7 +123,7 @@ def sample_frames(total: int, count: int, generator: torch.Generator) -> Int[Ten
 def sample_views(
     prior: GuidancePrior, frames: Int[Tensor, " k"], settings: MotionSettings, size: int, generator: torch.Generator
 ) -> tuple[list[GuidanceView], Int[Tensor, " m"]]:
-    """Random views of every frame that the prior can judge, and the row of `frames` each belongs to."""
+    """Draw random views of every frame that the prior supports; return them and their rows in `frames`."""
     rows = [row for row, f in enumerate(frames.tolist()) if prior.frames is None or f in prior.frames]
     rows = [row for row in rows for _ in range(settings.views)]
     if prior.viewpoints is None:
@@ -142,7 +144,7 @@ def sample_views(
 
 
 def bounds_of(gaussians: Gaussians, margin: float = 0.1) -> Float[Tensor, "2 3"]:
-    """The box of the centers, widened by a share of its longest side: where the planes of a deformation lie."""
+    """Return the bounding box of the means, widened by a fraction of its longest side: the box of a deformation."""
     low, high = gaussians.means.detach().amin(0), gaussians.means.detach().amax(0)
     slack = margin * (high - low).max().clamp(min=1e-3)
     return torch.stack([low - slack, high + slack])

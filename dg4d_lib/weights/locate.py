@@ -84,7 +84,8 @@ def content_name(folder: Path, home: Path) -> str:
     Equal folders have equal names on every machine, so results do not depend on the path of the weights.
     """
     home.mkdir(parents=True, exist_ok=True)
-    name = f"{folder.stem}{CONTENT_MARK}{identity(digests(folder, cache=home / DIGEST_CACHE)).removeprefix('sha256:')[:12]}"
+    digest = identity(digests(folder, cache=home / DIGEST_CACHE)).removeprefix("sha256:")
+    name = f"{folder.stem}{CONTENT_MARK}{digest[:12]}"
     link = home / name
     if not link.is_symlink() or link.readlink() != folder:
         scratch = home / f".{name}.{os.getpid()}"

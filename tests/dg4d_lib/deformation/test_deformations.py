@@ -148,5 +148,5 @@ def test_scattered_gaussians_begin_anywhere_within_the_radius_and_elsewhere_in_e
 
 
 def test_a_framewise_table_refuses_another_cloud():
-    with pytest.raises(BadInput, match="60 Gaussians cannot move 3"):
+    with pytest.raises(BadInput, match="has 60 Gaussians; given 3"):
         Framewise(FRAMES, COUNT).displace(torch.zeros(3, 3), torch.tensor([0.0]))

@@ -203,7 +203,7 @@ def test_a_users_folder_that_is_gone_is_asked_for_once_more(tmp_path: Path, home
     folder = fill(tmp_path / "mine")
     name = content_name(folder, home)
     folder.rename(tmp_path / "elsewhere")
-    with pytest.raises(BackendUnavailable, match="name the folder once more"):
+    with pytest.raises(BackendUnavailable, match="give its new path"):
         find_weights(name, home)
 
 

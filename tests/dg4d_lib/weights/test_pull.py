@@ -156,8 +156,8 @@ def test_a_repository_without_what_is_needed_is_refused(hub: Hub, tmp_path: Path
     ("error", "says"),
     [
         (OSError("Name or service not known\nand more"), "connect this machine to the network"),
-        (OfflineModeIsEnabled("offline"), "name the folder instead"),
-        (type("GatedRepoError", (Exception,), {})("403"), "accept its license there"),
+        (OfflineModeIsEnabled("offline"), "give its path"),
+        (type("GatedRepoError", (Exception,), {})("403"), "accept its license at https"),
         (type("RevisionNotFoundError", (Exception,), {})("404"), "the pinned revision no longer exists"),
     ],
 )
