@@ -40,7 +40,7 @@ from dg4d_lib.deformation.hexplane import HexPlane
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import HexPlaneSettings
 from steps.pack_asset import LANES
 
@@ -151,7 +151,7 @@ def _glb(asset: Asset4D, settings: GltfSettings, folder: Path) -> None:
 def splat_writers(asset: Asset4D, splats: CompactAsset, pack: PackSettings) -> Iterator[tuple[str, Write]]:
     cloud, field = splats.gaussians, splats.deformation
     states = pose_gaussians(cloud, field, FRAMES, torch.arange(float(FRAMES)))
-    rasterizer = choose_rasterizer("auto")
+    rasterizer = get_rasterizer("auto")
     yield "splats, PLY", lambda folder: write_splats(folder, states)
     yield "splats, SPZ", lambda folder: write_spz_frames(folder, states)
     yield "splats, glTF", lambda folder: write_splat_glb_frames(folder, states)

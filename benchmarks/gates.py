@@ -35,8 +35,8 @@ from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh, sh_to_rgb
 from dg4d_lib.images import resize_planes
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.metrics.gates import Gate, judge
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.metrics.gates import Gate, evaluate_gates
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 from flows.packages.publish import whole
 from steps.artifacts.media import read_frames, read_png
@@ -278,8 +278,8 @@ SPOILS: dict[str, tuple[str, Spoil]] = {
 def measured(sample: Sample) -> dict[str, Gate]:
     """Every gate by its name."""
     parts = Parts(partial(states_between, sample.states), sample.surface, len(sample.surface.offsets))
-    evidence = gather(parts, sample.video, sample.cutout, choose_rasterizer("cpu"))
-    return {gate.name: gate for gate in judge(evidence, GateSettings())}
+    evidence = gather(parts, sample.video, sample.cutout, get_rasterizer("cpu"))
+    return {gate.name: gate for gate in evaluate_gates(evidence, GateSettings())}
 
 
 def rows(samples: Sequence[Sample], tell: Callable[[str], None]) -> list[Row]:

@@ -28,8 +28,8 @@ from dg4d_lib.mesh.extraction.extract import select_level
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.metrics.image import iou, psnr
-from dg4d_lib.metrics.surface import chamfer_of_points, sample_surface
-from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
+from dg4d_lib.metrics.surface import chamfer_distance, sample_surface
+from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.settings import MeshSettings
 from steps.artifacts.packages import ASSET, COMPACT
 from steps.extract_mesh import textured
@@ -72,7 +72,7 @@ def of_package(folder: Path, count: int, rasterize: Rasterizer) -> list[Row]:
         truth, generator = splats(states.at(i), rasterize), torch.Generator().manual_seed(frame)
         for mode, mesh in (("tracked", tracked), ("per_frame", extracted)):
             points = [sample_surface(each.vertices, each.faces, POINTS, generator) for each in (mesh, extracted)]
-            apart = chamfer_of_points(*points)
+            apart = chamfer_distance(*points)
             rows.append(Row(folder.name, mode, 1, PER_WORLD_UNIT * apart, *look(mesh, truth)))
     return [mean_row(folder.name, [row for row in rows if row.mode == mode]) for mode in MODES]
 
@@ -107,7 +107,7 @@ def main() -> None:
     parser.add_argument("packages", type=Path, nargs="+", metavar="PACKAGE", help="folders that `dg4d make` wrote")
     parser.add_argument("--frames", type=int, default=4, help="frames per package, evenly spread")
     options = parser.parse_args()
-    rasterize = choose_rasterizer("auto")
+    rasterize = get_rasterizer("auto")
     count = 2 if options.quick else options.frames
     rows = [row for folder in options.packages for row in of_package(folder, count, rasterize)]
     means = [mean_row("mean", [row for row in rows if row.mode == mode]) for mode in MODES]

@@ -23,7 +23,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from flows.convert import connect
 from flows.serving import background
 from steps.artifacts.packages import read_manifest
@@ -50,7 +50,7 @@ def write_animation(package: Path, path: Path) -> None:
     """Write input picture, lit mesh and splats side by side while the camera sways."""
     manifest = read_manifest(package)
     states, surface = read_states(package, manifest), read_surface(package, manifest)
-    draw = choose_rasterizer("auto")
+    draw = get_rasterizer("auto")
     subject = _over_white(Image.open(package / "input" / "subject.png").resize((SIZE, SIZE), Image.Resampling.LANCZOS))
     count = round(LOOPS * manifest.frames / manifest.fps * FPS)
     pictures = []

@@ -15,11 +15,11 @@ from dg4d_lib.asset_settings import GateSettings
 from dg4d_lib.assets.rendering.sheet import draw_tiles
 from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.cameras.viewpoints import turntable
-from dg4d_lib.fitting.losses import resized
+from dg4d_lib.fitting.losses import resize_cutouts
 from dg4d_lib.images import color_over_white
 from dg4d_lib.mesh.extraction.topology import check_topology, weld_vertices
-from dg4d_lib.metrics.gates import MESH, SPLATS, Evidence, Gate, Pictures, Turn, fidelity, judge
-from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
+from dg4d_lib.metrics.gates import MESH, SPLATS, Gate, GateInputs, RgbaImages, Turntable, evaluate_gates, fidelity
+from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.archives import unpack
 from steps.artifacts.media import read_frames, read_png, write_png
@@ -64,8 +64,8 @@ def run(job: Job) -> StepReport:
         folder = Path(scratch)
         parts = read_parts(job.inputs["package"], folder / "package")
         video = read_frames(job.inputs["driving_video"], folder)
-    evidence = gather(parts, video, read_png(job.inputs["subject"]), choose_rasterizer(job.settings.rasterizer))
-    gates = judge(evidence, bounds)
+    evidence = gather(parts, video, read_png(job.inputs["subject"]), get_rasterizer(job.settings.rasterizer))
+    gates = evaluate_gates(evidence, bounds)
     job.outputs["gates"].write_text(json.dumps(verdict(gates), ensure_ascii=False, allow_nan=False), encoding="utf-8")
     write_png(job.outputs["picture"], picture(evidence, (_spread(len(video), MOST_FRAMES) / video.fps).tolist()))
     failing = [gate.name for gate in gates if not gate.passed]
@@ -85,7 +85,7 @@ def read_parts(package: Path, folder: Path) -> Parts:
     return Parts(read_states(folder, manifest), read_surface(folder, manifest), manifest.frames)
 
 
-def gather(parts: Parts, video: DrivingVideo, cutout: Float[Tensor, "h w 4"], rasterizer: Rasterizer) -> Evidence:
+def gather(parts: Parts, video: DrivingVideo, cutout: Float[Tensor, "h w 4"], rasterizer: Rasterizer) -> GateInputs:
     """Look at an asset from the input view, from four sides at four moments, and all around.
 
     Args:
@@ -118,12 +118,12 @@ def gather(parts: Parts, video: DrivingVideo, cutout: Float[Tensor, "h w 4"], ra
         seen[form] = _pictures(_drawn(draw, positions, [front] * len(positions)))
         around[form] = _pictures(_drawn(draw, moments.repeat_interleave(len(sides)), sides * len(moments)))
     turn = _drawn(splats, positions[:1].repeat(TURN), ring)
-    return Evidence(
+    return GateInputs(
         picture=_resized(cutout[None]),
         video=_resized(torch.cat([video.frames, video.alpha], -1)[frames.long()]),
         seen=seen,
         around=around,
-        turn=Turn(turn[..., 3:4], turn[..., 4:], viewmats(ring), front.focal),
+        turn=Turntable(turn[..., 3:4], turn[..., 4:], viewmats(ring), front.focal),
         flaws=max(_flaws(parts.surface, moment) for moment in moments),
     )
 
@@ -151,7 +151,7 @@ def verdict(gates: Sequence[Gate]) -> dict[str, Any]:
     }
 
 
-def picture(evidence: Evidence, seconds: Sequence[float]) -> Float[Tensor, "h w 3"]:
+def picture(evidence: GateInputs, seconds: Sequence[float]) -> Float[Tensor, "h w 3"]:
     """The video, both forms of the asset and where they are off, in [0, 1].
 
     Columns are moments: the first, and of three equal parts of the video the one that is shown worst.
@@ -184,12 +184,12 @@ def _drawn(
     return torch.cat([draw(positions[part], cameras[part]) for part in parts])
 
 
-def _pictures(drawn: Float[Tensor, "b s s c"]) -> Pictures:
-    return Pictures(drawn[..., :3].clamp(0, 1).contiguous(), drawn[..., 3:4].clamp(0, 1).contiguous())
+def _pictures(drawn: Float[Tensor, "b s s c"]) -> RgbaImages:
+    return RgbaImages(drawn[..., :3].clamp(0, 1).contiguous(), drawn[..., 3:4].clamp(0, 1).contiguous())
 
 
-def _resized(cutouts: Float[Tensor, "b h w 4"]) -> Pictures:
-    return Pictures(*(part.contiguous() for part in resized(cutouts, SIZE)))
+def _resized(cutouts: Float[Tensor, "b h w 4"]) -> RgbaImages:
+    return RgbaImages(*(part.contiguous() for part in resize_cutouts(cutouts, SIZE)))
 
 
 def _flaws(surface: Surface, position: Float[Tensor, ""]) -> float:

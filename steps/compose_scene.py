@@ -17,8 +17,8 @@ from dg4d_lib.assets.scenes.scene import Scene, SceneItem
 from dg4d_lib.cameras.orbit import FOV_Y_DEG, RADIUS, OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.gaussians.placing import joined, placed
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.gaussians.transform import concatenate, transform
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from steps.artifacts.packages import ASSET, COMPACT, USD, read_manifest
 
 FILM_SIZE = 384  # pixels of a side
@@ -120,7 +120,7 @@ class Cast:
             raise BadInput(
                 f"a film has 1 to {MOST_PICTURES} pictures; {count} were asked for: change fps or duration_s"
             )
-        draw = choose_rasterizer(rasterizer)
+        draw = get_rasterizer(rasterizer)
         clouds = {folder: _Cloud(folder) for folder in dict.fromkeys(self.folders)}
         center, radius = self._ball()
         scale = FILLED * RADIUS * math.sin(math.radians(FOV_Y_DEG / 2)) / radius
@@ -128,7 +128,7 @@ class Cast:
         background, pictures = studio_background(FILM_SIZE), []
         for start in range(0, count, BATCH):
             moments = torch.arange(start, min(start + BATCH, count), dtype=torch.float64)
-            states = joined(
+            states = concatenate(
                 [
                     clouds[folder].at(actor, moments / scene.fps)
                     for actor, folder in zip(self.actors, self.folders, strict=True)
@@ -143,7 +143,7 @@ class Cast:
                 )
                 for moment in moments.tolist()
             ]
-            pictures.append(render_over(background, placed(states, upright, scale, -scale * center), cameras, draw))
+            pictures.append(render_over(background, transform(states, upright, scale, -scale * center), cameras, draw))
             progress(start + len(moments), count)
         write_mp4(path, torch.cat(pictures), scene.fps)
 
@@ -173,7 +173,7 @@ class _Cloud:
         fit, positions = self.fit, (played * self.fps).clamp(max=self.fit.frames)
         states = pose_gaussians(fit.gaussians, fit.deformation, fit.frames, positions)
         quat = torch.from_numpy(actor.turn.as_quat(canonical=True))[[3, 0, 1, 2]]
-        return placed(states, quat, actor.item.scale, torch.from_numpy(actor.origin))
+        return transform(states, quat, actor.item.scale, torch.from_numpy(actor.origin))
 
 
 def _body(folder: Path) -> AnimatedGlb:

@@ -2,7 +2,7 @@
 
 import torch
 
-from dg4d_lib.diffusion.parts import device_here
+from dg4d_lib.diffusion.components import default_device
 from dg4d_lib.diffusion.text_to_image import draw_picture
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import TextSettings
@@ -23,7 +23,7 @@ def run(job: Job) -> StepReport:
         raise BadInput("no text-to-image pipeline was named: --set text.weights=FOLDER, or an id of the hub")
     words = job.inputs["text"].read_text(encoding="utf-8")
     opened = open_weights(settings.weights)
-    device = device_here()
+    device = default_device()
     picture = draw_picture(
         opened.folder,
         words,

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dg4d_lib.assets.rendering.preview import write_mp4
 from dg4d_lib.assets.rendering.sheet import draw_video_sheet
-from dg4d_lib.diffusion.parts import device_here
+from dg4d_lib.diffusion.components import default_device
 from dg4d_lib.diffusion.video_model import VideoModel
 from dg4d_lib.errors import BadInput
 from dg4d_lib.images import resize
@@ -101,7 +101,7 @@ def _stable_videos(
 ) -> tuple[list[_Motion], StepReport]:
     """Candidate k of a seed is candidate 1 of the seed plus k - 1."""
     opened = open_weights(settings.model.weights)
-    device = device_here()
+    device = default_device()
     maker = StableVideo(settings, VideoModel.load(opened.folder, settings.model, device))
     seeds = [seed + number - 1 for number in numbers]
     videos = maker.generate_all(subject, [torch.Generator().manual_seed(each) for each in seeds])

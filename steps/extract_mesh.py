@@ -22,7 +22,7 @@ from dg4d_lib.mesh.tracking.isosurface_projection import project_to_isosurface
 from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU, register_nonrigid
 from dg4d_lib.mesh.tracking.reference_frame import relative_to_frame
 from dg4d_lib.mesh.tracking.skinning import skin_vertices
-from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
+from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.settings import MeshSettings
 from steps.artifacts.media import write_png
 from steps.artifacts.mesh_plan import MeshPlan, read_plan
@@ -43,7 +43,7 @@ def run(job: Job) -> StepReport:
     settings: MeshSettings = job.settings.mesh
     frames_of_task: FrameRange = job.settings
     plan = read_plan(job.inputs["plan"])
-    rasterize = choose_rasterizer(job.settings.rasterizer)
+    rasterize = get_rasterizer(job.settings.rasterizer)
     gaussians = read_ply(job.inputs["gaussians"])
     deformation, frames = read_motion(job.inputs["motion"])
     with torch.no_grad():

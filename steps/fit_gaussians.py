@@ -10,7 +10,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import blob, on_surface
 from dg4d_lib.gaussians.ply import write_ply
 from dg4d_lib.inflation.surface import inflate, sample_surface
-from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
+from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
 from dg4d_lib.settings import (
     BlobStartSettings,
     GeometricPriorSettings,
@@ -35,8 +35,8 @@ def run(job: Job) -> StepReport:
     backend, turn_deg = job.settings.rasterizer, job.settings.turn_deg
     subject = read_png(job.inputs["subject"])
     generator = torch.Generator().manual_seed(job.seed)
-    rasterize = choose_rasterizer(backend)
-    device = device_of(backend)
+    rasterize = get_rasterizer(backend)
+    device = preferred_device(backend)
     reconstruction = None
     if isinstance(static.start, LgmStartSettings):
         reconstruction = reconstruct_subject(subject.to(device), static.start, rasterize, generator)

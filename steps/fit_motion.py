@@ -8,7 +8,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.losses import Diverged
 from dg4d_lib.fitting.motion import fit_motion
 from dg4d_lib.gaussians.ply import read_ply, write_ply
-from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
+from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
 from dg4d_lib.settings import DeformationSettings, MotionSettings, PriorSettings
 from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.motions import new_deformation, write_motion
@@ -30,11 +30,11 @@ def run(job: Job) -> StepReport:
     gaussians = read_ply(job.inputs["gaussians"])
     video = read_frames(job.inputs["driving_video"], job.pictures)
     generator = torch.Generator().manual_seed(job.seed)
-    rasterize = choose_rasterizer(backend)
+    rasterize = get_rasterizer(backend)
     cutouts = list(torch.cat([video.frames, video.alpha], -1))
     chosen = make_prior(prior, cutouts, settings, job.inputs.get("bank"), job.pictures, turn_deg)
     deformation = new_deformation(kind, gaussians, len(video), generator)
-    device = device_of(backend)
+    device = preferred_device(backend)
     deformation.to(device)
     curves = LossCurves(settings.iterations, job.progress)
     try:

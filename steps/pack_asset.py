@@ -29,7 +29,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.mesh.extraction.simplify import simplify_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
+from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.settings import DeformationSettings
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts import packages
@@ -263,7 +263,7 @@ def _contents(job: Job, scratch: Path) -> Contents:
             gaussians, fit.deformation, fit.frames, resampled_positions(fit.frames, video.fps, fps)
         ),
         fps=fps,
-        rasterizer=choose_rasterizer(job.settings.rasterizer),
+        rasterizer=get_rasterizer(job.settings.rasterizer),
         inputs=dict(job.inputs),
     )
 

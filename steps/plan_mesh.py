@@ -7,7 +7,7 @@ from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import select_level
 from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU
 from dg4d_lib.mesh.tracking.reference_frame import select_reference_frame
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
 from steps.artifacts.mesh_plan import MeshPlan, write_plan
 from steps.artifacts.motions import read_motion
@@ -23,7 +23,7 @@ def run(job: Job) -> StepReport:
         FitDiverged: the cloud is empty.
     """
     settings: MeshSettings = job.settings.mesh
-    rasterize = choose_rasterizer(job.settings.rasterizer)
+    rasterize = get_rasterizer(job.settings.rasterizer)
     gaussians = read_ply(job.inputs["gaussians"])
     deformation, frames = read_motion(job.inputs["motion"])
     with torch.no_grad():

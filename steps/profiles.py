@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field, ValidationError, create_model, model
 
 from dg4d_lib.asset_settings import GateSettings, PackSettings, ScoreSettings
 from dg4d_lib.errors import BadInput
-from dg4d_lib.rasterizer.choice import backend_name
+from dg4d_lib.rasterizer.backends import backend_name
 from dg4d_lib.settings import (
     DeformationSettings,
     DrivingSettings,

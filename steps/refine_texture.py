@@ -7,10 +7,10 @@ from tempfile import TemporaryDirectory
 
 import torch
 
-from dg4d_lib.diffusion.parts import device_here
+from dg4d_lib.diffusion.components import default_device
 from dg4d_lib.diffusion.video_model import VideoModel
 from dg4d_lib.errors import BadInput
-from dg4d_lib.guidance.distillation import Annealing
+from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.settings import IdentitySettings, ImageToImageSettings, RefinerSettings, VideoToVideoSettings
@@ -52,7 +52,7 @@ def _refined(job: Job, clips: Sequence[MeshClip]) -> tuple[list[RefinedTextures]
     kind: RefinerSettings = job.settings.refiner
     with TemporaryDirectory() as scratch:
         driving = read_frames(job.inputs["driving_video"], Path(scratch))
-    device = device_here()
+    device = default_device()
     driving = DrivingVideo(driving.frames.to(device), driving.alpha.to(device), driving.fps)
     pictures = driving.over(driving.frames.new_ones(3))
     refiner: Refiner
@@ -67,7 +67,7 @@ def _refined(job: Job, clips: Sequence[MeshClip]) -> tuple[list[RefinedTextures]
         case ImageToImageSettings():
             opened = open_weights(kind.prior.weights)
             loaded = Zero123.load(opened.folder, kind.prior, device)
-            prior = loaded.conditioned_on(pictures, Annealing(1.0))
+            prior = loaded.conditioned_on(pictures, TimestepSchedule(1.0))
             refiner, halved = ImageToImage(kind, prior), prior.batches.notes
             how = "picture by picture, by image diffusion"
     generator = torch.Generator().manual_seed(job.seed)

@@ -19,15 +19,15 @@ from dg4d_lib.asset_settings import ScoreSettings
 from dg4d_lib.assets.animated import interpolate_frames
 from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb
 from dg4d_lib.assets.rendering.preview import write_mp4
-from dg4d_lib.diffusion.parts import device_here
+from dg4d_lib.diffusion.components import default_device
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.images import over_background
-from dg4d_lib.metrics.clip import Clip, load_clip, similarity
+from dg4d_lib.metrics.clip import ClipModel, cosine_similarity, load_clip
 from dg4d_lib.metrics.fvd import SHORTEST, fvd_consistent4d, load_i3d, logits
-from dg4d_lib.metrics.image import iou, psnr, resized
+from dg4d_lib.metrics.image import iou, psnr, resize_square
 from dg4d_lib.metrics.lpips import Lpips, load_lpips
 from dg4d_lib.metrics.ssim import ssim
-from dg4d_lib.metrics.surface import aligned, chamfer_of_points, sample_surface
+from dg4d_lib.metrics.surface import align_bounding_boxes, chamfer_distance, sample_surface
 from dg4d_lib.metrics.video import flicker, motion_amount, temporal_error
 from steps.artifacts.archives import unpack
 from steps.artifacts.ground_truth import Truth, find_truth
@@ -80,7 +80,7 @@ class Judges:
     size: int
     device: torch.device
     lpips: Lpips | None = None
-    clip: Clip | None = None
+    clip: ClipModel | None = None
     i3d: Any = None
     missing: dict[str, str] = field(default_factory=dict)
     digests: dict[str, str] = field(default_factory=dict)
@@ -118,7 +118,7 @@ def run(job: Job) -> StepReport:
 
 def open_judges(settings: ScoreSettings) -> Judges:
     """The networks whose weights are here; the others' metrics are named as missing."""
-    judges = Judges(settings.size, device_here())
+    judges = Judges(settings.size, default_device())
 
     def load(metric: str, names: Sequence[str], make: Callable[..., Any]) -> Any:
         if not all(names):
@@ -161,11 +161,11 @@ def compare(ours: Film, theirs: Film, judges: Judges) -> Figures:
         figures["terr"] = float(temporal_error(ours.color, theirs.color))
         figures["motion"] = float(motion_amount(ours.color, theirs.color))
     if judges.lpips is not None:
-        pairs = (resized(film.color, judges.size) for film in (ours, theirs))
+        pairs = (resize_square(film.color, judges.size) for film in (ours, theirs))
         figures["lpips"] = float(judges.lpips(*pairs).mean())
     if judges.clip is not None:
-        embedded = [judges.clip.embed(resized(film.color, judges.size)) for film in (ours, theirs)]
-        figures["clip"] = float(similarity(*embedded).mean())
+        embedded = [judges.clip.embed(resize_square(film.color, judges.size)) for film in (ours, theirs)]
+        figures["clip"] = float(cosine_similarity(*embedded).mean())
     if judges.i3d is not None and len(theirs) >= SHORTEST:
         outputs = [logits(judges.i3d, film.color, judges.device) for film in (ours, theirs)]
         figures["fvd_consistent4d"] = float(fvd_consistent4d(*outputs))
@@ -197,9 +197,9 @@ def _of_package(
     films, clips, views = {"input": ours}, {}, {}
     of_input = compare(ours.pick(range(len(given))), given, judges)
     if judges.clip is not None:
-        embedded = judges.clip.embed(resized(ours.color, judges.size))
-        wanted = judges.clip.embed(resized(given.color[:1], judges.size))
-        of_input["clip_i"] = float(similarity(embedded, wanted.expand_as(embedded)).mean())
+        embedded = judges.clip.embed(resize_square(ours.color, judges.size))
+        wanted = judges.clip.embed(resize_square(given.color[:1], judges.size))
+        of_input["clip_i"] = float(cosine_similarity(embedded, wanted.expand_as(embedded)).mean())
     step_on(total)
     for view in truth.views:
         theirs = _read(view.frames, size)
@@ -263,8 +263,8 @@ def _geometry(package: Path, mesh: Path, samples: int, seed: int) -> Figures:
     theirs = torch.stack([sample_surface(moment, faces, samples, generator, weights) for moment in vertices])
     ours = torch.stack([sample_surface(*moment, samples, generator) for moment in _meshes(package, len(vertices))])
     return {
-        name: fmean(chamfer_of_points(a, b) for a, b in zip(points, theirs, strict=True))
-        for name, points in (("chamfer", ours), ("chamfer_aligned", aligned(ours, theirs)))
+        name: fmean(chamfer_distance(a, b) for a, b in zip(points, theirs, strict=True))
+        for name, points in (("chamfer", ours), ("chamfer_aligned", align_bounding_boxes(ours, theirs)))
     }
 
 

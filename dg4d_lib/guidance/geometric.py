@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.errors import BadInput
-from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.images import over_background
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import InflatedSurface, inflate
@@ -58,7 +58,7 @@ class InflatedSurfaces:
             self._surfaces[frame] = inflate(self._cutouts[frame], self._settings.size, self._turn_deg)
         return self._surfaces[frame]
 
-    def clean(self, views: Sequence[View]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
+    def clean(self, views: Sequence[GuidanceView]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
         """The pictures that the prior believes in.
 
         Args:

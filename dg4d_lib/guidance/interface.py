@@ -12,7 +12,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 
 
 @dataclass(frozen=True)
-class View:
+class GuidanceView:
     """Where and when a picture is judged.
 
     Attributes:
@@ -40,7 +40,7 @@ class GuidancePrior(Protocol):
         self,
         images: Float[Tensor, "b h w 3"],
         coverage: Float[Tensor, "b h w 1"],
-        views: Sequence[View],
+        views: Sequence[GuidanceView],
         progress: float,
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:
@@ -57,7 +57,7 @@ class GuidancePrior(Protocol):
 
 
 @runtime_checkable
-class JudgesRings(Protocol):
+class RingPrior(Protocol):
     """What a prior has beside `GuidancePrior` if it judges several cameras of a moment together.
 
     Attributes:
@@ -70,6 +70,6 @@ class JudgesRings(Protocol):
         ...
 
 
-def ring_of(prior: GuidancePrior) -> int:
+def ring_size(prior: GuidancePrior) -> int:
     """How many consecutive views the prior judges together; 1 if it judges each for itself."""
-    return prior.ring if isinstance(prior, JudgesRings) else 1
+    return prior.ring if isinstance(prior, RingPrior) else 1

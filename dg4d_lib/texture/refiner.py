@@ -12,7 +12,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.latents import decode_images, encode_images
 from dg4d_lib.diffusion.noise_schedule import add_noise, ddim_step, ddim_timesteps
 from dg4d_lib.diffusion.video_model import VideoModel, karras_sigmas, start_index
-from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.zero123 import ConditionedZero123
 from dg4d_lib.images import resize
 from dg4d_lib.settings import ImageToImageSettings, VideoToVideoSettings
@@ -66,10 +66,10 @@ class VideoToVideo:
         progress: float,
         generator: torch.Generator,
     ) -> Float[Tensor, "t h w 3"]:
-        """Return the denoised video; `cameras` and `progress` are not used."""
-        condition = self.model.look_at(resize(self._picture[None], video.shape[1:3])[0], [generator])
+        """The denoised video; viewpoints and progress do not matter."""
+        condition = self.model.encode_condition(resize(self._picture[None], video.shape[1:3])[0], [generator])
         latents = self.model.encode(video)[None]
-        noisy = latents + self.sigmas[0] * self.model.noise(latents.shape, [generator])
+        noisy = latents + self.sigmas[0] * self.model.sample_noise(latents.shape, [generator])
         return self.model.decode(self.model.denoise(noisy, condition, self.sigmas)[0]).to(video)
 
 
@@ -96,7 +96,7 @@ class ImageToImage:
         strength = settings.strength_start + progress * (settings.strength_end - settings.strength_start)
         steps = settings.num_inference_steps
         timesteps = ddim_timesteps(steps)[start_index(steps, strength) :]
-        tokens = prior.tokens([View(camera, frame) for frame, camera in enumerate(cameras)])
+        tokens = prior.tokens([GuidanceView(camera, frame) for frame, camera in enumerate(cameras)])
         renders = video.to(prior.vae.device)
 
         def denoise(batch: slice) -> Float[Tensor, "p h w 3"]:

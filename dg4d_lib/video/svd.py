@@ -31,8 +31,8 @@ class StableVideo:
         """Store the settings (number of frames, canvas size) and the loaded model."""
         self.settings, self.model = settings, model
         self.notes: tuple[str, ...] = ()
-        if settings.frames != model.trained_frames:
-            self.notes = (f"The video model was trained on {model.trained_frames} frames and made {settings.frames}.",)
+        if settings.frames != model.num_frames:
+            self.notes = (f"The video model was trained on {model.num_frames} frames and made {settings.frames}.",)
 
     def generate(self, subject: Float[Tensor, "h w 4"], generator: torch.Generator) -> DrivingVideo:
         """Generate one video.
@@ -66,9 +66,9 @@ class StableVideo:
         self, canvas: Float[Tensor, "y x 3"], generators: Sequence[torch.Generator]
     ) -> Iterator[Float[Tensor, "t y x 3"]]:
         model, settings = self.model, self.settings
-        condition = model.look_at(canvas, generators)
-        shape = model.blank(len(generators), settings.frames, *canvas.shape[:2])
-        start = math.sqrt(SIGMA_MAX**2 + 1) * model.noise(shape, generators)
+        condition = model.encode_condition(canvas, generators)
+        shape = model.latent_shape(len(generators), settings.frames, *canvas.shape[:2])
+        start = math.sqrt(SIGMA_MAX**2 + 1) * model.sample_noise(shape, generators)
         for latents in model.denoise(start, condition, karras_sigmas(settings.model.num_inference_steps)):
             yield model.decode(latents)
 

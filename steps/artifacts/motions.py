@@ -12,7 +12,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from dg4d_lib.deformation import factory
-from dg4d_lib.deformation.factory import AnyDeformation, from_state_dict, tensors_of
+from dg4d_lib.deformation.factory import AnyDeformation, deformation_tensors, from_state_dict
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.errors import BadInput
 from dg4d_lib.fitting.motion import bounds_of
@@ -32,7 +32,7 @@ def write_motion(
 ) -> None:
     """Write a deformation of `count` Gaussians over `frames` frames."""
     about = {"settings": settings.model_dump(mode="json"), "frames": frames, "gaussians": count}
-    path.write_bytes(save(tensors_of(deformation), {"motion": json.dumps(about, sort_keys=True)}))
+    path.write_bytes(save(deformation_tensors(deformation), {"motion": json.dumps(about, sort_keys=True)}))
 
 
 @dataclass(frozen=True)

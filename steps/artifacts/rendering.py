@@ -19,7 +19,7 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
+from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from steps.artifacts.media import write_png
 from steps.artifacts.packages import ASSET, COMPACT, MESHES, SPLATS, Manifest, read_manifest
 
@@ -68,7 +68,7 @@ def render_package(
     if mesh:
         draw = drawn_mesh(read_surface(folder, manifest))
     else:
-        draw = _drawn_splats(read_states(folder, manifest), choose_rasterizer(rasterizer))
+        draw = _drawn_splats(read_states(folder, manifest), get_rasterizer(rasterizer))
     count = manifest.frames if frames is None else frames
     positions = torch.arange(count, dtype=torch.float64) * (manifest.frames - 1) / max(1, count - 1)
     views = [out / f"view_{azimuth_deg + 0.0:g}" for azimuth_deg in azimuths_deg]

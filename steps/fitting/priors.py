@@ -10,14 +10,14 @@ from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.batching import MicroBatches
-from dg4d_lib.diffusion.parts import device_here
+from dg4d_lib.diffusion.components import default_device
 from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.analytic import AnalyticPrior
-from dg4d_lib.guidance.distillation import Annealing
+from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.geometric import InflatedSurfaces
 from dg4d_lib.guidance.imagedream import ImageDream, ImageDreamPrior
 from dg4d_lib.guidance.interface import GuidancePrior
-from dg4d_lib.guidance.oracle import Bank, imperfect
+from dg4d_lib.guidance.oracle import Bank, perturb
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.images import over_white
 from dg4d_lib.settings import (
@@ -28,7 +28,7 @@ from dg4d_lib.settings import (
     PriorSettings,
     Zero123PriorSettings,
 )
-from dg4d_lib.weights.registry import weights_called
+from dg4d_lib.weights.registry import lookup_weights
 from steps.artifacts.archives import unpack
 from steps.artifacts.media import read_png
 from steps.runtime.job import StepReport
@@ -84,7 +84,7 @@ def make_prior(
         BadInput: the oracle without a bank; weights that are damaged, or not those of this prior.
         BackendUnavailable: weights or packages that are not here.
     """
-    noise = Annealing(stage.t_max_start, stage.t_max_end, uniform=stage.noise_draw == "uniform")
+    noise = TimestepSchedule(stage.t_max_start, stage.t_max_end, uniform=stage.noise_draw == "uniform")
     match settings:
         case GeometricPriorSettings():
             surfaces = InflatedSurfaces(cutouts, settings, turn_deg)
@@ -96,18 +96,18 @@ def make_prior(
         case Zero123PriorSettings():
             check_variant(settings)
             opened = open_weights(settings.weights)
-            known = Zero123.load(opened.folder, settings, device_here()).conditioned_on(_pictures(cutouts), noise)
+            known = Zero123.load(opened.folder, settings, default_device()).conditioned_on(_pictures(cutouts), noise)
             return ChosenPrior(known, f"prior: Zero-1-to-3, weights {settings.weights}", opened, known.batches)
         case ImageDreamPriorSettings():
             opened = open_weights(settings.weights)
-            model = ImageDream.load(opened.folder, settings.precision, device_here())
+            model = ImageDream.load(opened.folder, settings.precision, default_device())
             dream = ImageDreamPrior(model, model.conditioned_on(_pictures(cutouts)), noise, settings)
             return ChosenPrior(dream, f"prior: ImageDream, weights {settings.weights}", opened, dream.batches)
 
 
-def oracle_prior(bank: Bank, settings: OraclePriorSettings, noise: Annealing) -> AnalyticPrior:
+def oracle_prior(bank: Bank, settings: OraclePriorSettings, noise: TimestepSchedule) -> AnalyticPrior:
     """A prior that knows the bank, or with imperfections something like it, always the same."""
-    known = imperfect(bank, settings, torch.Generator().manual_seed(0))
+    known = perturb(bank, settings, torch.Generator().manual_seed(0))
     return AnalyticPrior(known.clean, noise, known.cameras, known.frames)
 
 
@@ -122,7 +122,7 @@ def check_variant(settings: Zero123PriorSettings) -> None:
         BadInput: says how to set it right.
     """
     known = {"zero123-xl": "xl", "stable-zero123": "stable"}
-    name = weights_called(settings.weights).name
+    name = lookup_weights(settings.weights).name
     if known.get(name, settings.variant) != settings.variant:
         raise BadInput(
             f"prior.variant = {settings.variant} does not fit the weights {name}; set prior.variant={known[name]}"

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dg4d_lib.diffusion.parts import Placement, device_here, dtype_on
+from dg4d_lib.diffusion.components import Placement, compute_dtype, default_device
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.imagedream import ImageDream
 from dg4d_lib.images import over_white
@@ -56,11 +56,11 @@ def reconstruct_subject(
         BackendUnavailable: weights or packages that are not here.
     """
     opened = open_weights(settings.views_weights), open_weights(settings.weights)
-    device = device_here()
+    device = default_device()
     picture = over_white(subject)
     model = ImageDream.load(opened[0].folder, settings.precision, device)
     condition = model.conditioned_on(picture[None])
     views = model.views(condition, generator, settings.num_inference_steps, settings.guidance_scale).to(picture)
     del model  # before the next one takes its memory
-    lgm = load_lgm(opened[1].folder, Placement(device, dtype_on(device, settings.precision)))
+    lgm = load_lgm(opened[1].folder, Placement(device, compute_dtype(device, settings.precision)))
     return Reconstruction(reconstruct(lgm, views, picture, rasterize), opened)

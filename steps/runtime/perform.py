@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ValidationError
 
-from dg4d_lib.diffusion.flop_counter import counting_flops
+from dg4d_lib.diffusion.flop_counter import count_flops
 from dg4d_lib.errors import BadInput
 from steps.contract import ArtifactRef, ProvenanceRecord, StepFailure, StepRequest, StepResult, StepSpec
 from steps.profiles import settings_class
@@ -72,7 +72,7 @@ def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scr
     )
     (scratch / "out").mkdir()
     run: Callable[[Job], StepReport] = load_object(spec.entry)
-    with counting_flops() as flops:
+    with count_flops() as flops:
         report = run(job)
     outputs = _store_outputs(job, spec, store)
     record = ProvenanceRecord(

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.weights.locate import MEMORY, call_by_content, digests, find_weights, given_folder, identity
+from dg4d_lib.weights.locate import DIGEST_CACHE, content_name, digests, find_weights, given_folder, identity
 from dg4d_lib.weights.lock import read_lock
-from dg4d_lib.weights.registry import License, weights_called
+from dg4d_lib.weights.registry import License, lookup_weights
 from steps.store.files import home
 
 
@@ -57,7 +57,7 @@ def open_weights(name: str) -> Opened:
 def license_of(name: str) -> License:
     """What the registry says of weights, else the model card that was read when they were pulled."""
     locked = read_lock(weights_home()).get(name)
-    return weights_called(name, locked.license if locked else "").license
+    return lookup_weights(name, locked.license if locked else "").license
 
 
 def weights_in(tree: Mapping[str, Any]) -> Iterator[str]:
@@ -73,7 +73,7 @@ def without_paths(tree: dict[str, Any]) -> dict[str, Any]:
     """
     for branch, key, value in _places(tree):
         if (folder := given_folder(value)) is not None:
-            branch[key] = call_by_content(folder, weights_home())
+            branch[key] = content_name(folder, weights_home())
     return tree
 
 
@@ -106,7 +106,7 @@ def require_same(weights: Mapping[str, str]) -> None:
 
 
 def _digests(name: str, folder: Path) -> dict[str, str]:
-    return digests(folder, weights_called(name).parts, weights_home() / MEMORY)
+    return digests(folder, lookup_weights(name).parts, weights_home() / DIGEST_CACHE)
 
 
 def _places(tree: Any) -> Iterator[tuple[dict[str, Any], str, str]]:

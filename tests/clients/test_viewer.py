@@ -26,7 +26,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 
 VIEWER = CLIENTS.parents[1] / "dg4d_lib" / "assets" / "viewer"
 FRAMES, FPS = 4, 4.0
@@ -139,7 +139,7 @@ def test_splats_look_as_our_rasterizer_draws_them(tried: Try) -> None:
             log_scales=interpolate_frames(cloud.log_scales, position),
             quats=interpolate_frames(torch.nn.functional.normalize(cloud.quats, dim=-1), position),
         )
-        drawn = choose_rasterizer("cpu")(state, [page.camera()], torch.ones(3))
+        drawn = get_rasterizer("cpu")(state, [page.camera()], torch.ones(3))
         theirs = page.pictures["splats", time]
         assert overlap(theirs[..., 3], drawn.alpha[0, ..., 0].numpy()) > 0.98
         assert psnr(over_white(theirs), drawn.color[0].numpy()) > 35  # 8-bit blending and the compact file

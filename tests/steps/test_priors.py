@@ -7,8 +7,8 @@ import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.guidance.distillation import Annealing
-from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.distillation import TimestepSchedule
+from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.settings import (
     GeometricPriorSettings,
     MotionSettings,
@@ -33,7 +33,7 @@ def chosen(model: Path, stage: StaticSettings | MotionSettings, cutouts: list[to
 
 def judged(choice: ChosenPrior, frame: int = 0) -> torch.Tensor:
     images = torch.rand(1, 64, 64, 3, generator=torch.Generator().manual_seed(2))
-    view = View(OrbitCamera(10, 40), frame)
+    view = GuidanceView(OrbitCamera(10, 40), frame)
     return choice.prior.loss(images, images[..., :1], [view], 0.5, torch.Generator().manual_seed(3))
 
 
@@ -128,6 +128,8 @@ def test_a_bank_is_the_same_from_a_folder_and_from_a_zip(tmp_path: Path) -> None
 def test_an_imperfect_oracle_has_the_same_flaws_in_both_stages(tmp_path: Path) -> None:
     bank = read_bank_folder(bank_folder(tmp_path / "bank"))
     flawed = OraclePriorSettings(pose_deg=3.0)
-    first, second = (oracle_prior(bank, flawed, Annealing(start)) for start in (0.98, 0.5))
+    first, second = (oracle_prior(bank, flawed, TimestepSchedule(start)) for start in (0.98, 0.5))
     assert first.viewpoints == second.viewpoints
-    assert first.viewpoints != oracle_prior(bank, OraclePriorSettings(), Annealing(0.5)).viewpoints == bank.cameras
+    assert (
+        first.viewpoints != oracle_prior(bank, OraclePriorSettings(), TimestepSchedule(0.5)).viewpoints == bank.cameras
+    )

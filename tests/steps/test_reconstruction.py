@@ -11,7 +11,7 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.fitting import static
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.gaussians.ply import read_ply
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import LgmStartSettings, StaticSettings
 from steps import fit_gaussians
 from steps.artifacts.media import read_png, write_png
@@ -53,7 +53,7 @@ def test_the_fit_starts_from_the_reconstruction_that_the_seed_decides(
 
     start, used = given[0][0], given[0][4]
     exact = read_png(tmp_path / "subject.png")
-    expected = reconstruct_subject(exact, lgm, choose_rasterizer("cpu"), torch.Generator().manual_seed(1))
+    expected = reconstruct_subject(exact, lgm, get_rasterizer("cpu"), torch.Generator().manual_seed(1))
     assert torch.equal(start.means, expected.gaussians.means)
     assert torch.equal(read_ply(outputs["gaussians"]).means, start.means)
     assert used.means_lr == pytest.approx(0.1 * stage.means_lr)
@@ -94,4 +94,4 @@ def test_a_start_has_its_own_knobs_and_no_others() -> None:
 def test_weights_of_something_else_are_refused(lgm: LgmStartSettings) -> None:
     wrong = lgm.model_copy(update={"weights": lgm.views_weights})
     with pytest.raises(BadInput, match="model_fp16_fixrot"):
-        reconstruct_subject(subject(), wrong, choose_rasterizer("cpu"), torch.Generator())
+        reconstruct_subject(subject(), wrong, get_rasterizer("cpu"), torch.Generator())

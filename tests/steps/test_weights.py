@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.weights.lock import Locked, LockedFile, write_lock
+from dg4d_lib.weights.lock import LockedFile, LockEntry, write_lock
 from steps.contract import StepRequest
 from steps.runtime.perform import perform
 from steps.runtime.weights import (
@@ -73,7 +73,7 @@ def test_opened_weights_come_with_digests_and_licenses(home: Path) -> None:
 def test_a_model_card_that_was_pulled_is_the_license_of_unknown_weights(home: Path) -> None:
     assert not license_of("me/pictures").allows_commercial_use
     home.mkdir()
-    locked = Locked(hub_id="me/pictures", revision="", license="mit", files={"a": LockedFile(sha256="", size=0)})
+    locked = LockEntry(hub_id="me/pictures", revision="", license="mit", files={"a": LockedFile(sha256="", size=0)})
     write_lock(home, "me/pictures", locked)
     assert license_of("me/pictures").commercial == "yes"
 

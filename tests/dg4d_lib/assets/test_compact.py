@@ -67,9 +67,9 @@ def test_the_file_says_what_every_tensor_is(tmp_path: Path, settings: Deformatio
 def test_the_file_says_how_it_moves_and_how_fast(tmp_path: Path) -> None:
     write_compact(tmp_path / "a", asset())
     about, _ = metadata(tmp_path / "a")
-    facts = {name: about[name] for name in ("format", "version", "frames", "fps", "gaussians", "last_moment")}
+    facts = {name: about[name] for name in ("format", "version", "frames", "fps", "gaussians", "last_time")}
     assert facts == {
-        "format": "dg4d-compact", "version": 1, "frames": 5, "fps": 12.0, "gaussians": 30, "last_moment": 0.8,
+        "format": "dg4d-compact", "version": 1, "frames": 5, "fps": 12.0, "gaussians": 30, "last_time": 0.8,
     }  # fmt: skip
     assert about["settings"]["kind"] == "hexplane"
 

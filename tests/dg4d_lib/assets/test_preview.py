@@ -151,7 +151,7 @@ def test_without_any_codec_the_backend_is_missing(
 
 
 def test_a_failure_while_drawing_is_not_hidden(tmp_path: Path, red_dot: Gaussians, slide: Framewise) -> None:
-    def broken(gaussians: Gaussians, cameras: Sequence[OrbitCamera], background, screen_offsets=None):
+    def broken(gaussians: Gaussians, cameras: Sequence[OrbitCamera], background, means2d_offsets=None):
         raise ArithmeticError("no picture")
 
     with pytest.raises(ArithmeticError, match="no picture"):

@@ -99,5 +99,5 @@ def test_no_gaussians_are_refused() -> None:
 
 
 def test_numbers_that_are_not_finite_are_refused() -> None:
-    with pytest.raises(BadInput, match="finite numbers; given others in quats"):
+    with pytest.raises(BadInput, match="non-finite numbers; given some in quats"):
         write_splat_glb(replace(cloud(1), quats=torch.full((1, 4), torch.inf)))

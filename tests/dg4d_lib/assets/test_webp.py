@@ -93,7 +93,7 @@ def test_any_length_is_shown_in_real_time_with_few_pictures(
 
 def test_it_is_no_larger_than_256_pixels(tmp_path: Path, red_dot: Gaussians, slide: Framewise) -> None:
     def blank(
-        gaussians: Gaussians, cameras: Sequence[OrbitCamera], background: Tensor, screen_offsets=None
+        gaussians: Gaussians, cameras: Sequence[OrbitCamera], background: Tensor, means2d_offsets=None
     ) -> Rendering:
         return rendering_of(torch.zeros(len(cameras), cameras[0].height, cameras[0].width, 3))
 
@@ -106,7 +106,7 @@ def test_what_would_be_too_large_is_packed_harder(
     tmp_path: Path, red_dot: Gaussians, slide: Framewise, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def noise(
-        gaussians: Gaussians, cameras: Sequence[OrbitCamera], background: Tensor, screen_offsets=None
+        gaussians: Gaussians, cameras: Sequence[OrbitCamera], background: Tensor, means2d_offsets=None
     ) -> Rendering:
         return rendering_of(torch.rand(len(cameras), 64, 64, 3, generator=torch.Generator().manual_seed(0)))
 

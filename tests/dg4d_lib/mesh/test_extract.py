@@ -10,8 +10,8 @@ import trimesh
 from dg4d_lib.errors import FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import DensityField, density_field
-from dg4d_lib.mesh.extraction.extract import extract_surface, select_level, usable_level
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.mesh.extraction.extract import best_level, usable_level
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
 
 SMALL = MeshSettings(grid=64)
@@ -99,7 +99,7 @@ def test_a_level_that_is_not_reached_is_lowered() -> None:
 
 def test_the_best_level_has_the_outline_of_the_gaussians() -> None:
     # alpha of a Gaussian on a ray through its middle is its opacity times the same bell: half alpha at density one half
-    gaussians, rasterize = ball(), choose_rasterizer("auto")
+    gaussians, rasterize = ball(), get_rasterizer("auto")
     field = density_field(gaussians, SMALL)
     level, agreement = select_level(field, gaussians, rasterize, 0.2)
     assert level == pytest.approx(0.5, rel=0.1)
@@ -110,7 +110,7 @@ def test_the_best_level_has_the_outline_of_the_gaussians() -> None:
 def test_a_faint_model_still_gets_a_surface() -> None:
     gaussians = replace(ball(), opacity_logits=torch.tensor([-2.0]))
     field = density_field(gaussians, SMALL)
-    level, agreement = select_level(field, gaussians, choose_rasterizer("auto"), 0.5)
+    level, agreement = best_level(field, gaussians, get_rasterizer("auto"), 0.5)
     assert level < gaussians.opacities.item()
     assert agreement == 0.0, "nothing of it is more opaque than one half"
     assert len(extract_surface(field, level)[1]) > 0

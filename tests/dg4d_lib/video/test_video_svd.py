@@ -3,7 +3,7 @@ import torch
 from tiny_svd import save_tiny_svd
 from torch import Tensor
 
-from dg4d_lib.diffusion.video_model import Condition, VideoModel
+from dg4d_lib.diffusion.video_model import VideoCondition, VideoModel
 from dg4d_lib.settings import SvdSettings, VideoModelSettings
 from dg4d_lib.video.svd import StableVideo
 
@@ -32,11 +32,11 @@ def disc(shift: int) -> Tensor:
 class Known(VideoModel):
     """A model that shows the disc move over the canvas that it was given."""
 
-    def look_at(self, picture: Tensor, generators: object) -> Condition:
+    def encode_condition(self, picture: Tensor, generators: object) -> VideoCondition:
         self.canvas = picture
-        return super().look_at(picture, generators)
+        return super().encode_condition(picture, generators)
 
-    def denoise(self, latents: Tensor, condition: Condition, sigmas: object) -> Tensor:
+    def denoise(self, latents: Tensor, condition: VideoCondition, sigmas: object) -> Tensor:
         return latents
 
     def decode(self, latents: Tensor) -> Tensor:
