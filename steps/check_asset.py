@@ -38,7 +38,7 @@ DIGITS = 4  # after the point, of every number
 
 
 @dataclass(frozen=True)
-class Parts:
+class LoadedAsset:
     """An asset in memory.
 
     Attributes:
@@ -62,18 +62,22 @@ def run(job: Job) -> StepReport:
     bounds: GateSettings = job.settings.gates
     with TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        parts = read_parts(job.inputs["package"], folder / "package")
+        parts = read_asset(job.inputs["package"], folder / "package")
         video = read_frames(job.inputs["driving_video"], folder)
-    evidence = gather(parts, video, read_png(job.inputs["subject"]), choose_rasterizer(job.settings.rasterizer))
+    evidence = collect_evidence(
+        parts, video, read_png(job.inputs["subject"]), choose_rasterizer(job.settings.rasterizer)
+    )
     gates = judge(evidence, bounds)
-    job.outputs["gates"].write_text(json.dumps(verdict(gates), ensure_ascii=False, allow_nan=False), encoding="utf-8")
+    job.outputs["gates"].write_text(
+        json.dumps(gates_as_json(gates), ensure_ascii=False, allow_nan=False), encoding="utf-8"
+    )
     write_png(job.outputs["picture"], picture(evidence, (_spread(len(video), MOST_FRAMES) / video.fps).tolist()))
     failing = [gate.name for gate in gates if not gate.passed]
     notes = (f"Not accepted: {', '.join(failing)}. The report says what to do.",) if failing else ()
     return StepReport(backend=f"{job.settings.rasterizer} rasterizer", notes=notes)
 
 
-def read_parts(package: Path, folder: Path) -> Parts:
+def read_asset(package: Path, folder: Path) -> LoadedAsset:
     """What the gates need of a package; `folder` is where that is unpacked.
 
     Raises:
@@ -82,10 +86,12 @@ def read_parts(package: Path, folder: Path) -> Parts:
     wanted = (MANIFEST, ASSET, COMPACT, f"{MESHES}/", f"{SPLATS_FOLDER}/")
     unpack(package, folder, "the package", lambda name: name.startswith(wanted))
     manifest = read_manifest(folder)
-    return Parts(read_states(folder, manifest), read_surface(folder, manifest), manifest.frames)
+    return LoadedAsset(read_states(folder, manifest), read_surface(folder, manifest), manifest.frames)
 
 
-def gather(parts: Parts, video: DrivingVideo, cutout: Float[Tensor, "h w 4"], rasterizer: Rasterizer) -> Evidence:
+def collect_evidence(
+    parts: LoadedAsset, video: DrivingVideo, cutout: Float[Tensor, "h w 4"], rasterizer: Rasterizer
+) -> Evidence:
     """Look at an asset from the input view, from four sides at four moments, and all around.
 
     Args:
@@ -128,7 +134,7 @@ def gather(parts: Parts, video: DrivingVideo, cutout: Float[Tensor, "h w 4"], ra
     )
 
 
-def verdict(gates: Sequence[Gate]) -> dict[str, Any]:
+def gates_as_json(gates: Sequence[Gate]) -> dict[str, Any]:
     """What the gates say, as JSON."""
     return {
         "accepted": all(gate.passed for gate in gates),

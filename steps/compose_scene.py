@@ -29,7 +29,7 @@ FILLED = 0.9  # of the picture, by the ball around the scene
 BATCH = 8  # pictures of one rasterizer call, bounds the memory
 
 
-class Cast:
+class SceneWriter:
     """The packages of a scene, each read once."""
 
     def __init__(self, folders: Sequence[Path], items: Sequence[Item], names: Sequence[str]) -> None:

@@ -70,7 +70,7 @@ def run(job: Job) -> StepReport:
             raise BadInput(f"frames {first} to {end} were asked for; the motion has {frames}")
         meshes = {}
         for frame in range(first, end):
-            meshes[frame] = textured(states.at(frame), plan.level, rasterize, settings)
+            meshes[frame] = textured_mesh(states.at(frame), plan.level, rasterize, settings)
             job.progress(frame - first + 1, end - first, {})
         write_meshes(job.outputs["meshes"], meshes)
         notes = _soundness(meshes)
@@ -79,7 +79,7 @@ def run(job: Job) -> StepReport:
     return StepReport(backend=f"{job.settings.rasterizer} rasterizer, pymeshlab, xatlas", notes=tuple(notes))
 
 
-def textured(gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings) -> TexturedMesh:
+def textured_mesh(gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings) -> TexturedMesh:
     """The surface of one state of the cloud at a density, with its colors."""
     vertices, faces = _cleaned_surface(gaussians, level, settings)
     return _colored(vertices, faces, gaussians, rasterize, settings)[0]

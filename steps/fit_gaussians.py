@@ -40,9 +40,9 @@ def run(job: Job) -> StepReport:
     reconstruction = None
     if isinstance(static.start, LgmStartSettings):
         reconstruction = reconstruct_subject(subject.to(device), static.start, rasterize, generator)
-        start, static = reconstruction.gaussians, touched_up(static)
+        start, static = reconstruction.gaussians, fine_tuning_settings(static)
     else:
-        start = starting_cloud(subject, static.start, prior, turn_deg, generator).to(device)
+        start = initial_gaussians(subject, static.start, prior, turn_deg, generator).to(device)
     chosen = make_prior(prior, [subject], static, job.inputs.get("bank"), job.pictures, turn_deg)
     curves = LossCurves(static.iterations, job.progress)
     try:
@@ -58,13 +58,13 @@ def run(job: Job) -> StepReport:
     return facts
 
 
-def touched_up(static: StaticSettings) -> StaticSettings:
+def fine_tuning_settings(static: StaticSettings) -> StaticSettings:
     """Return settings for a cloud that is nearly right already: its means move a tenth as fast (public code)."""
     rates = {"means_lr": static.means_lr / 10, "means_lr_end": static.means_lr_end / 10}
     return static.model_copy(update=rates)
 
 
-def starting_cloud(
+def initial_gaussians(
     subject: Float[Tensor, "h w 4"],
     start: BlobStartSettings | SurfaceStartSettings,
     prior: PriorSettings,

@@ -43,7 +43,7 @@ from steps.runtime.job import Job, StepReport
 Surface = Asset4D | list[TexturedMesh]
 Notes = Sequence[str]
 
-LANES = 2  # writers at a time: each takes one core most of the time
+WRITER_THREADS = 2  # writers at a time: each takes one core most of the time
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ def run(job: Job) -> StepReport:
             contents.write_splats,
             contents.write_canonical,
         )
-        with ThreadPoolExecutor(LANES) as lanes:
+        with ThreadPoolExecutor(WRITER_THREADS) as lanes:
             for done, written in enumerate([lanes.submit(write) for write in writers], 1):
                 notes += written.result()
                 job.progress(done, len(writers), {})

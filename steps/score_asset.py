@@ -30,7 +30,7 @@ from dg4d_lib.metrics.ssim import ssim
 from dg4d_lib.metrics.surface import aligned, chamfer_of_points, sample_surface
 from dg4d_lib.metrics.video import flicker, motion_amount, temporal_error
 from steps.artifacts.archives import unpack
-from steps.artifacts.ground_truth import Truth, find_truth
+from steps.artifacts.ground_truth import GroundTruth, find_ground_truth
 from steps.artifacts.media import read_png, write_zip
 from steps.artifacts.packages import ASSET, MESHES, read_manifest
 from steps.artifacts.rendering import render_package
@@ -95,7 +95,7 @@ def run(job: Job) -> StepReport:
     settings: ScoreAssetSettings = job.settings
     with TemporaryDirectory() as folder:
         scratch = Path(folder)
-        truth = find_truth(_unpacked(job.inputs["truth"], scratch / "truth"))
+        truth = find_ground_truth(_unpacked(job.inputs["truth"], scratch / "truth"))
         judges = open_judges(settings.score)
         done: list[int] = []
 
@@ -174,7 +174,7 @@ def compare(ours: Film, theirs: Film, judges: Judges) -> Figures:
 
 def _of_package(
     package: Path,
-    truth: Truth,
+    truth: GroundTruth,
     settings: ScoreAssetSettings,
     judges: Judges,
     scratch: Path,
@@ -215,7 +215,9 @@ def _of_package(
     return _report(truth, size, {"asset": judgment}, clips), films
 
 
-def _of_guesses(truth: Truth, judges: Judges, step_on: Callable[[int], None]) -> tuple[dict[str, Any], dict[str, Film]]:
+def _of_guesses(
+    truth: GroundTruth, judges: Judges, step_on: Callable[[int], None]
+) -> tuple[dict[str, Any], dict[str, Film]]:
     """What the input itself scores at every view: as a film, and its first frame; and the view's own first frame."""
     given = _read(truth.inputs)
     size = given.color.shape[1]
@@ -236,7 +238,9 @@ def _of_guesses(truth: Truth, judges: Judges, step_on: Callable[[int], None]) ->
     return _report(truth, size, rows, clips), films
 
 
-def _report(truth: Truth, size: int, rows: Mapping[str, Judgment], clips: dict[str, list[float]]) -> dict[str, Any]:
+def _report(
+    truth: GroundTruth, size: int, rows: Mapping[str, Judgment], clips: dict[str, list[float]]
+) -> dict[str, Any]:
     frames = len(truth.views[0].frames) if truth.views else len(truth.inputs)
     opaque = [
         path.parent.name for path in (truth.inputs[0], *(view.frames[0] for view in truth.views)) if _opaque(path)

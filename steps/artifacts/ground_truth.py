@@ -25,7 +25,7 @@ CAMERA = {"elevation": 0.0, "radius": 2.0, "fovy": 49.1}  # degrees, world units
 CLOSE = 0.01  # in the units of the above
 
 
-class View(Frozen):
+class TrueView(Frozen):
     """What is seen from one side, level with the subject.
 
     Attributes:
@@ -42,7 +42,7 @@ class View(Frozen):
         return f"{self.azimuth_deg + 0.0:g}"
 
 
-class Truth(Frozen):
+class GroundTruth(Frozen):
     """What is known of one object.
 
     Attributes:
@@ -55,7 +55,7 @@ class Truth(Frozen):
 
     name: str
     inputs: tuple[Path, ...]
-    views: tuple[View, ...] = ()
+    views: tuple[TrueView, ...] = ()
     mesh: Path | None = None
     bank: Path | None = None
 
@@ -70,18 +70,18 @@ class Truth(Frozen):
         return (*self.pictures, *(path for path in (self.mesh, self.bank) if path is not None))
 
 
-def find_truth(place: Path) -> Truth:
+def find_ground_truth(place: Path) -> GroundTruth:
     """The ground truth of one object.
 
     Raises:
         BadInput: there is none, or it is not complete; says what is missing.
     """
     if place.is_file() and place.suffix.lower() in PICTURES:
-        return Truth(name=place.stem, inputs=(place,))
+        return GroundTruth(name=place.stem, inputs=(place,))
     if not place.is_dir():
         raise BadInput(f"{place} is no ground truth: give a folder of an object, or a picture")
     views = _views(place)
-    truth = Truth(
+    truth = GroundTruth(
         name=place.absolute().name,
         inputs=_inputs(place),
         views=views,
@@ -92,7 +92,7 @@ def find_truth(place: Path) -> Truth:
     return truth
 
 
-def find_truths(dataset: Path) -> list[Truth]:
+def find_ground_truths(dataset: Path) -> list[GroundTruth]:
     """The objects of a data set: a folder each, or a picture each; also of a folder that has these in `gt/`.
 
     Raises:
@@ -102,10 +102,10 @@ def find_truths(dataset: Path) -> list[Truth]:
         raise BadInput(f"{dataset} is no data set: give a folder that holds a folder per object")
     root = dataset / "gt" if (dataset / "gt").is_dir() else dataset
     if _view_folders(root) or (root / INPUT).is_dir():
-        return [find_truth(root)]
+        return [find_ground_truth(root)]
     folders = [path for path in sorted(root.iterdir()) if path.is_dir() and not path.name.startswith(".")]
     objects = [path for path in folders if _view_folders(path) or (path / INPUT).is_dir()]
-    found = [find_truth(path) for path in objects or _pictures(root)]
+    found = [find_ground_truth(path) for path in objects or _pictures(root)]
     if not found:
         raise BadInput(
             f"{dataset} holds no objects: an object is a folder with input/ and view_<azimuth>/, or, as in "
@@ -114,8 +114,8 @@ def find_truths(dataset: Path) -> list[Truth]:
     return found
 
 
-def _views(folder: Path) -> tuple[View, ...]:
-    views = [View(azimuth_deg=azimuth, frames=tuple(_pictures(path))) for azimuth, path in _view_folders(folder)]
+def _views(folder: Path) -> tuple[TrueView, ...]:
+    views = [TrueView(azimuth_deg=azimuth, frames=tuple(_pictures(path))) for azimuth, path in _view_folders(folder)]
     return tuple(sorted(views, key=lambda view: view.azimuth_deg))
 
 
@@ -154,7 +154,7 @@ def _pictures(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: (int((re.findall(r"\d+", path.stem) or ["0"])[-1]), path.name))
 
 
-def _check(truth: Truth, folder: Path) -> None:
+def _check(truth: GroundTruth, folder: Path) -> None:
     if not truth.inputs:
         raise BadInput(f"{folder} has no input frames: put them into {folder / INPUT}")
     counts = {f"view_{view.name}": len(view.frames) for view in truth.views}
@@ -169,7 +169,7 @@ def _check(truth: Truth, folder: Path) -> None:
         _check_cameras(folder / CAMERAS, truth)
 
 
-def _check_cameras(path: Path, truth: Truth) -> None:
+def _check_cameras(path: Path, truth: GroundTruth) -> None:
     """Refuse views that were not taken as ours are."""
     try:
         given = json.loads(path.read_text(encoding="utf-8"))

@@ -40,7 +40,7 @@ ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
 
 
 @dataclass(frozen=True)
-class ChosenPrior:
+class LoadedPrior:
     """A prior, and what the record says about it.
 
     Attributes:
@@ -69,7 +69,7 @@ def make_prior(
     bank: Path | None,
     scratch: Path,
     turn_deg: float = 0.0,
-) -> ChosenPrior:
+) -> LoadedPrior:
     """Make the prior of a stage.
 
     Args:
@@ -88,24 +88,24 @@ def make_prior(
     match settings:
         case GeometricPriorSettings():
             surfaces = InflatedSurfaces(cutouts, settings, turn_deg)
-            return ChosenPrior(AnalyticPrior(surfaces.clean, noise), GEOMETRIC_NOTE)
+            return LoadedPrior(AnalyticPrior(surfaces.clean, noise), GEOMETRIC_NOTE)
         case OraclePriorSettings():
             if bank is None:
                 raise BadInput("prior.kind = oracle needs true views: give --bank FOLDER (with a bank.json)")
-            return ChosenPrior(oracle_prior(read_bank(bank, scratch), settings, noise), ORACLE_NOTE)
+            return LoadedPrior(make_oracle_prior(read_bank(bank, scratch), settings, noise), ORACLE_NOTE)
         case Zero123PriorSettings():
             check_variant(settings)
             opened = open_weights(settings.weights)
             known = Zero123.load(opened.folder, settings, device_here()).conditioned_on(_pictures(cutouts), noise)
-            return ChosenPrior(known, f"prior: Zero-1-to-3, weights {settings.weights}", opened, known.batches)
+            return LoadedPrior(known, f"prior: Zero-1-to-3, weights {settings.weights}", opened, known.batches)
         case ImageDreamPriorSettings():
             opened = open_weights(settings.weights)
             model = ImageDream.load(opened.folder, settings.precision, device_here())
             dream = ImageDreamPrior(model, model.conditioned_on(_pictures(cutouts)), noise, settings)
-            return ChosenPrior(dream, f"prior: ImageDream, weights {settings.weights}", opened, dream.batches)
+            return LoadedPrior(dream, f"prior: ImageDream, weights {settings.weights}", opened, dream.batches)
 
 
-def oracle_prior(bank: Bank, settings: OraclePriorSettings, noise: Annealing) -> AnalyticPrior:
+def make_oracle_prior(bank: Bank, settings: OraclePriorSettings, noise: Annealing) -> AnalyticPrior:
     """A prior that knows the bank, or with imperfections something like it, always the same."""
     known = imperfect(bank, settings, torch.Generator().manual_seed(0))
     return AnalyticPrior(known.clean, noise, known.cameras, known.frames)

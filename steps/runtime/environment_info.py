@@ -18,14 +18,14 @@ def environment_info() -> dict[str, str]:
         "cores": str(_cores()),
         "gpu": _gpu(),
         "python": platform.python_version(),
-        "packages": digest_of(packages()),
+        "packages": digest_of(installed_distributions()),
         "image": os.environ.get("DG4D_IMAGE", ""),
     }
     return {name: value for name, value in facts.items() if value}
 
 
 @functools.cache
-def packages() -> list[str]:
+def installed_distributions() -> list[str]:
     """Return every installed distribution as "name-version", sorted, from the names of folders alone."""
     folders = (Path(entry) for entry in sys.path)
     return sorted({found.stem for folder in folders if folder.is_dir() for found in folder.glob("*.dist-info")})

@@ -17,7 +17,7 @@ from dg4d_lib.settings import (
     Zero123PriorSettings,
 )
 from steps.artifacts.media import write_png, write_zip
-from steps.fitting.priors import ChosenPrior, make_prior, oracle_prior, read_bank, read_bank_folder
+from steps.fitting.priors import LoadedPrior, make_oracle_prior, make_prior, read_bank, read_bank_folder
 
 CUTOUTS = [torch.rand(64, 64, 4, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1)]
 
@@ -27,11 +27,11 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tiny_weights.write_zero123(tmp_path_factory.mktemp("weights") / "mine")
 
 
-def chosen(model: Path, stage: StaticSettings | MotionSettings, cutouts: list[torch.Tensor]) -> ChosenPrior:
+def chosen(model: Path, stage: StaticSettings | MotionSettings, cutouts: list[torch.Tensor]) -> LoadedPrior:
     return make_prior(Zero123PriorSettings(weights=str(model)), cutouts, stage, None, model)
 
 
-def judged(choice: ChosenPrior, frame: int = 0) -> torch.Tensor:
+def judged(choice: LoadedPrior, frame: int = 0) -> torch.Tensor:
     images = torch.rand(1, 64, 64, 3, generator=torch.Generator().manual_seed(2))
     view = View(OrbitCamera(10, 40), frame)
     return choice.prior.loss(images, images[..., :1], [view], 0.5, torch.Generator().manual_seed(3))
@@ -128,6 +128,6 @@ def test_a_bank_is_the_same_from_a_folder_and_from_a_zip(tmp_path: Path) -> None
 def test_an_imperfect_oracle_has_the_same_flaws_in_both_stages(tmp_path: Path) -> None:
     bank = read_bank_folder(bank_folder(tmp_path / "bank"))
     flawed = OraclePriorSettings(pose_deg=3.0)
-    first, second = (oracle_prior(bank, flawed, Annealing(start)) for start in (0.98, 0.5))
+    first, second = (make_oracle_prior(bank, flawed, Annealing(start)) for start in (0.98, 0.5))
     assert first.viewpoints == second.viewpoints
-    assert first.viewpoints != oracle_prior(bank, OraclePriorSettings(), Annealing(0.5)).viewpoints == bank.cameras
+    assert first.viewpoints != make_oracle_prior(bank, OraclePriorSettings(), Annealing(0.5)).viewpoints == bank.cameras

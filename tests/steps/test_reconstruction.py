@@ -15,7 +15,7 @@ from dg4d_lib.rasterizer.interface import choose_rasterizer
 from dg4d_lib.settings import LgmStartSettings, StaticSettings
 from steps import fit_gaussians
 from steps.artifacts.media import read_png, write_png
-from steps.fit_gaussians import touched_up
+from steps.fit_gaussians import fine_tuning_settings
 from steps.fitting.reconstruction import NOTE, Reconstruction, reconstruct_subject
 from steps.profiles import PREVIEW, step_settings
 from steps.runtime.job import Job, StepReport
@@ -73,7 +73,7 @@ def test_what_the_prior_brought_stays_in_the_record(lgm: LgmStartSettings) -> No
 
 
 def test_means_of_a_reconstruction_move_a_tenth_as_fast() -> None:
-    slow = touched_up(StaticSettings())
+    slow = fine_tuning_settings(StaticSettings())
     assert (slow.means_lr, slow.means_lr_end) == pytest.approx((1e-3, 2e-5))
     assert slow.color_lr == StaticSettings().color_lr
 
