@@ -1,4 +1,4 @@
-"""AVIF pictures, through Pillow: OpenImageIO's wheel has no reader for them."""
+"""AVIF reader on Pillow, as OpenImageIO's wheel has none."""
 
 import warnings
 from pathlib import Path
@@ -14,8 +14,8 @@ from dg4d_lib.video.shrinking import BAND_BYTES, BandShrinker
 from steps.sources.decode_limit import DecodeLimit
 from steps.sources.stills import LARGEST_SIDE, check_size, upright, upright_size
 
-DECODED_BYTES = 20  # per pixel: planes of up to 16 bits, and Pillow's two copies as RGBA of 8 bits
-ORIENTATION = 0x0112  # tag of EXIF; Pillow puts AVIF's own rotation and mirror there
+DECODED_BYTES = 20  # per pixel: planes of up to 16 bits, and two 8-bit RGBA copies of Pillow's
+ORIENTATION = 0x0112  # EXIF tag, in which Pillow also stores AVIF's own rotation and mirror
 
 
 def read_avif(
@@ -40,6 +40,7 @@ def read_avif(
 
 
 def _in_bands(image: Image.Image, longest: int) -> Float[Tensor, "h2 w2 4"]:
+    """Decode and shrink a picture in bands of rows, which bounds the float copies in memory."""
     width, height = image.size
     shrinker, rows = BandShrinker(height, width, longest), max(1, BAND_BYTES // (16 * width))
     for top in range(0, height, rows):

@@ -1,4 +1,4 @@
-"""What users hand in: a picture, a video, or a zip of numbered pictures; told apart by content, never by name."""
+"""Reader of source files, recognized by content: a picture, a video, or a zip of numbered pictures."""
 
 import shutil
 import time
@@ -42,24 +42,25 @@ from steps.sources.stills import LARGEST_SIDE as STILL_SIDE
 from steps.sources.stills import read_still
 from steps.sources.webp import AnimatedWebp, is_animated
 
-FOLDER_FPS = 12.0  # pictures in a folder have no rate; drawn animation usually holds a drawing for two frames of 24
-STILL_FPS = 1.0  # of a picture; it is never played
+FOLDER_FPS = 12.0  # assumed for numbered pictures: drawn animation usually holds a drawing for two frames of 24
+STILL_FPS = 1.0  # placeholder, as a picture is never played
+OPAQUE_ALPHA = 250 / 255  # alpha channels at or above this everywhere are ignored
 MOST_ENTRY_BYTES = 512 * 2**20  # of one unpacked picture of a zip
 NAMED_AT_MOST = 8  # missing frames that a message lists
-MOST_DIGITS = 18  # of the number of a frame; cameras write up to 17, a time stamp
+MOST_DIGITS = 18  # of a frame number; cameras write time stamps of up to 17
 NAME_SHOWN = 40  # characters of a long name in a message
 
 
 @dataclass(frozen=True)
 class Source:
-    """A user's file, decoded.
+    """A decoded source file.
 
     Attributes:
         frames: straight sRGB and alpha in [0, 1], upright; a picture is one frame.
-        has_alpha: whether the alpha says anything; without it, it is 1 everywhere.
-        fps: frames per second of what is left after sampling; the duration stays.
-        kind: what it was.
-        notes: sentences for the report: what was left out or assumed.
+        has_alpha: True if some pixel is not opaque.
+        fps: frames per second after sampling, which keeps the duration.
+        kind: picture or video.
+        notes: sentences for the report about dropped frames and assumptions.
     """
 
     frames: Float[Tensor, "t h w 4"]
@@ -75,13 +76,13 @@ def read_source(
     """Decode a user's file.
 
     Args:
-        path: the file; its name does not matter.
-        scratch: an existing folder for links and unpacked pictures.
-        max_frames: frames that are kept of a video, evenly spaced, the first and the last among them; at least 2.
-        max_decode_gb: GiB of memory that may be used, the decoded frames included.
+        path: file with any name.
+        scratch: existing folder for links and unpacked pictures.
+        max_frames: number of frames to keep of a video, evenly spaced with first and last; at least 2.
+        max_decode_gb: memory limit in GiB, which includes the decoded frames.
 
     Raises:
-        BadInput: it is empty, broken, too small, too large, or nothing that can be read; says what to do.
+        BadInput: the file is empty, broken, too small, too large, or of an unknown format.
     """
     if not path.is_file():
         raise BadInput(f"{path.name} is not a file; give {ALLOWED}")
@@ -95,7 +96,7 @@ def read_source(
 
 
 def _decode(path: Path, head: bytes, scratch: Path, max_frames: int, limit: DecodeLimit) -> Source:
-    """Decode a file by its first bytes; what else it may be, further on, does not count."""
+    """Decode a file by its first bytes; a file that is also valid in another format is not refused."""
     if is_zip(head):
         return _read_zip(path, scratch, max_frames, limit)
     if is_animated(head):
@@ -108,8 +109,8 @@ def _decode(path: Path, head: bytes, scratch: Path, max_frames: int, limit: Deco
     return _picture(picture[None], has_alpha)
 
 
-def _picture(frames: Float[Tensor, "1 h w 4"], has_alpha: bool, notes: tuple[str, ...] = ()) -> Source:
-    return Source(frames, has_alpha and _says_something(frames), STILL_FPS, "picture", notes)
+def _picture(frames: Float[Tensor, "1 h w 4"], has_alpha: bool) -> Source:
+    return Source(frames, has_alpha and _is_transparent(frames), STILL_FPS, "picture")
 
 
 def _video(
@@ -118,19 +119,18 @@ def _video(
     kept = frames.shape[0]
     if kept < count:
         notes = (*notes, f"{kept} of the video's {count} frames are used, evenly spaced; it lasts as long as before.")
-    return Source(frames, has_alpha and _says_something(frames), thinned_rate(fps, count, kept), "video", notes)
+    return Source(frames, has_alpha and _is_transparent(frames), thinned_rate(fps, count, kept), "video", notes)
 
 
-def _says_something(frames: Float[Tensor, "t h w 4"]) -> bool:
-    """Return whether an alpha channel is more than decoration: some pixel is not opaque."""
-    return bool((frames[..., 3] < 250 / 255).any())
+def _is_transparent(frames: Float[Tensor, "t h w 4"]) -> bool:
+    return bool((frames[..., 3] < OPAQUE_ALPHA).any())
 
 
 def _read_clip(path: Path, container: str, max_frames: int, limit: DecodeLimit) -> Source:
     if container == "gif":
         check_first_frame(path)
     clip = Clip(path, container, limit)
-    if clip.count < 2 and container in ("gif", "apng") and clip.count:
+    if clip.count == 1 and container in ("gif", "apng"):
         return _picture(*clip.read([0]))
     _need_two(clip.count, "the video")
     frames, has_alpha = clip.read(evenly_spaced(clip.count, max_frames))
@@ -162,9 +162,8 @@ def _read_zip(path: Path, scratch: Path, max_frames: int, limit: DecodeLimit) ->
     try:
         with zipfile.ZipFile(path) as archive:
             check_no_scene(archive.namelist())
-            entries = _numbered(
-                [info for info in archive.infolist() if not info.is_dir() and is_frame_name(info.filename)]
-            )
+            frame_files = (info for info in archive.infolist() if not info.is_dir() and is_frame_name(info.filename))
+            entries = _numbered(list(frame_files))
             frames, any_alpha = _zipped_frames(archive, entries, scratch, max_frames, limit)
     except (zipfile.BadZipFile, RuntimeError, NotImplementedError, EOFError) as error:
         raise BadInput("the zip of frames is broken or encrypted; pack it again") from error
@@ -175,7 +174,7 @@ def _read_zip(path: Path, scratch: Path, max_frames: int, limit: DecodeLimit) ->
 def _zipped_frames(
     archive: zipfile.ZipFile, entries: list[zipfile.ZipInfo], scratch: Path, max_frames: int, limit: DecodeLimit
 ) -> tuple[Float[Tensor, "t h w 4"], bool]:
-    """Decode every frame, so that none is broken, and keep some; whether one of these has alpha."""
+    """Decode every frame, so that none is broken; return the selected ones, and True if one of them has alpha."""
     kept, any_alpha = KeptFrames(evenly_spaced(len(entries), max_frames), "the folder of frames"), False
     first, pixels, start = (0, 0), 0, time.monotonic()
     for i, info in enumerate(entries):
@@ -265,7 +264,7 @@ def _reader(suffix: str) -> Callable[..., tuple[Float[Tensor, "h w 4"], bool, tu
 
 
 def _link(path: Path, suffix: str, scratch: Path) -> Path:
-    """Return a link to the file under a name that tells its format."""
+    """Return a link to the file with the suffix of its format, by which OpenImageIO selects the decoder."""
     link = scratch / f"source{suffix}"
     link.unlink(missing_ok=True)
     link.symlink_to(path.resolve())

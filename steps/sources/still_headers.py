@@ -1,25 +1,25 @@
-"""Sizes of pictures whose decoders allocate when a file is opened, read from the file's own header."""
+"""Headers of still pictures, read before a decoder opens the file and allocates memory."""
 
 import struct
 from dataclasses import dataclass
 from pathlib import Path
 
-HEAD_BYTES = 2**20  # in which a header must begin; metadata before it are smaller
+HEAD_BYTES = 2**20  # beginning of a file with its header; metadata before that are smaller
 JXL_RATIOS = ((1, 1), (12, 10), (4, 3), (3, 2), (16, 9), (5, 4), (2, 1))  # width to height, ISO/IEC 18181-1
 JXL_SIZE_BITS = (9, 13, 18, 30)
 JPEG_STANDALONE = (0x01, *range(0xD0, 0xD9))  # markers without a length: TEM, RST0 to RST7, SOI
 JPEG_FRAMES = tuple(mark for mark in range(0xC0, 0xD0) if mark not in (0xC4, 0xC8, 0xCC))  # SOF0 to SOF15
-JPEG_SEQUENTIAL = (0xC0, 0xC1, 0xC9)  # of them decoded row by row, if a scan holds all components
+JPEG_SEQUENTIAL = (0xC0, 0xC1, 0xC9)  # frames that are decoded row by row
 
 
 @dataclass(frozen=True)
 class Header:
-    """A picture's size and what its decoder holds.
+    """Size of a picture, and memory of its decoder.
 
     Attributes:
         width: pixels.
         height: pixels.
-        held: bytes per pixel that the decoder keeps until the last row is read.
+        held: bytes per pixel that the decoder holds until the last row is read.
     """
 
     width: int
@@ -28,7 +28,7 @@ class Header:
 
 
 def read_header(path: Path, suffix: str) -> Header | None:
-    """Return the header of a JPEG, PNG, JPEG 2000 or JPEG XL; None for other formats and where it cannot be found."""
+    """Return the header of a JPEG, PNG, JPEG 2000 or JPEG XL; None for other formats and if it cannot be found."""
     reader = {".jpg": _jpeg, ".png": _png, ".jp2": _jpeg2000, ".jxl": _jpegxl}.get(suffix)
     if reader is None:
         return None
@@ -41,7 +41,7 @@ def read_header(path: Path, suffix: str) -> Header | None:
 
 
 def _png(head: bytes) -> Header | None:
-    """Read IHDR, which must be the first chunk; rows of interlaced files are complete only at the end."""
+    """Read IHDR, which must be the first chunk; decoders hold interlaced pictures as a whole."""
     if head[12:16] != b"IHDR":
         return None
     width, height, depth, color, interlaced = struct.unpack_from(">IIBBxxB", head, 16)
