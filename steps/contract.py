@@ -1,11 +1,12 @@
 """Contract of a step: references, requests, results, records and exit statuses, as plain JSON. Imports no torch."""
 
 import hashlib
+import importlib
 import json
 import re
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 CONTRACT_VERSION = 1
 LARGEST_SEED = 2**63 - 1  # limit of torch's generators
@@ -154,6 +155,18 @@ def canonical(value: Any) -> str:
 def digest_of(value: Any) -> str:
     """Return the SHA-256 digest of the canonical JSON of a value."""
     return "sha256:" + hashlib.sha256(canonical(value).encode()).hexdigest()
+
+
+def load_object(name: str) -> Any:
+    """Import and return the object that "module:name" names."""
+    module, _, attribute = name.partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def settings_errors(error: ValidationError) -> str:
+    """Return the wrong fields of settings with their values and the allowed ones, for a message."""
+    lines = [f"{'.'.join(map(str, e['loc']))} = {shown(e['input'])}: {e['msg']}" for e in error.errors()]
+    return "; ".join(lines)
 
 
 def shown(value: Any) -> str:

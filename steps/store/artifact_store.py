@@ -267,7 +267,7 @@ def remove_unused(folder: Path, unused_s: float) -> None:
             path.unlink(missing_ok=True)
 
 
-def _digest(file: BinaryIO) -> str:
+def _digest(file: io.BufferedReader) -> str:
     return f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}"
 
 

@@ -111,10 +111,10 @@ def sliding(frames: int) -> Gaussians:
     return replace(rest, means=rest.means + way, log_scales=scales, quats=quats)
 
 
-def seen(parts: LoadedAsset, video: DrivingVideo | None = None) -> Evidence:
+def seen(asset: LoadedAsset, video: DrivingVideo | None = None) -> Evidence:
     footage = video or DrivingVideo(torch.zeros(FRAMES, 32, 32, 3), torch.ones(FRAMES, 32, 32, 1), 24.0)
     cutout = torch.cat([footage.frames, footage.coverage], -1)[0]
-    return collect_evidence(parts, footage, cutout, choose_rasterizer("reference"))
+    return collect_evidence(asset, footage, cutout, choose_rasterizer("reference"))
 
 
 def parts_of(frames: int, surface: Asset4D) -> LoadedAsset:

@@ -39,7 +39,7 @@ def judged(choice: LoadedPrior, frame: int = 0) -> torch.Tensor:
 
 def test_zero123_comes_from_a_folder_with_its_digests_and_license(model: Path) -> None:
     choice = chosen(model, StaticSettings(), CUTOUTS[:1])
-    facts = choice.facts("cpu rasterizer")
+    facts = choice.report("cpu rasterizer")
     assert facts.backend == "cpu rasterizer"
     names = {name.split("/mine/")[1] if "/mine/" in name else name for name in facts.weights}
     assert {"unet/diffusion_pytorch_model.safetensors", "vae/config.json"} <= names
@@ -69,7 +69,7 @@ def test_frames_are_told_apart(model: Path) -> None:
 
 def test_that_memory_ran_out_is_said_of_the_run_and_of_nothing_else(model: Path) -> None:
     choice = chosen(model, StaticSettings(), CUTOUTS[:1])
-    plenty = choice.facts("cpu")
+    plenty = choice.report("cpu")
     assert len(plenty.notes) == 1 and not plenty.run_notes
 
     def tight(piece: slice) -> None:
@@ -78,8 +78,8 @@ def test_that_memory_ran_out_is_said_of_the_run_and_of_nothing_else(model: Path)
 
     assert choice.batches is not None
     choice.batches.run(tight, 16)
-    assert choice.facts("cpu").notes == plenty.notes
-    assert "memory ran out with 16 views" in choice.facts("cpu").run_notes[0]
+    assert choice.report("cpu").notes == plenty.notes
+    assert "memory ran out with 16 views" in choice.report("cpu").run_notes[0]
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_weights_that_are_not_here_are_named_with_the_command(monkeypatch: pytes
 
 def test_the_prior_without_weights_has_none_in_its_facts(tmp_path: Path) -> None:
     settings = GeometricPriorSettings(size=32)
-    facts = make_prior(settings, CUTOUTS[:1], StaticSettings(), None, tmp_path).facts("cpu")
+    facts = make_prior(settings, CUTOUTS[:1], StaticSettings(), None, tmp_path).report("cpu")
     assert facts.weights == {} and facts.licenses == {} and len(facts.notes) == 1
 
 

@@ -66,7 +66,7 @@ def test_the_fit_starts_from_the_reconstruction_that_the_seed_decides(
 def test_what_the_prior_brought_stays_in_the_record(lgm: LgmStartSettings) -> None:
     opened = open_weights(lgm.weights), open_weights(lgm.views_weights)
     made = Reconstruction(blob(16, 0.5, torch.Generator()), opened)
-    facts = made.added_to(StepReport("cpu", {"prior": "sha256:1"}, {"prior": "free"}, ("a prior",)))
+    facts = made.add_to(StepReport("cpu", {"prior": "sha256:1"}, {"prior": "free"}, ("a prior",)))
     assert facts.notes == ("a prior", NOTE)
     assert facts.weights["prior"] == "sha256:1"
     assert len(facts.licenses) == 3
