@@ -22,9 +22,9 @@ def failure_kind(error: BaseException) -> FailureKind:
     """Return the contract's kind of failure for an exception."""
     if isinstance(error, OSError) and error.errno in NO_SPACE:
         return "bad_input"
-    if isinstance(error, RuntimeError):  # torch's names for exhausted memory: CUDA, CPU
-        if type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in str(error):
-            return "out_of_memory"
+    no_memory = type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in str(error)  # CUDA, CPU
+    if isinstance(error, RuntimeError) and no_memory:
+        return "out_of_memory"
     return next((kind for matched, kind in KINDS.items() if isinstance(error, matched)), "crashed")
 
 

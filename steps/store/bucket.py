@@ -19,7 +19,6 @@ from steps.contract import ArtifactRef
 from steps.store.artifact_store import (
     CHUNK,
     OBJECTS,
-    ArtifactMissing,
     ArtifactStore,
     Entry,
     StoreUnreachable,
@@ -61,20 +60,6 @@ class BucketStore(ArtifactStore):
     def address(self) -> str:
         """Address of the bucket and the prefix in it."""
         return self._address
-
-    def get(self, ref: ArtifactRef, path: Path) -> None:
-        """Write an artifact to `path`; a damaged copy is fetched again."""
-        try:
-            super().get(ref, path)
-        except ArtifactMissing:
-            super().get(ref, path)
-
-    def path(self, ref: ArtifactRef) -> Path:
-        """Return the copy of an artifact; a damaged one is fetched again."""
-        try:
-            return super().path(ref)
-        except ArtifactMissing:
-            return super().path(ref)
 
     def has(self, ref: ArtifactRef) -> bool:
         """Return True if the artifact is in the bucket with its full size."""
@@ -172,14 +157,15 @@ class BucketStore(ArtifactStore):
         return ref
 
     def _file(self, ref: ArtifactRef) -> Path:
-        """Return the copy of an artifact, fetched if it is not here."""
-        if not super().has(ref):
+        """Return the copy of an artifact, fetched if it is not here or damaged."""
+        if not (super().has(ref) and self._is_right(ref)):
             self._fetch(ref)
         place = self._place(ref.digest)
         os.utime(place, (time.time(), place.stat().st_mtime))  # `tidy` keeps copies that were used
         return place
 
     def _fetch(self, ref: ArtifactRef) -> None:
+        """Copy an artifact from the bucket to this machine; a damaged one is dropped from the bucket."""
         try:
             with self._answering():
                 copy = super()._keep(self._reader(ref.digest), ref.media_type)
