@@ -87,7 +87,7 @@ def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scr
     outputs = _store_outputs(job, spec, store)
     record = ProvenanceRecord(
         step=spec.name,
-        code_version=f"{_product_version()}+{code}",
+        code_version=f"{importlib.metadata.version('dg4d')}+{code}",
         request_digest=request.digest(),
         inputs={name: ref.digest for name, ref in request.inputs.items()},
         outputs={name: ref.digest for name, ref in outputs.items()},
@@ -159,10 +159,3 @@ def _store_pictures(pictures: Path, store: ArtifactStore) -> dict[str, ArtifactR
         for file in sorted(pictures.glob("*.png")):
             stored[file.stem] = store.put(file, "image/png")
     return stored
-
-
-def _product_version() -> str:
-    try:
-        return importlib.metadata.version("dg4d")
-    except importlib.metadata.PackageNotFoundError:
-        return "0"

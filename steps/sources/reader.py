@@ -3,7 +3,6 @@
 import shutil
 import time
 import zipfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -14,7 +13,6 @@ from torch import Tensor
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import SubjectSettings
 from dg4d_lib.video.shrinking import shrink_by_bands
-from steps.sources.avif import read_avif
 from steps.sources.clips import (
     MOST_DECODED,
     MOST_DECODING_S,
@@ -38,8 +36,7 @@ from steps.sources.media_types import (
     is_zip,
     still_suffix,
 )
-from steps.sources.stills import LARGEST_SIDE as STILL_SIDE
-from steps.sources.stills import read_still
+from steps.sources.stills import StillPicture, read_still
 from steps.sources.webp import AnimatedWebp, is_animated
 
 FOLDER_FPS = 12.0  # assumed for numbered pictures: drawn animation usually holds a drawing for two frames of 24
@@ -104,9 +101,11 @@ def _decode(path: Path, head: bytes, scratch: Path, max_frames: int, limit: Deco
     container = "apng" if is_animated_png(head) else container_of(head)
     if container:
         return _read_clip(path, container, max_frames, limit)
-    suffix = still_suffix(head)
-    picture, has_alpha, _ = _reader(suffix)(_link(path, suffix, scratch), "the picture", limit, STILL_SIDE)
-    return _picture(picture[None], has_alpha)
+    link = scratch / f"source{still_suffix(head)}"  # read_still selects the decoder by the suffix
+    link.unlink(missing_ok=True)
+    link.symlink_to(path.resolve())
+    picture = read_still(link, "the picture", limit)
+    return _picture(picture.pixels[None], picture.has_alpha)
 
 
 def _picture(frames: Float[Tensor, "1 h w 4"], has_alpha: bool) -> Source:
@@ -178,22 +177,23 @@ def _zipped_frames(
     kept, any_alpha = KeptFrames(evenly_spaced(len(entries), max_frames), "the folder of frames"), False
     first, pixels, start = (0, 0), 0, time.monotonic()
     for i, info in enumerate(entries):
-        picture, has_alpha, size = _zipped_picture(archive, info, scratch, limit, kept.side)
-        first = first if i else size
-        if size != first:
+        picture = _zipped_picture(archive, info, scratch, limit, kept.side)
+        width, height = picture.size
+        first = first if i else picture.size
+        if picture.size != first:
             raise BadInput(
-                f"the frames have different sizes: {info.filename} is {size[0]} x {size[1]} "
+                f"the frames have different sizes: {info.filename} is {width} x {height} "
                 f"pixels, {entries[0].filename} is {first[0]} x {first[1]}; export all at one size"
             )
-        pixels += size[0] * size[1]
+        pixels += width * height
         if pixels > MOST_DECODED or time.monotonic() - start > MOST_DECODING_S:
             raise BadInput(
                 f"the folder of frames has more than {MOST_DECODED // 10**9} billion pixels in all, or takes more than "
                 f"{MOST_DECODING_S:g} s to read; leave some frames out, or export them smaller"
             )
         if i in kept:
-            kept.add(i, picture)
-            any_alpha = any_alpha or has_alpha
+            kept.add(i, picture.pixels)
+            any_alpha = any_alpha or picture.has_alpha
     return kept.frames, any_alpha
 
 
@@ -204,22 +204,23 @@ def _numbered(entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo]:
         raise BadInput(
             f"the folder of frames has {len(entries)} pictures; at most {MOST_FRAMES} are read: leave some out"
         )
-    found = {info.filename: _number_at_end(Path(info.filename).stem) for info in entries}
-    if all(number is None for number in found.values()):
-        return sorted(entries, key=lambda info: info.filename)
-    without = sorted(name for name, number in found.items() if number is None)
-    if without:
-        raise BadInput(
-            f"the frame {without[0]} has no number at the end of its name while others do; rename or remove it"
-        )
     by_number: dict[int, zipfile.ZipInfo] = {}
+    without: list[zipfile.ZipInfo] = []
+    same = None
     for info in entries:
-        number = found[info.filename] or 0
-        if number in by_number:
-            raise BadInput(
-                f"{by_number[number].filename} and {info.filename} have the same number; keep one sequence per folder"
-            )
-        by_number[number] = info
+        number = _number_at_end(Path(info.filename).stem)
+        if number is None:
+            without.append(info)
+        elif by_number.setdefault(number, info) is not info:
+            same = same or (by_number[number].filename, info.filename)
+    without.sort(key=lambda info: info.filename)
+    if not by_number:
+        return without
+    if without:
+        name = without[0].filename
+        raise BadInput(f"the frame {name} has no number at the end of its name while others do; rename or remove it")
+    if same:
+        raise BadInput(f"{same[0]} and {same[1]} have the same number; keep one sequence per folder")
     first, last = min(by_number), max(by_number)
     if last - first + 1 != len(by_number):
         gaps = [number for number in range(first, min(last, first + 10**6)) if number not in by_number]
@@ -243,7 +244,7 @@ def _number_at_end(name: str) -> int | None:
 
 def _zipped_picture(
     archive: zipfile.ZipFile, info: zipfile.ZipInfo, scratch: Path, limit: DecodeLimit, longest: int
-) -> tuple[Float[Tensor, "h w 4"], bool, tuple[int, int]]:
+) -> StillPicture:
     """Unpack one frame into `scratch` and decode it as `read_still` does."""
     if info.file_size > MOST_ENTRY_BYTES:
         raise BadInput(f"{info.filename} unpacks to {info.file_size} bytes; at most {MOST_ENTRY_BYTES} are read")
@@ -253,19 +254,6 @@ def _zipped_picture(
         with target.open("wb") as file:
             file.write(head)
             shutil.copyfileobj(content, file)
-    picture = _reader(target.suffix)(target, f"the frame {info.filename}", limit, longest)
+    picture = read_still(target, f"the frame {info.filename}", limit, longest)
     target.unlink()
     return picture
-
-
-def _reader(suffix: str) -> Callable[..., tuple[Float[Tensor, "h w 4"], bool, tuple[int, int]]]:
-    """Return the function that decodes a still picture."""
-    return read_avif if suffix == ".avif" else read_still
-
-
-def _link(path: Path, suffix: str, scratch: Path) -> Path:
-    """Return a link to the file with the suffix of its format, by which OpenImageIO selects the decoder."""
-    link = scratch / f"source{suffix}"
-    link.unlink(missing_ok=True)
-    link.symlink_to(path.resolve())
-    return link

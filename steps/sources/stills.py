@@ -1,13 +1,16 @@
-"""Still picture reader on OpenImageIO: any format, depth and mode, as straight RGBA in sRGB."""
+"""Still picture reader on OpenImageIO, and on Pillow for AVIF: any format, depth and mode, as straight RGBA in sRGB."""
 
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import OpenImageIO as oiio
 import torch
 from jaxtyping import Float
 from numpy import ndarray
+from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
@@ -29,9 +32,26 @@ TIFF_CONVERTED = (6, 8, 9, 10)  # photometric interpretations: YCbCr, CIE Lab, I
 LINEAR_FORMATS = ("openexr", "hdr")
 FAINT_ALPHA = 1e-3  # premultiplied colors are divided by no smaller alpha
 
+AVIF_BYTES = 20  # per pixel: planes of up to 16 bits, and two 8-bit RGBA copies of Pillow's
+
+ORIENTATION = 0x0112  # EXIF tag, in which Pillow also stores AVIF's own rotation and mirror
 TRANSPOSED = (5, 6, 7, 8)  # EXIF orientations that swap rows and columns; flips follow
 FLIPPED_ROWS = (3, 4, 7, 8)
 FLIPPED_COLUMNS = (2, 3, 6, 7)
+
+
+class StillPicture(NamedTuple):
+    """A decoded picture.
+
+    Attributes:
+        pixels: straight sRGB and alpha in [0, 1], upright.
+        has_alpha: True if the file has an alpha channel.
+        size: width and height of the upright file, before shrinking.
+    """
+
+    pixels: Float[Tensor, "h w 4"]
+    has_alpha: bool
+    size: tuple[int, int]
 
 
 def check_size(width: int, height: int, what: str) -> None:
@@ -58,9 +78,7 @@ def check_size(width: int, height: int, what: str) -> None:
         )
 
 
-def read_still(
-    path: Path, what: str, limit: DecodeLimit, longest: int = LARGEST_SIDE
-) -> tuple[Float[Tensor, "h w 4"], bool, tuple[int, int]]:
+def read_still(path: Path, what: str, limit: DecodeLimit, longest: int = LARGEST_SIDE) -> StillPicture:
     """Decode a picture in bands of rows, shrunk so that no side is longer than `longest`.
 
     Args:
@@ -69,12 +87,11 @@ def read_still(
         limit: memory limit.
         longest: pixels.
 
-    Returns:
-        Straight sRGB and alpha in [0, 1], upright; True if the file has alpha; and its own width and height.
-
     Raises:
         BadInput: the file cannot be read, or its size is out of range.
     """
+    if path.suffix == ".avif":
+        return _read_avif(path, what, limit, longest)
     file, held = _open(path, what, limit)
     try:
         spec = file.spec()
@@ -89,21 +106,34 @@ def read_still(
             shrinker.add(top, torch.from_numpy(band))
     finally:
         file.close()
-    orientation = int(spec.get_int_attribute("Orientation", 1))  # of EXIF
-    picture = upright(shrinker.picture(), orientation)
-    return picture, still.has_alpha, upright_size(still.width, still.height, orientation)
+    orientation = int(spec.get_int_attribute("Orientation", 1))
+    return _upright(shrinker.picture(), still.has_alpha, orientation, (still.width, still.height))
 
 
-def upright(picture: Float[Tensor, "h w 4"], orientation: int) -> Float[Tensor, "h2 w2 4"]:
+def _read_avif(path: Path, what: str, limit: DecodeLimit, longest: int) -> StillPicture:
+    """Decode an AVIF with Pillow, as OpenImageIO's wheel has no reader."""
+    try:
+        with warnings.catch_warnings(), Image.open(path, formats=["AVIF"]) as image:
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            width, height = image.size
+            check_size(width, height, what)
+            limit.require(AVIF_BYTES * width * height, what, width, height)
+            shrinker, rows = BandShrinker(height, width, longest), max(1, BAND_BYTES // (16 * width))
+            for top in range(0, height, rows):
+                band = image.crop((0, top, width, min(height, top + rows))).convert("RGBA")
+                shrinker.add(top, torch.from_numpy(np.array(band)).float() / 255)
+            has_alpha, orientation = image.mode.endswith("A"), image.getexif().get(ORIENTATION, 1)
+            return _upright(shrinker.picture(), has_alpha, orientation, image.size)
+    except (UnidentifiedImageError, Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
+        raise BadInput(f"{what} is a broken or too large AVIF; export it as PNG or JPEG") from error
+
+
+def _upright(pixels: Float[Tensor, "h w 4"], has_alpha: bool, orientation: int, size: tuple[int, int]) -> StillPicture:
     """Undo EXIF's orientation, 1 to 8; other values mean 1."""
-    picture = picture.transpose(0, 1) if orientation in TRANSPOSED else picture
+    if orientation in TRANSPOSED:
+        pixels, size = pixels.transpose(0, 1), (size[1], size[0])
     flipped = [axis for axis, values in enumerate((FLIPPED_ROWS, FLIPPED_COLUMNS)) if orientation in values]
-    return picture.flip(flipped).contiguous()
-
-
-def upright_size(width: int, height: int, orientation: int) -> tuple[int, int]:
-    """Return width and height after `upright`."""
-    return (height, width) if orientation in TRANSPOSED else (width, height)
+    return StillPicture(pixels.flip(flipped).contiguous(), has_alpha, size)
 
 
 def _open(path: Path, what: str, limit: DecodeLimit) -> tuple[oiio.ImageInput, float]:
