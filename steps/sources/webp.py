@@ -13,8 +13,10 @@ from torch import Tensor
 from dg4d_lib.errors import BadInput
 from steps.sources.clips import MOST_DECODED, MOST_FRAMES
 from steps.sources.decode_limit import DecodeLimit
+from steps.sources.decoder_errors import damage_is_bad_input
 from steps.sources.stills import check_size
 
+NAME = "the WebP animation"  # in messages
 FLAGS_AT, SIZE_AT, HEADER_BYTES = 20, 24, 30  # offsets in a VP8X file
 CHUNK_BYTES = (10).to_bytes(4, "little")  # length of a VP8X chunk, before its flags
 ANIMATION_FLAG = 0x02
@@ -33,8 +35,6 @@ class AnimatedWebp:
     """Frames of one file, which must stay open while they are read.
 
     Attributes:
-        width: pixels of the canvas.
-        height: pixels of the canvas.
         fps: mean frame rate of the frames read so far; `FASTEST_FPS` if they have no duration.
 
     Raises:
@@ -44,19 +44,17 @@ class AnimatedWebp:
     def __init__(self, file: BinaryIO, limit: DecodeLimit) -> None:
         header, size_bytes = file.read(HEADER_BYTES), file.seek(0, SEEK_END)
         if len(header) < HEADER_BYTES or header[FLAGS_AT - 4 : FLAGS_AT] != CHUNK_BYTES:
-            raise _broken()
+            raise BadInput(f"{NAME} is cut off or broken; export it again")
         sides = (header[at : at + 3] for at in (SIZE_AT, SIZE_AT + 3))
         self.width, self.height = (int.from_bytes(side, "little") + 1 for side in sides)
-        check_size(self.width, self.height, "the WebP animation")
+        check_size(self.width, self.height, NAME)
         needed = FILE_COPIES * size_bytes + CANVAS_BYTES * self.width * self.height
-        limit.require(needed, "the WebP animation", self.width, self.height)
-        try:  # `Image.open` would warn about sizes that are allowed here
-            file.seek(0)
-            self._image = WebPImageFile(file)
-        except (OSError, SyntaxError, ValueError) as error:
-            raise _broken() from error
+        limit.require(needed, NAME, self.width, self.height)
+        file.seek(0)
+        with damage_is_bad_input(NAME):
+            self._image = WebPImageFile(file)  # `Image.open` would warn about sizes that are allowed here
         if len(self) > MOST_FRAMES or len(self) * self.width * self.height > MOST_DECODED:
-            raise BadInput("the WebP animation has too many or too large frames; cut it, or export it smaller")
+            raise BadInput(f"{NAME} has too many or too large frames; cut it, or export it smaller")
         self.fps = FASTEST_FPS
 
     def __len__(self) -> int:
@@ -66,15 +64,9 @@ class AnimatedWebp:
         """Yield every composed frame as straight RGBA."""
         duration_ms = 0.0
         for number in range(len(self)):
-            try:
+            with damage_is_bad_input(NAME):
                 self._image.seek(number)
                 frame = torch.from_numpy(np.array(self._image.convert("RGBA")))
-            except (OSError, EOFError, ValueError) as error:
-                raise _broken() from error
             duration_ms += self._image.info["duration"]
             self.fps = 1000 * (number + 1) / duration_ms if duration_ms > 0 else FASTEST_FPS
             yield frame
-
-
-def _broken() -> BadInput:
-    return BadInput("the WebP animation is cut off or broken; export it again")
