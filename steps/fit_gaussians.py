@@ -43,13 +43,13 @@ def run(job: Job) -> StepReport:
     else:
         start = initial_gaussians(subject, static.start, prior, turn_deg, generator).to(device)
     chosen = make_prior(prior, [subject], static, job.inputs.get("bank"), job.pictures, turn_deg)
-    curves = LossCurves(static.iterations, job)
+    curves = LossCurves(static.iterations, job.progress)
     with picture_of_divergence(job, rasterize):
         gaussians = fit_gaussians(start, subject, chosen.prior, rasterize, static, generator, curves.add)
     report = chosen.report(f"{backend} rasterizer")
     report = reconstruction.add_to(report) if reconstruction else report
     write_ply(job.outputs["gaussians"], gaussians)
-    curves.write("static fit", report.notes)
+    curves.write(job.outputs["curves"], "static fit", report.notes)
     write_png(job.outputs["picture"], render_turnaround(gaussians, rasterize))
     return report
 

@@ -34,7 +34,7 @@ def run(job: Job) -> StepReport:
     deformation = new_deformation(kind, gaussians, len(video), generator)
     device = device_of(backend)
     deformation.to(device)
-    curves = LossCurves(settings.iterations, job)
+    curves = LossCurves(settings.iterations, job.progress)
     with picture_of_divergence(job, rasterize):
         fitted = fit_motion(
             gaussians.to(device), deformation, video, chosen.prior, rasterize, settings, generator, curves.add
@@ -44,7 +44,7 @@ def run(job: Job) -> StepReport:
     if settings.fine_tune:
         write_ply(job.outputs["gaussians"], gaussians)
     write_motion(job.outputs["motion"], deformation, kind, len(video), len(gaussians))
-    curves.write("motion fit", [chosen.note])
+    curves.write(job.outputs["curves"], "motion fit", [chosen.note])
     timestamps = torch.linspace(0, 1, min(PICTURE_FRAMES, len(video)))
     with torch.no_grad():
         moved = deformation.displace(gaussians.means, timestamps).apply(gaussians)

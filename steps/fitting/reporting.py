@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -12,7 +13,7 @@ from dg4d_lib.fitting.losses import Diverged
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer.interface import Rasterizer
 from steps.artifacts.media import write_curves, write_png
-from steps.runtime.job import Job
+from steps.runtime.job import Job, Progress
 
 TURNAROUND_AZIMUTHS_DEG = (0.0, 45.0, 90.0, 180.0, -90.0, -45.0)
 PICTURE_SIZE = 192  # pixels
@@ -23,11 +24,11 @@ class LossCurves:
 
     Args:
         total: number of iterations.
-        job: job of the fit.
+        progress: callback of the job.
     """
 
-    def __init__(self, total: int, job: Job) -> None:
-        self.total, self.job = total, job
+    def __init__(self, total: int, progress: Progress) -> None:
+        self.total, self.progress = total, progress
         self.iterations: list[int] = []
         self.series: dict[str, list[float]] = {}
 
@@ -36,11 +37,11 @@ class LossCurves:
         self.iterations.append(iteration)
         for name, value in values.items():
             self.series.setdefault(name, []).append(value)
-        self.job.progress(iteration, self.total, values)
+        self.progress(iteration, self.total, values)
 
-    def write(self, title: str, notes: Sequence[str]) -> None:
-        """Write the output `curves`."""
-        write_curves(self.job.outputs["curves"], title, self.iterations, self.series, notes)
+    def write(self, path: Path, title: str, notes: Sequence[str]) -> None:
+        """Write the `curves` artifact."""
+        write_curves(path, title, self.iterations, self.series, notes)
 
 
 @contextmanager

@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO, NamedTuple
+from typing import IO, BinaryIO, NamedTuple
 
 from dg4d_lib.errors import BackendUnavailable, DG4DError
 from steps.contract import ArtifactRef, is_digest
@@ -49,6 +49,8 @@ class Entry(NamedTuple):
 class ArtifactStore:
     """Artifacts by content, and small files by name, in a folder.
 
+    With an object store, all methods raise StoreUnreachable if it does not answer.
+
     Args:
         root: folder, made when the first file is put.
     """
@@ -67,7 +69,6 @@ class ArtifactStore:
 
         Raises:
             DiskFull: there is no room; the store is as it was.
-            StoreUnreachable: the store does not answer.
         """
         with path.open("rb") as source:
             return self._keep(source, media_type)
@@ -82,7 +83,6 @@ class ArtifactStore:
         Raises:
             ArtifactMissing: it is not here, or its bytes do not match its digest (then it is dropped).
             DiskFull: there is no room at `path`.
-            StoreUnreachable: the store does not answer.
         """
         with room_for(path.parent), self._file(ref).open("rb") as source, path.open("wb") as target:
             digest, _ = copy_hashed(source, target)
@@ -91,22 +91,14 @@ class ArtifactStore:
             raise self._damaged(ref)
 
     def has(self, ref: ArtifactRef) -> bool:
-        """Return True if the artifact is here with its full size.
-
-        Raises:
-            StoreUnreachable: the store does not answer.
-        """
+        """Return True if the artifact is here with its full size."""
         try:
             return self._place(ref.digest).stat().st_size == ref.size_bytes
         except FileNotFoundError:
             return False
 
     def is_sound(self, ref: ArtifactRef) -> bool:
-        """Return True if the artifact is here and matches its digest; unchanged files are read once per process.
-
-        Raises:
-            StoreUnreachable: the store does not answer.
-        """
+        """Return True if the artifact is here and matches its digest; unchanged files are read once per process."""
         return self.has(ref) and self._is_right(ref)
 
     def path(self, ref: ArtifactRef) -> Path:
@@ -114,7 +106,6 @@ class ArtifactStore:
 
         Raises:
             ArtifactMissing: it is not here, or its bytes do not match its digest (then it is dropped).
-            StoreUnreachable: the store does not answer.
         """
         file = self._file(ref)
         if not self._is_right(ref):
@@ -162,16 +153,12 @@ class ArtifactStore:
 
         Raises:
             DiskFull: there is no room; the old content stays.
-            StoreUnreachable: the store does not answer.
         """
-        path = self.root / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, text)
+        write_atomically(self._new_file(name), text)
 
     def create(self, name: str, text: str) -> bool:
         """Write a small file unless one of this name exists; return True for the one caller that wrote it."""
-        path = self.root / name
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path = self._new_file(name)
         try:
             with room_for(path.parent), path.open("x", encoding="utf-8") as file:
                 file.write(text)
@@ -187,6 +174,12 @@ class ArtifactStore:
     def tidy(self, unused_s: float) -> None:
         """Remove partial files of killed processes that nobody has used for so many seconds."""
         remove_unused(self.root / INCOMING, unused_s)
+
+    def _new_file(self, name: str) -> Path:
+        """Return the path of a named file, in a folder that exists."""
+        path = self.root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
 
     def _place(self, digest: str) -> Path:
         return self.root / object_name(digest)
@@ -226,20 +219,17 @@ class ArtifactStore:
 
     def _keep(self, source: BinaryIO, media_type: str) -> ArtifactRef:
         """Copy a stream into the store; an existing file is replaced, for it may be damaged."""
-        with room_for(self.root):
-            incoming = self.root / INCOMING
-            incoming.mkdir(parents=True, exist_ok=True)
-            handle, name = tempfile.mkstemp(dir=incoming)
-            scratch = Path(name)
+        with (
+            room_for(self.root),
+            tempfile.NamedTemporaryFile(dir=self._new_file(f"{INCOMING}/new").parent, delete=False) as target,
+        ):
+            scratch = Path(target.name)
             try:
-                with os.fdopen(handle, "wb") as target:
-                    digest, size = copy_hashed(source, target)
-                    target.flush()
-                    os.fsync(target.fileno())
-                place = self._place(digest)
-                place.parent.mkdir(parents=True, exist_ok=True)
+                digest, size = copy_hashed(source, target)
+                target.flush()
+                os.fsync(target.fileno())
                 scratch.chmod(0o400)  # read-only, for this user alone
-                scratch.replace(place)
+                scratch.replace(self._new_file(object_name(digest)))
             finally:
                 scratch.unlink(missing_ok=True)
         return ArtifactRef(digest=digest, media_type=media_type, size_bytes=size)
@@ -271,7 +261,7 @@ def _digest(file: io.BufferedReader) -> str:
     return f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}"
 
 
-def copy_hashed(source: BinaryIO, target: BinaryIO) -> tuple[str, int]:
+def copy_hashed(source: BinaryIO, target: IO[bytes]) -> tuple[str, int]:
     """Copy a stream to its end; return the digest and the number of bytes."""
     content, size = hashlib.sha256(), 0
     while chunk := source.read(CHUNK):

@@ -115,7 +115,6 @@ class BucketStore(ArtifactStore):
             BadInput: it has more than `most_bytes`; nothing is copied.
             FileNotFoundError: no file has this name.
             DiskFull: there is no room at `path`.
-            StoreUnreachable: the bucket does not answer.
         """
         with self._answering(), room_for(path.parent), path.open("wb") as target:
             reader = obstore.open_reader(self._bucket, name, buffer_size=READ_AHEAD)
