@@ -42,7 +42,7 @@ from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import HexPlaneSettings
-from steps.pack_asset import LANES
+from steps.pack_asset import WRITER_THREADS
 
 FRAMES, FPS = 14, 12.0
 MEGABYTE = 1e6
@@ -193,7 +193,7 @@ def fourdgs(folder: Path) -> Write:
 
 def side_by_side(writers: Sequence[Write], folder: Path) -> None:
     """Some at a time, as the step does."""
-    with ThreadPoolExecutor(LANES) as lanes:
+    with ThreadPoolExecutor(WRITER_THREADS) as lanes:
         places = [folder / str(number) for number in range(len(writers))]
         for place in places:
             place.mkdir(exist_ok=True)
@@ -241,7 +241,7 @@ def main() -> None:
     )
     console.print(
         f"one file of every kind, {counts[0]} splats: {sum(seconds[name] for name in EVERY_KIND):.2f} s one after the "
-        f"other, {whole.wall_s:.2f} s {LANES} at a time; goal {GOAL_S:.0f} s"
+        f"other, {whole.wall_s:.2f} s {WRITER_THREADS} at a time; goal {GOAL_S:.0f} s"
     )
     if options.json:
         write_rows(options.json, rows)

@@ -20,8 +20,8 @@ from dg4d_lib.metrics.video import temporal_error
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import FitSettings, LgmStartSettings, OraclePriorSettings
 from steps.artifacts.motions import new_deformation
-from steps.fit_gaussians import starting_cloud
-from steps.fitting.priors import oracle_prior
+from steps.fit_gaussians import initial_gaussians
+from steps.fitting.priors import make_oracle_prior
 from steps.profiles import PipelineSettings
 
 RASTERIZE = get_rasterizer("auto")
@@ -43,7 +43,7 @@ def static_fit(specimen: Specimen, settings: PipelineSettings, seed: int) -> Gau
     subject = specimen.cutouts[0]
     kind = settings.static.start
     assert not isinstance(kind, LgmStartSettings), "these fits start without LGM"
-    start = starting_cloud(subject, kind, settings.prior, settings.subject.turn_deg, generator)
+    start = initial_gaussians(subject, kind, settings.prior, settings.subject.turn_deg, generator)
     prior = prior_of(specimen.bank, settings, settings.static)
     return fit_gaussians(start, subject, prior, RASTERIZE, settings.static, generator)
 
@@ -91,7 +91,7 @@ def prior_of(bank: Bank, settings: PipelineSettings, stage: FitSettings) -> Anal
     """The oracle, perfect or not, with the timesteps of a stage."""
     assert isinstance(settings.prior, OraclePriorSettings), "these fits are made with prior.kind = oracle"
     noise = TimestepSchedule(stage.t_max_start, stage.t_max_end, uniform=stage.noise_draw == "uniform")
-    return oracle_prior(bank, settings.prior, noise)
+    return make_oracle_prior(bank, settings.prior, noise)
 
 
 def thinned(specimen: Specimen, most: int) -> tuple[Specimen, int]:

@@ -42,7 +42,7 @@ from flows.packages.publish import whole
 from steps.artifacts.media import read_frames, read_png
 from steps.artifacts.packages import SUBJECT, read_manifest
 from steps.artifacts.rendering import read_states, read_surface, states_between
-from steps.check_asset import Parts, gather
+from steps.check_asset import LoadedAsset, collect_evidence
 from steps.contract import ArtifactRef
 from steps.store.artifact_store import ArtifactStore
 from steps.store.files import home
@@ -277,8 +277,8 @@ SPOILS: dict[str, tuple[str, Spoil]] = {
 
 def measured(sample: Sample) -> dict[str, Gate]:
     """Every gate by its name."""
-    parts = Parts(partial(states_between, sample.states), sample.surface, len(sample.surface.offsets))
-    evidence = gather(parts, sample.video, sample.cutout, get_rasterizer("cpu"))
+    parts = LoadedAsset(partial(states_between, sample.states), sample.surface, len(sample.surface.offsets))
+    evidence = collect_evidence(parts, sample.video, sample.cutout, get_rasterizer("cpu"))
     return {gate.name: gate for gate in evaluate_gates(evidence, GateSettings())}
 
 

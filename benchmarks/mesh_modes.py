@@ -32,7 +32,7 @@ from dg4d_lib.metrics.surface import chamfer_distance, sample_surface
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.settings import MeshSettings
 from steps.artifacts.packages import ASSET, COMPACT
-from steps.extract_mesh import textured
+from steps.extract_mesh import textured_mesh
 
 AZIMUTHS_DEG = (0.0, 90.0)  # the input view, and the right side
 SIZE = 512  # pixels
@@ -67,7 +67,7 @@ def of_package(folder: Path, count: int, rasterize: Rasterizer) -> list[Row]:
     states = pose_gaussians(gaussians, deformation, frames, torch.tensor(chosen, dtype=torch.float32))
     rows = []
     for i, frame in enumerate(chosen):
-        extracted = textured(states.at(i), level, rasterize, SETTINGS)
+        extracted = textured_mesh(states.at(i), level, rasterize, SETTINGS)
         tracked = replace(asset.mesh, vertices=asset.mesh.vertices + asset.offsets[frame])
         truth, generator = splats(states.at(i), rasterize), torch.Generator().manual_seed(frame)
         for mode, mesh in (("tracked", tracked), ("per_frame", extracted)):

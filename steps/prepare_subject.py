@@ -1,4 +1,4 @@
-"""A user's picture or video becomes cut-outs in one square frame."""
+"""Step that turns a picture or video into cut-outs of the subject in one square frame."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,7 +20,7 @@ TILE = 256  # pixels
 
 
 def run(job: Job) -> StepReport:
-    """Decode `source`, cut out and frame the subject; `footage` is written when the source moves.
+    """Decode `source`, cut out and frame the subject; write `footage` if the source is a video.
 
     Raises:
         BadInput: the file cannot be used; says why and what to do.
@@ -41,7 +41,7 @@ def run(job: Job) -> StepReport:
 
 
 def picture_of(source: Float[Tensor, "h w 4"], cutout: Float[Tensor, "s s 4"]) -> Float[Tensor, "t w3 3"]:
-    """The source, its matte and the cut-out side by side, over white."""
+    """Compose the source, its matte and the cut-out side by side, over white."""
     tiles = [reframe(each[None], crop_whole_frame(*each.shape[:2]), TILE)[0] for each in (source, cutout)]
     given, cut = map(over_white, tiles)
     return torch.cat([given, tiles[1][..., 3:].expand(TILE, TILE, 3), cut], 1)

@@ -70,14 +70,14 @@ def rasterize(
     grad2d: list[Tensor] = []
     if means2d_offsets is not None:
         means = _Grad2d.apply(means, means2d_offsets, grad2d)
-    viewmats = to_device_async(viewmats(cameras).float(), DEVICE)
+    poses = to_device_async(viewmats(cameras).float(), DEVICE)
     Ks = to_device_async(_intrinsics(cameras), DEVICE)
     backgrounds = to_device_async(background.detach().float(), DEVICE).expand(len(cameras), 3)
     if per_camera:  # a batch of clouds with one camera each
         opacities, colors = opacities.expand(len(cameras), -1), colors.expand(len(cameras), -1, -1)
-        viewmats, Ks, backgrounds = viewmats[:, None], Ks[:, None], backgrounds[:, None]
+        poses, Ks, backgrounds = poses[:, None], Ks[:, None], backgrounds[:, None]
     images, alpha, info = rasterization(
-        means, quats, scales, opacities, colors, viewmats, Ks, width, height,
+        means, quats, scales, opacities, colors, poses, Ks, width, height,
         near_plane=NEAR, eps2d=BLUR, backgrounds=backgrounds, render_mode="RGB+D", packed=False,
     )  # fmt: skip
     if means2d_offsets is not None and info["means2d"].requires_grad:

@@ -53,9 +53,9 @@ def compose(
         folders = list(packages)
     for folder in dict.fromkeys(folders):
         whole(folder)
-    from steps.compose_scene import Cast
+    from steps.compose_scene import SceneWriter
 
-    cast = Cast(folders, plan.items, _names(folders, plan.items))
+    cast = SceneWriter(folders, plan.items, _names(folders, plan.items))
     if scene is None:
         cast.in_a_row(spacing)
     write = cast.write_glb if out.suffix.lower() == ".glb" else cast.write_usdz

@@ -20,7 +20,7 @@ from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import read_png
 from steps.artifacts.rendering import states_between
 from steps.catalog import STEPS
-from steps.check_asset import Parts, gather, run, verdict
+from steps.check_asset import LoadedAsset, collect_evidence, gates_as_json, run
 from steps.pack_asset import run as pack
 from steps.profiles import PREVIEW, step_settings
 from steps.runtime.job import Job, StepReport
@@ -111,14 +111,14 @@ def sliding(frames: int) -> Gaussians:
     return replace(rest, means=rest.means + way, log_scales=scales, quats=quats)
 
 
-def seen(parts: Parts, video: DrivingVideo | None = None) -> GateInputs:
+def seen(asset: LoadedAsset, video: DrivingVideo | None = None) -> GateInputs:
     footage = video or DrivingVideo(torch.zeros(FRAMES, 32, 32, 3), torch.ones(FRAMES, 32, 32, 1), 24.0)
     cutout = torch.cat([footage.frames, footage.coverage], -1)[0]
-    return gather(parts, footage, cutout, get_rasterizer("reference"))
+    return collect_evidence(asset, footage, cutout, get_rasterizer("reference"))
 
 
-def parts_of(frames: int, surface: Asset4D) -> Parts:
-    return Parts(partial(states_between, sliding(frames)), surface, frames)
+def parts_of(frames: int, surface: Asset4D) -> LoadedAsset:
+    return LoadedAsset(partial(states_between, sliding(frames)), surface, frames)
 
 
 def test_an_asset_at_another_frame_rate_is_seen_at_the_moments_of_the_video() -> None:
@@ -160,7 +160,7 @@ def test_flaws_are_counted_per_triangle(faces: Tensor, flaws: float) -> None:
 
 
 def test_a_verdict_is_plain_json() -> None:
-    answer = verdict(evaluate_gates(seen(parts_of(FRAMES, tracked())), GateSettings()))
+    answer = gates_as_json(evaluate_gates(seen(parts_of(FRAMES, tracked())), GateSettings()))
     assert json.loads(json.dumps(answer, allow_nan=False)) == answer
     assert all(round(gate["value"], 4) == gate["value"] for gate in answer["gates"])
 

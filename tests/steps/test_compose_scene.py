@@ -12,7 +12,7 @@ from dg4d_lib.assets.formats.usd import write_usdz
 from dg4d_lib.assets.scenes.compose import AnimatedGlb
 from dg4d_lib.assets.scenes.scene import Scene, SceneItem
 from dg4d_lib.errors import BadInput
-from steps.compose_scene import Cast
+from steps.compose_scene import SceneWriter
 
 SECONDS = FRAMES / FPS
 
@@ -24,8 +24,8 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def cast_of(package: Path, *items: SceneItem) -> Cast:
-    return Cast([package] * len(items), items, [item.name for item in items])
+def cast_of(package: Path, *items: Item) -> SceneWriter:
+    return SceneWriter([package] * len(items), items, [item.name for item in items])
 
 
 def item(name: str, **where: object) -> SceneItem:
@@ -79,7 +79,7 @@ def test_a_package_without_usdz_is_named(package: Path, tmp_path: Path) -> None:
     folder = packed(tmp_path / "older")
     (folder / "asset.usdz").unlink(missing_ok=True)
     with pytest.raises(BadInput, match=r"has no asset\.usdz"):
-        Cast([folder], [item("a")], ["a"]).write_usdz(tmp_path / "scene.usdz", None)
+        SceneWriter([folder], [item("a")], ["a"]).write_usdz(tmp_path / "scene.usdz", None)
 
 
 def test_a_film_shows_every_asset(package: Path, tmp_path: Path) -> None:
@@ -121,4 +121,4 @@ def test_a_film_has_an_end(package: Path, tmp_path: Path) -> None:
 def test_a_broken_asset_is_named(tmp_path: Path) -> None:
     (tmp_path / "asset.glb").write_bytes(b"no GLB")
     with pytest.raises(BadInput, match=r"asset\.glb: this is no GLB"):
-        Cast([tmp_path], [item("a")], ["a"])
+        SceneWriter([tmp_path], [item("a")], ["a"])

@@ -7,10 +7,10 @@ from dg4d_lib.weights.lock import LockedFile, LockEntry, write_lock
 from steps.contract import StepRequest
 from steps.runtime.perform import perform
 from steps.runtime.weights import (
+    check_unchanged,
     identities,
     license_of,
     open_weights,
-    require_same,
     weights_home,
     weights_in,
     without_paths,
@@ -84,9 +84,9 @@ def test_the_identity_follows_the_content_and_missing_weights_have_none(home: Pa
     assert set(before) == {"lgm"}
     (home / "lgm" / "model_fp16_fixrot.safetensors").write_text("other")
     assert identities(["lgm"]) != before
-    require_same(identities(["lgm"]))
+    check_unchanged(identities(["lgm"]))
     with pytest.raises(BadInput, match="the weights lgm changed in between"):
-        require_same(before)
+        check_unchanged(before)
 
 
 def test_a_request_for_other_weights_is_another_and_is_not_performed(home: Path, tmp_path: Path) -> None:
