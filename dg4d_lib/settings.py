@@ -152,6 +152,18 @@ class GeometricPriorSettings(Settings):
     )
 
 
+class LearnedPriorSettings(Settings):
+    """Shape prior of this package, trained on made-up shapes: expected views of the subject; no download."""
+
+    kind: Literal["learned"] = "learned"
+    level: float = Field(
+        0.35,
+        ge=0.05,
+        le=0.95,
+        description="probability of matter at which the surface lies that the static fit starts on",
+    )
+
+
 class Zero123PriorSettings(Settings):
     """Zero-1-to-3, a diffusion model of how a picture looks from another camera (Liu et al. 2023)."""
 
@@ -219,7 +231,11 @@ class OraclePriorSettings(Settings):
 
 
 PriorSettings = Annotated[
-    GeometricPriorSettings | Zero123PriorSettings | ImageDreamPriorSettings | OraclePriorSettings,
+    GeometricPriorSettings
+    | LearnedPriorSettings
+    | Zero123PriorSettings
+    | ImageDreamPriorSettings
+    | OraclePriorSettings,
     Field(discriminator="kind"),
 ]
 

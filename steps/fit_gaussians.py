@@ -9,18 +9,17 @@ from dg4d_lib.fitting.static import fit_gaussians
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import blob, on_surface
 from dg4d_lib.gaussians.ply import write_ply
-from dg4d_lib.inflation.surface import inflate, sample_surface
+from dg4d_lib.inflation.surface import sample_surface
 from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
 from dg4d_lib.settings import (
     BlobStartSettings,
-    GeometricPriorSettings,
     LgmStartSettings,
     PriorSettings,
     StaticSettings,
     SurfaceStartSettings,
 )
 from steps.artifacts.media import read_png, write_png
-from steps.fitting.priors import make_prior
+from steps.fitting.priors import make_prior, subject_shapes
 from steps.fitting.reconstruction import reconstruct_subject
 from steps.fitting.reporting import LossCurves, render_turnaround
 from steps.runtime.job import Job, StepReport
@@ -71,10 +70,9 @@ def starting_cloud(
     turn_deg: float,
     generator: torch.Generator,
 ) -> Gaussians:
-    """Make the cloud of iteration 0: the random blob, or points on the surface inflated from the picture."""
+    """Make the cloud of iteration 0: the random blob, or points on the surface of the prior."""
     if isinstance(start, BlobStartSettings):
         return blob(start.points, BLOB_RADIUS, generator)
-    shape = prior if isinstance(prior, GeometricPriorSettings) else GeometricPriorSettings()
-    surface = inflate(subject, shape.size, turn_deg)
+    surface = subject_shapes(prior, [subject], turn_deg).surface(0)
     points, _, colors, area = sample_surface(surface, start.points, generator)
     return on_surface(points, colors, area)
