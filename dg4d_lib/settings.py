@@ -65,6 +65,12 @@ class SubjectSettings(Settings):
     turn_deg: float = Field(
         0.0, ge=-60, le=60, description="how far the subject's plane is turned away from the camera; a user's hint"
     )
+    ground_turn: float = Field(
+        0.6,
+        ge=0,
+        le=1,
+        description="factor on the turn found from the ground line of footage, where `turn_deg` is 0; 0: none",
+    )
     max_frames: int = Field(32, ge=2, le=512, description="frames taken from a video; longer ones are sampled evenly")
     max_decode_gb: float = Field(
         1.0, ge=0.125, le=256, description="GiB of memory for decoding the source, its decoded frames included; ours"

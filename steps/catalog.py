@@ -2,6 +2,7 @@
 
 Artifacts between steps:
   frames      a stored zip of NNN.png (RGBA, straight alpha, square) and video.json {"fps": ...}
+  pose        JSON {"turn_deg": ...}: turn of the subject's plane that its footage shows, 0 where it shows none
   gaussians   a standard 3DGS PLY (float32)
   motion      safetensors; metadata says the kind of deformation, its settings and the number of frames
   plan        JSON of steps/artifacts/mesh_plan.py: {"mode": "tracked" or "per_frame", "level": ..., ...}
@@ -20,6 +21,7 @@ from steps.contract import Port, StepSpec
 
 PNG = Port(media_type="image/png", suffix=".png")
 FRAMES = Port(media_type="application/vnd.dg4d.frames+zip", suffix=".zip")
+POSE = Port(media_type="application/vnd.dg4d.pose+json", suffix=".json")
 PLY = Port(media_type="application/vnd.dg4d.gaussians+ply", suffix=".ply")
 MOTION = Port(media_type="application/vnd.dg4d.motion+safetensors", suffix=".safetensors")
 PLAN = Port(media_type="application/vnd.dg4d.mesh-plan+json", suffix=".json")
@@ -59,7 +61,7 @@ STEPS: dict[str, StepSpec] = {
             entry="steps.prepare_subject:run",
             sections=("subject",),
             inputs={"source": SOURCE},
-            outputs={"subject": PNG, "footage": _optional(FRAMES), "picture": PNG},
+            outputs={"subject": PNG, "footage": _optional(FRAMES), "pose": _optional(POSE), "picture": PNG},
             timeout_s=2400,  # a decoder that hangs in one frame cannot be stopped from within
         ),
         StepSpec(
@@ -83,7 +85,7 @@ STEPS: dict[str, StepSpec] = {
             version="1",
             entry="steps.fit_gaussians:run",
             sections=("rasterizer", "subject.turn_deg", "prior", "static"),
-            inputs={"subject": PNG, "bank": _optional(BANK)},
+            inputs={"subject": PNG, "pose": _optional(POSE), "bank": _optional(BANK)},
             outputs={"gaussians": PLY, "curves": CURVES, "picture": PNG},
             resource="gpu",
             late_imports=("dg4d_lib.rasterizer.cpu", "torch._dynamo"),  # the latter: of any optimizer
@@ -93,7 +95,7 @@ STEPS: dict[str, StepSpec] = {
             version="1",
             entry="steps.fit_motion:run",
             sections=("rasterizer", "subject.turn_deg", "prior", "deformation", "motion"),
-            inputs={"gaussians": PLY, "driving_video": FRAMES, "bank": _optional(BANK)},
+            inputs={"gaussians": PLY, "driving_video": FRAMES, "pose": _optional(POSE), "bank": _optional(BANK)},
             outputs={"motion": MOTION, "gaussians": _optional(PLY), "curves": CURVES, "picture": PNG},
             resource="gpu",
         ),

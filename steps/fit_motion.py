@@ -12,6 +12,7 @@ from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
 from dg4d_lib.settings import DeformationSettings, MotionSettings, PriorSettings
 from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.motions import new_deformation, write_motion
+from steps.artifacts.pose import read_turn
 from steps.fitting.priors import make_prior
 from steps.fitting.reporting import PICTURE_SIZE, LossCurves, pictures_in_a_row, render_turnaround
 from steps.runtime.job import Job, StepReport
@@ -23,7 +24,7 @@ PICTURE_AZIMUTHS_DEG = (0.0, 90.0)
 
 def run(job: Job) -> StepReport:
     """Fit the deformation, with `fine_tune` also the Gaussians; render six timestamps from front and side."""
-    backend, turn_deg = job.settings.rasterizer, job.settings.turn_deg
+    backend, turn_deg = job.settings.rasterizer, read_turn(job.inputs.get("pose"), job.settings.turn_deg)
     prior: PriorSettings = job.settings.prior
     kind: DeformationSettings = job.settings.deformation
     settings: MotionSettings = job.settings.motion

@@ -8,7 +8,7 @@ from typing import Any, no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Int64, UInt8
 from numba import njit
 from scipy import ndimage
 from torch import Tensor
@@ -33,51 +33,64 @@ class ShapeVolume:
     """Density and color in front of the input camera.
 
     Attributes:
-        cells: row, column, depth; optical density of a cell, then color times density.
+        cells: row, column, depth; optical density of a cell, then color times density; the part with density alone.
+        first: row, column and depth in the frustum of the first of these cells.
         free: Chebyshev distance of every block of `BLOCK` cells a side to the nearest one with density, in blocks.
-        low: corner of the box around all density, world axes.
-        high: opposite corner.
+        box: corners of the world box around them.
     """
 
-    cells: Float32[np.ndarray, "s s d 4"]
-    free: UInt8[np.ndarray, "t t e"]
-    low: Float32[np.ndarray, " 3"]
-    high: Float32[np.ndarray, " 3"]
+    cells: Float32[np.ndarray, "r c d 4"]
+    first: Int64[np.ndarray, " 3"]
+    free: UInt8[np.ndarray, "t u e"]
+    box: Float32[np.ndarray, "2 3"]
 
 
 def make_volume(density: Float[Tensor, "128 128 64"], color: Float[Tensor, "128 128 64 3"]) -> ShapeVolume:
-    """Index the filled parts of a volume.
+    """Crop and index the filled part of a volume.
 
     Args:
         density: optical density of every cell, row, column, depth.
         color: in [0, 1].
     """
     density = torch.where(density < FAINTEST_DENSITY, 0.0, density)
-    cells = torch.cat([density[..., None], density[..., None] * color.clamp(0, 1)], -1).numpy()
-    filled = np.pad(cells[..., 0] > 0, ((0, 1), (0, 1), (0, 1)))
+    filled = density > 0
+    spans = [_span(filled.any((1, 2))), _span(filled.any((0, 2))), _span(filled.any((0, 1)))]
+    part = tuple(slice(*span) for span in spans)
+    premultiplied = density[part][..., None] * color[part].clamp(0, 1)
+    cells = torch.cat([density[part][..., None], premultiplied], -1).contiguous().numpy()
+    first = np.array([span[0] for span in spans])
+    return ShapeVolume(cells, first, _free(cells[..., 0] > 0), _box(spans))
+
+
+def _span(filled: Bool[Tensor, " n"]) -> tuple[int, int]:
+    """Return the range of filled places, with an empty one on either side where there is room; at least two."""
+    places = filled.nonzero().flatten().tolist() or [0]
+    first = max(0, min(places[0] - 1, len(filled) - 2))
+    return first, min(len(filled), max(places[-1] + 2, first + 2))
+
+
+def _free(filled: Bool[np.ndarray, "r c d"]) -> UInt8[np.ndarray, "t u e"]:
+    """Return the distance of every block to the nearest filled one, in blocks."""
+    counts = [-(-size // BLOCK) for size in filled.shape]
+    grown = np.pad(filled, [(0, count * BLOCK - size + 1) for count, size in zip(counts, filled.shape, strict=True)])
     for axis in range(3):  # samples between two cells belong to the block of the first
-        filled = filled | np.roll(filled, -1, axis)
-    filled = filled[:-1, :-1, :-1]
-    shape = (SIZE // BLOCK, BLOCK, SIZE // BLOCK, BLOCK, BINS // BLOCK, BLOCK)
-    blocks = filled.reshape(shape).any((1, 3, 5))
-    free = np.full(blocks.shape, max(blocks.shape), np.uint8)
-    if blocks.any():
-        distances: Any = ndimage.distance_transform_cdt(~blocks, "chessboard")  # type: ignore[call-overload]
-        free = distances.astype(np.uint8)
-    return ShapeVolume(np.ascontiguousarray(cells), free, *_box(filled))
+        grown = grown | np.roll(grown, -1, axis)
+    rows, columns, bins = counts
+    blocks = grown[:-1, :-1, :-1].reshape(rows, BLOCK, columns, BLOCK, bins, BLOCK).any((1, 3, 5))
+    if not blocks.any():
+        return np.full(blocks.shape, max(blocks.shape), np.uint8)
+    distances: Any = ndimage.distance_transform_cdt(~blocks, "chessboard")  # type: ignore[call-overload]
+    return np.ascontiguousarray(distances, np.uint8)
 
 
-def _box(filled: Bool[np.ndarray, "s s d"]) -> tuple[Float32[np.ndarray, " 3"], Float32[np.ndarray, " 3"]]:
-    """Return the corners of the world box around some cells; empty cells give an empty box."""
-    if not filled.any():
-        return np.ones(3, np.float32), -np.ones(3, np.float32)
-    rows, columns, bins = (np.flatnonzero(filled.any(axes))[[0, -1]] + (0, 2) for axes in ((1, 2), (0, 2), (0, 1)))
+def _box(spans: Sequence[tuple[int, int]]) -> Float32[np.ndarray, "2 3"]:
+    """Return the corners of the world box around ranges of rows, columns and depths."""
+    rows, columns, bins = (np.array(span) for span in spans)
     distance = NEAR + bins * CELL
     x = np.outer((2 * columns / SIZE - 1) * TAN_HALF_FOV, distance)
     y = np.outer((1 - 2 * rows / SIZE) * TAN_HALF_FOV, distance)
     sides = [(part.min(), part.max()) for part in (x, y, RADIUS - distance)]
-    low, high = np.array(sides, np.float32).T
-    return low.copy(), high.copy()
+    return np.ascontiguousarray(np.array(sides, np.float32).T)
 
 
 def render_volumes(
@@ -102,8 +115,7 @@ def render_volumes(
         axes = np.ascontiguousarray(matrix[:3, :3].T).astype(np.float32)  # columns: camera axes in the world
         place = (-matrix[:3, :3].T @ matrix[:3, 3]).astype(np.float32)
         volume = volumes[view]
-        box = np.stack([volume.low, volume.high])
-        _march(volume.cells, volume.free, box, place, axes, np.float32(camera.focal), planes[view])
+        _march(volume.cells, volume.first, volume.free, volume.box, place, axes, np.float32(camera.focal), planes[view])
 
     run([partial(draw, view) for view in range(len(cameras))])
     pictures = torch.from_numpy(planes)
@@ -112,19 +124,17 @@ def render_volumes(
 
 @njit(**KERNEL)
 @no_type_check
-def _march(cells, free, box, place, axes, focal, picture):
+def _march(cells, first, free, box, place, axes, focal, picture):
     """Composite samples from front to back; steps are as long as a cell is deep."""
     height, width = picture.shape[:2]
     rows, columns, bins = cells.shape[:3]
     one, half = np.float32(1), np.float32(0.5)
     step, narrowest = np.float32(STRIDE * CELL), np.float32(NARROWEST * BLOCK)
-    across, down, deep = (
-        np.float32(columns / 2 / TAN_HALF_FOV),
-        np.float32(rows / 2 / TAN_HALF_FOV),
-        np.float32(1 / CELL),
-    )
+    across, deep = np.float32(SIZE / 2 / TAN_HALF_FOV), np.float32(1 / CELL)
     stride = np.float32(STRIDE)
     beyond = np.float32(BEYOND)
+    top, left_side, front = np.float32(first[0] + 0.5), np.float32(first[1] + 0.5), np.float32(first[2] + 0.5)
+    middle = np.float32(SIZE / 2)
     for row in range(height):
         y = (row + half - height * half) / focal
         for column in range(width):
@@ -134,20 +144,20 @@ def _march(cells, free, box, place, axes, focal, picture):
             dz = axes[2, 0] * x + axes[2, 1] * y + axes[2, 2]
             norm = one / math.sqrt(dx * dx + dy * dy + dz * dz)
             dx, dy, dz = dx * norm, dy * norm, dz * norm
-            first, last = beyond, np.float32(1e9)
+            begin, last = beyond, np.float32(1e9)
             for axis in range(3):
                 along = dx if axis == 0 else (dy if axis == 1 else dz)
                 near, far = (box[0, axis] - place[axis]) / along, (box[1, axis] - place[axis]) / along
-                first, last = max(first, min(near, far)), min(last, max(near, far))
-            t = (math.floor(first / step) + half) * step  # the same samples beside each other
+                begin, last = max(begin, min(near, far)), min(last, max(near, far))
+            t = (math.floor(begin / step) + half) * step  # the same samples beside each other
             left = one
             red = green = blue = np.float32(0)
             while t < last and left > FAINTEST:
                 depth = np.float32(RADIUS) - place[2] - t * dz
                 inverse = one / max(depth, half)
-                d = (depth - np.float32(NEAR)) * deep - half
-                c = columns * half - half + (place[0] + t * dx) * inverse * across
-                r = rows * half - half - (place[1] + t * dy) * inverse * down
+                d = (depth - np.float32(NEAR)) * deep - front
+                c = middle - left_side + (place[0] + t * dx) * inverse * across
+                r = middle - top - (place[1] + t * dy) * inverse * across
                 if c < 0 or r < 0 or d < 0 or c >= columns - 1 or r >= rows - 1 or d >= bins - 1:
                     t += step
                     continue
