@@ -65,6 +65,12 @@ class SubjectSettings(Settings):
     turn_deg: float = Field(
         0.0, ge=-60, le=60, description="how far the subject's plane is turned away from the camera; a user's hint"
     )
+    ground_turn: float = Field(
+        0.6,
+        ge=0,
+        le=1,
+        description="factor on the turn found from the ground line of footage, where `turn_deg` is 0; 0: none",
+    )
     max_frames: int = Field(32, ge=2, le=512, description="frames taken from a video; longer ones are sampled evenly")
     max_decode_gb: float = Field(
         1.0, ge=0.125, le=256, description="GiB of memory for decoding the source, its decoded frames included; ours"
@@ -152,6 +158,18 @@ class GeometricPriorSettings(Settings):
     )
 
 
+class LearnedPriorSettings(Settings):
+    """Shape prior of this package, trained on made-up shapes: expected views of the subject; no download."""
+
+    kind: Literal["learned"] = "learned"
+    level: float = Field(
+        0.35,
+        ge=0.05,
+        le=0.95,
+        description="probability of matter at which the surface lies that the static fit starts on",
+    )
+
+
 class Zero123PriorSettings(Settings):
     """Zero-1-to-3, a diffusion model of how a picture looks from another camera (Liu et al. 2023)."""
 
@@ -219,7 +237,11 @@ class OraclePriorSettings(Settings):
 
 
 PriorSettings = Annotated[
-    GeometricPriorSettings | Zero123PriorSettings | ImageDreamPriorSettings | OraclePriorSettings,
+    GeometricPriorSettings
+    | LearnedPriorSettings
+    | Zero123PriorSettings
+    | ImageDreamPriorSettings
+    | OraclePriorSettings,
     Field(discriminator="kind"),
 ]
 

@@ -95,7 +95,7 @@ def animate(subject: Subject, order: Order, conversion: Conversion, folder: Path
     filming = drive_video.submit(subject, conversion)
     gaussians = fit_gaussians(subject, conversion, order.bank)  # in this thread, beside the driving video
     driving_video = filming.result()
-    motion = fit_motion(gaussians, driving_video, conversion, order.bank)
+    motion = fit_motion(subject, gaussians, driving_video, conversion, order.bank)
     mesh = mesh_over_time(gaussians, motion, driving_video, conversion)
     if order.settings.refiner.kind != "identity":
         mesh = refine_texture(mesh, driving_video, conversion)

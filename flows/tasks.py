@@ -98,11 +98,21 @@ def fit_gaussians(subject: Subject, conversion: Conversion, bank: ArtifactRef | 
 
 @task(**CACHED, tags=[GPU])
 def fit_motion(
-    gaussians: Gaussians, driving_video: DrivingVideo, conversion: Conversion, bank: ArtifactRef | None = None
+    subject: Subject,
+    gaussians: Gaussians,
+    driving_video: DrivingVideo,
+    conversion: Conversion,
+    bank: ArtifactRef | None = None,
 ) -> Motion:
     """Fit a HexPlane deformation to the driving video (paper, "Gaussian Deformation for Dynamic Generation")."""
     return run_step(
-        "fit_motion", Motion, gaussians=gaussians, driving_video=driving_video, bank=bank, conversion=conversion
+        "fit_motion",
+        Motion,
+        subject=subject,
+        gaussians=gaussians,
+        driving_video=driving_video,
+        bank=bank,
+        conversion=conversion,
     )
 
 

@@ -2,6 +2,7 @@
 
 Artifacts:
   frames      uncompressed zip of NNN.png (RGBA, straight alpha, square) and video.json {"fps": ...}
+  pose        JSON {"turn_deg": ...}: turn of the subject's plane that its footage shows, 0 where it shows none
   gaussians   standard 3DGS PLY (float32)
   motion      safetensors; metadata: kind of deformation, its settings and the number of frames
   plan        JSON of steps/artifacts/mesh_plan.py: {"mode": "tracked" or "per_frame", "level": ..., ...}
@@ -37,6 +38,7 @@ PNG = Port(media_type="image/png", suffix=".png")
 TEXT = Port(media_type="text/plain", suffix=".txt")
 SOURCE = Port(media_type="application/octet-stream", suffix="")
 FRAMES = _port("frames", "zip")
+POSE = _port("pose", "json")
 PLY = _port("gaussians", "ply")
 MOTION = _port("motion", "safetensors")
 PLAN = _port("mesh-plan", "json")
@@ -59,7 +61,7 @@ STEPS: dict[str, StepSpec] = {
         _step(
             "prepare_subject",
             inputs={"source": SOURCE},
-            outputs={"subject": PNG, "footage": _optional(FRAMES), "picture": PNG},
+            outputs={"subject": PNG, "footage": _optional(FRAMES), "pose": _optional(POSE), "picture": PNG},
             sections=("subject",),
             timeout_s=2400,  # bounds decoders that hang in native code
         ),
@@ -79,7 +81,7 @@ STEPS: dict[str, StepSpec] = {
         ),
         _step(
             "fit_gaussians",
-            inputs={"subject": PNG, "bank": _optional(BANK)},
+            inputs={"subject": PNG, "pose": _optional(POSE), "bank": _optional(BANK)},
             outputs={"gaussians": PLY, "curves": CURVES, "picture": PNG},
             sections=("rasterizer", "subject.turn_deg", "prior", "static"),
             resource="gpu",
@@ -87,7 +89,7 @@ STEPS: dict[str, StepSpec] = {
         ),
         _step(
             "fit_motion",
-            inputs={"gaussians": PLY, "driving_video": FRAMES, "bank": _optional(BANK)},
+            inputs={"gaussians": PLY, "driving_video": FRAMES, "pose": _optional(POSE), "bank": _optional(BANK)},
             outputs={"motion": MOTION, "gaussians": _optional(PLY), "curves": CURVES, "picture": PNG},
             sections=("rasterizer", "subject.turn_deg", "prior", "deformation", "motion"),
             resource="gpu",

@@ -8,18 +8,18 @@ from dg4d_lib.fitting.static import fit_gaussians
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import blob, on_surface
 from dg4d_lib.gaussians.ply import write_ply
-from dg4d_lib.inflation.surface import inflate, sample_surface
+from dg4d_lib.inflation.surface import sample_surface
 from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
 from dg4d_lib.settings import (
     BlobStartSettings,
-    GeometricPriorSettings,
     LgmStartSettings,
     PriorSettings,
     StaticSettings,
     SurfaceStartSettings,
 )
 from steps.artifacts.media import read_png, write_png
-from steps.fitting.priors import make_prior
+from steps.artifacts.pose import read_turn
+from steps.fitting.priors import make_prior, subject_shapes
 from steps.fitting.reconstruction import reconstruct_subject
 from steps.fitting.reporting import LossCurves, picture_of_divergence, render_turnaround
 from steps.runtime.job import Job, StepReport
@@ -31,7 +31,7 @@ def run(job: Job) -> StepReport:
     """Fit the Gaussians and render them from six sides."""
     prior: PriorSettings = job.settings.prior
     static: StaticSettings = job.settings.static
-    backend, turn_deg = job.settings.rasterizer, job.settings.turn_deg
+    backend, turn_deg = job.settings.rasterizer, read_turn(job.inputs.get("pose"), job.settings.turn_deg)
     subject = read_png(job.inputs["subject"])
     generator = torch.Generator().manual_seed(job.seed)
     rasterize = get_rasterizer(backend)
@@ -66,10 +66,9 @@ def initial_gaussians(
     turn_deg: float,
     generator: torch.Generator,
 ) -> Gaussians:
-    """Initialize Gaussians as a random blob, or as points on the surface inflated from the picture."""
+    """Initialize Gaussians as a random blob, or as points on the surface of the prior."""
     if isinstance(start, BlobStartSettings):
         return blob(start.points, BLOB_RADIUS, generator)
-    shape = prior if isinstance(prior, GeometricPriorSettings) else GeometricPriorSettings()
-    surface = inflate(subject, shape.size, turn_deg)
+    surface = subject_shapes(prior, [subject], turn_deg).surface(0)
     points, _, colors, area = sample_surface(surface, start.points, generator)
     return on_surface(points, colors, area)

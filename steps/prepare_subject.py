@@ -8,11 +8,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.images import over_white
+from dg4d_lib.inflation.ground import ground_turn
 from dg4d_lib.settings import SubjectSettings
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.framing import crop_whole_frame, reframe
 from dg4d_lib.video.subject import prepare_subject
 from steps.artifacts.media import write_frames, write_png
+from steps.artifacts.pose import Pose, write_pose
 from steps.runtime.job import Job, StepReport
 from steps.sources.reader import read_source
 
@@ -20,7 +22,7 @@ TILE = 256  # pixels
 
 
 def run(job: Job) -> StepReport:
-    """Decode `source`, cut out and frame the subject; write `footage` if the source is a video.
+    """Decode `source`, cut out and frame the subject; write `footage` and `pose` if the source is a video.
 
     Raises:
         BadInput: the file cannot be used; says why and what to do.
@@ -35,9 +37,21 @@ def run(job: Job) -> StepReport:
     if source.kind == "video":
         footage = DrivingVideo(cutouts[..., :3].contiguous(), cutouts[..., 3:].contiguous(), source.fps)
         write_frames(job.outputs["footage"], footage)
+        turn_deg = ground_turn(footage.alpha, settings.ground_turn)
+        write_pose(job.outputs["pose"], Pose(turn_deg=round(turn_deg, 3)))
+        notes = (*notes, turn_note(turn_deg)) if turn_deg and not settings.turn_deg else notes
     write_png(job.outputs["picture"], picture_of(source.frames[0], cutouts[0]))
     job.progress(3, 3, {})
     return StepReport(notes=(*source.notes, *notes))
+
+
+def turn_note(turn_deg: float) -> str:
+    """Return the sentence about a turn that was found."""
+    nearer = "right" if turn_deg > 0 else "left"
+    return (
+        f"ground line of the footage: the {nearer} side is taken to be nearer, by a turn of {abs(turn_deg):.0f} "
+        "degrees, by the geometric prior; `subject.turn_deg` overrides it, `subject.ground_turn=0` ignores it"
+    )
 
 
 def picture_of(source: Float[Tensor, "h w 4"], cutout: Float[Tensor, "s s 4"]) -> Float[Tensor, "t w3 3"]:

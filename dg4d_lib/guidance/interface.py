@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.inflation.surface import InflatedSurface
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,18 @@ class GuidancePrior(Protocol):
             progress: share of the optimization that is done, in [0, 1].
             generator: the source of all randomness.
         """
+        ...
+
+
+class SubjectShapes(Protocol):
+    """Shapes of a subject, one per frame, from which a prior draws the views that it expects."""
+
+    def surface(self, frame: int) -> InflatedSurface:
+        """Return the closed, colored surface of a frame."""
+        ...
+
+    def clean(self, views: Sequence[GuidanceView]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
+        """Return expected color over white and expected alpha of views of one size, in [0, 1]."""
         ...
 
 

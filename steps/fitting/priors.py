@@ -16,7 +16,8 @@ from dg4d_lib.guidance.analytic import AnalyticPrior
 from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.geometric import InflatedSurfaces
 from dg4d_lib.guidance.imagedream import ImageDream, ImageDreamPrior
-from dg4d_lib.guidance.interface import GuidancePrior
+from dg4d_lib.guidance.interface import GuidancePrior, SubjectShapes
+from dg4d_lib.guidance.learned import LearnedShapes
 from dg4d_lib.guidance.oracle import Bank, perturb
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.images import over_white
@@ -24,10 +25,12 @@ from dg4d_lib.settings import (
     FitSettings,
     GeometricPriorSettings,
     ImageDreamPriorSettings,
+    LearnedPriorSettings,
     OraclePriorSettings,
     PriorSettings,
     Zero123PriorSettings,
 )
+from dg4d_lib.shape_prior import packaged
 from dg4d_lib.weights.registry import lookup_weights
 from steps.artifacts.archives import unpack
 from steps.artifacts.media import read_png
@@ -36,6 +39,8 @@ from steps.runtime.weights import LocatedWeights, open_weights
 from steps.sources.banks import BANK_JSON, BankIndex, check_sheet, read_index
 
 GEOMETRIC_NOTE = "prior: inflation of the silhouette (no model); sides the picture does not show are guesses"
+LEARNED_NOTE = "prior: shape network trained on made-up shapes; sides the picture does not show are guesses"
+SMALLEST_NOTED = 0.05  # share of the inflation from which the report mentions it
 ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
 
 
@@ -48,18 +53,25 @@ class LoadedPrior:
         note: sentence for the report.
         opened: weights; None for priors without a model.
         batches: micro-batches, which shrink when memory runs out.
+        shapes: shapes behind the prior; None for models of pictures and for the oracle.
     """
 
     prior: GuidancePrior
     note: str
     opened: LocatedWeights | None = None
     batches: MicroBatches | None = None
+    shapes: SubjectShapes | None = None
 
     def report(self, backend: str) -> StepReport:
         """Return the report of a step that has used this prior."""
         run_notes = self.batches.notes() if self.batches else ()
         weights, licenses = (self.opened.digests, self.opened.licenses) if self.opened else ({}, {})
-        return StepReport(backend, weights, licenses, notes=(self.note,), run_notes=run_notes)
+        notes: tuple[str, ...] = (self.note,)
+        if isinstance(self.shapes, LearnedShapes):
+            weights = packaged.digests()
+            share = self.shapes.inflated_share
+            notes = (self.note, inflated_note(share)) if share >= SMALLEST_NOTED else notes
+        return StepReport(backend, weights, licenses, notes=notes, run_notes=run_notes)
 
 
 def make_prior(
@@ -86,9 +98,10 @@ def make_prior(
     """
     noise = TimestepSchedule(stage.t_max_start, stage.t_max_end, uniform=stage.noise_draw == "uniform")
     match settings:
-        case GeometricPriorSettings():
-            surfaces = InflatedSurfaces(cutouts, settings, turn_deg)
-            return LoadedPrior(AnalyticPrior(surfaces.clean, noise), GEOMETRIC_NOTE)
+        case GeometricPriorSettings() | LearnedPriorSettings():
+            shapes = subject_shapes(settings, cutouts, turn_deg)
+            note = GEOMETRIC_NOTE if isinstance(settings, GeometricPriorSettings) else LEARNED_NOTE
+            return LoadedPrior(AnalyticPrior(shapes.clean, noise), note, shapes=shapes)
         case OraclePriorSettings():
             if bank is None:
                 raise BadInput("prior.kind = oracle needs true views: give --bank FOLDER (with a bank.json)")
@@ -103,6 +116,27 @@ def make_prior(
             model = ImageDream.load(opened.folder, settings.precision, default_device())
             dream = ImageDreamPrior(model, model.conditioned_on(_pictures(cutouts)), noise, settings)
             return LoadedPrior(dream, f"prior: ImageDream, weights {settings.weights}", opened, dream.batches)
+
+
+def subject_shapes(
+    settings: PriorSettings, cutouts: Sequence[Float[Tensor, "h w 4"]], turn_deg: float
+) -> SubjectShapes:
+    """Return the shapes behind a prior, by default inflated ones.
+
+    Args:
+        settings: of the prior; one that has no shapes of its own gets the inflation with its defaults.
+        cutouts: the subject at every frame.
+        turn_deg: turn of the subject about the vertical, for the inflation.
+    """
+    if isinstance(settings, LearnedPriorSettings):
+        return LearnedShapes(packaged.packaged_network(), cutouts, settings)
+    known = settings if isinstance(settings, GeometricPriorSettings) else GeometricPriorSettings()
+    return InflatedSurfaces(cutouts, known, turn_deg)
+
+
+def inflated_note(share: float) -> str:
+    """Return the sentence about a shape network that is unsure."""
+    return f"the shape network is unsure of this subject: {share:.0%} of its shape is the inflated silhouette"
 
 
 def make_oracle_prior(bank: Bank, settings: OraclePriorSettings, noise: TimestepSchedule) -> AnalyticPrior:

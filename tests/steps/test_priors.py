@@ -2,6 +2,7 @@ import json
 from pathlib import Path
 
 import pytest
+import tiny_shape_prior
 import tiny_weights
 import torch
 
@@ -11,11 +12,13 @@ from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.settings import (
     GeometricPriorSettings,
+    LearnedPriorSettings,
     MotionSettings,
     OraclePriorSettings,
     StaticSettings,
     Zero123PriorSettings,
 )
+from dg4d_lib.shape_prior import packaged
 from steps.artifacts.media import write_png, write_zip
 from steps.fitting.priors import LoadedPrior, make_oracle_prior, make_prior, read_bank, read_bank_folder
 
@@ -135,3 +138,26 @@ def test_an_imperfect_oracle_has_the_same_flaws_in_both_stages(tmp_path: Path) -
         != make_oracle_prior(bank, OraclePriorSettings(), TimestepSchedule(0.5)).viewpoints
         == bank.cameras
     )
+
+
+def test_the_learned_prior_records_its_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(packaged, "packaged_network", tiny_shape_prior.tiny_network)
+    choice = make_prior(LearnedPriorSettings(), CUTOUTS[:1], StaticSettings(), None, tmp_path)
+    assert choice.shapes is not None and choice.shapes.surface(0).faces.numel()
+    facts = choice.report("cpu")
+    assert facts.weights == packaged.digests() and facts.licenses == {} and "shape network" in facts.notes[0]
+
+
+def test_the_report_tells_how_much_of_an_unsure_shape_is_inflated(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    unsure = tiny_shape_prior.tiny_network()
+    with torch.no_grad():
+        unsure.head.weight.zero_()
+        unsure.head.bias.fill_(-4.0)
+    monkeypatch.setattr(packaged, "packaged_network", lambda: unsure)
+    choice = make_prior(LearnedPriorSettings(), CUTOUTS[:1], StaticSettings(), None, tmp_path)
+    assert choice.shapes is not None
+    assert len(choice.report("cpu").notes) == 1  # nothing was asked yet
+    choice.shapes.clean([GuidanceView(OrbitCamera(10, 40, width=32, height=32))])
+    assert "100% of its shape is the inflated silhouette" in choice.report("cpu").notes[1]

@@ -1,6 +1,7 @@
 """Samples: a made-up shape, seen as `prepare_subject` shows it, with the matter and colors behind every pixel."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -82,64 +83,147 @@ def make_sample(seed: int, index: int, family: str | None = None, size: int = SI
         size: pixels of a side.
     """
     chance = Chance([seed, index])
+    scene, seen = _shown_scene(chance, family, size)
+    colors, parts = seen.shaded(scene)
+    picture = _picture(chance, colors[:, :, 0], seen.coverage, seen.depths[:, :, 0], parts)
+    return _sample(scene, seen, colors, picture)
+
+
+def make_views(
+    seed: int, index: int, azimuths_deg: Sequence[float], size: int = SIZE
+) -> tuple[Sample, Float32[np.ndarray, "v s s 4"]]:
+    """Make a sample whose picture is a plain rendering, and renderings of it from other azimuths.
+
+    Args:
+        seed: of the whole set.
+        index: of the sample.
+        azimuths_deg: of the other cameras, at elevation 0.
+        size: pixels of a side.
+
+    Returns:
+        The sample, and premultiplied color and alpha of the views.
+    """
+    scene, seen = _shown_scene(Chance([seed, index]), None, size)
+    colors, _ = seen.shaded(scene)
+    views = []
+    for azimuth in azimuths_deg:
+        around = scene.seen_from(azimuth)
+        shown = _Seen.of(around, size)
+        views.append(_premultiplied(shown.shaded(around)[0][:, :, 0], shown.coverage))
+    picture = (_premultiplied(colors[:, :, 0], seen.coverage) * 255 + 0.5).astype(np.uint8)
+    return _sample(scene, seen, colors, picture), np.stack(views)
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """Placed shape with its light.
+
+    Attributes:
+        shape: in object units.
+        pose: of the shape.
+        family: name of the recipe.
+        materials: rows of `texture`.
+        light: row of `texture`.
+    """
+
+    shape: Shape
+    pose: Pose
+    family: str
+    materials: Float64[np.ndarray, "m n"]
+    light: Float64[np.ndarray, " 10"]
+
+    def packed(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return labels and numbers of the solids in world units."""
+        solids = self.shape.solids[:MOST_SOLIDS]
+        placed = [self.pose.place(solid) for solid in solids]
+        return packed([thickened(solid, THINNEST) if solid.operation == 0 else solid for solid in placed])
+
+    def to_object(self) -> Float64[np.ndarray, "3 4"]:
+        """Return the map from the world to object space, in units of the shape's extent."""
+        solids = [solid for solid in self.shape.solids[:MOST_SOLIDS] if solid.operation == 0]
+        return self.pose.inverse(max(float(np.abs(solid.outline_points()).max()) for solid in solids))
+
+    def seen_from(self, azimuth_deg: float) -> "_Scene":
+        """Return the scene, with its light, turned so that the input camera sees what a camera at an azimuth sees."""
+        turn = rotation(-math.radians(azimuth_deg))
+        pose = Pose(turn @ self.pose.turn, self.pose.scale, turn @ self.pose.shift)
+        return replace(self, pose=pose, light=np.concatenate([turn @ self.light[:3], self.light[3:]]))
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Rays of the input camera through a scene; see the kernels."""
+
+    labels: np.ndarray
+    numbers: np.ndarray
+    field: Float32[np.ndarray, "s s d"]
+    near: np.ndarray
+    counts: UInt8[np.ndarray, "s s"]
+    depths: Float32[np.ndarray, "s s k"]
+    coverage: Float32[np.ndarray, "s s"]
+    nearest: Float32[np.ndarray, "s s"]
+
+    @classmethod
+    def of(cls, scene: _Scene, size: int) -> "_Seen":
+        """Trace the scene."""
+        labels, numbers = scene.packed()
+        field = np.empty((size, size, BINS), np.float32)
+        near = np.empty((size, size, 2), np.uint64)
+        fill(labels, numbers, field, near)
+        counts, nearest = np.empty((size, size), np.uint8), np.empty((size, size), np.float32)
+        depths, coverage = np.zeros((size, size, 2 * INTERVALS), np.float32), np.empty((size, size), np.float32)
+        cross(field, counts, depths, coverage, nearest)
+        return cls(labels, numbers, field, near, counts, depths, coverage, nearest)
+
+    def shaded(self, scene: _Scene) -> tuple[Float32[np.ndarray, "s s k 3"], np.ndarray]:
+        """Return the colors of all crossings, and the solid seen first at every pixel."""
+        colors, parts = np.zeros((*self.depths.shape, 3), np.float32), np.empty(self.counts.shape, np.int16)
+        shade(
+            self.labels, self.numbers, scene.materials, scene.light, scene.to_object(), self.field, self.near,
+            self.counts, self.depths, self.coverage, self.nearest, colors, parts,
+        )  # fmt: skip
+        return colors, parts
+
+
+def _shown_scene(chance: Chance, family: str | None, size: int) -> tuple[_Scene, _Seen]:
+    """Return a random scene whose picture is neither nearly empty nor full, and its rays."""
     for _ in range(TRIES):
         name = family or chance.pick(list(FAMILIES), [weight for _, weight, _ in FAMILIES.values()])
         shape = Shape(blend=chance.pick((0.01, 0.03, 0.05)))
         recipe, _, style = FAMILIES[name]
         recipe(chance, shape)
-        sample = _seen(chance, shape, name, style, size)
-        if sample is not None:
-            return sample
-    raise RuntimeError(f"no sample after {TRIES} tries: seed {seed}, index {index}, family {family}")
+        pose = _pose(chance, [solid for solid in shape.solids[:MOST_SOLIDS] if solid.operation == 0])
+        scene = _Scene(shape, pose, name, np.empty((0, 0)), np.empty(10))
+        seen = _Seen.of(scene, size)
+        if SMALLEST_SHARE < (seen.counts > 0).mean() < LARGEST_SHARE:
+            return replace(scene, materials=palette(chance, style), light=lighting(chance)), seen
+    raise RuntimeError(f"no sample after {TRIES} tries: family {family}")
 
 
-def _seen(chance: Chance, shape: Shape, name: str, style: str, size: int) -> Sample | None:
-    """Return the shape in a random pose and light, or None if its picture is nearly empty or full."""
-    solids = shape.solids[:MOST_SOLIDS]
-    pose = _pose(chance, [solid for solid in solids if solid.operation == 0])
-    extent = max(float(np.abs(solid.outline_points()).max()) for solid in solids if solid.operation == 0)
-    placed = [thickened(pose.place(solid), THINNEST) if solid.operation == 0 else pose.place(solid) for solid in solids]
-    labels, numbers = packed(placed)
-    field = np.empty((size, size, BINS), np.float32)
-    near = np.empty((size, size, 2), np.uint64)
-    fill(labels, numbers, field, near)
-    counts, nearest = np.empty((size, size), np.uint8), np.empty((size, size), np.float32)
-    depths, coverage = np.zeros((size, size, 2 * INTERVALS), np.float32), np.empty((size, size), np.float32)
-    cross(field, counts, depths, coverage, nearest)
-    if not SMALLEST_SHARE < (counts > 0).mean() < LARGEST_SHARE:
-        return None
-    materials, light = palette(chance, style), lighting(chance)
-    colors, parts = np.zeros((*depths.shape, 3), np.float32), np.empty((size, size), np.int16)
-    shade(
-        labels,
-        numbers,
-        materials,
-        light,
-        pose.inverse(extent),
-        field,
-        near,
-        counts,
-        depths,
-        coverage,
-        nearest,
-        colors,
-        parts,
-    )
-    picture = _picture(chance, colors[:, :, 0], coverage, depths[:, :, 0], parts)
-    pixels = np.flatnonzero(counts)
-    normal = pose.turn[:, 0]
-    plane = np.array([*normal, normal @ pose.shift], np.float32) * (shape.symmetric is True)
-    unit = (depths.reshape(-1, 2 * INTERVALS)[pixels] - NEAR) / (FAR - NEAR)
+def _sample(
+    scene: _Scene, seen: _Seen, colors: Float32[np.ndarray, "s s k 3"], picture: UInt8[np.ndarray, "s s 4"]
+) -> Sample:
+    """Return the rays that meet matter, quantized."""
+    pixels = np.flatnonzero(seen.counts)
+    normal = scene.pose.turn[:, 0]
+    symmetric = scene.shape.symmetric
+    unit = (seen.depths.reshape(-1, 2 * INTERVALS)[pixels] - NEAR) / (FAR - NEAR)
     return Sample(
         picture=picture,
         pixels=pixels.astype(np.uint16),
-        counts=counts.reshape(-1)[pixels],
+        counts=seen.counts.reshape(-1)[pixels],
         depths=(unit.clip(0, 1) * 65535 + 0.5).astype(np.uint16),
         colors=(colors.reshape(-1, 2 * INTERVALS, 3)[pixels] * 255 + 0.5).astype(np.uint8),
-        plane=plane,
-        symmetric=0.5 if shape.symmetric is None else float(shape.symmetric),
-        family=name,
+        plane=np.array([*normal, normal @ scene.pose.shift], np.float32) * (symmetric is True),
+        symmetric=0.5 if symmetric is None else float(symmetric),
+        family=scene.family,
     )
+
+
+def _premultiplied(
+    color: Float32[np.ndarray, "s s 3"], coverage: Float32[np.ndarray, "s s"]
+) -> Float32[np.ndarray, "s s 4"]:
+    return np.concatenate([color.clip(0, 1) * coverage[..., None], coverage[..., None]], -1)
 
 
 def _pose(chance: Chance, solids: list[Solid]) -> Pose:

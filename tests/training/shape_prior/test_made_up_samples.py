@@ -4,13 +4,14 @@ import math
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV
 from training.shape_prior.chance import Chance
 from training.shape_prior.families import FAMILIES
 from training.shape_prior.kernels import cross, distance, fill, soft_occupancy
-from training.shape_prior.samples import CENTERED_SPAN, Sample, framed, make_sample
+from training.shape_prior.samples import CENTERED_SPAN, Sample, framed, make_sample, make_views
 from training.shape_prior.solids import CARVE, CONE, Shape, packed, rotation, scaled, turned
 
 STEP = (FAR - NEAR) / BINS
@@ -193,3 +194,23 @@ def test_soft_occupancy_sums_to_the_thickness() -> None:
     cells = soft_occupancy(depths, np.array([4], np.uint8), np.empty((1, BINS), np.float32))
     assert cells.sum() / BINS == pytest.approx(0.253, abs=1e-5)
     assert cells.max() <= 1
+
+
+def test_views_show_the_matter_where_their_cameras_see_it() -> None:
+    azimuths = (0.0, 75.0, 180.0, -105.0)
+    for index in range(6):
+        sample, views = make_views(6, index, azimuths)
+        assert np.abs(views[0] * 255 - sample.picture).max() <= 0.51
+        used = np.arange(sample.depths.shape[1])[None] < sample.counts[:, None]
+        ray, crossing = np.nonzero(used)
+        depth = NEAR + sample.depths[ray, crossing] / 65535 * (FAR - NEAR)
+        row, column = sample.pixels[ray].astype(int) // SIZE, sample.pixels[ray].astype(int) % SIZE
+        x = (2 * (column + 0.5) / SIZE - 1) * TAN_HALF_FOV * depth
+        y = (1 - 2 * (row + 0.5) / SIZE) * TAN_HALF_FOV * depth
+        points = np.column_stack([x, y, RADIUS - depth, np.ones_like(x)])
+        for azimuth, view in zip(azimuths, views, strict=True):
+            camera = OrbitCamera(0, azimuth, width=SIZE, height=SIZE)
+            seen = points @ camera.world_to_camera().numpy().T
+            at = (SIZE / 2 + camera.focal * seen[:, :2] / seen[:, 2:3]).astype(int).clip(0, SIZE - 1)
+            grown = ndimage.maximum_filter(view[..., 3], 5)  # matter is known on pixels of the input camera only
+            assert (grown[at[:, 1], at[:, 0]] > 0).mean() > 0.99

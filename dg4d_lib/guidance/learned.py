@@ -1,0 +1,93 @@
+"""Expected views of a subject by the shape prior: averages over the shapes that it holds possible."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dg4d_lib.errors import BadInput
+from dg4d_lib.guidance.interface import GuidanceView
+from dg4d_lib.images import resize
+from dg4d_lib.inflation.surface import InflatedSurface
+from dg4d_lib.settings import LearnedPriorSettings
+from dg4d_lib.shape_prior.expected import expected_volume
+from dg4d_lib.shape_prior.field import ShapeField, ShapeFields
+from dg4d_lib.shape_prior.frustum import SIZE
+from dg4d_lib.shape_prior.level_set import level_surface
+from dg4d_lib.shape_prior.network import ShapePriorNetwork
+from dg4d_lib.shape_prior.raymarch import ShapeVolume, render_volumes
+
+COARSER = 2  # times fewer pixels of a side than the camera has: expected views are soft
+
+
+class LearnedShapes:
+    """A predicted shape per frame, each built when it is first asked for."""
+
+    def __init__(
+        self, network: ShapePriorNetwork, cutouts: Sequence[Float[Tensor, "h w 4"]], settings: LearnedPriorSettings
+    ) -> None:
+        """Encode the pictures.
+
+        Args:
+            network: of the shape prior.
+            cutouts: one per frame: square, straight alpha, color and alpha in [0, 1].
+            settings: level of the surface.
+        """
+        self._fields = ShapeFields(network, cutouts)
+        self._settings = settings
+        self._volumes: dict[int, ShapeVolume] = {}
+        self._inflated: dict[int, float] = {}
+
+    @property
+    def inflated_share(self) -> float:
+        """Mean share of the inflation in the frames that were asked for; 0 if none was."""
+        return sum(self._inflated.values()) / max(1, len(self._inflated))
+
+    def surface(self, frame: int) -> InflatedSurface:
+        """Return the closed surface of a frame.
+
+        Raises:
+            BadInput: there is no such frame, or its picture shows no subject.
+        """
+        return level_surface(self._field(frame), self._settings.level)
+
+    def clean(self, views: Sequence[GuidanceView]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
+        """Return the expected color over white and the expected alpha, in [0, 1].
+
+        Args:
+            views: b cameras of one size, each with its frame.
+
+        Raises:
+            BadInput: no views, views of different sizes, or a frame that is not there.
+        """
+        if not views:
+            raise BadInput("the prior was asked for no view at all; ask for at least one")
+        sizes = sorted({(view.camera.height, view.camera.width) for view in views})
+        if len(sizes) > 1:
+            raise BadInput(f"views of one drawing must have one size; given {sizes}")
+        coarse = _coarse(sizes[0])
+        cameras = [replace(view.camera, height=coarse[0], width=coarse[1]) for view in views]
+        color, alpha = render_volumes([self._volume(view.frame) for view in views], cameras)
+        both = torch.cat([color + 1 - alpha, alpha], -1)
+        both = resize(both, sizes[0], "bicubic").clamp(0, 1)
+        return both[..., :3], both[..., 3:]
+
+    def _volume(self, frame: int) -> ShapeVolume:
+        if frame not in self._volumes:
+            self._volumes[frame] = expected_volume(self._field(frame))
+        return self._volumes[frame]
+
+    def _field(self, frame: int) -> ShapeField:
+        if not 0 <= frame < len(self._fields):
+            raise BadInput(f"frame {frame} was asked for; there are {len(self._fields)}, counted from 0")
+        field = self._fields.predict(frame)
+        self._inflated[frame] = field.inflated_share
+        return field
+
+
+def _coarse(size: tuple[int, int]) -> tuple[int, int]:
+    """Return the size at which a picture is rendered before it is enlarged."""
+    factor = max(COARSER, -(-max(size) // SIZE))
+    return max(1, size[0] // factor), max(1, size[1] // factor)

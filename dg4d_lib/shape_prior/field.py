@@ -1,0 +1,119 @@
+"""Predicted matter and colors on the rays of the input camera, for one picture or for the frames of a video."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from dg4d_lib.errors import BadInput
+from dg4d_lib.images import resize_planes
+from dg4d_lib.inflation.heights import heights
+from dg4d_lib.inflation.mask import subject_mask
+from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV
+from dg4d_lib.shape_prior.network import VISIBLE, Features, ShapePriorNetwork
+
+INFLATED_SOFTNESS = 0.05  # world units: depth over which the occupancy of an inflated shape falls
+SURE, UNSURE = 0.8, 0.95  # expected 1 - p of matter: below it the network alone, above it the inflation alone
+LARGEST_LOGIT = 5.3  # probabilities are kept from 0.005 to 0.995
+
+
+@dataclass(frozen=True)
+class ShapeField:
+    """Expected shape of a subject.
+
+    Attributes:
+        logits: of every cell lying inside the subject; row, column, depth.
+        front: color of every pixel, straight, in [0, 1].
+        hidden: color of surfaces that the picture does not show, in [0, 1].
+        mask: pixels of the subject.
+        inflated_share: share of the inflation in the probabilities, in [0, 1].
+    """
+
+    logits: Float[Tensor, "128 128 64"]
+    front: Float[Tensor, "128 128 3"]
+    hidden: Float[Tensor, "128 128 64 3"]
+    mask: Bool[Tensor, "128 128"]
+    inflated_share: float
+
+
+class ShapeFields:
+    """Fields of the frames of a subject, each predicted when first asked for.
+
+    All frames share one code of the subject, the mean of their own.
+    """
+
+    def __init__(self, network: ShapePriorNetwork, cutouts: Sequence[Float[Tensor, "h w 4"]]) -> None:
+        """Encode the pictures.
+
+        Args:
+            network: in evaluation mode.
+            cutouts: one per frame: square, straight alpha, color and alpha in [0, 1].
+
+        Raises:
+            BadInput: a picture is not square.
+        """
+        if crooked := [cutout.shape for cutout in cutouts if cutout.shape[0] != cutout.shape[1]]:
+            raise BadInput(
+                f"pictures of the shape prior must be square; given {crooked[0][1]} x {crooked[0][0]} pixels"
+            )
+        self._network = network
+        self._pictures = [premultiplied(cutout) for cutout in cutouts]
+        with torch.no_grad():
+            pairs = [network.encode(torch.stack([picture, picture.flip(2)])).code for picture in self._pictures]
+        self._code = torch.stack(pairs).mean(0) if pairs else torch.empty(0)
+
+    def __len__(self) -> int:
+        return len(self._pictures)
+
+    def predict(self, frame: int) -> ShapeField:
+        """Return the field of a frame: the mean over the picture and its mirror image.
+
+        Raises:
+            BadInput: the picture shows no subject.
+        """
+        picture = self._pictures[frame]
+        inside, _ = subject_mask(picture[3].double().numpy())
+        mask = torch.from_numpy(inside)
+        with torch.no_grad():
+            features = self._network.encode(torch.stack([picture, picture.flip(2)]))
+            both = self._rays(features)
+        logits, colors = ((part[0] + part[1].flip(1)) / 2 for part in both)
+        knots = colors.permute(3, 2, 0, 1)[None]
+        hidden = interpolate(knots, (BINS, SIZE, SIZE), mode="trilinear", align_corners=True)[0].permute(2, 3, 1, 0)
+        logits = torch.where(mask[..., None], logits.clamp(-LARGEST_LOGIT, LARGEST_LOGIT), -LARGEST_LOGIT)
+        share = inflated_share(logits.sigmoid(), mask)
+        if share > 0:
+            inflated = inflated_probability(mask).clamp(torch.tensor(-LARGEST_LOGIT).sigmoid())
+            logits = torch.logit((1 - share) * logits.sigmoid() + share * inflated, 1e-3)
+        front = (picture[:3] / picture[3:].clamp(min=VISIBLE)).clamp(0, 1).permute(1, 2, 0)
+        return ShapeField(logits, front, hidden, mask, share)
+
+    def _rays(self, features: Features) -> tuple[Float[Tensor, "2 128 128 64"], Float[Tensor, "2 128 128 8 3"]]:
+        decoded = self._network.decode(features, self._code)
+        pixels = torch.arange(2 * SIZE**2)
+        logits, colors, _ = self._network.rays(decoded, features.picture, pixels)
+        return logits.unflatten(0, (2, SIZE, SIZE)), colors.unflatten(0, (2, SIZE, SIZE))
+
+
+def premultiplied(cutout: Float[Tensor, "h w 4"]) -> Float[Tensor, "4 128 128"]:
+    """Return premultiplied color and alpha at the network's size."""
+    alpha = cutout[..., 3:]
+    planes = torch.cat([cutout[..., :3] * alpha, alpha], -1).permute(2, 0, 1)[None].float().cpu()
+    return resize_planes(planes, (SIZE, SIZE))[0].clamp(0, 1)
+
+
+def inflated_share(probability: Float[Tensor, "128 128 64"], mask: Bool[Tensor, "128 128"]) -> float:
+    """Return how far to fall back on the inflation, from the expected variance of the matter that is predicted."""
+    inside = probability[mask]
+    variance = float((inside * (1 - inside)).sum() / inside.sum().clamp(min=1e-6))
+    return min(1.0, max(0.0, (variance - SURE) / (UNSURE - SURE)))
+
+
+def inflated_probability(mask: Bool[Tensor, "128 128"]) -> Float[Tensor, "128 128 64"]:
+    """Return the occupancy of the inflated silhouette, soft at its surface."""
+    bulge = torch.from_numpy(heights(mask.numpy(), 4 * TAN_HALF_FOV / SIZE)).float()
+    middles = (NEAR + FAR) / 2 - (NEAR + (torch.arange(BINS) + 0.5) * (FAR - NEAR) / BINS)
+    return ((bulge[..., None] - middles.abs()) / INFLATED_SOFTNESS).sigmoid() * mask[..., None]

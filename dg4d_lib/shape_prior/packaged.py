@@ -1,0 +1,41 @@
+"""Weights of the shape prior that the package ships, read once per process."""
+
+import functools
+import hashlib
+from pathlib import Path
+
+from dg4d_lib.errors import BackendUnavailable, BadInput
+from dg4d_lib.shape_prior.network import ShapePriorNetwork, load_network
+
+NAME = "shape-prior"
+LICENSE = "Apache-2.0"
+WEIGHTS = Path(__file__).with_name("weights.safetensors")
+SHA256 = "592431513c872aed0342f297aefcdc8770a1c5ef61143e75e4a3767925c8b434"
+
+
+@functools.cache
+def packaged_network() -> ShapePriorNetwork:
+    """Load the shipped network.
+
+    Raises:
+        BackendUnavailable: the file is missing.
+        BadInput: the file is not the one of this version.
+    """
+    try:
+        found = hashlib.sha256(WEIGHTS.read_bytes()).hexdigest()
+    except FileNotFoundError:
+        raise BackendUnavailable(
+            f"The weights of the shape prior are missing: {WEIGHTS}. Install dg4d again, train them with "
+            "`make shape-prior`, or use --set prior.kind=geometric."
+        ) from None
+    if found != SHA256:
+        raise BadInput(
+            f"Digest mismatch in {WEIGHTS}: recorded {SHA256[:12]}, found {found[:12]}. Install dg4d again, or use "
+            "--set prior.kind=geometric."
+        )
+    return load_network(WEIGHTS)
+
+
+def digests() -> dict[str, str]:
+    """Return the digest of the shipped weights by name, as provenance records hold it."""
+    return {f"{NAME}/{WEIGHTS.name}": f"sha256:{SHA256}"}

@@ -1,0 +1,142 @@
+"""Fields, expected volumes and level surfaces of the shape prior."""
+
+import math
+
+import pytest
+import torch
+from tiny_shape_prior import tiny_network
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.errors import BadInput
+from dg4d_lib.inflation.render import render_surface
+from dg4d_lib.shape_prior.expected import expected_volume
+from dg4d_lib.shape_prior.field import (
+    LARGEST_LOGIT,
+    SURE,
+    UNSURE,
+    ShapeField,
+    ShapeFields,
+    inflated_probability,
+    inflated_share,
+)
+from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV
+from dg4d_lib.shape_prior.level_set import level_surface
+from dg4d_lib.shape_prior.raymarch import render_volumes
+
+RED, BLUE = torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.1, 0.1, 0.9])
+RADIUS = 0.4
+ROWS, COLUMNS = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")
+
+
+def ball(center_z: float = 0.0, unsure: float = 0.0) -> ShapeField:
+    """Return the field of a ball, red in front and blue behind; its logits are scaled by 1 - unsure."""
+    distance = NEAR + (torch.arange(BINS) + 0.5) * (FAR - NEAR) / BINS
+    x, y = (2 * COLUMNS / SIZE - 1) * TAN_HALF_FOV, (1 - 2 * ROWS / SIZE) * TAN_HALF_FOV
+    points = torch.stack([x[..., None] * distance, y[..., None] * distance, (2 - distance).expand(SIZE, SIZE, -1)], -1)
+    signed = RADIUS - (points - torch.tensor([0, 0, center_z])).norm(dim=-1)
+    logits = (signed * 100 * (1 - unsure)).clamp(-LARGEST_LOGIT, LARGEST_LOGIT)
+    mask = (signed > 0).any(-1)
+    return ShapeField(logits, RED.expand(SIZE, SIZE, 3), BLUE.expand(SIZE, SIZE, BINS, 3), mask, 0.0)
+
+
+def cutout(left: int = 40, right: int = 90) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(5)
+    alpha = ((left < COLUMNS) & (right > COLUMNS) & (ROWS > 30) & (ROWS < 100)).float()
+    return torch.cat([torch.rand(SIZE, SIZE, 3, generator=generator), alpha[..., None]], -1)
+
+
+def test_the_input_view_of_the_expected_volume_shows_the_picture():
+    field = ball()
+    color, alpha = render_volumes([expected_volume(field)], [OrbitCamera(width=SIZE, height=SIZE)])
+    inner = (COLUMNS - SIZE / 2) ** 2 + (ROWS - SIZE / 2) ** 2 < (0.8 * RADIUS / 2 / TAN_HALF_FOV * SIZE / 2) ** 2
+    assert alpha[0, ..., 0][inner].min() > 0.8
+    straight = color[0][inner] / alpha[0][inner]
+    assert (straight - RED).abs().max() < 0.12  # a trace of what lies behind it shines through
+    assert not alpha[0, ..., 0][COLUMNS < 20].any()
+
+
+def test_the_opposite_view_shows_hidden_colors():
+    color, alpha = render_volumes([expected_volume(ball())], [OrbitCamera(0, 180, width=64, height=64)])
+    assert (color[0, 32, 32] / alpha[0, 32, 32] - BLUE).abs().max() < 0.12
+
+
+def test_unsure_depth_is_soft_from_the_side():
+    side = OrbitCamera(0, 90, width=64, height=64)
+    sharp, soft = (render_volumes([expected_volume(ball(0, u))], [side])[1][0, ..., 0] for u in (0.0, 0.97))
+    between = [float(((alpha > 0.1) & (alpha < 0.9)).float().mean()) for alpha in (sharp, soft)]
+    assert between[1] > 2 * between[0]
+
+
+@pytest.mark.parametrize("center_z", [0.0, 0.3, -0.2])
+def test_the_level_surface_of_a_ball_is_the_ball(center_z):
+    surface = level_surface(ball(center_z), 0.5)
+    radii = (surface.vertices - torch.tensor([0, 0, center_z])).norm(dim=1)
+    assert (radii - RADIUS).abs().mean() < 0.015  # half a cell
+    corners = surface.vertices[surface.faces].double()
+    volume = (corners[:, 0] * torch.linalg.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    assert volume == pytest.approx(4 / 3 * math.pi * RADIUS**3, rel=0.08)
+    edges = torch.cat([surface.faces[:, [i, (i + 1) % 3]] for i in range(3)])
+    assert (torch.unique(edges.sort(1)[0], dim=0, return_counts=True)[1] == 2).all()
+    front = surface.vertices[:, 2] - center_z > 0.8 * RADIUS
+    back = surface.vertices[:, 2] - center_z < -0.8 * RADIUS
+    assert (surface.colors[front] - RED).abs().max() < 0.05 and surface.seen[front].all()
+    assert (surface.colors[back] - BLUE).abs().max() < 0.05 and not surface.seen[back].any()
+
+
+def test_a_lower_level_gives_a_larger_shape():
+    field = ball(unsure=0.9)
+    cameras = [OrbitCamera(0, 90, width=64, height=64)]
+    small, large = (render_surface(level_surface(field, level), cameras)[1].sum() for level in (0.6, 0.3))
+    assert large > 1.1 * small
+
+
+def test_every_pixel_of_the_subject_has_matter_at_any_level():
+    field = ball(unsure=0.99)
+    _, alpha = render_surface(level_surface(field, 0.9), [OrbitCamera(width=SIZE, height=SIZE)])
+    inside = (alpha[0, ..., 0] > 0.5) & field.mask
+    assert inside.sum() > 0.97 * field.mask.sum()
+
+
+def test_a_mirrored_picture_has_the_mirrored_field():
+    network, picture = tiny_network(), cutout()
+    here, there = (ShapeFields(network, [each]).predict(0) for each in (picture, picture.flip(1)))
+    torch.testing.assert_close(here.logits.flip(1), there.logits, atol=1e-4, rtol=0)
+    torch.testing.assert_close(here.hidden.flip(1), there.hidden, atol=1e-4, rtol=0)
+
+
+def test_frames_share_the_code_of_their_subject():
+    network, pictures = tiny_network(), [cutout(), cutout(20, 70)]
+    both, alone = ShapeFields(network, pictures), ShapeFields(network, pictures[:1])
+    twice = ShapeFields(network, pictures[:1] * 2)
+    torch.testing.assert_close(twice.predict(1).logits, alone.predict(0).logits)
+    assert (both.predict(0).logits - alone.predict(0).logits).abs().max() > 1e-4
+
+
+def test_matter_is_inside_the_silhouette_alone():
+    field = ShapeFields(tiny_network(), [cutout()]).predict(0)
+    assert (field.logits[~field.mask] == -LARGEST_LOGIT).all()
+    assert torch.equal(field.mask, cutout()[..., 3] > 0.5)
+
+
+def test_the_inflation_takes_over_as_the_network_gets_unsure():
+    mask = cutout()[..., 3] > 0.5
+    shares = [inflated_share(torch.full((SIZE, SIZE, BINS), 1 - unsure), mask) for unsure in (0.2, SURE, 0.9, UNSURE)]
+    assert shares[:2] == pytest.approx([0, 0], abs=1e-5) and shares[3] == pytest.approx(1, abs=1e-4)
+    assert 0.5 < shares[2] < 0.8
+
+
+def test_an_unsure_network_gives_the_inflated_shape():
+    network = tiny_network()
+    with torch.no_grad():
+        network.head.weight.zero_()
+        network.head.bias.fill_(-4.0)
+    field = ShapeFields(network, [cutout()]).predict(0)
+    assert field.inflated_share == 1
+    inflated = inflated_probability(field.mask)
+    assert (field.logits.sigmoid() - inflated).abs().max() < 0.02
+    assert (inflated[64, 65].argmax() + 0.5) == pytest.approx(BINS / 2, abs=6)
+
+
+def test_oblong_pictures_are_refused():
+    with pytest.raises(BadInput, match="square"):
+        ShapeFields(tiny_network(), [cutout()[:64]])
