@@ -24,7 +24,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def cast_of(package: Path, *items: Item) -> SceneWriter:
+def cast_of(package: Path, *items: SceneItem) -> SceneWriter:
     return SceneWriter([package] * len(items), items, [item.name for item in items])
 
 
