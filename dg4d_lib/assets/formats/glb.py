@@ -48,7 +48,7 @@ def write_glb(asset: Asset4D, settings: GltfSettings = DEFAULTS) -> bytes:
     offsets, atlas = _floats(asset.offsets), None
     if asset.textures is not None and settings.textures == "pointer":
         atlas = Atlas.of(asset.textures, settings.atlas_size)
-        animation.point(OFFSET_POINTER, "texture offset", atlas.offsets())
+        animation.add_pointer(OFFSET_POINTER, "texture offset", atlas.offsets())
     materials = _add_materials(document, asset, atlas, settings)
     cube = QuantizationCube.around([_floats(asset.mesh.vertices)], offsets) if settings.quantized else None
     shape = _add_shape(document, NAME, asset.mesh, cube, atlas)
@@ -61,9 +61,9 @@ def write_glb(asset: Asset4D, settings: GltfSettings = DEFAULTS) -> bytes:
         primitive = _primitive(shape, materials[span.first if len(materials) > 1 else 0])
         name = NAME if len(spans) == 1 else _frame_name(span.first)
         nodes.append(_add_posed_node(document, name, span, {**primitive, "targets": [poses[i] for i in span.poses]}))
-        animation.morph(nodes[-1], name, span, settings.interpolation.upper())
+        animation.add_morph(nodes[-1], name, span, settings.interpolation.upper())
         if len(spans) > 1:
-            animation.show(nodes[-1], name, span)
+            animation.add_visibility(nodes[-1], name, span)
     animation.finish()
     return _finish(document, nodes, cube)
 
@@ -93,7 +93,7 @@ def write_frames_glb(
     for frame, mesh in enumerate(meshes):
         name = f"frame_{frame:03d}"
         nodes.append(document.add("nodes", name=name, mesh=_add_mesh(document, name, mesh, cube, settings)))
-        animation.show(nodes[-1], name, Span(frame, frame + 1, len(meshes)))
+        animation.add_visibility(nodes[-1], name, Span(frame, frame + 1, len(meshes)))
     animation.finish()
     return _finish(document, nodes, cube)
 
@@ -201,7 +201,7 @@ def _floats(values: Tensor) -> NDArray[np.float32]:
 def _add_materials(document: GltfDocument, asset: Asset4D, atlas: Atlas | None, settings: GltfSettings) -> list[int]:
     """One for all frames, or one for each."""
     if atlas is not None and asset.textures is not None:
-        pictures = {NAME: atlas.join(asset.textures)}
+        pictures = {NAME: atlas.pack(asset.textures)}
     elif asset.textures is not None:
         pictures = {_frame_name(frame): to_uint8(texture) for frame, texture in enumerate(asset.textures)}
     else:
@@ -225,7 +225,7 @@ def _add_mesh(
 def _add_shape(
     document: GltfDocument, name: str, mesh: TexturedMesh, cube: QuantizationCube | None, atlas: Atlas | None = None
 ) -> MeshPrimitive:
-    uvs = _floats(mesh.uvs) if atlas is None else atlas.inside(_floats(mesh.uvs))
+    uvs = _floats(mesh.uvs) if atlas is None else atlas.to_atlas_uvs(_floats(mesh.uvs))
     return MeshPrimitive(document, name, _floats(mesh.vertices), mesh.faces.cpu().numpy(), uvs, cube)
 
 
@@ -249,7 +249,7 @@ def _finish(document: GltfDocument, nodes: list[int], cube: QuantizationCube | N
     """One root: the only node, or a parent of all; it carries the cube."""
     root = nodes[0] if len(nodes) == 1 else document.add("nodes", name=NAME, children=nodes)
     if cube is not None:
-        document.tree["nodes"][root] |= {**cube.placement(), "extras": {"largestError": cube.largest_error}}
+        document.tree["nodes"][root] |= {**cube.node_transform(), "extras": {"largestError": cube.max_error}}
     document.tree["scene"] = document.add("scenes", name="asset", nodes=[root])
     return document.to_bytes()
 
@@ -284,8 +284,8 @@ def _read_mesh(parsed: GlbReader, nodes: list[int]) -> TexturedMesh:
     mesh = TexturedMesh(
         torch.from_numpy(vertices),
         torch.from_numpy(indices.astype(np.int64).reshape(-1, 3)),
-        torch.from_numpy(uvs.copy() if atlas is None else atlas.outside(uvs)),
-        _colors(pixels if atlas is None else atlas.split(pixels)[0]),
+        torch.from_numpy(uvs.copy() if atlas is None else atlas.from_atlas_uvs(uvs)),
+        _colors(pixels if atlas is None else atlas.unpack(pixels)[0]),
     )
     if len(mesh.uvs) != len(mesh.vertices) or not (mesh.faces < len(mesh.vertices)).all():
         raise BadInput("the triangles or texture coordinates of this GLB do not fit its vertices")
@@ -338,7 +338,7 @@ def _read_textures(parsed: GlbReader, materials: list[int]) -> Float[Tensor, "t 
     """The textures of every frame, where they change."""
     pixels, atlas = _read_picture(parsed, materials[0])
     if atlas is not None:
-        return _colors(atlas.split(pixels))
+        return _colors(atlas.unpack(pixels))
     if len(set(materials)) == 1:
         return None
     return _colors(np.stack([_read_picture(parsed, material)[0] for material in materials]))

@@ -57,7 +57,7 @@ class GltfDocument:
         items.append({key: value for key, value in item.items() if value is not None})
         return len(items) - 1
 
-    def use(self, extension: str, *, required: bool = False) -> None:
+    def use_extension(self, extension: str, *, required: bool = False) -> None:
         """Announce an extension; required: readers that do not know it shall give up."""
         for collection in ("extensionsUsed", "extensionsRequired") if required else ("extensionsUsed",):
             names = self.tree.setdefault(collection, [])
@@ -75,7 +75,7 @@ class GltfDocument:
         """Append a view of another file as it is, packed or not. Returns its number."""
         view: dict[str, Any] = {**other.tree["bufferViews"][index]}
         packed = view.get("extensions", {}).get(meshopt.EXTENSION)
-        content = other.stored(index)
+        content = other.raw_view(index)
         place = {"buffer": 0, "byteOffset": len(self.binary)}
         self.binary += content + bytes(-len(content) % _ALIGNMENT)
         if packed is None:
@@ -139,7 +139,7 @@ class GltfDocument:
 
     def _add_packed_view(self, name: str, rows: NDArray[Any], target: int | None) -> int:
         """A view of a buffer that is nowhere, and where its packed bytes are."""
-        self.use(meshopt.EXTENSION, required=True)
+        self.use_extension(meshopt.EXTENSION, required=True)
         vertices = target == VERTEX_DATA
         padded = _padded(rows) if vertices else rows
         content = meshopt.pack_vertices(padded) if vertices else meshopt.pack_triangles(padded)
@@ -191,7 +191,7 @@ class GlbReader:
         unpack = {"ATTRIBUTES": meshopt.unpack_vertices, "TRIANGLES": meshopt.unpack_triangles}[packed["mode"]]
         return unpack(self._bytes(packed), packed["count"], packed["byteStride"])
 
-    def stored(self, index: int) -> bytes:
+    def raw_view(self, index: int) -> bytes:
         """The bytes of a buffer view as they are in the file, packed or not."""
         view = self.tree["bufferViews"][index]
         return self._bytes(view.get("extensions", {}).get(meshopt.EXTENSION, view))

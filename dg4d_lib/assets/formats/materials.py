@@ -83,15 +83,15 @@ class Atlas:
         corners = self.corners()
         return ((corners - corners[0]) / self.size).astype("<f4")
 
-    def inside(self, uvs: NDArray[np.float32]) -> NDArray[np.float32]:
+    def to_atlas_uvs(self, uvs: NDArray[np.float32]) -> NDArray[np.float32]:
         """Texture coordinates of a texture as those of the first cell."""
         return ((uvs * (self.width, self.height) + self.gutter) / self.size).astype("<f4")
 
-    def outside(self, uvs: NDArray[np.float32]) -> NDArray[np.float32]:
+    def from_atlas_uvs(self, uvs: NDArray[np.float32]) -> NDArray[np.float32]:
         """The inverse of `inside`."""
         return ((uvs * self.size - self.gutter) / (self.width, self.height)).astype("<f4")
 
-    def join(self, textures: Float[Tensor, "t h w 3"]) -> UInt8[np.ndarray, "i j 3"]:
+    def pack(self, textures: Float[Tensor, "t h w 3"]) -> UInt8[np.ndarray, "i j 3"]:
         """The atlas as a picture."""
         page = np.zeros((*self.size[::-1], 3), np.uint8)
         g = self.gutter
@@ -100,7 +100,7 @@ class Atlas:
             page[y - g : y - g + len(cell), x - g : x - g + cell.shape[1]] = cell
         return page
 
-    def split(self, page: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "t i j 3"]:
+    def unpack(self, page: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "t i j 3"]:
         """The textures in an atlas."""
         return np.stack([page[y : y + self.height, x : x + self.width] for x, y in self.corners()])
 
@@ -141,7 +141,7 @@ def add_texture(document: GltfDocument, name: str, pixels: UInt8[np.ndarray, "h 
         return document.add("textures", **common, source=_add_image(document, name, pixels, settings.image, settings))
     if max(pixels.shape) > WEBP_MAX:
         raise BadInput(f"a texture of {max(pixels.shape)} pixels cannot be webp, which ends at {WEBP_MAX}; use jpeg")
-    document.use(WEBP)
+    document.use_extension(WEBP)
     source = _add_image(document, name, pixels, "webp", settings)
     fallback = _add_image(document, f"{name} small", _small(pixels), "jpeg", settings)
     return document.add("textures", **common, source=fallback, extensions={WEBP: {"source": source}})
@@ -162,7 +162,7 @@ def add_material(
     color: dict[str, Any] = {"index": texture}
     extras = None
     if atlas is not None:
-        document.use(TEXTURE_TRANSFORM)
+        document.use_extension(TEXTURE_TRANSFORM)
         color["extensions"] = {TEXTURE_TRANSFORM: {"offset": [0.0, 0.0]}}
         extras = {"atlas": vars(atlas)}
     surface = {

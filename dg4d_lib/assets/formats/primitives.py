@@ -49,15 +49,15 @@ class QuantizationCube:
         return cls((low + high) / 2, side or 1.0)
 
     @property
-    def largest_error(self) -> float:
+    def max_error(self) -> float:
         """Of a vertex along an axis, world units."""
         return self.half_side / _SHORT / 2
 
-    def numbers(self, places: Floats) -> NDArray[np.int32]:
+    def quantize(self, places: Floats) -> NDArray[np.int32]:
         """The nearest points of the cube; beyond 16 bits where places lie outside."""
         return np.rint((places - self.center) * (_SHORT / self.half_side)).astype(np.int32)
 
-    def placement(self) -> dict[str, list[float]]:
+    def node_transform(self) -> dict[str, list[float]]:
         """How a node carries the cube."""
         return {"translation": self.center.tolist(), "scale": [self.half_side] * 3}
 
@@ -94,8 +94,8 @@ class MeshPrimitive:
         self._normals: Floats = self._normals_of(vertices)
         rows: tuple[NDArray[Any], ...] = (vertices, self._normals, uvs)
         if cube is not None:
-            document.use(QUANTIZATION, required=True)
-            normals, places = _shares(self._normals, _BYTE, "i1"), cube.numbers(vertices).astype("<i2")
+            document.use_extension(QUANTIZATION, required=True)
+            normals, places = _shares(self._normals, _BYTE, "i1"), cube.quantize(vertices).astype("<i2")
             rows = (places, normals, _shares(uvs.clip(0, 1), _UNSIGNED_SHORT, "<u2"))
             self._normals = (normals / _BYTE).astype(np.float32)  # what readers see
         names = {"POSITION": "positions", "NORMAL": "normals", "TEXCOORD_0": "texture coordinates"}
@@ -117,7 +117,7 @@ class MeshPrimitive:
         if self._cube is None:
             target = {"POSITION": self._add(f"{name} positions", offsets)}
         else:
-            steps = self._cube.numbers(moved) - self._cube.numbers(self._vertices)
+            steps = self._cube.quantize(moved) - self._cube.quantize(self._vertices)
             target = {"POSITION": self._add(f"{name} positions", steps.astype("<i2"))}
         if normals:
             turned = self._normals_of(moved)

@@ -48,7 +48,7 @@ def write_splat_glb(gaussians: Gaussians, version: SplatGlbVersion = "ratified")
         f"{EXTENSION}:SH_DEGREE_0_COEF_0": gaussians.harmonics[:, 0],
     }
     document = GltfDocument({})
-    document.use(EXTENSION)
+    document.use_extension(EXTENSION)
     attributes = {
         name: document.add_accessor(name, values.detach().cpu().numpy().astype("<f4"), VERTEX_DATA)
         for name, values in columns.items()

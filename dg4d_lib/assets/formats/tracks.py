@@ -23,12 +23,12 @@ class Span:
     Attributes:
         first: the first of them.
         end: the first that is not one of them.
-        of: frames of the whole animation.
+        total: frames of the whole animation.
     """
 
     first: int
     end: int
-    of: int
+    total: int
 
     @property
     def keys(self) -> list[int]:
@@ -38,16 +38,16 @@ class Span:
     @property
     def poses(self) -> list[int]:
         """The frames that are seen at its keys, each once."""
-        return list(dict.fromkeys(key % self.of for key in self.keys))
+        return list(dict.fromkeys(key % self.total for key in self.keys))
 
     def weights(self) -> NDArray[np.float32]:
         """The weights of its poses at its keys: one is 1."""
-        return np.array([[pose == key % self.of for pose in self.poses] for key in self.keys], "<f4")
+        return np.array([[pose == key % self.total for pose in self.poses] for key in self.keys], "<f4")
 
-    def shown(self) -> tuple[list[int], NDArray[np.float32]]:
+    def visibility(self) -> tuple[list[int], NDArray[np.float32]]:
         """Where it appears and disappears: keys, and the scale of its node from each on."""
-        keys = sorted({0, self.first, self.end, self.of})
-        visible = [self.first <= key % self.of < self.end for key in keys]
+        keys = sorted({0, self.first, self.end, self.total})
+        visible = [self.first <= key % self.total < self.end for key in keys]
         return keys, np.repeat(np.array(visible, "<f4")[:, None], 3, axis=1)
 
 
@@ -65,19 +65,19 @@ class Animation:
         self._channels: list[dict[str, Any]] = []
         self._times: dict[tuple[int, ...], int] = {}
 
-    def morph(self, node: int, name: str, span: Span, interpolation: str) -> None:
+    def add_morph(self, node: int, name: str, span: Span, interpolation: str) -> None:
         """A node shows the poses of its span, one at each key."""
         self._add(name, span.keys, span.weights().ravel(), interpolation, {"node": node, "path": "weights"})
 
-    def show(self, node: int, name: str, span: Span) -> None:
+    def add_visibility(self, node: int, name: str, span: Span) -> None:
         """A node is there in its span only; in readers that play nothing, the node of frame 0 is."""
-        keys, scales = span.shown()
+        keys, scales = span.visibility()
         self._document.tree["nodes"][node]["scale"] = scales[0].tolist()
         self._add(f"{name} shown", keys, scales, "STEP", {"node": node, "path": "scale"})
 
-    def point(self, pointer: str, name: str, values: NDArray[np.float32]) -> None:
+    def add_pointer(self, pointer: str, name: str, values: NDArray[np.float32]) -> None:
         """Something that is no node has a value at every frame; readers that do not know the extension leave it."""
-        self._document.use(POINTER)
+        self._document.use_extension(POINTER)
         target = {"path": "pointer", "extensions": {POINTER: {"pointer": pointer}}}
         self._add(name, list(range(len(values) + 1)), np.concatenate((values, values[:1])), "STEP", target)
 

@@ -54,9 +54,9 @@ class AnimatedGlb:
             poses = [pose for root in self.roots for pose in self._poses(root, np.eye(4))]
             if not poses:
                 raise BadInput("this GLB shows no mesh; give an asset that `dg4d make` wrote")
-            self.low: Vector = np.min([pose.min(0) for pose in poses], axis=0)
-            self.high: Vector = np.max([pose.max(0) for pose in poses], axis=0)
-            middle = (self.low + self.high) / 2
+            self.box_min: Vector = np.min([pose.min(0) for pose in poses], axis=0)
+            self.box_max: Vector = np.max([pose.max(0) for pose in poses], axis=0)
+            middle = (self.box_min + self.box_max) / 2
             self.foot: Vector = np.array((middle[0], poses[0][:, 1].min(), middle[2]))
             self.duration_s = max((float(self.file.accessor(s["input"])[-1, 0]) for s in self._samplers), default=0.0)
         except _FOREIGN as error:
@@ -118,20 +118,20 @@ class Actor:
     item: SceneItem
 
     @property
-    def turn(self) -> Rotation:
+    def rotation(self) -> Rotation:
         """How it is turned."""
         return Rotation.from_euler("xyz", self.item.rotation_deg, degrees=True)
 
     @property
     def origin(self) -> Vector:
         """Where the asset's own origin comes to lie, world units."""
-        return np.array(self.item.position) - self.turn.apply(self.glb.foot) * self.item.scale
+        return np.array(self.item.position) - self.rotation.apply(self.glb.foot) * self.item.scale
 
     @property
     def transform(self) -> Float[np.ndarray, "4 4"]:
         """Asset to scene, acts on column vectors."""
         matrix = np.eye(4)
-        matrix[:3, :3] = self.turn.as_matrix() * self.item.scale
+        matrix[:3, :3] = self.rotation.as_matrix() * self.item.scale
         matrix[:3, 3] = self.origin
         return matrix
 
@@ -140,7 +140,7 @@ class Actor:
         """When it has played once."""
         return self.item.start_s + self.glb.duration_s / self.item.speed
 
-    def seconds(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def animation_times(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Times of the scene as times of its animation."""
         played = (times_s - self.item.start_s).clip(0) * self.item.speed
         if self.item.loop and self.glb.duration_s > 0:
@@ -150,7 +150,7 @@ class Actor:
 
 def line_up(bodies: Sequence[AnimatedGlb], spacing: float) -> list[tuple[float, float, float]]:
     """Positions of feet on the ground, side by side, with this much room between the boxes; the middle is at x = 0."""
-    widths = [float(body.high[0] - body.low[0]) for body in bodies]
+    widths = [float(body.box_max[0] - body.box_min[0]) for body in bodies]
     starts = np.cumsum([0.0, *(width + spacing for width in widths)])
     middle = (starts[-1] - spacing) / 2
     return [(float(start + width / 2 - middle), 0.0, 0.0) for start, width in zip(starts, widths, strict=False)]
@@ -209,7 +209,7 @@ class _Transfer:
         self._own: dict[tuple[str, int], int] = {}
         required = self._file.tree.get("extensionsRequired", [])
         for extension in self._file.tree.get("extensionsUsed", []):
-            document.use(extension, required=extension in required)
+            document.use_extension(extension, required=extension in required)
 
     def add_node(self) -> int:
         """The actor's node with everything below it. Returns its number."""
@@ -217,7 +217,7 @@ class _Transfer:
             "nodes",
             name=self.actor.name,
             translation=self.actor.origin.tolist(),
-            rotation=self.actor.turn.as_quat(canonical=True).tolist(),
+            rotation=self.actor.rotation.as_quat(canonical=True).tolist(),
             scale=[self.actor.item.scale] * 3,
             children=[self.node(root) for root in self.actor.glb.roots],
             extras=self._file.tree["asset"].get("extras"),
