@@ -120,5 +120,5 @@ def test_a_film_has_an_end(package: Path, tmp_path: Path) -> None:
 
 def test_a_broken_asset_is_named(tmp_path: Path) -> None:
     (tmp_path / "asset.glb").write_bytes(b"no GLB")
-    with pytest.raises(BadInput, match=r"asset\.glb: this is no GLB"):
+    with pytest.raises(BadInput, match=r"asset\.glb: this is not a GLB"):
         Cast([tmp_path], [item("a")], ["a"])

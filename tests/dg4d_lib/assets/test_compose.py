@@ -285,7 +285,7 @@ def test_a_file_without_a_mesh_is_refused() -> None:
 
 
 def test_a_file_of_another_form_is_refused() -> None:
-    with pytest.raises(BadInput, match="has not the form"):
+    with pytest.raises(BadInput, match="not an animated asset"):
         AnimatedGlb(GltfDocument({}).to_bytes())
 
 

@@ -387,7 +387,7 @@ def test_a_scene_can_stand_in_a_scene(path: Path) -> None:
         ({"start_s": -1.0}, "start must be 0"),
         ({"transform": torch.full((4, 4), NAN)}, "not finite"),
         ({"file": Path("nowhere.usdz")}, "cannot be read"),
-        ({"file": Path(__file__)}, "is no USDZ"),
+        ({"file": Path(__file__)}, "is not a USDZ"),
     ],
 )
 def test_a_placement_without_sense_is_refused(change: dict[str, Any], says: str, path: Path) -> None:

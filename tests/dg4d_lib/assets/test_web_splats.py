@@ -125,8 +125,8 @@ def test_a_cloud_in_one_point_comes_back() -> None:
 @pytest.mark.parametrize(
     ("faulty", "word"),
     [
-        (cloud().at(0), "t n 3"),
-        (cloud().states([]), "none empty"),
+        (cloud().at(0), r"\(t, n, 3\)"),
+        (cloud().states([]), "at least one"),
         (replace(cloud(), means=torch.full((6, 50, 3), torch.nan)), "finite"),
         (replace(cloud(), opacity_logits=torch.full((50,), torch.inf)), "finite"),
     ],
