@@ -1,4 +1,4 @@
-"""Which assets stand in a scene, where, and when they move: what a scene file says."""
+"""Scene file format: assets with placement and timing."""
 
 from typing import Annotated
 
@@ -10,7 +10,7 @@ Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
 class SceneItem(Settings):
-    """An asset in a scene. World: right-handed, y up; an asset looks along +z before it is turned."""
+    """Placement and timing of an asset. World axes: right-handed, y up; unrotated assets face +z."""
 
     package: str = Field(min_length=1, description="folder of the package, relative to the folder of the scene file")
     name: str = Field("", max_length=200, description="in the scene; empty: that of the folder")
@@ -28,7 +28,7 @@ class SceneItem(Settings):
 
 
 class Scene(Settings):
-    """Assets, placed and timed."""
+    """Content of a scene file."""
 
     items: tuple[SceneItem, ...] = Field(min_length=1, max_length=1000)
     duration_s: Positive | None = Field(None, le=3600, description="seconds; not given: when every asset played once")

@@ -263,7 +263,7 @@ def test_a_scene_ends_when_every_asset_has_played_once() -> None:
 
 
 def test_an_asset_that_starts_after_the_end_is_refused() -> None:
-    with pytest.raises(BadInput, match=r"late starts at 3.0 s, when the scene of 2.0 s is over"):
+    with pytest.raises(BadInput, match=r"late starts at 3.0 s, after the end of the scene at 2.0 s"):
         compose_glb([actor("early", tracked()), actor("late", tracked(), start_s=3.0)], 2.0)
 
 
