@@ -1,4 +1,4 @@
-"""The compact form: everything comes back, it describes itself, broken files are refused."""
+"""Compact format: lossless round trip, self-description, corrupt files."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Composed scenes: what others read in them stands where it should, when it should."""
+"""Composed scenes: placement and timing as third-party readers see them."""
 
 import math
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""Animated meshes as GLB: what is written is valid, comes back, and is read the same by others."""
+"""Animated GLB: validity, round trip, third-party readers."""
 
 import io
 import json

@@ -1,4 +1,4 @@
-"""GLB files written in other ways than the plain one: what comes back, and what others read."""
+"""GLB with other settings than the defaults: round trip and third-party readers."""
 
 import io
 import sys

@@ -1,4 +1,4 @@
-"""Pictures and the atlas by themselves."""
+"""Images and the texture atlas."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The films: they play, they show the object where it is, and equal assets give equal films."""
+"""Preview videos: playback, position of the object, determinism."""
 
 import struct
 from collections.abc import Sequence

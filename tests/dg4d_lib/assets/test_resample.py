@@ -1,4 +1,4 @@
-"""Other frame rates: what is asked between frames is what the motion does there."""
+"""Resampling to other frame rates: states between frames follow the motion."""
 
 import math
 from collections.abc import Iterator
@@ -69,7 +69,7 @@ def cloud() -> Gaussians:
 
 
 def ridden(vertices: Tensor, positions: Tensor) -> Tensor:
-    """Where the turning takes vertices that are as they are at `REST`; the way home from the last frame is not told."""
+    """Return the vertices rotated from their positions at `REST`; undefined between the last frame and the first."""
     return vertices @ turns(STEP * (positions.float() - REST)).mT - vertices
 
 

@@ -1,4 +1,4 @@
-"""Splat sequences: every frame is a standard PLY, and the sequence comes back."""
+"""Splat sequences: standard PLY per frame, round trip."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Spans of frames."""
+"""Spans of animation tracks."""
 
 import numpy as np
 import pytest

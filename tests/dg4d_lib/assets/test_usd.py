@@ -1,4 +1,4 @@
-"""Animated meshes and splats as USDZ: valid, and others read what we meant."""
+"""Animated meshes and splats as USDZ: validity and third-party readers."""
 
 import io
 import json
@@ -88,7 +88,7 @@ def pictures(path: Path, layer_name: str = "/asset/mesh/materials/subject/color"
 
 
 def faults(stage: Usd.Stage) -> list[str]:
-    """What any validator of OpenUSD says."""
+    """Return the findings of all OpenUSD validators."""
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert len(validators) >= 25
     return [error.GetMessage() for error in UsdValidation.ValidationContext(validators).Validate(stage)]

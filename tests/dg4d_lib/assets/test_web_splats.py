@@ -1,4 +1,4 @@
-"""Moving splats for the web: what is lost is as little as the docstring says, and the rest comes back."""
+"""Web splats: round trip within the documented errors."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ def cloud(frames: int = 6, count: int = 50, seed: int = 0) -> Gaussians:
 
 
 def back(states: Gaussians, fps: float = 12.0) -> Gaussians:
-    """What comes back, in the order in which it was given."""
+    """Decode the file and restore the order of the Gaussians."""
     read, _ = read_web_splats(write_web_splats(states, fps))
     colors = (read.colors * 255).round().long()
     order = torch.argsort(colors[:, 0] + 256 * colors[:, 1])

@@ -1,4 +1,4 @@
-"""The small moving picture: it loops in real time, stays small, and shows the motion from the input side."""
+"""Animated WebP: real-time loop, file size, input view."""
 
 import math
 from collections.abc import Sequence
