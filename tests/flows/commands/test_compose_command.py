@@ -167,7 +167,7 @@ def test_a_failure_leaves_the_old_scene_and_nothing_else(shelf: Path) -> None:
     (shelf / "scene.glb").write_bytes(b"old")
     items = [{"package": "gem", "start_s": 9}]
     before = sorted(path.name for path in shelf.iterdir())
-    with pytest.raises(BadInput, match="is over"):
+    with pytest.raises(BadInput, match="after the end of the scene"):
         compose([], shelf / "scene.glb", scene_file(shelf, items=items, duration_s=1))
     assert (shelf / "scene.glb").read_bytes() == b"old"
     assert sorted(path.name for path in shelf.iterdir()) == sorted([*before, "scene.json"])
