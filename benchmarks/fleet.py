@@ -1,13 +1,12 @@
-"""Items an hour of a catalog on one, two and three machines that share a store, and what a killed machine costs.
+"""Throughput of one, two and three machines that share a store, and the cost of a killed machine.
 
 Run with `python -m benchmarks.fleet` (`--items 60 --seconds 6 --workers 1 2 3 --json FILE`). Machines are workers with
-a home and an identity each, in processes of this machine; steps are the stand-ins of the tests, one of which sleeps, so
-that the figures tell what the fleet adds and not how many cores there are. The store is `$DG4D_TEST_S3` (with the usual
-AWS_* variables), else a folder. The last pass has all workers again, one of which is killed with everything that it
-runs when a third of the items is done, and never comes back: its runs go on elsewhere when the server has missed their
-heartbeats.
+separate homes and identities, in processes of this machine; steps are the stand-ins of the tests, one of which sleeps,
+so that the result does not depend on the number of cores. The store is `$DG4D_TEST_S3` (with the usual AWS_*
+variables), else a folder. In the last pass one of the workers is killed with all its processes after a third of the
+items and does not return: its runs continue elsewhere when the server has missed their heartbeats.
 
-Lost is an item without its package, done twice a step that two machines finished for one item.
+An item is lost without a package; a step is done twice if two machines finish it for one item.
 """
 
 import os
@@ -38,17 +37,17 @@ LOOK_S = 0.5
 
 @dataclass(frozen=True)
 class Row:
-    """One catalog, made anew.
+    """Pass over the catalog, from scratch.
 
     Attributes:
-        workers: machines.
-        killed: of them, in the middle.
+        workers: number of machines.
+        killed: number of machines killed during the pass.
         items: of the catalog.
         wall_s: from the start of the command to its end.
-        per_hour: items.
+        per_hour: items per hour.
         lost: items without a package.
         twice: steps that were finished twice for one item.
-        shares: items that each machine finished.
+        shares: items finished by each machine.
     """
 
     workers: int
@@ -62,12 +61,12 @@ class Row:
 
 
 class Machine:
-    """A worker with a home and an identity of its own.
+    """Worker with its own home and identity.
 
     Args:
         name: of the machine.
-        folder: of everything that is its own.
-        variables: of the environment, shared with others.
+        folder: of its home and files.
+        variables: of the environment, shared with other machines.
     """
 
     def __init__(self, name: str, folder: Path, variables: dict[str, str]) -> None:
@@ -91,24 +90,24 @@ class Machine:
 
     @property
     def steps(self) -> list[str]:
-        """Steps that it finished, as STEP:ITEM."""
+        """Return the finished steps, as STEP:ITEM."""
         return self.log.read_text(encoding="utf-8").split() if self.log.exists() else []
 
     def sleeps(self) -> bool:
-        """Return whether it is in the middle of an item, at the step that sleeps."""
+        """Return true if the machine is in the sleeping step of an item."""
         before = self.steps[-1:]
         time.sleep(LOOK_S)
         return before == self.steps[-1:] and bool(before) and before[0].startswith("fit_gaussians:")
 
     def kill(self) -> None:
-        """End it as a loss of power does: the worker and all that it started, at once."""
+        """Kill the worker and all its processes at once, as a power failure does."""
         for pid in [self._worker.pid, *descendants(self._worker.pid)]:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         self._worker.wait()
 
     def stop(self) -> None:
-        """End it, unless it was killed."""
+        """Stop the worker, unless it was killed."""
         self._worker.terminate()
         try:
             self._worker.wait(30)
@@ -142,7 +141,7 @@ def main() -> None:
 
 
 def measured(folder: Path, variables: dict[str, str], items: int, seconds: float, workers: int, kill: bool) -> Row:
-    """Make one catalog anew."""
+    """Process the catalog once, from scratch."""
     draw_items(folder / "in", items, seconds)
     store = f"{os.environ['DG4D_TEST_S3']}/{os.getpid()}-{folder.name}" if "DG4D_TEST_S3" in os.environ else ""
     shared = {**variables, "DG4D_STORE": store or str(folder / "store"), "DG4D_CODE_VERSION": f"fleet-{folder.name}"}
@@ -184,12 +183,12 @@ def measured(folder: Path, variables: dict[str, str], items: int, seconds: float
 
 
 def finished(one: Machine) -> int:
-    """Return how many items a machine finished."""
+    """Return the number of items that a machine finished."""
     return sum(step.startswith("check_asset:") for step in one.steps)
 
 
 def draw_items(folder: Path, count: int, seconds: float) -> None:
-    """Write sources that the stand-ins of steps obey."""
+    """Write the input files of the stand-in steps."""
     folder.mkdir(parents=True)
     for i in range(count):
         words = f"fit_motion=sleep:{seconds} named={i:03d} {folder}"
@@ -198,7 +197,7 @@ def draw_items(folder: Path, count: int, seconds: float) -> None:
 
 @contextmanager
 def serving(folder: Path) -> Iterator[dict[str, str]]:
-    """Start the product's server with the pool of fleets; gives the environment of its clients."""
+    """Run the product's server with a work pool; yield the environment of its clients."""
     inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PREFECT_", "DG4D_"))}
     server = Server(folder / "server", folder / "prefect")
     with ExitStack() as running:
@@ -230,7 +229,7 @@ register(read_pools(), [{POOL!r}])
 
 
 def descendants(pid: int) -> list[int]:
-    """Return the processes that a process started, and those that these started."""
+    """Return the child processes of a process, recursively."""
     found: list[int] = []
     for children in Path(f"/proc/{pid}/task").glob("*/children"):
         with suppress(OSError):  # the thread has ended
@@ -240,7 +239,7 @@ def descendants(pid: int) -> list[int]:
 
 
 def table(rows: list[Row]) -> Table:
-    """Return the rows as they are printed."""
+    """Return the rows as a table."""
     shown = Table("machines", "killed", "items", "wall s", "items/hour", "lost", "done twice", "items by machine")
     for row in rows:
         shown.add_row(

@@ -23,7 +23,7 @@ from dg4d_lib.diffusion.components import default_device
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.images import over_background
 from dg4d_lib.metrics.clip import ClipModel, cosine_similarity, load_clip
-from dg4d_lib.metrics.fvd import SHORTEST, fvd_consistent4d, load_i3d, logits
+from dg4d_lib.metrics.fvd import MIN_FRAMES, fvd_consistent4d, load_i3d, logits
 from dg4d_lib.metrics.image import iou, psnr, resize_square
 from dg4d_lib.metrics.lpips import Lpips, load_lpips
 from dg4d_lib.metrics.ssim import ssim
@@ -108,8 +108,8 @@ def run(job: Job) -> StepReport:
             report, films = _of_package(package, truth, settings, judges, scratch, job.seed, step_on)
         else:
             report, films = _of_guesses(truth, judges, step_on)
-        if judges.i3d is not None and report["frames"] < SHORTEST:
-            shortage = f"I3D needs films of {SHORTEST} frames or more; these have {report['frames']}"
+        if judges.i3d is not None and report["frames"] < MIN_FRAMES:
+            shortage = f"I3D needs films of {MIN_FRAMES} frames or more; these have {report['frames']}"
             judges.missing["fvd_consistent4d"] = shortage
         _write_films(job.outputs["films"], films, scratch)
     job.outputs["scores"].write_text(json.dumps(_rounded({**report, "missing": judges.missing}), allow_nan=False))
@@ -166,7 +166,7 @@ def compare(ours: Film, theirs: Film, judges: Judges) -> Figures:
     if judges.clip is not None:
         embedded = [judges.clip.embed(resize_square(film.color, judges.size)) for film in (ours, theirs)]
         figures["clip"] = float(cosine_similarity(*embedded).mean())
-    if judges.i3d is not None and len(theirs) >= SHORTEST:
+    if judges.i3d is not None and len(theirs) >= MIN_FRAMES:
         outputs = [logits(judges.i3d, film.color, judges.device) for film in (ours, theirs)]
         figures["fvd_consistent4d"] = float(fvd_consistent4d(*outputs))
     return figures
@@ -205,7 +205,7 @@ def _of_package(
         theirs = _read(view.frames, size)
         films[f"view_{view.name}"] = film = drawn(view.azimuth_deg, len(theirs))
         views[view.name] = compare(film, theirs, judges)
-        if judges.i3d is not None and len(film) >= SHORTEST:
+        if judges.i3d is not None and len(film) >= MIN_FRAMES:
             clips[view.name] = logits(judges.i3d, film.color, judges.device).tolist()
         step_on(total)
     judgment: Judgment = {"input": of_input, "views": views, "mean": _mean(views)}
@@ -229,7 +229,7 @@ def _of_guesses(truth: Truth, judges: Judges, step_on: Callable[[int], None]) ->
         tried |= {"input_frozen": given.pick(still), "truth_frozen": theirs.pick(still)}
         for name, film in tried.items():
             guesses.setdefault(name, {})[view.name] = compare(film, theirs, judges)
-        if judges.i3d is not None and len(theirs) >= SHORTEST:
+        if judges.i3d is not None and len(theirs) >= MIN_FRAMES:
             clips[view.name] = logits(judges.i3d, theirs.color, judges.device).tolist()
         step_on(len(truth.views))
     rows = {name: {"views": views, "mean": _mean(views)} for name, views in guesses.items()}

@@ -164,8 +164,8 @@ def test_a_data_set_is_fitted_and_scored_as_the_objects_are(dataset, specimen, m
 
 def test_what_cannot_be_run_is_refused_with_what_can(dataset, monkeypatch, capsys):
     for words, message in (
-        (["noise", f"--data={dataset}", "--objects", "cat"], "there is no object cat; there are: balls, picture"),
-        (["static", "--objects", "cat"], "there is no object cat; there are: newt, parrot, jellyfish, excavator"),
+        (["noise", f"--data={dataset}", "--objects", "cat"], "unknown objects cat; choose from balls, picture"),
+        (["static", "--objects", "cat"], "unknown objects cat; choose from newt, parrot, jellyfish, excavator"),
         (["static", "noise", f"--data={dataset}"], "noise: needs a video; of picture there is one picture"),
         (["static", f"--data={dataset / 'nowhere'}"], "is no data set"),
     ):

@@ -112,7 +112,7 @@ def test_one_torn_frame_is_enough_for_the_silhouette() -> None:
 
 def test_the_worse_form_counts() -> None:
     still = film([0.0] * 8)
-    mixed = replace(evidence(SWAYING, SWAYING), seen={SPLATS: SWAYING, MESH: still})
+    mixed = replace(evidence(SWAYING, SWAYING), input_views={SPLATS: SWAYING, MESH: still})
     found = {gate.name: gate for gate in evaluate_gates(mixed, GateSettings())}
     assert (found["motion"].form, found["motion"].passed) == (MESH, False)
     assert found["motion"].values[SPLATS] == 1

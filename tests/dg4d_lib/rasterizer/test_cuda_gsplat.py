@@ -78,7 +78,7 @@ class StandIn(ModuleType):
         centers = torch.stack([view.means2d for view in splats]).reshape(*batch, views, n, 2)
         for view, own in zip(splats, centers.reshape(-1, n, 2), strict=True):
             view.means2d = own
-        pictures = [reference._picture(view, behind, height, width) for view, behind in zip(splats, backs, strict=True)]
+        pictures = [reference._render(view, behind, height, width) for view, behind in zip(splats, backs, strict=True)]
         color, alpha, depth, visible = (torch.stack(part).float() for part in zip(*pictures, strict=True))
         radii = (4 * visible).int()[..., None].expand(-1, -1, 2).reshape(centers.shape)
         shape = (*batch, views, height, width)
