@@ -7,7 +7,7 @@ The table has means over objects and seeds, with the standard deviation after +-
 the same object and seed. `--quick` is a smoke test.
 
 Unlike a diffusion model, an oracle is consistent over iterations. Claims of the paper that depend on this cannot be
-tested here; their caveat says so.
+tested here; their `caveat` states this.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from scipy.stats import t as student
 
 from benchmarks.fits import Figures, fits_per_frame, moving_fit, score, static_fit
 from benchmarks.measure import new_console, parser_of, write_rows
-from benchmarks.objects.specimens import OBJECTS, Specimen, made, read
+from benchmarks.objects.specimens import OBJECTS, Specimen, read_specimen, render_specimen
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from flows.inputs.manifest import parse_changes
@@ -35,7 +35,7 @@ from steps.profiles import PipelineSettings, revise
 DIGITS = {"psnr": 2, "psnr_obj": 2, "iou": 3, "terr": 3, "flicker": 2}
 LESS_IS_BETTER = {"terr", "flicker"}
 CONFIDENCE = 0.95  # of the interval of a gain, by Student's t over the pairs
-SLIGHT = {"psnr": 0.1, "psnr_obj": 0.1, "iou": 0.005, "terr": 0.01}  # invisible gains (ours)
+NEGLIGIBLE = {"psnr": 0.1, "psnr_obj": 0.1, "iou": 0.005, "terr": 0.01}  # invisible gains (ours)
 SHARES = ("subject.max_frames", "deformation.temporal")  # fractions of these are fractions of the frames
 
 SMALL: dict[str, Any] = {  # the paper's schedule scaled to seconds on a CPU: fewer iterations, larger learning rates
@@ -84,14 +84,14 @@ class Ablation:
     """Comparison of variants.
 
     Attributes:
-        says: claim of the paper, in our words.
+        statement: claim of the paper, in our words.
         variants: by name, in the order of the table.
         claims: conditions for the claim.
         still: run the static stage only.
         caveat: limitation of the oracle for this claim.
     """
 
-    says: str
+    statement: str
     variants: Mapping[str, Variant]
     claims: tuple[Claim, ...]
     still: bool = False
@@ -294,7 +294,7 @@ def verdict(ablation: Ablation, rows: Sequence[Row]) -> str:
     word = {"yes": "Reproduced", "open": "Not decided", "no": "Not reproduced"}
     outcome = word["no" if "no" in outcomes else "open" if "open" in outcomes else "yes"]
     caveat = f" (but {ablation.caveat})" if ablation.caveat else ""
-    return f"{outcome}{caveat}: {ablation.says}; gains: {'; '.join(parts)}."
+    return f"{outcome}{caveat}: {ablation.statement}; gains: {'; '.join(parts)}."
 
 
 def _outcome(claim: Claim, gain: float, error: float, pairs: int) -> str:
@@ -302,7 +302,7 @@ def _outcome(claim: Claim, gain: float, error: float, pairs: int) -> str:
     if pairs < 2:
         return "open"
     reach = float(student.ppf((1 + CONFIDENCE) / 2, pairs - 1)) * error
-    bound = SLIGHT[claim.figure] if claim.alike else 0.0
+    bound = NEGLIGIBLE[claim.figure] if claim.alike else 0.0
     if gain - reach <= bound <= gain + reach:
         return "open"
     return "yes" if (gain > bound) != claim.alike else "no"
@@ -394,9 +394,9 @@ def find_specimens(data: Path | None, names: Sequence[str] | None, frames: int, 
     Raises:
         BadInput: the data set cannot be used, or does not have all that are named.
     """
-    known: dict[str, Callable[[], Specimen]] = {name: partial(made, name, frames, size) for name in OBJECTS}
+    known: dict[str, Callable[[], Specimen]] = {name: partial(render_specimen, name, frames, size) for name in OBJECTS}
     if data is not None:
-        known = {truth.name: partial(read, truth, frames) for truth in find_truths(data)}
+        known = {truth.name: partial(read_specimen, truth, frames) for truth in find_truths(data)}
     if unknown := sorted(set(names or ()) - set(known)):
         raise BadInput(f"unknown objects {', '.join(unknown)}; choose from {', '.join(known)}")
     return [known[name]() for name in names or known]

@@ -191,7 +191,7 @@ def fourdgs(folder: Path) -> Write:
     return lambda out: library.write(str(out / "a.4dgs"), *convert(str(folder), fps=FPS))
 
 
-def side_by_side(writers: Sequence[Write], folder: Path) -> None:
+def write_in_parallel(writers: Sequence[Write], folder: Path) -> None:
     """Run some writers at a time, as the step does."""
     with ThreadPoolExecutor(LANES) as lanes:
         places = [folder / str(number) for number in range(len(writers))]
@@ -201,7 +201,7 @@ def side_by_side(writers: Sequence[Write], folder: Path) -> None:
             written.result()
 
 
-def measured(writers: dict[str, Write], splats: int | None, rounds: int) -> list[Row]:
+def measure_writers(writers: dict[str, Write], splats: int | None, rounds: int) -> list[Row]:
     """Measure every writer, each in a folder that it overwrites."""
     with TemporaryDirectory() as scratch:
         folders = {name: Path(scratch) / str(i) for i, name in enumerate(writers)}
@@ -222,7 +222,7 @@ def main() -> None:
     console, asset = new_console(), waving_ball(grid, texels)
     of_mesh = dict(mesh_writers(asset))
     of_splats = {count: dict(splat_writers(asset, waving_splats(count), pack)) for count in counts}
-    rows = measured(of_mesh, None, rounds)
+    rows = measure_writers(of_mesh, None, rounds)
     for count, writers in of_splats.items():
         with TemporaryDirectory() as scratch:
             writers["splats, PLY"](Path(scratch))
@@ -230,14 +230,14 @@ def main() -> None:
                 writers["splats, .4dgs"] = fourdgs(Path(scratch))
             except ImportError as error:
                 console.print(f"fourdgs is missing: {error}", markup=False, highlight=False)
-            rows += measured(writers, count, rounds)
+            rows += measure_writers(writers, count, rounds)
     title = f"{machine()}; {FRAMES} frames, {len(asset.mesh.vertices)} vertices, {texels} x {texels} texels"
     console.print(table(title, rows))
     every_writer = of_mesh | of_splats[counts[0]]
     seconds = {row.writer: row.wall_s for row in rows if row.splats in (None, counts[0])}
     longest_first = sorted(EVERY_KIND, key=seconds.__getitem__, reverse=True)
-    (whole,) = measured(
-        {"every kind": partial(side_by_side, [every_writer[name] for name in longest_first])}, None, rounds
+    (whole,) = measure_writers(
+        {"every kind": partial(write_in_parallel, [every_writer[name] for name in longest_first])}, None, rounds
     )
     console.print(
         f"one file of every kind, {counts[0]} splats: {sum(seconds[name] for name in EVERY_KIND):.2f} s one after the "

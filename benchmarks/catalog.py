@@ -86,7 +86,7 @@ def main() -> None:
     rows = []
     for database in options.database or DATABASES:
         with tempfile.TemporaryDirectory(prefix="dg4d-catalog-", ignore_cleanup_errors=True) as name:
-            rows += measured(database, options.items, options.workers, Path(name))
+            rows += measure_database(database, options.items, options.workers, Path(name))
     console = new_console()
     console.print(machine())
     console.print(table(rows))
@@ -94,7 +94,7 @@ def main() -> None:
         write_rows(options.json, rows)
 
 
-def measured(database: str, items: int, workers: int, folder: Path) -> list[Row]:
+def measure_database(database: str, items: int, workers: int, folder: Path) -> list[Row]:
     """Run all passes with one database, in a separate process with its own server."""
     folder.chmod(0o755)  # for the user of the database
     for i in range(items):
@@ -159,7 +159,7 @@ def run(items: list[Item], out: Path, workers: int, what: str) -> float:
     @flow(name="catalog", flow_run_name=what, persist_result=False)
     def catalog() -> None:
         todo = (ready(item, out, strict=False) for item in items)
-        convert_all(todo, out, workers, f"{what}: {len(items)} items", tally, work=work)
+        convert_all(todo, out, workers, f"{what}: {len(items)} items", tally, work=run_steps)
 
     with temporary_settings(flow_settings()):
         catalog()
@@ -167,7 +167,7 @@ def run(items: list[Item], out: Path, workers: int, what: str) -> float:
     return sizes[-1] - sizes[len(sizes) // 10]
 
 
-def work(order: Order, folder: Path) -> tuple[Any, bool]:
+def run_steps(order: Order, folder: Path) -> tuple[Any, bool]:
     """Resize, pack and publish; return true if every step was cached."""
     packed, cached = resize_and_pack(order)
 

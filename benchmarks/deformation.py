@@ -87,7 +87,7 @@ def heads_one_by_one(field: HexPlane, features: Tensor) -> list[Tensor]:
     return [head.outer(hidden + head.inner(hidden)) for head in heads]
 
 
-def by_convolution(images: Tensor, ground_truth: Tensor) -> Tensor:
+def ssim_by_convolution(images: Tensor, ground_truth: Tensor) -> Tensor:
     """Return the SSIM of "b c h w" images over positions of the window inside the image."""
     steps = torch.arange(WINDOW) - WINDOW // 2
     line = torch.exp(-steps.square() / (2 * SIGMA**2))
@@ -100,7 +100,7 @@ def by_convolution(images: Tensor, ground_truth: Tensor) -> Tensor:
     return (light * (2 * covariance + C2) / (variance_x + variance_y + C2)).mean((1, 2, 3))
 
 
-def of_deformation(count: int, settings: HexPlaneSettings, rounds: int) -> Iterator[Row]:
+def measure_deformation(count: int, settings: HexPlaneSettings, rounds: int) -> Iterator[Row]:
     """Measure the features, the features with trainable means, and the features with the network."""
     generator = torch.Generator().manual_seed(0)
     means = torch.rand(count, 3, generator=generator) * 2 - 1
@@ -139,7 +139,7 @@ def of_deformation(count: int, settings: HexPlaneSettings, rounds: int) -> Itera
             yield Row(peer + suffix, count, None, TIMES, ours, measured.cpu_ms, measured.cpu_ms / ours)
 
 
-def of_ssim(size: int, rounds: int) -> Iterator[Row]:
+def measure_ssim(size: int, rounds: int) -> Iterator[Row]:
     """Measure value and gradient of noisy colors over white, stored channels first as renders are."""
     generator = torch.Generator().manual_seed(0)
     ground_truth = functional.interpolate(
@@ -149,7 +149,7 @@ def of_ssim(size: int, rounds: int) -> Iterator[Row]:
     images = (ground_truth + 0.05 * torch.randn(ground_truth.shape, generator=generator)).clamp(0, 1).requires_grad_()
     functions: dict[str, Callable[[], object]] = {
         "ours": lambda: torch.autograd.grad(ssim(images.movedim(1, -1), ground_truth.movedim(1, -1)).sum(), images),
-        "conv2d": lambda: torch.autograd.grad(by_convolution(images, ground_truth).sum(), images),
+        "conv2d": lambda: torch.autograd.grad(ssim_by_convolution(images, ground_truth).sum(), images),
     }
     taken = interleaved(functions, rounds)
     ours, peer = (taken[name].cpu_ms / PICTURES for name in functions)
@@ -163,10 +163,10 @@ def main() -> None:
     console, rows = new_console(), []
     for settings in (paper,) if options.quick else (paper, small):
         title = f"{machine()}; {settings.features} features, {settings.hidden} hidden units, {TIMES} moments"
-        found = [row for count in counts for row in of_deformation(count, settings, rounds)]
+        found = [row for count in counts for row in measure_deformation(count, settings, rounds)]
         console.print(table(title, found))
         rows += found if settings is paper else []  # rows do not contain the number of features
-    found = [row for size in sizes for row in of_ssim(size, rounds)]
+    found = [row for size in sizes for row in measure_ssim(size, rounds)]
     console.print(table(f"{machine()}; SSIM of a color picture", found))
     if options.json:
         write_rows(options.json, [*rows, *found])

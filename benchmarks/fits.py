@@ -52,7 +52,7 @@ def moving_fit(specimen: Specimen, rest: Gaussians, settings: PipelineSettings, 
     """Run the dynamic stage; return the cloud at every frame, including frames that were not fitted."""
     generator = torch.Generator().manual_seed(seed)
     frames = len(specimen.cutouts)
-    seen, stride = thinned(specimen, settings.subject.max_frames)
+    seen, stride = subsample_frames(specimen, settings.subject.max_frames)
     deformation = new_deformation(settings.deformation, rest, len(seen.cutouts), generator)
     prior = prior_of(seen.bank, settings, settings.motion)
     fitted = fit_motion(rest, deformation, seen.video, prior, RASTERIZE, settings.motion, generator)
@@ -94,7 +94,7 @@ def prior_of(bank: Bank, settings: PipelineSettings, stage: FitSettings) -> Anal
     return oracle_prior(bank, settings.prior, noise)
 
 
-def thinned(specimen: Specimen, most: int) -> tuple[Specimen, int]:
+def subsample_frames(specimen: Specimen, most: int) -> tuple[Specimen, int]:
     """Return at most this many of the frames, and their stride."""
     stride = -(-len(specimen.cutouts) // most)
     kept = [column for column, frame in enumerate(specimen.bank.frames) if frame % stride == 0]

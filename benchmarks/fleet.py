@@ -128,10 +128,10 @@ def main() -> None:
     rows = []
     with (
         tempfile.TemporaryDirectory(prefix="dg4d-fleet-", ignore_cleanup_errors=True) as name,
-        serving(Path(name)) as variables,
+        run_server(Path(name)) as variables,
     ):
         for number, (count, kill) in enumerate(passes):
-            rows.append(measured(Path(name) / f"{number}", variables, options.items, options.seconds, count, kill))
+            rows.append(measure_pass(Path(name) / f"{number}", variables, options.items, options.seconds, count, kill))
             new_console().print(rows[-1])
     console = new_console()
     console.print(machine())
@@ -140,7 +140,7 @@ def main() -> None:
         write_rows(options.json, rows)
 
 
-def measured(folder: Path, variables: dict[str, str], items: int, seconds: float, workers: int, kill: bool) -> Row:
+def measure_pass(folder: Path, variables: dict[str, str], items: int, seconds: float, workers: int, kill: bool) -> Row:
     """Process the catalog once, from scratch."""
     draw_items(folder / "in", items, seconds)
     store = f"{os.environ['DG4D_TEST_S3']}/{os.getpid()}-{folder.name}" if "DG4D_TEST_S3" in os.environ else ""
@@ -160,7 +160,7 @@ def measured(folder: Path, variables: dict[str, str], items: int, seconds: float
     try:
         while command.poll() is None:
             time.sleep(LOOK_S)
-            if kill > killed and sum(map(finished, machines)) >= items / 3 and machines[-1].sleeps():
+            if kill > killed and sum(map(count_finished, machines)) >= items / 3 and machines[-1].sleeps():
                 machines[-1].kill()
                 killed = 1
         wall_s = time.monotonic() - begun
@@ -178,11 +178,11 @@ def measured(folder: Path, variables: dict[str, str], items: int, seconds: float
         per_hour=round(3600 * items / wall_s),
         lost=items - made,
         twice=sum(count - 1 for count in steps.values()),
-        shares=[finished(one) for one in machines],
+        shares=[count_finished(one) for one in machines],
     )
 
 
-def finished(one: Machine) -> int:
+def count_finished(one: Machine) -> int:
     """Return the number of items that a machine finished."""
     return sum(step.startswith("check_asset:") for step in one.steps)
 
@@ -196,7 +196,7 @@ def draw_items(folder: Path, count: int, seconds: float) -> None:
 
 
 @contextmanager
-def serving(folder: Path) -> Iterator[dict[str, str]]:
+def run_server(folder: Path) -> Iterator[dict[str, str]]:
     """Run the product's server with a work pool; yield the environment of its clients."""
     inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PREFECT_", "DG4D_"))}
     server = Server(folder / "server", folder / "prefect")

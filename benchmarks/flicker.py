@@ -50,7 +50,7 @@ class Row:
     temporal_error: float
 
 
-def filmed(painted: Painted, azimuth_deg: float, frames: int, size: int) -> Film:
+def render_cycle(painted: Painted, azimuth_deg: float, frames: int, size: int) -> Film:
     """Render one cycle of an object's motion from one azimuth."""
     camera = OrbitCamera(azimuth_deg=azimuth_deg, width=size, height=size)
     cutouts = torch.cat([painted.draw(frame / frames, [camera]) for frame in range(frames)])
@@ -58,14 +58,16 @@ def filmed(painted: Painted, azimuth_deg: float, frames: int, size: int) -> Film
     return Film(color_over_white(cutouts[..., :3], alpha), (alpha > 0.5).float())
 
 
-def rows_of(name: str, frames: int, size: int) -> list[Row]:
+def measure_object(name: str, frames: int, size: int) -> list[Row]:
     """Return the results of all videos of one object."""
     painted = Painted(OBJECTS[name]())
-    front = filmed(painted, 0, frames, size)
+    front = render_cycle(painted, 0, frames, size)
     figures: dict[str, list[tuple[float, float]]] = {}
     for azimuth in AZIMUTHS_DEG:
-        ground_truth = filmed(painted, azimuth, frames, size)
-        films = {f"ground truth, {off} degrees off": filmed(painted, azimuth + off, frames, size) for off in ERRORS_DEG}
+        ground_truth = render_cycle(painted, azimuth, frames, size)
+        films = {
+            f"ground truth, {off} degrees off": render_cycle(painted, azimuth + off, frames, size) for off in ERRORS_DEG
+        }
         for film, made in {**films, OWN: ground_truth.held(), FRONT: front.held(), REPEATED: front}.items():
             region = torch.maximum(made.region, ground_truth.region)
             found = flicker(made.frames, ground_truth.frames, region), temporal_error(made.frames, ground_truth.frames)
@@ -87,7 +89,7 @@ def table(rows: Sequence[Row]) -> Table:
 def main() -> None:
     options = parser_of(__doc__, "one object, four frames of 48 pixels").parse_args()
     frames, size = (4, 48) if options.quick else (32, 256)
-    rows = [row for name in list(OBJECTS)[: 1 if options.quick else None] for row in rows_of(name, frames, size)]
+    rows = [row for name in list(OBJECTS)[: 1 if options.quick else None] for row in measure_object(name, frames, size)]
     new_console().print(table(rows))
     if options.json:
         write_rows(options.json, rows)

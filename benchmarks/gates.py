@@ -122,7 +122,7 @@ def read_package(folder: Path) -> Sample:
     return Sample(folder.name, states, surface, video, read_png(folder / SUBJECT))
 
 
-def own(name: str) -> Sample:
+def own_sample(name: str) -> Sample:
     """Return a closed shape of our own as a nearly perfect asset: a mesh, and splats on its surface."""
     ball = icosphere(subdivisions=5, radius=1.0)
     ways, faces = torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces, dtype=torch.int64)
@@ -277,7 +277,7 @@ SPOILS: dict[str, tuple[str, Spoil]] = {
 }
 
 
-def measured(sample: Sample) -> dict[str, Gate]:
+def measure_gates(sample: Sample) -> dict[str, Gate]:
     """Return every gate by name."""
     parts = Parts(partial(states_between, sample.states), sample.surface, len(sample.surface.offsets))
     evidence = gather(parts, sample.video, sample.cutout, get_rasterizer("cpu"))
@@ -288,9 +288,9 @@ def rows(samples: Sequence[Sample], tell: Callable[[str], None]) -> list[Row]:
     """Return a row per degradation."""
     good = []
     for sample in samples:
-        good.append(measured(sample))
+        good.append(measure_gates(sample))
         tell(f"{sample.name}: {_verdict(good[-1])}")
-    return [_row(name, gate, good, [measured(spoil(sample)) for sample in samples])
+    return [_row(name, gate, good, [measure_gates(spoil(sample)) for sample in samples])
             for name, (gate, spoil) in SPOILS.items()]  # fmt: skip
 
 
@@ -325,9 +325,9 @@ def main() -> None:
     parser.add_argument("--poor", nargs="*", default=[], type=Path, help="folders of packages with visible faults")
     options = parser.parse_args()
     console = Console(width=WIDTH, soft_wrap=True, highlight=False)
-    found = rows([*map(read_package, options.packages), *map(own, SHAPES)], console.print)
+    found = rows([*map(read_package, options.packages), *map(own_sample, SHAPES)], console.print)
     for folder in options.poor:
-        console.print(f"{folder.name}, poor: {_verdict(measured(read_package(folder)))}")
+        console.print(f"{folder.name}, poor: {_verdict(measure_gates(read_package(folder)))}")
     console.print(table(found))
     if options.json:
         write_rows(options.json, found)

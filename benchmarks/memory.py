@@ -20,7 +20,7 @@ import torch  # isort: skip
 from diffusers.utils import logging
 from rich.table import Column, Table
 
-from benchmarks.paper_schedule import FULL, Clock, Schedule, Sizes, forget_peak, seeded
+from benchmarks.paper_schedule import FULL, Clock, Schedule, Sizes, reset_peak_memory, seeded
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.latents import SIZE
 from dg4d_lib.diffusion.video_model import DECODER_GB, ENCODER_GB, GIB, UNET_GB
@@ -54,14 +54,19 @@ def rows(sizes: Sizes, device: torch.device) -> Iterator[Row]:
 
     model = schedule.zero123(prior_settings)
     prior = model.conditioned_on(torch.ones(1, SIZE, SIZE, 3), TimestepSchedule(settings.static.t_max_start))
-    yield Row("Zero-1-to-3", 0, peak_of(lambda: None)[1])
+    yield Row("Zero-1-to-3", 0, measure_peak(lambda: None)[1])
     pictures = torch.rand(VIEWS, SIZE, SIZE, 3, generator=seeded()).to(device).requires_grad_()
     views = [GuidanceView(OrbitCamera(azimuth_deg=90.0 * i), 0) for i in range(VIEWS)]
-    yield row("views, there and back", VIEWS, VIEW_GB[prior_settings.precision], lambda: judged(prior, pictures, views))
+    yield row(
+        "views, there and back",
+        VIEWS,
+        VIEW_GB[prior_settings.precision],
+        lambda: differentiate_loss(prior, pictures, views),
+    )
     del model, prior
 
     video_model = schedule.video_model(driving.model, Clock(device))
-    yield Row("SVD", 0, peak_of(lambda: None)[1])
+    yield Row("SVD", 0, measure_peak(lambda: None)[1])
     condition = video_model.encode_condition(torch.rand(SIZE, SIZE, 3, generator=seeded()), [seeded()])
     video = torch.rand(FRAMES, SIZE, SIZE, 3, generator=seeded()).to(device)
     encoder, decoder = 4 * ENCODER_GB, 2 * DECODER_GB  # GiB x bytes of the dtype; the encoder needs float32
@@ -72,20 +77,20 @@ def rows(sizes: Sizes, device: torch.device) -> Iterator[Row]:
     yield row("frames, decoded", FRAMES, decoder * MEGAPIXELS, lambda: video_model.decode(noise[0]))
 
 
-def judged(prior: Any, pictures: torch.Tensor, views: list[GuidanceView]) -> None:
+def differentiate_loss(prior: Any, pictures: torch.Tensor, views: list[GuidanceView]) -> None:
     """Compute the loss and its gradient."""
     prior.loss(pictures, pictures[..., :1].detach(), views, 0.5, seeded()).backward()
 
 
 def row(passage: str, items: int, planned_gb: float, work: Callable[[], Any]) -> Row:
     """Measure items that are processed at once."""
-    before, peak = peak_of(work)
+    before, peak = measure_peak(work)
     return Row(passage, items, peak, (peak - before) / items * 1024, planned_gb * 1024)
 
 
-def peak_of(work: Callable[[], Any]) -> tuple[float, float]:
+def measure_peak(work: Callable[[], Any]) -> tuple[float, float]:
     """Return GiB before and at the peak."""
-    forget_peak()
+    reset_peak_memory()
     before = torch.cuda.max_memory_allocated() / GIB
     work()
     return before, torch.cuda.max_memory_allocated() / GIB

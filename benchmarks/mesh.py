@@ -146,7 +146,7 @@ def trimesh() -> Peer:
     return cast
 
 
-def installed() -> tuple[dict[str, Peer], dict[str, str]]:
+def available_peers() -> tuple[dict[str, Peer], dict[str, str]]:
     """Return the available peers, and the reasons why others are missing."""
     found, missing = {}, {}
     for prepare in (embreex, open3d, trimesh):
@@ -208,7 +208,7 @@ def finding(scene: Scene, peer: str, ours: Times, theirs: Times, agreement: floa
 def main() -> None:
     options = parser_of(__doc__, "a small case, few rounds").parse_args()
     count, sizes, frames, rounds = (5_000, (128,), 3, 3) if options.quick else (50_000, (256, 512), FRAMES, 7)
-    console, (peers, missing) = new_console(), installed()
+    console, (peers, missing) = new_console(), available_peers()
     found = []
     for size in sizes:
         scene = bumpy_ball(count, size, frames)

@@ -57,7 +57,7 @@ class Row:
     side_iou: float
 
 
-def of_package(folder: Path, count: int, rasterize: Rasterizer) -> list[Row]:
+def measure_package(folder: Path, count: int, rasterize: Rasterizer) -> list[Row]:
     asset = read_glb((folder / ASSET).read_bytes())
     fit = read_compact(folder / COMPACT)
     gaussians, deformation, frames = fit.gaussians, fit.deformation, fit.frames
@@ -73,7 +73,7 @@ def of_package(folder: Path, count: int, rasterize: Rasterizer) -> list[Row]:
         for mode, mesh in (("tracked", tracked), ("per_frame", extracted)):
             points = [sample_surface(each.vertices, each.faces, POINTS, generator) for each in (mesh, extracted)]
             apart = chamfer_distance(*points)
-            rows.append(Row(folder.name, mode, 1, PER_WORLD_UNIT * apart, *look(mesh, ground_truth)))
+            rows.append(Row(folder.name, mode, 1, PER_WORLD_UNIT * apart, *compare_renders(mesh, ground_truth)))
     return [mean_row(folder.name, [row for row in rows if row.mode == mode]) for mode in MODES]
 
 
@@ -88,7 +88,7 @@ def splats(state: Gaussians, rasterize: Rasterizer) -> tuple[Tensor, Tensor]:
     return drawn.color, drawn.alpha
 
 
-def look(mesh: TexturedMesh, ground_truth: tuple[Tensor, Tensor]) -> list[float]:
+def compare_renders(mesh: TexturedMesh, ground_truth: tuple[Tensor, Tensor]) -> list[float]:
     """Return PSNR and IoU in the first view, then in the second."""
     color, alpha = render_mesh(mesh, cameras())
     seen = ((alpha > 0.5) | (ground_truth[1] > 0.5)).float()
@@ -109,7 +109,7 @@ def main() -> None:
     options = parser.parse_args()
     rasterize = get_rasterizer("auto")
     count = 2 if options.quick else options.frames
-    rows = [row for folder in options.packages for row in of_package(folder, count, rasterize)]
+    rows = [row for folder in options.packages for row in measure_package(folder, count, rasterize)]
     means = [mean_row("mean", [row for row in rows if row.mode == mode]) for mode in MODES]
     new_console().print(table(f"{machine()}; {SIZE} px, {POINTS} points a surface", [*rows, *means]))
     if options.json:

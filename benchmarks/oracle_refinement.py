@@ -121,7 +121,7 @@ class Model:
         return texture.clamp(0, 1)
 
 
-def model_of(name: str, frames: int, texels: int) -> Model:
+def unwrapped_model(name: str, frames: int, texels: int) -> Model:
     """Return one of our own objects with a texture of this many texels per side."""
     painted = Painted(OBJECTS[name]())
     rest = painted.vertices(0.0)
@@ -133,14 +133,14 @@ def model_of(name: str, frames: int, texels: int) -> Model:
     def texture(neighbors: int) -> Float[Tensor, "n n 3"]:
         _, nearest = tree.query(places.positions.numpy(), neighbors)
         colors = painted.colors[torch.from_numpy(np.reshape(nearest, (-1, neighbors)))].mean(1)
-        return _filled(places, colors, texels)
+        return _fill_gaps(places, colors, texels)
 
     moved = torch.stack([painted.vertices(frame / frames)[copied.long()] for frame in range(frames)])
     mesh = TexturedMesh(vertices, corners, uvs, texture(1))
     return Model(mesh, moved - vertices, places, texture(max(2, round(BLURRED_OVER * len(rest)))))
 
 
-def _filled(places: Texels, colors: Float[Tensor, "p 3"], size: int) -> Float[Tensor, "n n 3"]:
+def _fill_gaps(places: Texels, colors: Float[Tensor, "p 3"], size: int) -> Float[Tensor, "n n 3"]:
     """Fill the gaps of a texture with the color of the nearest texel on the surface."""
     picture, empty = torch.zeros(size, size, 3), np.ones((size, size), bool)
     picture[places.rows, places.columns] = colors
@@ -173,7 +173,7 @@ class Oracle:
         return (believed + keep * (video + self.sigma * UNIT * left * noise - believed)).clamp(0, 1)
 
 
-def refined(model: Model, variant: Variant, settings: TextureSettings, seed: int) -> Refined:
+def refine_model(model: Model, variant: Variant, settings: TextureSettings, seed: int) -> Refined:
     """Refine the blurred texture with the pipeline's loop; return it unchanged without a noise level."""
     if not variant.changes:
         return Refined(model.blurred)
@@ -186,7 +186,7 @@ def refined(model: Model, variant: Variant, settings: TextureSettings, seed: int
     return refine_textures([stretch], video, oracle, settings, torch.Generator().manual_seed(seed))[0]
 
 
-def figures_of(model: Model, made: Refined, size: int) -> Figures:
+def score_model(model: Model, made: Refined, size: int) -> Figures:
     """Compare with the true texture."""
     count = len(model.offsets)
     textures = [made.texture] * count if made.frames is None else list(made.frames)
@@ -215,15 +215,15 @@ def main() -> None:
         "a texture per frame": (options.texels, (FLICKER, NOISE)),
         "one texture": (0, (NOISE,)),  # which cannot flicker
     }
-    models = {name: model_of(name, options.frames, options.texels) for name in options.objects}
+    models = {name: unwrapped_model(name, options.frames, options.texels) for name in options.objects}
     for kind, (added, ablations) in kinds.items():
         settings = TextureSettings(size=options.size, iterations=options.iterations, frame_size=added)
         mine = list[Row]()
         for name, model in models.items():
             for seed in range(options.seeds):
                 for title, variant in VARIANTS.items():
-                    made = refined(model, variant, settings, seed)
-                    mine.append(Row(kind, title, name, seed, figures_of(model, made, options.size)))
+                    made = refine_model(model, variant, settings, seed)
+                    mine.append(Row(kind, title, name, seed, score_model(model, made, options.size)))
         scale = f"{options.seeds} seeds, {options.frames} frames, {options.size} px, {options.iterations} iterations"
         console.print(table(f"refinement, {kind}: {', '.join(models)}; {scale}", mine))
         for ablation in ablations:

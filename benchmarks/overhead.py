@@ -60,11 +60,11 @@ def main() -> None:
     )  # internal: record and store, runs only the steps
     options = parser.parse_args()
     if options.again:
-        in_order(options.picture, *options.again)
+        repeat_steps(options.picture, *options.again)
         return
     taken: dict[str, list[float]] = {way: [] for way in WAYS}
     for seed in range(options.turns):
-        for way, seconds in turn(options.picture.resolve(), options.set, seed).items():
+        for way, seconds in run_turn(options.picture.resolve(), options.set, seed).items():
             taken[way].append(seconds)
     plain = median(taken["steps"])
     rows = [Row(way, median(of), 1 - plain / median(of)) for way, of in taken.items()]
@@ -73,7 +73,7 @@ def main() -> None:
         write_rows(options.json, rows)
 
 
-def turn(picture: Path, knobs: list[str], seed: int) -> dict[str, float]:
+def run_turn(picture: Path, knobs: list[str], seed: int) -> dict[str, float]:
     """Return the seconds of each way with this seed."""
     changes = [word for knob in knobs for word in ("--set", knob)]
     with tempfile.TemporaryDirectory(prefix="dg4d-overhead-") as folder:
@@ -83,7 +83,7 @@ def turn(picture: Path, knobs: list[str], seed: int) -> dict[str, float]:
         def command(way: str, **more: str) -> float:
             out = str(Path(folder) / f"{way}-out")
             make = [sys.executable, "-m", "flows.cli", "make", str(picture), "--seed", str(seed), "-o", out, *changes]
-            seconds = timed(make, DG4D_HOME=homes[way], **more)
+            seconds = time_command(make, DG4D_HOME=homes[way], **more)
             whole(Path(out))
             return seconds
 
@@ -93,13 +93,15 @@ def turn(picture: Path, knobs: list[str], seed: int) -> dict[str, float]:
                 "next", PREFECT_API_URL=server.wait(), PREFECT_API_AUTH_STRING=server.auth_string()
             )
             again = [str(Path(folder) / "first-out" / RECORD), homes["steps"]]
-            seconds["steps"] = timed([sys.executable, "-m", "benchmarks.overhead", str(picture), "--again", *again])
+            seconds["steps"] = time_command(
+                [sys.executable, "-m", "benchmarks.overhead", str(picture), "--again", *again]
+            )
         finally:
             server.stop()
     return seconds
 
 
-def timed(command: list[str], **environment: str) -> float:
+def time_command(command: list[str], **environment: str) -> float:
     """Return the seconds that a program takes with this environment.
 
     Raises:
@@ -110,7 +112,7 @@ def timed(command: list[str], **environment: str) -> float:
     return time.perf_counter() - start
 
 
-def in_order(picture: Path, record: Path, folder: Path) -> None:
+def repeat_steps(picture: Path, record: Path, folder: Path) -> None:
     """Repeat the steps of a finished conversion in this process.
 
     Raises:

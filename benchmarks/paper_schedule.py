@@ -193,7 +193,7 @@ class Schedule:
     def measured(self, stage: str, clock: Clock, work: Callable[[], Any]) -> tuple[Row, Any]:
         on_gpu = self.device.type == "cuda"
         if on_gpu:
-            forget_peak()
+            reset_peak_memory()
         clock.seconds, start = 0.0, clock.now()
         with count_flops() as flops:
             made = work()
@@ -214,7 +214,7 @@ class Schedule:
         static = self.settings.static
         assert isinstance(static.start, BlobStartSettings)
         start = blob(static.start.points, BLOB_RADIUS, seeded()).to(preferred_device("auto"))
-        prior = conditioned(model, subject[None], static, clock)
+        prior = load_prior(model, subject[None], static, clock)
         return fit_gaussians(start, subject, prior, get_rasterizer("auto"), static, seeded())
 
     def fit_motion(self, model: Zero123, gaussians: Gaussians, video: DrivingVideo, clock: Clock) -> None:
@@ -223,7 +223,7 @@ class Schedule:
             self.settings.deformation, gaussians.to(torch.device("cpu")), len(video), seeded()
         )
         deformation.to(gaussians.means.device)
-        prior = conditioned(model, torch.cat([video.frames, video.coverage], -1), dynamic, clock)
+        prior = load_prior(model, torch.cat([video.frames, video.coverage], -1), dynamic, clock)
         fit_motion(gaussians, deformation, video, prior, get_rasterizer("auto"), dynamic, seeded())
 
     def refine(self, settings: VideoToVideoSettings, model: VideoModel, video: DrivingVideo) -> None:
@@ -239,7 +239,7 @@ class Schedule:
         make = partial(self.network, settings.precision, channels_last=self.device.type == "cuda")
         return Zero123(
             vae=make(lambda: AutoencoderKL(up_block_types=("UpDecoderBlock2D",) * 4, **vae(sizes))),
-            unet=shorten_attention(make(lambda: picture_unet(sizes))),
+            unet=shorten_attention(make(lambda: zero123_unet(sizes))),
             image_encoder=make(lambda: image_encoder(sizes.clip)),
             camera_projection=make(lambda: torch.nn.Linear(tokens + POSE_DIM, tokens)),
             settings=settings,
@@ -247,7 +247,7 @@ class Schedule:
 
     def video_model(self, settings: Any, clock: Clock) -> VideoModel:
         make, sizes = partial(self.network, settings.precision), self.sizes
-        unet = shorten_attention(make(lambda: video_unet(sizes)))
+        unet = shorten_attention(make(lambda: svd_unet(sizes)))
         decoder = make(lambda: AutoencoderKLTemporalDecoder(**vae(sizes)))
         model = VideoModel(unet, decoder, make(lambda: image_encoder(sizes.eye)), settings, self.device)
         clock.watch(model, "encode_condition", "encode", "decode", "denoise")
@@ -259,14 +259,14 @@ class Schedule:
             return attach_flop_counter(frozen(build().to(placement.dtype), placement))
 
 
-def forget_peak() -> None:
+def reset_peak_memory() -> None:
     """Reset the peak of the GPU memory to the current use."""
     gc.collect()  # flop counters and hooks form reference cycles
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()
 
 
-def conditioned(
+def load_prior(
     model: Zero123, cutouts: torch.Tensor, stage: StaticSettings | MotionSettings, clock: Clock
 ) -> GuidancePrior:
     """Return the prior conditioned on some frames, with timed methods."""
@@ -276,7 +276,7 @@ def conditioned(
     return prior
 
 
-def picture_unet(sizes: Sizes) -> UNet2DConditionModel:
+def zero123_unet(sizes: Sizes) -> UNet2DConditionModel:
     """Return the U-Net of Zero-1-to-3."""
     return UNet2DConditionModel(
         in_channels=2 * LATENT_CHANNELS,
@@ -285,7 +285,7 @@ def picture_unet(sizes: Sizes) -> UNet2DConditionModel:
     )
 
 
-def video_unet(sizes: Sizes) -> UNetSpatioTemporalConditionModel:
+def svd_unet(sizes: Sizes) -> UNetSpatioTemporalConditionModel:
     """Return the U-Net of Stable Video Diffusion."""
     return UNetSpatioTemporalConditionModel(
         block_out_channels=levels(sizes.unet),

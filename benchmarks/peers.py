@@ -59,8 +59,8 @@ def blended_pairs(centers, depths, conics, opacities, width, height):
     order = np.argsort(depths, kind="stable")
     order = order[depths[order] > NEAR]
     counts = np.zeros(width * height, np.int64)
-    nobody = np.empty(0, np.int64)
-    _visit(centers, conics, opacities, order, width, height, counts, False, nobody, nobody)
+    empty = np.empty(0, np.int64)
+    _visit(centers, conics, opacities, order, width, height, counts, False, empty, empty)
     places = np.cumsum(counts) - counts
     pixels, members = np.empty((2, counts.sum()), np.int64)
     _visit(centers, conics, opacities, order, width, height, places, True, pixels, members)

@@ -109,7 +109,7 @@ def _backward(cloud: Gaussians, pictures: Sequence[Tensor]) -> None:
     torch.autograd.grad(pictures, list(vars(cloud).values()), [torch.ones_like(picture) for picture in pictures])
 
 
-def cell(count: int, size: int, views: Sequence[int], rounds: int) -> tuple[dict[str, Times], list[str]]:
+def measure_cell(count: int, size: int, views: Sequence[int], rounds: int) -> tuple[dict[str, Times], list[str]]:
     """Return the times per view of all programs at one number of Gaussians and size, and the missing peers."""
     fast, plain = get_rasterizer("cpu"), get_rasterizer("reference")
     cloud, several, missing = bumpy_ball(count), views[1], []
@@ -132,7 +132,7 @@ def cell(count: int, size: int, views: Sequence[int], rounds: int) -> tuple[dict
     return {name: times.per(views_drawn.get(name, 1)) for name, times in taken.items()}, missing
 
 
-def rows_of(count: int, size: int, views: Sequence[int], taken: dict[str, Times]) -> Iterator[Row]:
+def comparison_rows(count: int, size: int, views: Sequence[int], taken: dict[str, Times]) -> Iterator[Row]:
     """Compare every peer at every number of views."""
     for peer in PEERS:
         if peer in taken:
@@ -226,8 +226,8 @@ def compare(counts: Sequence[int], sizes: Sequence[int], views: Sequence[int], r
     headings = [*(f"V={name}" for name in ours), f"wall, V={several}", "one", "own"]
     table = Table("Gaussians", "pixels", *headings, *PEERS)
     for count, size in product(counts, sizes):
-        taken, missing = cell(count, size, views, rounds)
-        rows += rows_of(count, size, views, taken)
+        taken, missing = measure_cell(count, size, views, rounds)
+        rows += comparison_rows(count, size, views, taken)
         own = [f"{taken[name].cpu_ms:.2f}" for name in ours] + [f"{taken[several].wall_ms:.2f}"]
         ratios = [f"{taken[name].cpu_ms / taken[several].cpu_ms:.2f}" for name in (str(views[0]), OWN_STATES)]
         peers = [
@@ -240,7 +240,7 @@ def compare(counts: Sequence[int], sizes: Sequence[int], views: Sequence[int], r
     return table, rows
 
 
-def inside(counts: Sequence[int], sizes: Sequence[int], rounds: int) -> Table:
+def phase_table(counts: Sequence[int], sizes: Sequence[int], rounds: int) -> Table:
     """Return the phases of one view, and the time of the blended pairs at the machine's peak."""
     peak = peak_gflops()
     table = Table("Gaussians", "pixels", *PHASES, "M pairs", "limit", "over it")
@@ -262,7 +262,7 @@ def main() -> None:
     console = new_console()
     console.print(f"{machine()}, {torch.get_num_threads()} threads")
     table, rows = compare(counts, sizes, views, rounds)
-    console.print(table, inside(counts, sizes, 5 * rounds))
+    console.print(table, phase_table(counts, sizes, 5 * rounds))
     if given.json:
         write_rows(given.json, rows)
 

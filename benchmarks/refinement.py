@@ -65,11 +65,11 @@ def variants(texture: TextureSettings, svd: str, zero123: str) -> dict[str, Refi
     }
 
 
-def refined(asset: Asset4D, video: DrivingVideo, settings: RefinerSettings, seed: int) -> TrackedMesh:
+def run_refinement(asset: Asset4D, video: DrivingVideo, settings: RefinerSettings, seed: int) -> TrackedMesh:
     """Run the refinement step.
 
     Raises:
-        BackendUnavailable: the weights are not here; says what gets them.
+        BackendUnavailable: the weights are missing; the message names the remedy.
     """
     with TemporaryDirectory() as scratch:
         folder = Path(scratch)
@@ -82,7 +82,7 @@ def refined(asset: Asset4D, video: DrivingVideo, settings: RefinerSettings, seed
         return read_tracked(folder / "after")
 
 
-def measured(variant: str, before: Float[Tensor, "h w 3"], textures: Float[Tensor, "t i j 3"]) -> Row:
+def measure_textures(variant: str, before: Float[Tensor, "h w 3"], textures: Float[Tensor, "t i j 3"]) -> Row:
     """Return flicker and sharpness of textures per frame."""
     start = resize(before[None], textures.shape[1:3])[0]
     touched = ((textures - start).abs() > MIN_CHANGE).any(-1).any(0)
@@ -112,9 +112,9 @@ def main() -> None:
     texture = TextureSettings(frame_size=FRAME_TEXELS, **quick)
     rows = []
     for name, settings in variants(texture, options.svd, options.zero123).items():
-        after = refined(asset, video, settings, options.seed)
+        after = run_refinement(asset, video, settings, options.seed)
         assert after.textures is not None, "frame_size gives every frame a texture"
-        rows.append(measured(name, asset.mesh.texture, after.textures))
+        rows.append(measure_textures(name, asset.mesh.texture, after.textures))
     table = Table(Column("variant", no_wrap=True), "flicker", "sharpness", title=machine())
     for row in rows:
         table.add_row(row.variant, f"{row.flicker:.2f}", f"{row.sharpness:.2f}")

@@ -89,7 +89,7 @@ class Place:
         subprocess.run([sys.executable, "-m", "flows.cli", "down"], env=self.environment, check=False)
 
 
-def measured(place: Place, kills: int, seed: int) -> list[Row]:
+def run_trials(place: Place, kills: int, seed: int) -> list[Row]:
     """Run an undisturbed conversion, then the trials."""
     moments = random.Random(seed)
     duration_s = 0.0
@@ -123,7 +123,7 @@ def measured(place: Place, kills: int, seed: int) -> list[Row]:
     return rows
 
 
-def shown(rows: list[Row], console: Console) -> None:
+def print_rows(rows: list[Row], console: Console) -> None:
     """Return the rows as a table."""
     same = sum(row.same for row in rows)
     table = Table(title=f"{same} of {len(rows)} ended with the digests of an undisturbed run")
@@ -151,10 +151,10 @@ def main(arguments: list[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="dg4d-resume-", ignore_cleanup_errors=True) as folder:
         place = Place(Path(folder), given.picture)
         try:
-            rows = measured(place, given.kills, given.seed)
+            rows = run_trials(place, given.kills, given.seed)
         finally:
             place.close()
-    shown(rows, new_console())
+    print_rows(rows, new_console())
     if given.json is not None:
         write_rows(given.json, rows)
     return 0 if all(row.same for row in rows) else 1

@@ -25,7 +25,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.paper_schedule import FULL, Sizes, picture_unet, video_unet
+from benchmarks.paper_schedule import FULL, Sizes, svd_unet, zero123_unet
 from dg4d_lib.diffusion.latents import LATENT_CHANNELS, LATENT_SIZE
 from dg4d_lib.diffusion.single_token_attention import shorten_attention
 
@@ -125,7 +125,7 @@ def main() -> None:
     sizes, rounds = (Sizes(), 3) if options.quick else (FULL, 7)
     console, found = new_console(), []
     console.print(f"{machine()}; torch {torch.__version__}, one thread; before / after")
-    for build, cases in ((picture_unet, pictures), (video_unet, videos)):
+    for build, cases in ((zero123_unet, pictures), (svd_unet, videos)):
         found += list(rows(partial(build, sizes), cases, rounds))
     console.print(table(found))
     if options.json:

@@ -67,7 +67,7 @@ PAPER_TOTALS = (
 )
 
 
-def of_package(folder: Path) -> Row:
+def read_package_times(folder: Path) -> Row:
     """Read the records of one package."""
     record = whole(folder)
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
@@ -77,7 +77,7 @@ def of_package(folder: Path) -> Row:
         stage = STAGES.get(ran["step"].partition(" ")[0])  # "extract_mesh 1/4" is one part
         if stage is not None:
             seconds[stage] = seconds.get(stage, 0.0) + ran["duration_s"]
-            machines.append(described(ran.get("machine", {})))
+            machines.append(hardware_line(ran.get("machine", {})))
     return Row(
         profile=report["profile"],
         machine="; ".join(dict.fromkeys(machines)),
@@ -87,7 +87,7 @@ def of_package(folder: Path) -> Row:
     )
 
 
-def described(machine: dict[str, str]) -> str:
+def hardware_line(machine: dict[str, str]) -> str:
     """Return the hardware in a line: the GPU, or the processor without one."""
     if not machine:
         return "not recorded"
@@ -107,7 +107,7 @@ def iterations_in(steps: Sequence[dict[str, Any]]) -> dict[str, int]:
     return found
 
 
-def averaged(rows: Sequence[Row]) -> list[Row]:
+def average_rows(rows: Sequence[Row]) -> list[Row]:
     """Return one row per profile, machine and iterations, in order of appearance."""
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:
@@ -145,7 +145,7 @@ def main() -> None:
         "packages", type=Path, nargs="+", metavar="PACKAGE", help=f"folders with {RECORD}, as `dg4d make` writes them"
     )
     options = parser.parse_args()
-    rows = averaged([of_package(folder) for folder in options.packages])
+    rows = average_rows([read_package_times(folder) for folder in options.packages])
     console = new_console()
     console.print(table([*rows, *PAPER]))
     console.print(PAPER_TOTALS)

@@ -57,7 +57,7 @@ class Specimen:
         return DrivingVideo(self.cutouts[..., :3], self.cutouts[..., 3:], FPS)
 
 
-def made(name: str, frames: int, size: int) -> Specimen:
+def render_specimen(name: str, frames: int, size: int) -> Specimen:
     """Render one of our own objects: a loop of this many frames, `size` pixels.
 
     Raises:
@@ -77,7 +77,7 @@ def made(name: str, frames: int, size: int) -> Specimen:
     return Specimen(name, pictures[0], bank, scored, pictures[1:first])
 
 
-def read(ground_truth: Truth, frames: int) -> Specimen:
+def read_specimen(ground_truth: Truth, frames: int) -> Specimen:
     """Read an object of a data set.
 
     Of a longer video every second, third ... frame is taken, whatever gives at most `frames`.

@@ -22,12 +22,12 @@ from dg4d_lib.metrics.image import iou, psnr
 from dg4d_lib.metrics.video import EPS, temporal_error
 
 SUBJECT_ALPHA = 0.5  # pixels with a larger alpha belong to the subject
-FLOATER_ALPHA = 0.05  # fainter floaters are invisible
+FLOATER_ALPHA = 0.05  # fainter floaters are invisible (ours)
 CONNECTIVITY = np.ones((3, 3))  # 8-connected components
 RIM = 3  # pixels inside the silhouette that sharpness ignores, because a silhouette is always sharp
-STILL = 0.002  # imperceptible change per frame and subject pixel, colors in [0, 1]
-PLAIN = 0.002  # color gradient per pixel of an image without texture, colors in [0, 1]
-DEPTH_TOLERANCE = 0.05  # world units between the positions of one point in two views
+STILL = 0.002  # imperceptible change per frame and subject pixel, colors in [0, 1] (ours)
+PLAIN = 0.002  # color gradient per pixel of an image without texture (ours)
+DEPTH_TOLERANCE = 0.05  # world units between the positions of one point in two views (ours)
 SPLATS, MESH = "splats", "mesh"  # the forms of an asset
 
 

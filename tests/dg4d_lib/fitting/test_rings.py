@@ -1,4 +1,4 @@
-"""Priors that judge several cameras together get them together."""
+"""Camera rings for priors that score several views together."""
 
 import pytest
 import torch

@@ -42,7 +42,7 @@ def networks(model: Path) -> Zero123:
 
 @pytest.fixture(scope="module")
 def exact(model: Path) -> Zero123:
-    """The same networks in double precision."""
+    """Return the networks in double precision."""
     z = Zero123.load(model, SETTINGS, CPU)
     parts = {name: getattr(z, name).double() for name in ("vae", "unet", "image_encoder", "camera_projection")}
     return dataclasses.replace(z, **parts)
@@ -61,7 +61,7 @@ def seeded(seed: int = 11) -> torch.Generator:
 def judged(
     prior: ConditionedZero123, images: torch.Tensor, views: Sequence[GuidanceView] = VIEWS, progress: float = 0.5
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Loss and gradient."""
+    """Return loss and gradient."""
     images = images.clone().requires_grad_()
     loss = prior.loss(images, torch.ones_like(images[..., :1]), views, progress, seeded())
     loss.backward()
@@ -71,7 +71,7 @@ def judged(
 def by_the_formulas(
     z: Zero123, frames: torch.Tensor, images: torch.Tensor, timestep: int, last: float | None
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Loss and gradient of SDS written out, image by image, sharing only the networks with the product."""
+    """Return loss and gradient of SDS written out per image, with the networks of the product."""
     beta = torch.linspace(math.sqrt(0.00085), math.sqrt(0.012), 1000, dtype=torch.float64) ** 2
     alphabar = torch.cumprod(1 - beta, 0)[timestep]
     noise = torch.randn((len(images), 4, 32, 32), generator=seeded(), dtype=images.dtype)
@@ -139,7 +139,7 @@ def test_stable_zero123_is_told_the_angle_of_the_input_from_the_pole(exact: Zero
 
 
 def trained_numbers(condition: torch.Tensor, target: torch.Tensor) -> list[float]:
-    """What the training of Zero-1-to-3 computed from two camera positions, z up: differences of spherical coordinates.
+    """Return the pose as in the training code of Zero-1-to-3, from two camera positions with z up.
 
     Theta is the angle from the pole (arctan2 of the distance from the axis and z), azimuth arctan2 of y and x.
     """

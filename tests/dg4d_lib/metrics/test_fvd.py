@@ -1,4 +1,4 @@
-"""Distances of films against formulas, SciPy's matrix root, and NumPy's old covariance of one row."""
+"""Video distances against formulas, SciPy's matrix root, and NumPy's old covariance of one row."""
 
 from pathlib import Path
 from typing import Any
