@@ -166,7 +166,7 @@ def test_what_cannot_be_run_is_refused_with_what_can(dataset, monkeypatch, capsy
     for words, message in (
         (["noise", f"--data={dataset}", "--objects", "cat"], "unknown objects cat; choose from balls, picture"),
         (["static", "--objects", "cat"], "unknown objects cat; choose from newt, parrot, jellyfish, excavator"),
-        (["static", "noise", f"--data={dataset}"], "noise: needs a video; of picture there is one picture"),
+        (["static", "noise", f"--data={dataset}"], "noise: needs videos; picture has one frame only"),
         (["static", f"--data={dataset / 'nowhere'}"], "is no data set"),
     ):
         with pytest.raises(SystemExit) as ended:
