@@ -23,7 +23,7 @@ from dg4d_lib.diffusion.components import default_device
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.images import over_background
 from dg4d_lib.metrics.clip import ClipModel, cosine_similarity
-from dg4d_lib.metrics.fvd import SHORTEST, fvd_consistent4d, load_i3d, logits
+from dg4d_lib.metrics.fvd import MIN_FRAMES, fvd_consistent4d, load_i3d, logits
 from dg4d_lib.metrics.image import iou, psnr, resize_square
 from dg4d_lib.metrics.lpips import Lpips, load_lpips
 from dg4d_lib.metrics.ssim import ssim
@@ -107,7 +107,7 @@ class MetricNetworks:
 
     def i3d_logits(self, frames: ViewFrames) -> Tensor | None:
         """Return I3D's logits; None if it is not installed or the frames are too few."""
-        if self.i3d is None or len(frames) < SHORTEST:
+        if self.i3d is None or len(frames) < MIN_FRAMES:
             return None
         return logits(self.i3d, frames.color, self.device)
 
@@ -133,8 +133,8 @@ def run(job: Job) -> StepReport:
             report, films = _score_package(package, truth, settings, networks, scratch, job.seed, advance)
         else:
             report, films = _score_baselines(truth, networks, advance)
-        if networks.i3d is not None and report["frames"] < SHORTEST:
-            shortage = f"I3D needs films of {SHORTEST} frames or more; these have {report['frames']}"
+        if networks.i3d is not None and report["frames"] < MIN_FRAMES:
+            shortage = f"I3D needs films of {MIN_FRAMES} frames or more; these have {report['frames']}"
             networks.missing["fvd_consistent4d"] = shortage
         _write_films(job.outputs["films"], films, scratch)
     text = json.dumps({**report, "missing": networks.missing}, allow_nan=False)

@@ -1,4 +1,4 @@
-"""The processor's rasterizer on other processors, with other threads, and over many calls."""
+"""CPU rasterizer on other CPUs, with other threads, and over many calls."""
 
 import os
 import subprocess

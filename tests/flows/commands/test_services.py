@@ -1,6 +1,7 @@
 """`dg4d up` and `dg4d down`: what they leave behind, on a server that the user names."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -54,7 +55,8 @@ def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop
         assert other.returncode == 65 and f"reads {folder.parent}; `dg4d down` stops it" in other.stderr
     finally:
         stopped = dg4d("down")
-    assert (stopped.returncode, stopped.stdout) == (0, "ending worker process-cpu\nstopped\n")
+    ending = r"ending worker process-cpu( and its \d+ runs?)?\nstopped\n"  # runs that other tests left on this server
+    assert stopped.returncode == 0 and re.fullmatch(ending, stopped.stdout)
     assert running(folder) == []
     assert "stopped!" in log.read_text()  # it was not killed
     assert server.auth_string().partition(":")[2] not in stopped.stderr + log.read_text()
