@@ -187,6 +187,6 @@ def _resized(cutouts: Float[Tensor, "b h w 4"]) -> Pictures:
 def _flaws(surface: Surface, position: Float[Tensor, ""]) -> float:
     """Return the broken edges and triangles per triangle, plus the share of inverted components."""
     mesh = mesh_at(surface, position)
-    facts = checked(*welded(mesh.vertices.numpy(), mesh.faces.numpy()))
-    broken = facts.boundary + facts.crowded + facts.twisted + facts.flat
-    return broken / max(1, facts.triangles) + facts.inverted / max(1, facts.components)
+    check = checked(*welded(mesh.vertices.numpy(), mesh.faces.numpy()))
+    broken = check.boundary + check.crowded + check.twisted + check.flat
+    return broken / max(1, check.triangles) + check.inverted / max(1, check.components)
