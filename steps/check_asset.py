@@ -187,6 +187,6 @@ def _resized(cutouts: Float[Tensor, "b h w 4"]) -> RgbaImages:
 def _flaws(surface: Surface, position: Float[Tensor, ""]) -> float:
     """Return the broken edges and triangles per triangle, plus the share of inverted components."""
     mesh = mesh_at(surface, position)
-    facts = check_topology(*weld_vertices(mesh.vertices.numpy(), mesh.faces.numpy()))
-    broken = facts.boundary_edges + facts.nonmanifold_edges + facts.inconsistent_edges + facts.degenerate_faces
-    return broken / max(1, facts.triangles) + facts.inverted_components / max(1, facts.components)
+    check = check_topology(*weld_vertices(mesh.vertices.numpy(), mesh.faces.numpy()))
+    broken = check.boundary_edges + check.nonmanifold_edges + check.inconsistent_edges + check.degenerate_faces
+    return broken / max(1, check.triangles) + check.inverted_components / max(1, check.components)

@@ -1,6 +1,5 @@
 """Step that compares an asset, or naive baselines without an asset, with ground truth."""
 
-import itertools
 import json
 import shutil
 import zipfile
@@ -123,16 +122,10 @@ def run(job: Job) -> StepReport:
         scratch = Path(folder)
         truth = find_ground_truth(_unpacked(job.inputs["truth"], scratch / "truth"))
         networks = MetricNetworks(settings.score)
-        done = itertools.count(1)
-
-        def advance(total: int) -> None:
-            job.progress(next(done), total, {})
-
         if "package" in job.inputs:
-            package = _unpacked(job.inputs["package"], scratch / "package")
-            report, films = _score_package(package, truth, settings, networks, scratch, job.seed, advance)
+            report, films = _score_package(job, truth, networks, scratch)
         else:
-            report, films = _score_baselines(truth, networks, advance)
+            report, films = _score_baselines(job, truth, networks)
         if networks.i3d is not None and report["frames"] < MIN_FRAMES:
             shortage = f"I3D needs films of {MIN_FRAMES} frames or more; these have {report['frames']}"
             networks.missing["fvd_consistent4d"] = shortage
@@ -168,14 +161,10 @@ def compare(ours: ViewFrames, theirs: ViewFrames, networks: MetricNetworks) -> M
 
 
 def _score_package(
-    package: Path,
-    truth: GroundTruth,
-    settings: ScoreAssetSettings,
-    networks: MetricNetworks,
-    scratch: Path,
-    seed: int,
-    advance: Callable[[int], None],
+    job: Job, truth: GroundTruth, networks: MetricNetworks, scratch: Path
 ) -> tuple[dict[str, Any], dict[str, ViewFrames]]:
+    settings: ScoreAssetSettings = job.settings
+    package = _unpacked(job.inputs["package"], scratch / "package")
     given = _read(truth.inputs)
     size, total = given.color.shape[1], len(truth.views) + 2
 
@@ -194,29 +183,29 @@ def _score_package(
         embedded = networks.clip.embed(resize_square(ours.color, networks.size))
         wanted = networks.clip.embed(resize_square(given.color[:1], networks.size))
         of_input["clip_i"] = float(cosine_similarity(embedded, wanted.expand_as(embedded)).mean())
-    advance(total)
-    for view in truth.views:
+    job.progress(1, total, {})
+    for done, view in enumerate(truth.views, 2):
         theirs = _read(view.frames, size)
         films[f"view_{view.name}"] = rendered = render(view.azimuth_deg, len(theirs))
         views[view.name] = compare(rendered, theirs, networks)
         clips[view.name] = networks.i3d_logits(rendered)
-        advance(total)
+        job.progress(done, total, {})
     scores: Scores = {"input": of_input, "views": views, "mean": _mean(views)}
     if truth.mesh is not None:
-        scores["geometry"] = _geometry(package, truth.mesh, settings.score.samples, seed)
-    advance(total)
+        scores["geometry"] = _geometry(package, truth.mesh, settings.score.samples, job.seed)
+    job.progress(total, total, {})
     return _report(truth, size, {"asset": scores}, clips), films
 
 
 def _score_baselines(
-    truth: GroundTruth, networks: MetricNetworks, advance: Callable[[int], None]
+    job: Job, truth: GroundTruth, networks: MetricNetworks
 ) -> tuple[dict[str, Any], dict[str, ViewFrames]]:
     """Score three baselines per view: the input's frames, its first frame, and the first frame of the true view."""
     given = _read(truth.inputs)
     size = given.color.shape[1]
     films, clips = {"input": given}, {}
     baselines: dict[str, dict[str, Metrics]] = {}
-    for view in truth.views:
+    for done, view in enumerate(truth.views, 1):
         theirs = _read(view.frames, size)
         films[f"view_{view.name}"] = theirs
         still = [0] * len(theirs)
@@ -225,7 +214,7 @@ def _score_baselines(
         for name, frames in tried.items():
             baselines.setdefault(name, {})[view.name] = compare(frames, theirs, networks)
         clips[view.name] = networks.i3d_logits(theirs)
-        advance(len(truth.views))
+        job.progress(done, len(truth.views), {})
     rows = {name: {"views": views, "mean": _mean(views)} for name, views in baselines.items()}
     return _report(truth, size, rows, clips), films
 
