@@ -1,4 +1,4 @@
-"""Many orders in one run: a few at a time, each in a flow run of its own; a bad one stops no other."""
+"""Many jobs in one run: a few at a time, each in a flow run of its own; a bad one stops no other."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -22,18 +22,18 @@ from flows.engine.item_runs import failure, item_deployment
 from flows.engine.orphans import claim_run
 from flows.engine.runners import item_runner
 from flows.engine.step_tasks import flow_context
+from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.manifest import Item
-from flows.inputs.orders import Order
 from flows.inputs.places import parse_where
 from flows.packages.delivery import forget_shared
 from flows.packages.summary import Row, Tally, judged
 from flows.ui.gallery import Gallery
 from steps.contract import ArtifactRef
 
-Make = Callable[[Order, Path], tuple[Any, bool]]
+Make = Callable[[ConversionJob, Path], tuple[Any, bool]]
 Allow = Callable[[Item], None]
 
-ORDERS = "application/vnd.dg4d.orders+jsonl"
+JOBS_MEDIA_TYPE = "application/vnd.dg4d.orders+jsonl"
 
 
 @flow(name="catalog", flow_run_name="{title}", persist_result=False)
@@ -43,11 +43,11 @@ def catalog(request: CatalogRequest, title: str) -> None:
     convert_catalog(request, title)
 
 
-@flow(name="convert-orders", flow_run_name="{title}", persist_result=False)
-def convert_orders(orders: ArtifactRef, out: Path, workers: int, title: str) -> None:
-    """Make every order of a list in the store: JSON, one to a line."""
+@flow(name="convert-jobs", flow_run_name="{title}", persist_result=False)
+def convert_jobs(jobs: ArtifactRef, out: Path, workers: int, title: str) -> None:
+    """Make every job of a list in the store: JSON, one to a line."""
     claim_run()
-    _convert_list(orders, out, workers, title)
+    _convert_list(jobs, out, workers, title)
 
 
 def run_catalog(request: CatalogRequest, title: str, tally: Tally, allow: Allow | None = None) -> None:
@@ -69,13 +69,13 @@ def run_catalog(request: CatalogRequest, title: str, tally: Tally, allow: Allow 
             convert_catalog(request, title, allow)
 
 
-def run_orders(orders: list[Order], out: Path, workers: int, title: str, tally: Tally) -> None:
-    """Make orders as `run_catalog` makes a catalog."""
-    lines = "".join(f"{order.model_dump_json()}\n" for order in orders)
-    listed = home.store().put_bytes(lines.encode(), ORDERS)
+def run_jobs(jobs: list[ConversionJob], out: Path, workers: int, title: str, tally: Tally) -> None:
+    """Make jobs as `run_catalog` makes a catalog."""
+    lines = "".join(f"{job.model_dump_json()}\n" for job in jobs)
+    listed = home.store().put_bytes(lines.encode(), JOBS_MEDIA_TYPE)
     with flow_context(), _known(out, tally):
         if FlowRunContext.get() is None:
-            convert_orders(listed, out, workers, title)
+            convert_jobs(listed, out, workers, title)
         else:
             _convert_list(listed, out, workers, title)
 
@@ -89,7 +89,7 @@ def convert_catalog(request: CatalogRequest, title: str, allow: Allow | None = N
 
 
 def convert_all(
-    todo: Iterable[Order | Row],
+    todo: Iterable[ConversionJob | Row],
     out: Path,
     workers: int,
     title: str,
@@ -108,7 +108,7 @@ def convert_all(
         tally: told the row of every item; again, if it is tried again.
         strict: an item that a gate does not let pass counts as failed, and no other is begun after it.
         where: where items are made, as `flows.engine.runners.parse_where` reads it.
-        work: makes an order into a folder on this machine or in its cluster, and says whether every step had been done
+        work: makes a job into a folder on this machine or in its cluster, and says whether every step had been done
             before.
 
     Raises:
@@ -131,13 +131,13 @@ def convert_all(
 
 
 @task(name="convert", task_run_name="convert {item}", cache_policy=NO_CACHE, persist_result=False)
-def convert(item: str, order: str, out: str, strict: bool, attempt: int, work: Make) -> tuple[dict[str, Any], bool]:
-    """Make one order, given as JSON: Prefect would look for futures in every knob, and runners for graphs.
+def convert(item: str, job: str, out: str, strict: bool, attempt: int, work: Make) -> tuple[dict[str, Any], bool]:
+    """Make one job, given as JSON: Prefect would look for futures in every knob, and runners for graphs.
 
     A failure is a row too. Also says whether the same again may go better.
     """
     start = time.monotonic()
-    row, may_heal = _converted(Order.model_validate_json(order), Path(out) / item, strict, work)
+    row, may_heal = _converted(ConversionJob.model_validate_json(job), Path(out) / item, strict, work)
     row = row.model_copy(update={"wall_s": round(time.monotonic() - start, 1), "attempts": attempt})
     return row.model_dump(mode="json"), may_heal
 
@@ -158,14 +158,14 @@ def _known(out: Path, tally: Tally) -> Iterator[None]:
         del _tallies[out]
 
 
-def _convert_list(orders: ArtifactRef, out: Path, workers: int, title: str) -> None:
-    lines = home.store().path(orders).read_bytes().splitlines()
-    todo = (Order.model_validate_json(line) for line in lines)
+def _convert_list(jobs: ArtifactRef, out: Path, workers: int, title: str) -> None:
+    lines = home.store().path(jobs).read_bytes().splitlines()
+    todo = (ConversionJob.model_validate_json(line) for line in lines)
     convert_all(todo, out, workers, title, _tallies.get(out) or Tally(len(lines)))
 
 
 def _rounds(
-    todo: Iterable[Order | Row],
+    todo: Iterable[ConversionJob | Row],
     out: Path,
     workers: int,
     tally: Tally,
@@ -174,19 +174,19 @@ def _rounds(
     gallery: Gallery,
     runner: TaskRunner[Any],
     attempt: int,
-) -> Iterator[Order]:
+) -> Iterator[ConversionJob]:
     """Make everything in `todo`; gives those that died and may live next time."""
-    running: dict[PrefectFuture[Any], Order] = {}
+    running: dict[PrefectFuture[Any], ConversionJob] = {}
     finished: SimpleQueue[PrefectFuture[Any]] = SimpleQueue()
 
-    def settled() -> Iterator[Order]:
+    def settled() -> Iterator[ConversionJob]:
         future = finished.get()
-        order = running.pop(future)
+        job = running.pop(future)
         content, may_heal = future.result()
         row = Row.model_validate(content)
         if may_heal and attempt == 1:
             row = row.model_copy(update={"message": f"{row.message} (will be tried again at the end)"})
-            yield order
+            yield job
         tally.settle(row)
         gallery.update()
 
@@ -202,7 +202,7 @@ def _rounds(
         else:
             parameters = {
                 "item": one.item,
-                "order": one.model_dump_json(),
+                "job": one.model_dump_json(),
                 "out": str(out),
                 "strict": strict,
                 "attempt": attempt,
@@ -215,13 +215,13 @@ def _rounds(
         yield from settled()
 
 
-def _converted(order: Order, folder: Path, strict: bool, work: Make) -> tuple[Row, bool]:
-    row = Row(item=order.item, source=order.source_name, status="failed")
+def _converted(job: ConversionJob, folder: Path, strict: bool, work: Make) -> tuple[Row, bool]:
+    row = Row(item=job.item, source=job.source_name, status="failed")
     try:
-        _, cached = work(order, folder)
+        _, cached = work(job, folder)
     except Exception as error:  # whatever it is, it is this item's own
         outcome = failure(error)
-        pictures = [str(path) for path in save_pictures(order, error)]
+        pictures = [str(path) for path in save_pictures(job, error)]
         told = {"message": outcome.message, "kind": outcome.kind, "pictures": pictures}
         return row.model_copy(update=told), outcome.may_heal
     done = row.model_copy(update={"status": "done", "message": "every step was already done" if cached else ""})

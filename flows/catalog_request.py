@@ -1,4 +1,4 @@
-"""Request of a catalog, and the orders of its items."""
+"""Request of a catalog, and the jobs of its items."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,8 +10,8 @@ from dg4d_lib.errors import DG4DError
 from flows import home
 from flows.formatting.escaping import visible
 from flows.inputs import naming
+from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.manifest import Item, admitted, items_of, only_commercial
-from flows.inputs.orders import Order
 from flows.inputs.places import parse_where
 from flows.packages.publish import check_folder, is_current
 from flows.packages.summary import Row, judged
@@ -75,8 +75,8 @@ def default_workers(where: str) -> int:
     return ITEMS_IN_FLIGHT if parse_where(where).kind == "deployment" else 1
 
 
-def ready(item: Item, out: Path, strict: bool) -> Order | Row:
-    """Return the order of an item, or what became of it already; whatever is wrong with it makes a row that failed."""
+def ready(item: Item, out: Path, strict: bool) -> ConversionJob | Row:
+    """Return the job of an item, or what became of it already; whatever is wrong with it makes a row that failed."""
     row = Row(item=item.name, source=visible(item.wish.source_name) if item.wish else "", status="unchanged")
     failed = row.model_copy(update={"status": "failed"})
     try:
@@ -86,8 +86,8 @@ def ready(item: Item, out: Path, strict: bool) -> Order | Row:
         with item.here() as wish:
             wish.check()
             check_folder(out / item.name)
-            order = wish.order(home.store())
-        return judged(row, out / item.name, strict) if is_current(out / item.name, order.digest()) else order
+            job = wish.to_job(home.store())
+        return judged(row, out / item.name, strict) if is_current(out / item.name, job.digest()) else job
     except DG4DError as error:
         return failed.model_copy(update={"kind": type(error).__name__, "message": visible(str(error))})
     except Exception as error:  # it is this item's own

@@ -26,7 +26,7 @@ from flows.commands.weights import weights
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from flows.inputs.orders import Order
+    from flows.inputs.conversion_job import ConversionJob
 
 app = typer.Typer(
     name="dg4d",
@@ -95,9 +95,9 @@ def make(
         from dg4d_lib.errors import BadInput
         from flows import home
         from flows.commands import terminal
+        from flows.inputs.conversion_job import Wish, name_of
         from flows.inputs.manifest import parse_changes
         from flows.inputs.naming import clean
-        from flows.inputs.orders import Wish, name_of
         from flows.inputs.package_record import record_of
         from flows.packages.acceptance import failing_in
         from flows.packages.publish import check_folder, is_current
@@ -124,12 +124,12 @@ def make(
         wish.check()
         folder = out or Path("out") / item
         check_folder(folder, item, force)
-        order = wish.order(home.store())
-        if is_current(folder, order.digest()):
+        job = wish.to_job(home.store())
+        if is_current(folder, job.digest()):
             console.print("nothing to do: every step was already done")
             files = (record_of(folder) or {"files": {}})["files"]
         else:
-            files = _made(order, folder, console)
+            files = _made(job, folder, console)
         terminal.tell_where(console, folder, {name: fact["size_bytes"] for name, fact in files.items()})
         if (folder / "report.html").is_file():
             console.print(f"report: {folder / 'report.html'}", markup=False)
@@ -159,9 +159,9 @@ def motions(
         from flows import home
         from flows.commands import terminal
         from flows.convert import make_motions
+        from flows.inputs.conversion_job import Wish
         from flows.inputs.manifest import parse_changes
         from flows.inputs.naming import clean
-        from flows.inputs.orders import Wish
         from flows.packages.publish import check_writable
         from steps.profiles import profile as named
         from steps.profiles import revise
@@ -181,8 +181,8 @@ def motions(
         wish.check()
         folder = out or Path("out") / f"{item}-motions"
         check_writable(folder)
-        order = wish.order(home.store())
-        ranking = terminal.with_steps(order, console, lambda: make_motions(order, folder))
+        job = wish.to_job(home.store())
+        ranking = terminal.with_steps(job, console, lambda: make_motions(job, folder))
         for row in ranking["candidates"]:
             remarks = "; ".join(row["remarks"])
             console.print(f"{row['number']:>3}  {row['total']:.2f}  {row['name']}  {remarks}".rstrip(), markup=False)
@@ -363,12 +363,12 @@ def main() -> None:
     app()
 
 
-def _made(order: "Order", folder: Path, console: "Console") -> dict[str, dict[str, int]]:
-    """Run the flow of an order with its steps on the terminal; the files of the package."""
+def _made(job: "ConversionJob", folder: Path, console: "Console") -> dict[str, dict[str, int]]:
+    """Run the flow of a job with its steps on the terminal; the files of the package."""
     from flows.commands import terminal
     from flows.convert import make
 
-    files, cached = terminal.with_steps(order, console, lambda: make(order, folder))
+    files, cached = terminal.with_steps(job, console, lambda: make(job, folder))
     if cached:
         console.print("nothing to do: every step was already done")
     return files

@@ -1,4 +1,4 @@
-"""One order becomes one folder: connect to a server, run the flow, publish what it made."""
+"""One job becomes one folder: connect to a server, run the flow, publish what it made."""
 
 import importlib
 import os
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from flows import home
 from flows.engine.free_space import require_free_space
-from flows.inputs.orders import Order
+from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.package_record import record_of
 from flows.packages.publish import Files, is_current
 from flows.serving import background
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 ANSWER_S = 10.0  # for a server of the user's own
 
 
-def prepare(order: Order) -> None:
-    """Begin what the first step of an order would wait for, unless every step was done before."""
+def prepare(job: ConversionJob) -> None:
+    """Begin what the first step of a job would wait for, unless every step was done before."""
     from flows.engine import executors
     from flows.engine.versions import has_version
 
-    if not has_version(home.store(), order):
+    if not has_version(home.store(), job):
         executors.prepare()
 
 
@@ -57,8 +57,8 @@ def connect() -> None:
     settle_orphans()
 
 
-def make(order: Order, folder: Path) -> tuple[Files, bool]:
-    """Run the flow of an order and put the package into `folder`, signed if a key is configured; keep it as a version.
+def make(job: ConversionJob, folder: Path) -> tuple[Files, bool]:
+    """Run the flow of a job and put the package into `folder`, signed if a key is configured; keep it as a version.
 
     What turns out to be damaged or gone on the way is made again. Another run that writes the same folder is waited
     for; if it made the same package, there is nothing left to do.
@@ -76,23 +76,23 @@ def make(order: Order, folder: Path) -> tuple[Files, bool]:
     from flows.step_errors import StepLost
 
     def waiting() -> None:
-        tell(StepEvent(order.item, "output", "remark", text=f"waiting for another run that writes {folder}"))
+        tell(StepEvent(job.item, "output", "remark", text=f"waiting for another run that writes {folder}"))
 
     with output_lock(folder, waiting) as waited:
-        if waited and is_current(folder, order.digest()):
+        if waited and is_current(folder, job.digest()):
             return _files_in(folder), True
         try:
-            result = _make(order, folder)
+            result = _make(job, folder)
         except (ArtifactMissing, StepLost):  # it was dropped when it was found, and so was the result that named it
-            result = _make(order, folder)
+            result = _make(job, folder)
     return _files_in(folder), all(done.cached for done in result.steps)
 
 
-def run(order: Order, folder: Path | None = None, refresh: bool = False, mesh_parts: int = 0) -> "FlowResult":
-    """Run the flow of an order.
+def run(job: ConversionJob, folder: Path | None = None, refresh: bool = False, mesh_parts: int = 0) -> "FlowResult":
+    """Run the flow of a job.
 
     Args:
-        order: request of the conversion.
+        job: request of the conversion.
         folder: output folder; None: the package stays in the store.
         refresh: run every step, also those whose result exists.
         mesh_parts: number of tasks that extract a mesh per frame; 0: one per slot of this machine.
@@ -106,17 +106,17 @@ def run(order: Order, folder: Path | None = None, refresh: bool = False, mesh_pa
     from flows import pipeline
     from flows.engine.resources import slots
 
-    flow = pipeline.text_to_4d if order.drawn else pipeline.video_to_4d if order.moving else pipeline.image_to_4d
+    flow = pipeline.text_to_4d if job.drawn else pipeline.video_to_4d if job.moving else pipeline.image_to_4d
     runner: Any = ThreadPoolTaskRunner(max_workers=slots())
-    with _surroundings(order, {PREFECT_TASKS_REFRESH_CACHE: refresh}):
-        return flow.with_options(task_runner=runner)(order, folder, mesh_parts)
+    with _surroundings(job, {PREFECT_TASKS_REFRESH_CACHE: refresh}):
+        return flow.with_options(task_runner=runner)(job, folder, mesh_parts)
 
 
-def _make(order: Order, folder: Path) -> "FlowResult":
+def _make(job: ConversionJob, folder: Path) -> "FlowResult":
     from flows.engine.leases import running
 
-    with running(home.store(), order.item):
-        return run(order, folder)
+    with running(home.store(), job.item):
+        return run(job, folder)
 
 
 def _files_in(folder: Path) -> Files:
@@ -124,35 +124,35 @@ def _files_in(folder: Path) -> Files:
     return files
 
 
-def make_motions(order: Order, folder: Path) -> dict[str, Any]:
-    """Hold the tournament of an order's motions and put sheet, ranking and films into `folder`; the ranking.
+def make_motions(job: ConversionJob, folder: Path) -> dict[str, Any]:
+    """Hold the tournament of a job's motions and put sheet, ranking and films into `folder`; the ranking.
 
     Raises:
         StepError: a step did not finish.
     """
     from flows.motions import motions, unpack
 
-    with _surroundings(order):
-        outputs = motions(order)
+    with _surroundings(job):
+        outputs = motions(job)
     return unpack(outputs, folder)
 
 
 @contextmanager
-def _surroundings(order: Order, settings: dict[Any, Any] | None = None) -> Iterator[None]:
-    """What a flow of an order runs in, with these settings of Prefect beside those of every flow."""
+def _surroundings(job: ConversionJob, settings: dict[Any, Any] | None = None) -> Iterator[None]:
+    """What a flow of a job runs in, with these settings of Prefect beside those of every flow."""
     from prefect import tags
 
     from flows.engine.step_tasks import flow_context
 
-    with flow_context(settings), tags(order.profile):
+    with flow_context(settings), tags(job.profile):
         yield
 
 
-def save_pictures(order: Order, error: Exception) -> list[Path]:
+def save_pictures(job: ConversionJob, error: Exception) -> list[Path]:
     """Keep the pictures that explain a failure where the user can look at them."""
     saved = []
     for name, ref in getattr(error, "pictures", {}).items():
-        path = home.failures() / f"{order.item.replace('/', '-')}-{getattr(error, 'step', 'step')}-{name}.png"
+        path = home.failures() / f"{job.item.replace('/', '-')}-{getattr(error, 'step', 'step')}-{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             home.store().get(ref, path)

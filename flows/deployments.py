@@ -24,13 +24,13 @@ from flows.commands.benchmark import bench
 from flows.commands.options import knobs_of
 from flows.commands.terminal import console
 from flows.convert import connect, make
-from flows.engine.item_runs import FLOW, failure, read_order
+from flows.engine.item_runs import FLOW, failure, read_job
 from flows.engine.orphans import claim_run
 from flows.engine.shared_results import sharing_results
+from flows.inputs.conversion_job import Wish
 from flows.inputs.fetching import at_hand, without_secrets
 from flows.inputs.manifest import parse_changes
 from flows.inputs.naming import clean
-from flows.inputs.orders import Wish
 from flows.packages.delivery import Outcome, pack, write_outcome
 from flows.packages.publish import check_folder, is_current
 from flows.serving.roots import Roots
@@ -232,7 +232,7 @@ def catalog_to_4d(
 @flow(name=FLOW, flow_run_name="{item}", persist_result=False)
 def item_to_4d(
     item: Annotated[Text, Field(json_schema_extra=_title("Item"))],
-    order: Annotated[ArtifactRef, Field(json_schema_extra=_title("Order"))],
+    job: Annotated[ArtifactRef, Field(json_schema_extra=_title("ConversionJob"))],
     code: Annotated[Text, Field(json_schema_extra=_title("Code"))],
     store: Annotated[Text, Field(json_schema_extra=_title("Store"))],
 ) -> State[None]:
@@ -240,11 +240,11 @@ def item_to_4d(
 
     Args:
         item: name of the asset
-        order: what to make, in the store that catalog and worker share
+        job: what to make, in the store that catalog and worker share
         code: digest of the steps of the catalog; a worker with others refuses the item
         store: address of the catalog's store, for messages
     """
-    outcome = _made_for_catalog(order, code, store)
+    outcome = _made_for_catalog(job, code, store)
     write_outcome(home.store(), str(runtime.flow_run.id), outcome)
     if outcome.package is None:
         return Failed(message=f"{outcome.step}: {outcome.message}".removeprefix(": "))
@@ -297,12 +297,12 @@ def _begin() -> None:
         )
 
 
-def _made_for_catalog(order: ArtifactRef, code: str, address: str) -> Outcome:
-    """Make an order of a catalog into the store; a failure is an outcome too."""
+def _made_for_catalog(job: ArtifactRef, code: str, address: str) -> Outcome:
+    """Make a job of a catalog into the store; a failure is an outcome too."""
     store = home.store()
     try:
         _begin()
-        wanted = read_order(order, code, store, address)
+        wanted = read_job(job, code, store, address)
         Roots.of_this_process().check_weights(wanted.settings.model_dump(mode="json"))
         connect()
         with sharing_results(store), tempfile.TemporaryDirectory(prefix="dg4d-item-") as scratch:
@@ -333,7 +333,7 @@ def _make(address: str, folder: Path, options: Options, roots: Roots, **files: P
     )
     wish.check()
     check_folder(folder, wish.item)
-    order = wish.order(home.store())
-    if not is_current(folder, order.digest()):
+    job = wish.to_job(home.store())
+    if not is_current(folder, job.digest()):
         connect()
-        make(order, folder)
+        make(job, folder)

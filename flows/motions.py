@@ -8,7 +8,7 @@ from prefect import flow
 
 from flows import home
 from flows.engine.step_tasks import steps_of_flow
-from flows.inputs.orders import Order
+from flows.inputs.conversion_job import ConversionJob
 from flows.pipeline import conversion_of
 from flows.step_errors import StepBadInput
 from flows.tasks import drive_video, prepare_subject
@@ -16,16 +16,16 @@ from steps.artifacts.archives import unpack as unpack_zip
 from steps.contract import ArtifactRef
 
 
-@flow(name="motions", flow_run_name="{order.item}", persist_result=False)
-def motions(order: Order) -> dict[str, ArtifactRef]:
+@flow(name="motions", flow_run_name="{job.item}", persist_result=False)
+def motions(job: ConversionJob) -> dict[str, ArtifactRef]:
     """Prepare the subject and rank the candidates of `drive_video`; its outputs by name.
 
     Raises:
         StepError: a step did not finish.
     """
     with steps_of_flow():
-        conversion = conversion_of(order)
-        subject = prepare_subject(order.source, conversion)
+        conversion = conversion_of(job)
+        subject = prepare_subject(job.source, conversion)
         if subject.footage is not None:
             raise StepBadInput("prepare_subject", "this is a video and has its motion already; give a picture")
         return drive_video(subject, conversion).outputs

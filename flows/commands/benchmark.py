@@ -13,8 +13,8 @@ from dg4d_lib.asset_settings import ScoreSettings
 from dg4d_lib.errors import BadInput, DG4DError
 from flows import home
 from flows.commands import terminal
+from flows.inputs.conversion_job import ConversionJob, Wish
 from flows.inputs.manifest import parse_changes
-from flows.inputs.orders import Order, Wish
 from flows.packages import scores
 from flows.packages.publish import check_folder, check_writable, is_current, whole
 from flows.packages.scores import Results
@@ -147,7 +147,7 @@ def bench(
     from flows.convert import connect
 
     connect()
-    rows = _converted([wish.order(home.store()) for wish in wishes], out / ASSETS, workers, console, dataset.name)
+    rows = _converted([wish.to_job(home.store()) for wish in wishes], out / ASSETS, workers, console, dataset.name)
     from flows.judge import judge
 
     entries = [_entry(truth, out / ASSETS / truth.name, rows[truth.name]) for truth in truths]
@@ -234,15 +234,15 @@ def _wish(truth: Truth, bank: bool, **asked: Any) -> Wish:
     )
 
 
-def _converted(orders: list[Order], folder: Path, workers: int, console: "Console", name: str) -> dict[str, Row]:
+def _converted(jobs: list[ConversionJob], folder: Path, workers: int, console: "Console", name: str) -> dict[str, Row]:
     """Make what is not made yet; what became of every object."""
-    from flows.catalog import run_orders
+    from flows.catalog import run_jobs
 
-    rows = {order.item: Row(item=order.item, status="unchanged") for order in orders}
-    waiting = [order for order in orders if not is_current(folder / order.item, order.digest())]
+    rows = {job.item: Row(item=job.item, status="unchanged") for job in jobs}
+    waiting = [job for job in jobs if not is_current(folder / job.item, job.digest())]
     if not waiting:
         return rows
-    with terminal.batch_shown(console, [order.item for order in waiting]) as table:
+    with terminal.batch_shown(console, [job.item for job in waiting]) as table:
 
         def show(row: Row) -> None:
             table.settle(row.item, row.status, row.message)
@@ -250,7 +250,7 @@ def _converted(orders: list[Order], folder: Path, workers: int, console: "Consol
                 console.print(f"{row.item}: {row.status} {row.message}", markup=False)
 
         tally = Tally(len(waiting), show)
-        run_orders(waiting, folder, workers, f"{name}: {len(waiting)} objects", tally)
+        run_jobs(waiting, folder, workers, f"{name}: {len(waiting)} objects", tally)
     return rows | tally.rows
 
 

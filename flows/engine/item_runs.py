@@ -1,6 +1,6 @@
 """Items of a catalog as flow runs of a deployment: begun once, waited for, and found again after a catalog was killed.
 
-An item travels by reference: its order and source lie in the store, and so does what comes back.
+An item travels by reference: its job and source lie in the store, and so does what comes back.
 """
 
 import itertools
@@ -30,7 +30,7 @@ from flows.engine import resources
 from flows.engine.events import StepEvent, tell
 from flows.engine.leases import hold, running
 from flows.engine.output_lock import output_lock
-from flows.inputs.orders import Order
+from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.package_record import record_of
 from flows.packages.delivery import Outcome, deliver, read_outcome
 from flows.packages.publish import Files
@@ -40,7 +40,7 @@ from steps.runtime.installed_code import catalog, request_version
 from steps.store.artifact_store import ArtifactMissing, ArtifactStore, StoreUnreachable
 
 FLOW = "item-to-4d"
-ORDER = "application/vnd.dg4d.order+json"
+JOB_MEDIA_TYPE = "application/vnd.dg4d.order+json"
 STEP = "item"  # the name under which events of a waiting item are shown
 POLL_S = 1.0  # between two looks at a run
 POLLS_PER_S = 20  # of all waiting items of a catalog together
@@ -77,37 +77,37 @@ class ItemDeployment(NamedTuple):
     pool: str
     poll_s: float = POLL_S
 
-    def make(self, order: Order, folder: Path) -> tuple[Files, bool]:
-        """Have a worker make an order, and put the package into `folder`, as `flows.convert.make` does here.
+    def make(self, job: ConversionJob, folder: Path) -> tuple[Files, bool]:
+        """Have a worker make a job, and put the package into `folder`, as `flows.convert.make` does here.
 
         Raises:
             ItemFailed: the worker could not make it, or died.
             BadInput: the folder cannot be written.
         """
         store = home.store()
-        ref = store.put_bytes(order.model_dump_json().encode(), ORDER)
-        with running(store, order.item):
-            hold(store, order.item, [ref.digest, *(needed.digest for needed in (order.source, order.bank) if needed)])
-            outcome = self._outcome(order, ref, store)
+        ref = store.put_bytes(job.model_dump_json().encode(), JOB_MEDIA_TYPE)
+        with running(store, job.item):
+            hold(store, job.item, [ref.digest, *(needed.digest for needed in (job.source, job.bank) if needed)])
+            outcome = self._outcome(job, ref, store)
             if outcome.package is None:
                 raise ItemFailed(outcome)
             with output_lock(folder, lambda: None):
                 files = deliver(outcome.package, folder, store)
-        if (record_of(folder) or {}).get("order") != order.digest():
+        if (record_of(folder) or {}).get("order") != job.digest():
             note = "made with other weights, another rasterizer or another signing key than this machine has"
-            tell(StepEvent(order.item, STEP, "remark", text=note))
+            tell(StepEvent(job.item, STEP, "remark", text=note))
         return files, outcome.cached
 
-    def _outcome(self, order: Order, ref: ArtifactRef, store: ArtifactStore) -> Outcome:
+    def _outcome(self, job: ConversionJob, ref: ArtifactRef, store: ArtifactStore) -> Outcome:
         with get_client(sync_client=True) as client:
-            run = self._begin(client, order, ref, store)
-            run = self._wait(client, run, order.item)
+            run = self._begin(client, job, ref, store)
+            run = self._wait(client, run, job.item)
         return _outcome_of(run, store)
 
-    def _begin(self, client: SyncPrefectClient, order: Order, ref: ArtifactRef, store: ArtifactStore) -> FlowRun:
+    def _begin(self, client: SyncPrefectClient, job: ConversionJob, ref: ArtifactRef, store: ArtifactStore) -> FlowRun:
         """Begin the run of an item, or return the one that was begun before and is at work or has its package."""
         for number in itertools.count():
-            key = digest_of([order.digest(), ref.digest, self.name, number])
+            key = digest_of([job.digest(), ref.digest, self.name, number])
             found = client.read_flow_runs(
                 flow_run_filter=FlowRunFilter(idempotency_key=FlowRunFilterIdempotencyKey(any_=[key]))
             )
@@ -116,12 +116,12 @@ class ItemDeployment(NamedTuple):
             if _is_at_work(found[0]) or _has_package(found[0], store):
                 return found[0]
         parameters: dict[str, Any] = {
-            "item": order.item,
-            "order": ref.model_dump(mode="json"),
+            "item": job.item,
+            "job": ref.model_dump(mode="json"),
             "code": code_version(),
             "store": store.address,
         }
-        begun = run_deployment(self.name, parameters=parameters, timeout=0, tags=[order.profile], idempotency_key=key)
+        begun = run_deployment(self.name, parameters=parameters, timeout=0, tags=[job.profile], idempotency_key=key)
         assert isinstance(begun, FlowRun)
         return begun
 
@@ -190,11 +190,11 @@ def code_version() -> str:
     return digest_of({name: request_version(spec) for name, spec in catalog().items()})
 
 
-def read_order(order: ArtifactRef, code: str, store: ArtifactStore, address: str) -> Order:
-    """Read an order that a catalog put into the store.
+def read_job(job: ArtifactRef, code: str, store: ArtifactStore, address: str) -> ConversionJob:
+    """Read a job that a catalog put into the store.
 
     Args:
-        order: its reference.
+        job: its reference.
         code: the code of the catalog, by `code_version`.
         store: of this machine.
         address: of the catalog's store.
@@ -206,12 +206,12 @@ def read_order(order: ArtifactRef, code: str, store: ArtifactStore, address: str
         raise BackendUnavailable(
             "this worker runs another version of dg4d than the catalog; install the same on all machines"
         )
-    if not store.has(order):
+    if not store.has(job):
         raise BackendUnavailable(
-            f"the order {order.digest} is not in the store of this worker, {store.address}; the catalog put it into "
+            f"the job {job.digest} is not in the store of this worker, {store.address}; the catalog put it into "
             f"{address}: set $DG4D_STORE of both to one store"
         )
-    return Order.model_validate_json(store.path(order).read_bytes())
+    return ConversionJob.model_validate_json(store.path(job).read_bytes())
 
 
 def _described(error: Exception) -> str:

@@ -1,4 +1,4 @@
-"""What was made of an item, version by version: a record of every finished order, beside its artifacts in the store."""
+"""What was made of an item, version by version: a record of every finished job, beside its artifacts in the store."""
 
 import hashlib
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from dg4d_lib.errors import BadInput
 from flows.engine.leases import wait_for_collecting
-from flows.inputs.orders import Order
+from flows.inputs.conversion_job import ConversionJob
 from flows.packages.flow_result import FlowResult
 from steps.contract import ArtifactRef, Digest, Frozen
 from steps.store.artifact_store import ArtifactMissing, ArtifactStore
@@ -33,11 +33,11 @@ class StepDone(Frozen):
 
 
 class Version(Frozen):
-    """One finished order.
+    """One finished job.
 
     Attributes:
         item: name of the asset.
-        order: digest of what was asked for; the same order again is the same version.
+        order: digest of what was asked for; the same job again is the same version.
         package: what came out.
         finished: when it was last made or found to be made, ISO 8601 in UTC.
         source: the picture, video or words.
@@ -57,7 +57,7 @@ class Version(Frozen):
 
     @property
     def name(self) -> str:
-        """Its place in the store: a folder per item, a file per order."""
+        """Its place in the store: a folder per item, a file per job."""
         return _name(self.item, self.order)
 
     def artifacts(self) -> dict[str, str]:
@@ -74,23 +74,23 @@ class Version(Frozen):
         return found
 
 
-def keep_version(store: ArtifactStore, order: Order, result: FlowResult) -> Version:
-    """Record that an order is finished; from now on nothing removes what it needs.
+def keep_version(store: ArtifactStore, job: ConversionJob, result: FlowResult) -> Version:
+    """Record that a job is finished; from now on nothing removes what it needs.
 
     Raises:
-        ArtifactMissing: something it needs was removed at this very moment; the same order again makes it again.
+        ArtifactMissing: something it needs was removed at this very moment; the same job again makes it again.
         StoreUnreachable: the store does not answer.
         DiskFull: there is no room.
     """
     version = Version(
-        item=order.item,
-        order=order.digest(),
+        item=job.item,
+        order=job.digest(),
         package=result.package,
         finished=datetime.now(UTC).isoformat(timespec="seconds"),
-        profile=order.profile,
-        seed=order.seed,
-        source=order.source,
-        bank=order.bank,
+        profile=job.profile,
+        seed=job.seed,
+        source=job.source,
+        bank=job.bank,
         steps=tuple(
             StepDone(
                 label=done.label,
@@ -106,18 +106,18 @@ def keep_version(store: ArtifactStore, order: Order, result: FlowResult) -> Vers
         here = {entry.name for entry in store.artifacts()}
         if gone := [what for digest, what in version.artifacts().items() if digest not in here]:
             store.remove([version.name])
-            raise ArtifactMissing(f"{', '.join(gone)} of {order.item} was removed from {store.address} meanwhile")
+            raise ArtifactMissing(f"{', '.join(gone)} of {job.item} was removed from {store.address} meanwhile")
         store.write(version.name, version.model_dump_json(indent=1) + "\n")  # an older one of this name may have gone
     return version
 
 
-def has_version(store: ArtifactStore, order: Order) -> bool:
-    """Whether this order was finished before.
+def has_version(store: ArtifactStore, job: ConversionJob) -> bool:
+    """Whether this job was finished before.
 
     Raises:
         StoreUnreachable: the store does not answer.
     """
-    return store.read(_name(order.item, order.digest())) is not None
+    return store.read(_name(job.item, job.digest())) is not None
 
 
 def versions(store: ArtifactStore) -> list[Version]:
@@ -166,8 +166,8 @@ def faults(store: ArtifactStore, of: list[Version], sizes: Mapping[str, int]) ->
     return wrong
 
 
-def _name(item: str, order: Digest) -> str:
-    return f"{FOLDER}/{_key(item)}/{order.removeprefix('sha256:')}.json"
+def _name(item: str, job: Digest) -> str:
+    return f"{FOLDER}/{_key(item)}/{job.removeprefix('sha256:')}.json"
 
 
 def _key(item: str) -> str:

@@ -10,9 +10,9 @@ from typing import Any
 from dg4d_lib.errors import BadInput, DG4DError
 from flows.formatting.escaping import quoted, visible
 from flows.inputs import listing, sources
+from flows.inputs.conversion_job import Wish, name_of
 from flows.inputs.json_text import UnfitJSON, loads
 from flows.inputs.naming import check_path, clean, distinct
-from flows.inputs.orders import Wish, name_of
 from flows.inputs.rows import MANIFESTS, Row, read_rows
 from flows.inputs.setting_reference import check_names
 from steps.contract import LARGEST_SEED, Frozen

@@ -70,13 +70,13 @@ def check_writable(folder: Path) -> None:
         ) from error
 
 
-def is_current(folder: Path, order: str) -> bool:
-    """Whether a folder holds the package of an order (its digest), with every byte as it was written.
+def is_current(folder: Path, job: str) -> bool:
+    """Whether a folder holds the package of a job (its digest), with every byte as it was written.
 
     What lies beside the package, the reports for example, must be there, as whatever it is.
     """
     record = record_of(folder)
-    if record is None or record.get("order") != order:
+    if record is None or record.get("order") != job:
         return False
     try:
         unchanged = all(fact_of(folder / name) == fact for name, fact in record["files"].items())

@@ -7,7 +7,7 @@ from fake_steps import picture
 from typer.testing import Result
 
 from flows import home
-from flows.inputs.orders import Order, Wish
+from flows.inputs.conversion_job import ConversionJob, Wish
 from steps.profiles import PREVIEW, revise
 
 Run = Callable[..., Result]  # the command `dg4d`, in this process
@@ -24,9 +24,9 @@ def ran(log: Path) -> list[str]:
     return steps
 
 
-def order(words: str, folder: Path, *, name: str = "fake.png", item: str = "fake", **changes: object) -> Order:
+def job(words: str, folder: Path, *, name: str = "fake.png", item: str = "fake", **changes: object) -> ConversionJob:
     (folder / name).write_text(picture(words))
-    return Wish(item=item, picture=folder / name, settings=revise(PREVIEW, dict(changes))).order(home.store())
+    return Wish(item=item, picture=folder / name, settings=revise(PREVIEW, dict(changes))).to_job(home.store())
 
 
 def tree(folder: Path, *but: str) -> dict[str, bytes]:

@@ -14,7 +14,7 @@ from waiting import retry_after
 
 from flows import home
 from flows.convert import make
-from flows.inputs.orders import Wish
+from flows.inputs.conversion_job import Wish
 from flows.serving.auth import basic
 from flows.serving.server import Server
 from flows.step_errors import StepCrashed
@@ -44,7 +44,7 @@ def left_by(words: str, place: Path) -> dict[str, bytes]:
     (place / "secret.png").write_text(picture(words))
     wish = Wish(item="secret", picture=place / "secret.png", settings=PREVIEW)
     try:
-        make(wish.order(home.store()), place / "out")
+        make(wish.to_job(home.store()), place / "out")
     except StepCrashed:
         assert "crash" in words
     APILogHandler().flush()

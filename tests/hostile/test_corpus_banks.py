@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from flows.catalog_request import ready
+from flows.inputs.conversion_job import ConversionJob, Wish
 from flows.inputs.manifest import Item
-from flows.inputs.orders import Order, Wish
 from flows.packages.summary import Row
 from steps.profiles import profile, revise
 from steps.store.artifact_store import ArtifactStore
@@ -29,7 +29,7 @@ def decoder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Decoder]:
         yield child
 
 
-def ordered(place: Place, bank: Path) -> Order | Row:
+def ordered(place: Place, bank: Path) -> ConversionJob | Row:
     """Prepare an item with a bank as a batch does."""
     picture = place.work / "cat.png"
     picture.write_bytes(sound_png())
@@ -48,7 +48,7 @@ def test_a_bank_gets_what_the_table_says_at_the_door_or_in_the_step(name: str, p
     path = place.work / "bank"
     CASES[name](path)
     found = ordered(place, path)
-    if isinstance(found, Order):
+    if isinstance(found, ConversionJob):
         assert found.bank is not None
         blob = ArtifactStore(place.home / "store").path(found.bank)
         with zipfile.ZipFile(blob) as archive:

@@ -8,7 +8,7 @@ import pytest
 
 from dg4d_lib.errors import BadInput
 from flows.commands.compose import compose
-from flows.inputs.orders import order_again
+from flows.inputs.conversion_job import job_from_record
 from flows.inputs.package_record import RECORD, record_of
 from flows.packages.publish import check_folder, is_current, whole
 from flows.packages.verify import verify
@@ -54,7 +54,7 @@ def test_a_record_breaks_no_command_that_reads_one(name: str, place: Place) -> N
             assert len(str(error)) < 10_000
     if record is not None:
         with pytest.raises(BadInput):
-            order_again(record, ArtifactStore(place.home / "store"))
+            job_from_record(record, ArtifactStore(place.home / "store"))
 
 
 def verdict(name: str, folder: Path) -> str:

@@ -25,8 +25,8 @@ from flows.catalog import convert_all
 from flows.catalog_request import CatalogRequest, ready
 from flows.commands.batch import batch, tell
 from flows.engine import resources
+from flows.inputs.conversion_job import ConversionJob, Wish
 from flows.inputs.manifest import items_of
-from flows.inputs.orders import Order, Wish
 from flows.packages.summary import NOT_ACCEPTED, Row, Tally, Writer
 from flows.processes import locked
 from flows.serving.server import Server
@@ -47,19 +47,19 @@ def place(server: Server) -> Iterator[None]:
         yield
 
 
-def orders(folder: Path, *names: str) -> list[Order]:
+def jobs(folder: Path, *names: str) -> list[ConversionJob]:
     for name in names:
         (folder / f"{name}.png").write_text(picture(f"batch {name}"))
     wishes = [Wish(item=name, picture=folder / f"{name}.png", settings=PREVIEW) for name in names]
-    return [wish.order(home.store()) for wish in wishes]
+    return [wish.to_job(home.store()) for wish in wishes]
 
 
 def test_what_died_is_tried_once_more_at_the_end_and_bad_input_is_not(place: None, tmp_path: Path) -> None:
     begun: list[str] = []
 
-    def work(order: Order, folder: Path) -> tuple[None, bool]:
-        begun.append(order.item)
-        match order.item:
+    def work(job: ConversionJob, folder: Path) -> tuple[None, bool]:
+        begun.append(job.item)
+        match job.item:
             case "dies" if begun.count("dies") == 1:
                 raise StepOutOfMemory("fit_motion", "killed")
             case "hopeless":
@@ -70,7 +70,7 @@ def test_what_died_is_tried_once_more_at_the_end_and_bad_input_is_not(place: Non
 
     names = ("dies", "bad", "hopeless", "fine")
     tally = Tally(4)
-    inside_a_flow(convert_all, orders(tmp_path, *names), tmp_path, 1, "retries", tally, work=work)
+    inside_a_flow(convert_all, jobs(tmp_path, *names), tmp_path, 1, "retries", tally, work=work)
     assert begun == [*names, "dies", "hopeless"]
     assert {row.item: (row.status, row.attempts) for row in tally.rows.values()} == {
         "dies": ("done", 2),
@@ -84,16 +84,16 @@ def test_what_died_is_tried_once_more_at_the_end_and_bad_input_is_not(place: Non
 def test_items_are_prepared_one_ahead_of_those_at_work(place: None, tmp_path: Path) -> None:
     finished, ahead = 0, []
 
-    def work(order: Order, folder: Path) -> tuple[None, bool]:
+    def work(job: ConversionJob, folder: Path) -> tuple[None, bool]:
         nonlocal finished
         time.sleep(0.05)
         finished += 1
         return None, False
 
-    def todo() -> Iterator[Order]:
-        for drawn, order in enumerate(orders(tmp_path, *"abcdefgh"), 1):
+    def todo() -> Iterator[ConversionJob]:
+        for drawn, job in enumerate(jobs(tmp_path, *"abcdefgh"), 1):
             ahead.append(drawn - finished)
-            yield order
+            yield job
 
     tally = Tally(8)
     inside_a_flow(convert_all, todo(), tmp_path, 2, "ahead", tally, work=work)
@@ -109,33 +109,33 @@ def test_meshing_of_one_item_overlaps_fitting_of_the_next_and_fits_never_overlap
     fits, second_fit, mutex = 0, threading.Event(), threading.Lock()
     most = 0
 
-    def work(order: Order, folder: Path) -> tuple[None, bool]:
+    def work(job: ConversionJob, folder: Path) -> tuple[None, bool]:
         nonlocal fits, most
         with resources.slot("gpu", lambda text: None):
             with mutex:
                 fits += 1
                 most = max(most, fits)
-            if order.item == "second":
+            if job.item == "second":
                 second_fit.set()
             time.sleep(0.2)
             with mutex:
                 fits -= 1
         with resources.slot("cpu", lambda text: None):
-            if order.item == "first":
+            if job.item == "first":
                 assert second_fit.wait(30), "nothing is fitted while a mesh is made"
         return None, False
 
     tally = Tally(2)
-    inside_a_flow(convert_all, orders(tmp_path, "first", "second"), tmp_path, 2, "overlap", tally, work=work)
+    inside_a_flow(convert_all, jobs(tmp_path, "first", "second"), tmp_path, 2, "overlap", tally, work=work)
     assert [row.status for row in tally.rows.values()] == ["done", "done"]
     assert most == 1
 
 
 def test_the_server_shows_how_far_a_batch_is_and_a_page_that_can_be_read(place: None, tmp_path: Path) -> None:
     rows = [Row(item=f"{i:04d}", status="unchanged") for i in range(3 * ROWS_SHOWN)]
-    (one,) = orders(tmp_path, "zebra")
+    (one,) = jobs(tmp_path, "zebra")
 
-    def work(order: Order, folder: Path) -> tuple[None, bool]:
+    def work(job: ConversionJob, folder: Path) -> tuple[None, bool]:
         raise StepBadInput("prepare_subject", "ugly")
 
     tally = Tally(len(rows) + 1)
@@ -285,9 +285,9 @@ def test_a_hundred_items_are_found_unchanged_in_a_moment_each(tmp_path: Path, mo
     found = items_of(tmp_path / "in", tmp_path / "out", "preview", {}, 0)
     ready(found[0], tmp_path / "out", strict=False)  # reads the source
     for item in found:
-        order = ready(item, tmp_path / "out", strict=False)
-        assert isinstance(order, Order)
-        record = {"order": order.digest(), "files": {}}
+        job = ready(item, tmp_path / "out", strict=False)
+        assert isinstance(job, ConversionJob)
+        record = {"order": job.digest(), "files": {}}
         (tmp_path / "out" / item.name / "provenance.json").write_text(json.dumps(record))
     start = time.process_time()
     rows = [ready(item, tmp_path / "out", strict=False) for item in found]

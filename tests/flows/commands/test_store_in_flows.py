@@ -16,7 +16,7 @@ from flows import home
 from flows.convert import make
 from flows.engine.collecting import collect
 from flows.engine.versions import Version, faults, versions
-from flows.inputs.orders import Order, Wish
+from flows.inputs.conversion_job import ConversionJob, Wish
 from flows.packages.publish import whole
 from flows.serving.server import Server
 from flows.step_errors import StepLost, StepUnreachable
@@ -55,9 +55,9 @@ def ran(log: Path) -> list[str]:
     return steps
 
 
-def order(words: str, folder: Path) -> Order:
+def job(words: str, folder: Path) -> ConversionJob:
     (folder / "fake.png").write_text(picture(words))
-    return Wish(item="fake", picture=folder / "fake.png", settings=revise(PREVIEW, {})).order(home.store())
+    return Wish(item="fake", picture=folder / "fake.png", settings=revise(PREVIEW, {})).to_job(home.store())
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -89,7 +89,7 @@ def is_whole() -> bool:
 
 
 def test_a_finished_order_is_a_version_and_the_same_order_again_is_the_same(log: Path, tmp_path: Path) -> None:
-    wanted = order("version", tmp_path)
+    wanted = job("version", tmp_path)
     make(wanted, tmp_path / "out")
     made = the_version()
     record = json.loads((tmp_path / "out" / "provenance.json").read_text())
@@ -98,19 +98,19 @@ def test_a_finished_order_is_a_version_and_the_same_order_again_is_the_same(log:
     assert is_whole()
     make(wanted, tmp_path / "again")
     assert the_version().steps == made.steps
-    make(order("another version", tmp_path), tmp_path / "out")
+    make(job("another version", tmp_path), tmp_path / "out")
     assert len(versions(home.store())) == 2
     assert list(home.store().entries("running")) == []
 
 
 @pytest.mark.parametrize("how", ["gone", "flipped", "short"])
 def test_whatever_is_damaged_between_two_runs_is_made_again(log: Path, tmp_path: Path, how: str) -> None:
-    make(order("damage", tmp_path), tmp_path / "one")
+    make(job("damage", tmp_path), tmp_path / "one")
     every = ran(log)
     assert len(set(every)) == len(every) > 5
     for digest in the_version().artifacts():
         damage(digest, how)
-    make(order("damage", tmp_path), tmp_path / "two")
+    make(job("damage", tmp_path), tmp_path / "two")
     again = ran(log)  # what one step makes anew another may share
     assert again and set(again) <= set(every)
     assert is_whole()
@@ -118,13 +118,13 @@ def test_whatever_is_damaged_between_two_runs_is_made_again(log: Path, tmp_path:
     whole(tmp_path / "two")
     only = next(step for step in the_version().steps if step.label == "fit_motion").outputs["motion"]
     damage(only, how)
-    make(order("damage", tmp_path), tmp_path / "three")
+    make(job("damage", tmp_path), tmp_path / "three")
     assert ran(log) == ["fit_motion"]
     assert content(tmp_path / "one") == content(tmp_path / "three")
 
 
 def test_what_is_damaged_while_a_flow_runs_is_made_again(log: Path, tmp_path: Path) -> None:
-    wanted = order("midway fit_motion=sleep-once:1", tmp_path)
+    wanted = job("midway fit_motion=sleep-once:1", tmp_path)
 
     def spoil() -> None:
         while not log.exists() or "fit_motion" not in log.read_text():
@@ -142,21 +142,21 @@ def test_what_is_damaged_while_a_flow_runs_is_made_again(log: Path, tmp_path: Pa
 
 
 def test_a_source_that_is_gone_is_an_error_and_not_a_loop(log: Path, tmp_path: Path) -> None:
-    wanted = order("gone", tmp_path)
+    wanted = job("gone", tmp_path)
     damage(wanted.source.digest, "gone")
     with pytest.raises(StepLost, match="run the same command again"):
         make(wanted, tmp_path / "out")
-    make(order("gone", tmp_path), tmp_path / "out")
+    make(job("gone", tmp_path), tmp_path / "out")
 
 
 def test_removing_all_the_time_harms_no_run(log: Path, tmp_path: Path) -> None:
-    make(order("busy", tmp_path), tmp_path / "one")
+    make(job("busy", tmp_path), tmp_path / "one")
     ran(log)
     store = home.store()
     store.remove([the_version().name])
     for entry in store.entries("sha256"):  # all is old, and no version needs it
         os.utime(store.root / entry.name, (0, 0))
-    wanted, done, removed = order("busy", tmp_path), threading.Event(), []
+    wanted, done, removed = job("busy", tmp_path), threading.Event(), []
 
     def remove() -> None:
         while not done.is_set():
@@ -175,17 +175,17 @@ def test_removing_all_the_time_harms_no_run(log: Path, tmp_path: Path) -> None:
 
 
 def test_a_bucket_gives_the_same_as_a_folder(bucket: TinyS3, log: Path, tmp_path: Path) -> None:
-    make(order("bucket", tmp_path), tmp_path / "one")
+    make(job("bucket", tmp_path), tmp_path / "one")
     every = ran(log)
     assert set(the_version().artifacts()) == {entry.name for entry in home.store().artifacts()}
     for path in (tmp_path / "home" / "copies").rglob("*"):
         if path.is_file():
             path.unlink()
-    make(order("bucket", tmp_path), tmp_path / "two")
+    make(job("bucket", tmp_path), tmp_path / "two")
     assert ran(log) == []
     assert content(tmp_path / "one") == content(tmp_path / "two")
     os.environ.pop("DG4D_STORE")
-    make(order("bucket", tmp_path), tmp_path / "three")
+    make(job("bucket", tmp_path), tmp_path / "three")
     again = ran(log)
     assert again and set(again) <= set(every)
     assert content(tmp_path / "one") == content(tmp_path / "three")
@@ -194,7 +194,7 @@ def test_a_bucket_gives_the_same_as_a_folder(bucket: TinyS3, log: Path, tmp_path
 def test_a_bucket_that_goes_away_for_a_while_delays_a_flow_and_no_more(
     bucket: TinyS3, log: Path, tmp_path: Path
 ) -> None:
-    wanted = order("away fit_motion=sleep-once:0.5", tmp_path)
+    wanted = job("away fit_motion=sleep-once:0.5", tmp_path)
     absence = threading.Thread(target=_absent, args=(bucket, log, "fit_motion", 1.5))
     absence.start()
     make(wanted, tmp_path / "out")
@@ -209,7 +209,7 @@ def test_a_step_that_lost_patience_with_the_bucket_is_tried_again(
 ) -> None:
     monkeypatch.setattr("steps.store.opening.PATIENCE_S", 0.1)
     retry_after(3.0, monkeypatch)
-    wanted = order("patience fit_motion=sleep-once:0.3", tmp_path)
+    wanted = job("patience fit_motion=sleep-once:0.3", tmp_path)
     absence = threading.Thread(target=_absent, args=(bucket, log, "fit_motion", 2.0))
     absence.start()
     make(wanted, tmp_path / "out")
@@ -222,7 +222,7 @@ def test_a_bucket_that_stays_away_is_a_clear_error_and_the_next_run_goes_on(
     bucket: TinyS3, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("steps.store.opening.PATIENCE_S", 0.1)
-    wanted = order("stays-away fit_motion=sleep-once:0.3", tmp_path)
+    wanted = job("stays-away fit_motion=sleep-once:0.3", tmp_path)
     absence = threading.Thread(target=_absent, args=(bucket, log, "fit_motion", 0))
     absence.start()
     with pytest.raises(StepUnreachable, match="does not answer"):

@@ -193,7 +193,7 @@ def test_a_version_that_is_recorded_while_things_are_removed_is_whole_or_not_the
     template = version(store, "cat", "one")
     store.remove([template.name])
 
-    class Order:  # as much of one as is asked
+    class ConversionJob:  # as much of one as is asked
         item, profile, seed, source, bank = "cat", "preview", 0, template.source, None
 
         def digest(self) -> str:
@@ -202,7 +202,7 @@ def test_a_version_that_is_recorded_while_things_are_removed_is_whole_or_not_the
     class Made:
         package, steps = template.package, []
 
-    order: Any = Order()
+    job: Any = ConversionJob()
     made: Any = Made()
     removing, recorded = threading.Event(), threading.Event()
     results: list[Any] = []
@@ -219,7 +219,7 @@ def test_a_version_that_is_recorded_while_things_are_removed_is_whole_or_not_the
 
     def keep() -> None:
         try:
-            results.append(keep_version(store, order, made))
+            results.append(keep_version(store, job, made))
         except Exception as error:
             results.append(error)
 
@@ -233,7 +233,7 @@ def test_a_version_that_is_recorded_while_things_are_removed_is_whole_or_not_the
     assert "package of cat was removed" in str(results[0])
     assert versions(store) == []
     store.put_bytes(b"package one", "a/b")
-    keep_version(store, order, made)
+    keep_version(store, job, made)
     assert [v.item for v in versions(store)] == ["cat"]
 
 

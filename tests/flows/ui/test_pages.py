@@ -22,7 +22,7 @@ from waiting import retry_after, wait_until
 from flows import home
 from flows.convert import make
 from flows.formatting import curves
-from flows.inputs.orders import Order, Wish
+from flows.inputs.conversion_job import ConversionJob, Wish
 from flows.serving.auth import basic
 from flows.serving.server import Server
 from flows.step_errors import StepDiverged
@@ -53,9 +53,9 @@ def place(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     return tmp_path
 
 
-def order(words: str, folder: Path, item: str) -> Order:
+def job(words: str, folder: Path, item: str) -> ConversionJob:
     (folder / "fake.png").write_text(picture(words))
-    return Wish(item=item, picture=folder / "fake.png", settings=PREVIEW).order(home.store())
+    return Wish(item=item, picture=folder / "fake.png", settings=PREVIEW).to_job(home.store())
 
 
 def artifacts(item: str, path: str = "/artifacts/latest/filter") -> dict[str, list[dict[str, Any]]]:
@@ -92,7 +92,7 @@ def drawn_in_browser(server: Server, version: dict[str, Any], screenshot: Path) 
 
 
 def test_an_item_leaves_a_page_per_step_and_one_with_everything(place: Path) -> None:
-    _, cached = make(order("pages", place, "paged"), place / "out")
+    _, cached = make(job("pages", place, "paged"), place / "out")
     assert not cached
     kept = {key: latest[0] for key, latest in artifacts("paged").items()}
     labels = {step.replace("_", "-") for step in EVERY_STEP}
@@ -119,7 +119,7 @@ def test_an_item_leaves_a_page_per_step_and_one_with_everything(place: Path) -> 
 
 
 def test_files_and_the_viewer_are_a_link_away(place: Path) -> None:
-    make(order("links", place, "linked"), place / "out")
+    make(job("links", place, "linked"), place / "out")
     kept = {key: latest[0]["data"] for key, latest in artifacts("linked").items()}
     to = {key: re.findall(r"/dg4d/[^)\s\]]+", str(data)) for key, data in kept.items()}
     kind, subject = fetched(to["prepare-subject"][0])
@@ -143,9 +143,9 @@ def test_files_and_the_viewer_are_a_link_away(place: Path) -> None:
 
 
 def test_the_same_item_again_is_a_new_version_under_the_same_keys(place: Path) -> None:
-    make(order("version one", place, "versioned"), place / "out")
-    make(order("version two", place, "versioned"), place / "out")
-    make(order("version two", place, "versioned"), place / "out")
+    make(job("version one", place, "versioned"), place / "out")
+    make(job("version two", place, "versioned"), place / "out")
+    make(job("version two", place, "versioned"), place / "out")
     every, latest = artifacts("versioned", "/artifacts/filter"), artifacts("versioned")
     assert {key: len(versions) for key, versions in every.items() if key in ("asset", "fit-motion")} == {
         "asset": 3, "fit-motion": 2,
@@ -157,14 +157,14 @@ def test_the_same_item_again_is_a_new_version_under_the_same_keys(place: Path) -
 
 def test_a_step_that_failed_leaves_its_reason_and_its_last_good_state(place: Path) -> None:
     with pytest.raises(StepDiverged):
-        make(order("fit_motion=diverge", place, "diverged"), place / "out")
+        make(job("fit_motion=diverge", place, "diverged"), place / "out")
     kept = {key: latest[0]["data"] for key, latest in artifacts("diverged").items()}
     assert "iteration 7" in kept["fit-motion"] and "![last_good](data:image/webp;base64," in kept["fit-motion"]
     assert "asset" not in kept and "package" not in kept
 
 
 def test_a_browser_draws_every_picture_of_the_page(server: Server, place: Path) -> None:
-    make(order("drawn", place, "drawn"), place / "out")
+    make(job("drawn", place, "drawn"), place / "out")
     (version,) = artifacts("drawn", "/artifacts/filter")["asset"]
     seen = drawn_in_browser(server, version, place / "page.png")
     assert [shown["name"] for shown in seen["pictures"]] == [*TITLES, *["Losses of the fake"] * LOSSES]
@@ -219,7 +219,7 @@ def test_counts_are_read_with_all_their_digits() -> None:
 
 def test_an_item_may_be_called_anything_and_is_shown_letter_by_letter(server: Server, place: Path) -> None:
     name = "{0} {item} ![x](http:tracker) |b| <img src=x> *c*"
-    make(order("nasty", place, name), place / "out")
+    make(job("nasty", place, name), place / "out")
     with get_client(sync_client=True) as client:
         wanted = {"artifacts": {"key": {"like_": "-0-item-x-http-tracker-b-img-src-x-c-"}}, "limit": 200}
         found: list[dict[str, Any]] = client.request("POST", "/artifacts/filter", json=wanted).json()
