@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.measure import machine, new_console, parser_of, write_rows
-from flows.inputs.conversion_job import Wish
+from flows.inputs.conversion_job import ConversionRequest
 from flows.inputs.package_record import RECORD
 from flows.packages.publish import whole
 from flows.serving.server import Server
@@ -117,8 +117,8 @@ def in_order(picture: Path, record: Path, folder: Path) -> None:
     """
     prepare_process()
     store = ArtifactStore(folder)
-    wish = Wish(item=picture.stem, picture=picture, profile="preview", settings=profile("preview"))
-    source = wish.to_job(store).source
+    conversion = ConversionRequest(item=picture.stem, picture=picture, profile="preview", settings=profile("preview"))
+    source = conversion.to_job(store).source
     known = {source.digest: source}
     for done in json.loads(record.read_text(encoding="utf-8"))["steps"]:
         request = StepRequest(

@@ -77,16 +77,16 @@ def default_workers(where: str) -> int:
 
 def ready(item: Item, out: Path, strict: bool) -> ConversionJob | Row:
     """Return the job of an item, or what became of it already; whatever is wrong with it makes a row that failed."""
-    row = Row(item=item.name, source=visible(item.wish.source_name) if item.wish else "", status="unchanged")
+    row = Row(item=item.name, source=visible(item.request.source_name) if item.request else "", status="unchanged")
     failed = row.model_copy(update={"status": "failed"})
     try:
         naming.check_not_reserved(item.name)
-        if item.wish is not None:
-            item.wish.check_names()  # before a file of this name is fetched
-        with item.here() as wish:
-            wish.check()
+        if item.request is not None:
+            item.request.check_names()  # before a file of this name is fetched
+        with item.fetch() as request:
+            request.check()
             check_folder(out / item.name)
-            job = wish.to_job(home.store())
+            job = request.to_job(home.store())
         return judged(row, out / item.name, strict) if is_current(out / item.name, job.digest()) else job
     except DG4DError as error:
         return failed.model_copy(update={"kind": type(error).__name__, "message": visible(str(error))})

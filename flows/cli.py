@@ -95,7 +95,7 @@ def make(
         from dg4d_lib.errors import BadInput
         from flows import home
         from flows.commands import terminal
-        from flows.inputs.conversion_job import Wish, name_of
+        from flows.inputs.conversion_job import ConversionRequest, name_of
         from flows.inputs.manifest import parse_changes
         from flows.inputs.naming import clean
         from flows.inputs.package_record import record_of
@@ -110,7 +110,7 @@ def make(
         short = knobs_of(triangles, texture, fps) | ({"driving.pick": pick} if pick else {})
         settings = revise(named(profile), parse_changes(changes or []) | short)
         item = (clean(picture.stem) or "asset") if picture else name_of(text)
-        wish = Wish(
+        request = ConversionRequest(
             item=item,
             picture=picture,
             text=text,
@@ -121,10 +121,10 @@ def make(
             seed=seed,
             commercial_only=commercial_only,
         )
-        wish.check()
+        request.check()
         folder = out or Path("out") / item
         check_folder(folder, item, force)
-        job = wish.to_job(home.store())
+        job = request.to_job(home.store())
         if is_current(folder, job.digest()):
             console.print("nothing to do: every step was already done")
             files = (record_of(folder) or {"files": {}})["files"]
@@ -159,7 +159,7 @@ def motions(
         from flows import home
         from flows.commands import terminal
         from flows.convert import make_motions
-        from flows.inputs.conversion_job import Wish
+        from flows.inputs.conversion_job import ConversionRequest
         from flows.inputs.manifest import parse_changes
         from flows.inputs.naming import clean
         from flows.packages.publish import check_writable
@@ -170,7 +170,7 @@ def motions(
         several = {"driving.candidates": candidates, "driving.pick": 0}
         settings = revise(named(profile), parse_changes(changes or []) | several)
         item = clean(picture.stem) or "asset"
-        wish = Wish(
+        request = ConversionRequest(
             item=item,
             picture=picture,
             profile=profile,
@@ -178,10 +178,10 @@ def motions(
             seed=seed,
             commercial_only=commercial_only,
         )
-        wish.check()
+        request.check()
         folder = out or Path("out") / f"{item}-motions"
         check_writable(folder)
-        job = wish.to_job(home.store())
+        job = request.to_job(home.store())
         ranking = terminal.with_steps(job, console, lambda: make_motions(job, folder))
         for row in ranking["candidates"]:
             remarks = "; ".join(row["remarks"])

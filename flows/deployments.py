@@ -27,7 +27,7 @@ from flows.convert import connect, make
 from flows.engine.item_runs import FLOW, failure, read_job
 from flows.engine.orphans import claim_run
 from flows.engine.shared_results import sharing_results
-from flows.inputs.conversion_job import Wish
+from flows.inputs.conversion_job import ConversionRequest
 from flows.inputs.fetching import at_hand, without_secrets
 from flows.inputs.manifest import parse_changes
 from flows.inputs.naming import clean
@@ -323,7 +323,7 @@ def _knobs(options: Options, roots: Roots) -> dict[str, Any]:
 def _make(address: str, folder: Path, options: Options, roots: Roots, **files: Path) -> None:
     """Make an asset as `dg4d make` does: what is made already is left alone."""
     settings = revise(profile(options.profile), _knobs(options, roots))
-    wish = Wish(
+    request = ConversionRequest(
         item=clean(PurePosixPath(urlsplit(address).path).stem) or "asset",
         profile=options.profile,
         settings=settings,
@@ -331,9 +331,9 @@ def _make(address: str, folder: Path, options: Options, roots: Roots, **files: P
         commercial_only=options.commercial_only,
         **files,
     )
-    wish.check()
-    check_folder(folder, wish.item)
-    job = wish.to_job(home.store())
+    request.check()
+    check_folder(folder, request.item)
+    job = request.to_job(home.store())
     if not is_current(folder, job.digest()):
         connect()
         make(job, folder)

@@ -13,7 +13,7 @@ from dg4d_lib.asset_settings import ScoreSettings
 from dg4d_lib.errors import BadInput, DG4DError
 from flows import home
 from flows.commands import terminal
-from flows.inputs.conversion_job import ConversionJob, Wish
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.manifest import parse_changes
 from flows.packages import scores
 from flows.packages.publish import check_folder, check_writable, is_current, whole
@@ -140,14 +140,16 @@ def bench(
     settings = settings.model_copy(update={"rasterizer": pipeline.rasterizer})
     settings = ScoreAssetSettings.model_validate(settings.model_dump(mode="json"))
     check_writable(out)
-    wishes = [_wish(truth, bank, profile=profile_name, settings=pipeline, seed=seed) for truth in truths]
-    for wish in wishes:
-        wish.check()
-        check_folder(out / ASSETS / wish.item)
+    requests = [_request(truth, bank, profile=profile_name, settings=pipeline, seed=seed) for truth in truths]
+    for request in requests:
+        request.check()
+        check_folder(out / ASSETS / request.item)
     from flows.convert import connect
 
     connect()
-    rows = _converted([wish.to_job(home.store()) for wish in wishes], out / ASSETS, workers, console, dataset.name)
+    rows = _converted(
+        [request.to_job(home.store()) for request in requests], out / ASSETS, workers, console, dataset.name
+    )
     from flows.judge import judge
 
     entries = [_entry(truth, out / ASSETS / truth.name, rows[truth.name]) for truth in truths]
@@ -222,10 +224,10 @@ def _settings(changes: list[str] | None, mesh: bool) -> tuple[dict[str, Any], Sc
     return {key: value for key, value in given.items() if not key.startswith(OWN)}, settings
 
 
-def _wish(truth: Truth, bank: bool, **asked: Any) -> Wish:
+def _request(truth: Truth, bank: bool, **asked: Any) -> ConversionRequest:
     """What `dg4d make` would be asked for: the input film is followed, or the input picture is made to move."""
     folder = truth.inputs[0].parent
-    return Wish(
+    return ConversionRequest(
         item=truth.name,
         picture=truth.inputs[0],
         video=folder if len(truth.inputs) > 1 else None,

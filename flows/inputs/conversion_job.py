@@ -22,7 +22,7 @@ LONGEST_NAME = 60  # characters of a name made out of words
 NAMES = {"item", "profile", "source_name", "picture_name"}  # of a job: for people, no part of its digest
 
 
-class Wish(Frozen):
+class ConversionRequest(Frozen):
     """What a user asks for, by paths.
 
     Attributes:

@@ -111,11 +111,11 @@ class Roots(Frozen):
         Raises:
             BadInput: says which.
         """
-        if item.wish is None:
+        if item.request is None:
             return
-        files = (None if item.remote else item.wish.picture, item.wish.video, item.wish.bank)
+        files = (None if item.remote else item.request.picture, item.request.video, item.request.bank)
         self.check_files(file for file in files if file is not None)
-        self.check_weights(item.wish.settings.model_dump(mode="json"))
+        self.check_weights(item.request.settings.model_dump(mode="json"))
 
     def check_knobs(self, knobs: Mapping[str, Any]) -> None:
         """Refuse knobs, as `prior.weights`, that name folders of weights which may not be read.

@@ -7,7 +7,7 @@ from fake_steps import picture
 from typer.testing import Result
 
 from flows import home
-from flows.inputs.conversion_job import ConversionJob, Wish
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from steps.profiles import PREVIEW, revise
 
 Run = Callable[..., Result]  # the command `dg4d`, in this process
@@ -26,7 +26,9 @@ def ran(log: Path) -> list[str]:
 
 def job(words: str, folder: Path, *, name: str = "fake.png", item: str = "fake", **changes: object) -> ConversionJob:
     (folder / name).write_text(picture(words))
-    return Wish(item=item, picture=folder / name, settings=revise(PREVIEW, dict(changes))).to_job(home.store())
+    return ConversionRequest(item=item, picture=folder / name, settings=revise(PREVIEW, dict(changes))).to_job(
+        home.store()
+    )
 
 
 def tree(folder: Path, *but: str) -> dict[str, bytes]:

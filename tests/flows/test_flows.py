@@ -15,7 +15,7 @@ from flows.catalog import convert_all
 from flows.convert import make, make_motions, save_pictures
 from flows.engine.events import StepEvent, listening
 from flows.engine.orphans import settle_orphans
-from flows.inputs.conversion_job import Wish
+from flows.inputs.conversion_job import ConversionRequest
 from flows.packages.publish import whole
 from flows.packages.summary import NOT_ACCEPTED, Row, Tally
 from flows.serving import background
@@ -78,8 +78,8 @@ def test_a_video_moves_the_asset_and_a_picture_is_no_video(log: Path, tmp_path: 
 
 def test_words_become_a_picture_first(log: Path, tmp_path: Path) -> None:
     settings = revise(PREVIEW, {"text.weights": "somebody/pictures"})
-    wish = Wish(item="words", text="a  red\ndragon", settings=settings)
-    make(wish.to_job(home.store()), tmp_path / "out")
+    request = ConversionRequest(item="words", text="a  red\ndragon", settings=settings)
+    make(request.to_job(home.store()), tmp_path / "out")
     assert sorted(ran(log)) == sorted(["draw_picture", *EVERY_STEP])
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["banner"].startswith("Preview: the picture was drawn by a model; the motion was made up;")
@@ -88,7 +88,7 @@ def test_words_become_a_picture_first(log: Path, tmp_path: Path) -> None:
     record = json.loads((tmp_path / "out" / "provenance.json").read_text())
     assert record["licenses"] == report["licenses"]
     assert record["steps"][0]["weights"] == {"fake/unet.safetensors": "sha256:" + "e" * 64}
-    make(wish.model_copy(update={"text": "a red dragon"}).to_job(home.store()), tmp_path / "again")
+    make(request.model_copy(update={"text": "a red dragon"}).to_job(home.store()), tmp_path / "again")
     assert ran(log) == []
 
 

@@ -17,7 +17,7 @@ from flows import home
 from flows.convert import make
 from flows.engine import executors
 from flows.engine.events import StepEvent, listening
-from flows.inputs.conversion_job import Wish
+from flows.inputs.conversion_job import ConversionRequest
 from flows.packages import publish
 from steps.profiles import PREVIEW, revise
 from steps.store.artifact_store import StoreUnreachable
@@ -75,7 +75,10 @@ def test_parts_side_by_side_take_less_time_on_the_clock_than_to_compute(
     monkeypatch.setenv("DG4D_CPUS", "16")
     settings = revise(PREVIEW, {"mesh.mode": "per_frame"})
     (tmp_path / "a.png").write_text(picture("side by side extract_mesh=sleep:1"))
-    make(Wish(item="parts", picture=tmp_path / "a.png", settings=settings).to_job(home.store()), tmp_path / "out")
+    make(
+        ConversionRequest(item="parts", picture=tmp_path / "a.png", settings=settings).to_job(home.store()),
+        tmp_path / "out",
+    )
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     parts = [stage for stage in report["steps"] if stage["step"].startswith("extract_mesh")]
     assert len(parts) == 5 and all(part["compute_s"] >= 1 for part in parts)
@@ -114,17 +117,17 @@ def test_a_version_that_cannot_be_kept_brings_the_earlier_package_back(
         assert json.loads((tmp_path / "out" / "report.json").read_text())["seed"] == 1  # it is there already
         raise StoreUnreachable("the store is away")
 
-    wish = Wish(item="fake", picture=tmp_path / "fake.png", settings=PREVIEW, seed=1)
+    request = ConversionRequest(item="fake", picture=tmp_path / "fake.png", settings=PREVIEW, seed=1)
     with monkeypatch.context() as patch:
         patch.setattr("flows.engine.publishing.versions.keep_version", unreachable)
         with pytest.raises(StoreUnreachable):
-            make(wish.to_job(home.store()), tmp_path / "out")
+            make(request.to_job(home.store()), tmp_path / "out")
     assert tree(tmp_path / "out") == before
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
     with get_client(sync_client=True) as client:
         (newest,) = client.read_flow_runs(limit=1, sort="START_TIME_DESC")  # type: ignore[arg-type]
     assert newest.state is not None and newest.state.is_failed()
-    make(wish.to_job(home.store()), tmp_path / "out")
+    make(request.to_job(home.store()), tmp_path / "out")
     assert json.loads((tmp_path / "out" / "report.json").read_text())["seed"] == 1
     assert (tmp_path / "out" / "mine.txt").read_text() == "of the user"
 

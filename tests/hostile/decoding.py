@@ -165,9 +165,9 @@ def _read_as_manifest(suffix: str) -> Callable[[Path, Path], tuple[Kind, int]]:
         items = items_of(manifest, scratch / "out", "preview", {}, 0)
         for item in items:
             item.model_dump_json()
-            if item.wish is not None:
+            if item.request is not None:
                 with contextlib.suppress(DG4DError):
-                    item.wish.check()
+                    item.request.check()
         return "done", len(items)
 
     return read

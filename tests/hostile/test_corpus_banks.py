@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from flows.catalog_request import ready
-from flows.inputs.conversion_job import ConversionJob, Wish
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.manifest import Item
 from flows.packages.summary import Row
 from steps.profiles import profile, revise
@@ -34,8 +34,8 @@ def ordered(place: Place, bank: Path) -> ConversionJob | Row:
     picture = place.work / "cat.png"
     picture.write_bytes(sound_png())
     settings = revise(profile("preview"), {"prior.kind": "oracle"})
-    wish = Wish(item="cat", picture=picture, bank=bank, settings=settings)
-    return ready(Item(name="cat", wish=wish), place.work / "out", strict=False)
+    request = ConversionRequest(item="cat", picture=picture, bank=bank, settings=settings)
+    return ready(Item(name="cat", request=request), place.work / "out", strict=False)
 
 
 def test_every_bank_is_in_the_table() -> None:

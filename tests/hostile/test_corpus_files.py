@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from flows.catalog_request import ready
-from flows.inputs.conversion_job import ConversionJob, Wish
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.manifest import Item
 from steps.profiles import profile
 from tests.hostile.archives import UNPACKED, ZIPS
@@ -77,8 +77,8 @@ def test_what_is_no_source_never_enters_the_store(name: str, place: Place) -> No
         PLACES[name](path)
     else:
         path.write_bytes(CASES[name]())
-    wish = Wish(item="cat", picture=path, settings=profile("preview"))
-    row = ready(Item(name="cat", wish=wish), place.work / "out", strict=False)
+    request = ConversionRequest(item="cat", picture=path, settings=profile("preview"))
+    row = ready(Item(name="cat", request=request), place.work / "out", strict=False)
     assert not isinstance(row, ConversionJob)
     expected = SAID[name] if name in PLACES else UNKNOWN
     assert (row.status, row.kind) == ("failed", "BadInput")

@@ -25,7 +25,7 @@ from flows.catalog import convert_all
 from flows.catalog_request import CatalogRequest, ready
 from flows.commands.batch import batch, tell
 from flows.engine import resources
-from flows.inputs.conversion_job import ConversionJob, Wish
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.manifest import items_of
 from flows.packages.summary import NOT_ACCEPTED, Row, Tally, Writer
 from flows.processes import locked
@@ -50,8 +50,8 @@ def place(server: Server) -> Iterator[None]:
 def jobs(folder: Path, *names: str) -> list[ConversionJob]:
     for name in names:
         (folder / f"{name}.png").write_text(picture(f"batch {name}"))
-    wishes = [Wish(item=name, picture=folder / f"{name}.png", settings=PREVIEW) for name in names]
-    return [wish.to_job(home.store()) for wish in wishes]
+    requests = [ConversionRequest(item=name, picture=folder / f"{name}.png", settings=PREVIEW) for name in names]
+    return [request.to_job(home.store()) for request in requests]
 
 
 def test_what_died_is_tried_once_more_at_the_end_and_bad_input_is_not(place: None, tmp_path: Path) -> None:

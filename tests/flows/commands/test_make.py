@@ -9,7 +9,7 @@ from flows import home
 from flows.convert import prepare
 from flows.engine import executors
 from flows.engine.versions import has_version, keep_version
-from flows.inputs.conversion_job import Wish
+from flows.inputs.conversion_job import ConversionRequest
 from steps.profiles import PREVIEW
 
 
@@ -21,7 +21,9 @@ def test_processes_for_steps_begin_only_where_the_order_was_not_finished_before(
     monkeypatch.setattr(executors, "prepare", lambda: begun.append("processes"))
     Image.new("RGBA", (8, 8)).save(tmp_path / "a.png")
     jobs = [
-        Wish(item="a", picture=tmp_path / "a.png", profile="preview", settings=PREVIEW, seed=seed).to_job(home.store())
+        ConversionRequest(item="a", picture=tmp_path / "a.png", profile="preview", settings=PREVIEW, seed=seed).to_job(
+            home.store()
+        )
         for seed in range(2)
     ]
     prepare(jobs[0])

@@ -17,7 +17,7 @@ from dg4d_lib.errors import BadInput
 from flows import home
 from flows.commands.rebuild import Rebuilt, rebuild
 from flows.convert import make
-from flows.inputs.conversion_job import ConversionJob, Wish, job_from_record
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest, job_from_record
 from flows.inputs.package_record import record_of
 from flows.packages.verify import verify
 from flows.serving.server import Server
@@ -61,9 +61,9 @@ def fakes(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 def job(words: str, folder: Path, name: str = "fake.png", **changes: object) -> ConversionJob:
     (folder / name).write_text(picture(words))
-    return Wish(item="fake", picture=folder / name, settings=revise(PREVIEW, dict(changes)), seed=5).to_job(
-        home.store()
-    )
+    return ConversionRequest(
+        item="fake", picture=folder / name, settings=revise(PREVIEW, dict(changes)), seed=5
+    ).to_job(home.store())
 
 
 def again(folder: Path, out: Path | None = None, source: Path | None = None) -> Rebuilt:
@@ -113,7 +113,7 @@ def test_words_and_meshes_per_frame_are_rebuilt_too(
 ) -> None:
     settings = revise(PREVIEW, {"text.weights": "somebody/pictures", "mesh.mode": "per_frame"})
     monkeypatch.setenv("DG4D_CPUS", "3")
-    make(Wish(item="words", text="a red  fox", settings=settings).to_job(home.store()), tmp_path / "out")
+    make(ConversionRequest(item="words", text="a red  fox", settings=settings).to_job(home.store()), tmp_path / "out")
     record = record_of(tmp_path / "out")
     assert record is not None
     assert record["recipe"]["text"] == "a red fox"
@@ -210,7 +210,9 @@ def test_real_steps_give_equal_bytes_again(server: Server, tmp_path: Path, monke
     inside = (rows / 0.7) ** 2 + (columns / 0.5) ** 2 < 1
     egg = np.stack([inside * (rows + 1) / 2, inside * 0.4, inside * (columns + 1) / 2, inside], -1)
     Image.fromarray((egg * 255).astype(np.uint8)).save(tmp_path / "egg.png")
-    wanted = Wish(item="egg", picture=tmp_path / "egg.png", settings=revise(PREVIEW, dict(TINY))).to_job(home.store())
+    wanted = ConversionRequest(item="egg", picture=tmp_path / "egg.png", settings=revise(PREVIEW, dict(TINY))).to_job(
+        home.store()
+    )
     monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
     make(wanted, tmp_path / "egg")
     assert verify(tmp_path / "egg").exit_code == 0

@@ -16,7 +16,7 @@ from flows import home
 from flows.convert import make
 from flows.engine.collecting import collect
 from flows.engine.versions import Version, faults, versions
-from flows.inputs.conversion_job import ConversionJob, Wish
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.packages.publish import whole
 from flows.serving.server import Server
 from flows.step_errors import StepLost, StepUnreachable
@@ -57,7 +57,9 @@ def ran(log: Path) -> list[str]:
 
 def job(words: str, folder: Path) -> ConversionJob:
     (folder / "fake.png").write_text(picture(words))
-    return Wish(item="fake", picture=folder / "fake.png", settings=revise(PREVIEW, {})).to_job(home.store())
+    return ConversionRequest(item="fake", picture=folder / "fake.png", settings=revise(PREVIEW, {})).to_job(
+        home.store()
+    )
 
 
 def content(folder: Path) -> dict[str, bytes]:

@@ -29,7 +29,7 @@ from flows.engine.collecting import collect
 from flows.engine.orphans import settle_orphans
 from flows.engine.step_tasks import RETRIES
 from flows.engine.versions import faults, versions
-from flows.inputs.conversion_job import ConversionJob, Wish
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.packages.publish import whole
 from flows.serving.server import Server, answers
 from flows.step_errors import StepBadInput, StepOutOfMemory, StepTimedOut
@@ -79,7 +79,7 @@ def ran(log: Path) -> list[str]:
 
 def job(words: str, folder: Path) -> ConversionJob:
     (folder / "fake.png").write_text(picture(words))
-    return Wish(item="fake", picture=folder / "fake.png", settings=PREVIEW).to_job(home.store())
+    return ConversionRequest(item="fake", picture=folder / "fake.png", settings=PREVIEW).to_job(home.store())
 
 
 def content(folder: Path) -> dict[str, bytes]:

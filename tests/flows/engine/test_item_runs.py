@@ -26,7 +26,7 @@ from flows.engine.item_runs import (
     item_deployment,
     read_job,
 )
-from flows.inputs.conversion_job import ConversionJob, Wish
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.packages.delivery import Outcome, deliver, forget_shared, pack, read_outcome, write_outcome
 from flows.serving import registering
 from flows.serving.pools import read_pools
@@ -53,7 +53,7 @@ def client(server: Server) -> Iterator[SyncPrefectClient]:
 @pytest.fixture
 def job(client: SyncPrefectClient, tmp_path: Path) -> ConversionJob:
     (tmp_path / "fox.png").write_text(picture(f"item {tmp_path}"))
-    return Wish(item="fox", picture=tmp_path / "fox.png", settings=PREVIEW).to_job(home.store())
+    return ConversionRequest(item="fox", picture=tmp_path / "fox.png", settings=PREVIEW).to_job(home.store())
 
 
 @pytest.fixture

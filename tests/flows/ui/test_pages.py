@@ -22,7 +22,7 @@ from waiting import retry_after, wait_until
 from flows import home
 from flows.convert import make
 from flows.formatting import curves
-from flows.inputs.conversion_job import ConversionJob, Wish
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.serving.auth import basic
 from flows.serving.server import Server
 from flows.step_errors import StepDiverged
@@ -55,7 +55,7 @@ def place(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 def job(words: str, folder: Path, item: str) -> ConversionJob:
     (folder / "fake.png").write_text(picture(words))
-    return Wish(item=item, picture=folder / "fake.png", settings=PREVIEW).to_job(home.store())
+    return ConversionRequest(item=item, picture=folder / "fake.png", settings=PREVIEW).to_job(home.store())
 
 
 def artifacts(item: str, path: str = "/artifacts/latest/filter") -> dict[str, list[dict[str, Any]]]:
