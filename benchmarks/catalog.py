@@ -148,19 +148,19 @@ def run(items: list[Item], out: Path, workers: int, what: str) -> float:
         if row.status not in {"done", "unchanged"}:
             raise RuntimeError(f"{row.item}: {row.message}")
         sizes.append(memory_mb())
-        writer.write_sometimes(list(tally.rows.values()), tally.seconds)
+        writer.write_sometimes(list(progress.rows.values()), progress.seconds)
 
-    writer, tally = summary.Writer(out), summary.Tally(len(items), settled)
+    writer, progress = summary.Writer(out), summary.BatchProgress(len(items), settled)
     out.mkdir(exist_ok=True)
 
     @flow(name="catalog", flow_run_name=what, persist_result=False)
     def catalog() -> None:
         todo = (ready(item, out, strict=False) for item in items)
-        convert_all(todo, out, workers, f"{what}: {len(items)} items", tally, work=work)
+        convert_all(todo, out, workers, f"{what}: {len(items)} items", progress, work=work)
 
     with flow_context():
         catalog()
-    writer.write(list(tally.rows.values()), tally.seconds)
+    writer.write(list(progress.rows.values()), progress.seconds)
     return sizes[-1] - sizes[len(sizes) // 10]
 
 

@@ -26,7 +26,7 @@ from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.manifest import Item
 from flows.inputs.places import parse_where
 from flows.packages.delivery import forget_shared
-from flows.packages.summary import Row, Tally, judged
+from flows.packages.summary import BatchProgress, Row, judged
 from flows.ui.gallery import Gallery
 from steps.contract import ArtifactRef
 
@@ -50,30 +50,30 @@ def convert_jobs(jobs: ArtifactRef, out: Path, workers: int, title: str) -> None
     _convert_list(jobs, out, workers, title)
 
 
-def run_catalog(request: CatalogRequest, title: str, tally: Tally, allow: Allow | None = None) -> None:
+def run_catalog(request: CatalogRequest, title: str, progress: BatchProgress, allow: Allow | None = None) -> None:
     """Make a catalog within the current flow run, or in a run of its own where there is none.
 
     Args:
         request: the catalog.
         title: of a run of its own.
-        tally: knows rows of items that need no making, and is told all others.
+        progress: knows rows of items that need no making, and is told all others.
         allow: raises BadInput for an item that may not be made here; such items are checked in the current run only.
 
     Raises:
-        KeyboardInterrupt: the user stopped it; what is done stays, and `tally` knows it.
+        KeyboardInterrupt: the user stopped it; what is done stays, and `progress` knows it.
     """
-    with flow_context(), _known(request.out, tally):
+    with flow_context(), _known(request.out, progress):
         if FlowRunContext.get() is None:
             catalog(request, title)
         else:
             convert_catalog(request, title, allow)
 
 
-def run_jobs(jobs: list[ConversionJob], out: Path, workers: int, title: str, tally: Tally) -> None:
+def run_jobs(jobs: list[ConversionJob], out: Path, workers: int, title: str, progress: BatchProgress) -> None:
     """Make jobs as `run_catalog` makes a catalog."""
     lines = "".join(f"{job.model_dump_json()}\n" for job in jobs)
     listed = home.store().put_bytes(lines.encode(), JOBS_MEDIA_TYPE)
-    with flow_context(), _known(out, tally):
+    with flow_context(), _known(out, progress):
         if FlowRunContext.get() is None:
             convert_jobs(listed, out, workers, title)
         else:
@@ -83,9 +83,9 @@ def run_jobs(jobs: list[ConversionJob], out: Path, workers: int, title: str, tal
 def convert_catalog(request: CatalogRequest, title: str, allow: Allow | None = None) -> None:
     """Make a catalog within the current flow run; see `run_catalog`."""
     items = request.items(allow)
-    tally = _tallies.get(request.out) or Tally(len(items))
-    todo = (ready(item, request.out, request.strict) for item in items if item.name not in tally.rows)
-    convert_all(todo, request.out, request.workers, title, tally, request.strict, request.where)
+    progress = _progress_of.get(request.out) or BatchProgress(len(items))
+    todo = (ready(item, request.out, request.strict) for item in items if item.name not in progress.rows)
+    convert_all(todo, request.out, request.workers, title, progress, request.strict, request.where)
 
 
 def convert_all(
@@ -93,7 +93,7 @@ def convert_all(
     out: Path,
     workers: int,
     title: str,
-    tally: Tally,
+    progress: BatchProgress,
     strict: bool = False,
     where: str = "",
     work: Make = make,
@@ -105,7 +105,7 @@ def convert_all(
         out: the folder of the packages.
         workers: items at a time.
         title: of the gallery in the UI.
-        tally: told the row of every item; again, if it is tried again.
+        progress: told the row of every item; again, if it is tried again.
         strict: an item that a gate does not let pass counts as failed, and no other is begun after it.
         where: where items are made, as `flows.engine.runners.parse_where` reads it.
         work: makes a job into a folder on this machine or in its cluster, and says whether every step had been done
@@ -113,17 +113,17 @@ def convert_all(
 
     Raises:
         BadInput: `where` is no place for items.
-        KeyboardInterrupt: the user stopped it; what is done stays, and `tally` knows it.
+        KeyboardInterrupt: the user stopped it; what is done stays, and `progress` knows it.
     """
     place = parse_where(where)
     if place.kind == "deployment":
         work = item_deployment(place.address, workers).make
         forget_shared(home.store())
-    gallery = Gallery(title, tally, out)
+    gallery = Gallery(title, progress, out)
     with item_runner(place, workers) as runner:
         try:
             for attempt in (1, 2):
-                todo = list(_rounds(todo, out, workers, tally, strict, work, gallery, runner, attempt))
+                todo = list(_rounds(todo, out, workers, progress, strict, work, gallery, runner, attempt))
         except (KeyboardInterrupt, TerminationSignal):  # Prefect's own for SIGTERM, while a flow runs
             stop_all()
             raise
@@ -142,33 +142,33 @@ def convert(item: str, job: str, out: str, strict: bool, attempt: int, work: Mak
     return row.model_dump(mode="json"), may_heal
 
 
-_tallies: dict[Path, Tally] = {}
+_progress_of: dict[Path, BatchProgress] = {}
 
 
 @contextmanager
-def _known(out: Path, tally: Tally) -> Iterator[None]:
-    """Let the catalog of this process into `out` tell this tally while the block runs, and skip the rows it has.
+def _known(out: Path, progress: BatchProgress) -> Iterator[None]:
+    """Let the catalog of this process into `out` tell this progress while the block runs, and skip the rows it has.
 
     A catalog is complete without: it would look at every item again.
     """
-    _tallies[out] = tally
+    _progress_of[out] = progress
     try:
         yield
     finally:
-        del _tallies[out]
+        del _progress_of[out]
 
 
 def _convert_list(jobs: ArtifactRef, out: Path, workers: int, title: str) -> None:
     lines = home.store().path(jobs).read_bytes().splitlines()
     todo = (ConversionJob.model_validate_json(line) for line in lines)
-    convert_all(todo, out, workers, title, _tallies.get(out) or Tally(len(lines)))
+    convert_all(todo, out, workers, title, _progress_of.get(out) or BatchProgress(len(lines)))
 
 
 def _rounds(
     todo: Iterable[ConversionJob | Row],
     out: Path,
     workers: int,
-    tally: Tally,
+    progress: BatchProgress,
     strict: bool,
     work: Make,
     gallery: Gallery,
@@ -187,18 +187,18 @@ def _rounds(
         if may_heal and attempt == 1:
             row = row.model_copy(update={"message": f"{row.message} (will be tried again at the end)"})
             yield job
-        tally.settle(row)
+        progress.settle(row)
         gallery.update()
 
     for one in todo:
         while len(running) >= workers or not finished.empty():
             yield from settled()
         if isinstance(one, Row):
-            tally.settle(one)
+            progress.settle(one)
             gallery.update()
-        elif strict and tally.refused:
-            reason = f"not begun: {tally.refused} was not accepted"
-            tally.settle(Row(item=one.item, source=one.source_name, status="skipped", message=reason))
+        elif strict and progress.refused:
+            reason = f"not begun: {progress.refused} was not accepted"
+            progress.settle(Row(item=one.item, source=one.source_name, status="skipped", message=reason))
         else:
             parameters = {
                 "item": one.item,

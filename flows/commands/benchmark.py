@@ -18,7 +18,7 @@ from flows.inputs.manifest import parse_changes
 from flows.packages import scores
 from flows.packages.publish import check_folder, check_writable, is_current, whole
 from flows.packages.scores import Results
-from flows.packages.summary import BAD_INPUT, Row, Tally
+from flows.packages.summary import BAD_INPUT, BatchProgress, Row
 from flows.step_errors import StepError, StepMissing
 from steps.artifacts.archives import add_entry, unpack
 from steps.artifacts.ground_truth import Truth, find_truth, find_truths
@@ -251,9 +251,9 @@ def _converted(jobs: list[ConversionJob], folder: Path, workers: int, console: "
             if not console.is_terminal:
                 console.print(f"{row.item}: {row.status} {row.message}", markup=False)
 
-        tally = Tally(len(waiting), show)
-        run_jobs(waiting, folder, workers, f"{name}: {len(waiting)} objects", tally)
-    return rows | tally.rows
+        progress = BatchProgress(len(waiting), show)
+        run_jobs(waiting, folder, workers, f"{name}: {len(waiting)} objects", progress)
+    return rows | progress.rows
 
 
 def _entry(truth: Truth, folder: Path, row: Row) -> "Entry":

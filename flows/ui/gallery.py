@@ -10,7 +10,7 @@ from PIL import Image
 from prefect.artifacts import create_markdown_artifact, create_progress_artifact, update_progress_artifact
 
 from flows.formatting.escaping import markdown
-from flows.packages.summary import Row, Tally
+from flows.packages.summary import BatchProgress, Row
 from flows.ui import pages
 from flows.ui.showing import show
 
@@ -27,12 +27,12 @@ class Gallery:
 
     Args:
         title: of the catalog; what follows a colon is left out.
-        tally: what became of its items.
+        progress: what became of its items.
         out: the folder of their packages.
     """
 
-    def __init__(self, title: str, tally: Tally, out: Path) -> None:
-        self._name, self._tally, self._out = title.partition(":")[0], tally, out
+    def __init__(self, title: str, progress: BatchProgress, out: Path) -> None:
+        self._name, self._progress, self._out = title.partition(":")[0], progress, out
         self._key = pages.key("catalog", self._name)
         self._bar: Any = create_progress_artifact(0.0, key=f"progress-{self._key}", description=self._text())
         self._next = 0.0
@@ -40,19 +40,19 @@ class Gallery:
     def update(self) -> None:
         """Show the progress, unless that was a moment ago."""
         if time.monotonic() >= self._next:
-            update_progress_artifact(self._bar, 100 * self._tally.share, description=self._text())
+            update_progress_artifact(self._bar, 100 * self._progress.share, description=self._text())
             self._next = time.monotonic() + UPDATE_EVERY_S
 
     def finish(self) -> None:
         """Show the end, and the page."""
         self._next = 0.0
         self.update()
-        rows = list(self._tally.rows.values())
-        page = gallery_page(self._name, self._tally.line(), rows, self._out)
+        rows = list(self._progress.rows.values())
+        page = gallery_page(self._name, self._progress.line(), rows, self._out)
         show(create_markdown_artifact, key=self._key, markdown=page, description=self._text())
 
     def _text(self) -> str:
-        return f"{markdown(self._name)}: {self._tally.line()}"
+        return f"{markdown(self._name)}: {self._progress.line()}"
 
 
 def gallery_page(name: str, line: str, rows: list[Row], out: Path) -> str:

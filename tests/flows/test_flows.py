@@ -17,7 +17,7 @@ from flows.engine.events import StepEvent, listening
 from flows.engine.orphans import settle_orphans
 from flows.inputs.conversion_job import ConversionRequest
 from flows.packages.publish import whole
-from flows.packages.summary import NOT_ACCEPTED, Row, Tally
+from flows.packages.summary import NOT_ACCEPTED, BatchProgress, Row
 from flows.serving import background
 from flows.serving.server import Server
 from flows.step_errors import StepBadInput, StepCrashed, StepDiverged, StepError, StepMissing, StepOutOfMemory
@@ -278,9 +278,9 @@ def test_there_is_one_server(place: None, server: Server) -> None:
 def test_a_strict_batch_begins_nothing_after_an_item_that_is_not_accepted(log: Path, tmp_path: Path) -> None:
     names = ("first", "torn", "last")
     jobs = [job(f"strict {name}", tmp_path, name=f"{name}.png", item=name) for name in names]
-    tally = Tally(3)
-    inside_a_flow(convert_all, jobs, tmp_path / "out", 1, "strict", tally, strict=True)
-    rows = list(tally.rows.values())
+    progress = BatchProgress(3)
+    inside_a_flow(convert_all, jobs, tmp_path / "out", 1, "strict", progress, strict=True)
+    rows = list(progress.rows.values())
     assert [(row.item, row.status, row.failing) for row in rows] == [
         ("first", "done", []),
         ("torn", "failed", ["silhouette"]),
@@ -290,12 +290,12 @@ def test_a_strict_batch_begins_nothing_after_an_item_that_is_not_accepted(log: P
     assert (tmp_path / "out" / "torn" / "report.html").exists()
     assert not (tmp_path / "out" / "last").exists()
     made_before = Row(item="torn", status="failed", kind=NOT_ACCEPTED, failing=["silhouette"])
-    tally = Tally(2)
-    inside_a_flow(convert_all, [made_before, jobs[2]], tmp_path / "out", 1, "refused before", tally, strict=True)
-    assert [row.status for row in tally.rows.values()] == ["failed", "skipped"]
-    tally = Tally(3)
-    inside_a_flow(convert_all, jobs, tmp_path / "out", 1, "lenient", tally)
-    rows = list(tally.rows.values())
+    progress = BatchProgress(2)
+    inside_a_flow(convert_all, [made_before, jobs[2]], tmp_path / "out", 1, "refused before", progress, strict=True)
+    assert [row.status for row in progress.rows.values()] == ["failed", "skipped"]
+    progress = BatchProgress(3)
+    inside_a_flow(convert_all, jobs, tmp_path / "out", 1, "lenient", progress)
+    rows = list(progress.rows.values())
     assert [(row.status, row.failing) for row in rows] == [("done", []), ("done", ["silhouette"]), ("done", [])]
 
 

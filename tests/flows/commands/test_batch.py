@@ -27,7 +27,7 @@ from flows.commands.batch import batch, tell
 from flows.engine import resources
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.manifest import items_of
-from flows.packages.summary import NOT_ACCEPTED, Row, Tally, Writer
+from flows.packages.summary import NOT_ACCEPTED, BatchProgress, Row, Writer
 from flows.processes import locked
 from flows.serving.server import Server
 from flows.step_errors import StepBadInput, StepCrashed, StepOutOfMemory
@@ -69,16 +69,16 @@ def test_what_died_is_tried_once_more_at_the_end_and_bad_input_is_not(place: Non
         return None, False
 
     names = ("dies", "bad", "hopeless", "fine")
-    tally = Tally(4)
-    inside_a_flow(convert_all, jobs(tmp_path, *names), tmp_path, 1, "retries", tally, work=work)
+    progress = BatchProgress(4)
+    inside_a_flow(convert_all, jobs(tmp_path, *names), tmp_path, 1, "retries", progress, work=work)
     assert begun == [*names, "dies", "hopeless"]
-    assert {row.item: (row.status, row.attempts) for row in tally.rows.values()} == {
+    assert {row.item: (row.status, row.attempts) for row in progress.rows.values()} == {
         "dies": ("done", 2),
         "bad": ("failed", 1),
         "hopeless": ("failed", 2),
         "fine": ("done", 1),
     }
-    assert "again" not in tally.rows["hopeless"].message
+    assert "again" not in progress.rows["hopeless"].message
 
 
 def test_items_are_prepared_one_ahead_of_those_at_work(place: None, tmp_path: Path) -> None:
@@ -95,10 +95,10 @@ def test_items_are_prepared_one_ahead_of_those_at_work(place: None, tmp_path: Pa
             ahead.append(drawn - finished)
             yield job
 
-    tally = Tally(8)
-    inside_a_flow(convert_all, todo(), tmp_path, 2, "ahead", tally, work=work)
+    progress = BatchProgress(8)
+    inside_a_flow(convert_all, todo(), tmp_path, 2, "ahead", progress, work=work)
     assert max(ahead) <= 3
-    assert [row.status for row in tally.rows.values()] == ["done"] * 8
+    assert [row.status for row in progress.rows.values()] == ["done"] * 8
 
 
 def test_meshing_of_one_item_overlaps_fitting_of_the_next_and_fits_never_overlap(
@@ -125,9 +125,9 @@ def test_meshing_of_one_item_overlaps_fitting_of_the_next_and_fits_never_overlap
                 assert second_fit.wait(30), "nothing is fitted while a mesh is made"
         return None, False
 
-    tally = Tally(2)
-    inside_a_flow(convert_all, jobs(tmp_path, "first", "second"), tmp_path, 2, "overlap", tally, work=work)
-    assert [row.status for row in tally.rows.values()] == ["done", "done"]
+    progress = BatchProgress(2)
+    inside_a_flow(convert_all, jobs(tmp_path, "first", "second"), tmp_path, 2, "overlap", progress, work=work)
+    assert [row.status for row in progress.rows.values()] == ["done", "done"]
     assert most == 1
 
 
@@ -138,8 +138,8 @@ def test_the_server_shows_how_far_a_batch_is_and_a_page_that_can_be_read(place: 
     def work(job: ConversionJob, folder: Path) -> tuple[None, bool]:
         raise StepBadInput("prepare_subject", "ugly")
 
-    tally = Tally(len(rows) + 1)
-    inside_a_flow(convert_all, [*rows, one], tmp_path, 1, "many: 301 items", tally, work=work)
+    progress = BatchProgress(len(rows) + 1)
+    inside_a_flow(convert_all, [*rows, one], tmp_path, 1, "many: 301 items", progress, work=work)
     with get_client(sync_client=True) as client:
         wanted = {"artifacts": {"key": {"like_": "catalog-many-"}}, "limit": 10}
         pages: list[Any] = client.request("POST", "/artifacts/latest/filter", json=wanted).json()
@@ -361,14 +361,14 @@ def test_a_batch_of_thousands_is_summed_up_now_and_then_and_its_page_loads_what_
 
 
 def test_a_line_says_how_far_a_batch_is_and_when_it_will_be_done(monkeypatch: pytest.MonkeyPatch) -> None:
-    tally = Tally(103)
+    progress = BatchProgress(103)
     for i in range(3):
-        tally.settle(Row(item=f"old {i}", status="unchanged"))
-    assert tally.line() == "3 of 103 items, 0 failed"
+        progress.settle(Row(item=f"old {i}", status="unchanged"))
+    assert progress.line() == "3 of 103 items, 0 failed"
     for i in range(10):
-        tally.settle(Row(item=f"{i}", status="failed" if i == 4 else "done"))
-    monkeypatch.setattr(Tally, "seconds", property(lambda self: 600.0))
-    assert tally.line() == "13 of 103 items, 1 failed, 60 an hour, about 90 min left"
+        progress.settle(Row(item=f"{i}", status="failed" if i == 4 else "done"))
+    monkeypatch.setattr(BatchProgress, "seconds", property(lambda self: 600.0))
+    assert progress.line() == "13 of 103 items, 1 failed, 60 an hour, about 90 min left"
 
 
 def test_formulas_in_a_summary_are_text_and_numbers_are_numbers(tmp_path: Path) -> None:
