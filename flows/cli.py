@@ -256,7 +256,7 @@ def batch(
         from flows.catalog_request import CatalogRequest, default_workers
         from flows.commands import terminal
         from flows.commands.batch import batch as make_all
-        from flows.commands.batch import tell
+        from flows.commands.batch import print_summary
         from flows.inputs.manifest import parse_changes
 
         console = terminal.console()
@@ -273,7 +273,7 @@ def batch(
             root=root,
             price_per_hour=price_per_hour,
         )
-        if status := tell(make_all(request, console), out, console):
+        if status := print_summary(make_all(request, console), out, console):
             raise typer.Exit(status)
 
 

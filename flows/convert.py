@@ -71,12 +71,12 @@ def make(job: ConversionJob, folder: Path) -> tuple[Files, bool]:
         BadInput: the folder cannot be written, the disk is full, or the key cannot sign; it is as it was.
         BackendUnavailable: a key is configured, and signing is not installed.
     """
-    from flows.engine.events import StepEvent, tell
+    from flows.engine.events import StepEvent, emit
     from flows.engine.output_lock import output_lock
     from flows.step_errors import StepLost
 
     def waiting() -> None:
-        tell(StepEvent(job.item, "output", "remark", text=f"waiting for another run that writes {folder}"))
+        emit(StepEvent(job.item, "output", "remark", text=f"waiting for another run that writes {folder}"))
 
     with output_lock(folder, waiting) as waited:
         if waited and is_current(folder, job.digest()):

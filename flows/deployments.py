@@ -19,7 +19,7 @@ from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.settings import Motion
 from flows import home
 from flows.catalog_request import CatalogRequest
-from flows.commands.batch import batch, tell
+from flows.commands.batch import batch, print_summary
 from flows.commands.benchmark import bench
 from flows.commands.options import knobs_of
 from flows.commands.terminal import console
@@ -224,7 +224,7 @@ def catalog_to_4d(
         strict=strict,
     )
     rows = batch(request, console(), allow=roots.check_item)
-    failed = tell(rows, folder, console())
+    failed = print_summary(rows, folder, console())
     text = f"{sum(row.made for row in rows)} of {len(rows)} items are in {folder}"
     return Failed(message=text) if failed else Completed(message=text)
 

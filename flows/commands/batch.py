@@ -65,8 +65,8 @@ def batch(
     return rows
 
 
-def tell(rows: list[Row], out: Path, console: "Console") -> int:
-    """Say how a batch ended; the exit status of the command."""
+def print_summary(rows: list[Row], out: Path, console: "Console") -> int:
+    """Print how a batch ended and return the exit status of the command."""
     failed = [row for row in rows if row.status == "failed"]
     for row in failed:
         console.print(f"failed: {row.item}: {row.message}", markup=False, style="red")

@@ -45,7 +45,7 @@ def listening(listener: Listener) -> Iterator[None]:
         _listeners.remove(listener)
 
 
-def tell(event: StepEvent) -> None:
-    """Tell every listener."""
+def emit(event: StepEvent) -> None:
+    """Call every listener with an event."""
     for listener in tuple(_listeners):
         listener(event)

@@ -27,7 +27,7 @@ from prefect.states import Cancelled, Scheduled
 from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
 from flows import home
 from flows.engine import resources
-from flows.engine.events import StepEvent, tell
+from flows.engine.events import StepEvent, emit
 from flows.engine.leases import hold, running
 from flows.engine.output_lock import output_lock
 from flows.inputs.conversion_job import ConversionJob
@@ -95,7 +95,7 @@ class ItemDeployment(NamedTuple):
                 files = deliver(outcome.package, folder, store)
         if (record_of(folder) or {}).get("order") != job.digest():
             note = "made with other weights, another rasterizer or another signing key than this machine has"
-            tell(StepEvent(job.item, STEP, "remark", text=note))
+            emit(StepEvent(job.item, STEP, "remark", text=note))
         return files, outcome.cached
 
     def _outcome(self, job: ConversionJob, ref: ArtifactRef, store: ArtifactStore) -> Outcome:
@@ -132,7 +132,7 @@ class ItemDeployment(NamedTuple):
             name = run.state.name if run.state else ""
             if name != said:
                 said = str(name)
-                tell(StepEvent(item, STEP, "note", text=f"{said.lower()} in {self.pool}"))
+                emit(StepEvent(item, STEP, "note", text=f"{said.lower()} in {self.pool}"))
             if resources.stopping.wait(self.poll_s):
                 _give_up(client, run)
                 raise resources.Stopped(f"stopped while {item} was made in {self.pool}")

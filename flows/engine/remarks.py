@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from flows import home
-from flows.engine.events import StepEvent, tell
+from flows.engine.events import StepEvent, emit
 from steps.contract import ArtifactRef, StepResult
 from steps.store.artifact_store import ArtifactMissing, StoreUnreachable
 from steps.store.files import DiskFull
@@ -25,7 +25,7 @@ def remark(item: str, label: str, result: StepResult) -> None:
         return
     picture = _saved(item, result.outputs["picture"]) if "picture" in result.outputs else None
     look = [f"Source, matte and cut-out: {picture}"] if picture else []
-    tell(StepEvent(item, label, "remark", text=" ".join([*notes, *look])))
+    emit(StepEvent(item, label, "remark", text=" ".join([*notes, *look])))
 
 
 def _saved(item: str, ref: ArtifactRef) -> Path | None:

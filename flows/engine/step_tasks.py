@@ -25,7 +25,7 @@ from dg4d_lib.settings import Settings
 from flows import home
 from flows.engine import resources
 from flows.engine.caching import FileLocks, RequestPolicy
-from flows.engine.events import StepEvent, tell
+from flows.engine.events import StepEvent, emit
 from flows.engine.executors import chosen, stop_all
 from flows.engine.leases import hold
 from flows.engine.orphans import claim_run
@@ -139,14 +139,14 @@ def run_step(step: str, result_type: type[Result], **arguments: Any) -> Result:
     request, conversion = request_for(step, arguments), arguments["conversion"]
     item, label = conversion.item, label_of(step, arguments)
     progress = _Progress(item, label)
-    tell(StepEvent(item, label, "started"))
+    emit(StepEvent(item, label, "started"))
 
     def on_progress(done: int, total: int, values: dict[str, float]) -> None:
-        tell(StepEvent(item, label, "progress", done=done, total=total, values=values))
+        emit(StepEvent(item, label, "progress", done=done, total=total, values=values))
         progress.update(done, total, values)
 
     def say(text: str) -> None:
-        tell(StepEvent(item, label, "note", text=text))
+        emit(StepEvent(item, label, "note", text=text))
 
     try:
         turn = resources.Turn(conversion.begun_ns, f"{label} of {item}")
@@ -194,7 +194,7 @@ def note_end(task: Task[..., Any], run: TaskRun, state: State[Any]) -> None:
     seconds = (datetime.now(UTC) - run.start_time).total_seconds() if run.start_time else 0.0
     waited_s = _waited.pop(str(run.id), 0.0)
     if not state.is_completed():
-        tell(StepEvent(item, label, "failed", seconds=seconds))
+        emit(StepEvent(item, label, "failed", seconds=seconds))
         return
     result = state.result(raise_on_failure=False)
     assert isinstance(result, StepResult) and run.flow_run_id  # tasks of steps return one, and run in flows
@@ -205,7 +205,7 @@ def note_end(task: Task[..., Any], run: TaskRun, state: State[Any]) -> None:
         StepRun(label=label, cached=cached, wall_s=round(seconds, 3), waited_s=round(waited_s, 3), result=result)
     )
     remark(item, label, result)
-    tell(StepEvent(item, label, "finished", seconds=seconds, waited_s=waited_s, cached=cached))
+    emit(StepEvent(item, label, "finished", seconds=seconds, waited_s=waited_s, cached=cached))
 
 
 def finished_steps() -> list[StepRun]:

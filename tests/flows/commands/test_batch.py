@@ -23,7 +23,7 @@ from waiting import wait_until
 from flows import home
 from flows.catalog import convert_all
 from flows.catalog_request import CatalogRequest, ready
-from flows.commands.batch import batch, tell
+from flows.commands.batch import batch, print_summary
 from flows.engine import resources
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.manifest import items_of
@@ -312,7 +312,7 @@ def test_a_hundred_items_are_found_unchanged_in_a_moment_each(tmp_path: Path, mo
 def test_the_exit_status_says_how_a_batch_ended(
     rows: list[Row], status: int, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert tell(rows, tmp_path, Console(soft_wrap=True)) == status
+    assert print_summary(rows, tmp_path, Console(soft_wrap=True)) == status
     assert says in capsys.readouterr().out
 
 
