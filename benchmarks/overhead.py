@@ -24,7 +24,7 @@ from rich.table import Table
 from benchmarks.measure import machine, new_console, parser_of, write_rows
 from flows.inputs.conversion_job import ConversionRequest
 from flows.inputs.package_record import RECORD
-from flows.packages.publish import whole
+from flows.packages.publish import load_verified
 from flows.serving.server import Server
 from steps.contract import StepFailure, StepRequest
 from steps.profiles import profile
@@ -83,7 +83,7 @@ def turn(picture: Path, knobs: list[str], seed: int) -> dict[str, float]:
             out = str(Path(folder) / f"{way}-out")
             make = [sys.executable, "-m", "flows.cli", "make", str(picture), "--seed", str(seed), "-o", out, *changes]
             seconds = timed(make, DG4D_HOME=homes[way], **more)
-            whole(Path(out))
+            load_verified(Path(out))
             return seconds
 
         try:

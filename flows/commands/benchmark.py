@@ -16,7 +16,7 @@ from flows.commands import terminal
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.manifest import parse_changes
 from flows.packages import scores
-from flows.packages.publish import check_folder, check_writable, is_current, whole
+from flows.packages.publish import check_folder, check_writable, is_current, load_verified
 from flows.packages.scores import Results
 from flows.packages.summary import BAD_INPUT, BatchProgress, Row
 from flows.step_errors import StepError, StepMissing
@@ -66,7 +66,7 @@ def score(
     found, (pipeline, settings) = find_truth(truth), _settings(changes, mesh)
     if pipeline:
         raise BadInput(f"the asset is finished: only knobs that begin with {OWN!r} can be set; given {min(pipeline)}")
-    record = whole(package)
+    record = load_verified(package)
     if out is not None:
         check_writable(out.parent)
     from flows.convert import connect
@@ -263,7 +263,7 @@ def _entry(truth: Truth, folder: Path, row: Row) -> "Entry":
     if row.status == "failed":
         return Entry(name=truth.name, truth=ref, error=row.message, kind=row.kind)
     try:
-        record = whole(folder)
+        record = load_verified(folder)
         package = put_package(folder, record, home.store())
     except DG4DError as error:
         return Entry(name=truth.name, truth=ref, error=str(error), kind=type(error).__name__)

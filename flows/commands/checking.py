@@ -98,9 +98,9 @@ def rebuild(
         from flows import home
         from flows.commands import terminal
         from flows.inputs.conversion_job import job_from_record
-        from flows.packages.publish import check_folder, whole
+        from flows.packages.publish import check_folder, load_verified
 
-        record = whole(package)
+        record = load_verified(package)
         if out is not None:
             check_folder(out)
         job = job_from_record(record, home.store(), source, bank)

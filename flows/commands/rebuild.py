@@ -12,7 +12,7 @@ from flows.convert import run as run_flow
 from flows.exit_status import EXIT_FAILED
 from flows.inputs.conversion_job import ConversionJob
 from flows.packages.credentials import configured
-from flows.packages.publish import Files, fact_of, unpacked
+from flows.packages.publish import Files, file_digest, unpacked
 from flows.packages.report import deliver
 from steps.artifacts.artifact_diff import TOLERANCE, difference
 from steps.contract import ArtifactRef, Frozen, StepResult
@@ -160,7 +160,7 @@ def _files(record: Mapping[str, Any], folder: Path, files: Files, new: Path) -> 
             yield Likeness(kind="file", name=name, outcome="different", detail="it was not made the second time")
         elif files[name] == first:
             yield Likeness(kind="file", name=name, outcome="identical")
-        elif not (folder / name).is_file() or fact_of(folder / name) != fact:
+        elif not (folder / name).is_file() or file_digest(folder / name) != fact:
             detail = "it has other bytes, and the first file is not as it was made"
             yield Likeness(kind="file", name=name, outcome="not compared", detail=detail)
         else:

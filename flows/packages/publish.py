@@ -79,13 +79,13 @@ def is_current(folder: Path, job: str) -> bool:
     if record is None or record.get("order") != job:
         return False
     try:
-        unchanged = all(fact_of(folder / name) == fact for name, fact in record["files"].items())
+        unchanged = all(file_digest(folder / name) == fact for name, fact in record["files"].items())
         return unchanged and all((folder / name).is_file() for name in record.get("beside", ()))
     except OSError:
         return False
 
 
-def whole(folder: Path) -> dict[str, Any]:
+def load_verified(folder: Path) -> dict[str, Any]:
     """The provenance of the package in a folder, whose files are all there with every byte as it was written.
 
     Raises:
@@ -187,10 +187,10 @@ def unpacked(package: Path, folder: Path) -> Files:
     Raises:
         BadInput: an entry leads out of the folder, or the package is broken.
     """
-    return {name: fact_of(folder / name) for name in unpack(package, folder, "the package")}
+    return {name: file_digest(folder / name) for name in unpack(package, folder, "the package")}
 
 
-def fact_of(path: Path) -> dict[str, Any]:
+def file_digest(path: Path) -> dict[str, Any]:
     """The digest and the size of a file."""
     with path.open("rb") as file:
         return {
@@ -199,8 +199,8 @@ def fact_of(path: Path) -> dict[str, Any]:
         }
 
 
-def fact_of_bytes(content: bytes) -> dict[str, Any]:
-    """As `fact_of`, of what a file will hold."""
+def bytes_digest(content: bytes) -> dict[str, Any]:
+    """As `file_digest`, of what a file will hold."""
     return {"digest": f"sha256:{hashlib.sha256(content).hexdigest()}", "size_bytes": len(content)}
 
 
@@ -242,7 +242,7 @@ def _is_complete(record: dict[str, Any]) -> bool:
 def _fault(path: Path, fact: dict[str, Any]) -> str:
     """What is wrong with a file; empty if nothing is."""
     try:
-        return "" if fact_of(path) == fact else "was altered"
+        return "" if file_digest(path) == fact else "was altered"
     except FileNotFoundError:
         return "is missing"
     except OSError as error:

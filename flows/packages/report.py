@@ -20,7 +20,7 @@ from flows.packages.crate import CRATE, crate_text
 from flows.packages.credentials import Claim, Signer, sidecar_of
 from flows.packages.flow_result import FlowResult, StepRun
 from flows.packages.html_pages import render
-from flows.packages.publish import Files, Swap, fact_of_bytes, replace_package
+from flows.packages.publish import Files, Swap, bytes_digest, replace_package
 from flows.packages.view import VIEWER, page_of
 from steps.contract import RUN_ONLY, StepResult
 from steps.store.artifact_store import ArtifactStore
@@ -74,7 +74,7 @@ def texts(
         "report.html": page(report, picture_of(_results(result), store)),
         RECORD: written,
     }
-    facts = {name: fact_of_bytes(text.encode()) for name, text in beside.items()}
+    facts = {name: bytes_digest(text.encode()) for name, text in beside.items()}
     return {**beside, CRATE: crate_text(record, facts, banner(job, result))}
 
 

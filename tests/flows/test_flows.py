@@ -16,7 +16,7 @@ from flows.convert import make, make_motions, save_pictures
 from flows.engine.events import StepEvent, listening
 from flows.engine.orphans import settle_orphans
 from flows.inputs.conversion_job import ConversionRequest
-from flows.packages.publish import whole
+from flows.packages.publish import load_verified
 from flows.packages.summary import NOT_ACCEPTED, BatchProgress, Row
 from flows.serving import background
 from flows.serving.server import Server
@@ -156,7 +156,7 @@ def test_two_runs_into_one_folder_take_turns_and_the_second_finds_it_done(log: P
     assert sorted(ran(log)) == sorted(EVERY_STEP)
     assert sum("waiting for another run" in text for text in said) == 1
     assert sum("nothing to do" in text for text in said) == 1
-    whole(tmp_path / "out")
+    load_verified(tmp_path / "out")
 
 
 def test_a_package_of_another_asset_is_replaced_only_by_force(dg4d: Run, log: Path, tmp_path: Path) -> None:

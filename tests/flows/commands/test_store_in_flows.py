@@ -17,7 +17,7 @@ from flows.convert import make
 from flows.engine.collecting import collect
 from flows.engine.versions import Version, faults, versions
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest
-from flows.packages.publish import whole
+from flows.packages.publish import load_verified
 from flows.serving.server import Server
 from flows.step_errors import StepLost, StepUnreachable
 from steps.profiles import PREVIEW, revise
@@ -117,7 +117,7 @@ def test_whatever_is_damaged_between_two_runs_is_made_again(log: Path, tmp_path:
     assert again and set(again) <= set(every)
     assert is_whole()
     assert content(tmp_path / "one") == content(tmp_path / "two")
-    whole(tmp_path / "two")
+    load_verified(tmp_path / "two")
     only = next(step for step in the_version().steps if step.label == "fit_motion").outputs["motion"]
     damage(only, how)
     make(job("damage", tmp_path), tmp_path / "three")
@@ -140,7 +140,7 @@ def test_what_is_damaged_while_a_flow_runs_is_made_again(log: Path, tmp_path: Pa
     spoiler.join()
     assert sorted(set(ran(log))) != ["prepare_subject"]
     assert is_whole()
-    whole(tmp_path / "out")
+    load_verified(tmp_path / "out")
 
 
 def test_a_source_that_is_gone_is_an_error_and_not_a_loop(log: Path, tmp_path: Path) -> None:

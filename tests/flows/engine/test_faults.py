@@ -30,7 +30,7 @@ from flows.engine.orphans import settle_orphans
 from flows.engine.step_tasks import RETRIES
 from flows.engine.versions import faults, versions
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest
-from flows.packages.publish import whole
+from flows.packages.publish import load_verified
 from flows.serving.server import Server, answers
 from flows.step_errors import StepBadInput, StepOutOfMemory, StepTimedOut
 from steps.profiles import PREVIEW
@@ -140,7 +140,7 @@ def test_two_batches_of_the_same_folder_at_once_do_the_work_once(log: Path, tmp_
         assert command.returncode == 0, trouble
     assert sorted(ran(log)) == sorted(EVERY_STEP * 2)
     for name in ("a", "b"):
-        whole(tmp_path / "out" / name)
+        load_verified(tmp_path / "out" / name)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert sorted(row["item"] for row in summary["items"]) == ["a", "b"]
     assert [path.name for path in (tmp_path / "out").iterdir() if path.name.startswith(".")] == []
@@ -168,7 +168,7 @@ def test_a_server_killed_during_a_run_is_started_again_and_the_run_goes_on(
     with get_client(sync_client=True) as client:
         (newest,) = client.read_flow_runs(limit=1, sort="START_TIME_DESC")  # type: ignore[arg-type]
     assert newest.name == "fake" and newest.state is not None and newest.state.is_completed()
-    whole(tmp_path / "out")
+    load_verified(tmp_path / "out")
 
 
 def test_a_database_that_is_locked_for_a_while_delays_a_run_and_no_more(
@@ -191,7 +191,7 @@ def test_a_database_that_is_locked_for_a_while_delays_a_run_and_no_more(
     holder.join()
     assert time.monotonic() - began > locked_s
     assert sorted(ran(log)) == sorted(EVERY_STEP)
-    whole(tmp_path / "out")
+    load_verified(tmp_path / "out")
 
 
 def test_a_database_that_crashes_during_a_batch_and_comes_back_loses_and_doubles_nothing(
@@ -222,7 +222,7 @@ def test_a_database_that_crashes_during_a_batch_and_comes_back_loses_and_doubles
     assert sorted(run.name for run in runs if run.name in names) == names
     assert {run.state.name for run in runs if run.state is not None} == {"Completed"}
     for name in names:
-        whole(tmp_path / "out" / name)
+        load_verified(tmp_path / "out" / name)
     assert is_whole()
 
 

@@ -17,7 +17,7 @@ from waiting import wait_until
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows import deployments
-from flows.packages.publish import whole
+from flows.packages.publish import load_verified
 from flows.serving import registering
 from flows.serving.pools import read_pools
 from flows.serving.roots import SOURCES
@@ -194,7 +194,7 @@ def test_a_run_whose_process_was_killed_goes_on_after_its_last_finished_step(
     assert steps[0] == "prepare_subject"
     assert {*steps[1:3]} == {"drive_video", "fit_gaussians"}  # side by side
     assert steps[3:] == ["fit_motion", "fit_motion", "plan_mesh", "extract_mesh", "pack_asset", "check_asset"]
-    whole(tmp_path / "out")
+    load_verified(tmp_path / "out")
 
 
 def test_a_worker_knows_how_many_runs_would_end_with_it(
