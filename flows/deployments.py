@@ -28,7 +28,7 @@ from flows.engine.item_runs import FLOW, failure, read_job
 from flows.engine.orphans import claim_run
 from flows.engine.shared_results import sharing_results
 from flows.inputs.conversion_job import ConversionRequest
-from flows.inputs.fetching import at_hand, without_secrets
+from flows.inputs.fetching import local_copy, without_secrets
 from flows.inputs.manifest import parse_changes
 from flows.inputs.naming import clean
 from flows.packages.delivery import Outcome, pack, write_outcome
@@ -163,7 +163,7 @@ def picture_to_4d(
     _begin()
     roots = Roots.of_this_process()
     folder = roots.output(out)
-    with at_hand(roots.source(picture)) as path:
+    with local_copy(roots.source(picture)) as path:
         _make(picture, folder, options, roots, picture=path)
 
 
@@ -184,7 +184,7 @@ def video_to_4d(
     _begin()
     roots = Roots.of_this_process()
     folder = roots.output(out)
-    with at_hand(roots.source(video)) as path:
+    with local_copy(roots.source(video)) as path:
         _make(video, folder, options, roots, picture=path, video=path)
 
 
