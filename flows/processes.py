@@ -21,7 +21,7 @@ def start_of(pid: int) -> str:
     return stat.rpartition(")")[2].split()[19]
 
 
-def place() -> str:
+def host_id() -> str:
     """Return the identity of the machine, or container, whose processes this one sees.
 
     It is `$DG4D_HOST_ID`, else host name and PID namespace: containers may share the name of their host.

@@ -167,7 +167,7 @@ def _result_of(
 EXECUTORS: dict[str, Execute] = {"subprocess": in_subprocess, "container": in_container, "in_process": in_process}
 
 
-def chosen() -> Execute:
+def configured_executor() -> Execute:
     """The executor that `$DG4D_EXECUTOR` names; `subprocess` without it.
 
     Raises:
@@ -181,7 +181,7 @@ def chosen() -> Execute:
 
 def prepare() -> None:
     """Begin what the first step would wait for; for who is about to run one."""
-    if chosen() is in_subprocess:
+    if configured_executor() is in_subprocess:
         forks.prepare()
 
 

@@ -16,7 +16,7 @@ from pathlib import PurePosixPath
 from pydantic import Field, ValidationError
 
 from dg4d_lib.errors import BadInput
-from flows.processes import OWN_START, place, start_of
+from flows.processes import OWN_START, host_id, start_of
 from steps.contract import Digest, Frozen
 from steps.store.artifact_store import ArtifactStore, Entry
 
@@ -37,13 +37,13 @@ class Holder(Frozen):
         start: when it began, in the ticks of its kernel.
     """
 
-    host: str = Field(default_factory=place)
+    host: str = Field(default_factory=host_id)
     pid: int = Field(default_factory=os.getpid)
     start: str = OWN_START
 
     def is_gone(self, silent_s: float, patience_s: float) -> bool:
         """Return whether it has ended; on another machine, whether it was silent for longer than the patience."""
-        return start_of(self.pid) != self.start if self.host == place() else silent_s > patience_s
+        return start_of(self.pid) != self.start if self.host == host_id() else silent_s > patience_s
 
 
 class Lease(Holder):
@@ -164,7 +164,7 @@ _mutex = threading.Lock()
 
 
 def _name(item: str) -> str:
-    key = hashlib.sha256(f"{place()} {os.getpid()} {OWN_START} {item}".encode()).hexdigest()
+    key = hashlib.sha256(f"{host_id()} {os.getpid()} {OWN_START} {item}".encode()).hexdigest()
     return f"{FOLDER}/{key[:32]}.json"
 
 

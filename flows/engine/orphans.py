@@ -12,7 +12,7 @@ from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterState, Fl
 from prefect.client.schemas.objects import FlowRun, StateType
 from prefect.states import Crashed
 
-from flows.processes import place, start_of
+from flows.processes import host_id, start_of
 
 LABEL = "dg4d.process"  # of a flow run: machine, number of the process, its start
 PAGE = 200  # runs in one answer of the server
@@ -29,7 +29,7 @@ def claim_run() -> None:
 def process_identity(pid: int | None = None) -> str:
     """Return the identity of a process, this one by default; no later process with its number has the same."""
     pid = pid or os.getpid()
-    return f"{place()}:{pid}:{start_of(pid)}"
+    return f"{host_id()}:{pid}:{start_of(pid)}"
 
 
 def settle_orphans() -> int:
@@ -55,4 +55,4 @@ def _running(client: SyncPrefectClient) -> list[FlowRun]:
 def _is_orphan(identity: str) -> bool:
     """Return whether a process belongs to this machine and has ended."""
     machine, _, process = identity.rpartition(":")[0].rpartition(":")
-    return machine == place() and process.isdigit() and process_identity(int(process)) != identity
+    return machine == host_id() and process.isdigit() and process_identity(int(process)) != identity

@@ -26,7 +26,7 @@ from flows import home
 from flows.engine import resources
 from flows.engine.caching import FileLocks, RequestPolicy
 from flows.engine.events import StepEvent, emit
-from flows.engine.executors import chosen, stop_all
+from flows.engine.executors import configured_executor, stop_all
 from flows.engine.leases import hold
 from flows.engine.orphans import claim_run
 from flows.engine.remarks import remark
@@ -152,7 +152,7 @@ def run_step(step: str, result_type: type[Result], **arguments: Any) -> Result:
         turn = resources.Turn(conversion.begun_ns, f"{label} of {item}")
         with resources.slot(resources.resource_of(request), say, turn) as waited_s:
             _waited[runtime.task_run.id] = waited_s
-            result = chosen()(catalog()[step], request, on_progress, say)
+            result = configured_executor()(catalog()[step], request, on_progress, say)
     except StepError as error:
         _show_page(item, label, pages.failure_page(label, item, error, home.store()), f"{label} of {item} failed")
         raise

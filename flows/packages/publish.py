@@ -70,13 +70,13 @@ def check_writable(folder: Path) -> None:
         ) from error
 
 
-def is_current(folder: Path, job: str) -> bool:
+def is_current(folder: Path, job_digest: str) -> bool:
     """Whether a folder holds the package of a job (its digest), with every byte as it was written.
 
     What lies beside the package, the reports for example, must be there, as whatever it is.
     """
     record = record_of(folder)
-    if record is None or record.get("order") != job:
+    if record is None or record.get("order") != job_digest:
         return False
     try:
         unchanged = all(file_digest(folder / name) == fact for name, fact in record["files"].items())

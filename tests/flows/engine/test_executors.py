@@ -10,7 +10,7 @@ import pytest
 import stand_in_engine
 
 from flows.engine.containers import container
-from flows.engine.executors import Execute, chosen, in_container, in_process, in_subprocess
+from flows.engine.executors import Execute, configured_executor, in_container, in_process, in_subprocess
 from flows.step_errors import (
     StepBadInput,
     StepCrashed,
@@ -198,7 +198,7 @@ def test_an_engine_that_is_not_here_is_refused(place: Path, monkeypatch: pytest.
 def test_an_executor_that_does_not_exist_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DG4D_EXECUTOR", "rocket")
     with pytest.raises(StepMissing, match="subprocess, container, in_process"):
-        chosen()
+        configured_executor()
 
 
 def _processes() -> list[int]:
