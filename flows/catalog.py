@@ -16,7 +16,7 @@ from prefect.task_runners import TaskRunner
 
 from flows import home
 from flows.catalog_request import CatalogRequest, ready
-from flows.convert import make, save_pictures
+from flows.convert import convert_job, save_pictures
 from flows.engine.executors import stop_all
 from flows.engine.item_runs import failure, item_deployment
 from flows.engine.orphans import claim_run
@@ -96,7 +96,7 @@ def convert_all(
     progress: BatchProgress,
     strict: bool = False,
     where: str = "",
-    work: Make = make,
+    work: Make = convert_job,
 ) -> None:
     """Make items within the current flow run, `workers` at a time; what died is tried once more at the end.
 
@@ -117,7 +117,7 @@ def convert_all(
     """
     place = parse_where(where)
     if place.kind == "deployment":
-        work = item_deployment(place.address, workers).make
+        work = item_deployment(place.address, workers).convert_job
         forget_shared(home.store())
     gallery = Gallery(title, progress, out)
     with item_runner(place, workers) as runner:

@@ -158,7 +158,7 @@ def motions(
     with clear_ending():
         from flows import home
         from flows.commands import terminal
-        from flows.convert import make_motions
+        from flows.convert import rank_motions
         from flows.inputs.conversion_job import ConversionRequest
         from flows.inputs.manifest import parse_changes
         from flows.inputs.naming import clean
@@ -182,7 +182,7 @@ def motions(
         folder = out or Path("out") / f"{item}-motions"
         check_writable(folder)
         job = request.to_job(home.store())
-        ranking = terminal.with_steps(job, console, lambda: make_motions(job, folder))
+        ranking = terminal.with_steps(job, console, lambda: rank_motions(job, folder))
         for row in ranking["candidates"]:
             remarks = "; ".join(row["remarks"])
             console.print(f"{row['number']:>3}  {row['total']:.2f}  {row['name']}  {remarks}".rstrip(), markup=False)
@@ -366,9 +366,9 @@ def main() -> None:
 def _made(job: "ConversionJob", folder: Path, console: "Console") -> dict[str, dict[str, int]]:
     """Run the flow of a job with its steps on the terminal; the files of the package."""
     from flows.commands import terminal
-    from flows.convert import make
+    from flows.convert import convert_job
 
-    files, cached = terminal.with_steps(job, console, lambda: make(job, folder))
+    files, cached = terminal.with_steps(job, console, lambda: convert_job(job, folder))
     if cached:
         console.print("nothing to do: every step was already done")
     return files

@@ -57,7 +57,7 @@ def connect() -> None:
     settle_orphans()
 
 
-def make(job: ConversionJob, folder: Path) -> tuple[Files, bool]:
+def convert_job(job: ConversionJob, folder: Path) -> tuple[Files, bool]:
     """Run the flow of a job and put the package into `folder`, signed if a key is configured; keep it as a version.
 
     What turns out to be damaged or gone on the way is made again. Another run that writes the same folder is waited
@@ -82,13 +82,15 @@ def make(job: ConversionJob, folder: Path) -> tuple[Files, bool]:
         if waited and is_current(folder, job.digest()):
             return _files_in(folder), True
         try:
-            result = _make(job, folder)
+            result = _run_leased(job, folder)
         except (ArtifactMissing, StepLost):  # it was dropped when it was found, and so was the result that named it
-            result = _make(job, folder)
+            result = _run_leased(job, folder)
     return _files_in(folder), all(done.cached for done in result.steps)
 
 
-def run(job: ConversionJob, folder: Path | None = None, refresh: bool = False, mesh_parts: int = 0) -> "FlowResult":
+def run_flow(
+    job: ConversionJob, folder: Path | None = None, refresh: bool = False, mesh_parts: int = 0
+) -> "FlowResult":
     """Run the flow of a job.
 
     Args:
@@ -112,11 +114,11 @@ def run(job: ConversionJob, folder: Path | None = None, refresh: bool = False, m
         return flow.with_options(task_runner=runner)(job, folder, mesh_parts)
 
 
-def _make(job: ConversionJob, folder: Path) -> "FlowResult":
+def _run_leased(job: ConversionJob, folder: Path) -> "FlowResult":
     from flows.engine.leases import running
 
     with running(home.store(), job.item):
-        return run(job, folder)
+        return run_flow(job, folder)
 
 
 def _files_in(folder: Path) -> Files:
@@ -124,7 +126,7 @@ def _files_in(folder: Path) -> Files:
     return files
 
 
-def make_motions(job: ConversionJob, folder: Path) -> dict[str, Any]:
+def rank_motions(job: ConversionJob, folder: Path) -> dict[str, Any]:
     """Hold the tournament of a job's motions and put sheet, ranking and films into `folder`; the ranking.
 
     Raises:

@@ -23,7 +23,7 @@ from flows.commands.batch import batch, print_summary
 from flows.commands.benchmark import bench
 from flows.commands.options import knobs_of
 from flows.commands.terminal import console
-from flows.convert import connect, make
+from flows.convert import connect, convert_job
 from flows.engine.item_runs import FLOW, failure, read_job
 from flows.engine.orphans import claim_run
 from flows.engine.shared_results import sharing_results
@@ -307,7 +307,7 @@ def _made_for_catalog(job: ArtifactRef, code: str, address: str) -> Outcome:
         connect()
         with sharing_results(store), tempfile.TemporaryDirectory(prefix="dg4d-item-") as scratch:
             folder = Path(scratch) / "package"
-            _, cached = make(wanted, folder)
+            _, cached = convert_job(wanted, folder)
             return Outcome(package=pack(folder, store), cached=cached)
     except Exception as error:  # whatever it is, the catalog has to know
         return failure(error)
@@ -336,4 +336,4 @@ def _make(address: str, folder: Path, options: Options, roots: Roots, **files: P
     job = request.to_job(home.store())
     if not is_current(folder, job.digest()):
         connect()
-        make(job, folder)
+        convert_job(job, folder)

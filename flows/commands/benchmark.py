@@ -33,7 +33,7 @@ from steps.store.files import room_for, write_atomically
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from flows.judge import Entry, Judged
+    from flows.benchmark import BenchmarkEntry, BenchmarkResult
 
 NEEDED = ("asset.json", "asset.glb", "splats/", "meshes/", "canonical/")  # of a package, to draw it
 OWN = "score."  # before the knobs of scoring
@@ -72,16 +72,19 @@ def score(
     from flows.convert import connect
 
     connect()
-    from flows.judge import Entry, judge
+    from flows.benchmark import BenchmarkEntry, score_assets
+    from flows.engine.step_tasks import flow_context
 
-    entry = Entry(
+    entry = BenchmarkEntry(
         name=found.name,
         truth=put_truth(found, home.store()),
         package=put_package(package, record, home.store()),
         seconds=_seconds(record),
     )
-    with terminal.steps_shown(console):
-        judged = judge([entry], settings, f"{package.absolute().name} against {found.name}", package.absolute().name)
+    with terminal.steps_shown(console), flow_context():
+        judged = score_assets(
+            [entry], settings, f"{package.absolute().name} against {found.name}", package.absolute().name
+        )
     for one in judged.results.failed:
         if one.kind in BAD_INPUT:
             raise BadInput(f"{package} cannot be judged against {truth}: {one.error}")
@@ -150,12 +153,13 @@ def bench(
     rows = _converted(
         [request.to_job(home.store()) for request in requests], out / ASSETS, workers, console, dataset.name
     )
-    from flows.judge import judge
+    from flows.benchmark import score_assets
+    from flows.engine.step_tasks import flow_context
 
     entries = [_entry(truth, out / ASSETS / truth.name, rows[truth.name]) for truth in truths]
     title = f"{dataset.absolute().name}, {profile_name}{', true views as prior' if bank else ''}"
-    with terminal.batch_shown(console, [truth.name for truth in truths]) as table:
-        judged = judge(entries, settings, title, profile_name, seed)
+    with terminal.batch_shown(console, [truth.name for truth in truths]) as table, flow_context():
+        judged = score_assets(entries, settings, title, profile_name, seed)
         for one in judged.results.objects:
             table.settle(one.object, "failed" if one.error else "done", one.error)
     results = judged.results.model_copy(update={"settings": {**judged.results.settings, "changes": knobs}})
@@ -163,7 +167,7 @@ def bench(
     return results
 
 
-def write(results: Results, judged: "Judged", out: Path) -> None:
+def write(results: Results, judged: "BenchmarkResult", out: Path) -> None:
     """Write the files of a benchmark; raises DiskFull."""
     shown = _put_films(judged, out)
     texts = {
@@ -256,18 +260,18 @@ def _converted(jobs: list[ConversionJob], folder: Path, workers: int, console: "
     return rows | progress.rows
 
 
-def _entry(truth: Truth, folder: Path, row: Row) -> "Entry":
-    from flows.judge import Entry
+def _entry(truth: Truth, folder: Path, row: Row) -> "BenchmarkEntry":
+    from flows.benchmark import BenchmarkEntry
 
     ref = put_truth(truth, home.store())
     if row.status == "failed":
-        return Entry(name=truth.name, truth=ref, error=row.message, kind=row.kind)
+        return BenchmarkEntry(name=truth.name, truth=ref, error=row.message, kind=row.kind)
     try:
         record = load_verified(folder)
         package = put_package(folder, record, home.store())
     except DG4DError as error:
-        return Entry(name=truth.name, truth=ref, error=str(error), kind=type(error).__name__)
-    return Entry(name=truth.name, truth=ref, package=package, seconds=_seconds(record))
+        return BenchmarkEntry(name=truth.name, truth=ref, error=str(error), kind=type(error).__name__)
+    return BenchmarkEntry(name=truth.name, truth=ref, package=package, seconds=_seconds(record))
 
 
 def _seconds(record: Mapping[str, Any]) -> float:
@@ -280,7 +284,7 @@ def _json(results: Results) -> str:
     return json.dumps(results.model_dump(mode="json"), indent=1, ensure_ascii=False) + "\n"
 
 
-def _put_films(judged: "Judged", out: Path) -> dict[str, dict[str, dict[str, str]]]:
+def _put_films(judged: "BenchmarkResult", out: Path) -> dict[str, dict[str, dict[str, str]]]:
     """Unpack every film below OUT; where each lies, by object, whose it is, and view."""
     shown: dict[str, dict[str, dict[str, str]]] = {}
     for name, refs in judged.films.items():

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows import home
-from flows.convert import run as run_flow
+from flows.convert import run_flow
 from flows.exit_status import EXIT_FAILED
 from flows.inputs.conversion_job import ConversionJob
 from flows.packages.credentials import configured

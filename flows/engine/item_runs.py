@@ -77,8 +77,8 @@ class ItemDeployment(NamedTuple):
     pool: str
     poll_s: float = POLL_S
 
-    def make(self, job: ConversionJob, folder: Path) -> tuple[Files, bool]:
-        """Have a worker make a job, and put the package into `folder`, as `flows.convert.make` does here.
+    def convert_job(self, job: ConversionJob, folder: Path) -> tuple[Files, bool]:
+        """Have a worker make a job, and put the package into `folder`, as `flows.convert.convert_job` does here.
 
         Raises:
             ItemFailed: the worker could not make it, or died.

@@ -13,7 +13,7 @@ from signing import identity
 from waiting import retry_after
 
 from flows import home
-from flows.convert import make
+from flows.convert import convert_job
 from flows.inputs.conversion_job import ConversionRequest
 from flows.serving.auth import basic
 from flows.serving.server import Server
@@ -44,7 +44,7 @@ def left_by(words: str, place: Path) -> dict[str, bytes]:
     (place / "secret.png").write_text(picture(words))
     request = ConversionRequest(item="secret", picture=place / "secret.png", settings=PREVIEW)
     try:
-        make(request.to_job(home.store()), place / "out")
+        convert_job(request.to_job(home.store()), place / "out")
     except StepCrashed:
         assert "crash" in words
     APILogHandler().flush()

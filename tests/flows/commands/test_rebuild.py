@@ -16,7 +16,7 @@ from waiting import retry_after
 from dg4d_lib.errors import BadInput
 from flows import home
 from flows.commands.rebuild import Rebuilt, rebuild
-from flows.convert import make
+from flows.convert import convert_job
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest, job_from_record
 from flows.inputs.package_record import record_of
 from flows.packages.verify import verify
@@ -91,7 +91,7 @@ def altered(
 
 def test_every_step_runs_again_and_gives_the_same(fakes: Path, tmp_path: Path) -> None:
     wanted = job("same", tmp_path)
-    make(wanted, tmp_path / "out")
+    convert_job(wanted, tmp_path / "out")
     ran = fakes.read_text()
     fakes.unlink()
     rebuilt = again(tmp_path / "out", tmp_path / "again")
@@ -113,7 +113,9 @@ def test_words_and_meshes_per_frame_are_rebuilt_too(
 ) -> None:
     settings = revise(PREVIEW, {"text.weights": "somebody/pictures", "mesh.mode": "per_frame"})
     monkeypatch.setenv("DG4D_CPUS", "3")
-    make(ConversionRequest(item="words", text="a red  fox", settings=settings).to_job(home.store()), tmp_path / "out")
+    convert_job(
+        ConversionRequest(item="words", text="a red  fox", settings=settings).to_job(home.store()), tmp_path / "out"
+    )
     record = record_of(tmp_path / "out")
     assert record is not None
     assert record["recipe"]["text"] == "a red fox"
@@ -135,7 +137,7 @@ def curves(factor: float) -> Callable[[bytes], bytes]:
 def test_a_little_is_within_tolerance_more_is_different_and_what_is_lost_is_not_compared(
     fakes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    make(job("near", tmp_path), tmp_path / "out")
+    convert_job(job("near", tmp_path), tmp_path / "out")
     record = record_of(tmp_path / "out")
     assert record is not None
     (motion,) = [step["outputs"]["motion"] for step in record["steps"] if step["step"] == "fit_motion"]
@@ -168,7 +170,7 @@ def test_a_little_is_within_tolerance_more_is_different_and_what_is_lost_is_not_
 def test_another_file_is_different_and_other_code_is_told(
     fakes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    make(job("code", tmp_path), tmp_path / "out")
+    convert_job(job("code", tmp_path), tmp_path / "out")
     monkeypatch.setenv("DG4D_CODE_VERSION", "newer")
     monkeypatch.setenv("DG4D_IMAGE", "dg4d/cpu:2")
     noise = np.random.default_rng(0).integers(0, 255, (6, 8, 3), np.uint8)
@@ -214,7 +216,7 @@ def test_real_steps_give_equal_bytes_again(server: Server, tmp_path: Path, monke
         home.store()
     )
     monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
-    make(wanted, tmp_path / "egg")
+    convert_job(wanted, tmp_path / "egg")
     assert verify(tmp_path / "egg").exit_code == 0
     rebuilt = again(tmp_path / "egg")
     assert {name: outcome for name, outcome in outcomes(rebuilt).items() if outcome != "identical"} == {}

@@ -13,7 +13,7 @@ from tiny_s3 import BUCKET, TinyS3
 from waiting import retry_after
 
 from flows import home
-from flows.convert import make
+from flows.convert import convert_job
 from flows.engine.collecting import collect
 from flows.engine.versions import Version, faults, versions
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest
@@ -92,27 +92,27 @@ def is_whole() -> bool:
 
 def test_a_finished_order_is_a_version_and_the_same_order_again_is_the_same(log: Path, tmp_path: Path) -> None:
     wanted = job("version", tmp_path)
-    make(wanted, tmp_path / "out")
+    convert_job(wanted, tmp_path / "out")
     made = the_version()
     record = json.loads((tmp_path / "out" / "provenance.json").read_text())
     assert (made.item, made.order, made.package.digest) == ("fake", record["order"], record["package"])
     assert [step.record for step in made.steps] == [step["digest"] for step in record["steps"]]
     assert is_whole()
-    make(wanted, tmp_path / "again")
+    convert_job(wanted, tmp_path / "again")
     assert the_version().steps == made.steps
-    make(job("another version", tmp_path), tmp_path / "out")
+    convert_job(job("another version", tmp_path), tmp_path / "out")
     assert len(versions(home.store())) == 2
     assert list(home.store().entries("running")) == []
 
 
 @pytest.mark.parametrize("how", ["gone", "flipped", "short"])
 def test_whatever_is_damaged_between_two_runs_is_made_again(log: Path, tmp_path: Path, how: str) -> None:
-    make(job("damage", tmp_path), tmp_path / "one")
+    convert_job(job("damage", tmp_path), tmp_path / "one")
     every = ran(log)
     assert len(set(every)) == len(every) > 5
     for digest in the_version().artifacts():
         damage(digest, how)
-    make(job("damage", tmp_path), tmp_path / "two")
+    convert_job(job("damage", tmp_path), tmp_path / "two")
     again = ran(log)  # what one step makes anew another may share
     assert again and set(again) <= set(every)
     assert is_whole()
@@ -120,7 +120,7 @@ def test_whatever_is_damaged_between_two_runs_is_made_again(log: Path, tmp_path:
     load_verified(tmp_path / "two")
     only = next(step for step in the_version().steps if step.label == "fit_motion").outputs["motion"]
     damage(only, how)
-    make(job("damage", tmp_path), tmp_path / "three")
+    convert_job(job("damage", tmp_path), tmp_path / "three")
     assert ran(log) == ["fit_motion"]
     assert content(tmp_path / "one") == content(tmp_path / "three")
 
@@ -136,7 +136,7 @@ def test_what_is_damaged_while_a_flow_runs_is_made_again(log: Path, tmp_path: Pa
 
     spoiler = threading.Thread(target=spoil)
     spoiler.start()
-    make(wanted, tmp_path / "out")
+    convert_job(wanted, tmp_path / "out")
     spoiler.join()
     assert sorted(set(ran(log))) != ["prepare_subject"]
     assert is_whole()
@@ -147,12 +147,12 @@ def test_a_source_that_is_gone_is_an_error_and_not_a_loop(log: Path, tmp_path: P
     wanted = job("gone", tmp_path)
     damage(wanted.source.digest, "gone")
     with pytest.raises(StepLost, match="run the same command again"):
-        make(wanted, tmp_path / "out")
-    make(job("gone", tmp_path), tmp_path / "out")
+        convert_job(wanted, tmp_path / "out")
+    convert_job(job("gone", tmp_path), tmp_path / "out")
 
 
 def test_removing_all_the_time_harms_no_run(log: Path, tmp_path: Path) -> None:
-    make(job("busy", tmp_path), tmp_path / "one")
+    convert_job(job("busy", tmp_path), tmp_path / "one")
     ran(log)
     store = home.store()
     store.remove([the_version().name])
@@ -167,7 +167,7 @@ def test_removing_all_the_time_harms_no_run(log: Path, tmp_path: Path) -> None:
 
     remover = threading.Thread(target=remove)
     remover.start()
-    make(wanted, tmp_path / "two")
+    convert_job(wanted, tmp_path / "two")
     done.set()
     remover.join()
     assert len(removed) > 1
@@ -177,17 +177,17 @@ def test_removing_all_the_time_harms_no_run(log: Path, tmp_path: Path) -> None:
 
 
 def test_a_bucket_gives_the_same_as_a_folder(bucket: TinyS3, log: Path, tmp_path: Path) -> None:
-    make(job("bucket", tmp_path), tmp_path / "one")
+    convert_job(job("bucket", tmp_path), tmp_path / "one")
     every = ran(log)
     assert set(the_version().artifacts()) == {entry.name for entry in home.store().artifacts()}
     for path in (tmp_path / "home" / "copies").rglob("*"):
         if path.is_file():
             path.unlink()
-    make(job("bucket", tmp_path), tmp_path / "two")
+    convert_job(job("bucket", tmp_path), tmp_path / "two")
     assert ran(log) == []
     assert content(tmp_path / "one") == content(tmp_path / "two")
     os.environ.pop("DG4D_STORE")
-    make(job("bucket", tmp_path), tmp_path / "three")
+    convert_job(job("bucket", tmp_path), tmp_path / "three")
     again = ran(log)
     assert again and set(again) <= set(every)
     assert content(tmp_path / "one") == content(tmp_path / "three")
@@ -199,7 +199,7 @@ def test_a_bucket_that_goes_away_for_a_while_delays_a_flow_and_no_more(
     wanted = job("away fit_motion=sleep-once:0.5", tmp_path)
     absence = threading.Thread(target=_absent, args=(bucket, log, "fit_motion", 1.5))
     absence.start()
-    make(wanted, tmp_path / "out")
+    convert_job(wanted, tmp_path / "out")
     absence.join()
     done = ran(log)
     assert len(set(done)) == len(done)  # the result was there and waited
@@ -214,7 +214,7 @@ def test_a_step_that_lost_patience_with_the_bucket_is_tried_again(
     wanted = job("patience fit_motion=sleep-once:0.3", tmp_path)
     absence = threading.Thread(target=_absent, args=(bucket, log, "fit_motion", 2.0))
     absence.start()
-    make(wanted, tmp_path / "out")
+    convert_job(wanted, tmp_path / "out")
     absence.join()
     assert sorted(ran(log)).count("fit_motion") == 2
     assert is_whole()
@@ -228,12 +228,12 @@ def test_a_bucket_that_stays_away_is_a_clear_error_and_the_next_run_goes_on(
     absence = threading.Thread(target=_absent, args=(bucket, log, "fit_motion", 0))
     absence.start()
     with pytest.raises(StepUnreachable, match="does not answer"):
-        make(wanted, tmp_path / "out")
+        convert_job(wanted, tmp_path / "out")
     absence.join()
     assert not (tmp_path / "out").exists()
     ran(log)
     bucket.start()
-    make(wanted, tmp_path / "out")
+    convert_job(wanted, tmp_path / "out")
     assert ran(log)[:2] == ["fit_motion", "plan_mesh"]
 
 

@@ -23,7 +23,7 @@ from dg4d_lib.errors import BadInput
 from flows import home
 from flows.catalog_request import CatalogRequest
 from flows.commands.batch import batch
-from flows.convert import make
+from flows.convert import convert_job
 from flows.engine import leases
 from flows.engine.collecting import collect
 from flows.engine.orphans import settle_orphans
@@ -121,11 +121,11 @@ def test_a_command_killed_in_every_stage_ends_with_the_bytes_of_an_undisturbed_o
         assert not (tmp_path / "out").exists()
         before = stage
     assert settle_orphans() == 1  # every command settles the one before
-    make(job(words, tmp_path), tmp_path / "out")
+    convert_job(job(words, tmp_path), tmp_path / "out")
     assert ran(log) == EVERY_STEP[-1:]
     monkeypatch.delenv("DG4D_STORE")
     monkeypatch.setenv("DG4D_HOME", str(tmp_path / "fresh"))  # where nothing is done yet
-    make(job(words, tmp_path), tmp_path / "other")
+    convert_job(job(words, tmp_path), tmp_path / "other")
     assert sorted(ran(log)) == sorted(EVERY_STEP)
     assert content(tmp_path / "out") == content(tmp_path / "other")
 
@@ -161,7 +161,7 @@ def test_a_server_killed_during_a_run_is_started_again_and_the_run_goes_on(
         wait_until(lambda: not server.is_guarded())
 
     killer = during("fit_motion", log, kill)
-    make(job("server fit_motion=sleep-once:2", tmp_path), tmp_path / "out")
+    convert_job(job("server fit_motion=sleep-once:2", tmp_path), tmp_path / "out")
     killer.join()
     assert sorted(ran(log)) == sorted(EVERY_STEP)
     assert server.address() == address and answers(address, timeout_s=10)
@@ -187,7 +187,7 @@ def test_a_database_that_is_locked_for_a_while_delays_a_run_and_no_more(
 
     holder = during("prepare_subject", log, hold)
     began = time.monotonic()
-    make(job("locked prepare_subject=sleep-once:0.5", tmp_path), tmp_path / "out")
+    convert_job(job("locked prepare_subject=sleep-once:0.5", tmp_path), tmp_path / "out")
     holder.join()
     assert time.monotonic() - began > locked_s
     assert sorted(ran(log)) == sorted(EVERY_STEP)
@@ -232,13 +232,13 @@ def test_a_full_disk_is_a_clear_message_and_with_more_room_the_run_goes_on(
     monkeypatch.setenv("DG4D_STORE", str(disk / "store"))
     wanted = job("x" * 60_000, tmp_path)  # every artifact is as large
     with pytest.raises(StepBadInput, match=r"disk.* full"):
-        make(wanted, tmp_path / "out")
+        convert_job(wanted, tmp_path / "out")
     done = ran(log)
     assert 1 <= len(done) < len(EVERY_STEP)
     assert not (tmp_path / "out").exists()
     assert list((disk / "store" / "incoming").glob("*")) == []
     assert _mount("-o", "remount,size=64m", disk) == 0
-    make(wanted, tmp_path / "out")
+    convert_job(wanted, tmp_path / "out")
     assert {*done, *ran(log)} == set(EVERY_STEP)
     assert is_whole()
 
@@ -248,7 +248,7 @@ def test_a_step_whose_memory_is_limited_is_tried_again_and_then_says_so(
 ) -> None:
     monkeypatch.setenv("DG4D_EXECUTOR", "subprocess")
     with pytest.raises(StepOutOfMemory, match="memory ran out: end other programs, or choose smaller settings"):
-        make(job("prepare_subject=hoard", tmp_path), tmp_path / "out")
+        convert_job(job("prepare_subject=hoard", tmp_path), tmp_path / "out")
     assert ran(log) == EVERY_STEP[:1] * (1 + RETRIES)
 
 
@@ -262,22 +262,22 @@ def test_a_step_that_hangs_is_killed_and_the_next_run_begins_with_it(
         wanted = job("drive_video=sleep-once:300", tmp_path)
         began = time.monotonic()
         with pytest.raises(StepTimedOut, match="no result after 8 s, so it was stopped"):
-            make(wanted, tmp_path / "out")
+            convert_job(wanted, tmp_path / "out")
     assert time.monotonic() - began < 200
     assert ran(log).count("drive_video") == 1  # the same again would hang again
     monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
-    make(wanted, tmp_path / "out")
+    convert_job(wanted, tmp_path / "out")
     assert "prepare_subject" not in (again := ran(log)) and "drive_video" in again
 
 
 @pytest.mark.parametrize("skew_s", [-400 * DAY_S, 400 * DAY_S])
 def test_results_are_used_whatever_the_clock_said_when_they_were_made(log: Path, tmp_path: Path, skew_s: float) -> None:
-    make(job("skew", tmp_path), tmp_path / "one")
+    convert_job(job("skew", tmp_path), tmp_path / "one")
     assert sorted(ran(log)) == sorted(EVERY_STEP)
     for folder in (home.store().root, home.records()):
         for path in folder.rglob("*"):
             os.utime(path, times=(time.time() + skew_s,) * 2)
-    _, cached = make(job("skew", tmp_path), tmp_path / "two")
+    _, cached = convert_job(job("skew", tmp_path), tmp_path / "two")
     assert cached and ran(log) == []
     assert content(tmp_path / "one") == content(tmp_path / "two")
 
@@ -286,7 +286,7 @@ def test_results_are_used_whatever_the_clock_said_when_they_were_made(log: Path,
 def test_a_clock_that_jumps_during_a_run_makes_nothing_needed_go(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, skew_s: float
 ) -> None:
-    make(job("jump", tmp_path), tmp_path / "one")
+    convert_job(job("jump", tmp_path), tmp_path / "one")
     store, true_time = home.store(), time.time
     unwanted = store.put_bytes(b"of nobody", "text/plain")
     with leases.running(store, "fake"):

@@ -9,7 +9,7 @@ from prefect import flow
 from records import record_of, result_with
 
 from flows import home
-from flows.convert import make
+from flows.convert import convert_job
 from flows.engine.records import record_key
 from flows.engine.shared_results import fetch_result, sharing_results
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest
@@ -40,7 +40,7 @@ def test_a_machine_takes_over_what_another_finished(
         monkeypatch.setenv("DG4D_HOME", str(tmp_path / machine))
         log.unlink(missing_ok=True)
         with sharing_results(home.store()) if shares else nullcontext():
-            make(job(), tmp_path / machine / "out")
+            convert_job(job(), tmp_path / machine / "out")
         return len(log.read_text().split()) if log.exists() else 0
 
     def job() -> ConversionJob:
@@ -58,7 +58,7 @@ def test_a_conversion_within_another_flow_keeps_its_records_under_home(log: Path
 
     @flow(persist_result=False)
     def outer() -> None:
-        make(
+        convert_job(
             ConversionRequest(item="fox", picture=tmp_path / "fox.png", settings=PREVIEW).to_job(home.store()),
             tmp_path / "out",
         )

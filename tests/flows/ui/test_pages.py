@@ -20,7 +20,7 @@ from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL
 from waiting import retry_after, wait_until
 
 from flows import home
-from flows.convert import make
+from flows.convert import convert_job
 from flows.formatting import curves
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.serving.auth import basic
@@ -92,7 +92,7 @@ def drawn_in_browser(server: Server, version: dict[str, Any], screenshot: Path) 
 
 
 def test_an_item_leaves_a_page_per_step_and_one_with_everything(place: Path) -> None:
-    _, cached = make(job("pages", place, "paged"), place / "out")
+    _, cached = convert_job(job("pages", place, "paged"), place / "out")
     assert not cached
     kept = {key: latest[0] for key, latest in artifacts("paged").items()}
     labels = {step.replace("_", "-") for step in EVERY_STEP}
@@ -119,7 +119,7 @@ def test_an_item_leaves_a_page_per_step_and_one_with_everything(place: Path) -> 
 
 
 def test_files_and_the_viewer_are_a_link_away(place: Path) -> None:
-    make(job("links", place, "linked"), place / "out")
+    convert_job(job("links", place, "linked"), place / "out")
     kept = {key: latest[0]["data"] for key, latest in artifacts("linked").items()}
     to = {key: re.findall(r"/dg4d/[^)\s\]]+", str(data)) for key, data in kept.items()}
     kind, subject = fetched(to["prepare-subject"][0])
@@ -143,9 +143,9 @@ def test_files_and_the_viewer_are_a_link_away(place: Path) -> None:
 
 
 def test_the_same_item_again_is_a_new_version_under_the_same_keys(place: Path) -> None:
-    make(job("version one", place, "versioned"), place / "out")
-    make(job("version two", place, "versioned"), place / "out")
-    make(job("version two", place, "versioned"), place / "out")
+    convert_job(job("version one", place, "versioned"), place / "out")
+    convert_job(job("version two", place, "versioned"), place / "out")
+    convert_job(job("version two", place, "versioned"), place / "out")
     every, latest = artifacts("versioned", "/artifacts/filter"), artifacts("versioned")
     assert {key: len(versions) for key, versions in every.items() if key in ("asset", "fit-motion")} == {
         "asset": 3, "fit-motion": 2,
@@ -157,14 +157,14 @@ def test_the_same_item_again_is_a_new_version_under_the_same_keys(place: Path) -
 
 def test_a_step_that_failed_leaves_its_reason_and_its_last_good_state(place: Path) -> None:
     with pytest.raises(StepDiverged):
-        make(job("fit_motion=diverge", place, "diverged"), place / "out")
+        convert_job(job("fit_motion=diverge", place, "diverged"), place / "out")
     kept = {key: latest[0]["data"] for key, latest in artifacts("diverged").items()}
     assert "iteration 7" in kept["fit-motion"] and "![last_good](data:image/webp;base64," in kept["fit-motion"]
     assert "asset" not in kept and "package" not in kept
 
 
 def test_a_browser_draws_every_picture_of_the_page(server: Server, place: Path) -> None:
-    make(job("drawn", place, "drawn"), place / "out")
+    convert_job(job("drawn", place, "drawn"), place / "out")
     (version,) = artifacts("drawn", "/artifacts/filter")["asset"]
     seen = drawn_in_browser(server, version, place / "page.png")
     assert [shown["name"] for shown in seen["pictures"]] == [*TITLES, *["Losses of the fake"] * LOSSES]
@@ -219,7 +219,7 @@ def test_counts_are_read_with_all_their_digits() -> None:
 
 def test_an_item_may_be_called_anything_and_is_shown_letter_by_letter(server: Server, place: Path) -> None:
     name = "{0} {item} ![x](http:tracker) |b| <img src=x> *c*"
-    make(job("nasty", place, name), place / "out")
+    convert_job(job("nasty", place, name), place / "out")
     with get_client(sync_client=True) as client:
         wanted = {"artifacts": {"key": {"like_": "-0-item-x-http-tracker-b-img-src-x-c-"}}, "limit": 200}
         found: list[dict[str, Any]] = client.request("POST", "/artifacts/filter", json=wanted).json()
