@@ -8,7 +8,7 @@ from prefect.transactions import transaction
 
 from flows import home
 from flows.engine import resources
-from flows.engine.frames import divided, frames_in
+from flows.engine.frames import count_frames, divide_frames
 from flows.engine.publishing import keep_version, publish
 from flows.engine.step_tasks import Conversion, finished_steps, steps_of_flow
 from flows.inputs.conversion_job import ConversionJob
@@ -121,8 +121,8 @@ def mesh_over_time(gaussians: Gaussians, motion: Motion, driving_video: DrivingV
     plan = plan_mesh(gaussians, motion, conversion)
     if read_plan(home.store().path(plan.plan)).mode == "tracked":
         return extract_mesh(gaussians, motion, plan, conversion)
-    frames = frames_in(driving_video.frames, home.store())
-    parts = divided(frames, conversion.mesh_parts or resources.cpus())
+    frames = count_frames(driving_video.frames, home.store())
+    parts = divide_frames(frames, conversion.mesh_parts or resources.cpus())
     every = map(unmapped, (gaussians, motion, plan, conversion))
     meshes = extract_mesh.map(*every, parts).result()
     return meshes[0] if len(meshes) == 1 else join_meshes(meshes, conversion)

@@ -1,4 +1,4 @@
-"""Tasks at the end of a conversion: the package into the output folder, the version into the store."""
+"""Tasks that publish the package in the output folder and record the version in the store."""
 
 from pathlib import Path
 
@@ -28,7 +28,7 @@ def publish(package: StepResult, verdict: StepResult, job: ConversionJob, result
         package: result of `pack_asset`.
         verdict: result of `check_asset`.
         job: request of the conversion.
-        result: of the conversion.
+        result: result of the conversion.
         folder: output folder.
 
     Raises:

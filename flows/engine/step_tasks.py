@@ -55,8 +55,8 @@ class Conversion(Frozen):
 
     Attributes:
         item: name of the asset.
-        settings: of the whole pipeline; a step reads its sections.
-        seed: of every step.
+        settings: settings of the whole pipeline; a step reads its sections.
+        seed: seed of every step.
         begun_ns: start of the conversion, nanoseconds since the epoch; earlier conversions go first on a machine.
         mesh_parts: number of tasks that extract a mesh per frame; 0: one per slot of this machine.
     """
@@ -130,8 +130,8 @@ def run_step(step: str, result_type: type[Result], **arguments: Any) -> Result:
 
     Args:
         step: name in the catalog, and of the task.
-        result_type: of the result.
-        arguments: of the task, by name; see `request_for`.
+        result_type: class of the result.
+        arguments: arguments of the task by name; see `request_for`.
 
     Raises:
         StepError: the step did not finish.
@@ -176,7 +176,7 @@ def task_run_name() -> str:
 
 
 def should_retry(_task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
-    """Return whether a failed task run may succeed now: memory may be free, the store back; a crash gets one retry.
+    """Return true if a failed task run may succeed now: memory or the store may be available, a crash gets one retry.
 
     A run that the user stopped is not retried.
     """
@@ -189,7 +189,7 @@ def should_retry(_task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool
 
 
 def note_end(task: Task[..., Any], run: TaskRun, state: State[Any]) -> None:
-    """Record the end of a task run, computed, cached or failed, and tell the listeners of this process."""
+    """Record the end of a task run, computed, cached or failed, and emit its event."""
     label, _, item = run.name.partition(": ")
     seconds = (datetime.now(UTC) - run.start_time).total_seconds() if run.start_time else 0.0
     waited_s = _waited.pop(str(run.id), 0.0)
@@ -221,13 +221,13 @@ def finished_steps() -> list[StepRun]:
 
 @contextmanager
 def steps_of_flow() -> Iterator[None]:
-    """Label the current flow run with its process, and end its steps with it: at once if the user stops it."""
+    """Label the current flow run with its process; kill its steps if the user stops it."""
     flow_run = UUID(runtime.flow_run.id)
     claim_run()
     try:
         yield
     except (KeyboardInterrupt, TerminationSignal):
-        stop_all()  # steps in other threads would be waited for
+        stop_all()  # Prefect waits for tasks in other threads
         raise
     finally:
         _finished.pop(flow_run, None)
@@ -240,7 +240,7 @@ def flow_context(settings: Mapping[Any, Any] | None = None) -> Iterator[None]:
     A flow takes the storage of its results from the flow that calls it, so the current flow run gets that storage too.
 
     Args:
-        settings: of Prefect, beside these.
+        settings: further settings of Prefect.
     """
     records = home.records()
     records.mkdir(parents=True, exist_ok=True)
@@ -280,7 +280,7 @@ class _Progress:
     """Progress artifact of a step, updated every few seconds."""
 
     def __init__(self, item: str, label: str) -> None:
-        self._key, self._what = f"progress-{pages.key(label, item)}", f"{label} of {markdown(item)}"
+        self._key, self._title = f"progress-{pages.key(label, item)}", f"{label} of {markdown(item)}"
         self._artifact: Any = None
         self._last = 0.0
 
@@ -289,12 +289,11 @@ class _Progress:
         if now - self._last < PROGRESS_EVERY_S and done < total:
             return
         self._last = now
-        text = ", ".join(
-            [f"{self._what}: {done}/{total}", *(f"{name} {amount(value)}" for name, value in values.items())]
-        )
+        figures = "".join(f", {name} {amount(value)}" for name, value in values.items())
+        text, percent = f"{self._title}: {done}/{total}{figures}", 100 * done / max(total, 1)
         revive()
         with suppress(httpx.TransportError):  # the step goes on while the server is away
             if self._artifact is None:
-                self._artifact = create_progress_artifact(100 * done / max(total, 1), key=self._key, description=text)
+                self._artifact = create_progress_artifact(percent, key=self._key, description=text)
             else:
-                update_progress_artifact(self._artifact, 100 * done / max(total, 1), description=text)
+                update_progress_artifact(self._artifact, percent, description=text)
