@@ -1,4 +1,4 @@
-"""One job becomes one folder: connect to a server, run the flow, publish what it made."""
+"""Conversion of one job: connect to a server, run the flow, publish the package in a folder."""
 
 import importlib
 import os
@@ -22,11 +22,11 @@ from steps.store.files import home as store_home
 if TYPE_CHECKING:
     from flows.packages.flow_result import FlowResult
 
-ANSWER_S = 10.0  # for a server of the user's own
+ANSWER_S = 10.0  # time limit of a health check of the user's own server
 
 
 def prepare(job: ConversionJob) -> None:
-    """Begin what the first step of a job would wait for, unless every step was done before."""
+    """Start the fork server for the first step of a job, unless the job was finished before."""
     from flows.engine import executors
     from flows.engine.versions import has_version
 
@@ -35,11 +35,11 @@ def prepare(job: ConversionJob) -> None:
 
 
 def connect() -> None:
-    """Have a Prefect server, and import Prefect and the flows while it starts.
+    """Connect to a Prefect server, by default the background server; import Prefect and the flows while it starts.
 
     Raises:
-        ServerUnavailable: there is none; says what to do.
-        DiskFull: there is no room for what a run keeps.
+        ServerUnavailable: the server does not answer.
+        DiskFull: the disk of the home folder is nearly full.
     """
     require_free_space(store_home())
     own = os.environ.get("PREFECT_API_URL")
@@ -50,7 +50,7 @@ def connect() -> None:
         server = background.background_server()
         server.start()
         background.set_own_server(server, server.wait_for_address())
-        importlib.import_module("flows.pipeline")  # takes seconds, and so does the server
+        importlib.import_module("flows.pipeline")  # takes seconds, as the start of the server does
         server.wait()
     from flows.engine.orphans import settle_orphans
 
@@ -58,34 +58,37 @@ def connect() -> None:
 
 
 def convert_job(job: ConversionJob, folder: Path) -> tuple[Files, bool]:
-    """Run the flow of a job and put the package into `folder`, signed if a key is configured; keep it as a version.
+    """Run the flow of a job and publish the package in `folder`, signed if a key is configured.
 
-    What turns out to be damaged or gone on the way is made again. Another run that writes the same folder is waited
-    for; if it made the same package, there is nothing left to do.
+    Cached artifacts that turn out to be missing or damaged are computed again. A run that finds another one writing the
+    same folder waits for it, and reuses an equal package.
 
     Returns:
-        The files of the package, and whether every step had been done before.
+        Files of the package, and true if every step was cached.
 
     Raises:
-        StepError: a step did not finish; `folder` is as it was.
-        BadInput: the folder cannot be written, the disk is full, or the key cannot sign; it is as it was.
+        StepError: a step failed; `folder` is unchanged.
+        BadInput: the folder cannot be written, the disk is full, or the key cannot sign; `folder` is unchanged.
         BackendUnavailable: a key is configured, and signing is not installed.
     """
     from flows.engine.events import StepEvent, emit
+    from flows.engine.leases import running
     from flows.engine.output_lock import output_lock
     from flows.step_errors import StepLost
 
     def waiting() -> None:
         emit(StepEvent(job.item, "output", "remark", text=f"waiting for another run that writes {folder}"))
 
+    cached = True
     with output_lock(folder, waiting) as waited:
-        if waited and is_current(folder, job.digest()):
-            return _files_in(folder), True
-        try:
-            result = _run_leased(job, folder)
-        except (ArtifactMissing, StepLost):  # it was dropped when it was found, and so was the result that named it
-            result = _run_leased(job, folder)
-    return _files_in(folder), all(done.cached for done in result.steps)
+        if not (waited and is_current(folder, job.digest())):
+            with running(home.store(), job.item):
+                try:
+                    result = run_flow(job, folder)
+                except (ArtifactMissing, StepLost):  # the cache entry of the missing artifact was dropped
+                    result = run_flow(job, folder)
+            cached = all(done.cached for done in result.steps)
+    return (record_of(folder) or {"files": {}})["files"], cached
 
 
 def run_flow(
@@ -94,13 +97,13 @@ def run_flow(
     """Run the flow of a job.
 
     Args:
-        job: request of the conversion.
+        job: job to convert.
         folder: output folder; None: the package stays in the store.
-        refresh: run every step, also those whose result exists.
+        refresh: run cached steps again.
         mesh_parts: number of tasks that extract a mesh per frame; 0: one per slot of this machine.
 
     Raises:
-        StepError: a step did not finish.
+        StepError: a step failed.
     """
     from prefect.settings import PREFECT_TASKS_REFRESH_CACHE
     from prefect.task_runners import ThreadPoolTaskRunner
@@ -110,38 +113,26 @@ def run_flow(
 
     flow = pipeline.text_to_4d if job.drawn else pipeline.video_to_4d if job.moving else pipeline.image_to_4d
     runner: Any = ThreadPoolTaskRunner(max_workers=slots())
-    with _surroundings(job, {PREFECT_TASKS_REFRESH_CACHE: refresh}):
+    with _flow_context(job, {PREFECT_TASKS_REFRESH_CACHE: refresh}):
         return flow.with_options(task_runner=runner)(job, folder, mesh_parts)
 
 
-def _run_leased(job: ConversionJob, folder: Path) -> "FlowResult":
-    from flows.engine.leases import running
-
-    with running(home.store(), job.item):
-        return run_flow(job, folder)
-
-
-def _files_in(folder: Path) -> Files:
-    files: Files = (record_of(folder) or {"files": {}})["files"]
-    return files
-
-
 def rank_motions(job: ConversionJob, folder: Path) -> dict[str, Any]:
-    """Hold the tournament of a job's motions and put sheet, ranking and films into `folder`; the ranking.
+    """Generate and rank motions of a job's picture, write sheet, ranking and films into `folder`; return the ranking.
 
     Raises:
-        StepError: a step did not finish.
+        StepError: a step failed.
     """
     from flows.motions import motions, unpack
 
-    with _surroundings(job):
+    with _flow_context(job):
         outputs = motions(job)
     return unpack(outputs, folder)
 
 
 @contextmanager
-def _surroundings(job: ConversionJob, settings: dict[Any, Any] | None = None) -> Iterator[None]:
-    """What a flow of a job runs in, with these settings of Prefect beside those of every flow."""
+def _flow_context(job: ConversionJob, settings: dict[Any, Any] | None = None) -> Iterator[None]:
+    """Enter the context of a job's flow, tagged with its profile, with further settings of Prefect."""
     from prefect import tags
 
     from flows.engine.step_tasks import flow_context
@@ -151,7 +142,7 @@ def _surroundings(job: ConversionJob, settings: dict[Any, Any] | None = None) ->
 
 
 def save_pictures(job: ConversionJob, error: Exception) -> list[Path]:
-    """Keep the pictures that explain a failure where the user can look at them."""
+    """Copy the pictures that explain a failure to the folder of failures."""
     saved = []
     for name, ref in getattr(error, "pictures", {}).items():
         path = home.failures() / f"{job.item.replace('/', '-')}-{getattr(error, 'step', 'step')}-{name}.png"
@@ -169,6 +160,6 @@ def _check(api_url: str) -> None:
         urllib.request.urlopen(f"{api_url.rstrip('/')}/health", timeout=ANSWER_S).close()
     except (urllib.error.URLError, OSError, ValueError) as error:
         raise ServerUnavailable(
-            f"PREFECT_API_URL is {api_url} and nothing answers there ({error}); "
-            "start that server, or unset the variable to have one started"
+            f"PREFECT_API_URL is {api_url}, where no server answers ({error}); start that server, or unset the "
+            "variable to use the background server"
         ) from error

@@ -1,4 +1,4 @@
-"""The motions that a picture could make, judged and shown, so that a person can choose."""
+"""Flow that generates and ranks candidate motions of a picture, for `dg4d motions`."""
 
 import json
 from pathlib import Path
@@ -18,7 +18,7 @@ from steps.contract import ArtifactRef
 
 @flow(name="motions", flow_run_name="{job.item}", persist_result=False)
 def motions(job: ConversionJob) -> dict[str, ArtifactRef]:
-    """Prepare the subject and rank the candidates of `drive_video`; its outputs by name.
+    """Prepare the subject and rank the candidates of `drive_video`; return its outputs by name.
 
     Raises:
         StepError: a step did not finish.
@@ -31,12 +31,12 @@ def motions(job: ConversionJob) -> dict[str, ArtifactRef]:
         return drive_video(subject, conversion).outputs
 
 
-def unpack(made: dict[str, ArtifactRef], folder: Path) -> dict[str, Any]:
-    """Put the sheet, the ranking and a film per candidate into a folder; the ranking."""
+def unpack(outputs: dict[str, ArtifactRef], folder: Path) -> dict[str, Any]:
+    """Write contact sheet, ranking and a film per candidate into a folder; return the ranking."""
     store = home.store()
     folder.mkdir(parents=True, exist_ok=True)
-    store.get(made["candidates"], folder / "motions.png")
-    store.get(made["ranking"], folder / "motions.json")
-    unpack_zip(store.path(made["films"]), folder, "the zip of films")
+    store.get(outputs["candidates"], folder / "motions.png")
+    store.get(outputs["ranking"], folder / "motions.json")
+    unpack_zip(store.path(outputs["films"]), folder, "the zip of films")
     ranking: dict[str, Any] = json.loads((folder / "motions.json").read_text(encoding="utf-8"))
     return ranking

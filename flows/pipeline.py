@@ -86,14 +86,14 @@ def text_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int =
 
 
 def conversion_of(job: ConversionJob, mesh_parts: int = 0) -> Conversion:
-    """Return the values that all steps of a job share."""
+    """Return the parameters that all steps of a job share."""
     return Conversion(item=job.item, settings=job.settings, seed=job.seed, mesh_parts=mesh_parts)
 
 
 def animate(subject: Subject, job: ConversionJob, conversion: Conversion, folder: Path | None) -> FlowResult:
     """Turn a subject into a package: driving video, static Gaussians, motion, mesh, texture, files, verdict."""
     filming = drive_video.submit(subject, conversion)
-    gaussians = fit_gaussians(subject, conversion, job.bank)  # in this thread, beside the driving video
+    gaussians = fit_gaussians(subject, conversion, job.bank)  # in this thread, parallel to the driving video
     driving_video = filming.result()
     motion = fit_motion(gaussians, driving_video, conversion, job.bank)
     mesh = mesh_over_time(gaussians, motion, driving_video, conversion)
@@ -110,14 +110,14 @@ def animate(subject: Subject, job: ConversionJob, conversion: Conversion, folder
     )
     show_asset(job.item, result.steps, result.package, home.store())
     if folder is not None:
-        with transaction():  # folder and version change together, or neither does
+        with transaction():  # a failed version restores the earlier content of the folder
             publish(package, verdict, job, result, folder)
             keep_version(job, result)
     return result
 
 
 def mesh_over_time(gaussians: Gaussians, motion: Motion, driving_video: DrivingVideo, conversion: Conversion) -> Mesh:
-    """Extract one mesh that follows the motion, or else a mesh per frame, its frames divided among the slots."""
+    """Extract one mesh that follows the motion, or a mesh per frame with the frames divided among the slots."""
     plan = plan_mesh(gaussians, motion, conversion)
     if read_plan(home.store().path(plan.plan)).mode == "tracked":
         return extract_mesh(gaussians, motion, plan, conversion)

@@ -270,6 +270,6 @@ def _require_free_place(client: SyncPrefectClient, pool: str) -> None:
     limit = client.read_work_pool(pool).concurrency_limit
     if limit is not None and limit < 2:
         raise BadInput(
-            f"the pool {pool} has concurrency limit 1, which this catalog takes: its items would never start; give another "
-            "pool, or raise the limit"
+            f"the pool {pool} has concurrency limit 1, which this catalog takes: its items would never start; give "
+            "another pool, or raise the limit"
         )
