@@ -14,6 +14,6 @@ def require_free_space(folder: Path) -> None:
     free_bytes = shutil.disk_usage(existing).free
     if free_bytes < NEEDED_BYTES:
         raise DiskFull(
-            f"the disk of {folder} is full: {free_bytes / 1e6:.1f} MB are free and {NEEDED_BYTES / 1e6:.0f} MB are "
+            f"the disk of {folder} is full: {free_bytes / 1e6:.1f} MB are free, and {NEEDED_BYTES / 1e6:.0f} MB are "
             "needed; free some space, or name a folder on another disk in $DG4D_HOME"
         )

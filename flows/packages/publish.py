@@ -6,7 +6,7 @@ import os
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -133,11 +133,11 @@ def replace_package(package: Path, folder: Path, finish: Finish) -> "Swap":
     try:
         with room_for(folder):
             try:
-                return _publish(package, folder, finish)
+                return replace(_publish(package, folder, finish), first_made=missing)
             except OSError as error:
                 if error.errno not in CANNOT_SWAP or not folder.is_dir():
                     raise
-                return _publish(package, folder, finish, in_place=True)
+                return replace(_publish(package, folder, finish, in_place=True), first_made=missing)
     except OSError as error:
         _tidy(missing)
         raise BadInput(f"the output folder {folder} cannot be written: {error.strerror or error}") from error
@@ -155,12 +155,14 @@ class Swap:
         files: facts of the files of the new package.
         before: folder with what was there; it does not exist if nothing was.
         moved_in: files of the new package where it was moved in file by file; else None.
+        first_made: outermost parent folder that was created for the package; None if none was.
     """
 
     folder: Path
     files: Files
     before: Path
     moved_in: tuple[Path, ...] | None = None
+    first_made: Path | None = None
 
     def keep(self) -> None:
         """Remove the earlier package; files of the user move over from its folder."""
@@ -168,11 +170,12 @@ class Swap:
             _carry_over(_foreign(self.before) if self.moved_in is None else [], self.before, self.folder)
 
     def undo(self) -> None:
-        """Restore the folder as it was."""
+        """Restore the folder as it was, and remove parent folders that were created for it."""
         if self.moved_in is None:
             remove_tree(self.folder)
             if self.before.exists():
                 self.before.replace(self.folder)
+            _tidy(self.first_made)
             return
         for name in self.moved_in:
             (self.folder / name).unlink(missing_ok=True)

@@ -14,8 +14,8 @@ from flows.ui.showing import show
 
 ROWS_SHOWN = 100  # of the page, which the server keeps in its database
 PICTURES_BYTES = 60_000  # of all pictures of a page; as base64 they take a third more
-PICTURE_BYTES = 4_000  # of one of them
-PICTURE_SIZES = (96, 64)  # pixels of the longer side
+PICTURE_SIZE = 96  # pixels of the longer side
+PICTURE_QUALITY = 50  # of WebP
 PICTURES = ("preview.webp", "contact_sheet.png")  # of a package, the first that is there
 UPDATE_EVERY_S = 3.0
 
@@ -93,4 +93,4 @@ def verdict(row: Row) -> str:
 def small_picture(folder: Path) -> bytes | None:
     """Return a picture of the package in a folder as a small WebP; None if none can be read."""
     picture = next((folder / name for name in PICTURES if (folder / name).is_file()), None)
-    return pages.small_webp(picture, PICTURE_BYTES, PICTURE_SIZES) if picture else None
+    return pages.small_webp(picture, PICTURES_BYTES, (PICTURE_SIZE,), (PICTURE_QUALITY,)) if picture else None

@@ -97,13 +97,16 @@ def thumbnail(ref: ArtifactRef, store: ArtifactStore, most_bytes: int = THUMBNAI
         return None
 
 
-def small_webp(path: Path, most_bytes: int, sizes: tuple[int, ...] = THUMBNAIL_SIZES) -> bytes | None:
+def small_webp(
+    path: Path, most_bytes: int, sizes: tuple[int, ...] = THUMBNAIL_SIZES, qualities: tuple[int, ...] = QUALITIES
+) -> bytes | None:
     """Return the first frame of a picture as a WebP, as large and as good as `most_bytes` allows.
 
     Args:
         path: of the picture.
         most_bytes: of the result.
         sizes: longer side in pixels, the first choice first.
+        qualities: of WebP, tried for each size.
 
     Returns:
         None if the picture cannot be read or no size fits: a page is not worth a failed step.
@@ -115,7 +118,7 @@ def small_webp(path: Path, most_bytes: int, sizes: tuple[int, ...] = THUMBNAIL_S
         return None
     for size in sizes:
         small.thumbnail((size, size))
-        for quality in QUALITIES:
+        for quality in qualities:
             content = io.BytesIO()
             small.save(content, "WEBP", quality=quality)
             if content.tell() <= most_bytes:

@@ -1,4 +1,4 @@
-"""Packages made again: fake steps for the verdicts, real ones with small numbers for the truth; one server for all."""
+"""Rebuild of packages: outcomes with fake steps, digests with real steps and small settings."""
 
 import json
 import math
@@ -50,7 +50,7 @@ TINY = {
 
 @pytest.fixture
 def fakes(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where fake steps say that they ran."""
+    """Log of fake steps."""
     monkeypatch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
     monkeypatch.setenv("DG4D_CODE_VERSION", "test")
     monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
@@ -79,7 +79,7 @@ def outcomes(rebuilt: Rebuilt) -> dict[str, str]:
 def altered(
     step: Callable[[Job], StepReport], port: str, change: Callable[[bytes], bytes]
 ) -> Callable[[Job], StepReport]:
-    """A step whose output comes out otherwise."""
+    """Step whose output is changed."""
 
     def run(job: Job) -> StepReport:
         facts = step(job)

@@ -213,7 +213,7 @@ def _command(place: Path, execute: Execute, words: str, *before: str) -> "subpro
         from flows.engine.executors import {execute.__name__}
         from steps.contract import StepRequest
         request = StepRequest.model_validate_json({request.model_dump_json()!r})
-        {execute.__name__}(STEPS[{spec.name!r}], request, lambda *_: None)
+        {execute.__name__}(STEPS[{spec.name!r}], request, lambda *_: None, lambda _: None)
     """
     return subprocess.Popen([*before, sys.executable, "-c", textwrap.dedent(program)])
 

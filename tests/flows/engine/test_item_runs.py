@@ -162,7 +162,7 @@ def test_a_user_who_stops_takes_back_what_no_worker_has_begun(
 def test_a_pool_of_items_is_named_unless_there_is_only_one(client: SyncPrefectClient) -> None:
     assert item_deployment("fleet", 64) == ("item-to-4d/Item to 4D on a fleet", "fleet", 64 / item_runs.POLLS_PER_S)
     for pool in ("", "flet"):
-        with pytest.raises(BadInput, match="there are: fleet, process-cpu"):
+        with pytest.raises(BadInput, match="one of: fleet, process-cpu"):
             item_deployment(pool, 1)
 
 

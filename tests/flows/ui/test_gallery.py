@@ -11,7 +11,7 @@ from PIL import Image
 
 from flows.packages.summary import NOT_ACCEPTED, Row
 from flows.ui import gallery, pages
-from flows.ui.gallery import PICTURE_SIZES, PICTURES_BYTES, ROWS_SHOWN, gallery_page, small_picture, verdict
+from flows.ui.gallery import PICTURE_SIZE, PICTURES_BYTES, ROWS_SHOWN, gallery_page, small_picture, verdict
 
 MOST_BYTES = 100_000  # of a page in the server's database
 
@@ -37,7 +37,7 @@ def test_an_item_has_a_small_picture_a_verdict_and_a_link_to_its_page(tmp_path: 
     picture, item, said, seconds, _ = shown
     content = base64.b64decode(picture.partition("base64,")[2].rstrip(")"))
     with Image.open(io.BytesIO(content)) as small:
-        assert (small.format, small.size) == ("WEBP", (PICTURE_SIZES[0], PICTURE_SIZES[0] // 2))
+        assert (small.format, small.size) == ("WEBP", (PICTURE_SIZE, PICTURE_SIZE // 2))
     assert item == f"[fox](/artifacts/key/{pages.key('asset', 'fox')})"
     assert (said, seconds) == ("accepted", "12")
 
