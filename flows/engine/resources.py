@@ -55,7 +55,7 @@ class Turn(NamedTuple):
 
 
 class Stopped(Exception):
-    """The user stopped the command while a step waited for its slot."""
+    """Raised to a step that waits for its slot when the user stops the command."""
 
 
 def resource_of(request: StepRequest) -> Resource:

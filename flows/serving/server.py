@@ -53,11 +53,11 @@ SETTINGS = {
 
 
 class ServerUnavailable(Exception):
-    """The server could not be started, or does not answer; the message names its log."""
+    """Server that cannot be started or does not answer; the message names its log."""
 
 
 class Server:
-    """The background server whose state is in `folder`.
+    """Background server whose state is in `folder`.
 
     Args:
         folder: folder of lock files, log and `server.json`.
