@@ -1,6 +1,7 @@
 """Conversion of one job: connect to a server, run the flow, publish the package in a folder."""
 
 import importlib
+import json
 import os
 import urllib.error
 import urllib.request
@@ -16,6 +17,7 @@ from flows.inputs.package_record import record_of
 from flows.packages.publish import Files, is_current
 from flows.serving import background
 from flows.serving.server import ServerUnavailable
+from steps.artifacts.archives import unpack
 from steps.store.artifact_store import ArtifactMissing
 from steps.store.files import home as store_home
 
@@ -123,11 +125,17 @@ def rank_motions(job: ConversionJob, folder: Path) -> dict[str, Any]:
     Raises:
         StepError: a step failed.
     """
-    from flows.motions import motions, unpack
+    from flows.pipeline import motions
 
     with _flow_context(job):
         outputs = motions(job)
-    return unpack(outputs, folder)
+    store = home.store()
+    folder.mkdir(parents=True, exist_ok=True)
+    store.get(outputs["candidates"], folder / "motions.png")
+    store.get(outputs["ranking"], folder / "motions.json")
+    unpack(store.path(outputs["films"]), folder, "the zip of films")
+    ranking: dict[str, Any] = json.loads((folder / "motions.json").read_text(encoding="utf-8"))
+    return ranking
 
 
 @contextmanager

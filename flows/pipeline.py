@@ -34,6 +34,7 @@ from flows.tasks import (
 )
 from flows.ui.asset_page import show_asset
 from steps.artifacts.mesh_plan import read_plan
+from steps.contract import ArtifactRef
 
 
 @flow(name="image_to_4d", flow_run_name="{job.item}", persist_result=False)
@@ -83,6 +84,21 @@ def text_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int =
         picture = draw_picture(job.source, conversion)
         subject = prepare_subject(picture.picture, conversion)
         return animate(subject, job, conversion, folder)
+
+
+@flow(name="motions", flow_run_name="{job.item}", persist_result=False)
+def motions(job: ConversionJob) -> dict[str, ArtifactRef]:
+    """Generate and rank candidate motions of a picture; return the outputs of `drive_video`.
+
+    Raises:
+        StepError: a step did not finish.
+    """
+    with steps_of_flow():
+        conversion = conversion_of(job)
+        subject = prepare_subject(job.source, conversion)
+        if subject.footage is not None:
+            raise StepBadInput("prepare_subject", "this is a video and has its motion already; give a picture")
+        return drive_video(subject, conversion).outputs
 
 
 def conversion_of(job: ConversionJob, mesh_parts: int = 0) -> Conversion:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from dg4d_lib.errors import BackendUnavailable
 from flows.engine import forks, resources
@@ -52,6 +52,7 @@ Execute = Callable[[StepSpec, StepRequest, Progress, Say], StepResult]
 
 TAIL_BYTES = 4000  # of standard error, for the message of a crash
 IN_USE = "in-use"  # locked file of a scratch folder
+OUTCOME: TypeAdapter[StepResult | StepFailure] = TypeAdapter(StepResult | StepFailure)
 KILL_GRACE_S = 5.0  # for a killed process to be reaped
 
 
@@ -237,13 +238,9 @@ def _stop(process: Process, end: Callable[[], None]) -> None:
 
 
 def _outcome(path: Path) -> StepResult | StepFailure | None:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        return None
-    for kind in (StepResult, StepFailure):
-        with suppress(ValidationError):
-            return kind.model_validate_json(text)
+    """Return what the step wrote; None if it wrote nothing that can be read."""
+    with suppress(FileNotFoundError, ValidationError):
+        return OUTCOME.validate_json(path.read_bytes())
     return None
 
 

@@ -10,7 +10,7 @@ from uuid import UUID
 
 import httpx
 from prefect import runtime
-from prefect.artifacts import create_markdown_artifact, create_progress_artifact, update_progress_artifact
+from prefect.artifacts import create_progress_artifact, update_progress_artifact
 from prefect.client.schemas.objects import State, TaskRun
 from prefect.context import FlowRunContext
 from prefect.exceptions import TerminationSignal
@@ -35,7 +35,7 @@ from flows.formatting.escaping import markdown
 from flows.packages.flow_result import StepRun
 from flows.step_errors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable
 from flows.ui import pages
-from flows.ui.showing import revive, show
+from flows.ui.showing import create_page, revive
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen, StepRequest, StepResult
 from steps.profiles import PipelineSettings, step_settings
 from steps.runtime.installed_code import catalog, request_version
@@ -138,7 +138,8 @@ def run_step(step: str, result_type: type[Result], **arguments: Any) -> Result:
     """
     request, conversion = request_for(step, arguments), arguments["conversion"]
     item, label = conversion.item, label_of(step, arguments)
-    progress = _Progress(item, label)
+    key = pages.key(label, item)
+    progress = _Progress(f"progress-{key}", f"{label} of {markdown(item)}")
     emit(StepEvent(item, label, "started"))
 
     def on_progress(done: int, total: int, values: dict[str, float]) -> None:
@@ -154,12 +155,12 @@ def run_step(step: str, result_type: type[Result], **arguments: Any) -> Result:
             _waited[runtime.task_run.id] = waited_s
             result = configured_executor()(catalog()[step], request, on_progress, say)
     except StepError as error:
-        _show_page(item, label, pages.failure_page(label, item, error, home.store()), f"{label} of {item} failed")
+        create_page(key, pages.failure_page(label, item, error, home.store()), markdown(f"{label} of {item} failed"))
         raise
     progress.update(1, 1, {})
     for note in (*result.provenance.notes, *result.provenance.run_notes):
         get_run_logger().info(note)
-    _show_page(item, label, pages.step_page(label, item, result, home.store()), f"{label} of {item}")
+    create_page(key, pages.step_page(label, item, result, home.store()), markdown(f"{label} of {item}"))
     return result_type.model_validate(result.model_dump())
 
 
@@ -272,15 +273,11 @@ CACHED: dict[str, Any] = {
 }  # options of every task that runs a step
 
 
-def _show_page(item: str, label: str, page: str, description: str) -> None:
-    show(create_markdown_artifact, key=pages.key(label, item), markdown=page, description=markdown(description))
-
-
 class _Progress:
     """Progress artifact of a step, updated every few seconds."""
 
-    def __init__(self, item: str, label: str) -> None:
-        self._key, self._title = f"progress-{pages.key(label, item)}", f"{label} of {markdown(item)}"
+    def __init__(self, key: str, title: str) -> None:
+        self._key, self._title = key, title
         self._artifact: Any = None
         self._last = 0.0
 

@@ -4,15 +4,13 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-from prefect.artifacts import create_markdown_artifact
-
 from flows.formatting import curves
 from flows.formatting.escaping import markdown
 from flows.packages import acceptance
 from flows.packages.flow_result import StepRun
 from flows.serving.addresses import VIEWER_ADDRESS
 from flows.ui import pages
-from flows.ui.showing import show
+from flows.ui.showing import create_page
 from steps.contract import ArtifactRef
 from steps.store.artifact_store import ArtifactStore
 
@@ -37,12 +35,8 @@ def show_asset(item: str, finished: Sequence[StepRun], package: ArtifactRef, sto
         package: the package.
         store: with all artifacts of the steps.
     """
-    show(
-        create_markdown_artifact,
-        key=pages.key("asset", item),
-        markdown=asset_page(item, finished, package, store),
-        description=f"{markdown(item)}: everything on one page",
-    )
+    page = asset_page(item, finished, package, store)
+    create_page(pages.key("asset", item), page, f"{markdown(item)}: everything on one page")
 
 
 def asset_page(item: str, finished: Sequence[StepRun], package: ArtifactRef, store: ArtifactStore) -> str:

@@ -5,12 +5,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from prefect.artifacts import create_markdown_artifact, create_progress_artifact, update_progress_artifact
+from prefect.artifacts import create_progress_artifact, update_progress_artifact
 
 from flows.formatting.escaping import markdown
 from flows.packages.summary import BatchProgress, Row
 from flows.ui import pages
-from flows.ui.showing import show
+from flows.ui.showing import create_page
 
 ROWS_SHOWN = 100  # of the page, which the server keeps in its database
 PICTURES_BYTES = 60_000  # of all pictures of a page; as base64 they take a third more
@@ -47,7 +47,7 @@ class Gallery:
         self.update()
         rows = list(self._progress.rows.values())
         page = gallery_page(self._name, self._progress.line(), rows, self._out)
-        show(create_markdown_artifact, key=self._key, markdown=page, description=self._text())
+        create_page(self._key, page, self._text())
 
     def _text(self) -> str:
         return f"{markdown(self._name)}: {self._progress.line()}"

@@ -1,11 +1,10 @@
 """Creation of artifacts on a Prefect server that may be away for a while, because it was killed or restarts."""
 
 import time
-from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
 
 import httpx
+from prefect.artifacts import create_markdown_artifact
 from prefect.logging import get_run_logger
 from prefect.settings import PREFECT_API_URL
 
@@ -17,8 +16,8 @@ POLL_S = 0.5
 _revived: list[Server] = []  # kept alive: a server ends when no process uses it
 
 
-def show(create: Callable[..., Any], **what: Any) -> None:
-    """Create an artifact; wait for a server that is away, and start it again if it is the background server.
+def create_page(key: str, page: str, description: str) -> None:
+    """Create a Markdown artifact; wait for a server that is away, and start it again if it is the background server.
 
     A page is not worth a failed step: it is left out if the server does not answer for `PATIENCE_S` seconds.
     """
@@ -26,7 +25,7 @@ def show(create: Callable[..., Any], **what: Any) -> None:
     while True:
         revive()  # Prefect's client retries with growing pauses before it raises, so the server is checked first
         try:
-            create(**what)
+            create_markdown_artifact(page, key=key, description=description)
         except httpx.TransportError as error:
             if time.monotonic() > deadline:
                 get_run_logger().warning("the Prefect server does not answer; a page is left out: %s", error)
