@@ -193,7 +193,7 @@ def _attempt(
             progress.settle(one)
             gallery.update()
         elif strict and progress.refused:
-            reason = f"not begun: {progress.refused} was not accepted"
+            reason = f"not started: {progress.refused} was not accepted"
             progress.settle(Row(item=one.item, source=one.source_name, status="skipped", message=reason))
         else:
             parameters = {

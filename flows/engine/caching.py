@@ -109,15 +109,15 @@ class FileLocks:
         self._held.pop(key)[1].release()
 
     def is_locked(self, key: str) -> bool:
-        """Return whether anybody holds the lock, in this process or another."""
+        """Return true if a process holds the lock, this one or another."""
         return not self.wait_for_lock(key, 0)
 
     def is_lock_holder(self, key: str, holder: str) -> bool:
-        """Return whether this holder has the lock."""
+        """Return true if this holder has the lock."""
         return self._held.get(key, ("", None))[0] == holder
 
     def wait_for_lock(self, key: str, timeout: float | None = None) -> bool:
-        """Wait until nobody holds the lock; return false after `timeout` seconds."""
+        """Wait until the lock is free; return false after `timeout` seconds."""
         if (lock := self._waited_for(key, timeout)) is not None:
             lock.release()
         return lock is not None

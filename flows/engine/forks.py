@@ -59,8 +59,8 @@ def fork(
 ) -> Fork | None:
     """Fork a step from the server of this environment; None if the server exited repeatedly."""
     for _ in range(ATTEMPTS):
-        if (begun := _server().fork(arguments, environment, stderr, handles)) is not None:
-            return begun
+        if (process := _server().fork(arguments, environment, stderr, handles)) is not None:
+            return process
     return None
 
 

@@ -121,9 +121,9 @@ class ItemDeployment(NamedTuple):
             "code": code_version(),
             "store": store.address,
         }
-        begun = run_deployment(self.name, parameters=parameters, timeout=0, tags=[job.profile], idempotency_key=key)
-        assert isinstance(begun, FlowRun)
-        return begun
+        run = run_deployment(self.name, parameters=parameters, timeout=0, tags=[job.profile], idempotency_key=key)
+        assert isinstance(run, FlowRun)
+        return run
 
     def _wait(self, client: SyncPrefectClient, run: FlowRun, item: str) -> FlowRun:
         """Wait until a run has ended and will not be restarted."""

@@ -85,7 +85,7 @@ def slot(resource: Resource, waiting: Callable[[str], None], turn: Turn | None =
     folder.mkdir(parents=True, exist_ok=True)
     devices = gpus() if resource == "gpu" else tuple(map(str, range(cpus())))
     turn = turn or Turn(time.time_ns(), "another step")
-    begun, told = time.monotonic(), False
+    start, reported = time.monotonic(), False
     with ticket(folder / f"queue-{resource}", *turn) as own:
         while True:
             if stopping.is_set():
@@ -94,8 +94,8 @@ def slot(resource: Resource, waiting: Callable[[str], None], turn: Turn | None =
             handle, device = (None, "") if ahead else _free(folder, resource, devices)
             if handle is not None:
                 break
-            if not told:
-                told = True
+            if not reported:
+                reported = True
                 behind = ahead or _holder(folder, resource, devices)
                 waiting(f"waiting for {_WORDS[resource]}" + (f", behind {behind}" if behind else ""))
             stopping.wait(POLL_S)
@@ -103,7 +103,7 @@ def slot(resource: Resource, waiting: Callable[[str], None], turn: Turn | None =
     os.write(handle, turn.holder.encode(errors="replace"))
     token = _held.set(Slot(device if resource == "gpu" else "", handle))
     try:
-        yield time.monotonic() - begun
+        yield time.monotonic() - start
     finally:
         _held.reset(token)
         os.close(handle)

@@ -1,7 +1,7 @@
 """Authentication of the background server: its secret, and sessions of browsers that download artifacts.
 
-The secret is Prefect's `PREFECT_SERVER_API_AUTH_STRING`. Whoever knows it may run code as the user, so it lies in a
-file that only the user can read and never in an address that a browser sends.
+The secret is Prefect's `PREFECT_SERVER_API_AUTH_STRING`. It allows to run code as the user, so it is kept in a file
+that only the user can read, and is never part of an address that a browser sends.
 """
 
 import base64

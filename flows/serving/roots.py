@@ -118,8 +118,8 @@ class Roots(Frozen):
         Raises:
             BadInput: a folder is outside.
         """
-        for knob, value in knobs.items():
-            self.check_weights({knob.rpartition(".")[2]: value})
+        for name, value in knobs.items():
+            self.check_weights({name.rpartition(".")[2]: value})
 
     def check_weights(self, tree: Mapping[str, Any]) -> None:
         """Refuse a settings tree that names folders of weights which may not be read.

@@ -35,7 +35,7 @@ def create_app() -> ASGIApp:
     secret = PREFECT_SERVER_API_AUTH_STRING.value()
     if not secret:
         raise RuntimeError(
-            "PREFECT_SERVER_API_AUTH_STRING is not set: whoever reaches this server could run code on its workers. Set "
+            "PREFECT_SERVER_API_AUTH_STRING is not set: every client of this server could run code on its workers. Set "
             "it to NAME:PASSWORD here, and PREFECT_API_AUTH_STRING to the same for clients and workers."
         )
     application = prefect_compat.create_app()
@@ -50,7 +50,7 @@ def create_app() -> ASGIApp:
 
 
 def serve(listener: socket.socket) -> None:
-    """Serve the application on a bound socket until the process is told to stop."""
+    """Serve the application on a bound socket until the process is stopped."""
     uvicorn.Server(uvicorn.Config(create_app(), log_level="warning")).run(sockets=[listener])
 
 
