@@ -33,10 +33,8 @@ from flows.step_errors import (
     StepUnreachable,
 )
 from steps.contract import (
-    EXIT_BAD_INPUT,
-    EXIT_DIVERGED,
-    EXIT_MISSING,
     EXIT_OUT_OF_MEMORY,
+    EXIT_STATUS,
     StepFailure,
     StepRequest,
     StepResult,
@@ -56,7 +54,7 @@ OUTCOME: TypeAdapter[StepResult | StepFailure] = TypeAdapter(StepResult | StepFa
 KILL_GRACE_S = 5.0  # for a killed process to be reaped
 
 
-_ERRORS: dict[str, type[StepError]] = {
+_ERRORS: dict[str, type[StepError]] = {  # by the kind of a `StepFailure`
     "bad_input": StepBadInput,
     "missing": StepMissing,
     "lost": StepLost,
@@ -64,12 +62,6 @@ _ERRORS: dict[str, type[StepError]] = {
     "diverged": StepDiverged,
     "out_of_memory": StepOutOfMemory,
     "crashed": StepCrashed,
-}
-_ERRORS_BY_STATUS: dict[int, type[StepError]] = {
-    EXIT_BAD_INPUT: StepBadInput,
-    EXIT_MISSING: StepMissing,
-    EXIT_DIVERGED: StepDiverged,
-    EXIT_OUT_OF_MEMORY: StepOutOfMemory,
 }
 KILLED = (  # SIGKILL without a failure report is nearly always the kernel's out-of-memory killer
     "it was killed, most likely because memory ran out: end other programs, or choose smaller settings"
@@ -146,8 +138,9 @@ def _result_of(
     if status in (-signal.SIGKILL, EXIT_OUT_OF_MEMORY):
         raise StepOutOfMemory(spec.name, KILLED)
     tail = _tail(folder / "stderr")
-    if status in _ERRORS_BY_STATUS:
-        raise _ERRORS_BY_STATUS[status](spec.name, tail or f"the process ended with status {status}")
+    kind = next((kind for kind, code in EXIT_STATUS.items() if code == status), "crashed")
+    if kind != "crashed":
+        raise _ERRORS[kind](spec.name, tail or f"the process ended with status {status}")
     reason = f"killed by signal {-status}" if status < 0 else f"ended with status {status}"
     raise StepCrashed(spec.name, f"{reason} and no result" + (f": {tail}" if tail else ""))
 

@@ -1,7 +1,6 @@
 """Creation of artifacts on a Prefect server that may be away for a while, because it was killed or restarts."""
 
 import time
-from contextlib import suppress
 
 import httpx
 from prefect.artifacts import create_markdown_artifact
@@ -9,7 +8,7 @@ from prefect.logging import get_run_logger
 from prefect.settings import PREFECT_API_URL
 
 from flows.serving import background
-from flows.serving.server import HOST, Server
+from flows.serving.server import Server
 
 PATIENCE_S = 120.0  # as long as a server may take to start
 POLL_S = 0.5
@@ -38,8 +37,6 @@ def create_page(key: str, page: str, description: str) -> None:
 def revive() -> None:
     """Restart the background server at the address that this process has for it, unless it runs."""
     server = background.background_server()
-    with suppress(OSError):
-        port = (server.folder / "port").read_text(encoding="ascii").strip()
-        if PREFECT_API_URL.value() == f"http://{HOST}:{port}/api" and server.address() is None:
-            server.start()
-            _revived.append(server)
+    if server.is_at(str(PREFECT_API_URL.value())) and server.address() is None:
+        server.start()
+        _revived.append(server)
