@@ -35,8 +35,8 @@ from flows import home
 from flows.catalog import convert_all
 from flows.catalog_request import ready
 from flows.engine.step_tasks import finished_steps, flow_context, steps_of_flow
+from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.manifest import Item, items_of
-from flows.inputs.orders import Order
 from flows.inputs.package_record import RECORD
 from flows.packages import summary
 from flows.packages.flow_result import StepRun
@@ -150,46 +150,46 @@ def run(items: list[Item], out: Path, workers: int, what: str) -> float:
         if row.status not in {"done", "unchanged"}:
             raise RuntimeError(f"{row.item}: {row.message}")
         sizes.append(memory_mb())
-        writer.write_sometimes(list(tally.rows.values()), tally.seconds)
+        writer.write_sometimes(list(progress.rows.values()), progress.seconds)
 
-    writer, tally = summary.Writer(out), summary.Tally(len(items), settled)
+    writer, progress = summary.Writer(out), summary.BatchProgress(len(items), settled)
     out.mkdir(exist_ok=True)
 
     @flow(name="catalog", flow_run_name=what, persist_result=False)
     def catalog() -> None:
         todo = (ready(item, out, strict=False) for item in items)
-        convert_all(todo, out, workers, f"{what}: {len(items)} items", tally, work=run_steps)
+        convert_all(todo, out, workers, f"{what}: {len(items)} items", progress, work=run_steps)
 
     with flow_context():
         catalog()
-    writer.write(list(tally.rows.values()), tally.seconds)
+    writer.write(list(progress.rows.values()), progress.seconds)
     return sizes[-1] - sizes[len(sizes) // 10]
 
 
-def run_steps(order: Order, folder: Path) -> tuple[Any, bool]:
+def run_steps(job: ConversionJob, folder: Path) -> tuple[Any, bool]:
     """Resize, pack and publish; return true if every step was cached."""
-    packed, cached = resize_and_pack(order)
+    packed, cached = resize_and_pack(job)
 
     def finish(staging: Path, files: Files) -> Files:
-        (staging / RECORD).write_text(json.dumps({"order": order.digest(), "files": files}), encoding="utf-8")
+        (staging / RECORD).write_text(json.dumps({"order": job.digest(), "files": files}), encoding="utf-8")
         return files
 
     return publish(home.store().path(packed), folder, finish), cached
 
 
-def resize_and_pack(order: Order) -> tuple[Any, bool]:
+def resize_and_pack(job: ConversionJob) -> tuple[Any, bool]:
     """Run the two steps as a flow."""
     done: list[StepRun] = []
 
     @flow(name="resize_and_pack", flow_run_name="{item}", persist_result=False)
     def two_steps(item: str) -> None:
         with steps_of_flow():
-            conversion = conversion_of(order)
-            drive_video(prepare_subject(order.source, conversion), conversion)
+            conversion = conversion_of(job)
+            drive_video(prepare_subject(job.source, conversion), conversion)
             done.extend(finished_steps())
 
     with flow_context():
-        two_steps(order.item)
+        two_steps(job.item)
     return done[-1].result.outputs["driving_video"], all(step.cached for step in done)
 
 

@@ -38,7 +38,7 @@ from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.metrics.gates import Gate, evaluate_gates
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
-from flows.packages.publish import whole
+from flows.packages.publish import load_verified
 from steps.artifacts.media import read_frames, read_png
 from steps.artifacts.packages import SUBJECT, read_manifest
 from steps.artifacts.rendering import read_states, read_surface, states_between
@@ -104,7 +104,7 @@ def read_package(folder: Path) -> Sample:
     Raises:
         BadInput: it is broken, has a mesh per frame, or its driving video is kept no more.
     """
-    record, manifest, store = whole(folder), read_manifest(folder), ArtifactStore(home() / "store")
+    record, manifest, store = load_verified(folder), read_manifest(folder), ArtifactStore(home() / "store")
     surface = read_surface(folder, manifest)
     if not isinstance(surface, Asset4D):
         raise BadInput(f"{folder} has a mesh per frame; give packages made with mesh.mode=tracked")

@@ -21,9 +21,9 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.measure import machine, new_console, parser_of, write_rows
-from flows.inputs.orders import Wish
+from flows.inputs.conversion_job import ConversionRequest
 from flows.inputs.package_record import RECORD
-from flows.packages.publish import whole
+from flows.packages.publish import load_verified
 from flows.serving.server import Server
 from steps.contract import StepFailure, StepRequest
 from steps.profiles import profile
@@ -84,7 +84,7 @@ def run_turn(picture: Path, knobs: list[str], seed: int) -> dict[str, float]:
             out = str(Path(folder) / f"{way}-out")
             make = [sys.executable, "-m", "flows.cli", "make", str(picture), "--seed", str(seed), "-o", out, *changes]
             seconds = time_command(make, DG4D_HOME=homes[way], **more)
-            whole(Path(out))
+            load_verified(Path(out))
             return seconds
 
         try:
@@ -120,8 +120,8 @@ def repeat_steps(picture: Path, record: Path, folder: Path) -> None:
     """
     prepare_process()
     store = ArtifactStore(folder)
-    wish = Wish(item=picture.stem, picture=picture, profile="preview", settings=profile("preview"))
-    source = wish.order(store).source
+    conversion = ConversionRequest(item=picture.stem, picture=picture, profile="preview", settings=profile("preview"))
+    source = conversion.to_job(store).source
     known = {source.digest: source}
     for done in json.loads(record.read_text(encoding="utf-8"))["steps"]:
         request = StepRequest(

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.measure import new_console, write_rows
-from flows.packages.publish import whole
+from flows.packages.publish import load_verified
 
 SMALL = {
     "subject.size": "64",
@@ -76,7 +76,7 @@ class Place:
 
     def digests(self, trial: str) -> dict[str, object]:
         """Return the digests that must not depend on the number of attempts."""
-        record = whole(self.folder / trial)
+        record = load_verified(self.folder / trial)
         return {key: record[key] for key in ("order", "package", "files", "steps")}
 
     @property

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from benchmarks.measure import new_console, parser_of, write_rows
 from flows.inputs.package_record import RECORD
-from flows.packages.publish import whole
+from flows.packages.publish import load_verified
 
 STAGES = {
     "prepare_subject": "subject",
@@ -69,7 +69,7 @@ PAPER_TOTALS = (
 
 def read_package_times(folder: Path) -> Row:
     """Read the records of one package."""
-    record = whole(folder)
+    record = load_verified(folder)
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     seconds: dict[str, float] = {}
     machines = []

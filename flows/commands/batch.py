@@ -12,7 +12,7 @@ from flows.engine import resources
 from flows.inputs.manifest import Item
 from flows.inputs.places import parse_where
 from flows.packages.publish import check_writable
-from flows.packages.summary import BAD_INPUT, Row, Tally, Writer
+from flows.packages.summary import BAD_INPUT, BatchProgress, Row, Writer
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -53,20 +53,20 @@ def batch(
             table.settle(row.item, row.status, row.message)
             if not console.is_terminal:
                 console.print(f"{row.item}: {row.status} {row.message}".rstrip(), markup=False)
-            writer.write_sometimes(list(tally.rows.values()), tally.seconds)
+            writer.write_sometimes(list(progress.rows.values()), progress.seconds)
 
-        tally = Tally(len(items), show)
+        progress = BatchProgress(len(items), show)
         try:
-            _make_all(request, items, tally, connect, allow)
+            _make_all(request, items, progress, connect, allow)
         finally:
             stopped = (Row(item=item.name, status="skipped", message="not begun, or stopped") for item in items)
-            rows = [tally.rows.get(row.item, row) for row in stopped]
-            writer.write(rows, tally.seconds)
+            rows = [progress.rows.get(row.item, row) for row in stopped]
+            writer.write(rows, progress.seconds)
     return rows
 
 
-def tell(rows: list[Row], out: Path, console: "Console") -> int:
-    """Say how a batch ended; the exit status of the command."""
+def print_summary(rows: list[Row], out: Path, console: "Console") -> int:
+    """Print how a batch ended and return the exit status of the command."""
     failed = [row for row in rows if row.status == "failed"]
     for row in failed:
         console.print(f"failed: {row.item}: {row.message}", markup=False, style="red")
@@ -85,7 +85,7 @@ def tell(rows: list[Row], out: Path, console: "Console") -> int:
 def _make_all(
     request: CatalogRequest,
     items: list[Item],
-    tally: Tally,
+    progress: BatchProgress,
     connect: Callable[[], None] | None,
     allow: Callable[[Item], None] | None,
 ) -> None:
@@ -93,12 +93,12 @@ def _make_all(
     for item in items:
         first = ready(item, request.out, request.strict)
         if isinstance(first, Row):
-            tally.settle(first)
+            progress.settle(first)
             continue
         if parse_where(request.where).kind == "local":
             convert.prepare(first)
         (connect or convert.connect)()
         from flows.catalog import run_catalog
 
-        run_catalog(request, f"{Path(request.inputs).name}: {len(items)} items", tally, allow)
+        run_catalog(request, f"{Path(request.inputs).name}: {len(items)} items", progress, allow)
         return

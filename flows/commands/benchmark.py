@@ -13,12 +13,12 @@ from dg4d_lib.asset_settings import ScoreSettings
 from dg4d_lib.errors import BadInput, DG4DError
 from flows import home
 from flows.commands import terminal
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.manifest import parse_changes
-from flows.inputs.orders import Order, Wish
 from flows.packages import scores
-from flows.packages.publish import check_folder, check_writable, is_current, whole
+from flows.packages.publish import check_folder, check_writable, is_current, load_verified
 from flows.packages.scores import Results
-from flows.packages.summary import BAD_INPUT, Row, Tally
+from flows.packages.summary import BAD_INPUT, BatchProgress, Row
 from flows.step_errors import StepError, StepMissing
 from steps.artifacts.archives import add_entry, unpack
 from steps.artifacts.ground_truth import GroundTruth, find_ground_truth, find_ground_truths
@@ -33,7 +33,7 @@ from steps.store.files import room_for, write_atomically
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from flows.judge import Entry, Judged
+    from flows.benchmark import BenchmarkEntry, BenchmarkResult
 
 NEEDED = ("asset.json", "asset.glb", "splats/", "meshes/", "canonical/")  # of a package, to draw it
 OWN = "score."  # before the knobs of scoring
@@ -66,22 +66,25 @@ def score(
     found, (pipeline, settings) = find_ground_truth(truth), _settings(changes, mesh)
     if pipeline:
         raise BadInput(f"the asset is finished: only knobs that begin with {OWN!r} can be set; given {min(pipeline)}")
-    record = whole(package)
+    record = load_verified(package)
     if out is not None:
         check_writable(out.parent)
     from flows.convert import connect
 
     connect()
-    from flows.judge import Entry, judge
+    from flows.benchmark import BenchmarkEntry, score_assets
+    from flows.engine.step_tasks import flow_context
 
-    entry = Entry(
+    entry = BenchmarkEntry(
         name=found.name,
         truth=put_truth(found, home.store()),
         package=put_package(package, record, home.store()),
         seconds=_seconds(record),
     )
-    with terminal.steps_shown(console):
-        judged = judge([entry], settings, f"{package.absolute().name} against {found.name}", package.absolute().name)
+    with terminal.steps_shown(console), flow_context():
+        judged = score_assets(
+            [entry], settings, f"{package.absolute().name} against {found.name}", package.absolute().name
+        )
     for one in judged.results.failed:
         if one.kind in BAD_INPUT:
             raise BadInput(f"{package} cannot be judged against {truth}: {one.error}")
@@ -140,20 +143,23 @@ def bench(
     settings = settings.model_copy(update={"rasterizer": pipeline.rasterizer})
     settings = ScoreAssetSettings.model_validate(settings.model_dump(mode="json"))
     check_writable(out)
-    wishes = [_wish(truth, bank, profile=profile_name, settings=pipeline, seed=seed) for truth in truths]
-    for wish in wishes:
-        wish.check()
-        check_folder(out / ASSETS / wish.item)
+    requests = [_request(truth, bank, profile=profile_name, settings=pipeline, seed=seed) for truth in truths]
+    for request in requests:
+        request.check()
+        check_folder(out / ASSETS / request.item)
     from flows.convert import connect
 
     connect()
-    rows = _converted([wish.order(home.store()) for wish in wishes], out / ASSETS, workers, console, dataset.name)
-    from flows.judge import judge
+    rows = _converted(
+        [request.to_job(home.store()) for request in requests], out / ASSETS, workers, console, dataset.name
+    )
+    from flows.benchmark import score_assets
+    from flows.engine.step_tasks import flow_context
 
     entries = [_entry(truth, out / ASSETS / truth.name, rows[truth.name]) for truth in truths]
     title = f"{dataset.absolute().name}, {profile_name}{', true views as prior' if bank else ''}"
-    with terminal.batch_shown(console, [truth.name for truth in truths]) as table:
-        judged = judge(entries, settings, title, profile_name, seed)
+    with terminal.batch_shown(console, [truth.name for truth in truths]) as table, flow_context():
+        judged = score_assets(entries, settings, title, profile_name, seed)
         for one in judged.results.objects:
             table.settle(one.object, "failed" if one.error else "done", one.error)
     results = judged.results.model_copy(update={"settings": {**judged.results.settings, "changes": knobs}})
@@ -161,7 +167,7 @@ def bench(
     return results
 
 
-def write(results: Results, judged: "Judged", out: Path) -> None:
+def write(results: Results, judged: "BenchmarkResult", out: Path) -> None:
     """Write the files of a benchmark; raises DiskFull."""
     shown = _put_films(judged, out)
     texts = {
@@ -222,10 +228,10 @@ def _settings(changes: list[str] | None, mesh: bool) -> tuple[dict[str, Any], Sc
     return {key: value for key, value in given.items() if not key.startswith(OWN)}, settings
 
 
-def _wish(truth: GroundTruth, bank: bool, **asked: Any) -> Wish:
+def _request(truth: GroundTruth, bank: bool, **asked: Any) -> ConversionRequest:
     """What `dg4d make` would be asked for: the input film is followed, or the input picture is made to move."""
     folder = truth.inputs[0].parent
-    return Wish(
+    return ConversionRequest(
         item=truth.name,
         picture=truth.inputs[0],
         video=folder if len(truth.inputs) > 1 else None,
@@ -234,38 +240,38 @@ def _wish(truth: GroundTruth, bank: bool, **asked: Any) -> Wish:
     )
 
 
-def _converted(orders: list[Order], folder: Path, workers: int, console: "Console", name: str) -> dict[str, Row]:
+def _converted(jobs: list[ConversionJob], folder: Path, workers: int, console: "Console", name: str) -> dict[str, Row]:
     """Make what is not made yet; what became of every object."""
-    from flows.catalog import run_orders
+    from flows.catalog import run_jobs
 
-    rows = {order.item: Row(item=order.item, status="unchanged") for order in orders}
-    waiting = [order for order in orders if not is_current(folder / order.item, order.digest())]
+    rows = {job.item: Row(item=job.item, status="unchanged") for job in jobs}
+    waiting = [job for job in jobs if not is_current(folder / job.item, job.digest())]
     if not waiting:
         return rows
-    with terminal.batch_shown(console, [order.item for order in waiting]) as table:
+    with terminal.batch_shown(console, [job.item for job in waiting]) as table:
 
         def show(row: Row) -> None:
             table.settle(row.item, row.status, row.message)
             if not console.is_terminal:
                 console.print(f"{row.item}: {row.status} {row.message}", markup=False)
 
-        tally = Tally(len(waiting), show)
-        run_orders(waiting, folder, workers, f"{name}: {len(waiting)} objects", tally)
-    return rows | tally.rows
+        progress = BatchProgress(len(waiting), show)
+        run_jobs(waiting, folder, workers, f"{name}: {len(waiting)} objects", progress)
+    return rows | progress.rows
 
 
-def _entry(truth: GroundTruth, folder: Path, row: Row) -> "Entry":
-    from flows.judge import Entry
+def _entry(truth: GroundTruth, folder: Path, row: Row) -> "BenchmarkEntry":
+    from flows.benchmark import BenchmarkEntry
 
     ref = put_truth(truth, home.store())
     if row.status == "failed":
-        return Entry(name=truth.name, truth=ref, error=row.message, kind=row.kind)
+        return BenchmarkEntry(name=truth.name, truth=ref, error=row.message, kind=row.kind)
     try:
-        record = whole(folder)
+        record = load_verified(folder)
         package = put_package(folder, record, home.store())
     except DG4DError as error:
-        return Entry(name=truth.name, truth=ref, error=str(error), kind=type(error).__name__)
-    return Entry(name=truth.name, truth=ref, package=package, seconds=_seconds(record))
+        return BenchmarkEntry(name=truth.name, truth=ref, error=str(error), kind=type(error).__name__)
+    return BenchmarkEntry(name=truth.name, truth=ref, package=package, seconds=_seconds(record))
 
 
 def _seconds(record: Mapping[str, Any]) -> float:
@@ -278,7 +284,7 @@ def _json(results: Results) -> str:
     return json.dumps(results.model_dump(mode="json"), indent=1, ensure_ascii=False) + "\n"
 
 
-def _put_films(judged: "Judged", out: Path) -> dict[str, dict[str, dict[str, str]]]:
+def _put_films(judged: "BenchmarkResult", out: Path) -> dict[str, dict[str, dict[str, str]]]:
     """Unpack every film below OUT; where each lies, by object, whose it is, and view."""
     shown: dict[str, dict[str, dict[str, str]]] = {}
     for name, refs in judged.films.items():

@@ -97,21 +97,21 @@ def rebuild(
     with clear_ending():
         from flows import home
         from flows.commands import terminal
-        from flows.inputs.orders import order_again
-        from flows.packages.publish import check_folder, whole
+        from flows.inputs.conversion_job import job_from_record
+        from flows.packages.publish import check_folder, load_verified
 
-        record = whole(package)
+        record = load_verified(package)
         if out is not None:
             check_folder(out)
-        order = order_again(record, home.store(), source, bank)
+        job = job_from_record(record, home.store(), source, bank)
         console = terminal.console(stderr=as_json)
 
         def work() -> "Rebuilt":
             from flows.commands.rebuild import rebuild as do_again
 
-            return do_again(package, record, order, out)
+            return do_again(package, record, job, out)
 
-        _tell(terminal.with_steps(order, console, work), as_json)
+        _tell(terminal.with_steps(job, console, work), as_json)
 
 
 def _tell(found: "Verdict | Rebuilt", as_json: bool) -> None:

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from dg4d_lib.assets.scenes.scene import Scene, SceneItem
 from dg4d_lib.errors import BadInput
 from flows.inputs.package_record import record_of
-from flows.packages.publish import check_writable, whole
+from flows.packages.publish import check_writable, load_verified
 from steps.store.files import room_for
 
 SUFFIXES = (".glb", ".usdz")
@@ -52,7 +52,7 @@ def compose(
         plan = Scene(items=tuple(SceneItem(package=str(folder)) for folder in packages))
         folders = list(packages)
     for folder in dict.fromkeys(folders):
-        whole(folder)
+        load_verified(folder)
     from steps.compose_scene import SceneWriter
 
     cast = SceneWriter(folders, plan.items, _names(folders, plan.items))

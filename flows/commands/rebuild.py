@@ -8,11 +8,11 @@ from typing import Any, Literal
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows import home
-from flows.convert import run as run_flow
+from flows.convert import run_flow
 from flows.exit_status import EXIT_FAILED
-from flows.inputs.orders import Order
+from flows.inputs.conversion_job import ConversionJob
 from flows.packages.credentials import configured
-from flows.packages.publish import Files, fact_of, unpacked
+from flows.packages.publish import Files, file_digest, unpacked
 from flows.packages.report import deliver
 from steps.artifacts.artifact_diff import TOLERANCE, difference
 from steps.contract import ArtifactRef, Frozen, StepResult
@@ -69,13 +69,13 @@ class Rebuilt(Frozen):
         yield from ((text, "another then", "") for text in self.circumstances)
 
 
-def rebuild(folder: Path, record: Mapping[str, Any], order: Order, out: Path | None = None) -> Rebuilt:
+def rebuild(folder: Path, record: Mapping[str, Any], job: ConversionJob, out: Path | None = None) -> Rebuilt:
     """Do every step of a package again, none from what was kept, and compare.
 
     Args:
         folder: the package.
         record: its provenance.
-        order: what it was made from (`orders.order_again`).
+        job: what it was made from (`conversion_job.job_from_record`).
         out: where to put the new package; None: nowhere.
 
     Raises:
@@ -90,10 +90,10 @@ def rebuild(folder: Path, record: Mapping[str, Any], order: Order, out: Path | N
         )
     first = dict(zip(labels, record["steps"], strict=True))
     machines = {run["step"]: run.get("machine", {}) for run in record["run"]["steps"]}
-    made = run_flow(order, refresh=True, mesh_parts=sum(label.startswith("extract_mesh ") for label in labels))
+    made = run_flow(job, refresh=True, mesh_parts=sum(label.startswith("extract_mesh ") for label in labels))
     again = {done.label: done.result for done in made.steps}
     if out is not None:
-        deliver(order, made, out, signer).keep()
+        deliver(job, made, out, signer).keep()
     with TemporaryDirectory(prefix="dg4d-rebuild-") as scratch:
         new = Path(scratch) / "new"
         new.mkdir()
@@ -160,7 +160,7 @@ def _files(record: Mapping[str, Any], folder: Path, files: Files, new: Path) -> 
             yield Likeness(kind="file", name=name, outcome="different", detail="it was not made the second time")
         elif files[name] == first:
             yield Likeness(kind="file", name=name, outcome="identical")
-        elif not (folder / name).is_file() or fact_of(folder / name) != fact:
+        elif not (folder / name).is_file() or file_digest(folder / name) != fact:
             detail = "it has other bytes, and the first file is not as it was made"
             yield Likeness(kind="file", name=name, outcome="not compared", detail=detail)
         else:

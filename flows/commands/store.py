@@ -84,11 +84,11 @@ def show(
                 f"there is no item {name!r} ({some or 'none yet'}), and no digest of {LEAST_DIGITS} digits or more"
             )
         digest = f"sha256:{digits}"
-        of_order = [version for version in known if version.order.startswith(digest)]
+        of_job = [version for version in known if version.order.startswith(digest)]
         artifacts = [entry for entry in place.artifacts() if entry.name.startswith(digest)]
-        if not of_order and not artifacts:
+        if not of_job and not artifacts:
             raise BadInput(f"no version and no artifact in {place.address} begins with {digits}")
-        for version in of_order:
+        for version in of_job:
             _show_version(version, place)
         for entry in artifacts:
             _show_artifact(entry.name, entry.size_bytes, known)

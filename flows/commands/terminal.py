@@ -20,7 +20,7 @@ from flows.formatting.escaping import visible
 from flows.formatting.sizes import readable
 
 if TYPE_CHECKING:
-    from flows.inputs.orders import Order
+    from flows.inputs.conversion_job import ConversionJob
 
 Result = TypeVar("Result")
 
@@ -44,21 +44,21 @@ class _Terminal(Console):
         super().print(*(visible(one) if isinstance(one, str) else one for one in objects), **options)
 
 
-def with_steps(order: "Order", out: Console, work: Callable[[], Result]) -> Result:
-    """What `work` gives, which runs a flow of this order, with its steps on the terminal."""
+def with_steps(job: "ConversionJob", out: Console, work: Callable[[], Result]) -> Result:
+    """What `work` gives, which runs a flow of this job, with its steps on the terminal."""
     from flows.convert import connect, prepare, save_pictures
     from flows.step_errors import StepBadInput
 
     with out.status("starting") if out.is_terminal else nullcontext():
-        prepare(order)
+        prepare(job)
         connect()
     try:
         with steps_shown(out):
             return work()
     except StepBadInput as error:  # a step knows files by their content, the user by their names
-        raise StepBadInput(error.step, f"{order.source_name}: {error.message}", error.pictures) from error
+        raise StepBadInput(error.step, f"{job.source_name}: {error.message}", error.pictures) from error
     except Exception as error:
-        for path in save_pictures(order, error):
+        for path in save_pictures(job, error):
             sys.stderr.write(f"the last good state: {path}\n")
         raise
 

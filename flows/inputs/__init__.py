@@ -1,1 +1,1 @@
-"""What is asked for: files, manifests and settings become orders."""
+"""What is asked for: files, manifests and settings become jobs."""

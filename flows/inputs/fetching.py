@@ -31,7 +31,7 @@ UNQUOTED = "/%:@!$&'()*+,;=~"  # RFC 3986, section 3.3
 
 
 @contextmanager
-def at_hand(address: str) -> Iterator[Path]:
+def local_copy(address: str) -> Iterator[Path]:
     """Give the file at an address, on this machine as long as the block runs.
 
     Args:

@@ -10,9 +10,9 @@ from typing import Any
 from dg4d_lib.errors import BadInput, DG4DError
 from flows.formatting.escaping import quoted, visible
 from flows.inputs import listing, sources
+from flows.inputs.conversion_job import ConversionRequest, name_of
 from flows.inputs.json_text import UnfitJSON, loads
 from flows.inputs.naming import check_path, clean, distinct
-from flows.inputs.orders import Wish, name_of
 from flows.inputs.rows import MANIFESTS, Row, read_rows
 from flows.inputs.setting_reference import check_names
 from steps.contract import LARGEST_SEED, Frozen
@@ -32,35 +32,35 @@ class Item(Frozen):
 
     Attributes:
         name: of the folder of its package, within that of the batch.
-        wish: what to make.
+        request: conversion to run; None where the item has an error.
         error: why that is not known.
         priority: those with a higher one are made earlier.
-        store: the object store where the source is, as the user gave it; empty where `wish` says where it is.
+        store: the object store where the source is, as the user gave it; empty where `request` says where it is.
         remote: the source in that store.
     """
 
     name: str
-    wish: Wish | None = None
+    request: ConversionRequest | None = None
     error: str = ""
     priority: int = 0
     store: str = ""
     remote: str = ""
 
     @contextmanager
-    def here(self) -> Iterator[Wish]:
-        """The wish with its files on this machine, as long as the block runs; an object is fetched.
+    def fetch(self) -> Iterator[ConversionRequest]:
+        """Yield the request with its files on this machine; an object is fetched for the length of the block.
 
         Raises:
             BadInput: what to make is not known, or the object is gone.
             BackendUnavailable: the object store does not answer.
         """
-        if self.wish is None or self.wish.picture is None or not self.remote:
-            if self.wish is None:
+        if self.request is None or self.request.picture is None or not self.remote:
+            if self.request is None:
                 raise BadInput(self.error)
-            yield self.wish
+            yield self.request
             return
-        with listing.fetched(self.store, self.remote, self.wish.picture.name) as path:
-            yield self.wish.model_copy(update={"picture": path})
+        with listing.fetched(self.store, self.remote, self.request.picture.name) as path:
+            yield self.request.model_copy(update={"picture": path})
 
 
 def items_of(
@@ -109,7 +109,7 @@ def items_of(
         raise BadInput(f"{given} does not exist; give {WHAT}")
     if not found:
         raise BadInput(f"{given} holds no pictures or videos ({', '.join(sorted(listing.WANTED))})")
-    common = Wish(item="", profile=profile_name, settings=settings, seed=seed)
+    common = ConversionRequest(item="", profile=profile_name, settings=settings, seed=seed)
     return [_item(name, file, given, common) for name, file in zip(_names(found), found, strict=True)]
 
 
@@ -121,7 +121,7 @@ def admitted(items: list[Item], allow: Callable[[Item], None]) -> list[Item]:
             allow(item)
             found.append(item)
         except BadInput as error:
-            found.append(item.model_copy(update={"wish": None, "error": str(error)}))
+            found.append(item.model_copy(update={"request": None, "error": str(error)}))
     return found
 
 
@@ -133,10 +133,10 @@ def only_commercial(items: list[Item]) -> list[Item]:
     """
     strict = []
     for item in items:
-        wish = item.wish.model_copy(update={"commercial_only": True}) if item.wish else None
-        if wish is not None:
-            wish.check_licenses()
-        strict.append(item.model_copy(update={"wish": wish}))
+        request = item.request.model_copy(update={"commercial_only": True}) if item.request else None
+        if request is not None:
+            request.check_licenses()
+        strict.append(item.model_copy(update={"request": request}))
     return strict
 
 
@@ -165,11 +165,11 @@ def _names(found: list[listing.Found]) -> list[str]:
     )
 
 
-def _item(name: str, file: listing.Found, given: str, common: Wish) -> Item:
+def _item(name: str, file: listing.Found, given: str, common: ConversionRequest) -> Item:
     if file.error:
         return Item(name=name, error=visible(file.error))
-    wish = common.model_copy(update={"item": name, "picture": file.path})
-    return Item(name=name, wish=wish, store=given if file.remote else "", remote=file.remote)
+    request = common.model_copy(update={"item": name, "picture": file.path})
+    return Item(name=name, request=request, store=given if file.remote else "", remote=file.remote)
 
 
 def _of_manifest(file: Path, root: Path, profile_name: str, changes: Mapping[str, Any], seed: int) -> list[Item]:
@@ -201,17 +201,17 @@ class _Reader:
     def item(self, name: str, row: Row) -> Item:
         """Make an item of a row; whatever is wrong with the row is in its `error`."""
         try:
-            wish = self._wish(name, row.cells)
+            request = self._request(name, row.cells)
             priority = _whole("priority", row.cells.get("priority", 0), -HIGHEST_PRIORITY, HIGHEST_PRIORITY)
         except DG4DError as error:
             return Item(name=name, error=f"{row.place}: {visible(str(error))}")
         except Exception as error:  # whatever it is, it is this row's own
             return Item(name=name, error=f"{row.place}: {type(error).__name__}: {visible(str(error))}")
-        return Item(name=name, wish=wish, priority=priority)
+        return Item(name=name, request=request, priority=priority)
 
-    def _wish(self, name: str, cells: Mapping[str, Any]) -> Wish:
+    def _request(self, name: str, cells: Mapping[str, Any]) -> ConversionRequest:
         chosen = cells.get("profile", self._profile)
-        return Wish(
+        return ConversionRequest(
             item=name,
             profile=chosen,
             settings=self._settings(chosen, {**self._changes, **_knobs(cells)}),

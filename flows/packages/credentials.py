@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, Literal
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows.inputs.signing_key import CERTIFICATE, KEY, certificate, pem
-from flows.packages.publish import Files, fact_of
+from flows.packages.publish import Files, file_digest
 
 EMBEDDED = {".mp4": "video/mp4", ".png": "image/png"}  # formats that carry credentials, and what they are called
 BESIDE = (".glb", ".usdz")  # a USDZ that carries some breaks the rule that every entry starts at a multiple of 64 bytes
@@ -115,11 +115,11 @@ class Signer:
             if path.suffix in EMBEDDED:
                 self._embed(path, claim)
                 signed[name] = {"unsigned": files[name]}
-                now[name] = fact_of(path)
+                now[name] = file_digest(path)
             elif path.suffix in BESIDE:
                 sidecar = self.sign_beside(path, claim)
                 signed[name] = {"sidecar": sidecar.name}
-                now[sidecar.name] = fact_of(sidecar)
+                now[sidecar.name] = file_digest(sidecar)
         return now, signed
 
     def sign_beside(self, path: Path, claim: Claim) -> Path:

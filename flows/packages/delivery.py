@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pydantic import Field, ValidationError
 
-from flows.packages.publish import Files, publish, whole
+from flows.packages.publish import Files, load_verified, publish
 from steps.contract import ArtifactRef, Frozen
 from steps.store.artifact_store import ArtifactStore
 from steps.store.files import room_for
@@ -71,7 +71,7 @@ def deliver(package: ArtifactRef, folder: Path, store: ArtifactStore) -> Files:
     """
 
     def check(staging: Path, _: Files) -> Files:
-        files: Files = whole(staging)["files"]
+        files: Files = load_verified(staging)["files"]
         return files
 
     return publish(store.path(package), folder, check)

@@ -6,7 +6,7 @@ import os
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -70,22 +70,22 @@ def check_writable(folder: Path) -> None:
         ) from error
 
 
-def is_current(folder: Path, order: str) -> bool:
-    """Whether a folder holds the package of an order (its digest), with every byte as it was written.
+def is_current(folder: Path, job_digest: str) -> bool:
+    """Whether a folder holds the package of a job (its digest), with every byte as it was written.
 
     What lies beside the package, the reports for example, must be there, as whatever it is.
     """
     record = record_of(folder)
-    if record is None or record.get("order") != order:
+    if record is None or record.get("order") != job_digest:
         return False
     try:
-        unchanged = all(fact_of(folder / name) == fact for name, fact in record["files"].items())
+        unchanged = all(file_digest(folder / name) == fact for name, fact in record["files"].items())
         return unchanged and all((folder / name).is_file() for name in record.get("beside", ()))
     except OSError:
         return False
 
 
-def whole(folder: Path) -> dict[str, Any]:
+def load_verified(folder: Path) -> dict[str, Any]:
     """The provenance of the package in a folder, whose files are all there with every byte as it was written.
 
     Raises:
@@ -133,11 +133,11 @@ def replace_package(package: Path, folder: Path, finish: Finish) -> "Swap":
     try:
         with room_for(folder):
             try:
-                return _publish(package, folder, finish)
+                return replace(_publish(package, folder, finish), first_made=missing)
             except OSError as error:
                 if error.errno not in CANNOT_SWAP or not folder.is_dir():
                     raise
-                return _publish(package, folder, finish, in_place=True)
+                return replace(_publish(package, folder, finish, in_place=True), first_made=missing)
     except OSError as error:
         _tidy(missing)
         raise BadInput(f"the output folder {folder} cannot be written: {error.strerror or error}") from error
@@ -155,12 +155,14 @@ class Swap:
         files: facts of the files of the new package.
         before: folder with what was there; it does not exist if nothing was.
         moved_in: files of the new package where it was moved in file by file; else None.
+        first_made: outermost parent folder that was created for the package; None if none was.
     """
 
     folder: Path
     files: Files
     before: Path
     moved_in: tuple[Path, ...] | None = None
+    first_made: Path | None = None
 
     def keep(self) -> None:
         """Remove the earlier package; files of the user move over from its folder."""
@@ -168,11 +170,12 @@ class Swap:
             _carry_over(_foreign(self.before) if self.moved_in is None else [], self.before, self.folder)
 
     def undo(self) -> None:
-        """Restore the folder as it was."""
+        """Restore the folder as it was, and remove parent folders that were created for it."""
         if self.moved_in is None:
             remove_tree(self.folder)
             if self.before.exists():
                 self.before.replace(self.folder)
+            _tidy(self.first_made)
             return
         for name in self.moved_in:
             (self.folder / name).unlink(missing_ok=True)
@@ -187,10 +190,10 @@ def unpacked(package: Path, folder: Path) -> Files:
     Raises:
         BadInput: an entry leads out of the folder, or the package is broken.
     """
-    return {name: fact_of(folder / name) for name in unpack(package, folder, "the package")}
+    return {name: file_digest(folder / name) for name in unpack(package, folder, "the package")}
 
 
-def fact_of(path: Path) -> dict[str, Any]:
+def file_digest(path: Path) -> dict[str, Any]:
     """The digest and the size of a file."""
     with path.open("rb") as file:
         return {
@@ -199,8 +202,8 @@ def fact_of(path: Path) -> dict[str, Any]:
         }
 
 
-def fact_of_bytes(content: bytes) -> dict[str, Any]:
-    """As `fact_of`, of what a file will hold."""
+def bytes_digest(content: bytes) -> dict[str, Any]:
+    """As `file_digest`, of what a file will hold."""
     return {"digest": f"sha256:{hashlib.sha256(content).hexdigest()}", "size_bytes": len(content)}
 
 
@@ -242,7 +245,7 @@ def _is_complete(record: dict[str, Any]) -> bool:
 def _fault(path: Path, fact: dict[str, Any]) -> str:
     """What is wrong with a file; empty if nothing is."""
     try:
-        return "" if fact_of(path) == fact else "was altered"
+        return "" if file_digest(path) == fact else "was altered"
     except FileNotFoundError:
         return "is missing"
     except OSError as error:

@@ -11,7 +11,7 @@ from typing import Any
 from flows import home
 from flows.formatting import curves
 from flows.formatting.sizes import readable
-from flows.inputs.orders import Order
+from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.package_record import FORMAT, RECORD
 from flows.inputs.signing_key import certificate
 from flows.packages import acceptance
@@ -20,7 +20,7 @@ from flows.packages.crate import CRATE, crate_text
 from flows.packages.credentials import Claim, Signer, sidecar_of
 from flows.packages.flow_result import FlowResult, StepRun
 from flows.packages.html_pages import render
-from flows.packages.publish import Files, Swap, fact_of_bytes, replace_package
+from flows.packages.publish import Files, Swap, bytes_digest, replace_package
 from flows.packages.view import VIEWER, page_of
 from steps.contract import RUN_ONLY, StepResult
 from steps.store.artifact_store import ArtifactStore
@@ -30,26 +30,26 @@ GENERATIVE = ("draw_picture", "drive_video", "fit_gaussians", "fit_motion", "ref
 UNSIGNED: Mapping[str, Any] = MappingProxyType({})
 
 
-def deliver(order: Order, result: FlowResult, folder: Path, signer: Signer | None) -> Swap:
+def deliver(job: ConversionJob, result: FlowResult, folder: Path, signer: Signer | None) -> Swap:
     """Put the package of a conversion into a folder, with reports and record; see `replace_package`."""
     store = home.store()
     return replace_package(
         store.path(result.package),
         folder,
-        lambda staging, files: complete(staging, files, order, result, store, signer),
+        lambda staging, files: complete(staging, files, job, result, store, signer),
     )
 
 
 def complete(
-    folder: Path, files: Files, order: Order, result: FlowResult, store: ArtifactStore, signer: Signer | None
+    folder: Path, files: Files, job: ConversionJob, result: FlowResult, store: ArtifactStore, signer: Signer | None
 ) -> Files:
     """Sign the files of a package if there is a signer, and write what goes with them; their facts as they are then."""
     signatures = UNSIGNED
-    claim = Claim(_used_weights(result, *GENERATIVE), f"{banner(order, result)} Package {result.package.digest}.")
+    claim = Claim(_used_weights(result, *GENERATIVE), f"{banner(job, result)} Package {result.package.digest}.")
     if signer is not None:
         files, signed = signer.sign_package(folder, files, claim)
         signatures = {"certificate": certificate(), "subject": signer.subject, "files": signed}
-    for name, text in texts(order, result, files, store, folder, signatures).items():
+    for name, text in texts(job, result, files, store, folder, signatures).items():
         (folder / name).write_text(text, encoding="utf-8")
     if signer is not None:
         signer.sign_beside(folder / CRATE, claim)  # it holds the digest of every other file
@@ -57,7 +57,7 @@ def complete(
 
 
 def texts(
-    order: Order,
+    job: ConversionJob,
     result: FlowResult,
     files: Files,
     store: ArtifactStore,
@@ -65,8 +65,8 @@ def texts(
     signatures: Mapping[str, Any] = UNSIGNED,
 ) -> dict[str, str]:
     """The texts that go with the package in a folder, by name of file."""
-    report = report_of(order, result, files, store)
-    record = provenance(order, result, files, signatures)
+    report = report_of(job, result, files, store)
+    record = provenance(job, result, files, signatures)
     written = json.dumps(record, indent=1, ensure_ascii=False, sort_keys=True) + "\n"
     beside = {
         VIEWER: page_of(json.loads(written), lambda name: (folder / name).read_bytes()),  # as `dg4d view` will see it
@@ -74,12 +74,12 @@ def texts(
         "report.html": page(report, picture_of(_results(result), store)),
         RECORD: written,
     }
-    facts = {name: fact_of_bytes(text.encode()) for name, text in beside.items()}
-    return {**beside, CRATE: crate_text(record, facts, banner(order, result))}
+    facts = {name: bytes_digest(text.encode()) for name, text in beside.items()}
+    return {**beside, CRATE: crate_text(record, facts, banner(job, result))}
 
 
 def provenance(
-    order: Order, result: FlowResult, files: Files, signatures: Mapping[str, Any] = UNSIGNED
+    job: ConversionJob, result: FlowResult, files: Files, signatures: Mapping[str, Any] = UNSIGNED
 ) -> dict[str, Any]:
     """Every step's record, every file's digest, and the recipe; what belongs to one run only stands under `run`.
 
@@ -87,16 +87,16 @@ def provenance(
     """
     records = [done.result.provenance for done in result.steps]
     outputs = [ref for done in result.steps for ref in done.result.outputs.values()]
-    artifacts = [ref for ref in (order.source, order.bank, *outputs) if ref is not None]
+    artifacts = [ref for ref in (job.source, job.bank, *outputs) if ref is not None]
     return {
         "format": FORMAT,
-        "order": order.digest(),
-        "item": order.item,
-        "profile": order.profile,
-        "source": order.source.digest,
-        "seed": order.seed,
-        "commercial_only": order.commercial_only,
-        "recipe": order.recipe(),
+        "order": job.digest(),
+        "item": job.item,
+        "profile": job.profile,
+        "source": job.source.digest,
+        "seed": job.seed,
+        "commercial_only": job.commercial_only,
+        "recipe": job.recipe(),
         "licenses": licenses(result),
         "package": result.package.digest,
         "artifacts": {ref.digest: ref.model_dump(mode="json", exclude={"digest"}) for ref in artifacts},
@@ -108,7 +108,7 @@ def provenance(
         ],
         "run": {
             "flow_run": result.flow_run,
-            "names": {"source_name": order.source_name, "picture_name": order.picture_name},
+            "names": {"source_name": job.source_name, "picture_name": job.picture_name},
             "steps": [
                 {
                     "step": done.label,
@@ -121,16 +121,16 @@ def provenance(
     }
 
 
-def report_of(order: Order, result: FlowResult, files: Files, store: ArtifactStore) -> dict[str, Any]:
+def report_of(job: ConversionJob, result: FlowResult, files: Files, store: ArtifactStore) -> dict[str, Any]:
     """Stages, times, curves, notes and settings as JSON."""
     return {
-        "item": order.item,
-        "source": order.source_name,
-        "profile": order.profile,
-        "seed": order.seed,
-        "commercial_only": order.commercial_only,
-        "banner": banner(order, result),
-        "notes": notes(order, result),
+        "item": job.item,
+        "source": job.source_name,
+        "profile": job.profile,
+        "seed": job.seed,
+        "commercial_only": job.commercial_only,
+        "banner": banner(job, result),
+        "notes": notes(job, result),
         "wall_s": round(result.wall_s, 1),
         "compute_s": round(sum(done.result.provenance.duration_s for done in result.steps), 1),
         "peak_memory_mb": max(done.result.provenance.peak_memory_mb for done in result.steps),
@@ -138,21 +138,21 @@ def report_of(order: Order, result: FlowResult, files: Files, store: ArtifactSto
         "steps": [_stage(done, store) for done in result.steps],
         "licenses": licenses(result),
         "files": {name: fact["size_bytes"] for name, fact in files.items()},
-        "settings": order.settings.model_dump(mode="json"),
+        "settings": job.settings.model_dump(mode="json"),
     }
 
 
-def banner(order: Order, result: FlowResult) -> str:
+def banner(job: ConversionJob, result: FlowResult) -> str:
     """One honest sentence: what of this asset was seen and what was guessed."""
     given = any("footage" in done.result.outputs for done in result.steps)
     imagined = "the motion was made up by a model" if _used_weights(result, "drive_video") else "the motion was made up"
     motion = "the motion follows the video" if given else imagined
-    if order.settings.prior.kind == "oracle":
+    if job.settings.prior.kind == "oracle":
         return f"Test of the optimization: the true views were known; {motion}."
-    drawn = "the picture was drawn by a model; " if order.drawn else ""
+    drawn = "the picture was drawn by a model; " if job.drawn else ""
     weights = _used_weights(result, "fit_gaussians", "fit_motion")
     shape = "guessed by a model" if weights else "guessed without a model, from the outline of one picture"
-    return f"{order.profile.capitalize()}: {drawn}{motion}; shape and the sides nobody saw were {shape}."
+    return f"{job.profile.capitalize()}: {drawn}{motion}; shape and the sides nobody saw were {shape}."
 
 
 def licenses(result: FlowResult) -> dict[str, str]:
@@ -160,11 +160,11 @@ def licenses(result: FlowResult) -> dict[str, str]:
     return {name: terms for done in result.steps for name, terms in done.result.provenance.licenses.items()}
 
 
-def notes(order: Order, result: FlowResult) -> list[str]:
+def notes(job: ConversionJob, result: FlowResult) -> list[str]:
     """What the user should know, each sentence once."""
     own = []
-    if order.picture_name:
-        own.append(f"The subject is the first frame of {order.source_name}; {order.picture_name} only names the asset.")
+    if job.picture_name:
+        own.append(f"The subject is the first frame of {job.source_name}; {job.picture_name} only names the asset.")
     records = [done.result.provenance for done in result.steps]
     theirs = (note for record in records for note in (*record.notes, *record.run_notes))
     return list(dict.fromkeys([*own, *theirs]))

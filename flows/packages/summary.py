@@ -67,12 +67,12 @@ class Row(BaseModel):
         return self.status in {"done", "unchanged"} or self.kind == NOT_ACCEPTED
 
 
-class Tally:
-    """What became of the items of a batch so far; may be told from several threads.
+class BatchProgress:
+    """Outcomes of the items of a batch so far; safe to update from several threads.
 
     Args:
         total: how many items there are.
-        listener: told every row as it comes.
+        listener: called with every new row.
     """
 
     def __init__(self, total: int, listener: Callable[[Row], None] = lambda row: None) -> None:
@@ -198,10 +198,10 @@ def judged(row: Row, folder: Path, strict: bool) -> Row:
 def index(out: Path, rows: list[Row], counts: dict[str, int]) -> str:
     """A page with a moving picture of every asset; the failed ones first, then those that are not accepted."""
     ordered = sorted(rows, key=lambda row: (row.status != "failed", not row.failing, row.item))
-    tally = ", ".join(f"{number} {status}" for status, number in counts.items() if number)
+    title = ", ".join(f"{number} {status}" for status, number in counts.items() if number)
     if refused := sum(bool(row.failing) for row in rows):
-        tally += f"; {refused} not accepted"
-    return render("index.html", title=tally, rows=ordered, quote=quote, picture=partial(_picture, out))
+        title += f"; {refused} not accepted"
+    return render("index.html", title=title, rows=ordered, quote=quote, picture=partial(_picture, out))
 
 
 def _csv(items: list[dict[str, Any]]) -> str:

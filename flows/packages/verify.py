@@ -12,7 +12,7 @@ from flows.inputs.package_record import FORMAT, RECORD, record_of
 from flows.inputs.signing_key import CERTIFICATE
 from flows.packages.crate import CRATE, files_in, own_digest, rendered
 from flows.packages.credentials import Signature, sidecar_of, signature_of
-from flows.packages.publish import fact_of
+from flows.packages.publish import file_digest
 from steps.contract import RUN_ONLY, Frozen, digest_of
 
 State = Literal["whole", "altered", "missing", "extra", "trusted", "untrusted", "invalid", "unsigned", "unchecked"]
@@ -119,7 +119,7 @@ def _file(folder: Path, name: str, fact: Mapping[str, Any]) -> Check:
     try:
         if path.is_symlink():
             detail = "it is a link"
-        elif (now := fact_of(path)) == fact:
+        elif (now := file_digest(path)) == fact:
             state, detail = "whole", ""
         else:
             detail = (

@@ -11,7 +11,7 @@ from typing import Any
 from dg4d_lib.assets.rendering.viewer_page import build_viewer_page
 from dg4d_lib.errors import BadInput
 from flows.formatting.sizes import readable
-from flows.packages.publish import whole
+from flows.packages.publish import load_verified
 from steps.store.files import room_for
 
 VIEWER = "viewer.html"
@@ -35,7 +35,7 @@ def view(folder: Path, open_browser: bool) -> Path:
     Raises:
         BadInput: there is no package, a file of it is missing or altered (says which), or the page cannot be written.
     """
-    record = whole(folder)
+    record = load_verified(folder)
     if ASSET not in record["files"]:
         raise BadInput(f"{folder} has no {ASSET}; only animated assets can be viewed")
     page = folder / VIEWER

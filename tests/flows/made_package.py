@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.inputs.orders import Order
+from flows.inputs.conversion_job import ConversionJob
 from flows.packages.credentials import configured
 from flows.packages.flow_result import FlowResult, StepRun
 from flows.packages.publish import publish
@@ -37,7 +37,7 @@ def made_package(folder: Path, *, weights: dict[str, str] | None = None, item: s
     store = ArtifactStore(folder / "store")
     source = store.put_bytes(SOURCE, "application/octet-stream")
     package = store.put_bytes(_zip(), "application/vnd.dg4d.package+zip")
-    order = Order(item=item, source=source, profile="preview", settings=PREVIEW, seed=3, source_name="fox.png")
+    job = ConversionJob(item=item, source=source, profile="preview", settings=PREVIEW, seed=3, source_name="fox.png")
     made = FlowResult(package=package, steps=_steps(source, package, store, weights or {}), flow_run="run")
     signer = configured()
     with pytest.MonkeyPatch.context() as patch:
@@ -45,7 +45,7 @@ def made_package(folder: Path, *, weights: dict[str, str] | None = None, item: s
         publish(
             store.path(package),
             folder / "fox",
-            lambda staging, files: complete(staging, files, order, made, store, signer),
+            lambda staging, files: complete(staging, files, job, made, store, signer),
         )
     return folder / "fox"
 

@@ -23,7 +23,7 @@ def in_between(file: Path, content: str | bytes) -> tuple[str, str]:
     file.write_bytes(content if isinstance(content, bytes) else content.encode())
     first, bad, last = items(file)
     assert (first.name, first.error, last.name, last.error) == ("a", "", "z", "")
-    assert first.wish is not None and last.wish is not None and bad.wish is None
+    assert first.request is not None and last.request is not None and bad.request is None
     return bad.name, bad.error
 
 
@@ -126,7 +126,7 @@ def test_a_bad_line_of_csv_fails_its_row_alone(tmp_path: Path, line: bytes, says
 def test_line_breaks_in_quotes_belong_to_their_cell(tmp_path: Path) -> None:
     (tmp_path / "m.csv").write_text('path,text,text.weights\n,"a red\nfox\x0band more",some/pictures\nb.png,,\n')
     fox, b = items(tmp_path / "m.csv")
-    assert fox.wish is not None and fox.wish.text == "a red\nfox\x0band more"
+    assert fox.request is not None and fox.request.text == "a red\nfox\x0band more"
     assert b.name == "b"
 
 
@@ -160,8 +160,8 @@ def test_nan_is_an_empty_cell_in_parquet_alone(tmp_path: Path) -> None:
     ]
     parquet.write_table(arrow.Table.from_pylist(content), tmp_path / "m.parquet")
     bee, a, c = items(tmp_path / "m.parquet")
-    assert a.wish is not None and (a.name, a.wish.seed) == ("a", 3)  # the seed of the batch
-    assert bee.wish is not None and (bee.name, bee.wish.seed, bee.priority) == ("bee", 7, 2)
+    assert a.request is not None and (a.name, a.request.seed) == ("a", 3)  # the seed of the batch
+    assert bee.request is not None and (bee.name, bee.request.seed, bee.priority) == ("bee", 7, 2)
     assert "row 3: seed 7.5 is not a whole number" in c.error
 
 
@@ -200,7 +200,7 @@ def test_whatever_else_goes_wrong_with_a_row_is_its_own(tmp_path: Path, monkeypa
 def test_a_seed_may_be_written_as_tables_write_whole_numbers(tmp_path: Path, value: object, seed: int) -> None:
     (tmp_path / "m.json").write_text(json.dumps([{"path": "a.png", "seed": value}]))
     (item,) = items(tmp_path / "m.json")
-    assert item.wish is not None and item.wish.seed == seed
+    assert item.request is not None and item.request.seed == seed
 
 
 @pytest.mark.parametrize("name", [5, "5"])

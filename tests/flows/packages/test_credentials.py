@@ -12,7 +12,7 @@ from signing import MAKERS, Identity, identity
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows.packages import credentials
 from flows.packages.credentials import ALGORITHMIC, TRAINED, Claim, Signer, configured, sidecar_of, signature_of
-from flows.packages.publish import fact_of
+from flows.packages.publish import file_digest
 
 CLAIM = Claim(trained=False, about="Preview: a guess. Order sha256:1.")
 
@@ -38,7 +38,7 @@ def picture(tmp_path: Path) -> Path:
 
 
 def signed(signer: Signer, path: Path, claim: Claim = CLAIM) -> Path:
-    _, marks = signer.sign_package(path.parent, {path.name: fact_of(path)}, claim)
+    _, marks = signer.sign_package(path.parent, {path.name: file_digest(path)}, claim)
     assert path.name in marks
     return path
 
@@ -93,10 +93,10 @@ def test_a_file_that_cannot_carry_credentials_has_them_beside_it(
 ) -> None:
     asset = tmp_path / "asset.glb"
     asset.write_bytes(b"mesh" * 1000)
-    files, marks = signer.sign_package(tmp_path, {"asset.glb": fact_of(asset)}, CLAIM)
+    files, marks = signer.sign_package(tmp_path, {"asset.glb": file_digest(asset)}, CLAIM)
     assert asset.read_bytes() == b"mesh" * 1000
     assert marks == {"asset.glb": {"sidecar": "asset.c2pa"}}
-    assert files["asset.c2pa"] == fact_of(tmp_path / "asset.c2pa")
+    assert files["asset.c2pa"] == file_digest(tmp_path / "asset.c2pa")
     root = company.root.read_text()
     assert signature_of(asset, tmp_path / "asset.c2pa", root).state == "trusted"
     asset.write_bytes(b"mesh" * 999 + b"mash")
@@ -117,10 +117,10 @@ def test_only_files_at_the_top_are_signed_and_their_facts_before_are_kept(signer
     shutil.copy(picture, inner)
     (picture.parent / "asset.json").write_text("{}")
     names = ("contact_sheet.png", "input/subject.png", "asset.json")
-    before = {name: fact_of(picture.parent / name) for name in names}
+    before = {name: file_digest(picture.parent / name) for name in names}
     after, marks = signer.sign_package(picture.parent, before, CLAIM)
     assert marks == {"contact_sheet.png": {"unsigned": before["contact_sheet.png"]}}
-    assert after == {**before, "contact_sheet.png": fact_of(picture)}
+    assert after == {**before, "contact_sheet.png": file_digest(picture)}
     assert after != before
     assert signature_of(inner).state == "missing"
 

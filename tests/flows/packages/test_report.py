@@ -11,7 +11,7 @@ import pytest
 from jinja2 import UndefinedError
 
 from flows.formatting.curves import HEIGHT, WIDTH
-from flows.inputs.orders import Order
+from flows.inputs.conversion_job import ConversionJob
 from flows.packages import report
 from flows.packages.flow_result import FlowResult, StepRun
 from flows.packages.html_pages import render
@@ -64,18 +64,18 @@ def unpacked(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def made(store: ArtifactStore, seconds: float = 2.0) -> tuple[Order, FlowResult]:
+def made(store: ArtifactStore, seconds: float = 2.0) -> tuple[ConversionJob, FlowResult]:
     source = store.put_bytes(b"s", "application/octet-stream")
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
         archive.writestr(zipfile.ZipInfo("asset.glb"), b"a mesh")
     package = store.put_bytes(packed.getvalue(), "application/zip")
     curves = store.put_bytes(json.dumps(CURVES).encode(), "application/vnd.dg4d.curves+json")
-    order = Order(
+    job = ConversionJob(
         item="<fox>", source=source, moving=False, profile="preview", settings=PREVIEW, seed=0, source_name="fox.png"
     )
     steps = [finished("fit_gaussians", store, seconds, curves=curves), finished("pack_asset", store, seconds + 1)]
-    return order, FlowResult(package=package, steps=steps, flow_run=f"run {seconds}")
+    return job, FlowResult(package=package, steps=steps, flow_run=f"run {seconds}")
 
 
 class Links(HTMLParser):
@@ -93,8 +93,8 @@ class Links(HTMLParser):
 
 
 def test_the_page_is_self_contained_and_escapes_what_it_is_given(store: ArtifactStore, unpacked: Path) -> None:
-    order, what = made(store)
-    page = report.texts(order, what, FILES, store, unpacked)["report.html"]
+    job, what = made(store)
+    page = report.texts(job, what, FILES, store, unpacked)["report.html"]
     links = Links(page)
     assert "script" not in links.tags
     assert "fox" not in links.tags
@@ -107,20 +107,20 @@ def test_the_page_is_self_contained_and_escapes_what_it_is_given(store: Artifact
 
 
 def test_time_on_the_clock_and_time_of_computing_are_two_numbers(store: ArtifactStore) -> None:
-    order, what = made(store)  # two steps, of 2 and 3 seconds
-    told = report.report_of(order, what.model_copy(update={"wall_s": 3.2}), FILES, store)
+    job, what = made(store)  # two steps, of 2 and 3 seconds
+    told = report.report_of(job, what.model_copy(update={"wall_s": 3.2}), FILES, store)
     assert (told["wall_s"], told["compute_s"]) == (3.2, 5.0)
     page = report.page(told)
     assert "3.2 s on the clock for this run; 5.0 s of computing in all stages" in page
 
 
 def test_the_banner_is_honest(store: ArtifactStore) -> None:
-    order, what = made(store)
-    assert "the motion was made up" in report.banner(order, what)
-    assert "guessed without a model" in report.banner(order, what)
-    moving = what.model_copy(update={"steps": [finished("prepare_subject", store, 1, footage=order.source)]})
-    assert "the motion follows the video" in report.banner(order, moving)
-    oracle = order.model_copy(update={"settings": revise(PREVIEW, {"prior.kind": "oracle"})})
+    job, what = made(store)
+    assert "the motion was made up" in report.banner(job, what)
+    assert "guessed without a model" in report.banner(job, what)
+    moving = what.model_copy(update={"steps": [finished("prepare_subject", store, 1, footage=job.source)]})
+    assert "the motion follows the video" in report.banner(job, moving)
+    oracle = job.model_copy(update={"settings": revise(PREVIEW, {"prior.kind": "oracle"})})
     assert "true views were known" in report.banner(oracle, what)
 
 
@@ -132,23 +132,23 @@ def with_weights(step: StepRun, licenses: dict[str, str]) -> StepRun:
 
 
 def test_the_banner_says_what_models_did(store: ArtifactStore) -> None:
-    order, what = made(store)
+    job, what = made(store)
     fit, drive = finished("fit_gaussians", store, 1), finished("drive_video", store, 1)
     by_prior = what.model_copy(update={"steps": [with_weights(fit, {"zero123-xl": "x"}), drive]})
     assert "the motion was made up; shape and the sides nobody saw were guessed by a model" in report.banner(
-        order, by_prior
+        job, by_prior
     )
     by_video = what.model_copy(update={"steps": [fit, with_weights(drive, {"svd": "x"})]})
-    assert "the motion was made up by a model; " in report.banner(order, by_video)
-    assert "guessed without a model" in report.banner(order, by_video)
+    assert "the motion was made up by a model; " in report.banner(job, by_video)
+    assert "guessed without a model" in report.banner(job, by_video)
 
 
 def test_what_networks_did_is_said_for_every_step(store: ArtifactStore, unpacked: Path) -> None:
-    order, what = made(store)
+    job, what = made(store)
     fit, pack = what.steps
     record = fit.result.provenance.model_copy(update={"flops": {"Unet": 15_250_000_000_000, "Vae": 3_000_000}})
     fit = fit.model_copy(update={"result": fit.result.model_copy(update={"provenance": record})})
-    texts = report.texts(order, what.model_copy(update={"steps": [fit, pack]}), FILES, store, unpacked)
+    texts = report.texts(job, what.model_copy(update={"steps": [fit, pack]}), FILES, store, unpacked)
     stages = json.loads(texts["report.json"])["steps"]
     assert [stage["flops"] for stage in stages] == [record.flops, {}]
     assert texts["report.html"].count("FLOP") == 2
@@ -157,12 +157,12 @@ def test_what_networks_did_is_said_for_every_step(store: ArtifactStore, unpacked
 
 
 def test_licenses_follow_the_asset_only_where_weights_were_used(store: ArtifactStore, unpacked: Path) -> None:
-    order, what = made(store)
-    texts = report.texts(order, what, FILES, store, unpacked)
+    job, what = made(store)
+    texts = report.texts(job, what, FILES, store, unpacked)
     assert "No weights were used" in texts["report.html"]
     assert json.loads(texts["provenance.json"])["licenses"] == {}
     used = what.model_copy(update={"steps": [with_weights(step, {"svd": "S & Co"}) for step in what.steps]})
-    texts = report.texts(order, used, FILES, store, unpacked)
+    texts = report.texts(job, used, FILES, store, unpacked)
     assert "No weights were used" not in texts["report.html"]
     assert "S &amp; Co" in texts["report.html"]
     assert json.loads(texts["provenance.json"])["licenses"] == {"svd": "S & Co"}
@@ -170,9 +170,9 @@ def test_licenses_follow_the_asset_only_where_weights_were_used(store: ArtifactS
 
 
 def test_notes_are_said_once_and_a_picture_that_only_names_is_mentioned(store: ArtifactStore) -> None:
-    order, what = made(store)
-    order = order.model_copy(update={"picture_name": "fox.jpg", "source_name": "run.mp4"})
-    notes = report.notes(order, what)
+    job, what = made(store)
+    job = job.model_copy(update={"picture_name": "fox.jpg", "source_name": "run.mp4"})
+    notes = report.notes(job, what)
     assert notes[1:] == ["Twice said.", "<b>bold</b>"]
     assert report.notes(*made(store, 9.0)) == ["Twice said.", "<b>bold</b>", "memory ran out"]
     assert "run.mp4" in notes[0]

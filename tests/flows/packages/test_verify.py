@@ -12,7 +12,7 @@ from signing import Identity, identity
 
 from dg4d_lib.errors import BadInput
 from flows.packages.crate import CRATE, own_digest, rendered
-from flows.packages.publish import fact_of_bytes
+from flows.packages.publish import bytes_digest
 from flows.packages.verify import Verdict, verify
 
 
@@ -93,7 +93,7 @@ def with_new_crate(package: Path, change: Callable[[dict[str, Any]], None]) -> N
     text = json.dumps(record)
     (package / "provenance.json").write_text(text)
     crate = json.loads((package / CRATE).read_text())
-    fact = fact_of_bytes(text.encode())
+    fact = bytes_digest(text.encode())
     (entity,) = [entity for entity in crate["@graph"] if entity["@id"] == "provenance.json"]
     entity |= {"sha256": fact["digest"].removeprefix("sha256:"), "contentSize": str(fact["size_bytes"])}
     crate["@graph"][0]["sha256"] = own_digest(crate)

@@ -20,7 +20,7 @@ from waiting import wait_until
 from benchmarks.fleet import POOL, Machine
 from flows.engine.item_runs import FLOW
 from flows.engine.orphans import settle_orphans
-from flows.packages.publish import whole
+from flows.packages.publish import load_verified
 from flows.serving import registering
 from flows.serving.pools import read_pools
 from flows.serving.server import Server
@@ -108,7 +108,7 @@ def test_machines_share_a_catalog_and_a_machine_and_a_catalog_that_are_killed_co
     assert command.returncode == 0, said
     assert finished(machines) == {f"{step}:{i}": 1 for step in EVERY_STEP for i in range(ITEMS)}
     for i in range(ITEMS):
-        whole(tmp_path / "out" / str(i))
+        load_verified(tmp_path / "out" / str(i))
     rows = {row["item"]: row for row in json.loads((tmp_path / "out" / "summary.json").read_text())["items"]}
     assert {row["status"] for row in rows.values()} <= {"done", "unchanged"}
     assert rows["3"]["failing"] == ["silhouette"]

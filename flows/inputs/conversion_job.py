@@ -19,10 +19,10 @@ from steps.runtime.weights import identities, license_of, open_weights, weights_
 from steps.store.artifact_store import ArtifactStore
 
 LONGEST_NAME = 60  # characters of a name made out of words
-NAMES = {"item", "profile", "source_name", "picture_name"}  # of an order: for people, no part of its digest
+NAMES = {"item", "profile", "source_name", "picture_name"}  # of a job: for people, no part of its digest
 
 
-class Wish(Frozen):
+class ConversionRequest(Frozen):
     """What a user asks for, by paths.
 
     Attributes:
@@ -102,7 +102,7 @@ class Wish(Frozen):
                 f"--commercial-only: the settings name weights that may not be used commercially: {'; '.join(refused)}"
             )
 
-    def order(self, store: ArtifactStore) -> "Order":
+    def to_job(self, store: ArtifactStore) -> "ConversionJob":
         """Put the files into the store.
 
         Raises:
@@ -110,7 +110,7 @@ class Wish(Frozen):
         """
         footage = self._footage()
         try:
-            return Order(
+            return ConversionJob(
                 item=self.item,
                 source=sources.put_source(footage, store) if footage else sources.put_text(self.text, store),
                 text=sources.plain(self.text),
@@ -161,7 +161,7 @@ class Wish(Frozen):
         return list(weights_in(tree))
 
 
-class Order(Frozen):
+class ConversionJob(Frozen):
     """What a user asks for, by content; names are for people and do not count.
 
     Attributes:
@@ -193,7 +193,7 @@ class Order(Frozen):
         return recipe | {"settings": {**recipe["settings"], "rasterizer": backend_name(self.settings.rasterizer)}}
 
     def digest(self) -> str:
-        """Equal for orders that give the same package with the code and the signing key that are here."""
+        """Equal for jobs that give the same package with the code and the signing key that are here."""
         recipe = self.recipe()
         return digest_of(
             {
@@ -205,10 +205,10 @@ class Order(Frozen):
         )
 
 
-def order_again(
+def job_from_record(
     record: Mapping[str, Any], store: ArtifactStore, source: Path | None = None, bank: Path | None = None
-) -> Order:
-    """The order that a package was made from.
+) -> ConversionJob:
+    """The job that a package was made from.
 
     Args:
         record: the provenance of the package.
@@ -221,7 +221,7 @@ def order_again(
     """
     try:
         names = {name: record[name] for name in NAMES & set(record)}
-        order = Order.model_validate({**record["recipe"], **record["run"].get("names", {}), **names})
+        job = ConversionJob.model_validate({**record["recipe"], **record["run"].get("names", {}), **names})
     except (KeyError, TypeError, AttributeError, ValidationError) as error:
         reason = f"{type(error).__name__}: {error}"
         if isinstance(error, ValidationError):
@@ -230,19 +230,19 @@ def order_again(
             f"the record of this package was written by another version of dg4d ({reason}); "
             "make the asset again from its source"
         ) from error
-    require_backend(order.settings.rasterizer)
-    if order.text:
-        sources.put_text(order.text, store)
+    require_backend(job.settings.rasterizer)
+    if job.text:
+        sources.put_text(job.text, store)
     if source is not None:
         sources.check_video(source)
-        _require_same(source, sources.put_source(source, store), order.source)
-    if bank is not None and order.bank is not None:
+        _require_same(source, sources.put_source(source, store), job.source)
+    if bank is not None and job.bank is not None:
         sources.check_bank(bank)
-        _require_same(bank, sources.put_bank(bank, store), order.bank)
-    for option, ref in (("--source", order.source), ("--bank", order.bank)):
+        _require_same(bank, sources.put_bank(bank, store), job.bank)
+    for option, ref in (("--source", job.source), ("--bank", job.bank)):
         if ref is not None and not store.has(ref):
             raise BadInput(f"what this package was made from ({ref.digest}) is not in the store: give it with {option}")
-    return order
+    return job
 
 
 def _require_same(path: Path, given: ArtifactRef, recorded: ArtifactRef) -> None:
