@@ -55,7 +55,7 @@ def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop
         assert other.returncode == 65 and f"reads {folder.parent}; `dg4d down` stops it" in other.stderr
     finally:
         stopped = dg4d("down")
-    ending = r"ending worker process-cpu( and its \d+ runs?)?\nstopped\n"  # runs that other tests left on this server
+    ending = r"stopping worker process-cpu( and its \d+ runs?)?\nstopped\n"  # runs that other tests left on this server
     assert stopped.returncode == 0 and re.fullmatch(ending, stopped.stdout)
     assert running(folder) == []
     assert "stopped!" in log.read_text()  # it was not killed
