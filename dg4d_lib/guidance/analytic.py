@@ -28,6 +28,7 @@ class AnalyticPrior:
         noise: which timestep an iteration uses.
         viewpoints: the only cameras `clean` knows; None is all.
         frames: the only frames `clean` knows; None is all.
+        weight: factor on the loss.
     """
 
     def __init__(
@@ -36,8 +37,9 @@ class AnalyticPrior:
         noise: Annealing,
         viewpoints: tuple[OrbitCamera, ...] | None = None,
         frames: tuple[int, ...] | None = None,
+        weight: float = 1.0,
     ) -> None:
-        self.clean, self.noise = clean, noise
+        self.clean, self.noise, self.weight = clean, noise, weight
         self.viewpoints, self.frames = viewpoints, frames
 
     def loss(
@@ -58,7 +60,7 @@ class AnalyticPrior:
 
         pixels = 3 * images.shape[1] * images.shape[2]
         loss = score_distillation(self._encode(images, coverage), predict_noise, timestep, generator)
-        return loss * (LATENT_NUMBERS / pixels)
+        return loss * (self.weight * LATENT_NUMBERS / pixels)
 
     def _encode(self, images: Float[Tensor, "b h w 3"], coverage: Float[Tensor, "b h w 1"]) -> Float[Tensor, "b c h w"]:
         """Return pixels as they are diffused: color and alpha in [-1, 1]."""

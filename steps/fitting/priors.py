@@ -100,8 +100,10 @@ def make_prior(
     match settings:
         case GeometricPriorSettings() | LearnedPriorSettings():
             shapes = subject_shapes(settings, cutouts, turn_deg)
-            note = GEOMETRIC_NOTE if isinstance(settings, GeometricPriorSettings) else LEARNED_NOTE
-            return ChosenPrior(AnalyticPrior(shapes.clean, noise), note, shapes=shapes)
+            note, weight = GEOMETRIC_NOTE, 1.0
+            if isinstance(settings, LearnedPriorSettings):
+                note, weight = LEARNED_NOTE, settings.weight
+            return ChosenPrior(AnalyticPrior(shapes.clean, noise, weight=weight), note, shapes=shapes)
         case OraclePriorSettings():
             if bank is None:
                 raise BadInput("prior.kind = oracle needs true views: give --bank FOLDER (with a bank.json)")
