@@ -29,7 +29,7 @@ from benchmarks.objects.specimens import OBJECTS, Specimen, made, read
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from flows.inputs.manifest import parse_changes
-from steps.artifacts.ground_truth import find_truths
+from steps.artifacts.ground_truth import find_ground_truths
 from steps.profiles import PipelineSettings, revise
 
 DIGITS = {"psnr": 2, "psnr_obj": 2, "iou": 3, "terr": 3, "flicker": 2}
@@ -396,7 +396,7 @@ def find_specimens(data: Path | None, names: Sequence[str] | None, frames: int, 
     """
     known: dict[str, Callable[[], Specimen]] = {name: partial(made, name, frames, size) for name in OBJECTS}
     if data is not None:
-        known = {truth.name: partial(read, truth, frames) for truth in find_truths(data)}
+        known = {truth.name: partial(read, truth, frames) for truth in find_ground_truths(data)}
     if unknown := sorted(set(names or ()) - set(known)):
         raise BadInput(f"there is no object {', '.join(unknown)}; there are: {', '.join(known)}")
     return [known[name]() for name in names or known]

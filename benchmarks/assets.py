@@ -25,24 +25,24 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from dg4d_lib.asset_settings import GltfSettings, PackSettings
-from dg4d_lib.assets.animated import Asset4D, moved
-from dg4d_lib.assets.formats.compact import Compact, write_compact
+from dg4d_lib.assets.animated import Asset4D, pose_gaussians
+from dg4d_lib.assets.formats.compact import CompactAsset, write_compact
 from dg4d_lib.assets.formats.glb import write_glb
-from dg4d_lib.assets.formats.rigged import rig_of, write_rigged_glb
+from dg4d_lib.assets.formats.rigged import fit_asset_rig, write_rigged_glb
 from dg4d_lib.assets.formats.splats import write_splat_glb_frames, write_splats, write_spz_frames
 from dg4d_lib.assets.formats.usd import write_usdz
-from dg4d_lib.assets.formats.websplats import write_web_splats
+from dg4d_lib.assets.formats.web_splats import write_web_splats
 from dg4d_lib.assets.rendering.preview import write_preview, write_turntable
-from dg4d_lib.assets.rendering.viewer_page import viewer_page
+from dg4d_lib.assets.rendering.viewer_page import build_viewer_page
 from dg4d_lib.assets.rendering.webp import write_webp
 from dg4d_lib.deformation.factory import new_deformation
 from dg4d_lib.deformation.hexplane import HexPlane
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import HexPlaneSettings
-from steps.pack_asset import LANES
+from steps.pack_asset import WRITER_THREADS
 
 FRAMES, FPS = 14, 12.0
 MEGABYTE = 1e6
@@ -103,7 +103,7 @@ def noise_picture(texels: int) -> Tensor:
     return picture[0].movedim(0, -1).clamp(0, 1)
 
 
-def waving_splats(count: int) -> Compact:
+def waving_splats(count: int) -> CompactAsset:
     """Flat splats on the ball, and a HexPlane in the sizes of the profile `preview` with waves in its planes."""
     generator = torch.Generator().manual_seed(0)
     places = torch.rand(count, 2, generator=generator)
@@ -118,7 +118,7 @@ def waving_splats(count: int) -> Compact:
         log_scales,
         torch.randn(count, 4, generator=generator),
         3 + torch.randn(count, generator=generator),
-        harmonics_of_color(colors),
+        rgb_to_sh(colors),
     )
     settings = HexPlaneSettings(features=16, hidden=32)
     field = new_deformation(settings, torch.tensor([[-0.8] * 3, [0.8] * 3]), FRAMES, count, generator)
@@ -130,7 +130,7 @@ def waving_splats(count: int) -> Compact:
             parameter.normal_(std=0.04, generator=generator)
         field.space[0].copy_(1 + 0.3 * torch.sin(cells[:, None] + cells + phases[0]))
         field.time[0].copy_(1 + 0.3 * torch.sin(steps[:, None] + cells + phases[1]))
-    return Compact(cloud, field.requires_grad_(False), settings, FRAMES, FPS)
+    return CompactAsset(cloud, field.requires_grad_(False), settings, FRAMES, FPS)
 
 
 def mesh_writers(asset: Asset4D) -> Iterator[tuple[str, Write]]:
@@ -140,7 +140,7 @@ def mesh_writers(asset: Asset4D) -> Iterator[tuple[str, Write]]:
     yield "asset.usdz, mesh", lambda folder: write_usdz(folder / "a.usdz", asset, FPS)
     yield (
         "viewer page, empty",
-        lambda folder: (folder / "a.html").write_text(viewer_page("", b"", None, None, None, {})),
+        lambda folder: (folder / "a.html").write_text(build_viewer_page("", b"", None, None, None, {})),
     )
 
 
@@ -148,10 +148,10 @@ def _glb(asset: Asset4D, settings: GltfSettings, folder: Path) -> None:
     (folder / "a.glb").write_bytes(write_glb(asset, settings))
 
 
-def splat_writers(asset: Asset4D, splats: Compact, pack: PackSettings) -> Iterator[tuple[str, Write]]:
+def splat_writers(asset: Asset4D, splats: CompactAsset, pack: PackSettings) -> Iterator[tuple[str, Write]]:
     cloud, field = splats.gaussians, splats.deformation
-    states = moved(cloud, field, FRAMES, torch.arange(float(FRAMES)))
-    rasterizer = choose_rasterizer("auto")
+    states = pose_gaussians(cloud, field, FRAMES, torch.arange(float(FRAMES)))
+    rasterizer = get_rasterizer("auto")
     yield "splats, PLY", lambda folder: write_splats(folder, states)
     yield "splats, SPZ", lambda folder: write_spz_frames(folder, states)
     yield "splats, glTF", lambda folder: write_splat_glb_frames(folder, states)
@@ -175,7 +175,7 @@ def splat_writers(asset: Asset4D, splats: Compact, pack: PackSettings) -> Iterat
 
 def write_rig(path: Path, asset: Asset4D) -> None:
     """Find the asset's rig and write it."""
-    rig, _ = rig_of(asset, PackSettings().rig_bones, largest_error=1)
+    rig, _ = fit_asset_rig(asset, PackSettings().rig_bones, max_error=1)
     assert rig is not None
     path.write_bytes(write_rigged_glb(asset, rig, GltfSettings()))
 
@@ -193,7 +193,7 @@ def fourdgs(folder: Path) -> Write:
 
 def side_by_side(writers: Sequence[Write], folder: Path) -> None:
     """Some at a time, as the step does."""
-    with ThreadPoolExecutor(LANES) as lanes:
+    with ThreadPoolExecutor(WRITER_THREADS) as lanes:
         places = [folder / str(number) for number in range(len(writers))]
         for place in places:
             place.mkdir(exist_ok=True)
@@ -241,7 +241,7 @@ def main() -> None:
     )
     console.print(
         f"one file of every kind, {counts[0]} splats: {sum(seconds[name] for name in EVERY_KIND):.2f} s one after the "
-        f"other, {whole.wall_s:.2f} s {LANES} at a time; goal {GOAL_S:.0f} s"
+        f"other, {whole.wall_s:.2f} s {WRITER_THREADS} at a time; goal {GOAL_S:.0f} s"
     )
     if options.json:
         write_rows(options.json, rows)

@@ -27,7 +27,6 @@ from typing import Any
 from PIL import Image, ImageDraw
 from prefect import flow
 from prefect.client.orchestration import get_client
-from prefect.settings import temporary_settings
 from rich.table import Table
 
 from benchmarks.measure import machine, new_console, parser_of, write_rows
@@ -35,7 +34,7 @@ from benchmarks.postgresql import Database, free_port
 from flows import home
 from flows.catalog import convert_all
 from flows.catalog_request import ready
-from flows.engine.step_tasks import finished_steps, flow_settings, steps_of_flow
+from flows.engine.step_tasks import finished_steps, flow_context, steps_of_flow
 from flows.inputs.manifest import Item, items_of
 from flows.inputs.orders import Order
 from flows.inputs.package_record import RECORD
@@ -159,7 +158,7 @@ def run(items: list[Item], out: Path, workers: int, what: str) -> float:
         todo = (ready(item, out, strict=False) for item in items)
         convert_all(todo, out, workers, f"{what}: {len(items)} items", tally, work=work)
 
-    with temporary_settings(flow_settings()):
+    with flow_context():
         catalog()
     writer.write(list(tally.rows.values()), tally.seconds)
     return sizes[-1] - sizes[len(sizes) // 10]
@@ -187,7 +186,7 @@ def resize_and_pack(order: Order) -> tuple[Any, bool]:
             drive_video(prepare_subject(order.source, conversion), conversion)
             done.extend(finished_steps())
 
-    with temporary_settings(flow_settings()):
+    with flow_context():
         two_steps(order.item)
     return done[-1].result.outputs["driving_video"], all(step.cached for step in done)
 

@@ -12,19 +12,19 @@ from dg4d_lib.fitting.motion import fit_motion
 from dg4d_lib.fitting.static import fit_gaussians
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.analytic import AnalyticPrior
-from dg4d_lib.guidance.distillation import Annealing
+from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.images import over_white
 from dg4d_lib.metrics.image import iou, psnr
 from dg4d_lib.metrics.video import temporal_error
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import FitSettings, LgmStartSettings, OraclePriorSettings
 from steps.artifacts.motions import new_deformation
-from steps.fit_gaussians import starting_cloud
-from steps.fitting.priors import oracle_prior
+from steps.fit_gaussians import initial_gaussians
+from steps.fitting.priors import make_oracle_prior
 from steps.profiles import PipelineSettings
 
-RASTERIZE = choose_rasterizer("auto")
+RASTERIZE = get_rasterizer("auto")
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def static_fit(specimen: Specimen, settings: PipelineSettings, seed: int) -> Gau
     subject = specimen.cutouts[0]
     kind = settings.static.start
     assert not isinstance(kind, LgmStartSettings), "these fits start without LGM"
-    start = starting_cloud(subject, kind, settings.prior, settings.subject.turn_deg, generator)
+    start = initial_gaussians(subject, kind, settings.prior, settings.subject.turn_deg, generator)
     prior = prior_of(specimen.bank, settings, settings.static)
     return fit_gaussians(start, subject, prior, RASTERIZE, settings.static, generator)
 
@@ -90,8 +90,8 @@ def score(specimen: Specimen, states: Sequence[Gaussians]) -> Figures:
 def prior_of(bank: Bank, settings: PipelineSettings, stage: FitSettings) -> AnalyticPrior:
     """The oracle, perfect or not, with the timesteps of a stage."""
     assert isinstance(settings.prior, OraclePriorSettings), "these fits are made with prior.kind = oracle"
-    noise = Annealing(stage.t_max_start, stage.t_max_end, uniform=stage.noise_draw == "uniform")
-    return oracle_prior(bank, settings.prior, noise)
+    noise = TimestepSchedule(stage.t_max_start, stage.t_max_end, uniform=stage.noise_draw == "uniform")
+    return make_oracle_prior(bank, settings.prior, noise)
 
 
 def thinned(specimen: Specimen, most: int) -> tuple[Specimen, int]:

@@ -34,6 +34,7 @@ FAKES = Path(__file__).parents[1] / "tests" / "flows"
 POOL = "fleet"
 START_S = 120.0
 LOOK_S = 0.5
+BEFORE_SLEEP = ("drive_video", "fit_gaussians")  # side by side; the next step of the stand-ins sleeps
 
 
 @dataclass(frozen=True)
@@ -95,10 +96,13 @@ class Machine:
         return self.log.read_text(encoding="utf-8").split() if self.log.exists() else []
 
     def sleeps(self) -> bool:
-        """Return whether it is in the middle of an item, at the step that sleeps."""
-        before = self.steps[-1:]
+        """Return whether it is in the middle of an item, at `fit_motion`, which sleeps."""
+        before = self.steps
         time.sleep(LOOK_S)
-        return before == self.steps[-1:] and bool(before) and before[0].startswith("fit_gaussians:")
+        if not before or before != self.steps:
+            return False
+        step, _, item = before[-1].partition(":")
+        return step in BEFORE_SLEEP and all(f"{each}:{item}" in before for each in BEFORE_SLEEP)
 
     def kill(self) -> None:
         """End it as a loss of power does: the worker and all that it started, at once."""

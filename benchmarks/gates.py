@@ -31,18 +31,18 @@ from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import color_of_harmonics, harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh, sh_to_rgb
 from dg4d_lib.images import resize_planes
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.metrics.gates import Gate, judge
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.metrics.gates import Gate, evaluate_gates
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 from flows.packages.publish import whole
 from steps.artifacts.media import read_frames, read_png
 from steps.artifacts.packages import SUBJECT, read_manifest
 from steps.artifacts.rendering import read_states, read_surface, states_between
-from steps.check_asset import Parts, gather
+from steps.check_asset import LoadedAsset, collect_evidence
 from steps.contract import ArtifactRef
 from steps.store.artifact_store import ArtifactStore
 from steps.store.files import home
@@ -134,7 +134,7 @@ def own(name: str) -> Sample:
         log_scales=(SPREAD * edge).log().expand(FRAMES, len(ways), 3),
         quats=torch.tensor([1.0, 0, 0, 0]).expand(FRAMES, len(ways), 4),
         opacity_logits=torch.full((len(ways),), SOLID),
-        harmonics=harmonics_of_color(colors),
+        harmonics=rgb_to_sh(colors),
     )
     blank = TexturedMesh(places[0], faces, torch.zeros(len(ways), 2), torch.zeros(1, 1, 3))
     surface = Asset4D(*_painted(blank, places - places[0], colors), FPS)
@@ -186,7 +186,7 @@ def _noise(*shape: int) -> Tensor:
 
 def _recolored(sample: Sample, change: Callable[[Tensor], Tensor]) -> Sample:
     """Splats and mesh with other colors."""
-    colors = harmonics_of_color(change(color_of_harmonics(sample.states.harmonics)).clamp(0, 1))
+    colors = rgb_to_sh(change(sh_to_rgb(sample.states.harmonics)).clamp(0, 1))
     states = replace(sample.states, harmonics=colors)
     return replace(_retextured(sample, change), states=states)
 
@@ -277,9 +277,9 @@ SPOILS: dict[str, tuple[str, Spoil]] = {
 
 def measured(sample: Sample) -> dict[str, Gate]:
     """Every gate by its name."""
-    parts = Parts(partial(states_between, sample.states), sample.surface, len(sample.surface.offsets))
-    evidence = gather(parts, sample.video, sample.cutout, choose_rasterizer("cpu"))
-    return {gate.name: gate for gate in judge(evidence, GateSettings())}
+    parts = LoadedAsset(partial(states_between, sample.states), sample.surface, len(sample.surface.offsets))
+    evidence = collect_evidence(parts, sample.video, sample.cutout, get_rasterizer("cpu"))
+    return {gate.name: gate for gate in evaluate_gates(evidence, GateSettings())}
 
 
 def rows(samples: Sequence[Sample], tell: Callable[[str], None]) -> list[Row]:

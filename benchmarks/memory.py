@@ -24,8 +24,8 @@ from benchmarks.paper_schedule import FULL, Clock, Schedule, Sizes, forget_peak,
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.latents import SIZE
 from dg4d_lib.diffusion.video_model import DECODER_GB, ENCODER_GB, GIB, UNET_GB
-from dg4d_lib.guidance.distillation import Annealing
-from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.distillation import TimestepSchedule
+from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.zero123 import VIEW_GB
 from dg4d_lib.settings import SvdSettings, Zero123PriorSettings
 from steps.profiles import profile
@@ -53,26 +53,26 @@ def rows(sizes: Sizes, device: torch.device) -> Iterator[Row]:
     assert isinstance(prior_settings, Zero123PriorSettings) and isinstance(driving, SvdSettings)
 
     model = schedule.zero123(prior_settings)
-    prior = model.conditioned_on(torch.ones(1, SIZE, SIZE, 3), Annealing(settings.static.t_max_start))
+    prior = model.conditioned_on(torch.ones(1, SIZE, SIZE, 3), TimestepSchedule(settings.static.t_max_start))
     yield Row("Zero-1-to-3", 0, peak_of(lambda: None)[1])
     pictures = torch.rand(VIEWS, SIZE, SIZE, 3, generator=seeded()).to(device).requires_grad_()
-    views = [View(OrbitCamera(azimuth_deg=90.0 * i), 0) for i in range(VIEWS)]
+    views = [GuidanceView(OrbitCamera(azimuth_deg=90.0 * i), 0) for i in range(VIEWS)]
     yield row("views, there and back", VIEWS, VIEW_GB[prior_settings.precision], lambda: judged(prior, pictures, views))
     del model, prior
 
     video_model = schedule.video_model(driving.model, Clock(device))
     yield Row("SVD", 0, peak_of(lambda: None)[1])
-    condition = video_model.look_at(torch.rand(SIZE, SIZE, 3, generator=seeded()), [seeded()])
+    condition = video_model.encode_condition(torch.rand(SIZE, SIZE, 3, generator=seeded()), [seeded()])
     video = torch.rand(FRAMES, SIZE, SIZE, 3, generator=seeded()).to(device)
     encoder, decoder = 4 * ENCODER_GB, 2 * DECODER_GB  # bytes of a number: the encoder overflows in half precision
     yield row("frames, encoded", FRAMES, encoder * MEGAPIXELS, lambda: video_model.encode(video))
-    noise = video_model.noise(video_model.blank(1, FRAMES, SIZE, SIZE), [seeded()])
+    noise = video_model.sample_noise(video_model.latent_shape(1, FRAMES, SIZE, SIZE), [seeded()])
     half = 2 * UNET_GB * MEGAPIXELS * FRAMES
     yield row("videos, with and without the picture", 2, half, lambda: video_model.denoise(noise, condition, (9, 3)))
     yield row("frames, decoded", FRAMES, decoder * MEGAPIXELS, lambda: video_model.decode(noise[0]))
 
 
-def judged(prior: Any, pictures: torch.Tensor, views: list[View]) -> None:
+def judged(prior: Any, pictures: torch.Tensor, views: list[GuidanceView]) -> None:
     """The loss and its gradient."""
     prior.loss(pictures, pictures[..., :1].detach(), views, 0.5, seeded()).backward()
 

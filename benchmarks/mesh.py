@@ -33,7 +33,7 @@ from torch.nn.functional import grid_sample
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import turntable
-from dg4d_lib.mesh_rasterizer.texture import bilinear, look_up, read
+from dg4d_lib.mesh_rasterizer.texture import build_lookup, sample_bilinear, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
 
 FRAMES, TEXELS = 14, 1024
@@ -103,7 +103,7 @@ def bumpy_ball(faces: int, size: int, frames: int) -> Scene:
 def rays(camera: OrbitCamera) -> Rays:
     y, x = torch.meshgrid(*[torch.arange(side) + 0.5 for side in (camera.height, camera.width)], indexing="ij")
     sides = [(x - 0.5 * camera.width) / camera.focal, (y - 0.5 * camera.height) / camera.focal, torch.ones_like(x)]
-    directions = torch.stack(sides, -1).double().reshape(-1, 3) @ camera.world_to_camera()[:3, :3]
+    directions = torch.stack(sides, -1).double().reshape(-1, 3) @ camera.viewmat()[:3, :3]
     origins = camera.position().expand_as(directions)
     pair = origins.float().contiguous().numpy(), directions.float().contiguous().numpy()
     return *pair, np.concatenate(pair, 1)
@@ -177,7 +177,7 @@ def of_texture(scene: Scene, rounds: int) -> Iterator[Finding]:
     generator = torch.Generator().manual_seed(0)
     texture = torch.rand(TEXELS, TEXELS, 3, generator=generator, requires_grad=True)
     fragments = rasterize_mesh(scene.states, scene.faces, scene.cameras)
-    lookup = look_up(scene.states, scene.faces, scene.uvs, (TEXELS, TEXELS), scene.cameras, fragments)
+    lookup = build_lookup(scene.states, scene.faces, scene.uvs, (TEXELS, TEXELS), scene.cameras, fragments)
     everywhere = interpolate(fragments, scene.faces, scene.uvs)
     places = everywhere[lookup.covered]
     pull = torch.randn(len(places), 3, generator=generator)
@@ -189,8 +189,8 @@ def of_texture(scene: Scene, rounds: int) -> Iterator[Finding]:
         return grid_sample(expanded, 2 * everywhere - 1, align_corners=False, padding_mode="border").movedim(1, -1)
 
     functions: dict[str, Callable[[], object]] = {
-        "ours": lambda: torch.autograd.grad(read(texture, lookup), texture, pull),
-        "texture_list": lambda: torch.autograd.grad(bilinear(texture, places), texture, pull),
+        "ours": lambda: torch.autograd.grad(sample_texture(texture, lookup), texture, pull),
+        "texture_list": lambda: torch.autograd.grad(sample_bilinear(texture, places), texture, pull),
         "texture_frames": lambda: torch.autograd.grad(by_frames(), texture, pulls),
     }
     taken = interleaved(functions, rounds)

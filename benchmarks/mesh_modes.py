@@ -17,22 +17,22 @@ import torch  # isort: skip
 from rich.table import Column, Table
 from torch import Tensor
 
-from dg4d_lib.assets.animated import moved
+from dg4d_lib.assets.animated import pose_gaussians
 from dg4d_lib.assets.formats.compact import read_compact
 from dg4d_lib.assets.formats.glb import read_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.images import color_over_white
 from dg4d_lib.mesh.extraction.density import density_field
-from dg4d_lib.mesh.extraction.extract import best_level
+from dg4d_lib.mesh.extraction.extract import select_level
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.metrics.image import iou, psnr
-from dg4d_lib.metrics.surface import chamfer_of_points, sample_surface
-from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
+from dg4d_lib.metrics.surface import chamfer_distance, sample_surface
+from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.settings import MeshSettings
 from steps.artifacts.packages import ASSET, COMPACT
-from steps.extract_mesh import textured
+from steps.extract_mesh import textured_mesh
 
 AZIMUTHS_DEG = (0.0, 90.0)  # the input view, and the right side
 SIZE = 512  # pixels
@@ -61,18 +61,18 @@ def of_package(folder: Path, count: int, rasterize: Rasterizer) -> list[Row]:
     asset = read_glb((folder / ASSET).read_bytes())
     fit = read_compact(folder / COMPACT)
     gaussians, deformation, frames = fit.gaussians, fit.deformation, fit.frames
-    first = moved(gaussians, deformation, frames, torch.zeros(1)).at(0)
-    level, _ = best_level(density_field(first, SETTINGS), first, rasterize, SETTINGS.density_threshold)
+    first = pose_gaussians(gaussians, deformation, frames, torch.zeros(1)).at(0)
+    level, _ = select_level(density_field(first, SETTINGS), first, rasterize, SETTINGS.density_threshold)
     chosen = [i * frames // count for i in range(count)]
-    states = moved(gaussians, deformation, frames, torch.tensor(chosen, dtype=torch.float32))
+    states = pose_gaussians(gaussians, deformation, frames, torch.tensor(chosen, dtype=torch.float32))
     rows = []
     for i, frame in enumerate(chosen):
-        extracted = textured(states.at(i), level, rasterize, SETTINGS)
+        extracted = textured_mesh(states.at(i), level, rasterize, SETTINGS)
         tracked = replace(asset.mesh, vertices=asset.mesh.vertices + asset.offsets[frame])
         truth, generator = splats(states.at(i), rasterize), torch.Generator().manual_seed(frame)
         for mode, mesh in (("tracked", tracked), ("per_frame", extracted)):
             points = [sample_surface(each.vertices, each.faces, POINTS, generator) for each in (mesh, extracted)]
-            apart = chamfer_of_points(*points)
+            apart = chamfer_distance(*points)
             rows.append(Row(folder.name, mode, 1, PER_WORLD_UNIT * apart, *look(mesh, truth)))
     return [mean_row(folder.name, [row for row in rows if row.mode == mode]) for mode in MODES]
 
@@ -107,7 +107,7 @@ def main() -> None:
     parser.add_argument("packages", type=Path, nargs="+", metavar="PACKAGE", help="folders that `dg4d make` wrote")
     parser.add_argument("--frames", type=int, default=4, help="frames per package, evenly spread")
     options = parser.parse_args()
-    rasterize = choose_rasterizer("auto")
+    rasterize = get_rasterizer("auto")
     count = 2 if options.quick else options.frames
     rows = [row for folder in options.packages for row in of_package(folder, count, rasterize)]
     means = [mean_row("mean", [row for row in rows if row.mode == mode]) for mode in MODES]

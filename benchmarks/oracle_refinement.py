@@ -35,13 +35,13 @@ from benchmarks.objects.specimens import FPS, OBJECTS, SCORED_AZIMUTHS_DEG
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.video_model import karras_sigmas, start_index
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.mesh.texturing.bake import Texels, texels_of, vertex_normals
+from dg4d_lib.mesh.texturing.bake import Texels, locate_texels, vertex_normals
 from dg4d_lib.mesh.texturing.unwrap import unwrap
-from dg4d_lib.mesh_rasterizer.texture import look_up, read
+from dg4d_lib.mesh_rasterizer.texture import build_lookup, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.metrics.image import psnr
 from dg4d_lib.settings import TextureSettings
-from dg4d_lib.texture.refine import MeshClip, Refined, refine_textures
+from dg4d_lib.texture.refine import MeshClip, RefinedTextures, refine_textures
 from dg4d_lib.video.driving import DrivingVideo
 
 SKIPPED = (0.6, 0.7, 0.75, 0.8)  # shares of the noise levels; the paper's "noise level" is .7
@@ -106,10 +106,12 @@ class Model:
         pictures = []
         for state, texture, camera in zip(states, textures, cameras, strict=True):
             fragments = rasterize_mesh(state, self.mesh.faces, [camera])
-            look = look_up(state, self.mesh.faces, self.mesh.uvs, texture.shape[:2], [camera], fragments)
+            look = build_lookup(state, self.mesh.faces, self.mesh.uvs, texture.shape[:2], [camera], fragments)
             picture = torch.ones(*look.covered.shape[1:], 4)
             picture[..., 3] = look.covered[0].float()
-            picture[look.covered[0]] = torch.cat([read(texture, look), torch.ones(int(look.covered.sum()), 1)], -1)
+            picture[look.covered[0]] = torch.cat(
+                [sample_texture(texture, look), torch.ones(int(look.covered.sum()), 1)], -1
+            )
             pictures.append(picture)
         return torch.stack(pictures)
 
@@ -129,7 +131,7 @@ def model_of(name: str, frames: int, texels: int) -> Model:
     rest = painted.vertices(0.0)
     copied, corners, uvs = (torch.from_numpy(part) for part in unwrap(rest.numpy(), painted.faces.numpy(), texels))
     vertices = rest[copied.long()]
-    places = texels_of(vertices, vertex_normals(vertices, corners), corners, uvs, texels)
+    places = locate_texels(vertices, vertex_normals(vertices, corners), corners, uvs, texels)
     tree = cKDTree(rest.numpy())
 
     def texture(neighbors: int) -> Float[Tensor, "n n 3"]:
@@ -175,23 +177,23 @@ class Oracle:
         return (believed + keep * (video + self.sigma * UNIT * left * noise - believed)).clamp(0, 1)
 
 
-def refined(model: Model, variant: Variant, settings: TextureSettings, seed: int) -> Refined:
+def refined(model: Model, variant: Variant, settings: TextureSettings, seed: int) -> RefinedTextures:
     """What the pipeline's loop makes of the blurred texture; the blurred texture itself without a noise level."""
     if not variant.changes:
-        return Refined(model.blurred)
+        return RefinedTextures(model.blurred)
     sigma = karras_sigmas(STEPS)[start_index(STEPS, 1 - variant.changes["skipped"])]
     front = [OrbitCamera(width=settings.size, height=settings.size)] * len(model.offsets)
     seen = model.draw([model.mesh.texture] * len(front), front)
     video = DrivingVideo(seen[..., :3], seen[..., 3:], FPS)
-    stretch = MeshClip(replace(model.mesh, texture=model.blurred), model.offsets)
+    clip = MeshClip(replace(model.mesh, texture=model.blurred), model.offsets)
     oracle = Oracle(model, sigma, whole_videos=not variant.per_frame)
-    return refine_textures([stretch], video, oracle, settings, torch.Generator().manual_seed(seed))[0]
+    return refine_textures([clip], video, oracle, settings, torch.Generator().manual_seed(seed))[0]
 
 
-def figures_of(model: Model, made: Refined, size: int) -> Figures:
+def figures_of(model: Model, made: RefinedTextures, size: int) -> Figures:
     """Against the true texture."""
     count = len(model.offsets)
-    textures = [made.texture] * count if made.frames is None else list(made.frames)
+    textures = [made.texture] * count if made.frame_textures is None else list(made.frame_textures)
     colors = torch.stack(textures)[:, model.texels.rows, model.texels.columns]
     marks = []
     for azimuth in SCORED_AZIMUTHS_DEG:

@@ -33,21 +33,21 @@ from diffusers.utils import logging
 from rich.table import Column, Table
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
-from dg4d_lib.diffusion.flop_counter import counted, counting_flops
+from dg4d_lib.diffusion.components import Placement, compute_dtype, frozen
+from dg4d_lib.diffusion.flop_counter import attach_flop_counter, count_flops
 from dg4d_lib.diffusion.latents import LATENT_CHANNELS
-from dg4d_lib.diffusion.parts import Placement, dtype_on, frozen
 from dg4d_lib.diffusion.single_token_attention import shorten_attention
 from dg4d_lib.diffusion.video_model import GIB, VideoModel
 from dg4d_lib.fitting.motion import fit_motion
 from dg4d_lib.fitting.static import fit_gaussians
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import blob
-from dg4d_lib.guidance.distillation import Annealing
+from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.interface import GuidancePrior
 from dg4d_lib.guidance.zero123 import CAMERA_NUMBERS, Zero123
 from dg4d_lib.images import over_white
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
+from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
 from dg4d_lib.settings import (
     BlobStartSettings,
     MotionSettings,
@@ -191,7 +191,7 @@ class Schedule:
         if on_gpu:
             forget_peak()
         clock.seconds, start = 0.0, clock.now()
-        with counting_flops() as flops:
+        with count_flops() as flops:
             made = work()
         seconds, floor = clock.now() - start, FLOORS_S[stage] if self.sizes == FULL else None
         row = Row(
@@ -209,9 +209,9 @@ class Schedule:
     def fit(self, model: Zero123, subject: torch.Tensor, clock: Clock) -> Gaussians:
         static = self.settings.static
         assert isinstance(static.start, BlobStartSettings)
-        start = blob(static.start.points, BLOB_RADIUS, seeded()).to(device_of("auto"))
+        start = blob(static.start.points, BLOB_RADIUS, seeded()).to(preferred_device("auto"))
         prior = conditioned(model, subject[None], static, clock)
-        return fit_gaussians(start, subject, prior, choose_rasterizer("auto"), static, seeded())
+        return fit_gaussians(start, subject, prior, get_rasterizer("auto"), static, seeded())
 
     def fit_motion(self, model: Zero123, gaussians: Gaussians, video: DrivingVideo, clock: Clock) -> None:
         dynamic = self.settings.motion
@@ -219,15 +219,15 @@ class Schedule:
             self.settings.deformation, gaussians.to(torch.device("cpu")), len(video), seeded()
         )
         deformation.to(gaussians.means.device)
-        prior = conditioned(model, torch.cat([video.frames, video.coverage], -1), dynamic, clock)
-        fit_motion(gaussians, deformation, video, prior, choose_rasterizer("auto"), dynamic, seeded())
+        prior = conditioned(model, torch.cat([video.frames, video.alpha], -1), dynamic, clock)
+        fit_motion(gaussians, deformation, video, prior, get_rasterizer("auto"), dynamic, seeded())
 
     def refine(self, settings: VideoToVideoSettings, model: VideoModel, video: DrivingVideo) -> None:
-        there = DrivingVideo(video.frames.to(self.device), video.coverage.to(self.device), video.fps)
+        there = DrivingVideo(video.frames.to(self.device), video.alpha.to(self.device), video.fps)
         refiner = VideoToVideo(settings, model, there.over(there.frames.new_ones(3))[0])
         mesh = ball(self.settings.mesh.texture_size, self.device)
-        stretches = [MeshClip(mesh, torch.zeros_like(mesh.vertices)[None])] * len(video)
-        refine_textures(stretches, there, refiner, settings.texture, seeded())
+        clips = [MeshClip(mesh, torch.zeros_like(mesh.vertices)[None])] * len(video)
+        refine_textures(clips, there, refiner, settings.texture, seeded())
 
     def zero123(self, settings: Zero123PriorSettings) -> Zero123:
         sizes = self.sizes
@@ -246,18 +246,18 @@ class Schedule:
         unet = shorten_attention(make(lambda: video_unet(sizes)))
         decoder = make(lambda: AutoencoderKLTemporalDecoder(**vae(sizes)))
         model = VideoModel(unet, decoder, make(lambda: image_encoder(sizes.eye)), settings, self.device)
-        clock.watch(model, "look_at", "encode", "decode", "denoise")
+        clock.watch(model, "encode_condition", "encode", "decode", "denoise")
         return model
 
     def network(self, precision: Precision, build: Callable[[], Any], channels_last: bool = False) -> Any:
-        placement = Placement(self.device, dtype_on(self.device, precision), channels_last)
+        placement = Placement(self.device, compute_dtype(self.device, precision), channels_last)
         with self.device:
-            return counted(frozen(build().to(placement.dtype), placement))
+            return attach_flop_counter(frozen(build().to(placement.dtype), placement))
 
 
 def forget_peak() -> None:
     """What is held now is the most memory of the GPU so far."""
-    gc.collect()  # networks that are counted or watched are part of a circle
+    gc.collect()  # networks that have a flop counter or hooks are part of a circle
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()
 
@@ -267,7 +267,7 @@ def conditioned(
 ) -> GuidancePrior:
     """The prior that knows some frames, watched by the clock."""
     clock.watch(
-        prior := model.conditioned_on(over_white(cutouts), Annealing(stage.t_max_start, stage.t_max_end)), "loss"
+        prior := model.conditioned_on(over_white(cutouts), TimestepSchedule(stage.t_max_start, stage.t_max_end)), "loss"
     )
     return prior
 

@@ -31,7 +31,7 @@ def gsplat_torch(cloud: Gaussians, camera: OrbitCamera) -> Callable[[], tuple[Te
     """
     gsplat: Any = importlib.import_module("gsplat.cuda._torch_impl")
     width, height = camera.width, camera.height
-    pose = camera.world_to_camera().float()[None]
+    pose = camera.viewmat().float()[None]
     lens = torch.tensor([[[camera.focal, 0, width / 2], [0, camera.focal, height / 2], [0, 0, 1]]])
     nerfacc, behind = _nerfacc(), torch.cat((WHITE, torch.zeros(1)))
 

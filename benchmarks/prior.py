@@ -25,16 +25,16 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.motion import fit_motion
 from dg4d_lib.fitting.static import fit_gaussians
-from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.images import over_white, resize
 from dg4d_lib.metrics.image import iou, psnr
 from dg4d_lib.metrics.video import motion_amount, temporal_error
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import LgmStartSettings
 from dg4d_lib.video.driving import DrivingVideo
-from dg4d_lib.video.subject import prepare
+from dg4d_lib.video.subject import prepare_subject
 from steps.artifacts.motions import new_deformation
-from steps.fit_gaussians import starting_cloud
+from steps.fit_gaussians import initial_gaussians
 from steps.fitting.priors import make_prior, subject_shapes
 from steps.profiles import PREVIEW, PipelineSettings, revise
 from training.shape_prior.samples import make_views
@@ -87,13 +87,13 @@ def score_prior(subject: Subject, settings: PipelineSettings, frames: Sequence[i
     Returns:
         Figures, and the views of the first of these frames side by side, over white.
     """
-    cutouts, _ = prepare(subject.footage, True, settings.subject)
+    cutouts, _ = prepare_subject(subject.footage, True, settings.subject)
     shapes = subject_shapes(settings.prior, [cutouts[frame] for frame in frames], settings.subject.turn_deg)
     size = next(iter(subject.views.values())).shape[1]
     rows, strip = [], []
     for azimuth, truth in subject.views.items():
         camera = OrbitCamera(0, azimuth, width=size, height=size)
-        color, alpha = shapes.clean([View(camera, number) for number in range(len(frames))])
+        color, alpha = shapes.clean([GuidanceView(camera, number) for number in range(len(frames))])
         rows.append(_figures(color, alpha, truth[list(frames)]))
         strip.append(color[0])
     return _mean(rows), torch.cat(strip, 1)
@@ -105,11 +105,11 @@ def score_fit(subject: Subject, settings: PipelineSettings, seed: int = 0) -> tu
     Returns:
         Figures, and the views of the first frame side by side, over white.
     """
-    rasterize, generator = choose_rasterizer("auto"), torch.Generator().manual_seed(seed)
-    cutouts, _ = prepare(subject.footage, True, settings.subject)
+    rasterize, generator = get_rasterizer("auto"), torch.Generator().manual_seed(seed)
+    cutouts, _ = prepare_subject(subject.footage, True, settings.subject)
     turn_deg, start_settings = settings.subject.turn_deg, settings.static.start
     assert not isinstance(start_settings, LgmStartSettings), "these fits start without LGM"
-    start = starting_cloud(cutouts[0], start_settings, settings.prior, turn_deg, generator)
+    start = initial_gaussians(cutouts[0], start_settings, settings.prior, turn_deg, generator)
     prior = make_prior(settings.prior, [cutouts[0]], settings.static, None, Path(), turn_deg).prior
     rest = fit_gaussians(start, cutouts[0], prior, rasterize, settings.static, generator)
     prior = make_prior(settings.prior, list(cutouts), settings.motion, None, Path(), turn_deg).prior

@@ -32,15 +32,15 @@ from benchmarks.peers import WHITE, blended_pairs, gsplat_torch
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
-from dg4d_lib.kernels.vectors import LANES, LONG, Vectors
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
+from dg4d_lib.kernels.simd import LANES, LONG, SimdBuilder
 from dg4d_lib.kernels.workers import Scratch
-from dg4d_lib.rasterizer.cpu import packed
+from dg4d_lib.rasterizer.cpu import pack_camera
 from dg4d_lib.rasterizer.cpu_bins import TILE, bin_by_tile
 from dg4d_lib.rasterizer.cpu_blend import PLANE
 from dg4d_lib.rasterizer.cpu_project import RECORD, WHITEN_A, WHITEN_B, WHITEN_C, project, unproject
-from dg4d_lib.rasterizer.cpu_tiles import blend, blend_backward, gather, own_rows
-from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
+from dg4d_lib.rasterizer.cpu_tiles import add_duplicates, assign_rows, blend, blend_backward
+from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 
 COUNTS, SIZES, VIEWS = (5_000, 20_000, 100_000), (128, 256, 512), (1, 16, 56)
 QUICK_COUNTS, QUICK_SIZES, QUICK_VIEWS = (5_000, 20_000), (128, 256), (1, 16)
@@ -82,7 +82,7 @@ def bumpy_ball(count: int, states: int = 0) -> Gaussians:
     if states:
         phase = torch.linspace(0, 6, states)[:, None, None]
         fields = {name: value + 0.05 * torch.sin(phase + 4 * value) for name, value in fields.items()}
-    cloud = Gaussians(**fields, opacity_logits=opacities.logit(), harmonics=harmonics_of_color(colors))
+    cloud = Gaussians(**fields, opacity_logits=opacities.logit(), harmonics=rgb_to_sh(colors))
     return Gaussians(**{name: value.requires_grad_() for name, value in vars(cloud).items()})
 
 
@@ -109,7 +109,7 @@ def _backward(cloud: Gaussians, pictures: Sequence[Tensor]) -> None:
 
 def cell(count: int, size: int, views: Sequence[int], rounds: int) -> tuple[dict[str, Times], list[str]]:
     """Times per view of everything that draws this many Gaussians at this size, and the names of missing peers."""
-    fast, plain = choose_rasterizer("cpu"), choose_rasterizer("reference")
+    fast, plain = get_rasterizer("cpu"), get_rasterizer("reference")
     cloud, several, missing = bumpy_ball(count), views[1], []
     functions: dict[str, Callable[[], object]] = {}
     views_drawn: dict[str, float] = {}
@@ -145,7 +145,7 @@ def phases(count: int, size: int, rounds: int) -> tuple[dict[str, float], float]
     state = [value.detach().numpy() for value in (cloud.means, cloud.quats, cloud.log_scales.exp())]
     coefficients = cloud.harmonics.detach()[:, 0].numpy()
     log_opacities = torch.nn.functional.logsigmoid(cloud.opacity_logits.detach()).numpy()
-    lens = packed(camera)
+    lens = pack_camera(camera)
     across = -(-size // TILE)
     records, keys = np.empty((count, RECORD), np.float32), np.empty(count, np.float32)
     gradients = [np.zeros_like(value) for value in state]
@@ -167,9 +167,9 @@ def phases(count: int, size: int, rounds: int) -> tuple[dict[str, float], float]
         blend(records, offsets, entries, white, *planes, *kept, 0, across * across)
         marks.append(time.thread_time())
         slots = scratch.empty(entries.shape, np.uint32)
-        moments = scratch.empty((own_rows(entries, count, slots), RECORD))
+        moments = scratch.empty((assign_rows(entries, count, slots), RECORD))
         blend_backward(records, offsets, entries, white, *planes, *kept, slots, moments, 0, across * across)
-        gather(entries, slots, count, moments)
+        add_duplicates(entries, slots, count, moments)
         marks.append(time.thread_time())
         unproject(*state, coefficients, lens, keys, moments, *gradients, *more, 0, count)
         marks.append(time.thread_time())
@@ -201,7 +201,7 @@ def _chains(typing_context, turns):
     """Twelve sums, each multiplied and added to `turns` times; gives a number that depends on all."""
 
     def generate(context, builder, signature, arguments):
-        e = Vectors(builder)
+        e = SimdBuilder(builder)
         # all sums end near 1: numbers close to zero are slow on some processors
         factor, term = e.constant(0.999), e.constant([1e-3 * (1 + lane / LANES) for lane in range(LANES)])
         start = [e.constant(chain) for chain in range(_CHAINS)]

@@ -38,7 +38,7 @@ if [ "$(filters)" -lt 281 ]; then
 fi
 
 if [ "$CUDA" = 1 ]; then
-    lacks=$("$VENV/bin/python" -c 'from dg4d_lib.rasterizer.choice import what_gsplat_lacks; print(what_gsplat_lacks())')
+    lacks=$("$VENV/bin/python" -c 'from dg4d_lib.rasterizer.backends import gsplat_unavailable_reason; print(gsplat_unavailable_reason())')
     [ -z "$lacks" ] || echo "The GPU cannot be used yet: $lacks" >&2
     command -v nvcc >/dev/null || [ -x "${CUDA_HOME:-/usr/local/cuda}/bin/nvcc" ] || {
         echo "gsplat compiles its kernels at first use and needs nvcc (CUDA toolkit 13.0) and g++." >&2

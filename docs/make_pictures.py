@@ -23,7 +23,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from flows.convert import connect
 from flows.serving import background
 from steps.artifacts.packages import read_manifest
@@ -50,7 +50,7 @@ def write_animation(package: Path, path: Path) -> None:
     """Write input picture, lit mesh and splats side by side while the camera sways."""
     manifest = read_manifest(package)
     states, surface = read_states(package, manifest), read_surface(package, manifest)
-    draw = choose_rasterizer("auto")
+    draw = get_rasterizer("auto")
     subject = _over_white(Image.open(package / "input" / "subject.png").resize((SIZE, SIZE), Image.Resampling.LANCZOS))
     count = round(LOOPS * manifest.frames / manifest.fps * FPS)
     pictures = []
@@ -73,7 +73,7 @@ def lit(mesh: TexturedMesh, camera: OrbitCamera) -> Float[Tensor, "h w 3"]:
     normals = torch.from_numpy(SmoothNormals(vertices, faces)(vertices))
     fragments = rasterize_mesh(mesh.vertices, mesh.faces, [camera])
     seen = torch.nn.functional.normalize(interpolate(fragments, mesh.faces, normals), dim=-1)
-    axes = camera.world_to_camera()[:3, :3].to(seen)
+    axes = camera.viewmat()[:3, :3].to(seen)
     light = torch.nn.functional.normalize(torch.tensor(LIGHT), dim=0)
     cosine = ((seen @ axes.T) * light).sum(-1, keepdim=True).clamp_min(0)
     return (color * (AMBIENT + DIFFUSE * cosine) * alpha + 1 - alpha)[0].clamp(0, 1)

@@ -56,7 +56,7 @@ class Beetle:
         return np.stack([self._legs()(points), horns, ellipsoid(*SHELL)(points)], 1)
 
     def at(self, moment: float) -> ndarray:
-        """It stands still at every moment."""
+        """Return the vertices at rest: it stands still at every moment."""
         return self.skin.points
 
     def color(self, p: ndarray, features: ndarray) -> ndarray:

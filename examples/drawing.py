@@ -30,7 +30,7 @@ class Creature(Protocol):
 
     @property
     def features(self) -> ndarray:
-        """What its paint needs to know at every vertex, "v k"."""
+        """Inputs of its paint at every vertex, "v k"."""
         ...
 
     def at(self, moment: float) -> ndarray:
@@ -43,7 +43,7 @@ class Creature(Protocol):
 
 
 def draw(creature: Creature, moment: float, camera: OrbitCamera) -> Float[Tensor, "h w 4"]:
-    """A cut-out of the creature, straight alpha."""
+    """Draw a cut-out of the creature, straight alpha."""
     rest, points = creature.skin, creature.at(moment)
     fine = replace(camera, width=SAMPLES * camera.width, height=SAMPLES * camera.height)
     faces = torch.from_numpy(rest.faces.astype(np.int64))
@@ -62,7 +62,7 @@ def draw(creature: Creature, moment: float, camera: OrbitCamera) -> Float[Tensor
 
 
 def _shade(color: ndarray, normal: ndarray, openness: ndarray, towards_eye: ndarray) -> ndarray:
-    """Wrapped light from above, light from the sky and the ground, a soft highlight; darker in folds."""
+    """Shade with wrapped light from above, light of sky and ground, a soft highlight, and darker folds."""
     wrapped = np.clip((normal @ KEY + 0.35) / 1.35, 0, 1)[:, None]
     sky = 0.5 + 0.5 * normal[:, 1:2]
     light = openness * (AMBIENT + 0.10 * sky + 0.62 * wrapped)

@@ -23,7 +23,7 @@ def states(path: str | Path, time: float) -> dict[str, Array]:
         about = json.loads(file.metadata()["asset4d"])
     low, high = t["deformation.bounds"]
     x, y, z = np.clip((t["gaussians.means"] - low) / (high - low), 0, 1).T
-    w = np.full_like(x, time * about["last_moment"])
+    w = np.full_like(x, time * about["last_time"])
     places = [(y, x), (z, x), (z, y), (w, x), (w, y), (w, z)]
     levels = range(len(about["settings"]["scales"]))
     tables = [[*t[f"deformation.space.{level}"], *t[f"deformation.time.{level}"]] for level in levels]
@@ -44,5 +44,5 @@ def read(plane: Array, place: tuple[Array, Array]) -> Array:
 
 
 def linear(t: dict[str, Array], name: str, rows: Array) -> Array:
-    """A layer of the network."""
+    """Apply a layer of the network."""
     return rows @ t[f"deformation.{name}.weight"].T + t[f"deformation.{name}.bias"]

@@ -165,7 +165,7 @@ class Newt:
 
     @cached_property
     def features(self) -> ndarray:
-        """What the paint needs to know at every vertex, "v 7"; smooth, so that pixels may interpolate it.
+        """Inputs of the paint at every vertex, "v 7"; smooth, so that pixels may interpolate it.
 
         Share of the spine, height on the body, distance beyond the body, the legs, the spots, their specks, and 1 where
         the crest may be.

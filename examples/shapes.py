@@ -40,7 +40,7 @@ class Chain:
 
 
 def smooth_chain(joints: Sequence[tuple[float, float, float, float]], count: int) -> Chain:
-    """A tube through (x, y, z, radius), splined, with `count` joints at equal steps of length."""
+    """Join a tube through (x, y, z, radius), splined, with `count` joints at equal steps of length."""
     knots = np.array(joints)
     at = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(knots[:, :3], axis=0), axis=1))])
     values = CubicSpline(at, knots)(np.linspace(0, at[-1], count))
@@ -48,7 +48,7 @@ def smooth_chain(joints: Sequence[tuple[float, float, float, float]], count: int
 
 
 def ellipsoid(center: Sequence[float] | ndarray, radii: Sequence[float]) -> Field:
-    """An ellipsoid's distance, exact on its surface and nearly so around it."""
+    """Return the distance to an ellipsoid, exact on its surface and nearly so around it."""
     middle, size = np.array(center), np.array(radii)
 
     def field(p: ndarray) -> ndarray:
@@ -89,7 +89,7 @@ class Skin:
 
 
 def skin(field: Field, low: Sequence[float], high: Sequence[float]) -> Skin:
-    """The zero level of a distance inside a box."""
+    """Extract the zero level of a distance inside a box."""
     axes = [np.arange(a, b + CELL, CELL, dtype=np.float32) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     values = _near_surface(field, grid)
@@ -105,7 +105,7 @@ def skin(field: Field, low: Sequence[float], high: Sequence[float]) -> Skin:
 
 
 def _near_surface(field: Field, grid: ndarray) -> ndarray:
-    """The field on a grid, exact within two coarse cells of the surface, interpolated elsewhere."""
+    """Sample the field on a grid, exact within two coarse cells of the surface, interpolated elsewhere."""
     coarse = grid[::COARSE, ::COARSE, ::COARSE]
     rough = field(coarse.reshape(-1, 3)).reshape(coarse.shape[:3])
     places = [np.arange(n) / COARSE for n in grid.shape[:3]]
@@ -116,7 +116,7 @@ def _near_surface(field: Field, grid: ndarray) -> ndarray:
 
 
 def normals(points: ndarray, faces: ndarray) -> ndarray:
-    """Unit normals of the vertices, weighted by area."""
+    """Return unit normals of the vertices, weighted by area."""
     corners = points[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.zeros_like(points)

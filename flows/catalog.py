@@ -12,7 +12,6 @@ from prefect.cache_policies import NO_CACHE
 from prefect.context import FlowRunContext
 from prefect.exceptions import TerminationSignal
 from prefect.futures import PrefectFuture
-from prefect.settings import temporary_settings
 from prefect.task_runners import TaskRunner
 
 from flows import home
@@ -22,7 +21,7 @@ from flows.engine.executors import stop_all
 from flows.engine.item_runs import failure, item_deployment
 from flows.engine.orphans import claim_run
 from flows.engine.runners import item_runner
-from flows.engine.step_tasks import flow_settings
+from flows.engine.step_tasks import flow_context
 from flows.inputs.manifest import Item
 from flows.inputs.orders import Order
 from flows.inputs.places import parse_where
@@ -63,7 +62,7 @@ def run_catalog(request: CatalogRequest, title: str, tally: Tally, allow: Allow 
     Raises:
         KeyboardInterrupt: the user stopped it; what is done stays, and `tally` knows it.
     """
-    with temporary_settings(flow_settings()), _known(request.out, tally):
+    with flow_context(), _known(request.out, tally):
         if FlowRunContext.get() is None:
             catalog(request, title)
         else:
@@ -74,7 +73,7 @@ def run_orders(orders: list[Order], out: Path, workers: int, title: str, tally: 
     """Make orders as `run_catalog` makes a catalog."""
     lines = "".join(f"{order.model_dump_json()}\n" for order in orders)
     listed = home.store().put_bytes(lines.encode(), ORDERS)
-    with temporary_settings(flow_settings()), _known(out, tally):
+    with flow_context(), _known(out, tally):
         if FlowRunContext.get() is None:
             convert_orders(listed, out, workers, title)
         else:

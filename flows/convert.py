@@ -141,11 +141,10 @@ def make_motions(order: Order, folder: Path) -> dict[str, Any]:
 def _surroundings(order: Order, settings: dict[Any, Any] | None = None) -> Iterator[None]:
     """What a flow of an order runs in, with these settings of Prefect beside those of every flow."""
     from prefect import tags
-    from prefect.settings import temporary_settings
 
-    from flows.engine.step_tasks import flow_settings
+    from flows.engine.step_tasks import flow_context
 
-    with temporary_settings({**flow_settings(), **(settings or {})}), tags(order.profile):
+    with flow_context(settings), tags(order.profile):
         yield
 
 

@@ -5,11 +5,10 @@ from typing import Any, Literal
 
 from prefect import flow
 from prefect.artifacts import create_table_artifact
-from prefect.settings import temporary_settings
 
 from dg4d_lib.errors import BadInput
 from flows import home
-from flows.engine.step_tasks import Conversion, flow_settings
+from flows.engine.step_tasks import Conversion, flow_context
 from flows.formatting.escaping import markdown
 from flows.packages import scores
 from flows.packages.scores import ObjectScores, Results
@@ -90,7 +89,7 @@ def benchmark(entries: list[Entry], settings: ScoreAssetSettings, title: str, ou
 
 def judge(entries: list[Entry], settings: ScoreAssetSettings, title: str, ours: str, seed: int = 0) -> Judged:
     """Run the flow."""
-    with temporary_settings(flow_settings()):
+    with flow_context():
         return benchmark(entries, settings, title, ours, seed)
 
 

@@ -1,74 +1,72 @@
-"""Every step by name; imports no step and no torch.
+"""Catalog of all steps with their inputs and outputs; imports no step and no torch.
 
-Artifacts between steps:
-  frames      a stored zip of NNN.png (RGBA, straight alpha, square) and video.json {"fps": ...}
+Artifacts:
+  frames      uncompressed zip of NNN.png (RGBA, straight alpha, square) and video.json {"fps": ...}
   pose        JSON {"turn_deg": ...}: turn of the subject's plane that its footage shows, 0 where it shows none
-  gaussians   a standard 3DGS PLY (float32)
-  motion      safetensors; metadata says the kind of deformation, its settings and the number of frames
+  gaussians   standard 3DGS PLY (float32)
+  motion      safetensors; metadata: kind of deformation, its settings and the number of frames
   plan        JSON of steps/artifacts/mesh_plan.py: {"mode": "tracked" or "per_frame", "level": ..., ...}
   tracked     safetensors of a tracked mesh: vertices, faces, uvs, texture (uint8), offsets
-  meshes      a stored zip of NNN.safetensors, a textured mesh per frame
+  meshes      uncompressed zip of NNN.safetensors, a textured mesh per frame
   ranking     JSON {"weights": {...}, "candidates": [{"number": ..., "name": ..., "total": ..., ...}]}, best first
-  films       a stored zip of N.mp4, one per candidate
+  films       uncompressed zip of N.mp4, one per candidate or view
   gates       JSON {"accepted": ..., "failing": [...], "gates": [{"name", "passed", "value", "least", "most", ...}]}
-  truth       a stored zip of input/NNN.png, view_<azimuth>/NNN.png and, where it is known, mesh.npz
+  truth       uncompressed zip of input/NNN.png, view_<azimuth>/NNN.png and optionally mesh.npz
   scores      JSON {"frames": ..., "size": ..., "rows": {name: {"input", "views", "mean", "geometry"}}, "clips": ...,
-              "missing": {metric: what gets it}, "notes": [...]}
+              "missing": {metric: remedy}, "notes": [...]}
   curves      JSON {"title": ..., "x": [...], "series": {name: [...]}, "notes": [...]}
 """
 
+from typing import Any
+
 from steps.contract import Port, StepSpec
 
-PNG = Port(media_type="image/png", suffix=".png")
-FRAMES = Port(media_type="application/vnd.dg4d.frames+zip", suffix=".zip")
-POSE = Port(media_type="application/vnd.dg4d.pose+json", suffix=".json")
-PLY = Port(media_type="application/vnd.dg4d.gaussians+ply", suffix=".ply")
-MOTION = Port(media_type="application/vnd.dg4d.motion+safetensors", suffix=".safetensors")
-PLAN = Port(media_type="application/vnd.dg4d.mesh-plan+json", suffix=".json")
-TRACKED = Port(media_type="application/vnd.dg4d.tracked+safetensors", suffix=".safetensors")
-MESHES = Port(media_type="application/vnd.dg4d.meshes+zip", suffix=".zip")
-CURVES = Port(media_type="application/vnd.dg4d.curves+json", suffix=".json")
-RANKING = Port(media_type="application/vnd.dg4d.ranking+json", suffix=".json")
-FILMS = Port(media_type="application/vnd.dg4d.films+zip", suffix=".zip")
-TRUTH = Port(media_type="application/vnd.dg4d.truth+zip", suffix=".zip")
-GATES = Port(media_type="application/vnd.dg4d.gates+json", suffix=".json")
-SCORES = Port(media_type="application/vnd.dg4d.scores+json", suffix=".json")
-PACKAGE = Port(media_type="application/vnd.dg4d.package+zip", suffix=".zip")
-TEXT = Port(media_type="text/plain", suffix=".txt")
-SOURCE = Port(media_type="application/octet-stream", suffix="")
-BANK = Port(media_type="application/vnd.dg4d.bank+zip", suffix=".zip")
+
+def _port(kind: str, form: str) -> Port:
+    return Port(media_type=f"application/vnd.dg4d.{kind}+{form}", suffix=f".{form}")
 
 
 def _optional(port: Port) -> Port:
     return port.model_copy(update={"optional": True})
 
 
+def _step(name: str, inputs: dict[str, Port], outputs: dict[str, Port], **fields: Any) -> StepSpec:
+    return StepSpec(name=name, entry=f"steps.{name}:run", inputs=inputs, outputs=outputs, **fields)
+
+
+PNG = Port(media_type="image/png", suffix=".png")
+TEXT = Port(media_type="text/plain", suffix=".txt")
+SOURCE = Port(media_type="application/octet-stream", suffix="")
+FRAMES = _port("frames", "zip")
+POSE = _port("pose", "json")
+PLY = _port("gaussians", "ply")
+MOTION = _port("motion", "safetensors")
+PLAN = _port("mesh-plan", "json")
+TRACKED = _port("tracked", "safetensors")
+MESHES = _port("meshes", "zip")
+CURVES = _port("curves", "json")
+RANKING = _port("ranking", "json")
+FILMS = _port("films", "zip")
+TRUTH = _port("truth", "zip")
+GATES = _port("gates", "json")
+SCORES = _port("scores", "json")
+PACKAGE = _port("package", "zip")
+BANK = _port("bank", "zip")
+EITHER_MESH = {"tracked": _optional(TRACKED), "meshes": _optional(MESHES)}
+
 STEPS: dict[str, StepSpec] = {
     spec.name: spec
     for spec in (
-        StepSpec(
-            name="draw_picture",
-            version="1",
-            entry="steps.draw_picture:run",
-            sections=("text",),
-            inputs={"text": TEXT},
-            outputs={"picture": PNG},
-            resource="gpu",
-        ),
-        StepSpec(
-            name="prepare_subject",
-            version="1",
-            entry="steps.prepare_subject:run",
-            sections=("subject",),
+        _step("draw_picture", {"text": TEXT}, {"picture": PNG}, sections=("text",), resource="gpu"),
+        _step(
+            "prepare_subject",
             inputs={"source": SOURCE},
             outputs={"subject": PNG, "footage": _optional(FRAMES), "pose": _optional(POSE), "picture": PNG},
-            timeout_s=2400,  # a decoder that hangs in one frame cannot be stopped from within
+            sections=("subject",),
+            timeout_s=2400,  # bounds decoders that hang in native code
         ),
-        StepSpec(
-            name="drive_video",
-            version="1",
-            entry="steps.drive_video:run",
-            sections=("driving", "subject.turn_deg"),
+        _step(
+            "drive_video",
             inputs={"subject": PNG, "footage": _optional(FRAMES)},
             outputs={
                 "driving_video": FRAMES,
@@ -77,92 +75,59 @@ STEPS: dict[str, StepSpec] = {
                 "ranking": _optional(RANKING),
                 "films": _optional(FILMS),
             },
+            sections=("driving", "subject.turn_deg"),
             resource="gpu",
-            late_imports=("dg4d_lib.kernels.compiling:load",),
+            late_imports=("dg4d_lib.kernels.compiling:preload_numba",),
         ),
-        StepSpec(
-            name="fit_gaussians",
-            version="1",
-            entry="steps.fit_gaussians:run",
-            sections=("rasterizer", "subject.turn_deg", "prior", "static"),
+        _step(
+            "fit_gaussians",
             inputs={"subject": PNG, "pose": _optional(POSE), "bank": _optional(BANK)},
             outputs={"gaussians": PLY, "curves": CURVES, "picture": PNG},
+            sections=("rasterizer", "subject.turn_deg", "prior", "static"),
             resource="gpu",
-            late_imports=("dg4d_lib.rasterizer.cpu", "torch._dynamo"),  # the latter: of any optimizer
+            late_imports=("dg4d_lib.rasterizer.cpu", "torch._dynamo"),  # torch's optimizers import the latter
         ),
-        StepSpec(
-            name="fit_motion",
-            version="1",
-            entry="steps.fit_motion:run",
-            sections=("rasterizer", "subject.turn_deg", "prior", "deformation", "motion"),
+        _step(
+            "fit_motion",
             inputs={"gaussians": PLY, "driving_video": FRAMES, "pose": _optional(POSE), "bank": _optional(BANK)},
             outputs={"motion": MOTION, "gaussians": _optional(PLY), "curves": CURVES, "picture": PNG},
+            sections=("rasterizer", "subject.turn_deg", "prior", "deformation", "motion"),
             resource="gpu",
         ),
-        StepSpec(
-            name="plan_mesh",
-            version="1",
-            entry="steps.plan_mesh:run",
-            sections=("rasterizer", "mesh"),
-            inputs={"gaussians": PLY, "motion": MOTION},
-            outputs={"plan": PLAN},
-        ),
-        StepSpec(
-            name="extract_mesh",
-            version="1",
-            entry="steps.extract_mesh:run",
+        _step("plan_mesh", {"gaussians": PLY, "motion": MOTION}, {"plan": PLAN}, sections=("rasterizer", "mesh")),
+        _step(
+            "extract_mesh",
+            inputs={"gaussians": PLY, "motion": MOTION, "plan": PLAN},
+            outputs={**EITHER_MESH, "picture": PNG},
             settings="steps.profiles:FrameRange",
             sections=("rasterizer", "mesh"),
-            inputs={"gaussians": PLY, "motion": MOTION, "plan": PLAN},
-            outputs={"tracked": _optional(TRACKED), "meshes": _optional(MESHES), "picture": PNG},
         ),
-        StepSpec(
-            name="join_meshes",
-            version="1",
-            entry="steps.join_meshes:run",
-            inputs={"meshes": MESHES.model_copy(update={"many": True})},
-            outputs={"meshes": MESHES},
-        ),
-        StepSpec(
-            name="refine_texture",
-            version="1",
-            entry="steps.refine_texture:run",
+        _step("join_meshes", {"meshes": MESHES.model_copy(update={"many": True})}, {"meshes": MESHES}),
+        _step(
+            "refine_texture",
+            inputs={**EITHER_MESH, "driving_video": FRAMES},
+            outputs=EITHER_MESH,
             sections=("refiner",),
-            inputs={"tracked": _optional(TRACKED), "meshes": _optional(MESHES), "driving_video": FRAMES},
-            outputs={"tracked": _optional(TRACKED), "meshes": _optional(MESHES)},
             resource="gpu",
         ),
-        StepSpec(
-            name="pack_asset",
-            version="1",
-            entry="steps.pack_asset:run",
+        _step(
+            "pack_asset",
+            inputs={"subject": PNG, "driving_video": FRAMES, "gaussians": PLY, "motion": MOTION, **EITHER_MESH},
+            outputs={"package": PACKAGE, "sheet": PNG},
             settings="steps.profiles:PackNotes",
             sections=("rasterizer", "pack"),
-            inputs={
-                "subject": PNG,
-                "driving_video": FRAMES,
-                "gaussians": PLY,
-                "motion": MOTION,
-                "tracked": _optional(TRACKED),
-                "meshes": _optional(MESHES),
-            },
-            outputs={"package": PACKAGE, "sheet": PNG},
         ),
-        StepSpec(
-            name="check_asset",
-            version="1",
-            entry="steps.check_asset:run",
-            sections=("rasterizer", "gates"),
+        _step(
+            "check_asset",
             inputs={"package": PACKAGE, "driving_video": FRAMES, "subject": PNG},
             outputs={"gates": GATES, "picture": PNG},
+            sections=("rasterizer", "gates"),
         ),
-        StepSpec(
-            name="score_asset",
-            version="1",
-            entry="steps.score_asset:run",
-            settings="steps.profiles:ScoreAssetSettings",
+        _step(
+            "score_asset",
             inputs={"package": _optional(PACKAGE), "truth": TRUTH},
             outputs={"scores": SCORES, "films": FILMS},
+            settings="steps.profiles:ScoreAssetSettings",
             resource="gpu",
         ),
     )

@@ -1,4 +1,4 @@
-"""Whether a package is good enough to be handed on: every gate, and a picture of where it falls short."""
+"""Step that checks a package against the quality gates."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -12,39 +12,40 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.asset_settings import GateSettings
-from dg4d_lib.assets.rendering.sheet import page
-from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
+from dg4d_lib.assets.rendering.sheet import draw_tiles
+from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.cameras.viewpoints import turntable
-from dg4d_lib.fitting.losses import resized
+from dg4d_lib.fitting.losses import resize_cutouts
 from dg4d_lib.images import color_over_white
-from dg4d_lib.mesh.extraction.check import checked, welded
-from dg4d_lib.metrics.gates import MESH, SPLATS, Evidence, Gate, Pictures, Turn, fidelity, judge
-from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
+from dg4d_lib.mesh.extraction.topology import check_topology, weld_vertices
+from dg4d_lib.metrics.gates import MESH, SPLATS, Gate, GateInputs, RgbaImages, Turntable, evaluate_gates, fidelity
+from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.archives import unpack
 from steps.artifacts.media import read_frames, read_png, write_png
 from steps.artifacts.packages import ASSET, COMPACT, MANIFEST, MESHES, read_manifest
 from steps.artifacts.packages import SPLATS as SPLATS_FOLDER
-from steps.artifacts.rendering import BATCH, States, Surface, drawn_mesh, mesh_at, read_states, read_surface
+from steps.artifacts.rendering import BATCH, States, Surface, mesh_at, mesh_renderer, read_states, read_surface
 from steps.runtime.job import Job, StepReport
 
-SIZE = 128  # pixels of the pictures; the bounds of the gates belong to it
-MOST_FRAMES = 32  # of the video, evenly spread
-MOMENTS = 4  # at which the asset is looked at from other sides
+SIZE = 128  # pixels of a side of the renders; the bounds of the gates were calibrated at this size
+MOST_FRAMES = 32  # frames of the video that are compared, evenly spaced
+TIMESTAMPS = 4  # number of frames that are rendered from other sides
 SIDES = ((0.0, 45.0), (10.0, 90.0), (0.0, 180.0), (10.0, 270.0))  # elevation and azimuth, degrees
-TURN = 24  # pictures of one turn
-COLUMNS = 4  # moments in the picture
-DIGITS = 4  # after the point, of every number
+TURN = 24  # renders of one turn
+COLUMNS = 4  # frames in the picture
+DIGITS = 4  # decimals of every number
+GATE_FIELDS = ("name", "passed", "value", "unit", "least", "most", "form", "values", "meaning", "advice")
 
 
 @dataclass(frozen=True)
-class Parts:
+class LoadedAsset:
     """An asset in memory.
 
     Attributes:
-        states: the cloud at positions of the animation.
-        surface: the mesh that moves, or a mesh per frame.
-        frames: of the animation.
+        states: Gaussians at positions of the animation.
+        surface: tracked mesh, or a mesh per frame.
+        frames: number of frames.
     """
 
     states: States
@@ -53,7 +54,7 @@ class Parts:
 
 
 def run(job: Job) -> StepReport:
-    """Write the gates as JSON, and a picture of the worst moments beside the video's.
+    """Write the gates as JSON, and a picture of the worst frames beside those of the video.
 
     Raises:
         BadInput: the package is broken.
@@ -62,19 +63,20 @@ def run(job: Job) -> StepReport:
     bounds: GateSettings = job.settings.gates
     with TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        parts = read_parts(job.inputs["package"], folder / "package")
+        asset = read_asset(job.inputs["package"], folder / "package")
         video = read_frames(job.inputs["driving_video"], folder)
-    evidence = gather(parts, video, read_png(job.inputs["subject"]), choose_rasterizer(job.settings.rasterizer))
-    gates = judge(evidence, bounds)
-    job.outputs["gates"].write_text(json.dumps(verdict(gates), ensure_ascii=False, allow_nan=False), encoding="utf-8")
+    rasterizer = get_rasterizer(job.settings.rasterizer)
+    evidence = collect_evidence(asset, video, read_png(job.inputs["subject"]), rasterizer)
+    answer = gates_as_json(evaluate_gates(evidence, bounds))
+    job.outputs["gates"].write_text(json.dumps(answer, ensure_ascii=False, allow_nan=False), encoding="utf-8")
     write_png(job.outputs["picture"], picture(evidence, (_spread(len(video), MOST_FRAMES) / video.fps).tolist()))
-    failing = [gate.name for gate in gates if not gate.passed]
+    failing = answer["failing"]
     notes = (f"Not accepted: {', '.join(failing)}. The report says what to do.",) if failing else ()
     return StepReport(backend=f"{job.settings.rasterizer} rasterizer", notes=notes)
 
 
-def read_parts(package: Path, folder: Path) -> Parts:
-    """What the gates need of a package; `folder` is where that is unpacked.
+def read_asset(package: Path, folder: Path) -> LoadedAsset:
+    """Read the parts of a package that the gates need; `folder` is for unpacking.
 
     Raises:
         BadInput: files are missing or broken.
@@ -82,83 +84,73 @@ def read_parts(package: Path, folder: Path) -> Parts:
     wanted = (MANIFEST, ASSET, COMPACT, f"{MESHES}/", f"{SPLATS_FOLDER}/")
     unpack(package, folder, "the package", lambda name: name.startswith(wanted))
     manifest = read_manifest(folder)
-    return Parts(read_states(folder, manifest), read_surface(folder, manifest), manifest.frames)
+    return LoadedAsset(read_states(folder, manifest), read_surface(folder, manifest), manifest.frames)
 
 
-def gather(parts: Parts, video: DrivingVideo, cutout: Float[Tensor, "h w 4"], rasterizer: Rasterizer) -> Evidence:
-    """Look at an asset from the input view, from four sides at four moments, and all around.
+def collect_evidence(
+    asset: LoadedAsset, video: DrivingVideo, cutout: Float[Tensor, "h w 4"], rasterizer: Rasterizer
+) -> GateInputs:
+    """Render an asset from the input view, from four sides at four timestamps, and all around.
 
     Args:
-        parts: the asset.
-        video: what it was fitted to; lasts as long as its animation.
-        cutout: the input picture.
-        rasterizer: draws the splats.
+        asset: asset to check.
+        video: driving video of its motion, of the same duration.
+        cutout: input picture.
+        rasterizer: rasterizer for the splats.
     """
     frames = _spread(len(video), MOST_FRAMES)
-    positions = frames * parts.frames / len(video)
+    positions = frames * asset.frames / len(video)
     front = OrbitCamera(width=SIZE, height=SIZE)
-    moments = positions[_spread(len(frames), MOMENTS).long()]
+    timestamps = positions[_spread(len(frames), TIMESTAMPS).long()]
     sides = [OrbitCamera(elevation_deg, azimuth_deg, width=SIZE, height=SIZE) for elevation_deg, azimuth_deg in SIDES]
     ring = turntable(TURN, front)
-    mesh = drawn_mesh(parts.surface)
+    mesh = mesh_renderer(asset.surface)
 
     def splats(positions: Float[Tensor, " b"], cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b s s 5"]:
         with torch.no_grad():
-            drawn = rasterizer(parts.states(positions), cameras, torch.ones(3))
+            drawn = rasterizer(asset.states(positions), cameras, torch.ones(3))
         depth = drawn.depth / drawn.alpha.clamp_min(torch.finfo(drawn.alpha.dtype).tiny)
         return torch.cat([drawn.color, drawn.alpha, depth], -1)
 
     def triangles(positions: Float[Tensor, " b"], cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b s s 4"]:
         drawn = mesh(positions, cameras)
-        color, coverage = drawn[..., :3], drawn[..., 3:]
-        return torch.cat([color_over_white(color, coverage), coverage], -1)
+        color, alpha = drawn[..., :3], drawn[..., 3:]
+        return torch.cat([color_over_white(color, alpha), alpha], -1)
 
     seen, around = {}, {}
     for form, draw in ((SPLATS, splats), (MESH, triangles)):
         seen[form] = _pictures(_drawn(draw, positions, [front] * len(positions)))
-        around[form] = _pictures(_drawn(draw, moments.repeat_interleave(len(sides)), sides * len(moments)))
+        around[form] = _pictures(_drawn(draw, timestamps.repeat_interleave(len(sides)), sides * len(timestamps)))
     turn = _drawn(splats, positions[:1].repeat(TURN), ring)
-    return Evidence(
+    return GateInputs(
         picture=_resized(cutout[None]),
-        video=_resized(torch.cat([video.frames, video.coverage], -1)[frames.long()]),
+        video=_resized(torch.cat([video.frames, video.alpha], -1)[frames.long()]),
         seen=seen,
         around=around,
-        turn=Turn(turn[..., 3:4], turn[..., 4:], world_to_camera(ring), front.focal),
-        flaws=max(_flaws(parts.surface, moment) for moment in moments),
+        turn=Turntable(turn[..., 3:4], turn[..., 4:], viewmats(ring), front.focal),
+        flaws=max(_flaws(asset.surface, timestamp) for timestamp in timestamps),
     )
 
 
-def verdict(gates: Sequence[Gate]) -> dict[str, Any]:
-    """What the gates say, as JSON."""
-    return {
-        "accepted": all(gate.passed for gate in gates),
-        "failing": [gate.name for gate in gates if not gate.passed],
-        "gates": [
-            {
-                "name": gate.name,
-                "passed": gate.passed,
-                "value": round(gate.value, DIGITS),
-                "unit": gate.unit,
-                "least": gate.least,
-                "most": gate.most,
-                "form": gate.form,
-                "values": {form: round(value, DIGITS) for form, value in gate.values.items()},
-                "meaning": gate.meaning,
-                "advice": gate.advice,
-            }
-            for gate in gates
-        ],
-    }
+def gates_as_json(gates: Sequence[Gate]) -> dict[str, Any]:
+    """Return the gates as JSON, with rounded values."""
+    rows = []
+    for gate in gates:
+        values = {form: round(value, DIGITS) for form, value in gate.values.items()}
+        rows.append({name: getattr(gate, name) for name in GATE_FIELDS})
+        rows[-1] |= {"value": round(gate.value, DIGITS), "values": values}
+    failing = [gate.name for gate in gates if not gate.passed]
+    return {"accepted": not failing, "failing": failing, "gates": rows}
 
 
-def picture(evidence: Evidence, seconds: Sequence[float]) -> Float[Tensor, "h w 3"]:
-    """The video, both forms of the asset and where they are off, in [0, 1].
+def picture(evidence: GateInputs, seconds: Sequence[float]) -> Float[Tensor, "h w 3"]:
+    """Compose a picture of the video, splats and mesh, and their differences, in [0, 1].
 
-    Columns are moments: the first, and of three equal parts of the video the one that is shown worst.
+    Columns are frames: the first, and the worst one of every third of the video.
 
     Args:
-        evidence: what was seen.
-        seconds: when the frames of the evidence are.
+        evidence: renders of the asset and frames of the video.
+        seconds: timestamps of the frames.
     """
     scores = torch.stack([fidelity(pictures, evidence.video) for pictures in evidence.seen.values()]).amin(0)
     thirds = torch.arange(len(scores)).tensor_split(COLUMNS - 1)
@@ -169,11 +161,11 @@ def picture(evidence: Evidence, seconds: Sequence[float]) -> Float[Tensor, "h w 
         rows[form] = pictures.color[columns]
         rows[f"{form} off by"] = 1 - (pictures.color - evidence.video.color)[columns].abs()
     headings = [f"{seconds[column]:.2f} s: {scores[column]:.1f} dB" for column in columns]
-    return page(torch.stack(list(rows.values())), list(rows), headings)
+    return draw_tiles(torch.stack(list(rows.values())), list(rows), headings)
 
 
 def _spread(count: int, most: int) -> Float[Tensor, " n"]:
-    """Numbers of so many things at most, evenly from the first to the last."""
+    """Return at most `most` indices below `count`, evenly spaced from the first to the last."""
     return torch.linspace(0, count - 1, min(count, most), dtype=torch.float64).round()
 
 
@@ -184,17 +176,17 @@ def _drawn(
     return torch.cat([draw(positions[part], cameras[part]) for part in parts])
 
 
-def _pictures(drawn: Float[Tensor, "b s s c"]) -> Pictures:
-    return Pictures(drawn[..., :3].clamp(0, 1).contiguous(), drawn[..., 3:4].clamp(0, 1).contiguous())
+def _pictures(drawn: Float[Tensor, "b s s c"]) -> RgbaImages:
+    return RgbaImages(drawn[..., :3].clamp(0, 1).contiguous(), drawn[..., 3:4].clamp(0, 1).contiguous())
 
 
-def _resized(cutouts: Float[Tensor, "b h w 4"]) -> Pictures:
-    return Pictures(*(part.contiguous() for part in resized(cutouts, SIZE)))
+def _resized(cutouts: Float[Tensor, "b h w 4"]) -> RgbaImages:
+    return RgbaImages(*(part.contiguous() for part in resize_cutouts(cutouts, SIZE)))
 
 
 def _flaws(surface: Surface, position: Float[Tensor, ""]) -> float:
-    """What is broken about the mesh of a moment: edges and triangles per triangle, and the share of inverted pieces."""
+    """Return the broken edges and triangles per triangle, plus the share of inverted components."""
     mesh = mesh_at(surface, position)
-    facts = checked(*welded(mesh.vertices.numpy(), mesh.faces.numpy()))
-    broken = facts.boundary + facts.crowded + facts.twisted + facts.flat
-    return broken / max(1, facts.triangles) + facts.inverted / max(1, facts.components)
+    facts = check_topology(*weld_vertices(mesh.vertices.numpy(), mesh.faces.numpy()))
+    broken = facts.boundary_edges + facts.nonmanifold_edges + facts.inconsistent_edges + facts.degenerate_faces
+    return broken / max(1, facts.triangles) + facts.inverted_components / max(1, facts.components)

@@ -1,4 +1,4 @@
-"""Several finished packages as one animated scene; behind `dg4d compose`."""
+"""Composition of finished packages into one animated scene, for `dg4d compose`."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -8,42 +8,42 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dg4d_lib.assets.animated import moved
+from dg4d_lib.assets.animated import pose_gaussians
 from dg4d_lib.assets.formats.compact import read_compact
 from dg4d_lib.assets.formats.usd import UsdPlacement, compose_usdz
-from dg4d_lib.assets.rendering.preview import pictures_over, studio, write_film
-from dg4d_lib.assets.scenes.compose import Actor, Body, compose_glb, in_a_row, scene_duration
-from dg4d_lib.assets.scenes.scene import Item, Scene
+from dg4d_lib.assets.rendering.preview import render_over, studio_background, write_mp4
+from dg4d_lib.assets.scenes.compose import Actor, AnimatedGlb, compose_glb, line_up, scene_duration
+from dg4d_lib.assets.scenes.scene import Scene, SceneItem
 from dg4d_lib.cameras.orbit import FOV_Y_DEG, RADIUS, OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.gaussians.placing import joined, placed
-from dg4d_lib.rasterizer.interface import choose_rasterizer
-from steps.artifacts.packages import ASSET, COMPACT, USD, read_manifest
+from dg4d_lib.gaussians.transform import concatenate, transform
+from dg4d_lib.rasterizer.interface import get_rasterizer
+from steps.artifacts.packages import ASSET, COMPACT, USD, read_file, read_manifest
 
 FILM_SIZE = 384  # pixels of a side
-MOST_PICTURES = 300  # of a film; they are kept until it is written
-SWING_DEG = 25.0  # how far the camera of the film goes to either side
-ELEVATION_DEG = 10.0  # of that camera
-FILLED = 0.9  # of the picture, by the ball around the scene
-BATCH = 8  # pictures of one rasterizer call, bounds the memory
+MOST_PICTURES = 300  # of a film; all are in memory until it is written
+SWING_DEG = 25.0  # amplitude of the camera's azimuth
+ELEVATION_DEG = 10.0  # of the camera
+FILLED = 0.9  # part of the picture that the scene's bounding sphere fills
+BATCH = 8  # pictures per rasterizer call, bounds the memory
+IDENTITY_QUAT = torch.tensor((1.0, 0.0, 0.0, 0.0))  # wxyz
 
 
-class Cast:
-    """The packages of a scene, each read once."""
+class SceneWriter:
+    """Writer of a scene, which reads each package once.
 
-    def __init__(self, folders: Sequence[Path], items: Sequence[Item], names: Sequence[str]) -> None:
-        """Read the bodies.
+    Args:
+        folders: package folder of every item.
+        items: position, time and speed of every item.
+        names: unique names in the scene.
 
-        Args:
-            folders: of the package of every item.
-            items: where and when.
-            names: in the scene, each once.
+    Raises:
+        BadInput: a folder is no package, or its asset cannot be placed in a scene.
+        BackendUnavailable: an asset is compressed, and the library that decodes it is not installed.
+    """
 
-        Raises:
-            BadInput: a folder is no package, or its asset cannot stand in a scene.
-            BackendUnavailable: an asset is compressed, and the package that unpacks it is missing.
-        """
+    def __init__(self, folders: Sequence[Path], items: Sequence[SceneItem], names: Sequence[str]) -> None:
         self.folders = list(folders)
         bodies = {folder: _body(folder) for folder in dict.fromkeys(folders)}
         self.actors = [
@@ -51,15 +51,15 @@ class Cast:
         ]
 
     def in_a_row(self, spacing: float) -> None:
-        """Put them side by side on the ground, whatever positions they have."""
-        positions = in_a_row([actor.body for actor in self.actors], spacing)
+        """Place the items side by side on the ground, instead of at their own positions."""
+        positions = line_up([actor.glb for actor in self.actors], spacing)
         self.actors = [
-            Actor(actor.name, actor.body, actor.item.model_copy(update={"position": position}))
+            Actor(actor.name, actor.glb, actor.item.model_copy(update={"position": position}))
             for actor, position in zip(self.actors, positions, strict=True)
         ]
 
     def write_glb(self, path: Path, duration_s: float | None) -> tuple[str, ...]:
-        """Write the scene as GLB. Returns notes for the user.
+        """Write the scene as GLB and return notes for the user, here none.
 
         Raises:
             BadInput: an asset starts after the end.
@@ -69,29 +69,20 @@ class Cast:
         return ()
 
     def write_usdz(self, path: Path, duration_s: float | None) -> tuple[str, ...]:
-        """Write the scene as USDZ, in which every asset plays once. Returns notes for the user.
+        """Write the scene as USDZ, in which every asset plays once, and return notes for the user.
 
         Raises:
             BadInput: an asset starts after the end, or a package has no USDZ.
             OSError: the file could not be written.
         """
         length = scene_duration(self.actors, duration_s)
-        for folder in self.folders:
+        placements = []
+        for actor, folder in zip(self.actors, self.folders, strict=True):
             if not (folder / USD).is_file():
                 raise BadInput(f"{folder} has no {USD}; make it again, or write the scene as .glb")
-        compose_usdz(
-            path,
-            [
-                UsdPlacement(
-                    actor.name,
-                    folder / USD,
-                    torch.from_numpy(actor.transform),
-                    actor.item.start_s,
-                    actor.item.speed,
-                )
-                for actor, folder in zip(self.actors, self.folders, strict=True)
-            ],
-        )
+            transform, item = torch.from_numpy(actor.transform), actor.item
+            placements.append(UsdPlacement(actor.name, folder / USD, transform, item.start_s, item.speed))
+        compose_usdz(path, placements)
         again = [actor.name for actor in self.actors if actor.item.loop and actor.end_s < length]
         return (f"USDZ plays every asset once; these would go on in a GLB: {', '.join(again)}",) if again else ()
 
@@ -102,16 +93,16 @@ class Cast:
         rasterizer: str = "auto",
         progress: Callable[[int, int], None] = lambda done, total: None,
     ) -> None:
-        """Write a film of the moving Gaussians, before which the camera swings once from side to side.
+        """Write a film of the moving Gaussians, from a camera that swings once from side to side.
 
         Args:
-            path: of the file, ending in .mp4.
-            scene: gives length and frames per second.
-            rasterizer: draws the pictures.
-            progress: called with pictures done and their number.
+            path: file, ending in .mp4.
+            scene: scene with duration and frame rate.
+            rasterizer: name of the rasterizer.
+            progress: callback (pictures done, total).
 
         Raises:
-            BadInput: too many pictures, an asset that starts after the end, or a broken package.
+            BadInput: there are too many pictures, an asset starts after the end, or a package is broken.
             BackendUnavailable: there is no rasterizer or no codec.
             OSError: the file could not be written.
         """
@@ -120,38 +111,27 @@ class Cast:
             raise BadInput(
                 f"a film has 1 to {MOST_PICTURES} pictures; {count} were asked for: change fps or duration_s"
             )
-        draw = choose_rasterizer(rasterizer)
-        clouds = {folder: _Cloud(folder) for folder in dict.fromkeys(self.folders)}
-        center, radius = self._ball()
+        draw = get_rasterizer(rasterizer)
+        clouds = {folder: _MovingGaussians(folder) for folder in dict.fromkeys(self.folders)}
+        center, radius = self._bounding_sphere()
         scale = FILLED * RADIUS * math.sin(math.radians(FOV_Y_DEG / 2)) / radius
-        upright = torch.tensor((1.0, 0.0, 0.0, 0.0))
-        background, pictures = studio(FILM_SIZE), []
+        background, pictures = studio_background(FILM_SIZE), []
         for start in range(0, count, BATCH):
-            moments = torch.arange(start, min(start + BATCH, count), dtype=torch.float64)
-            states = joined(
-                [
-                    clouds[folder].at(actor, moments / scene.fps)
-                    for actor, folder in zip(self.actors, self.folders, strict=True)
-                ]
-            )
-            cameras = [
-                OrbitCamera(
-                    ELEVATION_DEG,
-                    SWING_DEG * math.sin(2 * math.pi * moment / count),
-                    width=FILM_SIZE,
-                    height=FILM_SIZE,
-                )
-                for moment in moments.tolist()
-            ]
-            pictures.append(pictures_over(background, placed(states, upright, scale, -scale * center), cameras, draw))
-            progress(start + len(moments), count)
-        write_film(path, torch.cat(pictures), scene.fps)
+            frames = torch.arange(start, min(start + BATCH, count), dtype=torch.float64)
+            pairs = zip(self.actors, self.folders, strict=True)
+            states = concatenate([clouds[folder].at(actor, frames / scene.fps) for actor, folder in pairs])
+            azimuths = [SWING_DEG * math.sin(2 * math.pi * frame / count) for frame in frames.tolist()]
+            cameras = [OrbitCamera(ELEVATION_DEG, each, width=FILM_SIZE, height=FILM_SIZE) for each in azimuths]
+            centered = transform(states, IDENTITY_QUAT, scale, -scale * center)
+            pictures.append(render_over(background, centered, cameras, draw))
+            progress(start + len(frames), count)
+        write_mp4(path, torch.cat(pictures), scene.fps)
 
-    def _ball(self) -> tuple[Float[Tensor, " 3"], float]:
-        """Center and radius of a ball around the boxes of all actors."""
+    def _bounding_sphere(self) -> tuple[Float[Tensor, " 3"], float]:
+        """Return center and radius of a sphere around the bounding boxes of all actors."""
         boxes = []
         for actor in self.actors:
-            low, high = (torch.from_numpy(corner) for corner in (actor.body.low, actor.body.high))
+            low, high = (torch.from_numpy(corner) for corner in (actor.glb.low, actor.glb.high))
             corners = torch.cartesian_prod(*torch.stack((low, high), 1))
             matrix = torch.from_numpy(actor.transform)
             boxes.append(corners @ matrix[:3, :3].mT + matrix[:3, 3])
@@ -160,26 +140,25 @@ class Cast:
         return center.float(), max(1e-6, float((points - center).norm(dim=1).max()))
 
 
-class _Cloud:
-    """The Gaussians of a package and their motion."""
+class _MovingGaussians:
+    """Gaussians of a package and their motion."""
 
     def __init__(self, folder: Path) -> None:
         self.fit = read_compact(folder / COMPACT)
-        self.fps = self.fit.frames / read_manifest(folder).duration_s  # written frames may be others
+        self.fps = self.fit.frames / read_manifest(folder).duration_s  # frames of the fit, not of the files
 
     def at(self, actor: Actor, times_s: Float[Tensor, " b"]) -> Gaussians:
-        """Its states at times of the scene, where the actor stands."""
+        """Return the states at times of the scene, at the actor's place."""
         played = torch.from_numpy(actor.seconds(times_s.numpy()))
         fit, positions = self.fit, (played * self.fps).clamp(max=self.fit.frames)
-        states = moved(fit.gaussians, fit.deformation, fit.frames, positions)
+        states = pose_gaussians(fit.gaussians, fit.deformation, fit.frames, positions)
         quat = torch.from_numpy(actor.turn.as_quat(canonical=True))[[3, 0, 1, 2]]
-        return placed(states, quat, actor.item.scale, torch.from_numpy(actor.origin))
+        return transform(states, quat, actor.item.scale, torch.from_numpy(actor.origin))
 
 
-def _body(folder: Path) -> Body:
+def _body(folder: Path) -> AnimatedGlb:
+    content = read_file(folder, ASSET)
     try:
-        return Body((folder / ASSET).read_bytes())
-    except OSError as error:
-        raise BadInput(f"{folder} is not complete: {ASSET} cannot be read ({error.strerror}); make it again") from error
+        return AnimatedGlb(content)
     except BadInput as error:
         raise BadInput(f"{folder / ASSET}: {error}") from error

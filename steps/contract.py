@@ -1,14 +1,16 @@
-"""Contract of a step: references, requests, results, records and exit statuses. Plain JSON; imports no torch."""
+"""Contract of a step: references, requests, results, records and exit statuses, as plain JSON. Imports no torch."""
 
 import hashlib
+import importlib
 import json
 import re
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 CONTRACT_VERSION = 1
-LARGEST_SEED = 2**63 - 1  # torch's generators take no larger one
+LARGEST_SEED = 2**63 - 1  # limit of torch's generators
+SHOWN = 80  # characters of a value in a message
 
 FailureKind = Literal["bad_input", "missing", "lost", "unreachable", "diverged", "out_of_memory", "crashed"]
 
@@ -29,7 +31,7 @@ EXIT_STATUS: dict[FailureKind, int] = {
     "crashed": EXIT_CRASHED,
 }
 
-RUN_ONLY = frozenset(  # fields of a record that are no part of its digest
+RUN_ONLY = frozenset(  # fields of a record that its digest leaves out
     ["started", "duration_s", "cpu_s", "peak_memory_mb", "flops", "run_notes", "machine"]
 )
 
@@ -43,7 +45,7 @@ class Frozen(BaseModel):
 
 
 class ArtifactRef(Frozen):
-    """A file named by its content; it never moves and never changes."""
+    """Reference to a file by the digest of its content, which never changes."""
 
     digest: Digest
     media_type: str
@@ -54,7 +56,7 @@ class Port(Frozen):
     """One input or output of a step."""
 
     media_type: str
-    suffix: str = Field(description="of the file while a step works on it, for example .png")
+    suffix: str = Field(description="suffix of the file while a step works on it, for example .png")
     optional: bool = False
     many: bool = Field(False, description="an input given once or more, as NAME_000, NAME_001, ...")
 
@@ -63,24 +65,24 @@ class StepSpec(Frozen):
     """Name, inputs, outputs and settings class of a step; its code is not imported."""
 
     name: str
-    version: str = Field(description="raised when the same request should give another result")
-    entry: str = Field(pattern=r"^[\w.]+:\w+$")
+    version: str = Field("1", description="raised when the same request should give another result")
+    entry: str = Field(pattern=r"^[\w.]+:\w+$", description="module:function of the step's code")
     settings: str = Field(
-        "dg4d_lib.settings:Settings", pattern=r"^[\w.]+:\w+$", description="module:class of settings of its own"
+        "dg4d_lib.settings:Settings", pattern=r"^[\w.]+:\w+$", description="module:class of the step's own settings"
     )
-    sections: tuple[str, ...] = Field((), description="of PipelineSettings, beside its own: a field, or a dotted one")
+    sections: tuple[str, ...] = Field((), description="fields of PipelineSettings that the step reads, may be dotted")
     inputs: dict[str, Port]
     outputs: dict[str, Port]
     resource: Literal["cpu", "gpu"] = Field(
-        "cpu", description="gpu: it has a GPU to itself where its settings use one; drawing on one in passing is cpu"
+        "cpu", description="gpu: the step has a GPU to itself where its settings use one; cpu: it only renders on one"
     )
     timeout_s: float = Field(3600, gt=0)
     late_imports: tuple[str, ...] = Field(
-        (), description="modules, and module:function that imports some, which its code needs only when it runs"
+        (), description="modules, or module:function that imports some, which the step needs only while it runs"
     )
 
     def input_port(self, name: str) -> str:
-        """Return the name of the port that an input goes to; empty if there is none."""
+        """Return the name of an input's port; empty if there is none."""
         port, _, number = name.rpartition("_")
         if port in self.inputs and self.inputs[port].many and number.isdecimal():
             return port
@@ -88,25 +90,22 @@ class StepSpec(Frozen):
 
 
 class StepRequest(Frozen):
-    """Everything a step may depend on; its digest is the cache key."""
+    """Everything that a step depends on; its digest is the cache key."""
 
     step: str
     version: str
     inputs: dict[str, ArtifactRef]
     settings: dict[str, Any]
     seed: int = Field(ge=0, le=LARGEST_SEED)
-    weights: dict[str, Digest] = Field({}, description="identity of the weights that the settings name, by name")
+    weights: dict[str, Digest] = Field({}, description="digest of the weights that the settings name, by name")
 
     def digest(self) -> str:
-        """Return the SHA-256 of the canonical JSON; names of files and the order of keys do not matter."""
+        """Return the SHA-256 of the canonical JSON; it depends on neither file names nor the order of keys."""
         return digest_of({"contract": CONTRACT_VERSION, **self.model_dump(mode="json")})
 
 
 class ProvenanceRecord(Frozen):
-    """Record of a run: enough to make the outputs again, and to explain differences.
-
-    The fields in `RUN_ONLY` belong to one run and differ between machines.
-    """
+    """Record of a run, from which the outputs can be made again; the fields in `RUN_ONLY` differ between machines."""
 
     step: str
     code_version: str
@@ -120,12 +119,12 @@ class ProvenanceRecord(Frozen):
     licenses: dict[str, str] = {}
     notes: tuple[str, ...] = ()
     run_notes: tuple[str, ...] = ()
-    flops: dict[str, int] = Field({}, description="floating-point operations of networks, by the name of their class")
-    started: str = Field("", description="when, in UTC, as ISO 8601")
+    flops: dict[str, int] = Field({}, description="floating-point operations of networks, by class name")
+    started: str = Field("", description="start in UTC, ISO 8601")
     duration_s: float = Field(ge=0)
-    cpu_s: float = Field(0.0, ge=0, description="seconds of all cores, of the step's process and those it started")
+    cpu_s: float = Field(0.0, ge=0, description="CPU seconds of the step's process and of its children")
     peak_memory_mb: float = Field(ge=0)
-    machine: dict[str, str] = Field({}, description="what computed it (steps/runtime/environment_info.py)")
+    machine: dict[str, str] = Field({}, description="environment (steps/runtime/environment_info.py)")
 
     def digest(self) -> str:
         """Return the SHA-256 of the record without the fields in `RUN_ONLY`."""
@@ -133,14 +132,14 @@ class ProvenanceRecord(Frozen):
 
 
 class StepResult(Frozen):
-    """References to the outputs, and the record of the run."""
+    """References to the outputs, and the provenance record of the run."""
 
     outputs: dict[str, ArtifactRef]
     provenance: ProvenanceRecord
 
 
 class StepFailure(Frozen):
-    """Reason why a step did not finish; written in place of the result."""
+    """Reason of a step's failure; written in place of the result."""
 
     step: str
     kind: FailureKind
@@ -156,6 +155,24 @@ def canonical(value: Any) -> str:
 def digest_of(value: Any) -> str:
     """Return the SHA-256 digest of the canonical JSON of a value."""
     return "sha256:" + hashlib.sha256(canonical(value).encode()).hexdigest()
+
+
+def load_object(name: str) -> Any:
+    """Import and return the object that "module:name" names."""
+    module, _, attribute = name.partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def settings_errors(error: ValidationError) -> str:
+    """Return the wrong fields of settings with their values and the allowed ones, for a message."""
+    lines = [f"{'.'.join(map(str, e['loc']))} = {shown(e['input'])}: {e['msg']}" for e in error.errors()]
+    return "; ".join(lines)
+
+
+def shown(value: Any) -> str:
+    """Return the `repr` of a value, shortened for a message."""
+    text = repr(value)
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
 def is_digest(text: str) -> bool:

@@ -1,4 +1,4 @@
-"""From Gaussians and their motion to textured triangles: one mesh that moves, or a mesh per frame."""
+"""Step that extracts textured meshes from moving Gaussians: one tracked mesh, or a mesh per frame."""
 
 import torch
 from jaxtyping import Float, Int
@@ -8,26 +8,25 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.images import color_over_white
-from dg4d_lib.mesh.extraction.check import MeshFacts, checked, welded
 from dg4d_lib.mesh.extraction.clean import clean
 from dg4d_lib.mesh.extraction.density import density_field
-from dg4d_lib.mesh.extraction.extract import surface, usable_level
+from dg4d_lib.mesh.extraction.extract import extract_surface, usable_level
+from dg4d_lib.mesh.extraction.topology import MeshTopology, check_topology, weld_vertices
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
-from dg4d_lib.mesh.texturing.bake import bake, vertex_normals
+from dg4d_lib.mesh.texturing.bake import bake_texture, vertex_normals
 from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.mesh.tracking.isosurface_projection import project_to_isosurface
-from dg4d_lib.mesh.tracking.nonrigid_registration import FOLLOWS, register_nonrigid
+from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU, register_nonrigid
 from dg4d_lib.mesh.tracking.reference_frame import relative_to_frame
 from dg4d_lib.mesh.tracking.skinning import skin_vertices
-from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
+from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.settings import MeshSettings
 from steps.artifacts.media import write_png
 from steps.artifacts.mesh_plan import MeshPlan, read_plan
 from steps.artifacts.meshes import write_meshes, write_tracked
-from steps.artifacts.motions import read_motion
+from steps.artifacts.motions import read_states
 from steps.profiles import FrameRange
 from steps.runtime.job import Job, StepReport
 
@@ -35,23 +34,20 @@ PICTURE_CAMERAS = [OrbitCamera(0, azimuth, width=256, height=256) for azimuth in
 
 
 def run(job: Job) -> StepReport:
-    """Extract what the plan says: the tracked mesh, or the meshes of frames `first_frame` to `end_frame`.
+    """Extract the tracked mesh, or the meshes of frames `first_frame` to `end_frame`, as the plan says.
 
     Raises:
-        BadInput: frames that the motion does not have.
+        BadInput: the motion does not have these frames.
     """
     settings: MeshSettings = job.settings.mesh
     frames_of_task: FrameRange = job.settings
     plan = read_plan(job.inputs["plan"])
-    rasterize = choose_rasterizer(job.settings.rasterizer)
-    gaussians = read_ply(job.inputs["gaussians"])
-    deformation, frames = read_motion(job.inputs["motion"])
-    with torch.no_grad():
-        displacement = deformation.displace(gaussians.means, torch.linspace(0, 1, frames))
-    states = displacement.apply(gaussians)
+    rasterize = get_rasterizer(job.settings.rasterizer)
+    states, displacement = read_states(job.inputs["gaussians"], job.inputs["motion"])
+    frames = len(states.means)
     if plan.mode == "tracked":
         job.progress(1, 3, {})
-        tracked, agreed = _tracked(states, displacement, plan, rasterize, settings)
+        tracked, ious = _tracked(states, displacement, plan, rasterize, settings)
         job.progress(2, 3, {})
         write_tracked(job.outputs["tracked"], tracked)
         mesh = tracked.mesh
@@ -60,9 +56,9 @@ def run(job: Job) -> StepReport:
             f"at rest it is {_facts(mesh)}",
             f"it is the surface of frame {plan.reference_frame}, which follows the motion best "
             f"({plan.followed:.1%} IoU on trial)",
-            f"its outlines agree with the Gaussians' to {agreed.mean():.1%} (IoU), to {agreed.min():.1%} at worst",
+            f"its outlines agree with the Gaussians' to {ious.mean():.1%} (IoU), to {ious.min():.1%} at worst",
         ]
-        if agreed.mean() < FOLLOWS:
+        if ious.mean() < MIN_IOU:
             notes.append("one mesh follows this motion poorly: --set mesh.mode=per_frame gives a mesh per frame")
     else:
         first, end = frames_of_task.first_frame, frames_of_task.end_frame or frames
@@ -70,7 +66,7 @@ def run(job: Job) -> StepReport:
             raise BadInput(f"frames {first} to {end} were asked for; the motion has {frames}")
         meshes = {}
         for frame in range(first, end):
-            meshes[frame] = textured(states.at(frame), plan.level, rasterize, settings)
+            meshes[frame] = textured_mesh(states.at(frame), plan.level, rasterize, settings)
             job.progress(frame - first + 1, end - first, {})
         write_meshes(job.outputs["meshes"], meshes)
         notes = _soundness(meshes)
@@ -79,8 +75,8 @@ def run(job: Job) -> StepReport:
     return StepReport(backend=f"{job.settings.rasterizer} rasterizer, pymeshlab, xatlas", notes=tuple(notes))
 
 
-def textured(gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings) -> TexturedMesh:
-    """The surface of one state of the cloud at a density, with its colors."""
+def textured_mesh(gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings) -> TexturedMesh:
+    """Return the isosurface of one state of the Gaussians at a density, with a baked texture."""
     vertices, faces = _cleaned_surface(gaussians, level, settings)
     return _colored(vertices, faces, gaussians, rasterize, settings)[0]
 
@@ -88,22 +84,22 @@ def textured(gaussians: Gaussians, level: float, rasterize: Rasterizer, settings
 def _tracked(
     states: Gaussians, displacement: Displacement, plan: MeshPlan, rasterize: Rasterizer, settings: MeshSettings
 ) -> tuple[TrackedMesh, Float[Tensor, " t"]]:
-    """Return the mesh of the reference frame with its offsets at every frame, and the agreement of its outlines."""
+    """Return the mesh of the reference frame with its offsets at every frame, and the IoU of its outlines."""
     frame, level = plan.reference_frame, plan.level
     rest = states.at(frame)
     vertices, faces = _cleaned_surface(rest, level, settings)
-    mesh, copied = _colored(vertices, faces, rest, rasterize, settings)
-    carried = skin_vertices(vertices, rest, relative_to_frame(displacement, frame))
-    snapped = project_to_isosurface(vertices, carried, faces, states, level, settings)
-    offsets, agreed = register_nonrigid(vertices, snapped, faces, states, level, rasterize, settings)
-    return TrackedMesh(mesh, offsets[:, copied], rest=frame), agreed
+    mesh, sources = _colored(vertices, faces, rest, rasterize, settings)
+    skinned = skin_vertices(vertices, rest, relative_to_frame(displacement, frame))
+    projected = project_to_isosurface(vertices, skinned, faces, states, level, settings)
+    offsets, ious = register_nonrigid(vertices, projected, faces, states, level, rasterize, settings)
+    return TrackedMesh(mesh, offsets[:, sources], reference_frame=frame), ious
 
 
 def _cleaned_surface(
     gaussians: Gaussians, level: float, settings: MeshSettings
 ) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
     field = density_field(gaussians, settings)
-    vertices, faces = clean(*surface(field, usable_level(field, level)), settings, field.unit)
+    vertices, faces = clean(*extract_surface(field, usable_level(field, level)), settings, field.unit)
     return torch.from_numpy(vertices), torch.from_numpy(faces)
 
 
@@ -114,24 +110,24 @@ def _colored(
     rasterize: Rasterizer,
     settings: MeshSettings,
 ) -> tuple[TexturedMesh, Int[Tensor, " w"]]:
-    """Unwrapped and baked; and the old vertex of every new one."""
-    copied, corners, uvs = (torch.from_numpy(a) for a in unwrap(vertices.numpy(), faces.numpy(), settings.texture_size))
-    normals = vertex_normals(vertices, faces)[copied]
-    texture = bake(vertices[copied], normals, corners, uvs, gaussians, rasterize, settings)
-    return TexturedMesh(vertices[copied], corners, uvs, texture), copied
+    """Return the unwrapped mesh with a baked texture, and the source vertex of each of its vertices."""
+    unwrapped = unwrap(vertices.numpy(), faces.numpy(), settings.texture_size)
+    sources, corners, uvs = map(torch.from_numpy, unwrapped)
+    normals = vertex_normals(vertices, faces)[sources]
+    texture = bake_texture(vertices[sources], normals, corners, uvs, gaussians, rasterize, settings)
+    return TexturedMesh(vertices[sources], corners, uvs, texture), sources
 
 
 def _soundness(meshes: dict[int, TexturedMesh]) -> list[str]:
     facts = {frame: _facts(mesh) for frame, mesh in meshes.items()}
-    flawed = [f"the mesh of frame {frame} is {its}" for frame, its in facts.items() if not its.sound]
+    flawed = [f"the mesh of frame {frame} is {its}" for frame, its in facts.items() if not its.valid]
     return [f"{len(facts) - len(flawed)} of {len(facts)} meshes from frame {min(facts)} on bound solids", *flawed]
 
 
-def _facts(mesh: TexturedMesh) -> MeshFacts:
-    return checked(*welded(mesh.vertices.numpy(), mesh.faces.numpy()))
+def _facts(mesh: TexturedMesh) -> MeshTopology:
+    return check_topology(*weld_vertices(mesh.vertices.numpy(), mesh.faces.numpy()))
 
 
 def _picture(mesh: TexturedMesh) -> Float[Tensor, "h w 3"]:
-    """Four views in a row, over white."""
-    color, coverage = render_mesh(mesh, PICTURE_CAMERAS)
-    return torch.cat(list(color_over_white(color, coverage)), 1)
+    """Render four views in a row, over white."""
+    return torch.cat(list(color_over_white(*render_mesh(mesh, PICTURE_CAMERAS))), 1)

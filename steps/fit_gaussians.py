@@ -4,13 +4,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dg4d_lib.fitting.losses import Diverged
 from dg4d_lib.fitting.static import fit_gaussians
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import blob, on_surface
 from dg4d_lib.gaussians.ply import write_ply
 from dg4d_lib.inflation.surface import sample_surface
-from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
+from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
 from dg4d_lib.settings import (
     BlobStartSettings,
     LgmStartSettings,
@@ -22,7 +21,7 @@ from steps.artifacts.media import read_png, write_png
 from steps.artifacts.pose import read_turn
 from steps.fitting.priors import make_prior, subject_shapes
 from steps.fitting.reconstruction import reconstruct_subject
-from steps.fitting.reporting import LossCurves, render_turnaround
+from steps.fitting.reporting import LossCurves, picture_of_divergence, render_turnaround
 from steps.runtime.job import Job, StepReport
 
 BLOB_RADIUS = 0.5  # world units
@@ -35,43 +34,39 @@ def run(job: Job) -> StepReport:
     backend, turn_deg = job.settings.rasterizer, read_turn(job.inputs.get("pose"), job.settings.turn_deg)
     subject = read_png(job.inputs["subject"])
     generator = torch.Generator().manual_seed(job.seed)
-    rasterize = choose_rasterizer(backend)
-    device = device_of(backend)
+    rasterize = get_rasterizer(backend)
+    device = preferred_device(backend)
     reconstruction = None
     if isinstance(static.start, LgmStartSettings):
         reconstruction = reconstruct_subject(subject.to(device), static.start, rasterize, generator)
-        start, static = reconstruction.gaussians, touched_up(static)
+        start, static = reconstruction.gaussians, fine_tuning_settings(static)
     else:
-        start = starting_cloud(subject, static.start, prior, turn_deg, generator).to(device)
+        start = initial_gaussians(subject, static.start, prior, turn_deg, generator).to(device)
     chosen = make_prior(prior, [subject], static, job.inputs.get("bank"), job.pictures, turn_deg)
     curves = LossCurves(static.iterations, job.progress)
-    try:
+    with picture_of_divergence(job, rasterize):
         gaussians = fit_gaussians(start, subject, chosen.prior, rasterize, static, generator, curves.add)
-    except Diverged as error:
-        write_png(job.pictures / "last_good_state.png", render_turnaround(error.gaussians, rasterize))
-        raise
-    facts = chosen.facts(f"{backend} rasterizer")
-    facts = reconstruction.added_to(facts) if reconstruction else facts
+    report = chosen.report(f"{backend} rasterizer")
+    report = reconstruction.add_to(report) if reconstruction else report
     write_ply(job.outputs["gaussians"], gaussians)
-    curves.write(job.outputs["curves"], "static fit", facts.notes)
+    curves.write(job.outputs["curves"], "static fit", report.notes)
     write_png(job.outputs["picture"], render_turnaround(gaussians, rasterize))
-    return facts
+    return report
 
 
-def touched_up(static: StaticSettings) -> StaticSettings:
-    """Return settings for a cloud that is nearly right already: its means move a tenth as fast (public code)."""
-    rates = {"means_lr": static.means_lr / 10, "means_lr_end": static.means_lr_end / 10}
-    return static.model_copy(update=rates)
+def fine_tuning_settings(static: StaticSettings) -> StaticSettings:
+    """Return settings for reconstructed Gaussians: a tenth of the learning rate of the means, as DG4D's public code."""
+    return static.model_copy(update={"means_lr": static.means_lr / 10, "means_lr_end": static.means_lr_end / 10})
 
 
-def starting_cloud(
+def initial_gaussians(
     subject: Float[Tensor, "h w 4"],
     start: BlobStartSettings | SurfaceStartSettings,
     prior: PriorSettings,
     turn_deg: float,
     generator: torch.Generator,
 ) -> Gaussians:
-    """Make the cloud of iteration 0: the random blob, or points on the surface of the prior."""
+    """Initialize Gaussians as a random blob, or as points on the surface of the prior."""
     if isinstance(start, BlobStartSettings):
         return blob(start.points, BLOB_RADIUS, generator)
     surface = subject_shapes(prior, [subject], turn_deg).surface(0)

@@ -4,22 +4,20 @@ from dataclasses import replace
 
 import torch
 
-from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.fitting.losses import Diverged
 from dg4d_lib.fitting.motion import fit_motion
 from dg4d_lib.gaussians.ply import read_ply, write_ply
-from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
+from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
 from dg4d_lib.settings import DeformationSettings, MotionSettings, PriorSettings
 from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.motions import new_deformation, write_motion
 from steps.artifacts.pose import read_turn
 from steps.fitting.priors import make_prior
-from steps.fitting.reporting import PICTURE_SIZE, LossCurves, pictures_in_a_row, render_turnaround
+from steps.fitting.reporting import LossCurves, picture_of_divergence, render_row
 from steps.runtime.job import Job, StepReport
 
 FINE_TUNED = "The Gaussians at rest were fitted to the whole video together with their motion."
 PICTURE_FRAMES = 6
-PICTURE_AZIMUTHS_DEG = (0.0, 90.0)
+FRONT_DEG, SIDE_DEG = 0.0, 90.0
 
 
 def run(job: Job) -> StepReport:
@@ -31,33 +29,27 @@ def run(job: Job) -> StepReport:
     gaussians = read_ply(job.inputs["gaussians"])
     video = read_frames(job.inputs["driving_video"], job.pictures)
     generator = torch.Generator().manual_seed(job.seed)
-    rasterize = choose_rasterizer(backend)
-    cutouts = list(torch.cat([video.frames, video.coverage], -1))
+    rasterize = get_rasterizer(backend)
+    cutouts = list(torch.cat([video.frames, video.alpha], -1))
     chosen = make_prior(prior, cutouts, settings, job.inputs.get("bank"), job.pictures, turn_deg)
     deformation = new_deformation(kind, gaussians, len(video), generator)
-    device = device_of(backend)
+    device = preferred_device(backend)
     deformation.to(device)
     curves = LossCurves(settings.iterations, job.progress)
-    try:
+    with picture_of_divergence(job, rasterize):
         fitted = fit_motion(
             gaussians.to(device), deformation, video, chosen.prior, rasterize, settings, generator, curves.add
         )
-    except Diverged as error:
-        write_png(job.pictures / "last_good_state.png", render_turnaround(error.gaussians, rasterize))
-        raise
     deformation.cpu()
     gaussians = fitted.to(torch.device("cpu"))
     if settings.fine_tune:
         write_ply(job.outputs["gaussians"], gaussians)
     write_motion(job.outputs["motion"], deformation, kind, len(video), len(gaussians))
     curves.write(job.outputs["curves"], "motion fit", [chosen.note])
+    timestamps = torch.linspace(0, 1, min(PICTURE_FRAMES, len(video)))
     with torch.no_grad():
-        moments = torch.linspace(0, 1, min(PICTURE_FRAMES, len(video)))
-        moved = deformation.displace(gaussians.means, moments).apply(gaussians)
-        rows = []
-        for azimuth in PICTURE_AZIMUTHS_DEG:
-            camera = OrbitCamera(0, azimuth, width=PICTURE_SIZE, height=PICTURE_SIZE)
-            rows.append(pictures_in_a_row(moved, [camera] * len(moments), rasterize))
+        moved = deformation.displace(gaussians.means, timestamps).apply(gaussians)
+    rows = [render_row(moved, [azimuth] * len(timestamps), rasterize) for azimuth in (FRONT_DEG, SIDE_DEG)]
     write_png(job.outputs["picture"], torch.cat(rows))
-    facts = chosen.facts(f"{backend} rasterizer")
-    return replace(facts, notes=(*facts.notes, FINE_TUNED)) if settings.fine_tune else facts
+    report = chosen.report(f"{backend} rasterizer")
+    return replace(report, notes=(*report.notes, FINE_TUNED)) if settings.fine_tune else report

@@ -1,4 +1,4 @@
-"""Meshes of single frames, extracted in parts, as one artifact."""
+"""Step that joins the meshes of single frames, extracted in parts, into one artifact."""
 
 import zipfile
 
@@ -8,7 +8,7 @@ from steps.runtime.job import Job, StepReport
 
 
 def run(job: Job) -> StepReport:
-    """Write the entries of all parts in the order of their names; the order of the parts does not matter.
+    """Write the entries of all parts, sorted by name; the order of the parts does not matter.
 
     Raises:
         BadInput: two parts have different meshes of one frame.

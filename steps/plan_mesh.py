@@ -1,39 +1,32 @@
-"""The kind of mesh that a motion gets, decided on coarse trial meshes before any mesh is extracted."""
+"""Step that chooses a tracked mesh or a mesh per frame, by trial meshes, before meshes are extracted."""
 
-import torch
-
-from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.mesh.extraction.density import density_field
-from dg4d_lib.mesh.extraction.extract import best_level
-from dg4d_lib.mesh.tracking.nonrigid_registration import FOLLOWS
+from dg4d_lib.mesh.extraction.extract import select_level
+from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU
 from dg4d_lib.mesh.tracking.reference_frame import select_reference_frame
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
 from steps.artifacts.mesh_plan import MeshPlan, write_plan
-from steps.artifacts.motions import read_motion
+from steps.artifacts.motions import read_states
 from steps.runtime.job import Job, StepReport
 
 
 def run(job: Job) -> StepReport:
-    """Choose one tracked mesh or a mesh per frame, the reference frame, and the level of the surface.
+    """Choose one tracked mesh or a mesh per frame, the reference frame, and the level of the isosurface.
 
-    The level is the one whose outlines agree best with those of the Gaussians in the reference frame.
+    The outlines of the surface at that level agree best with those of the Gaussians in the reference frame.
 
     Raises:
-        FitDiverged: the cloud is empty.
+        FitDiverged: there are no Gaussians.
     """
     settings: MeshSettings = job.settings.mesh
-    rasterize = choose_rasterizer(job.settings.rasterizer)
-    gaussians = read_ply(job.inputs["gaussians"])
-    deformation, frames = read_motion(job.inputs["motion"])
-    with torch.no_grad():
-        displacement = deformation.displace(gaussians.means, torch.linspace(0, 1, frames))
-    states = displacement.apply(gaussians)
+    rasterize = get_rasterizer(job.settings.rasterizer)
+    states, displacement = read_states(job.inputs["gaussians"], job.inputs["motion"])
     mode, frame, followed, notes = settings.mode, 0, 1.0, []
     if mode != "per_frame":
         frame, followed = select_reference_frame(states, displacement, rasterize, settings)
     if mode == "auto":
-        mode = "tracked" if followed >= FOLLOWS else "per_frame"
+        mode = "tracked" if followed >= MIN_IOU else "per_frame"
         if mode == "per_frame":
             frame = 0
             notes.append(
@@ -41,7 +34,7 @@ def run(job: Job) -> StepReport:
             )
     job.progress(1, 2, {})
     rest = states.at(frame)
-    level, agreement = best_level(density_field(rest, settings), rest, rasterize, settings.density_threshold)
+    level, agreement = select_level(density_field(rest, settings), rest, rasterize, settings.density_threshold)
     notes.append(f"surface at density {level:.3g}; its outlines agree with the Gaussians' to {agreement:.1%} (IoU)")
     write_plan(job.outputs["plan"], MeshPlan(mode=mode, reference_frame=frame, followed=followed, level=level))
     job.progress(2, 2, {})

@@ -1,4 +1,4 @@
-"""A user's picture or video becomes cut-outs in one square frame."""
+"""Step that turns a picture or video into cut-outs of the subject in one square frame."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,8 +11,8 @@ from dg4d_lib.images import over_white
 from dg4d_lib.inflation.ground import ground_turn
 from dg4d_lib.settings import SubjectSettings
 from dg4d_lib.video.driving import DrivingVideo
-from dg4d_lib.video.framing import reframe, whole_frame
-from dg4d_lib.video.subject import prepare
+from dg4d_lib.video.framing import crop_whole_frame, reframe
+from dg4d_lib.video.subject import prepare_subject
 from steps.artifacts.media import write_frames, write_png
 from steps.artifacts.pose import Pose, write_pose
 from steps.runtime.job import Job, StepReport
@@ -22,7 +22,7 @@ TILE = 256  # pixels
 
 
 def run(job: Job) -> StepReport:
-    """Decode `source`, cut out and frame the subject; `footage` and `pose` are written when the source moves.
+    """Decode `source`, cut out and frame the subject; write `footage` and `pose` if the source is a video.
 
     Raises:
         BadInput: the file cannot be used; says why and what to do.
@@ -31,13 +31,13 @@ def run(job: Job) -> StepReport:
     with TemporaryDirectory() as scratch:
         source = read_source(job.inputs["source"], Path(scratch), settings.max_frames, settings.max_decode_gb)
     job.progress(1, 3, {})
-    cutouts, notes = prepare(source.frames, source.has_alpha, settings)
+    cutouts, notes = prepare_subject(source.frames, source.has_alpha, settings)
     job.progress(2, 3, {})
     write_png(job.outputs["subject"], cutouts[0])
     if source.kind == "video":
         footage = DrivingVideo(cutouts[..., :3].contiguous(), cutouts[..., 3:].contiguous(), source.fps)
         write_frames(job.outputs["footage"], footage)
-        turn_deg = ground_turn(footage.coverage, settings.ground_turn)
+        turn_deg = ground_turn(footage.alpha, settings.ground_turn)
         write_pose(job.outputs["pose"], Pose(turn_deg=round(turn_deg, 3)))
         notes = (*notes, turn_note(turn_deg)) if turn_deg and not settings.turn_deg else notes
     write_png(job.outputs["picture"], picture_of(source.frames[0], cutouts[0]))
@@ -55,7 +55,7 @@ def turn_note(turn_deg: float) -> str:
 
 
 def picture_of(source: Float[Tensor, "h w 4"], cutout: Float[Tensor, "s s 4"]) -> Float[Tensor, "t w3 3"]:
-    """The source, its matte and the cut-out side by side, over white."""
-    tiles = [reframe(each[None], whole_frame(*each.shape[:2]), TILE)[0] for each in (source, cutout)]
+    """Compose the source, its matte and the cut-out side by side, over white."""
+    tiles = [reframe(each[None], crop_whole_frame(*each.shape[:2]), TILE)[0] for each in (source, cutout)]
     given, cut = map(over_white, tiles)
     return torch.cat([given, tiles[1][..., 3:].expand(TILE, TILE, 3), cut], 1)

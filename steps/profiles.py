@@ -1,7 +1,6 @@
-"""Settings of the pipeline and of its steps, named profiles, and the one way to change a knob."""
+"""Settings of the pipeline and of its steps, named profiles, and changes by dotted keys."""
 
 import functools
-import importlib
 from operator import attrgetter
 from typing import Annotated, Any, Literal
 
@@ -9,7 +8,7 @@ from pydantic import AfterValidator, Field, ValidationError, create_model, model
 
 from dg4d_lib.asset_settings import GateSettings, PackSettings, ScoreSettings
 from dg4d_lib.errors import BadInput
-from dg4d_lib.rasterizer.choice import backend_name
+from dg4d_lib.rasterizer.backends import backend_name
 from dg4d_lib.settings import (
     DeformationSettings,
     DrivingSettings,
@@ -28,10 +27,9 @@ from dg4d_lib.settings import (
     WarpSettings,
 )
 from steps.catalog import STEPS
-from steps.contract import StepSpec
+from steps.contract import StepSpec, load_object, settings_errors, shown
 
-LARGEST_WHOLE = 2**53  # of a knob; readers of JSON disagree about larger numbers
-SHOWN = 80  # letters of a value in a message
+LARGEST_WHOLE = 2**53  # largest integer that every JSON reader represents exactly
 CHANGED_KNOBS = {  # old name: new name, empty if the value is fixed now; removed with 1.0
     "text.steps": "text.num_inference_steps",
     "text.guidance": "text.guidance_scale",
@@ -80,11 +78,11 @@ CHANGED_KNOBS = {  # old name: new name, empty if the value is fixed now; remove
 }
 
 RasterizerName = Literal["auto", "reference", "cpu", "cuda_gsplat"]
-Backend = Annotated[RasterizerName, AfterValidator(backend_name)]  # never `auto`: a request says what will draw
+Backend = Annotated[RasterizerName, AfterValidator(backend_name)]  # `auto` resolved to the backend of this machine
 
 
 class PipelineSettings(Settings):
-    """Every knob of every stage; the command line's `--set stage.knob=value`."""
+    """All settings of the pipeline, as in `--set stage.name=value`."""
 
     rasterizer: RasterizerName = Field("auto", description="auto: cuda_gsplat where that can run, else cpu")
     text: TextSettings = TextSettings()
@@ -112,20 +110,20 @@ class PipelineSettings(Settings):
 
 
 class FrameRange(Settings):
-    """Frames of one task of `extract_mesh`, where every frame gets a mesh."""
+    """Frames of one task of `extract_mesh`, for a mesh per frame."""
 
     first_frame: int = Field(0, ge=0, description="first frame of this task")
     end_frame: int = Field(0, ge=0, description="one past the last; 0 is all frames")
 
 
 class PackNotes(Settings):
-    """Sentences that travel in the files of a package."""
+    """Sentences that are stored in the files of a package."""
 
     notes: tuple[str, ...] = Field((), description="for example that no model was used")
 
 
 class ScoreAssetSettings(Settings):
-    """Settings of `score_asset`, which reads none of the pipeline's."""
+    """Settings of `score_asset`, which reads no settings of the pipeline."""
 
     rasterizer: Backend
     mesh: bool = Field(False, description="the textured mesh is judged instead of the splats")
@@ -139,14 +137,13 @@ def settings_class(spec: StepSpec) -> type[Settings]:
 
 @functools.cache
 def _settings_class(name: str, own: str, sections: tuple[str, ...]) -> type[Settings]:
-    module, _, attribute = own.partition(":")
-    base: type[Settings] = getattr(importlib.import_module(module), attribute)
+    base: type[Settings] = load_object(own)
     fields: dict[str, Any] = {section.rpartition(".")[2]: (_annotation(section), ...) for section in sections}
     return create_model(name, __base__=base, __doc__=f"Settings of `{name}`.", **fields) if fields else base
 
 
 def _annotation(section: str) -> Any:
-    """Return the type of a section, with its bounds; a request never says `auto` as its rasterizer."""
+    """Return the annotated type of a section; in requests, the rasterizer is never `auto`."""
     if section == "rasterizer":
         return Backend
     owner: Any = PipelineSettings
@@ -158,26 +155,26 @@ def _annotation(section: str) -> Any:
 
 
 def step_settings(step: str, settings: PipelineSettings, **values: Any) -> Settings:
-    """Make the settings of a step from the sections that it declares, and from values of the run such as `notes`."""
+    """Make the settings of a step from the sections that it declares and from values of the run such as `notes`."""
     spec = STEPS[step]
     sections = {section.rpartition(".")[2]: attrgetter(section)(settings) for section in spec.sections}
     return settings_class(spec)(**sections, **values)
 
 
 def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSettings:
-    """The same settings with some dotted keys changed, validated again.
+    """Return validated settings with some dotted keys changed.
 
-    Another `kind` starts from its own defaults, and is chosen before anything else is set.
+    Changes of a `kind` come first and reset its section to the defaults of that kind.
 
     Raises:
-        BadInput: a key that does not exist, or a value out of range; says which and what is allowed.
+        BadInput: a key does not exist, or a value is out of range; says which and what is allowed.
     """
     tree = settings.model_dump(mode="json")
     for key, value in changes.items():
         if key in CHANGED_KNOBS and not isinstance(value, dict):
             raise BadInput(_renamed(key, CHANGED_KNOBS[key]))
         if isinstance(value, int) and abs(value) > LARGEST_WHOLE:
-            raise BadInput(f"{key} = {_shown(value)} is out of range; use at most {LARGEST_WHOLE}")
+            raise BadInput(f"{key} = {shown(value)} is out of range; use at most {LARGEST_WHOLE}")
     for key, value in sorted(changes.items(), key=lambda change: not change[0].endswith(".kind")):
         *path, last = key.split(".")
         branch: Any = tree
@@ -194,22 +191,15 @@ def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSetti
     try:
         return PipelineSettings.model_validate(tree)
     except ValidationError as error:
-        lines = [f"{'.'.join(map(str, e['loc']))} = {_shown(e['input'])}: {e['msg']}" for e in error.errors()]
-        raise BadInput("settings refused: " + "; ".join(lines)) from error
+        raise BadInput(f"settings refused: {settings_errors(error)}") from error
 
 
 def _renamed(old: str, new: str) -> str:
     return f"the setting {old} is now {new}" if new else f"the setting {old} is gone: its value is fixed"
 
 
-def _shown(value: Any) -> str:
-    """A value in a message, shortened."""
-    text = repr(value)
-    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
-
-
 def _with_defaults(tree: dict[str, Any]) -> dict[str, Any]:
-    """The tree with what a changed choice brings; where it is not valid (yet), the tree as it is."""
+    """Add the defaults of a changed `kind`; return a tree that is not valid yet unchanged."""
     try:
         return PipelineSettings.model_validate(tree).model_dump(mode="json")
     except ValidationError:
@@ -298,10 +288,10 @@ PROFILES: dict[str, PipelineSettings] = {
 
 
 def profile(name: str) -> PipelineSettings:
-    """The named profile.
+    """Return a profile by name.
 
     Raises:
-        BadInput: no such profile.
+        BadInput: there is no such profile.
     """
     if name not in PROFILES:
         raise BadInput(f"unknown profile {name!r}; choose one of: {', '.join(PROFILES)}")

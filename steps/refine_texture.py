@@ -1,4 +1,4 @@
-"""Better textures by diffusion models; the geometry stays as it is."""
+"""Step that refines textures with diffusion models and keeps the geometry."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -7,14 +7,14 @@ from tempfile import TemporaryDirectory
 
 import torch
 
-from dg4d_lib.diffusion.parts import device_here
+from dg4d_lib.diffusion.components import default_device
 from dg4d_lib.diffusion.video_model import VideoModel
 from dg4d_lib.errors import BadInput
-from dg4d_lib.guidance.distillation import Annealing
+from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.settings import IdentitySettings, ImageToImageSettings, RefinerSettings, VideoToVideoSettings
-from dg4d_lib.texture.refine import MeshClip, Refined, refine_textures
+from dg4d_lib.texture.refine import MeshClip, RefinedTextures, refine_textures
 from dg4d_lib.texture.refiner import ImageToImage, Refiner, VideoToVideo
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import read_frames
@@ -24,36 +24,37 @@ from steps.runtime.weights import open_weights
 
 
 def run(job: Job) -> StepReport:
-    """Refine the mesh that moves, or every frame's own; all frames are seen as one video.
+    """Refine the texture of the tracked mesh, or of every frame's mesh; the refiner sees all frames as one video.
 
-    A flow leaves this step out where `refiner.kind` is `identity`.
+    A flow skips this step if `refiner.kind` is `identity`.
 
     Raises:
         BadInput: meshes and driving video have different numbers of frames.
-        BackendUnavailable: weights, or what loads them, are not here.
-        FitDiverged: the loss left the finite numbers.
+        BackendUnavailable: weights or libraries are not installed.
+        FitDiverged: the loss is not finite.
     """
-    facts = StepReport()
+    report = StepReport()
     if "tracked" in job.inputs:
         tracked = read_tracked(job.inputs["tracked"])
-        (its,), facts = _refined(job, [MeshClip(tracked.mesh, tracked.offsets)])
-        mesh = replace(tracked.mesh, texture=its.texture)
-        write_tracked(job.outputs["tracked"], replace(tracked, mesh=mesh, textures=its.frames))
+        (textures,), report = _refine(job, [MeshClip(tracked.mesh, tracked.offsets)])
+        mesh = replace(tracked.mesh, texture=textures.texture)
+        write_tracked(job.outputs["tracked"], replace(tracked, mesh=mesh, textures=textures.frame_textures))
     if "meshes" in job.inputs:
         meshes = read_meshes(job.inputs["meshes"])
-        refined, facts = _refined(job, [MeshClip(mesh, torch.zeros(1, *mesh.vertices.shape)) for mesh in meshes])
-        better = [replace(mesh, texture=its.texture) for mesh, its in zip(meshes, refined, strict=True)]
-        write_meshes(job.outputs["meshes"], dict(enumerate(better)))
-    return facts
+        refined, report = _refine(job, [MeshClip(mesh, torch.zeros(1, *mesh.vertices.shape)) for mesh in meshes])
+        pairs = zip(meshes, refined, strict=True)
+        textured = [replace(mesh, texture=textures.texture) for mesh, textures in pairs]
+        write_meshes(job.outputs["meshes"], dict(enumerate(textured)))
+    return report
 
 
-def _refined(job: Job, stretches: Sequence[MeshClip]) -> tuple[list[Refined], StepReport]:
-    """The textures of a motion, and how they were made."""
+def _refine(job: Job, clips: Sequence[MeshClip]) -> tuple[list[RefinedTextures], StepReport]:
+    """Return the refined textures of consecutive clips, and the report."""
     kind: RefinerSettings = job.settings.refiner
     with TemporaryDirectory() as scratch:
         driving = read_frames(job.inputs["driving_video"], Path(scratch))
-    device = device_here()
-    driving = DrivingVideo(driving.frames.to(device), driving.coverage.to(device), driving.fps)
+    device = default_device()
+    driving = DrivingVideo(driving.frames.to(device), driving.alpha.to(device), driving.fps)
     pictures = driving.over(driving.frames.new_ones(3))
     refiner: Refiner
     match kind:
@@ -62,24 +63,27 @@ def _refined(job: Job, stretches: Sequence[MeshClip]) -> tuple[list[Refined], St
         case VideoToVideoSettings():
             opened = open_weights(kind.model.weights)
             model = VideoModel.load(opened.folder, kind.model, device)
-            refiner, halved = VideoToVideo(kind, model, pictures[0]), model.notes
-            how = f"by video diffusion from sigma {refiner.sigmas[0]:.3f} on, {len(refiner.sigmas) - 1} steps"
+            refiner, run_notes = VideoToVideo(kind, model, pictures[0]), model.notes
+            method = f"by video diffusion from sigma {refiner.sigmas[0]:.3f} on, {len(refiner.sigmas) - 1} steps"
         case ImageToImageSettings():
             opened = open_weights(kind.prior.weights)
             loaded = Zero123.load(opened.folder, kind.prior, device)
-            prior = loaded.conditioned_on(pictures, Annealing(1.0))
-            refiner, halved = ImageToImage(kind, prior), prior.batches.notes
-            how = "picture by picture, by image diffusion"
+            prior = loaded.conditioned_on(pictures, TimestepSchedule(1.0))
+            refiner, run_notes = ImageToImage(kind, prior), prior.batches.notes
+            method = "picture by picture, by image diffusion"
     generator = torch.Generator().manual_seed(job.seed)
-    there = [MeshClip(_on(device, stretch.mesh), stretch.offsets.to(device)) for stretch in stretches]
-    refined = refine_textures(there, driving, refiner, kind.texture, generator, job.progress)
+    on_device = [MeshClip(_to_device(clip.mesh, device), clip.offsets.to(device)) for clip in clips]
+    refined = refine_textures(on_device, driving, refiner, kind.texture, generator, job.progress)
     often = "every iteration" if kind.texture.refresh_every == 1 else f"every {kind.texture.refresh_every} iterations"
-    said = [f"Textures were refined {how}; {kind.texture.iterations} iterations, new targets {often}."]
-    if any(its.frames is not None for its in refined):
-        said.append("The texture changes from frame to frame: every frame adds colors of its own to the shared one.")
-    facts = StepReport(f"{device.type} (diffusers)", opened.digests, opened.licenses, tuple(said), halved())
-    return [Refined(its.texture.cpu(), None if its.frames is None else its.frames.cpu()) for its in refined], facts
+    notes = [f"Textures were refined {method}; {kind.texture.iterations} iterations, new targets {often}."]
+    if any(textures.frame_textures is not None for textures in refined):
+        notes.append("The texture changes from frame to frame: every frame adds colors of its own to the shared one.")
+    report = StepReport(f"{device.type} (diffusers)", opened.digests, opened.licenses, tuple(notes), run_notes())
+    return [
+        RefinedTextures(each.texture.cpu(), None if each.frame_textures is None else each.frame_textures.cpu())
+        for each in refined
+    ], report
 
 
-def _on(device: torch.device, mesh: TexturedMesh) -> TexturedMesh:
+def _to_device(mesh: TexturedMesh, device: torch.device) -> TexturedMesh:
     return TexturedMesh(mesh.vertices.to(device), mesh.faces.to(device), mesh.uvs.to(device), mesh.texture.to(device))

@@ -8,9 +8,9 @@ import torch
 from safetensors.torch import load_file, save_file
 from tiny_weights import tiny_vae, write_scheduler
 
-from dg4d_lib.guidance.imagedream_unet import MultiViewShape, MultiViewUnet
+from dg4d_lib.guidance.imagedream_unet import MultiViewUnet, MultiViewUnetConfig
 from dg4d_lib.reconstruction.lgm import WEIGHTS_FILE, Lgm
-from dg4d_lib.reconstruction.lgm_unet import UnetShape
+from dg4d_lib.reconstruction.lgm_unet import UnetConfig
 
 UNET_CONFIG: dict[str, Any] = {  # the keys of the published unet/config.json, and the two sizes it takes for granted
     "_class_name": "MultiViewUNetModel",
@@ -37,7 +37,7 @@ TOKENS = [*LETTERS, *(f"{letter}</w>" for letter in LETTERS), *ENDS.values()]
 
 
 def tiny_unet() -> MultiViewUnet:
-    return MultiViewUnet(MultiViewShape.of(UNET_CONFIG))
+    return MultiViewUnet(MultiViewUnetConfig.of(UNET_CONFIG))
 
 
 def write_imagedream(model: Path, seed: int = 0) -> Path:
@@ -78,7 +78,7 @@ def write_lgm(folder: Path, seed: int = 0) -> Path:
     """A tiny LGM of 4 x 16 x 16 Gaussians, in a folder like `ashawkey/LGM`."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = Lgm(UnetShape((32, 32, 32, 32, 64), (False, False, False, False, True), (64,), (True,)))
+        model = Lgm(UnetConfig((32, 32, 32, 32, 64), (False, False, False, False, True), (64,), (True,)))
     folder.mkdir(parents=True, exist_ok=True)
     save_file(model.half().state_dict(), folder / WEIGHTS_FILE)
     return folder

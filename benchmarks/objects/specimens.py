@@ -17,7 +17,7 @@ from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.video.driving import DrivingVideo
 from examples.drawing import Creature
 from examples.newt import Newt
-from steps.artifacts.ground_truth import Truth
+from steps.artifacts.ground_truth import GroundTruth
 from steps.artifacts.media import read_png
 from steps.fitting.priors import read_bank_folder
 
@@ -77,7 +77,7 @@ def made(name: str, frames: int, size: int) -> Specimen:
     return Specimen(name, pictures[0], bank, scored, pictures[1:first])
 
 
-def read(truth: Truth, frames: int) -> Specimen:
+def read(truth: GroundTruth, frames: int) -> Specimen:
     """An object out of a data set.
 
     Of a longer video every second, third ... frame is taken, whatever gives at most `frames`.
@@ -102,7 +102,7 @@ def read(truth: Truth, frames: int) -> Specimen:
     return Specimen(truth.name, pictures[0], bank, cameras, pictures[1:])
 
 
-def _pictures(truth: Truth, stride: int) -> Float[Tensor, "v t s s 4"]:
+def _pictures(truth: GroundTruth, stride: int) -> Float[Tensor, "v t s s 4"]:
     """What the input camera sees, and then all views: as many frames of each."""
     folders = [truth.inputs, *(view.frames for view in truth.views)]
     rows = [[read_png(path) for path in folder[: len(truth.inputs) : stride]] for folder in folders]

@@ -26,7 +26,7 @@ class Asset4D:
         fps: frames per second.
         extras: JSON that goes into the GLB untouched.
         textures: the colors of every frame in [0, 1], where they change; None: always the mesh's own.
-        rest: the position at which the moved mesh is the mesh at rest, but for what was corrected afterwards.
+        reference_frame: the position at which the moved mesh is the mesh at rest, but for what was corrected afterwards.
     """
 
     mesh: TexturedMesh
@@ -34,10 +34,12 @@ class Asset4D:
     fps: float
     extras: dict[str, Any] = field(default_factory=dict)
     textures: Float[Tensor, "t h w 3"] | None = None
-    rest: float = 0.0
+    reference_frame: float = 0.0
 
 
-def moved(gaussians: Gaussians, deformation: Deformation, frames: int, positions: Float[Tensor, " m"]) -> Gaussians:
+def pose_gaussians(
+    gaussians: Gaussians, deformation: Deformation, frames: int, positions: Float[Tensor, " m"]
+) -> Gaussians:
     """The cloud at positions of an animation with this many frames, one state each, without gradients.
 
     Between frames the deformation itself says where things are; only the way back from the last frame is linear.
@@ -56,7 +58,7 @@ def moved(gaussians: Gaussians, deformation: Deformation, frames: int, positions
         return there.apply(gaussians)
 
 
-def between(values: Float[Tensor, "t n c"], positions: Float[Tensor, " m"]) -> Float[Tensor, "m n c"]:
+def interpolate_frames(values: Float[Tensor, "t n c"], positions: Float[Tensor, " m"]) -> Float[Tensor, "m n c"]:
     """Values given per frame, linear between frames, as a player shows a GLB."""
     before = positions.floor().long()
     share = (positions - before).to(values)[:, None, None]

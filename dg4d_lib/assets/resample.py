@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dg4d_lib.assets.animated import Asset4D, between, moved
+from dg4d_lib.assets.animated import Asset4D, interpolate_frames, pose_gaussians
 from dg4d_lib.deformation.interface import Deformation, Displacement
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -16,7 +16,7 @@ MOST_STATES = 1000  # a GLB holds a morph target per state, and weights for all 
 STATES_AT_ONCE = 32  # bounds the memory
 
 
-def moments(frames: int, fps: float, wanted: float) -> Float[Tensor, " m"]:
+def resampled_positions(frames: int, fps: float, wanted: float) -> Float[Tensor, " m"]:
     """The positions of the states of a closed animation at another frame rate: round(frames * wanted / fps) of them.
 
     They part the loop evenly and begin with the first frame. The loop lasts as long as before, to half a state.
@@ -41,9 +41,11 @@ def moments(frames: int, fps: float, wanted: float) -> Float[Tensor, " m"]:
     return torch.arange(count, dtype=torch.float64) * frames / count
 
 
-def states(gaussians: Gaussians, deformation: Deformation, frames: int, positions: Float[Tensor, " m"]) -> Gaussians:
-    """What `moved` gives, a few positions at a time: networks need far more memory than the states they make."""
-    parts = [moved(gaussians, deformation, frames, part) for part in positions.split(STATES_AT_ONCE)]
+def pose_gaussians_in_chunks(
+    gaussians: Gaussians, deformation: Deformation, frames: int, positions: Float[Tensor, " m"]
+) -> Gaussians:
+    """What `pose_gaussians` gives, a few positions at a time: networks need far more memory than the states they make."""
+    parts = [pose_gaussians(gaussians, deformation, frames, part) for part in positions.split(STATES_AT_ONCE)]
     return replace(
         gaussians,
         means=torch.cat([part.means for part in parts]),
@@ -52,7 +54,7 @@ def states(gaussians: Gaussians, deformation: Deformation, frames: int, position
     )
 
 
-def resampled(asset: Asset4D, gaussians: Gaussians, deformation: Deformation, frames: int, fps: float) -> Asset4D:
+def resample_asset(asset: Asset4D, gaussians: Gaussians, deformation: Deformation, frames: int, fps: float) -> Asset4D:
     """A tracked mesh at another frame rate.
 
     Between frames its vertices ride the Gaussians of that moment, as they did at the frames; what they were corrected
@@ -73,7 +75,7 @@ def resampled(asset: Asset4D, gaussians: Gaussians, deformation: Deformation, fr
         raise BadInput(f"the mesh has {len(asset.offsets)} frames, its motion {frames}; extract the mesh again")
     if fps == asset.fps:
         return asset
-    positions = moments(frames, asset.fps, fps)
+    positions = resampled_positions(frames, asset.fps, fps)
     every = torch.arange(frames, dtype=torch.float64)
     asked, places = torch.cat([every, positions]).unique(return_inverse=True)
     carried = _carried(asset, gaussians, deformation, frames, asked)
@@ -81,10 +83,10 @@ def resampled(asset: Asset4D, gaussians: Gaussians, deformation: Deformation, fr
     nearest = positions.round().long() % frames
     return replace(
         asset,
-        offsets=between(asset.offsets, positions) + (there - between(at_frames, positions)),
+        offsets=interpolate_frames(asset.offsets, positions) + (there - interpolate_frames(at_frames, positions)),
         fps=fps,
         textures=None if asset.textures is None else asset.textures[nearest],
-        rest=asset.rest * len(positions) / frames,
+        reference_frame=asset.reference_frame * len(positions) / frames,
     )
 
 
@@ -92,7 +94,7 @@ def _carried(
     asset: Asset4D, gaussians: Gaussians, deformation: Deformation, frames: int, positions: Float[Tensor, " m"]
 ) -> Float[Tensor, "m v 3"]:
     """How far the vertices have ridden from rest at these positions."""
-    rest = moved(gaussians, deformation, frames, positions.new_tensor([asset.rest])).at(0)
-    there = states(gaussians, deformation, frames, positions)
+    rest = pose_gaussians(gaussians, deformation, frames, positions.new_tensor([asset.reference_frame])).at(0)
+    there = pose_gaussians_in_chunks(gaussians, deformation, frames, positions)
     since_rest = Displacement(there.means - rest.means, there.log_scales - rest.log_scales, there.quats - rest.quats)
     return skin_vertices(asset.mesh.vertices, rest, since_rest)

@@ -1,1 +1,1 @@
-"""Cameras on an orbit and sets of viewpoints."""
+"""Orbit cameras and sets of viewpoints."""

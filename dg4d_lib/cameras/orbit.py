@@ -1,6 +1,6 @@
-"""A camera that looks at the origin from a sphere around it.
+"""Pinhole camera on a sphere around the origin, looking at the origin.
 
-World: right-handed, y up, the object's front looks along +z. Azimuth 0 is on +z, 90 on +x; positive elevation is above.
+World axes: right-handed, y up, the object faces +z. Azimuth 0 is on +z, 90 on +x; positive elevation is above.
 """
 
 import math
@@ -11,21 +11,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-FOV_Y_DEG = 49.1  # field of view of the method's camera on both axes
+FOV_Y_DEG = 49.1  # degrees, on both axes; DreamGaussian's camera (Tang et al. 2024)
 RADIUS = 2.0  # world units
 
 
 @dataclass(frozen=True)
 class OrbitCamera:
-    """Where it stands, how wide it sees, how many pixels it has.
+    """Pose, field of view and image size of an orbit camera.
 
     Attributes:
-        elevation_deg: above the horizon, -90 to 90.
+        elevation_deg: angle above the horizon, -90 to 90.
         azimuth_deg: counter-clockwise seen from above, 0 on +z, 90 on +x.
         radius: distance from the origin, world units.
         fov_y_deg: vertical field of view.
-        width: pixels.
-        height: pixels.
+        width: image width, pixels.
+        height: image height, pixels.
     """
 
     elevation_deg: float = 0.0
@@ -46,13 +46,13 @@ class OrbitCamera:
         return 0.5 * self.width / self.focal, 0.5 * self.height / self.focal
 
     def position(self) -> Float[Tensor, " 3"]:
-        """The camera's place in the world, float64."""
+        """Return the camera center in world coordinates, float64."""
         e, a = math.radians(self.elevation_deg), math.radians(self.azimuth_deg)
         direction = (math.cos(e) * math.sin(a), math.sin(e), math.cos(e) * math.cos(a))
         return self.radius * torch.tensor(direction, dtype=torch.float64)
 
-    def world_to_camera(self) -> Float[Tensor, "4 4"]:
-        """World to camera, OpenCV axes (+x right, +y down, +z forward), float64."""
+    def viewmat(self) -> Float[Tensor, "4 4"]:
+        """Return the world-to-camera matrix, OpenCV axes (+x right, +y down, +z forward), float64."""
         e, a = math.radians(self.elevation_deg), math.radians(self.azimuth_deg)
         sin_e, cos_e, sin_a, cos_a = math.sin(e), math.cos(e), math.sin(a), math.cos(a)
         rows = (
@@ -64,6 +64,6 @@ class OrbitCamera:
         return torch.tensor(rows, dtype=torch.float64)
 
 
-def world_to_camera(cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b 4 4"]:
-    """The matrices of several cameras, float64."""
-    return torch.stack([camera.world_to_camera() for camera in cameras])
+def viewmats(cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b 4 4"]:
+    """Stack the world-to-camera matrices of several cameras, float64."""
+    return torch.stack([camera.viewmat() for camera in cameras])

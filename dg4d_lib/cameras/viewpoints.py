@@ -1,4 +1,4 @@
-"""Sets of viewpoints: random ones for score distillation, fixed ones for baking and inspection."""
+"""Sets of viewpoints: random orbits for score distillation, fixed sets for baking and turntables."""
 
 import math
 from dataclasses import replace
@@ -8,7 +8,7 @@ import torch
 from dg4d_lib.cameras.orbit import OrbitCamera
 
 BAKING_ELEVATIONS_DEG = (0.0, -45.0, 45.0)
-POLE_DEG = 89.9  # a camera exactly on the pole has no up
+POLE_DEG = 89.9  # elevation of the polar views; at exactly 90 the up vector is undefined
 
 
 def random_orbit(
@@ -20,9 +20,15 @@ def random_orbit(
     generator: torch.Generator,
     ring: int = 1,
 ) -> list[OrbitCamera]:
-    """Cameras all around: azimuth uniform in [-180, 180), elevation and radius uniform in the given ranges.
+    """Sample cameras: azimuth uniform in [-180, 180), elevation and radius uniform in the given ranges.
 
-    With `ring` above 1, that many cameras at a time differ only in azimuth, by equal steps around the object.
+    Args:
+        count: number of cameras.
+        size: image width and height, pixels.
+        elevation_deg: lowest and highest elevation.
+        radius: smallest and largest distance from the origin, world units.
+        generator: random numbers, on the CPU.
+        ring: cameras per ring; those of a ring differ only in azimuth, by equal steps around the object.
     """
     u = torch.rand(math.ceil(count / ring), 3, generator=generator, dtype=torch.float64).tolist()
     (low_e, high_e), (low_r, high_r) = elevation_deg, radius
@@ -34,12 +40,12 @@ def random_orbit(
 
 
 def turntable(count: int, camera: OrbitCamera) -> list[OrbitCamera]:
-    """`count` cameras at equal steps of azimuth, starting at the given one's."""
+    """Return `count` copies of a camera at equal steps of azimuth, the given azimuth first."""
     return [replace(camera, azimuth_deg=camera.azimuth_deg + 360 * i / count) for i in range(count)]
 
 
 def baking_views(size: int) -> list[OrbitCamera]:
-    """The 26 views of color back-projection: three rings of eight azimuths and the two poles."""
+    """Return the 26 views of texture baking: three rings of eight azimuths and the two poles."""
     rings = [
         OrbitCamera(elevation, 45.0 * i, width=size, height=size)
         for elevation in BAKING_ELEVATIONS_DEG

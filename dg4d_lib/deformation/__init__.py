@@ -1,1 +1,1 @@
-"""How Gaussians move over time."""
+"""Deformation models: displacements of Gaussians over time."""

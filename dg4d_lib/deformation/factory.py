@@ -1,4 +1,4 @@
-"""Factory of deformations: new, or from their state."""
+"""Factory of deformation models: from settings, or from a state dict."""
 
 from collections.abc import Mapping
 
@@ -21,46 +21,45 @@ def new_deformation(
     count: int,
     generator: torch.Generator | None = None,
 ) -> AnyDeformation:
-    """Create a deformation; it is the identity unless its settings say otherwise.
+    """Create a deformation; the identity, unless its settings start it elsewhere.
 
     Args:
-        settings: its kind and sizes.
-        bounds: lower and upper corner of the box of the Gaussians; what it covers unless the settings name a box.
-        frames: of the video.
-        count: Gaussians.
-        generator: for the start of planes, layers and scattered Gaussians.
+        settings: kind and sizes.
+        bounds: lower and upper corner of the box that the model covers, unless the settings have a box of their own.
+        frames: number of frames of the video.
+        count: number of Gaussians.
+        generator: initializes planes, layers and scattered displacements.
     """
     match settings:
         case HexPlaneSettings():
-            wide = torch.tensor([[-settings.half_side] * 3, [settings.half_side] * 3])
-            covered = wide if settings.half_side else bounds
-            return HexPlane(settings, covered, generator, last_moment(settings, frames))
+            cube = torch.tensor([[-settings.half_side] * 3, [settings.half_side] * 3])
+            return HexPlane(settings, cube if settings.half_side else bounds, generator, last_time(settings, frames))
         case MlpSettings():
-            return Mlp(settings, bounds, generator, last_moment(settings, frames))
+            return Mlp(settings, bounds, generator, last_time(settings, frames))
         case FramewiseSettings():
             radius = float((bounds[1] - bounds[0]).max()) / 2 if settings.start == "scattered" else 0.0
             return Framewise(frames, count, radius, generator)
 
 
-def tensors_of(deformation: AnyDeformation) -> dict[str, Tensor]:
-    """Return the tensors of a fitted deformation by name."""
+def deformation_tensors(deformation: AnyDeformation) -> dict[str, Tensor]:
+    """Return the tensors of a deformation by name, sorted, contiguous and on the CPU."""
     return {name: value.detach().cpu().contiguous() for name, value in sorted(deformation.state_dict().items())}
 
 
 def from_state_dict(
     settings: DeformationSettings, tensors: Mapping[str, Tensor], frames: int, count: int
 ) -> AnyDeformation:
-    """Create a deformation from the result of `tensors_of`, without gradients.
+    """Create a frozen deformation from the result of `deformation_tensors`.
 
     Raises:
-        RuntimeError: a tensor is missing, is of another shape or belongs to nothing.
+        RuntimeError: a tensor is missing, unexpected or of another shape.
     """
-    deformation = new_deformation(settings, torch.zeros(2, 3), frames, count)  # the true box is among the tensors
+    deformation = new_deformation(settings, torch.zeros(2, 3), frames, count)  # the tensors hold the real bounds
     deformation.load_state_dict(dict(tensors))
     return deformation.requires_grad_(False)
 
 
-def last_moment(settings: DeformationSettings, frames: int) -> float:
-    """Return the time of the last frame on the deformation's axis from 0 to 1."""
+def last_time(settings: DeformationSettings, frames: int) -> float:
+    """Return the time of the last frame on the deformation's time axis, which ends at 1."""
     open_ended = not isinstance(settings, FramewiseSettings) and not settings.endpoint
     return (frames - 1) / frames if open_ended else 1.0

@@ -1,4 +1,4 @@
-"""Ablation: every frame has its own free displacement (paper, ablation of the deformation field)."""
+"""Per-frame displacements without a shared model (ablation of the deformation field in the paper)."""
 
 import torch
 from jaxtyping import Float
@@ -10,13 +10,14 @@ from dg4d_lib.errors import BadInput
 
 
 class Framewise(nn.Module):
-    """A table of displacements; linear between frames.
+    """Table of displacements, interpolated linearly between frames.
 
     Args:
-        frames: t.
-        count: Gaussians, n.
-        scatter: how far from its place at rest a Gaussian may begin, at random and in every frame anew, world units.
-        generator: of these beginnings.
+        frames: number of frames, t.
+        count: number of Gaussians, n.
+        scatter: radius of the ball from which initial displacements of the means are drawn, independently per frame;
+            world units.
+        generator: draws them.
     """
 
     def __init__(self, frames: int, count: int, scatter: float = 0.0, generator: torch.Generator | None = None) -> None:
@@ -24,29 +25,29 @@ class Framewise(nn.Module):
         table = torch.zeros(frames, count, 10)
         if scatter:
             directions = functional.normalize(torch.randn(frames, count, 3, generator=generator), dim=-1)
-            shares = torch.rand(frames, count, 1, generator=generator) ** (1 / 3)  # evenly over the ball
-            table[..., :3] = scatter * shares * directions
+            radii = torch.rand(frames, count, 1, generator=generator) ** (1 / 3)  # uniform density in the ball
+            table[..., :3] = scatter * radii * directions
         self.table = nn.Parameter(table)
 
     def displace(self, means: Float[Tensor, "n 3"], times: Float[Tensor, " t"]) -> Displacement:
-        """What to add at every time in [0, 1]; the means only have to be as many as the table's.
+        """Return the displacements at times in [0, 1]; of the means only their number matters.
 
         Raises:
-            BadInput: another number of Gaussians than the table was made for.
+            BadInput: the number of Gaussians differs from the table's.
         """
         if len(means) != self.table.shape[1]:
-            raise BadInput(f"a frame-wise motion of {self.table.shape[1]} Gaussians cannot move {len(means)}")
+            raise BadInput(f"this frame-wise deformation has {self.table.shape[1]} Gaussians; given {len(means)}")
         last = self.table.shape[0] - 1
-        place = times.clamp(0, 1) * last
-        left = place.floor().clamp(0, max(last - 1, 0)).long()
-        share = (place - left)[:, None, None]
-        rows = self.table[left] * (1 - share) + self.table[(left + 1).clamp(max=last)] * share
+        position = times.clamp(0, 1) * last
+        left = position.floor().clamp(0, max(last - 1, 0)).long()
+        weight = (position - left)[:, None, None]
+        rows = self.table[left] * (1 - weight) + self.table[(left + 1).clamp(max=last)] * weight
         return Displacement(rows[..., :3], rows[..., 3:6], rows[..., 6:])
 
-    def planes(self) -> list[nn.Parameter]:
-        """The parameters that learn at the rate of planes: all."""
+    def grid_parameters(self) -> list[nn.Parameter]:
+        """Return the parameters that use `plane_lr`: all."""
         return [self.table]
 
-    def roughness(self) -> Float[Tensor, ""]:
-        """A table has no regularizer: zero."""
+    def regularization_loss(self) -> Float[Tensor, ""]:
+        """Return zero: the table has no regularizer."""
         return self.table.new_zeros(())

@@ -1,7 +1,7 @@
-"""HexPlane: six planes over space and time, and a small network that reads them (Cao and Johnson 2023; paper 3.2).
+"""HexPlane deformation field: six feature planes over space and time and a small MLP (Cao and Johnson 2023; paper 3.2).
 
-Zero initialization with residual heads makes the motion exactly zero at the start; at the first step only the last
-matrices of the heads receive gradient.
+With zero-initialized residual heads the deformation is exactly zero at the start; in the first iteration only the last
+matrices of the heads receive a gradient.
 """
 
 import torch
@@ -13,7 +13,7 @@ from dg4d_lib.deformation.hexplane_kernel import SPATIAL_AXES, hexplane_features
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.settings import HexPlaneSettings
 
-ROWS = 1 << 13  # Gaussians times moments that the network reads at a time
+ROWS = 1 << 13  # Gaussians times timestamps per pass of the MLP on the CPU: the activations fit into the cache
 
 
 class ResidualHead(nn.Module):
@@ -26,41 +26,41 @@ class ResidualHead(nn.Module):
             nn.init.zeros_(parameter)
 
     def folded(self) -> tuple[Float[Tensor, "outputs hidden"], Float[Tensor, "outputs 1"]]:
-        """B (1 + A) and B a + b: nothing bends after the relu, so the head is one matrix on h and one offset."""
+        """Return B (1 + A) and B a + b: the head is affine in h, so one matrix and one offset suffice."""
         a, b = self.inner, self.outer
         return torch.addmm(b.weight, b.weight, a.weight), torch.addmv(b.bias, b.weight, a.bias)[:, None]
 
 
 class Heads(nn.Module):
-    """What turns the features of a Gaussian at a time into its displacement."""
+    """MLP heads: features of a Gaussian at a time to its displacement."""
 
     def __init__(self, hidden: int) -> None:
         super().__init__()
         self.means, self.log_scales, self.quats = (ResidualHead(hidden, outputs) for outputs in (3, 3, 4))
 
     def forward(self, trunk: nn.Linear, features: Float[Tensor, "t n c"]) -> Displacement:
-        """One displacement per time, of the features as `trunk` reads them.
+        """Return the displacement at every time, with `trunk` as the first layer.
 
-        The processor takes so many rows at a time that what lies between stays in its cache; a matrix with ten rows is
-        faster for it than one with ten columns.
+        On the CPU the rows are split so that activations stay in the cache, and the product is taken transposed,
+        because a matrix with ten rows is faster there than one with ten columns.
         """
         heads = (self.means, self.log_scales, self.quats)
         matrix, offset = (torch.cat(parts) for parts in zip(*(head.folded() for head in heads), strict=True))
         times, count, _ = features.shape
         rows = features.flatten(0, 1)
         parts = rows.split(ROWS) if rows.device.type == "cpu" else [rows]
-        found = torch.cat([torch.addmm(offset, matrix, functional.relu(trunk(part)).T) for part in parts], 1)
-        return Displacement(*found.unflatten(1, (times, count)).movedim(0, -1).split((3, 3, 4), -1))
+        outputs = torch.cat([torch.addmm(offset, matrix, functional.relu(trunk(part)).T) for part in parts], 1)
+        return Displacement(*outputs.unflatten(1, (times, count)).movedim(0, -1).split((3, 3, 4), -1))
 
 
 class HexPlane(nn.Module):
-    """The paper's deformation model.
+    """Deformation model of the paper.
 
     Args:
         settings: sizes and regularizers.
         bounds: lower and upper corner of the box that the planes cover, world units.
-        generator: for the start of the planes and the trunk.
-        last: where the last frame lies on the time axis of the planes, which ends at 1.
+        generator: initializes the planes and the MLP.
+        last: time of the last frame on the time axis of the planes, which ends at 1.
     """
 
     bounds: Tensor
@@ -88,25 +88,24 @@ class HexPlane(nn.Module):
                 nn.init.xavier_uniform_(matrix, generator=generator)
 
     def displace(self, means: Float[Tensor, "n 3"], times: Float[Tensor, " t"]) -> Displacement:
-        """What to add at every time in [0, 1]; means outside the box read its border."""
+        """Return the displacements at times in [0, 1]; means outside the box are clamped to it."""
         low, high = self.bounds
         coordinates = ((means - low) / (high - low) * 2 - 1).clamp(-1, 1)
         on_cpu = means.device.type == "cpu" and means.dtype == torch.float32
         read = hexplane_features if on_cpu else plane_features
-        moments = self.last * times
         features = [
-            read(coordinates, space, time_lines(time, moments))
+            read(coordinates, space, time_lines(time, self.last * times))
             for space, time in zip(self.space, self.time, strict=True)
         ]
         displacement: Displacement = self.heads(self.trunk, torch.cat(features, -1))
         return displacement
 
-    def planes(self) -> list[nn.Parameter]:
-        """The parameters that learn at the rate of planes."""
+    def grid_parameters(self) -> list[nn.Parameter]:
+        """Return the parameters that use `plane_lr`: the six planes."""
         return [*self.space, *self.time]
 
-    def roughness(self) -> Float[Tensor, ""]:
-        """Variation in space, second differences in time, distance of time planes from one; all off by default."""
+    def regularization_loss(self) -> Float[Tensor, ""]:
+        """Return the weighted total variation, temporal smoothness and temporal sparsity; zero by default."""
         s = self.settings
         total = self.bounds.new_zeros(())
         for space, time in zip(self.space, self.time, strict=True):
@@ -122,30 +121,30 @@ class HexPlane(nn.Module):
 
 
 def time_lines(planes: Float[Tensor, "3 c steps r"], times: Float[Tensor, " t"]) -> Float[Tensor, "3 t c r"]:
-    """The rows of the time planes at these times: linear between the steps, both ends included."""
+    """Sample the time planes at these times, linearly between the steps, both ends included."""
     steps = planes.shape[2]
-    place = times.clamp(0, 1) * (steps - 1)
-    hat = (1 - (place[:, None] - torch.arange(steps, dtype=planes.dtype, device=planes.device)).abs()).clamp(min=0)
+    position = times.clamp(0, 1) * (steps - 1)
+    hat = (1 - (position[:, None] - torch.arange(steps, dtype=planes.dtype, device=planes.device)).abs()).clamp(min=0)
     return torch.einsum("ts,acsr->atcr", hat, planes)
 
 
 def plane_features(
     coordinates: Float[Tensor, "n 3"], planes: Float[Tensor, "3 c r r"], lines: Float[Tensor, "3 t c r"]
 ) -> Float[Tensor, "t n c"]:
-    """Product of the six bilinear samples; coordinates in [-1, 1], corners aligned.
+    """Return the product of the six samples; coordinates in [-1, 1], corners aligned.
 
-    Plain torch: the definition of `hexplane_features`, and what runs on other devices and precisions.
+    The reference implementation of `hexplane_features` in plain torch, used on other devices and precisions.
     """
     pairs = torch.stack([torch.stack([coordinates[:, axis] for axis in axes], -1) for axes in SPATIAL_AXES])
     samples = functional.grid_sample(planes, pairs[:, None], align_corners=True, padding_mode="border")[:, :, 0]
-    space = samples[0] * samples[1] * samples[2]  # the gradient of `prod` has a GPU waited for
+    space = samples[0] * samples[1] * samples[2]  # the backward pass of `prod` synchronizes with the GPU
     last = lines.shape[-1] - 1
-    place = (coordinates + 1) / 2 * last
-    left = place.floor().clamp(0, last - 1)
-    share = (place - left).to(lines.dtype)
+    position = (coordinates + 1) / 2 * last
+    left = position.floor().clamp(0, last - 1)
+    weight = (position - left).to(lines.dtype)
     left = left.long()
     features = space.T
     for axis in range(3):
-        i, f = left[:, axis], share[:, axis]
+        i, f = left[:, axis], weight[:, axis]
         features = features * (lines[axis][..., i] * (1 - f) + lines[axis][..., i + 1] * f).transpose(-1, -2)
     return features

@@ -1,4 +1,4 @@
-"""What moves Gaussians: a displacement at a time, always something to add."""
+"""Interface of deformation models: additive displacements of raw Gaussian parameters at given times."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,12 +12,12 @@ from dg4d_lib.gaussians.cloud import Gaussians
 
 @dataclass(frozen=True)
 class Displacement:
-    """Added to raw parameters; zeros is the identity. The leading t is one entry per time.
+    """Offsets of the raw parameters, one entry per time t; zero is the identity.
 
     Attributes:
-        means: world units.
-        log_scales: added before the exponential.
-        quats: added before normalization.
+        means: offset, world units.
+        log_scales: offset before the exponential.
+        quats: offset before normalization.
     """
 
     means: Float[Tensor, "t n 3"]
@@ -25,7 +25,7 @@ class Displacement:
     quats: Float[Tensor, "t n 4"]
 
     def apply(self, gaussians: Gaussians) -> Gaussians:
-        """The cloud at every time: means, scales and rotations get a leading t; opacity and color stay."""
+        """Return the cloud at every time; means, scales and quaternions get a leading t axis."""
         return Gaussians(
             gaussians.means + self.means,
             gaussians.log_scales + self.log_scales,
@@ -37,20 +37,20 @@ class Displacement:
 
 @runtime_checkable
 class Deformation(Protocol):
-    """A motion model: HexPlane, MLP, frame-wise."""
+    """Deformation model: HexPlane, MLP or frame-wise table."""
 
     def displace(self, means: Float[Tensor, "n 3"], times: Float[Tensor, " t"]) -> Displacement:
-        """What to add to Gaussians at these canonical means, at every time in [0, 1] (0 first frame, 1 last)."""
+        """Return the displacements of Gaussians at these canonical means, at times in [0, 1] (first to last frame)."""
         ...
 
     def parameters(self) -> Iterator[nn.Parameter]:
-        """Everything that is fitted."""
+        """Return all trainable parameters."""
         ...
 
-    def planes(self) -> list[nn.Parameter]:
-        """Those of the parameters that learn fast: tables and planes, not networks."""
+    def grid_parameters(self) -> list[nn.Parameter]:
+        """Return the parameters that use `plane_lr` (planes and tables); the others use `network_lr`."""
         ...
 
-    def roughness(self) -> Float[Tensor, ""]:
-        """The weighted sum of the model's own regularizers; zero where none is switched on."""
+    def regularization_loss(self) -> Float[Tensor, ""]:
+        """Return the weighted sum of the model's regularizers; zero if none is enabled."""
         ...

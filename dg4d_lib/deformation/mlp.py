@@ -1,4 +1,4 @@
-"""Ablation: one network over place and time instead of planes (paper, ablation of the deformation field)."""
+"""MLP deformation field over position and time (ablation of the deformation field in the paper)."""
 
 import torch
 from jaxtyping import Float
@@ -11,13 +11,13 @@ from dg4d_lib.settings import MlpSettings
 
 
 class Mlp(nn.Module):
-    """Sines and cosines of place and time, two layers, the zero-initialized heads of HexPlane.
+    """Positional encoding of position and time, two layers, and the zero-initialized heads of HexPlane.
 
     Args:
         settings: sizes.
         bounds: lower and upper corner of the box that maps to [-1, 1], world units.
-        generator: for the start of the layers.
-        last: where the last frame lies on the network's axis of time, which ends at 1.
+        generator: initializes the layers.
+        last: time of the last frame on the network's time axis, which ends at 1.
     """
 
     bounds: Tensor
@@ -40,25 +40,25 @@ class Mlp(nn.Module):
         self.heads = Heads(settings.hidden)
 
     def displace(self, means: Float[Tensor, "n 3"], times: Float[Tensor, " t"]) -> Displacement:
-        """What to add at every time in [0, 1]."""
+        """Return the displacements at times in [0, 1]."""
         low, high = self.bounds
-        place = ((means - low) / (high - low) * 2 - 1).expand(len(times), -1, -1)
+        position = ((means - low) / (high - low) * 2 - 1).expand(len(times), -1, -1)
         time = (2 * self.last * times - 1)[:, None, None].expand(-1, len(means), 1)
-        encoded = encode(torch.cat([place, time], -1), self.settings.frequencies)
+        encoded = encode(torch.cat([position, time], -1), self.settings.frequencies)
         displacement: Displacement = self.heads(self.second, functional.relu(self.first(encoded)))
         return displacement
 
-    def planes(self) -> list[nn.Parameter]:
-        """None: everything is network."""
+    def grid_parameters(self) -> list[nn.Parameter]:
+        """Return the parameters that use `plane_lr`: none."""
         return []
 
-    def roughness(self) -> Float[Tensor, ""]:
-        """A network of this size has no regularizer: zero."""
+    def regularization_loss(self) -> Float[Tensor, ""]:
+        """Return zero: the network has no regularizer."""
         return self.bounds.new_zeros(())
 
 
 def encode(values: Float[Tensor, "*b d"], frequencies: int) -> Float[Tensor, "*b e"]:
-    """The values, and sines and cosines of pi times 1, 2, 4, ... of them (Mildenhall et al. 2020)."""
+    """Return the values and their positional encoding: sines and cosines of pi 2^k x (Mildenhall et al. 2020)."""
     octaves = 2.0 ** torch.arange(frequencies, dtype=values.dtype, device=values.device)
     angles = values[..., None, :] * (torch.pi * octaves)[:, None]
     return torch.cat([values, angles.sin().flatten(-2), angles.cos().flatten(-2)], -1)

@@ -1,6 +1,6 @@
 """Floating-point operations of networks: measured once per input shape and added up at every call.
 
-torch is imported with the first network, because `counting_flops` is entered before (`steps/runtime/perform.py`).
+torch is imported with the first network, because `count_flops` is entered before (`steps/runtime/perform.py`).
 """
 
 from collections.abc import Callable, Hashable, Iterator
@@ -13,7 +13,7 @@ _OPEN: ContextVar[dict[str, int] | None] = ContextVar("flops", default=None)
 
 
 @contextmanager
-def counting_flops() -> Iterator[dict[str, int]]:
+def count_flops() -> Iterator[dict[str, int]]:
     """Count the floating-point operations of networks in the block, by the name of their class.
 
     A multiplication and an addition are two. Only matrix products, convolutions and attention count, as
@@ -27,8 +27,8 @@ def counting_flops() -> Iterator[dict[str, int]]:
         _OPEN.reset(token)
 
 
-def counted(network: Any) -> Any:
-    """Return the network with its calls counted inside `counting_flops`.
+def attach_flop_counter(network: Any) -> Any:
+    """Return the network with its calls counted inside `count_flops`.
 
     Encoder and decoder of a VAE, which is never called as a whole, are counted under its name. Where inputs have a
     gradient, the backward pass is counted too: with frozen weights it costs as much as the forward pass.

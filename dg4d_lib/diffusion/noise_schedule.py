@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 
-TRAIN_STEPS = 1000
+NUM_TRAIN_TIMESTEPS = 1000
 BETA_START, BETA_END = 0.00085, 0.012  # scaled-linear, Stable Diffusion v1
 
 
@@ -20,20 +20,20 @@ BETA_START, BETA_END = 0.00085, 0.012  # scaled-linear, Stable Diffusion v1
 class BetaSchedule:
     """Noise schedule and prediction type of a model, with the values of diffusers."""
 
-    start: float
-    end: float
-    kind: str
-    steps: int
-    prediction: str
+    beta_start: float
+    beta_end: float
+    beta_schedule: str
+    num_train_timesteps: int
+    prediction_type: str
 
 
-SCHEDULE = BetaSchedule(BETA_START, BETA_END, "scaled_linear", TRAIN_STEPS, "epsilon")
+SCHEDULE = BetaSchedule(BETA_START, BETA_END, "scaled_linear", NUM_TRAIN_TIMESTEPS, "epsilon")
 
 
 @cache
 def alphas_cumprod() -> Float[Tensor, " steps"]:
     """Return the products of 1 - beta, float64, one per training timestep."""
-    betas = torch.linspace(BETA_START**0.5, BETA_END**0.5, TRAIN_STEPS, dtype=torch.float64).square()
+    betas = torch.linspace(BETA_START**0.5, BETA_END**0.5, NUM_TRAIN_TIMESTEPS, dtype=torch.float64).square()
     return (1 - betas).cumprod(0)
 
 
@@ -43,10 +43,10 @@ def add_noise(latents: Float[Tensor, "*b"], noise: Float[Tensor, "*b"], timestep
     return alpha**0.5 * latents + (1 - alpha) ** 0.5 * noise
 
 
-def ddim_timesteps(steps: int) -> tuple[int, ...]:
+def ddim_timesteps(num_inference_steps: int) -> tuple[int, ...]:
     """Return evenly spaced timesteps from the noisiest to the cleanest: 981, 961, ..., 1 for 50 steps; 0 follows."""
-    stride = TRAIN_STEPS // steps
-    return tuple(stride * i + 1 for i in reversed(range(steps)))
+    stride = NUM_TRAIN_TIMESTEPS // num_inference_steps
+    return tuple(stride * i + 1 for i in reversed(range(num_inference_steps)))
 
 
 def ddim_step(
@@ -68,11 +68,11 @@ def read_schedule(model: Path) -> BetaSchedule:
     try:
         about = json.loads(file.read_text(encoding="utf-8"))
         return BetaSchedule(
-            start=float(about["beta_start"]),
-            end=float(about["beta_end"]),
-            kind=str(about["beta_schedule"]),
-            steps=int(about["num_train_timesteps"]),
-            prediction=str(about.get("prediction_type", "epsilon")),
+            beta_start=float(about["beta_start"]),
+            beta_end=float(about["beta_end"]),
+            beta_schedule=str(about["beta_schedule"]),
+            num_train_timesteps=int(about["num_train_timesteps"]),
+            prediction_type=str(about.get("prediction_type", "epsilon")),
         )
     except FileNotFoundError as error:
         raise BadInput(f"{file} is missing; weights are expected in the layout of diffusers") from error
@@ -87,8 +87,8 @@ def require_schedule(model: Path, expected: BetaSchedule) -> None:
         BadInput: says what differs.
     """
     given = read_schedule(model)
-    same = math.isclose(given.start, expected.start, rel_tol=1e-6) and math.isclose(
-        given.end, expected.end, rel_tol=1e-6
-    )
-    if not same or (given.kind, given.steps, given.prediction) != (expected.kind, expected.steps, expected.prediction):
+    betas = ((given.beta_start, expected.beta_start), (given.beta_end, expected.beta_end))
+    same = all(math.isclose(ours, theirs, rel_tol=1e-6) for ours, theirs in betas)
+    kept = replace(given, beta_start=expected.beta_start, beta_end=expected.beta_end)
+    if not same or kept != expected:
         raise BadInput(f"the scheduler of {model} is {given}; this model has to have {expected}")

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dg4d_lib.diffusion.flop_counter import counted
-from dg4d_lib.diffusion.parts import HALF, dtype_on, missing_packages
+from dg4d_lib.diffusion.components import HALF, compute_dtype, missing_packages
+from dg4d_lib.diffusion.flop_counter import attach_flop_counter
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.settings import TextSettings
 
@@ -40,10 +40,10 @@ def draw_picture(
         BadInput: the folder holds no such pipeline, or what came out is no picture.
         BackendUnavailable: diffusers or transformers is not installed.
     """
-    pipeline = _load(model, dtype_on(device, settings.precision))
+    pipeline = _load(model, compute_dtype(device, settings.precision))
     for part in pipeline.components.values():
         if isinstance(part, nn.Module):
-            counted(part)
+            attach_flop_counter(part)
     if settings.low_memory and device.type != "cpu":
         pipeline.enable_model_cpu_offload(device=device)
     else:

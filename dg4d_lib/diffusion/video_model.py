@@ -19,14 +19,14 @@ from torch import Tensor, nn
 
 from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.diffusion.clip_images import svd_clip_pixels
-from dg4d_lib.diffusion.latents import at_least_float32, to_images
-from dg4d_lib.diffusion.parts import (
+from dg4d_lib.diffusion.components import (
     Placement,
-    dtype_on,
+    compute_dtype,
     load_image_encoder,
     load_temporal_unet,
     load_temporal_vae,
 )
+from dg4d_lib.diffusion.latents import at_least_float32, to_images
 from dg4d_lib.diffusion.single_token_attention import shorten_attention
 from dg4d_lib.settings import VideoModelSettings
 
@@ -49,13 +49,15 @@ def start_index(steps: int, strength: float) -> int:
     return min(int(steps * (1 - strength) + 1e-9), steps - 1)
 
 
-def predicted_original(noisy: Float[Tensor, "*b"], velocity: Float[Tensor, "*b"], sigma: float) -> Float[Tensor, "*b"]:
+def pred_original_sample(
+    noisy: Float[Tensor, "*b"], velocity: Float[Tensor, "*b"], sigma: float
+) -> Float[Tensor, "*b"]:
     """Return x0 from x and the network's v."""
     return noisy / (1 + sigma**2) - velocity * sigma / math.sqrt(1 + sigma**2)
 
 
 @dataclass(frozen=True)
-class Condition:
+class VideoCondition:
     """Conditioning of b videos.
 
     Attributes:
@@ -106,7 +108,7 @@ class VideoModel:
             BadInput: a file is missing, damaged, or holds other tensors than its config says.
             BackendUnavailable: diffusers or transformers is not installed.
         """
-        dtype = dtype_on(device, settings.precision)
+        dtype = compute_dtype(device, settings.precision)
         place = Placement(torch.device("cpu") if settings.low_memory else device, dtype)
         unet = shorten_attention(load_temporal_unet(folder, place))
         vae, image_encoder = load_temporal_vae(folder, place), load_image_encoder(folder, place)
@@ -117,26 +119,28 @@ class VideoModel:
         return (*self._videos.notes(), *self._frames.notes())
 
     @property
-    def shrinkage(self) -> int:
+    def vae_scale_factor(self) -> int:
         """Pixels of a side of a latent: 8."""
         return int(2 ** (len(self.vae.config.block_out_channels) - 1))
 
     @property
-    def trained_frames(self) -> int:
+    def num_frames(self) -> int:
         """Frames of the videos that the network was trained on: 14 or 25."""
         return int(self.unet.config.num_frames)
 
-    def blank(self, videos: int, frames: int, height: int, width: int) -> tuple[int, int, int, int, int]:
+    def latent_shape(self, videos: int, frames: int, height: int, width: int) -> tuple[int, int, int, int, int]:
         """The shape of the latents of videos of this many pixels: "b t c i j"."""
         channels = int(self.vae.config.latent_channels)
-        return videos, frames, channels, height // self.shrinkage, width // self.shrinkage
+        return videos, frames, channels, height // self.vae_scale_factor, width // self.vae_scale_factor
 
     @torch.no_grad()
-    def look_at(self, picture: Float[Tensor, "h w 3"], generators: Sequence[torch.Generator]) -> Condition:
+    def encode_condition(
+        self, picture: Float[Tensor, "h w 3"], generators: Sequence[torch.Generator]
+    ) -> VideoCondition:
         """Return the conditioning of videos of this picture, one per generator.
 
         Args:
-            picture: in [0, 1]; sides are multiples of `shrinkage`.
+            picture: in [0, 1]; sides are multiples of `vae_scale_factor`.
             generators: of the noise on the picture.
         """
         settings, count = self.settings, len(generators)
@@ -149,7 +153,7 @@ class VideoModel:
         ids = torch.tensor(
             [settings.fps_id, settings.motion_bucket_id, settings.noise_aug_strength], dtype=self.unet.dtype
         )
-        return Condition(embedding.expand(count, -1, -1), latents, ids.to(self.device).expand(count, -1))
+        return VideoCondition(embedding.expand(count, -1, -1), latents, ids.to(self.device).expand(count, -1))
 
     @torch.no_grad()
     def encode(self, video: Float[Tensor, "t h w 3"]) -> Float[Tensor, "t c i j"]:
@@ -164,14 +168,14 @@ class VideoModel:
             pictures = self._frames.run(
                 lambda part: vae.decode(inside[part], num_frames=len(inside[part])).sample,
                 len(inside),
-                self._room(DECODER_GB, inside, self.shrinkage),
+                self._room(DECODER_GB, inside, self.vae_scale_factor),
             )
         decoded = torch.cat(pictures)
         return to_images(decoded.to(at_least_float32(decoded.dtype)))
 
     @torch.no_grad()
     def denoise(
-        self, latents: Float[Tensor, "b t c i j"], condition: Condition, sigmas: Sequence[float]
+        self, latents: Float[Tensor, "b t c i j"], condition: VideoCondition, sigmas: Sequence[float]
     ) -> Float[Tensor, "b t c i j"]:
         """Denoise latents from the first noise level to the last by Euler's method.
 
@@ -181,18 +185,18 @@ class VideoModel:
         with self._awake(self.unet) as unet:
             for sigma, following in pairwise(sigmas):
                 slope = (
-                    latents - predicted_original(latents, self._guided(unet, latents, condition, sigma), sigma)
+                    latents - pred_original_sample(latents, self._guided(unet, latents, condition, sigma), sigma)
                 ) / sigma
                 latents = latents + (following - sigma) * slope
         return latents
 
-    def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Float[Tensor, "b t c i j"]:
+    def sample_noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Float[Tensor, "b t c i j"]:
         """Draw standard normal noise for the latents of several videos, one generator each."""
         dtype = at_least_float32(self.unet.dtype)
         return torch.cat([_normal((1, *shape[1:]), generator, dtype) for generator in generators]).to(self.device)
 
     def _guided(
-        self, unet: Any, latents: Float[Tensor, "b t c i j"], condition: Condition, sigma: float
+        self, unet: Any, latents: Float[Tensor, "b t c i j"], condition: VideoCondition, sigma: float
     ) -> Float[Tensor, "b t c i j"]:
         """The network's v, guided towards the picture."""
         frames = latents.shape[1]
@@ -205,7 +209,7 @@ class VideoModel:
         velocities = self._videos.run(
             lambda part: unet(seen[part], time, embedding[part], ids[part], return_dict=False)[0],
             len(seen),
-            self._room(frames * UNET_GB, seen, self.shrinkage),
+            self._room(frames * UNET_GB, seen, self.vae_scale_factor),
         )
         without, informed = torch.cat(velocities).to(latents).chunk(2)
         guidance = torch.linspace(self.settings.min_guidance_scale, self.settings.max_guidance_scale, frames)

@@ -1,1 +1,1 @@
-"""The two optimizations: static Gaussians and their motion."""
+"""Optimization of static Gaussians and of their deformation."""

@@ -1,4 +1,4 @@
-"""The reference-view loss of both stages, and the check that losses are numbers."""
+"""Reference-view loss of both stages, and the check for non-finite losses and gradients."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -18,10 +18,12 @@ from dg4d_lib.rasterizer.interface import Rendering
 WHITE = (1.0, 1.0, 1.0)
 
 
-def resized(cutouts: Float[Tensor, "t h w 4"], size: int) -> tuple[Float[Tensor, "t s s 3"], Float[Tensor, "t s s 1"]]:
-    """Color over white and alpha of cut-outs at another size, resampled with premultiplied alpha, antialiased.
+def resize_cutouts(
+    cutouts: Float[Tensor, "t h w 4"], size: int
+) -> tuple[Float[Tensor, "t s s 3"], Float[Tensor, "t s s 1"]]:
+    """Resize cut-outs with premultiplied alpha and antialiasing; return color over white and alpha.
 
-    In memory they lie plane by plane, as renderings do: what compares the two reads both in one order.
+    The results are stored channels first, as renderings are, so that losses read both in the same order.
     """
     alpha = cutouts[..., 3:]
     both = torch.cat([cutouts[..., :3] * alpha, alpha], -1).permute(0, 3, 1, 2).contiguous()
@@ -39,53 +41,53 @@ def reference_loss(
     alpha_weight: float,
     ssim_weight: float = 0.0,
 ) -> Float[Tensor, ""]:
-    """Weighted mean squared errors of color and alpha, means over images, pixels and channels.
+    """Return the weighted mean squared errors of color and alpha, means over images, pixels and channels.
 
-    With `ssim_weight` also how far the colors' structural similarity is from 1 (3DGS; the paper has none).
+    With `ssim_weight` also 1 - SSIM of the colors (3DGS; not in the paper).
     """
     loss = color_weight * functional.mse_loss(rendering.color, color)
     loss = loss + alpha_weight * functional.mse_loss(rendering.alpha, alpha)
     return loss + ssim_weight * (1 - ssim(rendering.color, color).mean()) if ssim_weight else loss
 
 
-def finite_numbers(
+def check_finite(
     stage: str,
     losses: Mapping[str, Tensor],
-    slopes: Iterable[Tensor | None],
-    moment: str,
+    gradients: Iterable[Tensor | None],
+    iteration: str,
     advice: str,
     gaussians: Gaussians,
 ) -> dict[str, float]:
-    """The losses of an iteration, for people; stops a fit whose numbers are none.
+    """Return the losses of an iteration as numbers; raise if the total loss or a gradient is not finite.
 
-    A Gaussian that is no number is not drawn and its loss stays finite, so gradients are checked too. All are read at
-    once: a GPU is waited for a single time.
+    A Gaussian with non-finite parameters is not drawn and its loss stays finite, so gradients are checked too. All
+    values are copied at once, so that a GPU is synchronized only once.
 
     Args:
         stage: name of the fit.
-        losses: scalars by their names; "loss" is what is minimized.
-        slopes: the gradients; None is left out.
-        moment: "iteration 3 of 200".
-        advice: what the user can do.
-        gaussians: the last good cloud.
+        losses: scalars by name; "loss" is the minimized total.
+        gradients: of the parameters; None is skipped.
+        iteration: for the message, "iteration 3 of 200".
+        advice: remedy for the message.
+        gaussians: the cloud before this iteration.
 
     Raises:
         Diverged: "loss" or a gradient is not finite.
     """
-    steepest = get_total_norm([slope for slope in slopes if slope is not None], torch.inf)
-    *values, slope = torch.stack([*(loss.detach() for loss in losses.values()), steepest]).tolist()
+    norm = get_total_norm([gradient for gradient in gradients if gradient is not None], torch.inf)
+    *values, largest = torch.stack([*(loss.detach() for loss in losses.values()), norm]).tolist()
     numbers = dict(zip(losses, values, strict=True))
-    for quantity, value in (("loss", numbers["loss"]), ("gradient", slope)):
+    for quantity, value in (("loss", numbers["loss"]), ("gradient", largest)):
         if not math.isfinite(value):
-            raise Diverged(f"{stage}: the {quantity} became {value} at {moment}; {advice}", gaussians.detach())
+            raise Diverged(f"{stage}: the {quantity} became {value} at {iteration}; {advice}", gaussians.detach())
     return numbers
 
 
 class Diverged(FitDiverged):
-    """A loss that is no number; carries the last good cloud so that it can be looked at.
+    """Non-finite loss or gradient, with the last finite cloud for inspection.
 
     Attributes:
-        gaussians: the cloud before the step that failed.
+        gaussians: the cloud before the failed iteration.
     """
 
     def __init__(self, message: str, gaussians: Gaussians) -> None:

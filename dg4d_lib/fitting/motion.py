@@ -1,4 +1,4 @@
-"""The dynamic stage: a deformation fitted to the driving video and to a prior at every moment (paper section 3.2)."""
+"""Dynamic stage: optimization of the deformation on the driving video and a guidance prior (paper section 3.2)."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,13 +10,13 @@ from torch import Tensor, nn
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.cameras.viewpoints import random_orbit
 from dg4d_lib.deformation.interface import Deformation
-from dg4d_lib.deformation.rigidity import neighborhoods, rigidity
+from dg4d_lib.deformation.rigidity_loss import neighborhoods, rigidity_loss
 from dg4d_lib.devices import to_device_async
-from dg4d_lib.fitting.losses import WHITE, finite_numbers, reference_loss, resized
-from dg4d_lib.fitting.schedules import log_linear, size_at
-from dg4d_lib.fitting.static import rates
+from dg4d_lib.fitting.losses import WHITE, check_finite, reference_loss, resize_cutouts
+from dg4d_lib.fitting.schedules import log_linear, resolution_at
+from dg4d_lib.fitting.static import learning_rates
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.guidance.interface import GuidancePrior, View, ring_of
+from dg4d_lib.guidance.interface import GuidancePrior, GuidanceView, ring_size
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MotionSettings
 from dg4d_lib.video.driving import DrivingVideo
@@ -36,43 +36,45 @@ def fit_motion(
     report: Report = lambda iteration, values: None,
     input_camera: OrbitCamera | None = None,
 ) -> Gaussians:
-    """Fit `deformation` in place, and with `settings.fine_tune` the Gaussians at rest with it.
+    """Fit `deformation` in place, and with `settings.fine_tune` the canonical Gaussians too.
 
     Args:
-        gaussians: the canonical cloud; the fit runs on its device. Neither it nor its density changes.
-        deformation: what is fitted, the identity at the start; on the same device.
-        video: what the input camera sees.
-        prior: judges every frame from random views.
-        rasterize: draws.
-        settings: every number of the stage.
-        generator: the source of all randomness.
+        gaussians: the canonical cloud, which is not modified; the fit runs on its device.
+        deformation: the model to fit, on the same device; the identity at the start.
+        video: driving video of the input camera.
+        prior: scores random views of every frame.
+        rasterize: rasterizer.
+        settings: of the stage.
+        generator: source of all randomness.
         report: called after every iteration with (iterations done, named losses).
-        input_camera: where the video was taken from; the default is azimuth and elevation 0.
+        input_camera: camera of the video; the default is azimuth and elevation 0.
 
     Returns:
-        The cloud that `deformation` moves: the one that was given, or with `settings.fine_tune` a better one.
+        The canonical cloud of `deformation`: the given one, or with `settings.fine_tune` its optimized copy.
 
     Raises:
         FitDiverged: the loss became non-finite.
     """
     camera = replace(input_camera or OrbitCamera(), width=settings.reference_size, height=settings.reference_size)
     device = gaussians.means.device
-    pictures = resized(torch.cat([video.frames, video.coverage], -1).to(device), settings.reference_size)
-    color, alpha = (picture.permute(0, 3, 1, 2) for picture in pictures)  # so that chosen ones lie plane by plane too
+    references = resize_cutouts(torch.cat([video.frames, video.alpha], -1).to(device), settings.reference_size)
+    color, alpha = (images.permute(0, 3, 1, 2) for images in references)  # indexing keeps channels first in memory
     times = video.times.to(device)
     white = torch.tensor(WHITE, device=device)
     gaussians, groups = gaussians.detach(), _groups(deformation, settings)
     if settings.fine_tune:
         gaussians = Gaussians(**{name: nn.Parameter(value.clone()) for name, value in vars(gaussians).items()})
-        of_cloud = [{"params": getattr(gaussians, name), "lr": rate} for name, rate in rates(settings).items()]
-        groups = [*of_cloud, *groups]
+        cloud_groups = [
+            {"params": getattr(gaussians, name), "lr": rate} for name, rate in learning_rates(settings).items()
+        ]
+        groups = [*cloud_groups, *groups]
     adam = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15, fused=True)
     neighbors = neighborhoods(gaussians.means) if settings.rigidity_weight else None
     for step in range(1, settings.iterations + 1):
         progress = step / settings.iterations
         if settings.fine_tune:
             adam.param_groups[0]["lr"] = log_linear(settings.means_lr, settings.means_lr_end, progress)
-        frames = choose_frames(len(video), settings.frames_per_iteration, generator)
+        frames = sample_frames(len(video), settings.frames_per_iteration, generator)
         chosen = to_device_async(frames, device)
         moved = deformation.displace(gaussians.means, times[chosen]).apply(gaussians)
 
@@ -85,30 +87,32 @@ def fit_motion(
             settings.alpha_weight,
             settings.ssim_weight,
         )
-        loss = progress * reference + deformation.roughness()
+        loss = progress * reference + deformation.regularization_loss()
         guidance = torch.zeros((), device=device)
         if settings.views and settings.guidance_weight:
-            views, rows = moments(prior, frames, settings, size_at(settings.resolution_schedule, progress), generator)
+            views, rows = sample_views(
+                prior, frames, settings, resolution_at(settings.resolution_schedule, progress), generator
+            )
             if views:
                 states = moved.states(rows)
                 rendering = rasterize(states, [view.camera for view in views], white)
                 guidance = prior.loss(rendering.color, rendering.alpha, views, progress, generator)
                 loss = loss + settings.guidance_weight * guidance
         if neighbors is not None:
-            loss = loss + settings.rigidity_weight * rigidity(moved, *neighbors)
+            loss = loss + settings.rigidity_weight * rigidity_loss(moved, *neighbors)
         adam.zero_grad(set_to_none=True)
         loss.backward()
         losses = {"loss": loss, "reference": reference, "guidance": guidance}
-        slopes = [parameter.grad for group in adam.param_groups for parameter in group["params"]]
-        moment = f"iteration {step} of {settings.iterations}"
-        numbers = finite_numbers("fit_motion", losses, slopes, moment, ADVICE, gaussians)
+        gradients = [parameter.grad for group in adam.param_groups for parameter in group["params"]]
+        iteration = f"iteration {step} of {settings.iterations}"
+        numbers = check_finite("fit_motion", losses, gradients, iteration, ADVICE, gaussians)
         adam.step()
         report(step, numbers)
     return gaussians.detach()
 
 
-def choose_frames(total: int, count: int, generator: torch.Generator) -> Int[Tensor, " k"]:
-    """The frames of one iteration in order: all, or `count` different ones, one from each equal stretch of time."""
+def sample_frames(total: int, count: int, generator: torch.Generator) -> Int[Tensor, " k"]:
+    """Draw the frames of one iteration, in order: all, or one from each of `count` equal intervals of time."""
     if not count or count >= total:
         return torch.arange(total)
     edges = torch.linspace(0, total, count + 1, dtype=torch.float64)
@@ -116,10 +120,10 @@ def choose_frames(total: int, count: int, generator: torch.Generator) -> Int[Ten
     return (edges[:-1] + inside * edges.diff()).floor().long().clamp(max=total - 1).unique()
 
 
-def moments(
+def sample_views(
     prior: GuidancePrior, frames: Int[Tensor, " k"], settings: MotionSettings, size: int, generator: torch.Generator
-) -> tuple[list[View], Int[Tensor, " m"]]:
-    """Random views of every frame that the prior can judge, and the row of `frames` each belongs to."""
+) -> tuple[list[GuidanceView], Int[Tensor, " m"]]:
+    """Draw random views of every frame that the prior supports; return them and their rows in `frames`."""
     rows = [row for row, f in enumerate(frames.tolist()) if prior.frames is None or f in prior.frames]
     rows = [row for row in rows for _ in range(settings.views)]
     if prior.viewpoints is None:
@@ -130,24 +134,24 @@ def moments(
             elevation_deg=elevation,
             radius=(RADIUS, RADIUS),
             generator=generator,
-            ring=ring_of(prior),
+            ring=ring_size(prior),
         )
     else:
         choice = torch.randint(len(prior.viewpoints), (len(rows),), generator=generator).tolist()
         cameras = [replace(prior.viewpoints[i], width=size, height=size) for i in choice]
-    views = [View(camera, int(frames[row])) for camera, row in zip(cameras, rows, strict=True)]
+    views = [GuidanceView(camera, int(frames[row])) for camera, row in zip(cameras, rows, strict=True)]
     return views, torch.tensor(rows, dtype=torch.long)
 
 
 def bounds_of(gaussians: Gaussians, margin: float = 0.1) -> Float[Tensor, "2 3"]:
-    """The box of the centers, widened by a share of its longest side: where the planes of a deformation lie."""
+    """Return the bounding box of the means, widened by a fraction of its longest side: the box of a deformation."""
     low, high = gaussians.means.detach().amin(0), gaussians.means.detach().amax(0)
     slack = margin * (high - low).max().clamp(min=1e-3)
     return torch.stack([low - slack, high + slack])
 
 
 def _groups(deformation: Deformation, settings: MotionSettings) -> list[dict[str, object]]:
-    planes = deformation.planes()
+    planes = deformation.grid_parameters()
     fast = {id(parameter) for parameter in planes}
     network = [parameter for parameter in deformation.parameters() if id(parameter) not in fast]
     groups = [{"params": planes, "lr": settings.plane_lr}, {"params": network, "lr": settings.network_lr}]

@@ -7,10 +7,10 @@ from dg4d_lib.settings import ResolutionStage
 
 
 def log_linear(start: float, end: float, progress: float) -> float:
-    """Interpolate between `start` and `end` in equal ratios; progress in [0, 1]."""
+    """Interpolate log-linearly between `start` and `end`; progress in [0, 1]."""
     return math.exp(math.log(start) * (1 - progress) + math.log(end) * progress)
 
 
-def size_at(schedule: Sequence[ResolutionStage], progress: float) -> int:
-    """Pixels at this progress: the first stage that is not passed, else the last."""
+def resolution_at(schedule: Sequence[ResolutionStage], progress: float) -> int:
+    """Return the render size in pixels: that of the first stage with `until` above progress, else of the last."""
     return next((stage.size for stage in schedule if progress < stage.until), schedule[-1].size)

@@ -1,4 +1,4 @@
-"""The static stage: DreamGaussianHD (paper section 3.1)."""
+"""Static stage: optimization of canonical Gaussians, DreamGaussianHD (paper section 3.1)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -10,25 +10,25 @@ from torch import Tensor, nn
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.cameras.viewpoints import random_orbit
 from dg4d_lib.devices import to_device_async
-from dg4d_lib.fitting.losses import WHITE, Diverged, finite_numbers, reference_loss, resized
-from dg4d_lib.fitting.schedules import log_linear, size_at
+from dg4d_lib.fitting.losses import WHITE, Diverged, check_finite, reference_loss, resize_cutouts
+from dg4d_lib.fitting.schedules import log_linear, resolution_at
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.gaussians.growth import DensifyResult, ScreenGradients, densify, prune, reset_opacity
-from dg4d_lib.guidance.interface import GuidancePrior, View, ring_of
+from dg4d_lib.gaussians.density_control import DensifyResult, Grad2dStats, densify, prune, reset_opacity
+from dg4d_lib.guidance.interface import GuidancePrior, GuidanceView, ring_size
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import FitSettings, StaticSettings
 
 Report = Callable[[int, dict[str, float]], None]
 ADVICE = "lower the learning rates (static.*_lr) or the weights"
-RADIUS_JITTER = 0.5  # random views are at radius 2 +- this, world units (paper)
-SPLIT_SCALE = 0.05  # world units: larger Gaussians split, smaller ones are cloned (DreamGaussian)
-RESET_OPACITY_EVERY = 700  # iterations, never reached within 500 (DreamGaussian)
-FEWEST = 8  # Gaussians; with fewer there is no object left
+RADIUS_JITTER = 0.5  # world units; random views are at radius 2 +- 0.5 (paper)
+SPLIT_SCALE = 0.05  # world units; larger Gaussians are split, smaller ones cloned (DreamGaussian)
+RESET_OPACITY_EVERY = 700  # iterations (DreamGaussian); not reached with the default of 500
+MIN_GAUSSIANS = 8  # with fewer the fit counts as diverged (ours)
 
 
 @dataclass
 class _Cloud:
-    """Gaussians under optimization: one Adam group per kind of parameter."""
+    """Gaussians under optimization, one Adam parameter group per field."""
 
     parameters: dict[str, nn.Parameter]
     adam: torch.optim.Adam
@@ -44,19 +44,19 @@ class _Cloud:
         return Gaussians(**self.parameters)
 
     def replace(self, grown: DensifyResult) -> None:
-        """Take over a changed cloud; survivors keep their momentum, fresh Gaussians start without."""
+        """Replace the cloud after density control; kept Gaussians keep their Adam state, new ones start at zero."""
         for group in self.adam.param_groups:
             name = group["name"]
             state = self.adam.state.pop(self.parameters[name], None)
-            fresh = nn.Parameter(getattr(grown.gaussians, name).detach().clone())
+            parameter = nn.Parameter(getattr(grown.gaussians, name).detach().clone())
             if state is not None:
                 for key in ("exp_avg", "exp_avg_sq"):
                     momentum = state[key][grown.source]
                     momentum[grown.is_new] = 0
                     state[key] = momentum
-                self.adam.state[fresh] = state
-            group["params"] = [fresh]
-            self.parameters[name] = fresh
+                self.adam.state[parameter] = state
+            group["params"] = [parameter]
+            self.parameters[name] = parameter
 
 
 def fit_gaussians(
@@ -69,27 +69,27 @@ def fit_gaussians(
     report: Report = lambda iteration, values: None,
     input_camera: OrbitCamera | None = None,
 ) -> Gaussians:
-    """Fit a cloud to one picture, with a prior for the sides nobody sees.
+    """Fit a cloud to one image, with a guidance prior for unseen views.
 
     Args:
         start: the cloud at iteration 0; the fit runs on its device.
-        subject: the picture, straight alpha.
-        prior: judges random views.
-        rasterize: draws.
-        settings: every number of the stage.
-        generator: the source of all randomness.
+        subject: the cut-out, straight alpha.
+        prior: scores random views.
+        rasterize: rasterizer.
+        settings: of the stage.
+        generator: source of all randomness.
         report: called after every iteration with (iterations done, named losses).
-        input_camera: where the picture was taken from; the default is azimuth and elevation 0.
+        input_camera: camera of the image; the default is azimuth and elevation 0.
 
     Raises:
         FitDiverged: the loss became non-finite, or (almost) no Gaussian is left.
     """
     camera = replace(input_camera or OrbitCamera(), width=settings.reference_size, height=settings.reference_size)
     device = start.means.device
-    color, alpha = resized(subject[None].to(device), settings.reference_size)
+    color, alpha = resize_cutouts(subject[None].to(device), settings.reference_size)
     white = torch.tensor(WHITE, device=device)
-    cloud = _Cloud.of(start, rates(settings))
-    gradients = ScreenGradients.none(len(start), device)
+    cloud = _Cloud.of(start, learning_rates(settings))
+    grad2d = Grad2dStats.zeros(len(start), device)
     for step in range(1, settings.iterations + 1):
         progress = step / settings.iterations
         cloud.adam.param_groups[0]["lr"] = log_linear(settings.means_lr, settings.means_lr_end, progress)
@@ -97,38 +97,39 @@ def fit_gaussians(
 
         offsets = [torch.zeros(1, len(gaussians), 2, device=device, requires_grad=True)]
         rendering = rasterize(gaussians, [camera], white, offsets[0])
-        seen = [(rendering.visible, settings.reference_size)]
+        rendered = [(rendering.visible, settings.reference_size)]
         reference = reference_loss(
             rendering, color, alpha, settings.color_weight, settings.alpha_weight, settings.ssim_weight
         )
         loss = progress * reference
         guidance = torch.zeros((), device=device)
         if settings.views and settings.guidance_weight:
-            size = size_at(settings.resolution_schedule, progress)
-            views = [View(c) for c in viewpoints(prior, settings, size, generator)]
+            size = resolution_at(settings.resolution_schedule, progress)
+            views = [GuidanceView(c) for c in sample_cameras(prior, settings, size, generator)]
             offsets.append(torch.zeros(len(views), len(gaussians), 2, device=device, requires_grad=True))
-            behind = to_device_async(background(settings, generator), device)
-            rendering = rasterize(gaussians, [view.camera for view in views], behind, offsets[1])
-            seen.append((rendering.visible, size))
+            color_behind = to_device_async(background(settings, generator), device)
+            rendering = rasterize(gaussians, [view.camera for view in views], color_behind, offsets[1])
+            rendered.append((rendering.visible, size))
             guidance = prior.loss(rendering.color, rendering.alpha, views, progress, generator)
             loss = loss + settings.guidance_weight * guidance
         cloud.adam.zero_grad(set_to_none=True)
         loss.backward()
         losses = {"loss": loss, "reference": reference, "guidance": guidance}
-        slopes = [parameter.grad for parameter in cloud.parameters.values()]
-        moment = f"iteration {step} of {settings.iterations}"
-        numbers = finite_numbers("fit_gaussians", losses, slopes, moment, ADVICE, gaussians)
-        for offset, (visible, size) in zip(offsets, seen, strict=True):
+        gradients = [parameter.grad for parameter in cloud.parameters.values()]
+        iteration = f"iteration {step} of {settings.iterations}"
+        numbers = check_finite("fit_gaussians", losses, gradients, iteration, ADVICE, gaussians)
+        for offset, (visible, size) in zip(offsets, rendered, strict=True):
             if offset.grad is not None:
-                gradients.add(offset.grad, visible, size)
+                grad2d.add(offset.grad, visible, size)
         cloud.adam.step()
         if step % settings.densify_every == 0 and step < settings.iterations:
-            control_density(cloud, gradients, settings, generator)
-            gradients = ScreenGradients.none(len(cloud.gaussians), device)
-            if len(cloud.gaussians) < FEWEST:
+            control_density(cloud, grad2d, settings, generator)
+            grad2d = Grad2dStats.zeros(len(cloud.gaussians), device)
+            if len(cloud.gaussians) < MIN_GAUSSIANS:
                 raise Diverged(
                     f"fit_gaussians: {len(cloud.gaussians)} Gaussians are left at iteration {step} of "
-                    f"{settings.iterations}; lower static.prune_opacity or raise static.prune_scale",
+                    f"{settings.iterations}, at least {MIN_GAUSSIANS} are needed; lower static.prune_opacity or "
+                    "raise static.prune_scale",
                     gaussians.detach(),
                 )
         if step % RESET_OPACITY_EVERY == 0 and step < settings.iterations:
@@ -138,13 +139,13 @@ def fit_gaussians(
 
 
 def background(settings: StaticSettings, generator: torch.Generator) -> Float[Tensor, " 3"]:
-    """What is behind the random views of one iteration; the generator is touched only where it is random."""
+    """Return the background color of an iteration's random views; draw from the generator only if it is random."""
     black = settings.background == "random" and float(torch.rand((), generator=generator)) < 0.5
     return torch.zeros(3) if black else torch.tensor(WHITE)
 
 
-def rates(settings: FitSettings) -> dict[str, float]:
-    """Return the learning rate of every field of the cloud at the start of a stage; the means come first."""
+def learning_rates(settings: FitSettings) -> dict[str, float]:
+    """Return the initial learning rate of every field of the cloud; the means come first."""
     return {
         "means": settings.means_lr,
         "harmonics": settings.color_lr,
@@ -154,10 +155,10 @@ def rates(settings: FitSettings) -> dict[str, float]:
     }
 
 
-def viewpoints(
+def sample_cameras(
     prior: GuidancePrior, settings: StaticSettings, size: int, generator: torch.Generator
 ) -> list[OrbitCamera]:
-    """The random views of one iteration: all around, or out of those the prior knows."""
+    """Draw the random cameras of one iteration, from the prior's viewpoints if it has only some."""
     if prior.viewpoints is None:
         return random_orbit(
             settings.views,
@@ -165,19 +166,16 @@ def viewpoints(
             elevation_deg=(-settings.elevation_deg, settings.elevation_deg),
             radius=(RADIUS - RADIUS_JITTER, RADIUS + RADIUS_JITTER),
             generator=generator,
-            ring=ring_of(prior),
+            ring=ring_size(prior),
         )
     choice = torch.randint(len(prior.viewpoints), (settings.views,), generator=generator).tolist()
     return [replace(prior.viewpoints[i], width=size, height=size) for i in choice]
 
 
-def control_density(
-    cloud: _Cloud, gradients: ScreenGradients, settings: StaticSettings, generator: torch.Generator
-) -> None:
-    """Grow where the views pull, then remove what is faint or too large."""
+def control_density(cloud: _Cloud, grad2d: Grad2dStats, settings: StaticSettings, generator: torch.Generator) -> None:
+    """Densify Gaussians with a large screen-space gradient, then prune transparent and too large ones."""
     with torch.no_grad():
         room = settings.max_points - len(cloud.gaussians)
-        pull = gradients.mean
-        grown = densify(cloud.gaussians, pull, settings.densify_gradient, SPLIT_SCALE, room, generator)
+        grown = densify(cloud.gaussians, grad2d.mean, settings.densify_gradient, SPLIT_SCALE, room, generator)
         cloud.replace(grown)
         cloud.replace(prune(cloud.gaussians, settings.prune_opacity, settings.prune_scale))

@@ -1,1 +1,1 @@
-"""Clouds of 3D Gaussians: the value, how it starts, how it grows, how it is stored."""
+"""Clouds of 3D Gaussians: representation, initialization, density control, transforms and PLY files."""

@@ -1,4 +1,4 @@
-"""The value at the center of the method: a cloud of 3D Gaussians (Kerbl et al. 2023)."""
+"""Cloud of 3D Gaussians (Kerbl et al. 2023)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,16 +8,16 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dg4d_lib.devices import to_device_async
-from dg4d_lib.geometry.harmonics import color_of_harmonics
-from dg4d_lib.geometry.quaternion import rotation_matrix
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
+from dg4d_lib.geometry.spherical_harmonics import sh_to_rgb
 
 
 @dataclass(frozen=True)
 class Gaussians:
-    """Free parameters as fields, physical quantities as properties.
+    """Raw parameters as fields, activated quantities as properties.
 
-    `means`, `log_scales` and `quats` may carry a leading batch (one state of the same cloud per frame or view); opacity
-    and color never do, since they do not move (paper, section on deformation).
+    `means`, `log_scales` and `quats` may have a leading batch axis, one state of the cloud per frame or view; opacity
+    and color have none, because the deformation does not change them (paper section 3.2).
 
     Attributes:
         means: world units.
@@ -49,24 +49,24 @@ class Gaussians:
     @property
     def colors(self) -> Float[Tensor, "n 3"]:
         """Colors in [0, 1]."""
-        return color_of_harmonics(self.harmonics)
+        return sh_to_rgb(self.harmonics)
 
     @property
     def covariances(self) -> Float[Tensor, "*b n 3 3"]:
         """R S S^T R^T, world units squared."""
-        half = rotation_matrix(self.quats) * self.scales[..., None, :]
+        half = quat_to_rotmat(self.quats) * self.scales[..., None, :]
         return half @ half.mT
 
     def detach(self) -> "Gaussians":
-        """The same cloud, cut off from the graph."""
+        """Return the cloud detached from the autograd graph."""
         return Gaussians(**{name: value.detach() for name, value in vars(self).items()})
 
     def to(self, target: torch.dtype | torch.device) -> "Gaussians":
-        """The same cloud in another precision or on another device."""
+        """Return the cloud in another precision or on another device."""
         return Gaussians(**{name: value.to(target) for name, value in vars(self).items()})
 
     def states(self, rows: Sequence[int] | Int[Tensor, " m"]) -> "Gaussians":
-        """Some states of a batch, in this order; not copied if they are all, each in its place."""
+        """Return some states of a batch in this order; the cloud itself if they are all, in order."""
         chosen = torch.as_tensor(rows, dtype=torch.long)
         if chosen.tolist() == list(range(len(self.means))):
             return self
@@ -74,7 +74,7 @@ class Gaussians:
         return replace(self, means=self.means[chosen], log_scales=self.log_scales[chosen], quats=self.quats[chosen])
 
     def at(self, frame: int) -> "Gaussians":
-        """One state of a batch."""
+        """Return one state of a batch."""
         return Gaussians(
             self.means[frame], self.log_scales[frame], self.quats[frame], self.opacity_logits, self.harmonics
         )

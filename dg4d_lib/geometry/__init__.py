@@ -1,1 +1,1 @@
-"""Rotations, color harmonics and grids."""
+"""Quaternions and spherical-harmonics colors."""

@@ -1,15 +1,15 @@
-"""Rotations as quaternions, wxyz."""
+"""Rotations as quaternions, stored wxyz."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 
-def rotation_matrix(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrices of quaternions of any non-zero norm.
+def quat_to_rotmat(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """Convert quaternions of any non-zero norm to rotation matrices.
 
     Args:
-        quats: wxyz, scalar first; they are normalized here.
+        quats: wxyz, scalar first; normalized by this function.
 
     Returns:
         Proper rotations (determinant +1) that act on column vectors.
@@ -23,8 +23,8 @@ def rotation_matrix(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
-def multiply(first: Float[Tensor, "*batch 4"], second: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """The Hamilton product: rotating by `second`, then by `first`."""
+def quat_multiply(first: Float[Tensor, "*batch 4"], second: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """Return the Hamilton product, which rotates by `second` and then by `first`."""
     aw, ax, ay, az = first.unbind(-1)
     bw, bx, by, bz = second.unbind(-1)
     return torch.stack(

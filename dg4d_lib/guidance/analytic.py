@@ -12,12 +12,12 @@ from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.noise_schedule import alphas_cumprod
-from dg4d_lib.guidance.distillation import Annealing, score_distillation
-from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.distillation import TimestepSchedule, score_distillation
+from dg4d_lib.guidance.interface import GuidanceView
 
 LATENT_NUMBERS = 4 * 32 * 32  # of Zero-1-to-3; a pixel picture is weighted as if it had as many
 
-CleanPictures = Callable[[Sequence[View]], tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]]
+CleanPictures = Callable[[Sequence[GuidanceView]], tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]]
 
 
 class AnalyticPrior:
@@ -34,7 +34,7 @@ class AnalyticPrior:
     def __init__(
         self,
         clean: CleanPictures,
-        noise: Annealing,
+        noise: TimestepSchedule,
         viewpoints: tuple[OrbitCamera, ...] | None = None,
         frames: tuple[int, ...] | None = None,
         weight: float = 1.0,
@@ -46,7 +46,7 @@ class AnalyticPrior:
         self,
         images: Float[Tensor, "b h w 3"],
         coverage: Float[Tensor, "b h w 1"],
-        views: Sequence[View],
+        views: Sequence[GuidanceView],
         progress: float,
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:

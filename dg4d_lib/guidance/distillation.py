@@ -13,16 +13,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.diffusion.batching import MicroBatches
-from dg4d_lib.diffusion.noise_schedule import TRAIN_STEPS, add_noise, alphas_cumprod
+from dg4d_lib.diffusion.noise_schedule import NUM_TRAIN_TIMESTEPS, add_noise, alphas_cumprod
 
-NOISE_END = 0.02  # share of the schedule at which the paper's annealing ends
-LOWEST, HIGHEST = 20, 980  # timesteps
+T_MAX_END = 0.02  # share of the schedule at which the paper's annealing ends
+MIN_TIMESTEP, MAX_TIMESTEP = 20, 980  # timesteps
 
 PredictNoise = Callable[[Float[Tensor, "b c h w"], int], Float[Tensor, "b c h w"]]
 
 
 @dataclass(frozen=True)
-class Annealing:
+class TimestepSchedule:
     """Schedule of the timestep of an iteration, one for its whole batch.
 
     Attributes:
@@ -31,19 +31,19 @@ class Annealing:
         uniform: draw the timestep evenly from 0.02 to T_max, rather than take T_max itself.
     """
 
-    start: float
-    end: float = NOISE_END
+    t_max_start: float
+    t_max_end: float = T_MAX_END
     uniform: bool = False
 
     def timestep(self, progress: float, generator: torch.Generator) -> int:
         """Return the timestep at a progress in [0, 1]; only uniform draws use the generator."""
-        highest = annealed_timestep(progress, self.start, self.end)
+        highest = annealed_timestep(progress, self.t_max_start, self.t_max_end)
         if not self.uniform:
             return highest
-        return int(torch.randint(LOWEST, highest + 1, (), generator=generator))
+        return int(torch.randint(MIN_TIMESTEP, highest + 1, (), generator=generator))
 
 
-def annealed_timestep(progress: float, t_max_start: float, t_max_end: float = NOISE_END) -> int:
+def annealed_timestep(progress: float, t_max_start: float, t_max_end: float = T_MAX_END) -> int:
     """Linear from `t_max_start` to `t_max_end` of the schedule, and never outside of 20 to 980.
 
     Args:
@@ -52,7 +52,7 @@ def annealed_timestep(progress: float, t_max_start: float, t_max_end: float = NO
         t_max_end: and at progress 1.
     """
     share = t_max_start + (t_max_end - t_max_start) * progress
-    return min(max(round(TRAIN_STEPS * share), LOWEST), HIGHEST)
+    return min(max(round(NUM_TRAIN_TIMESTEPS * share), MIN_TIMESTEP), MAX_TIMESTEP)
 
 
 def sds_weight(timestep: int) -> float:

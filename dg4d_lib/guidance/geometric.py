@@ -15,14 +15,14 @@ from jaxtyping import Float, Float32
 from numba import njit
 from torch import Tensor
 
-from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
+from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.errors import BadInput
-from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.images import over_background
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import InflatedSurface, inflate
-from dg4d_lib.kernels.vectors import INLINE, KERNEL
-from dg4d_lib.kernels.workers import run
+from dg4d_lib.kernels.simd import INLINE, KERNEL
+from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.settings import GeometricPriorSettings
 
 SHARPEST = 0.05  # pixels: narrower Gaussians are the identity in float32
@@ -58,7 +58,7 @@ class InflatedSurfaces:
             self._surfaces[frame] = inflate(self._cutouts[frame], self._settings.size, self._turn_deg)
         return self._surfaces[frame]
 
-    def clean(self, views: Sequence[View]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
+    def clean(self, views: Sequence[GuidanceView]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
         """The pictures that the prior believes in.
 
         Args:
@@ -94,11 +94,11 @@ def averaged_over_depth(
         depth_sigma: standard deviation of the shift, world units.
     """
     sigma = torch.tensor([depth_sigma * camera.focal / camera.radius for camera in cameras], dtype=torch.float64)
-    shifts = (world_to_camera(cameras)[:, :2, 2].abs() * sigma[:, None]).tolist()
+    shifts = (viewmats(cameras)[:, :2, 2].abs() * sigma[:, None]).tolist()
     planes = images.movedim(-1, 1).to("cpu", torch.float32).contiguous().numpy()
     blurred = np.empty_like(planes)
     weights = [[_gaussian(shift) for shift in pair] for pair in shifts]
-    run([partial(_blur, *view) for view in zip(planes, *zip(*weights, strict=True), blurred, strict=True)])
+    run_parallel([partial(_blur, *view) for view in zip(planes, *zip(*weights, strict=True), blurred, strict=True)])
     return torch.from_numpy(blurred).movedim(1, -1).to(images)
 
 

@@ -22,22 +22,22 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.devices import to_device_async
 from dg4d_lib.diffusion.batching import MicroBatches
+from dg4d_lib.diffusion.checkpoints import load_checkpoint
 from dg4d_lib.diffusion.clip_images import clip_pixels
-from dg4d_lib.diffusion.latents import LATENT_CHANNELS, LATENT_SIZE, at_least_float32, decode_images, encode_images
-from dg4d_lib.diffusion.noise_schedule import SCHEDULE, ddim_step, ddim_timesteps, require_schedule
-from dg4d_lib.diffusion.parts import (
+from dg4d_lib.diffusion.components import (
     TRANSFORMERS_FILES,
     Placement,
-    dtype_on,
-    load_part,
+    compute_dtype,
+    load_component,
     load_vae,
     weights_file,
 )
-from dg4d_lib.diffusion.published import load_network
+from dg4d_lib.diffusion.latents import LATENT_CHANNELS, LATENT_SIZE, at_least_float32, decode_images, encode_images
+from dg4d_lib.diffusion.noise_schedule import SCHEDULE, ddim_step, ddim_timesteps, require_schedule
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.guidance.distillation import Annealing, distill_in_pieces
-from dg4d_lib.guidance.imagedream_unet import MultiViewShape, MultiViewUnet
-from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.distillation import TimestepSchedule, distill_in_pieces
+from dg4d_lib.guidance.imagedream_unet import MultiViewUnet, MultiViewUnetConfig
+from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.settings import ImageDreamPriorSettings, Precision
 
 RING = 4  # views that are denoised together, 90 degrees of azimuth apart
@@ -48,7 +48,7 @@ RING_GB = {"fp16": 2.0, "bf16": 2.0, "fp32": 4.0}  # what the VAE keeps of four 
 
 
 @dataclass(frozen=True)
-class Condition:
+class ImageDreamCondition:
     """What the network is told about s objects.
 
     Attributes:
@@ -63,10 +63,10 @@ class Condition:
     features: Float[Tensor, "s m e"]
     latents: Float[Tensor, "s 4 32 32"]
 
-    def rows(self, objects: Sequence[int]) -> "Condition":
+    def rows(self, objects: Sequence[int]) -> "ImageDreamCondition":
         """Some of the objects, in this order."""
         chosen = to_device_async(torch.tensor(list(objects)), self.latents.device)
-        return Condition(**{part.name: getattr(self, part.name)[chosen] for part in fields(self)})
+        return ImageDreamCondition(**{part.name: getattr(self, part.name)[chosen] for part in fields(self)})
 
 
 class ImageDream:
@@ -105,24 +105,24 @@ class ImageDream:
                 f"ImageDream needs packages that are not installed ({error}); run `make setup CUDA=1`"
             ) from error
         disable_progress_bar()
-        placement = Placement(device, dtype_on(device, precision), channels_last=device.type == "cuda")
+        placement = Placement(device, compute_dtype(device, precision), channels_last=device.type == "cuda")
         require_schedule(model, SCHEDULE)
         try:
-            shape = MultiViewShape.of(json.loads((model / "unet" / "config.json").read_text(encoding="utf-8")))
+            shape = MultiViewUnetConfig.of(json.loads((model / "unet" / "config.json").read_text(encoding="utf-8")))
             tokenizer = CLIPTokenizer.from_pretrained(model / "tokenizer", local_files_only=True)
         except (OSError, ValueError, TypeError) as error:
             raise BadInput(f"{model} is no ImageDream: {error}") from error
         file = weights_file(model / "unet", half=placement.dtype == torch.float16)
         return cls(
-            load_network(lambda tensors: MultiViewUnet(shape), file, placement),
+            load_checkpoint(lambda tensors: MultiViewUnet(shape), file, placement),
             load_vae(model, placement),
-            load_part(CLIPVisionModel, model / "image_encoder", placement, TRANSFORMERS_FILES),
-            load_part(CLIPTextModel, model / "text_encoder", placement, TRANSFORMERS_FILES),
+            load_component(CLIPVisionModel, model / "image_encoder", placement, TRANSFORMERS_FILES),
+            load_component(CLIPTextModel, model / "text_encoder", placement, TRANSFORMERS_FILES),
             tokenizer,
         )
 
     @torch.no_grad()
-    def conditioned_on(self, pictures: Float[Tensor, "s h w 3"], text: str = "") -> Condition:
+    def conditioned_on(self, pictures: Float[Tensor, "s h w 3"], text: str = "") -> ImageDreamCondition:
         """What the network is to know.
 
         Args:
@@ -132,12 +132,12 @@ class ImageDream:
         eye = clip_pixels(pictures).to(self.image_encoder.device, self.image_encoder.dtype)
         features = self.image_encoder(eye, output_hidden_states=True).hidden_states[-2]
         words, silence = (self._tokens(said).expand(len(pictures), -1, -1) for said in (text, ""))
-        return Condition(words, silence, features, self.encode(pictures))
+        return ImageDreamCondition(words, silence, features, self.encode(pictures))
 
     @torch.no_grad()
     def views(
         self,
-        condition: Condition,
+        condition: ImageDreamCondition,
         generator: torch.Generator,
         steps: int = 30,
         guidance: float = 5.0,
@@ -167,7 +167,7 @@ class ImageDream:
         latents: Float[Tensor, "s v 4 32 32"],
         timestep: int,
         rings: Sequence[Sequence[OrbitCamera]],
-        condition: Condition,
+        condition: ImageDreamCondition,
         guidance: float,
     ) -> Float[Tensor, "s v 4 32 32"]:
         """The noise in s sets of v views, with classifier-free guidance: e_u + guidance (e_c - e_u).
@@ -186,7 +186,7 @@ class ImageDream:
         features, fronts = (
             torch.cat([torch.zeros_like(told), told]).to(like) for told in (condition.features, condition.latents)
         )
-        poses = torch.stack([torch.stack([camera_numbers(camera) for camera in ring]) for ring in rings])
+        poses = torch.stack([torch.stack([camera_to_world_rows(camera) for camera in ring]) for ring in rings])
         poses = pad(poses, (0, 0, 0, 1)).repeat(2, 1, 1)  # the picture itself has no camera
         poses = to_device_async(poses.to(like.dtype), like.device)
         seen = torch.cat([latents.repeat(2, 1, 1, 1, 1).to(like), fronts[:, None]], 1)
@@ -221,8 +221,8 @@ class ImageDreamPrior:
     """
 
     model: ImageDream
-    condition: Condition
-    noise: Annealing
+    condition: ImageDreamCondition
+    noise: TimestepSchedule
     settings: ImageDreamPriorSettings
     viewpoints: tuple[OrbitCamera, ...] | None = field(default=None, init=False)
     frames: tuple[int, ...] | None = field(default=None, init=False)
@@ -240,7 +240,7 @@ class ImageDreamPrior:
         self,
         images: Float[Tensor, "b h w 3"],
         coverage: Float[Tensor, "b h w 1"],
-        views: Sequence[View],
+        views: Sequence[GuidanceView],
         progress: float,
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:
@@ -278,15 +278,15 @@ class ImageDreamPrior:
         return distill_in_pieces(stacked, encode, predict_noise, timestep, noise, self.batches) / RING
 
 
-def camera_numbers(camera: OrbitCamera) -> Float[Tensor, "16"]:
+def camera_to_world_rows(camera: OrbitCamera) -> Float[Tensor, "16"]:
     """The camera as ImageDream is told: camera to world by rows, OpenGL axes, z up, at radius 1; float64."""
     turned = OrbitCamera(camera.elevation_deg, camera.azimuth_deg + FRONT_DEG, radius=1.0)
-    pose = turned.world_to_camera().inverse() @ torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64).diag()
+    pose = turned.viewmat().inverse() @ torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64).diag()
     right, up, front, last = pose
     return torch.cat([right, -front, up, last])
 
 
-def _is_ring(views: Sequence[View]) -> bool:
+def _is_ring(views: Sequence[GuidanceView]) -> bool:
     first = views[0]
     same = all(v.frame == first.frame and v.camera.elevation_deg == first.camera.elevation_deg for v in views)
     turns = [(view.camera.azimuth_deg - first.camera.azimuth_deg) % 360 for view in views]

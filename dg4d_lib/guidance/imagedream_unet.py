@@ -22,7 +22,7 @@ EXPANSION = 4  # inner channels of a feed-forward layer, and of the embedding of
 
 
 @dataclass(frozen=True)
-class MultiViewShape:
+class MultiViewUnetConfig:
     """Sizes, under the names that `unet/config.json` has for them; the defaults are the published model's.
 
     Attributes:
@@ -58,13 +58,13 @@ class MultiViewShape:
     image_heads: int = 12
 
     @staticmethod
-    def of(config: dict[str, Any]) -> "MultiViewShape":
+    def of(config: dict[str, Any]) -> "MultiViewUnetConfig":
         """The sizes in a `config.json`; keys that are no sizes are ignored."""
-        names = [field.name for field in fields(MultiViewShape) if field.name in config]
+        names = [field.name for field in fields(MultiViewUnetConfig) if field.name in config]
         sizes: dict[str, Any] = {
             name: tuple(config[name]) if isinstance(config[name], list) else config[name] for name in names
         }
-        return MultiViewShape(**sizes)
+        return MultiViewUnetConfig(**sizes)
 
 
 class MultiViewUnet(nn.Module):
@@ -74,7 +74,7 @@ class MultiViewUnet(nn.Module):
         shape: the sizes.
     """
 
-    def __init__(self, shape: MultiViewShape) -> None:
+    def __init__(self, shape: MultiViewUnetConfig) -> None:
         super().__init__()
         self.shape = shape
         width, embedding = shape.model_channels, EXPANSION * shape.model_channels
@@ -185,7 +185,7 @@ class _Residual(nn.Module):
 class _Transformer(nn.Module):
     """Attention over the pixels of a set, then over tokens, beside a shortcut."""
 
-    def __init__(self, channels: int, shape: MultiViewShape) -> None:
+    def __init__(self, channels: int, shape: MultiViewUnetConfig) -> None:
         super().__init__()
         self.norm = nn.GroupNorm(GROUPS, channels, eps=1e-6)
         self.proj_in = nn.Linear(channels, channels)
@@ -204,7 +204,7 @@ class _Transformer(nn.Module):
 class _TransformerBlock(nn.Module):
     """What pixels tell each other, what the tokens tell them, and what they make of it."""
 
-    def __init__(self, channels: int, shape: MultiViewShape) -> None:
+    def __init__(self, channels: int, shape: MultiViewUnetConfig) -> None:
         super().__init__()
         head = shape.num_head_channels
         self.attn1 = _Attention(channels, channels, head)
@@ -269,7 +269,7 @@ class _Gated(nn.Module):
 class _Resampler(nn.Module):
     """Features of a picture to a few tokens, which ask the features and each other."""
 
-    def __init__(self, shape: MultiViewShape) -> None:
+    def __init__(self, shape: MultiViewUnetConfig) -> None:
         super().__init__()
         width = shape.context_dim
         self.latents = nn.Parameter(torch.randn(1, shape.ip_dim, width) / width**0.5)

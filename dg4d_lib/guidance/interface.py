@@ -13,7 +13,7 @@ from dg4d_lib.inflation.surface import InflatedSurface
 
 
 @dataclass(frozen=True)
-class View:
+class GuidanceView:
     """Where and when a picture is judged.
 
     Attributes:
@@ -41,7 +41,7 @@ class GuidancePrior(Protocol):
         self,
         images: Float[Tensor, "b h w 3"],
         coverage: Float[Tensor, "b h w 1"],
-        views: Sequence[View],
+        views: Sequence[GuidanceView],
         progress: float,
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:
@@ -64,13 +64,13 @@ class SubjectShapes(Protocol):
         """Return the closed, colored surface of a frame."""
         ...
 
-    def clean(self, views: Sequence[View]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
+    def clean(self, views: Sequence[GuidanceView]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
         """Return expected color over white and expected alpha of views of one size, in [0, 1]."""
         ...
 
 
 @runtime_checkable
-class JudgesRings(Protocol):
+class RingPrior(Protocol):
     """What a prior has beside `GuidancePrior` if it judges several cameras of a moment together.
 
     Attributes:
@@ -83,6 +83,6 @@ class JudgesRings(Protocol):
         ...
 
 
-def ring_of(prior: GuidancePrior) -> int:
+def ring_size(prior: GuidancePrior) -> int:
     """How many consecutive views the prior judges together; 1 if it judges each for itself."""
-    return prior.ring if isinstance(prior, JudgesRings) else 1
+    return prior.ring if isinstance(prior, RingPrior) else 1

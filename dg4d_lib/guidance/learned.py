@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.images import resize
 from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.settings import LearnedPriorSettings
@@ -53,7 +53,7 @@ class LearnedShapes:
         """
         return level_surface(self._field(frame), self._settings.level)
 
-    def clean(self, views: Sequence[View]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
+    def clean(self, views: Sequence[GuidanceView]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
         """Return the expected color over white and the expected alpha, in [0, 1].
 
         Args:

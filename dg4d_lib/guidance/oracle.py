@@ -1,4 +1,4 @@
-"""A bank of true pictures: what an ideal prior would say, and what an imperfect one. For tests and benchmarks."""
+"""A bank of true pictures: what an ideal prior would say, and what an perturb one. For tests and benchmarks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
-from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.images import over_white, resize_planes
 from dg4d_lib.settings import OraclePriorSettings
 
@@ -30,7 +30,7 @@ class Bank:
     frames: tuple[int, ...]
     pictures: UInt8[Tensor, "v t h w 4"]
 
-    def clean(self, views: Sequence[View]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
+    def clean(self, views: Sequence[GuidanceView]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
         """Color over white and coverage of views that are in the bank, resampled to the camera's size.
 
         Raises:
@@ -55,14 +55,14 @@ class Bank:
         return both[..., :3], both[..., 3:]
 
 
-def imperfect(bank: Bank, settings: OraclePriorSettings, generator: torch.Generator) -> Bank:
+def perturb(bank: Bank, settings: OraclePriorSettings, generator: torch.Generator) -> Bank:
     """What a prior says that knows less: blurred, a little beside the view, and in every frame otherwise.
 
     Everything is drawn once, so that the same question always has the same answer.
 
     Args:
         bank: the truth.
-        settings: how imperfect; with zeros the truth comes back.
+        settings: how perturb; with zeros the truth comes back.
         generator: of gains, shifts and errors.
     """
     pictures, cameras = bank.pictures, bank.cameras

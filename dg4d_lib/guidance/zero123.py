@@ -1,8 +1,8 @@
-"""Zero-1-to-3: a diffusion model that knows a picture, and how it should look from another camera (Liu et al. 2023).
+"""Zero-1-to-3 as a guidance prior: novel views of an image, conditioned on a relative camera pose (Liu et al. 2023).
 
-Loading is slow and done once; conditioning on frames is quick and gives a new frozen prior. Layout of the folder:
-`dg4d_lib/diffusion/parts.py`, and clip_camera_projection/ with the linear layer proj from [CLIP embedding, camera] to
-the one token of the UNet's cross-attention.
+Loading is slow and done once; conditioning on frames is quick and returns a new frozen prior. The folder has the layout
+of `dg4d_lib/diffusion/components.py` and clip_camera_projection/, which holds the linear layer `proj` from [CLIP
+embedding, relative pose] to the single token of the UNet's cross-attention.
 """
 
 import math
@@ -19,20 +19,20 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.devices import to_device_async
 from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.diffusion.clip_images import clip_pixels
-from dg4d_lib.diffusion.latents import LATENT_CHANNELS, LATENT_SIZE, SIZE, encode_images
-from dg4d_lib.diffusion.noise_schedule import SCHEDULE, require_schedule
-from dg4d_lib.diffusion.parts import (
+from dg4d_lib.diffusion.components import (
     Placement,
-    dtype_on,
+    compute_dtype,
     load_image_encoder,
     load_unet,
     load_vae,
     read_linear,
 )
+from dg4d_lib.diffusion.latents import LATENT_CHANNELS, LATENT_SIZE, SIZE, encode_images
+from dg4d_lib.diffusion.noise_schedule import SCHEDULE, require_schedule
 from dg4d_lib.diffusion.single_token_attention import shorten_attention
 from dg4d_lib.errors import BadInput
-from dg4d_lib.guidance.distillation import Annealing, distill_in_pieces
-from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.distillation import TimestepSchedule, distill_in_pieces
+from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.settings import Precision, Zero123PriorSettings
 
 CAMERA_NUMBERS = 4
@@ -72,7 +72,7 @@ class Zero123:
             BadInput: a file is missing or damaged, or the parts are not those of Zero-1-to-3.
             BackendUnavailable: diffusers is not installed.
         """
-        placement = Placement(device, dtype_on(device, settings.precision), channels_last=device.type == "cuda")
+        placement = Placement(device, compute_dtype(device, settings.precision), channels_last=device.type == "cuda")
         require_schedule(model, SCHEDULE)
         projection = read_linear(model / "clip_camera_projection", "proj", placement)
         encoder = load_image_encoder(model, placement)
@@ -94,7 +94,7 @@ class Zero123:
 
     @torch.no_grad()
     def conditioned_on(
-        self, frames: Float[Tensor, "t h w 3"], noise: Annealing, input_camera: OrbitCamera | None = None
+        self, frames: Float[Tensor, "t h w 3"], noise: TimestepSchedule, input_camera: OrbitCamera | None = None
     ) -> "ConditionedZero123":
         """A prior that knows these frames; the image encoder is not part of it and may be freed.
 
@@ -149,7 +149,7 @@ class ConditionedZero123:
     settings: Zero123PriorSettings
     embeddings: Float[Tensor, "t e"]
     latents: Float[Tensor, "t 4 32 32"]
-    noise: Annealing
+    noise: TimestepSchedule
     input_camera: OrbitCamera
     batches: MicroBatches
     viewpoints: tuple[OrbitCamera, ...] | None = field(default=None, init=False)
@@ -159,7 +159,7 @@ class ConditionedZero123:
         self,
         images: Float[Tensor, "b h w 3"],
         coverage: Float[Tensor, "b h w 1"],
-        views: Sequence[View],
+        views: Sequence[GuidanceView],
         progress: float,
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:
@@ -204,16 +204,16 @@ class ConditionedZero123:
         free, conditional = self.unet(inputs, timesteps, context).sample.to(noisy.dtype).chunk(2)
         return free + self.settings.guidance_scale * (conditional - free)
 
-    def tokens(self, views: Sequence[View]) -> Float[Tensor, "b 1 c"]:
+    def tokens(self, views: Sequence[GuidanceView]) -> Float[Tensor, "b 1 c"]:
         """What the cross-attention of the UNet reads: one token per view, out of its frame and its camera."""
         told = self.settings.input_elevation_deg if self.settings.variant == "stable" else None
-        cameras = torch.stack([camera_numbers(view.camera, self.input_camera, told) for view in views])
+        cameras = torch.stack([relative_pose(view.camera, self.input_camera, told) for view in views])
         embeddings = self.embeddings[self._rows(views)]
         with torch.no_grad():
             placed = to_device_async(cameras.to(embeddings.dtype), embeddings.device)
             return self.camera_projection(torch.cat([embeddings, placed], -1))[:, None]
 
-    def _rows(self, views: Sequence[View]) -> Int64[Tensor, " b"]:
+    def _rows(self, views: Sequence[GuidanceView]) -> Int64[Tensor, " b"]:
         """Where the frames of some views stand."""
         known = len(self.embeddings)
         if wrong := [view.frame for view in views if not 0 <= view.frame < known]:
@@ -221,7 +221,7 @@ class ConditionedZero123:
         return to_device_async(torch.tensor([view.frame for view in views]), self.embeddings.device)
 
 
-def camera_numbers(
+def relative_pose(
     camera: OrbitCamera, input_camera: OrbitCamera, input_elevation_deg: float | None = None
 ) -> Float[Tensor, " 4"]:
     """A camera as Zero-1-to-3 was trained to read it, relative to the input's: the one place of its conventions.

@@ -14,7 +14,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.inflation.surface import InflatedSurface
-from dg4d_lib.kernels.workers import run
+from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
 
@@ -58,7 +58,7 @@ def render_surface(
         )
 
     # one camera in each job: the z-buffer inside does not wait for the same threads
-    run([partial(draw, index) for index in range(len(cameras))])
+    run_parallel([partial(draw, index) for index in range(len(cameras))])
     pictures = torch.from_numpy(planes).to(each[0].vertices.device).movedim(1, -1)
     return pictures[..., :3], pictures[..., 3:]
 

@@ -1,1 +1,1 @@
-"""What compiled kernels share: vector instructions, threads and memory."""
+"""Shared parts of the Numba kernels: compilation cache, SIMD instructions, threads and memory."""

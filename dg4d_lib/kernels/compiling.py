@@ -1,8 +1,7 @@
-"""When kernels are compiled: after a change in any source they are made of, and people are told.
+"""Numba's on-disk cache, keyed by all source files of a kernel, and a log line before the first compilation.
 
-Numba keeps machine code on disk and compiles again when the file of a kernel changed. Our kernels are made of several
-files: what they inline, and constants, lie beside them or in this package. So the stamp of such a kernel is a digest of
-both folders.
+Numba caches machine code on disk and recompiles a kernel when its file changes. Our kernels also inline functions and
+constants from files beside them and from this package, so their cache key includes a digest of both folders.
 """
 
 import hashlib
@@ -16,65 +15,65 @@ from numba.core import event
 from numba.core.caching import InTreeCacheLocator, UserProvidedCacheLocator, UserWideCacheLocator
 from numba.core.registry import cpu_target
 
-NOTICE = "compiling kernels for this processor: some ten seconds, once"
+NOTICE = "compiling CPU kernels (about ten seconds, only the first time)"
 
 _HERE = Path(__file__).parent
 _log = logging.getLogger(__name__)
 
 
-def prepare() -> None:
-    """Set Numba up; to be called before the first kernel is defined."""
-    ours = [f"{__name__}.{place.__name__}" for place in (_Given, _Beside, _Home)]
-    places = ",".join([*ours, "IPythonCacheLocator", "ZipCacheLocator"])  # Numba's others, for code that is not ours
-    numba.config.CACHE_LOCATOR_CLASSES = places  # type: ignore[attr-defined]
-    event.register("numba:compile", _Teller())
+def configure_numba() -> None:
+    """Install our cache locators and the compilation notice; call this before the first kernel is defined."""
+    ours = [f"{__name__}.{locator.__name__}" for locator in (_EnvironmentCache, _SourceFolderCache, _UserCache)]
+    locators = ",".join([*ours, "IPythonCacheLocator", "ZipCacheLocator"])  # Numba's own, for kernels of others
+    numba.config.CACHE_LOCATOR_CLASSES = locators  # type: ignore[attr-defined]
+    event.register("numba:compile", _CompileNotice())
 
 
-def load() -> None:
-    """Have Numba import what it would for its first kernel, .4 s that forks of this process need not spend."""
+def preload_numba() -> None:
+    """Import Numba's compiler (0.4 s) before forking, so that forked processes do not each pay for it."""
     cpu_target.typing_context.refresh()
     cpu_target.target_context.refresh()
 
 
-class _Teller(event.Listener):
-    """Says once per process that kernels are being compiled; loading them from the disk is not worth a word."""
+class _CompileNotice(event.Listener):
+    """Listener that logs once per process that kernels are being compiled; cache hits are not logged."""
 
     def __init__(self) -> None:
-        self._told = False
+        self._logged = False
 
     def on_start(self, event: Any) -> None:
-        if not self._told:
-            self._told = True
+        if not self._logged:
+            self._logged = True
             _log.info(NOTICE)
 
     def on_end(self, event: Any) -> None:
         pass
 
 
-class _Stamped:
-    """A place for machine code whose stamp covers all sources of a kernel."""
+class _SourceDigest:
+    """Mixin for cache locators: the source stamp covers all files of a kernel."""
 
     _py_file: str
 
     def get_source_stamp(self) -> Any:
-        """The digest that must be the same for machine code to be used."""
+        """Return the key that cached machine code must match."""
         own = super().get_source_stamp()  # type: ignore[misc]
         source = Path(self._py_file)
-        if f"{__package__}.vectors" not in source.read_text(encoding="utf-8"):
-            return own  # it stands alone: as Numba would have it, whether this module is imported or not
+        if f"{__package__}.simd" not in source.read_text(encoding="utf-8"):
+            return own  # a kernel without our helpers keeps Numba's stamp, whether this module is imported or not
         return own, _digest(source.parent), _digest(_HERE)
 
 
-class _Given(_Stamped, UserProvidedCacheLocator):
-    """In $NUMBA_CACHE_DIR."""
+class _EnvironmentCache(_SourceDigest, UserProvidedCacheLocator):
+    """Cache in $NUMBA_CACHE_DIR."""
 
 
-class _Beside(_Stamped, InTreeCacheLocator):
-    """Beside the source."""
+class _SourceFolderCache(_SourceDigest, InTreeCacheLocator):
+    """Cache beside the source file."""
 
 
-class _Home(_Stamped, UserWideCacheLocator):
-    """In the user's cache folder, where the source may not be written to."""
+class _UserCache(_SourceDigest, UserWideCacheLocator):
+    """Cache in the user's cache folder, for a source folder that is not writable."""
 
 
 @cache

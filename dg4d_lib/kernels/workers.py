@@ -1,7 +1,7 @@
-"""Threads that run kernels, and memory that kernels use again.
+"""Thread pool and buffer pool of the Numba kernels.
 
-Kernels release the interpreter's lock, so plain threads do; they sleep between calls. Their number is
-`torch.get_num_threads()`. Fresh arrays of megabytes would cost more in page faults than blending them.
+Kernels release the GIL, so ordinary threads are enough; there are `torch.get_num_threads()` of them, idle between
+calls. Buffers are reused because the page faults of freshly allocated megabytes cost more than the blending itself.
 """
 
 import os
@@ -17,78 +17,78 @@ import numpy as np
 import torch
 from numpy.typing import DTypeLike, NDArray
 
-_IDLE: defaultdict[int, list[NDArray[np.uint8]]] = defaultdict(list)  # memory that is free, by size
-_IDLE_BYTES = 1 << 29  # of it at most
+_IDLE: defaultdict[int, list[NDArray[np.uint8]]] = defaultdict(list)  # free buffers by size in bytes
+_MAX_IDLE_BYTES = 1 << 29
 
 
-def run(jobs: Sequence[Callable[[], None]]) -> None:
-    """Run independent jobs, here and on other threads, and wait for all; raises what a failing one raised."""
-    waiting = iter(jobs)  # that threads take from it in turn needs no lock: its step is one of the interpreter's
+def run_parallel(jobs: Sequence[Callable[[], None]]) -> None:
+    """Run independent jobs on this thread and the pool, wait for all, and re-raise the exception of a failed one."""
+    queue = iter(jobs)  # shared by the threads without a lock: advancing a list iterator is atomic under the GIL
 
     def work() -> None:
-        for job in waiting:
+        for job in queue:
             job()
 
     helpers = min(torch.get_num_threads(), len(jobs)) - 1
-    helping = [_pool(os.getpid(), helpers).submit(work) for _ in range(helpers)]
+    futures = [_pool(os.getpid(), helpers).submit(work) for _ in range(helpers)]
     try:
         work()
     finally:
-        for helper in helping:
-            if not helper.cancel():  # one that did not start has nothing left to do
-                helper.result()
+        for future in futures:
+            if not future.cancel():  # a helper that has not started has nothing left to do
+                future.result()
 
 
-def ranges(count: int, parts: int, multiple: int = 1) -> list[tuple[int, int]]:
-    """About `parts` consecutive ranges that make up 0..count, their bounds at multiples."""
+def split_range(count: int, parts: int, multiple: int = 1) -> list[tuple[int, int]]:
+    """Split range(count) into about `parts` consecutive ranges with bounds at multiples of `multiple`."""
     step = max(1, -(-count // max(parts, 1) // multiple)) * multiple
     return [(start, min(start + step, count)) for start in range(0, count, step)]
 
 
 @cache
 def _pool(process: int, threads: int) -> ThreadPoolExecutor:
-    """One pool per process (threads do not survive a fork) and number of helpers."""
+    """Return the pool of a process (threads do not survive a fork) and a number of threads."""
     return ThreadPoolExecutor(threads, thread_name_prefix="kernels")
 
 
 class Scratch:
-    """Arrays for one call; their memory goes back to a common store when this object is no longer used."""
+    """Scratch arrays of one call; their buffers return to the pool when this object is garbage-collected."""
 
     def __init__(self) -> None:
-        self._taken: list[NDArray[np.uint8]] = []
-        weakref.finalize(self, _give_back, self._taken).atexit = False
+        self._buffers: list[NDArray[np.uint8]] = []
+        weakref.finalize(self, _release, self._buffers).atexit = False
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray[Any]:
-        """An array with arbitrary content."""
-        memory, array = _take(shape, dtype)
-        self._taken.append(memory)
+        """Return an uninitialized array."""
+        buffer, array = _acquire(shape, dtype)
+        self._buffers.append(buffer)
         return array
 
 
-def recycled(shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """An array with arbitrary content; its memory goes back when neither it nor a tensor made of it is used any more.
+def empty_recycled(shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return an uninitialized array whose buffer returns to the pool with the last reference to the array.
 
-    Its views do not count: they have to go first.
+    A tensor from `torch.from_numpy` holds such a reference; NumPy views do not and must not outlive the array.
     """
-    memory, array = _take(shape, np.float32)
-    weakref.finalize(array, _give_back, [memory]).atexit = False
+    buffer, array = _acquire(shape, np.float32)
+    weakref.finalize(array, _release, [buffer]).atexit = False
     return array
 
 
-def _take(shape: tuple[int, ...], dtype: DTypeLike) -> tuple[NDArray[np.uint8], NDArray[Any]]:
-    """Memory from the store, and an array in it."""
+def _acquire(shape: tuple[int, ...], dtype: DTypeLike) -> tuple[NDArray[np.uint8], NDArray[Any]]:
+    """Take a buffer from the pool and return it with an array in it."""
     bytes_needed = prod(shape) * np.dtype(dtype).itemsize
     size = 1 << max(12, (bytes_needed - 1).bit_length())
     try:
-        memory = _IDLE[size].pop()
+        buffer = _IDLE[size].pop()
     except IndexError:
-        memory = np.empty(size, np.uint8)
-    return memory, memory[:bytes_needed].view(dtype).reshape(shape)
+        buffer = np.empty(size, np.uint8)
+    return buffer, buffer[:bytes_needed].view(dtype).reshape(shape)
 
 
-def _give_back(taken: list[NDArray[np.uint8]]) -> None:
-    idle = sum(size * len(arrays) for size, arrays in list(_IDLE.items()))
-    for memory in taken:
-        idle += memory.size
-        if idle <= _IDLE_BYTES:
-            _IDLE[memory.size].append(memory)
+def _release(buffers: list[NDArray[np.uint8]]) -> None:
+    idle = sum(size * len(free) for size, free in list(_IDLE.items()))
+    for buffer in buffers:
+        idle += buffer.size
+        if idle <= _MAX_IDLE_BYTES:
+            _IDLE[buffer.size].append(buffer)

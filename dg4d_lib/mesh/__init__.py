@@ -1,1 +1,1 @@
-"""Textured meshes out of Gaussians."""
+"""Textured meshes from Gaussians: extraction, tracking, texturing and rendering."""

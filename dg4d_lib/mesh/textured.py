@@ -1,4 +1,4 @@
-"""Textured meshes as values."""
+"""Textured meshes, static and tracked over time."""
 
 from dataclasses import dataclass
 
@@ -8,13 +8,13 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class TexturedMesh:
-    """Triangles with one texture; vertices are already split at the seams of the texture.
+    """Triangle mesh with one texture; vertices are split along the texture seams.
 
     Attributes:
-        vertices: world units.
+        vertices: positions, world units.
         faces: indices into `vertices`, counter-clockwise seen from outside.
         uvs: texture coordinates in [0, 1], u to the right, v down (row 0 of the texture is v = 0, as in glTF).
-        texture: color in [0, 1].
+        texture: colors in [0, 1].
     """
 
     vertices: Float[Tensor, "v 3"]
@@ -25,16 +25,16 @@ class TexturedMesh:
 
 @dataclass(frozen=True)
 class TrackedMesh:
-    """One topology that moves; it has frames and no frame rate.
+    """Mesh of fixed topology whose vertices move over the frames; the frame rate is not part of it.
 
     Attributes:
-        mesh: at rest.
-        offsets: what to add to the vertices at every frame, world units.
-        textures: the colors of every frame in [0, 1], where they change; None: always the mesh's own.
-        rest: the frame at which the moved mesh is the mesh at rest, but for what was corrected afterwards.
+        mesh: the mesh at rest, that of the reference frame.
+        offsets: added to the vertices at every frame, world units.
+        textures: colors of every frame in [0, 1]; None if all frames have the texture of `mesh`.
+        reference_frame: frame that the mesh was extracted from; its offsets are 0 up to later corrections.
     """
 
     mesh: TexturedMesh
     offsets: Float[Tensor, "t v 3"]
     textures: Float[Tensor, "t h w 3"] | None = None
-    rest: float = 0.0
+    reference_frame: float = 0.0

@@ -1,1 +1,1 @@
-"""Which triangle a camera sees in every pixel, and where in it."""
+"""Z-buffer rasterizer for triangle meshes, and mip-mapped texture sampling."""

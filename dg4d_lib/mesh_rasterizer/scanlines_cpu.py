@@ -1,6 +1,6 @@
-"""Triangles to pixels along scan lines on the processor; the same numbers as `scanlines`, where the idea is told.
+"""Scan-line rasterization as Numba kernels for CPUs; algorithm and results are those of `scanlines`.
 
-Threads take whole views, so their number changes nothing.
+Each view is one job of the thread pool, so the number of threads does not change the result.
 """
 
 from collections.abc import Sequence
@@ -14,38 +14,38 @@ from numba import njit
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.kernels.workers import Scratch, run
+from dg4d_lib.kernels.workers import Scratch, run_parallel
 from dg4d_lib.mesh_rasterizer.scanlines import DEPTH_STEPS, EMPTY, FAR_OFF, NEAR
 
-_COMPILED = {"nogil": True, "cache": True, "error_model": "numpy"}  # without fastmath: neighbors need equal crossings
+_COMPILED = {"nogil": True, "cache": True, "error_model": "numpy"}  # no fastmath: neighbors must get equal crossings
 
 
-def draw(
+def rasterize(
     vertices: Float[Tensor, "*b v 3"], faces: Int[Tensor, "f 3"], cameras: Sequence[OrbitCamera]
 ) -> tuple[Int32[Tensor, "b h w"], Float32[Tensor, "b h w 3"], Float32[Tensor, "b h w"]]:
-    """What every pixel sees, as in `Fragments`: face, barycentric coordinates, depth."""
+    """Return faces, barycentric coordinates and depth per pixel, as in `Fragments`."""
     shape = len(cameras), cameras[0].height, cameras[0].width
     states = vertices.detach().double().contiguous().numpy()
     triangles = np.ascontiguousarray(faces.int().numpy())
     ids = np.empty(shape, np.int32)
-    weights, depth = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)  # pages of zeros cost nothing
+    weights, depth = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
 
     def draw_view(view: int) -> None:
         state, camera, scratch = states if states.ndim == 2 else states[view], cameras[view], Scratch()
         screen, lines = scratch.empty((len(state), 3), np.float64), scratch.empty((len(state),), np.int32)
         keys = scratch.empty(shape[1:], np.int64)
-        _project(state, camera.world_to_camera().numpy(), camera.focal, keys, screen, lines)
+        _project(state, camera.viewmat().numpy(), camera.focal, keys, screen, lines)
         _draw(screen, lines, triangles, keys)
         _resolve(screen, triangles, keys, ids[view], weights[view], depth[view])
 
-    run([partial(draw_view, view) for view in range(len(cameras))])
+    run_parallel([partial(draw_view, view) for view in range(len(cameras))])
     return torch.from_numpy(ids), torch.from_numpy(weights), torch.from_numpy(depth)
 
 
 @njit(**_COMPILED)
 @no_type_check
 def _project(vertices, pose, focal, keys, screen, lines):
-    """Column, row and 1/z of every vertex, zeros for those that cannot be drawn; the first line below every vertex."""
+    """Write column, row and 1/z of every vertex (zeros if it cannot be drawn), and the first row below it."""
     height, width = keys.shape
     for i in range(vertices.shape[0]):
         x, y, z = vertices[i, 0], vertices[i, 1], vertices[i, 2]
@@ -53,7 +53,7 @@ def _project(vertices, pose, focal, keys, screen, lines):
         near = 1.0 / far
         column = 0.5 * width + focal * near * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3])
         row = 0.5 * height + focal * near * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3])
-        if not (far >= NEAR and abs(column) < FAR_OFF and abs(row) < FAR_OFF):  # also what is not a number
+        if not (far >= NEAR and abs(column) < FAR_OFF and abs(row) < FAR_OFF):  # True for NaN, too
             column = row = near = 0.0
         screen[i, 0], screen[i, 1], screen[i, 2] = column, row, near
         lines[i] = int(np.ceil(row - 0.5))
@@ -62,11 +62,11 @@ def _project(vertices, pose, focal, keys, screen, lines):
 @njit(**_COMPILED)
 @no_type_check
 def _draw(screen, lines, faces, keys):
-    """Fill `keys` with the least key of every pixel."""
+    """Fill `keys` with the smallest key of every pixel."""
     height, width = keys.shape
     keys[:] = EMPTY
     for face in range(faces.shape[0]):
-        t, m, b = faces[face, 0], faces[face, 1], faces[face, 2]  # to be top, middle and bottom corner
+        t, m, b = faces[face, 0], faces[face, 1], faces[face, 2]  # sorted below to top, middle and bottom corner
         line_t, line_m, line_b = lines[t], lines[m], lines[b]
         if line_t == line_m == line_b:
             continue
@@ -81,7 +81,7 @@ def _draw(screen, lines, faces, keys):
         xb, yb, near_b = screen[b, 0], screen[b, 1], screen[b, 2]
         if near_t == 0 or near_m == 0 or near_b == 0:
             continue
-        # change of column and 1/z per row along the edges; not finite only where no line crosses the edge
+        # Change of column and 1/z per row along the edges; infinite only where no row crosses the edge.
         inverse_long, inverse_above, inverse_below = 1.0 / (yb - yt), 1.0 / (ym - yt), 1.0 / (yb - ym)
         x_long, near_long = (xb - xt) * inverse_long, (near_b - near_t) * inverse_long
         x_above, near_above = (xm - xt) * inverse_above, (near_m - near_t) * inverse_above
@@ -110,7 +110,7 @@ def _draw(screen, lines, faces, keys):
 @njit(**_COMPILED)
 @no_type_check
 def _resolve(screen, faces, keys, ids, weights, depth):
-    """Faces, perspective-correct weights and depth of the nearest triangles; the last two begin as zeros."""
+    """Decode `keys` to faces, perspective-correct barycentrics and depth; `weights` and `depth` start as zeros."""
     height, width = keys.shape
     for row in range(height):
         for column in range(width):
@@ -127,7 +127,7 @@ def _resolve(screen, faces, keys, ids, weights, depth):
             if area_a + area_b + area_c < 0:
                 area_a, area_b, area_c = -area_a, -area_b, -area_c
             area_a, area_b, area_c = max(area_a, 0.0), max(area_b, 0.0), max(area_c, 0.0)
-            if area_a + area_b + area_c == 0:  # a triangle seen edge on
+            if area_a + area_b + area_c == 0:  # edge-on triangle
                 area_a = area_b = area_c = 1.0
             share_a, share_b, share_c = area_a * screen[a, 2], area_b * screen[b, 2], area_c * screen[c, 2]
             total = share_a + share_b + share_c

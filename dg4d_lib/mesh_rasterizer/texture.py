@@ -1,12 +1,12 @@
-"""What pixels read from a texture: trilinear between mip levels, each half as wide as the one before.
+"""Texture sampling: trilinear between mip levels, each half as wide as the previous one.
 
-Where a mesh lies in its pictures does not depend on its texture, so `look_up` is called once, and `read` as often as
-the texture changes. The covered pixels of all pictures are one list with one texture: a texture per picture would have
-a gradient of its size per picture.
+The sampling positions do not depend on the texture, so `build_lookup` runs once and `sample_texture` as often as the
+texture changes. The covered pixels of all images form one list and read one texture: a texture per image would need a
+full-size gradient per image.
 
-The mip level of a pixel lets it read as wide a spot as it sees. A square of side w has the variance w^2 / 12 along both
-axes; reading texels of width w bilinearly has w^2 / 12 + w^2 / 6 = w^2 / 4. So texels are 1 / sqrt(3) of the pixel's
-side on the texture (of the root mean square of its two sides: the texture is inclined).
+The mip level is chosen so that a pixel averages the area it covers. A square of side w has the variance w^2 / 12 along
+both axes; reading texels of width w bilinearly has w^2 / 12 + w^2 / 6 = w^2 / 4. So the texel width is 1 / sqrt(3) of
+the side of the pixel's footprint on the texture (the root mean square of its two sides, as the surface may be tilted).
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,100 +23,100 @@ from dg4d_lib.mesh_rasterizer.zbuffer import Fragments
 
 @dataclass(frozen=True)
 class Taps:
-    """Which pixels read one mip level, where, and how much.
+    """Samples of one mip level.
 
     Attributes:
-        pixels: places in the list of covered pixels, ascending.
-        places: on the texture, in [0, 1], u right and v down.
-        shares: of what the pixel sees, in (0, 1]; a pixel's shares have the sum 1.
+        pixels: indices into the list of covered pixels, ascending.
+        uvs: texture coordinates in [0, 1], u right and v down.
+        weights: of the sample in its pixel, in (0, 1]; the weights of a pixel sum to 1.
     """
 
     pixels: Int64[Tensor, " n"]
-    places: Float[Tensor, "n 2"]
-    shares: Float[Tensor, " n"]
+    uvs: Float[Tensor, "n 2"]
+    weights: Float[Tensor, " n"]
 
 
 @dataclass(frozen=True)
-class Lookup:
-    """Where the covered pixels of b pictures look into a texture.
+class TextureLookup:
+    """Texture samples of the covered pixels of b images.
 
     Attributes:
-        covered: pixels that see the mesh; their list is in the order of `covered.nonzero()`.
-        levels: taps of every mip level, from the texture itself to the smallest that is read.
+        covered: pixels that show the mesh; listed in the order of `covered.nonzero()`.
+        levels: taps of every mip level, from full resolution to the smallest level that is read.
     """
 
     covered: Bool[Tensor, "b h w"]
     levels: tuple[Taps, ...]
 
 
-def look_up(
+def build_lookup(
     vertices: Float[Tensor, "*b v 3"],
     faces: Int[Tensor, "f 3"],
     uvs: Float[Tensor, "v 2"],
     size: Sequence[int],
     cameras: Sequence[OrbitCamera],
     fragments: Fragments,
-) -> Lookup:
-    """Where the pixels of drawings look into a texture.
+) -> TextureLookup:
+    """Compute texture coordinates and mip levels of all covered pixels.
 
     Args:
-        vertices: as they were drawn.
-        faces: as they were drawn.
+        vertices: the vertices that were rasterized.
+        faces: the faces that were rasterized.
         uvs: texture coordinates in [0, 1], u right and v down.
         size: height and width of the texture, texels.
-        cameras: the b cameras that drew.
-        fragments: what they drew.
+        cameras: the b cameras of the fragments.
+        fragments: output of the rasterizer.
     """
     covered, indices, texels = fragments.faces >= 0, faces.long(), uvs.new_tensor((size[1], size[0]))
-    places, levels = [], []
+    pixel_uvs, levels = [], []
     for view, camera in enumerate(cameras):
         seen, state = covered[view], vertices if vertices.ndim == 2 else vertices[view]
         corners = indices[fragments.faces[view][seen].long()]
-        ends = uvs[corners].double()
-        place = (fragments.barycentrics[view][seen][..., None].double() * ends).sum(1)
-        sides = _slopes(state.detach(), camera, corners, seen, ends - place[:, None]) * texels
-        places.append(place.float())
+        corner_uvs = uvs[corners].double()
+        uv = (fragments.barycentrics[view][seen][..., None].double() * corner_uvs).sum(1)
+        sides = _uv_slopes(state.detach(), camera, corners, seen, corner_uvs - uv[:, None]) * texels
+        pixel_uvs.append(uv.float())
         levels.append(0.5 * (sides.square().sum((1, 2)) / 2 / 3).log2())
-    smallest = (max(size) - 1).bit_length()  # of one texel
-    level = torch.cat(levels).nan_to_num(0).clamp(0, smallest)  # not a number in a triangle that is seen edge on
-    return Lookup(covered, tuple(_taps(torch.cat(places), level.float())))
+    coarsest = (max(size) - 1).bit_length()  # level of a single texel
+    level = torch.cat(levels).nan_to_num(0).clamp(0, coarsest)  # NaN in edge-on triangles
+    return TextureLookup(covered, tuple(_taps(torch.cat(pixel_uvs), level.float())))
 
 
-def read(texture: Float[Tensor, "h w c"], lookup: Lookup) -> Float[Tensor, "p c"]:
-    """What the covered pixels see of a texture, one after the other; differentiable in the texture."""
-    seen = texture.new_zeros((int(lookup.covered.sum()), texture.shape[-1]))
-    for taps, picture in zip(lookup.levels, _pyramid(texture), strict=False):
-        seen.index_add_(0, taps.pixels, taps.shares[:, None].to(texture) * bilinear(picture, taps.places))
-    return seen
+def sample_texture(texture: Float[Tensor, "h w c"], lookup: TextureLookup) -> Float[Tensor, "p c"]:
+    """Sample a texture at all covered pixels, in the order of the list; differentiable in the texture."""
+    values = texture.new_zeros((int(lookup.covered.sum()), texture.shape[-1]))
+    for taps, mip in zip(lookup.levels, _mip_levels(texture), strict=False):
+        values.index_add_(0, taps.pixels, taps.weights[:, None].to(texture) * sample_bilinear(mip, taps.uvs))
+    return values
 
 
-def bilinear(picture: Float[Tensor, "h w c"], places: Float[Tensor, "n 2"]) -> Float[Tensor, "n c"]:
-    """Samples of a picture at places in [0, 1], u right and v down; its border goes on outside."""
-    grid = (2 * places - 1).to(picture)[None, None]
-    return grid_sample(picture.movedim(-1, 0)[None], grid, align_corners=False, padding_mode="border")[0, :, 0].T
+def sample_bilinear(image: Float[Tensor, "h w c"], uvs: Float[Tensor, "n 2"]) -> Float[Tensor, "n c"]:
+    """Sample an image bilinearly at coordinates in [0, 1], u right and v down; clamped at the border."""
+    grid = (2 * uvs - 1).to(image)[None, None]
+    return grid_sample(image.movedim(-1, 0)[None], grid, align_corners=False, padding_mode="border")[0, :, 0].T
 
 
-def _slopes(
+def _uv_slopes(
     vertices: Float[Tensor, "v 3"],
     camera: OrbitCamera,
     corners: Int64[Tensor, "p 3"],
     seen: Bool[Tensor, "h w"],
     relative: Float64[Tensor, "p 3 2"],
 ) -> Float64[Tensor, "p 2 2"]:
-    """Change of the place on the texture per column and per row of the picture.
+    """Return the change of the texture coordinates per column and per row of the image.
 
     A ray r meets the plane of the corners a, b, c (camera axes) where their weights are r.(b x c), r.(c x a) and
-    r.(a x b), divided by their sum; a column or a row more adds 1 / focal to x or y of the ray.
+    r.(a x b), divided by their sum; one column or row more adds 1 / focal to x or y of the ray.
 
     Args:
         vertices: world units.
-        camera: that drew.
-        corners: vertices of the triangle that each pixel sees.
-        seen: these pixels.
-        relative: places of the corners minus the place of the pixel.
+        camera: of this image.
+        corners: vertices of the triangle that each pixel shows.
+        seen: the covered pixels.
+        relative: texture coordinates of the corners minus those of the pixel.
     """
-    pose = camera.world_to_camera().to(vertices.device)
-    a, b, c = (vertices.double() @ pose[:3, :3].T + pose[:3, 3])[corners].unbind(1)
+    viewmat = camera.viewmat().to(vertices.device)
+    a, b, c = (vertices.double() @ viewmat[:3, :3].T + viewmat[:3, 3])[corners].unbind(1)
     normals = torch.stack([b.cross(c, dim=-1), c.cross(a, dim=-1), a.cross(b, dim=-1)], 1)  # pixel, corner, axis
     row, column = (index.double() + 0.5 for index in seen.nonzero().T)
     x, y = (column - 0.5 * camera.width) / camera.focal, (row - 0.5 * camera.height) / camera.focal
@@ -124,16 +124,16 @@ def _slopes(
     return normals[..., :2].mT @ relative / (camera.focal * total)[:, None, None]
 
 
-def _taps(places: Float[Tensor, "p 2"], levels: Float[Tensor, " p"]) -> Iterator[Taps]:
+def _taps(uvs: Float[Tensor, "p 2"], levels: Float[Tensor, " p"]) -> Iterator[Taps]:
     for level in range(int(levels.max().ceil()) + 1 if len(levels) else 0):
-        shares = 1 - (levels - level).abs()
-        pixels = (shares > 0).nonzero()[:, 0]
-        yield Taps(pixels, places[pixels], shares[pixels])
+        weights = 1 - (levels - level).abs()
+        pixels = (weights > 0).nonzero()[:, 0]
+        yield Taps(pixels, uvs[pixels], weights[pixels])
 
 
-def _pyramid(texture: Float[Tensor, "h w c"]) -> Iterator[Float[Tensor, "i j c"]]:
-    """The texture, its half, and so on; a texel of a half is the mean of two by two, or of more where a side is odd."""
-    picture = texture.movedim(-1, 0)
+def _mip_levels(texture: Float[Tensor, "h w c"]) -> Iterator[Float[Tensor, "i j c"]]:
+    """Yield the texture and its halvings; a texel averages 2 x 2 texels, or more where a side is odd."""
+    mip = texture.movedim(-1, 0)
     while True:
-        yield picture.movedim(0, -1)
-        picture = adaptive_avg_pool2d(picture, (-(-picture.shape[1] // 2), -(-picture.shape[2] // 2)))
+        yield mip.movedim(0, -1)
+        mip = adaptive_avg_pool2d(mip, (-(-mip.shape[1] // 2), -(-mip.shape[2] // 2)))

@@ -10,13 +10,13 @@ from torch import Tensor
 
 from dg4d_lib.diffusion.clip_images import normalize_for_clip
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.metrics.image import resized
+from dg4d_lib.metrics.image import resize_square
 
 PICTURES_AT_ONCE = 16
 
 
 @dataclass(frozen=True)
-class Clip:
+class ClipModel:
     """The image side of a CLIP model.
 
     Attributes:
@@ -28,23 +28,23 @@ class Clip:
     device: torch.device
 
     def embed(self, images: Float[Tensor, "b h w 3"]) -> Float[Tensor, "b d"]:
-        """Embeddings of length 1 of square pictures in [0, 1], which are resized to what the model sees."""
+        """Embeddings of length 1 of square pictures in [0, 1], which are resize_square to what the model sees."""
         size = self.model.config.vision_config.image_size
         found = []
         with torch.no_grad():
             for part in images.split(PICTURES_AT_ONCE):
-                planes = normalize_for_clip(resized(part.to(self.device), size).movedim(-1, 1))
+                planes = normalize_for_clip(resize_square(part.to(self.device), size).movedim(-1, 1))
                 embedded = self.model.get_image_features(pixel_values=planes.contiguous())
                 found.append(getattr(embedded, "pooler_output", embedded))  # a tensor before transformers 5
         return torch.nn.functional.normalize(torch.cat(found), dim=-1)
 
 
-def similarity(a: Float[Tensor, "b d"], b: Float[Tensor, "b d"]) -> Float[Tensor, " b"]:
+def cosine_similarity(a: Float[Tensor, "b d"], b: Float[Tensor, "b d"]) -> Float[Tensor, " b"]:
     """Cosines of embeddings, pair by pair: 1 is equal."""
     return (a * b).sum(-1)
 
 
-def load_clip(folder: Path, device: torch.device) -> Clip:
+def load_clip(folder: Path, device: torch.device) -> ClipModel:
     """The CLIPModel of a folder in the layout of transformers.
 
     Raises:
@@ -61,4 +61,4 @@ def load_clip(folder: Path, device: torch.device) -> Clip:
         model = CLIPModel.from_pretrained(folder, local_files_only=True)
     except Exception as error:  # whatever a damaged folder makes transformers raise
         raise BadInput(f"{folder} holds no CLIP model: {type(error).__name__}: {error}".splitlines()[0]) from error
-    return Clip(model.eval().requires_grad_(False).to(device), device)
+    return ClipModel(model.eval().requires_grad_(False).to(device), device)

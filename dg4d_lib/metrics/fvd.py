@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.metrics.image import resized
+from dg4d_lib.metrics.image import resize_square
 
 SIZE = 224  # pixels of the frames that I3D sees
 SHORTEST = 10  # frames; shorter films vanish on their way through the network
@@ -48,7 +48,7 @@ def logits(i3d: Any, film: Float[Tensor, "t h w 3"], device: torch.device) -> Fl
     """
     if len(film) < SHORTEST:
         raise BadInput(f"I3D needs films of {SHORTEST} frames or more; this one has {len(film)}")
-    frames = resized(film.to(device), SIZE)
+    frames = resize_square(film.to(device), SIZE)
     with torch.no_grad():
         found: Tensor = i3d(2 * frames.permute(3, 0, 1, 2)[None] - 1, rescale=False, resize=False, return_features=True)
     return found.reshape(-1)

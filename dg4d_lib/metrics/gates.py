@@ -21,8 +21,8 @@ from dg4d_lib.asset_settings import GateSettings
 from dg4d_lib.metrics.image import iou, psnr
 from dg4d_lib.metrics.video import NOTHING, temporal_error
 
-COVERED = 0.5  # coverage from which a pixel belongs to the subject
-FAINT = 0.05  # coverage below which nobody sees a floater
+SUBJECT_ALPHA = 0.5  # alpha from which a pixel belongs to the subject
+FLOATER_ALPHA = 0.05  # alpha below which nobody sees a floater
 TOUCHING = np.ones((3, 3))  # pixels that share a corner hang together
 RIM = 3  # pixels inside the outline where sharpness is not measured: an outline is sharp by itself
 STILL = 0.002  # change per frame and pixel of the subject, colors in [0, 1], below which nothing seems to move
@@ -32,37 +32,37 @@ SPLATS, MESH = "splats", "mesh"  # the forms of an asset
 
 
 @dataclass(frozen=True)
-class Pictures:
+class RgbaImages:
     """Square pictures of a subject.
 
     Attributes:
         color: over white, in [0, 1].
-        coverage: alpha in [0, 1].
+        alpha: alpha in [0, 1].
     """
 
     color: Float[Tensor, "b s s 3"]
-    coverage: Float[Tensor, "b s s 1"]
+    alpha: Float[Tensor, "b s s 1"]
 
 
 @dataclass(frozen=True)
-class Turn:
+class Turntable:
     """Seen from all around at one moment: neighbors beside each other, the last beside the first.
 
     Attributes:
-        coverage: alpha in [0, 1], a picture per camera.
+        alpha: alpha in [0, 1], a picture per camera.
         depth: camera z of what is seen, world units; any number where nothing is.
         cameras: world to camera, OpenCV axes.
         focal: of all of them, pixels.
     """
 
-    coverage: Float[Tensor, "b s s 1"]
+    alpha: Float[Tensor, "b s s 1"]
     depth: Float[Tensor, "b s s 1"]
     cameras: Float[Tensor, "b 4 4"]
     focal: float
 
 
 @dataclass(frozen=True)
-class Evidence:
+class GateInputs:
     """All that the gates look at; every picture has the same size.
 
     Attributes:
@@ -74,11 +74,11 @@ class Evidence:
         flaws: of the mesh: broken edges and triangles, per triangle.
     """
 
-    picture: Pictures
-    video: Pictures
-    seen: Mapping[str, Pictures]
-    around: Mapping[str, Pictures]
-    turn: Turn
+    picture: RgbaImages
+    video: RgbaImages
+    seen: Mapping[str, RgbaImages]
+    around: Mapping[str, RgbaImages]
+    turn: Turntable
     flaws: float
 
 
@@ -126,7 +126,7 @@ class Gate:
         return min(below, above)
 
 
-def judge(evidence: Evidence, settings: GateSettings) -> list[Gate]:
+def evaluate_gates(evidence: GateInputs, settings: GateSettings) -> list[Gate]:
     """Every gate, in the order of a report."""
     video, seen, around = evidence.video, evidence.seen, evidence.around
     own = float(floaters(video).mean())
@@ -142,7 +142,7 @@ def judge(evidence: Evidence, settings: GateSettings) -> list[Gate]:
         ),
         Gate(
             "silhouette",
-            {form: float(iou(pictures.coverage, video.coverage).min()) for form, pictures in seen.items()},
+            {form: float(iou(pictures.alpha, video.alpha).min()) for form, pictures in seen.items()},
             settings.silhouette_least,
             None,
             "",
@@ -187,7 +187,7 @@ def judge(evidence: Evidence, settings: GateSettings) -> list[Gate]:
         ),
         Gate(
             "agreement",
-            {MESH: float(iou(around[MESH].coverage, around[SPLATS].coverage).mean())},
+            {MESH: float(iou(around[MESH].alpha, around[SPLATS].alpha).mean())},
             settings.agreement_least,
             None,
             "",
@@ -215,13 +215,13 @@ def judge(evidence: Evidence, settings: GateSettings) -> list[Gate]:
     ]
 
 
-def fidelity(pictures: Pictures, video: Pictures) -> Float[Tensor, " b"]:
+def fidelity(pictures: RgbaImages, video: RgbaImages) -> Float[Tensor, " b"]:
     """PSNR where either of two pictures shows the subject, dB."""
-    region = torch.maximum(pictures.coverage, video.coverage) > COVERED
-    return psnr(pictures.color, video.color, region.to(video.coverage))
+    region = torch.maximum(pictures.alpha, video.alpha) > SUBJECT_ALPHA
+    return psnr(pictures.color, video.color, region.to(video.alpha))
 
 
-def flicker(pictures: Pictures, video: Pictures) -> float:
+def flicker(pictures: RgbaImages, video: RgbaImages) -> float:
     """The temporal error, in units of the video's changes or of what seems still, whichever there is."""
     if len(video.color) < 2:
         return 0.0
@@ -229,17 +229,17 @@ def flicker(pictures: Pictures, video: Pictures) -> float:
     return float(temporal_error(pictures.color, video.color)) * changes / (changes + _still(video))
 
 
-def motion(pictures: Pictures, video: Pictures) -> float:
+def motion(pictures: RgbaImages, video: RgbaImages) -> float:
     """How much changes in all, in units of the video's changes; nothing in nothing is 1."""
     return (_changes(pictures) + _still(video)) / (_changes(video) + _still(video))
 
 
-def floaters(pictures: Pictures) -> Float[Tensor, " b"]:
-    """Share of the coverage in pieces away from the largest one; 0 where there is nothing."""
-    return torch.tensor([_apart(coverage) for coverage in pictures.coverage[..., 0].cpu().numpy()])
+def floaters(pictures: RgbaImages) -> Float[Tensor, " b"]:
+    """Share of the alpha in pieces away from the largest one; 0 where there is nothing."""
+    return torch.tensor([_apart(alpha) for alpha in pictures.alpha[..., 0].cpu().numpy()])
 
 
-def consistency(turn: Turn) -> float:
+def consistency(turn: Turntable) -> float:
     """How solid something is: share of the points seen from one side that the next side does not contradict.
 
     Every pixel of the subject is a point in space by its depth. The neighbor may see something in front of that point:
@@ -253,38 +253,38 @@ def consistency(turn: Turn) -> float:
     there = points @ onward[:, None, :3, :3].mT + onward[:, None, None, :3, 3]
     depth = there[..., 2:]
     places = there[..., :2] / depth * (2 * turn.focal / size)
-    neighbor = torch.cat([turn.coverage, turn.depth], -1).roll(-1, 0).movedim(-1, 1)
-    coverage, found = grid_sample(neighbor, places, align_corners=False).movedim(1, -1).split(1, -1)
-    solid = coverage > COVERED
-    asked = (turn.coverage > COVERED) & ~(solid & (found < depth - SAME_PLACE))
+    neighbor = torch.cat([turn.alpha, turn.depth], -1).roll(-1, 0).movedim(-1, 1)
+    alpha, found = grid_sample(neighbor, places, align_corners=False).movedim(1, -1).split(1, -1)
+    solid = alpha > SUBJECT_ALPHA
+    asked = (turn.alpha > SUBJECT_ALPHA) & ~(solid & (found < depth - SAME_PLACE))
     agreed = asked & solid & (found <= depth + SAME_PLACE)
     return float(agreed.sum() / asked.sum().clamp_min(1))
 
 
-def sharpness(pictures: Pictures, truth: Pictures) -> float:
+def sharpness(pictures: RgbaImages, truth: RgbaImages) -> float:
     """Color gradients inside the subject, in units of the truth's; nothing in nothing is 1."""
-    outside = torch.minimum(pictures.coverage, truth.coverage) <= COVERED
+    outside = torch.minimum(pictures.alpha, truth.alpha) <= SUBJECT_ALPHA
     inside = max_pool2d(outside.movedim(-1, 1).float(), 2 * RIM + 1, 1, RIM)[:, 0] == 0
     ours, theirs = (_gradient(each.color, inside) for each in (pictures, truth))
     return (ours + PLAIN) / (theirs + PLAIN)
 
 
-def _first(pictures: Pictures) -> Pictures:
-    return Pictures(pictures.color[:1], pictures.coverage[:1])
+def _first(pictures: RgbaImages) -> RgbaImages:
+    return RgbaImages(pictures.color[:1], pictures.alpha[:1])
 
 
-def _changes(pictures: Pictures) -> float:
+def _changes(pictures: RgbaImages) -> float:
     return float(pictures.color.diff(dim=0).abs().mean(-1).sum())
 
 
-def _still(video: Pictures) -> float:
+def _still(video: RgbaImages) -> float:
     """The changes of a video in which nothing seems to move."""
-    return STILL * float(video.coverage[1:].sum()) + NOTHING
+    return STILL * float(video.alpha[1:].sum()) + NOTHING
 
 
-def _apart(coverage: NDArray[np.float32]) -> float:
-    pieces, count = label(coverage > FAINT, TOUCHING)
-    masses = np.bincount(pieces.ravel(), coverage.ravel(), count + 1)[1:]
+def _apart(alpha: NDArray[np.float32]) -> float:
+    pieces, count = label(alpha > FLOATER_ALPHA, TOUCHING)
+    masses = np.bincount(pieces.ravel(), alpha.ravel(), count + 1)[1:]
     return 1 - float(masses.max() / masses.sum()) if count else 0.0
 
 

@@ -37,6 +37,6 @@ def iou(
     return torch.where(either > 0, both / either.clamp_min(1), 1.0).to(coverage)
 
 
-def resized(images: Float[Tensor, "b h w c"], size: int) -> Float[Tensor, "b size size c"]:
+def resize_square(images: Float[Tensor, "b h w c"], size: int) -> Float[Tensor, "b size size c"]:
     """Resize square images, bicubic and clamped to [0, 1], as Pillow's `resize` does."""
     return resize(images, (size, size), "bicubic").clamp(0, 1)

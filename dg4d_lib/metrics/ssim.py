@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.kernels.workers import run
+from dg4d_lib.kernels.workers import run_parallel
 
 WINDOW, SIGMA = 11, 1.5  # pixels, of the Gaussian (Wang et al. 2004)
 C1, C2 = 0.01**2, 0.03**2  # stabilizers of brightness and of contrast, for pictures in [0, 1]
@@ -53,7 +53,7 @@ class _Ssim(torch.autograd.Function):
         weights = np.exp(-np.square(steps) / (2 * SIGMA**2))
         weights = (weights / weights.sum()).astype(gradients.dtype)
         jobs = zip(*planes, gradients, sums.reshape(-1, 1), strict=True)
-        run([partial(_compare, *job, weights) for job in jobs])
+        run_parallel([partial(_compare, *job, weights) for job in jobs])
         ctx.gradient, ctx.places = gradient, channels * (height - WINDOW + 1) * (width - WINDOW + 1)
         return torch.from_numpy(sums.reshape(batch, channels).sum(1) / ctx.places).to(images.dtype)
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from dg4d_lib.errors import BadInput
 
 
-def chamfer_of_points(a: Float[Tensor, "n 3"], b: Float[Tensor, "m 3"]) -> float:
+def chamfer_distance(a: Float[Tensor, "n 3"], b: Float[Tensor, "m 3"]) -> float:
     """Return the mean distance from points of either cloud to the nearest of the other, averaged over both directions.
 
     Points are not the surfaces they are sampled from: two samples of one surface are about half a spacing apart,
@@ -20,7 +20,7 @@ def chamfer_of_points(a: Float[Tensor, "n 3"], b: Float[Tensor, "m 3"]) -> float
     return float(np.mean(there) + np.mean(back)) / 2
 
 
-def aligned(points: Float[Tensor, "t n 3"], target: Float[Tensor, "t m 3"]) -> Float[Tensor, "t n 3"]:
+def align_bounding_boxes(points: Float[Tensor, "t n 3"], target: Float[Tensor, "t m 3"]) -> Float[Tensor, "t n 3"]:
     """A moving crowd after one translation and one uniform scale for all moments, which match its box to the target's.
 
     A box holds 96 % of the points along every axis: its ends leave out the 2 % farthest on either side.

@@ -1,1 +1,1 @@
-"""Differentiable splatting: one call, several backends."""
+"""Differentiable rasterizers of 3D Gaussians: one interface, several backends."""

@@ -1,7 +1,7 @@
-"""The inner loops of blending, sixteen pixels at a time, as LLVM vectors.
+"""Inner loops of alpha blending as LLVM vectors, sixteen pixels at a time.
 
-A tile's pixels lie in planes of pairs of rows, the two rows interleaved: a vector of 16 floats is 8 x 2 pixels and may
-begin at any column. `cover` lists the vectors of a Gaussian, `blend_list` and `blend_list_backward` go through a list.
+A tile is stored in planes of row pairs, with the two rows interleaved: a vector of 16 floats is 8 x 2 pixels and may
+start at any column. `cover` lists the vectors of a Gaussian, `blend_list` and `blend_list_backward` process a list.
 """
 
 from typing import no_type_check
@@ -12,17 +12,17 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from dg4d_lib.kernels.vectors import FLOAT, FLOATS, INT, INTS, LANES, LONG, Value, Vectors, pointers
+from dg4d_lib.kernels.simd import FLOAT, FLOATS, INT, INTS, LANES, LONG, SimdBuilder, Value, pointers
 from dg4d_lib.rasterizer.cpu_bins import TILE
 from dg4d_lib.rasterizer.cpu_project import (
     BLUE,
-    CENTER_X,
-    CENTER_Y,
     DEPTH,
     EXTENT_Y,
+    GRAD_FIELDS,
     GREEN,
     LOG_OPACITY,
-    MOMENTS,
+    MEAN2D_X,
+    MEAN2D_Y,
     RECORD,
     RED,
     ROW_LOSS,
@@ -34,32 +34,32 @@ from dg4d_lib.rasterizer.cpu_project import (
 )
 from dg4d_lib.rasterizer.interface import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
-COLUMNS = LANES // 2  # of a vector
-PLANE_SHAPE = (TILE // 2, TILE + COLUMNS, 2)  # pairs of rows; a vector may reach past the tile's right edge
-STRIDE = 2 * (TILE + COLUMNS)  # floats of a pair of rows
+COLUMNS = LANES // 2  # pixel columns of a vector
+PLANE_SHAPE = (TILE // 2, TILE + COLUMNS, 2)  # row pairs; a vector may extend past the tile's right edge
+STRIDE = 2 * (TILE + COLUMNS)  # floats of a row pair
 PLANE = STRIDE * TILE // 2
 FORWARD_PLANES = 5  # transmittance (negative once stopped), red, green, blue, depth
-BACKWARD_PLANES = 6  # transmittance, what lies behind, gradients of red, green, blue, depth
-MOST_VECTORS = (TILE // 2) * (TILE // COLUMNS)  # of one Gaussian in one tile
+BACKWARD_PLANES = 6  # transmittance, loss gradient from behind, gradients of red, green, blue, depth
+MAX_VECTORS = (TILE // 2) * (TILE // COLUMNS)  # per Gaussian and tile
 OVERRUN = TILE // COLUMNS  # vectors that `cover` may write past the new length
 
 _LANE_COLUMN = [lane >> 1 for lane in range(LANES)]
 _LANE_ROW = [lane & 1 for lane in range(LANES)]
-_LEAST_LOG_ALPHA = float(np.log2(MIN_ALPHA))
+_MIN_LOG_ALPHA = float(np.log2(MIN_ALPHA))
 
 
 @intrinsic
 @no_type_check
-def cover(typing_context, records, g, left, top, places, us, vs, length):  # noqa: PLR0915
-    """Append the vectors that cover Gaussian g's ellipse inside a tile; gives the new length.
+def cover(typing_context, records, g, left, top, positions, us, vs, length):  # noqa: PLR0915
+    """Append the vectors that cover Gaussian g's ellipse inside a tile; return the new length.
 
-    A vector is the place of its first pixel in a plane and (u, v) there, whitened. Eight pairs of rows at once: the
-    span of each row from its own square root, then one span for the two rows of a pair.
+    A vector is the position of its first pixel in a plane and its whitened coordinates (u, v). Eight row pairs are
+    computed at once: the span of each row by a square root, then the union of the spans of a pair.
     """
-    signature = types.int64(records, types.int64, types.float32, types.float32, places, us, vs, types.int64)
+    signature = types.int64(records, types.int64, types.float32, types.float32, positions, us, vs, types.int64)
 
     def generate(context, builder, signature, arguments):
-        e = Vectors(builder)
+        e = SimdBuilder(builder)
         data = pointers(context, builder, signature, arguments)
         record, base = data[0], builder.mul(arguments[1], _long(RECORD))
 
@@ -67,11 +67,11 @@ def cover(typing_context, records, g, left, top, places, us, vs, length):  # noq
             return e.load(record, builder.add(base, _long(field)), FLOAT)
 
         half = _float(0.5)
-        x = builder.fsub(builder.fsub(scalar(CENTER_X), arguments[2]), half)
-        y = builder.fsub(builder.fsub(scalar(CENTER_Y), arguments[3]), half)
+        x = builder.fsub(builder.fsub(scalar(MEAN2D_X), arguments[2]), half)
+        y = builder.fsub(builder.fsub(scalar(MEAN2D_Y), arguments[3]), half)
         extent, a = scalar(EXTENT_Y), scalar(WHITEN_A)
         slope, reach, loss = (e.splat(scalar(field)) for field in (ROW_SLOPE, ROW_REACH, ROW_LOSS))
-        wide_a, wide_b, wide_c = (e.splat(scalar(field)) for field in (WHITEN_A, WHITEN_B, WHITEN_C))
+        broadcast_a, broadcast_b, broadcast_c = (e.splat(scalar(field)) for field in (WHITEN_A, WHITEN_B, WHITEN_C))
         center = e.splat(x)
 
         def pair(edge):
@@ -104,28 +104,28 @@ def cover(typing_context, records, g, left, top, places, us, vs, length):  # noq
             pixels = builder.sub(builder.fptosi(high, INTS), start)
             count = builder.ashr(builder.add(pixels, e.integers(COLUMNS)), e.integers(COLUMNS.bit_length() - 1))
             count = builder.select(builder.icmp_signed("<", count, e.integers(0)), e.integers(0), count)
-            place = builder.add(
+            position = builder.add(
                 e.integers([(lane >> 1) * STRIDE for lane in range(LANES)]),
                 e.splat(builder.mul(top_pair, _int(STRIDE))),
             )
-            place = builder.add(place, builder.add(start, start))
-            u = e.fma(wide_a, e.subtract(low, center), e.multiply(wide_b, dy))
-            for slot, value in zip(spill, (place, count, u, e.multiply(wide_c, dy)), strict=True):
+            position = builder.add(position, builder.add(start, start))
+            u = e.fma(broadcast_a, e.subtract(low, center), e.multiply(broadcast_b, dy))
+            for slot, value in zip(spill, (position, count, u, e.multiply(broadcast_c, dy)), strict=True):
                 builder.store(value, slot)
             left_over = builder.sub(last, top_pair)
             pairs = builder.select(builder.icmp_signed("<", left_over, _int(LANES // 2)), left_over, _int(LANES // 2))
 
             def emit(lane, carried):
-                place, count, u, v = (
+                position, count, u, v = (
                     builder.load(
                         builder.gep(builder.bitcast(slot, kind.as_pointer()), [lane], source_etype=kind), typ=kind
                     )
                     for slot, kind in zip(spill, (INT, INT, FLOAT, FLOAT), strict=True)
                 )
-                wide = TILE // COLUMNS
-                e.store(data[4], carried[0], builder.add(e.splat(place, wide), jumps))
-                e.store(data[5], carried[0], builder.fadd(e.splat(u, wide), ramp))
-                e.store(data[6], carried[0], e.splat(v, wide))
+                per_row = TILE // COLUMNS
+                e.store(data[4], carried[0], builder.add(e.splat(position, per_row), jumps))
+                e.store(data[5], carried[0], builder.fadd(e.splat(u, per_row), ramp))
+                e.store(data[6], carried[0], e.splat(v, per_row))
                 return [builder.add(carried[0], builder.sext(count, LONG))]
 
             return e.loop(_int(0), builder.shl(pairs, _int(1)), carried, emit, step=2)
@@ -137,27 +137,27 @@ def cover(typing_context, records, g, left, top, places, us, vs, length):  # noq
 
 @intrinsic
 @no_type_check
-def blend_list(typing_context, state, places, us, vs, masks, start, end, records, g):
-    """Blend Gaussian g into vectors start..end; gives the union of `masks`, the pixels of each vector that stopped."""
-    signature = types.int64(state, places, us, vs, masks, types.int64, types.int64, records, types.int64)
+def blend_list(typing_context, state, positions, us, vs, masks, start, end, records, g):
+    """Blend Gaussian g into vectors start..end; return the union of `masks`, the pixels of each vector that stopped."""
+    signature = types.int64(state, positions, us, vs, masks, types.int64, types.int64, records, types.int64)
 
     def generate(context, builder, signature, arguments):
-        e = Vectors(builder)
+        e = SimdBuilder(builder)
         data = pointers(context, builder, signature, arguments)
         pixels, splat = data[0], _Splat(e, data[7], arguments[8])
 
         def body(j, carried):
-            place, _, _, y = splat.exponent(data, j)
-            before = e.load(pixels, place)
-            seen = builder.and_(e.at_most(e.constant(_LEAST_LOG_ALPHA), y), e.less(e.constant(0), before))
+            position, _, _, y = splat.exponent(data, j)
+            before = e.load(pixels, position)
+            seen = builder.and_(e.at_most(e.constant(_MIN_LOG_ALPHA), y), e.less(e.constant(0), before))
             alpha = e.minimum(e.exp2(y), e.constant(MAX_ALPHA))
             after = e.fma(e.negate(before), alpha, before)
             stop = builder.and_(seen, e.at_most(after, e.constant(MIN_TRANSMITTANCE)))
             drawn = builder.and_(seen, builder.not_(stop))
             weight = e.select(drawn, e.multiply(before, alpha), e.constant(0))
-            e.store(pixels, place, e.select(drawn, after, e.select(stop, e.negate(before), before)))
+            e.store(pixels, position, e.select(drawn, after, e.select(stop, e.negate(before), before)))
             for plane, value in enumerate(splat.values, start=1):
-                there = builder.add(place, _long(plane * PLANE))
+                there = builder.add(position, _long(plane * PLANE))
                 e.store(pixels, there, e.fma(weight, value, e.load(pixels, there)))
             mask = builder.zext(builder.bitcast(stop, ir.IntType(LANES)), INT)
             e.store(data[4], j, mask)
@@ -170,11 +170,13 @@ def blend_list(typing_context, state, places, us, vs, masks, start, end, records
 
 @intrinsic
 @no_type_check
-def blend_list_backward(typing_context, state, places, us, vs, start, end, records, g, stops, place, moments, slot):
-    """Take Gaussian g off vectors start..end again, and write the gradient of its record to moments[slot]."""
+def blend_list_backward(
+    typing_context, state, positions, us, vs, start, end, records, g, stops, position, grad_records, slot
+):
+    """Undo the blending of Gaussian g in vectors start..end and write its record's gradient to grad_records[slot]."""
     signature = types.void(
         state,
-        places,
+        positions,
         us,
         vs,
         types.int64,
@@ -183,28 +185,28 @@ def blend_list_backward(typing_context, state, places, us, vs, start, end, recor
         types.int64,
         stops,
         types.float32,
-        moments,
+        grad_records,
         types.int64,
     )
 
     def generate(context, builder, signature, arguments):
-        e = Vectors(builder)
+        e = SimdBuilder(builder)
         data = pointers(context, builder, signature, arguments)
-        pixels, splat, own_place = data[0], _Splat(e, data[6], arguments[7]), e.splat(arguments[9])
+        pixels, splat, own_position = data[0], _Splat(e, data[6], arguments[7]), e.splat(arguments[9])
 
         def body(j, sums):
-            place, u, v, y = splat.exponent(data, j)
+            position, u, v, y = splat.exponent(data, j)
 
             def plane(i):
-                return builder.add(place, _long(i * PLANE))
+                return builder.add(position, _long(i * PLANE))
 
             drawn = builder.and_(
-                e.at_most(e.constant(_LEAST_LOG_ALPHA), y), e.less(own_place, e.load(data[8], place))
+                e.at_most(e.constant(_MIN_LOG_ALPHA), y), e.less(own_position, e.load(data[8], position))
             )  # fmt: skip
             raw = e.select(drawn, e.exp2(y), e.constant(0))
             alpha = e.minimum(raw, e.constant(MAX_ALPHA))
             inverse = e.reciprocal(e.subtract(e.constant(1), alpha))
-            before = e.multiply(e.load(pixels, place), inverse)
+            before = e.multiply(e.load(pixels, position), inverse)
             behind = e.load(pixels, plane(1))
             gradients = [e.load(pixels, plane(i)) for i in range(2, BACKWARD_PLANES)]
             weight = e.multiply(alpha, before)
@@ -212,7 +214,7 @@ def blend_list_backward(typing_context, state, places, us, vs, start, end, recor
             for value, gradient in zip(splat.values[:3], gradients[:3], strict=True):
                 gain = e.fma(value, gradient, gain)
             d_alpha = e.fma(before, gain, e.negate(e.multiply(behind, inverse)))
-            e.store(pixels, place, before)
+            e.store(pixels, position, before)
             e.store(pixels, plane(1), e.fma(weight, gain, behind))
             s = e.select(e.at_most(raw, e.constant(MAX_ALPHA)), e.multiply(d_alpha, alpha), e.constant(0))
             su, sv = e.multiply(s, u), e.multiply(s, v)
@@ -222,7 +224,7 @@ def blend_list_backward(typing_context, state, places, us, vs, start, end, recor
                 *(e.fma(a, b, total) for total, (a, b) in zip(sums[3:], terms, strict=True)),
             ]
 
-        sums = e.loop(arguments[4], arguments[5], [e.constant(0)] * MOMENTS, body)
+        sums = e.loop(arguments[4], arguments[5], [e.constant(0)] * GRAD_FIELDS, body)
         row = builder.mul(arguments[11], _long(RECORD))
         e.store(data[10], row, e.sums(sums))
         return context.get_dummy_value()
@@ -231,44 +233,44 @@ def blend_list_backward(typing_context, state, places, us, vs, start, end, recor
 
 
 class _Splat:
-    """One record, spread over the lanes."""
+    """Record of a Gaussian, broadcast to the lanes of a vector."""
 
-    def __init__(self, e: Vectors, records: Value, g: Value) -> None:
+    def __init__(self, e: SimdBuilder, records: Value, g: Value) -> None:
         builder = e.builder
         base = builder.mul(g, _long(RECORD))
 
-        def wide(field: int) -> Value:
+        def broadcast(field: int) -> Value:
             return e.splat(e.load(records, builder.add(base, _long(field)), FLOAT))
 
-        a, b, c = wide(WHITEN_A), wide(WHITEN_B), wide(WHITEN_C)
+        a, b, c = broadcast(WHITEN_A), broadcast(WHITEN_B), broadcast(WHITEN_C)
         lane_row = e.constant([float(row) for row in _LANE_ROW])
         lane_column = e.constant([float(column) for column in _LANE_COLUMN])
         self.e = e
         self.lane_u = e.fma(a, lane_column, e.multiply(b, lane_row))
         self.lane_v = e.multiply(c, lane_row)
-        self.log_opacity = wide(LOG_OPACITY)
-        self.values = [wide(field) for field in (RED, GREEN, BLUE, DEPTH)]
+        self.log_opacity = broadcast(LOG_OPACITY)
+        self.values = [broadcast(field) for field in (RED, GREEN, BLUE, DEPTH)]
 
     def exponent(self, data: list[Value], j: Value) -> tuple[Value, Value, Value, Value]:
-        """Place of vector j in a plane, whitened u and v of its pixels, and the logarithm of alpha to base 2."""
+        """Return the position of vector j in a plane, (u, v) of its pixels, and log2 of alpha."""
         e, builder = self.e, self.e.builder
-        place = builder.sext(e.load(data[1], j, INT), LONG)
+        position = builder.sext(e.load(data[1], j, INT), LONG)
         u = e.add(self.lane_u, e.splat(e.load(data[2], j, FLOAT)))
         v = e.add(self.lane_v, e.splat(e.load(data[3], j, FLOAT)))
-        return place, u, v, e.fma(e.negate(u), u, e.fma(e.negate(v), v, self.log_opacity))
+        return position, u, v, e.fma(e.negate(u), u, e.fma(e.negate(v), v, self.log_opacity))
 
 
 @intrinsic
 @no_type_check
 def prefetch(typing_context, array, index):
-    """Ask for the cache line of an element."""
+    """Prefetch the cache line of an element."""
 
     def generate(context, builder, signature, arguments):
         byte = ir.IntType(8).as_pointer()
-        place = builder.gep(pointers(context, builder, signature, arguments)[0], [arguments[1]], source_etype=FLOAT)
+        position = builder.gep(pointers(context, builder, signature, arguments)[0], [arguments[1]], source_etype=FLOAT)
         kind = ir.FunctionType(ir.VoidType(), [byte, INT, INT, INT])
         prefetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        builder.call(prefetch, [builder.bitcast(place, byte), _int(0), _int(3), _int(1)])  # read, keep, data
+        builder.call(prefetch, [builder.bitcast(position, byte), _int(0), _int(3), _int(1)])  # read, keep, data
         return context.get_dummy_value()
 
     return types.void(array, types.int64), generate

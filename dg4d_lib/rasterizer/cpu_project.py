@@ -1,8 +1,8 @@
-"""Gaussians to records on the screen, and gradients of records back to Gaussians.
+"""Projection of Gaussians to screen-space records, and its backward pass.
 
-The inverse covariance on the screen is factored, Sigma'^-1 = 2 ln2 W^T W with W = [[a, b], [0, c]], and a pixel is seen
-in the whitened frame (u, v) = W (pixel - center): alpha = 2^(log2 o - u^2 - v^2). Nothing cancels there, so needles
-keep their digits: with s = alpha dL/dalpha and the moments M of s over (u, v), dL/dcenter = 2 ln2 W^T M_1 and
+The inverse 2D covariance (conic) is factored, Sigma'^-1 = 2 ln2 W^T W with W = [[a, b], [0, c]], and pixels are mapped
+to the whitened frame (u, v) = W (pixel - mean2d): alpha = 2^(log2 o - u^2 - v^2). This avoids cancellation, so needles
+keep their digits. With s = alpha dL/dalpha and the moments M of s over (u, v), dL/dmean2d = 2 ln2 W^T M_1 and
 dL/dSigma' = 2 ln2^2 W^T M_2 W.
 """
 
@@ -12,70 +12,71 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from dg4d_lib.geometry.harmonics import C0
-from dg4d_lib.kernels.vectors import INLINE, KERNEL
+from dg4d_lib.geometry.spherical_harmonics import C0
+from dg4d_lib.kernels.simd import INLINE, KERNEL
 from dg4d_lib.rasterizer.interface import BLUR, MIN_ALPHA, NEAR
 
-# A record is what blending needs of one Gaussian: 16 floats, one cache line.
+# Record of a projected Gaussian, the input of blending: 16 floats, one cache line.
 RECORD = 16
-CENTER_X, CENTER_Y = 0, 1  # pixels
+MEAN2D_X, MEAN2D_Y = 0, 1  # pixels
 WHITEN_A, WHITEN_B, WHITEN_C = 2, 3, 4
 LOG_OPACITY = 5  # to base 2
 RED, GREEN, BLUE, DEPTH = 6, 7, 8, 9
-ROW_SLOPE, ROW_REACH, ROW_LOSS = 10, 11, 12  # half a row's span is sqrt(reach - loss dy^2), its middle slope dy
-EXTENT_X, EXTENT_Y = 13, 14  # pixels, half the bounding box
+ROW_SLOPE, ROW_REACH, ROW_LOSS = 10, 11, 12  # a row's span has half-width sqrt(reach - loss dy^2), center slope dy
+EXTENT_X, EXTENT_Y = 13, 14  # pixels, half of the bounding box (gsplat's radii)
 KEY = 15  # camera z or HIDDEN
-# Its gradient: moments of s over the whitened frame, then dL/dcolor and dL/ddepth.
+# Gradient of a record: moments of s over the whitened frame, then dL/dcolor and dL/ddepth.
 MOMENT, MOMENT_U, MOMENT_V, MOMENT_UU, MOMENT_UV, MOMENT_VV = 0, 1, 2, 3, 4, 5
-MOMENTS = DEPTH + 1
+GRAD_FIELDS = DEPTH + 1
 
-CAMERA = 17  # floats: rotation by rows, translation, focal, center x and y, limit of |x/z| and of |y/z|
-HIDDEN = np.float32(-1)  # key of a Gaussian that touches no pixel
+CAMERA = 17  # floats: rotation by rows, translation, focal, principal point, limits of |x/z| and |y/z|
+HIDDEN = np.float32(-1)  # key of a Gaussian that is not drawn
 
-_STATE = 13  # floats of a Gaussian: place, quaternion, scale, the coefficients of its constant color
-_BLOCK = 64  # Gaussians computed together, always as many: their fields lie side by side, so the compiler makes vectors
+_STATE = 13  # floats of a Gaussian: mean, quaternion, scale, degree-0 color coefficients
+_BLOCK = 64  # Gaussians per block, stored field by field; a constant size, so that the compiler vectorizes the loops
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _LOG2_E, _LN_2 = np.float32(1 / log(2)), np.float32(log(2))
-_LEAST_LOG_ALPHA = np.float32(log(MIN_ALPHA) / log(2))
+_MIN_LOG_ALPHA = np.float32(log(MIN_ALPHA) / log(2))
 _BLUR, _NEAR = np.float32(BLUR), np.float32(NEAR)
 _C0 = np.float32(C0)
-_ROUNDING = np.float32(1e-6)  # of colors: what lies so close to a bound of the clamp counts as inside
-_LARGEST = np.float32(1e30)  # a determinant beyond is an overflow
+_ROUNDING = np.float32(1e-6)  # tolerance of the color clamp: values this close to a bound count as inside
+_MAX_DETERMINANT = np.float32(1e30)  # larger ones count as overflow
 
 
 @njit(**KERNEL)
 @no_type_check
-def project(means, quats, scales, log_opacities, coefficients, camera, height, width, records, keys, start, stop):
-    """Fill records, and keys with camera z or HIDDEN, of Gaussians start..stop; coefficients are of the constant color.
+def project(means, quats, scales, log_opacities, sh0, camera, height, width, records, keys, start, stop):
+    """Fill the records of Gaussians start..stop, and their keys with camera z or HIDDEN.
 
-    The bound where alpha falls to MIN_ALPHA lies within MAX_SIGMA for every opacity up to one, so it alone counts.
+    The radius at which alpha falls to MIN_ALPHA is below MAX_SIGMA for every opacity up to one, so it alone is used.
+    `sh0` are the color coefficients of degree 0.
     """
-    rotation, translation, focal, center_x, center_y, limit_x, limit_y = _lens(camera)
+    rotation, translation, focal, principal_x, principal_y, limit_x, limit_y = _unpack_camera(camera)
     right, bottom = np.float32(width) - _HALF, np.float32(height) - _HALF
     state, record = np.empty((_STATE, _BLOCK), np.float32), np.empty((RECORD, _BLOCK), np.float32)
     for first in range(start, stop, _BLOCK):
         count = min(_BLOCK, stop - first)
-        _gather(means, quats, scales, coefficients, first, count, state)
+        _gather(means, quats, scales, sh0, first, count, state)
         for k in range(count):
             record[LOG_OPACITY, k] = _LOG2_E * log_opacities[first + k]
         for k in range(_BLOCK):
             x, y, z = _to_camera(rotation, translation, state[0, k], state[1, k], state[2, k])
-            turn, _, _ = _turn(state[3, k], state[4, k], state[5, k], state[6, k])
-            stretch = _stretch(turn, state[7, k], state[8, k], state[9, k])
-            half = _half(_jacobian(_slant(x, y, z, focal, limit_x, limit_y), rotation), stretch)
+            axes, _, _ = _rotation_matrix(state[3, k], state[4, k], state[5, k], state[6, k])
+            scaled = _scale_columns(axes, state[7, k], state[8, k], state[9, k])
+            half = _half(_world_jacobian(_projection_jacobian(x, y, z, focal, limit_x, limit_y), rotation), scaled)
             xx, xy, yy, determinant = _covariance(half)
             a, b, c = _whitening(xx, xy, yy, determinant)
-            reach = record[LOG_OPACITY, k] - _LEAST_LOG_ALPHA
-            spread = max(reach, _ZERO) * _TWO * _LN_2
-            extent_x, extent_y = np.sqrt(spread * xx), np.sqrt(spread * yy)
-            u, v = focal * x / z + center_x, focal * y / z + center_y
+            reach = record[LOG_OPACITY, k] - _MIN_LOG_ALPHA
+            squared_radius = max(reach, _ZERO) * _TWO * _LN_2
+            extent_x, extent_y = np.sqrt(squared_radius * xx), np.sqrt(squared_radius * yy)
+            u, v = focal * x / z + principal_x, focal * y / z + principal_y
             inverse_a2 = _ONE / (a * a)
-            shown = (z > _NEAR) & (reach > _ZERO) & (determinant > _ZERO) & (determinant < _LARGEST)
-            shown &= (u + extent_x > _HALF) & (u - extent_x < right)
-            shown &= (v + extent_y > _HALF) & (v - extent_y < bottom)
-            record[CENTER_X, k] = u
-            record[CENTER_Y, k] = v
+            visible = (z > _NEAR) & (reach > _ZERO) & (determinant > _ZERO) & (determinant < _MAX_DETERMINANT)
+            visible &= (u + extent_x > _HALF) & (u - extent_x < right)
+            visible &= (v + extent_y > _HALF) & (v - extent_y < bottom)
+            record[MEAN2D_X, k] = u
+            record[MEAN2D_Y, k] = v
             record[WHITEN_A, k] = a
             record[WHITEN_B, k] = b
             record[WHITEN_C, k] = c
@@ -88,7 +89,7 @@ def project(means, quats, scales, log_opacities, coefficients, camera, height, w
             record[ROW_LOSS, k] = c * c * inverse_a2
             record[EXTENT_X, k] = extent_x
             record[EXTENT_Y, k] = extent_y
-            record[KEY, k] = z if shown else HIDDEN
+            record[KEY, k] = z if visible else HIDDEN
         for k in range(count):
             for field in range(RECORD):
                 records[first + k, field] = record[field, k]
@@ -98,41 +99,45 @@ def project(means, quats, scales, log_opacities, coefficients, camera, height, w
 @njit(**KERNEL)
 @no_type_check
 def unproject(
-    means, quats, scales, coefficients, camera, keys, moments,
-    grad_means, grad_quats, grad_log_scales, grad_log_opacities, grad_coefficients, grad_centers, start, stop,
+    means, quats, scales, sh0, camera, keys, grad_records,
+    grad_means, grad_quats, grad_log_scales, grad_log_opacities, grad_sh0, grad_means2d, start, stop,
 ):  # fmt: skip
-    """Add what Gaussians start..stop get from the gradients of their records in one view."""
-    rotation, translation, focal, _, _, limit_x, limit_y = _lens(camera)
+    """Add the gradients of Gaussians start..stop, given those of their records in one view."""
+    rotation, translation, focal, _, _, limit_x, limit_y = _unpack_camera(camera)
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation
-    state, moment = np.empty((_STATE, _BLOCK), np.float32), np.empty((MOMENTS, _BLOCK), np.float32)
-    center, gradient = np.empty((2, _BLOCK), np.float32), np.empty((_STATE, _BLOCK), np.float32)
+    state, grad_record = np.empty((_STATE, _BLOCK), np.float32), np.empty((GRAD_FIELDS, _BLOCK), np.float32)
+    mean2d_gradient, gradient = np.empty((2, _BLOCK), np.float32), np.empty((_STATE, _BLOCK), np.float32)
     for first in range(start, stop, _BLOCK):
         count = min(_BLOCK, stop - first)
-        _gather(means, quats, scales, coefficients, first, count, state)
+        _gather(means, quats, scales, sh0, first, count, state)
         for k in range(count):
-            for field in range(MOMENTS):
-                moment[field, k] = moments[first + k, field]
+            for field in range(GRAD_FIELDS):
+                grad_record[field, k] = grad_records[first + k, field]
         for k in range(_BLOCK):
             s0, s1, s2 = state[7, k], state[8, k], state[9, k]
             x, y, z = _to_camera(rotation, translation, state[0, k], state[1, k], state[2, k])
-            turn, unit, inverse_norm = _turn(state[3, k], state[4, k], state[5, k], state[6, k])
-            stretch = _stretch(turn, s0, s1, s2)
-            slant = _slant(x, y, z, focal, limit_x, limit_y)
-            jacobian = _jacobian(slant, rotation)
-            half = _half(jacobian, stretch)
+            axes, unit, inverse_norm = _rotation_matrix(state[3, k], state[4, k], state[5, k], state[6, k])
+            scaled = _scale_columns(axes, s0, s1, s2)
+            projection = _projection_jacobian(x, y, z, focal, limit_x, limit_y)
+            jacobian = _world_jacobian(projection, rotation)
+            half = _half(jacobian, scaled)
             xx, xy, yy, determinant = _covariance(half)
             whitening = _whitening(xx, xy, yy, determinant)
-            d_center_x, d_center_y = _center_gradient(whitening, moment[MOMENT_U, k], moment[MOMENT_V, k])
+            d_mean2d_x, d_mean2d_y = _mean2d_gradient(whitening, grad_record[MOMENT_U, k], grad_record[MOMENT_V, k])
             whitened = _whitened(half, whitening, yy)
-            d_whitened = _whitened_gradient(whitened, moment[MOMENT_UU, k], moment[MOMENT_UV, k], moment[MOMENT_VV, k])
+            d_whitened = _whitened_gradient(
+                whitened, grad_record[MOMENT_UU, k], grad_record[MOMENT_UV, k], grad_record[MOMENT_VV, k]
+            )
             d_half = _half_gradient(whitening, d_whitened)
-            d_slant = _slant_gradient(d_half, stretch, rotation)
-            d_x, d_y, d_z = _place_gradient(x, y, z, focal, limit_x, limit_y, slant, d_slant, d_center_x, d_center_y)
-            d_z += moment[DEPTH, k]
-            d_turn = _stretch(_stretch_gradient(jacobian, d_half), s0, s1, s2)
-            d_qw, d_qx, d_qy, d_qz = _quat_gradient(unit, inverse_norm, d_turn)
-            center[0, k] = d_center_x
-            center[1, k] = d_center_y
+            d_projection = _projection_gradient(d_half, scaled, rotation)
+            d_x, d_y, d_z = _camera_mean_gradient(
+                x, y, z, focal, limit_x, limit_y, projection, d_projection, d_mean2d_x, d_mean2d_y
+            )
+            d_z += grad_record[DEPTH, k]
+            d_axes = _scale_columns(_scaled_gradient(jacobian, d_half), s0, s1, s2)
+            d_qw, d_qx, d_qy, d_qz = _quat_gradient(unit, inverse_norm, d_axes)
+            mean2d_gradient[0, k] = d_mean2d_x
+            mean2d_gradient[1, k] = d_mean2d_y
             gradient[0, k] = r00 * d_x + r10 * d_y + r20 * d_z
             gradient[1, k] = r01 * d_x + r11 * d_y + r21 * d_z
             gradient[2, k] = r02 * d_x + r12 * d_y + r22 * d_z
@@ -140,58 +145,58 @@ def unproject(
             gradient[4, k] = d_qx
             gradient[5, k] = d_qy
             gradient[6, k] = d_qz
-            # dL/d log s_k = (column k of P) . (column k of dL/dP), taken in the whitened frame
+            # dL/d log s_k = (column k of P) . (column k of dL/dP), in the whitened frame
             gradient[7, k] = whitened[0] * d_whitened[0] + whitened[3] * d_whitened[3]
             gradient[8, k] = whitened[1] * d_whitened[1] + whitened[4] * d_whitened[4]
             gradient[9, k] = whitened[2] * d_whitened[2] + whitened[5] * d_whitened[5]
-            gradient[10, k] = _color_gradient(state[10, k], moment[RED, k])
-            gradient[11, k] = _color_gradient(state[11, k], moment[GREEN, k])
-            gradient[12, k] = _color_gradient(state[12, k], moment[BLUE, k])
+            gradient[10, k] = _color_gradient(state[10, k], grad_record[RED, k])
+            gradient[11, k] = _color_gradient(state[11, k], grad_record[GREEN, k])
+            gradient[12, k] = _color_gradient(state[12, k], grad_record[BLUE, k])
         for k in range(count):
             i = first + k
             if keys[i] > _ZERO:
                 for axis in range(3):
                     grad_means[i, axis] += gradient[axis, k]
                     grad_log_scales[i, axis] += gradient[7 + axis, k]
-                    grad_coefficients[i, axis] += gradient[10 + axis, k]
+                    grad_sh0[i, axis] += gradient[10 + axis, k]
                 for axis in range(4):
                     grad_quats[i, axis] += gradient[3 + axis, k]
                 for axis in range(2):
-                    grad_centers[i, axis] += center[axis, k]
-                grad_log_opacities[i] += moment[MOMENT, k]
+                    grad_means2d[i, axis] += mean2d_gradient[axis, k]
+                grad_log_opacities[i] += grad_record[MOMENT, k]
 
 
 @njit(**INLINE)
 @no_type_check
-def _gather(means, quats, scales, coefficients, first, count, state):
-    """Place, quaternion, scale and coefficients of some Gaussians, by fields."""
+def _gather(means, quats, scales, sh0, first, count, state):
+    """Copy mean, quaternion, scale and color coefficients of a block of Gaussians, field by field."""
     for k in range(count):
         for axis in range(3):
             state[axis, k] = means[first + k, axis]
             state[7 + axis, k] = scales[first + k, axis]
-            state[10 + axis, k] = coefficients[first + k, axis]
+            state[10 + axis, k] = sh0[first + k, axis]
         for axis in range(4):
             state[3 + axis, k] = quats[first + k, axis]
 
 
 @njit(**INLINE)
 @no_type_check
-def _color(coefficient):
-    """The constant basis, before it is clamped to [0, 1]."""
-    return _C0 * coefficient + _HALF
+def _color(sh0):
+    """Evaluate the color of degree 0, before the clamp to [0, 1]."""
+    return _C0 * sh0 + _HALF
 
 
 @njit(**INLINE)
 @no_type_check
-def _color_gradient(coefficient, d_color):
-    """Through the clamp, which holds nothing back at its bounds."""
-    return _C0 * d_color if abs(_color(coefficient) - _HALF) <= _HALF + _ROUNDING else _ZERO
+def _color_gradient(sh0, d_color):
+    """Propagate through the clamp, which passes the gradient at its bounds."""
+    return _C0 * d_color if abs(_color(sh0) - _HALF) <= _HALF + _ROUNDING else _ZERO
 
 
 @njit(**INLINE)
 @no_type_check
-def _lens(camera):
-    """The parts of a camera as scalars, so that loops do not read it again."""
+def _unpack_camera(camera):
+    """Return the parts of a camera as scalars, so that loops do not read the array again."""
     rotation = (
         camera[0], camera[1], camera[2], camera[3], camera[4], camera[5], camera[6], camera[7], camera[8],
     )  # fmt: skip
@@ -211,8 +216,8 @@ def _to_camera(rotation, translation, x, y, z):
 
 @njit(**INLINE)
 @no_type_check
-def _turn(w, x, y, z):
-    """The rotation matrix by rows, the unit quaternion, and one over the given one's length."""
+def _rotation_matrix(w, x, y, z):
+    """Return the rotation matrix by rows, the unit quaternion and the inverse norm of the given one."""
     inverse = _ONE / np.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
     matrix = (
@@ -225,24 +230,24 @@ def _turn(w, x, y, z):
 
 @njit(**INLINE)
 @no_type_check
-def _stretch(turn, s0, s1, s2):
-    t00, t01, t02, t10, t11, t12, t20, t21, t22 = turn
+def _scale_columns(axes, s0, s1, s2):
+    t00, t01, t02, t10, t11, t12, t20, t21, t22 = axes
     return t00 * s0, t01 * s1, t02 * s2, t10 * s0, t11 * s1, t12 * s2, t20 * s0, t21 * s1, t22 * s2
 
 
 @njit(**INLINE)
 @no_type_check
-def _slant(x, y, z, focal, limit_x, limit_y):
-    """The four entries of the projection's Jacobian that are not zero: du/dx, du/dz, dv/dy, dv/dz."""
+def _projection_jacobian(x, y, z, focal, limit_x, limit_y):
+    """Return the nonzero entries of the projection's Jacobian J: du/dx, du/dz, dv/dy, dv/dz."""
     near = focal / z
     return near, -near * min(max(x / z, -limit_x), limit_x), near, -near * min(max(y / z, -limit_y), limit_y)
 
 
 @njit(**INLINE)
 @no_type_check
-def _jacobian(slant, rotation):
-    """J W: from the world to the screen, by rows."""
-    a0, a2, b1, b2 = slant
+def _world_jacobian(projection, rotation):
+    """Return J W by rows: the Jacobian from world space to the screen."""
+    a0, a2, b1, b2 = projection
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation
     return (
         a0 * r00 + a2 * r20, a0 * r01 + a2 * r21, a0 * r02 + a2 * r22,
@@ -252,10 +257,10 @@ def _jacobian(slant, rotation):
 
 @njit(**INLINE)
 @no_type_check
-def _half(jacobian, stretch):
-    """J W R S, two rows; times its transpose it is the covariance on the screen before the blur."""
+def _half(jacobian, scaled):
+    """Return P = J W R S, two rows; P P^T is the 2D covariance before the blur."""
     j00, j01, j02, j10, j11, j12 = jacobian
-    m00, m01, m02, m10, m11, m12, m20, m21, m22 = stretch
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = scaled
     return (
         j00 * m00 + j01 * m10 + j02 * m20, j00 * m01 + j01 * m11 + j02 * m21, j00 * m02 + j01 * m12 + j02 * m22,
         j10 * m00 + j11 * m10 + j12 * m20, j10 * m01 + j11 * m11 + j12 * m21, j10 * m02 + j11 * m12 + j12 * m22,
@@ -265,9 +270,9 @@ def _half(jacobian, stretch):
 @njit(**INLINE)
 @no_type_check
 def _covariance(half):
-    """xx, xy, yy and the determinant of the covariance on the screen, blur included, pixels squared.
+    """Return xx, xy, yy and the determinant of the 2D covariance with blur, pixels squared.
 
-    det(P P^T + blur) as a sum of positive terms, the first by Cauchy-Binet: xx yy - xy^2 would cancel for needles.
+    det(P P^T + blur) is a sum of positive terms, the first by Cauchy-Binet: xx yy - xy^2 would cancel for needles.
     """
     p00, p01, p02, p10, p11, p12 = half
     sharp_xx = p00 * p00 + p01 * p01 + p02 * p02
@@ -281,7 +286,7 @@ def _covariance(half):
 @njit(**INLINE)
 @no_type_check
 def _minors(half):
-    """The cross product of the two rows."""
+    """Return the cross product of the two rows of P."""
     p00, p01, p02, p10, p11, p12 = half
     return p01 * p12 - p02 * p11, p02 * p10 - p00 * p12, p00 * p11 - p01 * p10
 
@@ -289,7 +294,7 @@ def _minors(half):
 @njit(**INLINE)
 @no_type_check
 def _whitening(xx, xy, yy, determinant):
-    """W = [[a, b], [0, c]] of a covariance."""
+    """Return W = [[a, b], [0, c]] of a covariance."""
     half_log2_e = _HALF * _LOG2_E
     a = np.sqrt(half_log2_e * yy / determinant)
     return a, -half_log2_e * xy / (determinant * a), np.sqrt(half_log2_e / yy)
@@ -297,7 +302,7 @@ def _whitening(xx, xy, yy, determinant):
 
 @njit(**INLINE)
 @no_type_check
-def _center_gradient(whitening, mu, mv):
+def _mean2d_gradient(whitening, mu, mv):
     a, b, c = whitening
     return _TWO * _LN_2 * a * mu, _TWO * _LN_2 * (b * mu + c * mv)
 
@@ -305,7 +310,7 @@ def _center_gradient(whitening, mu, mv):
 @njit(**INLINE)
 @no_type_check
 def _whitened(half, whitening, yy):
-    """W P, two rows: the Gaussian's own axes in the whitened frame, again without cancellation.
+    """Return W P, two rows: the Gaussian's axes in the whitened frame, without cancellation.
 
     a (p0 - xy / yy p1) = a / yy (p1 x (p0 x p1) + blur p0), rows p0 and p1 of P.
     """
@@ -322,7 +327,7 @@ def _whitened(half, whitening, yy):
 @njit(**INLINE)
 @no_type_check
 def _whitened_gradient(whitened, muu, muv, mvv):
-    """4 ln2^2 M_2 W P, two rows."""
+    """Return 4 ln2^2 M_2 W P, two rows."""
     u0, u1, u2, v0, v1, v2 = whitened
     k = _TWO * _TWO * _LN_2 * _LN_2
     muu, muv, mvv = k * muu, k * muv, k * mvv
@@ -335,7 +340,7 @@ def _whitened_gradient(whitened, muu, muv, mvv):
 @njit(**INLINE)
 @no_type_check
 def _half_gradient(whitening, d_whitened):
-    """dL/dP = 2 dL/dSigma' P = W^T (4 ln2^2 M_2 W P), two rows."""
+    """Return dL/dP = 2 dL/dSigma' P = W^T (4 ln2^2 M_2 W P), two rows."""
     a, b, c = whitening
     d0, d1, d2, e0, e1, e2 = d_whitened
     return a * d0, a * d1, a * d2, b * d0 + c * e0, b * d1 + c * e1, b * d2 + c * e2
@@ -343,10 +348,10 @@ def _half_gradient(whitening, d_whitened):
 
 @njit(**INLINE)
 @no_type_check
-def _slant_gradient(d_half, stretch, rotation):
-    """From P = J W R S to the four entries of J."""
+def _projection_gradient(d_half, scaled, rotation):
+    """Propagate from P = J W R S to the four entries of J."""
     d00, d01, d02, d10, d11, d12 = d_half
-    m00, m01, m02, m10, m11, m12, m20, m21, m22 = stretch
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = scaled
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation
     e00 = d00 * m00 + d01 * m01 + d02 * m02
     e01 = d00 * m10 + d01 * m11 + d02 * m12
@@ -362,22 +367,22 @@ def _slant_gradient(d_half, stretch, rotation):
 
 @njit(**INLINE)
 @no_type_check
-def _place_gradient(x, y, z, focal, limit_x, limit_y, slant, d_slant, d_center_x, d_center_y):
-    """dL/d(x, y, z) in the camera's frame; a clamped ratio stands still in J, while the center always moves."""
-    a0, a2, b1, b2 = slant
-    d_a0, d_a2, d_b1, d_b2 = d_slant
+def _camera_mean_gradient(x, y, z, focal, limit_x, limit_y, projection, d_projection, d_mean2d_x, d_mean2d_y):
+    """Return dL/d(x, y, z) in the camera frame; a clamped ratio has no gradient in J, but always one in mean2d."""
+    a0, a2, b1, b2 = projection
+    d_a0, d_a2, d_b1, d_b2 = d_projection
     inverse = _ONE / z
     ratio_x, ratio_y = x * inverse, y * inverse
-    d_ratio_x = focal * d_center_x - (a0 * d_a2 if abs(ratio_x) < limit_x else _ZERO)
-    d_ratio_y = focal * d_center_y - (b1 * d_b2 if abs(ratio_y) < limit_y else _ZERO)
+    d_ratio_x = focal * d_mean2d_x - (a0 * d_a2 if abs(ratio_x) < limit_x else _ZERO)
+    d_ratio_y = focal * d_mean2d_y - (b1 * d_b2 if abs(ratio_y) < limit_y else _ZERO)
     d_z = a0 * d_a0 + a2 * d_a2 + b1 * d_b1 + b2 * d_b2 + d_ratio_x * ratio_x + d_ratio_y * ratio_y
     return d_ratio_x * inverse, d_ratio_y * inverse, -d_z * inverse
 
 
 @njit(**INLINE)
 @no_type_check
-def _stretch_gradient(jacobian, d_half):
-    """(J W)^T dL/dP: the gradient of R S."""
+def _scaled_gradient(jacobian, d_half):
+    """Return (J W)^T dL/dP: the gradient of R S."""
     j00, j01, j02, j10, j11, j12 = jacobian
     d00, d01, d02, d10, d11, d12 = d_half
     return (
@@ -389,10 +394,10 @@ def _stretch_gradient(jacobian, d_half):
 
 @njit(**INLINE)
 @no_type_check
-def _quat_gradient(unit, inverse_norm, d_turn):
-    """Through the rotation matrix and the normalization."""
+def _quat_gradient(unit, inverse_norm, d_axes):
+    """Propagate through the rotation matrix and the normalization of the quaternion."""
     w, x, y, z = unit
-    n00, n01, n02, n10, n11, n12, n20, n21, n22 = d_turn
+    n00, n01, n02, n10, n11, n12, n20, n21, n22 = d_axes
     d_w = _TWO * (x * (n21 - n12) + y * (n02 - n20) + z * (n10 - n01))
     d_x = _TWO * (w * (n21 - n12) - _TWO * x * (n11 + n22) + y * (n01 + n10) + z * (n02 + n20))
     d_y = _TWO * (w * (n02 - n20) + x * (n01 + n10) - _TWO * y * (n00 + n22) + z * (n12 + n21))

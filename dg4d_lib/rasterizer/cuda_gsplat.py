@@ -1,15 +1,15 @@
-"""The rasterizer for CUDA: gsplat's kernels (https://docs.gsplat.studio) behind the semantics of `interface`, float32.
+"""CUDA rasterizer: gsplat's kernels (https://docs.gsplat.studio) with the semantics of `interface`, float32.
 
-gsplat 1.5.3 has the same blur, least and greatest alpha, exclusive stop, bounds, margin of the frustum, order and
-depth; all but the blur and the near plane are compiled in. What differs:
-- Gradients: the last transmittance of a pixel is 1 - alpha, so where little light is left they are good to 1e-3 only;
-  sums are atomic, so two runs differ in the last digits; exponentials and divisions are CUDA's fast ones.
-- Gradients of several states with fewer Gaussians than a warp has lanes are mixed up: they are drawn one by one.
-- Covariances are formed in 3D: long needles lose digits, most of all the gradients of scales. In needles of a standard
-  deviation beyond some 1500 pixels, pairs whose exponent rounds below zero are left out, and then whole needles.
-- `visible` rounds the bounding box up to whole pixels: it may count a Gaussian that ends just outside of the picture.
+gsplat 1.5.3 has the same blur, alpha limits, exclusive stop, bounds, frustum margin, order and depth; all but the blur
+and the near plane are compiled in. Differences:
+- Gradients: the final transmittance of a pixel is computed as 1 - alpha, so where it is small they are accurate to 1e-3
+  only; sums are atomic, so two runs differ in the last digits; exponentials and divisions are CUDA's fast versions.
+- gsplat mixes the gradients of several states with fewer Gaussians than a warp has lanes: they are rendered one by one.
+- Covariances are formed in 3D: long needles lose digits, most of all in the gradients of scales. In needles with a
+  standard deviation above about 1500 pixels, pairs whose exponent rounds below zero are skipped, then whole needles.
+- `visible` rounds the bounding box up to whole pixels, so it may include a Gaussian that ends just outside the image.
 - Not drawn: a quaternion of norm zero, a depth beyond 1e10. A scale beyond 1e9 hides the Gaussian or everything behind
-  it, and may give gradients that are not finite.
+  it, and may give non-finite gradients.
 """
 
 import logging
@@ -27,16 +27,16 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.utils.cpp_extension import get_default_build_root
 
-from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
+from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.devices import to_device_async
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer import reference
-from dg4d_lib.rasterizer.interface import BLUR, NEAR, Rendering, require_finite, shared_size, state_per_camera
+from dg4d_lib.rasterizer.interface import BLUR, NEAR, Rendering, has_state_per_camera, require_finite, shared_size
 
 DEVICE = torch.device("cuda")
-WARP = 32  # lanes
-NOTICE = "compiling gsplat's kernels for this GPU: some minutes, once"
+WARP = 32  # threads
+NOTICE = "compiling gsplat's kernels for this GPU: takes minutes, once"
 
 _log = logging.getLogger(__name__)
 
@@ -45,54 +45,55 @@ def rasterize(
     gaussians: Gaussians,
     cameras: Sequence[OrbitCamera],
     background: Float[Tensor, " 3"],
-    screen_offsets: Float[Tensor, "b n 2"] | None = None,
+    means2d_offsets: Float[Tensor, "b n 2"] | None = None,
 ) -> Rendering:
-    """Render every camera's picture in one call of gsplat; differentiable once; `screen_offsets` are taken to be zero.
+    """Render one image per camera in one call of gsplat; differentiable once; `means2d_offsets` must be zero.
 
-    Drawn on the GPU; pictures and gradients come back where the Gaussians are, in their precision. For the arguments
-    see `Rasterizer`.
+    Images and gradients are returned on the device and in the precision of the Gaussians. For the arguments see
+    `Rasterizer`.
 
     Raises:
         BadInput: no cameras, cameras of different sizes, a number of states other than the number of cameras, or
-            Gaussians with numbers that are not finite.
-        BackendUnavailable: gsplat could not compile its kernels.
+            non-finite Gaussians.
+        BackendUnavailable: gsplat has no kernels and could not compile them.
     """
     height, width = shared_size(cameras)
-    moving = state_per_camera(gaussians, cameras)
+    per_camera = has_state_per_camera(gaussians, cameras)
     require_finite(gaussians)
-    if len(gaussians) == 0:  # gsplat divides by their number
-        return reference.rasterize(gaussians, cameras, background, screen_offsets)
-    if moving and len(cameras) > 1 and len(gaussians) < WARP:
-        return _one_by_one(gaussians, cameras, background, screen_offsets)
+    if len(gaussians) == 0:  # gsplat divides by the number of Gaussians
+        return reference.rasterize(gaussians, cameras, background, means2d_offsets)
+    if per_camera and len(cameras) > 1 and len(gaussians) < WARP:
+        return _one_by_one(gaussians, cameras, background, means2d_offsets)
     _require_kernels()
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
     means, quats, scales, opacities, colors = (value.to(DEVICE, torch.float32) for value in fields)
-    caught: list[Tensor] = []
-    if screen_offsets is not None:
-        means = _ScreenGradient.apply(means, screen_offsets, caught)
-    poses, lenses = to_device_async(world_to_camera(cameras).float(), DEVICE), to_device_async(_lenses(cameras), DEVICE)
+    grad2d: list[Tensor] = []
+    if means2d_offsets is not None:
+        means = _Grad2d.apply(means, means2d_offsets, grad2d)
+    poses = to_device_async(viewmats(cameras).float(), DEVICE)
+    Ks = to_device_async(_intrinsics(cameras), DEVICE)
     backgrounds = to_device_async(background.detach().float(), DEVICE).expand(len(cameras), 3)
-    if moving:  # a batch of clouds with one camera each
+    if per_camera:  # a batch of clouds with one camera each
         opacities, colors = opacities.expand(len(cameras), -1), colors.expand(len(cameras), -1, -1)
-        poses, lenses, backgrounds = poses[:, None], lenses[:, None], backgrounds[:, None]
-    pictures, alpha, info = rasterization(
-        means, quats, scales, opacities, colors, poses, lenses, width, height,
+        poses, Ks, backgrounds = poses[:, None], Ks[:, None], backgrounds[:, None]
+    images, alpha, info = rasterization(
+        means, quats, scales, opacities, colors, poses, Ks, width, height,
         near_plane=NEAR, eps2d=BLUR, backgrounds=backgrounds, render_mode="RGB+D", packed=False,
     )  # fmt: skip
-    if screen_offsets is not None and info["means2d"].requires_grad:
-        info["means2d"].register_hook(caught.append)
-    views = (len(cameras), height, width)
-    color, depth = pictures.reshape(*views, 4).to(gaussians.means).split((3, 1), -1)
+    if means2d_offsets is not None and info["means2d"].requires_grad:
+        info["means2d"].register_hook(grad2d.append)
+    shape = (len(cameras), height, width)
+    color, depth = images.reshape(*shape, 4).to(gaussians.means).split((3, 1), -1)
     visible = (info["radii"] > 0).all(-1).reshape(len(cameras), len(gaussians)).to(gaussians.means.device)
-    return Rendering(color, alpha.reshape(*views, 1).to(gaussians.means), depth, visible)
+    return Rendering(color, alpha.reshape(*shape, 1).to(gaussians.means), depth, visible)
 
 
 @cache
 def _require_kernels() -> None:
-    """Have gsplat load its kernels or compile them; that takes minutes once, and fails in many ways.
+    """Load gsplat's kernels or compile them, which takes minutes once.
 
     Raises:
-        BackendUnavailable: it has none (None where there is no nvcc), or could not compile them.
+        BackendUnavailable: gsplat has no kernels and could not compile them (`_C` is None without nvcc).
     """
     if find_spec("gsplat.csrc") is None and not any(Path(get_default_build_root()).rglob("gsplat_cuda.so")):
         _log.info(NOTICE)
@@ -104,8 +105,8 @@ def _require_kernels() -> None:
         first_line = str(failure or "").partition("\n")[0]
         reason = f" ({first_line})" if first_line else ""
         raise BackendUnavailable(
-            f"gsplat has no kernels here{reason}: install the CUDA toolkit (nvcc) of torch's CUDA version, or a wheel "
-            "of gsplat that holds them (https://docs.gsplat.studio/whl); or choose rasterizer=cpu"
+            f"gsplat's CUDA kernels are missing{reason}: install the CUDA toolkit (nvcc) of torch's CUDA version, or a "
+            "gsplat wheel with kernels (https://docs.gsplat.studio/whl); or choose rasterizer=cpu"
         ) from failure
 
 
@@ -113,18 +114,18 @@ def _one_by_one(
     gaussians: Gaussians,
     cameras: Sequence[OrbitCamera],
     background: Float[Tensor, " 3"],
-    screen_offsets: Float[Tensor, "b n 2"] | None,
+    means2d_offsets: Float[Tensor, "b n 2"] | None,
 ) -> Rendering:
-    """Every state in a call of its own: gsplat sums gradients in a warp by a Gaussian's number, whatever its state."""
+    """Render every state in a separate call; in a warp, gsplat adds up gradients by index regardless of the state."""
     views = []
     for view, camera in enumerate(cameras):
-        offsets = None if screen_offsets is None else screen_offsets[view : view + 1]
+        offsets = None if means2d_offsets is None else means2d_offsets[view : view + 1]
         views.append(vars(rasterize(gaussians.at(view), [camera], background, offsets)).values())
     return Rendering(*(torch.cat(parts) for parts in zip(*views, strict=True)))
 
 
-def _lenses(cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b 3 3"]:
-    """Intrinsics: focal lengths and the principal point, pixels."""
+def _intrinsics(cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b 3 3"]:
+    """Return gsplat's `Ks`: focal lengths and principal points, pixels."""
     return torch.tensor(
         [
             ((camera.focal, 0, camera.width / 2), (0, camera.focal, camera.height / 2), (0, 0, 1))
@@ -133,18 +134,18 @@ def _lenses(cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b 3 3"]:
     )  # fmt: skip
 
 
-class _ScreenGradient(torch.autograd.Function):
-    """The identity on the means; gives `screen_offsets` the gradient that was caught at the projected centers.
+class _Grad2d(torch.autograd.Function):
+    """Identity on the means that passes the gradient of gsplat's internal means2d to `means2d_offsets`.
 
-    These exist inside of gsplat only. In backward they come before the means, so their gradient is there by then.
+    Backward reaches means2d before the means, so the hook has stored its gradient by then.
     """
 
     @staticmethod
-    def forward(ctx: Any, means: Tensor, offsets: Tensor, caught: list[Tensor]) -> Tensor:
-        ctx.caught, ctx.offsets = caught, offsets.detach()
+    def forward(ctx: Any, means: Tensor, offsets: Tensor, grad2d: list[Tensor]) -> Tensor:
+        ctx.grad2d, ctx.offsets = grad2d, offsets.detach()
         return means.view_as(means)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
-        return gradient, ctx.caught.pop().reshape(ctx.offsets.shape).to(ctx.offsets), None
+        return gradient, ctx.grad2d.pop().reshape(ctx.offsets.shape).to(ctx.offsets), None

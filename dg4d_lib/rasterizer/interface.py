@@ -1,8 +1,9 @@
-"""What every splatting backend promises: the call, the picture it gives, and the constants they share (gsplat classic).
+"""Interface of the rasterizer backends and their shared constants, with the semantics of gsplat ("classic" mode).
 
-Pixel centers at +0.5; 2D covariance + BLUR on the diagonal, also for the gradients; alpha = min(MAX_ALPHA, o e^-s); a
-pair counts iff alpha >= MIN_ALPHA; a pixel stops before the Gaussian that would take its transmittance to
-MIN_TRANSMITTANCE or below; color + transmittance * background; depth is the weighted sum of camera z.
+Pixel centers are at +0.5. BLUR is added to the diagonal of the 2D covariance, also in the gradients. alpha =
+min(MAX_ALPHA, o e^-sigma); contributions below MIN_ALPHA are skipped. A pixel stops before the Gaussian that would
+reduce its transmittance to MIN_TRANSMITTANCE or less. Color is composited over transmittance * background; depth is the
+weighted sum of camera z.
 """
 
 from collections.abc import Sequence
@@ -18,26 +19,26 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.rasterizer.choice import CUDA, backend_name, require_backend
+from dg4d_lib.rasterizer.backends import CUDA, backend_name, require_backend
 
-BLUR = 0.3  # pixels squared, the low-pass filter
+BLUR = 0.3  # pixels squared: gsplat's eps2d, the low-pass filter of 3DGS
 MAX_ALPHA = 0.999
 MIN_ALPHA = 1 / 255
 MIN_TRANSMITTANCE = 1e-4
-MAX_SIGMA = 3.33  # standard deviations, bound of a Gaussian on screen; also sqrt(2 ln(255 o)), whichever is less
-NEAR = 0.2  # world units of camera z; nearer Gaussians are not drawn
-FRUSTUM_MARGIN = 1.3  # the Jacobian's x/z and y/z are clamped to this times tan(fov/2)
+MAX_SIGMA = 3.33  # standard deviations: screen radius of a Gaussian, or sqrt(2 ln(255 o)) if less (gsplat)
+NEAR = 0.2  # near plane, world units of camera z
+FRUSTUM_MARGIN = 1.3  # the Jacobian's x/z and y/z are clamped to this multiple of tan(fov/2) (3DGS)
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """Pictures of one cloud, composited over the background it was given.
+    """Rendered images of one cloud, composited over the background.
 
     Attributes:
         color: in [0, 1] for colors in [0, 1].
         alpha: 1 - transmittance.
         depth: sum of weight times camera z, world units (not normalized).
-        visible: which Gaussians may touch which picture.
+        visible: true if a Gaussian may contribute to an image (gsplat: radii > 0).
     """
 
     color: Float[Tensor, "b h w 3"]
@@ -48,27 +49,27 @@ class Rendering:
 
 @runtime_checkable
 class Rasterizer(Protocol):
-    """A splatting backend."""
+    """Rasterizer backend."""
 
     def __call__(
         self,
         gaussians: Gaussians,
         cameras: Sequence[OrbitCamera],
         background: Float[Tensor, " 3"],
-        screen_offsets: Float[Tensor, "b n 2"] | None = None,
+        means2d_offsets: Float[Tensor, "b n 2"] | None = None,
     ) -> Rendering:
-        """Render every camera's picture, differentiable in the Gaussians.
+        """Render one image per camera, differentiable in the Gaussians.
 
         Args:
             gaussians: one cloud for all cameras (fields "n 3"), or one state per camera (fields "b n 3").
             cameras: b cameras of one width and height.
-            background: color behind everything.
-            screen_offsets: zeros that are added to the projected centers, in pixels; their gradient is what density
-                control reads. Backends may assume that they are zero.
+            background: background color.
+            means2d_offsets: zeros, added to the projected means (means2d) in pixels; density control uses their
+                gradient. Backends may assume that they are zero.
 
         Raises:
-            BadInput: no cameras, cameras of different sizes, another number of states than of cameras, or Gaussians
-                with numbers that are not finite.
+            BadInput: no cameras, cameras of different sizes, a number of states other than the number of cameras, or
+                non-finite Gaussians.
         """
         ...
 
@@ -80,21 +81,21 @@ _BACKENDS = {
 }
 
 
-def choose_rasterizer(name: str) -> Rasterizer:
-    """The backend of this name, or the one that `auto` stands for here.
+def get_rasterizer(name: str) -> Rasterizer:
+    """Return the backend of this name; `auto` is resolved for this machine.
 
     Raises:
-        BadInput: the name is not known.
-        BackendUnavailable: it is known but cannot run here.
+        BadInput: the name is unknown.
+        BackendUnavailable: the backend cannot run on this machine.
     """
     name = backend_name(name)
     if name not in _BACKENDS:
-        raise BadInput(f"rasterizer {name!r} is not known; choose one of auto, {', '.join(_BACKENDS)}")
+        raise BadInput(f"unknown rasterizer {name!r}; choose one of auto, {', '.join(_BACKENDS)}")
     require_backend(name)
     if name == CUDA and not torch.cuda.is_available():
         raise BackendUnavailable(
-            f"rasterizer {name!r} cannot run here: torch {torch.__version__} cannot use the GPU (often the driver is "
-            "too old; python -c 'import torch; torch.cuda.init()' says what is wrong); or choose rasterizer=cpu"
+            f"rasterizer {name!r} cannot run here: torch {torch.__version__} cannot use the GPU (often because "
+            "of an old driver; `python -c 'import torch; torch.cuda.init()'` shows the error); or choose rasterizer=cpu"
         )
     try:
         backend: Rasterizer = import_module(_BACKENDS[name]).rasterize
@@ -103,28 +104,28 @@ def choose_rasterizer(name: str) -> Rasterizer:
     return backend
 
 
-def device_of(name: str) -> torch.device:
-    """Where Gaussians should lie that this backend draws often; elsewhere they are moved for every call, or refused."""
+def preferred_device(name: str) -> torch.device:
+    """Return the device this backend prefers its inputs on; others cost a copy per call, or are refused."""
     return torch.device("cuda" if backend_name(name) == CUDA else "cpu")
 
 
 def shared_size(cameras: Sequence[OrbitCamera]) -> tuple[int, int]:
-    """Height and width that all cameras have in common, pixels.
+    """Return the common height and width of all cameras, pixels.
 
     Raises:
         BadInput: no cameras, or cameras of different sizes.
     """
     sizes = {(camera.height, camera.width) for camera in cameras}
     if len(sizes) != 1:
-        raise BadInput(f"cameras of one rendering must have one size; given {sorted(sizes) or 'no camera'}")
+        raise BadInput(f"all cameras of a rendering must have the same size; given {sorted(sizes) or 'no camera'}")
     return sizes.pop()
 
 
-def state_per_camera(gaussians: Gaussians, cameras: Sequence[OrbitCamera]) -> bool:
-    """Whether the cloud has a state of its own for every camera, rather than one for all.
+def has_state_per_camera(gaussians: Gaussians, cameras: Sequence[OrbitCamera]) -> bool:
+    """Return true if the cloud has one state per camera, false if it has one for all.
 
     Raises:
-        BadInput: it has several states, but not as many as there are cameras.
+        BadInput: the number of states differs from the number of cameras.
     """
     shape = gaussians.means.shape
     if shape[:-2] not in ((), (len(cameras),)):
@@ -136,13 +137,13 @@ def state_per_camera(gaussians: Gaussians, cameras: Sequence[OrbitCamera]) -> bo
 
 
 def require_finite(gaussians: Gaussians) -> None:
-    """Refuse a cloud with numbers that are none.
+    """Refuse a cloud with non-finite numbers.
 
-    One sum per field instead of a test per number: a sum is finite unless a number is not, or all are beyond use. On
-    the processor NumPy adds them up: torch wakes its threads for it, which takes ten times as long.
+    Tests one sum per field instead of every number: the sum is finite unless a number is not, or they overflow. On the
+    CPU, NumPy computes it, because starting torch's threads takes ten times as long.
 
     Raises:
-        BadInput: says which fields hold how many.
+        BadInput: names the fields and the number of non-finite entries.
     """
     fields = {name: value.detach() for name, value in vars(gaussians).items()}
     if gaussians.means.device.type == "cpu":
@@ -156,6 +157,6 @@ def require_finite(gaussians: Gaussians) -> None:
     counts = ", ".join(f"{count} in {name}" for name, count in bad.items() if count)
     if counts:
         raise BadInput(
-            f"{len(gaussians)} Gaussians with numbers that are not finite ({counts}) cannot be drawn; remove the "
-            "broken ones, or look for what made them"
+            f"{len(gaussians)} Gaussians have non-finite numbers ({counts}) and cannot be rendered; remove those, or "
+            "lower the learning rates of the fit that made them"
         )

@@ -1,7 +1,8 @@
-"""The rasterizer that defines the others: plain torch, every pixel against every Gaussian, gradients by autograd.
+"""Reference rasterizer in plain torch: every pixel against every Gaussian, gradients by autograd.
 
-Notation of Kerbl et al. 2023, section 4 (name here -> symbol there): `half` -> J W R S, `jacobian` -> J,
-`covariances` -> Sigma', `sigma` -> the exponent s of alpha = o e^-s, `transmittance` -> T.
+It defines the results of the other backends. Notation of Kerbl et al. 2023, section 4 (name here -> symbol there):
+`half` -> J W R S, `jacobian` -> J, `covars2d` -> Sigma', `sigma` -> the exponent of alpha = o e^-sigma,
+`transmittance` -> T.
 """
 
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ from torch.utils.checkpoint import checkpoint
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.quaternion import rotation_matrix
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
 from dg4d_lib.rasterizer.interface import (
     BLUR,
     FRUSTUM_MARGIN,
@@ -25,48 +26,48 @@ from dg4d_lib.rasterizer.interface import (
     MIN_TRANSMITTANCE,
     NEAR,
     Rendering,
+    has_state_per_camera,
     require_finite,
     shared_size,
-    state_per_camera,
 )
 
-_PAIRS_AT_ONCE = 1 << 18  # pixels times Gaussians of one chunk: what stays in the cache
+_PAIRS_PER_CHUNK = 1 << 18  # pixels times Gaussians; fits into the cache
 
 
 def rasterize(
     gaussians: Gaussians,
     cameras: Sequence[OrbitCamera],
     background: Float[Tensor, " 3"],
-    screen_offsets: Float[Tensor, "b n 2"] | None = None,
+    means2d_offsets: Float[Tensor, "b n 2"] | None = None,
 ) -> Rendering:
-    """Render every camera's picture in the precision of the Gaussians, float32 or float64.
+    """Render one image per camera in the precision of the Gaussians, float32 or float64.
 
-    Gaussians whose size overflows are not drawn. For the arguments see `Rasterizer`.
+    Gaussians whose covariance overflows are not drawn. For the arguments see `Rasterizer`.
 
     Raises:
         BadInput: no cameras, cameras of different sizes, a number of states other than the number of cameras, or
-            Gaussians with numbers that are not finite.
+            non-finite Gaussians.
     """
     height, width = shared_size(cameras)
-    moving = state_per_camera(gaussians, cameras)
+    per_camera = has_state_per_camera(gaussians, cameras)
     require_finite(gaussians)
     background = background.to(gaussians.means)
     views = []
     for view, camera in enumerate(cameras):
-        splats = _project(gaussians.at(view) if moving else gaussians, camera)
-        if screen_offsets is not None:
-            splats.centers = splats.centers + screen_offsets[view].to(splats.centers)
-        views.append(_picture(splats, background, height, width))
+        splats = _project(gaussians.at(view) if per_camera else gaussians, camera)
+        if means2d_offsets is not None:
+            splats.means2d = splats.means2d + means2d_offsets[view].to(splats.means2d)
+        views.append(_render(splats, background, height, width))
     color, alpha, depth, visible = (torch.stack(parts) for parts in zip(*views, strict=True))
     return Rendering(color, alpha, depth, visible)
 
 
 @dataclass
 class _Splats:
-    """Gaussians on the screen of one camera, pixels."""
+    """Projected Gaussians of one camera, pixels."""
 
-    centers: Float[Tensor, "n 2"]
-    covariances: Float[Tensor, "n 2 2"]
+    means2d: Float[Tensor, "n 2"]
+    covars2d: Float[Tensor, "n 2 2"]
     depths: Float[Tensor, " n"]
     opacities: Float[Tensor, " n"]
     colors: Float[Tensor, "n 3"]
@@ -76,23 +77,23 @@ class _Splats:
 
 
 def _project(gaussians: Gaussians, camera: OrbitCamera) -> _Splats:
-    pose = camera.world_to_camera().to(gaussians.means)
-    rotation, translation = pose[:3, :3], pose[:3, 3]
+    viewmat = camera.viewmat().to(gaussians.means)
+    rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     x, y, z = (gaussians.means @ rotation.T + translation).unbind(-1)
     focal, (tan_x, tan_y) = camera.focal, camera.tan_half_fov
-    centers = torch.stack((focal * x / z + 0.5 * camera.width, focal * y / z + 0.5 * camera.height), -1)
+    means2d = torch.stack((focal * x / z + 0.5 * camera.width, focal * y / z + 0.5 * camera.height), -1)
     clamped_x = z * (x / z).clamp(-FRUSTUM_MARGIN * tan_x, FRUSTUM_MARGIN * tan_x)
     clamped_y = z * (y / z).clamp(-FRUSTUM_MARGIN * tan_y, FRUSTUM_MARGIN * tan_y)
     zero = torch.zeros_like(z)
     jacobian = focal * torch.stack(
         (1 / z, zero, -clamped_x / z**2, zero, 1 / z, -clamped_y / z**2), -1
     ).unflatten(-1, (2, 3))  # fmt: skip
-    half = jacobian @ rotation @ (rotation_matrix(gaussians.quats) * gaussians.scales[:, None, :])
-    covariances = half @ half.mT + BLUR * torch.eye(2).to(half)
-    return _Splats(centers, covariances, z, gaussians.opacities, gaussians.colors)
+    half = jacobian @ rotation @ (quat_to_rotmat(gaussians.quats) * gaussians.scales[:, None, :])
+    covars2d = half @ half.mT + BLUR * torch.eye(2).to(half)
+    return _Splats(means2d, covars2d, z, gaussians.opacities, gaussians.colors)
 
 
-def _picture(
+def _render(
     splats: _Splats, background: Float[Tensor, " 3"], height: int, width: int
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"], Float[Tensor, "h w 1"], Bool[Tensor, " n"]]:
     visible = _visible(splats, height, width)
@@ -100,7 +101,7 @@ def _picture(
     drawn = splats[order[visible[order]]]
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     pixels = torch.stack((columns, rows), -1).reshape(-1, 2).to(background)
-    chunk = max(1, _PAIRS_AT_ONCE // max(1, drawn.depths.numel()))
+    chunk = max(1, _PAIRS_PER_CHUNK // max(1, drawn.depths.numel()))
     parts = [checkpoint(_blend, part, drawn, background, use_reentrant=False) for part in pixels.split(chunk)]
     color, alpha, depth = torch.cat(parts).reshape(height, width, 5).split((3, 1, 1), -1)
     return color, alpha, depth, visible
@@ -108,28 +109,28 @@ def _picture(
 
 @torch.no_grad()
 def _visible(splats: _Splats, height: int, width: int) -> Bool[Tensor, " n"]:
-    """In front of the camera, opaque enough, and with a bounding box that holds a pixel center."""
+    """Return true for Gaussians beyond the near plane, opaque enough, and with a pixel center in their bounds."""
     opaque = splats.opacities > MIN_ALPHA
-    reach = (2 * (splats.opacities.clamp(min=MIN_ALPHA).log() - log(MIN_ALPHA))).sqrt().clamp(max=MAX_SIGMA)
-    extent = reach[:, None] * splats.covariances.diagonal(dim1=-2, dim2=-1).sqrt()
-    size = torch.tensor((width, height)).to(splats.centers)
-    on_screen = ((splats.centers + extent > 0.5) & (splats.centers - extent < size - 0.5)).all(-1)
-    finite = splats.centers.isfinite().all(-1) & torch.linalg.det(splats.covariances).isfinite()
+    radius = (2 * (splats.opacities.clamp(min=MIN_ALPHA).log() - log(MIN_ALPHA))).sqrt().clamp(max=MAX_SIGMA)
+    extent = radius[:, None] * splats.covars2d.diagonal(dim1=-2, dim2=-1).sqrt()
+    size = torch.tensor((width, height)).to(splats.means2d)
+    on_screen = ((splats.means2d + extent > 0.5) & (splats.means2d - extent < size - 0.5)).all(-1)
+    finite = splats.means2d.isfinite().all(-1) & torch.linalg.det(splats.covars2d).isfinite()
     return opaque & on_screen & finite & (splats.depths > NEAR)
 
 
 def _blend(pixels: Float[Tensor, "p 2"], splats: _Splats, background: Float[Tensor, " 3"]) -> Float[Tensor, "p 5"]:
-    """Color, alpha and depth at these places, from Gaussians in order of depth."""
-    (xx, xy), (_, yy) = splats.covariances.permute(1, 2, 0)
+    """Return color, alpha and depth of some pixels; the Gaussians are sorted by depth."""
+    (xx, xy), (_, yy) = splats.covars2d.permute(1, 2, 0)
     determinant = xx * yy - xy * xy
-    dx, dy = (pixels[:, None] - splats.centers).unbind(-1)
+    dx, dy = (pixels[:, None] - splats.means2d).unbind(-1)
     sigma = (0.5 * (yy * dx * dx + xx * dy * dy) - xy * dx * dy) / determinant
     alpha = (splats.opacities * (-sigma).exp()).clamp(max=MAX_ALPHA)
     alpha = torch.where(alpha >= MIN_ALPHA, alpha, 0)
-    with torch.no_grad():  # once at the limit always at the limit: the product of all never grows
+    with torch.no_grad():  # the product never grows, so a stopped pixel stays stopped
         blended = (1 - alpha).cumprod(-1) > MIN_TRANSMITTANCE
     alpha = torch.where(blended, alpha, 0)
-    passed = torch.cat((pixels.new_ones(len(pixels), 1), (1 - alpha).cumprod(-1)), -1)
-    weights, transmittance = alpha * passed[:, :-1], passed[:, -1:]
+    remaining = torch.cat((pixels.new_ones(len(pixels), 1), (1 - alpha).cumprod(-1)), -1)
+    weights, transmittance = alpha * remaining[:, :-1], remaining[:, -1:]
     color = weights @ splats.colors + transmittance * background
     return torch.cat((color, 1 - transmittance, weights @ splats.depths[:, None]), -1)

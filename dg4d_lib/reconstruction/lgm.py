@@ -1,8 +1,8 @@
-"""LGM: four views of an object to 65,536 Gaussians in one pass (Tang et al. 2024).
+"""LGM: feed-forward reconstruction of 65,536 Gaussians from four views of an object (Tang et al. 2024).
 
-LGM's world is ours (right-handed, y up, the first camera on +z, azimuth counter-clockwise from above, quaternions
-wxyz), except that its cameras stand at radius 1.5. Everything is scaled by 2 / 1.5 once, in `gaussians_of`: a picture
-taken from radius 2 then equals LGM's own from 1.5, because sizes and distances grow by the same factor.
+LGM uses our conventions (right-handed, y up, the first camera on +z, azimuth counter-clockwise from above, quaternions
+wxyz), but its cameras are at radius 1.5. `decode_gaussians` scales everything by 2 / 1.5 once: a render from radius 2
+then equals LGM's own from radius 1.5, because sizes and distances grow by the same factor.
 """
 
 import math
@@ -16,14 +16,14 @@ from torch.nn import functional
 
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.cameras.viewpoints import turntable
-from dg4d_lib.diffusion.parts import Placement
-from dg4d_lib.diffusion.published import load_network
+from dg4d_lib.diffusion.checkpoints import load_checkpoint
+from dg4d_lib.diffusion.components import Placement
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.reconstruction.alignment import best_azimuth
-from dg4d_lib.reconstruction.lgm_unet import VIEWS, Unet, UnetShape
+from dg4d_lib.reconstruction.lgm_unet import VIEWS, Unet, UnetConfig
 
 WEIGHTS_FILE = "model_fp16_fixrot.safetensors"
 LGM_RADIUS = 1.5  # of LGM's cameras
@@ -42,7 +42,7 @@ class Lgm(nn.Module):
         shape: of the U-Net.
     """
 
-    def __init__(self, shape: UnetShape) -> None:
+    def __init__(self, shape: UnetConfig) -> None:
         super().__init__()
         self.unet = Unet(INPUTS, OUTPUTS, shape)
         self.conv = nn.Conv2d(OUTPUTS, OUTPUTS, 1)
@@ -75,13 +75,13 @@ def ray_embedding(cameras: list[OrbitCamera]) -> Float[Tensor, "v 6 h w"]:
     seen = functional.normalize(torch.stack([right, down, torch.ones_like(right)], -1), dim=-1)
     embeddings = []
     for camera in cameras:
-        directions = seen @ camera.world_to_camera()[:3, :3]  # the transpose of a rotation takes the camera's axes back
+        directions = seen @ camera.viewmat()[:3, :3]  # the transpose of a rotation takes the camera's axes back
         origins = camera.position().expand_as(directions)
         embeddings.append(torch.cat([torch.linalg.cross(origins, directions), directions], -1))
     return torch.stack(embeddings).permute(0, 3, 1, 2)
 
 
-def gaussians_of(raw: Float[Tensor, "n 14"]) -> Gaussians:
+def decode_gaussians(raw: Float[Tensor, "n 14"]) -> Gaussians:
     """LGM's activations, in our world: positions within +-4/3, scale 0.1 softplus, color 0.5 tanh + 0.5."""
     means, opacity_logits, scales, quats, colors = raw.split((3, 1, 3, 4, 3), -1)
     return Gaussians(
@@ -89,7 +89,7 @@ def gaussians_of(raw: Float[Tensor, "n 14"]) -> Gaussians:
         (0.1 * functional.softplus(scales)).clamp(min=SMALLEST).log() + math.log(WORLD_SCALE),
         functional.normalize(quats, dim=-1),
         opacity_logits[:, 0],
-        harmonics_of_color(0.5 * colors.tanh() + 0.5),
+        rgb_to_sh(0.5 * colors.tanh() + 0.5),
     )
 
 
@@ -109,10 +109,10 @@ def reconstruct(
         rasterize: draws Gaussians that lie there.
     """
     size = views.shape[1]
-    first = visible(gaussians_of(model(views)))
+    first = visible(decode_gaussians(model(views)))
     camera = OrbitCamera(azimuth_deg=best_azimuth(first, picture, rasterize), width=size, height=size)
     aligned = rasterize(first, turntable(VIEWS, camera), torch.ones(3, device=first.means.device)).color
-    return visible(gaussians_of(model(aligned)))
+    return visible(decode_gaussians(model(aligned)))
 
 
 def visible(gaussians: Gaussians) -> Gaussians:
@@ -132,10 +132,10 @@ def load_lgm(path: Path, placement: Placement) -> Lgm:
         BadInput: no such file, a damaged one, or one with other tensors.
     """
     file = path / WEIGHTS_FILE if path.is_dir() else path
-    return load_network(lambda tensors: Lgm(shape_of(tensors)), file, placement)
+    return load_checkpoint(lambda tensors: Lgm(infer_unet_config(tensors)), file, placement)
 
 
-def shape_of(tensors: Mapping[str, Tensor]) -> UnetShape:
+def infer_unet_config(tensors: Mapping[str, Tensor]) -> UnetConfig:
     """The size of the network that these tensors belong to.
 
     Raises:
@@ -150,4 +150,4 @@ def shape_of(tensors: Mapping[str, Tensor]) -> UnetShape:
         attention[way] = tuple(f"{level}.attns.0.norm.weight" in tensors for level in levels)
     if not 1 <= len(channels["up"]) < len(channels["down"]):
         raise BadInput(f"these are no weights of LGM: levels down {channels['down']}, up {channels['up']}")
-    return UnetShape(channels["down"], attention["down"], channels["up"], attention["up"])
+    return UnetConfig(channels["down"], attention["down"], channels["up"], attention["up"])

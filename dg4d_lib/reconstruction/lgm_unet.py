@@ -18,7 +18,7 @@ SKIP_SCALE = 0.5**0.5  # keeps the variance of a sum of two
 
 
 @dataclass(frozen=True)
-class UnetShape:
+class UnetConfig:
     """Channels of every level, and which levels exchange what the views see; the defaults are the published "big".
 
     Attributes:
@@ -43,7 +43,7 @@ class Unet(nn.Module):
         shape: of the levels.
     """
 
-    def __init__(self, inputs: int, outputs: int, shape: UnetShape) -> None:
+    def __init__(self, inputs: int, outputs: int, shape: UnetConfig) -> None:
         super().__init__()
         down, up = shape.down_channels, shape.up_channels
         self.conv_in = nn.Conv2d(inputs, down[0], 3, padding=1)

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.errors import BadInput
-from dg4d_lib.kernels.vectors import INLINE, KERNEL
-from dg4d_lib.kernels.workers import run
+from dg4d_lib.kernels.simd import INLINE, KERNEL
+from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV
 
 CELL = (FAR - NEAR) / BINS  # depth of a cell, world units
@@ -111,13 +111,13 @@ def render_volumes(
 
     def draw(view: int) -> None:
         camera = cameras[view]
-        matrix = camera.world_to_camera().numpy()
+        matrix = camera.viewmat().numpy()
         axes = np.ascontiguousarray(matrix[:3, :3].T).astype(np.float32)  # columns: camera axes in the world
         place = (-matrix[:3, :3].T @ matrix[:3, 3]).astype(np.float32)
         volume = volumes[view]
         _march(volume.cells, volume.first, volume.free, volume.box, place, axes, np.float32(camera.focal), planes[view])
 
-    run([partial(draw, view) for view in range(len(cameras))])
+    run_parallel([partial(draw, view) for view in range(len(cameras))])
     pictures = torch.from_numpy(planes)
     return pictures[..., :3], pictures[..., 3:]
 

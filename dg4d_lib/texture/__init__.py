@@ -1,1 +1,1 @@
-"""Texture refinement."""
+"""Texture refinement with diffusion models."""

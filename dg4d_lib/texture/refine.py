@@ -1,11 +1,12 @@
-"""Textures follow better pictures of a moving mesh (paper section 3.4).
+"""Texture optimization against refined renders of a moving mesh (paper section 3.4).
 
-Every iteration looks at all frames twice: from the input view, where the driving video says how they look, and from a
-camera that goes round at constant speed, where a refiner says it. Colors are optimized as logits, the shape stays.
+Every iteration renders all frames twice: from the input view, where the target is the driving video, and from a camera
+that orbits at constant speed, where the target comes from a refiner. Colors are optimized as logits; the geometry is
+fixed.
 
-A mesh that is tracked through many frames may get a texture per frame: what a frame adds to the shared texture is
-optimized with it, as color and not as logit. Pictures are linear in colors, so the sum is read part by part, each with
-its own number of texels, and no frame ever needs a texture of full size.
+A tracked mesh may also get a residual texture per frame, which is added to the shared texture and optimized as color,
+not as logit. Rendering is linear in the colors, so both are sampled separately at their own resolutions and no frame
+needs a texture of full size.
 """
 
 import math
@@ -22,24 +23,23 @@ from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.images import resize
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.bake import vertex_normals
-from dg4d_lib.mesh_rasterizer.texture import Lookup, look_up, read
-from dg4d_lib.mesh_rasterizer.zbuffer import Fragments, rasterize_mesh
-from dg4d_lib.mesh_rasterizer.zbuffer import interpolate as spread
+from dg4d_lib.mesh_rasterizer.texture import TextureLookup, build_lookup, sample_texture
+from dg4d_lib.mesh_rasterizer.zbuffer import Fragments, interpolate, rasterize_mesh
 from dg4d_lib.settings import TextureSettings
 from dg4d_lib.texture.refiner import Refiner
 from dg4d_lib.video.driving import DrivingVideo
 
-DARKEST = 1 / 512  # colors are kept this far from 0 and 1, whose logits are infinite
-STEEPEST = 1 / 4  # slope of a color over its logit, at most: colors learn at so much of the logits' rate
+MARGIN = 1 / 512  # distance of colors from 0 and 1, whose logits are infinite
+MAX_SLOPE = 1 / 4  # maximum derivative of the sigmoid; ratio of the residuals' learning rate to that of the logits
 
 
 @dataclass(frozen=True)
 class MeshClip:
-    """Consecutive frames of one mesh with one texture: a tracked mesh is one stretch, a mesh per frame many.
+    """Consecutive frames of one mesh with one texture; a tracked mesh is one clip, a mesh per frame many.
 
     Attributes:
-        mesh: at rest.
-        offsets: added to its vertices in every frame, world units.
+        mesh: the mesh at rest.
+        offsets: added to its vertices at every frame, world units.
     """
 
     mesh: TexturedMesh
@@ -47,104 +47,117 @@ class MeshClip:
 
 
 @dataclass(frozen=True)
-class Refined:
-    """The colors of a stretch, in [0, 1].
+class RefinedTextures:
+    """Refined textures of a clip, in [0, 1].
 
     Attributes:
-        texture: for all of its frames; texels that no picture shows are as they were.
-        frames: for each of its frames, where they differ (`TextureSettings.frame_size`); smaller than `texture`.
+        texture: shared by all frames; texels that no render shows keep their values.
+        frame_textures: one per frame if `TextureSettings.frame_size` is set, smaller than `texture`.
     """
 
     texture: Float[Tensor, "h w 3"]
-    frames: Float[Tensor, "t i j 3"] | None = None
+    frame_textures: Float[Tensor, "t i j 3"] | None = None
 
 
 def refine_textures(
-    stretches: Sequence[MeshClip],
+    clips: Sequence[MeshClip],
     driving: DrivingVideo,
     refiner: Refiner,
     settings: TextureSettings,
     generator: torch.Generator,
     progress: Callable[[int, int, dict[str, float]], None] = lambda done, total, values: None,
-) -> list[Refined]:
-    """The textures of every stretch after the refinement.
+) -> list[RefinedTextures]:
+    """Refine the textures of all clips.
 
     Args:
-        stretches: the whole motion, in the order of time.
-        driving: what the input view sees, a frame per frame of the stretches; on their device.
-        refiner: makes videos of the mesh better.
-        settings: iterations, rate, sizes and the trajectory.
-        generator: of the trajectories and of the refiner's noise, on the processor.
-        progress: called with iterations done, their number, and the loss.
+        clips: the whole motion in temporal order.
+        driving: target of the input view, one frame per frame of the clips; on their device.
+        refiner: improves renders of the mesh.
+        settings: iterations, learning rate, sizes and trajectory.
+        generator: random numbers for the trajectories and the refiner's noise, on the CPU.
+        progress: called with finished iterations, all iterations, and the loss.
 
     Raises:
-        BadInput: another number of frames than the driving video has.
-        FitDiverged: the loss left the finite numbers.
+        BadInput: the clips and the driving video have different numbers of frames.
+        FitDiverged: the loss became NaN or infinite.
     """
-    frames = sum(len(stretch.offsets) for stretch in stretches)
+    frames = sum(len(clip.offsets) for clip in clips)
     if frames != len(driving):
-        raise BadInput(f"the mesh has {frames} frames and the driving video {len(driving)}; make them from one video")
+        raise BadInput(
+            f"the mesh has {frames} frames and the driving video has {len(driving)}; extract the mesh again from a "
+            "motion that was fitted to this video"
+        )
     front = OrbitCamera(width=settings.size, height=settings.size)
-    added = [_nothing_added(stretch, settings.frame_size) for stretch in stretches]
-    reference, drawn = _look(stretches, added, [front] * frames)
-    facing = _facing(stretches, drawn, [front] * frames, settings.min_cosine)
-    del drawn  # as large as the pictures
-    wanted = resize(driving.over(driving.frames.new_ones(3)), (settings.size, settings.size))
-    textures = [stretch.mesh.texture for stretch in stretches]
-    starts = [texture.clamp(DARKEST, 1 - DARKEST).logit() for texture in textures]
+    residuals = [_new_residual(clip, settings.frame_size) for clip in clips]
+    reference, fragments = _build_lookups(clips, residuals, [front] * frames)
+    facing = _facing(clips, fragments, [front] * frames, settings.min_cosine)
+    del fragments  # as large as the renders
+    ground_truth = resize(driving.over(driving.frames.new_ones(3)), (settings.size, settings.size))
+    textures = [clip.mesh.texture for clip in clips]
+    starts = [texture.clamp(MARGIN, 1 - MARGIN).logit() for texture in textures]
     logits = [start.clone().requires_grad_() for start in starts]
-    own = [colors for colors in added if colors is not None]
-    groups = [{"params": logits, "lr": settings.lr}, {"params": own, "lr": STEEPEST * settings.lr}]
-    adam = torch.optim.Adam(groups if own else groups[:1])
+    trained = [residual for residual in residuals if residual is not None]
+    groups = [{"params": logits, "lr": settings.lr}, {"params": trained, "lr": MAX_SLOPE * settings.lr}]
+    adam = torch.optim.Adam(groups if trained else groups[:1])
     for iteration in range(settings.iterations):
         colors = [logit.sigmoid() for logit in logits]
         if iteration % settings.refresh_every == 0:
             cameras = _trajectory(frames, settings, generator)
-            looks, _ = _look(stretches, added, cameras)
-            seen = _draw(colors, added, looks)
+            lookups, _ = _build_lookups(clips, residuals, cameras)
+            renders = _render(colors, residuals, lookups)
             done = iteration / max(1, settings.iterations - 1)
-            better = refiner.refine(seen.detach().clamp(0, 1), cameras, done, generator)
+            refined = refiner.refine(renders.detach().clamp(0, 1), cameras, done, generator)
         else:
-            seen = _draw(colors, added, looks)
-        known = ((_draw(colors, added, reference) - wanted) * facing).square().mean((1, 2, 3)).sum()
-        loss = known + (seen - better).square().mean() + settings.frame_weight * sum(map(_restlessness, own))
+            renders = _render(colors, residuals, lookups)
+        reference_loss = (
+            ((_render(colors, residuals, reference) - ground_truth) * facing).square().mean((1, 2, 3)).sum()
+        )
+        regularization = settings.frame_weight * sum(map(_regularization_loss, trained))
+        loss = reference_loss + (renders - refined).square().mean() + regularization
         value = loss.item()
         if not math.isfinite(value):
-            raise FitDiverged(f"textures: the loss is {value} in iteration {iteration}; lower refiner.texture.lr")
+            raise FitDiverged(
+                f"texture refinement: the loss is {value} in iteration {iteration}; lower refiner.texture.lr"
+            )
         adam.zero_grad()
         loss.backward()
         adam.step()
         progress(iteration + 1, settings.iterations, {"loss": value})
     ends = zip(textures, starts, (logit.detach() for logit in logits), strict=True)
     shared = [torch.where(logit == start, texture, logit.sigmoid()) for texture, start, logit in ends]
-    return [Refined(texture, _summed(texture, colors)) for texture, colors in zip(shared, added, strict=True)]
+    return [
+        RefinedTextures(texture, _frame_textures(texture, residual))
+        for texture, residual in zip(shared, residuals, strict=True)
+    ]
 
 
-def _nothing_added(stretch: MeshClip, size: int) -> Float[Tensor, "t i j 3"] | None:
-    """Where what every frame adds is kept: black, no larger than the texture; None where there is nothing to add."""
-    frames, texture = len(stretch.offsets), stretch.mesh.texture
+def _new_residual(clip: MeshClip, size: int) -> Float[Tensor, "t i j 3"] | None:
+    """Allocate residual textures of zeros, no larger than the texture; None for a single frame or `size` 0."""
+    frames, texture = len(clip.offsets), clip.mesh.texture
     if not size or frames == 1:
         return None
-    shrunk = min(1.0, size / max(texture.shape[:2]))
-    height, width = (max(1, round(side * shrunk)) for side in texture.shape[:2])
+    scale = min(1.0, size / max(texture.shape[:2]))
+    height, width = (max(1, round(side * scale)) for side in texture.shape[:2])
     return texture.new_zeros((frames, height, width, 3)).requires_grad_()
 
 
-def _restlessness(added: Float[Tensor, "t i j 3"]) -> Float[Tensor, ""]:
-    """How much frames add and how much that changes: mean squares, summed over frames as the pictures' errors are."""
-    size, change = added.square(), added.diff(dim=0).square()
+def _regularization_loss(residual: Float[Tensor, "t i j 3"]) -> Float[Tensor, ""]:
+    """Return mean squares of the residuals and of their change over time, summed over frames."""
+    size, change = residual.square(), residual.diff(dim=0).square()
     return size.mean((1, 2, 3)).sum() + change.mean((1, 2, 3)).sum()
 
 
-def _summed(texture: Float[Tensor, "h w 3"], added: Float[Tensor, "t i j 3"] | None) -> Float[Tensor, "t i j 3"] | None:
-    """The texture of every frame."""
-    if added is None:
+def _frame_textures(
+    texture: Float[Tensor, "h w 3"], residual: Float[Tensor, "t i j 3"] | None
+) -> Float[Tensor, "t i j 3"] | None:
+    """Add the residuals to the shared texture."""
+    if residual is None:
         return None
-    return (resize(texture[None], added.shape[1:3]) + added.detach()).clamp(0, 1)
+    return (resize(texture[None], residual.shape[1:3]) + residual.detach()).clamp(0, 1)
 
 
 def _trajectory(frames: int, settings: TextureSettings, generator: torch.Generator) -> list[OrbitCamera]:
-    """A camera per frame on the horizon, at constant speed from a random start."""
+    """Return a camera per frame on the horizon, orbiting at constant speed from a random azimuth."""
     start = 360 * float(torch.rand((), generator=generator)) - 180
     return [
         OrbitCamera(azimuth_deg=start + frame * settings.azimuth_step_deg, width=settings.size, height=settings.size)
@@ -153,71 +166,69 @@ def _trajectory(frames: int, settings: TextureSettings, generator: torch.Generat
 
 
 @dataclass(frozen=True)
-class _Look:
-    """Where the pixels of a stretch look: into the shared texture, and frame by frame into what its frames add."""
+class _ClipLookup:
+    """Texture lookups of a clip: into the shared texture, and into the residual of every frame."""
 
-    shared: Lookup
-    own: tuple[Lookup, ...]
+    shared: TextureLookup
+    residuals: tuple[TextureLookup, ...]
 
 
-def _look(
-    stretches: Sequence[MeshClip],
-    added: Sequence[Float[Tensor, "_ _ _ 3"] | None],
+def _build_lookups(
+    clips: Sequence[MeshClip],
+    residuals: Sequence[Float[Tensor, "_ _ _ 3"] | None],
     cameras: Sequence[OrbitCamera],
-) -> tuple[list[_Look], list[Fragments]]:
-    """Where the pixels of every frame look, and what was drawn for it."""
-    looks, drawn, first = [], [], 0
-    for stretch, colors in zip(stretches, added, strict=True):
-        mesh, moved = stretch.mesh, stretch.mesh.vertices + stretch.offsets
-        mine = cameras[first : first + len(moved)]
+) -> tuple[list[_ClipLookup], list[Fragments]]:
+    """Rasterize all clips, one camera per frame; return their texture lookups and fragments."""
+    lookups, all_fragments, first = [], [], 0
+    for clip, residual in zip(clips, residuals, strict=True):
+        mesh, moved = clip.mesh, clip.mesh.vertices + clip.offsets
+        views = cameras[first : first + len(moved)]
         first += len(moved)
-        fragments = rasterize_mesh(moved, mesh.faces, mine)
-        shared = look_up(moved, mesh.faces, mesh.uvs, mesh.texture.shape[:2], mine, fragments)
-        own = (
-            []
-            if colors is None
-            else [
-                look_up(moved[i], mesh.faces, mesh.uvs, colors.shape[1:3], mine[i : i + 1], _of_view(fragments, i))
-                for i in range(len(moved))
-            ]
-        )
-        looks.append(_Look(shared, tuple(own)))
-        drawn.append(fragments)
-    return looks, drawn
+        fragments = rasterize_mesh(moved, mesh.faces, views)
+        shared = build_lookup(moved, mesh.faces, mesh.uvs, mesh.texture.shape[:2], views, fragments)
+        per_frame = []
+        if residual is not None:
+            for i, view in enumerate(views):
+                fragment, size = _view_of(fragments, i), residual.shape[1:3]
+                per_frame.append(build_lookup(moved[i], mesh.faces, mesh.uvs, size, [view], fragment))
+        lookups.append(_ClipLookup(shared, tuple(per_frame)))
+        all_fragments.append(fragments)
+    return lookups, all_fragments
 
 
 def _facing(
-    stretches: Sequence[MeshClip], drawn: Sequence[Fragments], cameras: Sequence[OrbitCamera], min_cosine: float
+    clips: Sequence[MeshClip], all_fragments: Sequence[Fragments], cameras: Sequence[OrbitCamera], min_cosine: float
 ) -> Bool[Tensor, "t h w 1"]:
-    """Which pixels of every frame see the surface at a better cosine."""
-    places = torch.stack([camera.position() for camera in cameras])[:, None, None]
+    """Mark the pixels of every frame that show the surface at more than the minimum cosine."""
+    camera_centers = torch.stack([camera.position() for camera in cameras])[:, None, None]
     facing = []
-    for stretch, fragments in zip(stretches, drawn, strict=True):
-        faces, moved = stretch.mesh.faces, stretch.mesh.vertices + stretch.offsets
-        here, places = places[: len(moved)].to(moved), places[len(moved) :]
+    for clip, fragments in zip(clips, all_fragments, strict=True):
+        faces, moved = clip.mesh.faces, clip.mesh.vertices + clip.offsets
+        centers, camera_centers = camera_centers[: len(moved)].to(moved), camera_centers[len(moved) :]
         normals = torch.stack([vertex_normals(state, faces) for state in moved])
-        rays = normalize(here - spread(fragments, faces, moved), dim=-1)
-        cosines = (rays * normalize(spread(fragments, faces, normals), dim=-1)).sum(-1, keepdim=True)
+        rays = normalize(centers - interpolate(fragments, faces, moved), dim=-1)
+        cosines = (rays * normalize(interpolate(fragments, faces, normals), dim=-1)).sum(-1, keepdim=True)
         facing.append((fragments.faces >= 0)[..., None] & (cosines > min_cosine))
     return torch.cat(facing)
 
 
-def _of_view(fragments: Fragments, view: int) -> Fragments:
+def _view_of(fragments: Fragments, view: int) -> Fragments:
     return Fragments(*(getattr(fragments, field.name)[view : view + 1] for field in fields(fragments)))
 
 
-def _draw(
+def _render(
     textures: Sequence[Float[Tensor, "_ _ 3"]],
-    added: Sequence[Float[Tensor, "_ _ _ 3"] | None],
-    looks: Sequence[_Look],
+    residuals: Sequence[Float[Tensor, "_ _ _ 3"] | None],
+    lookups: Sequence[_ClipLookup],
 ) -> Float[Tensor, "t h w 3"]:
-    """All frames over white; differentiable in the textures and in what is added to them."""
-    pictures = []
-    for texture, colors, look in zip(textures, added, looks, strict=True):
-        covered, seen = look.shared.covered, read(texture, look.shared)
-        if colors is not None:
-            seen = seen + torch.cat([read(frame, own) for frame, own in zip(colors, look.own, strict=True)])
-        picture = texture.new_ones((*covered.shape, 3))
-        picture[covered] = seen
-        pictures.append(picture)
-    return torch.cat(pictures)
+    """Render all frames over white; differentiable in the textures and residuals."""
+    renders = []
+    for texture, residual, lookup in zip(textures, residuals, lookups, strict=True):
+        covered, colors = lookup.shared.covered, sample_texture(texture, lookup.shared)
+        if residual is not None:
+            frames = zip(residual, lookup.residuals, strict=True)
+            colors = colors + torch.cat([sample_texture(frame, own) for frame, own in frames])
+        render = texture.new_ones((*covered.shape, 3))
+        render[covered] = colors
+        renders.append(render)
+    return torch.cat(renders)

@@ -1,4 +1,4 @@
-"""What makes the pictures of a moving textured mesh better; the texture then follows them."""
+"""Refiners: image-to-image and video-to-video diffusion that improve renders of a moving textured mesh."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -12,7 +12,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.latents import decode_images, encode_images
 from dg4d_lib.diffusion.noise_schedule import add_noise, ddim_step, ddim_timesteps
 from dg4d_lib.diffusion.video_model import VideoModel, karras_sigmas, start_index
-from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.zero123 import ConditionedZero123
 from dg4d_lib.images import resize
 from dg4d_lib.settings import ImageToImageSettings, VideoToVideoSettings
@@ -20,7 +20,7 @@ from dg4d_lib.settings import ImageToImageSettings, VideoToVideoSettings
 
 @runtime_checkable
 class Refiner(Protocol):
-    """Pictures in, better pictures out."""
+    """Interface of models that improve rendered frames."""
 
     def refine(
         self,
@@ -29,27 +29,30 @@ class Refiner(Protocol):
         progress: float,
         generator: torch.Generator,
     ) -> Float[Tensor, "t h w 3"]:
-        """The same moments from the same viewpoints.
+        """Return improved frames with the same content and viewpoints.
 
         Args:
-            video: the mesh over white, in [0, 1], a picture per frame of the driving video.
-            cameras: of every picture.
-            progress: of the refinement, 0 in its first iteration and 1 in its last.
-            generator: of noise.
+            video: the mesh over white, in [0, 1], one image per frame of the driving video.
+            cameras: camera of every image.
+            progress: 0 in the first iteration of the texture optimization, 1 in the last.
+            generator: random numbers for the noise.
         """
         ...
 
 
 class VideoToVideo:
-    """Noises the video and denoises it with Stable Video Diffusion, which knows the input picture."""
+    """SDEdit-style refiner: adds noise to the video and denoises it with Stable Video Diffusion.
+
+    The model is conditioned on the input picture.
+    """
 
     def __init__(self, settings: VideoToVideoSettings, model: VideoModel, picture: Float[Tensor, "h w 3"]) -> None:
-        """Choose how much noise.
+        """Create the noise schedule.
 
         Args:
-            settings: share of the schedule that is used.
-            model: read from weights.
-            picture: the input over white, in [0, 1].
+            settings: number of steps and `strength`, the share of the schedule that is used.
+            model: Stable Video Diffusion, loaded.
+            picture: the input picture over white, in [0, 1].
         """
         self.model = model
         steps = settings.model.num_inference_steps
@@ -64,20 +67,20 @@ class VideoToVideo:
         generator: torch.Generator,
     ) -> Float[Tensor, "t h w 3"]:
         """The denoised video; viewpoints and progress do not matter."""
-        condition = self.model.look_at(resize(self._picture[None], video.shape[1:3])[0], [generator])
+        condition = self.model.encode_condition(resize(self._picture[None], video.shape[1:3])[0], [generator])
         latents = self.model.encode(video)[None]
-        noisy = latents + self.sigmas[0] * self.model.noise(latents.shape, [generator])
+        noisy = latents + self.sigmas[0] * self.model.sample_noise(latents.shape, [generator])
         return self.model.decode(self.model.denoise(noisy, condition, self.sigmas)[0]).to(video)
 
 
 class ImageToImage:
-    """Noises every picture on its own and denoises it with Zero-1-to-3, which knows its frame and its camera.
+    """SDEdit-style refiner: adds noise to every image and denoises it with Zero-1-to-3, given its frame and camera.
 
-    Less noise from iteration to iteration, as in DreamGaussian (Tang et al. 2024).
+    The strength decreases over the iterations, as in DreamGaussian (Tang et al. 2024).
     """
 
     def __init__(self, settings: ImageToImageSettings, prior: ConditionedZero123) -> None:
-        """Choose the schedule; `prior` is conditioned on the frames of the driving video."""
+        """Store the schedule and the prior, which must be conditioned on the frames of the driving video."""
         self.settings, self.prior = settings, prior
 
     @torch.no_grad()
@@ -88,22 +91,22 @@ class ImageToImage:
         progress: float,
         generator: torch.Generator,
     ) -> Float[Tensor, "t h w 3"]:
-        """The denoised pictures; they have the 256 pixels of Zero-1-to-3 and are enlarged."""
+        """Return the denoised images, upscaled from the 256 pixels of Zero-1-to-3."""
         settings, prior, scale = self.settings, self.prior, float(self.prior.vae.config.scaling_factor)
         strength = settings.strength_start + progress * (settings.strength_end - settings.strength_start)
         steps = settings.num_inference_steps
         timesteps = ddim_timesteps(steps)[start_index(steps, strength) :]
-        tokens = prior.tokens([View(camera, frame) for frame, camera in enumerate(cameras)])
+        tokens = prior.tokens([GuidanceView(camera, frame) for frame, camera in enumerate(cameras)])
         renders = video.to(prior.vae.device)
 
-        def denoised(piece: slice) -> Float[Tensor, "p h w 3"]:
-            latents = scale * encode_images(prior.vae, renders[piece])
-            latents = add_noise(latents, noise[piece].to(latents), timesteps[0])
-            for timestep, following in pairwise((*timesteps, 0)):
-                noise_pred = prior.predict_noise(latents, timestep, prior.latents[piece], tokens[piece])
-                latents = ddim_step(latents, noise_pred, timestep, following)
+        def denoise(batch: slice) -> Float[Tensor, "p h w 3"]:
+            latents = scale * encode_images(prior.vae, renders[batch])
+            latents = add_noise(latents, noise[batch].to(latents), timesteps[0])
+            for timestep, next_timestep in pairwise((*timesteps, 0)):
+                noise_pred = prior.predict_noise(latents, timestep, prior.latents[batch], tokens[batch])
+                latents = ddim_step(latents, noise_pred, timestep, next_timestep)
             images = decode_images(prior.vae, (latents / scale).to(prior.vae.dtype), latents.dtype)
             return resize(images, video.shape[1:3])
 
         noise = torch.randn((len(video), *prior.latents.shape[1:]), dtype=video.dtype, generator=generator)
-        return torch.cat(prior.batches.run(denoised, len(renders))).to(video)
+        return torch.cat(prior.batches.run(denoise, len(renders))).to(video)

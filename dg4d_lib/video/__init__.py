@@ -1,1 +1,1 @@
-"""Subjects, driving videos and what generates them."""
+"""Subject matting and framing, driving videos and their generators."""

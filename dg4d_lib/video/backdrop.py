@@ -1,7 +1,8 @@
-"""Subjects before a plain backdrop: one smooth model of the backdrop for all frames, and a flood from the border.
+"""Segmentation before a plain backdrop: a smooth color model for all frames, and a flood fill from the border.
 
-The backdrop's color is a low polynomial in x and y, fitted robustly to the border, so gradients and vignettes are plain
-too and a subject may touch the border. What the flood reaches from the border is backdrop; soft shadows on it are too.
+The backdrop's color is a low-degree polynomial in x and y, fitted robustly to the border, so gradients and vignettes
+count as plain and the subject may touch the border. Pixels that the flood fill reaches are backdrop, including soft
+shadows.
 """
 
 from dataclasses import dataclass
@@ -11,31 +12,31 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy import ndimage
 
-BORDER = 0.02  # of the longest side: width of the ring on which the backdrop is learned
-BORDER_DEGREE = 2  # of the polynomial that the border can support
-FLOODED_DEGREE = 4  # and the whole backdrop
-PLAIN_SHARE = 0.6  # of the ring that must agree with the model
-PLAIN_SPREAD = 6.0  # Lab units: above it the ring is no plain backdrop
-EVEN_SPREAD = 2.4  # Lab units: below are studio backdrops with noise of cameras and of JPEG, above also skies
-EVEN_SHARE = 0.9  # of the ring: above it, a backdrop may vary more
-TOLERANCE = (5.0, 14.0)  # Lab units: least and most difference that is still backdrop
-SPREADS = 4.0  # tolerance in spreads of the ring
-SHADOW_DROP = 35.0  # lightness by which a shadow may darken the backdrop
-SHADOW_SLOPE = 1.6  # lightness per pixel: shadows fade, outlines do not
-SHADOW_MOST = 0.4  # of the subject that may turn out to be shadow; more is a pale subject
-HOLE = 0.0006  # of the subject: a smaller spot of the backdrop's color in it is a highlight, not a gap between limbs
-SAMPLES = 20000  # pixels that a fit looks at
+BORDER = 0.02  # width of the ring that the model is fitted to, as a share of the longest side
+BORDER_DEGREE = 2  # degree of the polynomial fitted to the ring
+FLOODED_DEGREE = 4  # degree of the polynomial fitted to the whole backdrop
+PLAIN_SHARE = 0.6  # minimum share of the ring that agrees with the model of a plain backdrop
+PLAIN_SPREAD = 6.0  # maximum spread of a plain backdrop, Lab units
+EVEN_SPREAD = 2.4  # Lab units; studio backdrops with camera and JPEG noise are below, skies can be above
+EVEN_SHARE = 0.9  # share of agreement from which a backdrop counts as even at any spread
+TOLERANCE = (5.0, 14.0)  # minimum and maximum color tolerance, Lab units
+SPREADS = 4.0  # tolerance in units of the spread
+SHADOW_DROP = 35.0  # maximum darkening by a shadow, L* units
+SHADOW_SLOPE = 1.6  # maximum lightness gradient of a shadow, L* per pixel; outlines are steeper
+MAX_SHADOW = 0.4  # maximum share of the foreground that may be shadow; beyond, it is a pale subject
+HOLE = 0.0006  # share of the subject; smaller spots of the backdrop's color are highlights, not gaps between limbs
+SAMPLES = 20000  # pixels per fit
 
 
 @dataclass(frozen=True)
 class Backdrop:
-    """A smooth color over the frame.
+    """Polynomial color model of a backdrop.
 
     Attributes:
-        weights: of the monomials x^i y^j, i + j <= degree, per Lab channel; x and y run over [-1, 1].
+        weights: of the monomials x^i y^j, i + j <= degree, per Lab channel; x and y in [-1, 1].
         degree: of the polynomial.
-        spread: robust standard deviation of what it was fitted to, Lab units.
-        share: of the border that agrees with it.
+        spread: robust standard deviation of the residual, Lab units.
+        share: share of the border that agrees with the model.
     """
 
     weights: Float[ndarray, "k 3"]
@@ -45,21 +46,21 @@ class Backdrop:
 
     @property
     def is_plain(self) -> bool:
-        """True if the border is explained well enough to call everything like it backdrop."""
+        """True if the border is plain enough for segmentation by color."""
         return self.share >= PLAIN_SHARE and self.spread <= PLAIN_SPREAD
 
     @property
     def is_even(self) -> bool:
-        """True if the border is explained so well that the cut-out is more than a guess."""
+        """True if the border is so even that the segmentation is reliable."""
         return self.is_plain and (self.spread <= EVEN_SPREAD or self.share >= EVEN_SHARE)
 
     @property
     def tolerance(self) -> float:
-        """Difference in Lab below which a pixel is backdrop."""
+        """Color difference in Lab units below which a pixel is backdrop."""
         return float(np.clip(SPREADS * self.spread, *TOLERANCE))
 
     def color(self, height: int, width: int) -> Float[ndarray, "h w 3"]:
-        """The backdrop without a subject, Lab."""
+        """Evaluate the model at all pixels, Lab."""
         powers = np.arange(self.degree + 1)
         x, y = (np.linspace(-1, 1, side)[:, None] ** powers for side in (width, height))
         terms = np.zeros((self.degree + 1, self.degree + 1, 3))  # power of y, power of x
@@ -69,7 +70,7 @@ class Backdrop:
 
 
 def fit_backdrop(lab: Float[ndarray, "t h w 3"]) -> Backdrop:
-    """The backdrop that the borders of all frames have in common."""
+    """Fit a common backdrop to the borders of all frames."""
     ring = border_ring(*lab.shape[1:3])
     border = np.broadcast_to(ring, lab.shape[:3])
     first = _fit(lab, border, BORDER_DEGREE, border)
@@ -84,13 +85,13 @@ def fit_backdrop(lab: Float[ndarray, "t h w 3"]) -> Backdrop:
 
 
 def cut_out(lab: Float[ndarray, "t h w 3"], backdrop: Backdrop) -> Bool[ndarray, "t h w"]:
-    """Everything the flood does not reach, without shadows and with its small holes filled."""
+    """Segment the subject: pixels that the flood fill does not reach, without shadows, small holes filled."""
     color = backdrop.color(*lab.shape[1:3])
     return np.stack([_subject(frame - color, backdrop) for frame in lab])
 
 
 def border_ring(height: int, width: int) -> Bool[ndarray, "h w"]:
-    """The pixels along the edge of a frame."""
+    """Mark the pixels along the edge of a frame."""
     margin = max(2, round(BORDER * max(height, width)))
     ring = np.ones((height, width), bool)
     ring[margin : height - margin, margin : width - margin] = False
@@ -100,7 +101,7 @@ def border_ring(height: int, width: int) -> Bool[ndarray, "h w"]:
 def _subject(difference: Float[ndarray, "h w 3"], backdrop: Backdrop) -> Bool[ndarray, "h w"]:
     tight = ~_flood(difference, backdrop)
     loose = ~_flood(difference, backdrop, shadows=True)
-    subject = loose if loose.sum() > (1 - SHADOW_MOST) * tight.sum() else tight
+    subject = loose if loose.sum() > (1 - MAX_SHADOW) * tight.sum() else tight
     filled = ndimage.binary_fill_holes(subject)
     like_backdrop = np.linalg.norm(difference, axis=-1) < 0.7 * backdrop.tolerance
     enclosed, count = ndimage.label(filled & (like_backdrop | ~subject))
@@ -110,7 +111,7 @@ def _subject(difference: Float[ndarray, "h w 3"], backdrop: Backdrop) -> Bool[nd
 
 
 def _flood(difference: Float[ndarray, "h w 3"], backdrop: Backdrop, shadows: bool = False) -> Bool[ndarray, "h w"]:
-    """What is like the backdrop and reached from the border through gaps of three pixels or more."""
+    """Mark pixels of the backdrop's color that connect to the border through gaps of at least three pixels."""
     like = np.linalg.norm(difference, axis=-1) < backdrop.tolerance
     if shadows:
         slope = ndimage.gaussian_gradient_magnitude(difference[..., 0], 1.0)
@@ -127,7 +128,7 @@ def _flood(difference: Float[ndarray, "h w 3"], backdrop: Backdrop, shadows: boo
 def _fit(
     lab: Float[ndarray, "t h w 3"], where: Bool[ndarray, "t h w"], degree: int, border: Bool[ndarray, "t h w"]
 ) -> Backdrop:
-    """Reweighted least squares with Cauchy weights, growing from a constant so that outliers cannot lead."""
+    """Fit by iteratively reweighted least squares (Cauchy weights), raising the degree from 0 to resist outliers."""
     colors, design = _sample(lab, where, degree)
     weights = np.zeros((design.shape[1], 3))
     weights[0] = np.median(colors, axis=0)
@@ -135,9 +136,8 @@ def _fit(
     for order in (0, 1, *(degree,) * 8):
         terms = (order + 1) * (order + 2) // 2
         residual = np.linalg.norm(colors - design @ weights, axis=1)
-        spread = max(
-            0.5, 1.4826 * float(np.median(residual)) / 1.5382
-        )  # of a norm of three: its median is 1.5382 sigma
+        # The median norm of three normal variables is 1.5382 sigma.
+        spread = max(0.5, 1.4826 * float(np.median(residual)) / 1.5382)
         trust = 1 / (1 + (residual / (2 * spread)) ** 2)
         weights = np.zeros_like(weights)
         weighted = design[:, :terms] * trust[:, None]
@@ -152,20 +152,20 @@ def _fit(
 def _sample(
     lab: Float[ndarray, "t h w 3"], where: Bool[ndarray, "t h w"], degree: int
 ) -> tuple[Float[ndarray, "s 3"], Float[ndarray, "s k"]]:
-    """Colors and monomials at an even choice of the marked pixels."""
+    """Return colors and monomials at an evenly spaced subset of the marked pixels."""
     height, width = lab.shape[1:3]
     times, rows, columns = np.nonzero(where)
-    choice = np.arange(0, len(times), max(1, len(times) // SAMPLES))
-    times, rows, columns = times[choice], rows[choice], columns[choice]
+    subset = np.arange(0, len(times), max(1, len(times) // SAMPLES))
+    times, rows, columns = times[subset], rows[subset], columns[subset]
     return lab[times, rows, columns].astype(np.float64), _monomials(rows, columns, height, width, degree)
 
 
 def _monomials(rows: ndarray, columns: ndarray, height: int, width: int, degree: int) -> Float[ndarray, "p k"]:
-    """1, x, y, x^2, xy, y^2 and so on, lower degrees first; x and y run over [-1, 1]."""
+    """Evaluate the monomials 1, x, y, x^2, xy, y^2, ... at pixels, lower degrees first; x and y in [-1, 1]."""
     x, y = 2 * columns / (width - 1) - 1, 2 * rows / (height - 1) - 1
     return np.stack([x**i * y**j for i, j in _exponents(degree)], 1)
 
 
 def _exponents(degree: int) -> list[tuple[int, int]]:
-    """Powers of x and y of every monomial, lower degrees first."""
+    """List the powers of x and y of every monomial, lower degrees first."""
     return [(order - j, j) for order in range(degree + 1) for j in range(order + 1)]

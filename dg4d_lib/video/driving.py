@@ -1,4 +1,4 @@
-"""Driving video: the subject over time from the input view."""
+"""Driving video: frames of the subject from the input view."""
 
 from dataclasses import dataclass
 
@@ -11,16 +11,16 @@ from dg4d_lib.images import over_background
 
 @dataclass(frozen=True)
 class DrivingVideo:
-    """Cut-out frames.
+    """Cut-out frames of the subject.
 
     Attributes:
-        frames: straight color in [0, 1] (undefined where coverage is 0).
-        coverage: alpha in [0, 1].
+        frames: straight color in [0, 1], undefined where alpha is 0.
+        alpha: opacity in [0, 1].
         fps: frames per second.
     """
 
     frames: Float[Tensor, "t h w 3"]
-    coverage: Float[Tensor, "t h w 1"]
+    alpha: Float[Tensor, "t h w 1"]
     fps: float
 
     def __len__(self) -> int:
@@ -28,9 +28,9 @@ class DrivingVideo:
 
     @property
     def times(self) -> Float[Tensor, " t"]:
-        """0 is the first frame, 1 the last, both included."""
+        """Timestamps of the frames in [0, 1]; the first is 0, the last 1."""
         return torch.linspace(0, 1, len(self), device=self.frames.device)
 
     def over(self, background: Float[Tensor, " 3"]) -> Float[Tensor, "t h w 3"]:
         """Composite the frames over one color."""
-        return over_background(self.frames, self.coverage, background)
+        return over_background(self.frames, self.alpha, background)

@@ -1,7 +1,7 @@
-"""A cut-out picture on a sheet of rubber: a grid of nodes that may be moved, and the picture drawn on the moved grid.
+"""Image warping with a triangle grid over a cut-out picture.
 
-Every pixel looks up where it came from in the picture, so edges come from the picture's own alpha, never from the grid,
-and soft hair stays soft.
+Every output pixel looks up its source position in the picture, so edges come from the picture's alpha, not from the
+grid, and soft edges such as hair stay soft.
 """
 
 import math
@@ -16,29 +16,29 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.inflation.mask import subject_mask
 from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
 
-CELLS = 64  # of the grid along the picture's height
+CELLS = 64  # grid cells along the picture's height
 SMALLEST_CELL = 3  # pixels
-FAINT = 0.02  # alpha above which a pixel is on the sheet
-MARGIN = 4  # pixels of sheet around them
-OFF_CENTER = 1e-3  # pixels: keeps the grid's edges off the pixel centers
-BORDER = 8  # pixels by which the picture is continued for the splines
-TRANSPARENT, OPAQUE = 2 / 255, 253 / 255  # alpha beyond is rounded: splines ring
-TORN = 1.6  # times its length at rest, or the inverse: such a side only bridges a gap
-FOOT = 0.08  # of the height: the lowest part, whose middle the subject stands on
+FAINT = 0.02  # alpha above which the grid covers a pixel
+MARGIN = 4  # width of the grid's margin around these pixels, pixels
+OFF_CENTER = 1e-3  # shift that keeps the grid's edges off the pixel centers, pixels
+BORDER = 8  # edge padding for spline interpolation, pixels
+TRANSPARENT, OPAQUE = 2 / 255, 253 / 255  # alpha outside is rounded to 0 or 1, because splines ring
+TORN = 1.6  # ratio of a side to its rest length, or inverse, beyond which the triangle only bridges a gap
+FOOT = 0.08  # height of the feet relative to the subject; their mean x is the standing point
 
 
 @dataclass(frozen=True)
-class Body:
-    """Where the subject stands in its picture, pixels, x to the right and y down.
+class SubjectBounds:
+    """Bounding box and standing point of the subject, pixels, x right and y down.
 
     Attributes:
-        left: of the subject.
-        right: of the subject.
-        top: of the subject.
-        bottom: of the subject, where the feet are.
-        middle: mean x.
+        left: left edge.
+        right: right edge.
+        top: upper edge.
+        bottom: lower edge, at the feet.
+        middle: mean x of the subject.
         foot: mean x of the feet.
-        cropped: whether the picture's lower border cuts the subject off.
+        cropped: True if the subject is cut off at the lower border of the picture.
     """
 
     left: float
@@ -51,78 +51,78 @@ class Body:
 
     @property
     def height(self) -> float:
-        """From the feet to the top."""
+        """Height of the bounding box, pixels."""
         return self.bottom - self.top
 
     @property
     def width(self) -> float:
-        """From the left to the right."""
+        """Width of the bounding box, pixels."""
         return self.right - self.left
 
 
 class Puppet:
-    """The grid at rest and the picture on it.
+    """Triangle grid over a picture, for drawing it deformed.
 
     Attributes:
         mask: the subject's pixels.
-        body: where it stands.
+        bounds: bounding box and standing point of the subject.
         nodes: x and y at rest, pixels.
         triangles: indices into the nodes; the two halves of cell i are i and i + half of their number.
-        cell: pixels between nodes.
+        cell: distance of nodes, pixels.
     """
 
     def __init__(self, picture: Float64[np.ndarray, "h w 4"]) -> None:
-        """Lay the grid over a picture (straight alpha, in [0, 1]).
+        """Build the grid over a picture (straight alpha, in [0, 1]).
 
         Raises:
             BadInput: the picture shows no subject.
         """
         alpha = picture[..., 3:]
         self.mask, _ = subject_mask(picture[..., 3])
-        self.body = _measure(self.mask)
+        self.bounds = _measure(self.mask)
         self.cell = max(SMALLEST_CELL, picture.shape[0] // CELLS)
-        self.nodes, self.triangles = _lay_grid(picture[..., 3] > FAINT, self.cell)
+        self.nodes, self.triangles = _build_grid(picture[..., 3] > FAINT, self.cell)
         premultiplied = np.concatenate([picture[..., :3] * alpha, alpha], -1)
-        continued = np.pad(premultiplied, ((BORDER, BORDER), (BORDER, BORDER), (0, 0)), mode="edge")
-        self._splines = [ndimage.spline_filter(plane, 3) for plane in np.moveaxis(continued, -1, 0)]
+        padded = np.pad(premultiplied, ((BORDER, BORDER), (BORDER, BORDER), (0, 0)), mode="edge")
+        self._splines = [ndimage.spline_filter(plane, 3) for plane in np.moveaxis(padded, -1, 0)]
 
     def edges(self) -> Int64[np.ndarray, "e 2"]:
-        """Every side of a triangle once."""
+        """Return every edge of the grid once."""
         sides = np.concatenate([self.triangles[:, [0, 1]], self.triangles[:, [1, 2]], self.triangles[:, [2, 0]]])
         return np.unique(np.sort(sides, 1), axis=0)
 
     def draw(
-        self, places: Float64[np.ndarray, "n 2"], in_front: Bool[np.ndarray, " n"] | None = None
+        self, positions: Float64[np.ndarray, "n 2"], in_front: Bool[np.ndarray, " n"] | None = None
     ) -> Float64[np.ndarray, "h w 4"]:
-        """The picture with its nodes moved.
+        """Draw the picture with moved nodes.
 
         Args:
-            places: where the nodes went, pixels.
-            in_front: cells whose nodes are all marked are drawn over the others.
+            positions: of the moved nodes, pixels.
+            in_front: marks nodes; cells with all nodes marked are drawn over the others.
 
         Returns:
-            Straight alpha, in [0, 1]; color 0 where alpha is 0.
+            Image with straight alpha, in [0, 1]; color 0 where alpha is 0.
         """
         if in_front is None:
-            return self._draw_layer(places, self.triangles)
+            return self._draw_layer(positions, self.triangles)
         first, second = in_front[self.triangles].all(1).reshape(2, -1)
         upper = np.tile(first & second, 2)
-        below = self._draw_layer(places, self.triangles[~upper])
-        above = self._draw_layer(places, self.triangles[upper])
+        below = self._draw_layer(positions, self.triangles[~upper])
+        above = self._draw_layer(positions, self.triangles[upper])
         share, rest = above[..., 3:], below[..., 3:] * (1 - above[..., 3:])
         color = (above[..., :3] * share + below[..., :3] * rest) / np.maximum(share + rest, 1e-6)
         return np.concatenate([color, share + rest], -1)
 
     def _draw_layer(
-        self, places: Float64[np.ndarray, "n 2"], triangles: Int64[np.ndarray, "f 3"]
+        self, positions: Float64[np.ndarray, "n 2"], triangles: Int64[np.ndarray, "f 3"]
     ) -> Float64[np.ndarray, "h w 4"]:
         height, width = self.mask.shape
         result = np.zeros((height, width, 4))
         camera = OrbitCamera(width=width, height=height)
-        pixel = camera.radius / camera.focal  # a flat sheet at the camera's distance: space is picture
-        flat = (places - np.array([width, height]) / 2) * np.array([pixel, -pixel])
+        pixel = camera.radius / camera.focal  # size of a pixel in the plane through the origin, world units
+        flat = (positions - np.array([width, height]) / 2) * np.array([pixel, -pixel])
         vertices = torch.from_numpy(np.pad(flat, ((0, 0), (0, 1))))
-        torn = self._torn(places, triangles)  # a gap between two parts: whatever else is there hides it
+        torn = self._torn(positions, triangles)  # drawn last, so that all other triangles hide them
         faces = torch.from_numpy(np.concatenate([triangles[~torn], triangles[torn]]))
         fragments = rasterize_mesh(vertices, faces, [camera])
         source = interpolate(fragments, faces, torch.from_numpy(self.nodes))[0].numpy()
@@ -135,20 +135,22 @@ class Puppet:
         result[covered] = np.column_stack([straight, alpha])
         return result
 
-    def _torn(self, places: Float64[np.ndarray, "n 2"], triangles: Int64[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
-        """Which triangles are turned over, or have a side that is much longer or shorter than at rest."""
-        corners, rest = places[triangles], self.nodes[triangles]
+    def _torn(
+        self, positions: Float64[np.ndarray, "n 2"], triangles: Int64[np.ndarray, "f 3"]
+    ) -> Bool[np.ndarray, " f"]:
+        """Mark triangles that are flipped, or have a side much longer or shorter than at rest."""
+        corners, rest = positions[triangles], self.nodes[triangles]
         sides, resting = corners - np.roll(corners, 1, 1), rest - np.roll(rest, 1, 1)
         stretch = np.linalg.norm(sides, axis=-1) / np.linalg.norm(resting, axis=-1)
         area = sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]  # positive at rest: rows point down
         return (area <= 0) | (stretch > TORN).any(1) | (stretch < 1 / TORN).any(1)
 
 
-def _measure(mask: Bool[np.ndarray, "h w"]) -> Body:
+def _measure(mask: Bool[np.ndarray, "h w"]) -> SubjectBounds:
     rows, columns = np.nonzero(mask)
     top, bottom = float(rows.min()), float(rows.max() + 1)
     feet = columns[rows >= bottom - max(FOOT * (bottom - top), 1)]
-    return Body(
+    return SubjectBounds(
         left=float(columns.min()),
         right=float(columns.max() + 1),
         top=top,
@@ -159,12 +161,14 @@ def _measure(mask: Bool[np.ndarray, "h w"]) -> Body:
     )
 
 
-def _lay_grid(drawn: Bool[np.ndarray, "h w"], cell: int) -> tuple[Float64[np.ndarray, "n 2"], Int64[np.ndarray, "f 3"]]:
-    """Nodes and triangles of the cells that touch the picture or its margin."""
-    near = ndimage.binary_dilation(drawn, iterations=MARGIN)
-    down, across = math.ceil(drawn.shape[0] / cell), math.ceil(drawn.shape[1] / cell)
+def _build_grid(
+    visible: Bool[np.ndarray, "h w"], cell: int
+) -> tuple[Float64[np.ndarray, "n 2"], Int64[np.ndarray, "f 3"]]:
+    """Return nodes and triangles of the cells that touch visible pixels or the margin around them."""
+    near = ndimage.binary_dilation(visible, iterations=MARGIN)
+    down, across = math.ceil(visible.shape[0] / cell), math.ceil(visible.shape[1] / cell)
     padded = np.zeros((down * cell, across * cell), bool)
-    padded[: drawn.shape[0], : drawn.shape[1]] = near
+    padded[: visible.shape[0], : visible.shape[1]] = near
     used = padded.reshape(down, cell, across, cell).any((1, 3))
     touched = np.zeros((down + 1, across + 1), bool)
     for dy in (0, 1):

@@ -1,9 +1,9 @@
-"""Subjects in photographs, without learned weights: what does not belong to the border, sharpened by color models.
+"""Segmentation of the subject of photographs by saliency and color models, without learned weights.
 
-First guess: boundary connectivity of superpixels and background-weighted contrast (Zhu, Liang, Wei and Sun 2014,
-"Saliency Optimization from Robust Background Detection"). Then, as in GrabCut (Rother et al. 2004), Gaussian mixtures
-of both sides and a smoothness that stops at edges; the cut is relaxed to a random walk with priors (Grady 2005), a
-linear system.
+The initial estimate uses boundary connectivity of superpixels and background-weighted contrast (Zhu, Liang, Wei and Sun
+2014, "Saliency Optimization from Robust Background Detection"). It is refined as in GrabCut (Rother et al. 2004) by
+Gaussian mixtures of foreground and background with an edge-aware smoothness term; the graph cut is relaxed to a random
+walk with priors (Grady 2005), which is a linear system.
 """
 
 from dataclasses import dataclass
@@ -18,29 +18,29 @@ from skimage.segmentation import slic
 
 SUPERPIXELS = 250
 COMPACTNESS = 15.0  # of superpixels, Lab units
-SAME_COLOR = 4.0  # Lab units: a step below it costs nothing on a path to the border
-GEODESIC = 10.0  # Lab units: reach of a region along such paths (sigma_clr of the paper)
-NEIGHBORHOOD = 0.4  # of the frame: reach of contrast (sigma_spa of the paper)
-CENTER = 0.45  # of the half frame: how far from the middle a photograph's subject is expected, standard deviation
-MIXTURE = 5  # Gaussians of a color model, as in GrabCut
-ROUNDS = 3  # of color models and cuts in turn
-SMOOTHNESS = 6.0  # weight of the edges of the pixel grid against the color models
-PRIOR = 0.6  # weight of the first guess in log odds; the rest is color
-SURE = 4.0  # log odds beyond which color does not get more certain
-SAMPLES = 8000  # pixels a mixture is fitted to
+SAME_COLOR = 4.0  # color step that costs nothing on a path to the border, Lab units
+GEODESIC = 10.0  # sigma_clr of the paper, the reach of a region along such paths, Lab units
+NEIGHBORHOOD = 0.4  # sigma_spa of the paper, the reach of contrast, as a share of the frame
+CENTER = 0.45  # standard deviation of the subject's position around the center, in half frames
+MIXTURE = 5  # Gaussians per color model, as in GrabCut
+ROUNDS = 3  # alternations of color models and segmentation
+SMOOTHNESS = 6.0  # weight of the pixel grid's edges relative to the color models
+PRIOR = 0.6  # weight of the initial estimate in the log odds; the rest is color
+MAX_LOG_ODDS = 4.0  # bound of the color models' log odds
+SAMPLES = 8000  # pixels per mixture fit
 EM_STEPS = 12
-GRAIN = 2.0  # Lab units squared: the least variance of a Gaussian
+MIN_VARIANCE = 2.0  # of a Gaussian, squared Lab units
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Gaussians in Lab.
+    """Gaussian mixture in Lab.
 
     Attributes:
-        shares: their weights, with sum 1.
-        means: their centers.
+        shares: mixture weights, sum 1.
+        means: centers.
         roots: R with R R^T the inverse of the covariance.
-        log_norms: logarithm of the density at the center.
+        log_norms: log density at the center.
     """
 
     shares: Float[ndarray, " k"]
@@ -49,23 +49,22 @@ class Mixture:
     log_norms: Float[ndarray, " k"]
 
     def log_density(self, colors: Float[ndarray, "p 3"]) -> Float[ndarray, " p"]:
-        """Natural logarithm of the density at these colors."""
+        """Return the log density at colors."""
         return np.logaddexp.reduce(self.log_joint(colors), axis=1)
 
     def log_joint(self, colors: Float[ndarray, "p 3"]) -> Float[ndarray, "p k"]:
-        """Log of share times density, for every Gaussian."""
+        """Return the log of share times density for every Gaussian."""
         distances = [(((colors - mean) @ root) ** 2).sum(1) for mean, root in zip(self.means, self.roots, strict=True)]
         return np.log(self.shares) + self.log_norms - 0.5 * np.stack(distances, 1)
 
 
 @dataclass(frozen=True)
 class Segmentation:
-    """The result for every frame.
+    """Segmentation of all frames.
 
     Attributes:
-        likelihood: of belonging to the subject, in [0, 1].
-        separation: chance that a pixel of the subject looks more like the subject's colors than one of the background;
-            0.5 means that colors tell nothing.
+        likelihood: probability that a pixel belongs to the subject, in [0, 1].
+        separation: area under the ROC curve of the color models; 0.5 means that colors carry no information.
     """
 
     likelihood: Float[ndarray, "t h w"]
@@ -73,22 +72,22 @@ class Segmentation:
 
 
 def segment(lab: Float[ndarray, "t h w 3"]) -> Segmentation:
-    """Tell the subject from the background, with one pair of color models for all frames."""
-    guess = np.stack([first_guess(frame) for frame in lab])
-    likelihood = guess
+    """Segment subject and background, with one pair of color models for all frames."""
+    initial = np.stack([estimate_saliency(frame) for frame in lab])
+    likelihood = initial
     colors = lab.reshape(-1, 3).astype(np.float64)
     odds = np.zeros(len(colors))
     for _ in range(ROUNDS):
         flat = likelihood.reshape(-1)
         front, back = fit_mixture(colors, flat**2), fit_mixture(colors, (1 - flat) ** 2)
-        odds = np.clip(front.log_density(colors) - back.log_density(colors), -SURE, SURE)
-        belief = PRIOR * _logit(guess) + (1 - PRIOR) * odds.reshape(guess.shape)
-        likelihood = np.stack([random_walk(frame, _sigmoid(b)) for frame, b in zip(lab, belief, strict=True)])
+        odds = np.clip(front.log_density(colors) - back.log_density(colors), -MAX_LOG_ODDS, MAX_LOG_ODDS)
+        logits = PRIOR * _logit(initial) + (1 - PRIOR) * odds.reshape(initial.shape)
+        likelihood = np.stack([random_walk(frame, _sigmoid(x)) for frame, x in zip(lab, logits, strict=True)])
     return Segmentation(likelihood, _separation(odds, likelihood.reshape(-1) > 0.5))
 
 
-def first_guess(lab: Float[ndarray, "h w 3"]) -> Float[ndarray, "h w"]:
-    """How much every pixel stands out from what is connected to the border, in [0, 1]."""
+def estimate_saliency(lab: Float[ndarray, "h w 3"]) -> Float[ndarray, "h w"]:
+    """Estimate how much every pixel stands out from the regions connected to the border, in [0, 1]."""
     labels = np.unique(slic(lab, SUPERPIXELS, COMPACTNESS, convert2lab=False, channel_axis=-1), return_inverse=True)[1]
     labels = labels.reshape(lab.shape[:2])
     regions = int(labels.max()) + 1
@@ -113,9 +112,9 @@ def first_guess(lab: Float[ndarray, "h w 3"]) -> Float[ndarray, "h w"]:
 
 
 def fit_mixture(colors: Float[ndarray, "p 3"], weights: Float[ndarray, " p"]) -> Mixture:
-    """Weighted expectation maximization, started by splitting along the widest axis; no randomness."""
-    choice = np.arange(0, len(colors), max(1, len(colors) // SAMPLES))
-    colors, weights = colors[choice], weights[choice] + 1e-6
+    """Fit a mixture by weighted EM, initialized by splits along the widest axis; deterministic."""
+    subset = np.arange(0, len(colors), max(1, len(colors) // SAMPLES))
+    colors, weights = colors[subset], weights[subset] + 1e-6
     owners = np.zeros(len(colors), np.int64)
     for k in range(1, MIXTURE):
         spreads = [
@@ -139,9 +138,9 @@ def fit_mixture(colors: Float[ndarray, "p 3"], weights: Float[ndarray, " p"]) ->
     return mixture
 
 
-def random_walk(lab: Float[ndarray, "h w 3"], belief: Float[ndarray, "h w"]) -> Float[ndarray, "h w"]:
-    """The smoothest map that follows a belief, where smoothness does not count across edges of the picture."""
-    height, width = belief.shape
+def random_walk(lab: Float[ndarray, "h w 3"], prior: Float[ndarray, "h w"]) -> Float[ndarray, "h w"]:
+    """Smooth a prior probability map within the edges of the image."""
+    height, width = prior.shape
     index = np.arange(height * width).reshape(height, width)
     pairs = np.concatenate(
         [
@@ -154,12 +153,12 @@ def random_walk(lab: Float[ndarray, "h w 3"], belief: Float[ndarray, "h w"]) -> 
     links = SMOOTHNESS * np.exp(-steps / (2 * max(float(steps.mean()), 1e-6))) + 1e-3
     laplacian = _laplacian(pairs, links, height * width)
     system = (laplacian + sparse.identity(height * width)).tocsc()
-    walked: Float[ndarray, "h w"] = spsolve(system, belief.ravel(), permc_spec="MMD_AT_PLUS_A").reshape(height, width)
-    return walked.clip(0, 1)
+    smooth: Float[ndarray, "h w"] = spsolve(system, prior.ravel(), permc_spec="MMD_AT_PLUS_A").reshape(height, width)
+    return smooth.clip(0, 1)
 
 
 def _background(apart: Float[ndarray, "r r"], pairs: Int[ndarray, "e 2"], edge: ndarray) -> Float[ndarray, " r"]:
-    """Chance that a region is background: how much of its surroundings of like color lies on the border."""
+    """Return the probability that each region is background, from its boundary connectivity."""
     regions = len(edge)
     costs = np.maximum(apart[pairs[:, 0], pairs[:, 1]] - SAME_COLOR, 0) + 1e-6
     graph = sparse.coo_matrix((costs, (pairs[:, 0], pairs[:, 1])), (regions, regions)).tocsr()
@@ -169,7 +168,7 @@ def _background(apart: Float[ndarray, "r r"], pairs: Int[ndarray, "e 2"], edge: 
 
 
 def _neighbors(labels: Int[ndarray, "h w"]) -> Int[ndarray, "e 2"]:
-    """Pairs of regions that touch, each once."""
+    """Return pairs of adjacent regions, each once."""
     pairs = np.concatenate(
         [
             np.stack([labels[:, :-1].ravel(), labels[:, 1:].ravel()], 1),
@@ -192,13 +191,13 @@ def _estimate(colors: Float[ndarray, "p 3"], weights: Float[ndarray, " p"], memb
     spreads = np.empty((len(total), 3, 3))
     for k, mean in enumerate(means):
         offset = colors - mean
-        spreads[k] = (offset * share[:, k : k + 1]).T @ offset / total[k] + GRAIN * np.eye(3)
+        spreads[k] = (offset * share[:, k : k + 1]).T @ offset / total[k] + MIN_VARIANCE * np.eye(3)
     log_norms = -0.5 * np.linalg.slogdet(spreads)[1] - 1.5 * np.log(2 * np.pi)
     return Mixture(total / total.sum(), means, np.linalg.cholesky(np.linalg.inv(spreads)), log_norms)
 
 
 def _separation(odds: Float[ndarray, " p"], subject: ndarray) -> float:
-    """Area under the curve: the Mann-Whitney statistic of the odds inside against outside."""
+    """Return the area under the ROC curve: the Mann-Whitney statistic of the odds inside against outside."""
     inside, outside = np.sort(odds[subject]), np.sort(odds[~subject])
     if not len(inside) or not len(outside):
         return 0.5

@@ -1,4 +1,4 @@
-"""Driving videos by Stable Video Diffusion (Blattmann et al. 2023)."""
+"""Driving videos from Stable Video Diffusion (Blattmann et al. 2023)."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -13,70 +13,72 @@ from dg4d_lib.images import over_white
 from dg4d_lib.settings import SvdSettings
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.framing import resample
-from dg4d_lib.video.matting import matte_after
+from dg4d_lib.video.matting import matte_from_first_alpha
 
-UNTOLD = "In a generated video the subject could not be told from the background; it keeps the outline of the input."
+MATTING_FAILED = (
+    "The subject could not be separated from the background of a generated video; it keeps the outline of the input."
+)
 
 
 class StableVideo:
-    """Animates the subject before a white background, and cuts it out of every frame.
+    """Image-to-video generator: animates the subject on a white background and mattes every frame.
 
     Attributes:
-        notes: what the videos do otherwise than the network was trained for, in sentences for the user.
+        notes: sentences for the user about deviations from the model's training and about failed matting.
     """
 
     def __init__(self, settings: SvdSettings, model: VideoModel) -> None:
-        """Choose frames and canvas; `model` holds what is read from the weights."""
+        """Store the settings (number of frames, canvas size) and the loaded model."""
         self.settings, self.model = settings, model
         self.notes: tuple[str, ...] = ()
-        if settings.frames != model.trained_frames:
-            self.notes = (f"The video model was trained on {model.trained_frames} frames and made {settings.frames}.",)
+        if settings.frames != model.num_frames:
+            self.notes = (f"The video model was trained on {model.num_frames} frames and made {settings.frames}.",)
 
     def generate(self, subject: Float[Tensor, "h w 4"], generator: torch.Generator) -> DrivingVideo:
-        """One video; the generator decides how the subject moves.
+        """Generate one video.
 
         Args:
             subject: straight alpha, in [0, 1].
-            generator: of the noise, on the processor: then devices agree.
+            generator: random numbers for the noise, on the CPU so that all devices agree; determines the motion.
         """
         return self.generate_all(subject, [generator])[0]
 
     def generate_all(
         self, subject: Float[Tensor, "h w 4"], generators: Sequence[torch.Generator]
     ) -> list[DrivingVideo]:
-        """A video per generator, each as `generate` makes it, up to rounding."""
+        """Generate a video per random generator in one batch; equal to `generate` up to rounding."""
         canvas, (rows, columns) = self._canvas(subject)
         return [self._cut_out(frames[:, rows, columns], subject) for frames in self._sample(canvas, generators)]
 
     def _canvas(self, subject: Float[Tensor, "h w 4"]) -> tuple[Float[Tensor, "y x 3"], tuple[slice, slice]]:
-        """The subject over white in the middle of the canvas, as large as fits, and where its frame is."""
+        """Scale the subject to a white canvas, centered; return the canvas and the rows and columns of the subject."""
         height, width = self.settings.height, self.settings.width
         scale = min(height / subject.shape[0], width / subject.shape[1])
         rows, columns = (round(side * scale) for side in subject.shape[:2])
         small = resample(subject[None], rows, columns)[0]
         top, left = (height - rows) // 2, (width - columns) // 2
-        place = slice(top, top + rows), slice(left, left + columns)
+        window = slice(top, top + rows), slice(left, left + columns)
         canvas = subject.new_ones((height, width, 3))
-        canvas[place] = over_white(small)
-        return canvas, place
+        canvas[window] = over_white(small)
+        return canvas, window
 
     def _sample(
         self, canvas: Float[Tensor, "y x 3"], generators: Sequence[torch.Generator]
     ) -> Iterator[Float[Tensor, "t y x 3"]]:
         model, settings = self.model, self.settings
-        condition = model.look_at(canvas, generators)
-        shape = model.blank(len(generators), settings.frames, *canvas.shape[:2])
-        start = math.sqrt(SIGMA_MAX**2 + 1) * model.noise(shape, generators)
+        condition = model.encode_condition(canvas, generators)
+        shape = model.latent_shape(len(generators), settings.frames, *canvas.shape[:2])
+        start = math.sqrt(SIGMA_MAX**2 + 1) * model.sample_noise(shape, generators)
         for latents in model.denoise(start, condition, karras_sigmas(settings.model.num_inference_steps)):
             yield model.decode(latents)
 
     def _cut_out(self, frames: Float[Tensor, "t y x 3"], subject: Float[Tensor, "h w 4"]) -> DrivingVideo:
-        """The frames at the subject's size, matted; where that fails, with the outline of the input."""
+        """Resize frames to the subject's size and matte them; if that fails, use the alpha of the input."""
         opaque = torch.cat([frames, torch.ones_like(frames[..., :1])], -1).to(subject)
         colors = resample(opaque, *subject.shape[:2])[..., :3]
         try:
-            cutouts = matte_after(colors, subject[..., 3])
+            cutouts = matte_from_first_alpha(colors, subject[..., 3])
         except BadInput:
-            self.notes = (*dict.fromkeys((*self.notes, UNTOLD)),)
+            self.notes = (*dict.fromkeys((*self.notes, MATTING_FAILED)),)
             cutouts = torch.cat([colors, subject[..., 3:].expand(len(colors), -1, -1, -1)], -1)
         return DrivingVideo(cutouts[..., :3], cutouts[..., 3:], self.settings.fps)

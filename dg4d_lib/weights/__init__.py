@@ -1,1 +1,1 @@
-"""Trained weights: which are known, where they lie, whether they are whole; imports no torch."""
+"""Pretrained weights: registry, location, verification and download. Imports no torch."""

@@ -1,4 +1,4 @@
-"""Finding weights on this machine, whole: a folder, a name in the folder of all weights, or the Hugging Face cache."""
+"""Location and verification of weights: a path, a name in the weights folder, or the Hugging Face cache."""
 
 import hashlib
 import json
@@ -8,54 +8,54 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.weights.lock import Locked, read_lock, write_json
-from dg4d_lib.weights.registry import KNOWN, Weights, weights_called
+from dg4d_lib.weights.lock import LockEntry, read_lock, write_json
+from dg4d_lib.weights.registry import KNOWN, Weights, lookup_weights
 
-TENSORS = frozenset([".safetensors", ".bin", ".pth", ".pt"])  # suffixes
-READ = TENSORS | {".json", ".txt", ".model"}  # suffixes of what loading reads
-NO_TENSORS = f"has no tensors ({', '.join(sorted(TENSORS))})"
-MEMORY = "digests.json"  # digests of large files, so that they are read once and not at every run
-BY_CONTENT = "@"  # between a folder's name and the first digits of its identity
-CHUNK = 1 << 22  # bytes read at a time
+TENSOR_SUFFIXES = frozenset([".safetensors", ".bin", ".pth", ".pt"])
+READABLE_SUFFIXES = TENSOR_SUFFIXES | {".json", ".txt", ".model"}  # files that loading may read
+NO_TENSORS = f"has no tensors ({', '.join(sorted(TENSOR_SUFFIXES))})"
+DIGEST_CACHE = "digests.json"  # sha256 of large files, so that they are hashed once and not at every run
+CONTENT_MARK = "@"  # separates a folder's name from the first digits of its content digest
+CHUNK = 1 << 22  # bytes hashed at a time
 
 
 def find_weights(name_or_folder: str | Path, home: Path | None = None) -> Path:
-    """The folder (or the single file) of some weights; nothing is downloaded.
+    """Return the folder (or the single file) of some weights; download nothing.
 
     Args:
-        name_or_folder: a name of the registry, a hub id, or a folder, which is taken as it is.
-        home: the folder of all weights, one folder per name; what was pulled into it is compared with its lock.
+        name_or_folder: a name of the registry, a hub id, or a folder, which is used as it is.
+        home: the weights folder, with one subfolder per name; pulled files are compared with its lock.
 
     Raises:
-        BadInput: this can be neither a name nor a folder.
-        BackendUnavailable: they are not here, or not whole; says which command mends it.
+        BadInput: neither a known name nor an existing folder.
+        BackendUnavailable: the weights are missing or incomplete; the message names the command to run.
     """
     name = str(name_or_folder)
     if (path := given_folder(name_or_folder)) is not None:
         return path
-    if BY_CONTENT in name:
+    if CONTENT_MARK in name:
         return _called_by_content(name, home)
-    weights = weights_called(name)
+    weights = lookup_weights(name)
     if home is not None and (folder := home / folder_name(weights)).exists():
         locked = read_lock(home).get(weights.name)
-        if wrong := troubles(folder, weights, locked, home / MEMORY):
+        if wrong := find_problems(folder, weights, locked, home / DIGEST_CACHE):
             first = " ".join(next(iter(wrong.items()))) + ", and more" * (len(wrong) > 1)
             raise BackendUnavailable(
-                f"weights {name} in {folder} are not whole: {first}; "
-                f"`dg4d weights check {name}` lists what is wrong, `dg4d weights pull {name}` gets it again"
+                f"weights {name} in {folder} are incomplete or changed: {first}; "
+                f"`dg4d weights check {name}` lists all problems, `dg4d weights pull {name}` downloads them again"
             )
         return folder
-    cached = in_hub_cache(weights)
-    if cached is not None and not troubles(cached, weights):
+    cached = hub_cache_snapshot(weights)
+    if cached is not None and not find_problems(cached, weights):
         return cached
-    raise BackendUnavailable(f"weights {name} are not on this machine: `dg4d weights pull {name}` gets them")
+    raise BackendUnavailable(f"weights {name} are not on this machine; run `dg4d weights pull {name}`")
 
 
 def given_folder(name_or_folder: str | Path) -> Path | None:
-    """The folder or file that a user named by its path; None for a name or a hub id.
+    """Return the folder or file that the user gave as a path; None for a name or a hub id.
 
     Raises:
-        BadInput: a path that does not exist, or a name that nobody knows.
+        BadInput: a path that does not exist, or an unknown name.
     """
     name = str(name_or_folder)
     path = Path(name).expanduser()
@@ -64,8 +64,8 @@ def given_folder(name_or_folder: str | Path) -> Path | None:
     if path.exists():
         return path.absolute()
     if isinstance(name_or_folder, Path) or path.is_absolute() or name.startswith(".") or name.count("/") > 1:
-        raise BadInput(f"weights {name}: there is no such folder")
-    if "/" not in name and BY_CONTENT not in name:
+        raise BadInput(f"weights {name}: there is no such folder or file; give an existing path")
+    if "/" not in name and CONTENT_MARK not in name:
         raise BadInput(
             f"unknown weights {name!r}; give a folder, an id of the Hugging Face hub (owner/name), or one of: "
             f"{', '.join(KNOWN)}"
@@ -74,17 +74,18 @@ def given_folder(name_or_folder: str | Path) -> Path | None:
 
 
 def folder_name(weights: Weights) -> str:
-    """What the folder of these weights is called within the folder of all weights."""
+    """Return the name of the subfolder of these weights in the weights folder."""
     return weights.name.replace("/", "--")
 
 
-def call_by_content(folder: Path, home: Path) -> str:
-    """A name for a user's folder that says its content and not its place; `home` remembers the place.
+def content_name(folder: Path, home: Path) -> str:
+    """Return a name for a user's folder that depends on its content alone; a link in `home` records its path.
 
-    Equal folders have equal names on every machine, so nothing that is made with them depends on where they lie.
+    Equal folders have equal names on every machine, so results do not depend on the path of the weights.
     """
     home.mkdir(parents=True, exist_ok=True)
-    name = f"{folder.stem}{BY_CONTENT}{identity(digests(folder, memory=home / MEMORY)).removeprefix('sha256:')[:12]}"
+    digest = identity(digests(folder, cache=home / DIGEST_CACHE)).removeprefix("sha256:")
+    name = f"{folder.stem}{CONTENT_MARK}{digest[:12]}"
     link = home / name
     if not link.is_symlink() or link.readlink() != folder:
         scratch = home / f".{name}.{os.getpid()}"
@@ -94,73 +95,73 @@ def call_by_content(folder: Path, home: Path) -> str:
     return name
 
 
-def troubles(
-    folder: Path, weights: Weights, locked: Locked | None = None, memory: Path | None = None
+def find_problems(
+    folder: Path, weights: Weights, locked: LockEntry | None = None, cache: Path | None = None
 ) -> dict[str, str]:
-    """What keeps weights from being whole: for a file or a part, what is wrong with it; nothing where they are whole.
+    """Return the problem of every missing or changed file; empty if the weights are complete.
 
     Args:
-        folder: where they lie.
-        weights: what they should be.
-        locked: what was pulled; without it, only what is missing can be told.
-        memory: as in `digests`.
+        folder: of the weights.
+        weights: their entry of the registry.
+        locked: the lock entry of the pull; without one, only missing files are found.
+        cache: as in `digests`.
     """
     if locked is None:
-        return _lacking(folder, weights.parts)
+        return _missing(folder, weights.parts)
     wrong: dict[str, str] = {}
     for name, file in locked.files.items():
         path = folder / name
         if not path.is_file():
             wrong[name] = "is missing"
         elif path.stat().st_size != file.size:
-            wrong[name] = f"has {path.stat().st_size} bytes instead of {file.size}"
-    have = _digests_of([folder / name for name in locked.files if name not in wrong], memory)
+            wrong[name] = f"has {path.stat().st_size} bytes, recorded are {file.size}"
+    have = _digests_of([folder / name for name in locked.files if name not in wrong], cache)
     changed = {path.relative_to(folder).as_posix(): digest for path, digest in have.items()}
     other = {name for name, digest in changed.items() if digest != locked.files[name].sha256}
-    return wrong | dict.fromkeys(sorted(other), "is not the file that was pulled: its sha256 differs")
+    return wrong | dict.fromkeys(sorted(other), "differs from the pulled file (sha256)")
 
 
-def unpublished(folder: Path, weights: Weights, memory: Path | None = None) -> dict[str, str]:
-    """Files that are not what was published, and how so; files of which nothing is known, or that are not here, pass.
+def find_unpublished(folder: Path, weights: Weights, cache: Path | None = None) -> dict[str, str]:
+    """Return the problem of every file that differs from its published digest; unknown and missing files pass.
 
     Args:
-        folder: where the weights lie.
-        weights: what they should be.
-        memory: as in `digests`.
+        folder: of the weights.
+        weights: their entry of the registry.
+        cache: as in `digests`.
     """
-    have = _digests_of([path for name in weights.published if (path := folder / name).is_file()], memory)
+    have = _digests_of([path for name in weights.published if (path := folder / name).is_file()], cache)
     found = {path.relative_to(folder).as_posix(): digest for path, digest in have.items()}
     where = f" at revision {weights.revision[:10]}" if weights.revision else ""
     other = [name for name, digest in found.items() if digest != weights.published[name]]
-    return dict.fromkeys(other, f"is not the file that was published{where}: its sha256 differs")
+    return dict.fromkeys(other, f"differs from the published file{where} (sha256)")
 
 
-def digests(folder: Path, parts: tuple[str, ...] = (), memory: Path | None = None) -> dict[str, str]:
-    """The sha256 (64 hexadecimal digits) of every file that loading may read, by its path within the folder.
+def digests(folder: Path, parts: tuple[str, ...] = (), cache: Path | None = None) -> dict[str, str]:
+    """Return the sha256 (64 hexadecimal digits) of every file that loading may read, by its path in the folder.
 
     Args:
-        folder: of some weights; or a single file.
-        parts: only these; empty: everything.
-        memory: a file that remembers digests by place, size and time of change, so that an unchanged file is not read
+        folder: of the weights; or a single file.
+        parts: subfolders to read; empty: all.
+        cache: a JSON file of digests by path, size and modification time, so that an unchanged file is not hashed
             again.
     """
     files = sorted(_files(folder, parts))
     root = folder if folder.is_dir() else folder.parent
-    have = _digests_of(files, memory)
+    have = _digests_of(files, cache)
     return {path.relative_to(root).as_posix(): have[path] for path in files}
 
 
 def identity(files: dict[str, str]) -> str:
-    """One digest for all of `digests`: equal content under equal names has an equal identity, wherever it lies."""
+    """Return one digest of the result of `digests`; it depends on names and content, not on the folder's path."""
     listing = json.dumps(files, sort_keys=True, separators=(",", ":"))
     return "sha256:" + hashlib.sha256(listing.encode()).hexdigest()
 
 
-def in_hub_cache(weights: Weights) -> Path | None:
-    """What other programs downloaded: the snapshot of the pinned commit, else the newest; None where there is none."""
+def hub_cache_snapshot(weights: Weights) -> Path | None:
+    """Return the Hugging Face cache's snapshot of the pinned commit, else of `main`; None if there is neither."""
     if find_spec("huggingface_hub") is None:
         return None
-    from huggingface_hub import constants  # noqa: PLC0415 - reads the environment when it is imported
+    from huggingface_hub import constants  # noqa: PLC0415 - reads the environment on import
 
     repository = Path(constants.HF_HUB_CACHE) / f"models--{weights.hub_id.replace('/', '--')}"
     main = repository / "refs" / "main"
@@ -172,7 +173,7 @@ def in_hub_cache(weights: Weights) -> Path | None:
 def _called_by_content(name: str, home: Path | None) -> Path:
     link = home / name if home is not None else Path(name)
     if not link.exists():
-        raise BackendUnavailable(f"the folder of the weights {name} is gone; name the folder once more where it is now")
+        raise BackendUnavailable(f"the folder of the weights {name} no longer exists; give its new path")
     return link.readlink()
 
 
@@ -183,49 +184,54 @@ def _files(folder: Path, parts: tuple[str, ...]) -> Iterator[Path]:
     for path in folder.rglob("*"):
         inside = path.relative_to(folder)
         wanted = not parts or inside.parts[0] in parts or inside.name == "model_index.json"
-        if wanted and path.suffix in READ and path.is_file() and not any(p.startswith(".") for p in inside.parts):
+        if (
+            wanted
+            and path.suffix in READABLE_SUFFIXES
+            and path.is_file()
+            and not any(p.startswith(".") for p in inside.parts)
+        ):
             yield path
 
 
-def _lacking(folder: Path, parts: tuple[str, ...]) -> dict[str, str]:
-    """Parts that are not there, models without tensors, and shards that an index names in vain."""
-    lacking = {part: "is missing" for part in parts if not (folder / part).exists()}
+def _missing(folder: Path, parts: tuple[str, ...]) -> dict[str, str]:
+    """Return missing parts, models without tensors, and shards that an index lists but the folder lacks."""
+    missing = {part: "is missing" for part in parts if not (folder / part).exists()}
     files = list(_files(folder, parts))
-    if not any(path.suffix in TENSORS for path in files):
-        lacking[folder.name] = NO_TENSORS
+    if not any(path.suffix in TENSOR_SUFFIXES for path in files):
+        missing[folder.name] = NO_TENSORS
     for path in files:
         here = {other.name for other in files if other.parent == path.parent}
-        if path.name == "config.json" and not any(Path(name).suffix in TENSORS for name in here):
-            lacking[path.parent.name] = NO_TENSORS
+        if path.name == "config.json" and not any(Path(name).suffix in TENSOR_SUFFIXES for name in here):
+            missing[path.parent.name] = NO_TENSORS
         if path.name.endswith(".index.json"):
             shards = set(json.loads(path.read_text(encoding="utf-8")).get("weight_map", {}).values())
-            lacking |= {f"{path.parent.name}/{shard}": "is missing" for shard in sorted(shards - here)}
-    return lacking
+            missing |= {f"{path.parent.name}/{shard}": "is missing" for shard in sorted(shards - here)}
+    return missing
 
 
-def _digests_of(files: list[Path], memory: Path | None) -> dict[Path, str]:
-    known = _remembered(memory)
+def _digests_of(files: list[Path], cache: Path | None) -> dict[Path, str]:
+    known = _cached(cache)
     found: dict[Path, str] = {}
-    fresh: dict[str, list[str]] = {}
+    computed: dict[str, list[str]] = {}
     for path in files:
-        facts = path.stat()
-        key, stamp = str(path.resolve()), f"{facts.st_size} {facts.st_mtime_ns}"
+        status = path.stat()
+        key, stamp = str(path.resolve()), f"{status.st_size} {status.st_mtime_ns}"
         if key in known and known[key][0] == stamp:
             found[path] = known[key][1]
         else:
             found[path] = _sha256(path)
-            fresh[key] = [stamp, found[path]]
-    if fresh and memory is not None and memory.parent.is_dir():
-        write_json(memory, {**_remembered(memory), **fresh})
+            computed[key] = [stamp, found[path]]
+    if computed and cache is not None and cache.parent.is_dir():
+        write_json(cache, {**_cached(cache), **computed})
     return found
 
 
-def _remembered(memory: Path | None) -> dict[str, list[str]]:
-    """What was computed before; a memory that is broken is no memory."""
-    if memory is None:
+def _cached(cache: Path | None) -> dict[str, list[str]]:
+    """Return cached digests; a missing or unreadable cache counts as empty, because digests can be computed again."""
+    if cache is None:
         return {}
     try:
-        return dict(json.loads(memory.read_text(encoding="utf-8")))
+        return dict(json.loads(cache.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):
         return {}
 

@@ -1,7 +1,7 @@
-"""What was pulled: revision, license, and the digest of every file. Later uses are compared with it.
+"""Lock file of pulled weights: revision, license and the digest of every file.
 
-`weights.lock.json` lies in the folder of all weights. Trust on first use: what the first pull got is right from then
-on; copy the file to other machines to have the same there.
+`weights.lock.json` is in the weights folder. Trust on first use: the first pull records digests, later uses are
+compared with them. Copy the file to other machines to pull the same files there.
 """
 
 import json
@@ -16,21 +16,21 @@ LOCK = "weights.lock.json"
 
 
 class LockedFile(BaseModel):
-    """One file: its sha256 as 64 hexadecimal digits, and its size in bytes."""
+    """Digest (sha256, 64 hexadecimal digits) and size in bytes of one file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     sha256: str
     size: int
 
 
-class Locked(BaseModel):
-    """One set of weights as it was pulled.
+class LockEntry(BaseModel):
+    """Record of one pull.
 
     Attributes:
         hub_id: owner and repository.
-        revision: the commit of the hub.
-        license: what the model card calls it, for example "openrail++"; empty where it says nothing.
-        files: by their path within the folder.
+        revision: commit on the hub.
+        license: id on the model card, for example "openrail++"; empty if the card has none.
+        files: by their path in the folder.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -40,8 +40,8 @@ class Locked(BaseModel):
     files: dict[str, LockedFile]
 
 
-def read_lock(home: Path) -> dict[str, Locked]:
-    """Everything that was pulled into the folder `home`, by name; nothing where there is no lock.
+def read_lock(home: Path) -> dict[str, LockEntry]:
+    """Read the lock of the weights folder `home`, by name; empty if there is no lock file.
 
     Raises:
         BadInput: the lock cannot be read.
@@ -49,21 +49,21 @@ def read_lock(home: Path) -> dict[str, Locked]:
     path = home / LOCK
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))
-        return {name: Locked.model_validate(entry) for name, entry in entries.items()}
+        return {name: LockEntry.model_validate(entry) for name, entry in entries.items()}
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, AttributeError, ValidationError) as error:
         raise BadInput(f"{path} cannot be read ({error}); delete it and pull the weights again") from error
 
 
-def write_lock(home: Path, name: str, locked: Locked) -> None:
-    """Remember what was pulled under a name, in place of what was there."""
+def write_lock(home: Path, name: str, locked: LockEntry) -> None:
+    """Record a pull under a name, in place of an older record."""
     entries = {**read_lock(home), name: locked}
     write_json(home / LOCK, {key: entries[key].model_dump() for key in sorted(entries)})
 
 
 def write_json(path: Path, content: object) -> None:
-    """Write a JSON file so that a reader sees the old content or the new one, never a part."""
+    """Write a JSON file atomically: a reader sees the old content or the new one."""
     scratch = path.with_name(f".{path.name}.{os.getpid()}")
     scratch.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n", encoding="utf-8")
     scratch.replace(path)

@@ -1,4 +1,4 @@
-"""Getting weights from the Hugging Face hub into the folder of all weights, and remembering what came."""
+"""Download of weights from the Hugging Face hub into the weights folder, recorded in its lock."""
 
 import errno
 from collections import defaultdict
@@ -6,37 +6,49 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
 from dg4d_lib.errors import BackendUnavailable
-from dg4d_lib.weights.locate import MEMORY, READ, TENSORS, digests, folder_name, troubles
-from dg4d_lib.weights.lock import Locked, LockedFile, read_lock, write_lock
+from dg4d_lib.weights.locate import (
+    DIGEST_CACHE,
+    READABLE_SUFFIXES,
+    TENSOR_SUFFIXES,
+    digests,
+    find_problems,
+    folder_name,
+)
+from dg4d_lib.weights.lock import LockedFile, LockEntry, read_lock, write_lock
 from dg4d_lib.weights.registry import Weights
 
-HALF = ".fp16"  # in the names of files in half precision
-FORMATS = ((True, ".safetensors"), (False, ".safetensors"), (True, ".bin"), (False, ".bin"))  # wanted most first
+HALF = ".fp16"  # part of the names of half-precision files
+FORMATS = (
+    (True, ".safetensors"),
+    (False, ".safetensors"),
+    (True, ".bin"),
+    (False, ".bin"),
+)  # (half precision, suffix), preferred first
 
 
-def pull(weights: Weights, home: Path) -> Locked:
-    """Download what is needed of some weights; goes on where it was stopped, and leaves alone what is here already.
+def pull(weights: Weights, home: Path) -> LockEntry:
+    """Download the needed files of some weights; resume partial downloads and keep files that are complete.
 
     The revision is the lock's, else the registry's, else the newest.
 
     Returns:
-        What the lock now says.
+        The new lock entry.
 
     Raises:
-        BackendUnavailable: the hub cannot be reached or does not give them, or what came is not what the hub lists and
-            what was published.
+        BackendUnavailable: the hub cannot be reached or refuses access, or a file differs from the digest that the
+            hub lists or the registry records.
         OSError: the disk is full.
     """
     try:
-        import huggingface_hub as hub  # noqa: PLC0415 - part of an extra
+        import huggingface_hub as hub  # noqa: PLC0415 - an optional dependency
     except ModuleNotFoundError as error:
         raise BackendUnavailable(
             "downloading weights needs the package huggingface_hub; run `make setup CUDA=1`"
         ) from error
     before = read_lock(home).get(weights.name)
     folder = home / folder_name(weights)
-    for name in troubles(folder, weights, before, home / MEMORY) if before else ():
-        (folder / name).unlink(missing_ok=True)  # the download alone may take it for whole
+    for name in find_problems(folder, weights, before, home / DIGEST_CACHE) if before else ():
+        (folder / name).unlink(missing_ok=True)  # the downloader may consider a damaged file complete
     try:
         info = hub.HfApi().model_info(
             weights.hub_id, revision=before.revision if before else weights.revision, files_metadata=True
@@ -48,53 +60,53 @@ def pull(weights: Weights, home: Path) -> Locked:
         chosen = needed([file.rfilename for file in listed], weights.parts)
         folder.mkdir(parents=True, exist_ok=True)
         hub.snapshot_download(weights.hub_id, revision=info.sha, local_dir=folder, allow_patterns=chosen)
-    except Exception as error:  # whatever a network, a proxy or a server may answer
+    except Exception as error:  # networks, proxies and servers fail in many ways
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise
         raise BackendUnavailable(_refusal(weights, error)) from error
-    have = {name: digest for name, digest in digests(folder, memory=home / MEMORY).items() if name in chosen}
-    wrong = {name: "did not come" for name in chosen if name not in have} | troubles(folder, weights)
+    have = {name: digest for name, digest in digests(folder, cache=home / DIGEST_CACHE).items() if name in chosen}
+    wrong = {name: "was not downloaded" for name in chosen if name not in have} | find_problems(folder, weights)
     for name in [name for name, digest in have.items() if published.get(name, digest) != digest]:
         wrong[name] = "is damaged"
         (folder / name).unlink()
     if wrong:
         raise BackendUnavailable(
-            f"weights {weights.name} did not come whole from {weights.hub_id}: "
+            f"the download of weights {weights.name} from {weights.hub_id} is incomplete: "
             f"{'; '.join(map(' '.join, wrong.items()))}; run `dg4d weights pull {weights.name}` again"
         )
     files = {name: LockedFile(sha256=have[name], size=(folder / name).stat().st_size) for name in chosen}
     card = str(getattr(info.card_data, "license", None) or "")
-    locked = Locked(hub_id=weights.hub_id, revision=info.sha or "", license=card, files=files)
+    locked = LockEntry(hub_id=weights.hub_id, revision=info.sha or "", license=card, files=files)
     write_lock(home, weights.name, locked)
     return locked
 
 
 def needed(names: Iterable[str], parts: tuple[str, ...] = ()) -> list[str]:
-    """Of all files of a repository, those to download: texts, and the tensors of each folder in one format.
+    """Return the files of a repository to download: configurations, and the tensors of each folder in one format.
 
-    Half precision is preferred to full, safetensors to pickles; checkpoints beside `model_index.json`, which hold all
-    parts once more, are left out.
+    Half precision is preferred to full, safetensors to pickles; single-file checkpoints beside `model_index.json`
+    are left out, because the folders hold the same tensors.
     """
     everything = sorted(names)
     folders: dict[PurePosixPath, list[str]] = defaultdict(list)
     for name in everything:
         path = PurePosixPath(name)
         hidden = any(part.startswith(".") for part in path.parts)
-        whole = "model_index.json" in everything and len(path.parts) == 1 and path.suffix in TENSORS
+        duplicate = "model_index.json" in everything and len(path.parts) == 1 and path.suffix in TENSOR_SUFFIXES
         other = ".non_ema." in name or path.name.startswith("openvino")
-        wanted = path.parts[0] in parts or path.name == "model_index.json" if parts else not whole
-        if wanted and path.suffix in READ and not hidden and not other:
+        wanted = path.parts[0] in parts or path.name == "model_index.json" if parts else not duplicate
+        if wanted and path.suffix in READABLE_SUFFIXES and not hidden and not other:
             folders[path.parent].append(name)
     return sorted(name for files in folders.values() for name in _one_format(files))
 
 
 def _one_format(files: list[str]) -> list[str]:
-    """The files of a folder that hold no tensors, and those that do in the format that is wanted most."""
+    """Return the files of a folder without tensors, and those with tensors in the most preferred format."""
 
     def fits(name: str, half: bool, suffix: str) -> bool:
         return suffix in name and (HALF in name) == half
 
-    tensors = [name for name in files if PurePosixPath(name).suffix in TENSORS]
+    tensors = [name for name in files if PurePosixPath(name).suffix in TENSOR_SUFFIXES]
     for half, suffix in FORMATS:
         if any(fits(name, half, suffix) for name in tensors):
             held = {name for name in files if name in tensors or ".index." in name}  # an index lists the shards
@@ -104,15 +116,15 @@ def _one_format(files: list[str]) -> list[str]:
 
 def _refusal(weights: Weights, error: Exception) -> str:
     kind = type(error).__name__
-    where = f"https://huggingface.co/{weights.hub_id}"
+    url = f"https://huggingface.co/{weights.hub_id}"
     if kind in ("GatedRepoError", "RepositoryNotFoundError"):
-        mend = f"look at {where}: accept its license there and log in with `hf auth login`, or correct the id"
+        remedy = f"accept its license at {url} and log in with `hf auth login`, or correct the id"
     elif kind == "RevisionNotFoundError":
-        mend = f"the revision is gone; see {where}"
+        remedy = f"the pinned revision no longer exists; see {url}"
     else:
-        mend = (
-            "connect this machine to the network and run the command again, or copy the folder from a machine that has "
-            "it and name the folder instead"
+        remedy = (
+            "connect this machine to the network and run the command again, or copy the folder from another machine "
+            "and give its path"
         )
     reason = str(error).strip().splitlines()[0] if str(error).strip() else "no reason given"
-    return f"weights {weights.name} could not be downloaded from {where} ({kind}: {reason}); {mend}"
+    return f"weights {weights.name} could not be downloaded from {url} ({kind}: {reason}); {remedy}"

@@ -1,8 +1,8 @@
-"""The weights that profiles and scores name: where they come from, what of them is needed, what their license allows.
+"""Registry of the weights that profiles and scores use: source, needed files, digests and license.
 
-`revision` pins a commit of the hub, `published` says what the files of tensors are there, as far as public records
-tell. The first `dg4d weights pull` compares what it gets with that and writes all of it down (lock.py); every later use
-is compared with what was written. What no public record tells is trusted on first use.
+`revision` pins a commit of the hub; `published` holds the digests of tensor files at that commit, where public records
+have them. The first `dg4d weights pull` compares its download with them and records every digest (lock.py); every later
+use is compared with that record. Files without a public digest are trusted on first use.
 """
 
 from collections.abc import Mapping
@@ -14,12 +14,12 @@ Commercial = Literal["yes", "conditions", "no", "unverified"]
 
 @dataclass(frozen=True)
 class License:
-    """What may be done with weights, and with what they make.
+    """License of weights, and of the assets made with them.
 
     Attributes:
-        name: as its owner calls it.
+        name: given by its owner.
         commercial: "conditions": allowed under the conditions in `terms`; "unverified" is treated as "no".
-        terms: one sentence for people.
+        terms: one sentence for users.
     """
 
     name: str
@@ -28,7 +28,7 @@ class License:
 
     @property
     def allows_commercial_use(self) -> bool:
-        """Whether `--commercial-only` lets it pass."""
+        """True if `--commercial-only` accepts it."""
         return self.commercial in ("yes", "conditions")
 
     def __str__(self) -> str:
@@ -37,17 +37,17 @@ class License:
 
 @dataclass(frozen=True)
 class Weights:
-    """One set of weights on the Hugging Face hub.
+    """Weights of one model on the Hugging Face hub.
 
     Attributes:
-        name: what settings and commands call it.
+        name: in settings and commands.
         hub_id: owner and repository.
-        purpose: what it is for.
+        purpose: shown by `dg4d weights list`.
         license: of the weights, not of the code around them.
-        parts: folders (of a model in diffusers' layout) or single files that are needed; empty: all of the repository.
-        revision: a commit of the hub; None: the newest at the first pull, which the lock then remembers.
-        published: sha256 of files at that commit, by path: those of tensors as far as they are known.
-        about_gb: size of the download in units of 1e9 bytes as far as it is known without asking the hub.
+        parts: needed folders (of a model in diffusers' layout) or single files; empty: the whole repository.
+        revision: commit on the hub; None: the newest at the first pull, which the lock then records.
+        published: sha256 of tensor files at that commit, by path, where known.
+        about_gb: approximate size of the download, units of 1e9 bytes; None: unknown.
     """
 
     name: str
@@ -72,11 +72,11 @@ STABILITY_COMMUNITY = License(
     '"Powered by Stability AI" in sight; above, it takes an enterprise license (https://stability.ai/license)',
 )
 
-ON_CARDS: dict[str, Commercial] = {
+CARD_LICENSES: dict[str, Commercial] = {
     **dict.fromkeys(("apache-2.0", "mit", "bsd-3-clause", "cc0-1.0", "cc-by-4.0"), "yes"),
     **dict.fromkeys(("openrail", "openrail++", "creativeml-openrail-m", "bigscience-openrail-m"), "conditions"),
     **dict.fromkeys(("cc-by-nc-4.0", "cc-by-nc-sa-4.0", "cc-by-nc-nd-4.0"), "no"),
-}  # what model cards of the hub call licenses
+}  # license ids on model cards of the hub
 TERMS: dict[Commercial, str] = {
     "yes": "commercial use is allowed",
     "conditions": "commercial use is allowed, but not for the purposes that the license lists",
@@ -86,11 +86,11 @@ TERMS: dict[Commercial, str] = {
 
 ZERO123_PARTS = ("vae", "unet", "image_encoder", "clip_camera_projection", "scheduler")
 SVD_PARTS = ("vae", "unet", "image_encoder", "scheduler")
-SD_VAE = "3e4c08995484ee61270175e9e7a072b66a6e4eeb5f0c266667fe1f45b90daf9a"  # Stable Diffusion's, half precision
+SD_VAE = "3e4c08995484ee61270175e9e7a072b66a6e4eeb5f0c266667fe1f45b90daf9a"  # Stable Diffusion's VAE, half precision
 SVD_SHARED = {
     "vae/diffusion_pytorch_model.fp16.safetensors": "af602cd0eb4ad6086ec94fbf1438dfb1be5ec9ac03fd0215640854e90d6463a3",
     "image_encoder/model.fp16.safetensors": "ae616c24393dd1854372b0639e5541666f7521cbe219669255e865cb7f89466a",
-}  # of both lengths
+}  # the same files in the variants for 14 and for 25 frames
 
 KNOWN: dict[str, Weights] = {
     weights.name: weights
@@ -98,12 +98,12 @@ KNOWN: dict[str, Weights] = {
         Weights(
             name="zero123-xl",
             hub_id="ashawkey/zero123-xl-diffusers",
-            purpose="prior: other sides (Zero-1-to-3-XL)",
+            purpose="prior: novel views (Zero-1-to-3-XL)",
             license=License(
                 "MIT on its card",
                 "unverified",
                 "the card says MIT, but the authors of Zero-1-to-3 call the model intended for research only, and it "
-                "was fine-tuned from one under CreativeML OpenRAIL-M; clear it up with them before any commercial use",
+                "was fine-tuned from one under CreativeML OpenRAIL-M; ask them before any commercial use",
             ),
             parts=ZERO123_PARTS,
             revision="10e9e8e75adaa3bf77f5ac9c381419016fed68c7",
@@ -112,7 +112,7 @@ KNOWN: dict[str, Weights] = {
         Weights(
             name="stable-zero123",
             hub_id="ashawkey/stable-zero123-diffusers",
-            purpose="prior: other sides (Stable-Zero123)",
+            purpose="prior: novel views (Stable-Zero123)",
             license=STABILITY_RESEARCH,
             parts=ZERO123_PARTS,
             revision="a6c09344fbd45843d35f2095c203c4a8e55b4dbb",
@@ -130,7 +130,7 @@ KNOWN: dict[str, Weights] = {
         Weights(
             name="svd",
             hub_id="stabilityai/stable-video-diffusion-img2vid",
-            purpose="motions of 14 frames, textures",
+            purpose="driving videos of 14 frames, texture refinement",
             license=STABILITY_COMMUNITY,
             parts=SVD_PARTS,
             revision="9cf024d5bfa8f56622af86c884f26a52f6676f2e",
@@ -145,7 +145,7 @@ KNOWN: dict[str, Weights] = {
         Weights(
             name="svd-xt",
             hub_id="stabilityai/stable-video-diffusion-img2vid-xt",
-            purpose="motions of 25 frames",
+            purpose="driving videos of 25 frames",
             license=STABILITY_COMMUNITY,
             parts=SVD_PARTS,
             revision="9e43909513c6714f1bc78bcb44d96e733cd242aa",
@@ -160,7 +160,7 @@ KNOWN: dict[str, Weights] = {
         Weights(
             name="imagedream",
             hub_id="ashawkey/imagedream-ipmv-diffusers",
-            purpose="four views of an object, for LGM",
+            purpose="four views of an object, for LGM; prior",
             license=License("OpenRAIL", "conditions", TERMS["conditions"]),
             revision="73a034178e748421506492e91790cc62d6aefef5",
             published={
@@ -176,7 +176,7 @@ KNOWN: dict[str, Weights] = {
         Weights(
             name="lgm",
             hub_id="ashawkey/LGM",
-            purpose="Gaussians out of four views",
+            purpose="Gaussians from four views",
             license=License("MIT", "yes", "commercial use is allowed; trained on objects of Objaverse"),
             parts=("model_fp16_fixrot.safetensors",),
             revision="1c28a2fd3bb1982414f722503ae862bdbb82636c",
@@ -231,7 +231,7 @@ KNOWN: dict[str, Weights] = {
             license=License(
                 "none stated",
                 "unverified",
-                "this copy says nothing; DeepMind released the checkpoints that it was made from under Apache-2.0",
+                "this copy states no license; DeepMind released the original checkpoints under Apache-2.0",
             ),
             parts=("i3d_torchscript.pt",),
             published={"i3d_torchscript.pt": "bec6519f66ea534e953026b4ae2c65553c17bf105611c746d904657e5860a5e2"},
@@ -241,18 +241,18 @@ KNOWN: dict[str, Weights] = {
 }
 
 
-def weights_called(name: str, card: str = "") -> Weights:
-    """The weights of a name or a hub id.
+def lookup_weights(name: str, card: str = "") -> Weights:
+    """Return the registered weights of a name or a hub id, or an entry for unknown ones.
 
     Args:
-        name: as a user wrote it.
-        card: what the model card calls the license; it counts for weights that are not known here, but nobody frees
-            weights by copying them: whose name holds the name of weights that forbid commercial use has their license.
+        name: from the user.
+        card: license id on the model card, used for unknown weights. A copy inherits the license of the original: a
+            name that contains the name of registered weights without commercial use gets their license.
     """
     by_id = {weights.hub_id.lower(): weights for weights in KNOWN.values()}
-    commercial = ON_CARDS.get(card, "unverified")
-    theirs = License(card or "unknown license", commercial, TERMS[commercial])
+    commercial = CARD_LICENSES.get(card, "unverified")
+    inherited = License(card or "unknown license", commercial, TERMS[commercial])
     for weights in KNOWN.values():
         if weights.license.commercial == "no" and weights.name in name.lower():
-            theirs = weights.license
-    return KNOWN.get(name) or by_id.get(name.lower()) or Weights(name, name, "named by the user", theirs)
+            inherited = weights.license
+    return KNOWN.get(name) or by_id.get(name.lower()) or Weights(name, name, "given by the user", inherited)

@@ -21,7 +21,7 @@ from flows.packages.scores import Results
 from flows.packages.summary import BAD_INPUT, Row, Tally
 from flows.step_errors import StepError, StepMissing
 from steps.artifacts.archives import add_entry, unpack
-from steps.artifacts.ground_truth import Truth, find_truth, find_truths
+from steps.artifacts.ground_truth import GroundTruth, find_ground_truth, find_ground_truths
 from steps.catalog import PACKAGE, TRUTH
 from steps.contract import ArtifactRef
 from steps.profiles import ScoreAssetSettings, profile, revise
@@ -63,7 +63,7 @@ def score(
         BadInput: the asset, the truth or a setting cannot be used, or `out` cannot be written.
         StepError: the step did not finish.
     """
-    found, (pipeline, settings) = find_truth(truth), _settings(changes, mesh)
+    found, (pipeline, settings) = find_ground_truth(truth), _settings(changes, mesh)
     if pipeline:
         raise BadInput(f"the asset is finished: only knobs that begin with {OWN!r} can be set; given {min(pipeline)}")
     record = whole(package)
@@ -126,7 +126,7 @@ def bench(
         BadInput: the data set or a setting cannot be used, or `out` cannot be written.
         BackendUnavailable: what the profile needs is not here.
     """
-    truths = find_truths(dataset)[:limit]
+    truths = find_ground_truths(dataset)[:limit]
     for truth in truths:
         if allow:
             allow(truth.files)
@@ -174,7 +174,7 @@ def write(results: Results, judged: "Judged", out: Path) -> None:
         write_atomically(out / name, text)
 
 
-def check_truth(truth: Truth) -> None:
+def check_truth(truth: GroundTruth) -> None:
     """Refuse a ground truth with files that are no pictures, or a mesh that is no NumPy archive.
 
     Raises:
@@ -186,7 +186,7 @@ def check_truth(truth: Truth) -> None:
         check_arrays(truth.mesh)
 
 
-def put_truth(truth: Truth, store: ArtifactStore) -> ArtifactRef:
+def put_truth(truth: GroundTruth, store: ArtifactStore) -> ArtifactRef:
     """Keep a ground truth in our own layout; equal pictures give equal bytes, whatever layout they had.
 
     Raises:
@@ -222,7 +222,7 @@ def _settings(changes: list[str] | None, mesh: bool) -> tuple[dict[str, Any], Sc
     return {key: value for key, value in given.items() if not key.startswith(OWN)}, settings
 
 
-def _wish(truth: Truth, bank: bool, **asked: Any) -> Wish:
+def _wish(truth: GroundTruth, bank: bool, **asked: Any) -> Wish:
     """What `dg4d make` would be asked for: the input film is followed, or the input picture is made to move."""
     folder = truth.inputs[0].parent
     return Wish(
@@ -254,7 +254,7 @@ def _converted(orders: list[Order], folder: Path, workers: int, console: "Consol
     return rows | tally.rows
 
 
-def _entry(truth: Truth, folder: Path, row: Row) -> "Entry":
+def _entry(truth: GroundTruth, folder: Path, row: Row) -> "Entry":
     from flows.judge import Entry
 
     ref = put_truth(truth, home.store())

@@ -6,7 +6,7 @@ from pathlib import Path, PurePath
 
 from pydantic import ValidationError
 
-from dg4d_lib.assets.scenes.scene import Item, Scene
+from dg4d_lib.assets.scenes.scene import Scene, SceneItem
 from dg4d_lib.errors import BadInput
 from flows.inputs.package_record import record_of
 from flows.packages.publish import check_writable, whole
@@ -49,13 +49,13 @@ def compose(
         plan = read_scene(scene)
         folders = [scene.parent / item.package for item in plan.items]
     else:
-        plan = Scene(items=tuple(Item(package=str(folder)) for folder in packages))
+        plan = Scene(items=tuple(SceneItem(package=str(folder)) for folder in packages))
         folders = list(packages)
     for folder in dict.fromkeys(folders):
         whole(folder)
-    from steps.compose_scene import Cast
+    from steps.compose_scene import SceneWriter
 
-    cast = Cast(folders, plan.items, _names(folders, plan.items))
+    cast = SceneWriter(folders, plan.items, _names(folders, plan.items))
     if scene is None:
         cast.in_a_row(spacing)
     write = cast.write_glb if out.suffix.lower() == ".glb" else cast.write_usdz
@@ -98,7 +98,7 @@ def _check_out(out: Path) -> None:
     check_writable(out.parent)
 
 
-def _names(folders: Sequence[Path], items: Sequence[Item]) -> list[str]:
+def _names(folders: Sequence[Path], items: Sequence[SceneItem]) -> list[str]:
     """A name of its own for every item: the given one or that of its folder, with a number if it is taken."""
     wanted = [item.name or folder.resolve().name for folder, item in zip(folders, items, strict=True)]
     names: list[str] = []

@@ -41,14 +41,14 @@ def up(
     """
     with clear_ending():
         from dg4d_lib.errors import BadInput
-        from dg4d_lib.rasterizer.choice import cuda_devices
+        from dg4d_lib.rasterizer.backends import cuda_device_count
         from flows.convert import connect
         from flows.serving import background, roots
         from flows.serving.pools import read_pools
         from flows.serving.workers import Worker, limit
 
         known = read_pools()
-        chosen = pools or ["process-cpu", *(["process-gpu"] if cuda_devices() else [])]
+        chosen = pools or ["process-cpu", *(["process-gpu"] if cuda_device_count() else [])]
         if unknown := [name for name in chosen if name not in known]:
             raise BadInput(f"there is no pool {unknown[0]!r} in deploy/pools.yaml; there are: {', '.join(known)}")
         server = background.background_server()

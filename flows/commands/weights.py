@@ -9,7 +9,7 @@ import typer
 from flows.commands.endings import clear_ending
 
 if TYPE_CHECKING:
-    from dg4d_lib.weights.lock import Locked
+    from dg4d_lib.weights.lock import LockEntry
     from dg4d_lib.weights.registry import Weights
 
 weights = typer.Typer(
@@ -60,7 +60,7 @@ def pull(names: Names) -> None:
         from dg4d_lib.errors import BadInput
         from dg4d_lib.weights.locate import given_folder
         from dg4d_lib.weights.pull import pull as get
-        from dg4d_lib.weights.registry import weights_called
+        from dg4d_lib.weights.registry import lookup_weights
         from steps.runtime.weights import license_of, weights_home
 
         for name in names:
@@ -68,7 +68,7 @@ def pull(names: Names) -> None:
                 raise BadInput(f"{name} is a folder on this machine; name weights, or an id of the Hugging Face hub")
             home = weights_home()
             home.mkdir(parents=True, exist_ok=True)
-            locked = get(weights_called(name), home)
+            locked = get(lookup_weights(name), home)
             typer.echo(f"{name}: {_size(locked)} GB, revision {locked.revision}; {license_of(name)}")
 
 
@@ -79,9 +79,9 @@ def check(
     """Verify every file against recorded or published digests."""
     with clear_ending():
         from dg4d_lib.errors import BackendUnavailable
-        from dg4d_lib.weights.locate import find_weights, troubles, unpublished
+        from dg4d_lib.weights.locate import find_problems, find_unpublished, find_weights
         from dg4d_lib.weights.lock import read_lock
-        from dg4d_lib.weights.registry import weights_called
+        from dg4d_lib.weights.registry import lookup_weights
         from steps.runtime.weights import weights_home
 
         home = weights_home()
@@ -91,10 +91,10 @@ def check(
         if not wanted:
             typer.echo("no weights are here, so there is nothing to check")
         for name in wanted:
-            one = weights_called(name)
+            one = lookup_weights(name)
             folder = _place(one) or find_weights(name, home)
             locked = locks.get(one.name) if folder.parent == home else None
-            wrong = troubles(folder, one, locked) or (unpublished(folder, one) if locked is None else {})
+            wrong = find_problems(folder, one, locked) or (find_unpublished(folder, one) if locked is None else {})
             for file, what in wrong.items():
                 typer.echo(f"{name}: {file} {what}")
             if wrong:
@@ -114,20 +114,20 @@ def check(
 
 def _all_of_them() -> list["Weights"]:
     from dg4d_lib.weights.lock import read_lock
-    from dg4d_lib.weights.registry import KNOWN, weights_called
+    from dg4d_lib.weights.registry import KNOWN, lookup_weights
     from steps.runtime.weights import weights_home
 
     pulled = {name: locked.license for name, locked in read_lock(weights_home()).items()}
-    return [*KNOWN.values(), *(weights_called(name, card) for name, card in pulled.items() if name not in KNOWN)]
+    return [*KNOWN.values(), *(lookup_weights(name, card) for name, card in pulled.items() if name not in KNOWN)]
 
 
 def _place(one: "Weights") -> Path | None:
     """Where weights lie, whole or not; None where they are not here."""
-    from dg4d_lib.weights.locate import folder_name, in_hub_cache
+    from dg4d_lib.weights.locate import folder_name, hub_cache_snapshot
     from steps.runtime.weights import weights_home
 
     folder = weights_home() / folder_name(one)
-    return folder if folder.exists() else in_hub_cache(one)
+    return folder if folder.exists() else hub_cache_snapshot(one)
 
 
 def _columns(texts: Sequence[str], width: int) -> str:
@@ -136,27 +136,27 @@ def _columns(texts: Sequence[str], width: int) -> str:
     return f"{name:<{width}}  {here:<7}  {size:<5}  {revision:<10}  {commercial}".rstrip()
 
 
-def _row(one: "Weights", locked: "Locked | None") -> list[str]:
-    from dg4d_lib.weights.locate import MEMORY, troubles
+def _row(one: "Weights", locked: "LockEntry | None") -> list[str]:
+    from dg4d_lib.weights.locate import DIGEST_CACHE, find_problems
     from steps.runtime.weights import weights_home
 
     place = _place(one)
     here = "no"
     if place is not None:
         own = place.parent == weights_home()
-        whole = not troubles(place, one, locked if own else None, weights_home() / MEMORY)
+        whole = not find_problems(place, one, locked if own else None, weights_home() / DIGEST_CACHE)
         here = ("yes" if own else "hub cache") if whole else "damaged"
     size = _size(locked) if locked else f"~{one.about_gb:g}" if one.about_gb else "?"
     revision = locked.revision if locked else one.revision or "-"
     return [one.name, here, size, revision[:10], one.license.commercial, one.license.name]
 
 
-def _files_of(one: "Weights", locked: "Locked | None") -> list[tuple[str, str, str]]:
+def _files_of(one: "Weights", locked: "LockEntry | None") -> list[tuple[str, str, str]]:
     """Path, sha256 and bytes of what was pulled, else of what is known to be published."""
     if locked:
         return [(path, file.sha256, str(file.size)) for path, file in locked.files.items()]
     return [(path, sha256, "-") for path, sha256 in one.published.items()]
 
 
-def _size(locked: "Locked") -> str:
+def _size(locked: "LockEntry") -> str:
     return f"{sum(file.size for file in locked.files.values()) / 1e9:.2f}"

@@ -5,7 +5,6 @@ Prefect's own policies hash arguments and source text and miss what matters; its
 
 import asyncio
 import hashlib
-import json
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -16,19 +15,14 @@ from typing import Any
 from filelock import FileLock, Timeout
 from prefect.cache_policies import CachePolicy
 from prefect.context import TaskRunContext
-from prefect.serializers import JSONSerializer
 
 from flows import home
+from flows.engine.records import read_record, record_key
 from flows.engine.shared_results import fetch_result
 from steps.contract import StepRequest, StepResult
 from steps.store.artifact_store import ArtifactStore, StoreUnreachable
 
 POLL_S = 0.1  # between two looks at a lock that another process holds
-
-
-def record_key(request: StepRequest) -> str:
-    """The name of the record that says what a request gave."""
-    return f"{request.step}-{request.digest().removeprefix('sha256:')}"
 
 
 def recorded(path: Path, store: ArtifactStore) -> StepResult | None:
@@ -37,18 +31,8 @@ def recorded(path: Path, store: ArtifactStore) -> StepResult | None:
     Raises:
         StoreUnreachable: the store does not answer.
     """
-    result = result_in(path)
+    result = read_record(path)
     return result if result and all(store.is_sound(ref) for ref in result.outputs.values()) else None
-
-
-def result_in(path: Path) -> StepResult | None:
-    """Return the result in a record that Prefect wrote; None if it cannot be read."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))["result"]
-        result = JSONSerializer().loads(content.encode())
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, ImportError):  # pydantic's is a ValueError
-        return None
-    return result if isinstance(result, StepResult) else None
 
 
 @dataclass

@@ -6,7 +6,7 @@ from itertools import islice
 from pathlib import Path
 
 from flows.engine import leases
-from flows.engine.caching import result_in
+from flows.engine.records import read_record
 from flows.engine.versions import Version, versions
 from steps.store.artifact_store import ArtifactStore, Entry
 
@@ -87,5 +87,5 @@ def _forget_results(records: Path, here: set[str], before: float) -> None:
 
 def _outputs(record: Path) -> set[str]:
     """Return the artifacts that a result refers to; an artifact that no store has where the record is unreadable."""
-    result = result_in(record)
+    result = read_record(record)
     return {"unreadable"} if result is None else {ref.digest for ref in result.outputs.values()}

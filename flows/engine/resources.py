@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.rasterizer.choice import CUDA, cuda_devices
+from dg4d_lib.rasterizer.backends import CUDA, cuda_device_count
 from flows.engine.turns import first_ahead, ticket
 from steps.contract import StepRequest
 from steps.runtime.installed_code import catalog
@@ -156,7 +156,7 @@ _WORDS: dict[Resource, str] = {"gpu": "a GPU", "cpu": "its turn on the processor
 
 @functools.cache
 def _devices() -> tuple[str, ...]:
-    return tuple(map(str, range(cuda_devices())))
+    return tuple(map(str, range(cuda_device_count())))
 
 
 def _free(folder: Path, resource: Resource, devices: tuple[str, ...]) -> tuple[int | None, str]:

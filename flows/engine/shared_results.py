@@ -12,6 +12,7 @@ from pathlib import Path
 
 from flows import home
 from flows.engine.events import StepEvent, listening
+from flows.engine.records import parse_record
 from flows.packages.delivery import RESULTS
 from steps.store.artifact_store import ArtifactStore, StoreUnreachable
 from steps.store.files import write_atomically
@@ -36,12 +37,15 @@ def sharing_results(store: ArtifactStore) -> Iterator[None]:
 
 
 def fetch_result(key: str, record: Path) -> None:
-    """Write the record of a result that another machine shares, unless there is one; note the key for sharing it."""
+    """Write the record of a result that another machine shares, unless there is one; note the key for sharing it.
+
+    A record that `parse_record` refuses is replaced after its step has run again.
+    """
     for store, keys in _sharing:
         if record.exists():
             return
         content = store.read(f"{RESULTS}/{key}")
-        if content is None:
+        if content is None or not parse_record(content.decode(errors="replace")):
             keys.add(key)
         else:
             record.parent.mkdir(parents=True, exist_ok=True)

@@ -3,7 +3,7 @@
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from typing import Any, TypeVar
 from uuid import UUID
@@ -12,9 +12,11 @@ import httpx
 from prefect import runtime
 from prefect.artifacts import create_markdown_artifact, create_progress_artifact, update_progress_artifact
 from prefect.client.schemas.objects import State, TaskRun
+from prefect.context import FlowRunContext
 from prefect.exceptions import TerminationSignal
+from prefect.filesystems import LocalFileSystem
 from prefect.logging import get_run_logger
-from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, PREFECT_LOCAL_STORAGE_PATH
+from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 from prefect.tasks import Task, exponential_backoff
 from prefect.transactions import IsolationLevel
 from pydantic import Field
@@ -231,13 +233,25 @@ def steps_of_flow() -> Iterator[None]:
         _finished.pop(flow_run, None)
 
 
-def flow_settings() -> dict[Any, Any]:
-    """Return the settings of Prefect under which flows run: records of results under `$DG4D_HOME`, no heartbeat.
+@contextmanager
+def flow_context(settings: Mapping[Any, Any] | None = None) -> Iterator[None]:
+    """Keep records of results under `$DG4D_HOME`, and send no heartbeat: one delays the end of a flow run by a second.
 
-    With a heartbeat every flow run waits a second at its end.
+    A flow takes the storage of its results from the flow that calls it, so the current flow run gets that storage too.
+
+    Args:
+        settings: of Prefect, beside these.
     """
-    home.records().mkdir(parents=True, exist_ok=True)
-    return {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None, PREFECT_LOCAL_STORAGE_PATH: home.records()}
+    records = home.records()
+    records.mkdir(parents=True, exist_ok=True)
+    changes = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None, PREFECT_LOCAL_STORAGE_PATH: records}
+    with ExitStack() as contexts:
+        contexts.enter_context(temporary_settings({**changes, **(settings or {})}))
+        if current := FlowRunContext.get():
+            storage = {"result_storage": LocalFileSystem(basepath=str(records))}
+            store = current.result_store.model_copy(update=storage)
+            contexts.enter_context(current.model_copy(update={"result_store": store}))
+        yield
 
 
 _waited: dict[str, float] = {}  # seconds a task run waited for its turn, by its id

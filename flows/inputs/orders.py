@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import Field, ValidationError
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.rasterizer.choice import backend_name, require_backend
+from dg4d_lib.rasterizer.backends import backend_name, require_backend
 from flows.inputs import naming, sources
 from flows.inputs.signing_key import certificate
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen, digest_of

@@ -15,7 +15,7 @@ from urllib.parse import quote
 from flows.inputs.package_record import RECORD
 from flows.packages.publish import Files
 from steps.contract import canonical, digest_of
-from steps.runtime.environment_info import packages
+from steps.runtime.environment_info import installed_distributions
 
 CRATE = "ro-crate-metadata.json"
 PROFILE = "https://w3id.org/ro/wfrun/process/0.5"
@@ -252,8 +252,8 @@ def _packages(machine: Mapping[str, str]) -> Entity:
         "name": "installed Python distributions",
         "softwareVersion": machine["packages"],
     }
-    if machine["packages"] == digest_of(packages()):
-        entity["description"] = " ".join(packages())
+    if machine["packages"] == digest_of(installed_distributions()):
+        entity["description"] = " ".join(installed_distributions())
     return entity
 
 

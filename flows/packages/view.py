@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from dg4d_lib.assets.rendering.viewer_page import viewer_page
+from dg4d_lib.assets.rendering.viewer_page import build_viewer_page
 from dg4d_lib.errors import BadInput
 from flows.formatting.sizes import readable
 from flows.packages.publish import whole
@@ -60,7 +60,7 @@ def page_of(record: Mapping[str, Any], read: Callable[[str], bytes]) -> str:
     splats, picture, video = (
         read(name) if name in record["files"] else None for name in (WEB_SPLATS, SUBJECT, DRIVING)
     )
-    return viewer_page(record.get("item", "asset"), read(ASSET), splats, picture, video, facts_of(record))
+    return build_viewer_page(record.get("item", "asset"), read(ASSET), splats, picture, video, facts_of(record))
 
 
 def page_of_package(package: Path, title: str) -> str:
@@ -76,7 +76,7 @@ def page_of_package(package: Path, title: str) -> str:
                 archive.read(name) if name in sizes else None for name in (WEB_SPLATS, SUBJECT, DRIVING)
             )
             facts = {"Files": {name: readable(size) for name, size in sizes.items()}}
-            return viewer_page(title, archive.read(ASSET), splats, picture, video, facts)
+            return build_viewer_page(title, archive.read(ASSET), splats, picture, video, facts)
     except (zipfile.BadZipFile, KeyError) as error:
         raise BadInput(f"{title} is no package that can be viewed") from error
 

@@ -24,6 +24,7 @@ GRACE_S = 10.0  # for a worker and its runs to end
 QUERY_S = 2.0  # between two looks at the pool; Prefect's own is 10
 LIMIT = "DG4D_WORKER_LIMIT"  # runs of a worker at a time
 HEARTBEAT_S = 30  # of runs; what misses three of them is dead
+RUN_VARIABLE = b"PREFECT__FLOW_RUN_ID="  # in the environment of the process of a run
 
 
 class Worker:
@@ -75,7 +76,7 @@ class Worker:
         """Return the number of runs that it executes at this moment."""
         with suppress(OSError, ValueError):  # it may just be ending
             guard = int(self._place("pid").read_text(encoding="ascii"))
-            return sum(len(_children(int(worker))) for worker in _children(guard))
+            return sum(_is_run(child) for worker in _children(guard) for child in _children(int(worker)))
         return 0
 
     def stop(self) -> bool:
@@ -185,6 +186,13 @@ def _children(pid: int) -> list[str]:
         with suppress(OSError):  # the thread has ended
             found += children.read_text(encoding="ascii").split()
     return found
+
+
+def _is_run(pid: str) -> bool:
+    """Return whether a process executes a flow run; a worker also starts short helpers."""
+    with suppress(OSError):  # it has ended
+        return RUN_VARIABLE in Path(f"/proc/{pid}/environ").read_bytes()
+    return False
 
 
 if __name__ == "__main__":

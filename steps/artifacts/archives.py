@@ -1,4 +1,4 @@
-"""Zips that somebody else may have written, unpacked so that nothing lands outside, and not without end."""
+"""Safe extraction of untrusted zips: no entries outside of the target, bounded in number and size."""
 
 import errno
 import lzma
@@ -14,38 +14,33 @@ from pathlib import Path, PurePosixPath
 from dg4d_lib.errors import BadInput
 
 MOST_ENTRIES = 100_000
-MOST_UNPACKED_BYTES = 64 * 2**30  # of all entries together; what they say of themselves is the most that is read
-BROKEN = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, NotImplementedError, RuntimeError, EOFError, ValueError)
-UNFIT_ERRNOS = {errno.EINVAL, errno.ENAMETOOLONG, errno.EEXIST, errno.ENOTDIR, errno.EISDIR}  # lying offsets, names
-LONGEST_PART_BYTES = 255  # of a file's name, on all common file systems
-LONGEST_NAME_BYTES = 1024  # with folders; Linux takes paths of 4095, and those of our folders come before
+MOST_UNPACKED_BYTES = 64 * 2**30  # of all entries; zipfile reads no more of an entry than its header says
+ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, NotImplementedError, RuntimeError, EOFError, ValueError)
+UNFIT_ERRNOS = {errno.EINVAL, errno.ENAMETOOLONG, errno.EEXIST, errno.ENOTDIR, errno.EISDIR}  # false offsets and names
+LONGEST_PART_BYTES = 255  # file name, on all common file systems
+LONGEST_NAME_BYTES = 1024  # path in the zip; Linux allows 4095, of which our folders need some
 UNFIT = re.compile(r"[\\\x00-\x1f]|^[A-Za-z]:")  # backslashes, control characters, drives
-EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a zip can hold
+EPOCH = (1980, 1, 1, 0, 0, 0)  # earliest time that a zip can hold; every entry has it
 
 
 def stays_inside(name: str) -> bool:
-    """Whether a name with slashes leads to a file in or below its folder, on every system."""
-    parts = name.split("/")
-    return bool(name) and not UNFIT.search(name) and not {"", ".", ".."} & set(parts)
+    """Return True if a name with slashes leads to a file in or below its folder, on every system."""
+    return bool(name) and not UNFIT.search(name) and not {"", ".", ".."} & set(name.split("/"))
 
 
 def can_exist(name: str) -> bool:
-    """Return whether a name with slashes is short enough for a file and its folders."""
+    """Return True if a name with slashes is short enough for a file and its folders."""
     size = len(os.fsencode(name))
     return size <= LONGEST_NAME_BYTES and all(len(os.fsencode(part)) <= LONGEST_PART_BYTES for part in name.split("/"))
 
 
-def checked(archive: zipfile.ZipFile, what: str) -> list[zipfile.ZipInfo]:
-    """The files of a zip, by name.
-
-    Args:
-        archive: the zip.
-        what: how messages call it.
+def _checked_entries(archive: zipfile.ZipFile, what: str) -> list[zipfile.ZipInfo]:
+    """Return the files of a zip, sorted by name.
 
     Raises:
-        BadInput: an entry leads outside or is a link, two have one name, or there is too much in it.
+        BadInput: an entry leads outside or is a link, two have the same name, or they are too many or too large.
     """
-    files = (entry for entry in archive.infolist() if not entry.filename.endswith("/"))  # is_dir() needs a name
+    files = (entry for entry in archive.infolist() if not entry.filename.endswith("/"))  # is_dir() fails without a name
     entries = sorted(files, key=lambda entry: entry.filename)
     if len(entries) > MOST_ENTRIES:
         raise BadInput(f"{what} has {len(entries)} entries; at most {MOST_ENTRIES} are unpacked")
@@ -65,36 +60,36 @@ def checked(archive: zipfile.ZipFile, what: str) -> list[zipfile.ZipInfo]:
 
 
 def unpack(path: Path, folder: Path, what: str, wanted: Callable[[str], bool] = lambda name: True) -> list[str]:
-    """Unpack a zip into an existing folder; the names of its files.
+    """Unpack a zip into an existing folder and return the names of its files.
 
     Args:
         path: the zip.
-        folder: best a new one: links in it would be followed.
-        what: how messages call the zip.
-        wanted: whether a file of this name is unpacked.
+        folder: target, new if possible, as links in it are followed.
+        what: name of the zip in messages.
+        wanted: filter for the names of the files.
 
     Raises:
-        BadInput: no zip, or what `checked` refuses; then nothing is unpacked.
+        BadInput: the file is no zip, or is broken, or has unsafe, too many or too large entries.
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            entries = [entry for entry in checked(archive, what) if wanted(entry.filename)]
+            entries = [entry for entry in _checked_entries(archive, what) if wanted(entry.filename)]
             for entry in entries:
                 target = folder / PurePosixPath(entry.filename)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with archive.open(entry) as source, target.open("wb") as file:
                     shutil.copyfileobj(source, file)
-    except BROKEN as error:
+    except ZIP_ERRORS as error:
         raise BadInput(f"{what} is broken, encrypted, or no zip: {error}") from error
     except OSError as error:
-        if error.errno not in UNFIT_ERRNOS and error.errno is not None:  # bzip2 damage has none
+        if error.errno not in UNFIT_ERRNOS and error.errno is not None:  # damaged bzip2 data has no errno
             raise
         raise BadInput(f"{what} is broken, or has a name that no file may have: {error.strerror or error}") from error
     return [entry.filename for entry in entries]
 
 
 def add_entry(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
-    """Add an entry without anything that depends on time or machine: equal entries give equal bytes."""
+    """Add an entry whose bytes depend on name and content alone, not on time or machine."""
     info = zipfile.ZipInfo(name, EPOCH)
     info.external_attr = 0o644 << 16
     archive.writestr(info, content)

@@ -1,4 +1,4 @@
-"""How far two artifacts of one kind are apart, in numbers."""
+"""Numerical difference of two artifacts of the same format."""
 
 import json
 import math
@@ -16,40 +16,46 @@ from PIL import Image, ImageSequence
 from safetensors import SafetensorError
 from safetensors.numpy import load
 
-from dg4d_lib.assets.formats.gltf import Parsed
+from dg4d_lib.assets.formats.gltf import GlbReader
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.ply import read_ply
 
 TOLERANCE = 0.01  # of the range of values: 40 dB for pictures
 FULL_SCALE = 255.0
+FIELDS = ("means", "log_scales", "quats", "opacity_logits", "harmonics")  # of Gaussians
+UNREADABLE = (OSError, SyntaxError, ValueError, IndexError, av.FFmpegError, SafetensorError)
 
 Arrays = dict[str, NDArray[Any]]
 
 
 def difference(one: Path, two: Path) -> float | None:
-    """How far two files of one suffix are apart.
+    """Return the largest difference of two files with the same suffix.
 
-    Everything that a file holds is compared array by array: pixels, frames, vertices, texture, the columns of a cloud,
-    tensors, numbers in JSON, and the entries of a zip. The difference of two arrays is the root mean square of the
-    differences of their values, as a share of the range of values: full scale for pictures, else what the values of
-    `one` and zero span.
+    All content is compared array by array: pixels, frames, vertices, textures, columns of Gaussians, tensors, numbers
+    in JSON, and the entries of a zip. The difference of two arrays is the root mean square error of their values
+    relative to the range of values: full scale for pictures, else the interval that the values of `one` and zero span.
 
     Returns:
-        The largest of these; infinite where shapes, whole numbers or texts differ; None where nothing is known about
-        the format.
+        The largest difference; infinite if shapes, integers or texts differ; None for an unknown format.
 
     Raises:
         BadInput: a file is broken.
     """
     if one.suffix == ".zip":
         return _zips(one, two)
-    read = READERS.get(one.suffix)
-    if read is None:
+    if one.suffix not in READERS:
         return None
-    first, second = read(one), read(two)
+    first, second = _read(one), _read(two)
     if first.keys() != second.keys():
         return math.inf
     return max((_distance(first[name], second[name]) for name in first), default=0.0)
+
+
+def _read(path: Path) -> Arrays:
+    try:
+        return READERS[path.suffix](path)
+    except UNREADABLE as error:
+        raise BadInput(f"{path.name} cannot be read: {error}") from error
 
 
 def _distance(one: NDArray[Any], two: NDArray[Any]) -> float:
@@ -68,7 +74,7 @@ def _distance(one: NDArray[Any], two: NDArray[Any]) -> float:
 
 
 def _zips(one: Path, two: Path) -> float | None:
-    """The largest difference of the entries; None if it would be of an entry about which nothing is known."""
+    """Return the largest difference of two zips' entries; None if entries of an unknown format differ."""
     known = [0.0]
     with zipfile.ZipFile(one) as first, zipfile.ZipFile(two) as second, TemporaryDirectory() as scratch:
         if sorted(first.namelist()) != sorted(second.namelist()):
@@ -87,45 +93,29 @@ def _zips(one: Path, two: Path) -> float | None:
     return max(known)
 
 
-def _pixels(path: Path) -> Arrays:
-    """Every frame of a picture, animated or not."""
-    return _decoded(path.read_bytes(), path.name)
-
-
-def _decoded(content: bytes, name: str) -> Arrays:
-    try:
-        with Image.open(BytesIO(content)) as picture:
-            frames = [np.asarray(frame.convert("RGBA")) for frame in ImageSequence.Iterator(picture)]
-    except (OSError, SyntaxError, ValueError) as error:
-        raise BadInput(f"{name} is no picture that can be read: {error}") from error
+def _numbered(frames: list[NDArray[Any]]) -> Arrays:
     return {f"frame {number}": frame for number, frame in enumerate(frames)}
 
 
-def _film(path: Path) -> Arrays:
-    try:
-        with av.open(str(path)) as film:
-            frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
-    except (av.FFmpegError, IndexError) as error:
-        raise BadInput(f"{path.name} is no film that can be read: {error}") from error
-    return {f"frame {number}": frame for number, frame in enumerate(frames)}
+def _pixels(content: bytes) -> Arrays:
+    """Decode every frame of a picture."""
+    with Image.open(BytesIO(content)) as picture:
+        return _numbered([np.asarray(frame.convert("RGBA")) for frame in ImageSequence.Iterator(picture)])
 
 
-def _cloud(path: Path) -> Arrays:
-    cloud = read_ply(path)
-    fields = ("means", "log_scales", "quats", "opacity_logits", "harmonics")
-    return {name: getattr(cloud, name).numpy() for name in fields}
+def _video(path: Path) -> Arrays:
+    with av.open(str(path)) as video:
+        return _numbered([frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)])
 
 
-def _tensors(path: Path) -> Arrays:
-    try:
-        return dict(load(path.read_bytes()))
-    except SafetensorError as error:
-        raise BadInput(f"{path.name} holds no tensors that can be read: {error}") from error
+def _gaussians(path: Path) -> Arrays:
+    gaussians = read_ply(path)
+    return {name: getattr(gaussians, name).numpy() for name in FIELDS}
 
 
-def _asset(path: Path) -> Arrays:
-    """The rows of numbers of a GLB, all of one type together, and its pictures; places in the file do not count."""
-    parsed = Parsed(path.read_bytes())
+def _glb(path: Path) -> Arrays:
+    """Return the accessors of a GLB, joined by type, and its pictures; their offsets in the file do not count."""
+    parsed = GlbReader(path.read_bytes())
     rows = [parsed.accessor(i) for i in range(len(parsed.tree.get("accessors", ())))]
     types = dict.fromkeys((values.dtype, values.shape[1]) for values in rows)
     arrays: Arrays = {
@@ -133,32 +123,29 @@ def _asset(path: Path) -> Arrays:
         for dtype, width in types
     }
     for number, image in enumerate(parsed.tree.get("images", ())):
-        pixels = _decoded(parsed.view(image["bufferView"]), path.name)
+        pixels = _pixels(parsed.view(image["bufferView"]))
         arrays |= {f"image {number}, {frame}": values for frame, values in pixels.items()}
     return arrays
 
 
-def _numbers(path: Path) -> Arrays:
-    """The broken numbers of a JSON file, and all the rest as one text."""
+def _json(path: Path) -> Arrays:
+    """Return the decimal fractions of a JSON file, and the rest as one text."""
     numbers: list[float] = []
 
     def keep(digits: str) -> str:
         numbers.append(float(digits))
         return "number"
 
-    try:
-        rest = json.loads(path.read_bytes(), parse_float=keep)
-    except ValueError as error:
-        raise BadInput(f"{path.name} is no JSON: {error}") from error
+    rest = json.loads(path.read_bytes(), parse_float=keep)
     return {"numbers": np.array(numbers), "rest": np.array([json.dumps(rest, sort_keys=True)])}
 
 
 READERS: dict[str, Callable[[Path], Arrays]] = {
-    ".png": _pixels,
-    ".webp": _pixels,
-    ".mp4": _film,
-    ".ply": _cloud,
-    ".safetensors": _tensors,
-    ".glb": _asset,
-    ".json": _numbers,
+    ".png": lambda path: _pixels(path.read_bytes()),
+    ".webp": lambda path: _pixels(path.read_bytes()),
+    ".mp4": _video,
+    ".ply": _gaussians,
+    ".safetensors": lambda path: dict(load(path.read_bytes())),
+    ".glb": _glb,
+    ".json": _json,
 }

@@ -1,12 +1,12 @@
-"""Ground truth on disk: where the frames of every view lie. Imports no torch.
+"""Ground-truth datasets on disk: frames of the input and of other views. Imports no torch.
 
-Three layouts are read, an object a folder:
+An object is a folder in one of three layouts:
 
-  ours           input/, view_<azimuth>/ ..., mesh.npz and bank/ where there are any
+  ours           input/, view_<azimuth>/ ..., optionally mesh.npz and bank/
   Consistent4D   eval_0/ ... eval_3/, and the input in a folder beside them, or directly in the object's folder
-  input only     one picture, or a folder of frames: nothing is known of other sides
+  input only     one picture, or a folder of frames, without other views
 
-Frames are pictures whose names end in their number; RGBA is best, for opaque ones the subject is what is not white.
+Frames are pictures whose names end in their number, best as RGBA; in opaque ones the subject is all that is not white.
 """
 
 import json
@@ -20,17 +20,17 @@ CONSISTENT4D_AZIMUTHS_DEG = (-75.0, 15.0, 105.0, 195.0)  # of eval_0 to eval_3 (
 PICTURES = frozenset([".png", ".jpg", ".jpeg", ".webp"])
 OURS, THEIRS = re.compile(r"view_(-?\d+(?:\.\d+)?)"), re.compile(r"eval_(\d+)")
 INPUT, MESH, BANK, CAMERAS = "input", "mesh.npz", "bank", "cameras.json"
-# of every view, as in dg4d_lib/cameras/orbit.py, whose import would bring torch
+# camera of all views; equals that of dg4d_lib/cameras/orbit.py, which imports torch
 CAMERA = {"elevation": 0.0, "radius": 2.0, "fovy": 49.1}  # degrees, world units, degrees
-CLOSE = 0.01  # in the units of the above
+CLOSE = 0.01  # tolerance, in the units of the above
 
 
-class View(Frozen):
-    """What is seen from one side, level with the subject.
+class TrueView(Frozen):
+    """Frames of one view at elevation 0.
 
     Attributes:
-        azimuth_deg: of the camera; 0 is the input's.
-        frames: in the order in which they play.
+        azimuth_deg: azimuth of the camera; 0 is the input view.
+        frames: pictures in order of time.
     """
 
     azimuth_deg: float
@@ -38,24 +38,24 @@ class View(Frozen):
 
     @property
     def name(self) -> str:
-        """As folders and scores call it, for example "-75"."""
+        """Azimuth in folder names and scores, for example "-75"."""
         return f"{self.azimuth_deg + 0.0:g}"
 
 
-class Truth(Frozen):
-    """What is known of one object.
+class GroundTruth(Frozen):
+    """Ground truth of one object.
 
     Attributes:
-        name: of the object.
-        inputs: the frames of the input; one where only a picture was given.
-        views: what should be seen from other sides; as many frames as the input, if that has more than one.
-        mesh: NumPy archive of `vertices` [t v 3], `faces` [f 3] and perhaps `face_weight` [f]; None: unknown.
-        bank: folder of true views for the oracle prior; None: there is none.
+        name: name of the object.
+        inputs: frames of the input; one if it is a picture.
+        views: other views; as many frames as the input, if that has more than one.
+        mesh: NumPy archive of `vertices` [t v 3], `faces` [f 3] and optionally `face_weight` [f].
+        bank: folder of views for the oracle prior.
     """
 
     name: str
     inputs: tuple[Path, ...]
-    views: tuple[View, ...] = ()
+    views: tuple[TrueView, ...] = ()
     mesh: Path | None = None
     bank: Path | None = None
 
@@ -70,21 +70,21 @@ class Truth(Frozen):
         return (*self.pictures, *(path for path in (self.mesh, self.bank) if path is not None))
 
 
-def find_truth(place: Path) -> Truth:
-    """The ground truth of one object.
+def find_ground_truth(place: Path) -> GroundTruth:
+    """Return the ground truth of the object in a folder, or of a picture.
 
     Raises:
         BadInput: there is none, or it is not complete; says what is missing.
     """
     if place.is_file() and place.suffix.lower() in PICTURES:
-        return Truth(name=place.stem, inputs=(place,))
+        return GroundTruth(name=place.stem, inputs=(place,))
     if not place.is_dir():
         raise BadInput(f"{place} is no ground truth: give a folder of an object, or a picture")
-    views = _views(place)
-    truth = Truth(
+    views = [TrueView(azimuth_deg=azimuth, frames=tuple(_pictures(path))) for azimuth, path in _view_folders(place)]
+    truth = GroundTruth(
         name=place.absolute().name,
-        inputs=_inputs(place),
-        views=views,
+        inputs=tuple(_inputs(place)),
+        views=tuple(sorted(views, key=lambda view: view.azimuth_deg)),
         mesh=place / MESH if (place / MESH).is_file() else None,
         bank=place / BANK if (place / BANK / "bank.json").is_file() else None,
     )
@@ -92,8 +92,8 @@ def find_truth(place: Path) -> Truth:
     return truth
 
 
-def find_truths(dataset: Path) -> list[Truth]:
-    """The objects of a data set: a folder each, or a picture each; also of a folder that has these in `gt/`.
+def find_ground_truths(dataset: Path) -> list[GroundTruth]:
+    """Return the objects of a data set, which are folders or pictures in it or in its folder `gt/`.
 
     Raises:
         BadInput: there are none, or one of them is not complete.
@@ -102,10 +102,10 @@ def find_truths(dataset: Path) -> list[Truth]:
         raise BadInput(f"{dataset} is no data set: give a folder that holds a folder per object")
     root = dataset / "gt" if (dataset / "gt").is_dir() else dataset
     if _view_folders(root) or (root / INPUT).is_dir():
-        return [find_truth(root)]
+        return [find_ground_truth(root)]
     folders = [path for path in sorted(root.iterdir()) if path.is_dir() and not path.name.startswith(".")]
     objects = [path for path in folders if _view_folders(path) or (path / INPUT).is_dir()]
-    found = [find_truth(path) for path in objects or _pictures(root)]
+    found = [find_ground_truth(path) for path in objects or _pictures(root)]
     if not found:
         raise BadInput(
             f"{dataset} holds no objects: an object is a folder with input/ and view_<azimuth>/, or, as in "
@@ -114,12 +114,8 @@ def find_truths(dataset: Path) -> list[Truth]:
     return found
 
 
-def _views(folder: Path) -> tuple[View, ...]:
-    views = [View(azimuth_deg=azimuth, frames=tuple(_pictures(path))) for azimuth, path in _view_folders(folder)]
-    return tuple(sorted(views, key=lambda view: view.azimuth_deg))
-
-
 def _view_folders(folder: Path) -> list[tuple[float, Path]]:
+    """Return azimuth and folder of every view."""
     found = []
     for path in sorted(folder.iterdir()):
         ours, theirs = OURS.fullmatch(path.name), THEIRS.fullmatch(path.name)
@@ -134,27 +130,27 @@ def _view_folders(folder: Path) -> list[tuple[float, Path]]:
     return found
 
 
-def _inputs(folder: Path) -> tuple[Path, ...]:
-    """The frames in `input/`; else those directly in the folder; else those of the only other folder with pictures."""
+def _inputs(folder: Path) -> list[Path]:
+    """Return the frames in `input/`, else those directly in the folder, else those of the only other picture folder."""
     if (folder / INPUT).is_dir():
-        return tuple(_pictures(folder / INPUT))
+        return _pictures(folder / INPUT)
     if direct := _pictures(folder):
-        return tuple(direct)
+        return direct
     known = {path for _, path in _view_folders(folder)} | {folder / BANK, folder / "static"}
     others = [path for path in sorted(folder.iterdir()) if path.is_dir() and path not in known and _pictures(path)]
     if len(others) != 1:
         named = f" ({', '.join(path.name for path in others)}: which?)" if others else ""
         raise BadInput(f"{folder} has no input{named}: put the frames that are given into {folder / INPUT}")
-    return tuple(_pictures(others[0]))
+    return _pictures(others[0])
 
 
 def _pictures(folder: Path) -> list[Path]:
-    """The pictures directly in a folder, by the number at the end of their names."""
+    """Return the pictures directly in a folder, sorted by the last number in their names."""
     found = [p for p in folder.iterdir() if p.suffix.lower() in PICTURES and p.is_file() and p.name[0] != "."]
     return sorted(found, key=lambda path: (int((re.findall(r"\d+", path.stem) or ["0"])[-1]), path.name))
 
 
-def _check(truth: Truth, folder: Path) -> None:
+def _check(truth: GroundTruth, folder: Path) -> None:
     if not truth.inputs:
         raise BadInput(f"{folder} has no input frames: put them into {folder / INPUT}")
     counts = {f"view_{view.name}": len(view.frames) for view in truth.views}
@@ -169,8 +165,8 @@ def _check(truth: Truth, folder: Path) -> None:
         _check_cameras(folder / CAMERAS, truth)
 
 
-def _check_cameras(path: Path, truth: Truth) -> None:
-    """Refuse views that were not taken as ours are."""
+def _check_cameras(path: Path, truth: GroundTruth) -> None:
+    """Refuse views of another elevation, radius or field of view."""
     try:
         given = json.loads(path.read_text(encoding="utf-8"))
         cameras = {name: given[name] for name in (INPUT, *(f"view_{view.name}" for view in truth.views))}

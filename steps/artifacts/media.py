@@ -1,22 +1,23 @@
-"""Files that steps hand to each other: pictures, frames, motions, curves. Equal content gives equal bytes."""
+"""Readers and writers of pictures, frames, tensors and loss curves; equal content gives equal bytes."""
 
 import json
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
 import torch
 from jaxtyping import Float
+from safetensors import safe_open
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.video.driving import DrivingVideo
-from steps.artifacts.archives import unpack
+from steps.artifacts.archives import add_entry, unpack
 
-EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a zip can hold; every entry has it
-CURVES_POINTS = 200  # a curve is thinned to about this many points
+CURVES_POINTS = 200  # approximate number of points of a stored curve
 
 
 def write_png(path: Path, picture: Float[Tensor, "h w c"]) -> None:
@@ -39,34 +40,30 @@ def read_png(path: Path) -> Float[Tensor, "h w c"]:
     """Read a picture as straight color and alpha in [0, 1].
 
     Raises:
-        BadInput: it cannot be read.
+        BadInput: the file cannot be read.
     """
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
     file = oiio.ImageInput.open(str(path), config)
-    if file is None:
-        raise BadInput(f"{path.name} cannot be read as a picture: {oiio.geterror()}")
-    pixels = file.read_image("float")
+    pixels = file.read_image("float") if file is not None else None
     if pixels is None:
-        raise BadInput(f"{path.name} cannot be read as a picture: {file.geterror()}")
-    file.close()
+        reason = file.geterror() if file is not None else oiio.geterror()
+        raise BadInput(f"{path.name} cannot be read as a picture: {reason}")
     return torch.from_numpy(np.ascontiguousarray(pixels))
 
 
 def write_zip(path: Path, entries: Sequence[tuple[str, bytes]]) -> None:
-    """A stored zip with fixed dates: equal entries give equal bytes."""
+    """Write an uncompressed zip whose bytes depend on the entries alone."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
         for name, content in entries:
-            info = zipfile.ZipInfo(name, EPOCH)
-            info.external_attr = 0o644 << 16
-            archive.writestr(info, content)
+            add_entry(archive, name, content)
 
 
 def write_frames(path: Path, video: DrivingVideo) -> None:
-    """A driving video as RGBA pictures in a zip."""
+    """Write a driving video as RGBA pictures in a zip."""
     scratch = path.with_suffix(".png")
     entries = []
-    for i, cutout in enumerate(torch.cat([video.frames, video.coverage], -1)):
+    for i, cutout in enumerate(torch.cat([video.frames, video.alpha], -1)):
         write_png(scratch, cutout)
         entries.append((f"{i:03d}.png", scratch.read_bytes()))
     scratch.unlink()
@@ -75,7 +72,7 @@ def write_frames(path: Path, video: DrivingVideo) -> None:
 
 
 def read_frames(path: Path, scratch: Path) -> DrivingVideo:
-    """Read what `write_frames` wrote; `scratch` is a folder for the unpacked pictures."""
+    """Read a file of `write_frames`; `scratch` is a folder for the unpacked pictures."""
     names = unpack(path, scratch, "the zip of frames", lambda name: name.endswith(".png"))
     stack = torch.stack([read_png(scratch / name) for name in names])
     with zipfile.ZipFile(path) as archive:
@@ -83,10 +80,22 @@ def read_frames(path: Path, scratch: Path) -> DrivingVideo:
     return DrivingVideo(stack[..., :3].contiguous(), stack[..., 3:].contiguous(), fps)
 
 
+def read_tensors(path: Path, key: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Return the JSON under a key of a safetensors file's metadata, and its tensors.
+
+    Raises:
+        SafetensorError: the file is no safetensors file.
+        KeyError: its metadata lack the key.
+    """
+    with safe_open(path, "pt") as file:
+        about = json.loads((file.metadata() or {})[key])
+        return about, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no dict)
+
+
 def write_curves(
-    path: Path, title: str, x: Sequence[int], series: Mapping[str, Sequence[float]], notes: Sequence[str] = ()
+    path: Path, title: str, x: Sequence[int], series: Mapping[str, Sequence[float]], notes: Sequence[str]
 ) -> None:
-    """Losses over iterations as JSON, thinned."""
+    """Write losses over iterations as JSON, subsampled to about `CURVES_POINTS` points."""
     step = max(1, len(x) // CURVES_POINTS)
     thin = {name: [round(float(v), 6) for v in values[::step]] for name, values in series.items()}
     text = json.dumps({"title": title, "x": list(x[::step]), "series": thin, "notes": list(notes)})

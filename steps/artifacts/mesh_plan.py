@@ -1,4 +1,4 @@
-"""The `plan` artifact: kind of mesh that a motion gets, and density of its surface. Imports no torch."""
+"""The `plan` artifact: tracked mesh or mesh per frame, and the density of its surface. Imports no torch."""
 
 from pathlib import Path
 from typing import Literal
@@ -14,7 +14,7 @@ class MeshPlan(Frozen):
 
     mode: Literal["tracked", "per_frame"]
     reference_frame: int = Field(0, ge=0, description="frame whose surface is extracted (tracked) or sets the level")
-    followed: float = Field(1.0, description="IoU of outlines over the motion, of the best trial mesh; 1 without trial")
+    followed: float = Field(1.0, description="IoU of outlines over the motion, of the best trial mesh; 1 if none")
     level: float = Field(description="density of the surface")
 
 
@@ -24,7 +24,7 @@ def write_plan(path: Path, plan: MeshPlan) -> None:
 
 
 def read_plan(path: Path) -> MeshPlan:
-    """Read what `write_plan` wrote.
+    """Read a file of `write_plan`.
 
     Raises:
         BadInput: the file is no plan.

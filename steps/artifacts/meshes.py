@@ -1,4 +1,4 @@
-"""The `tracked` and `meshes` artifacts: textured meshes in safetensors. Equal meshes give equal bytes."""
+"""The `tracked` and `meshes` artifacts: textured meshes in safetensors; equal meshes give equal bytes."""
 
 import json
 import zipfile
@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
-from steps.artifacts.media import write_zip
+from steps.artifacts.media import read_tensors, write_zip
 
 
 def write_tracked(path: Path, tracked: TrackedMesh) -> None:
@@ -20,19 +20,17 @@ def write_tracked(path: Path, tracked: TrackedMesh) -> None:
     tensors = {**_tensors(tracked.mesh), "offsets": tracked.offsets.float().cpu().contiguous()}
     if tracked.textures is not None:
         tensors["textures"] = _rounded(tracked.textures)
-    path.write_bytes(save(tensors, {"tracked": json.dumps({"rest": tracked.rest})}))
+    path.write_bytes(save(tensors, {"tracked": json.dumps({"rest": tracked.reference_frame})}))
 
 
 def read_tracked(path: Path) -> TrackedMesh:
-    """Read what `write_tracked` wrote.
+    """Read a file of `write_tracked`.
 
     Raises:
         BadInput: the file is no tracked mesh.
     """
     try:
-        with safe_open(path, "pt") as file:
-            about = json.loads((file.metadata() or {})["tracked"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no dict)
+        about, tensors = read_tensors(path, "tracked")
         textures = tensors["textures"].float() / 255 if "textures" in tensors else None
         return TrackedMesh(_mesh(tensors), tensors["offsets"], textures, float(about["rest"]))
     except (SafetensorError, KeyError) as error:
@@ -42,12 +40,12 @@ def read_tracked(path: Path) -> TrackedMesh:
 
 
 def write_meshes(path: Path, meshes: Mapping[int, TexturedMesh]) -> None:
-    """Write a mesh per frame, by the number of the frame."""
+    """Write meshes by the number of their frame."""
     write_zip(path, [(f"{frame:03d}.safetensors", save(_tensors(mesh))) for frame, mesh in sorted(meshes.items())])
 
 
 def read_meshes(path: Path) -> list[TexturedMesh]:
-    """Read what `write_meshes` wrote, in the order of the frames.
+    """Read a file of `write_meshes`, in the order of the frames.
 
     Raises:
         BadInput: the file holds no meshes, or frames are missing between them.

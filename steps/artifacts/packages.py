@@ -1,4 +1,4 @@
-"""What lies where in a package, and the manifest that says so (`asset.json`)."""
+"""File names in a package, and its manifest `asset.json`."""
 
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -50,7 +50,7 @@ ABOUT_FOLDERS = {
 
 
 class Camera(Frozen):
-    """The viewpoint of the input picture, and what the numbers mean."""
+    """Camera of the input picture, and the convention of its angles."""
 
     elevation_deg: float = 0.0
     azimuth_deg: float = 0.0
@@ -63,9 +63,9 @@ class Camera(Frozen):
 
 
 class Manifest(Frozen):
-    """What a package holds. Frame i is shown at i / fps seconds; after the last frame comes the first again.
+    """Content of a package, an animation that loops: frame i is shown at i / fps seconds.
 
-    Frames are those that are written: another number than the driving video's where `pack.fps` asks for another rate.
+    With `pack.fps`, the number of frames differs from that of the driving video.
     """
 
     format: Literal["dg4d-asset"] = "dg4d-asset"
@@ -79,21 +79,33 @@ class Manifest(Frozen):
     vertices: tuple[int, ...] = Field(description="of the tracked mesh, or of every frame's mesh")
     triangles: tuple[int, ...] = Field(description="of the tracked mesh, or of every frame's mesh")
     camera: Camera = Camera()
-    files: dict[str, str] = Field(description="what every file is, by its name in the package")
+    files: dict[str, str] = Field(description="description of every file, by its name in the package")
     notes: tuple[str, ...] = ()
 
 
 def about(name: str) -> str:
-    """One line on a file of a package, by its name there."""
+    """Return one line on a file of a package, by its name there."""
     path = PurePosixPath(name)
     return ABOUT.get(name) or ABOUT_FOLDERS[path.parts[0], path.suffix]
 
 
-def read_manifest(folder: Path) -> Manifest:
-    """The manifest of an unpacked package.
+def read_file(folder: Path, name: str) -> bytes:
+    """Return the content of a file of an unpacked package.
 
     Raises:
-        BadInput: the folder is no package, or its manifest is broken or from another version.
+        BadInput: the file is missing or cannot be read.
+    """
+    try:
+        return (folder / name).read_bytes()
+    except OSError as error:
+        raise BadInput(f"{folder} is not complete: {name} cannot be read ({error.strerror}); make it again") from error
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """Read the manifest of an unpacked package.
+
+    Raises:
+        BadInput: the folder is no package, or its manifest is broken or of another version.
     """
     path = folder / MANIFEST
     if not path.is_file():

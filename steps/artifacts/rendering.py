@@ -1,4 +1,4 @@
-"""Pictures of a finished package, from any side at any moment; behind `dg4d render`."""
+"""Rendering of finished packages from any camera at any time, for `dg4d render` and the metrics."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dg4d_lib.assets.animated import Asset4D, between, moved
+from dg4d_lib.assets.animated import Asset4D, interpolate_frames, pose_gaussians
 from dg4d_lib.assets.formats.compact import read_compact
 from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb
 from dg4d_lib.assets.formats.splats import read_splats
@@ -19,16 +19,16 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
+from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from steps.artifacts.media import write_png
-from steps.artifacts.packages import ASSET, COMPACT, MESHES, SPLATS, Manifest, read_manifest
+from steps.artifacts.packages import ASSET, COMPACT, MESHES, SPLATS, Manifest, read_file, read_manifest
 
-BATCH = 8  # pictures drawn at once, bounds the memory
-SIZES = (16, 4096)  # pixels
+BATCH = 8  # pictures per rasterizer call, bounds the memory
+SMALLEST, LARGEST = 16, 4096  # pixels of a side
 
-States = Callable[[Float[Tensor, " b"]], Gaussians]  # the cloud at positions of the animation
-Surface = Asset4D | list[TexturedMesh]  # one mesh that moves, or a mesh per frame
-Draw = Callable[[Float[Tensor, " b"], Sequence[OrbitCamera]], Float[Tensor, "b h w 4"]]
+States = Callable[[Float[Tensor, " b"]], Gaussians]  # Gaussians at positions of the animation, in frames
+Surface = Asset4D | list[TexturedMesh]  # tracked mesh, or a mesh per frame
+Renderer = Callable[[Float[Tensor, " b"], Sequence[OrbitCamera]], Float[Tensor, "b h w 4"]]
 
 
 def render_package(
@@ -42,21 +42,21 @@ def render_package(
     progress: Callable[[int, int], None] = lambda done, total: None,
     rasterizer: str = "auto",
 ) -> list[Path]:
-    """Write OUT/view_<azimuth>/NNN.png, RGBA with straight alpha, for every azimuth and moment.
+    """Write OUT/view_<azimuth>/NNN.png, RGBA with straight alpha, for every azimuth and frame.
 
     Args:
-        folder: an unpacked package.
-        azimuths_deg: of the cameras.
-        elevation_deg: of the cameras, -90 to 90.
+        folder: unpacked package.
+        azimuths_deg: azimuths of the cameras.
+        elevation_deg: elevation of the cameras, -90 to 90.
         size: pixels of a side, 16 to 4096.
-        frames: moments, evenly spread from the first to the last frame; None is every frame.
-        mesh: the textured mesh instead of the splats.
-        out: made if it is not there; pictures of the same name are written over.
-        progress: called with pictures done and their number.
-        rasterizer: draws the splats.
+        frames: number of pictures, evenly spaced from the first to the last frame; None: one per frame.
+        mesh: render the textured mesh instead of the splats.
+        out: folder, made if necessary; pictures of the same name are replaced.
+        progress: callback (pictures done, total).
+        rasterizer: name of the rasterizer for splats.
 
     Returns:
-        The folders, one per azimuth.
+        Folders, one per azimuth.
 
     Raises:
         BadInput: the folder is no package or a broken one, or a number is out of range.
@@ -66,11 +66,11 @@ def render_package(
     manifest = read_manifest(folder)
     _check(azimuths_deg, elevation_deg, size, frames)
     if mesh:
-        draw = drawn_mesh(read_surface(folder, manifest))
+        draw = mesh_renderer(read_surface(folder, manifest))
     else:
-        draw = _drawn_splats(read_states(folder, manifest), choose_rasterizer(rasterizer))
-    count = manifest.frames if frames is None else frames
-    positions = torch.arange(count, dtype=torch.float64) * (manifest.frames - 1) / max(1, count - 1)
+        draw = _splat_renderer(read_states(folder, manifest), get_rasterizer(rasterizer))
+    positions = frame_positions(manifest.frames if frames is None else frames, manifest)
+    count = len(positions)
     views = [out / f"view_{azimuth_deg + 0.0:g}" for azimuth_deg in azimuths_deg]
     for number, (view, azimuth_deg) in enumerate(zip(views, azimuths_deg, strict=True)):
         view.mkdir(parents=True, exist_ok=True)
@@ -83,8 +83,13 @@ def render_package(
     return views
 
 
+def frame_positions(count: int, manifest: Manifest) -> Float[Tensor, " n"]:
+    """Return evenly spaced positions from the first to the last frame, in frames."""
+    return torch.arange(count, dtype=torch.float64) * (manifest.frames - 1) / max(1, count - 1)
+
+
 def read_states(folder: Path, manifest: Manifest) -> States:
-    """The stored states of the cloud, or those of the fitted motion where an unpacked package holds no splats.
+    """Return the stored Gaussians of all frames, or those of the fitted motion if a package has no splats.
 
     Raises:
         BadInput: files are missing or broken, or have another number of frames than the package.
@@ -94,55 +99,62 @@ def read_states(folder: Path, manifest: Manifest) -> States:
         _check_frames(SPLATS, len(stored.means), manifest)
         return partial(states_between, stored)
     fit = read_compact(folder / COMPACT)
-    return lambda positions: moved(fit.gaussians, fit.deformation, fit.frames, positions * fit.frames / manifest.frames)
+    return lambda positions: pose_gaussians(
+        fit.gaussians, fit.deformation, fit.frames, positions * fit.frames / manifest.frames
+    )
 
 
 def states_between(states: Gaussians, positions: Float[Tensor, " b"]) -> Gaussians:
-    """States of a cloud given per frame, linear between frames."""
+    """Interpolate Gaussians that are given per frame linearly."""
     return Gaussians(
-        between(states.means, positions),
-        between(states.log_scales, positions),
-        between(states.quats, positions),
+        interpolate_frames(states.means, positions),
+        interpolate_frames(states.log_scales, positions),
+        interpolate_frames(states.quats, positions),
         states.opacity_logits,
         states.harmonics,
     )
 
 
 def read_surface(folder: Path, manifest: Manifest) -> Surface:
-    """The mesh that moves, or the mesh of every frame, of an unpacked package.
+    """Read the tracked mesh, or the mesh of every frame, of an unpacked package.
 
     Raises:
         BadInput: files are missing or broken, or have another number of frames than the package.
     """
     if manifest.mode == "per_frame":
-        return [read_mesh_glb(_content(folder, f"{MESHES}/{i:03d}.glb")) for i in range(manifest.frames)]
-    asset = read_glb(_content(folder, ASSET))
+        return [read_mesh_glb(read_file(folder, f"{MESHES}/{i:03d}.glb")) for i in range(manifest.frames)]
+    asset = read_glb(read_file(folder, ASSET))
     _check_frames(ASSET, len(asset.offsets), manifest)
     return asset
 
 
-def drawn_mesh(surface: Surface) -> Draw:
-    """Draws the moved mesh as a player shows it: linear between frames, or each frame's own mesh until the next."""
+def mesh_renderer(surface: Surface) -> Renderer:
+    """Return a function that renders meshes as players do: linear between frames, or each frame's mesh until the next.
+
+    The function takes positions in frames and a camera for each.
+    """
     if isinstance(surface, Asset4D) and surface.textures is None:
         return lambda positions, cameras: torch.cat(
-            render_mesh(surface.mesh, cameras, between(surface.offsets, positions)), -1
+            render_mesh(surface.mesh, cameras, interpolate_frames(surface.offsets, positions)), -1
         )
 
     def draw(positions: Float[Tensor, " b"], cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b h w 4"]:
-        shown = zip(positions, cameras, strict=True)
-        return torch.cat([torch.cat(render_mesh(mesh_at(surface, there), [camera]), -1) for there, camera in shown])
+        pairs = zip(positions, cameras, strict=True)
+        return torch.cat([torch.cat(render_mesh(mesh_at(surface, at), [camera]), -1) for at, camera in pairs])
 
     return draw
 
 
 def mesh_at(surface: Surface, position: Float[Tensor, ""]) -> TexturedMesh:
-    """The mesh of a moment, with the texture of its frame where textures change."""
+    """Return the mesh at a position of the animation, with the texture of its frame if textures change."""
     frame = int(position)
     if not isinstance(surface, Asset4D):
         return surface[frame]
     texture = surface.mesh.texture if surface.textures is None else surface.textures[frame % len(surface.textures)]
     return replace(
-        surface.mesh, vertices=surface.mesh.vertices + between(surface.offsets, position[None])[0], texture=texture
+        surface.mesh,
+        vertices=surface.mesh.vertices + interpolate_frames(surface.offsets, position[None])[0],
+        texture=texture,
     )
 
 
@@ -151,13 +163,13 @@ def _check(azimuths_deg: Sequence[float], elevation_deg: float, size: int, frame
         raise BadInput(f"azimuths must be one or more angles in degrees, for example 0,-75,15; given {azimuths_deg}")
     if not -90 <= elevation_deg <= 90:
         raise BadInput(f"the elevation must lie between -90 and 90 degrees; given {elevation_deg}")
-    if not SIZES[0] <= size <= SIZES[1]:
-        raise BadInput(f"the size must lie between {SIZES[0]} and {SIZES[1]} pixels; given {size}")
+    if not SMALLEST <= size <= LARGEST:
+        raise BadInput(f"the size must lie between {SMALLEST} and {LARGEST} pixels; given {size}")
     if frames is not None and frames < 1:
         raise BadInput(f"there must be at least one frame to render; given {frames}")
 
 
-def _drawn_splats(states: States, rasterizer: Rasterizer) -> Draw:
+def _splat_renderer(states: States, rasterizer: Rasterizer) -> Renderer:
     def draw(positions: Float[Tensor, " b"], cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b h w 4"]:
         with torch.no_grad():
             drawn = rasterizer(states(positions), cameras, torch.zeros(3))
@@ -165,13 +177,6 @@ def _drawn_splats(states: States, rasterizer: Rasterizer) -> Draw:
         return torch.cat([straight, drawn.alpha], -1).clamp(0, 1)
 
     return draw
-
-
-def _content(folder: Path, name: str) -> bytes:
-    try:
-        return (folder / name).read_bytes()
-    except OSError as error:
-        raise BadInput(f"{folder} is not complete: {name} cannot be read ({error.strerror}); make it again") from error
 
 
 def _check_frames(name: str, given: int, manifest: Manifest) -> None:

@@ -1,4 +1,4 @@
-"""The prior of a stage, from settings and files."""
+"""Guidance priors of the fits, from settings and files."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,15 +10,15 @@ from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.batching import MicroBatches
-from dg4d_lib.diffusion.parts import device_here
+from dg4d_lib.diffusion.components import default_device
 from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.analytic import AnalyticPrior
-from dg4d_lib.guidance.distillation import Annealing
+from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.geometric import InflatedSurfaces
 from dg4d_lib.guidance.imagedream import ImageDream, ImageDreamPrior
 from dg4d_lib.guidance.interface import GuidancePrior, SubjectShapes
 from dg4d_lib.guidance.learned import LearnedShapes
-from dg4d_lib.guidance.oracle import Bank, imperfect
+from dg4d_lib.guidance.oracle import Bank, perturb
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.images import over_white
 from dg4d_lib.settings import (
@@ -31,11 +31,11 @@ from dg4d_lib.settings import (
     Zero123PriorSettings,
 )
 from dg4d_lib.shape_prior import packaged
-from dg4d_lib.weights.registry import weights_called
+from dg4d_lib.weights.registry import lookup_weights
 from steps.artifacts.archives import unpack
 from steps.artifacts.media import read_png
 from steps.runtime.job import StepReport
-from steps.runtime.weights import Opened, open_weights
+from steps.runtime.weights import LocatedWeights, open_weights
 from steps.sources.banks import BANK_JSON, BankIndex, check_sheet, read_index
 
 GEOMETRIC_NOTE = "prior: inflation of the silhouette (no model); sides the picture does not show are guesses"
@@ -45,33 +45,33 @@ ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
 
 
 @dataclass(frozen=True)
-class ChosenPrior:
-    """A prior, and what the record says about it.
+class LoadedPrior:
+    """A guidance prior with its provenance.
 
     Attributes:
-        prior: judges renders.
-        note: the sentence about it that the report shows.
-        opened: the weights it came from; None where there are none.
-        batches: micro-batches of it that may run out of memory.
+        prior: guidance prior.
+        note: sentence for the report.
+        opened: weights; None for priors without a model.
+        batches: micro-batches, which shrink when memory runs out.
         shapes: shapes behind the prior; None for models of pictures and for the oracle.
     """
 
     prior: GuidancePrior
     note: str
-    opened: Opened | None = None
+    opened: LocatedWeights | None = None
     batches: MicroBatches | None = None
     shapes: SubjectShapes | None = None
 
-    def facts(self, backend: str) -> StepReport:
-        """Return the report of a step that used the prior, after it did."""
-        halved = self.batches.notes() if self.batches else ()
+    def report(self, backend: str) -> StepReport:
+        """Return the report of a step that has used this prior."""
+        run_notes = self.batches.notes() if self.batches else ()
         weights, licenses = (self.opened.digests, self.opened.licenses) if self.opened else ({}, {})
         notes: tuple[str, ...] = (self.note,)
         if isinstance(self.shapes, LearnedShapes):
             weights = packaged.digests()
             share = self.shapes.inflated_share
             notes = (self.note, inflated_note(share)) if share >= SMALLEST_NOTED else notes
-        return StepReport(backend, weights, licenses, notes=notes, run_notes=halved)
+        return StepReport(backend, weights, licenses, notes=notes, run_notes=run_notes)
 
 
 def make_prior(
@@ -81,43 +81,43 @@ def make_prior(
     bank: Path | None,
     scratch: Path,
     turn_deg: float = 0.0,
-) -> ChosenPrior:
-    """Make the prior of a stage.
+) -> LoadedPrior:
+    """Make the guidance prior of a stage.
 
     Args:
-        settings: which one.
-        cutouts: the subject at every frame (one in the static stage).
-        stage: says which timesteps its iterations use.
-        bank: file of true views, for the oracle.
-        scratch: a folder for unpacking.
-        turn_deg: how far the subject is turned, for the geometric prior.
+        settings: kind of prior and its settings.
+        cutouts: subject at every frame, one in the static stage.
+        stage: settings of the fit, which give the timesteps.
+        bank: zip of ground-truth views, for the oracle.
+        scratch: folder for unpacking.
+        turn_deg: azimuth by which the subject is turned, for the geometric prior.
 
     Raises:
-        BadInput: the oracle without a bank; weights that are damaged, or not those of this prior.
-        BackendUnavailable: weights or packages that are not here.
+        BadInput: the oracle has no bank, or the weights are damaged or of another model.
+        BackendUnavailable: weights or libraries are not installed.
     """
-    noise = Annealing(stage.t_max_start, stage.t_max_end, uniform=stage.noise_draw == "uniform")
+    noise = TimestepSchedule(stage.t_max_start, stage.t_max_end, uniform=stage.noise_draw == "uniform")
     match settings:
         case GeometricPriorSettings() | LearnedPriorSettings():
             shapes = subject_shapes(settings, cutouts, turn_deg)
             note, weight = GEOMETRIC_NOTE, 1.0
             if isinstance(settings, LearnedPriorSettings):
                 note, weight = LEARNED_NOTE, settings.weight
-            return ChosenPrior(AnalyticPrior(shapes.clean, noise, weight=weight), note, shapes=shapes)
+            return LoadedPrior(AnalyticPrior(shapes.clean, noise, weight=weight), note, shapes=shapes)
         case OraclePriorSettings():
             if bank is None:
                 raise BadInput("prior.kind = oracle needs true views: give --bank FOLDER (with a bank.json)")
-            return ChosenPrior(oracle_prior(read_bank(bank, scratch), settings, noise), ORACLE_NOTE)
+            return LoadedPrior(make_oracle_prior(read_bank(bank, scratch), settings, noise), ORACLE_NOTE)
         case Zero123PriorSettings():
             check_variant(settings)
             opened = open_weights(settings.weights)
-            known = Zero123.load(opened.folder, settings, device_here()).conditioned_on(_pictures(cutouts), noise)
-            return ChosenPrior(known, f"prior: Zero-1-to-3, weights {settings.weights}", opened, known.batches)
+            known = Zero123.load(opened.folder, settings, default_device()).conditioned_on(_pictures(cutouts), noise)
+            return LoadedPrior(known, f"prior: Zero-1-to-3, weights {settings.weights}", opened, known.batches)
         case ImageDreamPriorSettings():
             opened = open_weights(settings.weights)
-            model = ImageDream.load(opened.folder, settings.precision, device_here())
+            model = ImageDream.load(opened.folder, settings.precision, default_device())
             dream = ImageDreamPrior(model, model.conditioned_on(_pictures(cutouts)), noise, settings)
-            return ChosenPrior(dream, f"prior: ImageDream, weights {settings.weights}", opened, dream.batches)
+            return LoadedPrior(dream, f"prior: ImageDream, weights {settings.weights}", opened, dream.batches)
 
 
 def subject_shapes(
@@ -141,9 +141,9 @@ def inflated_note(share: float) -> str:
     return f"the shape network is unsure of this subject: {share:.0%} of its shape is the inflated silhouette"
 
 
-def oracle_prior(bank: Bank, settings: OraclePriorSettings, noise: Annealing) -> AnalyticPrior:
-    """A prior that knows the bank, or with imperfections something like it, always the same."""
-    known = imperfect(bank, settings, torch.Generator().manual_seed(0))
+def make_oracle_prior(bank: Bank, settings: OraclePriorSettings, noise: TimestepSchedule) -> AnalyticPrior:
+    """Make a prior from a view bank, which the settings may perturb; the perturbation has a fixed seed."""
+    known = perturb(bank, settings, torch.Generator().manual_seed(0))
     return AnalyticPrior(known.clean, noise, known.cameras, known.frames)
 
 
@@ -152,13 +152,13 @@ def _pictures(cutouts: Sequence[Float[Tensor, "h w 4"]]) -> Float[Tensor, "t h w
 
 
 def check_variant(settings: Zero123PriorSettings) -> None:
-    """Refuse weights that the registry knows to be of the other variant.
+    """Refuse weights that the registry lists under the other variant.
 
     Raises:
         BadInput: says how to set it right.
     """
     known = {"zero123-xl": "xl", "stable-zero123": "stable"}
-    name = weights_called(settings.weights).name
+    name = lookup_weights(settings.weights).name
     if known.get(name, settings.variant) != settings.variant:
         raise BadInput(
             f"prior.variant = {settings.variant} does not fit the weights {name}; set prior.variant={known[name]}"
@@ -166,10 +166,10 @@ def check_variant(settings: Zero123PriorSettings) -> None:
 
 
 def read_bank(path: Path, scratch: Path) -> Bank:
-    """Read the bank in a zip; see `read_bank_folder`.
+    """Read the view bank in a zip; see `read_bank_folder`.
 
     Raises:
-        BadInput: no bank.json in it, or a name that leads out of it.
+        BadInput: the zip has no bank.json, or is unsafe to unpack.
     """
     if BANK_JSON not in unpack(path, scratch, "the bank"):
         raise BadInput(f"the bank has no {BANK_JSON}")
@@ -177,7 +177,7 @@ def read_bank(path: Path, scratch: Path) -> Bank:
 
 
 def read_bank_folder(folder: Path) -> Bank:
-    """Read the bank in a folder: `bank.json` (see `steps.sources.banks.BankIndex`) and one sheet of tiles per view.
+    """Read the view bank in a folder: `bank.json` (`steps.sources.banks.BankIndex`) and one sheet of tiles per view.
 
     Raises:
         BadInput: `bank.json` or a sheet is missing, broken or of another form.
@@ -194,7 +194,7 @@ def read_bank_folder(folder: Path) -> Bank:
 
 
 def _tiles(path: Path, index: BankIndex) -> UInt8[Tensor, "n s s 4"]:
-    """Decode a sheet and cut it into its tiles, row by row."""
+    """Decode a sheet and split it into its tiles, row by row."""
     if not path.is_file():
         raise BadInput(f"{BANK_JSON} names {path.name}, which is not in the bank")
     check_sheet(path, index)

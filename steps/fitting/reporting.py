@@ -1,6 +1,7 @@
-"""Loss curves and pictures that both fits report."""
+"""Loss curves and renders of fits."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -8,17 +9,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.fitting.losses import Diverged
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer.interface import Rasterizer
-from steps.artifacts.media import write_curves
-from steps.runtime.job import Progress
+from steps.artifacts.media import write_curves, write_png
+from steps.runtime.job import Job, Progress
 
-PICTURE_AZIMUTHS_DEG = (0.0, 45.0, 90.0, 180.0, -90.0, -45.0)
+TURNAROUND_AZIMUTHS_DEG = (0.0, 45.0, 90.0, 180.0, -90.0, -45.0)
 PICTURE_SIZE = 192  # pixels
 
 
 class LossCurves:
-    """Values that an optimization reports, passed on as progress and written as an artifact.
+    """Losses of an optimization, passed on as progress and written as an artifact.
 
     Args:
         total: number of iterations.
@@ -31,7 +33,7 @@ class LossCurves:
         self.series: dict[str, list[float]] = {}
 
     def add(self, iteration: int, values: dict[str, float]) -> None:
-        """Record the values of an iteration."""
+        """Record the losses of an iteration."""
         self.iterations.append(iteration)
         for name, value in values.items():
             self.series.setdefault(name, []).append(value)
@@ -42,18 +44,23 @@ class LossCurves:
         write_curves(path, title, self.iterations, self.series, notes)
 
 
+@contextmanager
+def picture_of_divergence(job: Job, rasterize: Rasterizer) -> Iterator[None]:
+    """Save a render of the last good state if the fit in the block diverges."""
+    try:
+        yield
+    except Diverged as error:
+        write_png(job.pictures / "last_good_state.png", render_turnaround(error.gaussians, rasterize))
+        raise
+
+
 def render_turnaround(gaussians: Gaussians, rasterize: Rasterizer) -> Float[Tensor, "h w 3"]:
-    """Render the cloud from six sides in a row, over white."""
-    return pictures_in_a_row(
-        gaussians,
-        [OrbitCamera(0, azimuth, width=PICTURE_SIZE, height=PICTURE_SIZE) for azimuth in PICTURE_AZIMUTHS_DEG],
-        rasterize,
-    )
+    """Render Gaussians from six sides in a row, over white."""
+    return render_row(gaussians, TURNAROUND_AZIMUTHS_DEG, rasterize)
 
 
-def pictures_in_a_row(
-    gaussians: Gaussians, cameras: Sequence[OrbitCamera], rasterize: Rasterizer
-) -> Float[Tensor, "h w 3"]:
-    """Render one state from several cameras, or one state per camera, over white."""
+def render_row(gaussians: Gaussians, azimuths_deg: Sequence[float], rasterize: Rasterizer) -> Float[Tensor, "h w 3"]:
+    """Render one state from several azimuths, or one state per azimuth, in a row over white."""
+    cameras = [OrbitCamera(0, azimuth, width=PICTURE_SIZE, height=PICTURE_SIZE) for azimuth in azimuths_deg]
     with torch.no_grad():
         return torch.cat(list(rasterize(gaussians, cameras, torch.ones(3)).color), 1).cpu()

@@ -1,4 +1,4 @@
-"""Environment of a step: processor, system, installed packages, container image. No name of a host, user or path."""
+"""Environment of a step: processor, system, Python packages and image, without names of hosts, users or paths."""
 
 import functools
 import os
@@ -11,22 +11,22 @@ from steps.contract import digest_of
 
 
 def environment_info() -> dict[str, str]:
-    """Return facts about this process for the record of a step, without those that do not exist here."""
-    facts = {
+    """Return the environment of this process for the record of a step, without empty entries."""
+    info = {
         "system": platform.platform(),
         "processor": processor(),
         "cores": str(_cores()),
         "gpu": _gpu(),
         "python": platform.python_version(),
-        "packages": digest_of(packages()),
+        "packages": digest_of(installed_distributions()),
         "image": os.environ.get("DG4D_IMAGE", ""),
     }
-    return {name: value for name, value in facts.items() if value}
+    return {name: value for name, value in info.items() if value}
 
 
 @functools.cache
-def packages() -> list[str]:
-    """Return every installed distribution as "name-version", sorted, from the names of folders alone."""
+def installed_distributions() -> list[str]:
+    """Return every installed Python package as "name-version", sorted; folder names are faster than metadata."""
     folders = (Path(entry) for entry in sys.path)
     return sorted({found.stem for folder in folders if folder.is_dir() for found in folder.glob("*.dist-info")})
 
@@ -35,10 +35,10 @@ def packages() -> list[str]:
 def processor() -> str:
     """Return the model of the processor, or its architecture."""
     try:
-        about = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     except OSError:
-        about = ""
-    models = [line.partition(":")[2].strip() for line in about.splitlines() if line.startswith("model name")]
+        text = ""
+    models = [line.partition(":")[2].strip() for line in text.splitlines() if line.startswith("model name")]
     return models[0] if models else platform.processor() or platform.machine()
 
 

@@ -1,4 +1,4 @@
-"""Exceptions of a step as failures of the contract: kind and message."""
+"""Kind and message of a step's failure, from its exception."""
 
 import traceback
 from pathlib import Path
@@ -8,28 +8,24 @@ from steps.contract import FailureKind
 from steps.store.artifact_store import ArtifactMissing, StoreUnreachable
 from steps.store.files import NO_SPACE
 
+KINDS: dict[type[BaseException], FailureKind] = {  # the first match counts: StoreUnreachable is a BackendUnavailable
+    BadInput: "bad_input",
+    StoreUnreachable: "unreachable",
+    ArtifactMissing: "lost",
+    BackendUnavailable: "missing",
+    FitDiverged: "diverged",
+    MemoryError: "out_of_memory",
+}
+
 
 def failure_kind(error: BaseException) -> FailureKind:
     """Return the contract's kind of failure for an exception."""
-    kind: FailureKind = "crashed"
-    match error:
-        case BadInput():
-            kind = "bad_input"
-        case OSError() if error.errno in NO_SPACE:
-            kind = "bad_input"
-        case StoreUnreachable():
-            kind = "unreachable"
-        case ArtifactMissing():
-            kind = "lost"
-        case BackendUnavailable():
-            kind = "missing"
-        case FitDiverged():
-            kind = "diverged"
-        case MemoryError():
-            kind = "out_of_memory"
-        case RuntimeError() if type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in str(error):
-            kind = "out_of_memory"  # torch: CUDA, CPU
-    return kind
+    if isinstance(error, OSError) and error.errno in NO_SPACE:
+        return "bad_input"
+    no_memory = type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in str(error)  # CUDA, CPU
+    if isinstance(error, RuntimeError) and no_memory:
+        return "out_of_memory"
+    return next((kind for matched, kind in KINDS.items() if isinstance(error, matched)), "crashed")
 
 
 def failure_message(error: BaseException) -> str:
@@ -37,10 +33,10 @@ def failure_message(error: BaseException) -> str:
     if isinstance(error, OSError) and error.errno in NO_SPACE:
         return "the disk is full: free some space and run the same command again; finished steps are kept"
     if failure_kind(error) == "out_of_memory":
-        said = f" ({error})" if str(error) else ""
-        return f"memory ran out: end other programs, or choose smaller settings{said}"
+        reason = f" ({error})" if str(error) else ""
+        return f"memory ran out: end other programs, or choose smaller settings{reason}"
     if failure_kind(error) == "crashed":
-        where = traceback.extract_tb(error.__traceback__)
-        place = f" (at {Path(where[-1].filename).name}:{where[-1].lineno})" if where else ""
-        return f"{type(error).__name__}: {error}{place}"
+        frames = traceback.extract_tb(error.__traceback__)
+        line = f" (at {Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+        return f"{type(error).__name__}: {error}{line}"
     return str(error) or type(error).__name__

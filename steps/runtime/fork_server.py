@@ -1,13 +1,13 @@
 """Server that imports the libraries of all steps once and forks a process per step.
 
-`python -m steps.runtime.fork_server SOCKET` reads orders from a socket (SOCK_SEQPACKET) that it inherits as a file
-descriptor. An order is `{"arguments": [...], "environment": {...}}`: arguments of `steps.main`, and variables that the
-step has beside those of this process. Descriptors come with it: a socket for answers (SOCK_SEQPACKET), standard output
-and error, and others that the step must hold open. The answers are the number of the process, and later its exit
-status, or the negative number of a signal. When the other end of the first socket is closed this process ends.
+`python -m steps.runtime.fork_server SOCKET` reads orders from an inherited socket (SOCK_SEQPACKET), given as a file
+descriptor. An order is `{"arguments": [...], "environment": {...}}`: arguments of `steps.main`, and additional
+environment variables. Descriptors come with it: a socket for answers (SOCK_SEQPACKET), standard output and error, and
+others that the step must hold open. The answers are the process id, and later the exit status or the negative number
+of a signal. The server exits when the other end of the first socket is closed.
 
-A step is a process group of its own, as it is when it is begun by `python -m steps.main`. The client should have it end
-with its parent, which is this process.
+A step is a process group of its own, as with `python -m steps.main`. The client should make it exit with its parent,
+which is this process.
 
 The standard library's forkserver imports the program's main module in every child, which is Prefect's engine in a
 worker (2.5 s), and its children outlive a client that is killed. A step whose code cannot be imported prints the
@@ -37,7 +37,7 @@ ANSWER_BYTES = 32
 def main() -> int:
     """Serve until the socket is closed; in a fork, perform the step and return its exit status."""
     parser = argparse.ArgumentParser(prog="python -m steps.runtime.fork_server", description="Fork steps.")
-    parser.add_argument("socket", type=int, help="file descriptor of a socket whose other end the program holds")
+    parser.add_argument("socket", type=int, help="file descriptor of a socket whose other end the client holds")
     control = socket.socket(fileno=parser.parse_args().socket)
     control.set_inheritable(False)
     program = _load_program()
@@ -47,14 +47,11 @@ def main() -> int:
     status = program(arguments)
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
-    os._exit(status)  # freeing imported modules would take up to a second
+    os._exit(status)  # a regular exit frees imported modules for up to a second
 
 
 def _load_program() -> Callable[[list[str]], int]:
-    """Import the program that performs steps; if that fails, return one that prints the traceback.
-
-    This process has no standard error that anybody reads, but every fork has.
-    """
+    """Import the program that performs steps; if that fails, return one that prints the traceback in every fork."""
     try:
         from steps.runtime import process_setup, program  # noqa: PLC0415 - errors must be caught
 
@@ -70,8 +67,8 @@ def _fail(reason: str, arguments: list[str]) -> int:
 
 
 def _late_imports() -> Iterator[str]:
-    """Yield modules, and functions to call, that steps need, in the order of the steps."""
-    with suppress(Exception):  # the step will raise it again
+    """Yield the modules and functions that steps import, in the order of the steps."""
+    with suppress(Exception):  # the step raises it again
         from steps.runtime.installed_code import catalog  # noqa: PLC0415 - errors must be caught
 
         for spec in catalog().values():
@@ -79,12 +76,12 @@ def _late_imports() -> Iterator[str]:
 
 
 def _serve(control: socket.socket, modules: Iterator[str]) -> list[str] | None:
-    """Import modules between orders and fork for every order, so that first steps do not wait for later ones' imports.
+    """Fork for every order, and import modules between orders, so that first steps do not wait for later ones' imports.
 
     Returns:
-        Arguments of the step in a fork; None in this process, when there will be no more orders.
+        In a fork, the arguments of its step; in the server, None when the client is gone.
     """
-    coming = next(modules, None)
+    upcoming = next(modules, None)
     running: dict[int, socket.socket] = {}
     ended, signaled = socket.socketpair()
     for end in (ended, signaled):
@@ -95,11 +92,11 @@ def _serve(control: socket.socket, modules: Iterator[str]) -> list[str] | None:
         events.register(control, selectors.EVENT_READ)
         events.register(ended, selectors.EVENT_READ)
         while True:
-            ready = [key.fileobj for key, _ in events.select(0 if coming else None)]
-            if coming and not ready:
-                with suppress(Exception):  # the step will raise it again
-                    _preload(coming)
-                coming = next(modules, None)
+            ready = [key.fileobj for key, _ in events.select(0 if upcoming else None)]
+            if upcoming and not ready:
+                with suppress(Exception):  # the step raises it again
+                    _preload(upcoming)
+                upcoming = next(modules, None)
             if ended in ready:
                 with suppress(BlockingIOError):
                     ended.recv(ORDER_BYTES)
@@ -108,14 +105,14 @@ def _serve(control: socket.socket, modules: Iterator[str]) -> list[str] | None:
                 order, (*handles,), _, _ = socket.recv_fds(control, ORDER_BYTES, ORDER_HANDLES)
                 if not order:
                     return None
-                gc.freeze()  # what forks share stays shared
+                gc.freeze()  # the collector would write to memory that forks share
                 pid = os.fork()
                 if pid == 0:
                     signal.set_wakeup_fd(-1)
                     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
                     return _become(handles, **json.loads(order))
-                with suppress(OSError):  # it has ended
-                    os.setpgid(pid, pid)  # here too, so that whoever hears its number can end the group
+                with suppress(OSError):  # it has exited
+                    os.setpgid(pid, pid)  # also here: the group must exist before the client learns the process id
                 running[pid] = socket.socket(fileno=handles[0])
                 for handle in handles[1:]:
                     os.close(handle)
@@ -134,7 +131,7 @@ def _become(handles: list[int], arguments: list[str], environment: dict[str, str
     """Make this fork the process that was ordered; return its arguments."""
     os.setpgid(0, 0)
     os.environ.update(environment)
-    tempfile.tempdir = None  # as the environment says, not what an import found
+    tempfile.tempdir = None  # forget the folder that an import found; $TMPDIR may differ
     os.close(handles[0])
     for number, handle in enumerate(handles[1:3], 1):
         os.dup2(handle, number)
@@ -151,7 +148,7 @@ def _answer_for_ended(running: dict[int, socket.socket]) -> None:
 
 
 def _answer(answers: socket.socket, number: int) -> None:
-    with suppress(BrokenPipeError, ConnectionResetError):  # the client has lost interest, or has ended
+    with suppress(BrokenPipeError, ConnectionResetError):  # the client has closed its end
         answers.sendall(str(number).encode())
 
 

@@ -7,20 +7,13 @@ import importlib.util
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from steps.contract import StepSpec
+from steps.contract import StepSpec, load_object
 
 
 def catalog() -> dict[str, StepSpec]:
     """Return every step by name, without importing a step's code."""
     return dict(load_object(os.environ.get("DG4D_CATALOG", "steps.catalog:STEPS")))
-
-
-def load_object(name: str) -> Any:
-    """Import and return the object that "module:name" names."""
-    module, _, attribute = name.partition(":")
-    return getattr(importlib.import_module(module), attribute)
 
 
 def request_version(spec: StepSpec) -> str:
@@ -31,8 +24,8 @@ def request_version(spec: StepSpec) -> str:
 def code_version(spec: StepSpec) -> str:
     """Return twelve hex digits that change with any source file of the library, the steps, or the step's own module.
 
-    Files are read once per process, because imported code stays too; a step in a process of its own refuses a request
-    that was made for other code. `$DG4D_CODE_VERSION` replaces the digest, for images whose code cannot change.
+    Files are read once per process, as imported code does not change either; a step in another process refuses a
+    request that was made for other code. `$DG4D_CODE_VERSION` replaces the digest, for images with fixed code.
     """
     if fixed := os.environ.get("DG4D_CODE_VERSION"):
         return fixed

@@ -1,4 +1,4 @@
-"""Input and report of a step's code."""
+"""Input of a step's code, and its report."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -13,12 +13,12 @@ class Job:
     """One run of one step.
 
     Attributes:
-        inputs: files by port; an optional input that was not given is absent.
-        outputs: paths to write by port; an optional output may stay unwritten.
+        inputs: files by port, without optional inputs that were not given.
+        outputs: paths to write by port; optional outputs may be left out.
         settings: instance of the step's settings class.
-        seed: seed of every random generator of the step.
+        seed: seed of all random generators of the step.
         progress: callback (done, total, values to show); calls are cheap.
-        pictures: folder for pictures that explain a failure; they are kept.
+        pictures: folder for pictures that explain a failure.
     """
 
     inputs: Mapping[str, Path]
@@ -31,14 +31,14 @@ class Job:
 
 @dataclass(frozen=True)
 class StepReport:
-    """Facts that only the step knows, for the provenance record.
+    """Part of the provenance record that the step's code contributes.
 
     Attributes:
         backend: rasterizer or library that computed, for example "cpu (numba)".
-        weights: digest of every weights file, by name; empty where none were used.
-        licenses: license of everything whose license follows the asset, by name.
-        notes: sentences the user should read in the report.
-        run_notes: such sentences about this run alone, for example that memory ran out and batches were halved.
+        weights: digests of weights files, by name.
+        licenses: licenses that apply to the asset, by name of the weights.
+        notes: sentences for the user's report.
+        run_notes: notes about this run alone, for example that batches were halved when memory ran out.
     """
 
     backend: str = "cpu"

@@ -1,4 +1,4 @@
-"""Progress and notes of a running step, as JSON lines on its standard output."""
+"""Progress and notes of a running step as JSON lines on standard output."""
 
 import json
 import logging
@@ -16,9 +16,9 @@ PROGRESS_EVERY_S = 0.2
 
 
 def progress_file(path: Path | None) -> TextIO:
-    """Open the file for progress: `path`, or standard output, whose other users then write to standard error.
+    """Open the file for progress: `path`, or standard output, which then belongs to progress alone.
 
-    C++ libraries print to the file descriptor, so that it is redirected rather than `sys.stdout`.
+    Other output goes to standard error; the file descriptor is redirected because C++ libraries write to it.
     """
     if path is not None:
         return path.open("a", encoding="utf-8")
@@ -29,7 +29,7 @@ def progress_file(path: Path | None) -> TextIO:
 
 
 def progress_lines(file: TextIO) -> Progress:
-    """Return a progress callback that writes JSON lines, a few per second, and always the last."""
+    """Return a progress callback that writes at most five JSON lines per second, and always the last."""
     last = -PROGRESS_EVERY_S
 
     def report(done: int, total: int, values: dict[str, float]) -> None:
@@ -50,9 +50,9 @@ def note_lines(file: TextIO) -> Callable[[str], None]:
 
 @contextmanager
 def notes_to(say: Callable[[str], None]) -> Iterator[None]:
-    """Pass log messages of the library to `say` while the block runs, for example that kernels are being compiled."""
+    """Pass log messages of the library to `say` in the block, for example that kernels are being compiled."""
     handler = logging.Handler(logging.INFO)
-    handler.emit = lambda record: say(record.getMessage())  # type: ignore[method-assign]
+    handler.emit = lambda record: say(record.getMessage())  # type: ignore[method-assign]  # saves a subclass
     logger = logging.getLogger("dg4d_lib")
     level = logger.level
     logger.addHandler(handler)

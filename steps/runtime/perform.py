@@ -4,21 +4,31 @@ import importlib.metadata
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
 from pydantic import BaseModel, ValidationError
 
-from dg4d_lib.diffusion.flop_counter import counting_flops
+from dg4d_lib.diffusion.flop_counter import count_flops
 from dg4d_lib.errors import BadInput
-from steps.contract import ArtifactRef, ProvenanceRecord, StepFailure, StepRequest, StepResult, StepSpec
+from steps.contract import (
+    ArtifactRef,
+    ProvenanceRecord,
+    StepFailure,
+    StepRequest,
+    StepResult,
+    StepSpec,
+    load_object,
+    settings_errors,
+)
 from steps.profiles import settings_class
 from steps.runtime.environment_info import environment_info
 from steps.runtime.failures import failure_kind, failure_message
-from steps.runtime.installed_code import catalog, code_version, load_object
+from steps.runtime.installed_code import catalog, code_version
 from steps.runtime.job import Job, Progress, StepReport
 from steps.runtime.process_setup import cpu_seconds, peak_memory_mb
-from steps.runtime.weights import require_same
+from steps.runtime.weights import check_unchanged
 from steps.store.artifact_store import ArtifactStore, StoreUnreachable
 
 
@@ -30,7 +40,7 @@ def perform(
     Args:
         request: step, inputs, settings and seed.
         store: source of its inputs and destination of its outputs.
-        progress: called with the progress of the step.
+        progress: callback of the step's progress.
 
     Returns:
         The result and None, or the failure and its exception.
@@ -61,7 +71,7 @@ def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scr
             f"this request was made for version {request.version} of {spec.name} and the code here is "
             f"{spec.version}+{code}: the code changed in between; run the same command again"
         )
-    require_same(request.weights)
+    check_unchanged(request.weights)
     job = Job(
         inputs=_fetch_inputs(request, spec, store, scratch),
         outputs={name: scratch / "out" / f"{name}{port.suffix}" for name, port in spec.outputs.items()},
@@ -72,12 +82,12 @@ def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scr
     )
     (scratch / "out").mkdir()
     run: Callable[[Job], StepReport] = load_object(spec.entry)
-    with counting_flops() as flops:
+    with count_flops() as flops:
         report = run(job)
     outputs = _store_outputs(job, spec, store)
     record = ProvenanceRecord(
         step=spec.name,
-        code_version=f"{_product_version()}+{code}",
+        code_version=f"{importlib.metadata.version('dg4d')}+{code}",
         request_digest=request.digest(),
         inputs={name: ref.digest for name, ref in request.inputs.items()},
         outputs={name: ref.digest for name, ref in outputs.items()},
@@ -99,7 +109,7 @@ def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scr
 
 
 def _checked_spec(request: StepRequest) -> StepSpec:
-    """Return the spec of the requested step, once the names of its inputs are checked."""
+    """Return the spec of the requested step after a check of the input names."""
     specs = catalog()
     if request.step not in specs:
         raise BadInput(f"unknown step {request.step!r}; there are: {', '.join(specs)}")
@@ -117,8 +127,7 @@ def _checked_settings(request: StepRequest, spec: StepSpec) -> BaseModel:
     try:
         return settings_class(spec).model_validate(request.settings)
     except ValidationError as error:
-        lines = [f"{'.'.join(map(str, e['loc']))} = {e['input']!r}: {e['msg']}" for e in error.errors()]
-        raise BadInput(f"settings of {spec.name} refused: {'; '.join(lines)}") from error
+        raise BadInput(f"settings of {spec.name} refused: {settings_errors(error)}") from error
 
 
 def _fetch_inputs(request: StepRequest, spec: StepSpec, store: ArtifactStore, scratch: Path) -> dict[str, Path]:
@@ -145,17 +154,8 @@ def _store_outputs(job: Job, spec: StepSpec, store: ArtifactStore) -> dict[str, 
 
 def _store_pictures(pictures: Path, store: ArtifactStore) -> dict[str, ArtifactRef]:
     """Put pictures that explain a failure into the store, as many as fit, and return their references by name."""
-    kept: dict[str, ArtifactRef] = {}
-    try:
+    stored: dict[str, ArtifactRef] = {}
+    with suppress(OSError, BadInput, StoreUnreachable):
         for file in sorted(pictures.glob("*.png")):
-            kept[file.stem] = store.put(file, "image/png")
-    except (OSError, BadInput, StoreUnreachable):
-        return kept
-    return kept
-
-
-def _product_version() -> str:
-    try:
-        return importlib.metadata.version("dg4d")
-    except importlib.metadata.PackageNotFoundError:
-        return "0"
+            stored[file.stem] = store.put(file, "image/png")
+    return stored

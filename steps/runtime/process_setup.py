@@ -1,4 +1,4 @@
-"""Process of a step: memory allocator, thread settings, lifetime and resource usage."""
+"""Set-up of a step's process: memory allocator, threads, lifetime and resource usage."""
 
 import ctypes
 import faulthandler
@@ -17,14 +17,14 @@ PR_SET_PDEATHSIG = 1  # option of Linux's prctl
 
 
 def prepare_process() -> None:
-    """Set everything that must be set before torch is imported; have crashes of native code print a traceback."""
+    """Set environment and allocator before torch is imported; print a traceback when native code crashes."""
     faulthandler.enable(all_threads=False)
-    signal.signal(signal.SIGABRT, signal.SIG_DFL)  # whoever aborts says why; a traceback would push that out of view
+    signal.signal(signal.SIGABRT, signal.SIG_DFL)  # aborting libraries print a reason, which a traceback would hide
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # torch's threads would spin after every operation
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy's would spin too, and its matrices are small
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy's threads would spin too, and its matrices are small
     if not sys.platform.startswith("linux"):
         return
-    try:  # keep freed memory: large temporaries would be mapped and unmapped at every operation
+    try:  # keep freed memory, so that large temporaries are not mapped anew in every operation
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError):  # not glibc
         return
@@ -40,10 +40,9 @@ def set_process_name(name: str) -> None:
 
 
 def die_with(parent: str) -> None:
-    """End this process when its parent ends: a process id, or - for whoever keeps standard input open.
+    """Exit with a parent process, given by its id; "-" exits when standard input is closed.
 
-    The other processes of a container end with its first, which is this one; it cannot see the process that started
-    the container.
+    In a container, "-" replaces the id of the parent, which runs outside. Its other processes end with this one.
     """
     if parent == "-":
         threading.Thread(target=_end_with_input, daemon=True).start()
@@ -68,7 +67,7 @@ def cpu_seconds() -> float:
 
 def peak_memory_mb() -> float:
     """Return the peak resident memory of this process, in MiB."""
-    try:  # of this program alone; getrusage also counts what the process was before exec
+    try:  # getrusage would include the program that ran in this process before exec
         status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
         return int(status.split("VmHWM:")[1].split()[0]) / 1024
     except (OSError, IndexError):  # not Linux

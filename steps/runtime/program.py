@@ -23,11 +23,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("request", type=Path, help="a StepRequest as JSON")
     parser.add_argument("result", type=Path, help="where to write the StepResult or StepFailure")
     parser.add_argument(
-        "--store", help="of the artifacts: a folder or s3://BUCKET/PREFIX (default: $DG4D_STORE, else $DG4D_HOME/store)"
+        "--store", help="artifact store: a folder or s3://BUCKET/PREFIX (default: $DG4D_STORE, else $DG4D_HOME/store)"
     )
     parser.add_argument("--progress", type=Path, help="write progress here instead of to standard output")
     parser.add_argument(
-        "--parent", help="end with this process id; -: end when standard input is closed (inside containers)"
+        "--parent", help="exit with this process id; -: exit when standard input is closed (inside containers)"
     )
     given = parser.parse_args(arguments)
     if given.parent is not None:

@@ -1,30 +1,31 @@
-"""The weights that settings name: found, identified by content, and with their licenses. Imports no torch.
+"""Weights that settings name: their files, digests and licenses. Imports no torch.
 
-Every knob called `weights`, or ending in `_weights`, names some: a name of the registry, a hub id or a folder; empty is
-none. Requests and records never hold the path of a folder, but its name and the first digits of its content.
+Settings called `weights` or `*_weights` hold a name of the registry, a hub id or a folder; empty is none. Requests and
+records never hold the path of a folder, but its name and the beginning of its digest.
 """
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.weights.locate import MEMORY, call_by_content, digests, find_weights, given_folder, identity
+from dg4d_lib.weights.locate import DIGEST_CACHE, content_name, digests, find_weights, given_folder, identity
 from dg4d_lib.weights.lock import read_lock
-from dg4d_lib.weights.registry import License, weights_called
+from dg4d_lib.weights.registry import License, lookup_weights
 from steps.store.files import home
 
 
 @dataclass(frozen=True)
-class Opened:
-    """Weights that a step is about to load.
+class LocatedWeights:
+    """Installed weights.
 
     Attributes:
-        folder: where they lie.
-        digests: of every file, for `StepReport.weights`.
-        licenses: for `StepReport.licenses`.
+        folder: folder of their files.
+        digests: digest of every file, for `StepReport.weights`.
+        licenses: their license by name, for `StepReport.licenses`.
     """
 
     folder: Path
@@ -33,72 +34,64 @@ class Opened:
 
 
 def weights_home() -> Path:
-    """The folder of all weights: `$DG4D_WEIGHTS`, else `weights` under the home folder."""
+    """Return the folder of all weights: `$DG4D_WEIGHTS`, else `weights` under the home folder."""
     given = os.environ.get("DG4D_WEIGHTS")
     return Path(given).expanduser().absolute() if given else home() / "weights"
 
 
-def open_weights(name: str) -> Opened:
-    """Find weights for loading.
+def open_weights(name: str) -> LocatedWeights:
+    """Return installed weights by name.
 
     Raises:
-        BadInput: nothing can be called so.
-        BackendUnavailable: they are not here or not whole; says which command mends it.
+        BadInput: the name is neither in the registry, nor a hub id, nor a folder.
+        BackendUnavailable: they are not installed or not complete; says which command installs them.
     """
     folder = find_weights(name, weights_home())
-    files = _digests(name, folder)
-    return Opened(
-        folder=folder,
-        digests={f"{name}/{file}": f"sha256:{digest}" for file, digest in files.items()},
-        licenses={name: str(license_of(name))},
-    )
+    digests = {f"{name}/{file}": f"sha256:{digest}" for file, digest in _digests(name, folder).items()}
+    return LocatedWeights(folder, digests, {name: str(license_of(name))})
 
 
 def license_of(name: str) -> License:
-    """What the registry says of weights, else the model card that was read when they were pulled."""
+    """Return the license of weights from the registry, else from the model card that was downloaded with them."""
     locked = read_lock(weights_home()).get(name)
-    return weights_called(name, locked.license if locked else "").license
+    return lookup_weights(name, locked.license if locked else "").license
 
 
 def weights_in(tree: Mapping[str, Any]) -> Iterator[str]:
-    """The weights that a dumped settings tree names, each once."""
+    """Yield the weights that a dumped settings tree names, each once."""
     yield from dict.fromkeys(value for _, _, value in _places(tree))
 
 
 def without_paths(tree: dict[str, Any]) -> dict[str, Any]:
-    """Change a dumped settings tree so that folders are called by name and content; the same tree.
+    """Replace folders in a dumped settings tree by their name and digest; change and return the same tree.
 
     Raises:
-        BadInput: a folder that does not exist.
+        BadInput: a folder does not exist.
     """
     for branch, key, value in _places(tree):
         if (folder := given_folder(value)) is not None:
-            branch[key] = call_by_content(folder, weights_home())
+            branch[key] = content_name(folder, weights_home())
     return tree
 
 
 def identities(names: Iterable[str]) -> dict[str, str]:
-    """One digest for all that loading some weights may read, by name.
-
-    Those that are not here are left out: a step may do without, and the one that cannot says so.
+    """Return one digest per weights, by name, without those that are not installed: steps that need these will raise.
 
     Raises:
-        BadInput: nothing can be called so.
+        BadInput: a name is neither in the registry, nor a hub id, nor a folder.
     """
     found = {}
     for name in names:
-        try:
+        with suppress(BackendUnavailable):
             found[name] = identity(_digests(name, find_weights(name, weights_home())))
-        except BackendUnavailable:
-            continue
     return found
 
 
-def require_same(weights: Mapping[str, str]) -> None:
-    """Refuse weights that are not what a request was made for.
+def check_unchanged(weights: Mapping[str, str]) -> None:
+    """Refuse weights whose digests differ from those of a request.
 
     Raises:
-        BadInput: says which.
+        BadInput: names the weights that changed.
     """
     here = identities(weights)
     if changed := sorted(name for name, digest in weights.items() if here.get(name) != digest):
@@ -106,11 +99,11 @@ def require_same(weights: Mapping[str, str]) -> None:
 
 
 def _digests(name: str, folder: Path) -> dict[str, str]:
-    return digests(folder, weights_called(name).parts, weights_home() / MEMORY)
+    return digests(folder, lookup_weights(name).parts, weights_home() / DIGEST_CACHE)
 
 
 def _places(tree: Any) -> Iterator[tuple[dict[str, Any], str, str]]:
-    """Every knob that names weights: the branch it is in, its key, its value."""
+    """Yield every setting that names weights: its section, key and value."""
     if not isinstance(tree, dict):
         return
     for key, value in tree.items():

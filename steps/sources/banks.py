@@ -1,9 +1,9 @@
-"""Format of banks of true views: `bank.json`, and the header of the sheets that it names. Imports no torch.
+"""Format of view banks: `bank.json` and the headers of its sheets. Imports no torch.
 
-A bank is a folder, or a zip, with `bank.json` and one PNG per view, whose tiles are the frames, row by row.
+A bank holds ground-truth views: a folder, or a zip, with `bank.json` and one PNG sheet per view, whose tiles are the
+frames, row by row.
 """
 
-import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -12,20 +12,20 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from dg4d_lib.errors import BadInput
 from steps.artifacts.archives import can_exist, stays_inside
+from steps.contract import shown
 from steps.sources.media_types import check_still
+from steps.sources.still_headers import read_header
 
 BANK_JSON = "bank.json"
-LARGEST_BANK_JSON = 16 * 2**20  # bytes; one with 10,000 views has 1 MB
+LARGEST_BANK_JSON = 16 * 2**20  # bytes; 10,000 views take 1 MB
 MOST_VIEWS = 10_000
 MOST_SHEET_PIXELS = 2**26  # 8,192 x 8,192: 1 GiB while a sheet is decoded to floats
 MOST_PIXELS = 2**30  # of all frames of all views, kept as 8-bit RGBA: 4 GiB
-PNG_START = struct.Struct(">8s4x4sII")  # signature, length of the first chunk, its name, width, height
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-SHOWN = 80  # letters of a value in a message
 
 
 class _Strict(BaseModel):
-    """Frozen, without conversions; keys that are not known here are ignored, for banks describe more than is read."""
+    """Frozen model without type conversions; unknown keys are ignored, as banks describe more than is read."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, strict=True, allow_inf_nan=False)
 
@@ -35,7 +35,7 @@ class BankView(_Strict):
 
     Attributes:
         file: name of the sheet within the bank.
-        azimuth: degrees, 0 is the input's.
+        azimuth: degrees, 0 is the input view.
         elevation: degrees, positive above.
         radius: distance from the origin, world units.
     """
@@ -113,46 +113,41 @@ def read_index(path: Path) -> BankIndex:
 
 
 def check_sheet(path: Path, index: BankIndex) -> None:
-    """Refuse a sheet that is no PNG of the size that `bank.json` asks for; only the header is read.
+    """Refuse a sheet that is no PNG of the size that `bank.json` gives; only the header is read.
 
     Raises:
         BadInput: says what it is and what is allowed.
     """
     check_still(path)
     with path.open("rb") as file:
-        head = file.read(PNG_START.size)
-    if not head.startswith(PNG_SIGNATURE):
-        raise BadInput(f"the sheet {path.name} of the bank is no PNG; export it as PNG with alpha")
-    if len(head) < PNG_START.size or (start := PNG_START.unpack(head))[1] != b"IHDR":
+        if file.read(len(PNG_SIGNATURE)) != PNG_SIGNATURE:
+            raise BadInput(f"the sheet {path.name} of the bank is no PNG; export it as PNG with alpha")
+    header = read_header(path, ".png")
+    if header is None:
         raise BadInput(f"the sheet {path.name} of the bank is cut off or broken; export it again")
-    if (size := start[2:]) != index.sheet_size:
+    if (header.width, header.height) != index.sheet_size:
         rows, columns = index.tile
         raise BadInput(
-            f"the sheet {path.name} of the bank is {size[0]} x {size[1]} pixels; tile = [{rows}, {columns}] and "
-            f"tile_size = {index.tile_size} ask for {index.sheet_size[0]} x {index.sheet_size[1]}"
+            f"the sheet {path.name} of the bank is {header.width} x {header.height} pixels; tile = [{rows}, {columns}] "
+            f"and tile_size = {index.tile_size} ask for {index.sheet_size[0]} x {index.sheet_size[1]}"
         )
 
 
 def _check_name(path: Path, field: str, name: str) -> None:
-    """Refuse names that lead out of the bank, and those whose suffix would choose another decoder than that of PNG."""
+    """Refuse names that lead out of the bank, and suffixes that would select another decoder than that of PNG."""
     if not stays_inside(name):
-        raise BadInput(f"{path} names a picture outside of the bank: {field} is {_shown(name)}; name one in the bank")
+        raise BadInput(f"{path} names a picture outside of the bank: {field} is {shown(name)}; name one in the bank")
     if not can_exist(name):
-        raise BadInput(f"{path}: {field} is {_shown(name)}, which is too long for the name of a file")
+        raise BadInput(f"{path}: {field} is {shown(name)}, which is too long for the name of a file")
     if not name.lower().endswith(".png"):
-        raise BadInput(f"{path}: {field} is {_shown(name)}; sheets of a bank are PNG files, whose names end in .png")
+        raise BadInput(f"{path}: {field} is {shown(name)}; sheets of a bank are PNG files, whose names end in .png")
 
 
 def _sentence(error: Mapping[str, Any]) -> str:
-    """Say which field is wrong, what was given and what is allowed."""
+    """Return the field that is wrong, its value and the allowed values as a sentence."""
     where, reason = ".".join(map(str, error["loc"])), str(error["msg"])
     if error["type"] in ("json_invalid", "value_error"):
         return reason.removeprefix("Value error, ")
     if error["type"] == "missing":
         return f"{where} is missing"
-    return f"{where or 'the whole'} is {_shown(error['input'])}, and {reason.removeprefix('Input ')}"
-
-
-def _shown(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
+    return f"{where or 'the whole'} is {shown(error['input'])}, and {reason.removeprefix('Input ')}"

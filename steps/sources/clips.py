@@ -1,4 +1,4 @@
-"""Moving pictures of users, through PyAV: counted first, then only the wanted frames are kept, already small."""
+"""Video reader on PyAV, in two passes: count the frames, then decode and shrink the selected ones."""
 
 import math
 import time
@@ -14,43 +14,41 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.video.framing import shrunk_size
-from dg4d_lib.video.shrinking import shrink_by_bands
+from dg4d_lib.video.downscaling import downscale_in_bands
+from dg4d_lib.video.framing import downscaled_size
 from steps.sources.decode_limit import DecodeLimit
 from steps.sources.stills import MOST_PIXELS, check_size
 
-LARGEST_SIDE = 1024  # pixels of a frame that is worked on
-MOST_WORK = (
-    32 * LARGEST_SIDE**2
-)  # pixels of all frames together: half a gigabyte as float32 RGBA; more frames, smaller ones
-MOST_FRAMES = 9000  # five minutes at 30 per second; every one must be decoded
-MOST_DECODED = 40_000_000_000  # pixels of all frames as they come: nine thousand of 2560 x 1600
-MOST_DECODING_S = 900.0  # for reading a video once; only files that are made to take long need so much
-USUAL_FPS = 24.0  # assumed when a file does not tell
-SAME_RATE = 0.02  # relative difference up to which the rate in the header is believed over the time stamps
-HELD_FRAMES = 4  # that a decoder keeps at least: references, and those that wait for their turn
-ALPHA_DECODERS = {"vp9": "libvpx-vp9", "vp8": "libvpx"}  # the default ones drop the alpha plane of WebM
+LARGEST_SIDE = 1024  # pixels of a frame after shrinking
+MOST_WORK = 32 * LARGEST_SIDE**2  # pixels of all kept frames: 0.5 GB as float32 RGBA; more frames are shrunk further
+MOST_FRAMES = 9000  # five minutes at 30 per second, all of which are decoded
+MOST_DECODED = 40_000_000_000  # pixels of all frames before shrinking: 9,000 of 2560 x 1600
+MOST_DECODING_S = 900.0  # for one pass over a video; only hostile files take longer
+USUAL_FPS = 24.0  # assumed for files without a rate
+SAME_RATE = 0.02  # relative difference up to which the header's rate is preferred to the time stamps
+HELD_FRAMES = 4  # frames that a decoder keeps at least: references and reordered ones
+ALPHA_DECODERS = {"vp9": "libvpx-vp9", "vp8": "libvpx"}  # FFmpeg's own decoders drop the alpha plane of WebM
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:
-    """At most `most` of the indices below `count`, first and last included, as even as integers allow."""
+    """Return at most `most` indices below `count`, first and last included, as evenly as integers allow."""
     if count <= most:
         return list(range(count))
     return [round(i * (count - 1) / (most - 1)) for i in range(most)]
 
 
 def thinned_rate(fps: float, count: int, kept: int) -> float:
-    """The frame rate at which `kept` of `count` frames last as long as all of them did."""
+    """Return the frame rate at which `kept` of `count` frames last as long as all of them."""
     return fps * (kept - 1) / (count - 1) if count > 1 else fps
 
 
 def work_side(count: int) -> int:
-    """Longest side, in pixels, that so many frames may have."""
+    """Return the longest side, in pixels, that so many frames may have."""
     return min(LARGEST_SIDE, math.isqrt(MOST_WORK // max(1, count)))
 
 
 class KeptFrames:
-    """Frames that are kept of a moving source, in one tensor.
+    """Selected frames of a video, in one tensor.
 
     Attributes:
         side: longest side of a frame, pixels.
@@ -83,7 +81,7 @@ class Clip:
 
     Attributes:
         count: frames that can be decoded.
-        announced: frames that the header promises; 0 where it does not tell.
+        announced: number of frames in the header; 0 if absent.
         fps: frames per second.
     """
 
@@ -98,7 +96,7 @@ class Clip:
         self.fps = self._rate(times)
 
     def read(self, indices: Sequence[int]) -> tuple[Float[Tensor, "t h w 4"], bool]:
-        """Return the frames of these ascending indices, and whether the codec carries alpha."""
+        """Return the frames of these ascending indices, and True if the codec carries alpha."""
         kept, has_alpha = KeptFrames(indices, self._what), False
         for i, frame in enumerate(self._frames()):
             if i in kept:
@@ -124,21 +122,20 @@ class Clip:
                 name = ALPHA_DECODERS.get(context.name, "") if stream.metadata.get("alpha_mode") == "1" else ""
                 decoder = cast(VideoCodecContext, av.CodecContext.create(name, "r")) if name else context
                 decoder.options = {"max_pixels": str(MOST_PIXELS)}  # frames may be larger than the header says
-                yield from self._bounded(
-                    frame for packet in container.demux(stream) for frame in decoder.decode(packet)
-                )
+                frames = (frame for packet in container.demux(stream) for frame in decoder.decode(packet))
+                yield from self._bounded(frames)
         except FFmpegError as error:
             raise BadInput(
                 f"{self._what} is cut off or broken ({error.strerror}); copy it again, or export it as H.264 mp4"
             ) from error
 
     def _require(self, width: int, height: int, pixel_format: str | None) -> None:
-        """Refuse frames that are too large for the memory; most formats have 12 to 32 bits per pixel."""
+        """Refuse frames that are too large for the memory; formats have 12 to 32 bits per pixel, mostly."""
         bits = av.VideoFormat(pixel_format, width, height).padded_bits_per_pixel if pixel_format else 12
         self._limit.require(HELD_FRAMES * width * height * bits / 8, f"a frame of {self._what}", width, height)
 
     def _bounded(self, frames: Iterable[av.VideoFrame]) -> Iterator[av.VideoFrame]:
-        """The frames of one reading, for as long as number, size and time are within reason."""
+        """Yield the frames of one pass; raise when their number, size or time exceeds the limits."""
         start, pixels = time.monotonic(), 0
         for number, frame in enumerate(frames, 1):
             check_size(frame.width, frame.height, self._what)
@@ -155,6 +152,7 @@ class Clip:
             yield frame
 
     def _rate(self, times: Sequence[float | None]) -> float:
+        """Return the header's frame rate, unless the time stamps contradict it."""
         known = [time for time in times if time is not None]
         span = known[-1] - known[0] if len(known) > 1 else 0.0
         measured = (len(known) - 1) / span if span > 0 else 0.0
@@ -166,8 +164,8 @@ class Clip:
 def _picture(frame: av.VideoFrame, side: int, has_alpha: bool) -> Float[Tensor, "h w 4"]:
     """Return a frame as straight RGBA, upright, no side longer than `side`."""
     width, height = frame.width, frame.height
-    if not has_alpha:  # the scaler does not know that alpha weighs colors
-        height, width = shrunk_size(height, width, side)
+    if not has_alpha:  # FFmpeg's scaler does not weight colors by alpha
+        height, width = downscaled_size(height, width, side)
     pixels = frame.reformat(width=width, height=height, format="rgba", interpolation="AREA").to_ndarray()
-    picture = shrink_by_bands(torch.from_numpy(pixels), side)
+    picture = downscale_in_bands(torch.from_numpy(pixels), side)
     return torch.rot90(picture, round(frame.rotation / 90)).contiguous()

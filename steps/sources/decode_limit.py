@@ -1,4 +1,4 @@
-"""Bound on the memory for decoding a user's file: estimates from headers first, a limit of the process behind them."""
+"""Memory limit for decoding a user's file: estimates from headers, enforced by a limit of the process."""
 
 import os
 import resource
@@ -12,23 +12,19 @@ from dg4d_lib.errors import BadInput
 
 GIB = 2**30
 PAGE = os.sysconf("SC_PAGE_SIZE")  # bytes
-SLACK_BYTES = 192 * 2**20  # for what libraries load and keep when they are used for the first time
-THREAD_BYTES = 10 * 2**20  # reserved for the stack of a thread, and not used; pools have one per core
-POOLS = 2  # of torch and of a decoder
+SLACK_BYTES = 192 * 2**20  # for memory that libraries allocate at their first use
+THREAD_BYTES = 10 * 2**20  # reserved for a thread's stack and mostly unused; pools have a thread per core
+POOLS = 2  # thread pools: torch's and a decoder's
 
 
 @dataclass(frozen=True)
 class DecodeLimit:
-    """The setting `subject.max_decode_gb`.
-
-    Attributes:
-        gb: GiB for one source, its decoded frames included.
-    """
+    """Memory for decoding one source, its decoded frames included, in GiB; the setting `subject.max_decode_gb`."""
 
     gb: float
 
     def require(self, needed: float, what: str, width: int, height: int) -> None:
-        """Refuse what needs more, before it is decoded.
+        """Refuse a picture that needs more, before it is decoded.
 
         Args:
             needed: estimate, bytes.
@@ -47,7 +43,7 @@ class DecodeLimit:
             )
 
     def require_file(self, path: Path, what: str) -> None:
-        """Refuse a file that has to be in memory as a whole, and is too large for that.
+        """Refuse a file that must be in memory as a whole and is larger than the limit.
 
         Raises:
             BadInput: says size, setting and remedy.
@@ -61,9 +57,7 @@ class DecodeLimit:
 
     @contextmanager
     def enforced(self, what: str) -> Iterator[None]:
-        """Let allocations beyond the limit fail while the block runs; Linux only.
-
-        The soft limit of the process's data segment holds for all of its threads.
+        """Make allocations beyond the limit fail in the block, in all threads; Linux only.
 
         Raises:
             BadInput: memory ran out in the block.

@@ -1,4 +1,4 @@
-"""Exceptions of decoders for damaged files, as one sentence for the user."""
+"""Conversion of decoders' exceptions for damaged files to `BadInput`."""
 
 import lzma
 import struct
@@ -12,7 +12,7 @@ from av.error import FFmpegError
 from dg4d_lib.errors import BadInput
 from steps.store.files import NO_SPACE
 
-DAMAGED = (  # raised by PyAV, OpenImageIO, Pillow, zipfile and the parsers here, for bytes that break the format
+DAMAGED = (  # exceptions of PyAV, OpenImageIO, Pillow, zipfile and our parsers for bytes that break the format
     FFmpegError, OSError, EOFError, SyntaxError, ValueError, LookupError, ArithmeticError, RuntimeError,
     struct.error, zlib.error, lzma.LZMAError, zipfile.BadZipFile, zipfile.LargeZipFile,
 )  # fmt: skip
@@ -20,7 +20,7 @@ DAMAGED = (  # raised by PyAV, OpenImageIO, Pillow, zipfile and the parsers here
 
 @contextmanager
 def damage_is_bad_input(what: str) -> Iterator[None]:
-    """Turn what decoders raise in the block for a damaged file into `BadInput`; a full disk stays an `OSError`.
+    """Turn decoders' exceptions for damaged files into `BadInput`; a full disk stays an `OSError`.
 
     Raises:
         BadInput: names the file, the decoder's reason and the remedy.

@@ -1,4 +1,4 @@
-"""Block structure of GIF files: FFmpeg fills the pixels that a truncated frame lacks, without an error."""
+"""Check for truncated GIF files, whose missing pixels FFmpeg fills without an error."""
 
 from pathlib import Path
 from typing import BinaryIO
@@ -6,16 +6,13 @@ from typing import BinaryIO
 from dg4d_lib.errors import BadInput
 
 SCREEN_BYTES = 13  # signature, version and logical screen descriptor
-IMAGE_BYTES = 9  # of an image descriptor behind its separator
-FLAGS = -1  # place of the flags in an image descriptor
-SCREEN_FLAGS = 10  # place of the flags in the screen descriptor
+IMAGE_BYTES = 9  # image descriptor after its separator
+SCREEN_FLAGS, IMAGE_FLAGS = 10, 8  # offsets of the flags in the two descriptors
 EXTENSION, IMAGE = b"!", b","
 
 
 def check_first_frame(path: Path) -> None:
-    """Refuse a GIF that ends before the data of its first frame do.
-
-    Other damage is left to the decoder.
+    """Refuse a GIF that ends within its first frame; other damage is left to the decoder.
 
     Raises:
         BadInput: the file is cut off.
@@ -30,13 +27,13 @@ def check_first_frame(path: Path) -> None:
 
 
 def _skip_first_frame(file: BinaryIO) -> None:
-    """Read until the first frame, or what stands in its place, has ended."""
+    """Read to the end of the first frame, or of the block in its place."""
     _skip_palette(file, _read(file, SCREEN_BYTES)[SCREEN_FLAGS])
     while (block := _read(file, 1)) == EXTENSION:
         _read(file, 1)
         _skip_data(file)
     if block == IMAGE:
-        _skip_palette(file, _read(file, IMAGE_BYTES)[FLAGS])
+        _skip_palette(file, _read(file, IMAGE_BYTES)[IMAGE_FLAGS])
         _read(file, 1)  # LZW code size
         _skip_data(file)
 

@@ -1,18 +1,16 @@
 """Recognition of pictures, videos and frames by their first bytes, never by their names. Imports no torch."""
 
 import codecs
-import lzma
 import re
 import struct
 import zipfile
-import zlib
 from collections.abc import Iterable
 from pathlib import Path
 
 from dg4d_lib.errors import BadInput
-from steps.artifacts.archives import MOST_ENTRIES
+from steps.artifacts.archives import MOST_ENTRIES, ZIP_ERRORS
 
-SNIFFED_BYTES = 4096  # of the beginning of a file, from which it is recognized
+SNIFFED_BYTES = 4096  # beginning of a file, from which it is recognized
 
 STILLS = (  # signature, suffix by which OpenImageIO finds the reader
     (b"\x89PNG\r\n\x1a\n", ".png"),
@@ -54,20 +52,10 @@ PICTURE_SUFFIXES = {
     ".png", ".jpg", ".jpeg", ".webp", ".avif", ".tif", ".tiff", ".bmp", ".exr", ".hdr", ".jxl", ".jp2", ".psd", ".ppm",
     ".pgm",
 }  # fmt: skip
-SCENE_SUFFIXES = {".usd", ".usda", ".usdc"}  # of the layers in a USDZ, which is a zip of a scene and its textures
-CLUTTER = {"Thumbs.db", "desktop.ini"}
+SCENE_SUFFIXES = {".usd", ".usda", ".usdc"}  # layers of a USDZ, which is a zip of a scene and its textures
+CLUTTER = {"Thumbs.db", "desktop.ini"}  # files that Windows adds to folders
 NPY = b"\x93NUMPY"
-ZIP_ERRORS = (
-    zipfile.BadZipFile,
-    zlib.error,
-    lzma.LZMAError,
-    MemoryError,
-    RuntimeError,
-    NotImplementedError,
-    EOFError,
-    OSError,
-    ValueError,
-)
+UNREADABLE = (*ZIP_ERRORS, MemoryError, OSError)
 ALLOWED = (
     "pictures (PNG, JPEG, WebP, AVIF, TIFF, BMP, EXR), videos (mp4, mov, webm, mkv, gif) and zips of numbered pictures"
 )
@@ -77,7 +65,7 @@ def still_suffix(head: bytes) -> str:
     """Return the suffix of a still picture.
 
     Raises:
-        BadInput: none that is known.
+        BadInput: the format is unknown.
     """
     if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
         return ".webp"
@@ -92,7 +80,7 @@ def still_suffix(head: bytes) -> str:
 
 
 def container_of(head: bytes) -> str:
-    """Return FFmpeg's name of the container that these bytes begin, or nothing; FFmpeg would also guess playlists.
+    """Return FFmpeg's name of the container that these bytes begin, or ""; FFmpeg itself would also accept playlists.
 
     Raises:
         BadInput: a format that cannot be read here.
@@ -110,7 +98,7 @@ def container_of(head: bytes) -> str:
 
 
 def is_avif(head: bytes) -> bool:
-    """Return whether these bytes begin a still AVIF: its brand is the major one, or a compatible one of plain HEIF."""
+    """Return True for the beginning of a still AVIF: brand "avif", or plain HEIF that is compatible with it."""
     if head[4:8] != b"ftyp":
         return False
     brands = head[16 : min(len(head), int.from_bytes(head[:4], "big"))]
@@ -119,7 +107,7 @@ def is_avif(head: bytes) -> bool:
 
 
 def is_animated_png(head: bytes) -> bool:
-    """Return whether a PNG announces frames (acTL) before its first pixels."""
+    """Return True for a PNG with an animation chunk (acTL) before its first pixels."""
     at = 8
     while head[:4] == b"\x89PNG" and at + 8 <= len(head):
         length, name = struct.unpack_from(">I4s", head, at)
@@ -130,7 +118,7 @@ def is_animated_png(head: bytes) -> bool:
 
 
 def is_text(head: bytes) -> bool:
-    """Return whether these bytes are UTF-8 without a NUL; a last character that is cut off does not count."""
+    """Return True for UTF-8 without a NUL; the last character may be cut off."""
     try:
         codecs.getincrementaldecoder("utf-8")().decode(head)
     except UnicodeDecodeError:
@@ -139,21 +127,20 @@ def is_text(head: bytes) -> bool:
 
 
 def is_zip(head: bytes) -> bool:
-    """Return whether these bytes begin a zip."""
+    """Return True for the beginning of a zip."""
     return head[:4] in (b"PK\3\4", b"PK\5\6")
 
 
 def is_frame_name(name: str) -> bool:
-    """Return whether an entry of a zip is a frame; hidden files and macOS's copies of them are not."""
-    path = Path(name)
-    return path.suffix.lower() in PICTURE_SUFFIXES and not path.name.startswith(".") and "__MACOSX" not in path.parts
+    """Return True for an entry of a zip that is a frame; hidden files and those of macOS are not."""
+    return Path(name).suffix.lower() in PICTURE_SUFFIXES and not _is_clutter(name)
 
 
 def check_no_scene(names: Iterable[str]) -> None:
     """Refuse a zip that is a USDZ: its pictures are textures, not frames.
 
     Raises:
-        BadInput: names the scene and says what to give.
+        BadInput: it holds a scene; names it and the allowed files.
     """
     scene = next((name for name in names if Path(name).suffix.lower() in SCENE_SUFFIXES), None)
     if scene is not None:
@@ -187,7 +174,7 @@ def check_head(head: bytes) -> None:
 
 
 def check_media(path: Path) -> None:
-    """Refuse a file that is neither a picture, a video nor a zip of frames; nothing but the beginning is read.
+    """Refuse a file that is neither a picture, a video nor a zip of frames; only the beginning is read.
 
     Raises:
         BadInput: says what it is and what to give.
@@ -219,7 +206,7 @@ def check_arrays(path: Path) -> None:
     try:
         with zipfile.ZipFile(path) as archive:
             foreign = [info.filename for info in archive.infolist() if not _begins(archive, info, NPY)]
-    except ZIP_ERRORS as error:
+    except UNREADABLE as error:
         raise BadInput(f"{path} is no NumPy archive (.npz): {error}") from error
     if foreign:
         raise BadInput(f"{path} is no NumPy archive (.npz): {foreign[0]} is no array")
@@ -238,7 +225,7 @@ def _check_zip(path: Path) -> None:
                     raise BadInput(f"the zip holds {info.filename!r}, which is no frame; pack the pictures alone")
                 with archive.open(info) as file:
                     frame_suffix(info.filename, file.read(SNIFFED_BYTES))
-    except ZIP_ERRORS as error:
+    except UNREADABLE as error:
         raise BadInput("the zip of frames is broken or encrypted; pack it again") from error
     if len(entries) < 2:
         raise BadInput(f"the zip holds {len(entries) or 'no'} picture{'s' * (len(entries) != 1)}; give two or more")
@@ -250,18 +237,18 @@ def _begins(archive: zipfile.ZipFile, info: zipfile.ZipInfo, signature: bytes) -
 
 
 def _is_clutter(name: str) -> bool:
-    """Return whether an entry of a zip is one that systems add and nobody looks at."""
+    """Return True for an entry of a zip that an operating system added."""
     path = Path(name)
     return path.name.startswith(".") or path.name in CLUTTER or "__MACOSX" in path.parts
 
 
 def _is_plausible(head: bytes, suffix: str, text: bool) -> bool:
-    """Return whether a file that has the signature of a format can be one; two letters also begin other files."""
+    """Return True if the header fits the signature; signatures of two letters also begin other files."""
     if suffix in (".ppm", ".pgm"):
         return NETPBM.match(head) is not None
     if suffix == ".bmp":
         return int.from_bytes(head[14:18], "little") in BMP_HEADERS
-    return suffix == ".hdr" or not text  # the header of HDR is text, and longer than two letters
+    return suffix == ".hdr" or not text  # HDR has a text header and a long signature
 
 
 def _head(path: Path) -> bytes:

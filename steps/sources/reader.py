@@ -1,9 +1,8 @@
-"""What users hand in: a picture, a video, or a zip of numbered pictures; told apart by content, never by name."""
+"""Reader of source files, recognized by content: a picture, a video, or a zip of numbered pictures."""
 
 import shutil
 import time
 import zipfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,8 +12,7 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import SubjectSettings
-from dg4d_lib.video.shrinking import shrink_by_bands
-from steps.sources.avif import read_avif
+from dg4d_lib.video.downscaling import downscale_in_bands
 from steps.sources.clips import (
     MOST_DECODED,
     MOST_DECODING_S,
@@ -38,28 +36,28 @@ from steps.sources.media_types import (
     is_zip,
     still_suffix,
 )
-from steps.sources.stills import LARGEST_SIDE as STILL_SIDE
-from steps.sources.stills import read_still
+from steps.sources.stills import StillPicture, read_still
 from steps.sources.webp import AnimatedWebp, is_animated
 
-FOLDER_FPS = 12.0  # pictures in a folder have no rate; drawn animation usually holds a drawing for two frames of 24
-STILL_FPS = 1.0  # of a picture; it is never played
+FOLDER_FPS = 12.0  # assumed for numbered pictures: drawn animation usually holds a drawing for two frames of 24
+STILL_FPS = 1.0  # placeholder, as a picture is never played
+OPAQUE_ALPHA = 250 / 255  # alpha channels at or above this everywhere are ignored
 MOST_ENTRY_BYTES = 512 * 2**20  # of one unpacked picture of a zip
 NAMED_AT_MOST = 8  # missing frames that a message lists
-MOST_DIGITS = 18  # of the number of a frame; cameras write up to 17, a time stamp
+MOST_DIGITS = 18  # of a frame number; cameras write time stamps of up to 17
 NAME_SHOWN = 40  # characters of a long name in a message
 
 
 @dataclass(frozen=True)
 class Source:
-    """A user's file, decoded.
+    """A decoded source file.
 
     Attributes:
         frames: straight sRGB and alpha in [0, 1], upright; a picture is one frame.
-        has_alpha: whether the alpha says anything; without it, it is 1 everywhere.
-        fps: frames per second of what is left after sampling; the duration stays.
-        kind: what it was.
-        notes: sentences for the report: what was left out or assumed.
+        has_alpha: True if some pixel is not opaque.
+        fps: frames per second after sampling, which keeps the duration.
+        kind: picture or video.
+        notes: sentences for the report about dropped frames and assumptions.
     """
 
     frames: Float[Tensor, "t h w 4"]
@@ -75,13 +73,13 @@ def read_source(
     """Decode a user's file.
 
     Args:
-        path: the file; its name does not matter.
-        scratch: an existing folder for links and unpacked pictures.
-        max_frames: frames that are kept of a video, evenly spaced, the first and the last among them; at least 2.
-        max_decode_gb: GiB of memory that may be used, the decoded frames included.
+        path: file with any name.
+        scratch: existing folder for links and unpacked pictures.
+        max_frames: number of frames to keep of a video, evenly spaced with first and last; at least 2.
+        max_decode_gb: memory limit in GiB, which includes the decoded frames.
 
     Raises:
-        BadInput: it is empty, broken, too small, too large, or nothing that can be read; says what to do.
+        BadInput: the file is empty, broken, too small, too large, or of an unknown format.
     """
     if not path.is_file():
         raise BadInput(f"{path.name} is not a file; give {ALLOWED}")
@@ -95,7 +93,7 @@ def read_source(
 
 
 def _decode(path: Path, head: bytes, scratch: Path, max_frames: int, limit: DecodeLimit) -> Source:
-    """Decode a file by its first bytes; what else it may be, further on, does not count."""
+    """Decode a file by its first bytes; a file that is also valid in another format is not refused."""
     if is_zip(head):
         return _read_zip(path, scratch, max_frames, limit)
     if is_animated(head):
@@ -103,13 +101,15 @@ def _decode(path: Path, head: bytes, scratch: Path, max_frames: int, limit: Deco
     container = "apng" if is_animated_png(head) else container_of(head)
     if container:
         return _read_clip(path, container, max_frames, limit)
-    suffix = still_suffix(head)
-    picture, has_alpha, _ = _reader(suffix)(_link(path, suffix, scratch), "the picture", limit, STILL_SIDE)
-    return _picture(picture[None], has_alpha)
+    link = scratch / f"source{still_suffix(head)}"  # read_still selects the decoder by the suffix
+    link.unlink(missing_ok=True)
+    link.symlink_to(path.resolve())
+    picture = read_still(link, "the picture", limit)
+    return _picture(picture.pixels[None], picture.has_alpha)
 
 
-def _picture(frames: Float[Tensor, "1 h w 4"], has_alpha: bool, notes: tuple[str, ...] = ()) -> Source:
-    return Source(frames, has_alpha and _says_something(frames), STILL_FPS, "picture", notes)
+def _picture(frames: Float[Tensor, "1 h w 4"], has_alpha: bool) -> Source:
+    return Source(frames, has_alpha and _is_transparent(frames), STILL_FPS, "picture")
 
 
 def _video(
@@ -118,19 +118,18 @@ def _video(
     kept = frames.shape[0]
     if kept < count:
         notes = (*notes, f"{kept} of the video's {count} frames are used, evenly spaced; it lasts as long as before.")
-    return Source(frames, has_alpha and _says_something(frames), thinned_rate(fps, count, kept), "video", notes)
+    return Source(frames, has_alpha and _is_transparent(frames), thinned_rate(fps, count, kept), "video", notes)
 
 
-def _says_something(frames: Float[Tensor, "t h w 4"]) -> bool:
-    """Return whether an alpha channel is more than decoration: some pixel is not opaque."""
-    return bool((frames[..., 3] < 250 / 255).any())
+def _is_transparent(frames: Float[Tensor, "t h w 4"]) -> bool:
+    return bool((frames[..., 3] < OPAQUE_ALPHA).any())
 
 
 def _read_clip(path: Path, container: str, max_frames: int, limit: DecodeLimit) -> Source:
     if container == "gif":
         check_first_frame(path)
     clip = Clip(path, container, limit)
-    if clip.count < 2 and container in ("gif", "apng") and clip.count:
+    if clip.count == 1 and container in ("gif", "apng"):
         return _picture(*clip.read([0]))
     _need_two(clip.count, "the video")
     frames, has_alpha = clip.read(evenly_spaced(clip.count, max_frames))
@@ -146,7 +145,7 @@ def _read_webp(path: Path, max_frames: int, limit: DecodeLimit) -> Source:
         kept = KeptFrames(evenly_spaced(len(clip), max_frames), "the WebP animation")
         for i, frame in enumerate(clip):
             if i in kept:
-                kept.add(i, shrink_by_bands(frame, kept.side))
+                kept.add(i, downscale_in_bands(frame, kept.side))
     return _picture(kept.frames, True) if len(clip) == 1 else _video(kept.frames, True, clip.fps, len(clip))
 
 
@@ -162,9 +161,8 @@ def _read_zip(path: Path, scratch: Path, max_frames: int, limit: DecodeLimit) ->
     try:
         with zipfile.ZipFile(path) as archive:
             check_no_scene(archive.namelist())
-            entries = _numbered(
-                [info for info in archive.infolist() if not info.is_dir() and is_frame_name(info.filename)]
-            )
+            frame_files = (info for info in archive.infolist() if not info.is_dir() and is_frame_name(info.filename))
+            entries = _numbered(list(frame_files))
             frames, any_alpha = _zipped_frames(archive, entries, scratch, max_frames, limit)
     except (zipfile.BadZipFile, RuntimeError, NotImplementedError, EOFError) as error:
         raise BadInput("the zip of frames is broken or encrypted; pack it again") from error
@@ -175,26 +173,27 @@ def _read_zip(path: Path, scratch: Path, max_frames: int, limit: DecodeLimit) ->
 def _zipped_frames(
     archive: zipfile.ZipFile, entries: list[zipfile.ZipInfo], scratch: Path, max_frames: int, limit: DecodeLimit
 ) -> tuple[Float[Tensor, "t h w 4"], bool]:
-    """Decode every frame, so that none is broken, and keep some; whether one of these has alpha."""
+    """Decode every frame, so that none is broken; return the selected ones, and True if one of them has alpha."""
     kept, any_alpha = KeptFrames(evenly_spaced(len(entries), max_frames), "the folder of frames"), False
     first, pixels, start = (0, 0), 0, time.monotonic()
     for i, info in enumerate(entries):
-        picture, has_alpha, size = _zipped_picture(archive, info, scratch, limit, kept.side)
-        first = first if i else size
-        if size != first:
+        picture = _zipped_picture(archive, info, scratch, limit, kept.side)
+        width, height = picture.size
+        first = first if i else picture.size
+        if picture.size != first:
             raise BadInput(
-                f"the frames have different sizes: {info.filename} is {size[0]} x {size[1]} "
+                f"the frames have different sizes: {info.filename} is {width} x {height} "
                 f"pixels, {entries[0].filename} is {first[0]} x {first[1]}; export all at one size"
             )
-        pixels += size[0] * size[1]
+        pixels += width * height
         if pixels > MOST_DECODED or time.monotonic() - start > MOST_DECODING_S:
             raise BadInput(
                 f"the folder of frames has more than {MOST_DECODED // 10**9} billion pixels in all, or takes more than "
                 f"{MOST_DECODING_S:g} s to read; leave some frames out, or export them smaller"
             )
         if i in kept:
-            kept.add(i, picture)
-            any_alpha = any_alpha or has_alpha
+            kept.add(i, picture.pixels)
+            any_alpha = any_alpha or picture.has_alpha
     return kept.frames, any_alpha
 
 
@@ -205,22 +204,23 @@ def _numbered(entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo]:
         raise BadInput(
             f"the folder of frames has {len(entries)} pictures; at most {MOST_FRAMES} are read: leave some out"
         )
-    found = {info.filename: _number_at_end(Path(info.filename).stem) for info in entries}
-    if all(number is None for number in found.values()):
-        return sorted(entries, key=lambda info: info.filename)
-    without = sorted(name for name, number in found.items() if number is None)
-    if without:
-        raise BadInput(
-            f"the frame {without[0]} has no number at the end of its name while others do; rename or remove it"
-        )
     by_number: dict[int, zipfile.ZipInfo] = {}
+    without: list[zipfile.ZipInfo] = []
+    same = None
     for info in entries:
-        number = found[info.filename] or 0
-        if number in by_number:
-            raise BadInput(
-                f"{by_number[number].filename} and {info.filename} have the same number; keep one sequence per folder"
-            )
-        by_number[number] = info
+        number = _number_at_end(Path(info.filename).stem)
+        if number is None:
+            without.append(info)
+        elif by_number.setdefault(number, info) is not info:
+            same = same or (by_number[number].filename, info.filename)
+    without.sort(key=lambda info: info.filename)
+    if not by_number:
+        return without
+    if without:
+        name = without[0].filename
+        raise BadInput(f"the frame {name} has no number at the end of its name while others do; rename or remove it")
+    if same:
+        raise BadInput(f"{same[0]} and {same[1]} have the same number; keep one sequence per folder")
     first, last = min(by_number), max(by_number)
     if last - first + 1 != len(by_number):
         gaps = [number for number in range(first, min(last, first + 10**6)) if number not in by_number]
@@ -244,7 +244,7 @@ def _number_at_end(name: str) -> int | None:
 
 def _zipped_picture(
     archive: zipfile.ZipFile, info: zipfile.ZipInfo, scratch: Path, limit: DecodeLimit, longest: int
-) -> tuple[Float[Tensor, "h w 4"], bool, tuple[int, int]]:
+) -> StillPicture:
     """Unpack one frame into `scratch` and decode it as `read_still` does."""
     if info.file_size > MOST_ENTRY_BYTES:
         raise BadInput(f"{info.filename} unpacks to {info.file_size} bytes; at most {MOST_ENTRY_BYTES} are read")
@@ -254,19 +254,6 @@ def _zipped_picture(
         with target.open("wb") as file:
             file.write(head)
             shutil.copyfileobj(content, file)
-    picture = _reader(target.suffix)(target, f"the frame {info.filename}", limit, longest)
+    picture = read_still(target, f"the frame {info.filename}", limit, longest)
     target.unlink()
     return picture
-
-
-def _reader(suffix: str) -> Callable[..., tuple[Float[Tensor, "h w 4"], bool, tuple[int, int]]]:
-    """Return the function that decodes a still picture."""
-    return read_avif if suffix == ".avif" else read_still
-
-
-def _link(path: Path, suffix: str, scratch: Path) -> Path:
-    """Return a link to the file under a name that tells its format."""
-    link = scratch / f"source{suffix}"
-    link.unlink(missing_ok=True)
-    link.symlink_to(path.resolve())
-    return link

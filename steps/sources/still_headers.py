@@ -1,26 +1,19 @@
-"""Sizes of pictures whose decoders allocate when a file is opened, read from the file's own header."""
+"""Headers of still pictures, read before a decoder opens the file and allocates memory."""
 
 import struct
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
-HEAD_BYTES = 2**20  # in which a header must begin; metadata before it are smaller
+HEAD_BYTES = 2**20  # beginning of a file with its header; metadata before that are smaller
 JXL_RATIOS = ((1, 1), (12, 10), (4, 3), (3, 2), (16, 9), (5, 4), (2, 1))  # width to height, ISO/IEC 18181-1
 JXL_SIZE_BITS = (9, 13, 18, 30)
 JPEG_STANDALONE = (0x01, *range(0xD0, 0xD9))  # markers without a length: TEM, RST0 to RST7, SOI
 JPEG_FRAMES = tuple(mark for mark in range(0xC0, 0xD0) if mark not in (0xC4, 0xC8, 0xCC))  # SOF0 to SOF15
-JPEG_SEQUENTIAL = (0xC0, 0xC1, 0xC9)  # of them decoded row by row, if a scan holds all components
+JPEG_SEQUENTIAL = (0xC0, 0xC1, 0xC9)  # frames that are decoded row by row
 
 
-@dataclass(frozen=True)
-class Header:
-    """A picture's size and what its decoder holds.
-
-    Attributes:
-        width: pixels.
-        height: pixels.
-        held: bytes per pixel that the decoder keeps until the last row is read.
-    """
+class Header(NamedTuple):
+    """Size of a picture in pixels, and the bytes per pixel that its decoder holds until the last row is read."""
 
     width: int
     height: int
@@ -28,7 +21,7 @@ class Header:
 
 
 def read_header(path: Path, suffix: str) -> Header | None:
-    """Return the header of a JPEG, PNG, JPEG 2000 or JPEG XL; None for other formats and where it cannot be found."""
+    """Return the header of a JPEG, PNG, JPEG 2000 or JPEG XL; None for other formats and if it cannot be found."""
     reader = {".jpg": _jpeg, ".png": _png, ".jp2": _jpeg2000, ".jxl": _jpegxl}.get(suffix)
     if reader is None:
         return None
@@ -41,7 +34,7 @@ def read_header(path: Path, suffix: str) -> Header | None:
 
 
 def _png(head: bytes) -> Header | None:
-    """Read IHDR, which must be the first chunk; rows of interlaced files are complete only at the end."""
+    """Read IHDR, which must be the first chunk; decoders hold interlaced pictures as a whole."""
     if head[12:16] != b"IHDR":
         return None
     width, height, depth, color, interlaced = struct.unpack_from(">IIBBxxB", head, 16)
@@ -89,26 +82,19 @@ def _jpegxl(head: bytes) -> Header | None:
         at = min((found + skip for found, skip in boxes if found >= 0), default=-1)
         if at < 0 or head[at : at + 2] != b"\xff\x0a":
             return None
-    bits = _Bits(int.from_bytes(head[at + 2 : at + 18], "little"))
-    small = bits.take(1)
-    height = bits.side(small)
-    ratio = bits.take(3)
-    width = height * JXL_RATIOS[ratio - 1][0] // JXL_RATIOS[ratio - 1][1] if ratio else bits.side(small)
-    return Header(width, height, 6)
+    bits = int.from_bytes(head[at + 2 : at + 18], "little")
 
-
-class _Bits:
-    """Fields of a JPEG XL header, lowest bit first."""
-
-    def __init__(self, value: int) -> None:
-        self._rest = value
-
-    def take(self, count: int) -> int:
-        """Return the next bits."""
-        value = self._rest & ((1 << count) - 1)
-        self._rest >>= count
+    def take(count: int) -> int:
+        """Return the next bits, lowest first."""
+        nonlocal bits
+        value, bits = bits & ((1 << count) - 1), bits >> count
         return value
 
-    def side(self, small: int) -> int:
-        """Return a height or width."""
-        return 8 * (self.take(5) + 1) if small else self.take(JXL_SIZE_BITS[self.take(2)]) + 1
+    def side() -> int:
+        return 8 * (take(5) + 1) if small else take(JXL_SIZE_BITS[take(2)]) + 1
+
+    small = take(1)
+    height = side()
+    ratio = take(3)
+    width = height * JXL_RATIOS[ratio - 1][0] // JXL_RATIOS[ratio - 1][1] if ratio else side()
+    return Header(width, height, 6)

@@ -1,4 +1,4 @@
-"""Animated WebP, through Pillow, whose decoder composes the frames."""
+"""Animated WebP reader on Pillow, whose decoder composes the frames."""
 
 from collections.abc import Iterator
 from io import SEEK_END
@@ -13,29 +13,29 @@ from torch import Tensor
 from dg4d_lib.errors import BadInput
 from steps.sources.clips import MOST_DECODED, MOST_FRAMES
 from steps.sources.decode_limit import DecodeLimit
+from steps.sources.decoder_errors import damage_is_bad_input
 from steps.sources.stills import check_size
 
-FLAGS_AT, SIZE_AT, HEADER_BYTES = 20, 24, 30  # of a VP8X file, counted from its beginning
+NAME = "the WebP animation"  # in messages
+FLAGS_AT, SIZE_AT, HEADER_BYTES = 20, 24, 30  # offsets in a VP8X file
 CHUNK_BYTES = (10).to_bytes(4, "little")  # length of a VP8X chunk, before its flags
 ANIMATION_FLAG = 0x02
-FILE_COPIES = 3  # that Pillow holds at once while it opens a file
-CANVAS_BYTES = 28  # per pixel: two canvases of libwebp, Pillow's copies, and planes of the frame being decoded
+FILE_COPIES = 3  # copies of the file that Pillow holds while it opens one
+CANVAS_BYTES = 28  # per pixel: two canvases of libwebp, Pillow's copies, and planes of the current frame
 FASTEST_FPS = 10.0  # rate of files whose frames have no duration
 
 
 def is_animated(content: bytes) -> bool:
-    """Return whether these bytes, or the beginning of them, are a WebP with frames."""
+    """Return True for the beginning of a WebP with frames."""
     is_extended = content[:4] == b"RIFF" and content[8:16] == b"WEBPVP8X" and len(content) > FLAGS_AT
     return is_extended and bool(content[FLAGS_AT] & ANIMATION_FLAG)
 
 
 class AnimatedWebp:
-    """The frames of one file, which stays open for as long as they are read.
+    """Frames of one file, which must stay open while they are read.
 
     Attributes:
-        width: pixels of the canvas.
-        height: pixels of the canvas.
-        fps: mean frame rate of the frames that were read so far; `FASTEST_FPS` where they have no duration.
+        fps: mean frame rate of the frames read so far; `FASTEST_FPS` if they have no duration.
 
     Raises:
         BadInput: the file is damaged, or has too many or too large frames.
@@ -44,37 +44,29 @@ class AnimatedWebp:
     def __init__(self, file: BinaryIO, limit: DecodeLimit) -> None:
         header, size_bytes = file.read(HEADER_BYTES), file.seek(0, SEEK_END)
         if len(header) < HEADER_BYTES or header[FLAGS_AT - 4 : FLAGS_AT] != CHUNK_BYTES:
-            raise _broken()
+            raise BadInput(f"{NAME} is cut off or broken; export it again")
         sides = (header[at : at + 3] for at in (SIZE_AT, SIZE_AT + 3))
         self.width, self.height = (int.from_bytes(side, "little") + 1 for side in sides)
-        check_size(self.width, self.height, "the WebP animation")
+        check_size(self.width, self.height, NAME)
         needed = FILE_COPIES * size_bytes + CANVAS_BYTES * self.width * self.height
-        limit.require(needed, "the WebP animation", self.width, self.height)
-        try:  # without `Image.open`, which warns of sizes that are allowed here
-            file.seek(0)
-            self._image = WebPImageFile(file)
-        except (OSError, SyntaxError, ValueError) as error:
-            raise _broken() from error
+        limit.require(needed, NAME, self.width, self.height)
+        file.seek(0)
+        with damage_is_bad_input(NAME):
+            self._image = WebPImageFile(file)  # `Image.open` would warn about sizes that are allowed here
         if len(self) > MOST_FRAMES or len(self) * self.width * self.height > MOST_DECODED:
-            raise BadInput("the WebP animation has too many or too large frames; cut it, or export it smaller")
+            raise BadInput(f"{NAME} has too many or too large frames; cut it, or export it smaller")
         self.fps = FASTEST_FPS
 
     def __len__(self) -> int:
         return int(self._image.n_frames)
 
     def __iter__(self) -> Iterator[UInt8[Tensor, "h w 4"]]:
-        """Yield every frame as it is shown, straight RGBA."""
+        """Yield every composed frame as straight RGBA."""
         duration_ms = 0.0
         for number in range(len(self)):
-            try:
+            with damage_is_bad_input(NAME):
                 self._image.seek(number)
                 frame = torch.from_numpy(np.array(self._image.convert("RGBA")))
-            except (OSError, EOFError, ValueError) as error:
-                raise _broken() from error
             duration_ms += self._image.info["duration"]
             self.fps = 1000 * (number + 1) / duration_ms if duration_ms > 0 else FASTEST_FPS
             yield frame
-
-
-def _broken() -> BadInput:
-    return BadInput("the WebP animation is cut off or broken; export it again")

@@ -1,6 +1,5 @@
-"""The store in a bucket of an S3-compatible object store, with a folder of copies in front."""
+"""Artifact store in an S3-compatible object store, with a local folder of copies."""
 
-import hashlib
 import os
 import shutil
 import time
@@ -20,11 +19,12 @@ from steps.contract import ArtifactRef
 from steps.store.artifact_store import (
     CHUNK,
     OBJECTS,
-    ArtifactMissing,
     ArtifactStore,
     Entry,
     StoreUnreachable,
+    copy_hashed,
     object_name,
+    remove_unused,
 )
 from steps.store.endpoints import ENDPOINTS, LOOPBACK
 from steps.store.files import room_for
@@ -32,23 +32,23 @@ from steps.store.files import room_for
 if TYPE_CHECKING:
     from obstore.store import ClientConfig, ObjectStore
 
-CONNECT_S = 10.0
-YES = {"1", "on", "true", "y", "yes"}  # of $AWS_ALLOW_HTTP, as the library reads it
+CONNECT_S = 10.0  # time limit of a connection attempt
+YES = {"1", "on", "true", "y", "yes"}  # values of $AWS_ALLOW_HTTP, as obstore reads it
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 5.0  # between two attempts
-MOST_ATTEMPTS = 10_000  # patience ends them first
-READ_AHEAD = 8 * CHUNK  # bytes of one request for a part of an artifact
-CLOCK = "clock"  # a file that is written to learn the time
+MOST_ATTEMPTS = 10_000  # more than fit into any time limit
+READ_AHEAD = 8 * CHUNK  # bytes per request for a part of an artifact
+CLOCK = "clock"  # file that is written to read the time of the object store
 
 
 class BucketStore(ArtifactStore):
     """Artifacts by content, and small files by name, in an object store.
 
-    What is read or written stays as a copy in a folder on this machine; whether an artifact exists, the bucket says.
+    The bucket decides which artifacts exist; those read or written here stay as copies in a local folder.
 
     Args:
-        bucket: the object store, at the prefix under which everything lies.
-        copies: the folder of copies; several stores may share one.
-        address: what opens this store again.
+        bucket: object store, at the prefix of all names.
+        copies: folder of copies; several stores may share one.
+        address: address that `open_store` opens.
     """
 
     def __init__(self, bucket: "ObjectStore", copies: Path, address: str) -> None:
@@ -58,42 +58,28 @@ class BucketStore(ArtifactStore):
 
     @property
     def address(self) -> str:
-        """The address of the bucket and the prefix in it."""
+        """Address of the bucket and the prefix in it."""
         return self._address
 
-    def get(self, ref: ArtifactRef, path: Path) -> None:
-        """As the folder does; a damaged copy is fetched again."""
-        try:
-            super().get(ref, path)
-        except ArtifactMissing:
-            super().get(ref, path)
-
-    def path(self, ref: ArtifactRef) -> Path:
-        """The copy of an artifact; a damaged one is fetched again."""
-        try:
-            return super().path(ref)
-        except ArtifactMissing:
-            return super().path(ref)
-
     def has(self, ref: ArtifactRef) -> bool:
-        """Whether the artifact is in the bucket with its full size."""
-        return self._size(ref.digest) == ref.size_bytes
+        """Return True if the artifact is in the bucket with its full size."""
+        try:
+            with self._answering():
+                return obstore.head(self._bucket, object_name(ref.digest))["size"] == ref.size_bytes
+        except FileNotFoundError:
+            return False
 
     def is_sound(self, ref: ArtifactRef) -> bool:
-        """Whether the artifact is in the bucket with its full size; its bytes are checked when they are fetched."""
+        """Return True if the artifact is in the bucket with its full size; `get` and `path` check its bytes."""
         return self.has(ref)
 
     def content_digest(self, digest: str) -> str | None:
-        """What the bytes kept under a digest really hash to; None if there are none."""
-        content = hashlib.sha256()
+        """Return the true digest of the bytes stored under a digest; None if there are none."""
         try:
-            with self._answering():
-                file = self._reader(digest)
-                while chunk := file.read(READ_AHEAD):
-                    content.update(chunk)
+            with self._answering(), Path(os.devnull).open("wb") as nowhere:
+                return copy_hashed(self._reader(digest), nowhere)[0]
         except FileNotFoundError:
             return None
-        return f"sha256:{content.hexdigest()}"
 
     def drop(self, digests: Sequence[str]) -> None:
         """Remove artifacts from the bucket, and their copies."""
@@ -102,20 +88,20 @@ class BucketStore(ArtifactStore):
             self._place(digest).unlink(missing_ok=True)
 
     def now(self) -> float:
-        """The time by the clock of the object store."""
+        """Return the time of the object store's clock, in seconds."""
         self.write(CLOCK, "")
         with self._answering():
             return obstore.head(self._bucket, CLOCK)["last_modified"].timestamp()
 
     def entries(self, folder: str) -> Iterator[Entry]:
-        """Every file under a folder of the bucket."""
+        """Yield every file under a folder of the bucket."""
         with self._answering():
             for page in obstore.list(self._bucket, prefix=folder):
                 for found in page:
                     yield Entry(found["path"], found["size"], found["last_modified"].timestamp())
 
     def read(self, name: str) -> bytes | None:
-        """The content of a small file; None if there is none."""
+        """Return the content of a small file; None if there is none."""
         try:
             with self._answering():
                 return bytes(obstore.get(self._bucket, name).bytes())
@@ -123,13 +109,12 @@ class BucketStore(ArtifactStore):
             return None
 
     def fetch(self, name: str, path: Path, most_bytes: int) -> None:
-        """Copy any file of the bucket to `path`, in parts.
+        """Copy a named file of the bucket to `path`, in parts.
 
         Raises:
             BadInput: it has more than `most_bytes`; nothing is copied.
-            FileNotFoundError: there is none of that name.
+            FileNotFoundError: no file has this name.
             DiskFull: there is no room at `path`.
-            StoreUnreachable: the bucket does not answer.
         """
         with self._answering(), room_for(path.parent), path.open("wb") as target:
             reader = obstore.open_reader(self._bucket, name, buffer_size=READ_AHEAD)
@@ -138,12 +123,12 @@ class BucketStore(ArtifactStore):
             shutil.copyfileobj(cast(BinaryIO, reader), target, READ_AHEAD)
 
     def write(self, name: str, text: str) -> None:
-        """Write a small file, or replace it."""
+        """Write or replace a small file."""
         with self._writing():
             obstore.put(self._bucket, name, text.encode(), use_multipart=False)
 
     def create(self, name: str, text: str) -> bool:
-        """Write a small file unless there is one; one request, for object stores enforce no condition on more."""
+        """Write a small file unless it exists; one request, as multipart uploads cannot be conditional."""
         try:
             with self._writing():
                 obstore.put(self._bucket, name, text.encode(), mode="create", use_multipart=False)
@@ -158,12 +143,12 @@ class BucketStore(ArtifactStore):
                 obstore.delete(self._bucket, list(names))
 
     def tidy(self, unused_s: float) -> None:
-        """Remove what was left half-written on this machine, and copies that nobody read for so many seconds."""
+        """Remove partial files on this machine, and copies that nobody has read for so many seconds."""
         super().tidy(unused_s)
-        self._forget(self.root / OBJECTS, unused_s)
+        remove_unused(self.root / OBJECTS, unused_s)
 
     def _keep(self, source: BinaryIO, media_type: str) -> ArtifactRef:
-        """Copy to this machine first, so that the name is known; then to the bucket, whole or not at all."""
+        """Copy to this machine, which yields the digest, then to the bucket in one upload."""
         ref = super()._keep(source, media_type)
         if not self.has(ref):
             with self._writing():
@@ -171,14 +156,15 @@ class BucketStore(ArtifactStore):
         return ref
 
     def _file(self, ref: ArtifactRef) -> Path:
-        """The copy of an artifact, fetched if it is not here."""
-        if not self._is_here(ref):
+        """Return the copy of an artifact, fetched if it is not here or damaged."""
+        if not (super().has(ref) and self._is_right(ref)):
             self._fetch(ref)
         place = self._place(ref.digest)
-        os.utime(place, (time.time(), place.stat().st_mtime))  # it was used; its content is as old as before
+        os.utime(place, (time.time(), place.stat().st_mtime))  # `tidy` keeps copies that were used
         return place
 
     def _fetch(self, ref: ArtifactRef) -> None:
+        """Copy an artifact from the bucket to this machine; a damaged one is dropped from the bucket."""
         try:
             with self._answering():
                 copy = super()._keep(self._reader(ref.digest), ref.media_type)
@@ -190,20 +176,12 @@ class BucketStore(ArtifactStore):
             raise self._damaged(ref)
 
     def _reader(self, digest: str) -> BinaryIO:
-        """An artifact in the bucket, read in parts."""
+        """Open an artifact in the bucket for reading in parts."""
         return cast(BinaryIO, obstore.open_reader(self._bucket, object_name(digest), buffer_size=READ_AHEAD))
-
-    def _size(self, digest: str) -> int | None:
-        """Bytes of an artifact in the bucket; None if it is not there."""
-        try:
-            with self._answering():
-                return obstore.head(self._bucket, object_name(digest))["size"]
-        except FileNotFoundError:
-            return None
 
     @contextmanager
     def _answering(self) -> Iterator[None]:
-        """Turn what the client says into our errors; a file that is not there stays a FileNotFoundError."""
+        """Turn errors of obstore into those of the library; FileNotFoundError stays."""
         try:
             yield
         except (PermissionDeniedError, UnauthenticatedError) as error:
@@ -229,12 +207,12 @@ class BucketStore(ArtifactStore):
 
 
 def open_bucket(address: str, copies: Path, patience_s: float) -> BucketStore:
-    """The store at `s3://BUCKET/PREFIX`, with the usual AWS_* variables.
+    """Open the store at `s3://BUCKET/PREFIX`, with the usual AWS_* variables.
 
     Args:
-        address: that.
-        copies: the folder of copies.
-        patience_s: how long requests are repeated before they fail.
+        address: `s3://BUCKET/PREFIX`.
+        copies: folder of copies.
+        patience_s: seconds for which requests are repeated before they fail.
     """
     bucket = S3Store.from_url(
         address,
@@ -253,9 +231,9 @@ def open_bucket(address: str, copies: Path, patience_s: float) -> BucketStore:
 
 
 def _client_options() -> "ClientConfig":
-    """Plain http goes to this machine itself; elsewhere $AWS_ALLOW_HTTP must allow it.
+    """Return options that allow plain http to this machine, and elsewhere only with $AWS_ALLOW_HTTP.
 
-    The library reads that variable only where it is given no options.
+    obstore ignores that variable when it is given options.
     """
     options: ClientConfig = {"connect_timeout": timedelta(seconds=CONNECT_S)}
     endpoint = next((os.environ[name] for name in ENDPOINTS if os.environ.get(name)), "")
@@ -265,5 +243,5 @@ def _client_options() -> "ClientConfig":
 
 
 def _reason(error: BaseError) -> str:
-    """What went wrong, without the request and the attempts."""
+    """Return the reason of an error, without the request and the attempts."""
     return str(error).partition("\n")[0].rpartition(" - ")[2].strip()

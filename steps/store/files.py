@@ -1,4 +1,4 @@
-"""Files on this machine: the home folder, writes that are whole, and one error for a full disk."""
+"""Files on this machine: home folder, atomic writes and the error for a full disk."""
 
 import errno
 import os
@@ -13,11 +13,11 @@ NO_SPACE = {errno.ENOSPC, errno.EDQUOT}
 
 
 class DiskFull(BadInput):
-    """No room for a file; nothing half-written was left."""
+    """No room for a file; no partial file is left."""
 
 
 def home() -> Path:
-    """Where everything that outlives a command is kept: `$DG4D_HOME`, else the platform's user data folder."""
+    """Return the folder of everything that outlives a command: `$DG4D_HOME`, else the platform's user data folder."""
     given = os.environ.get("DG4D_HOME")
     if given:
         return Path(given).expanduser().absolute()
@@ -27,7 +27,7 @@ def home() -> Path:
 
 @contextmanager
 def room_for(place: Path) -> Iterator[None]:
-    """Turn "no space left" into one clear sentence about `place`.
+    """Turn "no space left" in the block into `DiskFull`, which names the disk of `place`.
 
     Raises:
         DiskFull: the disk, or the user's share of it, is full.

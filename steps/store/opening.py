@@ -1,4 +1,4 @@
-"""Opening a store by its address; what object stores need is imported only for one."""
+"""Opening of stores by address; obstore is imported only for object stores."""
 
 import functools
 import os
@@ -9,7 +9,7 @@ from dg4d_lib.errors import BackendUnavailable, BadInput
 from steps.store.artifact_store import ArtifactStore
 from steps.store.files import home
 
-PATIENCE_S = 120.0  # a request that gets no answer is repeated for so long
+PATIENCE_S = 120.0  # seconds for which a request without an answer is repeated
 
 
 def open_store(address: str | Path | None = None, patience_s: float | None = None) -> ArtifactStore:
@@ -17,10 +17,10 @@ def open_store(address: str | Path | None = None, patience_s: float | None = Non
 
     Args:
         address: default: `$DG4D_STORE`, else the folder `store` under the home folder.
-        patience_s: how long requests to an object store are repeated before they fail; `PATIENCE_S` without it.
+        patience_s: seconds for which requests to an object store are repeated; default: `PATIENCE_S`.
 
     Raises:
-        BadInput: an address of something else.
+        BadInput: the address has another form.
         BackendUnavailable: the library for object stores is not installed.
     """
     given = str(address or os.environ.get("DG4D_STORE") or home() / "store")
@@ -29,7 +29,7 @@ def open_store(address: str | Path | None = None, patience_s: float | None = Non
 
 @functools.cache
 def _opened(given: str, copies: Path, patience_s: float) -> ArtifactStore:
-    """Open a store once per process: it keeps connections, and remembers which files are sound."""
+    """Open a store once per process: it keeps connections and remembers verified files."""
     if "://" not in given:
         return ArtifactStore(Path(given).expanduser())
     parts = urlsplit(given)

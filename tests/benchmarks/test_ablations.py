@@ -12,7 +12,7 @@ from benchmarks.objects.specimens import Specimen
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.initialize import isotropic
 from dg4d_lib.guidance.oracle import Bank
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from steps.artifacts.media import write_png
 
 SIZE, FRAMES = 32, 4
@@ -34,7 +34,7 @@ def ball(frame: int):
 
 @pytest.fixture(scope="module")
 def specimen() -> Specimen:
-    rasterize = choose_rasterizer("cpu")
+    rasterize = get_rasterizer("cpu")
     scored = (OrbitCamera(0, 15, width=SIZE, height=SIZE), OrbitCamera(0, 105, width=SIZE, height=SIZE))
     known = tuple(OrbitCamera(0, 45 * i, width=SIZE, height=SIZE) for i in range(8))
     states = [ball(frame) for frame in range(FRAMES)]

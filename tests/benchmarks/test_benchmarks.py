@@ -8,7 +8,7 @@ import torch
 
 import benchmarks
 from benchmarks.paper_schedule import QUICK, Schedule, Sizes
-from dg4d_lib.rasterizer.interface import device_of
+from dg4d_lib.rasterizer.interface import preferred_device
 from steps.profiles import profile, revise
 
 NAMES = sorted(path.stem for path in Path(benchmarks.__path__[0]).glob("[!_]*.py"))
@@ -24,7 +24,7 @@ def test_a_benchmark_finds_what_it_uses(name: str) -> None:
 @pytest.mark.gpu
 @pytest.mark.filterwarnings("ignore:There are modules in")
 def test_the_paper_schedule_is_measured_stage_by_stage() -> None:
-    device = device_of("auto")
+    device = preferred_device("auto")
     rows = list(Schedule(revise(profile("paper"), QUICK), Sizes(), device).rows())
     assert [row.stage for row in rows] == ["video", "static", "dynamic", "refinement"]
     assert all(row.tflop > 0 and 0 < row.outside_networks < 1 for row in rows)

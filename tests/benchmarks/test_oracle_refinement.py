@@ -6,9 +6,9 @@ from benchmarks.ablations import Variant
 from benchmarks.oracle_refinement import FLICKER, NOISE, VARIANTS, Model, Oracle, figures_of, refined
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.mesh.texturing.bake import texels_of
+from dg4d_lib.mesh.texturing.bake import locate_texels
 from dg4d_lib.settings import TextureSettings
-from dg4d_lib.texture.refine import Refined
+from dg4d_lib.texture.refine import RefinedTextures
 
 FRAMES, SIZE = 3, 64
 FRONT = [OrbitCamera(width=SIZE, height=SIZE)] * FRAMES
@@ -22,7 +22,7 @@ def board() -> Model:
     faces = torch.tensor([[0, 3, 2], [0, 2, 1]], dtype=torch.int32)
     stripes = torch.tensor([[0.3, 0.4, 0.5], [0.7, 0.6, 0.5]]).repeat_interleave(4, 0).repeat(4, 1)
     mesh = TexturedMesh(corners, faces, uvs, stripes[None].expand(32, 32, 3).contiguous())
-    texels = texels_of(corners, torch.tensor([[0.0, 0.0, 1.0]]).expand(4, 3), faces, uvs, 32)
+    texels = locate_texels(corners, torch.tensor([[0.0, 0.0, 1.0]]).expand(4, 3), faces, uvs, 32)
     return Model(mesh, torch.zeros(FRAMES, 4, 3), texels, torch.full((32, 32, 3), 0.5))
 
 
@@ -65,7 +65,8 @@ def test_the_loop_restores_what_the_oracle_knows(board: Model, monkeypatch: pyte
     settings = TextureSettings(size=SIZE, iterations=60, azimuth_step_deg=0.0)
     variant = VARIANTS["video to video, 0.6 skipped"]
     before, after = (
-        figures_of(board, made, SIZE) for made in (Refined(board.blurred), refined(board, variant, settings, seed=0))
+        figures_of(board, made, SIZE)
+        for made in (RefinedTextures(board.blurred), refined(board, variant, settings, seed=0))
     )
     assert refined(board, Variant(), settings, seed=0).texture is board.blurred
     assert after.psnr_obj > before.psnr_obj + 10

@@ -10,7 +10,7 @@ from benchmarks.objects.drawing import Painted
 from benchmarks.objects.specimens import OBJECTS, SCORED_AZIMUTHS_DEG, made, read
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
-from steps.artifacts.ground_truth import Truth, View
+from steps.artifacts.ground_truth import GroundTruth, TrueView
 from steps.artifacts.media import read_png, write_png
 
 SIZE = 8  # of made-up pictures
@@ -96,13 +96,13 @@ def bank(folder: Path, moments: list[int], pictures: torch.Tensor) -> Path:
 
 
 @pytest.fixture
-def truth(tmp_path: Path) -> Truth:
+def truth(tmp_path: Path) -> GroundTruth:
     """Six frames from two sides, every second of them in the bank."""
     shown = torch.rand(2, 6, SIZE, SIZE, 4, generator=torch.Generator().manual_seed(0))
-    return Truth(
+    return GroundTruth(
         name="cat",
         inputs=frames(tmp_path / "input", shown[0]),
-        views=(View(azimuth_deg=15, frames=frames(tmp_path / "view_15", shown[1])),),
+        views=(TrueView(azimuth_deg=15, frames=frames(tmp_path / "view_15", shown[1])),),
         bank=bank(tmp_path / "bank", [0, 2, 4], 1 - shown[0, ::2]),
     )
 
@@ -131,7 +131,7 @@ def test_a_data_set_that_lacks_something_is_refused(truth, tmp_path):
         ({"bank": None}, "cat has no bank/"),
         ({"bank": late}, "does not have frame 0"),
         ({"views": ()}, "cat has no view_<azimuth>/"),
-        ({"views": (View(azimuth_deg=15, frames=large),)}, "16 x 16 x 4, 8 x 8 x 4"),
+        ({"views": (TrueView(azimuth_deg=15, frames=large),)}, "16 x 16 x 4, 8 x 8 x 4"),
         ({"inputs": opaque}, "8 x 8 x 3, 8 x 8 x 4"),
     ):
         with pytest.raises(BadInput, match=message):

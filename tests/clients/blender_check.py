@@ -140,7 +140,7 @@ def _compare_file(file: Path, states: Sequence[tuple[TexturedMesh, Any]], fps: f
 
 def _camera_to_world(camera: OrbitCamera) -> list[list[float]]:
     """Of a camera that looks along its -z with +y up."""
-    return (torch.linalg.inv(camera.world_to_camera()) @ torch.diag(torch.tensor([1.0, -1, -1, 1]).double())).tolist()
+    return (torch.linalg.inv(camera.viewmat()) @ torch.diag(torch.tensor([1.0, -1, -1, 1]).double())).tolist()
 
 
 def _agreement(ours: NDArray[Any], theirs: NDArray[Any]) -> tuple[float, float]:

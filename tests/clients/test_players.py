@@ -12,7 +12,7 @@ import trimesh
 from PIL import Image
 
 from dg4d_lib.asset_settings import GltfSettings
-from dg4d_lib.assets.animated import Asset4D, between
+from dg4d_lib.assets.animated import Asset4D, interpolate_frames
 from dg4d_lib.assets.formats.glb import write_frames_glb, write_glb, write_mesh_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.mesh.render import render_mesh
@@ -120,7 +120,7 @@ def picture(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def expected(case: Case, player: str) -> list[tuple[np.ndarray, np.ndarray]]:
     """What our renderer shows at the moments of a case."""
     moments = torch.tensor(case.moments, dtype=torch.float64)
-    offsets = between(case.asset.offsets, moments.floor() if case.held else moments)
+    offsets = interpolate_frames(case.asset.offsets, moments.floor() if case.held else moments)
     pictures = []
     for moment, offset in zip(case.moments, offsets, strict=True):
         mesh = case.asset.mesh

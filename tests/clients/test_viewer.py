@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dg4d_lib.asset_settings import GltfSettings
-from dg4d_lib.assets.animated import Asset4D, between
+from dg4d_lib.assets.animated import Asset4D, interpolate_frames
 from dg4d_lib.assets.formats.glb import write_frames_glb, write_glb
-from dg4d_lib.assets.formats.websplats import write_web_splats
-from dg4d_lib.assets.rendering.preview import write_film
-from dg4d_lib.assets.rendering.viewer_page import viewer_page
+from dg4d_lib.assets.formats.web_splats import write_web_splats
+from dg4d_lib.assets.rendering.preview import write_mp4
+from dg4d_lib.assets.rendering.viewer_page import build_viewer_page
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 
 VIEWER = CLIENTS.parents[1] / "dg4d_lib" / "assets" / "viewer"
 FRAMES, FPS = 4, 4.0
@@ -82,7 +82,7 @@ def splats() -> Gaussians:
         scales.log() + 0.2 * wave,
         torch.nn.functional.normalize(turns, dim=-1) + 0.3 * wave * torch.randn(count, 4, generator=generator),
         torch.randn(count, generator=generator) * 2,
-        harmonics_of_color(torch.rand(count, 3, generator=generator)),
+        rgb_to_sh(torch.rand(count, 3, generator=generator)),
     )
 
 
@@ -103,7 +103,7 @@ def tried(tmp_path: Path) -> Try:
     ) -> Tried:
         packed = None if cloud is None else write_web_splats(cloud, FPS)
         page = tmp_path / "viewer with ümlaut.html"
-        page.write_text(viewer_page("Egg", glb, packed, None, video, facts or {}), encoding="utf-8")
+        page.write_text(build_viewer_page("Egg", glb, packed, None, video, facts or {}), encoding="utf-8")
         files = {shot: tmp_path / f"{number}.png" for number, shot in enumerate(shots)}
         asked = [{"show": show, "time": time, "file": str(files[show, time])} for show, time in shots]
         said = run_node("view.mjs", json.dumps({"page": str(page), "shots": asked, **WINDOW, **request}))
@@ -135,11 +135,11 @@ def test_splats_look_as_our_rasterizer_draws_them(tried: Try) -> None:
         position = torch.tensor([time * FPS])
         state = replace(
             cloud,
-            means=between(cloud.means, position),
-            log_scales=between(cloud.log_scales, position),
-            quats=between(torch.nn.functional.normalize(cloud.quats, dim=-1), position),
+            means=interpolate_frames(cloud.means, position),
+            log_scales=interpolate_frames(cloud.log_scales, position),
+            quats=interpolate_frames(torch.nn.functional.normalize(cloud.quats, dim=-1), position),
         )
-        drawn = choose_rasterizer("cpu")(state, [page.camera()], torch.ones(3))
+        drawn = get_rasterizer("cpu")(state, [page.camera()], torch.ones(3))
         theirs = page.pictures["splats", time]
         assert overlap(theirs[..., 3], drawn.alpha[0, ..., 0].numpy()) > 0.98
         assert psnr(over_white(theirs), drawn.color[0].numpy()) > 35  # 8-bit blending and the compact file
@@ -159,7 +159,7 @@ def test_the_mesh_looks_as_our_renderer_draws_it(tried: Try, variant: str) -> No
         pytest.importorskip("meshoptimizer", reason="meshoptimizer is not installed: make clients")
     page = tried(write_glb(asset, settings), shots=tuple(("mesh", time) for time in TIMES))
     for time in TIMES:
-        offsets = between(asset.offsets, torch.tensor([time * FPS]))
+        offsets = interpolate_frames(asset.offsets, torch.tensor([time * FPS]))
         color, coverage = (part[0].numpy() for part in render_mesh(asset.mesh, [page.camera()], offsets))
         theirs = page.pictures["mesh", time]
         assert overlap(theirs[..., 3], coverage[..., 0]) > 0.98
@@ -217,12 +217,12 @@ def test_it_plays_at_once_answers_hands_and_keys_and_asks_no_network(tried: Try)
 
 
 def test_the_page_is_small() -> None:
-    assert len(viewer_page("", b"", None, None, None, {}).encode()) < PAGE_BYTES
+    assert len(build_viewer_page("", b"", None, None, None, {}).encode()) < PAGE_BYTES
 
 
 def test_the_driving_video_follows_the_clock(tried: Try, tmp_path: Path) -> None:
     film = tmp_path / "film.mp4"
-    write_film(film, torch.linspace(0, 1, FRAMES)[:, None, None, None].expand(FRAMES, 32, 32, 3), FPS)
+    write_mp4(film, torch.linspace(0, 1, FRAMES)[:, None, None, None].expand(FRAMES, 32, 32, 3), FPS)
     deeds = [["wait", 0.5], ["press", "Home"], ["press", "ArrowRight"], ["press", "ArrowRight"], ["wait", 0.3]]
     page = tried(write_glb(egg()), None, film.read_bytes(), deeds=deeds)
     assert page.said["states"][-1]["frame"] == 2

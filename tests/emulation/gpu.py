@@ -105,9 +105,9 @@ def answer(gpu: Emulated) -> None:
     for name, told in answers.items():
         setattr(torch.cuda, name, told)
 
-    from dg4d_lib.rasterizer import choice
+    from dg4d_lib.rasterizer import backends
 
-    choice.what_gsplat_lacks = lambda: ""
+    backends.gsplat_unavailable_reason = lambda: ""
 
 
 def loaded(path: str) -> ModuleType:

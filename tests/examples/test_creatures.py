@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.video.framing import extent, lies_well
+from dg4d_lib.video.framing import bounding_box, is_well_framed
 from examples.drawing import draw
 from examples.newt import Newt
 from examples.shapes import Chain, ellipsoid, normals, skin, union
@@ -42,9 +42,9 @@ def test_the_picture_in_the_repository_is_the_one_that_is_drawn(newt):
 @pytest.mark.parametrize("name", ["newt.png", "beetle.png"])
 def test_cutouts_lie_well_in_their_frames(name):
     picture = read_png(FOLDER / name)
-    left, top, right, bottom = extent(picture[None, ..., 3])
+    left, top, right, bottom = bounding_box(picture[None, ..., 3])
     assert picture.shape == (512, 512, 4)
-    assert lies_well(picture[None, ..., 3])
+    assert is_well_framed(picture[None, ..., 3])
     assert 0.7 < (right - left) / 512 < 0.95 and abs((top + bottom) / 2 - 256) < 40
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from dg4d_lib.assets.animated import moved
-from dg4d_lib.assets.formats.compact import Compact, write_compact
+from dg4d_lib.assets.animated import pose_gaussians
+from dg4d_lib.assets.formats.compact import CompactAsset, write_compact
 from dg4d_lib.deformation.factory import new_deformation
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.settings import HexPlaneSettings
@@ -19,7 +19,7 @@ FRAMES = 14
 SCRIPT = Path(__file__).parents[2] / "examples" / "load_compact.py"
 
 
-def asset(settings: HexPlaneSettings) -> Compact:
+def asset(settings: HexPlaneSettings) -> CompactAsset:
     """A cloud half outside the planes, moved by random numbers."""
     generator = torch.Generator().manual_seed(0)
     cloud = blob(300, 0.5, generator)
@@ -27,7 +27,7 @@ def asset(settings: HexPlaneSettings) -> Compact:
     for parameter in deformation.parameters():
         parameter.data.normal_(std=0.4, generator=generator)
     deformation.bounds = torch.tensor([[-0.3, -0.2, -0.4], [0.3, 0.5, 0.2]])
-    return Compact(cloud, deformation.requires_grad_(False), settings, FRAMES, 12.0)
+    return CompactAsset(cloud, deformation.requires_grad_(False), settings, FRAMES, 12.0)
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def test_the_states_are_those_of_the_library(tmp_path: Path, settings: HexPlaneS
     given = asset(settings)
     write_compact(tmp_path / "a.safetensors", given)
     times = [0.0, 0.31, 0.5, 1.0]
-    ours = moved(given.gaussians, given.deformation, FRAMES, torch.tensor(times) * (FRAMES - 1))
+    ours = pose_gaussians(given.gaussians, given.deformation, FRAMES, torch.tensor(times) * (FRAMES - 1))
     assert (ours.means - given.gaussians.means).abs().max() > 0.1
     for i, time in enumerate(times):
         theirs = states(tmp_path / "a.safetensors", time)

@@ -4,9 +4,8 @@ from collections.abc import Callable
 from typing import Any
 
 from prefect import flow
-from prefect.settings import temporary_settings
 
-from flows.engine.step_tasks import flow_settings
+from flows.engine.step_tasks import flow_context
 
 
 def inside_a_flow(call: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
@@ -16,5 +15,5 @@ def inside_a_flow(call: Callable[..., Any], *arguments: Any, **named: Any) -> An
     def test() -> Any:
         return call(*arguments, **named)
 
-    with temporary_settings(flow_settings()):
+    with flow_context():
         return test()

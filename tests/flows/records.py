@@ -1,4 +1,4 @@
-"""Records of step results, as Prefect writes them."""
+"""Results of steps and their records, as Prefect writes them."""
 
 import json
 from pathlib import Path
@@ -26,4 +26,10 @@ def result_with(ref: ArtifactRef, request_digest: str = "sha256:" + "0" * 64) ->
 def write_record(path: Path, value: StepResult) -> None:
     """Write the record of a result."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"metadata": {}, "result": JSONSerializer().dumps(value).decode()}))
+    path.write_text(record_of(value))
+
+
+def record_of(value: Any) -> str:
+    """Return the record of a task's result."""
+    serializer = JSONSerializer()
+    return json.dumps({"metadata": {"serializer": serializer.model_dump()}, "result": serializer.dumps(value).decode()})

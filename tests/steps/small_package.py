@@ -12,7 +12,7 @@ from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import write_ply
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
 from dg4d_lib.settings import FramewiseSettings
 from dg4d_lib.video.driving import DrivingVideo
@@ -34,7 +34,7 @@ def cloud() -> Gaussians:
     means = torch.cat([torch.zeros(1, 3), corners])
     log_scales = torch.tensor([[0.1] * 3, *[[0.05] * 3] * 8]).log()
     quats = torch.tensor([1.0, 0, 0, 0]).expand(9, 4)
-    return Gaussians(means, log_scales, quats, torch.full((9,), 4.0), harmonics_of_color(BLUE.expand(9, 3)))
+    return Gaussians(means, log_scales, quats, torch.full((9,), 4.0), rgb_to_sh(BLUE.expand(9, 3)))
 
 
 def motion() -> Framewise:

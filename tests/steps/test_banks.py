@@ -62,7 +62,7 @@ def test_a_bank_without_its_description_is_refused(tmp_path: Path) -> None:
 
 
 def header(width: int, height: int) -> bytes:
-    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", width, height)
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII5B", 13, b"IHDR", width, height, 8, 6, 0, 0, 0)
 
 
 @pytest.mark.parametrize(

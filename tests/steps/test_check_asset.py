@@ -14,13 +14,13 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.render import render_mesh
-from dg4d_lib.metrics.gates import Evidence, judge
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.metrics.gates import GateInputs, evaluate_gates
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import read_png
 from steps.artifacts.rendering import states_between
 from steps.catalog import STEPS
-from steps.check_asset import Parts, gather, run, verdict
+from steps.check_asset import LoadedAsset, collect_evidence, gates_as_json, run
 from steps.pack_asset import run as pack
 from steps.profiles import PREVIEW, step_settings
 from steps.runtime.job import Job, StepReport
@@ -111,14 +111,14 @@ def sliding(frames: int) -> Gaussians:
     return replace(rest, means=rest.means + way, log_scales=scales, quats=quats)
 
 
-def seen(parts: Parts, video: DrivingVideo | None = None) -> Evidence:
+def seen(asset: LoadedAsset, video: DrivingVideo | None = None) -> GateInputs:
     footage = video or DrivingVideo(torch.zeros(FRAMES, 32, 32, 3), torch.ones(FRAMES, 32, 32, 1), 24.0)
     cutout = torch.cat([footage.frames, footage.coverage], -1)[0]
-    return gather(parts, footage, cutout, choose_rasterizer("reference"))
+    return collect_evidence(asset, footage, cutout, get_rasterizer("reference"))
 
 
-def parts_of(frames: int, surface: Asset4D) -> Parts:
-    return Parts(partial(states_between, sliding(frames)), surface, frames)
+def parts_of(frames: int, surface: Asset4D) -> LoadedAsset:
+    return LoadedAsset(partial(states_between, sliding(frames)), surface, frames)
 
 
 def test_an_asset_at_another_frame_rate_is_seen_at_the_moments_of_the_video() -> None:
@@ -129,7 +129,7 @@ def test_an_asset_at_another_frame_rate_is_seen_at_the_moments_of_the_video() ->
     once = seen(parts_of(3, replace(fast, offsets=fast.offsets[::2])))
     for form in ("splats", "mesh"):
         assert torch.allclose(twice.seen[form].color, once.seen[form].color, atol=1e-5)
-        assert torch.allclose(twice.around[form].coverage, once.around[form].coverage, atol=1e-5)
+        assert torch.allclose(twice.around[form].alpha, once.around[form].alpha, atol=1e-5)
 
 
 def test_a_mesh_that_was_filmed_is_seen_as_it_was_filmed() -> None:
@@ -138,7 +138,7 @@ def test_a_mesh_that_was_filmed_is_seen_as_it_was_filmed() -> None:
     color, coverage = render_mesh(asset.mesh, [camera] * FRAMES, asset.offsets)
     found = seen(parts_of(FRAMES, asset), DrivingVideo(color, coverage, 24.0))
     assert torch.allclose(found.seen["mesh"].color, found.video.color, atol=1e-5)
-    gates = {gate.name: gate.values for gate in judge(found, GateSettings())}
+    gates = {gate.name: gate.values for gate in evaluate_gates(found, GateSettings())}
     assert gates["fidelity"]["mesh"] > 50
     assert gates["silhouette"]["mesh"] == 1
     assert gates["flicker"]["mesh"] == pytest.approx(0, abs=1e-4)
@@ -160,7 +160,7 @@ def test_flaws_are_counted_per_triangle(faces: Tensor, flaws: float) -> None:
 
 
 def test_a_verdict_is_plain_json() -> None:
-    answer = verdict(judge(seen(parts_of(FRAMES, tracked())), GateSettings()))
+    answer = gates_as_json(evaluate_gates(seen(parts_of(FRAMES, tracked())), GateSettings()))
     assert json.loads(json.dumps(answer, allow_nan=False)) == answer
     assert all(round(gate["value"], 4) == gate["value"] for gate in answer["gates"])
 

@@ -9,10 +9,10 @@ from pxr import Usd, UsdGeom
 from small_package import FPS, FRAMES, REACH, packed, tracked
 
 from dg4d_lib.assets.formats.usd import write_usdz
-from dg4d_lib.assets.scenes.compose import Body
-from dg4d_lib.assets.scenes.scene import Item, Scene
+from dg4d_lib.assets.scenes.compose import AnimatedGlb
+from dg4d_lib.assets.scenes.scene import Scene, SceneItem
 from dg4d_lib.errors import BadInput
-from steps.compose_scene import Cast
+from steps.compose_scene import SceneWriter
 
 SECONDS = FRAMES / FPS
 
@@ -24,12 +24,12 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def cast_of(package: Path, *items: Item) -> Cast:
-    return Cast([package] * len(items), items, [item.name for item in items])
+def cast_of(package: Path, *items: Item) -> SceneWriter:
+    return SceneWriter([package] * len(items), items, [item.name for item in items])
 
 
-def item(name: str, **where: object) -> Item:
-    return Item(package="p", name=name, **where)
+def item(name: str, **where: object) -> SceneItem:
+    return SceneItem(package="p", name=name, **where)
 
 
 def pictures(film: Path) -> np.ndarray:
@@ -45,7 +45,7 @@ def blue(picture: np.ndarray) -> np.ndarray:
 def test_a_glb_holds_every_asset_where_it_was_put(package: Path, tmp_path: Path) -> None:
     cast = cast_of(package, item("left", position=(-1, 0, 0)), item("right", position=(1, 0, 0), scale=2))
     assert cast.write_glb(tmp_path / "scene.glb", None) == ()
-    scene = Body((tmp_path / "scene.glb").read_bytes())
+    scene = AnimatedGlb((tmp_path / "scene.glb").read_bytes())
     width = REACH + 2 * tracked().mesh.vertices[:, 0].max().item()
     np.testing.assert_allclose((scene.low[0], scene.high[0]), (-1 - width / 2, 1 + width), atol=1e-5)
     assert scene.low[1] == pytest.approx(0, abs=1e-6)
@@ -79,7 +79,7 @@ def test_a_package_without_usdz_is_named(package: Path, tmp_path: Path) -> None:
     folder = packed(tmp_path / "older")
     (folder / "asset.usdz").unlink(missing_ok=True)
     with pytest.raises(BadInput, match=r"has no asset\.usdz"):
-        Cast([folder], [item("a")], ["a"]).write_usdz(tmp_path / "scene.usdz", None)
+        SceneWriter([folder], [item("a")], ["a"]).write_usdz(tmp_path / "scene.usdz", None)
 
 
 def test_a_film_shows_every_asset(package: Path, tmp_path: Path) -> None:
@@ -121,4 +121,4 @@ def test_a_film_has_an_end(package: Path, tmp_path: Path) -> None:
 def test_a_broken_asset_is_named(tmp_path: Path) -> None:
     (tmp_path / "asset.glb").write_bytes(b"no GLB")
     with pytest.raises(BadInput, match=r"asset\.glb: this is no GLB"):
-        Cast([tmp_path], [item("a")], ["a"])
+        SceneWriter([tmp_path], [item("a")], ["a"])

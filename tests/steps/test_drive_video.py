@@ -57,9 +57,9 @@ def test_without_footage_the_subject_moves(tmp_path, subject):
     video = read_frames(tmp_path / "driving_video.zip", tmp_path)
     assert len(video) == 5 and video.fps == 6
     assert any("bend" in note for note in facts.notes)
-    assert (video.coverage[1:3] - video.coverage[0]).abs().max() > 0.2
-    still = torch.minimum(video.coverage[0], read_png(subject)[..., 3:]).sum()
-    assert still / torch.maximum(video.coverage[0], read_png(subject)[..., 3:]).sum() > 0.95
+    assert (video.alpha[1:3] - video.alpha[0]).abs().max() > 0.2
+    still = torch.minimum(video.alpha[0], read_png(subject)[..., 3:]).sum()
+    assert still / torch.maximum(video.alpha[0], read_png(subject)[..., 3:]).sum() > 0.95
 
 
 def test_footage_that_shows_nothing_of_the_subject_is_warned_of(tmp_path, subject):

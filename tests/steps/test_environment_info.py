@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from steps.contract import is_digest
-from steps.runtime.environment_info import environment_info, packages
+from steps.runtime.environment_info import environment_info, installed_distributions
 
 
 def test_a_machine_is_told_by_facts_and_names_nobody() -> None:
@@ -22,8 +22,8 @@ def test_a_machine_is_told_by_facts_and_names_nobody() -> None:
 
 
 def test_packages_are_those_that_are_installed() -> None:
-    assert f"numpy-{__import__('numpy').__version__}" in packages()
-    assert packages() == sorted(set(packages()))
+    assert f"numpy-{__import__('numpy').__version__}" in installed_distributions()
+    assert installed_distributions() == sorted(set(installed_distributions()))
 
 
 def test_an_image_is_named_where_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:

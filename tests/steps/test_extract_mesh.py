@@ -8,7 +8,7 @@ from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import write_ply
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.settings import FramewiseSettings, MeshSettings
 from steps import plan_mesh
 from steps.artifacts.media import read_png
@@ -30,7 +30,7 @@ def ball() -> Gaussians:
     points = 0.4 * torch.nn.functional.normalize(points, dim=-1)
     color = torch.tensor([[0.1, 0.2, 0.9]]).expand(300, 3)
     quats = torch.tensor([[1.0, 0, 0, 0]]).expand(300, 4)
-    return Gaussians(points, torch.full((300, 3), -2.8), quats, torch.full((300,), 3.0), harmonics_of_color(color))
+    return Gaussians(points, torch.full((300, 3), -2.8), quats, torch.full((300,), 3.0), rgb_to_sh(color))
 
 
 def extract(folder: Path, gaussians: Gaussians, mesh: MeshSettings = MESH, **frames: int) -> tuple[Job, StepReport]:
@@ -109,7 +109,7 @@ def test_the_frame_whose_surface_it_is_stays_with_the_mesh(tmp_path: Path, monke
     monkeypatch.setattr(plan_mesh, "select_reference_frame", lambda *arguments: (2, 1.0))
     extract(tmp_path, ball())
     asset = read_tracked(tmp_path / "tracked")
-    assert asset.rest == 2
+    assert asset.reference_frame == 2
     torch.testing.assert_close(asset.mesh.vertices.mean(0), 3 * SHIFT, atol=0.02, rtol=0)
 
 

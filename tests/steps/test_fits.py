@@ -11,7 +11,7 @@ import torch
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.gaussians.ply import read_ply
-from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.video.driving import DrivingVideo
 from steps import fit_gaussians, fit_motion
 from steps.artifacts.media import read_png, write_frames, write_png
@@ -91,7 +91,7 @@ def test_a_motion_comes_out_of_gaussians_and_a_video(tmp_path: Path, subject: Pa
     (tmp_path / "moving").mkdir()
     work = job(tmp_path / "moving", settings, inputs, ["motion", "gaussians", "curves", "picture"])
     facts = fit_motion.run(work)
-    _, frames_fitted = read_motion(work.outputs["motion"])
+    frames_fitted = read_motion(work.outputs["motion"]).frames
     assert frames_fitted == 3
     assert "no model" in facts.notes[0]
     assert not work.outputs["gaussians"].exists()
@@ -149,5 +149,5 @@ def test_a_bank_is_read_tile_by_tile(tmp_path: Path):
         archive.write(tmp_path / "view.png", "view.png")
         archive.writestr("bank.json", json.dumps(about))
     bank = read_bank(tmp_path / "bank.zip", tmp_path)
-    color, _ = bank.clean([View(OrbitCamera(-20, 22.5, width=8, height=8), frame) for frame in (0, 4)])
+    color, _ = bank.clean([GuidanceView(OrbitCamera(-20, 22.5, width=8, height=8), frame) for frame in (0, 4)])
     assert color[:, 0, 0, 0].tolist() == [0.0, 1.0]

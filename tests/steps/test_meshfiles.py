@@ -26,12 +26,12 @@ def assert_same(first: TexturedMesh, second: TexturedMesh) -> None:
 
 
 def test_a_tracked_mesh_comes_back_as_it_was(tmp_path: Path) -> None:
-    asset = TrackedMesh(some_mesh(), torch.randn(3, 5, 3), rest=2)
+    asset = TrackedMesh(some_mesh(), torch.randn(3, 5, 3), reference_frame=2)
     write_tracked(tmp_path / "a.safetensors", asset)
     back = read_tracked(tmp_path / "a.safetensors")
     assert_same(back.mesh, asset.mesh)
     assert torch.equal(back.offsets, asset.offsets)
-    assert (back.textures, back.rest) == (None, 2)
+    assert (back.textures, back.reference_frame) == (None, 2)
 
 
 def test_a_texture_per_frame_comes_back_in_eight_bits(tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ from small_package import FPS, FRAMES, NOTE, REACH, cloud, extracted, gem, input
 from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb
 from dg4d_lib.assets.formats.splats import read_splats
 from dg4d_lib.errors import BadInput
-from steps.artifacts.media import EPOCH, read_png
+from steps.artifacts.archives import EPOCH
+from steps.artifacts.media import read_png
 from steps.artifacts.meshes import write_tracked
 from steps.artifacts.packages import read_manifest
 from steps.pack_asset import run

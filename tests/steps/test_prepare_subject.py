@@ -7,7 +7,7 @@ from media_files import disc, opaque, save, save_clip, walk
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import SubjectSettings
-from dg4d_lib.video.framing import extent
+from dg4d_lib.video.framing import bounding_box
 from steps.artifacts.media import read_frames, read_png
 from steps.artifacts.pose import read_turn
 from steps.prepare_subject import run
@@ -27,7 +27,7 @@ def prepare(source: Path, out: Path, **settings: object) -> StepReport:
 def test_a_picture_becomes_a_square_cutout_and_no_footage(tmp_path):
     prepare(save(tmp_path / "a.png", opaque(disc())), tmp_path / "out")
     subject = read_png(tmp_path / "out" / "subject.png")
-    left, top, right, bottom = extent(subject[None, ..., 3])
+    left, top, right, bottom = bounding_box(subject[None, ..., 3])
     assert subject.shape == (64, 64, 4)
     assert (right - left, bottom - top) == (pytest.approx(51, abs=3), pytest.approx(51, abs=3))
     assert not (tmp_path / "out" / "footage.zip").exists() and not (tmp_path / "out" / "pose.json").exists()
@@ -49,7 +49,7 @@ def test_a_video_becomes_footage_whose_first_frame_is_the_subject(tmp_path):
     footage = read_frames(tmp_path / "out" / "footage.zip", tmp_path)
     subject = read_png(tmp_path / "out" / "subject.png")
     assert len(footage) == 5 and footage.fps == pytest.approx(5)
-    assert torch.equal(torch.cat([footage.frames[0], footage.coverage[0]], -1), subject)
+    assert torch.equal(torch.cat([footage.frames[0], footage.alpha[0]], -1), subject)
     assert any("5 of the video's 9 frames" in note for note in facts.notes)
 
 
@@ -93,9 +93,9 @@ def test_the_settings_are_read(tmp_path):
     prepare(source, tmp_path / "wide", framing="center", border=0.5)
     prepare(source, tmp_path / "kept", framing="keep")
     wide, kept = (read_png(tmp_path / name / "subject.png") for name in ("wide", "kept"))
-    left, _, right, _ = extent(wide[None, ..., 3])
+    left, _, right, _ = bounding_box(wide[None, ..., 3])
     assert right - left == pytest.approx(32, abs=2)
-    assert extent(kept[None, ..., 3])[0] == 13
+    assert bounding_box(kept[None, ..., 3])[0] == 13
 
 
 def test_nothing_is_written_for_a_picture_that_is_refused(tmp_path):

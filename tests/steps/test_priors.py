@@ -8,8 +8,8 @@ import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.guidance.distillation import Annealing
-from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.distillation import TimestepSchedule
+from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.settings import (
     GeometricPriorSettings,
     LearnedPriorSettings,
@@ -20,7 +20,7 @@ from dg4d_lib.settings import (
 )
 from dg4d_lib.shape_prior import packaged
 from steps.artifacts.media import write_png, write_zip
-from steps.fitting.priors import ChosenPrior, make_prior, oracle_prior, read_bank, read_bank_folder
+from steps.fitting.priors import LoadedPrior, make_oracle_prior, make_prior, read_bank, read_bank_folder
 
 CUTOUTS = [torch.rand(64, 64, 4, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1)]
 
@@ -30,19 +30,19 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tiny_weights.write_zero123(tmp_path_factory.mktemp("weights") / "mine")
 
 
-def chosen(model: Path, stage: StaticSettings | MotionSettings, cutouts: list[torch.Tensor]) -> ChosenPrior:
+def chosen(model: Path, stage: StaticSettings | MotionSettings, cutouts: list[torch.Tensor]) -> LoadedPrior:
     return make_prior(Zero123PriorSettings(weights=str(model)), cutouts, stage, None, model)
 
 
-def judged(choice: ChosenPrior, frame: int = 0) -> torch.Tensor:
+def judged(choice: LoadedPrior, frame: int = 0) -> torch.Tensor:
     images = torch.rand(1, 64, 64, 3, generator=torch.Generator().manual_seed(2))
-    view = View(OrbitCamera(10, 40), frame)
+    view = GuidanceView(OrbitCamera(10, 40), frame)
     return choice.prior.loss(images, images[..., :1], [view], 0.5, torch.Generator().manual_seed(3))
 
 
 def test_zero123_comes_from_a_folder_with_its_digests_and_license(model: Path) -> None:
     choice = chosen(model, StaticSettings(), CUTOUTS[:1])
-    facts = choice.facts("cpu rasterizer")
+    facts = choice.report("cpu rasterizer")
     assert facts.backend == "cpu rasterizer"
     names = {name.split("/mine/")[1] if "/mine/" in name else name for name in facts.weights}
     assert {"unet/diffusion_pytorch_model.safetensors", "vae/config.json"} <= names
@@ -72,7 +72,7 @@ def test_frames_are_told_apart(model: Path) -> None:
 
 def test_that_memory_ran_out_is_said_of_the_run_and_of_nothing_else(model: Path) -> None:
     choice = chosen(model, StaticSettings(), CUTOUTS[:1])
-    plenty = choice.facts("cpu")
+    plenty = choice.report("cpu")
     assert len(plenty.notes) == 1 and not plenty.run_notes
 
     def tight(piece: slice) -> None:
@@ -81,8 +81,8 @@ def test_that_memory_ran_out_is_said_of_the_run_and_of_nothing_else(model: Path)
 
     assert choice.batches is not None
     choice.batches.run(tight, 16)
-    assert choice.facts("cpu").notes == plenty.notes
-    assert "memory ran out with 16 views" in choice.facts("cpu").run_notes[0]
+    assert choice.report("cpu").notes == plenty.notes
+    assert "memory ran out with 16 views" in choice.report("cpu").run_notes[0]
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_weights_that_are_not_here_are_named_with_the_command(monkeypatch: pytes
 
 def test_the_prior_without_weights_has_none_in_its_facts(tmp_path: Path) -> None:
     settings = GeometricPriorSettings(size=32)
-    facts = make_prior(settings, CUTOUTS[:1], StaticSettings(), None, tmp_path).facts("cpu")
+    facts = make_prior(settings, CUTOUTS[:1], StaticSettings(), None, tmp_path).report("cpu")
     assert facts.weights == {} and facts.licenses == {} and len(facts.notes) == 1
 
 
@@ -131,16 +131,20 @@ def test_a_bank_is_the_same_from_a_folder_and_from_a_zip(tmp_path: Path) -> None
 def test_an_imperfect_oracle_has_the_same_flaws_in_both_stages(tmp_path: Path) -> None:
     bank = read_bank_folder(bank_folder(tmp_path / "bank"))
     flawed = OraclePriorSettings(pose_deg=3.0)
-    first, second = (oracle_prior(bank, flawed, Annealing(start)) for start in (0.98, 0.5))
+    first, second = (make_oracle_prior(bank, flawed, TimestepSchedule(start)) for start in (0.98, 0.5))
     assert first.viewpoints == second.viewpoints
-    assert first.viewpoints != oracle_prior(bank, OraclePriorSettings(), Annealing(0.5)).viewpoints == bank.cameras
+    assert (
+        first.viewpoints
+        != make_oracle_prior(bank, OraclePriorSettings(), TimestepSchedule(0.5)).viewpoints
+        == bank.cameras
+    )
 
 
 def test_the_learned_prior_records_its_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(packaged, "packaged_network", tiny_shape_prior.tiny_network)
     choice = make_prior(LearnedPriorSettings(), CUTOUTS[:1], StaticSettings(), None, tmp_path)
     assert choice.shapes is not None and choice.shapes.surface(0).faces.numel()
-    facts = choice.facts("cpu")
+    facts = choice.report("cpu")
     assert facts.weights == packaged.digests() and facts.licenses == {} and "shape network" in facts.notes[0]
 
 
@@ -154,6 +158,6 @@ def test_the_report_tells_how_much_of_an_unsure_shape_is_inflated(
     monkeypatch.setattr(packaged, "packaged_network", lambda: unsure)
     choice = make_prior(LearnedPriorSettings(), CUTOUTS[:1], StaticSettings(), None, tmp_path)
     assert choice.shapes is not None
-    assert len(choice.facts("cpu").notes) == 1  # nothing was asked yet
-    choice.shapes.clean([View(OrbitCamera(10, 40, width=32, height=32))])
-    assert "100% of its shape is the inflated silhouette" in choice.facts("cpu").notes[1]
+    assert len(choice.report("cpu").notes) == 1  # nothing was asked yet
+    choice.shapes.clean([GuidanceView(OrbitCamera(10, 40, width=32, height=32))])
+    assert "100% of its shape is the inflated silhouette" in choice.report("cpu").notes[1]

@@ -6,14 +6,14 @@ import pytest
 from pydantic import ValidationError
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.rasterizer import choice
+from dg4d_lib.rasterizer import backends
 from dg4d_lib.settings import Zero123PriorSettings
 from steps.profiles import CHANGED_KNOBS, PREVIEW, PROFILES, PipelineSettings, profile, revise, step_settings
 
 
 @pytest.mark.parametrize(("lack", "backend"), [("no GPU", "cpu"), ("", "cuda_gsplat")])
 def test_a_request_says_what_will_draw(lack: str, backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(choice, "what_gsplat_lacks", lambda: lack)
+    monkeypatch.setattr(backends, "gsplat_unavailable_reason", lambda: lack)
     for step in ("fit_gaussians", "fit_motion", "plan_mesh", "extract_mesh", "pack_asset", "check_asset"):
         for asked, draws in (("auto", backend), ("reference", "reference")):
             made = step_settings(step, PREVIEW.model_copy(update={"rasterizer": asked}))

@@ -11,11 +11,11 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.fitting import static
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.gaussians.ply import read_ply
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import LgmStartSettings, StaticSettings
 from steps import fit_gaussians
 from steps.artifacts.media import read_png, write_png
-from steps.fit_gaussians import touched_up
+from steps.fit_gaussians import fine_tuning_settings
 from steps.fitting.reconstruction import NOTE, Reconstruction, reconstruct_subject
 from steps.profiles import PREVIEW, step_settings
 from steps.runtime.job import Job, StepReport
@@ -53,7 +53,7 @@ def test_the_fit_starts_from_the_reconstruction_that_the_seed_decides(
 
     start, used = given[0][0], given[0][4]
     exact = read_png(tmp_path / "subject.png")
-    expected = reconstruct_subject(exact, lgm, choose_rasterizer("cpu"), torch.Generator().manual_seed(1))
+    expected = reconstruct_subject(exact, lgm, get_rasterizer("cpu"), torch.Generator().manual_seed(1))
     assert torch.equal(start.means, expected.gaussians.means)
     assert torch.equal(read_ply(outputs["gaussians"]).means, start.means)
     assert used.means_lr == pytest.approx(0.1 * stage.means_lr)
@@ -66,14 +66,14 @@ def test_the_fit_starts_from_the_reconstruction_that_the_seed_decides(
 def test_what_the_prior_brought_stays_in_the_record(lgm: LgmStartSettings) -> None:
     opened = open_weights(lgm.weights), open_weights(lgm.views_weights)
     made = Reconstruction(blob(16, 0.5, torch.Generator()), opened)
-    facts = made.added_to(StepReport("cpu", {"prior": "sha256:1"}, {"prior": "free"}, ("a prior",)))
+    facts = made.add_to(StepReport("cpu", {"prior": "sha256:1"}, {"prior": "free"}, ("a prior",)))
     assert facts.notes == ("a prior", NOTE)
     assert facts.weights["prior"] == "sha256:1"
     assert len(facts.licenses) == 3
 
 
 def test_means_of_a_reconstruction_move_a_tenth_as_fast() -> None:
-    slow = touched_up(StaticSettings())
+    slow = fine_tuning_settings(StaticSettings())
     assert (slow.means_lr, slow.means_lr_end) == pytest.approx((1e-3, 2e-5))
     assert slow.color_lr == StaticSettings().color_lr
 
@@ -94,4 +94,4 @@ def test_a_start_has_its_own_knobs_and_no_others() -> None:
 def test_weights_of_something_else_are_refused(lgm: LgmStartSettings) -> None:
     wrong = lgm.model_copy(update={"weights": lgm.views_weights})
     with pytest.raises(BadInput, match="model_fp16_fixrot"):
-        reconstruct_subject(subject(), wrong, choose_rasterizer("cpu"), torch.Generator())
+        reconstruct_subject(subject(), wrong, get_rasterizer("cpu"), torch.Generator())

@@ -106,7 +106,7 @@ def test_the_identity_needs_no_step(folder: Path) -> None:
 
 def test_a_video_of_another_length_is_refused(folder: Path) -> None:
     write_frames(folder / "video", DrivingVideo(torch.rand(5, 64, 64, 3), torch.ones(5, 64, 64, 1), 24.0))
-    with pytest.raises(BadInput, match="3 frames and the driving video 5"):
+    with pytest.raises(BadInput, match="3 frames and the driving video has 5"):
         refine(folder, "tracked", video_to_video(folder))
 
 

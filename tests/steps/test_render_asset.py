@@ -43,7 +43,7 @@ def column(picture: torch.Tensor) -> float:
 
 def expected_column(azimuth_deg: float, share: float) -> float:
     camera = OrbitCamera(azimuth_deg=azimuth_deg, width=SIZE, height=SIZE)
-    place = camera.world_to_camera() @ torch.tensor([REACH * share, 0, 0, 1], dtype=torch.float64)
+    place = camera.viewmat() @ torch.tensor([REACH * share, 0, 0, 1], dtype=torch.float64)
     return camera.focal * float(place[0] / place[2])
 
 

@@ -3,14 +3,14 @@ from pathlib import Path
 import pytest
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.weights.lock import Locked, LockedFile, write_lock
+from dg4d_lib.weights.lock import LockedFile, LockEntry, write_lock
 from steps.contract import StepRequest
 from steps.runtime.perform import perform
 from steps.runtime.weights import (
+    check_unchanged,
     identities,
     license_of,
     open_weights,
-    require_same,
     weights_home,
     weights_in,
     without_paths,
@@ -73,7 +73,7 @@ def test_opened_weights_come_with_digests_and_licenses(home: Path) -> None:
 def test_a_model_card_that_was_pulled_is_the_license_of_unknown_weights(home: Path) -> None:
     assert not license_of("me/pictures").allows_commercial_use
     home.mkdir()
-    locked = Locked(hub_id="me/pictures", revision="", license="mit", files={"a": LockedFile(sha256="", size=0)})
+    locked = LockEntry(hub_id="me/pictures", revision="", license="mit", files={"a": LockedFile(sha256="", size=0)})
     write_lock(home, "me/pictures", locked)
     assert license_of("me/pictures").commercial == "yes"
 
@@ -84,9 +84,9 @@ def test_the_identity_follows_the_content_and_missing_weights_have_none(home: Pa
     assert set(before) == {"lgm"}
     (home / "lgm" / "model_fp16_fixrot.safetensors").write_text("other")
     assert identities(["lgm"]) != before
-    require_same(identities(["lgm"]))
+    check_unchanged(identities(["lgm"]))
     with pytest.raises(BadInput, match="the weights lgm changed in between"):
-        require_same(before)
+        check_unchanged(before)
 
 
 def test_a_request_for_other_weights_is_another_and_is_not_performed(home: Path, tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """The exact compact form of an asset: the Gaussians at rest and what moves them, in one safetensors file.
 
 Metadata, under the key `asset4d`, is JSON: `format` and `version`; `settings` of the deformation, of which `kind` says
-how it works; `frames`, `fps`, `gaussians`; `last_moment`, where the last frame lies on the deformation's axis of time
+how it works; `frames`, `fps`, `gaussians`; `last_time`, where the last frame lies on the deformation's axis of time
 from 0 to 1; `tensors`, which says what each is. Tensors: those of the Gaussians under `gaussians.`, those of the
 deformation under `deformation.`. What a deformation gives is added to means, log scales and quaternions as they are
 stored; after the last frame they go back to the first in a straight line. `examples/load_compact.py` reads it without
@@ -17,7 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from dg4d_lib.deformation.factory import AnyDeformation, from_state_dict, last_moment, tensors_of
+from dg4d_lib.deformation.factory import AnyDeformation, deformation_tensors, from_state_dict, last_time
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import check_storable
@@ -43,7 +43,7 @@ TENSORS = {
 
 
 @dataclass(frozen=True)
-class Compact:
+class CompactAsset:
     """What a file holds.
 
     Attributes:
@@ -61,7 +61,7 @@ class Compact:
     fps: float
 
 
-def write_compact(path: Path, asset: Compact) -> None:
+def write_compact(path: Path, asset: CompactAsset) -> None:
     """Write one file; equal assets give equal bytes.
 
     Raises:
@@ -70,20 +70,20 @@ def write_compact(path: Path, asset: Compact) -> None:
     """
     check_storable(asset.gaussians, "a compact asset")
     tensors = {GAUSSIANS + name: value.detach().cpu().contiguous() for name, value in vars(asset.gaussians).items()}
-    tensors |= {DEFORMATION + name: value for name, value in tensors_of(asset.deformation).items()}
+    tensors |= {DEFORMATION + name: value for name, value in deformation_tensors(asset.deformation).items()}
     about = {
         **FORM,
         "settings": asset.settings.model_dump(mode="json"),
         "frames": asset.frames,
         "fps": asset.fps,
         "gaussians": len(asset.gaussians),
-        "last_moment": last_moment(asset.settings, asset.frames),
+        "last_time": last_time(asset.settings, asset.frames),
         "tensors": TENSORS,
     }
     path.write_bytes(save(tensors, {KEY: json.dumps(about, sort_keys=True)}))
 
 
-def read_compact(path: Path) -> Compact:
+def read_compact(path: Path) -> CompactAsset:
     """Read what `write_compact` wrote: everything comes back exactly.
 
     Raises:
@@ -102,6 +102,6 @@ def read_compact(path: Path) -> Compact:
         }
         gaussians = Gaussians(**parts[GAUSSIANS])
         deformation = from_state_dict(settings, parts[DEFORMATION], about["frames"], len(gaussians))
-        return Compact(gaussians, deformation, settings, about["frames"], about["fps"])
+        return CompactAsset(gaussians, deformation, settings, about["frames"], about["fps"])
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, ValidationError, RuntimeError) as error:
         raise BadInput(f"{path.name} is no compact asset: {error}") from error

@@ -20,10 +20,10 @@ from torch import Tensor
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.assets.formats.gltf import Document, Parsed
-from dg4d_lib.assets.formats.shapes import Cube, Shape
-from dg4d_lib.assets.formats.surfaces import WEBP, Atlas, add_material, add_texture, pixels_of
-from dg4d_lib.assets.formats.tracks import Animation, Span, cut
+from dg4d_lib.assets.formats.gltf import GlbReader, GltfDocument
+from dg4d_lib.assets.formats.materials import WEBP, Atlas, add_material, add_texture, to_uint8
+from dg4d_lib.assets.formats.primitives import MeshPrimitive, QuantizationCube
+from dg4d_lib.assets.formats.tracks import Animation, Span, split_into_spans
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.textured import TexturedMesh
 
@@ -43,20 +43,20 @@ def write_glb(asset: Asset4D, settings: GltfSettings = DEFAULTS) -> bytes:
         BackendUnavailable: the package for compression is missing.
     """
     _check_asset(asset)
-    document = Document(asset.extras, compressed=settings.meshopt)
+    document = GltfDocument(asset.extras, compressed=settings.meshopt)
     animation = Animation(document, asset.fps)
     offsets, atlas = _floats(asset.offsets), None
     if asset.textures is not None and settings.textures == "pointer":
         atlas = Atlas.of(asset.textures, settings.atlas_size)
         animation.point(OFFSET_POINTER, "texture offset", atlas.offsets())
     materials = _add_materials(document, asset, atlas, settings)
-    cube = Cube.around([_floats(asset.mesh.vertices)], offsets) if settings.quantized else None
+    cube = QuantizationCube.around([_floats(asset.mesh.vertices)], offsets) if settings.quantized else None
     shape = _add_shape(document, NAME, asset.mesh, cube, atlas)
     poses = [
         shape.add_pose(_frame_name(frame), pose, normals=settings.moving_normals) for frame, pose in enumerate(offsets)
     ]
     nodes = []
-    spans = cut(len(poses), MAX_POSES if len(materials) == 1 else 1)
+    spans = split_into_spans(len(poses), MAX_POSES if len(materials) == 1 else 1)
     for span in spans:
         primitive = _primitive(shape, materials[span.first if len(materials) > 1 else 0])
         name = NAME if len(spans) == 1 else _frame_name(span.first)
@@ -86,8 +86,8 @@ def write_frames_glb(
     _check_fps(fps)
     for mesh in meshes:
         _check(mesh)
-    document = Document(extras or {}, compressed=settings.meshopt)
-    cube = Cube.around([_floats(mesh.vertices) for mesh in meshes]) if settings.quantized else None
+    document = GltfDocument(extras or {}, compressed=settings.meshopt)
+    cube = QuantizationCube.around([_floats(mesh.vertices) for mesh in meshes]) if settings.quantized else None
     animation = Animation(document, fps)
     nodes = []
     for frame, mesh in enumerate(meshes):
@@ -106,8 +106,8 @@ def write_mesh_glb(mesh: TexturedMesh, settings: GltfSettings = DEFAULTS) -> byt
         BackendUnavailable: a package for compression is missing.
     """
     _check(mesh)
-    document = Document({}, compressed=settings.meshopt)
-    cube = Cube.around([_floats(mesh.vertices)]) if settings.quantized else None
+    document = GltfDocument({}, compressed=settings.meshopt)
+    cube = QuantizationCube.around([_floats(mesh.vertices)]) if settings.quantized else None
     return _finish(
         document, [document.add("nodes", name=NAME, mesh=_add_mesh(document, NAME, mesh, cube, settings))], cube
     )
@@ -123,7 +123,7 @@ def read_glb(content: bytes) -> Asset4D:
         BadInput: it is broken or has another form; says what is missing.
         BackendUnavailable: it is compressed, and the package that unpacks it is missing.
     """
-    parsed = Parsed(content)
+    parsed = GlbReader(content)
     try:
         nodes = _mesh_nodes(parsed)
         primitives = [_primitive_of(parsed, node) for node in nodes]
@@ -149,7 +149,7 @@ def read_mesh_glb(content: bytes) -> TexturedMesh:
         BadInput: it is broken or has another form.
         BackendUnavailable: it is compressed, and the package that unpacks it is missing.
     """
-    parsed = Parsed(content)
+    parsed = GlbReader(content)
     try:
         return _read_mesh(parsed, _mesh_nodes(parsed))
     except _FOREIGN as error:
@@ -198,40 +198,42 @@ def _floats(values: Tensor) -> NDArray[np.float32]:
     return np.ascontiguousarray(values.detach().cpu().numpy().astype("<f4"))
 
 
-def _add_materials(document: Document, asset: Asset4D, atlas: Atlas | None, settings: GltfSettings) -> list[int]:
+def _add_materials(document: GltfDocument, asset: Asset4D, atlas: Atlas | None, settings: GltfSettings) -> list[int]:
     """One for all frames, or one for each."""
     if atlas is not None and asset.textures is not None:
         pictures = {NAME: atlas.join(asset.textures)}
     elif asset.textures is not None:
-        pictures = {_frame_name(frame): pixels_of(texture) for frame, texture in enumerate(asset.textures)}
+        pictures = {_frame_name(frame): to_uint8(texture) for frame, texture in enumerate(asset.textures)}
     else:
-        pictures = {NAME: pixels_of(asset.mesh.texture)}
+        pictures = {NAME: to_uint8(asset.mesh.texture)}
     return [
         add_material(document, name, add_texture(document, name, pixels, settings), settings, atlas)
         for name, pixels in pictures.items()
     ]
 
 
-def _add_mesh(document: Document, name: str, mesh: TexturedMesh, cube: Cube | None, settings: GltfSettings) -> int:
+def _add_mesh(
+    document: GltfDocument, name: str, mesh: TexturedMesh, cube: QuantizationCube | None, settings: GltfSettings
+) -> int:
     """A mesh that does not move, with its material. Returns its number."""
-    texture = add_texture(document, name, pixels_of(mesh.texture), settings)
+    texture = add_texture(document, name, to_uint8(mesh.texture), settings)
     shape = _add_shape(document, name, mesh, cube)
     primitive = _primitive(shape, add_material(document, name, texture, settings))
     return document.add("meshes", name=name, primitives=[primitive])
 
 
 def _add_shape(
-    document: Document, name: str, mesh: TexturedMesh, cube: Cube | None, atlas: Atlas | None = None
-) -> Shape:
+    document: GltfDocument, name: str, mesh: TexturedMesh, cube: QuantizationCube | None, atlas: Atlas | None = None
+) -> MeshPrimitive:
     uvs = _floats(mesh.uvs) if atlas is None else atlas.inside(_floats(mesh.uvs))
-    return Shape(document, name, _floats(mesh.vertices), mesh.faces.cpu().numpy(), uvs, cube)
+    return MeshPrimitive(document, name, _floats(mesh.vertices), mesh.faces.cpu().numpy(), uvs, cube)
 
 
-def _primitive(shape: Shape, material: int) -> dict[str, Any]:
+def _primitive(shape: MeshPrimitive, material: int) -> dict[str, Any]:
     return {"attributes": shape.attributes, "indices": shape.indices, "material": material, "mode": 4}
 
 
-def _add_posed_node(document: Document, name: str, span: Span, primitive: dict[str, Any]) -> int:
+def _add_posed_node(document: GltfDocument, name: str, span: Span, primitive: dict[str, Any]) -> int:
     """A node with the poses of a span, the first of them shown. Returns its number."""
     mesh = document.add(
         "meshes",
@@ -243,7 +245,7 @@ def _add_posed_node(document: Document, name: str, span: Span, primitive: dict[s
     return document.add("nodes", name=name, mesh=mesh)
 
 
-def _finish(document: Document, nodes: list[int], cube: Cube | None) -> bytes:
+def _finish(document: GltfDocument, nodes: list[int], cube: QuantizationCube | None) -> bytes:
     """One root: the only node, or a parent of all; it carries the cube."""
     root = nodes[0] if len(nodes) == 1 else document.add("nodes", name=NAME, children=nodes)
     if cube is not None:
@@ -252,7 +254,7 @@ def _finish(document: Document, nodes: list[int], cube: Cube | None) -> bytes:
     return document.to_bytes()
 
 
-def _mesh_nodes(parsed: Parsed) -> list[int]:
+def _mesh_nodes(parsed: GlbReader) -> list[int]:
     """The nodes that show the one mesh of a file."""
     nodes = [number for number, node in enumerate(parsed.tree["nodes"]) if "mesh" in node]
     shapes = []
@@ -264,12 +266,12 @@ def _mesh_nodes(parsed: Parsed) -> list[int]:
     return nodes
 
 
-def _primitive_of(parsed: Parsed, node: int) -> dict[str, Any]:
+def _primitive_of(parsed: GlbReader, node: int) -> dict[str, Any]:
     primitive: dict[str, Any] = parsed.tree["meshes"][parsed.tree["nodes"][node]["mesh"]]["primitives"][0]
     return primitive
 
 
-def _read_mesh(parsed: Parsed, nodes: list[int]) -> TexturedMesh:
+def _read_mesh(parsed: GlbReader, nodes: list[int]) -> TexturedMesh:
     """The mesh at rest, with the texture of the first node."""
     primitive = _primitive_of(parsed, nodes[0])
     attributes, indices = primitive["attributes"], parsed.accessor(primitive["indices"])
@@ -290,7 +292,7 @@ def _read_mesh(parsed: Parsed, nodes: list[int]) -> TexturedMesh:
     return mesh
 
 
-def _placement(parsed: Parsed, node: int) -> tuple[float, NDArray[np.float64]]:
+def _placement(parsed: GlbReader, node: int) -> tuple[float, NDArray[np.float64]]:
     """The scale of a node in the world, and where its origin lies; a scale that shows and hides it counts as 1."""
     tree, scale, shift = parsed.tree, 1.0, np.zeros(3)
     targets = [channel["target"] for animation in tree.get("animations", []) for channel in animation["channels"]]
@@ -308,7 +310,7 @@ def _placement(parsed: Parsed, node: int) -> tuple[float, NDArray[np.float64]]:
     return scale, shift
 
 
-def _read_frames(parsed: Parsed, nodes: list[int]) -> tuple[list[tuple[dict[str, int], int]], float]:
+def _read_frames(parsed: GlbReader, nodes: list[int]) -> tuple[list[tuple[dict[str, int], int]], float]:
     """The morph target and the material of every frame, and the frames per second."""
     (animation,) = parsed.tree["animations"]
     tracks = {
@@ -332,7 +334,7 @@ def _read_frames(parsed: Parsed, nodes: list[int]) -> tuple[list[tuple[dict[str,
     return [frames[frame] for frame in range(len(frames))], fps
 
 
-def _read_textures(parsed: Parsed, materials: list[int]) -> Float[Tensor, "t h w 3"] | None:
+def _read_textures(parsed: GlbReader, materials: list[int]) -> Float[Tensor, "t h w 3"] | None:
     """The textures of every frame, where they change."""
     pixels, atlas = _read_picture(parsed, materials[0])
     if atlas is not None:
@@ -342,7 +344,7 @@ def _read_textures(parsed: Parsed, materials: list[int]) -> Float[Tensor, "t h w
     return _colors(np.stack([_read_picture(parsed, material)[0] for material in materials]))
 
 
-def _read_picture(parsed: Parsed, material: int) -> tuple[NDArray[np.uint8], Atlas | None]:
+def _read_picture(parsed: GlbReader, material: int) -> tuple[NDArray[np.uint8], Atlas | None]:
     """The color of a material, and how frames lie in it."""
     tree = parsed.tree
     item = tree["materials"][material]

@@ -29,7 +29,7 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _KIND_OF = {width: kind for kind, width in _WIDTHS.items()}
 
 
-class Document:
+class GltfDocument:
     """A glTF document under construction; what is added later may refer to what was added before, by its number.
 
     Attributes:
@@ -71,7 +71,7 @@ class Document:
         place = {"buffer": 0, "byteOffset": start, "byteLength": len(content)}
         return self.add("bufferViews", name=name, **place, byteStride=stride, target=target)
 
-    def add_view_of(self, other: "Parsed", index: int) -> int:
+    def add_view_of(self, other: "GlbReader", index: int) -> int:
         """Append a view of another file as it is, packed or not. Returns its number."""
         view: dict[str, Any] = {**other.tree["bufferViews"][index]}
         packed = view.get("extensions", {}).get(meshopt.EXTENSION)
@@ -156,7 +156,7 @@ class Document:
         return number
 
 
-class Parsed:
+class GlbReader:
     """A GLB that was read: its JSON and its buffer.
 
     Raises:

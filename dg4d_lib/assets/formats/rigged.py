@@ -13,36 +13,36 @@ from numpy.typing import NDArray
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.assets.formats.gltf import VERTEX_DATA, Document
-from dg4d_lib.assets.formats.shapes import Shape
-from dg4d_lib.assets.formats.surfaces import add_material, add_texture, pixels_of
+from dg4d_lib.assets.formats.gltf import VERTEX_DATA, GltfDocument
+from dg4d_lib.assets.formats.materials import add_material, add_texture, to_uint8
+from dg4d_lib.assets.formats.primitives import MeshPrimitive
 from dg4d_lib.errors import BadInput
-from dg4d_lib.geometry.quaternion import multiply, rotation_matrix
+from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
 from dg4d_lib.mesh.tracking.rig import Rig, fit_rig
 
 NAME = "subject"
 ENOUGH = 0.05  # of the motion may be missed: more bones would follow what nobody sees
-MOST_BONES = 255  # that bytes can number
+MAX_BONES = 255  # that bytes can number
 FLOAT = 5126  # glTF's name of a kind of number
 SHARES = 65535  # of which weights are whole multiples
 
 
-def rig_of(asset: Asset4D, most_bones: int, largest_error: float) -> tuple[Rig | None, str]:
+def fit_asset_rig(asset: Asset4D, max_bones: int, max_error: float) -> tuple[Rig | None, str]:
     """The rig of an asset, if one follows the motion well enough; and a sentence for the report, either way.
 
     Args:
         asset: what moves.
-        most_bones: of the rig, at most 255.
-        largest_error: part of the motion that may be missed (`Rig.error`).
+        max_bones: of the rig, at most 255.
+        max_error: part of the motion that may be missed (`Rig.error`).
 
     Raises:
         BadInput: no vertices, no frames, or numbers that are not finite.
     """
-    rig = fit_rig(asset.mesh.vertices, asset.offsets, ENOUGH, most_bones)
-    bones = "1 bone misses" if len(rig.rest) == 1 else f"{len(rig.rest)} bones miss"
-    figures = f"{bones} {rig.error:.1%} of the motion: {rig.rms:.2g} world units (rms), at most {rig.largest:.2g}"
-    if rig.error > largest_error:
-        return None, f"no rig: {figures}; {largest_error:.1%} is allowed"
+    rig = fit_rig(asset.mesh.vertices, asset.offsets, ENOUGH, max_bones)
+    bones = "1 bone misses" if len(rig.rest_positions) == 1 else f"{len(rig.rest_positions)} bones miss"
+    figures = f"{bones} {rig.error:.1%} of the motion: {rig.rms:.2g} world units (rms), at most {rig.max_distance:.2g}"
+    if rig.error > max_error:
+        return None, f"no rig: {figures}; {max_error:.1%} is allowed"
     return rig, f"rig: {figures}"
 
 
@@ -59,16 +59,16 @@ def write_rigged_glb(asset: Asset4D, rig: Rig, settings: GltfSettings) -> bytes:
         BackendUnavailable: the package for compression is missing.
     """
     mesh = asset.mesh
-    if len(rig.weights) != len(mesh.vertices) or len(rig.rest) > MOST_BONES:
-        given = f"{len(rig.rest)} bones and {len(rig.weights)} vertices"
+    if len(rig.weights) != len(mesh.vertices) or len(rig.rest_positions) > MAX_BONES:
+        given = f"{len(rig.rest_positions)} bones and {len(rig.weights)} vertices"
         raise BadInput(
-            f"a rig for this mesh has at most {MOST_BONES} bones and {len(mesh.vertices)} vertices; given {given}"
+            f"a rig for this mesh has at most {MAX_BONES} bones and {len(mesh.vertices)} vertices; given {given}"
         )
-    document = Document(asset.extras, compressed=settings.meshopt)
-    texture = add_texture(document, NAME, pixels_of(mesh.texture), settings)
+    document = GltfDocument(asset.extras, compressed=settings.meshopt)
+    texture = add_texture(document, NAME, to_uint8(mesh.texture), settings)
     material = add_material(document, NAME, texture, settings)
     vertices, uvs = (values.detach().cpu().numpy().astype("<f4") for values in (mesh.vertices, mesh.uvs))
-    shape = Shape(document, NAME, vertices, mesh.faces.cpu().numpy(), uvs, None)
+    shape = MeshPrimitive(document, NAME, vertices, mesh.faces.cpu().numpy(), uvs, None)
     shares = _whole_shares(rig.weights.double().cpu().numpy())
     bones = np.where(shares > 0, rig.bones.cpu().numpy(), 0).astype("u1")
     attributes = {
@@ -79,7 +79,7 @@ def write_rigged_glb(asset: Asset4D, rig: Rig, settings: GltfSettings) -> bytes:
     primitive = {"attributes": attributes, "indices": shape.indices, "material": material, "mode": 4}
     number = document.add("meshes", name=NAME, primitives=[primitive])
     skeleton, joints = _add_joints(document, rig)
-    binding = _add_matrices(document, rig.rest.double().cpu().numpy())
+    binding = _add_matrices(document, rig.rest_positions.double().cpu().numpy())
     skin = document.add("skins", name="rig", inverseBindMatrices=binding, skeleton=skeleton, joints=joints)
     node = document.add("nodes", name=NAME, mesh=number, skin=skin)
     _add_motion(document, rig, joints, asset.fps, settings.interpolation.upper())
@@ -97,9 +97,9 @@ def _whole_shares(weights: Float[np.ndarray, "v 4"]) -> UInt16[np.ndarray, "v 4"
     return shares.astype("<u2")
 
 
-def _add_joints(document: Document, rig: Rig) -> tuple[int, list[int]]:
+def _add_joints(document: GltfDocument, rig: Rig) -> tuple[int, list[int]]:
     """The nodes of the joints at rest. Returns the node above all, and theirs."""
-    parents, rest = rig.parents.tolist(), rig.rest.double().cpu().numpy()
+    parents, rest = rig.parents.tolist(), rig.rest_positions.double().cpu().numpy()
     joints = []
     for bone, parent in enumerate(parents):
         arm = rest[bone] - (rest[parent] if parent >= 0 else 0)
@@ -111,7 +111,7 @@ def _add_joints(document: Document, rig: Rig) -> tuple[int, list[int]]:
     return document.add("nodes", name="skeleton", children=[joints[0]]), joints
 
 
-def _add_matrices(document: Document, rest: Float[np.ndarray, "b 3"]) -> int:
+def _add_matrices(document: GltfDocument, rest: Float[np.ndarray, "b 3"]) -> int:
     """From the mesh to every joint at rest. Returns the number of the accessor."""
     matrices = np.tile(np.eye(4, dtype="<f4"), (len(rest), 1, 1))
     matrices[:, 3, :3] = -rest  # columns one after another
@@ -121,15 +121,15 @@ def _add_matrices(document: Document, rest: Float[np.ndarray, "b 3"]) -> int:
     )
 
 
-def _add_motion(document: Document, rig: Rig, joints: list[int], fps: float, interpolation: str) -> None:
+def _add_motion(document: GltfDocument, rig: Rig, joints: list[int], fps: float, interpolation: str) -> None:
     """Rotations and translations of all joints, relative to their parents."""
-    quats, places = rig.quats.double().cpu(), rig.places.double().cpu()
+    quats, places = rig.quats.double().cpu(), rig.positions.double().cpu()
     inner = rig.parents[1:]
     back = quats[:, inner] * quats.new_tensor((1, -1, -1, -1))
     arms = places[:, 1:] - places[:, inner]
     turns, moves = quats.clone(), places.clone()
-    turns[:, 1:] = multiply(back, quats[:, 1:])
-    moves[:, 1:] = (rotation_matrix(back) @ arms[..., None])[..., 0]
+    turns[:, 1:] = quat_multiply(back, quats[:, 1:])
+    moves[:, 1:] = (quat_to_rotmat(back) @ arms[..., None])[..., 0]
     samplers: list[dict[str, Any]] = []
     channels = []
     times = document.add_accessor("times", (np.arange(len(quats) + 1) / fps).astype("<f4"))

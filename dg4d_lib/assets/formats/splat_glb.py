@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from jaxtyping import Float
 
-from dg4d_lib.assets.formats.gltf import VERTEX_DATA, Document
+from dg4d_lib.assets.formats.gltf import VERTEX_DATA, GltfDocument
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import check_storable
@@ -47,7 +47,7 @@ def write_splat_glb(gaussians: Gaussians, version: SplatGlbVersion = "ratified")
         f"{EXTENSION}:OPACITY": gaussians.opacities,
         f"{EXTENSION}:SH_DEGREE_0_COEF_0": gaussians.harmonics[:, 0],
     }
-    document = Document({})
+    document = GltfDocument({})
     document.use(EXTENSION)
     attributes = {
         name: document.add_accessor(name, values.detach().cpu().numpy().astype("<f4"), VERTEX_DATA)

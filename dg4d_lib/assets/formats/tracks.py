@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dg4d_lib.assets.formats.gltf import Document
+from dg4d_lib.assets.formats.gltf import GltfDocument
 
 POINTER = "KHR_animation_pointer"
 
@@ -51,7 +51,7 @@ class Span:
         return keys, np.repeat(np.array(visible, "<f4")[:, None], 3, axis=1)
 
 
-def cut(frames: int, longest: int) -> list[Span]:
+def split_into_spans(frames: int, longest: int) -> list[Span]:
     """Spans of an animation, one after another, none longer than `longest` frames."""
     return [Span(first, min(first + longest, frames), frames) for first in range(0, frames, longest)]
 
@@ -59,7 +59,7 @@ def cut(frames: int, longest: int) -> list[Span]:
 class Animation:
     """Tracks that are played together."""
 
-    def __init__(self, document: Document, fps: float) -> None:
+    def __init__(self, document: GltfDocument, fps: float) -> None:
         self._document, self._fps = document, fps
         self._samplers: list[dict[str, Any]] = []
         self._channels: list[dict[str, Any]] = []

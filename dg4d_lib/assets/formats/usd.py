@@ -36,8 +36,8 @@ from torch import Tensor
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.assets.formats.materials import encode_image, to_uint8
 from dg4d_lib.assets.formats.normals import SmoothNormals
-from dg4d_lib.assets.formats.surfaces import picture_file, pixels_of
 from dg4d_lib.assets.formats.usdz import UsdzPackage, write_usdz_package
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -377,7 +377,7 @@ def _picture(name: str, pixels: Float[Tensor, "h w 3"], settings: GltfSettings) 
     A digest in the name tells pictures of several assets apart: Blender takes files of one name for one picture.
     """
     kind, suffix = ("png", "png") if settings.image == "png" else ("jpeg", "jpg")
-    content = picture_file(pixels_of(pixels), kind, settings.quality)
+    content = encode_image(to_uint8(pixels), kind, settings.quality)
     return f"textures/{name}_{sha256(content).hexdigest()[:8]}.{suffix}", content
 
 

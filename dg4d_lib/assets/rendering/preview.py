@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.asset_settings import PackSettings
-from dg4d_lib.assets.animated import moved
+from dg4d_lib.assets.animated import pose_gaussians
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.deformation.interface import Deformation
@@ -69,7 +69,7 @@ def write_preview(
     positions = torch.arange(frames * repeats).repeat(settings.preview_turns) / repeats
 
     def states(part: slice) -> Gaussians:
-        return moved(gaussians, deformation, frames, positions[part])
+        return pose_gaussians(gaussians, deformation, frames, positions[part])
 
     return _round(path, states, len(positions), fps * repeats, rasterizer, settings, progress)
 
@@ -113,24 +113,24 @@ def _round(
 ) -> tuple[str, ...]:
     """Write a film in which the camera goes round once; `states` are those of a range of its pictures."""
     cameras = turntable(count, OrbitCamera(ELEVATION_DEG, width=settings.preview_size, height=settings.preview_size))
-    background = studio(settings.preview_size)
+    background = studio_background(settings.preview_size)
     codec = _codec()
-    with Film(path, codec, fps, settings.preview_size) as film:
+    with Mp4Writer(path, codec, fps, settings.preview_size) as film:
         for start in range(0, count, BATCH):
             part = slice(start, start + BATCH)
-            film.add(pictures_over(background, states(part), cameras[part], rasterizer))
+            film.add(render_over(background, states(part), cameras[part], rasterizer))
             progress(min(start + BATCH, count), count)
     return () if codec == "libx264" else (f"{path.name} is written with {codec}, since libx264 is not in this FFmpeg",)
 
 
-def write_film(path: Path, pictures: Float[Tensor, "t s s 3"], fps: float) -> None:
+def write_mp4(path: Path, pictures: Float[Tensor, "t s s 3"], fps: float) -> None:
     """Write pictures in [0, 1] with an even number of pixels a side as a silent MP4.
 
     Raises:
         BackendUnavailable: this build of FFmpeg can write no MP4 codec we know.
         OSError: the file could not be written.
     """
-    with Film(path, _codec(), fps, pictures.shape[1]) as film:
+    with Mp4Writer(path, _codec(), fps, pictures.shape[1]) as film:
         film.add(pictures)
 
 
@@ -141,7 +141,7 @@ def _codec() -> str:
     return codec
 
 
-def pictures_over(
+def render_over(
     background: Float[Tensor, "h w 3"], states: Gaussians, cameras: Sequence[OrbitCamera], rasterizer: Rasterizer
 ) -> Float[Tensor, "b h w 3"]:
     """Every state from its camera, over a background picture, without gradients."""
@@ -150,14 +150,14 @@ def pictures_over(
         return torch.addcmul(drawn.color, 1 - drawn.alpha, background.to(drawn.color)).clamp_(0, 1)
 
 
-def studio(size: int) -> Float[Tensor, "h w 3"]:
+def studio_background(size: int) -> Float[Tensor, "h w 3"]:
     """A soft light background, brightest in the middle."""
     line = torch.linspace(-1, 1, size)
     distance = (line[:, None].square() + line.square()).div(2).clamp(max=1)[..., None]
     return torch.lerp(torch.tensor(CENTER), torch.tensor(CORNER), distance)
 
 
-class Film:
+class Mp4Writer:
     """An MP4 that is being written; nothing in it depends on time, host or number of cores."""
 
     def __init__(self, path: Path, codec: str, fps: float, size: int) -> None:
@@ -172,7 +172,7 @@ class Film:
         context.color_range = ColorRange.MPEG
         context.colorspace = context.color_primaries = context.color_trc = BT709
 
-    def __enter__(self) -> "Film":
+    def __enter__(self) -> "Mp4Writer":
         return self
 
     def __exit__(self, *failure: object) -> None:

@@ -10,8 +10,8 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from dg4d_lib.asset_settings import PackSettings
-from dg4d_lib.assets.animated import moved
-from dg4d_lib.assets.rendering.preview import BATCH, pictures_over
+from dg4d_lib.assets.animated import pose_gaussians
+from dg4d_lib.assets.rendering.preview import BATCH, render_over
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -25,7 +25,7 @@ FONT = 1 / 12  # height of the captions, in tiles
 SMALLEST_FONT = 9  # pixels; below it nobody can read
 
 
-def contact_sheet(
+def draw_contact_sheet(
     gaussians: Gaussians,
     deformation: Deformation,
     video: DrivingVideo,
@@ -48,19 +48,19 @@ def contact_sheet(
     frames = torch.linspace(0, len(video) - 1, columns).round().long()
     panel = torch.tensor(PANEL).expand(settings.sheet_size, settings.sheet_size, 3)
     rows = [_footage(video, frames, settings.sheet_size)]
-    states = moved(gaussians, deformation, len(video), frames.float())
+    states = pose_gaussians(gaussians, deformation, len(video), frames.float())
     for azimuth_deg in settings.sheet_azimuths_deg:
         camera = OrbitCamera(azimuth_deg=azimuth_deg, width=settings.sheet_size, height=settings.sheet_size)
         tiles = [
-            pictures_over(panel, _part(states, part), [camera] * len(part), rasterizer)
+            render_over(panel, _part(states, part), [camera] * len(part), rasterizer)
             for part in torch.arange(columns).split(BATCH)
         ]
         rows.append(torch.cat(tiles))
     names = ["input", *(f"{azimuth_deg:g}°" for azimuth_deg in settings.sheet_azimuths_deg)]
-    return page(torch.stack(rows), names, _moments(frames, video.fps))
+    return draw_tiles(torch.stack(rows), names, _moments(frames, video.fps))
 
 
-def videos_sheet(
+def draw_video_sheet(
     videos: Sequence[DrivingVideo], names: Sequence[str], size: int, columns: int
 ) -> Float[Tensor, "h w 3"]:
     """Several videos below each other as a picture in [0, 1]; columns are moments, from the first frame to the last.
@@ -73,10 +73,12 @@ def videos_sheet(
     """
     frames = torch.linspace(0, len(videos[0]) - 1, min(columns, len(videos[0]))).round().long()
     rows = torch.stack([_footage(video, frames, size) for video in videos])
-    return page(rows, names, _moments(frames, videos[0].fps))
+    return draw_tiles(rows, names, _moments(frames, videos[0].fps))
 
 
-def page(tiles: Float[Tensor, "r m s s 3"], names: Sequence[str], headings: Sequence[str]) -> Float[Tensor, "h w 3"]:
+def draw_tiles(
+    tiles: Float[Tensor, "r m s s 3"], names: Sequence[str], headings: Sequence[str]
+) -> Float[Tensor, "h w 3"]:
     """Tiles in [0, 1] on a white page, rows named on the left, columns above."""
     size = tiles.shape[2]
     gap = max(2, round(size * GAP))
@@ -106,5 +108,5 @@ def _part(states: Gaussians, wanted: Tensor) -> Gaussians:
 
 def _footage(video: DrivingVideo, frames: Tensor, size: int) -> Float[Tensor, "m size size 3"]:
     """Frames of the driving video over the panel, resampled to the size of a tile."""
-    over = DrivingVideo(video.frames[frames], video.coverage[frames], video.fps).over(torch.tensor(PANEL))
+    over = DrivingVideo(video.frames[frames], video.alpha[frames], video.fps).over(torch.tensor(PANEL))
     return resize(over, (size, size)).clamp(0, 1)

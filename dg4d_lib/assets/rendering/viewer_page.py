@@ -21,7 +21,7 @@ FLOAT = 5126  # of 32 bits, the type of an accessor
 _TITLE, _DATA = "@title@", "@data@"
 
 
-def viewer_page(
+def build_viewer_page(
     title: str,
     glb: bytes,
     splats: bytes | None,

@@ -10,8 +10,8 @@ import torch
 from PIL import Image
 
 from dg4d_lib.asset_settings import PackSettings
-from dg4d_lib.assets.animated import moved
-from dg4d_lib.assets.rendering.preview import BATCH, pictures_over, studio
+from dg4d_lib.assets.animated import pose_gaussians
+from dg4d_lib.assets.rendering.preview import BATCH, render_over, studio_background
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -58,13 +58,13 @@ def write_webp(
     share = torch.arange(count, dtype=torch.float64) / count
     positions = share * loops * frames % frames
     size = min(LARGEST, settings.preview_size)
-    middle, background = OrbitCamera(width=size, height=size), studio(size)
+    middle, background = OrbitCamera(width=size, height=size), studio_background(size)
     cameras = [replace(middle, azimuth_deg=SWAY_DEG * math.sin(math.tau * turn)) for turn in share.tolist()]
     pictures: list[Image.Image] = []
     for start in range(0, count, BATCH):
         part = slice(start, start + BATCH)
-        states = moved(gaussians, deformation, frames, positions[part])
-        drawn = pictures_over(background, states, cameras[part], rasterizer)
+        states = pose_gaussians(gaussians, deformation, frames, positions[part])
+        drawn = render_over(background, states, cameras[part], rasterizer)
         pictures += [Image.fromarray(pixels) for pixels in (drawn.cpu() * 255).round().to(torch.uint8).numpy()]
         progress(len(pictures), count)
     ends_ms = [round(1000 * loops * duration_s * (i + 1) / count) for i in range(count)]

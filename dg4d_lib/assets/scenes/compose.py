@@ -19,9 +19,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dg4d_lib.assets.formats.gltf import Document, Parsed
+from dg4d_lib.assets.formats.gltf import GlbReader, GltfDocument
 from dg4d_lib.assets.formats.tracks import POINTER
-from dg4d_lib.assets.scenes.scene import Item
+from dg4d_lib.assets.scenes.scene import SceneItem
 from dg4d_lib.errors import BadInput
 
 ANIMATION = "scene"
@@ -31,7 +31,7 @@ Vector = Float[np.ndarray, " 3"]
 _FOREIGN = (KeyError, IndexError, TypeError, ValueError, ArithmeticError)  # what a file of another form runs into
 
 
-class Body:
+class AnimatedGlb:
     """An animated GLB that can stand in a scene.
 
     Attributes:
@@ -49,7 +49,7 @@ class Body:
             BadInput: it is no GLB, or has no mesh or a form that dg4d does not write.
             BackendUnavailable: it is compressed, and the package that unpacks it is missing.
         """
-        self.file = Parsed(content)
+        self.file = GlbReader(content)
         try:
             poses = [pose for root in self.roots for pose in self._poses(root, np.eye(4))]
             if not poses:
@@ -109,13 +109,13 @@ class Actor:
 
     Attributes:
         name: of its node; no other has it.
-        body: what stands there.
+        glb: the animated mesh it shows.
         item: where and when.
     """
 
     name: str
-    body: Body
-    item: Item
+    glb: AnimatedGlb
+    item: SceneItem
 
     @property
     def turn(self) -> Rotation:
@@ -125,7 +125,7 @@ class Actor:
     @property
     def origin(self) -> Vector:
         """Where the asset's own origin comes to lie, world units."""
-        return np.array(self.item.position) - self.turn.apply(self.body.foot) * self.item.scale
+        return np.array(self.item.position) - self.turn.apply(self.glb.foot) * self.item.scale
 
     @property
     def transform(self) -> Float[np.ndarray, "4 4"]:
@@ -138,17 +138,17 @@ class Actor:
     @property
     def end_s(self) -> float:
         """When it has played once."""
-        return self.item.start_s + self.body.duration_s / self.item.speed
+        return self.item.start_s + self.glb.duration_s / self.item.speed
 
     def seconds(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Times of the scene as times of its animation."""
         played = (times_s - self.item.start_s).clip(0) * self.item.speed
-        if self.item.loop and self.body.duration_s > 0:
-            return played % self.body.duration_s
-        return played.clip(max=self.body.duration_s)
+        if self.item.loop and self.glb.duration_s > 0:
+            return played % self.glb.duration_s
+        return played.clip(max=self.glb.duration_s)
 
 
-def in_a_row(bodies: Sequence[Body], spacing: float) -> list[tuple[float, float, float]]:
+def line_up(bodies: Sequence[AnimatedGlb], spacing: float) -> list[tuple[float, float, float]]:
     """Positions of feet on the ground, side by side, with this much room between the boxes; the middle is at x = 0."""
     widths = [float(body.high[0] - body.low[0]) for body in bodies]
     starts = np.cumsum([0.0, *(width + spacing for width in widths)])
@@ -164,7 +164,7 @@ def scene_duration(actors: Sequence[Actor], duration_s: float | None) -> float:
     """
     length = max(actor.end_s for actor in actors) if duration_s is None else duration_s
     for actor in actors:
-        if actor.body.duration_s > 0 and actor.item.start_s + SHORTEST_S >= length:
+        if actor.glb.duration_s > 0 and actor.item.start_s + SHORTEST_S >= length:
             raise BadInput(f"{actor.name} starts at {actor.item.start_s} s, when the scene of {length} s is over")
     return length
 
@@ -182,13 +182,13 @@ def compose_glb(actors: Sequence[Actor], duration_s: float | None = None) -> byt
     if not actors:
         raise BadInput("a scene needs at least one asset; given none")
     length = scene_duration(actors, duration_s)
-    document = Document({})
+    document = GltfDocument({})
     shared: dict[int, dict[tuple[str, int], int]] = {}
     samplers: list[dict[str, Any]] = []
     channels: list[dict[str, Any]] = []
     nodes = []
     for actor in actors:
-        transfer = _Transfer(document, actor, shared.setdefault(id(actor.body), {}))
+        transfer = _Transfer(document, actor, shared.setdefault(id(actor.glb), {}))
         try:
             nodes.append(transfer.add_node())
             _add_tracks(transfer, length, samplers, channels)
@@ -203,9 +203,9 @@ def compose_glb(actors: Sequence[Actor], duration_s: float | None = None) -> byt
 class _Transfer:
     """Copies what an actor needs into a document: each thing once, data once for all actors with the same body."""
 
-    def __init__(self, document: Document, actor: Actor, shared: dict[tuple[str, int], int]) -> None:
+    def __init__(self, document: GltfDocument, actor: Actor, shared: dict[tuple[str, int], int]) -> None:
         self.document, self.actor = document, actor
-        self._file, self._shared = actor.body.file, shared
+        self._file, self._shared = actor.glb.file, shared
         self._own: dict[tuple[str, int], int] = {}
         required = self._file.tree.get("extensionsRequired", [])
         for extension in self._file.tree.get("extensionsUsed", []):
@@ -219,7 +219,7 @@ class _Transfer:
             translation=self.actor.origin.tolist(),
             rotation=self.actor.turn.as_quat(canonical=True).tolist(),
             scale=[self.actor.item.scale] * 3,
-            children=[self.node(root) for root in self.actor.body.roots],
+            children=[self.node(root) for root in self.actor.glb.roots],
             extras=self._file.tree["asset"].get("extras"),
         )
 
@@ -288,7 +288,7 @@ def _add_tracks(
     transfer: _Transfer, length: float, samplers: list[dict[str, Any]], channels: list[dict[str, Any]]
 ) -> None:
     """The animation of an actor at its times, as samplers and channels of the scene's."""
-    actor, document, animation = transfer.actor, transfer.document, transfer.actor.body.animation
+    actor, document, animation = transfer.actor, transfer.document, transfer.actor.glb.animation
     inputs: dict[bytes, int] = {}
     for channel in animation["channels"]:
         sampler, target = animation["samplers"][channel["sampler"]], deepcopy(channel["target"])
@@ -297,14 +297,14 @@ def _add_tracks(
             pointer["pointer"] = transfer.pointer(pointer["pointer"])
         else:
             target["node"] = transfer.node(target["node"])
-        keys = actor.body.file.accessor(sampler["input"])[:, 0].astype(np.float64)
-        output = actor.body.file.accessor(sampler["output"])
+        keys = actor.glb.file.accessor(sampler["input"])[:, 0].astype(np.float64)
+        output = actor.glb.file.accessor(sampler["output"])
         rows = output.reshape(len(keys), -1)
         times, values = _timed(actor, keys, rows, length, sampler.get("interpolation", "LINEAR"))
         content = times.tobytes()
         if content not in inputs:
             inputs[content] = document.add_accessor(f"{actor.name} times", times)
-        name = actor.body.file.tree["accessors"][sampler["output"]].get("name", target["path"])
+        name = actor.glb.file.tree["accessors"][sampler["output"]].get("name", target["path"])
         number = document.add_accessor(f"{actor.name} {name}", values.reshape(-1, output.shape[1]))
         channels.append({"sampler": len(samplers), "target": target})
         samplers.append({**sampler, "input": inputs[content], "output": number})
@@ -316,7 +316,7 @@ def _timed(
     """Keys and values of a track at an actor's times: from its start to the very end of the scene."""
     if interpolation == "CUBICSPLINE":
         raise BadInput(f"{actor.name} is animated by cubic splines, which scenes do not take")
-    period, speed = actor.body.duration_s, actor.item.speed
+    period, speed = actor.glb.duration_s, actor.item.speed
     keys, rows = _from_to(keys, rows, period)
     rounds = math.ceil((length - actor.item.start_s) * speed / period) if actor.item.loop else 1
     if rounds > MOST_ROUNDS:

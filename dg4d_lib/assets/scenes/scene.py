@@ -9,7 +9,7 @@ from dg4d_lib.settings import NotNegative, Positive, Settings
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
-class Item(Settings):
+class SceneItem(Settings):
     """An asset in a scene. World: right-handed, y up; an asset looks along +z before it is turned."""
 
     package: str = Field(min_length=1, description="folder of the package, relative to the folder of the scene file")
@@ -30,6 +30,6 @@ class Item(Settings):
 class Scene(Settings):
     """Assets, placed and timed."""
 
-    items: tuple[Item, ...] = Field(min_length=1, max_length=1000)
+    items: tuple[SceneItem, ...] = Field(min_length=1, max_length=1000)
     duration_s: Positive | None = Field(None, le=3600, description="seconds; not given: when every asset played once")
     fps: float = Field(24.0, ge=1, le=120, description="frames per second of the film")

@@ -1,4 +1,4 @@
-"""How much matter Gaussians put where: the scalar field whose level set is the surface.
+"""Density field of a Gaussian cloud; its level set is the surface.
 
 density(p) = sum_i opacity_i exp(-0.5 d^T Sigma_i^-1 d), d = p - mean_i (Tang et al. 2024, 3.2).
 """
@@ -14,22 +14,22 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.quaternion import rotation_matrix
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
 from dg4d_lib.settings import MeshSettings
 
-LONGEST_SIDE = 1.8  # of the box around the means, inside the box [-1, 1] of the field
-MARGIN = 2.0  # standard deviations around every mean that lie in the field too, however large they are
-REACH = 4.0  # standard deviations at which a Gaussian ends; what is left out is below opacity * exp(-8) = 3.4e-4 each
-THINNEST = 0.7  # cells: a standard deviation below this is raised to it, else a flat Gaussian falls between the samples
+LONGEST_SIDE = 1.8  # of the bounding box of the means, in the field's box [-1, 1]
+MARGIN = 2.0  # standard deviations around every mean that the field must contain
+REACH = 4.0  # standard deviations at which a Gaussian is cut off; the rest is below opacity * exp(-8) = 3.4e-4
+THINNEST = 0.7  # cells; smaller standard deviations are raised to this, else flat Gaussians fall between the samples
 
 
 @dataclass(frozen=True)
 class DensityField:
-    """Samples of the density at the centers of the cells of a cube.
+    """Density sampled at the cell centers of a cube.
 
     Attributes:
-        values: indexed x, y, z.
-        origin: where the first sample lies, world units.
+        values: densities, indexed x, y, z.
+        origin: position of the first sample, world units.
         cell: distance between samples, world units.
         unit: world length of one unit of the normalized box, which spans [-1, 1].
     """
@@ -43,10 +43,10 @@ class DensityField:
 def density_field(gaussians: Gaussians, settings: MeshSettings) -> DensityField:
     """Sample the density of one cloud on `settings.grid` cells per axis.
 
-    The box is centered on the means, whose longest side takes 1.8 of its 2 units; less where large Gaussians need room.
-    Standard deviations below 0.7 cells are raised to that and the opacity is kept, so that a flat Gaussian
-    keeps its peak; it moves a level set outwards by less than one cell. A Gaussian ends at four standard deviations:
-    a sample misses less than 3.4e-4 times the opacities it cannot see.
+    The bounding box of the means is centered and its longest side takes 1.8 of the box's 2 units, less if large
+    Gaussians need room. Standard deviations below 0.7 cells are raised to that with unchanged opacity, so a flat
+    Gaussian keeps its peak; this moves a level set outwards by less than one cell. Each Gaussian is cut off at four
+    standard deviations, where it is below 3.4e-4 times its opacity.
 
     Raises:
         BadInput: the cloud is a batch of states; give one state.
@@ -54,19 +54,20 @@ def density_field(gaussians: Gaussians, settings: MeshSettings) -> DensityField:
     """
     if gaussians.means.dim() != 2:
         raise BadInput(
-            f"density needs one state of a cloud, given a batch of shape {tuple(gaussians.means.shape[:-2])}"
+            f"the density is computed for one state of a cloud; given a batch of shape "
+            f"{tuple(gaussians.means.shape[:-2])}: select one with Gaussians.at"
         )
     opacities = gaussians.opacities.double()
     shown = opacities > settings.min_opacity
     means, scales = gaussians.means.double()[shown], gaussians.scales.double()[shown]
-    axes = rotation_matrix(gaussians.quats.double()[shown])
+    axes = quat_to_rotmat(gaussians.quats.double()[shown])
     if not bool(shown.any()):
         raise FitDiverged(
             f"no surface: none of {len(gaussians)} Gaussians is more opaque than mesh.min_opacity = "
             f"{settings.min_opacity}; the model is empty, fit it again"
         )
     if not all(bool(t.isfinite().all()) for t in (means, scales, axes)):
-        raise FitDiverged("no surface: some Gaussians are not finite; fit the model again")
+        raise FitDiverged("no surface: some Gaussians are not finite (NaN or infinity); fit the model again")
 
     low, high = means.amin(0), means.amax(0)
     center = (low + high) / 2
@@ -76,8 +77,8 @@ def density_field(gaussians: Gaussians, settings: MeshSettings) -> DensityField:
     origin = center - unit + cell / 2
 
     scales = scales.clamp_min(THINNEST * cell)
-    half_inverse = (axes / scales[:, None, :]).mT  # d^T Sigma^-1 d is the squared length of this times d
-    reach = REACH * (axes * scales[:, None, :]).norm(dim=-1)  # half sides of the box around the ellipsoid
+    half_inverse = (axes / scales[:, None, :]).mT  # M with d^T Sigma^-1 d = |M d|^2
+    reach = REACH * (axes * scales[:, None, :]).norm(dim=-1)  # half sides of the ellipsoid's bounding box
     values = np.zeros((settings.grid,) * 3, np.float32)
     _splat(
         ((means - origin) / cell).numpy(force=True),
@@ -92,7 +93,7 @@ def density_field(gaussians: Gaussians, settings: MeshSettings) -> DensityField:
 @njit(cache=True, nogil=True)
 @no_type_check
 def _splat(means, half_inverse, reach, opacities, values):
-    """Add every Gaussian to the samples inside its ellipsoid; all lengths in cells."""
+    """Add every Gaussian to the samples inside its ellipsoid; lengths in cells."""
     size = values.shape[0]
     first, last = np.zeros(3, np.int64), np.zeros(3, np.int64)
     for i in range(means.shape[0]):

@@ -1,4 +1,4 @@
-"""The surface of a density field."""
+"""Isosurface extraction from a density field, and selection of its level."""
 
 import numpy as np
 import torch
@@ -10,81 +10,83 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import DensityField
-from dg4d_lib.mesh.extraction.outlines import SOLID
+from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 
-LOWEST_SHARE = 0.25  # of the field's peak: where the surface is put when the level lies above the peak
-LEAK = 2  # cells: an inner cavity that opens to the outside only through narrower gaps than twice this is filled
+LOWEST_SHARE = 0.25  # of the field's peak; the level used when the given one lies above the peak
+LEAK = 2  # cells; a cavity that opens to the outside only through gaps narrower than twice this is filled
 
-STEP = 2**0.5  # between levels that are tried
-MOST_STEPS = 4  # away from the given level
-# Where outlines are compared: elevation and azimuth in degrees; the input view, where an eye compares, counts twice.
-OUTLINE_VIEWS_DEG = ((0, 0), (0, 0), (0, 90), (0, 180), (0, 270), (35, 45), (-35, 225))
-OUTLINE_SIZE = 192  # pixels
+STEP = 2**0.5  # ratio of successive trial levels
+MAX_STEPS = 4  # trial levels on either side of the given one
+# Views for comparing silhouettes: elevation and azimuth in degrees. The input view, where people compare, counts twice.
+SILHOUETTE_VIEWS_DEG = ((0, 0), (0, 0), (0, 90), (0, 180), (0, 270), (35, 45), (-35, 225))
+SILHOUETTE_SIZE = 192  # pixels
 
 
-def surface(field: DensityField, level: float) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """The level set of the density: vertices in world units, faces counter-clockwise seen from outside.
+def extract_surface(field: DensityField, level: float) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """Extract the level set of the density: vertices in world units, faces counter-clockwise seen from outside.
 
-    It is closed, also where the matter touches the border of the box, and has no inner walls: cavities are filled,
-    those too whose only way out is a gap of a few cells.
+    The surface is closed, even where the density touches the border of the box, and has no inner walls: cavities are
+    filled, including those that open to the outside only through a gap of a few cells.
 
     Raises:
-        FitDiverged: the field stays below the level everywhere (`usable_level` gives one that works).
+        FitDiverged: the field is below the level everywhere (see `usable_level`).
     """
     values = field.values.numpy()
     if not values.max() > level:
-        raise FitDiverged(f"no surface: the density reaches {values.max():.3g}, the level is {level:.3g}")
+        raise FitDiverged(
+            f"no surface: the largest density is {values.max():.3g}, below the level {level:.3g}; lower the level"
+        )
     filled = np.where(_cavities(values >= level), np.float32(2 * level), values)
     vertices, faces, _, _ = marching_cubes(np.pad(filled, 1), level)
     world = (vertices.astype(np.float64) - 1) * field.cell + field.origin.double().numpy()
     return world.astype(np.float32), faces[:, ::-1].astype(np.int32)
 
 
-def best_level(field: DensityField, gaussians: Gaussians, rasterize: Rasterizer, level: float) -> tuple[float, float]:
-    """The level whose surface has the outlines of the Gaussians themselves, to a factor of the fourth root of 2.
+def select_level(field: DensityField, gaussians: Gaussians, rasterize: Rasterizer, level: float) -> tuple[float, float]:
+    """Search the level whose surface matches the silhouettes of the Gaussians best, to a factor of 2^(1/4).
 
-    How dense opaque matter is depends on how a fit spreads it over Gaussians; the outline (alpha above one half) does
-    not.
+    The density inside an opaque object depends on the number and size of the Gaussians that a fit uses for it; the
+    silhouette (alpha above 0.5) does not.
 
     Args:
-        field: of these Gaussians.
+        field: the density of these Gaussians.
         gaussians: one state.
         rasterize: the splatting backend.
-        level: where the search begins.
+        level: start of the search.
 
     Returns:
-        The best level, within a factor of five of the given one, and the intersection over union of its outlines with
-        the Gaussians' over all views, in [0, 1].
+        The best level, within a factor of five of the given one, and the intersection over union of its silhouettes
+        with those of the Gaussians over all views, in [0, 1].
 
     Raises:
         FitDiverged: the field is zero everywhere.
     """
-    cameras = [OrbitCamera(e, a, width=OUTLINE_SIZE, height=OUTLINE_SIZE) for e, a in OUTLINE_VIEWS_DEG]
+    cameras = [OrbitCamera(e, a, width=SILHOUETTE_SIZE, height=SILHOUETTE_SIZE) for e, a in SILHOUETTE_VIEWS_DEG]
     with torch.no_grad():
-        truth = rasterize(gaussians, cameras, torch.zeros(3)).alpha[..., 0] > SOLID
+        expected = rasterize(gaussians, cameras, torch.zeros(3)).alpha[..., 0] > ALPHA_THRESHOLD
 
-    def agreement(candidate: float) -> float:
+    def iou(candidate: float) -> float:
         if not float(field.values.max()) > candidate:
             return -1.0
-        vertices, faces = surface(field, candidate)
-        drawn = rasterize_mesh(torch.from_numpy(vertices), torch.from_numpy(faces), cameras).faces >= 0
-        return float((drawn & truth).sum() / (drawn | truth).sum().clamp_min(1))
+        vertices, faces = extract_surface(field, candidate)
+        rendered = rasterize_mesh(torch.from_numpy(vertices), torch.from_numpy(faces), cameras).faces >= 0
+        return float((rendered & expected).sum() / (rendered | expected).sum().clamp_min(1))
 
-    start = usable_level(field, level)
-    best, score = start, agreement(start)
-    for factor, steps in ((1 / STEP, MOST_STEPS), (STEP, MOST_STEPS), (STEP**-0.5, 1), (STEP**0.5, 1)):
+    best = usable_level(field, level)
+    best_iou = iou(best)
+    for factor, steps in ((1 / STEP, MAX_STEPS), (STEP, MAX_STEPS), (STEP**-0.5, 1), (STEP**0.5, 1)):
         for _ in range(steps):
-            tried = agreement(best * factor)
-            if tried <= score:
+            candidate_iou = iou(best * factor)
+            if candidate_iou <= best_iou:
                 break
-            best, score = best * factor, tried
-    return best, score
+            best, best_iou = best * factor, candidate_iou
+    return best, best_iou
 
 
 def usable_level(field: DensityField, level: float) -> float:
-    """The level itself, or a quarter of the field's peak where the field does not reach the level.
+    """Return the level, or a quarter of the field's peak if the field does not reach the level.
 
     Raises:
         FitDiverged: the field is zero everywhere.
@@ -96,23 +98,23 @@ def usable_level(field: DensityField, level: float) -> float:
 
 
 def _cavities(solid: Bool[np.ndarray, "r r r"]) -> Bool[np.ndarray, "r r r"]:
-    """Empty samples that a ball of `LEAK` cells cannot reach from outside, though there is room for it."""
+    """Mark empty samples that a ball of `LEAK` cells fits into but cannot reach from outside."""
     padded = np.pad(solid, LEAK + 1)
-    thick = _grown(padded)
+    thick = _dilate(padded)
     room = ~_outside(thick) & ~thick
-    inside = ~_outside(padded | _grown(room)) & ~padded
+    inside = ~_outside(padded | _dilate(room)) & ~padded
     border = slice(LEAK + 1, -LEAK - 1)
     return inside[border, border, border]
 
 
 def _outside(solid: Bool[np.ndarray, "r r r"]) -> Bool[np.ndarray, "r r r"]:
-    """The empty samples that hang together with the first one."""
-    pieces, _ = ndimage.label(~solid)
-    return pieces == pieces[0, 0, 0]
+    """Mark the empty samples connected to the first one."""
+    components, _ = ndimage.label(~solid)
+    return components == components[0, 0, 0]
 
 
-def _grown(solid: Bool[np.ndarray, "r r r"]) -> Bool[np.ndarray, "r r r"]:
-    """Every sample within `LEAK` steps along the axes of a solid one."""
+def _dilate(solid: Bool[np.ndarray, "r r r"]) -> Bool[np.ndarray, "r r r"]:
+    """Mark every sample within `LEAK` steps along the axes of a solid one."""
     for _ in range(LEAK):
         grown = solid.copy()
         for axis in range(3):

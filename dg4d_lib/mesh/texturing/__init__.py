@@ -1,1 +1,1 @@
-"""UV maps and textures baked from Gaussians."""
+"""UV unwrapping and texture baking."""

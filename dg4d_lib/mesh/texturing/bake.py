@@ -1,8 +1,8 @@
-"""The colors of Gaussians, projected back onto a surface (Tang et al. 2024, section 3.2).
+"""Texture baking: colors of Gaussians projected onto a mesh (Tang et al. 2024, section 3.2).
 
-Every texel looks at pictures of the Gaussians from 26 sides and from the input view, and keeps a mean of the colors it
-sees, heavily in favor of the view that looks straight at it. Pictures are un-premultiplied and their soft outlines left
-out, so nothing of a background gets into the texture.
+The Gaussians are rendered from 26 views and from the input view, and every texel takes a weighted mean of the colors
+it projects to; views that face it head-on weigh most. Colors are un-premultiplied and pixels along soft silhouettes
+skipped, so no background bleeds into the texture.
 """
 
 from collections.abc import Sequence
@@ -25,35 +25,35 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import baking_views
 from dg4d_lib.errors import DG4DError
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.kernels.workers import run
-from dg4d_lib.mesh.extraction.outlines import SOLID
+from dg4d_lib.kernels.workers import run_parallel
+from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
 
-SHARPNESS = 2  # power in a view's weight of how far the cosine is above the least; views fade in and out without seams
-INPUT_WEIGHT = 200.0  # of the input view against another one: only there the colors come from a picture
-MIN_COSINE = 0.5  # texels seen at a flatter angle are not colored
-INPUT_FLATTER = 0.6  # of `MIN_COSINE` in the input view: a stretched true color is better than a guessed one
-OUTLINE = 2  # pixels: the band along outlines and along nearer surfaces that is not trusted
-LAST_RESORT = 1e-4  # weight of views that are too flat or on an outline: they count where nothing better is
-FLATTEST = 0.05  # cosine below which a view does not count at all
-DEPTH_SLACK = 1.5  # pixels by which a texel's place in a picture is uncertain when its depth is compared
-NEIGHBORS = 4  # seen texels whose colors an unseen one takes
-GUTTER = 2  # texels around charts that repeat their rim: what bilinear reading needs, and the next mip level
-VIEWS_AT_ONCE = 9
-TEXELS_AT_ONCE = 1 << 16
+SHARPNESS = 2  # exponent of a view's weight in the cosine above the minimum; views blend without seams
+INPUT_WEIGHT = 200.0  # weight of the input view relative to others; only its colors come from a photograph
+MIN_COSINE = 0.5  # texels seen at a more oblique angle are not colored
+INPUT_FLATTER = 0.6  # factor of `MIN_COSINE` in the input view: a stretched true color beats a guessed one
+OUTLINE = 2  # width of the unreliable band along silhouettes and occluding edges, pixels
+LAST_RESORT = 1e-4  # weight of oblique views and of the unreliable band, used only where no better view exists
+FLATTEST = 0.05  # cosine below which a view is ignored
+DEPTH_SLACK = 1.5  # tolerance of the depth test, in pixels of a texel's projected position
+NEIGHBORS = 4  # colored texels that a texel without a view interpolates
+GUTTER = 2  # texels of chart border that are repeated outwards, for bilinear filtering and the next mip level
+VIEWS_AT_ONCE = 9  # bounds memory
+TEXELS_AT_ONCE = 1 << 16  # texels per job of the thread pool
 
 
 @dataclass(frozen=True)
 class Texels:
-    """The texels whose centers lie on the surface.
+    """Texels whose centers lie on the surface.
 
     Attributes:
-        rows: in the texture.
-        columns: in the texture.
-        positions: world units.
-        normals: of length 1, outwards.
+        rows: row in the texture.
+        columns: column in the texture.
+        positions: on the surface, world units.
+        normals: unit normals, outwards.
     """
 
     rows: Int[Tensor, " p"]
@@ -62,7 +62,7 @@ class Texels:
     normals: Float[Tensor, "p 3"]
 
 
-def bake(
+def bake_texture(
     vertices: Float[Tensor, "v 3"],
     normals: Float[Tensor, "v 3"],
     faces: Int[Tensor, "f 3"],
@@ -71,59 +71,59 @@ def bake(
     rasterize: Rasterizer,
     settings: MeshSettings,
 ) -> Float[Tensor, "h w 3"]:
-    """The texture of a mesh that was made of these Gaussians.
+    """Bake the texture of a mesh from the Gaussians it was extracted from.
 
     Args:
-        vertices: world units, split at the seams.
-        normals: of the surface before it was split (`vertex_normals`), one per split vertex.
+        vertices: world units, split along the seams.
+        normals: of the unsplit surface (`vertex_normals`), one per split vertex.
         faces: counter-clockwise seen from outside.
-        uvs: in [0, 1], v down.
+        uvs: texture coordinates in [0, 1], v down.
         gaussians: one state.
         rasterize: the splatting backend.
-        settings: of the mesh.
+        settings: mesh settings.
 
     Returns:
-        Colors in [0, 1] of every texel; texels outside of all charts go on from those beside them.
+        Colors in [0, 1] of every texel; texels outside all charts are filled from their surroundings.
     """
-    texels = texels_of(vertices, normals, faces, uvs, settings.texture_size)
+    texels = locate_texels(vertices, normals, faces, uvs, settings.texture_size)
     size = settings.texture_size
     if len(texels.rows) == 0:  # all triangles are smaller than a texel
         return torch.full((size, size, 3), 0.5)
-    total = np.zeros((len(texels.rows), 4), np.float32)  # sum of weight times color, and of weight
+    total = np.zeros((len(texels.rows), 4), np.float32)  # sums of weight * color and of weight
     side = settings.render_size
     cameras = [OrbitCamera(width=side, height=side), *baking_views(side)]
     for start in range(0, len(cameras), VIEWS_AT_ONCE):
         batch = cameras[start : start + VIEWS_AT_ONCE]
-        pictures = _look(batch, vertices, faces, gaussians, rasterize)
+        renders = _render_views(batch, vertices, faces, gaussians, rasterize)
         rules = [(MIN_COSINE, 1.0)] * len(batch)
         if start == 0:
             rules[0] = (INPUT_FLATTER * MIN_COSINE, INPUT_WEIGHT)
-        run([partial(_add, texels, batch, pictures, rules, part, total) for part in _parts(len(total))])
+        run_parallel([partial(_add, texels, batch, renders, rules, part, total) for part in _parts(len(total))])
     weight = torch.from_numpy(total[:, 3:])
     seen = weight[:, 0] > 0
     colors = torch.where(seen[:, None], torch.from_numpy(total[:, :3]) / weight.clamp_min(1e-30), 0.5)
-    colors = _spread(colors, seen, texels.positions)
-    return _padded(colors, texels, size)
+    colors = _fill_unseen(colors, seen, texels.positions)
+    return _fill_texture(colors, texels, size)
 
 
 def vertex_normals(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "v 3"]:
-    """Outward normals of length 1, weighted by the areas of the faces around a vertex."""
+    """Compute unit vertex normals, weighted by the areas of the adjacent faces."""
     corners = vertices[faces.long()]
     area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = torch.zeros_like(vertices).index_add_(0, faces.long().flatten(), area.repeat_interleave(3, 0))
     return normalize(total, dim=-1)
 
 
-def texels_of(
+def locate_texels(
     vertices: Float[Tensor, "v 3"],
     normals: Float[Tensor, "v 3"],
     faces: Int[Tensor, "f 3"],
     uvs: Float[Tensor, "v 2"],
     size: int,
 ) -> Texels:
-    """Where the texels of a square texture lie on the surface; a texel's center is at (index + 0.5) / size."""
+    """Locate the texels of a square texture on the surface; texel centers are at (index + 0.5) / size."""
     ids, weights = np.full((size, size), -1, np.int32), np.zeros((size, size, 3), np.float32)
-    _map(uvs.double().numpy() * size, faces.to(torch.int32).numpy(), ids, weights)
+    _rasterize_uvs(uvs.double().numpy() * size, faces.to(torch.int32).numpy(), ids, weights)
     found = torch.from_numpy(ids)
     rows, columns = torch.nonzero(found >= 0, as_tuple=True)
     corners = faces.long()[found[rows, columns].long()]
@@ -143,68 +143,68 @@ def _parts(count: int) -> list[slice]:
 def _add(
     texels: Texels,
     cameras: Sequence[OrbitCamera],
-    pictures: Sequence[Tensor],
+    renders: Sequence[Tensor],
     rules: Sequence[tuple[float, float]],
     part: slice,
     total: NDArray[np.float32],
 ) -> None:
-    """Add what some of the texels see to their sums; for every camera its least cosine and its weight."""
-    places, normals = texels.positions[part].numpy(), texels.normals[part].numpy()
+    """Add the colors of some texels to their sums; `rules` holds minimum cosine and weight of every camera."""
+    positions, normals = texels.positions[part].numpy(), texels.normals[part].numpy()
     for view, (camera, rule) in enumerate(zip(cameras, rules, strict=True)):
-        pose = camera.world_to_camera().numpy(), camera.position().numpy(), camera.focal
-        shown = (picture[view].numpy() for picture in pictures)
-        _gather(places, normals, *pose, *shown, *rule, total[part])
+        pose = camera.viewmat().numpy(), camera.position().numpy(), camera.focal
+        images = (render[view].numpy() for render in renders)
+        _gather(positions, normals, *pose, *images, *rule, total[part])
 
 
-def _look(
+def _render_views(
     cameras: Sequence[OrbitCamera],
     vertices: Float[Tensor, "v 3"],
     faces: Int[Tensor, "f 3"],
     gaussians: Gaussians,
     rasterize: Rasterizer,
 ) -> tuple[Float[Tensor, "b h w 3"], UInt8[Tensor, "b h w"], Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
-    """Pictures of the Gaussians and of the mesh.
+    """Render the Gaussians and the mesh.
 
     Returns:
-        Straight color; 0 where there is background, 1 on outlines, 2 inside of them; the mesh's camera z; and the least
-        z around a pixel. The z of nothing is infinite.
+        Straight color; grade (0: background, 1: along the silhouette, 2: inside); camera z of the mesh; and the minimum
+        of z around every pixel. The z of background is infinite.
     """
     with torch.no_grad():
-        picture = rasterize(gaussians, cameras, torch.zeros(3))
-    straight = (picture.color / picture.alpha.clamp_min(1e-6)).clamp(0, 1)
-    alpha = picture.alpha[..., 0]
+        render = rasterize(gaussians, cameras, torch.zeros(3))
+    color = (render.color / render.alpha.clamp_min(1e-6)).clamp(0, 1)
+    alpha = render.alpha[..., 0]
     depth = rasterize_mesh(vertices, faces, cameras).depth
     depth = torch.where(depth > 0, depth, torch.full_like(depth, torch.inf))
-    grade = (alpha > SOLID).to(torch.uint8) + (_lowest(alpha) > SOLID).to(torch.uint8)
-    return straight, grade, depth, _lowest(depth)
+    grade = (alpha > ALPHA_THRESHOLD).to(torch.uint8) + (_min_filter(alpha) > ALPHA_THRESHOLD).to(torch.uint8)
+    return color, grade, depth, _min_filter(depth)
 
 
-def _lowest(values: Float[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
-    """The least value within `OUTLINE` pixels."""
+def _min_filter(values: Float[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
+    """Return the minimum within `OUTLINE` pixels."""
     rows = max_pool2d(-values, (2 * OUTLINE + 1, 1), stride=1, padding=(OUTLINE, 0))
     return -max_pool2d(rows, (1, 2 * OUTLINE + 1), stride=1, padding=(0, OUTLINE))
 
 
-def _spread(
+def _fill_unseen(
     colors: Float[Tensor, "p 3"], seen: Bool[Tensor, " p"], positions: Float[Tensor, "p 3"]
 ) -> Float[Tensor, "p 3"]:
-    """Texels that no view saw take the colors of the nearest ones on the surface that were seen."""
+    """Interpolate the colors of texels that no view saw from the nearest seen texels on the surface."""
     if bool(seen.all()) or not bool(seen.any()):
         return colors
     count = min(NEIGHBORS, int(seen.sum()))
     found = cKDTree(positions[seen].numpy()).query(positions[~seen].numpy(), k=range(1, count + 1))
     distance, nearest = (torch.from_numpy(np.asarray(a)) for a in found)
-    share, taken = 1 / (distance.float() + 1e-6), colors[seen][nearest]
+    weight, neighbors = 1 / (distance.float() + 1e-6), colors[seen][nearest]
     colors = colors.clone()
-    colors[~seen] = (share[..., None] * taken).sum(1) / share.sum(1, keepdim=True)
+    colors[~seen] = (weight[..., None] * neighbors).sum(1) / weight.sum(1, keepdim=True)
     return colors
 
 
-def _padded(colors: Float[Tensor, "p 3"], texels: Texels, size: int) -> Float[Tensor, "h w 3"]:
-    """The texture without holes.
+def _fill_texture(colors: Float[Tensor, "p 3"], texels: Texels, size: int) -> Float[Tensor, "h w 3"]:
+    """Write the texels into a texture and fill the empty ones.
 
-    Empty texels within the gutter of a chart repeat its nearest one, so that nothing bleeds over a seam. Those further
-    away blend what lies around them by push and pull (Gortler et al. 1996, section 3.4): smooth pictures pack well.
+    Empty texels within the gutter of a chart repeat the nearest texel of the chart, so that nothing bleeds over a seam.
+    The others are filled by push-pull (Gortler et al. 1996, section 3.4), because smooth images compress well.
     """
     texture, empty = np.zeros((size, size, 4), np.float32), np.ones((size, size), bool)
     texture[texels.rows, texels.columns] = np.pad(colors.numpy(), ((0, 0), (0, 1)), constant_values=1)
@@ -213,15 +213,15 @@ def _padded(colors: Float[Tensor, "p 3"], texels: Texels, size: int) -> Float[Te
     texture = np.where((distance <= GUTTER)[..., None], texture[rows, columns], 0)
     filled = oiio.ImageBufAlgo.fillholes_pushpull(oiio.ImageBuf(texture))
     if filled.has_error:
-        raise DG4DError(f"the texture could not be filled: {filled.geterror()}; lower mesh.texture_size")
+        raise DG4DError(f"OpenImageIO could not fill the texture: {filled.geterror()}; lower mesh.texture_size")
     pixels = np.asarray(filled.get_pixels(oiio.FLOAT))
     return torch.from_numpy((pixels[..., :3] / pixels[..., 3:]).clip(0, 1))
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _map(corners, faces, ids, weights):
-    """Which triangle lies over which texel's center, and the weights of its corners; all lengths in texels."""
+def _rasterize_uvs(corners, faces, ids, weights):
+    """Write the triangle over every texel center and the barycentric weights of its corners; lengths in texels."""
     height, width = ids.shape
     for f in range(faces.shape[0]):
         xa, ya = corners[faces[f, 0], 0] - 0.5, corners[faces[f, 0], 1] - 0.5
@@ -245,7 +245,7 @@ def _map(corners, faces, ids, weights):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _gather(positions, normals, pose, eye, focal, color, grade, depth, front, min_cosine, boost, total):
-    """Add what the texels see in one picture to their sums; all arrays of one view."""
+    """Add the colors that the texels project to in one view to their sums; all arrays are of one view."""
     height, width = grade.shape
     for i in range(positions.shape[0]):
         x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
@@ -262,10 +262,10 @@ def _gather(positions, normals, pose, eye, focal, color, grade, depth, front, mi
         if not (0 <= u < width and 0 <= v < height):
             continue
         row, column = int(v), int(u)
-        slope = far / focal / max(cosine, 0.2)  # how much deeper a tilted surface gets within a pixel, at most
+        slope = far / focal / max(cosine, 0.2)  # upper bound of the depth change of a tilted surface within a pixel
         if grade[row, column] == 0 or far - DEPTH_SLACK * slope > depth[row, column]:
             continue
-        beside = far - (DEPTH_SLACK + 1.5 * OUTLINE) * slope <= front[row, column]  # no edge of something nearer
+        beside = far - (DEPTH_SLACK + 1.5 * OUTLINE) * slope <= front[row, column]  # no occluding edge nearby
         facing = (cosine - min_cosine) / (1 - min_cosine) if beside and grade[row, column] == 2 else 0.0
         weight = boost * max(facing, 0.0) ** SHARPNESS + LAST_RESORT * cosine
         left, top = min(max(u - 0.5, 0.0), width - 1.0), min(max(v - 0.5, 0.0), height - 1.0)

@@ -1,8 +1,7 @@
-"""A flat map of a surface: every triangle gets its own place in one square texture (xatlas).
+"""UV unwrapping into one square texture with xatlas.
 
-xatlas runs in a process of its own, `python -m dg4d_lib.mesh.texturing.unwrap`: its destructor stops its threads with
-a wake-up that can come too early, and then waits forever (seen once in some hundred calls on a busy machine). That
-process ends without calling it.
+xatlas runs in a child process, `python -m dg4d_lib.mesh.texturing.unwrap`, which exits without running destructors:
+that of xatlas can deadlock while it stops its threads (seen about once in a hundred calls on a busy machine).
 """
 
 from importlib import import_module
@@ -15,32 +14,33 @@ from scipy.sparse import coo_array, diags_array
 from dg4d_lib.errors import BackendUnavailable, DG4DError
 from dg4d_lib.mesh.subprocess_runner import Arrays, run_in_subprocess, serve
 
-PADDING = 2  # texels between charts, at least
-SMOOTHING = 20  # Taubin steps; xatlas' time grows with roughness, so the charts are cut on a smooth copy
+PADDING = 2  # minimum distance between charts, texels
+SMOOTHING = 20  # Taubin steps; xatlas is slow on rough surfaces, so charts are cut on a smoothed copy
 MOST_PADDING = (
     1 / 8
 )  # of the side of the atlas: its padding grows, up to this, until it survives the fit into the square
 
-_KEPT: list[Any] = []  # atlases of the child, which must not be destroyed
+_KEPT: list[Any] = []  # keeps the child's atlases alive, so that their destructors never run
 
 
 def unwrap(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], size: int
 ) -> tuple[Int[np.ndarray, " w"], Int[np.ndarray, "f 3"], Float[np.ndarray, "w 2"]]:
-    """Texture coordinates without overlaps.
+    """Unwrap a mesh: compute texture coordinates without overlaps.
 
     Args:
         vertices: any units.
         faces: counter-clockwise seen from outside.
-        size: texels of a side of the square texture.
+        size: side of the square texture, texels.
 
     Returns:
-        For every new vertex the old one it copies (vertices are split along seams); the faces in their order, with new
-        indices; and a place in [0, 1] for every new vertex, u right and v down. Charts are at least two texels apart.
+        For every new vertex the index of the old one it copies (vertices are split along seams); the faces in their
+        order, with new indices; and texture coordinates in [0, 1] of every new vertex, u right and v down. Charts are
+        at least two texels apart.
 
     Raises:
         BackendUnavailable: xatlas is missing.
-        DG4DError: it found no place for the charts, or died.
+        DG4DError: the charts do not fit into the texture, or xatlas crashed.
     """
     smooth = taubin_smooth(vertices, faces).astype(np.float32)
     arrays = {"vertices": smooth, "faces": faces.astype(np.uint32), "size": np.array(size)}
@@ -51,23 +51,23 @@ def unwrap(
 def taubin_smooth(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], steps: int = SMOOTHING
 ) -> Float[np.ndarray, "v 3"]:
-    """Smoothed by turns inwards and outwards, so that it hardly shrinks (Taubin 1995)."""
+    """Smooth a mesh with alternating inward and outward steps, which keep its volume (Taubin 1995)."""
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     ends = np.concatenate([ends, ends[:, ::-1]]).T
     graph = coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(len(vertices),) * 2).tocsr()
-    graph.data[:] = 1  # an edge counts once, however many faces share it
+    graph.data[:] = 1  # every edge counts once, regardless of the number of faces that share it
     degree = graph.sum(axis=1)
     mean = diags_array(1 / np.maximum(degree, 1)) @ graph
-    lonely = (degree == 0)[:, None]
+    isolated = (degree == 0)[:, None]
     points = vertices.astype(np.float64)
     for step in range(steps):
         factor = 0.5 if step % 2 == 0 else -0.53
-        points = np.where(lonely, points, points + factor * (mean @ points - points))
+        points = np.where(isolated, points, points + factor * (mean @ points - points))
     return points
 
 
-def _unwrap_here(arrays: Arrays) -> Arrays:
-    """What the child does."""
+def _unwrap_in_child(arrays: Arrays) -> Arrays:
+    """Unwrap the mesh in the child process."""
     try:
         xatlas: Any = import_module("xatlas")
     except ImportError as error:
@@ -80,17 +80,17 @@ def _unwrap_here(arrays: Arrays) -> Arrays:
         _KEPT.append(atlas)
         atlas.add_mesh(vertices, faces)
         atlas.generate(chart, pack)
-        # the atlas is a rectangle of about the wanted size; stretched to the square, its padding may shrink
+        # The atlas is a rectangle of about the requested size; stretching it to the square may shrink its padding.
         if pack.padding * size >= PADDING * max(atlas.width, atlas.height):
             copied, corners, uvs = atlas.get_mesh(0)
             uvs = np.clip(uvs, 0, 1).astype(np.float32)
             return {"copied": copied.astype(np.int32), "corners": corners.astype(np.int32), "uvs": uvs}
         pack.padding = max(pack.padding + 1, int(np.ceil(1.2 * PADDING * max(atlas.width, atlas.height) / size)))
     raise DG4DError(
-        f"the texture has no room for the charts of {len(faces)} faces: {size} texels a side; "
+        f"the charts of {len(faces)} faces do not fit into a texture of {size} x {size} texels; "
         "raise mesh.texture_size or lower mesh.max_faces"
     )
 
 
 if __name__ == "__main__":
-    serve(_unwrap_here)
+    serve(_unwrap_in_child)

@@ -1,1 +1,1 @@
-"""One topology over time: skinning, registration and rigging."""
+"""Mesh tracking with fixed topology: skinning, registration and rigging."""

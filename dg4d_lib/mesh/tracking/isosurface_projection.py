@@ -1,7 +1,7 @@
 """Projection of skinned vertices onto the density isosurface of each frame.
 
-Skinning misses what Gaussians do besides moving rigidly: they grow, thin out, part. A vertex moves along its normal to
-the nearest place where the density of that frame falls through the level, if there is one near.
+Skinning follows only rigid motion; Gaussians also grow, shrink and separate. Each vertex moves along its normal to the
+nearest point where the density of the frame falls below the level, if there is one within reach.
 """
 
 import numpy as np
@@ -16,11 +16,11 @@ from dg4d_lib.mesh.extraction.density import DensityField, density_field
 from dg4d_lib.mesh.texturing.bake import vertex_normals
 from dg4d_lib.settings import MeshSettings
 
-LEVEL_FACTOR = 1.4  # a mesh that joins parting limbs is too fat over the whole motion
+LEVEL_FACTOR = 1.4  # factor of the level; a mesh that joins separating limbs is too thick over the whole motion
 REACH = 3.0  # longest step of a vertex, in cells of the density field
 STEPS = 13  # samples along the normal, from inside to outside
-PASSES = 3  # projections, each from the result of the last
-SMOOTHING = 3  # rounds in which a vertex takes half of its neighbors' step
+PASSES = 3  # projections, each starting from the previous result
+SMOOTHING = 3  # averaging rounds of the steps over neighboring vertices
 
 
 def project_to_isosurface(
@@ -34,12 +34,12 @@ def project_to_isosurface(
     """Return the offsets, corrected along the normals of the moved mesh.
 
     Args:
-        vertices: in the reference frame, not split at seams.
+        vertices: in the reference frame, not split along seams.
         offsets: of the skinned vertices at every frame.
         faces: counter-clockwise seen from outside.
         states: the cloud at every frame (fields "t n 3").
-        level: density of the surface in the reference frame; vertices are projected to 1.4 times that.
-        settings: of the mesh.
+        level: density of the surface in the reference frame; vertices are projected to 1.4 times this level.
+        settings: mesh settings.
     """
     mesh = trimesh.Trimesh(vertices.numpy(), faces.numpy(), process=False)
     mean_of_neighbors = trimesh.smoothing.laplacian_calculation(mesh)
@@ -57,17 +57,17 @@ def project_to_isosurface(
 
 
 def _steps_to_isosurface(
-    field: DensityField, places: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"], level: float
+    field: DensityField, positions: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"], level: float
 ) -> Float[np.ndarray, " v"]:
-    """Return how far along its normal every vertex has to move, world units; 0 where no surface is near."""
+    """Return the signed distance of every vertex along its normal to the isosurface; 0 where none is within reach."""
     steps = np.linspace(-REACH, REACH, STEPS) * field.cell
-    samples = places[:, None] + steps[:, None] * normals[:, None]
+    samples = positions[:, None] + steps[:, None] * normals[:, None]
     cells = (samples - field.origin.numpy()) / field.cell
     density = map_coordinates(field.values.numpy(), cells.reshape(-1, 3).T, order=1, mode="nearest")
-    density = density.reshape(len(places), STEPS)
+    density = density.reshape(len(positions), STEPS)
     falls = (density[:, :-1] >= level) & (density[:, 1:] < level)
     share = (density[:, :-1] - level) / np.maximum(density[:, :-1] - density[:, 1:], 1e-9)
     crossings = np.where(falls, steps[:-1] + share * (steps[1] - steps[0]), np.inf)
     nearest = np.abs(crossings).argmin(1)
-    distances = crossings[np.arange(len(places)), nearest]
+    distances = crossings[np.arange(len(positions)), nearest]
     return np.where(np.isfinite(distances), distances, 0.0)

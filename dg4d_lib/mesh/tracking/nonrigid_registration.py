@@ -1,8 +1,9 @@
-"""Non-rigid registration with the surface of a frame, where skinning failed.
+"""Non-rigid registration of the mesh to the surface of frames where skinning failed.
 
 Gaussians that form a wing in one frame may form the body in another, and a mesh skinned to them crumples. In such
-frames it is registered with the surface of the Gaussians by non-rigid iterative closest points (Amberg et al. 2007):
-every vertex moves towards its nearest point and those whose nearest vertex it is, and steps are smoothed less and less.
+frames the mesh is registered to the surface of the Gaussians by non-rigid iterative closest points (Amberg et al.
+2007): every vertex moves towards its nearest surface point and towards the points it is nearest to, with decreasing
+smoothing of the steps.
 """
 
 from functools import partial
@@ -16,18 +17,18 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.kernels.workers import run
+from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.clean import drop_small_components
 from dg4d_lib.mesh.extraction.density import density_field
-from dg4d_lib.mesh.extraction.extract import surface, usable_level
-from dg4d_lib.mesh.extraction.outlines import agreement, outlines_of
+from dg4d_lib.mesh.extraction.extract import extract_surface, usable_level
+from dg4d_lib.mesh.extraction.silhouettes import render_silhouettes, silhouette_iou
 from dg4d_lib.mesh.texturing.bake import vertex_normals
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
 
-FOLLOWS = 0.85  # agreement of outlines from which a frame is left unchanged
+MIN_IOU = 0.85  # silhouette IoU from which a frame is left unchanged
 STIFFNESS = (5.0,) * 2 + (2.0,) * 6 + (1.0,) * 8 + (0.5,) * 8  # smoothing of successive steps
-FACING = 0.1  # half the distance that opposite normals add, world units: the far side of a sheet is not near
+FACING = 0.1  # weight of unit normals in the distance, world units; keeps the two sides of a thin sheet apart
 
 
 def register_nonrigid(
@@ -39,58 +40,58 @@ def register_nonrigid(
     rasterize: Rasterizer,
     settings: MeshSettings,
 ) -> tuple[Float[Tensor, "t v 3"], Float[Tensor, " t"]]:
-    """Return better offsets for frames in which the mesh has other outlines than the Gaussians.
+    """Register the mesh in frames where its silhouettes differ from those of the Gaussians.
 
     Args:
-        vertices: in the reference frame, not split at seams.
+        vertices: in the reference frame, not split along seams.
         offsets: of the skinned vertices at every frame.
         faces: counter-clockwise seen from outside.
         states: the cloud at every frame (fields "t n 3").
         level: density of the surface.
         rasterize: the splatting backend.
-        settings: of the mesh.
+        settings: mesh settings.
 
     Returns:
-        The offsets, and the agreement of outlines at every frame with them, in [0, 1]: never less than before.
+        The offsets, and the silhouette IoU at every frame with them, in [0, 1], never lower than before.
     """
-    outlines = outlines_of(states, range(len(offsets)), rasterize)
-    followed = agreement(vertices + offsets, faces, outlines)
-    astray = torch.nonzero(followed < FOLLOWS)[:, 0].tolist()
-    if not astray:
-        return offsets, followed
-    still, uneven = eye_array(len(vertices)), _laplacian(faces, len(vertices))
-    smooth = {stiffness: splu(csc_array(still + stiffness * uneven)) for stiffness in set(STIFFNESS)}
+    silhouettes = render_silhouettes(states, range(len(offsets)), rasterize)
+    ious = silhouette_iou(vertices + offsets, faces, silhouettes)
+    failed = torch.nonzero(ious < MIN_IOU)[:, 0].tolist()
+    if not failed:
+        return offsets, ious
+    identity, laplacian = eye_array(len(vertices)), _laplacian(faces, len(vertices))
+    smooth = {stiffness: splu(csc_array(identity + stiffness * laplacian)) for stiffness in set(STIFFNESS)}
     registered = offsets.clone()
 
     def register_frame(frame: int) -> None:
         field = density_field(states.at(frame), settings)
-        target = drop_small_components(*surface(field, usable_level(field, level)), settings.min_component)
-        places, theirs = (torch.from_numpy(array) for array in target)
-        targets = _with_normals(places, theirs)
+        target = drop_small_components(*extract_surface(field, usable_level(field, level)), settings.min_component)
+        target_vertices, target_faces = (torch.from_numpy(array) for array in target)
+        targets = _with_normals(target_vertices, target_faces)
         tree = cKDTree(targets)
         moved = vertices + offsets[frame]
         for stiffness in STIFFNESS:
             step = smooth[stiffness].solve(_steps(_with_normals(moved, faces), targets, tree))
             moved = moved + torch.from_numpy(step.astype(np.float32))
-            now = agreement(moved[None], faces, outlines[frame, None])[0]
-            if now > followed[frame]:
-                followed[frame], registered[frame] = now, moved - vertices
+            iou = silhouette_iou(moved[None], faces, silhouettes[frame, None])[0]
+            if iou > ious[frame]:
+                ious[frame], registered[frame] = iou, moved - vertices
 
-    run([partial(register_frame, frame) for frame in astray])
-    return registered, followed
+    run_parallel([partial(register_frame, frame) for frame in failed])
+    return registered, ious
 
 
 def _steps(
     points: Float[np.ndarray, "v 6"], targets: Float[np.ndarray, "w 6"], tree: cKDTree
 ) -> Float[np.ndarray, "v 3"]:
-    """Return steps to the nearest target, averaged with those to the targets whose nearest point this is."""
+    """Return the step of every point to its nearest target, averaged with that to the targets it is nearest to."""
     steps = targets[tree.query(points)[1], :3] - points[:, :3]
     nearest = cKDTree(points).query(targets)[1]
     count = np.bincount(nearest, minlength=len(points))
-    wanted = count > 0
+    chosen = count > 0  # points that are nearest to some target
     for axis in range(3):
-        pull = np.bincount(nearest, targets[:, axis], len(points))[wanted] / count[wanted] - points[wanted, axis]
-        steps[wanted, axis] = 0.5 * (steps[wanted, axis] + pull)
+        back = np.bincount(nearest, targets[:, axis], len(points))[chosen] / count[chosen] - points[chosen, axis]
+        steps[chosen, axis] = 0.5 * (steps[chosen, axis] + back)
     return steps
 
 

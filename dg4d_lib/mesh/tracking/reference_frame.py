@@ -1,7 +1,7 @@
-"""Reference frame: the frame from whose surface one mesh follows the whole motion best.
+"""Reference frame selection: the frame whose extracted mesh follows the whole motion best.
 
-Parts that touch in the frame of extraction share a surface and tear when they part; hidden or folded parts have no
-surface yet. A few frames are tried on a coarse grid and compared by their outlines over the whole motion.
+Parts that touch in the reference frame share a surface and tear when they separate; hidden or folded parts have no
+surface yet. So several frames are tried on a coarse grid and compared by their silhouettes over the whole motion.
 """
 
 import torch
@@ -9,16 +9,16 @@ import torch
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import density_field
-from dg4d_lib.mesh.extraction.extract import best_level, surface
-from dg4d_lib.mesh.extraction.outlines import agreement, outlines_of
+from dg4d_lib.mesh.extraction.extract import extract_surface, select_level
+from dg4d_lib.mesh.extraction.silhouettes import render_silhouettes, silhouette_iou
 from dg4d_lib.mesh.tracking.skinning import skin_vertices
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
 
-CANDIDATES = 12  # frames that are tried
-COMPARED = 8  # frames at which outlines are compared
-GRID = 64  # cells of the trial's density field
-GAIN = 0.005  # of intersection over union; with less the first frame is kept
+CANDIDATES = 12  # candidate frames
+COMPARED = 8  # frames at which silhouettes are compared
+GRID = 64  # cells per axis of the candidates' density field
+GAIN = 0.005  # intersection over union that a candidate must gain over the first frame, else the first is kept
 
 
 def relative_to_frame(displacement: Displacement, frame: int) -> Displacement:
@@ -29,38 +29,38 @@ def relative_to_frame(displacement: Displacement, frame: int) -> Displacement:
 def select_reference_frame(
     states: Gaussians, displacement: Displacement, rasterize: Rasterizer, settings: MeshSettings
 ) -> tuple[int, float]:
-    """Select the frame whose skinned surface agrees best with the outlines of the Gaussians in all frames.
+    """Select the frame whose skinned surface matches the silhouettes of the Gaussians in all frames best.
 
     Args:
         states: the cloud at every frame (fields "t n 3").
         displacement: of the canonical cloud at every frame.
         rasterize: the splatting backend.
-        settings: of the mesh.
+        settings: mesh settings.
 
     Returns:
-        The frame, and its mean intersection over union over frames and views, in [0, 1].
+        The frame, and the mean intersection over union over frames and views, in [0, 1].
 
     Raises:
         FitDiverged: the cloud is empty.
     """
     frames = len(states.means)
     compared = evenly_spaced(frames, COMPARED)
-    outlines = outlines_of(states, compared, rasterize)
+    silhouettes = render_silhouettes(states, compared, rasterize)
     scores = {}
     for frame in evenly_spaced(frames, CANDIDATES):
         rest = states.at(frame)
         field = density_field(rest, settings.model_copy(update={"grid": min(GRID, settings.grid)}))
-        level, _ = best_level(field, rest, rasterize, settings.density_threshold)
-        vertices, faces = (torch.from_numpy(array) for array in surface(field, level))
+        level, _ = select_level(field, rest, rasterize, settings.density_threshold)
+        vertices, faces = (torch.from_numpy(array) for array in extract_surface(field, level))
         motion = relative_to_frame(displacement, frame)
-        some = Displacement(**{name: value[compared] for name, value in vars(motion).items()})
-        moved = vertices + skin_vertices(vertices, rest, some)
-        scores[frame] = float(agreement(moved, faces, outlines).mean())
+        selected = Displacement(**{name: value[compared] for name, value in vars(motion).items()})
+        moved = vertices + skin_vertices(vertices, rest, selected)
+        scores[frame] = float(silhouette_iou(moved, faces, silhouettes).mean())
     best = max(scores, key=lambda frame: scores[frame])
-    chosen = best if scores[best] > scores[0] + GAIN else 0
-    return chosen, scores[chosen]
+    reference_frame = best if scores[best] > scores[0] + GAIN else 0
+    return reference_frame, scores[reference_frame]
 
 
 def evenly_spaced(total: int, count: int) -> list[int]:
-    """Return up to `count` different numbers below `total`, the first and the last included."""
+    """Return up to `count` distinct indices below `total`, including the first and the last."""
     return sorted({round(i * (total - 1) / max(min(count, total) - 1, 1)) for i in range(min(count, total))})

@@ -1,9 +1,9 @@
-"""Mesh vertices skinned to the Gaussians around them: one topology at all times.
+"""Skinning of mesh vertices to the Gaussians around them, with fixed topology.
 
 A vertex moves with the rigid motion that fits its neighborhood best (moving least squares with rotations: Schaefer et
-al. 2006, section 3; Mueller et al. 2005). Both the centers of the Gaussians and their own rotations say how the
-neighborhood turns (oriented particles: Mueller and Chentanez 2011). Neighbors that move away from the dominant one,
-as one leg from the other, get little weight.
+al. 2006, section 3; Mueller et al. 2005). The rotation is estimated from the centers of the Gaussians and from their
+own rotations (oriented particles: Mueller and Chentanez 2011). Neighbors that move away from the dominant one, such as
+those of the other leg, get little weight.
 """
 
 from functools import partial
@@ -19,16 +19,16 @@ from torch import Tensor
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.quaternion import rotation_matrix
-from dg4d_lib.kernels.workers import run
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
+from dg4d_lib.kernels.workers import run_parallel
 
 NEIGHBORS = 24  # Gaussians per vertex
-FAINT = 0.005  # opacity below which the motion of a Gaussian is not visible and has no weight
+FAINT = 0.005  # opacity below which a Gaussian is invisible and gets no weight
 FALLBACK = 0.01  # weight of proximity relative to density
-THINNEST = 0.25  # smallest scale of a Gaussian, relative to the neighborhood: flat ones also act beside their plane
-PARTING = 0.5  # standard deviation of allowed changes of distance to the dominant Gaussian, in neighborhood radii
+THINNEST = 0.25  # minimum scale of a Gaussian relative to the neighborhood; flat ones then also act off their plane
+PARTING = 0.5  # standard deviation of tolerated changes of distance to the dominant Gaussian, in neighborhood radii
 OWN_ROTATION = 0.5  # weight of the Gaussians' own rotations, per squared size of the neighborhood
-SWEEPS = 6  # of Jacobi; a 4 x 4 matrix needs five for full precision
+SWEEPS = 6  # Jacobi sweeps; a 4 x 4 matrix needs five for full precision
 
 
 def skin_vertices(
@@ -37,7 +37,7 @@ def skin_vertices(
     """Skin vertices to the Gaussians and return their offsets over time.
 
     Args:
-        vertices: of the surface of `gaussians`, world units.
+        vertices: on the surface of `gaussians`, world units.
         gaussians: one state, to which the displacement is added.
         displacement: of the Gaussians, at t timestamps.
 
@@ -49,26 +49,27 @@ def skin_vertices(
     """
     if gaussians.means.dim() != 2 or len(gaussians) == 0:
         raise BadInput(
-            f"skinning needs one state of a cloud that is not empty; given shape {tuple(gaussians.means.shape)}"
+            f"skinning needs one state of a non-empty cloud, means of shape (n, 3); "
+            f"given {tuple(gaussians.means.shape)}"
         )
     points = vertices.double().cpu()
     rest = gaussians.to(torch.device("cpu")).to(torch.float64)
     moved = (rest.means + displacement.means.double().cpu()).numpy()
     bones, weights = (part.numpy() for part in _skinning_weights(points, rest))
     _drop_parting_bones(bones, weights, points.numpy(), rest.means.numpy(), moved)
-    back = rotation_matrix(rest.quats).mT
+    back = quat_to_rotmat(rest.quats).mT
     offsets = np.empty((len(moved), len(points), 3))
 
     def move(time: int) -> None:
-        turns = rotation_matrix(rest.quats + displacement.quats[time].double().cpu()) @ back
+        turns = quat_to_rotmat(rest.quats + displacement.quats[time].double().cpu()) @ back
         _move(bones, weights, points.numpy(), rest.means.numpy(), moved[time], turns.numpy(), offsets[time])
 
-    run([partial(move, time) for time in range(len(offsets))])
+    run_parallel([partial(move, time) for time in range(len(offsets))])
     return torch.from_numpy(offsets).to(vertices)
 
 
 def _skinning_weights(points: Float[Tensor, "v 3"], rest: Gaussians) -> tuple[Int[Tensor, "v k"], Float[Tensor, "v k"]]:
-    """Return the Gaussians of every vertex and their skinning weights with sum 1: shares of the density there."""
+    """Return the Gaussians of every vertex and their weights, which are their shares of the density and sum to 1."""
     shown = torch.nonzero(rest.opacities > FAINT)[:, 0]
     if len(shown) == 0:
         shown = torch.arange(len(rest))
@@ -77,7 +78,7 @@ def _skinning_weights(points: Float[Tensor, "v 3"], rest: Gaussians) -> tuple[In
     distance, nearest = (torch.from_numpy(np.asarray(a)) for a in found)
     bones = shown[nearest]
     reach = distance[:, -1:].clamp_min(1e-9)
-    axes = rotation_matrix(rest.quats)[bones]
+    axes = quat_to_rotmat(rest.quats)[bones]
     scales = rest.scales[bones].maximum(THINNEST * reach[..., None])
     arms = points[:, None] - rest.means[bones]
     local = (arms[..., None, :] @ axes)[..., 0, :] / scales
@@ -92,7 +93,7 @@ def _skinning_weights(points: Float[Tensor, "v 3"], rest: Gaussians) -> tuple[In
 def _drop_parting_bones(bones, weights, points, rest, moved):
     """Reduce the weights of Gaussians whose distance to the dominant one changes over time.
 
-    The dominant one is that with which most weight moves along. Rows of weights sum to 1 again.
+    The dominant one has the largest total weight of Gaussians that move with it. The rows are normalized to sum 1.
     """
     count = bones.shape[1]
     agree = np.empty((count, count))

@@ -5,7 +5,7 @@ import torch
 
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 
 
 @pytest.fixture
@@ -16,7 +16,7 @@ def red_dot() -> Gaussians:
         log_scales=torch.full((1, 3), 0.08).log(),
         quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
         opacity_logits=torch.tensor([5.0]),
-        harmonics=harmonics_of_color(torch.tensor([[1.0, 0.0, 0.0]])),
+        harmonics=rgb_to_sh(torch.tensor([[1.0, 0.0, 0.0]])),
     )
 
 

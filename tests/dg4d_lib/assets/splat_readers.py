@@ -8,16 +8,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dg4d_lib.assets.formats.gltf import Parsed
+from dg4d_lib.assets.formats.gltf import GlbReader
 from dg4d_lib.assets.formats.splat_glb import EXTENSION, KERNEL, POINTS, SplatGlbVersion
-from dg4d_lib.assets.formats.websplats import MAGIC, VERSION
+from dg4d_lib.assets.formats.web_splats import MAGIC, VERSION
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 
 
 def read_splat_glb(content: bytes, version: SplatGlbVersion = "ratified") -> Gaussians:
     """Read the splats of a GLB with floats and colors of degree 0."""
-    parsed = Parsed(content)
+    parsed = GlbReader(content)
     primitive = parsed.tree["meshes"][0]["primitives"][0]
     assert primitive["mode"] == POINTS and primitive["extensions"][EXTENSION]["kernel"] == KERNEL["kernel"]
 
@@ -50,7 +50,7 @@ def read_web_splats(content: bytes) -> tuple[Gaussians, float]:
         (header["scale_step"] * sizes).float(),
         _quats(header["rotation_step"] * turns).float(),
         colors[:, 3].clamp(0.5 / 255, 1 - 0.5 / 255).logit(),
-        harmonics_of_color(colors[:, :3]),
+        rgb_to_sh(colors[:, :3]),
     )
     return states, float(header["fps"])
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from dg4d_lib.assets.animated import moved
-from dg4d_lib.assets.formats.compact import TENSORS, Compact, read_compact, write_compact
+from dg4d_lib.assets.animated import pose_gaussians
+from dg4d_lib.assets.formats.compact import TENSORS, CompactAsset, read_compact, write_compact
 from dg4d_lib.deformation.factory import new_deformation
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.initialize import blob
@@ -23,13 +23,13 @@ SETTINGS = [
 ]
 
 
-def asset(settings: DeformationSettings = SETTINGS[0]) -> Compact:
+def asset(settings: DeformationSettings = SETTINGS[0]) -> CompactAsset:
     generator = torch.Generator().manual_seed(0)
     bounds = torch.tensor([[-1.0] * 3, [1.0, 2.0, 3.0]])
     deformation = new_deformation(settings, bounds, 5, 30, generator)
     for parameter in deformation.parameters():
         parameter.data.normal_(generator=generator)
-    return Compact(blob(30, 0.5, generator), deformation.requires_grad_(False), settings, 5, 12.0)
+    return CompactAsset(blob(30, 0.5, generator), deformation.requires_grad_(False), settings, 5, 12.0)
 
 
 def metadata(path: Path) -> Any:
@@ -44,7 +44,7 @@ def test_an_asset_comes_back_exactly(tmp_path: Path, settings: DeformationSettin
     back = read_compact(tmp_path / "a")
     assert (back.settings, back.frames, back.fps) == (settings, 5, 12.0)
     positions = torch.tensor([0.0, 0.5, 3.9, 4.0, 4.5])
-    before, after = (moved(each.gaussians, each.deformation, 5, positions) for each in (given, back))
+    before, after = (pose_gaussians(each.gaussians, each.deformation, 5, positions) for each in (given, back))
     assert all(torch.equal(value, vars(after)[name]) for name, value in vars(before).items())
 
 
@@ -67,9 +67,9 @@ def test_the_file_says_what_every_tensor_is(tmp_path: Path, settings: Deformatio
 def test_the_file_says_how_it_moves_and_how_fast(tmp_path: Path) -> None:
     write_compact(tmp_path / "a", asset())
     about, _ = metadata(tmp_path / "a")
-    facts = {name: about[name] for name in ("format", "version", "frames", "fps", "gaussians", "last_moment")}
+    facts = {name: about[name] for name in ("format", "version", "frames", "fps", "gaussians", "last_time")}
     assert facts == {
-        "format": "dg4d-compact", "version": 1, "frames": 5, "fps": 12.0, "gaussians": 30, "last_moment": 0.8,
+        "format": "dg4d-compact", "version": 1, "frames": 5, "fps": 12.0, "gaussians": 30, "last_time": 0.8,
     }  # fmt: skip
     assert about["settings"]["kind"] == "hexplane"
 

@@ -12,11 +12,11 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from dg4d_lib.asset_settings import GltfSettings
-from dg4d_lib.assets.animated import Asset4D, between
+from dg4d_lib.assets.animated import Asset4D, interpolate_frames
 from dg4d_lib.assets.formats.glb import write_frames_glb, write_glb, write_mesh_glb
-from dg4d_lib.assets.formats.gltf import Document
-from dg4d_lib.assets.scenes.compose import Actor, Body, compose_glb, in_a_row, scene_duration
-from dg4d_lib.assets.scenes.scene import Item
+from dg4d_lib.assets.formats.gltf import GltfDocument
+from dg4d_lib.assets.scenes.compose import Actor, AnimatedGlb, compose_glb, line_up, scene_duration
+from dg4d_lib.assets.scenes.scene import SceneItem
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.textured import TexturedMesh
 from tests.clients.node import run_node
@@ -48,16 +48,16 @@ def hopping(frames: int = FRAMES, changing: bool = False) -> Asset4D:
     return Asset4D(mesh, offsets, FPS, {"notes": ["hops"]}, textures)
 
 
-def tracked(settings: GltfSettings = SETTINGS["plain"]) -> Body:
-    return Body(write_glb(hopping(), settings))
+def tracked(settings: GltfSettings = SETTINGS["plain"]) -> AnimatedGlb:
+    return AnimatedGlb(write_glb(hopping(), settings))
 
 
-def per_frame() -> Body:
-    return Body(write_frames_glb([gem(0.1 * (1 + i)) for i in range(3)], FPS))
+def per_frame() -> AnimatedGlb:
+    return AnimatedGlb(write_frames_glb([gem(0.1 * (1 + i)) for i in range(3)], FPS))
 
 
-def actor(name: str, body: Body, **where: object) -> Actor:
-    return Actor(name, body, Item(package="p", **where))
+def actor(name: str, body: AnimatedGlb, **where: object) -> Actor:
+    return Actor(name, body, SceneItem(package="p", **where))
 
 
 def rows(file: pygltflib.GLTF2, index: int) -> np.ndarray:
@@ -99,7 +99,7 @@ def shown_at(file: pygltflib.GLTF2, name: str, seconds: float) -> np.ndarray:
 def expected_at(one: Actor, position: float) -> np.ndarray:
     """The same, from the asset: a position is a frame number."""
     asset = hopping()
-    vertices = asset.mesh.vertices + between(asset.offsets, torch.tensor([position]))[0]
+    vertices = asset.mesh.vertices + interpolate_frames(asset.offsets, torch.tensor([position]))[0]
     return trimesh.transform_points(vertices.numpy(), one.transform)
 
 
@@ -176,15 +176,15 @@ def test_others_find_the_vertices_at_rest_where_they_were_placed(name: str, tmp_
 
 
 def mixed() -> list[Actor]:
-    pointed = Body(write_glb(hopping(changing=True), GltfSettings(textures="pointer")))
+    pointed = AnimatedGlb(write_glb(hopping(changing=True), GltfSettings(textures="pointer")))
     return [
         actor("plain", tracked(), position=(1, 0, 0)),
         actor("frames", per_frame(), start_s=0.5, speed=2.0),
-        actor("core", Body(write_glb(hopping(changing=True), GltfSettings(textures="core")))),
+        actor("core", AnimatedGlb(write_glb(hopping(changing=True), GltfSettings(textures="core")))),
         actor("pointed", pointed, **TURNED),
         actor("pointed again", pointed, start_s=0.1),
         *(actor(name, tracked(settings)) for name, settings in SETTINGS.items() if name != "plain"),
-        actor("still", Body(write_mesh_glb(gem()))),
+        actor("still", AnimatedGlb(write_mesh_glb(gem()))),
         actor("日本 ü/.:", tracked(), loop=False),
     ]
 
@@ -204,21 +204,21 @@ def test_compressed_assets_stay_compressed_and_valid(tmp_path: Path) -> None:
     (tmp_path / "scene.glb").write_bytes(content)
     report = run_node("validate.mjs", str(tmp_path / "scene.glb"))
     assert report["errors"] == 0, report["messages"]
-    again = Body(content)
+    again = AnimatedGlb(content)
     assert "EXT_meshopt_compression" in again.file.tree["extensionsRequired"]
-    boxes = [np.stack((each.body.low, each.body.high)) + each.origin for each in (one, two)]
+    boxes = [np.stack((each.glb.low, each.glb.high)) + each.origin for each in (one, two)]
     np.testing.assert_allclose(again.low[0], boxes[0].min(0)[0], atol=1e-5)
     np.testing.assert_allclose(again.high[0], boxes[1].max(0)[0], atol=1e-5)
 
 
 def test_extensions_are_announced_as_in_the_assets() -> None:
-    tree = Body(compose_glb(mixed(), 2.3)).file.tree
+    tree = AnimatedGlb(compose_glb(mixed(), 2.3)).file.tree
     assert tree["extensionsRequired"] == ["KHR_mesh_quantization"]
     assert {"KHR_animation_pointer", "KHR_texture_transform", "EXT_texture_webp"} < set(tree["extensionsUsed"])
 
 
 def test_pointers_lead_to_the_materials_of_their_own_actor() -> None:
-    tree = Body(compose_glb(mixed(), 2.3)).file.tree
+    tree = AnimatedGlb(compose_glb(mixed(), 2.3)).file.tree
     targets = [channel["target"] for channel in tree["animations"][0]["channels"]]
     pointers = [t["extensions"]["KHR_animation_pointer"]["pointer"] for t in targets if t["path"] == "pointer"]
     names = [tree["materials"][int(pointer.split("/")[2])]["name"] for pointer in pointers]
@@ -240,11 +240,11 @@ def test_a_foot_stands_on_its_position() -> None:
 
 
 def test_a_row_leaves_the_room_asked_for_and_has_its_middle_at_the_origin() -> None:
-    bodies = [tracked(), per_frame(), Body(write_mesh_glb(gem(0.5)))]
+    bodies = [tracked(), per_frame(), AnimatedGlb(write_mesh_glb(gem(0.5)))]
     actors = [
-        actor(str(i), body, position=p) for i, (body, p) in enumerate(zip(bodies, in_a_row(bodies, 0.2), strict=True))
+        actor(str(i), body, position=p) for i, (body, p) in enumerate(zip(bodies, line_up(bodies, 0.2), strict=True))
     ]
-    edges = [(a.body.low[0] + a.origin[0], a.body.high[0] + a.origin[0]) for a in actors]
+    edges = [(a.glb.low[0] + a.origin[0], a.glb.high[0] + a.origin[0]) for a in actors]
     for (_, end), (start, _) in pairwise(edges):
         assert start - end == pytest.approx(0.2)
     assert edges[0][0] + edges[-1][1] == pytest.approx(0.0)
@@ -278,15 +278,15 @@ def test_a_scene_needs_an_asset() -> None:
 
 
 def test_a_file_without_a_mesh_is_refused() -> None:
-    document = Document({})
+    document = GltfDocument({})
     document.tree["scene"] = document.add("scenes", nodes=[document.add("nodes", name="nothing")])
     with pytest.raises(BadInput, match="no mesh"):
-        Body(document.to_bytes())
+        AnimatedGlb(document.to_bytes())
 
 
 def test_a_file_of_another_form_is_refused() -> None:
     with pytest.raises(BadInput, match="has not the form"):
-        Body(Document({}).to_bytes())
+        AnimatedGlb(GltfDocument({}).to_bytes())
 
 
 def test_equal_scenes_give_equal_bytes() -> None:

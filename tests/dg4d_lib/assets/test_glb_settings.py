@@ -16,7 +16,7 @@ from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats import gltf
 from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb, write_frames_glb, write_glb, write_mesh_glb
-from dg4d_lib.assets.formats.gltf import Parsed
+from dg4d_lib.assets.formats.gltf import GlbReader
 from dg4d_lib.assets.formats.normals import SmoothNormals
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.mesh.textured import TexturedMesh
@@ -58,7 +58,7 @@ def placed(asset: Asset4D) -> torch.Tensor:
 
 
 def scale_of(content: bytes) -> float:
-    return float(Parsed(content).tree["nodes"][0]["scale"][0])
+    return float(GlbReader(content).tree["nodes"][0]["scale"][0])
 
 
 @pytest.mark.parametrize("settings", [GltfSettings(quantized=True), COMPACT], ids=["quantized", "packed"])
@@ -67,7 +67,7 @@ def test_quantized_places_are_within_half_a_step_in_every_pose(settings: GltfSet
     half_step = scale_of(content) / 32767 / 2
     worst = (placed(read_glb(content)) - placed(turning_ball())).abs().max()
     assert 0 < worst <= half_step + 1e-7
-    assert Parsed(content).tree["nodes"][0]["extras"]["largestError"] == pytest.approx(half_step)
+    assert GlbReader(content).tree["nodes"][0]["extras"]["largestError"] == pytest.approx(half_step)
 
 
 def test_quantized_texture_coordinates_are_within_half_a_step() -> None:
@@ -105,7 +105,7 @@ def test_each_way_to_write_less_makes_the_file_smaller() -> None:
 
 
 def normals_shown(content: bytes, frame: int) -> np.ndarray:
-    parsed = Parsed(content)
+    parsed = GlbReader(content)
     primitive = parsed.tree["meshes"][0]["primitives"][0]
     base = parsed.accessor(primitive["attributes"]["NORMAL"])
     changes = parsed.accessor(primitive["targets"][frame]["NORMAL"])
@@ -131,7 +131,7 @@ def test_normals_are_those_of_the_moved_surface(given: Asset4D, quantized: bool)
 
 def test_normals_along_an_axis_that_turn_over_keep_their_floats() -> None:
     def kinds(asset: Asset4D) -> list[int]:
-        tree = Parsed(write_glb(asset, GltfSettings(quantized=True))).tree
+        tree = GlbReader(write_glb(asset, GltfSettings(quantized=True))).tree
         targets = tree["meshes"][0]["primitives"][0]["targets"]
         return [tree["accessors"][target["NORMAL"]]["componentType"] for target in targets]
 
@@ -141,18 +141,18 @@ def test_normals_along_an_axis_that_turn_over_keep_their_floats() -> None:
 
 
 def test_without_moving_normals_targets_have_places_only() -> None:
-    tree = Parsed(write_glb(turning_ball(), GltfSettings(moving_normals=False))).tree
+    tree = GlbReader(write_glb(turning_ball(), GltfSettings(moving_normals=False))).tree
     assert all(set(target) == {"POSITION"} for target in tree["meshes"][0]["primitives"][0]["targets"])
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "step"])
 def test_frames_are_joined_as_asked(interpolation: Any) -> None:
-    tree = Parsed(write_glb(turning_ball(), GltfSettings(interpolation=interpolation))).tree
+    tree = GlbReader(write_glb(turning_ball(), GltfSettings(interpolation=interpolation))).tree
     assert tree["animations"][0]["samplers"][0]["interpolation"] == interpolation.upper()
 
 
 def test_the_surface_is_as_rough_and_metallic_as_asked() -> None:
-    tree = Parsed(write_mesh_glb(ball(), GltfSettings(roughness=0.4, metallic=0.75))).tree
+    tree = GlbReader(write_mesh_glb(ball(), GltfSettings(roughness=0.4, metallic=0.75))).tree
     surface = tree["materials"][0]["pbrMetallicRoughness"]
     assert (surface["roughnessFactor"], surface["metallicFactor"]) == (0.4, 0.75)
 
@@ -161,11 +161,11 @@ def test_the_surface_is_as_rough_and_metallic_as_asked() -> None:
 def test_pictures_come_back_as_their_format_keeps_them(image: Any, worst: float) -> None:
     content = write_mesh_glb(ball(), GltfSettings(image=image))
     torch.testing.assert_close(read_mesh_glb(content).texture, ball().texture, atol=worst / 255, rtol=0)
-    assert Parsed(content).tree["images"][0]["mimeType"] == f"image/{image}"
+    assert GlbReader(content).tree["images"][0]["mimeType"] == f"image/{image}"
 
 
 def test_a_reader_without_webp_finds_the_same_picture_as_jpeg() -> None:
-    parsed = Parsed(write_mesh_glb(ball(), GltfSettings(image="webp")))
+    parsed = GlbReader(write_mesh_glb(ball(), GltfSettings(image="webp")))
     assert "extensionsRequired" not in parsed.tree
     image = parsed.tree["images"][parsed.tree["textures"][0]["source"]]
     with Image.open(io.BytesIO(parsed.view(image["bufferView"]))) as picture:
@@ -194,14 +194,14 @@ def test_changing_textures_come_back(textures: Any, compact: bool) -> None:
 
 
 def test_changing_textures_need_no_extension_in_core() -> None:
-    tree = Parsed(write_glb(flickering_ball(), GltfSettings(textures="core"))).tree
+    tree = GlbReader(write_glb(flickering_ball(), GltfSettings(textures="core"))).tree
     assert "extensionsUsed" not in tree
     assert len(tree["materials"]) == FRAMES
 
 
 def test_who_knows_no_extension_sees_the_first_texture() -> None:
     content = write_glb(flickering_ball(), GltfSettings(image="png"))
-    assert "extensionsRequired" not in Parsed(content).tree
+    assert "extensionsRequired" not in GlbReader(content).tree
     (mesh,) = trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()
     seen = mesh.visual.to_color().vertex_colors[:, :3].mean(0)
     first = replace(ball(), texture=ball().texture / FRAMES)
@@ -210,7 +210,7 @@ def test_who_knows_no_extension_sees_the_first_texture() -> None:
 
 
 def test_the_offset_of_the_texture_steps_with_the_frames_and_returns() -> None:
-    parsed = Parsed(write_glb(flickering_ball()))
+    parsed = GlbReader(write_glb(flickering_ball()))
     animation = parsed.tree["animations"][0]
     (track,) = [c for c in animation["channels"] if c["target"]["path"] == "pointer"]
     sampler = animation["samplers"][track["sampler"]]
@@ -287,7 +287,7 @@ def test_packing_without_its_package_says_what_to_install(monkeypatch: pytest.Mo
 
 def test_broken_packing_is_refused() -> None:
     content = write_mesh_glb(ball(), COMPACT)
-    parsed = Parsed(content)
+    parsed = GlbReader(content)
     start = content.index(parsed.view.__self__.binary[:64])
     broken = content[:start] + bytes(64) + content[start + 64 :]
     with pytest.raises(BadInput):

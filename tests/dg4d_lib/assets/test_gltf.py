@@ -5,30 +5,30 @@ import struct
 import numpy as np
 import pytest
 
-from dg4d_lib.assets.formats.gltf import VERTEX_DATA, Document, Parsed
+from dg4d_lib.assets.formats.gltf import VERTEX_DATA, GlbReader, GltfDocument
 from dg4d_lib.errors import BadInput
 
 
 def test_what_is_added_comes_back() -> None:
-    document = Document({"a": [1, {"b": None}]})
+    document = GltfDocument({"a": [1, {"b": None}]})
     points = np.arange(9, dtype="<f4").reshape(3, 3)
     numbers = np.array([7, 1, 3], dtype="<u2")
     first, second = document.add_accessor("points", points, VERTEX_DATA), document.add_accessor("numbers", numbers)
-    parsed = Parsed(document.to_bytes())
+    parsed = GlbReader(document.to_bytes())
     assert np.array_equal(parsed.accessor(first), points)
     assert np.array_equal(parsed.accessor(second), numbers[:, None])
     assert parsed.tree["asset"] == {"version": "2.0", "generator": "dg4d", "extras": {"a": [1, {"b": None}]}}
 
 
 def test_properties_that_are_none_are_left_out() -> None:
-    document = Document({})
+    document = GltfDocument({})
     document.add("nodes", name="n", mesh=None, scale=[1, 1, 1])
     assert document.tree["nodes"] == [{"name": "n", "scale": [1, 1, 1]}]
     assert "extras" not in document.tree["asset"]
 
 
 def test_views_start_at_multiples_of_four_and_padding_is_zero() -> None:
-    document = Document({})
+    document = GltfDocument({})
     document.add_view("odd", b"abcde")
     document.add_view("next", b"f")
     assert [view["byteOffset"] for view in document.tree["bufferViews"]] == [0, 8]
@@ -36,7 +36,7 @@ def test_views_start_at_multiples_of_four_and_padding_is_zero() -> None:
 
 
 def test_chunks_are_padded_and_announced_with_their_true_length() -> None:
-    content = Document({"text": "ä"}).to_bytes()
+    content = GltfDocument({"text": "ä"}).to_bytes()
     (length,) = struct.unpack_from("<I", content, 8)
     (text_length,) = struct.unpack_from("<I", content, 12)
     assert (length, length % 4, text_length % 4) == (len(content), 0, 0)
@@ -44,33 +44,33 @@ def test_chunks_are_padded_and_announced_with_their_true_length() -> None:
 
 
 def test_interleaved_vertices_of_other_writers_are_read() -> None:
-    document = Document({})
+    document = GltfDocument({})
     rows = np.arange(10, dtype="<f4").reshape(2, 5)  # a position and texture coordinates
     view = document.add_view("vertices", rows.tobytes())
     document.tree["bufferViews"][view]["byteStride"] = 20
     common = {"bufferView": view, "componentType": 5126, "count": 2}
     document.add("accessors", type="VEC3", **common)
     document.add("accessors", type="VEC2", byteOffset=12, **common)
-    parsed = Parsed(document.to_bytes())
+    parsed = GlbReader(document.to_bytes())
     assert np.array_equal(parsed.accessor(0), rows[:, :3])
     assert np.array_equal(parsed.accessor(1), rows[:, 3:])
 
 
 @pytest.mark.parametrize("extra", [1, 100])
 def test_an_accessor_beyond_its_view_is_not_read(extra: int) -> None:
-    document = Document({})
+    document = GltfDocument({})
     number = document.add_accessor("points", np.zeros((4, 3), "<f4"))
     document.tree["accessors"][number]["count"] += extra
     with pytest.raises((TypeError, ValueError)):
-        Parsed(document.to_bytes()).accessor(number)
+        GlbReader(document.to_bytes()).accessor(number)
 
 
 @pytest.mark.parametrize("keep", [0, 3, 11, 19, 24])
 def test_a_cut_off_container_is_refused(keep: int) -> None:
     with pytest.raises(BadInput, match="GLB"):
-        Parsed(Document({}).to_bytes()[:keep])
+        GlbReader(GltfDocument({}).to_bytes()[:keep])
 
 
 def test_numbers_that_are_not_finite_never_reach_the_json() -> None:
     with pytest.raises(ValueError, match="JSON"):
-        Document({"loss": float("nan")}).to_bytes()
+        GltfDocument({"loss": float("nan")}).to_bytes()

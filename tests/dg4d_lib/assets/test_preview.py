@@ -13,7 +13,7 @@ import torch
 
 from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.rendering import preview
-from dg4d_lib.assets.rendering.preview import studio, write_film, write_preview, write_turntable
+from dg4d_lib.assets.rendering.preview import studio_background, write_mp4, write_preview, write_turntable
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.errors import BackendUnavailable
@@ -77,7 +77,7 @@ def test_a_slow_motion_is_not_sampled_without_end(
 
 def test_colors_survive_the_encoding(written: Path) -> None:
     first = film(written)[0][0]
-    np.testing.assert_allclose(first[:4, :4], studio(64)[:4, :4].numpy(), atol=4 / 255)
+    np.testing.assert_allclose(first[:4, :4], studio_background(64)[:4, :4].numpy(), atol=4 / 255)
     assert first[32, 32, 0] > 0.85
     assert first[32, 32, 1:].max() < 0.25
 
@@ -87,7 +87,7 @@ def test_the_object_is_drawn_where_it_is(written: Path) -> None:
     redness = (film(written)[0][..., 0] - film(written)[0][..., 1]).clip(0)
     columns = (redness.sum(1) * np.arange(64)).sum(-1) / redness.sum((1, 2))
     camera = OrbitCamera(preview.ELEVATION_DEG, 360 * 6 / 18, width=64, height=64)
-    view = camera.world_to_camera() @ torch.tensor([0.5, 0, 0, 1], dtype=torch.float64)
+    view = camera.viewmat() @ torch.tensor([0.5, 0, 0, 1], dtype=torch.float64)
     expected = 32 + camera.focal * float(view[0] / view[2]) - 0.5
     assert columns[0] == pytest.approx(31.5, abs=0.5)
     assert columns[6] == pytest.approx(expected, abs=1)
@@ -151,7 +151,7 @@ def test_without_any_codec_the_backend_is_missing(
 
 
 def test_a_failure_while_drawing_is_not_hidden(tmp_path: Path, red_dot: Gaussians, slide: Framewise) -> None:
-    def broken(gaussians: Gaussians, cameras: Sequence[OrbitCamera], background, screen_offsets=None):
+    def broken(gaussians: Gaussians, cameras: Sequence[OrbitCamera], background, means2d_offsets=None):
         raise ArithmeticError("no picture")
 
     with pytest.raises(ArithmeticError, match="no picture"):
@@ -160,7 +160,7 @@ def test_a_failure_while_drawing_is_not_hidden(tmp_path: Path, red_dot: Gaussian
 
 def test_pictures_become_a_film_of_their_rate_and_colors(tmp_path: Path) -> None:
     shades = torch.linspace(0.1, 0.9, 4)[:, None, None, None].expand(4, 32, 32, 3)
-    write_film(tmp_path / "film.mp4", shades, 7.0)
+    write_mp4(tmp_path / "film.mp4", shades, 7.0)
     pictures, rate = film(tmp_path / "film.mp4")
     assert rate == 7
     np.testing.assert_allclose(pictures, shades.numpy(), atol=4 / 255)

@@ -9,8 +9,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from dg4d_lib.assets.animated import Asset4D, between, moved
-from dg4d_lib.assets.resample import MOST_STATES, STATES_AT_ONCE, moments, resampled, states
+from dg4d_lib.assets.animated import Asset4D, interpolate_frames, pose_gaussians
+from dg4d_lib.assets.resample import (
+    MOST_STATES,
+    STATES_AT_ONCE,
+    pose_gaussians_in_chunks,
+    resample_asset,
+    resampled_positions,
+)
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -85,7 +91,7 @@ def corrections() -> Tensor:
     ("fps", "states"), [(8, 16), (12, 24), (24, 48), (30, 60), (28, 56), (7, 14), (3.5, 7), (0.1, 1)]
 )
 def test_there_are_as_many_states_as_the_loop_has_room_for(fps: float, states: int) -> None:
-    positions = moments(14, 7.0, fps)
+    positions = resampled_positions(14, 7.0, fps)
     assert len(positions) == states
     assert positions[0] == 0
     torch.testing.assert_close(
@@ -95,64 +101,67 @@ def test_there_are_as_many_states_as_the_loop_has_room_for(fps: float, states: i
 
 @pytest.mark.parametrize("factor", [1, 2, 3, 4])
 def test_frames_are_met_exactly_by_whole_factors(factor: int) -> None:
-    assert torch.equal(moments(14, 7.0, factor * 7.0)[::factor], torch.arange(14, dtype=torch.float64))
+    assert torch.equal(resampled_positions(14, 7.0, factor * 7.0)[::factor], torch.arange(14, dtype=torch.float64))
 
 
 def test_a_rate_of_too_many_states_is_refused_but_all_frames_never_are() -> None:
     with pytest.raises(BadInput, match=r"1001 states .* at most 7$"):
-        moments(1000, 7.0, 7.007)
-    assert len(moments(2000, 7.0, 7.0)) == 2000
-    assert len(moments(1000, 7.0, 7.0)) == MOST_STATES
+        resampled_positions(1000, 7.0, 7.007)
+    assert len(resampled_positions(2000, 7.0, 7.0)) == 2000
+    assert len(resampled_positions(1000, 7.0, 7.0)) == MOST_STATES
 
 
 def test_states_in_parts_are_the_states(cloud: Gaussians) -> None:
-    positions = moments(FRAMES, FPS, 20 * FPS)
+    positions = resampled_positions(FRAMES, FPS, 20 * FPS)
     assert len(positions) > 2 * STATES_AT_ONCE
-    parts, whole = states(cloud, Turning(), FRAMES, positions), moved(cloud, Turning(), FRAMES, positions)
+    parts, whole = (
+        pose_gaussians_in_chunks(cloud, Turning(), FRAMES, positions),
+        pose_gaussians(cloud, Turning(), FRAMES, positions),
+    )
     for name, value in vars(whole).items():
         torch.testing.assert_close(getattr(parts, name), value, atol=1e-6, rtol=0)
 
 
 def test_frames_stay_as_they_were_bit_by_bit(asset: Asset4D, cloud: Gaussians) -> None:
-    fine = resampled(asset, cloud, Turning(), FRAMES, 4 * FPS)
+    fine = resample_asset(asset, cloud, Turning(), FRAMES, 4 * FPS)
     assert torch.equal(fine.offsets[::4], asset.offsets)
     assert (len(fine.offsets), fine.fps, fine.extras) == (4 * FRAMES, 4 * FPS, {"a": 1})
 
 
 @pytest.mark.parametrize("fps", [4 * FPS, 12.0, 3.0])
 def test_between_frames_the_mesh_turns_with_the_cloud(asset: Asset4D, cloud: Gaussians, fps: float) -> None:
-    fine = resampled(asset, cloud, Turning(), FRAMES, fps)
-    positions = moments(FRAMES, FPS, fps)
+    fine = resample_asset(asset, cloud, Turning(), FRAMES, fps)
+    positions = resampled_positions(FRAMES, FPS, fps)
     told = positions <= FRAMES - 1
-    expected = ridden(asset.mesh.vertices, positions) + between(corrections(), positions)
+    expected = ridden(asset.mesh.vertices, positions) + interpolate_frames(corrections(), positions)
     torch.testing.assert_close(fine.offsets[told], expected[told], atol=2e-6, rtol=0)
-    morphed = between(asset.offsets, positions)
+    morphed = interpolate_frames(asset.offsets, positions)
     assert (morphed - expected)[told].norm(dim=-1).max() > 0.03  # chords of 60 degrees
 
 
 def test_after_the_last_frame_it_goes_home_as_the_cloud_does(asset: Asset4D, cloud: Gaussians) -> None:
     offsets = torch.arange(FRAMES)[:, None, None] / (FRAMES - 1) * torch.tensor([1.0, 0, 0]).expand(4, 3)
-    fine = resampled(Asset4D(asset.mesh, offsets, FPS), cloud, Sliding(), FRAMES, 2 * FPS)
-    way = moved(cloud, Sliding(), FRAMES, moments(FRAMES, FPS, 2 * FPS)).means - cloud.means
+    fine = resample_asset(Asset4D(asset.mesh, offsets, FPS), cloud, Sliding(), FRAMES, 2 * FPS)
+    way = pose_gaussians(cloud, Sliding(), FRAMES, resampled_positions(FRAMES, FPS, 2 * FPS)).means - cloud.means
     torch.testing.assert_close(fine.offsets, way[:, :4], atol=1e-6, rtol=0)
     torch.testing.assert_close(fine.offsets[-1, :, 0], torch.full((4,), 0.5), atol=1e-6, rtol=0)
 
 
 def test_textures_are_those_of_the_nearest_frame(asset: Asset4D, cloud: Gaussians) -> None:
-    fine = resampled(asset, cloud, Turning(), FRAMES, 4 * FPS)
+    fine = resample_asset(asset, cloud, Turning(), FRAMES, 4 * FPS)
     assert asset.textures is not None and fine.textures is not None
     assert torch.equal(fine.textures[:6], asset.textures[[0, 0, 0, 1, 1, 1]])
     assert torch.equal(fine.textures[-1], asset.textures[0])
 
 
 def test_rest_is_the_same_moment_at_the_new_rate(asset: Asset4D, cloud: Gaussians) -> None:
-    assert resampled(asset, cloud, Turning(), FRAMES, 4 * FPS).rest == 4 * REST
+    assert resample_asset(asset, cloud, Turning(), FRAMES, 4 * FPS).reference_frame == 4 * REST
 
 
 def test_at_its_own_rate_nothing_changes(asset: Asset4D, cloud: Gaussians) -> None:
-    assert resampled(asset, cloud, Turning(), FRAMES, FPS) is asset
+    assert resample_asset(asset, cloud, Turning(), FRAMES, FPS) is asset
 
 
 def test_a_mesh_of_another_motion_is_refused(asset: Asset4D, cloud: Gaussians) -> None:
     with pytest.raises(BadInput, match="the mesh has 5 frames, its motion 9"):
-        resampled(asset, cloud, Turning(), 9, 24.0)
+        resample_asset(asset, cloud, Turning(), 9, 24.0)

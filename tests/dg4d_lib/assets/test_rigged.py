@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.glb import write_glb
-from dg4d_lib.assets.formats.rigged import rig_of, write_rigged_glb
+from dg4d_lib.assets.formats.rigged import fit_asset_rig, write_rigged_glb
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.tracking.rig import Rig, fit_rig
@@ -100,7 +100,7 @@ def test_the_skin_in_the_file_misses_the_morphed_file_by_what_the_rig_says(
     _, poses = skin(pygltflib.GLTF2.load_from_bytes(content))
     missed = np.linalg.norm(poses[:-1] - morphed(write_glb(asset)), axis=-1)
     assert np.sqrt(np.square(missed).mean()) == pytest.approx(rig.rms, rel=1e-3)  # weights have 16 bits
-    assert missed.max() == pytest.approx(rig.largest, rel=1e-2)
+    assert missed.max() == pytest.approx(rig.max_distance, rel=1e-2)
     assert rig.error <= 0.02
 
 
@@ -115,12 +115,12 @@ def test_the_nodes_stand_at_rest(rigged: tuple[Asset4D, Rig, bytes]) -> None:
     _, rig, content = rigged
     file = pygltflib.GLTF2.load_from_bytes(content)
     binding = rows(file, file.skins[0].inverseBindMatrices).reshape(-1, 4, 4)
-    np.testing.assert_allclose(-binding[:, 3, :3], rig.rest, atol=1e-6)
+    np.testing.assert_allclose(-binding[:, 3, :3], rig.rest_positions, atol=1e-6)
     places: dict[int, Any] = {}
     for joint, parent in zip(file.skins[0].joints, rig.parents.tolist(), strict=True):
         above = places[file.skins[0].joints[parent]] if parent >= 0 else np.zeros(3)
         places[joint] = above + file.nodes[joint].translation
-    np.testing.assert_allclose(list(places.values()), rig.rest, atol=1e-6)
+    np.testing.assert_allclose(list(places.values()), rig.rest_positions, atol=1e-6)
 
 
 def test_weights_sum_to_exactly_one_and_unused_slots_name_no_bone(rigged: tuple[Asset4D, Rig, bytes]) -> None:
@@ -165,16 +165,16 @@ def test_equal_rigs_give_equal_bytes(rigged: tuple[Asset4D, Rig, bytes]) -> None
 
 def test_a_rig_that_misses_too_much_is_left_out_with_the_reason() -> None:
     asset = swaying()
-    rig, said = rig_of(asset, 1, 0.05)
+    rig, said = fit_asset_rig(asset, 1, 0.05)
     assert rig is None
     assert said.startswith("no rig: 1 bone misses")
     assert "5.0% is allowed" in said
 
 
 def test_a_rig_that_follows_is_given_with_its_figures() -> None:
-    rig, said = rig_of(swaying(), 8, 0.1)
+    rig, said = fit_asset_rig(swaying(), 8, 0.1)
     assert rig is not None
-    assert f"{len(rig.rest)} bones miss {rig.error:.1%}" in said
+    assert f"{len(rig.rest_positions)} bones miss {rig.error:.1%}" in said
 
 
 def test_a_rig_of_another_mesh_is_refused(rigged: tuple[Asset4D, Rig, bytes]) -> None:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dg4d_lib.asset_settings import PackSettings
-from dg4d_lib.assets.rendering.sheet import PANEL, contact_sheet, videos_sheet
+from dg4d_lib.assets.rendering.sheet import PANEL, draw_contact_sheet, draw_video_sheet
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer.reference import rasterize
@@ -17,14 +17,14 @@ SETTINGS = PackSettings(sheet_size=SIZE, sheet_frames=3, sheet_azimuths_deg=(0.0
 
 def footage(frames: int) -> DrivingVideo:
     """A green square."""
-    coverage = torch.zeros(frames, 64, 64, 1)
-    coverage[:, 16:48, 16:48] = 1
-    return DrivingVideo(torch.tensor((0.0, 1.0, 0.0)).expand(frames, 64, 64, 3), coverage, 10.0)
+    alpha = torch.zeros(frames, 64, 64, 1)
+    alpha[:, 16:48, 16:48] = 1
+    return DrivingVideo(torch.tensor((0.0, 1.0, 0.0)).expand(frames, 64, 64, 3), alpha, 10.0)
 
 
 @pytest.fixture
 def sheet(red_dot: Gaussians, slide: Framewise) -> torch.Tensor:
-    return contact_sheet(red_dot, slide, footage(5), rasterize, SETTINGS)
+    return draw_contact_sheet(red_dot, slide, footage(5), rasterize, SETTINGS)
 
 
 def tile(sheet: torch.Tensor, row: int, column: int, rows: int = 3, columns: int = 3) -> torch.Tensor:
@@ -65,8 +65,10 @@ def test_margins_hold_captions_and_gaps_are_white(sheet: torch.Tensor) -> None:
 
 
 def test_long_captions_are_not_cut_off(red_dot: Gaussians, slide: Framewise) -> None:
-    short = contact_sheet(red_dot, slide, footage(2), rasterize, PackSettings(sheet_size=32, sheet_azimuths_deg=(0,)))
-    long = contact_sheet(
+    short = draw_contact_sheet(
+        red_dot, slide, footage(2), rasterize, PackSettings(sheet_size=32, sheet_azimuths_deg=(0,))
+    )
+    long = draw_contact_sheet(
         red_dot, slide, footage(2), rasterize, PackSettings(sheet_size=32, sheet_azimuths_deg=(-123.456,))
     )
     assert long.shape[1] > short.shape[1]
@@ -76,19 +78,19 @@ def test_long_captions_are_not_cut_off(red_dot: Gaussians, slide: Framewise) -> 
 
 
 def test_a_short_video_has_a_column_per_frame(red_dot: Gaussians, slide: Framewise) -> None:
-    two = contact_sheet(red_dot, slide, footage(2), rasterize, SETTINGS)
-    three = contact_sheet(red_dot, slide, footage(3), rasterize, SETTINGS)
+    two = draw_contact_sheet(red_dot, slide, footage(2), rasterize, SETTINGS)
+    three = draw_contact_sheet(red_dot, slide, footage(3), rasterize, SETTINGS)
     assert three.shape[1] - two.shape[1] == SIZE + GAP
 
 
 def test_equal_assets_give_equal_sheets(sheet: torch.Tensor, red_dot: Gaussians, slide: Framewise) -> None:
-    assert torch.equal(contact_sheet(red_dot, slide, footage(5), rasterize, SETTINGS), sheet)
+    assert torch.equal(draw_contact_sheet(red_dot, slide, footage(5), rasterize, SETTINGS), sheet)
 
 
 def test_several_videos_are_rows_in_the_given_order() -> None:
     second = footage(5)
-    blue = DrivingVideo(torch.tensor((0.0, 0.0, 1.0)).expand(5, 64, 64, 3), second.coverage, 10.0)
-    page = videos_sheet([footage(5), blue], ["1 sway: 0.90", "2 bend: 0.50"], SIZE, 3)
+    blue = DrivingVideo(torch.tensor((0.0, 0.0, 1.0)).expand(5, 64, 64, 3), second.alpha, 10.0)
+    page = draw_video_sheet([footage(5), blue], ["1 sway: 0.90", "2 bend: 0.50"], SIZE, 3)
     for column in range(3):
         torch.testing.assert_close(tile(page, 0, column, rows=2)[24, 24], torch.tensor([0.0, 1.0, 0.0]))
         torch.testing.assert_close(tile(page, 1, column, rows=2)[24, 24], torch.tensor([0.0, 0.0, 1.0]))

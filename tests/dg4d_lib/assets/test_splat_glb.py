@@ -10,7 +10,7 @@ import pytest
 import torch
 from splat_readers import read_splat_glb
 
-from dg4d_lib.assets.formats.gltf import Parsed
+from dg4d_lib.assets.formats.gltf import GlbReader
 from dg4d_lib.assets.formats.splat_glb import EXTENSION, write_splat_glb
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -28,7 +28,7 @@ def cloud(count: int = 40) -> Gaussians:
 
 
 def column(content: bytes, name: str) -> Any:
-    parsed = Parsed(content)
+    parsed = GlbReader(content)
     return parsed.accessor(parsed.tree["meshes"][0]["primitives"][0]["attributes"][name])
 
 
@@ -99,5 +99,5 @@ def test_no_gaussians_are_refused() -> None:
 
 
 def test_numbers_that_are_not_finite_are_refused() -> None:
-    with pytest.raises(BadInput, match="finite numbers; given others in quats"):
+    with pytest.raises(BadInput, match="non-finite numbers; given some in quats"):
         write_splat_glb(replace(cloud(1), quats=torch.full((1, 4), torch.inf)))

@@ -8,7 +8,7 @@ import pytest
 import torch
 from splat_readers import read_splat_glb
 
-from dg4d_lib.assets.animated import moved
+from dg4d_lib.assets.animated import pose_gaussians
 from dg4d_lib.assets.formats.splats import read_splats, write_splat_glb_frames, write_splats, write_spz_frames
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.errors import BadInput
@@ -18,7 +18,7 @@ from dg4d_lib.gaussians.ply import read_ply, write_ply
 
 @pytest.fixture
 def states(red_dot: Gaussians, slide: Framewise) -> Gaussians:
-    return moved(red_dot, slide, 3, torch.arange(3.0))
+    return pose_gaussians(red_dot, slide, 3, torch.arange(3.0))
 
 
 def test_a_sequence_comes_back_exactly(tmp_path: Path, states: Gaussians) -> None:

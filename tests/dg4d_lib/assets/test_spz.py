@@ -14,7 +14,7 @@ import torch
 from dg4d_lib.assets.formats.spz import write_spz
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.quaternion import rotation_matrix
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
 
 
 def cloud(count: int = 200) -> Gaussians:
@@ -42,7 +42,7 @@ def test_another_reader_sees_the_rotations_to_the_stated_angle(tmp_path: Path) -
     given = cloud(5000)
     write_spz(tmp_path / "a.spz", given)
     seen = torch.from_numpy(gsply.read_spz(str(tmp_path / "a.spz")).quats).double()
-    between = rotation_matrix(seen) @ rotation_matrix(given.quats.double()).mT
+    between = quat_to_rotmat(seen) @ quat_to_rotmat(given.quats.double()).mT
     cosines = (between.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
     assert math.degrees(float(cosines.clamp(-1, 1).acos().max())) < 0.3
 

@@ -3,24 +3,24 @@
 import numpy as np
 import pytest
 
-from dg4d_lib.assets.formats.tracks import Span, cut
+from dg4d_lib.assets.formats.tracks import Span, split_into_spans
 
 
 @pytest.mark.parametrize(("frames", "longest"), [(1, 1), (5, 1), (5, 2), (6, 3), (300, 128)])
 def test_every_frame_is_in_one_span(frames: int, longest: int) -> None:
-    spans = cut(frames, longest)
+    spans = split_into_spans(frames, longest)
     assert [frame for span in spans for frame in range(span.first, span.end)] == list(range(frames))
     assert max(span.end - span.first for span in spans) <= longest
 
 
 def test_a_span_ends_with_the_first_pose_of_the_next() -> None:
-    first, second = cut(4, 2)
+    first, second = split_into_spans(4, 2)
     assert (first.keys, first.poses) == ([0, 1, 2], [0, 1, 2])
     assert (second.keys, second.poses) == ([2, 3, 4], [2, 3, 0])
 
 
 def test_a_whole_animation_comes_back_to_its_first_pose_without_a_pose_more() -> None:
-    (span,) = cut(3, 8)
+    (span,) = split_into_spans(3, 8)
     assert span.poses == [0, 1, 2]
     assert np.array_equal(span.weights(), np.eye(3)[[0, 1, 2, 0]])
 

@@ -12,7 +12,7 @@ from usd_samples import FPS, FRAMES, HALF, cloud, growing_ball
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.formats.usd import write_usdz
-from dg4d_lib.geometry.quaternion import rotation_matrix
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
 
 MOVING = "positions", "orientations", "scales"
 
@@ -36,8 +36,8 @@ def test_splats_are_the_states(path: Path) -> None:
         np.testing.assert_allclose(scales, state.log_scales.exp(), rtol=1e-6)
         quats = [(q.GetReal(), *q.GetImaginary()) for q in splats.GetOrientationsAttr().Get(time)]
         np.testing.assert_allclose(np.linalg.norm(quats, axis=1), 1, atol=1e-6)
-        turns = rotation_matrix(torch.tensor(quats))
-        np.testing.assert_allclose(turns, rotation_matrix(state.quats), atol=1e-5)
+        turns = quat_to_rotmat(torch.tensor(quats))
+        np.testing.assert_allclose(turns, quat_to_rotmat(state.quats), atol=1e-5)
         low, high = np.array(splats.GetExtentAttr().Get(time))
         reach = 3 * state.covariances.diagonal(dim1=-2, dim2=-1).sqrt()
         np.testing.assert_allclose(low, (state.means - reach).amin(0), rtol=1e-4)
@@ -63,7 +63,7 @@ def test_half_splats_are_the_states_to_eleven_bits(path: Path) -> None:
         np.testing.assert_allclose(splats.GetPositionshAttr().Get(time), state.means, rtol=2**-11)
         np.testing.assert_allclose(splats.GetScaleshAttr().Get(time), state.scales.clamp(min=2**-14), rtol=2**-11)
         quats = [(q.GetReal(), *q.GetImaginary()) for q in splats.GetOrientationshAttr().Get(time)]
-        np.testing.assert_allclose(rotation_matrix(torch.tensor(quats)), rotation_matrix(state.quats), atol=2**-9)
+        np.testing.assert_allclose(quat_to_rotmat(torch.tensor(quats)), quat_to_rotmat(state.quats), atol=2**-9)
     np.testing.assert_allclose(splats.GetOpacitiesAttr().Get(), states.opacity_logits.sigmoid(), rtol=1e-6)
 
 

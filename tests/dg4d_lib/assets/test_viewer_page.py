@@ -17,8 +17,8 @@ import trimesh
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.glb import write_glb
-from dg4d_lib.assets.formats.gltf import Parsed
-from dg4d_lib.assets.rendering.viewer_page import viewer_page
+from dg4d_lib.assets.formats.gltf import GlbReader
+from dg4d_lib.assets.rendering.viewer_page import build_viewer_page
 from dg4d_lib.mesh.textured import TexturedMesh
 
 NASTY = "</script><script>alert(1)</script><!-- @data@ @title@ & \"ümlaut\" 'π'"
@@ -51,7 +51,7 @@ class Blocks(HTMLParser):
 
 
 def page(title: str = "Fox", facts: dict[str, Any] | None = None) -> str:
-    return viewer_page(title, GLB, b"splats", None, b"film", facts or {})
+    return build_viewer_page(title, GLB, b"splats", None, b"film", facts or {})
 
 
 def test_the_data_can_be_read_out_again() -> None:
@@ -75,8 +75,8 @@ def mesh_in(text: str) -> bytes:
 
 def test_the_mesh_of_a_page_has_the_bits_that_are_seen() -> None:
     content = moving_ball(GltfSettings())
-    text = viewer_page("Ball", content, None, None, None, {})
-    given, seen = Parsed(content), Parsed(mesh_in(text))
+    text = build_viewer_page("Ball", content, None, None, None, {})
+    given, seen = GlbReader(content), GlbReader(mesh_in(text))
     assert seen.tree == given.tree
     kinds = {"positions": 2**-15, "coordinates": 2**-15, "normals": None}
     for number, accessor in enumerate(given.tree["accessors"]):
@@ -87,13 +87,13 @@ def test_the_mesh_of_a_page_has_the_bits_that_are_seen() -> None:
         )
     picture = given.tree["images"][0]["bufferView"]
     assert seen.view(picture) == given.view(picture)
-    empty = len(viewer_page("Ball", b"", None, None, None, {}))
+    empty = len(build_viewer_page("Ball", b"", None, None, None, {}))
     assert len(text) - empty < 0.6 * len(content)
 
 
 def test_a_mesh_of_whole_numbers_goes_into_a_page_as_it_is() -> None:
     content = moving_ball(GltfSettings(quantized=True))
-    assert mesh_in(viewer_page("Ball", content, None, None, None, {})) == content
+    assert mesh_in(build_viewer_page("Ball", content, None, None, None, {})) == content
 
 
 def test_text_stays_text() -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.rendering import webp
-from dg4d_lib.assets.rendering.preview import studio
+from dg4d_lib.assets.rendering.preview import studio_background
 from dg4d_lib.assets.rendering.webp import write_webp
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.framewise import Framewise
@@ -67,13 +67,13 @@ def test_the_object_is_drawn_where_it_is(written: Path) -> None:
     for i in range(48):
         x = 0.5 * (1 - abs(i / 12 % 2 - 1))
         camera = OrbitCamera(0, webp.SWAY_DEG * math.sin(math.tau * i / 48), width=64, height=64)
-        view = camera.world_to_camera() @ torch.tensor([x, 0, 0, 1], dtype=torch.float64)
+        view = camera.viewmat() @ torch.tensor([x, 0, 0, 1], dtype=torch.float64)
         assert columns[i] == pytest.approx(camera.focal * float(view[0] / view[2]), abs=1)
 
 
 def test_colors_survive_the_encoding(written: Path) -> None:
     first = frames(written)[0][0]
-    np.testing.assert_allclose(first[:4, :4], studio(64)[:4, :4].numpy(), atol=5 / 255)
+    np.testing.assert_allclose(first[:4, :4], studio_background(64)[:4, :4].numpy(), atol=5 / 255)
     assert first[32, 32, 0] > 0.8
     assert first[32, 32, 1:].max() < 0.25
 
@@ -93,7 +93,7 @@ def test_any_length_is_shown_in_real_time_with_few_pictures(
 
 def test_it_is_no_larger_than_256_pixels(tmp_path: Path, red_dot: Gaussians, slide: Framewise) -> None:
     def blank(
-        gaussians: Gaussians, cameras: Sequence[OrbitCamera], background: Tensor, screen_offsets=None
+        gaussians: Gaussians, cameras: Sequence[OrbitCamera], background: Tensor, means2d_offsets=None
     ) -> Rendering:
         return rendering_of(torch.zeros(len(cameras), cameras[0].height, cameras[0].width, 3))
 
@@ -106,7 +106,7 @@ def test_what_would_be_too_large_is_packed_harder(
     tmp_path: Path, red_dot: Gaussians, slide: Framewise, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def noise(
-        gaussians: Gaussians, cameras: Sequence[OrbitCamera], background: Tensor, screen_offsets=None
+        gaussians: Gaussians, cameras: Sequence[OrbitCamera], background: Tensor, means2d_offsets=None
     ) -> Rendering:
         return rendering_of(torch.rand(len(cameras), 64, 64, 3, generator=torch.Generator().manual_seed(0)))
 

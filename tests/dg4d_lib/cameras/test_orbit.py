@@ -3,11 +3,11 @@ import math
 import pytest
 import torch
 
-from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
+from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 
 
 def seen(camera: OrbitCamera, point: tuple[float, float, float]) -> torch.Tensor:
-    return (camera.world_to_camera() @ torch.tensor([*point, 1.0], dtype=torch.float64))[:3]
+    return (camera.viewmat() @ torch.tensor([*point, 1.0], dtype=torch.float64))[:3]
 
 
 @pytest.mark.parametrize("elevation", [-80.0, -30.0, 0.0, 45.0, 89.9])
@@ -36,7 +36,7 @@ def test_positive_elevation_is_above():
 
 
 def test_rotations_are_proper():
-    matrices = world_to_camera([OrbitCamera(e, a) for e in (-40, 0, 70) for a in (0, 33, 200)])[:, :3, :3]
+    matrices = viewmats([OrbitCamera(e, a) for e in (-40, 0, 70) for a in (0, 33, 200)])[:, :3, :3]
     torch.testing.assert_close(matrices @ matrices.mT, torch.eye(3, dtype=torch.float64).expand(9, 3, 3))
     assert (torch.linalg.det(matrices) > 0).all()
 

@@ -65,7 +65,7 @@ def test_it_recovers_a_slide_along_x(kind: str, cloud):
 def test_planes_are_some_of_the_parameters(kind: str):
     deformation = make(kind)
     everything = {id(parameter) for parameter in deformation.parameters()}
-    assert {id(parameter) for parameter in deformation.planes()} <= everything
+    assert {id(parameter) for parameter in deformation.grid_parameters()} <= everything
 
 
 def test_only_the_last_matrices_learn_at_the_first_step(cloud):
@@ -117,13 +117,13 @@ def test_features_are_the_product_of_six_samples():
 
 
 def test_regularizers_count_only_when_switched_on():
-    assert HexPlane(SMALL, BOX, torch.Generator().manual_seed(0)).roughness() == 0
+    assert HexPlane(SMALL, BOX, torch.Generator().manual_seed(0)).regularization_loss() == 0
     weights = {"variation_weight": 1.0, "smoothness_weight": 1.0, "sparsity_weight": 1.0}
     rough = HexPlane(SMALL.model_copy(update=weights), BOX, torch.Generator().manual_seed(0))
-    assert rough.roughness() > 0  # random spatial planes
+    assert rough.regularization_loss() > 0  # random spatial planes
     for plane in rough.space:
         plane.data.fill_(0.3)
-    assert rough.roughness() == 0  # constant planes, time planes at one
+    assert rough.regularization_loss() == 0  # constant planes, time planes at one
 
 
 def test_random_heads_move_the_cloud_before_the_first_step(cloud):
@@ -148,5 +148,5 @@ def test_scattered_gaussians_begin_anywhere_within_the_radius_and_elsewhere_in_e
 
 
 def test_a_framewise_table_refuses_another_cloud():
-    with pytest.raises(BadInput, match="60 Gaussians cannot move 3"):
+    with pytest.raises(BadInput, match="has 60 Gaussians; given 3"):
         Framewise(FRAMES, COUNT).displace(torch.zeros(3, 3), torch.tensor([0.0]))

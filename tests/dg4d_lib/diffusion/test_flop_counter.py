@@ -8,7 +8,7 @@ import torch
 from tiny_weights import TOKEN, tiny_unet, tiny_vae
 from torch.utils.flop_counter import FlopCounterMode
 
-from dg4d_lib.diffusion.flop_counter import counted, counting_flops
+from dg4d_lib.diffusion.flop_counter import attach_flop_counter, count_flops
 
 plain = tiny_unet()
 
@@ -26,8 +26,8 @@ def by_torch(work: Callable[[], object]) -> int:
 
 def test_a_unet_does_what_torch_counts_whether_its_shapes_are_new_or_known() -> None:
     expected = by_torch(lambda: [call(plain, batch) for batch in (1, 2, 1)])
-    unet = counted(tiny_unet())
-    with counting_flops() as flops:
+    unet = attach_flop_counter(tiny_unet())
+    with count_flops() as flops:
         call(unet)
         first = flops["UNet2DConditionModel"]
         call(unet, 2)
@@ -37,8 +37,8 @@ def test_a_unet_does_what_torch_counts_whether_its_shapes_are_new_or_known() -> 
 
 
 def test_a_convolution_costs_two_operations_per_weight_and_output() -> None:
-    layer = counted(torch.nn.Conv2d(3, 5, 3, padding=1))
-    with counting_flops() as flops:
+    layer = attach_flop_counter(torch.nn.Conv2d(3, 5, 3, padding=1))
+    with count_flops() as flops:
         layer(torch.ones(2, 3, 8, 8))
     assert flops == {"Conv2d": 2 * (5 * 3 * 3 * 3) * (2 * 8 * 8)}
 
@@ -54,8 +54,8 @@ def test_the_way_back_to_the_pictures_is_counted_and_a_way_that_is_not_gone_is_n
     there_and_back_again = by_torch(there_and_back)
     there = by_torch(lambda: vae.encode(pictures.detach()))
     back_of_decoder = by_torch(lambda: vae.decode(torch.ones(1, 4, 8, 8)))
-    counted(vae)
-    with counting_flops() as flops:
+    attach_flop_counter(vae)
+    with count_flops() as flops:
         there_and_back()
         assert flops["AutoencoderKL"] == pytest.approx(there_and_back_again, rel=0.02)
         before = flops["AutoencoderKL"]
@@ -70,8 +70,8 @@ def test_counting_changes_no_result_and_calls_outside_are_not_entered() -> None:
     torch.manual_seed(0)
     unet = tiny_unet()
     expected = call(unet)
-    assert torch.equal(call(counted(unet)), expected)
-    with counting_flops() as flops:
+    assert torch.equal(call(attach_flop_counter(unet)), expected)
+    with count_flops() as flops:
         assert torch.equal(call(unet), expected)
         inside = dict(flops)
     call(unet)
@@ -79,8 +79,8 @@ def test_counting_changes_no_result_and_calls_outside_are_not_entered() -> None:
 
 
 def test_an_error_in_a_network_leaves_nothing_counting() -> None:
-    unet = counted(tiny_unet())
-    with counting_flops() as flops:
+    unet = attach_flop_counter(tiny_unet())
+    with count_flops() as flops:
         with pytest.raises(RuntimeError):
             unet(torch.ones(1, 3, 32, 32), 500, encoder_hidden_states=torch.ones(1, 1, TOKEN))
         assert flops == {}
@@ -90,10 +90,10 @@ def test_an_error_in_a_network_leaves_nothing_counting() -> None:
 
 
 def test_a_compiled_network_is_counted_as_well() -> None:
-    unet = counted(tiny_unet())
+    unet = attach_flop_counter(tiny_unet())
     expected = call(unet)
     unet.compile(backend="eager")
-    with counting_flops() as flops:
+    with count_flops() as flops:
         for _ in range(2):
             torch.testing.assert_close(call(unet), expected)
     assert flops["UNet2DConditionModel"] == 2 * by_torch(lambda: call(plain))

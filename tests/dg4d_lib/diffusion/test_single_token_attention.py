@@ -11,7 +11,7 @@ from tiny_svd import tiny_svd
 from tiny_weights import TOKEN, tiny_unet
 from torch.utils.flop_counter import FlopCounterMode
 
-from dg4d_lib.diffusion.flop_counter import counted, counting_flops
+from dg4d_lib.diffusion.flop_counter import attach_flop_counter, count_flops
 from dg4d_lib.diffusion.single_token_attention import SingleTokenProcessor, shorten_attention
 
 NETWORKS = ("pictures", "videos")
@@ -119,8 +119,8 @@ def test_what_is_left_is_one_value_and_one_output_per_row() -> None:
 def test_the_ledger_counts_what_is_left_out(name: str) -> None:
     counts = []
     for unet in (network(name), shorten_attention(network(name))):
-        with counting_flops() as flops:
-            call(counted(unet), drawn(BATCH, 1, TOKEN))
+        with count_flops() as flops:
+            call(attach_flop_counter(unet), drawn(BATCH, 1, TOKEN))
         counts.append(sum(flops.values()))
     assert 0.5 * counts[0] < counts[1] < 0.99 * counts[0]
 

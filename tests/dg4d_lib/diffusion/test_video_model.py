@@ -10,7 +10,7 @@ from tiny_svd import SCHEDULE, save_tiny_svd, tiny_svd
 
 from dg4d_lib.diffusion import batching, video_model
 from dg4d_lib.diffusion.single_token_attention import SingleTokenProcessor
-from dg4d_lib.diffusion.video_model import VideoModel, karras_sigmas, predicted_original, start_index
+from dg4d_lib.diffusion.video_model import VideoModel, karras_sigmas, pred_original_sample, start_index
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import VideoModelSettings
 
@@ -41,8 +41,8 @@ def pixels() -> torch.Tensor:
 
 def generated(model: VideoModel, picture: torch.Tensor, *seeds: int) -> torch.Tensor:
     generators = [rng(seed) for seed in seeds]
-    condition = model.look_at(picture, generators)
-    start = math.sqrt(700**2 + 1) * model.noise(model.blank(len(seeds), FRAMES, SIDE, SIDE), generators)
+    condition = model.encode_condition(picture, generators)
+    start = math.sqrt(700**2 + 1) * model.sample_noise(model.latent_shape(len(seeds), FRAMES, SIDE, SIDE), generators)
     videos = model.denoise(start, condition, karras_sigmas(model.settings.num_inference_steps))
     return torch.stack([model.decode(latents) for latents in videos])
 
@@ -78,7 +78,7 @@ def test_the_clean_video_comes_out_of_the_true_velocity(sigma: float) -> None:
     x0, noise = torch.randn(2, 5, generator=rng(0), dtype=torch.float64)
     angle = math.atan(sigma)
     velocity = math.cos(angle) * noise - math.sin(angle) * x0
-    torch.testing.assert_close(predicted_original(x0 + sigma * noise, velocity, sigma), x0, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(pred_original_sample(x0 + sigma * noise, velocity, sigma), x0, rtol=1e-9, atol=1e-9)
 
 
 @SCHEDULERS_OWN

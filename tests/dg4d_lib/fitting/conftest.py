@@ -9,9 +9,9 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import isotropic
 from dg4d_lib.guidance.analytic import AnalyticPrior
-from dg4d_lib.guidance.distillation import Annealing
-from dg4d_lib.guidance.interface import View
-from dg4d_lib.rasterizer.interface import Rasterizer, choose_rasterizer
+from dg4d_lib.guidance.distillation import TimestepSchedule
+from dg4d_lib.guidance.interface import GuidanceView
+from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.settings import MotionSettings, ResolutionStage, StaticSettings
 from dg4d_lib.video.driving import DrivingVideo
 
@@ -26,7 +26,7 @@ class KnownObject:
         generator = torch.Generator().manual_seed(4)
         means = (torch.rand(40, 3, generator=generator) - 0.5) * 0.7
         self.gaussians = isotropic(means, torch.full((40,), 0.06), torch.rand(40, 3, generator=generator), 0.95)
-        self.rasterize: Rasterizer = choose_rasterizer("cpu")
+        self.rasterize: Rasterizer = get_rasterizer("cpu")
 
     def at(self, frames: Sequence[int]) -> Gaussians:
         shift = torch.tensor([[SLIDE * frame / (FRAMES - 1), 0.0, 0.0] for frame in frames])[:, None]
@@ -39,14 +39,14 @@ class KnownObject:
             g.harmonics,
         )
 
-    def clean(self, views: Sequence[View]) -> tuple[torch.Tensor, torch.Tensor]:
+    def clean(self, views: Sequence[GuidanceView]) -> tuple[torch.Tensor, torch.Tensor]:
         picture = self.rasterize(
             self.at([view.frame for view in views]), [view.camera for view in views], torch.ones(3)
         )
         return picture.color, picture.alpha
 
     def prior(self, t_max_start: float) -> AnalyticPrior:
-        return AnalyticPrior(self.clean, Annealing(t_max_start))
+        return AnalyticPrior(self.clean, TimestepSchedule(t_max_start))
 
     def video(self) -> DrivingVideo:
         camera = OrbitCamera(width=SIZE, height=SIZE)
@@ -55,7 +55,7 @@ class KnownObject:
 
     def subject(self) -> torch.Tensor:
         video = self.video()
-        return torch.cat([video.frames[0], video.coverage[0]], -1)
+        return torch.cat([video.frames[0], video.alpha[0]], -1)
 
 
 @pytest.fixture(scope="session")

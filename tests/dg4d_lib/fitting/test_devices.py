@@ -16,17 +16,17 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.deformation.hexplane import HexPlane
 from dg4d_lib.deformation.mlp import Mlp
-from dg4d_lib.deformation.rigidity import neighborhoods, rigidity
+from dg4d_lib.deformation.rigidity_loss import neighborhoods, rigidity_loss
 from dg4d_lib.errors import BackendUnavailable
-from dg4d_lib.fitting.losses import reference_loss, resized
+from dg4d_lib.fitting.losses import reference_loss, resize_cutouts
 from dg4d_lib.fitting.motion import bounds_of, fit_motion
 from dg4d_lib.fitting.static import fit_gaussians
-from dg4d_lib.gaussians.growth import ScreenGradients, reset_opacity
+from dg4d_lib.gaussians.density_control import Grad2dStats, reset_opacity
 from dg4d_lib.gaussians.initialize import blob, isotropic, on_surface
-from dg4d_lib.guidance.distillation import Annealing
-from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.distillation import TimestepSchedule
+from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.zero123 import ConditionedZero123, Zero123
-from dg4d_lib.rasterizer.interface import Rasterizer, Rendering, choose_rasterizer, device_of
+from dg4d_lib.rasterizer.interface import Rasterizer, Rendering, get_rasterizer, preferred_device
 from dg4d_lib.settings import HexPlaneSettings, MlpSettings, MotionSettings, StaticSettings, Zero123PriorSettings
 from dg4d_lib.video.driving import DrivingVideo
 from tests.emulation.gpu import Emulated
@@ -60,7 +60,7 @@ def test_motions_stay_on_the_device_of_their_cloud(kind):
     video = DrivingVideo(torch.zeros(FRAMES, 8, 8, 3, device=META), torch.zeros(FRAMES, 8, 8, 1, device=META), 8.0)
     deformation = DEFORMATIONS[kind](bounds_of(cloud)).to(META)
     moved = deformation.displace(cloud.means, video.times).apply(cloud)
-    assert moved.means.device == deformation.roughness().device == META
+    assert moved.means.device == deformation.regularization_loss().device == META
     assert moved.states([0, 0, 1]).means.device == META
 
 
@@ -68,13 +68,13 @@ def test_rigidity_stays_on_the_device_of_the_cloud():
     cloud, times = blob(COUNT, 0.5, seed()).to(META), torch.zeros(FRAMES, device=META)
     moved = Framewise(FRAMES, COUNT).to(META).displace(cloud.means, times).apply(cloud)
     neighbors, weights = neighborhoods(blob(COUNT, 0.5, seed()).means)
-    assert rigidity(moved, neighbors, weights.to(META)).device == META
+    assert rigidity_loss(moved, neighbors, weights.to(META)).device == META
 
 
 def test_losses_stay_on_the_device_of_the_pictures(known):
-    color, alpha = resized(torch.zeros(2, 16, 16, 4, device=META), 8)
+    color, alpha = resize_cutouts(torch.zeros(2, 16, 16, 4, device=META), 8)
     assert reference_loss(meta_rendering(), color, alpha, 1.0, 1.0).device == META
-    views = [View(OrbitCamera(azimuth_deg=90.0 * i, width=8, height=8)) for i in range(2)]
+    views = [GuidanceView(OrbitCamera(azimuth_deg=90.0 * i, width=8, height=8)) for i in range(2)]
     rendering = meta_rendering()
     loss = known.prior(0.98).loss(rendering.color, rendering.alpha, views, 0.5, seed())  # its pictures are elsewhere
     assert loss.device == META
@@ -87,7 +87,7 @@ def test_clouds_stay_on_the_device_of_their_points():
     for cloud in (on_surface(points, points, 1.0), isotropic(points, points[:, 0], points, 0.5)):
         assert {value.device for value in vars(cloud).values()} == {META}
         assert {value.device for value in vars(reset_opacity(cloud)).values()} == {META}
-    gradients = ScreenGradients.none(COUNT, META)
+    gradients = Grad2dStats.zeros(COUNT, META)
     gradients.add(torch.zeros(2, COUNT, 2, device=META), meta_rendering().visible, 8)
     assert gradients.mean.device == META
 
@@ -96,10 +96,10 @@ def test_clouds_stay_on_the_device_of_their_points():
 def drawn_here_and_there(known) -> dict[str, tuple[torch.device, Rasterizer]]:
     """The device and the rasterizer of the processor, and those of gsplat."""
     try:
-        gsplat = choose_rasterizer("cuda_gsplat")
+        gsplat = get_rasterizer("cuda_gsplat")
     except BackendUnavailable as missing:
         pytest.skip(str(missing))
-    return {"here": (torch.device("cpu"), known.rasterize), "there": (device_of("cuda_gsplat"), gsplat)}
+    return {"here": (torch.device("cpu"), known.rasterize), "there": (preferred_device("cuda_gsplat"), gsplat)}
 
 
 @pytest.mark.gpu
@@ -140,8 +140,8 @@ def test_the_motion_fit_on_a_gpu_ends_where_the_processor_ends(kind, known, moti
 @pytest.fixture
 def on_gpu(known, emulated_gpu: Emulated, tmp_path: Path) -> ConditionedZero123:
     """A tiny Zero-1-to-3 that knows the video."""
-    model = Zero123.load(write_zero123(tmp_path / "zero123"), Zero123PriorSettings(), device_of("cuda_gsplat"))
-    return model.conditioned_on(known.video().frames, Annealing(0.98))
+    model = Zero123.load(write_zero123(tmp_path / "zero123"), Zero123PriorSettings(), preferred_device("cuda_gsplat"))
+    return model.conditioned_on(known.video().frames, TimestepSchedule(0.98))
 
 
 def waits_of_an_iteration(gpu: Emulated, fit: Callable[[Callable[..., None]], object]) -> dict[str, int]:
@@ -157,7 +157,7 @@ def test_an_iteration_waits_for_the_gpu_where_it_draws_and_for_its_losses_only(
     fit: str, known, static_settings: StaticSettings, motion_settings: MotionSettings, emulated_gpu, on_gpu
 ) -> None:
     """Two drawings: are the Gaussians finite, and how many of gsplat's tiles are touched. Then all losses at once."""
-    draw, device = choose_rasterizer("cuda_gsplat"), device_of("cuda_gsplat")
+    draw, device = get_rasterizer("cuda_gsplat"), preferred_device("cuda_gsplat")
     cloud, few = known.gaussians.to(device), {"iterations": 4}
 
     def run(report: Callable[..., None]) -> None:
@@ -176,8 +176,8 @@ def test_an_iteration_waits_for_the_gpu_where_it_draws_and_for_its_losses_only(
 @pytest.mark.gpu
 def test_a_batch_that_does_not_fit_into_the_memory_of_a_gpu_is_halved(emulated_gpu: Emulated, on_gpu) -> None:
     """The loss of four views takes more than a quarter above that of one; the gradient is the same in pieces."""
-    views = [View(OrbitCamera(azimuth_deg=90.0 * i), 0) for i in range(4)]
-    pictures = torch.rand(4, 64, 64, 3, generator=seed()).to(device_of("cuda_gsplat"))
+    views = [GuidanceView(OrbitCamera(azimuth_deg=90.0 * i), 0) for i in range(4)]
+    pictures = torch.rand(4, 64, 64, 3, generator=seed()).to(preferred_device("cuda_gsplat"))
 
     def gradient(count: int) -> torch.Tensor:
         seen = pictures[:count].clone().requires_grad_()

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from dg4d_lib.errors import FitDiverged
-from dg4d_lib.fitting.losses import Diverged, finite_numbers, reference_loss, resized
+from dg4d_lib.fitting.losses import Diverged, check_finite, reference_loss, resize_cutouts
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.rasterizer.interface import Rendering
 
@@ -11,7 +11,7 @@ def test_resizing_is_over_white_and_does_not_bleed_hidden_color():
     cutout = torch.zeros(1, 8, 8, 4)
     cutout[..., :3] = torch.tensor([0.0, 1.0, 0.0])  # green everywhere, also where it is transparent
     cutout[:, :, :4, 3] = 1.0
-    color, alpha = resized(cutout, 4)
+    color, alpha = resize_cutouts(cutout, 4)
     torch.testing.assert_close(alpha[0, :, 0], torch.ones(4, 1))
     torch.testing.assert_close(color[0, :, 3], torch.ones(4, 3))
     torch.testing.assert_close(color[0, :, 0], torch.tensor([[0.0, 1.0, 0.0]]).expand(4, 3))
@@ -40,10 +40,10 @@ def test_structural_similarity_counts_when_it_has_a_weight():
 def test_a_gradient_that_is_no_number_stops_the_fit(broken):
     cloud = blob(9, 0.5, torch.Generator().manual_seed(0))
     losses = {"loss": torch.tensor(2.5), "reference": torch.tensor(1.0)}
-    numbers = finite_numbers("fit", losses, [None, torch.zeros(3)], "iteration 1 of 2", "rest", cloud)
+    numbers = check_finite("fit", losses, [None, torch.zeros(3)], "iteration 1 of 2", "rest", cloud)
     assert numbers == {"loss": 2.5, "reference": 1.0}
     slopes = [None, torch.zeros(4), torch.tensor([1.0, broken])]
     with pytest.raises(FitDiverged, match=f"fit: the gradient became {broken} at iteration 1 of 2; rest") as caught:
-        finite_numbers("fit", losses, slopes, "iteration 1 of 2", "rest", cloud)
+        check_finite("fit", losses, slopes, "iteration 1 of 2", "rest", cloud)
     assert isinstance(caught.value, Diverged)
     assert len(caught.value.gaussians) == 9

@@ -7,7 +7,7 @@ from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.deformation.hexplane import HexPlane
 from dg4d_lib.deformation.mlp import Mlp
 from dg4d_lib.errors import FitDiverged
-from dg4d_lib.fitting.motion import bounds_of, choose_frames, fit_motion, moments
+from dg4d_lib.fitting.motion import bounds_of, fit_motion, sample_frames, sample_views
 from dg4d_lib.settings import HexPlaneSettings, MlpSettings
 
 FRAMES, SLIDE = 4, 0.3
@@ -74,16 +74,18 @@ def test_fine_tuning_learns_at_the_rates_of_the_public_code(known, motion_settin
 
 def test_frames_of_an_iteration_are_spread_over_time():
     for number in range(20):
-        frames = choose_frames(32, 8, seed(number))
+        frames = sample_frames(32, 8, seed(number))
         assert [int(f) // 4 for f in frames] == list(range(8))
-    assert choose_frames(5, 0, seed()).tolist() == [0, 1, 2, 3, 4]
-    assert choose_frames(5, 9, seed()).tolist() == [0, 1, 2, 3, 4]
+    assert sample_frames(5, 0, seed()).tolist() == [0, 1, 2, 3, 4]
+    assert sample_frames(5, 9, seed()).tolist() == [0, 1, 2, 3, 4]
 
 
 def test_a_prior_is_only_asked_what_it_can_judge(known, motion_settings):
     prior = known.prior(0.5)
     prior.frames = (0, 2)
-    views, rows = moments(prior, torch.tensor([1, 2, 3]), motion_settings.model_copy(update={"views": 2}), 16, seed())
+    views, rows = sample_views(
+        prior, torch.tensor([1, 2, 3]), motion_settings.model_copy(update={"views": 2}), 16, seed()
+    )
     assert [view.frame for view in views] == [2, 2]
     assert rows.tolist() == [1, 1]
 

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from dg4d_lib.fitting.motion import moments
-from dg4d_lib.fitting.static import viewpoints
-from dg4d_lib.guidance.interface import ring_of
+from dg4d_lib.fitting.motion import sample_views
+from dg4d_lib.fitting.static import sample_cameras
+from dg4d_lib.guidance.interface import ring_size
 from dg4d_lib.settings import MotionSettings, StaticSettings
 
 
@@ -25,19 +25,19 @@ def turns(cameras) -> list[float]:
 
 
 def test_a_prior_without_a_ring_judges_every_view_for_itself():
-    assert ring_of(Judge()) == 1
-    cameras = viewpoints(Judge(), StaticSettings(views=4), 32, torch.Generator().manual_seed(0))
+    assert ring_size(Judge()) == 1
+    cameras = sample_cameras(Judge(), StaticSettings(views=4), 32, torch.Generator().manual_seed(0))
     assert len({camera.elevation_deg for camera in cameras}) == 4
 
 
 def test_the_static_stage_draws_rings():
-    cameras = viewpoints(RingJudge(), StaticSettings(views=8), 32, torch.Generator().manual_seed(0))
+    cameras = sample_cameras(RingJudge(), StaticSettings(views=8), 32, torch.Generator().manual_seed(0))
     assert turns(cameras[:4]) == turns(cameras[4:]) == pytest.approx([0, 90, 180, 270])
 
 
 def test_in_the_dynamic_stage_a_ring_is_of_one_frame():
     frames = torch.tensor([2, 5, 7])
-    views, rows = moments(RingJudge(), frames, MotionSettings(views=4), 32, torch.Generator().manual_seed(0))
+    views, rows = sample_views(RingJudge(), frames, MotionSettings(views=4), 32, torch.Generator().manual_seed(0))
     for k, frame in enumerate((2, 5, 7)):
         ring = views[4 * k : 4 * k + 4]
         assert {view.frame for view in ring} == {frame}

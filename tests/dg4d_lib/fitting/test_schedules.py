@@ -1,6 +1,6 @@
 import pytest
 
-from dg4d_lib.fitting.schedules import log_linear, size_at
+from dg4d_lib.fitting.schedules import log_linear, resolution_at
 from dg4d_lib.settings import RESOLUTION_SCHEDULE
 
 
@@ -13,4 +13,4 @@ def test_mean_rates_of_the_method(step: int, rate: float):
     ("progress", "size"), [(0.0, 128), (0.29, 128), (0.3, 256), (0.59, 256), (0.6, 512), (1.0, 512)]
 )
 def test_the_resolution_schedule_of_the_method(progress: float, size: int):
-    assert size_at(RESOLUTION_SCHEDULE, progress) == size
+    assert resolution_at(RESOLUTION_SCHEDULE, progress) == size

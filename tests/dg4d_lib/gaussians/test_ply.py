@@ -38,7 +38,7 @@ def test_equal_clouds_give_equal_bytes(tmp_path: Path) -> None:
 
 def test_numbers_that_are_not_finite_are_refused_by_name(tmp_path: Path) -> None:
     given = cloud()
-    with pytest.raises(BadInput, match="a PLY holds finite numbers; given others in log_scales;"):
+    with pytest.raises(BadInput, match="a PLY cannot hold non-finite numbers; given some in log_scales;"):
         write_ply(tmp_path / "a.ply", replace(given, log_scales=given.log_scales / 0))
 
 
@@ -88,14 +88,14 @@ def test_columns_may_stand_in_another_order(tmp_path: Path) -> None:
     [
         (lambda content: b"", "no PLY"),
         (lambda content: b"a text file", "no PLY"),
-        (lambda content: content[:-1], "cut off: 7 Gaussians announced, 6 there"),
+        (lambda content: content[:-1], "truncated: 7 Gaussians declared, 6 found"),
         (lambda content: content[:100], "no PLY"),
         (lambda content: content.replace(b"opacity", b"opacitx"), "lacks opacity"),
         (lambda content: content.replace(b"binary_little_endian", b"ascii"), "binary_little_endian"),
         (lambda content: content.replace(b"vertex 7", b"vertex x"), "header"),
         (lambda content: content.replace(b"vertex 7", b"face 7"), "'vertex'"),
         (lambda content: content.replace(b"property float nx", b"property float f_rest_0"), "higher degree"),
-        (lambda content: content[:-4] + np.float32(np.nan).tobytes(), "not finite"),
+        (lambda content: content[:-4] + np.float32(np.nan).tobytes(), "non-finite"),
     ],
 )
 def test_a_broken_file_is_refused_with_its_reason(tmp_path: Path, damage, says: str) -> None:  # type: ignore[no-untyped-def]

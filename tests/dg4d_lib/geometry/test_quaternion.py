@@ -1,6 +1,6 @@
 import torch
 
-from dg4d_lib.geometry.quaternion import multiply, rotation_matrix
+from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
 
 
 def some_quats(count: int = 50) -> torch.Tensor:
@@ -8,21 +8,21 @@ def some_quats(count: int = 50) -> torch.Tensor:
 
 
 def test_rotations_are_proper():
-    turns = rotation_matrix(some_quats())
+    turns = quat_to_rotmat(some_quats())
     torch.testing.assert_close(turns @ turns.mT, torch.eye(3, dtype=torch.float64).expand(50, 3, 3))
     torch.testing.assert_close(torch.linalg.det(turns), torch.ones(50, dtype=torch.float64))
 
 
 def test_a_quarter_turn_about_y_carries_z_to_x():
     quarter = torch.tensor([2**0.5 / 2, 0, 2**0.5 / 2, 0])
-    torch.testing.assert_close(rotation_matrix(quarter) @ torch.tensor([0.0, 0, 1]), torch.tensor([1.0, 0, 0]))
+    torch.testing.assert_close(quat_to_rotmat(quarter) @ torch.tensor([0.0, 0, 1]), torch.tensor([1.0, 0, 0]))
 
 
 def test_the_norm_of_a_quaternion_does_not_matter():
     quats = some_quats()
-    torch.testing.assert_close(rotation_matrix(quats), rotation_matrix(0.01 * quats))
+    torch.testing.assert_close(quat_to_rotmat(quats), quat_to_rotmat(0.01 * quats))
 
 
 def test_multiplying_is_rotating_by_the_second_then_the_first():
     a, b = some_quats()[:25], some_quats()[25:]
-    torch.testing.assert_close(rotation_matrix(multiply(a, b)), rotation_matrix(a) @ rotation_matrix(b))
+    torch.testing.assert_close(quat_to_rotmat(quat_multiply(a, b)), quat_to_rotmat(a) @ quat_to_rotmat(b))

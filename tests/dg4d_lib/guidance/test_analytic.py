@@ -4,11 +4,11 @@ import torch
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.noise_schedule import alphas_cumprod
 from dg4d_lib.guidance.analytic import LATENT_NUMBERS, AnalyticPrior
-from dg4d_lib.guidance.distillation import Annealing, annealed_timestep
-from dg4d_lib.guidance.interface import GuidancePrior, View
+from dg4d_lib.guidance.distillation import TimestepSchedule, annealed_timestep
+from dg4d_lib.guidance.interface import GuidancePrior, GuidanceView
 
 SIZE = 12
-VIEWS = [View(OrbitCamera(width=SIZE, height=SIZE))] * 3
+VIEWS = [GuidanceView(OrbitCamera(width=SIZE, height=SIZE))] * 3
 
 
 def known_pictures() -> tuple[torch.Tensor, torch.Tensor]:
@@ -17,7 +17,7 @@ def known_pictures() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def prior() -> AnalyticPrior:
-    return AnalyticPrior(lambda views: known_pictures(), Annealing(0.98))
+    return AnalyticPrior(lambda views: known_pictures(), TimestepSchedule(0.98))
 
 
 def test_it_is_a_guidance_prior():

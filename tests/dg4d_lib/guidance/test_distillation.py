@@ -4,7 +4,7 @@ import torch
 from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.diffusion.noise_schedule import alphas_cumprod
 from dg4d_lib.guidance.distillation import (
-    Annealing,
+    TimestepSchedule,
     annealed_timestep,
     distill_in_pieces,
     distillation_loss,
@@ -37,12 +37,12 @@ def test_the_papers_timesteps(start: float, iterations: int):
     for i in range(1, iterations + 1):
         s = i / iterations
         expected = round(1000 * (start + (0.02 - start) * s))
-        assert Annealing(start).timestep(s, generator) == expected
+        assert TimestepSchedule(start).timestep(s, generator) == expected
 
 
 def test_the_timesteps_of_the_public_code():
     generator = torch.Generator()
-    found = [Annealing(1.0, 0.0).timestep(i / 500, generator) for i in range(1, 501)]
+    found = [TimestepSchedule(1.0, 0.0).timestep(i / 500, generator) for i in range(1, 501)]
     assert found == [min(max(round(1000 * (1 - i / 500)), 20), 980) for i in range(1, 501)]
     assert set(found[:10]) == {980} and found[10] == 978
     assert found[488] == 22 and set(found[489:]) == {20}
@@ -50,17 +50,17 @@ def test_the_timesteps_of_the_public_code():
 
 def test_a_schedule_without_draws_leaves_the_generator_alone():
     generator = torch.Generator().manual_seed(1)
-    Annealing(0.98).timestep(0.3, generator)
+    TimestepSchedule(0.98).timestep(0.3, generator)
     assert torch.equal(generator.get_state(), torch.Generator().manual_seed(1).get_state())
 
 
 def test_uniform_timesteps_fill_the_stretch_below_the_highest():
     generator = torch.Generator().manual_seed(0)
-    draws = [Annealing(0.98, uniform=True).timestep(0.9, generator) for _ in range(4000)]
+    draws = [TimestepSchedule(0.98, uniform=True).timestep(0.9, generator) for _ in range(4000)]
     highest = annealed_timestep(0.9, 0.98)
     assert (min(draws), max(draws)) == (20, highest)
     assert sum(draws) / len(draws) == pytest.approx((20 + highest) / 2, rel=0.02)
-    assert [Annealing(0.98, uniform=True).timestep(1.0, generator) for _ in range(5)] == [20] * 5
+    assert [TimestepSchedule(0.98, uniform=True).timestep(1.0, generator) for _ in range(5)] == [20] * 5
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 8])

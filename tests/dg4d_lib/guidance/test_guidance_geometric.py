@@ -4,7 +4,7 @@ import torch
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.geometric import InflatedSurfaces, averaged_over_depth
-from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.settings import GeometricPriorSettings
 
 SIZE = 48
@@ -22,7 +22,7 @@ CAMERA = OrbitCamera(width=SIZE, height=SIZE)
 
 def test_the_input_view_of_a_frame_shows_that_frame_over_white():
     surfaces = InflatedSurfaces([disc(16), disc(32)], SETTINGS)
-    color, coverage = surfaces.clean([View(CAMERA, 1), View(CAMERA, 0)])
+    color, coverage = surfaces.clean([GuidanceView(CAMERA, 1), GuidanceView(CAMERA, 0)])
     for view, x in enumerate((32, 16)):
         picture = disc(x)
         share = (coverage[view] - picture[..., 3:]).abs().mean()
@@ -33,7 +33,10 @@ def test_the_input_view_of_a_frame_shows_that_frame_over_white():
 
 
 def test_views_do_not_depend_on_their_neighbors():
-    views = [View(OrbitCamera(elevation, 70 * elevation, width=32, height=32), elevation % 2) for elevation in range(5)]
+    views = [
+        GuidanceView(OrbitCamera(elevation, 70 * elevation, width=32, height=32), elevation % 2)
+        for elevation in range(5)
+    ]
     surfaces = InflatedSurfaces([disc(16), disc(32)], SETTINGS)
     color, coverage = surfaces.clean(views)
     for i, view in enumerate(views):
@@ -49,9 +52,9 @@ def test_only_the_frames_that_are_asked_for_are_built_and_only_once():
 
 
 def test_the_turn_of_the_subject_is_used():
-    color, _ = InflatedSurfaces([disc(24)], SETTINGS).clean([View(OrbitCamera(0, 50, width=SIZE, height=SIZE))])
+    color, _ = InflatedSurfaces([disc(24)], SETTINGS).clean([GuidanceView(OrbitCamera(0, 50, width=SIZE, height=SIZE))])
     turned, _ = InflatedSurfaces([disc(24)], SETTINGS, turn_deg=40).clean(
-        [View(OrbitCamera(0, 50, width=SIZE, height=SIZE))]
+        [GuidanceView(OrbitCamera(0, 50, width=SIZE, height=SIZE))]
     )
     assert (color - turned).abs().mean() > 0.01
 
@@ -59,7 +62,7 @@ def test_the_turn_of_the_subject_is_used():
 @pytest.mark.parametrize("frame", [-1, 1])
 def test_a_frame_that_is_not_there_is_refused(frame):
     with pytest.raises(BadInput, match="there are 1"):
-        InflatedSurfaces([disc(24)], SETTINGS).clean([View(CAMERA, frame)])
+        InflatedSurfaces([disc(24)], SETTINGS).clean([GuidanceView(CAMERA, frame)])
 
 
 def test_no_view_at_all_is_refused():
@@ -69,7 +72,7 @@ def test_no_view_at_all_is_refused():
 
 def test_large_pictures_show_the_same_surface():
     surfaces = InflatedSurfaces([disc(20)], SETTINGS)
-    small, large = (surfaces.clean([View(OrbitCamera(10, 40, width=s, height=s))])[1] for s in (SIZE, 3 * SIZE))
+    small, large = (surfaces.clean([GuidanceView(OrbitCamera(10, 40, width=s, height=s))])[1] for s in (SIZE, 3 * SIZE))
     shrunk = torch.nn.functional.avg_pool2d(large.permute(0, 3, 1, 2), 3).permute(0, 2, 3, 1)
     torch.testing.assert_close(shrunk, small, atol=0.4, rtol=0)
     assert (shrunk - small).abs().mean() < 0.01
@@ -103,7 +106,7 @@ def test_the_blur_is_the_normalized_gaussian_of_the_places_inside():
     images = torch.rand(3, 30, 30, 2, generator=torch.Generator().manual_seed(0))
     places = torch.arange(30.0, dtype=torch.float64)
     for camera, image, found in zip(cameras, images, averaged_over_depth(images, cameras, 0.15), strict=True):
-        depth = camera.world_to_camera()[:2, 2].abs() * 0.15 * camera.focal / camera.radius
+        depth = camera.viewmat()[:2, 2].abs() * 0.15 * camera.focal / camera.radius
         weights = [(-((places[:, None] - places) ** 2) / (2 * max(float(d), 1e-3) ** 2)).exp() for d in depth]
         across, down = (each / each.sum(1, keepdim=True) for each in weights)
         expected = torch.einsum("ij,jlc,kl->ikc", down, image.double(), across)

@@ -15,9 +15,9 @@ from dg4d_lib.cameras.viewpoints import random_orbit, turntable
 from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.diffusion.noise_schedule import alphas_cumprod, ddim_timesteps
 from dg4d_lib.errors import BadInput
-from dg4d_lib.guidance.distillation import Annealing
-from dg4d_lib.guidance.imagedream import Condition, ImageDream, ImageDreamPrior, camera_numbers
-from dg4d_lib.guidance.interface import GuidancePrior, View, ring_of
+from dg4d_lib.guidance.distillation import TimestepSchedule
+from dg4d_lib.guidance.imagedream import ImageDream, ImageDreamCondition, ImageDreamPrior, camera_to_world_rows
+from dg4d_lib.guidance.interface import GuidancePrior, GuidanceView, ring_size
 from dg4d_lib.settings import ImageDreamPriorSettings
 
 CPU = torch.device("cpu")
@@ -34,7 +34,7 @@ def model(folder: Path) -> ImageDream:
 
 
 @pytest.fixture(scope="module")
-def condition(model: ImageDream) -> Condition:
+def condition(model: ImageDream) -> ImageDreamCondition:
     return model.conditioned_on(pictures(2))
 
 
@@ -87,10 +87,10 @@ def test_damaged_folders_are_refused_by_name(folder: Path, tmp_path: Path) -> No
 def test_the_picture_is_of_the_front_in_the_cameras_words() -> None:
     """Front: ImageDream's azimuth 90, that is on +x with z up; written out by hand."""
     front = torch.tensor([[0, 0, 1, 1], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
-    torch.testing.assert_close(camera_numbers(OrbitCamera()).reshape(4, 4), front, atol=1e-12, rtol=0)
-    side = camera_numbers(OrbitCamera(azimuth_deg=90, radius=3)).reshape(4, 4)[:3, 3]
+    torch.testing.assert_close(camera_to_world_rows(OrbitCamera()).reshape(4, 4), front, atol=1e-12, rtol=0)
+    side = camera_to_world_rows(OrbitCamera(azimuth_deg=90, radius=3)).reshape(4, 4)[:3, 3]
     torch.testing.assert_close(side, torch.tensor([0, 1, 0]).double(), atol=1e-12, rtol=0)
-    above = camera_numbers(OrbitCamera(elevation_deg=30)).reshape(4, 4)[:3, 3]
+    above = camera_to_world_rows(OrbitCamera(elevation_deg=30)).reshape(4, 4)[:3, 3]
     torch.testing.assert_close(above, torch.tensor([0.75**0.5, 0, 0.5], dtype=torch.float64), atol=1e-12, rtol=0)
 
 
@@ -104,7 +104,7 @@ def test_timesteps_are_those_of_the_usual_sampler(folder: Path) -> None:
 
 
 def test_views_are_what_the_usual_sampler_makes_of_the_same_noise(
-    folder: Path, model: ImageDream, condition: Condition
+    folder: Path, model: ImageDream, condition: ImageDreamCondition
 ) -> None:
     from diffusers import DDIMScheduler
 
@@ -123,7 +123,7 @@ def test_views_are_what_the_usual_sampler_makes_of_the_same_noise(
     assert not torch.equal(views, model.views(one, seeded(4), 2, 5.0, 10.0))
 
 
-def test_sets_do_not_see_each_other(model: ImageDream, condition: Condition) -> None:
+def test_sets_do_not_see_each_other(model: ImageDream, condition: ImageDreamCondition) -> None:
     rings = [ring(), ring(20, 45)]
     both = model.predict_noise(noisy(2), 500, rings, condition, 5.0)
     for i in range(2):
@@ -131,7 +131,9 @@ def test_sets_do_not_see_each_other(model: ImageDream, condition: Condition) -> 
         torch.testing.assert_close(both[i : i + 1], alone, atol=1e-5, rtol=1e-4)
 
 
-def test_views_of_a_set_see_each_other_and_know_their_cameras(model: ImageDream, condition: Condition) -> None:
+def test_views_of_a_set_see_each_other_and_know_their_cameras(
+    model: ImageDream, condition: ImageDreamCondition
+) -> None:
     one, latents = condition.rows([0]), noisy(1)
     noise = model.predict_noise(latents, 500, [ring()], one, 1.0)
     changed = latents.clone()
@@ -140,19 +142,21 @@ def test_views_of_a_set_see_each_other_and_know_their_cameras(model: ImageDream,
     assert (model.predict_noise(latents, 500, [ring(30)], one, 1.0) - noise).abs().max() > 1e-5
 
 
-def test_the_order_of_views_does_not_matter(model: ImageDream, condition: Condition) -> None:
+def test_the_order_of_views_does_not_matter(model: ImageDream, condition: ImageDreamCondition) -> None:
     one, order = condition.rows([0]), [2, 0, 3, 1]
     noise = model.predict_noise(noisy(1), 300, [ring()], one, 5.0)
     turned = model.predict_noise(noisy(1)[:, order], 300, [[ring()[i] for i in order]], one, 5.0)
     torch.testing.assert_close(turned, noise[:, order], atol=1e-5, rtol=1e-4)
 
 
-def test_guidance_goes_from_what_is_believed_without_the_picture(model: ImageDream, condition: Condition) -> None:
+def test_guidance_goes_from_what_is_believed_without_the_picture(
+    model: ImageDream, condition: ImageDreamCondition
+) -> None:
     one = condition.rows([0])
     without, told, strong = (model.predict_noise(noisy(1), 300, [ring()], one, scale) for scale in (0.0, 1.0, 5.0))
     torch.testing.assert_close(strong, without + 5 * (told - without), atol=1e-5, rtol=1e-4)
     silence = model.conditioned_on(pictures(1)).text
-    blank = Condition(silence, silence, one.features * 0, one.latents * 0)
+    blank = ImageDreamCondition(silence, silence, one.features * 0, one.latents * 0)
     torch.testing.assert_close(without, model.predict_noise(noisy(1), 300, [ring()], blank, 3.0), atol=1e-5, rtol=1e-4)
 
 
@@ -164,9 +168,9 @@ def test_text_is_heard(model: ImageDream) -> None:
     assert not torch.equal(model.predict_noise(noisy(1), 300, [ring()], told, 5.0), noise)
 
 
-def views_of(rings: Sequence[Sequence[OrbitCamera]], frames: Sequence[int]) -> list[View]:
+def views_of(rings: Sequence[Sequence[OrbitCamera]], frames: Sequence[int]) -> list[GuidanceView]:
     return [
-        View(dataclasses.replace(camera, width=48, height=48), frame)
+        GuidanceView(dataclasses.replace(camera, width=48, height=48), frame)
         for cameras, frame in zip(rings, frames, strict=True)
         for camera in cameras
     ]
@@ -175,8 +179,8 @@ def views_of(rings: Sequence[Sequence[OrbitCamera]], frames: Sequence[int]) -> l
 VIEWS = views_of([ring(0, 20), ring(15, -100)], [1, 0])
 
 
-def prior(model: ImageDream, condition: Condition, rings_at_once: int = 9) -> ImageDreamPrior:
-    made = ImageDreamPrior(model, condition, Annealing(0.98), ImageDreamPriorSettings())
+def prior(model: ImageDream, condition: ImageDreamCondition, rings_at_once: int = 9) -> ImageDreamPrior:
+    made = ImageDreamPrior(model, condition, TimestepSchedule(0.98), ImageDreamPriorSettings())
     made.__dict__["batches"] = MicroBatches("rings", rings_at_once)
     return made
 
@@ -189,14 +193,14 @@ def judged(judge: ImageDreamPrior, images: torch.Tensor, progress: float = 0.5) 
     return loss.detach(), images.grad
 
 
-def test_it_is_a_prior_that_wants_rings(model: ImageDream, condition: Condition) -> None:
+def test_it_is_a_prior_that_wants_rings(model: ImageDream, condition: ImageDreamCondition) -> None:
     judge = prior(model, condition)
     assert isinstance(judge, GuidancePrior)
-    assert ring_of(judge) == 4
+    assert ring_size(judge) == 4
     for views in (
         VIEWS[:6],
         VIEWS[1:5],
-        [View(c) for c in random_orbit(4, 48, elevation_deg=(0, 9), radius=(2, 2), generator=seeded())],
+        [GuidanceView(c) for c in random_orbit(4, 48, elevation_deg=(0, 9), radius=(2, 2), generator=seeded())],
     ):
         with pytest.raises(BadInput, match="multiples of 4"):
             judge.loss(pictures(len(views), 48), pictures(len(views), 48)[..., :1], views, 0.5, seeded())
@@ -223,7 +227,9 @@ def test_loss_and_gradient_are_those_of_the_formulas_in_double_precision(folder:
         with torch.no_grad():
             x = alphabar.sqrt() * z + (1 - alphabar).sqrt() * e[i]
             five = torch.cat([torch.stack([x, x]), torch.cat([0 * told.latents, told.latents])[:, None]], 1)
-            poses = torch.stack([*(camera_numbers(view.camera) for view in VIEWS[4 * i : 4 * i + 4]), torch.zeros(16)])
+            poses = torch.stack(
+                [*(camera_to_world_rows(view.camera) for view in VIEWS[4 * i : 4 * i + 4]), torch.zeros(16)]
+            )
             text = torch.cat([exact.conditioned_on(pictures(1).double()).text, told.text])
             features = torch.cat([0 * told.features, told.features])
             free, conditional = exact.unet(five, 500, torch.stack([poses, poses]), text, features)[:, :4]
@@ -234,7 +240,7 @@ def test_loss_and_gradient_are_those_of_the_formulas_in_double_precision(folder:
     torch.testing.assert_close(gradient, expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
 
 
-def test_rings_one_by_one_or_together_are_judged_the_same(model: ImageDream, condition: Condition) -> None:
+def test_rings_one_by_one_or_together_are_judged_the_same(model: ImageDream, condition: ImageDreamCondition) -> None:
     loss, gradient = judged(prior(model, condition), pictures(8, 48))
     one, other = judged(prior(model, condition, rings_at_once=1), pictures(8, 48))
     torch.testing.assert_close(one, loss, rtol=1e-4, atol=0)

@@ -4,7 +4,7 @@ import pytest
 import tiny_imagedream
 import torch
 
-from dg4d_lib.guidance.imagedream_unet import MultiViewShape, MultiViewUnet
+from dg4d_lib.guidance.imagedream_unet import MultiViewUnet, MultiViewUnetConfig
 
 STABLE_DIFFUSION_2 = 865_910_724  # parameters of its U-Net
 PUBLISHED = {  # unet/config.json of ashawkey/imagedream-ipmv-diffusers
@@ -26,7 +26,7 @@ PUBLISHED = {  # unet/config.json of ashawkey/imagedream-ipmv-diffusers
 
 def published() -> dict[str, tuple[int, ...]]:
     with torch.device("meta"):
-        network = MultiViewUnet(MultiViewShape.of(PUBLISHED))
+        network = MultiViewUnet(MultiViewUnetConfig.of(PUBLISHED))
     return {name: tuple(value.shape) for name, value in network.state_dict().items()}
 
 

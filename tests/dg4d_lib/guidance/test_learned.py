@@ -6,7 +6,7 @@ from tiny_shape_prior import tiny_network
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
-from dg4d_lib.guidance.interface import SubjectShapes, View
+from dg4d_lib.guidance.interface import SubjectShapes, GuidanceView
 from dg4d_lib.guidance.learned import LearnedShapes
 from dg4d_lib.settings import LearnedPriorSettings
 
@@ -25,7 +25,7 @@ def shapes(*places: float) -> SubjectShapes:
 
 
 def test_the_input_view_of_a_frame_shows_that_frame_over_white():
-    color, alpha = shapes(16, 32).clean([View(OrbitCamera(width=SIZE, height=SIZE), frame) for frame in (1, 0)])
+    color, alpha = shapes(16, 32).clean([GuidanceView(OrbitCamera(width=SIZE, height=SIZE), frame) for frame in (1, 0)])
     for view, x in enumerate((32, 16)):
         picture = disc(x)
         assert (alpha[view] - picture[..., 3:]).abs().mean() < 0.06  # a tenth of the disc shines through, and edges
@@ -34,7 +34,7 @@ def test_the_input_view_of_a_frame_shows_that_frame_over_white():
 
 
 def test_views_do_not_depend_on_their_neighbors():
-    views = [View(OrbitCamera(10 * i, 70 * i, width=32, height=32), i % 2) for i in range(4)]
+    views = [GuidanceView(OrbitCamera(10 * i, 70 * i, width=32, height=32), i % 2) for i in range(4)]
     color, alpha = shapes(16, 32).clean(views)
     for i, view in enumerate(views):
         alone, cover = shapes(16, 32).clean([view])
@@ -43,7 +43,7 @@ def test_views_do_not_depend_on_their_neighbors():
 
 def test_pictures_have_the_size_of_their_camera():
     for height, width in ((33, 33), (128, 128), (512, 512), (64, 40)):
-        color, alpha = shapes(24).clean([View(OrbitCamera(0, 30, width=width, height=height))])
+        color, alpha = shapes(24).clean([GuidanceView(OrbitCamera(0, 30, width=width, height=height))])
         assert color.shape == (1, height, width, 3) and alpha.shape == (1, height, width, 1)
         assert ((color >= 0) & (color <= 1)).all() and ((alpha >= 0) & (alpha <= 1)).all()
 
@@ -56,11 +56,11 @@ def test_the_surface_of_a_frame_lies_where_the_frame_shows_it():
 @pytest.mark.parametrize("frame", [-1, 1])
 def test_a_frame_that_is_not_there_is_refused(frame):
     with pytest.raises(BadInput, match="there are 1"):
-        shapes(24).clean([View(OrbitCamera(width=32, height=32), frame)])
+        shapes(24).clean([GuidanceView(OrbitCamera(width=32, height=32), frame)])
 
 
 def test_no_view_and_views_of_two_sizes_are_refused():
     with pytest.raises(BadInput, match="at least one"):
         shapes(24).clean([])
     with pytest.raises(BadInput, match="one size"):
-        shapes(24).clean([View(OrbitCamera()), View(OrbitCamera(width=64, height=64))])
+        shapes(24).clean([GuidanceView(OrbitCamera()), GuidanceView(OrbitCamera(width=64, height=64))])

@@ -3,8 +3,8 @@ import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
-from dg4d_lib.guidance.interface import View
-from dg4d_lib.guidance.oracle import Bank, imperfect
+from dg4d_lib.guidance.interface import GuidanceView
+from dg4d_lib.guidance.oracle import Bank, perturb
 from dg4d_lib.settings import OraclePriorSettings
 
 CAMERAS = (OrbitCamera(0, 0, width=4, height=4), OrbitCamera(20, 337.5, width=4, height=4))
@@ -20,7 +20,7 @@ def bank() -> Bank:
 
 
 def test_it_finds_the_pose_and_the_frame():
-    views = [View(CAMERAS[1], 2), View(OrbitCamera(20, -22.5, width=4, height=4), 0)]
+    views = [GuidanceView(CAMERAS[1], 2), GuidanceView(OrbitCamera(20, -22.5, width=4, height=4), 0)]
     color, coverage = bank().clean(views)
     assert (color[:, 0, 0, 0] * 255).round().tolist() == [150, 100]
     assert (coverage == 1).all()
@@ -28,16 +28,16 @@ def test_it_finds_the_pose_and_the_frame():
 
 def test_transparent_pixels_are_white():
     empty = Bank(CAMERAS[:1], (0,), torch.zeros(1, 1, 4, 4, 4, dtype=torch.uint8))
-    assert (empty.clean([View(CAMERAS[0])])[0] == 1).all()
+    assert (empty.clean([GuidanceView(CAMERAS[0])])[0] == 1).all()
 
 
 def test_pictures_come_at_the_size_of_the_camera():
-    color, _ = bank().clean([View(OrbitCamera(0, 0, width=8, height=8))])
+    color, _ = bank().clean([GuidanceView(OrbitCamera(0, 0, width=8, height=8))])
     assert color.shape == (1, 8, 8, 3)
 
 
-@pytest.mark.parametrize("view", [View(OrbitCamera(1, 0)), View(CAMERAS[0], 1)])
-def test_a_view_it_does_not_have_is_refused(view: View):
+@pytest.mark.parametrize("view", [GuidanceView(OrbitCamera(1, 0)), GuidanceView(CAMERAS[0], 1)])
+def test_a_view_it_does_not_have_is_refused(view: GuidanceView):
     with pytest.raises(BadInput, match="the bank has no picture"):
         bank().clean([view])
 
@@ -50,7 +50,7 @@ def spotted() -> Bank:
 
 
 def spoiled(**flaws: float) -> Bank:
-    return imperfect(spotted(), OraclePriorSettings(**flaws), torch.Generator().manual_seed(0))
+    return perturb(spotted(), OraclePriorSettings(**flaws), torch.Generator().manual_seed(0))
 
 
 def test_an_oracle_without_flaws_tells_the_truth():
@@ -89,7 +89,7 @@ def test_a_wrong_pose_moves_the_cameras_and_leaves_the_pictures():
     for camera, true_camera in zip(wrong.cameras, spotted().cameras, strict=True):
         assert 0 < abs(camera.azimuth_deg - true_camera.azimuth_deg) < 12
         assert 0 < abs(camera.elevation_deg - true_camera.elevation_deg) < 12
-    wrong.clean([View(wrong.cameras[1], 2)])  # it knows its own views
+    wrong.clean([GuidanceView(wrong.cameras[1], 2)])  # it knows its own views
 
 
 def test_flaws_are_the_same_for_the_same_seed():

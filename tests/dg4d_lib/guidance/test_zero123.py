@@ -16,16 +16,16 @@ from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.diffusion.clip_images import clip_pixels
 from dg4d_lib.diffusion.single_token_attention import SingleTokenProcessor
 from dg4d_lib.errors import BadInput
-from dg4d_lib.guidance.distillation import Annealing
-from dg4d_lib.guidance.interface import GuidancePrior, View
-from dg4d_lib.guidance.zero123 import ConditionedZero123, Zero123, camera_numbers
+from dg4d_lib.guidance.distillation import TimestepSchedule
+from dg4d_lib.guidance.interface import GuidancePrior, GuidanceView
+from dg4d_lib.guidance.zero123 import ConditionedZero123, Zero123, relative_pose
 from dg4d_lib.settings import Zero123PriorSettings
 
 CPU = torch.device("cpu")
 SETTINGS = Zero123PriorSettings()
-PAPER = Annealing(0.98)
+PAPER = TimestepSchedule(0.98)
 VIEWS = tuple(
-    View(OrbitCamera(elevation, azimuth, radius, width=96, height=96), frame)
+    GuidanceView(OrbitCamera(elevation, azimuth, radius, width=96, height=96), frame)
     for elevation, azimuth, radius, frame in ((20, 50, 2.3, 1), (-10, -130, 1.8, 0), (0, 180, 2.0, 1))
 )
 
@@ -59,7 +59,7 @@ def seeded(seed: int = 11) -> torch.Generator:
 
 
 def judged(
-    prior: ConditionedZero123, images: torch.Tensor, views: Sequence[View] = VIEWS, progress: float = 0.5
+    prior: ConditionedZero123, images: torch.Tensor, views: Sequence[GuidanceView] = VIEWS, progress: float = 0.5
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Loss and gradient."""
     images = images.clone().requires_grad_()
@@ -159,13 +159,13 @@ def test_cameras_are_told_as_the_model_was_trained(seed: int) -> None:
     z_up = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)  # our z, x, y: right-handed as well
     assert z_up.det() == 1
     expected = trained_numbers(z_up @ known.position(), z_up @ new.position())
-    assert camera_numbers(new, known).tolist() == pytest.approx(expected, abs=1e-12)
+    assert relative_pose(new, known).tolist() == pytest.approx(expected, abs=1e-12)
 
 
 def test_a_camera_that_moves_above_the_object_comes_nearer_to_the_pole() -> None:
     above = OrbitCamera(elevation_deg=30)
     assert above.position()[1] > 0
-    polar, sine, cosine, last = camera_numbers(above, OrbitCamera()).tolist()
+    polar, sine, cosine, last = relative_pose(above, OrbitCamera()).tolist()
     assert polar == pytest.approx(-math.pi / 6)
     assert (sine, cosine, last) == (0, 1, 0)
 
@@ -173,13 +173,13 @@ def test_a_camera_that_moves_above_the_object_comes_nearer_to_the_pole() -> None
 def test_a_camera_that_moves_to_the_right_grows_in_azimuth() -> None:
     right = OrbitCamera(azimuth_deg=90)
     assert right.position()[0] > 0
-    assert camera_numbers(right, OrbitCamera()).tolist() == pytest.approx([0, 1, 0, 0])
+    assert relative_pose(right, OrbitCamera()).tolist() == pytest.approx([0, 1, 0, 0])
 
 
 def test_the_input_view_is_no_move_wherever_it_was_taken() -> None:
     camera = OrbitCamera(17, 40, 1.5)
-    assert camera_numbers(camera, camera).tolist() == [0, 0, 1, 0]
-    assert camera_numbers(camera, camera, 17.0)[3] == pytest.approx(math.radians(73))
+    assert relative_pose(camera, camera).tolist() == [0, 0, 1, 0]
+    assert relative_pose(camera, camera, 17.0)[3] == pytest.approx(math.radians(73))
 
 
 def test_the_token_is_the_projection_of_embedding_and_camera(networks: Zero123) -> None:
@@ -187,7 +187,7 @@ def test_the_token_is_the_projection_of_embedding_and_camera(networks: Zero123) 
     tokens = prior.tokens(VIEWS)
     assert tokens.shape == (3, 1, tiny_weights.TOKEN)
     for token, view in zip(tokens, VIEWS, strict=True):
-        camera = camera_numbers(view.camera, OrbitCamera(10, 20)).float()
+        camera = relative_pose(view.camera, OrbitCamera(10, 20)).float()
         expected = networks.camera_projection(torch.cat([prior.embeddings[view.frame], camera]))
         torch.testing.assert_close(token[0], expected, atol=1e-6, rtol=1e-5)
 
@@ -279,14 +279,14 @@ def test_half_precision_is_near_and_keeps_pictures_in_single(
 def test_another_frame_is_another_condition(networks: Zero123) -> None:
     prior, images = networks.conditioned_on(pictures(2, 64), PAPER), pictures(1, 96)
     camera = OrbitCamera(10, 40)
-    assert judged(prior, images, [View(camera, 0)])[0] != judged(prior, images, [View(camera, 1)])[0]
+    assert judged(prior, images, [GuidanceView(camera, 0)])[0] != judged(prior, images, [GuidanceView(camera, 1)])[0]
 
 
 @pytest.mark.parametrize("frame", [-1, 2])
 def test_a_frame_that_is_not_there_is_refused(networks: Zero123, frame: int) -> None:
     prior = networks.conditioned_on(pictures(2, 64), PAPER)
     with pytest.raises(BadInput, match="there are 2"):
-        judged(prior, pictures(1, 96), [View(OrbitCamera(), frame)])
+        judged(prior, pictures(1, 96), [GuidanceView(OrbitCamera(), frame)])
 
 
 def test_clip_sees_the_colors_it_was_trained_on() -> None:

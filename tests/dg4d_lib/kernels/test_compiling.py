@@ -1,57 +1,57 @@
-"""When kernels are compiled, and what is said about it."""
+"""Numba cache keys of our kernels, and the notice before a compilation."""
 
 import logging
 
 import pytest
 from numba import njit
 
-from dg4d_lib.kernels import compiling, vectors
+from dg4d_lib.kernels import compiling, simd
 
-PLACES = [compiling._Beside, compiling._Home]
+LOCATORS = [compiling._SourceFolderCache, compiling._UserCache]
 
 
 @pytest.fixture
 def stamp(tmp_path):
-    """The stamp of a kernel with this source beside a file of constants."""
+    """Return a function that stamps a kernel with this source beside a file of constants."""
 
-    def made(place, source: str, constants: str):
+    def make(locator, source: str, constants: str):
         compiling._digest.cache_clear()
         (tmp_path / "constants.py").write_text(constants)
         (tmp_path / "kernel.py").write_text(source)
-        return place(lambda: None, str(tmp_path / "kernel.py")).get_source_stamp()
+        return locator(lambda: None, str(tmp_path / "kernel.py")).get_source_stamp()
 
-    yield made
+    yield make
     compiling._digest.cache_clear()
 
 
-@pytest.mark.parametrize("place", PLACES)
-def test_a_change_beside_a_kernel_makes_its_machine_code_stale(place, stamp):
-    source = f"from {vectors.__name__} import KERNEL"
-    assert stamp(place, source, "BLUR = 0.3") == stamp(place, source, "BLUR = 0.3")
-    assert stamp(place, source, "BLUR = 0.3") != stamp(place, source, "BLUR = 0.4")
+@pytest.mark.parametrize("locator", LOCATORS)
+def test_a_change_beside_a_kernel_makes_its_machine_code_stale(locator, stamp):
+    source = f"from {simd.__name__} import KERNEL"
+    assert stamp(locator, source, "BLUR = 0.3") == stamp(locator, source, "BLUR = 0.3")
+    assert stamp(locator, source, "BLUR = 0.3") != stamp(locator, source, "BLUR = 0.4")
 
 
-@pytest.mark.parametrize("place", PLACES)
-def test_a_kernel_that_stands_alone_depends_on_its_own_file_only(place, stamp):
-    assert stamp(place, "x = 1", "BLUR = 0.3") == stamp(place, "x = 1", "BLUR = 0.4")
-    assert stamp(place, "x = 1", "") != stamp(place, "x = 2", "")
+@pytest.mark.parametrize("locator", LOCATORS)
+def test_a_kernel_that_stands_alone_depends_on_its_own_file_only(locator, stamp):
+    assert stamp(locator, "x = 1", "BLUR = 0.3") == stamp(locator, "x = 1", "BLUR = 0.4")
+    assert stamp(locator, "x = 1", "") != stamp(locator, "x = 2", "")
 
 
-def test_kernels_are_kept_at_these_places():
-    kept = njit(cache=True)(lambda: None)
-    assert isinstance(kept._cache._impl.locator, compiling._Stamped)
+def test_kernels_use_our_cache_locators():
+    kernel = njit(cache=True)(lambda: None)
+    assert isinstance(kernel._cache._impl.locator, compiling._SourceDigest)
 
 
-def test_compiling_is_told_once(caplog):
-    teller = compiling._Teller()
+def test_compiling_is_logged_once(caplog):
+    notice = compiling._CompileNotice()
     with caplog.at_level(logging.INFO, logger="dg4d_lib"):
-        teller.on_start(None)
-        teller.on_start(None)
+        notice.on_start(None)
+        notice.on_start(None)
     assert [record.message for record in caplog.records] == [compiling.NOTICE]
 
 
-def test_who_compiles_is_heard(monkeypatch):
-    heard = []
-    monkeypatch.setattr(compiling._Teller, "on_start", lambda teller, event: heard.append(event))
+def test_a_compilation_reaches_the_listener(monkeypatch):
+    events = []
+    monkeypatch.setattr(compiling._CompileNotice, "on_start", lambda notice, event: events.append(event))
     njit(lambda: 1)()
-    assert heard
+    assert events

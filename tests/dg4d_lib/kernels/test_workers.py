@@ -1,16 +1,16 @@
-"""Threads and memory of kernels."""
+"""Thread pool and buffer pool of the kernels."""
 
 import numpy as np
 import pytest
 import torch
 
-from dg4d_lib.kernels.workers import Scratch, ranges, recycled, run
+from dg4d_lib.kernels.workers import Scratch, empty_recycled, run_parallel, split_range
 
 
-def test_ranges_make_up_the_whole_at_multiples():
-    assert ranges(10, 3) == [(0, 4), (4, 8), (8, 10)]
-    assert ranges(10000, 2, 4096) == [(0, 8192), (8192, 10000)]
-    assert ranges(0, 4) == []
+def test_ranges_cover_the_whole_at_multiples():
+    assert split_range(10, 3) == [(0, 4), (4, 8), (8, 10)]
+    assert split_range(10000, 2, 4096) == [(0, 8192), (8192, 10000)]
+    assert split_range(0, 4) == []
 
 
 @pytest.mark.parametrize("threads", [1, 3])
@@ -18,9 +18,9 @@ def test_every_job_runs_and_a_failure_is_raised(threads):
     before, done = torch.get_num_threads(), []
     torch.set_num_threads(threads)
     try:
-        run([lambda i=i: done.append(i) for i in range(7)])
+        run_parallel([lambda i=i: done.append(i) for i in range(7)])
         with pytest.raises(ZeroDivisionError):
-            run([lambda: 1 / 0, lambda: None])
+            run_parallel([lambda: 1 / 0, lambda: None])
     finally:
         torch.set_num_threads(before)
     assert sorted(done) == list(range(7))
@@ -38,12 +38,12 @@ def test_memory_is_used_again_but_never_while_in_use():
 
 
 def test_memory_of_a_recycled_array_waits_for_the_tensor_made_of_it():
-    array = recycled((1000, 3))
+    array = empty_recycled((1000, 3))
     array[:] = 1
     address, tensor = array.ctypes.data, torch.from_numpy(array)
     part = tensor[5:]
     del array, tensor
-    assert recycled((1000, 3)).ctypes.data != address
+    assert empty_recycled((1000, 3)).ctypes.data != address
     assert part.eq(1).all()
     del part
-    assert recycled((1000, 3)).ctypes.data == address
+    assert empty_recycled((1000, 3)).ctypes.data == address

@@ -9,7 +9,7 @@ import torch
 from skimage.measure import marching_cubes
 
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 
 Cloud = Callable[..., Gaussians]
 
@@ -33,7 +33,7 @@ def sphere_of_gaussians() -> Cloud:
         scales = torch.tensor([across, across, 0.1 * across]).expand(count, 3)
         # from +z to the normal: the half-way quaternion
         quats = torch.stack([1 + points[:, 2], -points[:, 1], points[:, 0], 0 * points[:, 0]], -1)
-        harmonics = harmonics_of_color(color(points))
+        harmonics = rgb_to_sh(color(points))
         return Gaussians(radius * points, scales.log(), quats, torch.full((count,), 3.0), harmonics)
 
     return make

@@ -7,9 +7,9 @@ from scipy import ndimage
 from torch.nn.functional import max_pool2d
 
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.mesh.texturing.bake import bake, texels_of, vertex_normals
+from dg4d_lib.mesh.texturing.bake import locate_texels, vertex_normals
 from dg4d_lib.mesh.texturing.unwrap import unwrap
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
 
 SETTINGS = MeshSettings(texture_size=128, render_size=128)
@@ -36,7 +36,7 @@ def baked(sphere: Mesh, sphere_of_gaussians: Cloud) -> tuple[torch.Tensor, ...]:
     vertices = np.concatenate([sphere[0], 0.6 * sphere[0]])
     mesh = flattened(vertices, np.concatenate([sphere[1], sphere[1] + len(sphere[0])]))
     gaussians = sphere_of_gaussians(2500, 0.5, red_and_blue)
-    texture = bake(*mesh, gaussians, choose_rasterizer("auto"), SETTINGS)
+    texture = bake(*mesh, gaussians, get_rasterizer("auto"), SETTINGS)
     texels = texels_of(*mesh, SETTINGS.texture_size)
     where = torch.stack([texels.rows, texels.columns])
     return texture[texels.rows, texels.columns], texels.positions, texture, where
@@ -90,14 +90,14 @@ def test_a_transparent_cloud_leaves_the_texture_gray(sphere: Mesh, sphere_of_gau
     faint = Gaussians(
         gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.opacity_logits - 9, gaussians.harmonics
     )
-    texture = bake(*flattened(*sphere), faint, choose_rasterizer("auto"), SETTINGS)
+    texture = bake(*flattened(*sphere), faint, get_rasterizer("auto"), SETTINGS)
     assert (texture == 0.5).all()
 
 
 def test_texel_centers_lie_half_a_texel_inside() -> None:
     square = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(4, 3)
-    texels = texels_of(square, up, torch.tensor([[0, 1, 2], [0, 2, 3]]), square[:, :2], 4)
+    texels = locate_texels(square, up, torch.tensor([[0, 1, 2], [0, 2, 3]]), square[:, :2], 4)
     assert len(texels.rows) == 16
     expected = (torch.stack([texels.columns, texels.rows], -1) + 0.5) / 4
     torch.testing.assert_close(texels.positions[:, :2], expected)

@@ -9,8 +9,8 @@ import trimesh
 from skimage.measure import marching_cubes
 
 from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
-from dg4d_lib.mesh.extraction.check import checked
 from dg4d_lib.mesh.extraction.clean import clean, drop_small_components
+from dg4d_lib.mesh.extraction.topology import check_topology
 from dg4d_lib.settings import MeshSettings
 
 COARSE = MeshSettings(edge_length=0.08)
@@ -58,14 +58,14 @@ def test_handles_do_not_stand_in_the_way_of_the_limit() -> None:
     assert mesh.euler_number < -200
     cleaned = clean(mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32), MeshSettings(max_faces=400))
     assert 100 < len(cleaned[1]) <= 400
-    assert checked(*cleaned).watertight
+    assert check_topology(*cleaned).watertight
 
 
 def test_what_is_inside_out_is_turned(sphere: Mesh) -> None:
     inverted = sphere[0] + 1.5, sphere[1][:, ::-1]
     cleaned = clean(*both(sphere, inverted), COARSE)
-    facts = checked(*cleaned)
-    assert (facts.components, facts.inverted, facts.watertight) == (2, 0, True)
+    facts = check_topology(*cleaned)
+    assert (facts.components, facts.inverted_components, facts.watertight) == (2, 0, True)
 
 
 def test_specks_go_and_a_hole_is_closed(sphere: Mesh) -> None:
@@ -111,7 +111,7 @@ def fake_pymeshlab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_missing_filters_name_the_system_libraries(sphere: Mesh, fake_pymeshlab: Path) -> None:
     fake_pymeshlab.write_text("def filter_list(): return ['meshing_close_holes']")
-    with pytest.raises(BackendUnavailable, match=r"no filter .* and 10 others.*libgl1 libopengl0"):
+    with pytest.raises(BackendUnavailable, match=r"lacks the filter .* and 10 other required ones.*libgl1 libopengl0"):
         clean(*sphere, COARSE)
 
 

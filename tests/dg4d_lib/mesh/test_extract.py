@@ -10,8 +10,8 @@ import trimesh
 from dg4d_lib.errors import FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import DensityField, density_field
-from dg4d_lib.mesh.extraction.extract import best_level, surface, usable_level
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.mesh.extraction.extract import best_level, usable_level
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
 
 SMALL = MeshSettings(grid=64)
@@ -19,7 +19,7 @@ Cloud = Callable[..., Gaussians]
 
 
 def body(field: DensityField, level: float) -> trimesh.Trimesh:
-    return trimesh.Trimesh(*surface(field, level), process=False)
+    return trimesh.Trimesh(*extract_surface(field, level), process=False)
 
 
 def ball(opacity_logit: float = 3.0) -> Gaussians:
@@ -86,8 +86,8 @@ def test_matter_that_fills_the_box_is_closed_at_its_border() -> None:
 
 
 def test_a_level_above_the_density_is_refused() -> None:
-    with pytest.raises(FitDiverged, match="the density reaches 1"):
-        surface(constant(1.0), 2.0)
+    with pytest.raises(FitDiverged, match="the largest density is 1"):
+        extract_surface(constant(1.0), 2.0)
 
 
 def test_a_level_that_is_not_reached_is_lowered() -> None:
@@ -99,18 +99,18 @@ def test_a_level_that_is_not_reached_is_lowered() -> None:
 
 def test_the_best_level_has_the_outline_of_the_gaussians() -> None:
     # alpha of a Gaussian on a ray through its middle is its opacity times the same bell: half alpha at density one half
-    gaussians, rasterize = ball(), choose_rasterizer("auto")
+    gaussians, rasterize = ball(), get_rasterizer("auto")
     field = density_field(gaussians, SMALL)
-    level, agreement = best_level(field, gaussians, rasterize, 0.2)
+    level, agreement = select_level(field, gaussians, rasterize, 0.2)
     assert level == pytest.approx(0.5, rel=0.1)
     assert agreement > 0.9
-    assert best_level(field, gaussians, rasterize, 0.5)[1] == pytest.approx(0.98, abs=0.02)
+    assert select_level(field, gaussians, rasterize, 0.5)[1] == pytest.approx(0.98, abs=0.02)
 
 
 def test_a_faint_model_still_gets_a_surface() -> None:
     gaussians = replace(ball(), opacity_logits=torch.tensor([-2.0]))
     field = density_field(gaussians, SMALL)
-    level, agreement = best_level(field, gaussians, choose_rasterizer("auto"), 0.5)
+    level, agreement = best_level(field, gaussians, get_rasterizer("auto"), 0.5)
     assert level < gaussians.opacities.item()
     assert agreement == 0.0, "nothing of it is more opaque than one half"
-    assert len(surface(field, level)[1]) > 0
+    assert len(extract_surface(field, level)[1]) > 0

@@ -4,7 +4,7 @@ import trimesh
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import isotropic
 from dg4d_lib.mesh.extraction.density import density_field
-from dg4d_lib.mesh.extraction.extract import surface
+from dg4d_lib.mesh.extraction.extract import extract_surface
 from dg4d_lib.mesh.tracking.isosurface_projection import project_to_isosurface
 from dg4d_lib.settings import MeshSettings
 
@@ -28,7 +28,7 @@ def test_vertices_that_stayed_behind_reach_the_surface_of_their_moment():
         rest.opacity_logits,
         rest.harmonics,
     )
-    vertices, faces = (torch.from_numpy(a) for a in surface(density_field(rest, SETTINGS), LEVEL))
+    vertices, faces = (torch.from_numpy(a) for a in extract_surface(density_field(rest, SETTINGS), LEVEL))
     nothing = torch.zeros(2, len(vertices), 3)
     snapped = vertices + project_to_isosurface(vertices, nothing, faces, states, LEVEL, SETTINGS)
     assert (snapped[0] - vertices).norm(dim=-1).max() < 0.02  # it was on the surface, and is drawn in a little
@@ -42,6 +42,6 @@ def test_a_vertex_without_a_surface_near_stays():
     states = Gaussians(
         cloud.means[None] + 5, cloud.log_scales[None], cloud.quats[None], cloud.opacity_logits, cloud.harmonics
     )
-    vertices, faces = (torch.from_numpy(a) for a in surface(density_field(cloud, SETTINGS), LEVEL))
+    vertices, faces = (torch.from_numpy(a) for a in extract_surface(density_field(cloud, SETTINGS), LEVEL))
     nothing = torch.zeros(1, len(vertices), 3)
     assert torch.equal(project_to_isosurface(vertices, nothing, faces, states, LEVEL, SETTINGS), nothing)

@@ -23,32 +23,32 @@ def board() -> TexturedMesh:
 
 
 def test_the_top_left_of_the_texture_is_the_top_left_of_the_picture(board: TexturedMesh) -> None:
-    color, coverage = render_mesh(board, [CAMERA])
+    color, alpha = render_mesh(board, [CAMERA])
     for (row, column), expected in {(9, 9): (1, 0, 0), (9, 22): (0, 1, 0), (22, 9): (0, 0, 1)}.items():
         torch.testing.assert_close(color[0, row, column], torch.tensor(expected, dtype=torch.float32))
-    assert coverage[0, 8:24, 8:24].min() == 1
-    assert coverage.sum() == 16 * 16
+    assert alpha[0, 8:24, 8:24].min() == 1
+    assert alpha.sum() == 16 * 16
 
 
 def test_half_covered_pixels_keep_their_color(board: TexturedMesh) -> None:
     pixel = 2 * HALF / SIZE
     shifted = board.vertices.new_tensor([0.5 * pixel, 0, 0]).expand_as(board.vertices)
-    color, coverage = render_mesh(board, [CAMERA], shifted)
-    assert coverage[0, 10, 8, 0] == 0.5
+    color, alpha = render_mesh(board, [CAMERA], shifted)
+    assert alpha[0, 10, 8, 0] == 0.5
     torch.testing.assert_close(color[0, 10, 8], torch.tensor([1.0, 0, 0]))
 
 
 def test_every_camera_can_have_a_state_of_its_own(board: TexturedMesh) -> None:
     away = torch.zeros(2, 4, 3)
     away[1] += 10
-    _, coverage = render_mesh(board, [CAMERA, CAMERA], away)
-    assert coverage[0].sum() > 0
-    assert coverage[1].sum() == 0
+    _, alpha = render_mesh(board, [CAMERA, CAMERA], away)
+    assert alpha[0].sum() > 0
+    assert alpha[1].sum() == 0
 
 
 def test_what_is_not_covered_is_zero_and_finite(board: TexturedMesh) -> None:
-    color, coverage = render_mesh(board, [CAMERA])
-    assert (color[coverage[..., 0] == 0] == 0).all()
+    color, alpha = render_mesh(board, [CAMERA])
+    assert (color[alpha[..., 0] == 0] == 0).all()
 
 
 def test_the_picture_is_differentiable_in_the_texture(board: TexturedMesh) -> None:

@@ -5,9 +5,8 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import isotropic
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import surface
-from dg4d_lib.mesh.extraction.outlines import agreement, outlines_of
-from dg4d_lib.mesh.tracking.nonrigid_registration import FOLLOWS, register_nonrigid
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.mesh.tracking.nonrigid_registration import register_nonrigid
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
 
 SETTINGS = MeshSettings(grid=48)
@@ -30,18 +29,18 @@ def test_vertices_that_were_left_behind_come_to_the_outlines_and_others_stay():
         harmonics=rest.harmonics,
         **both,
     )
-    rasterize = choose_rasterizer("cpu")
+    rasterize = get_rasterizer("cpu")
     vertices, faces = (torch.from_numpy(a) for a in surface(density_field(rest, SETTINGS), LEVEL))
     nothing = torch.zeros(2, len(vertices), 3)
     offsets, agreed = register_nonrigid(vertices, nothing, faces, states, LEVEL, rasterize, SETTINGS)
-    outlines = outlines_of(states, [0, 1], rasterize)
-    before, after = (agreement(vertices + offset, faces, outlines) for offset in (nothing, offsets))
+    outlines = render_silhouettes(states, [0, 1], rasterize)
+    before, after = (silhouette_iou(vertices + offset, faces, outlines) for offset in (nothing, offsets))
     torch.testing.assert_close(after, agreed)
-    assert before[0] > FOLLOWS > before[1]
+    assert before[0] > MIN_IOU > before[1]
     assert torch.equal(offsets[0], nothing[0])
     assert before[1] < 0.65
     assert after[1] > 0.93
     moved = trimesh.Trimesh((vertices + offsets[1]).numpy(), faces.numpy(), process=False)
-    aim = trimesh.Trimesh(*surface(density_field(stretched, SETTINGS), LEVEL), process=False)
+    aim = trimesh.Trimesh(*extract_surface(density_field(stretched, SETTINGS), LEVEL), process=False)
     assert moved.is_watertight
     assert abs(moved.extents / aim.extents - 1).max() < 0.1

@@ -5,7 +5,7 @@ from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import isotropic
 from dg4d_lib.mesh.tracking.reference_frame import evenly_spaced, relative_to_frame, select_reference_frame
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
 
 
@@ -40,6 +40,6 @@ def test_two_legs_that_part_are_taken_apart_where_they_are_apart(
     motion = Displacement(gaps[:, None, None] * sides, zeros, torch.zeros(4, 600, 4))
     states = motion.apply(legs)
     assert isinstance(states, Gaussians)
-    frame, agreement = select_reference_frame(states, motion, choose_rasterizer("cpu"), MeshSettings(grid=64))
+    frame, agreement = select_reference_frame(states, motion, get_rasterizer("cpu"), MeshSettings(grid=64))
     assert (frame > 0) == expected_last
     assert agreement > 0.8

@@ -6,9 +6,9 @@ import torch
 from scipy.optimize import minimize
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.geometry.quaternion import rotation_matrix
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
 from dg4d_lib.mesh.tracking import rig as module
-from dg4d_lib.mesh.tracking.rig import Rig, fit_rig, skinned
+from dg4d_lib.mesh.tracking.rig import Rig, fit_rig, rig_offsets
 
 FRAMES = 9
 
@@ -21,7 +21,7 @@ def turning(axis: tuple[float, float, float], largest_deg: float) -> torch.Tenso
     """Rotation matrices there and back again, the first is none."""
     angles = torch.linspace(0, math.pi, FRAMES).sin() * math.radians(largest_deg)
     half = (angles / 2)[:, None]
-    return rotation_matrix(torch.cat((half.cos(), half.sin() * torch.tensor(axis)), 1))
+    return quat_to_rotmat(torch.cat((half.cos(), half.sin() * torch.tensor(axis)), 1))
 
 
 def two_boxes() -> tuple[torch.Tensor, torch.Tensor]:
@@ -46,8 +46,8 @@ def bent_cylinder() -> tuple[torch.Tensor, torch.Tensor]:
 def test_two_rigid_boxes_are_two_bones() -> None:
     rest, offsets = two_boxes()
     rig = fit_rig(rest, offsets, 1e-3, 16)
-    assert len(rig.rest) == 2
-    assert rig.largest < 2e-6  # float32 at places of size 1
+    assert len(rig.rest_positions) == 2
+    assert rig.max_distance < 2e-6  # float32 at places of size 1
     assert ((rig.weights > 1 - 1e-6) | (rig.weights < 1e-6)).all()
 
 
@@ -55,24 +55,24 @@ def test_bones_of_boxes_turn_as_the_boxes_do() -> None:
     rest, offsets = two_boxes()
     rig = fit_rig(rest, offsets, 1e-3, 16)
     left, right = int(rig.bones[0, 0]), int(rig.bones[-1, 0])
-    torch.testing.assert_close(rotation_matrix(rig.quats[:, left]), turning((0.0, 0.0, 1.0), 40), atol=1e-5, rtol=0)
-    torch.testing.assert_close(rotation_matrix(rig.quats[:, right]), turning((0.6, 0.8, 0.0), -70), atol=1e-5, rtol=0)
+    torch.testing.assert_close(quat_to_rotmat(rig.quats[:, left]), turning((0.0, 0.0, 1.0), 40), atol=1e-5, rtol=0)
+    torch.testing.assert_close(quat_to_rotmat(rig.quats[:, right]), turning((0.6, 0.8, 0.0), -70), atol=1e-5, rtol=0)
 
 
 def test_a_bent_cylinder_is_two_bones_that_meet_at_the_bend() -> None:
     rest, offsets = bent_cylinder()
     rig = fit_rig(rest, offsets, 0.01, 16)
-    assert len(rig.rest) == 2
+    assert len(rig.rest_positions) == 2
     assert rig.error < 0.01
-    assert abs(float(rig.rest[1, 1])) < 0.1  # the joint between them; the cylinder reaches from -1 to 1
+    assert abs(float(rig.rest_positions[1, 1])) < 0.1  # the joint between them; the cylinder reaches from -1 to 1
     assert rig.parents.tolist() == [-1, 0]
 
 
 def test_a_mesh_that_stands_still_is_one_bone_that_stands_still() -> None:
     rest = torch.rand(100, 3, generator=torch.Generator().manual_seed(0))
     rig = fit_rig(rest, torch.zeros(5, 100, 3), 0.1, 16)
-    assert (len(rig.rest), rig.error) == (1, 0.0)
-    assert rig.largest < 1e-12
+    assert (len(rig.rest_positions), rig.error) == (1, 0.0)
+    assert rig.max_distance < 1e-12
     torch.testing.assert_close(rig.quats, torch.tensor([1.0, 0, 0, 0]).expand(5, 1, 4))
 
 
@@ -80,13 +80,13 @@ def test_noise_is_left_over() -> None:
     rest, offsets = two_boxes()
     noise = 0.01 * torch.randn(offsets.shape, generator=torch.Generator().manual_seed(1))
     rig = fit_rig(rest, offsets + noise, 0.1, 16)
-    assert len(rig.rest) == 2
+    assert len(rig.rest_positions) == 2
     assert rig.rms == pytest.approx(0.01 * math.sqrt(3), rel=0.05)  # a few of 600 numbers a frame fit the bones
 
 
 def test_a_single_frame_and_a_single_vertex_have_a_rig() -> None:
     rig = fit_rig(torch.tensor([[0.1, 0.2, 0.3]]), torch.tensor([[[1.0, 0.0, 0.0]]]), 0.1, 16)
-    assert (len(rig.rest), rig.largest < 1e-6) == (1, True)
+    assert (len(rig.rest_positions), rig.max_distance < 1e-6) == (1, True)
 
 
 def waving(points: int = 300) -> tuple[torch.Tensor, torch.Tensor]:
@@ -105,7 +105,7 @@ def twelve_bones() -> Rig:
 def test_more_bones_follow_better_and_their_limit_is_kept() -> None:
     rest, offsets = waving()
     rigs = [fit_rig(rest, offsets, 0.0, most) for most in (1, 4, 12)]
-    assert [len(rig.rest) for rig in rigs] == [1, 4, 12]
+    assert [len(rig.rest_positions) for rig in rigs] == [1, 4, 12]
     assert rigs[0].rms > 1.5 * rigs[1].rms > 2 * rigs[2].rms
 
 
@@ -121,15 +121,17 @@ def test_weights_are_shares_of_at_most_four_bones(twelve_bones: Rig) -> None:
 def test_the_residual_is_that_of_the_skin() -> None:
     rest, offsets = waving()
     rig = fit_rig(rest, offsets, 0.0, 6)
-    missed = (skinned(rig, rest) - offsets).norm(dim=-1)
+    missed = (rig_offsets(rig, rest) - offsets).norm(dim=-1)
     assert float(missed.square().mean().sqrt()) == pytest.approx(rig.rms, rel=1e-4)
-    assert float(missed.max()) == pytest.approx(rig.largest, rel=1e-4)
+    assert float(missed.max()) == pytest.approx(rig.max_distance, rel=1e-4)
     assert rig.error == pytest.approx(rig.rms / float((offsets - offsets.mean(0)).norm(dim=-1).square().mean().sqrt()))
 
 
 def test_equal_motions_have_equal_rigs() -> None:
     first, second = (fit_rig(*waving(), 0.0, 6) for _ in range(2))
-    assert all(torch.equal(getattr(first, name), getattr(second, name)) for name in ("rest", "quats", "weights"))
+    assert all(
+        torch.equal(getattr(first, name), getattr(second, name)) for name in ("rest_positions", "quats", "weights")
+    )
 
 
 def test_copies_of_a_vertex_follow_the_same_bones() -> None:
@@ -149,7 +151,7 @@ def test_parents_come_before_their_children(twelve_bones: Rig) -> None:
 def test_bones_turn_without_jumps_of_sign() -> None:
     rest = box((0.0, 0.0, 0.0), torch.Generator().manual_seed(0))
     angles = torch.linspace(0, 2 * math.pi, FRAMES)
-    turns = rotation_matrix(torch.stack((torch.cos(angles / 2), *[0 * angles] * 2, torch.sin(angles / 2)), 1))
+    turns = quat_to_rotmat(torch.stack((torch.cos(angles / 2), *[0 * angles] * 2, torch.sin(angles / 2)), 1))
     rig = fit_rig(rest, rest @ turns.mT - rest, 1e-3, 4)
     torch.testing.assert_close(rig.quats[-1], -rig.quats[0], atol=1e-5, rtol=0)  # a whole turn is the other sign
     assert ((rig.quats[1:] * rig.quats[:-1]).sum(-1) > 0.9).all()
@@ -158,7 +160,7 @@ def test_bones_turn_without_jumps_of_sign() -> None:
 def test_where_the_mesh_lies_does_not_matter() -> None:
     rest, offsets = two_boxes()
     far = fit_rig(rest.double() + 50, offsets.double(), 1e-3, 16)
-    assert (len(far.rest), far.largest < 1e-6) == (2, True)
+    assert (len(far.rest_positions), far.max_distance < 1e-6) == (2, True)
 
 
 def test_numbers_that_are_not_finite_are_refused() -> None:
@@ -178,7 +180,7 @@ def test_convex_weights_are_the_best_there_are() -> None:
     for _ in range(20):
         arms, goal = generator.normal(size=(6, 4)), generator.normal(size=6)
         gram, given = arms.T @ arms, arms.T @ goal
-        found = module._convex(gram[None], given[None])[0]
+        found = module._convex_weights(gram[None], given[None])[0]
         sought = minimize(
             lambda w, gram=gram, given=given: w @ gram @ w - 2 * w @ given,
             np.full(4, 0.25),

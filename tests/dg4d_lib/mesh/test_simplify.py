@@ -11,8 +11,8 @@ from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.mesh.extraction.check import checked, welded
-from dg4d_lib.mesh.extraction.simplify import simplified
+from dg4d_lib.mesh.extraction.simplify import simplify_mesh
+from dg4d_lib.mesh.extraction.topology import check_topology, weld_vertices
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.unwrap import unwrap
@@ -41,14 +41,14 @@ def bent(mesh: TexturedMesh, times: int = 5) -> Tensor:
 
 def pictures(mesh: TexturedMesh, offsets: Tensor) -> Tensor:
     cameras = [OrbitCamera(10, 90.0 * side, width=96, height=96) for side in range(len(offsets))]
-    color, coverage = render_mesh(mesh, cameras, offsets)
-    return color * coverage + 1 - coverage
+    color, alpha = render_mesh(mesh, cameras, offsets)
+    return color * alpha + 1 - alpha
 
 
 @pytest.mark.parametrize("share", [0.5, 0.25, 0.1])
 def test_there_are_as_many_triangles_as_asked_for(ball: TexturedMesh, share: float) -> None:
     wanted = int(share * len(ball.faces))
-    small, offsets = simplified(ball, bent(ball), wanted)
+    small, offsets = simplify_mesh(ball, bent(ball), wanted)
     assert 0.97 * wanted < len(small.faces) <= wanted
     assert offsets.shape == (5, len(small.vertices), 3)
 
@@ -56,7 +56,7 @@ def test_there_are_as_many_triangles_as_asked_for(ball: TexturedMesh, share: flo
 def test_what_is_left_is_part_of_what_was(ball: TexturedMesh) -> None:
     """Place, texture coordinates and offsets of a vertex stay together."""
     before = bent(ball)
-    small, offsets = simplified(ball, before, 400)
+    small, offsets = simplify_mesh(ball, before, 400)
     old = torch.cat([ball.vertices, ball.uvs, before.movedim(0, 1).flatten(1)], 1)
     new = torch.cat([small.vertices, small.uvs, offsets.movedim(0, 1).flatten(1)], 1)
     rows = {row.numpy().tobytes() for row in old}
@@ -65,16 +65,16 @@ def test_what_is_left_is_part_of_what_was(ball: TexturedMesh) -> None:
 
 
 def test_the_surface_stays_closed_along_the_seams(ball: TexturedMesh) -> None:
-    small, _ = simplified(ball, bent(ball), 600)
-    vertices, faces = welded(small.vertices.numpy(), small.faces.numpy())
+    small, _ = simplify_mesh(ball, bent(ball), 600)
+    vertices, faces = weld_vertices(small.vertices.numpy(), small.faces.numpy())
     assert len(vertices) < len(small.vertices)  # there are seams
-    facts = checked(vertices, faces)
-    assert (facts.boundary, facts.flat, facts.inverted, facts.components) == (0, 0, 0, 1)
+    facts = check_topology(vertices, faces)
+    assert (facts.boundary_edges, facts.degenerate_faces, facts.inverted_components, facts.components) == (0, 0, 0, 1)
 
 
 def test_a_quarter_of_the_triangles_look_the_same(ball: TexturedMesh) -> None:
     before = bent(ball)
-    small, offsets = simplified(ball, before, len(ball.faces) // 4)
+    small, offsets = simplify_mesh(ball, before, len(ball.faces) // 4)
     error = (pictures(small, offsets) - pictures(ball, before)).square().mean()
     assert -10 * torch.log10(error) > 30
 
@@ -90,43 +90,43 @@ def test_what_moves_by_itself_is_kept_though_it_is_flat_at_rest() -> None:
     sheet = TexturedMesh(places, faces, places[:, :2] / 2 + 0.5, torch.ones(4, 4, 3))
     fold = torch.zeros(2, len(places), 3)
     fold[1, :, 2] = (places[:, 0] - 0.25).clamp(min=0)  # the crease lies at x = 0.25
-    small, offsets = simplified(sheet, fold, 8)
+    small, offsets = simplify_mesh(sheet, fold, 8)
     expected = (small.vertices[:, 0] - 0.25).clamp(min=0)
     torch.testing.assert_close(offsets[1, :, 2], expected)
     crossing = small.vertices[small.faces][..., 0]
     assert not ((crossing.amin(1) < 0.2) & (crossing.amax(1) > 0.3)).any()
-    still, _ = simplified(sheet, torch.zeros(1, len(places), 3), 8)
+    still, _ = simplify_mesh(sheet, torch.zeros(1, len(places), 3), 8)
     crossing = still.vertices[still.faces][..., 0]
     assert ((crossing.amin(1) < 0.2) & (crossing.amax(1) > 0.3)).any()
 
 
 def test_equal_meshes_give_equal_levels(ball: TexturedMesh) -> None:
-    first, second = (simplified(ball, bent(ball), 500) for _ in range(2))
+    first, second = (simplify_mesh(ball, bent(ball), 500) for _ in range(2))
     assert torch.equal(first[0].faces, second[0].faces)
     assert torch.equal(first[1], second[1])
 
 
 def test_a_mesh_that_is_small_enough_stays_as_it_is(ball: TexturedMesh) -> None:
     offsets = bent(ball)
-    same, ways = simplified(ball, offsets, len(ball.faces))
+    same, ways = simplify_mesh(ball, offsets, len(ball.faces))
     assert same is ball
     assert ways is offsets
 
 
 def test_more_than_seams_allow_is_not_a_failure(ball: TexturedMesh) -> None:
-    small, _ = simplified(ball, bent(ball), 1)
+    small, _ = simplify_mesh(ball, bent(ball), 1)
     assert 1 <= len(small.faces) < 500
 
 
 def test_without_the_library_it_says_what_to_install(ball: TexturedMesh, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "meshoptimizer", None)
-    with pytest.raises(BackendUnavailable, match=r"dg4d\[meshopt\]"):
-        simplified(ball, bent(ball), 500)
+    with pytest.raises(BackendUnavailable, match=r"deploy/install.sh meshopt"):
+        simplify_mesh(ball, bent(ball), 500)
 
 
 def test_bad_numbers_are_refused(ball: TexturedMesh) -> None:
-    with pytest.raises(BadInput, match="at least one triangle"):
-        simplified(ball, bent(ball), 0)
+    with pytest.raises(BadInput, match="at least 1 triangle"):
+        simplify_mesh(ball, bent(ball), 0)
     broken = replace(ball, vertices=ball.vertices / 0)
     with pytest.raises(BadInput, match="not finite"):
-        simplified(broken, bent(ball), 100)
+        simplify_mesh(broken, bent(ball), 100)

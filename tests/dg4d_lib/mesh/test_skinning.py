@@ -7,7 +7,7 @@ import torch
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.quaternion import multiply, rotation_matrix
+from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
 from dg4d_lib.mesh.tracking.skinning import skin_vertices
 
 
@@ -31,8 +31,8 @@ def vertices() -> torch.Tensor:
 
 def turned(gaussians: Gaussians, quat: torch.Tensor) -> Displacement:
     """All Gaussians turned together about the origin, as one displacement."""
-    means = gaussians.means @ rotation_matrix(quat).T - gaussians.means
-    quats = multiply(quat.expand_as(gaussians.quats), gaussians.quats) - gaussians.quats
+    means = gaussians.means @ quat_to_rotmat(quat).T - gaussians.means
+    quats = quat_multiply(quat.expand_as(gaussians.quats), gaussians.quats) - gaussians.quats
     return replace(still(gaussians, 1), means=means[None], quats=quats[None])
 
 
@@ -50,7 +50,7 @@ def test_a_turn_of_all_gaussians_turns_every_vertex(
     half = math.radians(degrees) / 2
     quat = torch.tensor([math.cos(half), 0.6 * math.sin(half), 0.0, 0.8 * math.sin(half)])
     offsets = skin_vertices(vertices, gaussians, turned(gaussians, quat))
-    torch.testing.assert_close(vertices + offsets[0], vertices @ rotation_matrix(quat).T, atol=1e-5, rtol=0)
+    torch.testing.assert_close(vertices + offsets[0], vertices @ quat_to_rotmat(quat).T, atol=1e-5, rtol=0)
 
 
 def test_nothing_moves_where_no_gaussian_does(gaussians: Gaussians, vertices: torch.Tensor) -> None:
@@ -61,7 +61,7 @@ def test_a_single_gaussian_carries_with_its_own_rotation(gaussians: Gaussians, v
     one = Gaussians(**{name: value[:1] for name, value in vars(gaussians).items()})
     quat = torch.tensor([math.cos(0.4), 0.0, math.sin(0.4), 0.0])
     offsets = skin_vertices(vertices, one, turned(one, quat))
-    torch.testing.assert_close(vertices + offsets[0], vertices @ rotation_matrix(quat).T, atol=1e-5, rtol=0)
+    torch.testing.assert_close(vertices + offsets[0], vertices @ quat_to_rotmat(quat).T, atol=1e-5, rtol=0)
 
 
 def test_a_smooth_bend_is_followed(gaussians: Gaussians, vertices: torch.Tensor) -> None:
@@ -120,5 +120,5 @@ def test_order_of_the_gaussians_does_not_matter(gaussians: Gaussians, vertices: 
 
 def test_an_empty_cloud_is_refused(gaussians: Gaussians, vertices: torch.Tensor) -> None:
     empty = Gaussians(**{name: value[:0] for name, value in vars(gaussians).items()})
-    with pytest.raises(BadInput, match="not empty"):
+    with pytest.raises(BadInput, match="non-empty"):
         skin_vertices(vertices, empty, still(empty, 1))

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
-from dg4d_lib.mesh_rasterizer.texture import Lookup, bilinear, look_up, read
+from dg4d_lib.mesh_rasterizer.texture import TextureLookup, build_lookup, sample_bilinear, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
 
 CAMERA = OrbitCamera(width=32, height=32)
@@ -25,16 +25,16 @@ def slanted() -> torch.Tensor:
     return vertices
 
 
-def look(vertices: torch.Tensor, size: int, uvs: torch.Tensor = UVS, faces: torch.Tensor = FACES) -> Lookup:
-    return look_up(vertices, faces, uvs, (size, size), [CAMERA], rasterize_mesh(vertices, faces, [CAMERA]))
+def look(vertices: torch.Tensor, size: int, uvs: torch.Tensor = UVS, faces: torch.Tensor = FACES) -> TextureLookup:
+    return build_lookup(vertices, faces, uvs, (size, size), [CAMERA], rasterize_mesh(vertices, faces, [CAMERA]))
 
 
-def level_of(lookup: Lookup) -> torch.Tensor:
+def level_of(lookup: TextureLookup) -> torch.Tensor:
     """Mip level of every pixel, h w; not a number where nothing is."""
     picture = torch.full(lookup.covered.shape, math.nan)
     levels = torch.zeros(int(lookup.covered.sum()))
     for level, taps in enumerate(lookup.levels):
-        levels[taps.pixels] += level * taps.shares
+        levels[taps.pixels] += level * taps.weights
     picture[lookup.covered] = levels
     return picture[0]
 
@@ -47,7 +47,9 @@ def noise(*shape: int) -> torch.Tensor:
 def test_one_color_is_read_as_it_is(size):
     color = torch.tensor([0.2, 0.5, 0.9])
     lookup = look(slanted(), size)
-    torch.testing.assert_close(read(color.expand(size, size, 3), lookup), color.expand(int(lookup.covered.sum()), 3))
+    torch.testing.assert_close(
+        sample_texture(color.expand(size, size, 3), lookup), color.expand(int(lookup.covered.sum()), 3)
+    )
 
 
 def test_a_magnified_ramp_is_exact():
@@ -56,7 +58,7 @@ def test_a_magnified_ramp_is_exact():
     lookup = look(board(30), 16)
     u = ((torch.arange(32) + 0.5 - 16) / 30 + 0.5) * 16 - 0.5  # in texels
     expected = torch.stack(torch.broadcast_tensors(u[:, None], u), -1).clamp(0, 15)[1:31, 1:31] / 15
-    torch.testing.assert_close(read(texture, lookup), expected.reshape(-1, 2), atol=1e-6, rtol=0)
+    torch.testing.assert_close(sample_texture(texture, lookup), expected.reshape(-1, 2), atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize(("pixels", "size"), [(30, 16), (30, 64), (12.5, 64), (4.7, 1024)])
@@ -96,7 +98,7 @@ def test_the_level_of_a_triangle_does_not_ask_its_neighbors():
 def test_a_checkerboard_far_away_is_gray():
     index = torch.arange(256)
     checkers = ((index[:, None] + index) % 2)[..., None].float()
-    gray = read(checkers, look(board(24), 256))
+    gray = sample_texture(checkers, look(board(24), 256))
     torch.testing.assert_close(gray, torch.full_like(gray, 0.5))
 
 
@@ -105,7 +107,7 @@ def test_a_texture_in_one_pixel_is_its_mean(size):
     texture, shift = noise(size, size, 3), torch.tensor([0.5, 0.5, 0.0]) * RADIUS / CAMERA.focal
     point = look(board(0.9 / size) + shift, size)  # in the middle of a pixel
     tolerance = 1e-5 if size == 64 else 0.05  # halves of odd sides weigh some texels twice
-    torch.testing.assert_close(read(texture, point), texture.mean((0, 1))[None], atol=tolerance, rtol=0)
+    torch.testing.assert_close(sample_texture(texture, point), texture.mean((0, 1))[None], atol=tolerance, rtol=0)
 
 
 @pytest.mark.parametrize("size", [6, 12])
@@ -113,13 +115,13 @@ def test_gradients_of_the_texture_are_finite_differences(size):
     lookup = look(slanted(), 16 * size)  # the levels of a larger texture: several are read
     assert 3 <= len(lookup.levels) <= (size - 1).bit_length() + 1
     texture = noise(size, size, 2).double().requires_grad_()
-    assert torch.autograd.gradcheck(lambda value: read(value, lookup), texture)
+    assert torch.autograd.gradcheck(lambda value: sample_texture(value, lookup), texture)
 
 
 @pytest.mark.parametrize("size", [16, 300])
 def test_every_pixel_hands_one_gradient_to_the_texture(size):
     texture = noise(size, size, 3).double().requires_grad_()
-    seen = read(texture, look(slanted(), size))
+    seen = sample_texture(texture, look(slanted(), size))
     seen.sum().backward()
     assert texture.grad.sum() == pytest.approx(seen.numel(), rel=1e-6)
 
@@ -127,39 +129,39 @@ def test_every_pixel_hands_one_gradient_to_the_texture(size):
 def test_states_and_cameras_belong_together():
     cameras = [CAMERA, OrbitCamera(30, 40, width=32, height=32)]
     states, texture = torch.stack([board(20), slanted()]), noise(128, 128, 3)
-    both = look_up(states, FACES, UVS, (128, 128), cameras, rasterize_mesh(states, FACES, cameras))
+    both = build_lookup(states, FACES, UVS, (128, 128), cameras, rasterize_mesh(states, FACES, cameras))
     parts = [
-        look_up(state, FACES, UVS, (128, 128), [camera], rasterize_mesh(state, FACES, [camera]))
+        build_lookup(state, FACES, UVS, (128, 128), [camera], rasterize_mesh(state, FACES, [camera]))
         for state, camera in zip(states, cameras, strict=True)
     ]
-    alone = torch.cat([read(texture, part) for part in parts])
-    torch.testing.assert_close(read(texture, both), alone, atol=1e-6, rtol=0)
+    alone = torch.cat([sample_texture(texture, part) for part in parts])
+    torch.testing.assert_close(sample_texture(texture, both), alone, atol=1e-6, rtol=0)
 
 
 def test_nothing_seen_is_nothing_read():
-    assert read(noise(8, 8, 3), look(board(20) + 10, 8)).shape == (0, 3)
+    assert sample_texture(noise(8, 8, 3), look(board(20) + 10, 8)).shape == (0, 3)
 
 
 def test_a_triangle_seen_edge_on_is_no_trouble():
     fragments = rasterize_mesh(board(20), FACES, [CAMERA])
     edge_on = board(20)[:, [2, 1, 0]]
-    lookup = look_up(edge_on, FACES, UVS, (64, 64), [CAMERA], fragments)
-    assert read(noise(64, 64, 3), lookup).isfinite().all()
+    lookup = build_lookup(edge_on, FACES, UVS, (64, 64), [CAMERA], fragments)
+    assert sample_texture(noise(64, 64, 3), lookup).isfinite().all()
 
 
 def test_the_border_goes_on_outside():
     picture = noise(4, 6, 3)
-    corners = bilinear(picture, torch.tensor([[-0.5, -0.5], [2.0, 0.0], [0.0, 1.0], [1.5, 1.5]]))
+    corners = sample_bilinear(picture, torch.tensor([[-0.5, -0.5], [2.0, 0.0], [0.0, 1.0], [1.5, 1.5]]))
     torch.testing.assert_close(corners, picture[[0, 0, -1, -1], [0, -1, 0, -1]])
 
 
 def test_nothing_is_made_on_another_device(monkeypatch):
     """The default device holds no numbers: whatever is made there cannot be computed with."""
     vertices, texture = slanted(), noise(64, 64, 3)
-    fragments, pose = rasterize_mesh(vertices, FACES, [CAMERA]), CAMERA.world_to_camera()
-    monkeypatch.setattr(OrbitCamera, "world_to_camera", lambda _: pose)
+    fragments, pose = rasterize_mesh(vertices, FACES, [CAMERA]), CAMERA.viewmat()
+    monkeypatch.setattr(OrbitCamera, "viewmat", lambda _: pose)
     with torch.device("meta"):
-        seen = read(texture, look_up(vertices, FACES, UVS, (64, 64), [CAMERA], fragments))
+        seen = sample_texture(texture, build_lookup(vertices, FACES, UVS, (64, 64), [CAMERA], fragments))
     assert seen.device.type == "cpu"
 
 
@@ -172,7 +174,7 @@ def test_a_gpu_reads_what_the_processor_reads():
         vertices, faces, uvs, texture = (value.to(device) for value in (slanted(), FACES, UVS, noise(256, 256, 3)))
         texture.requires_grad_()
         fragments = rasterize_mesh(vertices, faces, [CAMERA])
-        seen = read(texture, look_up(vertices, faces, uvs, (256, 256), [CAMERA], fragments))
+        seen = sample_texture(texture, build_lookup(vertices, faces, uvs, (256, 256), [CAMERA], fragments))
         seen.square().sum().backward()
         pictures.append((seen.detach().cpu(), texture.grad.cpu()))
     for here, there in zip(*pictures, strict=True):

@@ -4,7 +4,7 @@ import pytest
 import torch
 from test_zbuffer import soup, square
 
-from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
+from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.mesh_rasterizer import scanlines, scanlines_cpu
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
@@ -33,7 +33,7 @@ def test_both_forms_draw_the_same(mesh, batched):
     vertices, faces = mesh
     if batched:
         vertices = torch.stack([vertices, 0.8 * vertices.flip(-1)])
-    fast, plain = (form.draw(vertices, faces, CAMERAS) for form in (scanlines_cpu, scanlines))
+    fast, plain = (backend.rasterize(vertices, faces, CAMERAS) for backend in (scanlines_cpu, scanlines))
     assert torch.equal(fast[0], plain[0])
     torch.testing.assert_close(fast[1], plain[1], atol=1e-6, rtol=0)
     torch.testing.assert_close(fast[2], plain[2], atol=1e-6, rtol=0)
@@ -41,9 +41,9 @@ def test_both_forms_draw_the_same(mesh, batched):
 
 def test_what_is_in_memory_at_a_time_does_not_matter(monkeypatch):
     vertices, faces = soup(4, 300)
-    whole = scanlines.draw(vertices, faces, CAMERAS)
+    whole = scanlines.rasterize(vertices, faces, CAMERAS)
     monkeypatch.setattr(scanlines, "AT_ONCE", 97)
-    for one, other in zip(whole, scanlines.draw(vertices, faces, CAMERAS), strict=True):
+    for one, other in zip(whole, scanlines.rasterize(vertices, faces, CAMERAS), strict=True):
         assert torch.equal(one, other)
 
 
@@ -54,7 +54,7 @@ def test_the_number_of_threads_does_not_matter():
         drawn = []
         for count in (1, 3):
             torch.set_num_threads(count)
-            drawn.append(scanlines_cpu.draw(vertices, faces, CAMERAS))
+            drawn.append(scanlines_cpu.rasterize(vertices, faces, CAMERAS))
     finally:
         torch.set_num_threads(threads)
     for one, other in zip(*drawn, strict=True):
@@ -64,10 +64,10 @@ def test_the_number_of_threads_does_not_matter():
 def test_nothing_is_made_on_another_device(monkeypatch):
     """The default device holds no numbers: whatever is made there cannot be computed with."""
     vertices, faces = soup(4)
-    poses = world_to_camera(CAMERAS)
-    monkeypatch.setattr(scanlines, "world_to_camera", lambda _: poses)
+    poses = viewmats(CAMERAS)
+    monkeypatch.setattr(scanlines, "viewmats", lambda _: poses)
     with torch.device("meta"):
-        drawn = scanlines.draw(vertices, faces, CAMERAS)
+        drawn = scanlines.rasterize(vertices, faces, CAMERAS)
     assert {value.device.type for value in drawn} == {"cpu"}
 
 

@@ -27,7 +27,7 @@ def soup(seed: int, count: int = 40) -> tuple[torch.Tensor, torch.Tensor]:
 
 def shoot(vertices, faces, camera):
     """Every pixel's ray against every triangle (Moeller and Trumbore), nearest hit: face, weights, camera z."""
-    pose = camera.world_to_camera()
+    pose = camera.viewmat()
     points = vertices.double() @ pose[:3, :3].T + pose[:3, 3]
     x = (torch.arange(camera.width) + 0.5 - camera.width / 2) / camera.focal
     y = (torch.arange(camera.height) + 0.5 - camera.height / 2) / camera.focal
@@ -207,7 +207,7 @@ def test_interpolation_recovers_a_linear_function_of_space():
     camera = OrbitCamera(10, 30, width=48, height=48)
     fragments = rasterize_mesh(vertices, faces, [camera, camera])
     points = interpolate(fragments, faces, vertices)
-    pose = camera.world_to_camera().float()
+    pose = camera.viewmat().float()
     depth = (points @ pose[2, :3] + pose[2, 3]) * (fragments.faces >= 0)
     torch.testing.assert_close(depth, fragments.depth, atol=1e-5, rtol=0)
     assert (points[fragments.faces < 0] == 0).all()
@@ -225,7 +225,7 @@ def test_interpolation_hands_gradients_to_the_attributes():
 
 @pytest.mark.parametrize("cameras", [[], [OrbitCamera(width=8, height=8), OrbitCamera(width=9, height=8)]])
 def test_cameras_of_different_sizes_are_refused(cameras):
-    with pytest.raises(BadInput, match="one size"):
+    with pytest.raises(BadInput, match="same size"):
         rasterize_mesh(square(0.1), SQUARE_FACES, cameras)
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.metrics.clip import Clip, load_clip, similarity
+from dg4d_lib.metrics.clip import ClipModel, cosine_similarity, load_clip
 
 CPU = torch.device("cpu")
 
@@ -22,7 +22,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def clip(folder: Path) -> Clip:
+def clip(folder: Path) -> ClipModel:
     return load_clip(folder, CPU)
 
 
@@ -33,7 +33,7 @@ def pictures(size: int = 96, count: int = 3) -> Tensor:
     return (smooth * 255).round().movedim(1, -1) / 255
 
 
-def test_embeddings_are_those_of_transformers(clip: Clip, folder: Path) -> None:
+def test_embeddings_are_those_of_transformers(clip: ClipModel, folder: Path) -> None:
     from transformers import CLIPModel
 
     model = CLIPModel.from_pretrained(folder).eval()
@@ -48,13 +48,13 @@ def test_embeddings_are_those_of_transformers(clip: Clip, folder: Path) -> None:
     torch.testing.assert_close(clip.embed(pictures()), expected, atol=2e-3, rtol=0)  # Pillow rounds to 8 bits
 
 
-def test_a_picture_is_like_itself_and_less_like_others(clip: Clip) -> None:
+def test_a_picture_is_like_itself_and_less_like_others(clip: ClipModel) -> None:
     embedded = clip.embed(pictures())
-    assert similarity(embedded, embedded).tolist() == pytest.approx([1, 1, 1])
-    assert similarity(embedded[:1], embedded[1:2]).item() < 0.9999
+    assert cosine_similarity(embedded, embedded).tolist() == pytest.approx([1, 1, 1])
+    assert cosine_similarity(embedded[:1], embedded[1:2]).item() < 0.9999
 
 
-def test_many_pictures_are_embedded_as_few_are(clip: Clip) -> None:
+def test_many_pictures_are_embedded_as_few_are(clip: ClipModel) -> None:
     many = pictures(count=20)
     torch.testing.assert_close(clip.embed(many)[17:18], clip.embed(many[17:18]), atol=1e-5, rtol=1e-4)
 

@@ -7,20 +7,20 @@ import torch
 from torch import Tensor
 
 from dg4d_lib.asset_settings import GateSettings
-from dg4d_lib.cameras.orbit import OrbitCamera, world_to_camera
+from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.metrics.gates import (
     MESH,
     SPLATS,
-    Evidence,
     Gate,
-    Pictures,
-    Turn,
+    GateInputs,
+    RgbaImages,
+    Turntable,
     consistency,
+    evaluate_gates,
     fidelity,
     flicker,
     floaters,
-    judge,
     motion,
     sharpness,
 )
@@ -28,21 +28,21 @@ from dg4d_lib.metrics.gates import (
 SIZE = 64
 
 
-def disk(x: float = 0.0, radius: float = 0.5, gray: float = 0.3) -> Pictures:
+def disk(x: float = 0.0, radius: float = 0.5, gray: float = 0.3) -> RgbaImages:
     """A striped disk at x, in halves of the picture."""
     line = (torch.arange(SIZE) + 0.5) / SIZE * 2 - 1
     v, u = torch.meshgrid(line, line, indexing="ij")
     inside = (((u - x) ** 2 + v**2) < radius**2).float()[None, ..., None]
     stripes = gray + 0.2 * torch.sin(20 * (u - x))[None, ..., None]
-    return Pictures((stripes * inside + 1 - inside).expand(1, SIZE, SIZE, 3).contiguous(), inside)
+    return RgbaImages((stripes * inside + 1 - inside).expand(1, SIZE, SIZE, 3).contiguous(), inside)
 
 
-def film(places: list[float]) -> Pictures:
+def film(places: list[float]) -> RgbaImages:
     disks = [disk(x) for x in places]
-    return Pictures(torch.cat([d.color for d in disks]), torch.cat([d.coverage for d in disks]))
+    return RgbaImages(torch.cat([d.color for d in disks]), torch.cat([d.alpha for d in disks]))
 
 
-def ball_turn(radius: float = 0.5, count: int = 24) -> Turn:
+def ball_turn(radius: float = 0.5, count: int = 24) -> Turntable:
     """A ball around the origin, whose depth is known in closed form."""
     cameras = turntable(count, OrbitCamera(width=SIZE, height=SIZE))
     focal = cameras[0].focal
@@ -53,24 +53,24 @@ def ball_turn(radius: float = 0.5, count: int = 24) -> Turn:
     hit = (b**2 - 4 * a * c > 0).float()
     depth = torch.where(hit > 0, (-b - root) / (2 * a), 0.0)
     everywhere = (count, SIZE, SIZE, 1)
-    return Turn(
+    return Turntable(
         hit[None, ..., None].expand(everywhere).contiguous(),
         depth[None, ..., None].expand(everywhere).contiguous(),
-        world_to_camera(cameras),
+        viewmats(cameras),
         focal,
     )
 
 
-def evidence(pictures: Pictures, video: Pictures) -> Evidence:
+def evidence(pictures: RgbaImages, video: RgbaImages) -> GateInputs:
     forms = {SPLATS: pictures, MESH: pictures}
-    return Evidence(Pictures(video.color[:1], video.coverage[:1]), video, forms, forms, ball_turn(), 0.0)
+    return GateInputs(RgbaImages(video.color[:1], video.alpha[:1]), video, forms, forms, ball_turn(), 0.0)
 
 
 SWAYING = film([0.1 * math.sin(t) for t in range(8)])
 
 
 def test_the_video_itself_passes_every_gate() -> None:
-    gates = judge(evidence(SWAYING, SWAYING), GateSettings())
+    gates = evaluate_gates(evidence(SWAYING, SWAYING), GateSettings())
     assert [gate.name for gate in gates if not gate.passed] == []
     assert {gate.name: gate.value for gate in gates} == {
         "fidelity": pytest.approx(60, abs=1e-3),
@@ -90,20 +90,22 @@ def test_the_video_itself_passes_every_gate() -> None:
     [
         (film([0.0] * 8), {"motion", "flicker"}),
         (film([0.4 * math.sin(t) for t in range(8)]), {"motion", "flicker", "silhouette", "fidelity"}),
-        (Pictures((SWAYING.color + 1) / 2, SWAYING.coverage), {"fidelity", "motion", "sharpness"}),
+        (RgbaImages((SWAYING.color + 1) / 2, SWAYING.alpha), {"fidelity", "motion", "sharpness"}),
     ],
     ids=["frozen", "four times the motion", "washed out"],
 )
-def test_what_is_wrong_is_named(pictures: Pictures, failing: set[str]) -> None:
-    gates = judge(evidence(pictures, SWAYING), GateSettings())
+def test_what_is_wrong_is_named(pictures: RgbaImages, failing: set[str]) -> None:
+    gates = evaluate_gates(evidence(pictures, SWAYING), GateSettings())
     assert failing <= {gate.name for gate in gates if not gate.passed}
     assert {"consistency", "flaws", "agreement", "floaters"} <= {gate.name for gate in gates if gate.passed}
 
 
 def test_one_torn_frame_is_enough_for_the_silhouette() -> None:
-    torn = SWAYING.coverage.clone()
+    torn = SWAYING.alpha.clone()
     torn[3, :, : SIZE // 2] = 0
-    found = {gate.name: gate for gate in judge(evidence(replace(SWAYING, coverage=torn), SWAYING), GateSettings())}
+    found = {
+        gate.name: gate for gate in evaluate_gates(evidence(replace(SWAYING, alpha=torn), SWAYING), GateSettings())
+    }
     assert found["silhouette"].value < 0.6
     assert found["fidelity"].passed
 
@@ -111,7 +113,7 @@ def test_one_torn_frame_is_enough_for_the_silhouette() -> None:
 def test_the_worse_form_counts() -> None:
     still = film([0.0] * 8)
     mixed = replace(evidence(SWAYING, SWAYING), seen={SPLATS: SWAYING, MESH: still})
-    found = {gate.name: gate for gate in judge(mixed, GateSettings())}
+    found = {gate.name: gate for gate in evaluate_gates(mixed, GateSettings())}
     assert (found["motion"].form, found["motion"].passed) == (MESH, False)
     assert found["motion"].values[SPLATS] == 1
 
@@ -130,7 +132,7 @@ def test_a_band_is_left_on_either_side() -> None:
 
 
 def test_fidelity_looks_at_the_subject_only() -> None:
-    dark = Pictures(disk().color - 0.1 * disk().coverage, disk().coverage)
+    dark = RgbaImages(disk().color - 0.1 * disk().alpha, disk().alpha)
     assert fidelity(dark, disk()).item() == pytest.approx(20, abs=1e-3)  # 0.1 off everywhere on the subject
 
 
@@ -155,22 +157,22 @@ def test_motion_counts_changes() -> None:
 
 
 def test_floaters_are_what_hangs_apart() -> None:
-    coverage = torch.zeros(3, SIZE, SIZE, 1)
-    coverage[:, 10:20, 10:20] = 1  # 100 pixels
-    coverage[1, 40:45, 40:45] = 1  # 25 apart
-    coverage[2, 20:25, 20:25] = 1  # 25 that touch a corner
-    pictures = Pictures(torch.zeros(3, SIZE, SIZE, 3), coverage)
+    alpha = torch.zeros(3, SIZE, SIZE, 1)
+    alpha[:, 10:20, 10:20] = 1  # 100 pixels
+    alpha[1, 40:45, 40:45] = 1  # 25 apart
+    alpha[2, 20:25, 20:25] = 1  # 25 that touch a corner
+    pictures = RgbaImages(torch.zeros(3, SIZE, SIZE, 3), alpha)
     assert floaters(pictures).tolist() == pytest.approx([0, 0.2, 0])
-    assert floaters(Pictures(torch.zeros(1, 8, 8, 3), torch.zeros(1, 8, 8, 1))).tolist() == [0]
+    assert floaters(RgbaImages(torch.zeros(1, 8, 8, 3), torch.zeros(1, 8, 8, 1))).tolist() == [0]
 
 
 def test_what_hangs_apart_in_the_video_too_is_no_floater() -> None:
-    coverage = SWAYING.coverage.clone()
-    coverage[:, :6, :6] = 1
-    apart = replace(SWAYING, coverage=coverage)
-    found = {gate.name: gate.value for gate in judge(evidence(apart, apart), GateSettings())}
+    alpha = SWAYING.alpha.clone()
+    alpha[:, :6, :6] = 1
+    apart = replace(SWAYING, alpha=alpha)
+    found = {gate.name: gate.value for gate in evaluate_gates(evidence(apart, apart), GateSettings())}
     assert found["floaters"] == 0
-    assert judge(evidence(apart, SWAYING), GateSettings())[4].value > 0.02
+    assert evaluate_gates(evidence(apart, SWAYING), GateSettings())[4].value > 0.02
 
 
 def test_a_solid_ball_is_consistent() -> None:
@@ -180,12 +182,12 @@ def test_a_solid_ball_is_consistent() -> None:
 def test_depths_that_do_not_fit_each_other_are_not() -> None:
     turn = ball_turn()
     generator = torch.Generator().manual_seed(0)
-    flat = turn.coverage * 2.0  # every side shows a disk through the middle, turned towards it
+    flat = turn.alpha * 2.0  # every side shows a disk through the middle, turned towards it
     noisy = turn.depth + 0.2 * torch.randn(turn.depth.shape, generator=generator)
     near = torch.arange(24).reshape(-1, 1, 1, 1) % 2 * 0.3  # every other side shows it nearer
     for depth in (flat, noisy, turn.depth - near):
         assert consistency(replace(turn, depth=depth)) < 0.9
-    assert consistency(replace(turn, coverage=torch.zeros_like(turn.coverage))) == 0
+    assert consistency(replace(turn, alpha=torch.zeros_like(turn.alpha))) == 0
 
 
 def test_blur_and_noise_are_told_by_sharpness() -> None:
@@ -203,15 +205,17 @@ def test_blur_and_noise_are_told_by_sharpness() -> None:
 
 
 def test_a_plain_subject_is_as_sharp_as_can_be() -> None:
-    plain = Pictures(torch.full((1, SIZE, SIZE, 3), 0.5), disk().coverage)
+    plain = RgbaImages(torch.full((1, SIZE, SIZE, 3), 0.5), disk().alpha)
     assert sharpness(plain, plain) == 1
 
 
 def test_every_threshold_decides() -> None:
-    found = {gate.name: gate for gate in judge(evidence(SWAYING, SWAYING), GateSettings())}
+    found = {gate.name: gate for gate in evaluate_gates(evidence(SWAYING, SWAYING), GateSettings())}
     for knob in GateSettings.model_fields:
         name, _, side = knob.rpartition("_")
-        changed = judge(evidence(SWAYING, SWAYING), GateSettings(**{knob: getattr(GateSettings(), knob) * 0.5}))
+        changed = evaluate_gates(
+            evidence(SWAYING, SWAYING), GateSettings(**{knob: getattr(GateSettings(), knob) * 0.5})
+        )
         moved = {gate.name: gate for gate in changed}
         assert getattr(moved[name], side) == pytest.approx(getattr(found[name], side) / 2)
         assert all(moved[other] == found[other] for other in found if other != name)
@@ -222,7 +226,7 @@ def test_every_piece_of_advice_names_knobs_that_exist() -> None:
     tree = profiles.PREVIEW.model_dump()
     knobs = [
         knob
-        for gate in judge(evidence(SWAYING, SWAYING), GateSettings())
+        for gate in evaluate_gates(evidence(SWAYING, SWAYING), GateSettings())
         for knob in re.findall(r"\b([a-z]+\.[a-z_]+)\b", gate.advice)
     ]
     assert len(knobs) > 9

@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from dg4d_lib.metrics.image import iou, psnr, resized
+from dg4d_lib.metrics.image import iou, psnr, resize_square
 
 
 def noise(seed: int, *shape: int) -> torch.Tensor:
@@ -61,5 +61,5 @@ def test_resizing_is_pillows() -> None:
     levels = (smooth * 255).round().to(torch.uint8)
     for size in (16, 96):
         expected = np.asarray(Image.fromarray(levels[0].numpy()).resize((size, size), Image.BICUBIC)) / 255
-        difference = resized(levels / 255, size)[0].numpy() - expected
+        difference = resize_square(levels / 255, size)[0].numpy() - expected
         assert np.abs(difference).max() < 2 / 255  # Pillow rounds after either axis

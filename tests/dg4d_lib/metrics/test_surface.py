@@ -8,7 +8,7 @@ import trimesh
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.metrics.surface import aligned, chamfer_of_points, sample_surface
+from dg4d_lib.metrics.surface import align_bounding_boxes, chamfer_distance, sample_surface
 
 SQUARE = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), torch.tensor([[0, 1, 2], [0, 2, 3]])
 SAMPLES = 20_000
@@ -26,7 +26,7 @@ def sphere(radius: float) -> tuple[Tensor, Tensor]:
 
 def chamfer(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor], samples: int = SAMPLES) -> float:
     generator = seed()
-    return chamfer_of_points(sample_surface(*a, samples, generator), sample_surface(*b, samples, generator))
+    return chamfer_distance(sample_surface(*a, samples, generator), sample_surface(*b, samples, generator))
 
 
 def test_a_plane_and_its_shifted_copy_are_the_shift_apart() -> None:
@@ -91,7 +91,7 @@ def test_a_triangle_without_weight_gets_no_points() -> None:
 
 def test_a_moved_and_grown_crowd_is_put_back_by_the_alignment() -> None:
     target = torch.rand(3, 500, 3, generator=seed(), dtype=torch.float64)
-    found = aligned(2.5 * target + torch.tensor([1.0, -2.0, 0.5]), target)
+    found = align_bounding_boxes(2.5 * target + torch.tensor([1.0, -2.0, 0.5]), target)
     torch.testing.assert_close(found, target)
 
 
@@ -99,10 +99,10 @@ def test_the_alignment_is_one_for_all_moments() -> None:
     """A crowd that moves where the target stands still is not held fast."""
     target = torch.rand(1, 500, 3, generator=seed(), dtype=torch.float64).expand(2, -1, -1)
     moving = target + torch.tensor([[[0.0]], [[1.0]]])
-    steps = aligned(moving, target).diff(dim=0)
+    steps = align_bounding_boxes(moving, target).diff(dim=0)
     assert steps.min() > 0.1
 
 
 def test_points_are_as_far_as_the_mean_of_both_ways() -> None:
     a, b = torch.zeros(1, 3, dtype=torch.float64), torch.tensor([[1.0, 0, 0], [0, 3, 0]], dtype=torch.float64)
-    assert chamfer_of_points(a, b) == pytest.approx((1 + (1 + 3) / 2) / 2)
+    assert chamfer_distance(a, b) == pytest.approx((1 + (1 + 3) / 2) / 2)

@@ -9,8 +9,8 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
-from dg4d_lib.rasterizer.interface import Rasterizer, Rendering, choose_rasterizer
+from dg4d_lib.geometry.harmonics import rgb_to_sh
+from dg4d_lib.rasterizer.interface import Rasterizer, Rendering, get_rasterizer
 
 COLORFUL = torch.tensor([0.9, 0.1, 0.4])
 
@@ -19,7 +19,7 @@ COLORFUL = torch.tensor([0.9, 0.1, 0.4])
 def backend(request: pytest.FixtureRequest) -> str:
     """The name of every backend that can run here."""
     try:
-        choose_rasterizer(request.param)
+        get_rasterizer(request.param)
     except BackendUnavailable as missing:
         pytest.skip(str(missing))
     return request.param
@@ -28,7 +28,7 @@ def backend(request: pytest.FixtureRequest) -> str:
 @pytest.fixture
 def rasterize(backend: str) -> Rasterizer:
     """Every backend that can run here."""
-    return choose_rasterizer(backend)
+    return get_rasterizer(backend)
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def blobs() -> Callable[..., Gaussians]:
             torch.full((n, 3), scale).double().log(),
             torch.tensor([[1.0, 0.0, 0.0, 0.0]]).double().repeat(n, 1),
             torch.full((n,), opacity).double().logit(),
-            harmonics_of_color(rgb),
+            rgb_to_sh(rgb),
         )
 
     return make
@@ -105,7 +105,7 @@ def drawn() -> Callable[..., tuple[Rendering, dict[str, Tensor]]]:
     ) -> tuple[Rendering, dict[str, Tensor]]:
         leaves = {name: value.detach().to(dtype).requires_grad_() for name, value in vars(cloud).items()}
         offsets = cloud.means.new_zeros(len(cameras), len(cloud), 2, dtype=dtype).requires_grad_()
-        return rasterize(Gaussians(**leaves), cameras, background, offsets), {**leaves, "screen_offsets": offsets}
+        return rasterize(Gaussians(**leaves), cameras, background, offsets), {**leaves, "means2d_offsets": offsets}
 
     return draw
 

@@ -11,9 +11,9 @@ import torch
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.kernels import workers
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 
-CPU = choose_rasterizer("cpu")
+CPU = get_rasterizer("cpu")
 WHITE = torch.ones(3)
 CAMERAS = [OrbitCamera(10, 50 * i, width=75, height=131) for i in range(4)]
 
@@ -94,4 +94,4 @@ def test_without_numba_the_backend_is_not_here(monkeypatch):
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "numba", None)
     with pytest.raises(BackendUnavailable, match=r"'cpu' cannot run here: .*numba"):
-        choose_rasterizer("cpu")
+        get_rasterizer("cpu")

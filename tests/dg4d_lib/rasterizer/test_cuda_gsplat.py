@@ -12,7 +12,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.rasterizer import reference
 from dg4d_lib.rasterizer.interface import BLUR, NEAR
 
@@ -32,7 +32,7 @@ class Pinhole(OrbitCamera):
     def focal(self) -> float:
         return self.lens
 
-    def world_to_camera(self) -> Tensor:
+    def viewmat(self) -> Tensor:
         assert self.pose is not None
         return self.pose
 
@@ -70,14 +70,14 @@ class StandIn(ModuleType):
         clouds = [tensor.double().reshape(-1, *tensor.shape[len(batch) :]) for tensor in tensors]
         splats, backs = [], []
         for mean, quat, scale, opacity, color, poses, lenses, behind in zip(*clouds, strict=True):
-            cloud = Gaussians(mean, scale.log(), quat, opacity.logit(), harmonics_of_color(color))
+            cloud = Gaussians(mean, scale.log(), quat, opacity.logit(), rgb_to_sh(color))
             for pose, lens in zip(poses, lenses, strict=True):
                 camera = Pinhole(width=width, height=height, pose=pose, lens=float(lens[0, 0]))
                 splats.append(reference._project(cloud, camera))
             backs.extend(behind)
-        centers = torch.stack([view.centers for view in splats]).reshape(*batch, views, n, 2)
+        centers = torch.stack([view.means2d for view in splats]).reshape(*batch, views, n, 2)
         for view, own in zip(splats, centers.reshape(-1, n, 2), strict=True):
-            view.centers = own
+            view.means2d = own
         pictures = [reference._picture(view, behind, height, width) for view, behind in zip(splats, backs, strict=True)]
         color, alpha, depth, visible = (torch.stack(part).float() for part in zip(*pictures, strict=True))
         radii = (4 * visible).int()[..., None].expand(-1, -1, 2).reshape(centers.shape)

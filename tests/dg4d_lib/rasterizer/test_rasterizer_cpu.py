@@ -7,7 +7,7 @@ import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 
 WHITE = torch.ones(3)
 
@@ -20,7 +20,7 @@ def keep_the_number_of_threads():
 
 
 def test_neither_the_number_of_threads_nor_of_views_changes_a_byte(random_cloud, forward_and_backward):
-    cpu = choose_rasterizer("cpu")
+    cpu = get_rasterizer("cpu")
     cloud = random_cloud(5000, scale=0.03)
     cameras = [OrbitCamera(10, 40 * i, width=200, height=140) for i in range(3)]
     results = []
@@ -35,7 +35,7 @@ def test_neither_the_number_of_threads_nor_of_views_changes_a_byte(random_cloud,
 
 
 def test_a_second_run_gives_the_same_bytes(random_cloud, forward_and_backward):
-    cpu = choose_rasterizer("cpu")
+    cpu = get_rasterizer("cpu")
     first, second = (
         forward_and_backward(cpu, random_cloud(500), [OrbitCamera(width=90, height=70)], torch.float32)
         for _ in range(2)
@@ -46,7 +46,7 @@ def test_a_second_run_gives_the_same_bytes(random_cloud, forward_and_backward):
 
 def test_memory_of_a_picture_in_use_is_not_drawn_over(random_cloud):
     """Two graphs alive at once, gone through in either order and twice, give the same gradients."""
-    cpu = choose_rasterizer("cpu")
+    cpu = get_rasterizer("cpu")
     camera, cloud = OrbitCamera(width=70, height=70), random_cloud(200).to(torch.float32)
     means = [(cloud.means + shift).requires_grad_() for shift in (0.0, 0.1)]
     losses = [cpu(replace(cloud, means=leaf), [camera], WHITE).color.square().sum() for leaf in means]
@@ -58,7 +58,7 @@ def test_memory_of_a_picture_in_use_is_not_drawn_over(random_cloud):
 
 
 def test_layout_of_the_inputs_and_of_the_cotangent_does_not_matter(random_cloud):
-    cpu = choose_rasterizer("cpu")
+    cpu = get_rasterizer("cpu")
     camera, cloud = OrbitCamera(width=40, height=30), random_cloud(100).to(torch.float32)
     strided = Gaussians(
         **{name: value.transpose(0, -1).contiguous().transpose(0, -1) for name, value in vars(cloud).items()}
@@ -73,7 +73,7 @@ def test_layout_of_the_inputs_and_of_the_cotangent_does_not_matter(random_cloud)
 
 
 def test_a_gaussian_whose_size_overflows_is_not_drawn_and_changes_nothing(blobs):
-    cpu, camera = choose_rasterizer("cpu"), OrbitCamera(width=40, height=30)
+    cpu, camera = get_rasterizer("cpu"), OrbitCamera(width=40, height=30)
     cloud = blobs([(0, 0, 0), (0.2, 0, 0.1)]).to(torch.float32)
     alone = cpu(replace(cloud, opacity_logits=cloud.opacity_logits - torch.tensor([0.0, 1e9])), [camera], WHITE)
     cloud.log_scales[1] = 100
@@ -83,7 +83,7 @@ def test_a_gaussian_whose_size_overflows_is_not_drawn_and_changes_nothing(blobs)
 
 
 def test_colors_at_the_bounds_of_the_clamp_can_be_learned_and_those_beyond_cannot(blobs):
-    cpu, camera = choose_rasterizer("cpu"), OrbitCamera(width=40, height=30)
+    cpu, camera = get_rasterizer("cpu"), OrbitCamera(width=40, height=30)
     cloud = blobs([(0, 0, 0)], colors=[(0, 1, 0.5)]).to(torch.float32)
     harmonics = cloud.harmonics.requires_grad_()
     gradients = [

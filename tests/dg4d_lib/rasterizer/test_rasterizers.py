@@ -178,7 +178,7 @@ def test_an_empty_cloud_shows_the_background(rasterize, random_cloud):
 @pytest.mark.parametrize(
     ("broken", "message"),
     [
-        ({"means": (1, torch.nan)}, "4 Gaussians with numbers that are not finite (3 in means)"),
+        ({"means": (1, torch.nan)}, "4 Gaussians have non-finite numbers (3 in means)"),
         ({"log_scales": (2, torch.inf)}, "(3 in log_scales)"),
         ({"quats": (0, torch.nan), "opacity_logits": (3, -torch.inf)}, "(4 in quats, 1 in opacity_logits)"),
         ({"harmonics": (0, torch.nan)}, "(3 in harmonics)"),
@@ -233,7 +233,7 @@ def test_the_screen_gradient_is_what_a_shift_of_the_picture_gives(rasterize, blo
     """A blob far from thresholds: per pixel along x, the sum of alpha times x grows by the sum of alpha."""
     picture, leaves = drawn(rasterize, blobs([(0, 0, 0)], scale=0.05, opacity=0.8), [FRONT], torch.float32)
     columns = torch.arange(33) + 0.5
-    (gradient,) = torch.autograd.grad((picture.alpha[..., 0] * columns).sum(), leaves["screen_offsets"])
+    (gradient,) = torch.autograd.grad((picture.alpha[..., 0] * columns).sum(), leaves["means2d_offsets"])
     # alpha below 1/255 is cut off, a share of 1/255 / 0.8 of all of it
     torch.testing.assert_close(gradient[0, 0], torch.stack((picture.alpha.sum(), torch.zeros(()))), atol=0.2, rtol=0.05)
 
@@ -269,7 +269,7 @@ def test_few_gaussians_keep_the_gradients_of_every_state_apart(count, rasterize,
 def test_a_wrong_number_of_states_or_cameras_of_two_sizes_are_refused(rasterize, random_cloud):
     with pytest.raises(BadInput, match="2 states"):
         rasterize(random_cloud(3, states=3), [FRONT, FRONT], BACKGROUND)
-    with pytest.raises(BadInput, match="one size"):
+    with pytest.raises(BadInput, match="the same size"):
         rasterize(random_cloud(3), [FRONT, OrbitCamera(width=16, height=16)], BACKGROUND)
     with pytest.raises(BadInput, match="no camera"):
         rasterize(random_cloud(3), [], BACKGROUND)

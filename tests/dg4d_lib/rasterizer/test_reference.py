@@ -33,7 +33,7 @@ def test_gradients_beyond_the_margin_of_the_frustum_are_differences(blobs):
     """There the Jacobian no longer depends on x, but still on z."""
     camera = OrbitCamera(**PIXELS)
     cloud = blobs([(1.6, 0.1, 0.2), (0.1, -1.5, 0.1)], scale=0.7)
-    x, y, z = (cloud.means @ camera.world_to_camera()[:3, :3].T + camera.world_to_camera()[:3, 3]).unbind(-1)
+    x, y, z = (cloud.means @ camera.viewmat()[:3, :3].T + camera.viewmat()[:3, 3]).unbind(-1)
     assert (torch.maximum(x.abs(), y.abs()) / z > 1.3 * camera.tan_half_fov[0]).all()
 
     def pictures(*leaves):

@@ -4,7 +4,7 @@ import torch
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import isotropic
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.reconstruction.alignment import best_azimuth
 
 WHITE = torch.ones(3)
@@ -28,7 +28,7 @@ def lopsided() -> Gaussians:
 
 @pytest.mark.parametrize("azimuth", [0.0, 33.3, -97.8, 179.6])
 def test_the_known_rotation_is_found_within_a_degree(azimuth: float):
-    cloud, rasterize = lopsided(), choose_rasterizer("cpu")
+    cloud, rasterize = lopsided(), get_rasterizer("cpu")
     picture = rasterize(cloud, [OrbitCamera(0, azimuth, width=256, height=256)], WHITE).color[0]
     found = best_azimuth(cloud, picture, rasterize)
     assert -180 <= found < 180
@@ -37,7 +37,7 @@ def test_the_known_rotation_is_found_within_a_degree(azimuth: float):
 
 def test_it_is_found_in_another_rendition_of_the_object():
     """What LGM makes is never quite the picture: other colors, noise, another size."""
-    cloud, rasterize = lopsided(), choose_rasterizer("cpu")
+    cloud, rasterize = lopsided(), get_rasterizer("cpu")
     picture = rasterize(cloud, [OrbitCamera(0, 61.0, radius=1.9, width=200, height=200)], WHITE).color[0]
     noise = 0.1 * torch.randn(picture.shape, generator=torch.Generator().manual_seed(1))
     assert best_azimuth(cloud, (0.9 * picture + 0.05 + noise).clamp(0, 1), rasterize) == pytest.approx(61.0, abs=1)

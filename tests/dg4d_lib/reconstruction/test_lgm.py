@@ -8,25 +8,25 @@ from torch.nn import functional
 
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.cameras.viewpoints import turntable
-from dg4d_lib.diffusion.parts import Placement
+from dg4d_lib.diffusion.components import Placement
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply, write_ply
-from dg4d_lib.rasterizer.interface import choose_rasterizer
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.reconstruction import lgm
 from dg4d_lib.reconstruction.lgm import (
     LGM_RADIUS,
     Lgm,
-    gaussians_of,
+    decode_gaussians,
+    infer_unet_config,
     load_lgm,
     ray_embedding,
     reconstruct,
-    shape_of,
     visible,
 )
-from dg4d_lib.reconstruction.lgm_unet import UnetShape
+from dg4d_lib.reconstruction.lgm_unet import UnetConfig
 
-TINY = UnetShape((32, 32, 64), (False, True, True), (64, 32), (True, False))
+TINY = UnetConfig((32, 32, 64), (False, True, True), (64, 32), (True, False))
 CPU = Placement(torch.device("cpu"), torch.float32)
 
 
@@ -46,7 +46,7 @@ def raw(count: int = 500, spread: float = 3.0) -> torch.Tensor:
 
 def test_the_published_size_has_the_published_number_of_parameters_and_names():
     with torch.device("meta"):
-        shapes = {name: tuple(value.shape) for name, value in Lgm(UnetShape()).state_dict().items()}
+        shapes = {name: tuple(value.shape) for name, value in Lgm(UnetConfig()).state_dict().items()}
     assert sum(torch.Size(shape).numel() for shape in shapes.values()) == 415_042_848  # "415M"
     expected = {
         "unet.conv_in.weight": (64, 9, 3, 3),
@@ -75,7 +75,7 @@ def test_the_published_size_has_the_published_number_of_parameters_and_names():
 
 def test_four_views_of_256_pixels_make_65536_gaussians():
     with torch.device("meta"):
-        model = Lgm(UnetShape())
+        model = Lgm(UnetConfig())
         assert model(torch.empty(4, 256, 256, 3)).shape == (65_536, 14)
     assert tiny()(pictures(32)).shape == (4 * 16 * 16, 14)
 
@@ -107,10 +107,10 @@ def test_a_file_that_does_not_fit_is_refused_by_name(tmp_path: Path):
         load_lgm(tmp_path / "nowhere.safetensors", CPU)
 
 
-@pytest.mark.parametrize("shape", [UnetShape(), TINY, UnetShape(up_channels=(1024, 512), up_attention=(True, False))])
-def test_weights_tell_the_size_of_their_network(shape: UnetShape):
+@pytest.mark.parametrize("shape", [UnetConfig(), TINY, UnetConfig(up_channels=(1024, 512), up_attention=(True, False))])
+def test_weights_tell_the_size_of_their_network(shape: UnetConfig):
     with torch.device("meta"):
-        assert shape_of(Lgm(shape).state_dict()) == shape
+        assert infer_unet_config(Lgm(shape).state_dict()) == shape
 
 
 def written_out(state: dict[str, torch.Tensor], x: torch.Tensor) -> torch.Tensor:
@@ -195,7 +195,7 @@ def test_rays_are_their_closed_form():
 
 
 def test_activations_stay_in_their_ranges():
-    gaussians = gaussians_of(raw(spread=20.0))
+    gaussians = decode_gaussians(raw(spread=20.0))
     assert gaussians.means.abs().max() <= 4 / 3 + 1e-6
     assert gaussians.scales.min() > 0
     assert gaussians.opacities.min() >= 0
@@ -208,7 +208,7 @@ def test_activations_stay_in_their_ranges():
 
 def test_activations_are_their_closed_form():
     numbers = torch.tensor([[0.3, -0.6, 3.0, 0.4, 0.0, 1.0, -2.0, 0.0, 3.0, 0.0, 4.0, 0.0, 0.5, -30.0]])
-    gaussians = gaussians_of(numbers)
+    gaussians = decode_gaussians(numbers)
     torch.testing.assert_close(gaussians.means, torch.tensor([[0.4, -0.8, 4 / 3]]))
     softplus = torch.tensor([[2.0, 1 + torch.e, 1 + torch.e**-2]]).log()
     torch.testing.assert_close(gaussians.scales, 0.1 * softplus / 0.75)
@@ -219,7 +219,7 @@ def test_activations_are_their_closed_form():
 
 
 def test_a_ply_holds_a_reconstruction(tmp_path: Path):
-    gaussians = gaussians_of(raw())
+    gaussians = decode_gaussians(raw())
     write_ply(tmp_path / "object.ply", gaussians)
     again = read_ply(tmp_path / "object.ply")
     for name, value in vars(gaussians).items():
@@ -227,12 +227,12 @@ def test_a_ply_holds_a_reconstruction(tmp_path: Path):
 
 
 def test_the_picture_at_our_radius_is_lgms_own():
-    ours = gaussians_of(raw(200, 1.0))
+    ours = decode_gaussians(raw(200, 1.0))
     factor = LGM_RADIUS / RADIUS
     theirs = Gaussians(
         ours.means * factor, (ours.scales * factor).log(), ours.quats, ours.opacity_logits, ours.harmonics
     )
-    rasterize, white = choose_rasterizer("reference"), torch.ones(3)
+    rasterize, white = get_rasterizer("reference"), torch.ones(3)
     size = {"width": 48, "height": 48}
     near = rasterize(theirs, [OrbitCamera(10, 30, LGM_RADIUS, **size)], white)
     far = rasterize(ours, [OrbitCamera(10, 30, RADIUS, **size)], white)
@@ -243,17 +243,17 @@ def test_the_picture_at_our_radius_is_lgms_own():
 
 def test_the_faintest_are_left_out():
     numbers = raw(100)
-    kept = visible(gaussians_of(numbers))
+    kept = visible(decode_gaussians(numbers))
     assert 0 < len(kept) == int((numbers[:, 3].sigmoid() >= 0.005).sum()) < 100
 
 
 def test_the_second_pass_sees_the_first_from_the_side_of_the_picture(monkeypatch: pytest.MonkeyPatch):
     model, seen = tiny(), []
-    rasterize = choose_rasterizer("cpu")
+    rasterize = get_rasterizer("cpu")
     monkeypatch.setattr(lgm, "best_azimuth", lambda gaussians, picture, rasterize: 37.0)
     model.register_forward_pre_hook(lambda module, given: seen.append(given[0]))
     result = reconstruct(model, pictures(), torch.ones(32, 32, 3), rasterize)
-    first = visible(gaussians_of(model(pictures())))
+    first = visible(decode_gaussians(model(pictures())))
     cameras = [OrbitCamera(0, 37.0 + turn, width=32, height=32) for turn in (0, 90, 180, 270)]
     torch.testing.assert_close(seen[1], rasterize(first, cameras, torch.ones(3)).color)
-    torch.testing.assert_close(result.means, visible(gaussians_of(model(seen[1]))).means, rtol=0, atol=0)
+    torch.testing.assert_close(result.means, visible(decode_gaussians(model(seen[1]))).means, rtol=0, atol=0)

@@ -9,7 +9,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.mesh_rasterizer.texture import bilinear, look_up, read
+from dg4d_lib.mesh_rasterizer.texture import build_lookup, sample_bilinear, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.settings import TextureSettings
 from dg4d_lib.texture.refine import MeshClip, refine_textures
@@ -46,9 +46,9 @@ def shown(meshes: Sequence[TexturedMesh], cameras: Sequence[OrbitCamera]) -> Ten
     pictures = []
     for mesh, camera in zip(meshes, cameras, strict=True):
         fragments = rasterize_mesh(mesh.vertices, mesh.faces, [camera])
-        lookup = look_up(mesh.vertices, mesh.faces, mesh.uvs, mesh.texture.shape[:2], [camera], fragments)
+        lookup = build_lookup(mesh.vertices, mesh.faces, mesh.uvs, mesh.texture.shape[:2], [camera], fragments)
         picture = torch.ones(*lookup.covered.shape, 3)
-        picture[lookup.covered] = read(mesh.texture, lookup)
+        picture[lookup.covered] = sample_texture(mesh.texture, lookup)
         pictures.append(picture[0])
     return torch.stack(pictures)
 
@@ -99,7 +99,7 @@ def error(texture: Tensor, truth: Tensor) -> float:
     """Mean over the texels that the sides show."""
     inside = torch.linspace(0.1, 0.9, 20)
     places = torch.stack([torch.stack([(side + u) / 4, v]) for side in range(4) for u in inside for v in inside])
-    return float((bilinear(texture, places) - bilinear(truth, places)).abs().mean())
+    return float((sample_bilinear(texture, places) - sample_bilinear(truth, places)).abs().mean())
 
 
 def tracked(texture: Tensor) -> list[MeshClip]:
@@ -113,15 +113,15 @@ def test_a_refiner_that_knows_the_truth_gives_a_tracked_mesh_its_texture() -> No
     (refined,) = refine_textures(tracked(start), driving_of(meshes), Oracle(meshes), SETTINGS, rng())
     assert error(start, truth) > 0.2
     assert error(refined.texture, truth) < 0.02
-    assert refined.frames is None
+    assert refined.frame_textures is None
 
 
 def test_it_gives_every_frame_of_its_own_mesh_its_own_texture() -> None:
     truths = [painted(frame) for frame in range(FRAMES)]
     meshes = [moved(box(truth), frame) for frame, truth in enumerate(truths)]
     start = torch.full((32, 128, 3), 0.5)
-    stretches = [MeshClip(moved(box(start), frame), torch.zeros(1, 16, 3)) for frame in range(FRAMES)]
-    refined = refine_textures(stretches, driving_of(meshes), Oracle(meshes), SETTINGS, rng())
+    clips = [MeshClip(moved(box(start), frame), torch.zeros(1, 16, 3)) for frame in range(FRAMES)]
+    refined = refine_textures(clips, driving_of(meshes), Oracle(meshes), SETTINGS, rng())
     textures = [each.texture for each in refined]
     for texture, truth in zip(textures, truths, strict=True):
         assert error(texture, truth) < 0.05  # each is seen by one camera per iteration
@@ -135,8 +135,8 @@ def test_a_texture_that_changes_over_time_takes_what_every_frame_adds() -> None:
     for size in (0, 64):
         settings = SETTINGS.model_copy(update={"frame_size": size})
         (refined,) = refine_textures(tracked(painted()), driving_of(meshes), Oracle(meshes), settings, rng())
-        shown_at = [refined.texture] * FRAMES if refined.frames is None else list(refined.frames)
-        assert (refined.frames is None) == (size == 0)
+        shown_at = [refined.texture] * FRAMES if refined.frame_textures is None else list(refined.frame_textures)
+        assert (refined.frame_textures is None) == (size == 0)
         errors[size] = max(error(texture, truth) for texture, truth in zip(shown_at, truths, strict=True))
     assert shown_at[0].shape == (16, 64, 3)  # as the texture, half as large
     assert errors[0] > 0.1
@@ -148,10 +148,10 @@ def test_where_nothing_changes_frames_add_next_to_nothing() -> None:
     settings = SETTINGS.model_copy(update={"frame_size": 128})
     start = torch.full((32, 128, 3), 0.5)
     (refined,) = refine_textures(tracked(start), driving_of(meshes), Oracle(meshes), settings, rng())
-    assert refined.frames is not None and refined.frames.shape == (FRAMES, 32, 128, 3)
-    for texture in refined.frames:
+    assert refined.frame_textures is not None and refined.frame_textures.shape == (FRAMES, 32, 128, 3)
+    for texture in refined.frame_textures:
         assert error(texture, painted()) < 0.03
-    assert max(error(one, other) for one in refined.frames for other in refined.frames) < 0.03
+    assert max(error(one, other) for one in refined.frame_textures for other in refined.frame_textures) < 0.03
 
 
 def test_what_frames_add_is_what_its_weight_leaves_of_it() -> None:
@@ -173,8 +173,8 @@ def test_what_frames_add_is_what_its_weight_leaves_of_it() -> None:
     base, *added = torch.linalg.solve(equations, torch.cat([colors.double().sum()[None], colors.double()])).tolist()
     inside = refined.texture[2:-2, 2:-2]
     assert float(inside.mean()) == pytest.approx(base, abs=0.01)
-    assert refined.frames is not None
-    for texture, more in zip(refined.frames, added, strict=True):
+    assert refined.frame_textures is not None
+    for texture, more in zip(refined.frame_textures, added, strict=True):
         assert float(texture[2:-2, 2:-2].mean()) == pytest.approx(base + more, abs=0.01)
     assert max(added) < 0.8 * float(colors.max() - colors.mean())  # so that the weight is felt
 
@@ -222,13 +222,13 @@ def test_the_input_view_does_not_color_what_it_sees_from_the_side() -> None:
     turn = torch.tensor([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
     turned = TexturedMesh(mesh.vertices @ turn.T, mesh.faces, mesh.uvs, start)
     red = DrivingVideo(torch.tensor([1.0, 0, 0]).expand(1, SIZE, SIZE, 3), torch.ones(1, SIZE, SIZE, 1), 7.0)
-    stretches = [MeshClip(turned, torch.zeros(1, 16, 3))]
+    clips = [MeshClip(turned, torch.zeros(1, 16, 3))]
     settings = SETTINGS.model_copy(update={"iterations": 3, "min_cosine": 0.6})
-    (refined,) = refine_textures(stretches, red, Satisfied(), settings, rng())
+    (refined,) = refine_textures(clips, red, Satisfied(), settings, rng())
     change = (refined.texture - start).abs().mean(-1).mean(0).reshape(4, 32).mean(1)
     assert change[0] > 0.1
     assert change[1:].max() < 0.01
-    (refined,) = refine_textures(stretches, red, Satisfied(), settings.model_copy(update={"min_cosine": 0.0}), rng())
+    (refined,) = refine_textures(clips, red, Satisfied(), settings.model_copy(update={"min_cosine": 0.0}), rng())
     assert (refined.texture - start).abs().mean(-1).mean(0).reshape(4, 32).mean(1)[1:].max() > 0.1
 
 
@@ -244,7 +244,7 @@ def test_equal_seeds_give_equal_bits() -> None:
 
 def test_another_number_of_frames_is_refused() -> None:
     meshes = [box(painted())] * 2
-    with pytest.raises(BadInput, match="3 frames and the driving video 2"):
+    with pytest.raises(BadInput, match="3 frames and the driving video has 2"):
         refine_textures(tracked(painted()), driving_of(meshes), Satisfied(), SETTINGS, rng())
 
 

@@ -13,8 +13,8 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.latents import encode_images
 from dg4d_lib.diffusion.noise_schedule import ddim_timesteps
 from dg4d_lib.diffusion.video_model import VideoModel
-from dg4d_lib.guidance.distillation import Annealing
-from dg4d_lib.guidance.interface import View
+from dg4d_lib.guidance.distillation import TimestepSchedule
+from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.settings import ImageToImageSettings, VideoModelSettings, VideoToVideoSettings, Zero123PriorSettings
 from dg4d_lib.texture.refiner import ImageToImage, Refiner, VideoToVideo
@@ -117,7 +117,7 @@ def test_pictures_are_denoised_as_the_ddim_scheduler_does_it(
     from diffusers import DDIMScheduler
 
     frames = video(3).float()
-    prior = zero123.conditioned_on(frames, Annealing(1.0))
+    prior = zero123.conditioned_on(frames, TimestepSchedule(1.0))
     settings = ImageToImageSettings(num_inference_steps=20)
     refiner = ImageToImage(settings, prior)
     assert isinstance(refiner, Refiner)
@@ -133,7 +133,7 @@ def test_pictures_are_denoised_as_the_ddim_scheduler_does_it(
     scale = zero123.vae.config.scaling_factor
     noise = torch.randn((FRAMES, 4, 32, 32), generator=rng(7))
     latents = scheduler.add_noise(scale * encode_images(prior.vae, video().float()), noise, timesteps[:1])
-    tokens = prior.tokens([View(camera, frame) for frame, camera in enumerate(CAMERAS)])
+    tokens = prior.tokens([GuidanceView(camera, frame) for frame, camera in enumerate(CAMERAS)])
     for timestep in timesteps:
         believed = prior.predict_noise(latents, int(timestep), prior.latents, tokens)
         latents = scheduler.step(believed, timestep, latents).prev_sample

@@ -5,9 +5,9 @@ import torch
 from torch import Tensor
 
 from dg4d_lib.settings import WarpSettings
-from dg4d_lib.video.candidate_ranking import WEIGHTS, Candidate, Score, ranked, score
+from dg4d_lib.video.candidate_ranking import WEIGHTS, Candidate, VideoScore, rank_candidates, score_video
 from dg4d_lib.video.driving import DrivingVideo
-from dg4d_lib.video.warp import MOTIONS, Warp, candidate
+from dg4d_lib.video.warp import MOTIONS, Warp, candidate_settings
 
 SIZE, FRAMES = 96, 14
 
@@ -28,7 +28,7 @@ def good(subject: Tensor) -> DrivingVideo:
 
 
 def frozen(video: DrivingVideo) -> DrivingVideo:
-    return DrivingVideo(video.frames[:1].repeat(FRAMES, 1, 1, 1), video.coverage[:1].repeat(FRAMES, 1, 1, 1), 7.0)
+    return DrivingVideo(video.frames[:1].repeat(FRAMES, 1, 1, 1), video.alpha[:1].repeat(FRAMES, 1, 1, 1), 7.0)
 
 
 def black(video: DrivingVideo) -> DrivingVideo:
@@ -36,7 +36,7 @@ def black(video: DrivingVideo) -> DrivingVideo:
 
 
 def empty(video: DrivingVideo) -> DrivingVideo:
-    return replace(video, coverage=torch.cat([video.coverage[:2], torch.zeros_like(video.coverage[2:])]))
+    return replace(video, alpha=torch.cat([video.alpha[:2], torch.zeros_like(video.alpha[2:])]))
 
 
 def flickering(video: DrivingVideo) -> DrivingVideo:
@@ -47,7 +47,7 @@ def flickering(video: DrivingVideo) -> DrivingVideo:
 def cropped(video: DrivingVideo) -> DrivingVideo:
     """It walks out of the frame, to the right."""
     shifted = [
-        torch.cat([video.frames[i], video.coverage[i]], -1).roll(4 * i, 1) * (torch.arange(SIZE) >= 4 * i)[:, None]
+        torch.cat([video.frames[i], video.alpha[i]], -1).roll(4 * i, 1) * (torch.arange(SIZE) >= 4 * i)[:, None]
         for i in range(FRAMES)
     ]
     stack = torch.stack(shifted)
@@ -55,8 +55,8 @@ def cropped(video: DrivingVideo) -> DrivingVideo:
 
 
 def swelling(video: DrivingVideo) -> DrivingVideo:
-    grown = torch.nn.functional.max_pool2d(video.coverage[7:].movedim(-1, 1), 25, 1, 12).movedim(1, -1)
-    return replace(video, coverage=torch.cat([video.coverage[:7], grown]))
+    grown = torch.nn.functional.max_pool2d(video.alpha[7:].movedim(-1, 1), 25, 1, 12).movedim(1, -1)
+    return replace(video, alpha=torch.cat([video.alpha[:7], grown]))
 
 
 def another(video: DrivingVideo) -> DrivingVideo:
@@ -67,7 +67,7 @@ BROKEN = {
     frozen: "hardly anything moves",
     black: "frames are dark or empty",
     empty: "frames are dark or empty",
-    flickering: "it flickers",
+    flickering: "the video flickers",
     cropped: "the subject leaves the frame",
     swelling: "the subject changes its size",
     another: "the subject does not look like the input",
@@ -76,51 +76,51 @@ BROKEN = {
 
 @pytest.mark.parametrize(("breaks", "remark"), BROKEN.items(), ids=lambda value: getattr(value, "__name__", ""))
 def test_a_good_motion_beats_a_broken_one(breaks, remark: str, good: DrivingVideo, subject: Tensor) -> None:
-    fine, broken = score(good, subject), score(breaks(good), subject)
+    fine, broken = score_video(good, subject), score_video(breaks(good), subject)
     assert broken.total < fine.total - 0.1
     assert remark in broken.remarks and not fine.remarks
 
 
 def test_a_frozen_video_is_worth_nothing(good: DrivingVideo, subject: Tensor) -> None:
-    assert score(frozen(good), subject).total == 0
+    assert score_video(frozen(good), subject).total == 0
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_every_made_up_motion_is_good(motion, subject: Tensor) -> None:
-    found = score(Warp(WarpSettings(motion=motion)).generate(subject, torch.Generator()), subject)
+    found = score_video(Warp(WarpSettings(motion=motion)).generate(subject, torch.Generator()), subject)
     assert found.total > 0.8 and not found.remarks
 
 
 def test_a_subject_that_the_input_cuts_off_is_not_blamed_for_it(subject: Tensor) -> None:
     bust = torch.cat([subject[SIZE // 3 :], subject[SIZE // 2 : SIZE // 2 + 1].expand(SIZE // 3, -1, -1)])
     video = Warp(WarpSettings(motion="breathe")).generate(bust, torch.Generator())
-    assert score(video, bust).whole > 0.7
+    assert score_video(video, bust).whole > 0.7
 
 
 def test_two_frames_are_enough(good: DrivingVideo, subject: Tensor) -> None:
-    short = DrivingVideo(good.frames[[0, 3]], good.coverage[[0, 3]], 7.0)
-    assert 0.5 < score(short, subject).total <= 1
+    short = DrivingVideo(good.frames[[0, 3]], good.alpha[[0, 3]], 7.0)
+    assert 0.5 < score_video(short, subject).total <= 1
 
 
 def test_numbers_lie_between_nothing_and_one(good: DrivingVideo, subject: Tensor) -> None:
     assert sum(WEIGHTS.values()) == pytest.approx(1)
     for video in (good, *(breaks(good) for breaks in BROKEN)):
-        found = score(video, subject)
+        found = score_video(video, subject)
         for name in ("alive", *WEIGHTS, "total"):
             assert 0 <= getattr(found, name) <= 1
 
 
 def test_the_best_comes_first_and_equal_ones_by_number(good: DrivingVideo) -> None:
-    high, low = Score(1, 1, 1, 1, 1, ()), Score(1, 1, 0, 1, 1, ())
+    high, low = VideoScore(1, 1, 1, 1, 1, ()), VideoScore(1, 1, 0, 1, 1, ())
     given = [Candidate(3, "c", good, high), Candidate(1, "a", good, low), Candidate(2, "b", good, high)]
-    assert [each.number for each in ranked(given)] == [2, 3, 1]
+    assert [each.number for each in rank_candidates(given)] == [2, 3, 1]
     assert given[1].row()["total"] == 0.7
     assert low.weakest == "identity"
 
 
 def test_candidates_begin_with_the_chosen_motion_and_repeat_none_before_all_are_there() -> None:
     settings = WarpSettings(motion="wave", strength=1.0)
-    made = [candidate(settings, number) for number in range(1, 9)]
+    made = [candidate_settings(settings, number) for number in range(1, 9)]
     assert made[0] == settings
     assert {each.motion for each in made[:6]} == set(MOTIONS)
     assert made[6].motion == "wave" and made[6].strength == pytest.approx(0.6)

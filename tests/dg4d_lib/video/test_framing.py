@@ -4,14 +4,14 @@ import torch
 from dg4d_lib.errors import BadInput
 from dg4d_lib.video.framing import (
     Crop,
-    around_subject,
+    bounding_box,
+    crop_around_subject,
+    crop_whole_frame,
+    downscale,
     extend_color,
-    extent,
-    lies_well,
+    is_well_framed,
     reframe,
     resample,
-    shrink,
-    whole_frame,
 )
 
 
@@ -25,19 +25,19 @@ def box(height: int, width: int, top: int, left: int, bottom: int, right: int) -
 
 def test_the_extent_is_that_of_all_frames_together():
     alpha = torch.cat([box(40, 50, 5, 6, 10, 12), box(40, 50, 8, 20, 30, 26)])[..., 3]
-    assert extent(alpha) == (6, 5, 26, 30)
+    assert bounding_box(alpha) == (6, 5, 26, 30)
 
 
 def test_an_invisible_subject_is_refused():
     with pytest.raises(BadInput, match="fully transparent"):
-        extent(torch.full((1, 8, 8), 0.04))
+        bounding_box(torch.full((1, 8, 8), 0.04))
 
 
 @pytest.mark.parametrize("border", [0.0, 0.2, 0.5])
 def test_a_centered_subject_leaves_the_border_free(border):
     frame = box(60, 200, 10, 120, 30, 160)
-    out = reframe(frame, around_subject(frame[..., 3], border), 50)
-    left, top, right, bottom = extent(out[..., 3])
+    out = reframe(frame, crop_around_subject(frame[..., 3], border), 50)
+    left, top, right, bottom = bounding_box(out[..., 3])
     assert right - left == pytest.approx(50 * (1 - border), abs=2)
     assert bottom - top == pytest.approx(25 * (1 - border), abs=2)
     assert left == pytest.approx(50 - right, abs=1) and top == pytest.approx(50 - bottom, abs=1)
@@ -46,17 +46,17 @@ def test_a_centered_subject_leaves_the_border_free(border):
 def test_a_crop_may_reach_beyond_the_picture():
     frame = box(20, 20, 0, 0, 20, 20)
     out = reframe(frame, Crop(-10, -10, 40), 40)
-    assert extent(out[..., 3]) == (10, 10, 30, 30)
+    assert bounding_box(out[..., 3]) == (10, 10, 30, 30)
 
 
 def test_the_whole_frame_is_padded_to_a_square_around_its_middle():
-    out = reframe(box(20, 40, 0, 0, 20, 40), whole_frame(20, 40), 40)
-    assert extent(out[..., 3]) == (0, 10, 40, 30)
+    out = reframe(box(20, 40, 0, 0, 20, 40), crop_whole_frame(20, 40), 40)
+    assert bounding_box(out[..., 3]) == (0, 10, 40, 30)
 
 
 def test_a_crop_of_the_whole_square_changes_nothing():
     frame = torch.rand(2, 32, 32, 4, generator=torch.Generator().manual_seed(0)).clamp(0.1, 1)
-    assert torch.equal(reframe(frame, whole_frame(32, 32), 32), frame)
+    assert torch.equal(reframe(frame, crop_whole_frame(32, 32), 32), frame)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_a_crop_of_the_whole_square_changes_nothing():
     ],
 )
 def test_a_frame_is_kept_when_its_subject_lies_well(frame, well):
-    assert lies_well(frame[..., 3]) is well
+    assert is_well_framed(frame[..., 3]) is well
 
 
 def test_hidden_colors_do_not_bleed_when_a_picture_shrinks():
@@ -86,8 +86,8 @@ def test_shrinking_keeps_the_area_of_alpha():
 
 
 def test_shrinking_keeps_small_frames_and_proportions():
-    assert shrink(torch.zeros(1, 30, 40, 4), 40).shape == (1, 30, 40, 4)
-    assert shrink(torch.zeros(1, 300, 400, 4), 40).shape == (1, 30, 40, 4)
+    assert downscale(torch.zeros(1, 30, 40, 4), 40).shape == (1, 30, 40, 4)
+    assert downscale(torch.zeros(1, 300, 400, 4), 40).shape == (1, 30, 40, 4)
 
 
 def test_hidden_pixels_take_the_nearest_opaque_color():

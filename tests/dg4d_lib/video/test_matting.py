@@ -7,7 +7,7 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.video.backdrop import fit_backdrop
-from dg4d_lib.video.matting import matte, matte_after
+from dg4d_lib.video.matting import matte, matte_from_first_alpha
 from dg4d_lib.video.saliency import fit_mixture
 
 SIZE = 160
@@ -205,7 +205,7 @@ def test_what_is_known_of_the_first_frame_steadies_the_rest():
     frames = torch.stack(
         [(still + 0.015 * torch.randn(still.shape, generator=generator)).clamp(0, 1) for _ in range(6)]
     )
-    alone, after = matte(frames).frames[..., 3], matte_after(frames, truth)[..., 3]
+    alone, after = matte(frames).frames[..., 3], matte_from_first_alpha(frames, truth)[..., 3]
     assert torch.equal(after[0], truth)
     flicker = [(alpha[1:] - alpha[:-1]).abs().mean() for alpha in (alone, after)]
     assert flicker[1] < 0.85 * flicker[0]
@@ -215,7 +215,7 @@ def test_what_is_known_of_the_first_frame_steadies_the_rest():
 def test_a_moving_subject_leaves_no_trail_when_the_first_frame_is_known():
     alphas = torch.stack([ragged(0.08 * step) for step in range(4)])
     frames = torch.stack([over(alpha, texture(), white()) for alpha in alphas])
-    found = matte_after(frames, alphas[0])[..., 3]
+    found = matte_from_first_alpha(frames, alphas[0])[..., 3]
     for alpha, known in zip(found, alphas, strict=True):
         assert iou(alpha, known) > 0.97
 

@@ -3,8 +3,8 @@ import torch
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.settings import SubjectSettings
-from dg4d_lib.video.framing import extent
-from dg4d_lib.video.subject import prepare
+from dg4d_lib.video.framing import bounding_box
+from dg4d_lib.video.subject import prepare_subject
 
 
 def cutout(size: int = 96, top: int = 20, left: int = 30, height: int = 50, width: int = 30) -> torch.Tensor:
@@ -17,35 +17,35 @@ def cutout(size: int = 96, top: int = 20, left: int = 30, height: int = 50, widt
 
 def test_auto_keeps_a_square_cutout_bit_for_bit():
     frame = cutout()
-    result, notes = prepare(frame, True, SubjectSettings(size=96))
+    result, notes = prepare_subject(frame, True, SubjectSettings(size=96))
     assert notes == ()
     visible = frame[..., 3] > 0
     assert torch.equal(result[..., 3], frame[..., 3]) and torch.equal(result[visible], frame[visible])
 
 
 def test_center_puts_the_same_cutout_into_the_middle():
-    result, _ = prepare(cutout(), True, SubjectSettings(size=96, framing="center", border=0.2))
-    left, top, right, bottom = extent(result[..., 3])
+    result, _ = prepare_subject(cutout(), True, SubjectSettings(size=96, framing="center", border=0.2))
+    left, top, right, bottom = bounding_box(result[..., 3])
     assert bottom - top == pytest.approx(0.8 * 96, abs=2)
     assert abs(left - (96 - right)) <= 2 and abs(top - (96 - bottom)) <= 2
 
 
 def test_auto_centers_what_touches_the_edge():
-    result, _ = prepare(cutout(top=0), True, SubjectSettings(size=96))
-    left, top, right, bottom = extent(result[..., 3])
+    result, _ = prepare_subject(cutout(top=0), True, SubjectSettings(size=96))
+    left, top, right, bottom = bounding_box(result[..., 3])
     assert min(left, top, 96 - right, 96 - bottom) >= 8
 
 
 def test_keep_pads_to_a_square_only():
     frame = cutout()[:, :80]
-    result, _ = prepare(frame, True, SubjectSettings(size=96, framing="keep"))
-    assert extent(result[..., 3]) == (30, 28, 60, 78)
+    result, _ = prepare_subject(frame, True, SubjectSettings(size=96, framing="keep"))
+    assert bounding_box(result[..., 3]) == (30, 28, 60, 78)
 
 
 def test_all_frames_share_one_crop():
     frames = torch.cat([cutout(left=2 + 8 * i) for i in range(5)])
-    result, _ = prepare(frames, True, SubjectSettings(size=96, framing="center"))
-    lefts = [extent(frame[None, ..., 3])[0] for frame in result]
+    result, _ = prepare_subject(frames, True, SubjectSettings(size=96, framing="center"))
+    lefts = [bounding_box(frame[None, ..., 3])[0] for frame in result]
     steps = torch.tensor(lefts).diff()
     assert (steps > 0).all() and steps.max() - steps.min() <= 2
 
@@ -54,30 +54,30 @@ def test_opaque_pictures_are_cut_out_and_centered():
     frame = cutout()
     opaque = torch.cat([frame[..., :3] * frame[..., 3:] + 1 - frame[..., 3:], torch.ones_like(frame[..., 3:])], -1)
     opaque[0, 20:70, 30:60, :3] *= 0.5
-    result, notes = prepare(opaque, False, SubjectSettings(size=96))
+    result, notes = prepare_subject(opaque, False, SubjectSettings(size=96))
     assert any("background was removed" in note for note in notes)
-    left, top, right, bottom = extent(result[..., 3])
+    left, top, right, bottom = bounding_box(result[..., 3])
     assert bottom - top == pytest.approx(0.8 * 96, abs=3)
     assert abs(left - (96 - right)) <= 3 and abs(top - (96 - bottom)) <= 3
 
 
 def test_a_fully_transparent_picture_is_refused():
     with pytest.raises(BadInput, match="fully transparent"):
-        prepare(torch.zeros(1, 64, 64, 4), True, SubjectSettings())
+        prepare_subject(torch.zeros(1, 64, 64, 4), True, SubjectSettings())
 
 
 def test_a_first_frame_without_a_subject_is_refused():
     with pytest.raises(BadInput, match="first frame"):
-        prepare(torch.cat([torch.zeros(1, 96, 96, 4), cutout()]), True, SubjectSettings())
+        prepare_subject(torch.cat([torch.zeros(1, 96, 96, 4), cutout()]), True, SubjectSettings())
 
 
 def test_a_subject_of_a_few_pixels_is_refused():
     with pytest.raises(BadInput, match="10 x 8 pixels"):
-        prepare(cutout(height=8, width=10), True, SubjectSettings())
+        prepare_subject(cutout(height=8, width=10), True, SubjectSettings())
 
 
 def test_a_filled_frame_says_that_it_has_no_outline():
     full = torch.ones(1, 64, 64, 4)
     full[..., 3] = 0.9
-    _, notes = prepare(full, True, SubjectSettings(size=64, framing="keep"))
+    _, notes = prepare_subject(full, True, SubjectSettings(size=64, framing="keep"))
     assert any("no outline" in note for note in notes)

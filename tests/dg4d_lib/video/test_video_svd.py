@@ -3,7 +3,7 @@ import torch
 from tiny_svd import save_tiny_svd
 from torch import Tensor
 
-from dg4d_lib.diffusion.video_model import Condition, VideoModel
+from dg4d_lib.diffusion.video_model import VideoCondition, VideoModel
 from dg4d_lib.settings import SvdSettings, VideoModelSettings
 from dg4d_lib.video.svd import StableVideo
 
@@ -32,11 +32,11 @@ def disc(shift: int) -> Tensor:
 class Known(VideoModel):
     """A model that shows the disc move over the canvas that it was given."""
 
-    def look_at(self, picture: Tensor, generators: object) -> Condition:
+    def encode_condition(self, picture: Tensor, generators: object) -> VideoCondition:
         self.canvas = picture
-        return super().look_at(picture, generators)
+        return super().encode_condition(picture, generators)
 
-    def denoise(self, latents: Tensor, condition: Condition, sigmas: object) -> Tensor:
+    def denoise(self, latents: Tensor, condition: VideoCondition, sigmas: object) -> Tensor:
         return latents
 
     def decode(self, latents: Tensor) -> Tensor:
@@ -81,10 +81,10 @@ def test_the_subject_stands_in_the_middle_of_a_white_canvas_and_comes_back_cut_o
     assert (known.canvas[0] > 0.99).all() and (known.canvas[:, 0] > 0.99).all()
     orange = known.canvas[height // 2, width // 2]
     torch.testing.assert_close(orange, torch.tensor([0.9, 0.5, 0.1]), atol=0.02, rtol=0)
-    assert torch.equal(video.coverage[0], subject[..., 3:])
+    assert torch.equal(video.alpha[0], subject[..., 3:])
     for frame in (1, 3):
         truth = disc(round(2 * frame * SIZE / side))[..., 3:]
-        shown = torch.minimum(video.coverage[frame], truth).sum() / torch.maximum(video.coverage[frame], truth).sum()
+        shown = torch.minimum(video.alpha[frame], truth).sum() / torch.maximum(video.alpha[frame], truth).sum()
         assert shown > 0.9
 
 
@@ -95,5 +95,5 @@ def test_where_nothing_can_be_told_the_outline_stays_and_it_is_said(model: Video
 
     maker = StableVideo(SETTINGS, Gray(model.unet, model.vae, model.image_encoder, SETTINGS.model, model.device))
     video = maker.generate(subject, rng(0))
-    assert torch.equal(video.coverage, subject[..., 3:].expand(FRAMES, -1, -1, -1))
+    assert torch.equal(video.alpha, subject[..., 3:].expand(FRAMES, -1, -1, -1))
     assert any("keeps the outline" in note for note in maker.notes)

@@ -8,8 +8,8 @@ import pytest
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.weights import locate
-from dg4d_lib.weights.locate import call_by_content, digests, find_weights, identity, troubles
-from dg4d_lib.weights.lock import LOCK, Locked, LockedFile, read_lock, write_lock
+from dg4d_lib.weights.locate import content_name, digests, find_problems, find_weights, identity
+from dg4d_lib.weights.lock import LOCK, LockedFile, LockEntry, read_lock, write_lock
 from dg4d_lib.weights.registry import KNOWN
 
 PARTS = KNOWN["svd"].parts
@@ -37,11 +37,11 @@ def fill(folder: Path, parts: tuple[str, ...] = PARTS) -> Path:
     return folder
 
 
-def locked(folder: Path) -> Locked:
+def locked(folder: Path) -> LockEntry:
     files = {
         name: LockedFile(sha256=digest, size=(folder / name).stat().st_size) for name, digest in digests(folder).items()
     }
-    return Locked(hub_id=KNOWN["svd"].hub_id, revision="c" * 40, files=files)
+    return LockEntry(hub_id=KNOWN["svd"].hub_id, revision="c" * 40, files=files)
 
 
 def pulled(home: Path) -> Path:
@@ -108,7 +108,7 @@ def test_damage_is_one_clear_message(change: str, home: Path) -> None:
         case "drop a part":
             (folder / "scheduler" / "scheduler_config.json").unlink()
     with pytest.raises(
-        BackendUnavailable, match=r"not whole: .*`dg4d weights check svd`.*`dg4d weights pull svd`"
+        BackendUnavailable, match=r"incomplete or changed: .*`dg4d weights check svd`.*`dg4d weights pull svd`"
     ) as told:
         find_weights("svd", home)
     assert len(str(told.value).splitlines()) == 1
@@ -116,17 +116,17 @@ def test_damage_is_one_clear_message(change: str, home: Path) -> None:
 
 def test_without_a_lock_missing_parts_tensors_and_shards_are_told(tmp_path: Path) -> None:
     folder = fill(tmp_path / "svd")
-    assert troubles(folder, KNOWN["svd"]) == {}
+    assert find_problems(folder, KNOWN["svd"]) == {}
     (folder / "unet" / "diffusion_pytorch_model.safetensors").unlink()
-    assert list(troubles(folder, KNOWN["svd"])) == ["unet"]
+    assert list(find_problems(folder, KNOWN["svd"])) == ["unet"]
     index = {"weight_map": {"x": "model-00001-of-00002.safetensors", "y": "model-00002-of-00002.safetensors"}}
     (folder / "unet" / "model.safetensors.index.json").write_text(json.dumps(index))
     (folder / "unet" / "model-00001-of-00002.safetensors").touch()
-    assert troubles(folder, KNOWN["svd"]) == {"unet/model-00002-of-00002.safetensors": "is missing"}
+    assert find_problems(folder, KNOWN["svd"]) == {"unet/model-00002-of-00002.safetensors": "is missing"}
     (folder / "unet" / "model-00002-of-00002.safetensors").touch()
     (folder / "vae").rename(folder / "vea")
-    assert list(troubles(folder, KNOWN["svd"])) == ["vae"]
-    assert "has no tensors" in troubles(tmp_path / "empty", KNOWN["lgm"])["empty"]
+    assert list(find_problems(folder, KNOWN["svd"])) == ["vae"]
+    assert "has no tensors" in find_problems(tmp_path / "empty", KNOWN["lgm"])["empty"]
 
 
 def test_the_hub_cache_is_used_as_other_programs_left_it(no_hub_cache: Path, home: Path) -> None:
@@ -164,19 +164,19 @@ def test_an_unchanged_file_is_read_once(tmp_path: Path, monkeypatch: pytest.Monk
     read: list[Path] = []
     honest = locate._sha256
     monkeypatch.setattr(locate, "_sha256", lambda path: read.append(path) or honest(path))
-    first = digests(folder, memory=memory)
+    first = digests(folder, cache=memory)
     assert len(read) == 7
-    assert digests(folder, memory=memory) == first
+    assert digests(folder, cache=memory) == first
     assert len(read) == 7
     file = folder / "unet" / "diffusion_pytorch_model.safetensors"
     file.write_bytes(b"more than before")
-    assert digests(folder, memory=memory) != first
+    assert digests(folder, cache=memory) != first
     assert read[7:] == [file]
     os.utime(file, ns=(1, 1))
-    digests(folder, memory=memory)
+    digests(folder, cache=memory)
     assert read[8:] == [file]
     memory.write_text("not json")
-    assert len(digests(folder, memory=memory)) == 7
+    assert len(digests(folder, cache=memory)) == 7
 
 
 def test_the_identity_is_of_content_and_not_of_place(tmp_path: Path) -> None:
@@ -188,29 +188,29 @@ def test_the_identity_is_of_content_and_not_of_place(tmp_path: Path) -> None:
 
 def test_a_users_folder_is_called_by_its_content_wherever_it_lies(tmp_path: Path, home: Path) -> None:
     one, two = fill(tmp_path / "one" / "mine"), fill(tmp_path / "two" / "mine")
-    name = call_by_content(one, home)
+    name = content_name(one, home)
     assert name.startswith("mine@")
     assert str(tmp_path) not in name
-    assert call_by_content(two, home) == name
+    assert content_name(two, home) == name
     assert find_weights(name, home) == two
-    assert call_by_content(one, home) == name
+    assert content_name(one, home) == name
     assert find_weights(name, home) == one
     (one / "vae" / "config.json").write_text("{} ")
-    assert call_by_content(one, home) != name
+    assert content_name(one, home) != name
 
 
 def test_a_users_folder_that_is_gone_is_asked_for_once_more(tmp_path: Path, home: Path) -> None:
     folder = fill(tmp_path / "mine")
-    name = call_by_content(folder, home)
+    name = content_name(folder, home)
     folder.rename(tmp_path / "elsewhere")
-    with pytest.raises(BackendUnavailable, match="name the folder once more"):
+    with pytest.raises(BackendUnavailable, match="give its new path"):
         find_weights(name, home)
 
 
 def test_a_single_file_is_called_by_its_content_too(tmp_path: Path, home: Path) -> None:
     file = tmp_path / "lgm.safetensors"
     file.write_bytes(b"tensors")
-    assert find_weights(call_by_content(file, home), home) == file
+    assert find_weights(content_name(file, home), home) == file
 
 
 def test_the_lock_keeps_what_else_was_pulled(home: Path) -> None:

@@ -12,7 +12,7 @@ from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.weights.locate import digests, find_weights
 from dg4d_lib.weights.lock import read_lock
 from dg4d_lib.weights.pull import needed, pull
-from dg4d_lib.weights.registry import KNOWN, weights_called
+from dg4d_lib.weights.registry import KNOWN, lookup_weights
 
 SVD = replace(KNOWN["svd"], revision=None, published={})
 REPOSITORY = {
@@ -143,7 +143,7 @@ def test_what_the_hub_lists_is_refused_where_something_else_was_published(hub: H
 
 def test_a_download_without_a_file_is_refused(hub: Hub, tmp_path: Path) -> None:
     del hub.files["vae/config.json"]
-    with pytest.raises(BackendUnavailable, match=r"vae/config\.json did not come"):
+    with pytest.raises(BackendUnavailable, match=r"vae/config\.json was not downloaded"):
         pull(SVD, tmp_path)
 
 
@@ -156,9 +156,9 @@ def test_a_repository_without_what_is_needed_is_refused(hub: Hub, tmp_path: Path
     ("error", "says"),
     [
         (OSError("Name or service not known\nand more"), "connect this machine to the network"),
-        (OfflineModeIsEnabled("offline"), "name the folder instead"),
-        (type("GatedRepoError", (Exception,), {})("403"), "accept its license there"),
-        (type("RevisionNotFoundError", (Exception,), {})("404"), "the revision is gone"),
+        (OfflineModeIsEnabled("offline"), "give its path"),
+        (type("GatedRepoError", (Exception,), {})("403"), "accept its license at https"),
+        (type("RevisionNotFoundError", (Exception,), {})("404"), "the pinned revision no longer exists"),
     ],
 )
 def test_without_the_hub_there_is_one_clear_message(error: Exception, says: str, hub: Hub, tmp_path: Path) -> None:
@@ -188,7 +188,7 @@ def test_a_pin_of_the_registry_is_what_is_asked_for(hub: Hub, tmp_path: Path) ->
 
 
 def test_weights_that_only_the_user_knows_come_whole_but_once(hub: Hub, tmp_path: Path) -> None:
-    pull(weights_called("somebody/pictures"), tmp_path)
+    pull(lookup_weights("somebody/pictures"), tmp_path)
     assert set(hub.downloaded) == set(WANTED)  # not svd.safetensors, which holds all parts once more
     assert find_weights("somebody/pictures", tmp_path) == tmp_path / "somebody--pictures"
 

@@ -3,14 +3,14 @@ import re
 import pytest
 
 from dg4d_lib.weights.pull import needed
-from dg4d_lib.weights.registry import KNOWN, weights_called
+from dg4d_lib.weights.registry import KNOWN, lookup_weights
 
 
 def test_a_name_and_its_hub_id_mean_the_same() -> None:
     for weights in KNOWN.values():
-        assert weights_called(weights.name) is weights
-        assert weights_called(weights.hub_id) is weights
-        assert weights_called(weights.hub_id.upper()) is weights
+        assert lookup_weights(weights.name) is weights
+        assert lookup_weights(weights.hub_id) is weights
+        assert lookup_weights(weights.hub_id.upper()) is weights
 
 
 def test_pins_are_commits_and_digests_of_files_that_are_needed() -> None:
@@ -23,8 +23,8 @@ def test_pins_are_commits_and_digests_of_files_that_are_needed() -> None:
 def test_what_is_not_verified_is_not_commercial() -> None:
     allowed = {name for name, weights in KNOWN.items() if weights.license.allows_commercial_use}
     assert allowed == {"svd", "svd-xt", "imagedream", "lgm", "vgg16", "lpips-vgg"}
-    assert weights_called("stable-zero123").license.commercial == "no"
-    assert not weights_called("somebody/something").license.allows_commercial_use
+    assert lookup_weights("stable-zero123").license.commercial == "no"
+    assert not lookup_weights("somebody/something").license.allows_commercial_use
 
 
 @pytest.mark.parametrize(
@@ -32,17 +32,17 @@ def test_what_is_not_verified_is_not_commercial() -> None:
     [("mit", "yes"), ("openrail++", "conditions"), ("cc-by-nc-4.0", "no"), ("other", "unverified"), ("", "unverified")],
 )
 def test_a_model_card_counts_for_weights_that_are_not_known(card: str, commercial: str) -> None:
-    its = weights_called("somebody/something", card).license
+    its = lookup_weights("somebody/something", card).license
     assert its.commercial == commercial
     assert (card or "unknown") in str(its)
 
 
 def test_a_model_card_does_not_change_what_is_known() -> None:
-    assert weights_called("stable-zero123", "mit").license.commercial == "no"
+    assert lookup_weights("stable-zero123", "mit").license.commercial == "no"
 
 
 def test_a_copy_is_no_freer_than_what_it_is_a_copy_of() -> None:
-    copied = weights_called("Somebody/Stable-Zero123-diffusers", "mit")
+    copied = lookup_weights("Somebody/Stable-Zero123-diffusers", "mit")
     assert copied.license == KNOWN["stable-zero123"].license
     assert copied.hub_id == "Somebody/Stable-Zero123-diffusers"
-    assert weights_called("somebody/zero123", "mit").license.commercial == "yes"
+    assert lookup_weights("somebody/zero123", "mit").license.commercial == "yes"

@@ -20,7 +20,7 @@ from flows.commands.benchmark import bench, put_truth, score
 from flows.packages.scores import Results
 from flows.serving.server import Server
 from flows.step_errors import StepError, StepMissing
-from steps.artifacts.ground_truth import find_truth
+from steps.artifacts.ground_truth import find_ground_truth
 from steps.store.artifact_store import ArtifactStore
 
 VIEWS = ("view_-75", "view_15")
@@ -180,9 +180,9 @@ def test_a_finished_asset_takes_no_knobs_of_the_conversion(tmp_path: Path) -> No
 def test_equal_truths_are_one_artifact_whatever_their_files_are_called(tmp_path: Path) -> None:
     store = ArtifactStore(tmp_path / "store")
     first, second = thing(tmp_path / "1" / "newt", "x"), thing(tmp_path / "2" / "newt", "x", "{}.png")
-    assert put_truth(find_truth(first), store) == put_truth(find_truth(second), store)
+    assert put_truth(find_ground_truth(first), store) == put_truth(find_ground_truth(second), store)
     (second / VIEWS[0] / "0.png").write_text(picture("another picture"))
-    assert put_truth(find_truth(first), store) != put_truth(find_truth(second), store)
+    assert put_truth(find_ground_truth(first), store) != put_truth(find_ground_truth(second), store)
 
 
 def test_a_truth_that_cannot_be_judged_against_is_bad_input_and_no_table_is_written(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dg4d_lib.assets.scenes.compose import Body
+from dg4d_lib.assets.scenes.compose import AnimatedGlb
 from dg4d_lib.errors import BadInput
 from flows.commands.compose import compose, read_scene
 from flows.inputs.package_record import RECORD
@@ -43,7 +43,7 @@ def shelf(finished: Path, tmp_path: Path) -> Path:
 
 
 def names(path: Path) -> list[str]:
-    tree = Body(path.read_bytes()).file.tree
+    tree = AnimatedGlb(path.read_bytes()).file.tree
     return [tree["nodes"][number]["name"] for number in tree["scenes"][0]["nodes"]]
 
 
@@ -55,7 +55,7 @@ def scene_file(folder: Path, **scene: object) -> Path:
 
 def test_packages_stand_in_a_row_in_the_order_given(shelf: Path) -> None:
     compose([shelf / "große Eule 猫", shelf / "gem"], shelf / "new" / "scene.glb", spacing=0.5)
-    tree = Body((shelf / "new" / "scene.glb").read_bytes()).file.tree
+    tree = AnimatedGlb((shelf / "new" / "scene.glb").read_bytes()).file.tree
     assert names(shelf / "new" / "scene.glb") == ["große Eule 猫", "gem"]
     left, right = (tree["nodes"][number]["translation"][0] for number in tree["scenes"][0]["nodes"])
     assert left < right
@@ -74,7 +74,7 @@ def test_a_scene_file_places_and_times(shelf: Path) -> None:
     ]
     compose([], shelf / "scene.glb", scene_file(shelf, items=items, duration_s=2))
     assert names(shelf / "scene.glb") == ["gem 2", "gem", "gem 3"]
-    body = Body((shelf / "scene.glb").read_bytes())
+    body = AnimatedGlb((shelf / "scene.glb").read_bytes())
     assert body.duration_s == 2
     assert body.file.tree["nodes"][body.roots[0]]["scale"] == [2, 2, 2]
 

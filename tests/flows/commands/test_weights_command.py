@@ -12,7 +12,7 @@ from fake_steps import picture
 from typer.testing import CliRunner, Result
 
 from dg4d_lib.weights.locate import digests
-from dg4d_lib.weights.lock import Locked, LockedFile, write_lock
+from dg4d_lib.weights.lock import LockedFile, LockEntry, write_lock
 from dg4d_lib.weights.registry import KNOWN
 from flows import cli
 
@@ -39,7 +39,7 @@ def pulled(home: Path) -> Path:
     files = {
         name: LockedFile(sha256=digest, size=(folder / name).stat().st_size) for name, digest in digests(folder).items()
     }
-    write_lock(home, "lgm", Locked(hub_id="ashawkey/LGM", revision="c0ffee" + "0" * 34, files=files))
+    write_lock(home, "lgm", LockEntry(hub_id="ashawkey/LGM", revision="c0ffee" + "0" * 34, files=files))
     return folder / LGM
 
 
@@ -67,7 +67,7 @@ def test_the_list_names_all_weights_their_licenses_and_what_is_here(home: Path) 
     assert LGM not in listing
     file.write_bytes(b"cut")
     assert line_of("lgm", dg4d("weights", "list").stdout).split()[1] == "damaged"
-    write_lock(home, "me/pictures", Locked(hub_id="me/pictures", revision="", license="cc-by-nc-4.0", files={}))
+    write_lock(home, "me/pictures", LockEntry(hub_id="me/pictures", revision="", license="cc-by-nc-4.0", files={}))
     assert "cc-by-nc-4.0" in dg4d("weights", "list").stdout.split("\nme/pictures ")[1].splitlines()[1]
 
 
@@ -93,7 +93,7 @@ def test_check_reads_every_file_again(home: Path) -> None:
     os.utime(file, ns=times)  # as a disk that forgets does
     bad = dg4d("weights", "check")
     assert bad.exit_code == 69
-    assert f"lgm: {LGM} is not the file that was pulled" in bad.stdout
+    assert f"lgm: {LGM} differs from the pulled file" in bad.stdout
     assert "`dg4d weights pull lgm`" in bad.stderr
 
 
@@ -111,7 +111,7 @@ def test_weights_that_were_copied_are_compared_with_what_was_published(
     (home / "lgm" / LGM).write_bytes(b"tensors")
     other = dg4d("weights", "check")
     assert other.exit_code == 69
-    assert f"lgm: {LGM} is not the file that was published at revision 1c28a2fd3b" in other.stdout
+    assert f"lgm: {LGM} differs from the published file at revision 1c28a2fd3b" in other.stdout
     told = replace(KNOWN["lgm"], published={LGM: hashlib.sha256(b"tensors").hexdigest(), "more": "0" * 64})
     monkeypatch.setitem(KNOWN, "lgm", told)
     assert "lgm: complete; it was not pulled by this command: 1 of its files is as published" in check()

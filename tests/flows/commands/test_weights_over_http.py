@@ -79,7 +79,7 @@ def test_content_that_is_not_what_the_hub_says_is_refused(hub: TinyHub, home: Pa
 @pytest.mark.parametrize(
     ("status", "error", "says"),
     [
-        (HTTPStatus.UNAUTHORIZED, "GatedRepo", "accept its license there and log in"),
+        (HTTPStatus.UNAUTHORIZED, "GatedRepo", "accept its license at https"),
         (HTTPStatus.NOT_FOUND, "RepoNotFound", "or correct the id"),
         (HTTPStatus.SERVICE_UNAVAILABLE, "", "connect this machine to the network"),
     ],

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 from records import result_with, write_record
 
-from flows.engine.caching import FileLocks, RequestPolicy, record_key, recorded
+from flows.engine.caching import FileLocks, RequestPolicy, recorded
+from flows.engine.records import record_key
 from steps.contract import ArtifactRef, StepRequest, StepResult
 from steps.store.artifact_store import ArtifactStore
 

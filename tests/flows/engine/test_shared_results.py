@@ -5,10 +5,12 @@ from pathlib import Path
 
 import pytest
 from fake_steps import picture
+from prefect import flow
+from records import record_of, result_with
 
 from flows import home
 from flows.convert import make
-from flows.engine.caching import record_key
+from flows.engine.records import record_key
 from flows.engine.shared_results import fetch_result, sharing_results
 from flows.inputs.orders import Order, Wish
 from flows.packages.delivery import RESULTS
@@ -21,7 +23,7 @@ STEPS = 8
 
 @pytest.fixture
 def log(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where steps note that they ran; the store is shared."""
+    """File in which steps note that they ran; the store is shared."""
     monkeypatch.setenv("DG4D_STORE", str(tmp_path / "store"))
     monkeypatch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
     monkeypatch.setenv("DG4D_CODE_VERSION", tmp_path.name)
@@ -51,12 +53,33 @@ def test_a_machine_takes_over_what_another_finished(
     assert len(list(home.store().entries(RESULTS))) == (STEPS if shares else 0)
 
 
+def test_a_conversion_within_another_flow_keeps_its_records_under_home(log: Path, tmp_path: Path) -> None:
+    (tmp_path / "fox.png").write_text(picture("within"))
+
+    @flow(persist_result=False)
+    def outer() -> None:
+        make(Wish(item="fox", picture=tmp_path / "fox.png", settings=PREVIEW).order(home.store()), tmp_path / "out")
+
+    before = set(home.records().iterdir()) if home.records().exists() else set()
+    outer()
+    assert len(set(home.records().iterdir()) - before) == STEPS
+
+
 def test_a_result_is_fetched_only_by_a_process_that_shares(log: Path, tmp_path: Path) -> None:
     request = StepRequest(step="pack_asset", version="1", inputs={}, settings={}, seed=0)
     store, record = home.store(), tmp_path / "results" / record_key(request)
-    store.write(f"{RESULTS}/{record.name}", "torn")
+    shared = record_of(result_with(store.put_bytes(b"content", "a/b"), request.digest()))
+    store.write(f"{RESULTS}/{record.name}", shared)
     fetch_result(record.name, record)
     assert not record.exists()  # nobody shares
     with sharing_results(store):
         fetch_result(record.name, record)
-    assert record.read_text() == "torn"  # which the policy of the cache drops, as it drops its own
+    assert record.read_text() == shared
+
+
+def test_a_shared_record_that_is_torn_is_not_fetched(log: Path, tmp_path: Path) -> None:
+    store, record = home.store(), tmp_path / "results" / "pack_asset-0"
+    store.write(f"{RESULTS}/{record.name}", "torn")
+    with sharing_results(store):
+        fetch_result(record.name, record)
+    assert not record.exists()

@@ -4,7 +4,7 @@ import pytest
 from fake_steps import PNG, bank_json, picture
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.rasterizer import choice
+from dg4d_lib.rasterizer import backends
 from flows.inputs.orders import Order, Wish, name_of
 from steps.profiles import PREVIEW, revise
 from steps.store.artifact_store import ArtifactStore
@@ -67,7 +67,7 @@ def test_another_backend_is_another_order(
     (tmp_path / "a.png").write_text(picture("picture"))
     digests = []
     for lack in ("no GPU", ""):
-        monkeypatch.setattr(choice, "what_gsplat_lacks", lambda lack=lack: lack)
+        monkeypatch.setattr(backends, "gsplat_unavailable_reason", lambda lack=lack: lack)
         digests.append(order(wish(tmp_path / "a.png"), store).digest())
     assert digests[0] != digests[1]
 
@@ -78,10 +78,10 @@ def test_a_rasterizer_that_cannot_run_is_refused_before_any_work(tmp_path: Path)
         wish(tmp_path / "a.png", rasterizer="gpu")
     gsplat = wish(tmp_path / "a.png", rasterizer="cuda_gsplat")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(choice, "what_gsplat_lacks", lambda: "no GPU")
+        patch.setattr(backends, "gsplat_unavailable_reason", lambda: "no GPU")
         with pytest.raises(BackendUnavailable, match="no GPU; or choose rasterizer=cpu"):
             gsplat.check()
-        patch.setattr(choice, "what_gsplat_lacks", str)
+        patch.setattr(backends, "gsplat_unavailable_reason", str)
         gsplat.check()
 
 

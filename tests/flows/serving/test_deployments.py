@@ -191,8 +191,9 @@ def test_a_run_whose_process_was_killed_goes_on_after_its_last_finished_step(
     run = ask(client, "picture-to-4d", picture=str(tmp_path / "killed.png"), out=str(tmp_path / "out"))
     assert run.state.is_completed() and run.run_count == 2
     steps = log.read_text().split()[before:]
-    assert steps[:4] == ["prepare_subject", "drive_video", "fit_gaussians", "fit_motion"]
-    assert steps[4:] == ["fit_motion", "plan_mesh", "extract_mesh", "pack_asset", "check_asset"]
+    assert steps[0] == "prepare_subject"
+    assert {*steps[1:3]} == {"drive_video", "fit_gaussians"}  # side by side
+    assert steps[3:] == ["fit_motion", "fit_motion", "plan_mesh", "extract_mesh", "pack_asset", "check_asset"]
     whole(tmp_path / "out")
 
 

@@ -42,7 +42,7 @@ def shared(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
         **environment(api_url),
         **objects.environment,
         "DG4D_STORE": "s3://bucket/store",
-        "DG4D_CATALOG": "fake_steps:EVERY_STEP",
+        "DG4D_CATALOG": "fake_steps:STEPS",
         "DG4D_CODE_VERSION": tmp_path.name,
         "DG4D_EXECUTOR": "in_process",
         "DG4D_CPUS": "2",
@@ -75,6 +75,11 @@ def item_runs() -> int:
     return len(runs)
 
 
+def _all_begun(command: "subprocess.Popen[str]") -> bool:
+    assert command.poll() is None, command.communicate()[0]  # it waits for the items
+    return item_runs() == ITEMS
+
+
 @pytest.mark.slow
 def test_machines_share_a_catalog_and_a_machine_and_a_catalog_that_are_killed_cost_no_item_and_no_step(
     shared: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -86,7 +91,7 @@ def test_machines_share_a_catalog_and_a_machine_and_a_catalog_that_are_killed_co
     machines = [Machine(name, tmp_path / name, shared) for name in ("one", "two", "three")]
     command = begin(tmp_path, shared)
     try:
-        wait_until(lambda: item_runs() == ITEMS and finished(machines).total() > len(EVERY_STEP))
+        wait_until(lambda: _all_begun(command) and finished(machines).total() > len(EVERY_STEP))
         command.kill()  # what it asked for goes on
         command.communicate()
         wait_until(machines[2].sleeps)

@@ -68,7 +68,7 @@ def test_the_camera_is_the_input_camera() -> None:
     counts, _, _ = crossings(shape)
     rows, columns = np.nonzero(counts)
     camera = OrbitCamera(width=SIZE, height=SIZE)
-    view = camera.world_to_camera().numpy() @ [0.3, 0.25, 0.2, 1]
+    view = camera.viewmat().numpy() @ [0.3, 0.25, 0.2, 1]
     center = view[:2] / view[2] * camera.focal + SIZE / 2
     assert (columns.mean() + 0.5, rows.mean() + 0.5) == pytest.approx(tuple(center), abs=0.5)
 

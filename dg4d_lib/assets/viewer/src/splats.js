@@ -1,4 +1,4 @@
-// Moving splats out of their compact form; the writer, and what the numbers mean: dg4d_lib/assets/formats/websplats.py.
+// Moving splats out of their compact form; the writer, and what the numbers mean: dg4d_lib/assets/formats/web_splats.py.
 import { inflate } from "./embedded.js";
 
 const MAGIC = "D4WS";

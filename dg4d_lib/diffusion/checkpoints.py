@@ -7,14 +7,14 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 
-from dg4d_lib.diffusion.flop_counter import counted
-from dg4d_lib.diffusion.parts import Placement, frozen, read_tensors
+from dg4d_lib.diffusion.components import Placement, frozen, read_tensors
+from dg4d_lib.diffusion.flop_counter import attach_flop_counter
 from dg4d_lib.errors import BadInput
 
 Network = TypeVar("Network", bound=nn.Module)
 
 
-def load_network(build: Callable[[dict[str, Tensor]], Network], file: Path, placement: Placement) -> Network:
+def load_checkpoint(build: Callable[[dict[str, Tensor]], Network], file: Path, placement: Placement) -> Network:
     """The network that `build` makes, with the tensors of a file, frozen; tensors it does not know are left out.
 
     Args:
@@ -36,5 +36,5 @@ def load_network(build: Callable[[dict[str, Tensor]], Network], file: Path, plac
             f"or of another shape, the first is {wrong[0]}"
         )
     network.load_state_dict({name: tensors[name].to(placement.dtype) for name in wanted}, assign=True)
-    loaded: Network = counted(frozen(network, placement))
+    loaded: Network = attach_flop_counter(frozen(network, placement))
     return loaded

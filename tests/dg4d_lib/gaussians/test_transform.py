@@ -7,8 +7,8 @@ import torch
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.gaussians.placing import joined, placed
-from dg4d_lib.geometry.quaternion import rotation_matrix
+from dg4d_lib.gaussians.transform import concatenate, transform
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
 from dg4d_lib.rasterizer.reference import rasterize
 
 STILL, HERE = torch.tensor([1.0, 0.0, 0.0, 0.0]), torch.zeros(3)
@@ -32,15 +32,15 @@ def random_cloud(count: int = 12, states: int = 1) -> Gaussians:
 def test_a_placed_cloud_has_the_moved_means_and_covariances() -> None:
     cloud, quat = random_cloud(states=2).to(torch.float64), torch.tensor([0.5, -0.5, 0.1, 0.7], dtype=torch.float64)
     quat = quat / quat.norm()
-    turn, shift = rotation_matrix(quat), torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    moved = placed(cloud, quat, 1.5, shift)
+    turn, shift = quat_to_rotmat(quat), torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    moved = transform(cloud, quat, 1.5, shift)
     torch.testing.assert_close(moved.means, 1.5 * cloud.means @ turn.mT + shift)
     torch.testing.assert_close(moved.covariances, 2.25 * turn @ cloud.covariances @ turn.mT)
 
 
 def test_turning_a_cloud_is_walking_around_it() -> None:
     half = math.radians(40) / 2
-    turned = placed(random_cloud(), torch.tensor([math.cos(half), 0, math.sin(half), 0]), 1.0, HERE)
+    turned = transform(random_cloud(), torch.tensor([math.cos(half), 0, math.sin(half), 0]), 1.0, HERE)
     cameras = [OrbitCamera(10, azimuth, width=32, height=32) for azimuth in (0, 40)]
     walked = rasterize(random_cloud(), cameras[:1], HERE)
     seen = rasterize(turned, cameras[1:], HERE)
@@ -49,12 +49,12 @@ def test_turning_a_cloud_is_walking_around_it() -> None:
 
 def test_a_placing_that_does_nothing_changes_nothing() -> None:
     cloud = random_cloud()
-    torch.testing.assert_close(vars(placed(cloud, STILL, 1.0, HERE)), vars(cloud))
+    torch.testing.assert_close(vars(transform(cloud, STILL, 1.0, HERE)), vars(cloud))
 
 
 def test_joined_clouds_keep_their_gaussians_in_order() -> None:
     first, second = random_cloud(3, states=2), random_cloud(5, states=2)
-    both = joined([first, second])
+    both = concatenate([first, second])
     assert len(both) == 8
     assert torch.equal(both.means[:, 3:], second.means)
     assert torch.equal(both.harmonics[:3], first.harmonics)
@@ -63,4 +63,4 @@ def test_joined_clouds_keep_their_gaussians_in_order() -> None:
 def test_colors_that_depend_on_the_view_cannot_be_turned() -> None:
     cloud = replace(random_cloud(), harmonics=torch.zeros(12, 4, 3))
     with pytest.raises(BadInput, match="degree 0"):
-        placed(cloud, STILL, 1.0, HERE)
+        transform(cloud, STILL, 1.0, HERE)

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.rasterizer import choice
-from dg4d_lib.rasterizer.interface import choose_rasterizer, device_of
+from dg4d_lib.rasterizer import backends
+from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
 
 
 class Driver:
@@ -30,8 +30,8 @@ def machine(monkeypatch):
     """A machine with or without gsplat, a build of torch, a driver."""
 
     def make(gsplat: bool = True, torch_version: str = "2.13.0", driver: Driver | None = None) -> None:
-        monkeypatch.setattr(choice, "find_spec", lambda name: object() if gsplat else None)
-        monkeypatch.setattr(choice, "version", lambda name: torch_version)
+        monkeypatch.setattr(backends, "find_spec", lambda name: object() if gsplat else None)
+        monkeypatch.setattr(backends, "version", lambda name: torch_version)
 
         def load(name: str) -> Driver:
             if driver is None:
@@ -45,10 +45,10 @@ def machine(monkeypatch):
 
 def test_auto_is_gsplat_where_everything_is_there(machine):
     machine(driver=Driver(1))
-    assert choice.backend_name("auto") == "cuda_gsplat"
-    assert device_of("auto") == device_of("cuda_gsplat") == torch.device("cuda")
-    choice.require_backend("auto")
-    choice.require_backend("cuda_gsplat")
+    assert backends.backend_name("auto") == "cuda_gsplat"
+    assert preferred_device("auto") == preferred_device("cuda_gsplat") == torch.device("cuda")
+    backends.require_backend("auto")
+    backends.require_backend("cuda_gsplat")
 
 
 @pytest.mark.parametrize(
@@ -63,11 +63,11 @@ def test_auto_is_gsplat_where_everything_is_there(machine):
 )
 def test_auto_is_the_processor_elsewhere_and_gsplat_is_refused_with_the_reason(here, lack, machine):
     machine(**here)
-    assert choice.backend_name("auto") == "cpu"
-    assert device_of("auto") == torch.device("cpu")
-    choice.require_backend("auto")
+    assert backends.backend_name("auto") == "cpu"
+    assert preferred_device("auto") == torch.device("cpu")
+    backends.require_backend("auto")
     with pytest.raises(BackendUnavailable, match="rasterizer 'cuda_gsplat' cannot run here") as caught:
-        choose_rasterizer("cuda_gsplat")
+        get_rasterizer("cuda_gsplat")
     assert lack in str(caught.value)
     assert "or choose rasterizer=cpu" in str(caught.value)
 
@@ -76,11 +76,11 @@ def test_a_gpu_that_torch_cannot_use_is_no_import_error(machine, monkeypatch):
     machine(driver=Driver(1))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(BackendUnavailable, match=r"torch .* cannot use the GPU"):
-        choose_rasterizer("auto")
+        get_rasterizer("auto")
 
 
 def test_other_names_stand_for_themselves():
-    assert [choice.backend_name(name) for name in ("reference", "cpu", "cuda_gsplat")] == [
+    assert [backends.backend_name(name) for name in ("reference", "cpu", "cuda_gsplat")] == [
         "reference",
         "cpu",
         "cuda_gsplat",
@@ -89,9 +89,9 @@ def test_other_names_stand_for_themselves():
 
 def test_here_auto_is_what_torch_says():
     here = importlib.util.find_spec("gsplat") is not None and torch.cuda.is_available()
-    assert choice.backend_name("auto") == ("cuda_gsplat" if here else "cpu")
+    assert backends.backend_name("auto") == ("cuda_gsplat" if here else "cpu")
 
 
 def test_an_unknown_rasterizer_is_refused():
     with pytest.raises(BadInput, match="auto, reference, cpu, cuda_gsplat"):
-        choose_rasterizer("magic")
+        get_rasterizer("magic")

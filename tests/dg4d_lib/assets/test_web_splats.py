@@ -6,7 +6,7 @@ import pytest
 import torch
 from splat_readers import read_web_splats
 
-from dg4d_lib.assets.formats.websplats import (
+from dg4d_lib.assets.formats.web_splats import (
     POSITION_STEPS,
     ROTATION_STEP,
     SCALE_STEP,
@@ -14,8 +14,8 @@ from dg4d_lib.assets.formats.websplats import (
 )
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import harmonics_of_color
-from dg4d_lib.geometry.quaternion import rotation_matrix
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 
 
 def cloud(frames: int = 6, count: int = 50, seed: int = 0) -> Gaussians:
@@ -29,7 +29,7 @@ def cloud(frames: int = 6, count: int = 50, seed: int = 0) -> Gaussians:
         torch.randn(frames, count, 3, generator=generator) - 4,
         torch.randn(frames, count, 4, generator=generator),
         torch.randn(count, generator=generator) * 3,
-        harmonics_of_color(colors),
+        rgb_to_sh(colors),
     )
 
 
@@ -44,7 +44,7 @@ def back(states: Gaussians, fps: float = 12.0) -> Gaussians:
 
 def angles_between(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     """Of the turn from one rotation to another, radians."""
-    turn = rotation_matrix(first.double()).mT @ rotation_matrix(second.double())
+    turn = quat_to_rotmat(first.double()).mT @ quat_to_rotmat(second.double())
     return ((turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1).acos()
 
 

@@ -1,17 +1,17 @@
 import pytest
 import torch
 
-from dg4d_lib.deformation.rigidity import neighborhoods, plain_strain, rigidity
-from dg4d_lib.deformation.rigidity_kernel import strain
+from dg4d_lib.deformation.rigidity_loss import neighborhoods, rigidity_loss, rigidity_sum_reference
+from dg4d_lib.deformation.rigidity_loss_kernel import rigidity_sum
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import blob
-from dg4d_lib.geometry.quaternion import multiply, rotation_matrix
+from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
 
 
 def two_states(turn: torch.Tensor, shift: float, stretch: float = 1.0) -> Gaussians:
     cloud = blob(100, 0.05, torch.Generator().manual_seed(0))
-    moved = stretch * (cloud.means @ rotation_matrix(turn).T) + shift
-    quats = multiply(turn.expand(100, 4), cloud.quats)
+    moved = stretch * (cloud.means @ quat_to_rotmat(turn).T) + shift
+    quats = quat_multiply(turn.expand(100, 4), cloud.quats)
     return Gaussians(
         torch.stack([cloud.means, moved]),
         cloud.log_scales.expand(2, -1, -1),
@@ -23,12 +23,12 @@ def two_states(turn: torch.Tensor, shift: float, stretch: float = 1.0) -> Gaussi
 
 def test_a_rigid_motion_costs_nothing():
     states = two_states(torch.tensor([0.8, 0.1, 0.5, 0.3]), 0.2)
-    assert rigidity(states, *neighborhoods(states.means[0])) < 1e-5
+    assert rigidity_loss(states, *neighborhoods(states.means[0])) < 1e-5
 
 
 def test_stretching_costs():
     states = two_states(torch.tensor([1.0, 0, 0, 0]), 0.0, stretch=1.5)
-    assert rigidity(states, *neighborhoods(states.means[0])) > 1e-3
+    assert rigidity_loss(states, *neighborhoods(states.means[0])) > 1e-3
 
 
 def pairs(times: int) -> tuple[torch.Tensor, ...]:
@@ -37,7 +37,7 @@ def pairs(times: int) -> tuple[torch.Tensor, ...]:
     means = torch.rand(300, 3, generator=generator, dtype=torch.float64)
     moved = means + 0.1 * torch.rand(times, 300, 3, generator=generator, dtype=torch.float64)
     quats = torch.randn(times, 300, 4, generator=generator, dtype=torch.float64)
-    return moved, rotation_matrix(quats), *neighborhoods(means, 7)
+    return moved, quat_to_rotmat(quats), *neighborhoods(means, 7)
 
 
 @pytest.mark.parametrize("times", [2, 3, 16, 17])
@@ -47,10 +47,10 @@ def test_the_kernel_is_its_definition_and_so_are_its_gradients(times: int) -> No
     means[:, indices[5]] = means[0, indices[5]]
     turns[:, 5] = turns[0, 5]  # these pairs do not move: there the distance has no slope
     truth_leaves = [means.clone().requires_grad_(), turns.clone().requires_grad_()]
-    truth = plain_strain(*truth_leaves, indices, weights)
+    truth = rigidity_sum_reference(*truth_leaves, indices, weights)
     truth.backward()
     leaves = [means.float().requires_grad_(), turns.float().requires_grad_()]
-    found = strain(*leaves, indices, weights.float())
+    found = rigidity_sum(*leaves, indices, weights.float())
     (3 * found).backward()
     assert torch.isclose(found.double(), truth, rtol=1e-5)
     for leaf, true_leaf in zip(leaves, truth_leaves, strict=True):
@@ -67,7 +67,7 @@ def test_the_number_of_threads_changes_no_bit_of_the_strain() -> None:
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
             leaf = means.clone().requires_grad_()
-            strain(leaf, turns, indices, weights).backward()
+            rigidity_sum(leaf, turns, indices, weights).backward()
             gradients.append(leaf.grad)
     finally:
         torch.set_num_threads(before)

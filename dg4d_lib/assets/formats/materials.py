@@ -18,7 +18,7 @@ from PIL import Image
 from torch import Tensor
 
 from dg4d_lib.asset_settings import GltfSettings
-from dg4d_lib.assets.formats.gltf import Document
+from dg4d_lib.assets.formats.gltf import GltfDocument
 from dg4d_lib.errors import BadInput
 from dg4d_lib.images import resize_planes
 
@@ -96,7 +96,7 @@ class Atlas:
         page = np.zeros((*self.size[::-1], 3), np.uint8)
         g = self.gutter
         for texture, (x, y) in zip(textures, self.corners(), strict=True):
-            cell = np.pad(pixels_of(self._fitted(texture)), ((g, g), (g, g), (0, 0)), "edge")
+            cell = np.pad(to_uint8(self._fitted(texture)), ((g, g), (g, g), (0, 0)), "edge")
             page[y - g : y - g + len(cell), x - g : x - g + cell.shape[1]] = cell
         return page
 
@@ -112,13 +112,13 @@ class Atlas:
         return small[0].movedim(0, -1)
 
 
-def pixels_of(texture: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+def to_uint8(texture: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """Colors in [0, 1] as bytes."""
     parts = texture.detach().split(ROWS)
     return torch.cat([part.cpu().clamp(0, 1).mul_(255).round_().to(torch.uint8) for part in parts]).numpy()
 
 
-def picture_file(pixels: UInt8[np.ndarray, "h w 3"], kind: str, quality: int) -> bytes:
+def encode_image(pixels: UInt8[np.ndarray, "h w 3"], kind: str, quality: int) -> bytes:
     """A picture as a file, `png`, `jpeg` or `webp`; equal pictures give equal bytes."""
     options: dict[str, dict[str, Any]] = {
         "png": {"compress_level": PNG_LEVEL},
@@ -130,7 +130,7 @@ def picture_file(pixels: UInt8[np.ndarray, "h w 3"], kind: str, quality: int) ->
     return file.getvalue()
 
 
-def add_texture(document: Document, name: str, pixels: UInt8[np.ndarray, "h w 3"], settings: GltfSettings) -> int:
+def add_texture(document: GltfDocument, name: str, pixels: UInt8[np.ndarray, "h w 3"], settings: GltfSettings) -> int:
     """Add a picture as the settings want it. Returns the number of its texture.
 
     Raises:
@@ -148,7 +148,7 @@ def add_texture(document: Document, name: str, pixels: UInt8[np.ndarray, "h w 3"
 
 
 def add_material(
-    document: Document, name: str, texture: int, settings: GltfSettings, atlas: Atlas | None = None
+    document: GltfDocument, name: str, texture: int, settings: GltfSettings, atlas: Atlas | None = None
 ) -> int:
     """Add a surface that wears a texture. Returns the number of the material.
 
@@ -175,7 +175,7 @@ def add_material(
     )
 
 
-def _sampler(document: Document) -> int:
+def _sampler(document: GltfDocument) -> int:
     if document.tree.get("samplers"):
         return 0
     wrap = {"wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}
@@ -183,9 +183,9 @@ def _sampler(document: Document) -> int:
 
 
 def _add_image(
-    document: Document, name: str, pixels: UInt8[np.ndarray, "h w 3"], kind: str, settings: GltfSettings
+    document: GltfDocument, name: str, pixels: UInt8[np.ndarray, "h w 3"], kind: str, settings: GltfSettings
 ) -> int:
-    view = document.add_view(f"{name} color", picture_file(pixels, kind, settings.quality))
+    view = document.add_view(f"{name} color", encode_image(pixels, kind, settings.quality))
     return document.add("images", name=f"{name} color", mimeType=f"image/{kind}", bufferView=view)
 
 

@@ -19,7 +19,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from dg4d_lib.diffusion.flop_counter import counted
+from dg4d_lib.diffusion.flop_counter import attach_flop_counter
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.settings import Precision
 
@@ -45,12 +45,12 @@ class Placement:
     channels_last: bool = False
 
 
-def dtype_on(device: torch.device, precision: Precision) -> torch.dtype:
+def compute_dtype(device: torch.device, precision: Precision) -> torch.dtype:
     """The numbers that networks compute with: what the settings say, and fp32 on a processor, which is slow in half."""
     return torch.float32 if device.type == "cpu" else DTYPES[precision]
 
 
-def device_here() -> torch.device:
+def default_device() -> torch.device:
     """Where networks run: the first CUDA device, or the processor."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
@@ -62,22 +62,22 @@ def load_vae(model: Path, placement: Placement) -> Any:
         BadInput: a file is missing, damaged, or holds other tensors than its config says.
         BackendUnavailable: diffusers is not installed.
     """
-    return load_part(_diffusers().AutoencoderKL, model / "vae", placement)
+    return load_component(_diffusers().AutoencoderKL, model / "vae", placement)
 
 
 def load_unet(model: Path, placement: Placement) -> Any:
     """The UNet2DConditionModel of `model`/unet; raises as `load_vae`."""
-    return load_part(_diffusers().UNet2DConditionModel, model / "unet", placement)
+    return load_component(_diffusers().UNet2DConditionModel, model / "unet", placement)
 
 
 def load_temporal_vae(model: Path, placement: Placement) -> Any:
     """The AutoencoderKLTemporalDecoder of `model`/vae, for videos; raises as `load_vae`."""
-    return load_part(_diffusers().AutoencoderKLTemporalDecoder, model / "vae", placement)
+    return load_component(_diffusers().AutoencoderKLTemporalDecoder, model / "vae", placement)
 
 
 def load_temporal_unet(model: Path, placement: Placement) -> Any:
     """The UNetSpatioTemporalConditionModel of `model`/unet, for videos; raises as `load_vae`."""
-    return load_part(_diffusers().UNetSpatioTemporalConditionModel, model / "unet", placement)
+    return load_component(_diffusers().UNetSpatioTemporalConditionModel, model / "unet", placement)
 
 
 def load_image_encoder(model: Path, placement: Placement) -> Any:
@@ -88,10 +88,10 @@ def load_image_encoder(model: Path, placement: Placement) -> Any:
     except ImportError as error:
         raise missing_packages(error) from error
     disable_progress_bar()
-    return load_part(CLIPVisionModelWithProjection, model / "image_encoder", placement, TRANSFORMERS_FILES)
+    return load_component(CLIPVisionModelWithProjection, model / "image_encoder", placement, TRANSFORMERS_FILES)
 
 
-def load_part(kind: Any, folder: Path, placement: Placement, names: tuple[str, ...] = (DIFFUSERS_FILE,)) -> Any:
+def load_component(kind: Any, folder: Path, placement: Placement, names: tuple[str, ...] = (DIFFUSERS_FILE,)) -> Any:
     """A model of a class of diffusers or transformers, in evaluation mode and without weight gradients.
 
     Args:
@@ -124,7 +124,7 @@ def load_part(kind: Any, folder: Path, placement: Placement, names: tuple[str, .
             f"{file} does not fit its config.json: {len(lacking)} tensors are missing or of another shape, "
             f"the first is {lacking[0]}"
         )
-    return counted(frozen(part, placement))
+    return attach_flop_counter(frozen(part, placement))
 
 
 def weights_file(folder: Path, names: tuple[str, ...] = (DIFFUSERS_FILE,), half: bool = False) -> Path:

@@ -7,13 +7,13 @@ import tiny_weights
 import torch
 from safetensors.torch import load_file, save_file
 
-from dg4d_lib.diffusion import noise_schedule, parts
-from dg4d_lib.diffusion.parts import Placement
+from dg4d_lib.diffusion import components, noise_schedule
+from dg4d_lib.diffusion.components import Placement
 from dg4d_lib.errors import BackendUnavailable, BadInput
 
 CPU = torch.device("cpu")
 FP32 = Placement(CPU, torch.float32)
-LOADERS = {"vae": parts.load_vae, "unet": parts.load_unet, "image_encoder": parts.load_image_encoder}
+LOADERS = {"vae": components.load_vae, "unet": components.load_unet, "image_encoder": components.load_image_encoder}
 FILES = {
     "vae": "diffusion_pytorch_model.safetensors",
     "unet": "diffusion_pytorch_model.safetensors",
@@ -64,7 +64,7 @@ def test_every_tensor_of_a_part_goes_to_its_device(name: str, whole: Path) -> No
 
 
 def test_channels_can_lie_innermost_and_change_nothing(whole: Path) -> None:
-    plain, innermost = parts.load_vae(whole, FP32), parts.load_vae(whole, Placement(CPU, torch.float32, True))
+    plain, innermost = components.load_vae(whole, FP32), components.load_vae(whole, Placement(CPU, torch.float32, True))
     assert innermost.encoder.conv_in.weight.is_contiguous(memory_format=torch.channels_last)
     pixels = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
     expected, found = (vae.encode(pixels).latent_dist.mode() for vae in (plain, innermost))
@@ -84,8 +84,8 @@ def test_half_precision_reads_the_variant_and_others_the_whole(tmp_path: Path) -
     for name in ("diffusion_pytorch_model.safetensors", "diffusion_pytorch_model.fp16.safetensors"):
         save_file({}, tmp_path / name)
     (tmp_path / "diffusion_pytorch_model.bin").touch()
-    assert parts.weights_file(tmp_path).name == "diffusion_pytorch_model.safetensors"
-    assert parts.weights_file(tmp_path, half=True).name == "diffusion_pytorch_model.fp16.safetensors"
+    assert components.weights_file(tmp_path).name == "diffusion_pytorch_model.safetensors"
+    assert components.weights_file(tmp_path, half=True).name == "diffusion_pytorch_model.fp16.safetensors"
 
 
 @pytest.mark.parametrize("name", LOADERS)
@@ -138,18 +138,18 @@ def test_a_linear_layer_is_read_from_either_format(suffix: str, tmp_path: Path) 
     tensors = {f"proj.{name}": value.detach() for name, value in layer.named_parameters()}
     file = tmp_path / f"diffusion_pytorch_model.{suffix}"
     save_file(tensors, file) if suffix == "safetensors" else torch.save(tensors, file)
-    read = parts.read_linear(tmp_path, "proj", FP32)
+    read = components.read_linear(tmp_path, "proj", FP32)
     given = torch.rand(2, 5)
     assert torch.equal(read(given), layer(given)) and not read.weight.requires_grad
     with pytest.raises(BadInput, match=r"no linear layer other\.weight"):
-        parts.read_linear(tmp_path, "other", FP32)
+        components.read_linear(tmp_path, "other", FP32)
 
 
 def test_a_pickle_that_would_run_code_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "diffusion_pytorch_model.bin"
     torch.save({"proj.weight": tiny_weights.write_scheduler}, file)
     with pytest.raises(BadInput, match="cannot be read"):
-        parts.read_tensors(file)
+        components.read_tensors(file)
 
 
 def test_a_model_with_another_schedule_is_refused(copy: Path) -> None:
@@ -177,8 +177,8 @@ def test_missing_packages_are_named(name: str, whole: Path, monkeypatch: pytest.
 
 
 def test_processors_compute_in_whole_precision() -> None:
-    assert parts.dtype_on(CPU, "fp16") == torch.float32
-    assert parts.dtype_on(torch.device("cuda"), "fp16") == torch.float16
+    assert components.compute_dtype(CPU, "fp16") == torch.float32
+    assert components.compute_dtype(torch.device("cuda"), "fp16") == torch.float16
 
 
 def test_files_of_older_releases_are_read(copy: Path) -> None:
@@ -194,12 +194,12 @@ def test_files_of_older_releases_are_read(copy: Path) -> None:
         renamed[name] = value
     assert len(renamed.keys() - tensors.keys()) == 16  # four layers of encoder and decoder, weight and bias
     save_file(renamed, vae, {"format": "pt"})
-    found = parts.load_vae(copy, FP32).state_dict()
+    found = components.load_vae(copy, FP32).state_dict()
     assert all(torch.equal(found[key], value) for key, value in tensors.items())
     clip = copy / "image_encoder" / FILES["image_encoder"]
     tensors = load_file(clip)
     assert "vision_model.embeddings.class_embedding" in tensors and "visual_projection.weight" in tensors
     buffer = {"vision_model.embeddings.position_ids": torch.arange(17)[None]}
     save_file({**tensors, **buffer}, clip, {"format": "pt"})
-    found = parts.load_image_encoder(copy, FP32).state_dict()
+    found = components.load_image_encoder(copy, FP32).state_dict()
     assert all(torch.equal(found[key], value) for key, value in tensors.items())

@@ -1,34 +1,36 @@
-"""Shrinking of pictures that arrive in bands of rows, so that the full resolution is never in memory at once."""
+"""Downscaling of images that are decoded in bands of rows, so that memory never holds the full resolution."""
 
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from dg4d_lib.images import resize_planes
-from dg4d_lib.video.framing import shrunk_size, straight
+from dg4d_lib.video.framing import downscaled_size, unpremultiply
 
-BAND_BYTES = 8 * 2**20  # of rows that are worked on at once, as float32
+BAND_BYTES = 8 * 2**20  # memory of one band of rows as float32
 
 
-def shrink_by_bands(picture: Float[Tensor, "h w 4"] | UInt8[Tensor, "h w 4"], longest: int) -> Float[Tensor, "h2 w2 4"]:
-    """Shrink a picture in memory without copies of its full size; bytes become numbers in [0, 1]."""
+def downscale_in_bands(
+    picture: Float[Tensor, "h w 4"] | UInt8[Tensor, "h w 4"], longest: int
+) -> Float[Tensor, "h2 w2 4"]:
+    """Downscale an image in memory without copies of its full size; uint8 becomes float in [0, 1]."""
     height, width = picture.shape[:2]
-    shrinker, rows = BandShrinker(height, width, longest), max(1, BAND_BYTES // (16 * width))
+    downscaler, rows = BandDownscaler(height, width, longest), max(1, BAND_BYTES // (16 * width))
     for top in range(0, height, rows):
         band = picture[top : top + rows]
-        shrinker.add(top, band.float() / 255 if band.dtype == torch.uint8 else band)
-    return shrinker.picture()
+        downscaler.add(top, band.float() / 255 if band.dtype == torch.uint8 else band)
+    return downscaler.picture()
 
 
-class BandShrinker:
-    """Running sum of bands of rows; gives what `framing.shrink` gives, up to rounding of float32.
+class BandDownscaler:
+    """Incremental equivalent of `framing.downscale`, up to float32 rounding.
 
     The triangle filter is separable: every band is filtered along its rows, and its rows are added with their weights
-    to the rows of the result. A picture that needs no shrinking keeps its values.
+    to the rows of the result. An image that is small enough keeps its values.
     """
 
     def __init__(self, height: int, width: int, longest: int) -> None:
-        self._height, self._size = height, shrunk_size(height, width, longest)
+        self._height, self._size = height, downscaled_size(height, width, longest)
         self._keeps_size = self._size == (height, width)
         if self._keeps_size:
             self._picture = torch.empty(height, width, 4)
@@ -37,7 +39,7 @@ class BandShrinker:
             self._weight = torch.zeros(self._size[0])
 
     def add(self, top: int, band: Float[Tensor, "rows w 4"]) -> None:
-        """Add the rows from `top` on, straight alpha; every row of the picture must be added once."""
+        """Add a band of rows that starts at row `top`, straight alpha; every row must be added exactly once."""
         rows = len(band)
         if self._keeps_size:
             self._picture[top : top + rows] = band
@@ -51,16 +53,16 @@ class BandShrinker:
         self._weight[reached] += weights.sum(1)
 
     def picture(self) -> Float[Tensor, "h w 4"]:
-        """Return the shrunken picture once every row was added."""
+        """Return the result, after all rows were added."""
         if self._keeps_size:
             return self._picture
         picture = torch.empty(*self._size, 4)
         for row, weight in enumerate(self._weight):
-            picture[row] = straight(self._sum[None, :, row : row + 1] / weight)[0, 0]
+            picture[row] = unpremultiply(self._sum[None, :, row : row + 1] / weight)[0, 0]
         return picture
 
     def _weights(self, top: int, rows: int) -> tuple[int, Float[Tensor, "o rows"]]:
-        """Return the first row of the result that a band reaches, and the weights of the band's rows in each."""
+        """Return the first row of the result that a band contributes to, and the weights of its rows in each."""
         scale = self._height / self._size[0]
         centers = (torch.arange(self._size[0], dtype=torch.float64) + 0.5) * scale
         reached = ((centers > top - scale) & (centers < top + rows + scale)).nonzero().flatten()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from dg4d_lib.assets.formats.surfaces import GUTTER, Atlas
+from dg4d_lib.assets.formats.materials import GUTTER, Atlas
 from dg4d_lib.errors import BadInput
 
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.gaussians.growth import ScreenGradients, densify, prune, reset_opacity
+from dg4d_lib.gaussians.density_control import Grad2dStats, densify, prune, reset_opacity
 from dg4d_lib.gaussians.initialize import isotropic
 
 
@@ -53,7 +53,7 @@ def test_a_reset_only_lowers_opacities():
 
 
 def test_screen_gradients_are_averaged_over_the_views_that_saw_them():
-    gradients = ScreenGradients.none(2)
+    gradients = Grad2dStats.zeros(2)
     pixel = torch.tensor([[[3.0, 4.0], [1.0, 0.0]], [[0.0, 0.0], [9.0, 9.0]]])
     gradients.add(pixel, torch.tensor([[True, True], [True, False]]), size=128)
     torch.testing.assert_close(gradients.mean, torch.tensor([5.0 * 64 / 2, 64.0]))

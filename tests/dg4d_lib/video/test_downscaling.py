@@ -1,12 +1,12 @@
 import pytest
 import torch
 
-from dg4d_lib.video.framing import shrink
-from dg4d_lib.video.shrinking import BandShrinker
+from dg4d_lib.video.downscaling import BandDownscaler
+from dg4d_lib.video.framing import downscale
 
 
 def in_bands(picture: torch.Tensor, longest: int, rows: int) -> torch.Tensor:
-    shrinker = BandShrinker(*picture.shape[:2], longest)
+    shrinker = BandDownscaler(*picture.shape[:2], longest)
     for top in range(0, len(picture), rows):
         shrinker.add(top, picture[top : top + rows])
     return shrinker.picture()
@@ -22,7 +22,7 @@ def test_a_picture_in_bands_shrinks_as_the_whole_does(height, width, rows):
     picture = noise(height, width)
     picture[:, : width // 3, 3] = 0
     # float32 sums of a few hundred terms in another order
-    torch.testing.assert_close(in_bands(picture, 60, rows), shrink(picture[None], 60)[0], atol=2e-6, rtol=0)
+    torch.testing.assert_close(in_bands(picture, 60, rows), downscale(picture[None], 60)[0], atol=2e-6, rtol=0)
 
 
 def test_a_picture_that_is_small_enough_keeps_its_values():
@@ -31,7 +31,7 @@ def test_a_picture_that_is_small_enough_keeps_its_values():
 
 
 def test_bands_may_come_in_any_order():
-    picture, shrinker = noise(90, 70), BandShrinker(90, 70, 31)
+    picture, shrinker = noise(90, 70), BandDownscaler(90, 70, 31)
     for top in (60, 0, 30):
         shrinker.add(top, picture[top : top + 30])
-    torch.testing.assert_close(shrinker.picture(), shrink(picture[None], 31)[0], atol=2e-6, rtol=0)
+    torch.testing.assert_close(shrinker.picture(), downscale(picture[None], 31)[0], atol=2e-6, rtol=0)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dg4d_lib.assets.formats.gltf import INDEX_DATA, VERTEX_DATA, Document
+from dg4d_lib.assets.formats.gltf import INDEX_DATA, VERTEX_DATA, GltfDocument
 from dg4d_lib.assets.formats.normals import SmoothNormals
 
 QUANTIZATION = "KHR_mesh_quantization"
@@ -28,7 +28,7 @@ Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Cube:
+class QuantizationCube:
     """Where whole numbers of 16 bits lie in the world.
 
     Attributes:
@@ -40,7 +40,7 @@ class Cube:
     half_side: float
 
     @classmethod
-    def around(cls, places: Sequence[Floats], displacements: Iterable[Floats] = ()) -> "Cube":
+    def around(cls, places: Sequence[Floats], displacements: Iterable[Floats] = ()) -> "QuantizationCube":
         """A cube that holds all places, and is not smaller than any displacement."""
         low = np.min([rows.min(0) for rows in places], axis=0).astype(np.float64)
         high = np.max([rows.max(0) for rows in places], axis=0).astype(np.float64)
@@ -62,7 +62,7 @@ class Cube:
         return {"translation": self.center.tolist(), "scale": [self.half_side] * 3}
 
 
-class Shape:
+class MeshPrimitive:
     """A mesh at rest, added to a document; poses can be added to it.
 
     Attributes:
@@ -72,12 +72,12 @@ class Shape:
 
     def __init__(
         self,
-        document: Document,
+        document: GltfDocument,
         name: str,
         vertices: Floats,
         faces: NDArray[np.integer[Any]],
         uvs: Floats,
-        cube: Cube | None,
+        cube: QuantizationCube | None,
     ) -> None:
         """Add a mesh.
 

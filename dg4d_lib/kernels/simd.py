@@ -1,7 +1,7 @@
-"""Sixteen float lanes inside Numba: LLVM vector instructions, built as expressions.
+"""SIMD code generation inside Numba: LLVM vectors of 16 floats.
 
 Numba does not vectorize the blending loops by itself (branches, reductions, possible aliasing), so they are emitted as
-LLVM vectors; LLVM lowers them to what the machine has: one AVX-512 register, two of AVX2, four of SSE or NEON.
+LLVM vectors; LLVM lowers each to one AVX-512 register, two AVX2 registers, or four SSE or NEON registers.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,98 +12,99 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from dg4d_lib.kernels.compiling import prepare
+from dg4d_lib.kernels.compiling import configure_numba
 
-prepare()
+configure_numba()
 
-Value: TypeAlias = Any  # an llvmlite value; that library's types do not know their attributes
+Value: TypeAlias = Any  # llvmlite value; its type stubs lack the attributes
 
-LANES = 16
+LANES = 16  # floats per vector
 FLOAT, INT, LONG = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 FLOATS, INTS = ir.VectorType(FLOAT, LANES), ir.VectorType(INT, LANES)
-# arcp and afn would cost needles their digits; with nnan and ninf, comparisons would not refuse what is not finite
+# Not arcp and afn: they lose too many digits on needle-shaped Gaussians. Not nnan and ninf: comparisons would no longer
+# reject values that are not finite.
 FAST = ("nsz", "contract", "reassoc")
 KERNEL = {"fastmath": set(FAST), "nogil": True, "cache": True, "error_model": "numpy"}  # options of njit
 INLINE = {**KERNEL, "inline": "always"}
-_EXP2 = (1.3333558e-3, 9.6181291e-3, 5.5504109e-2, 2.4022651e-1, 6.9314718e-1, 1.0)  # of 2^f, |f| <= 1/2
+_EXP2 = (1.3333558e-3, 9.6181291e-3, 5.5504109e-2, 2.4022651e-1, 6.9314718e-1, 1.0)  # polynomial of 2^f, |f| <= 1/2
 
 
-class Vectors:
-    """Expressions on vectors of `LANES` floats at the builder's place.
+class SimdBuilder:
+    """Emitter of instructions on vectors of `LANES` floats at the current position of an LLVM builder.
 
-    `fma` is llvm.fmuladd: fused where the machine can, two instructions elsewhere (llvm.fma would call libm there).
+    `fma` emits llvm.fmuladd: fused where the CPU supports it, else two instructions (llvm.fma would call libm).
     """
 
     def __init__(self, builder: ir.IRBuilder) -> None:
         self.builder = builder
 
     def constant(self, values: float | Sequence[float]) -> Value:
-        """The same float in all lanes, or one per lane."""
+        """Return a constant vector: the same float in all lanes, or one per lane."""
         lanes = np.broadcast_to(np.asarray(values, np.float32), LANES)
         return ir.Constant(FLOATS, [float(value) for value in lanes])
 
     def integers(self, values: int | Sequence[int]) -> Value:
-        """The same int32 in all lanes, or one per lane."""
+        """Return a constant vector: the same int32 in all lanes, or one per lane."""
         return ir.Constant(INTS, [int(value) for value in np.broadcast_to(values, LANES)])
 
     def splat(self, scalar: Value, lanes: int = LANES) -> Value:
-        """A vector with a scalar in all lanes."""
+        """Broadcast a scalar to all lanes."""
         undefined = ir.Constant(ir.VectorType(scalar.type, lanes), ir.Undefined)
         first = self.builder.insert_element(undefined, scalar, ir.Constant(INT, 0))
         return self.builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(INT, lanes), [0] * lanes))
 
     def add(self, a: Value, b: Value) -> Value:
-        """a + b."""
+        """Emit a + b."""
         return self.builder.fadd(a, b, flags=FAST)
 
     def subtract(self, a: Value, b: Value) -> Value:
-        """a - b."""
+        """Emit a - b."""
         return self.builder.fsub(a, b, flags=FAST)
 
     def multiply(self, a: Value, b: Value) -> Value:
-        """a * b."""
+        """Emit a * b."""
         return self.builder.fmul(a, b, flags=FAST)
 
     def reciprocal(self, a: Value) -> Value:
-        """1 / a."""
+        """Emit 1 / a."""
         return self.builder.fdiv(self.constant(1), a, flags=FAST)
 
     def negate(self, a: Value) -> Value:
-        """-a."""
+        """Emit -a."""
         return self.builder.fneg(a)
 
     def fma(self, a: Value, b: Value, c: Value) -> Value:
-        """a * b + c."""
+        """Emit a * b + c."""
         return self.call("fmuladd", a, b, c)
 
     def less(self, a: Value, b: Value) -> Value:
-        """A mask of a < b."""
+        """Emit the mask a < b."""
         return self.builder.fcmp_ordered("<", a, b)
 
     def at_most(self, a: Value, b: Value) -> Value:
-        """A mask of a <= b."""
+        """Emit the mask a <= b."""
         return self.builder.fcmp_ordered("<=", a, b)
 
     def select(self, mask: Value, a: Value, b: Value) -> Value:
-        """A where the mask is set, else b."""
+        """Emit a where the mask is set, else b."""
         return self.builder.select(mask, a, b)
 
     def minimum(self, a: Value, b: Value) -> Value:
-        """The lesser; scalars too."""
+        """Emit the minimum of two vectors or scalars."""
         return self.select(self.less(a, b), a, b)
 
     def maximum(self, a: Value, b: Value) -> Value:
-        """The greater; scalars too."""
+        """Emit the maximum of two vectors or scalars."""
         return self.select(self.less(b, a), a, b)
 
     def call(self, name: str, *arguments: Value) -> Value:
-        """An LLVM intrinsic on vectors: sqrt, ceil, floor, rint, fmuladd."""
+        """Call an LLVM intrinsic on vectors: sqrt, ceil, floor, rint, fmuladd."""
         signature = ir.FunctionType(FLOATS, [FLOATS] * len(arguments))
         function = cgutils.get_or_insert_function(self.builder.module, signature, f"llvm.{name}.v{LANES}f32")
         return self.builder.call(function, arguments)
 
     def exp2(self, a: Value) -> Value:
-        """2^a for a <= 127; below -126 it stays at 2^-126. Relative error 2e-7."""
+        """Emit 2^a for a <= 127, clamped to 2^-126 below; relative error 2e-7."""
         a = self.maximum(a, self.constant(-126))
         whole = self.call("rint", a)
         fraction = self.subtract(a, whole)
@@ -114,17 +115,17 @@ class Vectors:
         return self.builder.bitcast(self.builder.add(self.builder.bitcast(power, INTS), exponent), FLOATS)
 
     def sum(self, a: Value) -> Value:
-        """The sum of the lanes, a scalar."""
+        """Reduce a vector to the scalar sum of its lanes."""
         signature = ir.FunctionType(FLOAT, [FLOAT, FLOATS])
         name = f"llvm.vector.reduce.fadd.v{LANES}f32"
         function = cgutils.get_or_insert_function(self.builder.module, signature, name)
         return self.builder.call(function, [ir.Constant(FLOAT, 0.0), a], fastmath=FAST)
 
     def sums(self, terms: Sequence[Value]) -> Value:
-        """The sums of the lanes of up to `LANES` vectors, one per lane of the result; zeros in the lanes left over.
+        """Reduce up to `LANES` vectors to one vector with the sum of each in a lane; unused lanes are 0.
 
-        Neighbors are added crosswise, so that every turn halves both the vectors and what is left to add in each: two
-        shuffles a pair rather than the log2(LANES) that every vector would take alone.
+        Neighboring vectors are added crosswise, so each round halves the number of vectors and of terms left in each:
+        two shuffles per pair instead of log2(LANES) per vector.
         """
         lanes, remaining, step = range(LANES), list(terms), 1
         while step < LANES:
@@ -140,18 +141,18 @@ class Vectors:
         return remaining[0]
 
     def _pick(self, a: Value, b: Value, lanes: Sequence[int]) -> Value:
-        """Lanes of two vectors; those of the second are counted from `LANES` on."""
+        """Shuffle the lanes of two vectors; lanes of the second are numbered from `LANES` on."""
         return self.builder.shuffle_vector(a, b, ir.Constant(INTS, list(lanes)))
 
     def load(self, pointer: Value, index: Value, kind: ir.Type = FLOATS) -> Value:
-        """A vector or a scalar that begins at an element of a float or int32 array; no alignment needed."""
-        return self.builder.load(self._place(pointer, index, kind), align=4, typ=kind)
+        """Load a vector or a scalar at an element of a float or int32 array; no vector alignment needed."""
+        return self.builder.load(self._address(pointer, index, kind), align=4, typ=kind)
 
     def store(self, pointer: Value, index: Value, value: Value) -> None:
-        """Write a vector or a scalar from an element of a float or int32 array on."""
-        self.builder.store(value, self._place(pointer, index, value.type), align=4)
+        """Store a vector or a scalar at an element of a float or int32 array; no vector alignment needed."""
+        self.builder.store(value, self._address(pointer, index, value.type), align=4)
 
-    def _place(self, pointer: Value, index: Value, kind: ir.Type) -> Value:
+    def _address(self, pointer: Value, index: Value, kind: ir.Type) -> Value:
         return self.builder.bitcast(self.builder.gep(pointer, [index], source_etype=FLOAT), kind.as_pointer())
 
     def loop(
@@ -162,10 +163,10 @@ class Vectors:
         body: Callable[[Value, list[Value]], Sequence[Value]],
         step: int = 1,
     ) -> list[Value]:
-        """A counted loop; `body` gets the index and the carried values and gives their next ones.
+        """Emit a counted loop; `body` maps the index and the carried values to their next values.
 
         Returns:
-            The carried values after the last turn.
+            The carried values after the last iteration.
         """
         builder = self.builder
         before, inside, after = (
@@ -193,7 +194,7 @@ class Vectors:
 
 
 def pointers(context: Any, builder: Any, signature: Any, arguments: Sequence[Value]) -> list[Value]:
-    """The data of an intrinsic's array arguments; None for scalars."""
+    """Return the data pointers of an intrinsic's array arguments; None for scalars."""
     return [
         context.make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else None
         for kind, value in zip(signature.args, arguments, strict=True)

@@ -1,0 +1,56 @@
+"""Silhouettes of meshes and Gaussians, and their intersection over union."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
+from dg4d_lib.rasterizer.interface import Rasterizer
+
+SIZE = 128  # pixels of a silhouette
+VIEWS = ((0.0, 2.0), (75.0, 1.0))  # azimuth in degrees and weight; people compare at the input view, so it counts twice
+ALPHA_THRESHOLD = 0.5  # alpha above which a pixel belongs to the subject
+
+
+def render_silhouettes(states: Gaussians, frames: Sequence[int], rasterize: Rasterizer) -> Bool[Tensor, "m k h w"]:
+    """Render silhouettes of the Gaussians at m frames from k views.
+
+    Args:
+        states: the cloud at every frame (fields "t n 3").
+        frames: indices of the frames to render.
+        rasterize: the splatting backend.
+    """
+    selected = states.states(frames)
+    black = torch.zeros(3, device=states.means.device)
+    with torch.no_grad():
+        views = [
+            rasterize(selected, cameras, black).alpha[..., 0] > ALPHA_THRESHOLD for cameras in _cameras(len(frames))
+        ]
+    return torch.stack(views, 1)
+
+
+def silhouette_iou(
+    vertices: Float[Tensor, "m v 3"], faces: Int[Tensor, "f 3"], silhouettes: Bool[Tensor, "m k h w"]
+) -> Float[Tensor, " m"]:
+    """Return the intersection over union of a mesh's silhouettes with given ones, weighted mean over views, in [0, 1].
+
+    Args:
+        vertices: of the mesh at m frames, world units.
+        faces: indices into the vertices.
+        silhouettes: output of `render_silhouettes` for these frames.
+    """
+    total = torch.zeros(len(vertices))
+    for view, cameras in enumerate(_cameras(len(vertices))):
+        rendered = rasterize_mesh(vertices, faces, cameras).faces >= 0
+        expected = silhouettes[:, view]
+        intersection, union = (mask.flatten(1).sum(1) for mask in (rendered & expected, rendered | expected))
+        total += VIEWS[view][1] * (intersection / union.clamp(min=1)).cpu()
+    return total / sum(weight for _, weight in VIEWS)
+
+
+def _cameras(frames: int) -> list[list[OrbitCamera]]:
+    return [[OrbitCamera(0, azimuth, width=SIZE, height=SIZE)] * frames for azimuth, _ in VIEWS]
