@@ -1,4 +1,4 @@
-"""The exact denoiser of a picture that is known: the prior without weights.
+"""Analytic denoiser of a known picture, the prior without weights.
 
 If the clean picture z0 of a view is known, the noise in x_t is (x_t - sqrt(alphabar) z0) / sqrt(1 - alphabar); the same
 score distillation then converges to z0. In pixel space, over white, with the alpha as a fourth channel.
@@ -50,7 +50,7 @@ class AnalyticPrior:
         progress: float,
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:
-        """How far the renders are from the known pictures, weighted as at this moment of the annealing."""
+        """Return the distance between renders and known pictures, with the weight of this moment of the annealing."""
         timestep = self.noise.timestep(progress, generator)
         alphabar = float(alphas_cumprod()[timestep])
         clean = self._encode(*self.clean(views)).to(images.device)

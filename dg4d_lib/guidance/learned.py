@@ -23,7 +23,7 @@ COARSER = 2  # times fewer pixels of a side than the camera has: expected views 
 
 
 class LearnedShapes:
-    """A predicted shape per frame, each built when it is first asked for."""
+    """Predicted shape per frame, each built when first asked for."""
 
     def __init__(
         self, network: ShapePriorNetwork, cutouts: Sequence[Float[Tensor, "h w 4"]], settings: LearnedPriorSettings

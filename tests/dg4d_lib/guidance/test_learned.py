@@ -6,7 +6,7 @@ from tiny_shape_prior import tiny_network
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
-from dg4d_lib.guidance.interface import SubjectShapes, GuidanceView
+from dg4d_lib.guidance.interface import GuidanceView, SubjectShapes
 from dg4d_lib.guidance.learned import LearnedShapes
 from dg4d_lib.settings import LearnedPriorSettings
 
