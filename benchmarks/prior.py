@@ -8,6 +8,7 @@ FOLDER has a folder per object with cut-outs `input/NNN.png` and `view_AZIMUTH/N
 """
 
 import argparse
+import hashlib
 import json
 import sys
 from collections.abc import Iterator, Sequence
@@ -27,10 +28,12 @@ from dg4d_lib.fitting.motion import fit_motion
 from dg4d_lib.fitting.static import fit_gaussians
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.images import over_white, resize
+from dg4d_lib.inflation.ground import ground_turn
 from dg4d_lib.metrics.image import iou, psnr
 from dg4d_lib.metrics.video import motion_amount, temporal_error
 from dg4d_lib.rasterizer.interface import get_rasterizer
-from dg4d_lib.settings import LgmStartSettings
+from dg4d_lib.settings import LearnedPriorSettings, LgmStartSettings
+from dg4d_lib.shape_prior import packaged
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.subject import prepare_subject
 from steps.artifacts.motions import new_deformation
@@ -88,7 +91,7 @@ def score_prior(subject: Subject, settings: PipelineSettings, frames: Sequence[i
         Figures, and the views of the first of these frames side by side, over white.
     """
     cutouts, _ = prepare_subject(subject.footage, True, settings.subject)
-    shapes = subject_shapes(settings.prior, [cutouts[frame] for frame in frames], settings.subject.turn_deg)
+    shapes = subject_shapes(settings.prior, [cutouts[frame] for frame in frames], _turn(cutouts, settings))
     size = next(iter(subject.views.values())).shape[1]
     rows, strip = [], []
     for azimuth, truth in subject.views.items():
@@ -107,7 +110,7 @@ def score_fit(subject: Subject, settings: PipelineSettings, seed: int = 0) -> tu
     """
     rasterize, generator = get_rasterizer("auto"), torch.Generator().manual_seed(seed)
     cutouts, _ = prepare_subject(subject.footage, True, settings.subject)
-    turn_deg, start_settings = settings.subject.turn_deg, settings.static.start
+    turn_deg, start_settings = _turn(cutouts, settings), settings.static.start
     assert not isinstance(start_settings, LgmStartSettings), "these fits start without LGM"
     start = initial_gaussians(cutouts[0], start_settings, settings.prior, turn_deg, generator)
     prior = make_prior(settings.prior, [cutouts[0]], settings.static, None, Path(), turn_deg).prior
@@ -137,12 +140,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--kinds", nargs="+", default=KINDS, help="values of prior.kind")
     parser.add_argument("--frames", type=int, nargs="+", default=(0,), help="frames of which priors are compared")
     parser.add_argument("--video", action="store_true", help="fit Gaussians and motion with the profile preview")
+    parser.add_argument("--weights", type=Path, help="network instead of the shipped one")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting, for all kinds")
     parser.add_argument("--sheet", type=Path, help="picture: input, truth, and the views of every kind")
     parser.add_argument("--json", type=Path, help="file of all figures")
     given = parser.parse_args(arguments)
     if (given.objects is None) == (given.made_up == 0):
         parser.error("give a folder of objects or --made-up N")
+    if given.weights:
+        packaged.WEIGHTS = given.weights
+        packaged.SHA256 = hashlib.sha256(given.weights.read_bytes()).hexdigest()
     changes = dict(pair.split("=", 1) for pair in given.set)
     values = {key: json.loads(value) for key, value in changes.items()}
     subjects = made_up_subjects(given.made_up) if given.made_up else read_subjects(given.objects, given.only)
@@ -166,6 +173,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if given.sheet:
         pixels = (torch.cat(strips).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
         Image.fromarray(pixels).reduce(2).save(given.sheet)
+
+
+def _turn(cutouts: Float[Tensor, "t h w 4"], settings: PipelineSettings) -> float:
+    """Return the turn that the pipeline uses for this footage."""
+    learned = isinstance(settings.prior, LearnedPriorSettings)
+    found = 0.0 if learned else ground_turn(cutouts[..., 3:], settings.subject.ground_turn)
+    return settings.subject.turn_deg or found
 
 
 def _figures(

@@ -162,6 +162,12 @@ class LearnedPriorSettings(Settings):
     """Shape prior of this package, trained on made-up shapes: expected views of the subject; no download."""
 
     kind: Literal["learned"] = "learned"
+    weight: float = Field(
+        0.5,
+        ge=0,
+        le=10,
+        description="factor on the guidance loss: expected views are soft, and half of it leaves the input view sharp",
+    )
     level: float = Field(
         0.35,
         ge=0.05,

@@ -18,8 +18,7 @@ from dg4d_lib.settings import (
     SurfaceStartSettings,
 )
 from steps.artifacts.media import read_png, write_png
-from steps.artifacts.pose import read_turn
-from steps.fitting.priors import make_prior, subject_shapes
+from steps.fitting.priors import make_prior, subject_shapes, subject_turn
 from steps.fitting.reconstruction import reconstruct_subject
 from steps.fitting.reporting import LossCurves, picture_of_divergence, render_turnaround
 from steps.runtime.job import Job, StepReport
@@ -29,9 +28,9 @@ BLOB_RADIUS = 0.5  # world units
 
 def run(job: Job) -> StepReport:
     """Fit the Gaussians and render them from six sides."""
-    prior: PriorSettings = job.settings.prior
     static: StaticSettings = job.settings.static
-    backend, turn_deg = job.settings.rasterizer, read_turn(job.inputs.get("pose"), job.settings.turn_deg)
+    prior: PriorSettings = job.settings.prior
+    backend, turn_deg = job.settings.rasterizer, subject_turn(prior, job.inputs.get("pose"), job.settings.turn_deg)
     subject = read_png(job.inputs["subject"])
     generator = torch.Generator().manual_seed(job.seed)
     rasterize = get_rasterizer(backend)

@@ -7,11 +7,10 @@ import torch
 from dg4d_lib.fitting.motion import fit_motion
 from dg4d_lib.gaussians.ply import read_ply, write_ply
 from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
-from dg4d_lib.settings import DeformationSettings, MotionSettings, PriorSettings
+from dg4d_lib.settings import DeformationSettings, MotionSettings
 from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.motions import new_deformation, write_motion
-from steps.artifacts.pose import read_turn
-from steps.fitting.priors import make_prior
+from steps.fitting.priors import make_prior, subject_turn
 from steps.fitting.reporting import LossCurves, picture_of_divergence, render_row
 from steps.runtime.job import Job, StepReport
 
@@ -22,8 +21,8 @@ FRONT_DEG, SIDE_DEG = 0.0, 90.0
 
 def run(job: Job) -> StepReport:
     """Fit the deformation, with `fine_tune` also the Gaussians; render six timestamps from front and side."""
-    backend, turn_deg = job.settings.rasterizer, read_turn(job.inputs.get("pose"), job.settings.turn_deg)
-    prior: PriorSettings = job.settings.prior
+    backend, prior = job.settings.rasterizer, job.settings.prior
+    turn_deg = subject_turn(prior, job.inputs.get("pose"), job.settings.turn_deg)
     kind: DeformationSettings = job.settings.deformation
     settings: MotionSettings = job.settings.motion
     gaussians = read_ply(job.inputs["gaussians"])

@@ -1,4 +1,4 @@
-"""The exact denoiser of a picture that is known: the prior without weights.
+"""Analytic denoiser of a known picture, the prior without weights.
 
 If the clean picture z0 of a view is known, the noise in x_t is (x_t - sqrt(alphabar) z0) / sqrt(1 - alphabar); the same
 score distillation then converges to z0. In pixel space, over white, with the alpha as a fourth channel.
@@ -28,6 +28,7 @@ class AnalyticPrior:
         schedule: of the timestep.
         viewpoints: the only cameras `clean` knows; None is all.
         frames: the only frames `clean` knows; None is all.
+        weight: factor on the loss.
     """
 
     def __init__(
@@ -36,8 +37,9 @@ class AnalyticPrior:
         schedule: TimestepSchedule,
         viewpoints: tuple[OrbitCamera, ...] | None = None,
         frames: tuple[int, ...] | None = None,
+        weight: float = 1.0,
     ) -> None:
-        self.clean, self.schedule = clean, schedule
+        self.clean, self.schedule, self.weight = clean, schedule, weight
         self.viewpoints, self.frames = viewpoints, frames
 
     def loss(
@@ -58,7 +60,7 @@ class AnalyticPrior:
 
         pixels = 3 * images.shape[1] * images.shape[2]
         loss = score_distillation(self._encode(images, alpha), predict_noise, timestep, generator)
-        return loss * (LATENT_NUMBERS / pixels)
+        return loss * (self.weight * LATENT_NUMBERS / pixels)
 
     def _encode(self, images: Float[Tensor, "b h w 3"], alpha: Float[Tensor, "b h w 1"]) -> Float[Tensor, "b c h w"]:
         """Return pixels as they are diffused: color and alpha in [-1, 1]."""

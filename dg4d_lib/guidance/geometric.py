@@ -1,4 +1,4 @@
-"""The weights-free stand-in for a diffusion model: renders of surfaces inflated from the driving video.
+"""Geometric prior without weights: renders of surfaces inflated from the driving video.
 
 The outline says nothing sure about depth. The best single picture of a view is then the average over what may be, so a
 view is blurred along the direction in which depth shows: not at all from the input camera, most from the side.
@@ -30,24 +30,24 @@ LARGE = 2  # times the surface's own resolution: larger pictures take one sample
 
 
 class InflatedSurfaces:
-    """A surface per frame, each built when it is first asked for."""
+    """Inflated surface per frame, each built when first asked for."""
 
     def __init__(
         self, cutouts: Sequence[Float[Tensor, "h w 4"]], settings: GeometricPriorSettings, turn_deg: float = 0.0
     ) -> None:
-        """Remember the pictures.
+        """Store the pictures.
 
         Args:
             cutouts: one per frame: square, straight alpha, color and alpha in [0, 1].
-            settings: at how many pixels to build.
-            turn_deg: how far the subject is turned.
+            settings: size of the surface, and uncertainty of its depth.
+            turn_deg: turn of the subject about the vertical.
         """
         self._cutouts = tuple(cutouts)
         self._settings, self._turn_deg = settings, turn_deg
         self._surfaces: dict[int, InflatedSurface] = {}
 
     def surface(self, frame: int) -> InflatedSurface:
-        """The surface of a frame.
+        """Return the surface of a frame.
 
         Raises:
             BadInput: there is no such frame, or its picture shows no subject.
@@ -59,7 +59,7 @@ class InflatedSurfaces:
         return self._surfaces[frame]
 
     def clean(self, views: Sequence[GuidanceView]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
-        """The pictures that the prior believes in.
+        """Return the expected views.
 
         Args:
             views: b cameras of one size, each with its frame.
@@ -86,11 +86,11 @@ class InflatedSurfaces:
 def averaged_over_depth(
     images: Float[Tensor, "b h w c"], cameras: Sequence[OrbitCamera], depth_sigma: float
 ) -> Float[Tensor, "b h w c"]:
-    """The pictures averaged over shifts of the subject along the input camera's axis (the world's z).
+    """Average pictures over shifts of the subject along the input camera's axis (the world's z).
 
     Args:
         images: one per camera.
-        cameras: where they were taken; the shift is that of a point at the origin.
+        cameras: of the pictures; the shift is that of a point at the origin.
         depth_sigma: standard deviation of the shift, world units.
     """
     sigma = torch.tensor([depth_sigma * camera.focal / camera.radius for camera in cameras], dtype=torch.float64)

@@ -23,10 +23,14 @@ COARSER = 2  # times fewer pixels of a side than the camera has: expected views 
 
 
 class LearnedShapes:
-    """A predicted shape per frame, each built when it is first asked for."""
+    """Predicted shape per frame, each built when first asked for."""
 
     def __init__(
-        self, network: ShapePriorNetwork, cutouts: Sequence[Float[Tensor, "h w 4"]], settings: LearnedPriorSettings
+        self,
+        network: ShapePriorNetwork,
+        cutouts: Sequence[Float[Tensor, "h w 4"]],
+        settings: LearnedPriorSettings,
+        turn_deg: float = 0.0,
     ) -> None:
         """Encode the pictures.
 
@@ -34,8 +38,9 @@ class LearnedShapes:
             network: of the shape prior.
             cutouts: one per frame: square, straight alpha, color and alpha in [0, 1].
             settings: level of the surface.
+            turn_deg: hint at the turn of the subject about the vertical; it decides where the network is unsure.
         """
-        self._fields = ShapeFields(network, cutouts)
+        self._fields = ShapeFields(network, cutouts, turn_deg)
         self._settings = settings
         self._volumes: dict[int, ShapeVolume] = {}
         self._inflated: dict[int, float] = {}

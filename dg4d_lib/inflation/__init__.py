@@ -1,1 +1,1 @@
-"""A closed, colored surface guessed from one cut-out picture; needs no weights."""
+"""Closed, colored surface inflated from one cut-out picture, without weights."""

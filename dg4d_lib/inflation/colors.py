@@ -1,4 +1,4 @@
-"""What color the surface has: the picture in front, its rim diffused inwards behind."""
+"""Colors of the inflated surface: the picture in front, its rim diffused inwards behind."""
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -19,7 +19,7 @@ RIM_SHARE = 0.4  # of the local radius: where the core begins
 def front_colors(
     colors: Float64[np.ndarray, "h w 3"], alpha: Float64[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]
 ) -> Float64[np.ndarray, "h w 3"]:
-    """The picture's colors; pixels near the outline, which mix with the old background, take the nearest sure color."""
+    """Return the picture's colors; pixels at the outline, mixed with the background, take the nearest sure color."""
     opaque = mask & (alpha > OPAQUE)
     sure = opaque & ndimage.binary_erosion(opaque)
     gap = ndimage.distance_transform_edt(~sure) if sure.any() else np.full(mask.shape, np.inf)
@@ -31,7 +31,7 @@ def front_colors(
 
 
 def back_colors(front: Float64[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w 3"]:
-    """Colors of the side that nobody saw.
+    """Return the colors of the unseen side.
 
     They equal the front's at the rim (no seam); in the core of wide parts they are filled in from the rim, with a faint
     blurred mirror image of the front: the least of sum |c_i - c_j|^2 + sum w_i |c_i - front_i|^2.
@@ -51,6 +51,6 @@ def back_colors(front: Float64[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w
 def _blur_inside(
     values: Float64[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"], sigma: float
 ) -> Float64[np.ndarray, "h w"]:
-    """A Gaussian blur that only sees the mask."""
+    """Blur values with a Gaussian, normalized inside the mask."""
     share = ndimage.gaussian_filter(mask.astype(np.float64), sigma)
     return ndimage.gaussian_filter(values * mask, sigma) / np.maximum(share, 1e-6) * mask

@@ -9,7 +9,7 @@ from scipy.sparse.linalg import splu
 def neighbor_pairs(
     mask: Bool[np.ndarray, "h w"],
 ) -> tuple[Int64[np.ndarray, " pairs"], Int64[np.ndarray, " pairs"]]:
-    """Every two pixels of the mask that share a side, as indices into the mask's pixels in row order."""
+    """Return every two pixels of the mask that share a side, as indices into the mask's pixels in row order."""
     index = np.cumsum(mask.ravel()).reshape(mask.shape) - 1
     across, down = mask[:, :-1] & mask[:, 1:], mask[:-1] & mask[1:]
     first = np.concatenate([index[:, :-1][across], index[:-1][down]])
@@ -18,7 +18,7 @@ def neighbor_pairs(
 
 
 def neighbor_counts(mask: Bool[np.ndarray, "h w"]) -> Float64[np.ndarray, " n"]:
-    """How many neighbors in the mask each of its n pixels has."""
+    """Count the neighbors in the mask of each of its n pixels."""
     ends = np.concatenate(neighbor_pairs(mask))
     return np.bincount(ends, minlength=int(mask.sum())).astype(np.float64)
 

@@ -1,4 +1,4 @@
-"""How far a silhouette bulges: half the union of its inscribed balls, half the solution of a Poisson equation.
+"""Heights of an inflated silhouette: half the union of its inscribed balls, half the solution of a Poisson equation.
 
 The balls are medial-axis inflation without a skeleton: limbs come out round, heads nearly spherical. The Poisson
 membrane has no creases and is the steadier over time. Both scale with the picture. (After Baran and Lehtinen, Notes on
@@ -19,7 +19,7 @@ ANCHOR = 1e-9  # keeps the membrane of a part without an outline finite
 
 
 def heights(mask: Bool[np.ndarray, "h w"], pixel: float) -> Float64[np.ndarray, "h w"]:
-    """Half the thickness at every pixel, 0 outside.
+    """Return half the thickness at every pixel, 0 outside.
 
     The border of the picture is no outline: what it cuts stays thick there.
 
@@ -39,14 +39,14 @@ def heights(mask: Bool[np.ndarray, "h w"], pixel: float) -> Float64[np.ndarray, 
 
 
 def outline_distance(mask: Bool[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]:
-    """Distance to the nearest pixel outside in pixels, as if the picture went on beyond its border."""
+    """Return the distance to the nearest pixel outside, in pixels, as if the picture went on beyond its border."""
     margin = max(mask.shape) // 2
     distance = ndimage.distance_transform_edt(np.pad(mask, margin, mode="edge"))
     return np.ascontiguousarray(distance[margin : margin + mask.shape[0], margin : margin + mask.shape[1]])
 
 
 def inscribed_balls(mask: Bool[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]:
-    """Squared height of the union of all balls inside, pixels squared: max over c of d(c)^2 - |x - c|^2.
+    """Return the squared height of the union of all balls inside, pixels squared: max over c of d(c)^2 - |x - c|^2.
 
     A dilation by a paraboloid, one axis after the other.
     """
@@ -62,7 +62,7 @@ def inscribed_balls(mask: Bool[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]
 
 
 def membrane(mask: Bool[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]:
-    """Squared height u, pixels squared: minus Laplacian of u = 2 in the mask, u = 0 outside.
+    """Return the squared height u, pixels squared: minus Laplacian of u = 2 in the mask, u = 0 outside.
 
     A long strip becomes a round rod, a disc an ellipsoid 0.71 as high as a ball.
     """
@@ -75,7 +75,7 @@ def membrane(mask: Bool[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]:
 
 
 def local_radius(mask: Bool[np.ndarray, "h w"], distance: Float64[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]:
-    """Radius of the largest inscribed disc that covers a pixel, pixels; 0 outside."""
+    """Return the radius of the largest inscribed disc that covers a pixel, in pixels; 0 outside."""
     radius = np.where(mask, distance, 0.0)
     centers = mask & (distance >= ndimage.maximum_filter(distance, 3) - 1e-9)
     for row, column in np.argwhere(centers).tolist():

@@ -1,4 +1,4 @@
-"""Which pixels belong to the subject."""
+"""Mask of the subject's pixels."""
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -16,7 +16,7 @@ PINHOLE_SHARE = 2e-5
 
 
 def subject_mask(alpha: Float64[np.ndarray, "h w"]) -> tuple[Bool[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
-    """The subject's pixels without specks and pin holes, and an alpha whose level 0.5 is their outline.
+    """Return the subject's pixels without specks and pin holes, and an alpha whose level 0.5 is their outline.
 
     Args:
         alpha: in [0, 1]; a subject that is translucent everywhere is taken at half of its greatest alpha.

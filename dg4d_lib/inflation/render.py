@@ -1,4 +1,4 @@
-"""Pictures of inflated surfaces."""
+"""Rendering of inflated surfaces."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,11 +21,11 @@ from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 def render_surface(
     surfaces: InflatedSurface | Sequence[InflatedSurface], cameras: Sequence[OrbitCamera], supersample: int = 2
 ) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
-    """What b cameras of one size see.
+    """Render surfaces for b cameras of one size.
 
     Args:
         surfaces: one for all cameras, or one per camera.
-        cameras: where from.
+        cameras: poses and picture size.
         supersample: samples per pixel and axis.
 
     Returns:

@@ -1,4 +1,4 @@
-"""A flat triangulation of a silhouette."""
+"""Flat triangulation of a silhouette."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float64, Int64
 
 @dataclass(frozen=True)
 class Sheet:
-    """A flat triangulation of a silhouette: a node on every pixel of the mask and on every crossing of the outline.
+    """Flat triangulation of a silhouette: a node on every pixel of the mask and on every crossing of the outline.
 
     Attributes:
         points: column and row of the nodes, pixels, centers at +0.5, measured from the middle of the picture.
@@ -25,18 +25,18 @@ class Sheet:
     mask: Bool[np.ndarray, "h w"]
 
     def at(self, values: Float64[np.ndarray, "h w *c"]) -> Float64[np.ndarray, "k *c"]:
-        """A picture's values at the nodes."""
+        """Return a picture's values at the nodes."""
         return values[self.pixels[:, 0], self.pixels[:, 1]]
 
     def covers(self, points: Float64[np.ndarray, "m 2"]) -> Bool[np.ndarray, " m"]:
-        """Whether the pixels under these points belong to the silhouette."""
+        """Return true for points whose pixels belong to the silhouette."""
         size = np.array(self.mask.shape[::-1])
         columns, rows = np.clip(np.floor(points + size / 2).astype(np.int64), 0, size - 1).T
         return self.mask[rows, columns]
 
 
 def triangulate(mask: Bool[np.ndarray, "h w"], alpha: Float64[np.ndarray, "h w"]) -> Sheet:
-    """Marching squares over the pixel centers; the outline is where alpha is 0.5, forced to the mask's side."""
+    """Triangulate by marching squares over the pixel centers; the outline is where alpha is 0.5, forced to the mask's side."""
     inside = np.pad(mask, 1)  # the picture's border cuts the subject off
     level = np.pad(np.where(mask, np.maximum(alpha, 0.501), np.minimum(alpha, 0.499)), 1)
     height, width = inside.shape
@@ -79,7 +79,7 @@ def triangulate(mask: Bool[np.ndarray, "h w"], alpha: Float64[np.ndarray, "h w"]
 
 
 def _triangles_of_cell(case: int) -> list[tuple[int, int, int]]:
-    """How four neighboring pixels are covered, clockwise: corners are 0 to 3, the sides behind them 4 to 7.
+    """Return the triangles over four neighboring pixels, clockwise: corners are 0 to 3, the sides behind them 4 to 7.
 
     Args:
         case: bit i says whether corner i is inside. Corners that only meet across the diagonal stay apart.

@@ -1,4 +1,4 @@
-"""From a cut-out picture to a closed, colored surface.
+"""Closed, colored surface inflated from a cut-out picture.
 
 Two sheets over one triangulation of the silhouette, welded along the outline: the front one carries the picture, the
 back one a guess. Both slide inwards along the rays of the input camera as they leave the plane z = 0: the front sheet
@@ -30,13 +30,13 @@ CELLS = 1 << 10  # of a space-filling curve, per axis
 
 @dataclass(frozen=True)
 class InflatedSurface:
-    """A closed triangle mesh with a color at every vertex.
+    """Closed triangle mesh with a color at every vertex.
 
     Attributes:
         vertices: world units.
         faces: indices into `vertices`, counter-clockwise seen from outside.
         colors: in [0, 1].
-        seen: whether the picture shows this vertex; the others are a guess.
+        seen: true for vertices that the picture shows; the others are guesses.
     """
 
     vertices: Float[Tensor, "v 3"]
@@ -46,7 +46,7 @@ class InflatedSurface:
 
 
 def inflate(cutout: Float[Tensor, "h w 4"], size: int, turn_deg: float = 0.0) -> InflatedSurface:
-    """A plausible shape for the subject of a picture taken by the input camera (azimuth and elevation 0, radius 2).
+    """Inflate the subject of a picture taken by the input camera (azimuth and elevation 0, radius 2).
 
     An opaque picture has no silhouette and becomes a slab.
 
@@ -81,15 +81,15 @@ def inflate(cutout: Float[Tensor, "h w 4"], size: int, turn_deg: float = 0.0) ->
 def sample_surface(
     surface: InflatedSurface, count: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n 3"], float]:
-    """Points spread evenly over the area.
+    """Sample points evenly over the area.
 
     The triangles are lined up along a space-filling curve and the line is cut into `count` pieces of equal area, each
     of which gets one point.
 
     Args:
-        surface: what to sample.
+        surface: mesh to sample.
         count: number of points n.
-        generator: where in its piece a point lies.
+        generator: source of the place of each point in its piece.
 
     Returns:
         Points (world units), outward unit normals, colors in [0, 1], and the surface's area (world units squared).
@@ -113,7 +113,7 @@ def sample_surface(
 
 
 def resample(cutout: Float[Tensor, "h w 4"], size: int) -> Float[Tensor, "{size} {size} 4"]:
-    """The picture at another size; the colors of transparent pixels do not bleed in."""
+    """Resize a cut-out; the colors of transparent pixels do not bleed in."""
     if cutout.shape[0] == cutout.shape[1] == size:
         return cutout
     alpha = cutout[..., 3:]
@@ -152,7 +152,7 @@ def _two_sheets(
 def _hidden_share(
     sheet: Sheet, plane: Float64[np.ndarray, " k"], bulge: Float64[np.ndarray, " k"]
 ) -> Float64[np.ndarray, " k"]:
-    """How far out the back sheet must stay to be hidden: 0 is as far in as the front sheet, 1 on the front's ray."""
+    """Return the share by which the back sheet must stay out to be hidden: 0 is as far in as the front, 1 on its ray."""
     share, hidden = np.ones(len(bulge)), np.ones(len(bulge), bool)
     for step in SLIDES:
         reach = (RADIUS - plane + (2 * step - 1) * bulge) / (RADIUS - plane + bulge)  # where the input view sees it
@@ -162,7 +162,7 @@ def _hidden_share(
 
 
 def _curve_order(points: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:
-    """The order of points along Morton's curve: near in the order is near in space."""
+    """Return the order of points along Morton's curve: near in the order is near in space."""
     low = points.amin(0)
     cell = ((points - low) / (points - low).amax().clamp(min=1e-9) * (CELLS - 1)).long()
     code = torch.zeros(len(points), dtype=torch.long, device=points.device)

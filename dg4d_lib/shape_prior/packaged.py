@@ -10,7 +10,7 @@ from dg4d_lib.shape_prior.network import ShapePriorNetwork, load_network
 NAME = "shape-prior"
 LICENSE = "Apache-2.0"
 WEIGHTS = Path(__file__).with_name("weights.safetensors")
-SHA256 = "592431513c872aed0342f297aefcdc8770a1c5ef61143e75e4a3767925c8b434"
+SHA256 = "9431ca42d9788a903ddbd8bb5ca242bd33e3567909d5de10da3edd2c5aa6dba2"
 
 
 @functools.cache

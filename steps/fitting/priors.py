@@ -34,6 +34,7 @@ from dg4d_lib.shape_prior import packaged
 from dg4d_lib.weights.registry import lookup_weights
 from steps.artifacts.archives import unpack
 from steps.artifacts.media import read_png
+from steps.artifacts.pose import read_turn
 from steps.runtime.job import StepReport
 from steps.runtime.weights import LocatedWeights, open_weights
 from steps.sources.banks import BANK_JSON, BankIndex, check_sheet, read_index
@@ -90,7 +91,7 @@ def make_prior(
         stage: settings of the fit, which give the timesteps.
         bank: zip of ground-truth views, for the oracle.
         scratch: folder for unpacking.
-        turn_deg: azimuth by which the subject is turned, for the geometric prior.
+        turn_deg: azimuth by which the subject is turned; see `subject_turn`.
 
     Raises:
         BadInput: the oracle has no bank, or the weights are damaged or of another model.
@@ -100,8 +101,10 @@ def make_prior(
     match settings:
         case GeometricPriorSettings() | LearnedPriorSettings():
             shapes = subject_shapes(settings, cutouts, turn_deg)
-            note = GEOMETRIC_NOTE if isinstance(settings, GeometricPriorSettings) else LEARNED_NOTE
-            return LoadedPrior(AnalyticPrior(shapes.clean, noise), note, shapes=shapes)
+            note, weight = GEOMETRIC_NOTE, 1.0
+            if isinstance(settings, LearnedPriorSettings):
+                note, weight = LEARNED_NOTE, settings.weight
+            return LoadedPrior(AnalyticPrior(shapes.clean, noise, weight=weight), note, shapes=shapes)
         case OraclePriorSettings():
             if bank is None:
                 raise BadInput("prior.kind = oracle needs true views: give --bank FOLDER (with a bank.json)")
@@ -126,12 +129,20 @@ def subject_shapes(
     Args:
         settings: of the prior; one that has no shapes of its own gets the inflation with its defaults.
         cutouts: the subject at every frame.
-        turn_deg: turn of the subject about the vertical, for the inflation.
+        turn_deg: turn of the subject about the vertical; see `subject_turn`.
     """
     if isinstance(settings, LearnedPriorSettings):
-        return LearnedShapes(packaged.packaged_network(), cutouts, settings)
+        return LearnedShapes(packaged.packaged_network(), cutouts, settings, turn_deg)
     known = settings if isinstance(settings, GeometricPriorSettings) else GeometricPriorSettings()
     return InflatedSurfaces(cutouts, known, turn_deg)
+
+
+def subject_turn(settings: PriorSettings, pose: Path | None, hint_deg: float) -> float:
+    """Return the turn of the subject for a prior, degrees: the user's hint, else that of its footage.
+
+    The shape network sees turns itself: even true ones from elsewhere do not improve it, so it gets hints alone.
+    """
+    return read_turn(None if isinstance(settings, LearnedPriorSettings) else pose, hint_deg)
 
 
 def inflated_note(share: float) -> str:

@@ -18,6 +18,7 @@ from dg4d_lib.shape_prior.field import (
     ShapeFields,
     inflated_probability,
     inflated_share,
+    plane_evidence,
 )
 from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV
 from dg4d_lib.shape_prior.level_set import level_surface
@@ -135,6 +136,18 @@ def test_an_unsure_network_gives_the_inflated_shape():
     inflated = inflated_probability(field.mask)
     assert (field.logits.sigmoid() - inflated).abs().max() < 0.02
     assert (inflated[64, 65].argmax() + 0.5) == pytest.approx(BINS / 2, abs=6)
+
+
+def test_a_hint_brings_the_right_side_nearer_and_mirrors():
+    network, picture = tiny_network(), cutout(20, 110)
+    near = torch.linspace(1, -1, BINS)
+    sides = []
+    for turn_deg in (0.0, 30.0, -30.0):
+        matter = ShapeFields(network, [picture], turn_deg).predict(0).logits[60].sigmoid()
+        depth = (matter * near).sum(1) / matter.sum(1)
+        sides.append(float(depth[95:105].mean() - depth[25:35].mean()))
+    assert sides[1] - sides[0] > 0.05 and sides[2] - sides[0] < -0.05
+    torch.testing.assert_close(plane_evidence(30.0), plane_evidence(-30.0).flip(1))
 
 
 def test_oblong_pictures_are_refused():
