@@ -72,7 +72,8 @@ def register(pools: Mapping[str, Pool], chosen: list[str]) -> list[str]:
         BackendUnavailable: the server rejected the deployments.
     """
     with get_client(sync_client=True) as client:
-        defaults = default_templates(client)
+        workers = {kind: worker for types in client.read_worker_metadata().values() for kind, worker in types.items()}
+        defaults = {kind: worker["default_base_job_configuration"] for kind, worker in workers.items()}
         templates = {name: pools[name].template(defaults[pools[name].type]) for name in chosen}
         for name, template in templates.items():
             pool = pools[name]
@@ -97,16 +98,6 @@ def register(pools: Mapping[str, Pool], chosen: list[str]) -> list[str]:
 def _flow_of(deployment: Json) -> str:
     """Return the name of the flow of a deployment, which is that of its function with dashes."""
     return str(deployment["entrypoint"]).rpartition(".")[2].replace("_", "-")
-
-
-def default_templates(client: SyncPrefectClient) -> dict[str, Json]:
-    """Return the base job template of every worker type."""
-    collections = client.read_worker_metadata().values()
-    return {
-        kind: worker["default_base_job_configuration"]
-        for collection in collections
-        for kind, worker in collection.items()
-    }
 
 
 def _deploy(names: list[str]) -> None:

@@ -100,8 +100,9 @@ class Worker:
 
     def _run(self, api_url: str, server: Server | None) -> None:
         """Run a worker until it exits, or the background server ends."""
+        limited = ("--limit", given) if (given := os.environ.get(LIMIT)) else ()
         process = subprocess.Popen(
-            python("-m", "prefect", "worker", "start", "--pool", self.pool, *_limited()),
+            python("-m", "prefect", "worker", "start", "--pool", self.pool, *limited),
             env={**os.environ, **environment(api_url)},
             cwd=self.folder,
             start_new_session=True,
@@ -146,12 +147,6 @@ def running(folder: Path) -> list[Worker]:
     """Return the running workers of this machine, sorted by pool."""
     workers = [Worker(lock.stem.removeprefix("worker-"), folder) for lock in sorted(folder.glob("worker-*.lock"))]
     return [worker for worker in workers if worker.is_there()]
-
-
-def _limited() -> list[str]:
-    """Return the option of a worker that limits its runs."""
-    given = os.environ.get(LIMIT)
-    return ["--limit", given] if given else []
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
