@@ -168,6 +168,12 @@ class LearnedPriorSettings(Settings):
         le=10,
         description="factor on the guidance loss: expected views are soft, and half of it leaves the input view sharp",
     )
+    contrast: float = Field(
+        1.2,
+        ge=0.25,
+        le=16,
+        description="factor on the log-odds of matter: more gives sharper unseen sides, on average farther from the truth",
+    )
     level: float = Field(
         0.35,
         ge=0.05,
@@ -262,7 +268,7 @@ class BlobStartSettings(Settings):
 
 
 class SurfaceStartSettings(Settings):
-    """Points on the surface of the geometric prior (ours)."""
+    """Points on the surface of the prior, predicted or inflated from the picture (ours)."""
 
     kind: Literal["surface"] = "surface"
     points: int = Field(5000, ge=16, le=500000, description="initial number of Gaussians")

@@ -37,7 +37,7 @@ class LearnedShapes:
         Args:
             network: of the shape prior.
             cutouts: one per frame: square, straight alpha, color and alpha in [0, 1].
-            settings: level of the surface.
+            settings: contrast of the views, level of the surface.
             turn_deg: hint at the turn of the subject about the vertical; it decides where the network is unsure.
         """
         self._fields = ShapeFields(network, cutouts, turn_deg)
@@ -81,7 +81,7 @@ class LearnedShapes:
 
     def _volume(self, frame: int) -> ShapeVolume:
         if frame not in self._volumes:
-            self._volumes[frame] = expected_volume(self._field(frame))
+            self._volumes[frame] = expected_volume(self._field(frame), self._settings.contrast)
         return self._volumes[frame]
 
     def _field(self, frame: int) -> ShapeField:

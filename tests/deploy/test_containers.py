@@ -47,6 +47,7 @@ SMALL = revise(
     {
         "subject.size": 64,
         "driving.frames": 3,
+        "prior.kind": "geometric",
         "prior.size": 32,
         "static.iterations": 2,
         "static.views": 1,

@@ -33,6 +33,7 @@ SMALL = revise(
         "motion.frames_per_iteration": 0,
         "static.resolution_schedule": [{"until": 1.0, "size": 32}],
         "motion.resolution_schedule": [{"until": 1.0, "size": 32}],
+        "prior.kind": "geometric",
         "prior.size": 32,
     },
 )

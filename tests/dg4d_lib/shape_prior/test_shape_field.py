@@ -48,7 +48,7 @@ def cutout(left: int = 40, right: int = 90) -> torch.Tensor:
 
 def test_the_input_view_of_the_expected_volume_shows_the_picture():
     field = ball()
-    color, alpha = render_volumes([expected_volume(field)], [OrbitCamera(width=SIZE, height=SIZE)])
+    color, alpha = render_volumes([expected_volume(field, 1.2)], [OrbitCamera(width=SIZE, height=SIZE)])
     inner = (COLUMNS - SIZE / 2) ** 2 + (ROWS - SIZE / 2) ** 2 < (0.8 * RADIUS / 2 / TAN_HALF_FOV * SIZE / 2) ** 2
     assert alpha[0, ..., 0][inner].min() > 0.8
     straight = color[0][inner] / alpha[0][inner]
@@ -57,15 +57,22 @@ def test_the_input_view_of_the_expected_volume_shows_the_picture():
 
 
 def test_the_opposite_view_shows_hidden_colors():
-    color, alpha = render_volumes([expected_volume(ball())], [OrbitCamera(0, 180, width=64, height=64)])
+    color, alpha = render_volumes([expected_volume(ball(), 1.2)], [OrbitCamera(0, 180, width=64, height=64)])
     assert (color[0, 32, 32] / alpha[0, 32, 32] - BLUE).abs().max() < 0.12
 
 
 def test_unsure_depth_is_soft_from_the_side():
     side = OrbitCamera(0, 90, width=64, height=64)
-    sharp, soft = (render_volumes([expected_volume(ball(0, u))], [side])[1][0, ..., 0] for u in (0.0, 0.97))
+    sharp, soft = (render_volumes([expected_volume(ball(0, u), 1.2)], [side])[1][0, ..., 0] for u in (0.0, 0.97))
     between = [float(((alpha > 0.1) & (alpha < 0.9)).float().mean()) for alpha in (sharp, soft)]
     assert between[1] > 2 * between[0]
+
+
+def test_contrast_sharpens_unsure_depth():
+    side = OrbitCamera(0, 90, width=64, height=64)
+    soft, sharp = (render_volumes([expected_volume(ball(0, 0.97), c)], [side])[1][0, ..., 0] for c in (1.0, 8.0))
+    between = [float(((alpha > 0.1) & (alpha < 0.9)).float().mean()) for alpha in (sharp, soft)]
+    assert between[1] > 1.5 * between[0]
 
 
 @pytest.mark.parametrize("center_z", [0.0, 0.3, -0.2])

@@ -28,6 +28,7 @@ from steps.store.artifact_store import ArtifactStore
 TINY = {
     "subject.size": 64,
     "driving.frames": 2,
+    "prior.kind": "geometric",
     "prior.size": 48,
     "static.iterations": 2,
     "static.views": 1,
