@@ -25,8 +25,8 @@ from flows.engine.step_tasks import flow_context
 from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.manifest import Item
 from flows.inputs.places import parse_where
-from flows.packages.delivery import forget_shared
-from flows.packages.summary import BatchProgress, Row, judged
+from flows.packages.delivery import remove_expired
+from flows.packages.summary import BatchProgress, Row, with_verdict
 from flows.ui.gallery import Gallery
 from steps.contract import ArtifactRef
 
@@ -107,7 +107,7 @@ def convert_all(
     place = parse_where(where)
     if place.kind == "deployment":
         work = item_deployment(place.address, workers).convert_job
-        forget_shared(home.store())
+        remove_expired(home.store())
     gallery = Gallery(title, progress, out)
     with item_runner(place, workers) as runner:
         try:
@@ -221,4 +221,4 @@ def _converted(job: ConversionJob, folder: Path, strict: bool, work: Convert) ->
         facts = {"message": outcome.message, "kind": outcome.kind, "pictures": pictures}
         return row.model_copy(update=facts), outcome.may_heal
     done = row.model_copy(update={"status": "done", "message": "every step was already done" if cached else ""})
-    return judged(done, folder, strict), False
+    return with_verdict(done, folder, strict), False

@@ -14,7 +14,7 @@ from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.manifest import Item, admitted, items_of, only_commercial
 from flows.inputs.places import parse_where
 from flows.packages.publish import check_folder, is_current
-from flows.packages.summary import Row, judged
+from flows.packages.summary import Row, with_verdict
 from steps.contract import Frozen
 
 ITEMS_IN_FLIGHT = 16  # of a deployment; pool and workers may allow fewer
@@ -84,7 +84,7 @@ def ready(item: Item, out: Path, strict: bool) -> ConversionJob | Row:
             request.check()
             check_folder(out / item.name)
             job = request.to_job(home.store())
-        return judged(row, out / item.name, strict) if is_current(out / item.name, job.digest()) else job
+        return with_verdict(row, out / item.name, strict) if is_current(out / item.name, job.digest()) else job
     except DG4DError as error:
         return failed.model_copy(update={"kind": type(error).__name__, "message": visible(str(error))})
     except Exception as error:  # must not stop the other items

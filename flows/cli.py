@@ -94,17 +94,17 @@ def make(
         from flows import home
         from flows.commands import terminal
         from flows.convert import convert_job
-        from flows.inputs.conversion_job import name_of
-        from flows.inputs.naming import clean
+        from flows.inputs.conversion_job import name_from_text
+        from flows.inputs.naming import clean_name
         from flows.inputs.package_record import record_of
-        from flows.packages.acceptance import failing_in
+        from flows.packages.acceptance import failing_gates
         from flows.packages.publish import check_folder, is_current
 
         console = terminal.console()
         if pick and video:
             raise BadInput("--pick chooses a generated motion and cannot be combined with --video")
         short = knobs_of(triangles, texture, fps) | ({"driving.pick": pick} if pick else {})
-        item = (clean(picture.stem) or "asset") if picture else name_of(text)
+        item = (clean_name(picture.stem) or "asset") if picture else name_from_text(text)
         files = {"picture": picture, "text": text, "video": video, "bank": bank}
         request = _request(profile, changes, short, item=item, seed=seed, commercial_only=commercial_only, **files)
         folder = out or Path("out") / item
@@ -119,7 +119,7 @@ def make(
         terminal.tell_where(console, folder, {name: fact["size_bytes"] for name, fact in written.items()})
         if (folder / "report.html").is_file():
             console.print(f"report: {folder / 'report.html'}", markup=False)
-        if failing := failing_in(folder):
+        if failing := failing_gates(folder):
             console.print(
                 f"not accepted: {', '.join(failing)}; the report says what to do", markup=False, style="yellow"
             )
@@ -145,12 +145,12 @@ def motions(
         from flows import home
         from flows.commands import terminal
         from flows.convert import rank_motions
-        from flows.inputs.naming import clean
+        from flows.inputs.naming import clean_name
         from flows.packages.publish import check_writable
 
         console = terminal.console()
         several = {"driving.candidates": candidates, "driving.pick": 0}
-        item = clean(picture.stem) or "asset"
+        item = clean_name(picture.stem) or "asset"
         files = {"item": item, "picture": picture}
         request = _request(profile, changes, several, seed=seed, commercial_only=commercial_only, **files)
         folder = out or Path("out") / f"{item}-motions"

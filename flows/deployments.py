@@ -30,8 +30,8 @@ from flows.engine.shared_results import sharing_results
 from flows.inputs.conversion_job import ConversionRequest
 from flows.inputs.fetching import local_copy, without_secrets
 from flows.inputs.manifest import parse_changes
-from flows.inputs.naming import clean
-from flows.packages.delivery import Outcome, pack, write_outcome
+from flows.inputs.naming import clean_name
+from flows.packages.delivery import Outcome, pack_package, write_outcome
 from flows.packages.publish import check_folder, is_current
 from flows.serving.roots import Roots
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen
@@ -287,7 +287,7 @@ def _convert_item(job: ArtifactRef, code: str, address: str) -> Outcome:
         with sharing_results(store), tempfile.TemporaryDirectory(prefix="dg4d-item-") as scratch:
             folder = Path(scratch) / "package"
             _, cached = convert_job(wanted, folder)
-            return Outcome(package=pack(folder, store), cached=cached)
+            return Outcome(package=pack_package(folder, store), cached=cached)
     except Exception as error:  # the catalog waits for an outcome
         return failure(error)
 
@@ -306,7 +306,7 @@ def _convert(address: str, out: str, options: Options, is_video: bool = False) -
     folder = roots.output(out)
     with local_copy(roots.source(address)) as path:
         request = ConversionRequest(
-            item=clean(PurePosixPath(urlsplit(address).path).stem) or "asset",
+            item=clean_name(PurePosixPath(urlsplit(address).path).stem) or "asset",
             picture=path,
             video=path if is_video else None,
             profile=options.profile,

@@ -174,7 +174,7 @@ def write(results: Results, judged: "BenchmarkResult", out: Path) -> None:
         "results.json": _json(results),
         "results.csv": scores.csv_text(results),
         "table.md": scores.markdown(results),
-        "index.html": scores.page(results, shown),
+        "index.html": scores.scores_page(results, shown),
     }
     for name, text in texts.items():
         write_atomically(out / name, text)

@@ -10,7 +10,7 @@ from flows.commands.options import Changes, Profile, Seed
 
 if TYPE_CHECKING:
     from flows.commands.rebuild import Rebuilt
-    from flows.packages.verify import Verdict
+    from flows.packages.verify import Verification
 
 
 def score(
@@ -114,7 +114,7 @@ def rebuild(
         _tell(terminal.with_steps(job, console, work), as_json)
 
 
-def _tell(found: "Verdict | Rebuilt", as_json: bool) -> None:
+def _tell(found: "Verification | Rebuilt", as_json: bool) -> None:
     """What was found, as JSON or as a table, and the exit status that says so."""
     from flows.commands import terminal
 

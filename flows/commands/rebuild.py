@@ -11,7 +11,7 @@ from flows import home
 from flows.convert import run_flow
 from flows.exit_status import EXIT_FAILED
 from flows.inputs.conversion_job import ConversionJob
-from flows.packages.credentials import configured
+from flows.packages.credentials import configured_signer
 from flows.packages.publish import Files, file_digest, unpacked
 from flows.packages.report import deliver
 from steps.artifacts.artifact_diff import TOLERANCE, difference
@@ -82,7 +82,7 @@ def rebuild(folder: Path, record: Mapping[str, Any], job: ConversionJob, out: Pa
         StepError: a step did not finish.
         BadInput: `out` cannot be written.
     """
-    signer = configured() if out else None
+    signer = configured_signer() if out else None
     labels = [run["step"] for run in record["run"]["steps"]]
     if len(labels) != len(record["steps"]):
         raise BadInput(

@@ -33,7 +33,7 @@ def list_versions() -> None:
         from flows import home
         from flows.commands import terminal
         from flows.engine.versions import versions
-        from flows.formatting.sizes import readable
+        from flows.formatting.numbers import format_size
 
         place = home.store()
         sizes = {entry.name: entry.size_bytes for entry in place.artifacts()}
@@ -48,15 +48,15 @@ def list_versions() -> None:
                 _short(version.order),
                 _when(version),
                 version.profile,
-                readable(version.package.size_bytes),
-                readable(sum(sizes.get(digest, 0) for digest in version.artifacts())),
+                format_size(version.package.size_bytes),
+                format_size(sum(sizes.get(digest, 0) for digest in version.artifacts())),
             )
             before = version.item
         out = terminal.console()
         if known:
             out.print(table)
         items = len({version.item for version in known})
-        total = f"{len(sizes)} artifacts, {readable(sum(sizes.values()))}"
+        total = f"{len(sizes)} artifacts, {format_size(sum(sizes.values()))}"
         out.print(f"{items} items, {len(known)} versions, {total} in {place.address}", markup=False)
 
 
@@ -111,13 +111,13 @@ def gc(
     with clear_ending():
         from flows import home
         from flows.engine.collecting import collect
-        from flows.formatting.sizes import readable
+        from flows.formatting.numbers import format_size
 
         place = home.store()
         gone = collect(place, home.records(), keep, dry_run, grace_hours * 3600)
         for version in gone.versions:
             _echo(f"version {_short(version.order)} of {version.item}, {_when(version)}")
-        size = readable(sum(entry.size_bytes for entry in gone.artifacts))
+        size = format_size(sum(entry.size_bytes for entry in gone.artifacts))
         verb = "would be removed" if dry_run else "were removed"
         typer.echo(
             f"{len(gone.versions)} versions and {len(gone.artifacts)} artifacts ({size}) {verb} from {place.address}"
@@ -149,26 +149,26 @@ def verify() -> None:
 
 
 def _show_version(version: "Version", place: "ArtifactStore") -> None:
-    from flows.formatting.sizes import readable
+    from flows.formatting.numbers import format_size
 
     sizes = {entry.name: entry.size_bytes for entry in place.artifacts()}
     _echo(f"{version.item}  version {version.order}")
     _echo(f"  finished  {_when(version)}, profile {version.profile}, seed {version.seed}")
     for digest, what in version.artifacts().items():
-        size = readable(sizes[digest]) if digest in sizes else "missing"
+        size = format_size(sizes[digest]) if digest in sizes else "missing"
         _echo(f"  {_short(digest)}  {size:>9}  {what}")
     if version.package.digest in sizes:
         with zipfile.ZipFile(place.path(version.package)) as package:
             _echo("  files of the package")
             for entry in package.infolist():
-                _echo(f"  {'':{SHOWN_DIGITS}}  {readable(entry.file_size):>9}  {entry.filename}")
+                _echo(f"  {'':{SHOWN_DIGITS}}  {format_size(entry.file_size):>9}  {entry.filename}")
 
 
 def _show_artifact(digest: str, size_bytes: int, known: list["Version"]) -> None:
     from flows.engine.versions import users
-    from flows.formatting.sizes import readable
+    from flows.formatting.numbers import format_size
 
-    _echo(f"{digest}  {readable(size_bytes)}")
+    _echo(f"{digest}  {format_size(size_bytes)}")
     for version, what in users(known).get(digest, []):
         _echo(f"  {what} of {version.item}, version {_short(version.order)}")
     if digest not in users(known):

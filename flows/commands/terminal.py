@@ -15,9 +15,8 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 from rich.table import Table
 
 from flows.engine.events import StepEvent, listening
-from flows.formatting.curves import amount
 from flows.formatting.escaping import visible
-from flows.formatting.sizes import readable
+from flows.formatting.numbers import format_number, format_size
 
 if TYPE_CHECKING:
     from flows.inputs.conversion_job import ConversionJob
@@ -221,7 +220,7 @@ def batch_shown(out: Console, items: list[str]) -> Iterator[BatchTable]:
 def numbers(event: StepEvent, most: int | None = None) -> str:
     """How far a step is, and its current values, at most the first `most` of them."""
     parts = [f"{event.done}/{event.total}"] if event.total > COUNTED else []
-    return "  ".join([*parts, *(f"{name} {amount(value)}" for name, value in list(event.values.items())[:most])])
+    return "  ".join([*parts, *(f"{name} {format_number(value)}" for name, value in list(event.values.items())[:most])])
 
 
 def plain(text: str) -> str:
@@ -240,7 +239,7 @@ def tell_where(out: Console, folder: Path, sizes: dict[str, int]) -> None:
         count, total = groups.get(group, (0, 0))
         groups[group] = count + 1, total + size
     for group, (count, total) in groups.items():
-        table.add_row(plain(group) + (f" ({_files(count)})" if group.endswith("/") else ""), readable(total))
+        table.add_row(plain(group) + (f" ({_files(count)})" if group.endswith("/") else ""), format_size(total))
     out.print(table)
 
 

@@ -32,7 +32,7 @@ from flows.engine.leases import hold, running
 from flows.engine.output_lock import output_lock
 from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.package_record import record_of
-from flows.packages.delivery import Outcome, deliver, read_outcome
+from flows.packages.delivery import Outcome, read_outcome, unpack_package
 from flows.packages.publish import Files
 from flows.step_errors import StepCrashed, StepError, StepOutOfMemory, StepTimedOut, StepUnreachable
 from steps.contract import ArtifactRef, digest_of
@@ -92,7 +92,7 @@ class ItemDeployment(NamedTuple):
             if outcome.package is None:
                 raise ItemFailed(outcome)
             with output_lock(folder, lambda: None):
-                files = deliver(outcome.package, folder, store)
+                files = unpack_package(outcome.package, folder, store)
         if (record_of(folder) or {}).get("order") != job.digest():
             note = "converted with weights, a rasterizer or a signing key that differ from those of this machine"
             emit(StepEvent(job.item, STEP, "remark", text=note))

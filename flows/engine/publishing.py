@@ -9,7 +9,7 @@ from prefect.transactions import Transaction, get_transaction
 from flows import home
 from flows.engine import versions
 from flows.inputs.conversion_job import ConversionJob
-from flows.packages.credentials import configured
+from flows.packages.credentials import configured_signer
 from flows.packages.flow_result import FlowResult
 from flows.packages.publish import Swap
 from flows.packages.report import deliver
@@ -20,7 +20,7 @@ SWAP = "swap"  # key of the swap in the transaction
 
 @task(name="publish", task_run_name="publish: {job.item}", cache_policy=NO_CACHE, persist_result=False)
 def publish(package: StepResult, verdict: StepResult, job: ConversionJob, result: FlowResult, folder: Path) -> None:
-    """Write the reports, sign the files if a key is configured, and put the package into the output folder.
+    """Write the reports, sign the files if a key is configured_signer, and put the package into the output folder.
 
     In a transaction the package that was there comes back if a later task of the transaction fails.
 
@@ -33,9 +33,9 @@ def publish(package: StepResult, verdict: StepResult, job: ConversionJob, result
 
     Raises:
         BadInput: the folder cannot be written, the disk is full, or the key cannot sign; the folder is as it was.
-        BackendUnavailable: a key is configured, and signing is not installed.
+        BackendUnavailable: a key is configured_signer, and signing is not installed.
     """
-    swap = deliver(job, result, folder, configured())
+    swap = deliver(job, result, folder, configured_signer())
     transaction = get_transaction()
     if transaction is None:
         swap.keep()

@@ -30,8 +30,8 @@ from flows.engine.executors import configured_executor, stop_all
 from flows.engine.leases import hold
 from flows.engine.orphans import claim_run
 from flows.engine.remarks import remark
-from flows.formatting.curves import amount
 from flows.formatting.escaping import markdown
+from flows.formatting.numbers import format_number
 from flows.packages.flow_result import StepRun
 from flows.step_errors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable
 from flows.ui import pages
@@ -286,7 +286,7 @@ class _Progress:
         if now - self._last < PROGRESS_EVERY_S and done < total:
             return
         self._last = now
-        figures = "".join(f", {name} {amount(value)}" for name, value in values.items())
+        figures = "".join(f", {name} {format_number(value)}" for name, value in values.items())
         text, percent = f"{self._title}: {done}/{total}{figures}", 100 * done / max(total, 1)
         revive()
         with suppress(httpx.TransportError):  # the step goes on while the server is away

@@ -16,7 +16,7 @@ from urllib.parse import unquote
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.weights.registry import KNOWN
-from flows.inputs.listing import BUCKET, WILD
+from flows.inputs.listing import BUCKET, WILDCARDS
 from flows.inputs.manifest import Item
 from flows.processes import locked
 from flows.serving import background
@@ -64,7 +64,7 @@ class Roots(Frozen):
             BadInput: it is outside of the roots.
         """
         parts = Path(given).parts
-        first = next((i for i, part in enumerate(parts) if WILD & set(part)), len(parts))
+        first = next((i for i, part in enumerate(parts) if WILDCARDS & set(part)), len(parts))
         if given.startswith(BUCKET) or first == len(parts) or _exists(given):
             return self.folder(given)
         if ".." in parts[first:]:

@@ -51,7 +51,7 @@ def asset_page(item: str, finished: Sequence[StepRun], package: ArtifactRef, sto
         for ref in result.outputs.values():
             if ref.media_type.endswith("curves+json"):
                 lines += curve_picture(json.loads(store.path(ref).read_text(encoding="utf-8")))
-    verdict = acceptance.verdict_of((done.result for done in finished), store)
+    verdict = acceptance.load_verdict((done.result for done in finished), store)
     if verdict is not None:
         lines += ["## Gates", "", *acceptance.markdown(verdict)]
     notes = dict.fromkeys(note for done in finished for note in done.result.provenance.notes)
@@ -90,6 +90,6 @@ def timings(finished: Sequence[StepRun]) -> list[dict[str, str]]:
 
 def curve_picture(values: dict[str, Any]) -> list[str]:
     """Return a loss curve as lines of Markdown; none if it has no values to draw."""
-    drawn = curves.picture(values)
+    drawn = curves.svg_picture(values)
     title = f"Losses of the {values['title']}"
     return [f"## {title}", "", pages.embedded(title, "image/svg+xml", drawn.encode()), ""] if drawn else []

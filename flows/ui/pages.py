@@ -12,7 +12,7 @@ from typing import Any
 from PIL import Image
 
 from flows.formatting.escaping import markdown
-from flows.formatting.sizes import readable
+from flows.formatting.numbers import format_size
 from flows.packages import acceptance
 from flows.serving.addresses import ARTIFACT_ADDRESS
 from flows.step_errors import StepError
@@ -63,7 +63,7 @@ def step_page(label: str, item: str, result: StepResult, store: ArtifactStore) -
     suffixes = {name: port.suffix for name, port in catalog()[record.step].outputs.items()}
     lines += [
         f"| [{name}{suffixes[name]}]({address(name, ref, suffixes[name])}) | {ref.media_type} "
-        f"| {readable(ref.size_bytes)} | `{ref.digest[7:19]}` |"
+        f"| {format_size(ref.size_bytes)} | `{ref.digest[7:19]}` |"
         for name, ref in result.outputs.items()
     ]
     return "\n".join(lines) + "\n"

@@ -82,7 +82,7 @@ def test_words_become_a_picture_first(log: Path, tmp_path: Path) -> None:
     convert_job(request.to_job(home.store()), tmp_path / "out")
     assert sorted(ran(log)) == sorted(["draw_picture", *EVERY_STEP])
     report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert report["banner"].startswith("Preview: the picture was drawn by a model; the motion was made up;")
+    assert report["banner"].startswith("Preview: the picture was generated from text; the motion was generated;")
     assert report["licenses"] == {"fake": "fake license: <free>"}
     assert "fake license: &lt;free&gt;" in (tmp_path / "out" / "report.html").read_text()
     record = json.loads((tmp_path / "out" / "provenance.json").read_text())

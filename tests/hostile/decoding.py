@@ -192,7 +192,7 @@ def read_as_scene(path: Path, scratch: Path) -> tuple[Kind, int]:
 
 
 def read_as_record(path: Path, scratch: Path) -> tuple[Kind, int]:
-    """Check a package whose record somebody else wrote, and ask for the job that it names."""
+    """Check a package whose record somebody else wrote, and ask for the order that it names."""
     from flows.inputs.conversion_job import job_from_record
     from flows.inputs.package_record import RECORD, record_of
     from flows.packages.publish import is_current

@@ -173,7 +173,7 @@ def test_a_finished_asset_takes_no_knobs_of_the_conversion(tmp_path: Path) -> No
     thing(tmp_path / "newt", "x")
     with pytest.raises(BadInput, match=r"only knobs that begin with 'score\.'.*motion\.views"):
         score(tmp_path, tmp_path / "newt", Console(), changes=["motion.views=1"])
-    with pytest.raises(BadInput, match="is no asset"):
+    with pytest.raises(BadInput, match="is not an asset"):
         score(tmp_path, tmp_path / "newt", Console())
 
 

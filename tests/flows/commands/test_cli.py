@@ -84,7 +84,7 @@ def test_an_unknown_profile() -> None:
         ("motion.iteration=5", "motion.iteration"),
         ("motion.iterations=0", "greater than or equal to 1"),
         ("motion.iterations=many", "many"),
-        ("motion.iterations", "knob=value"),
+        ("motion.iterations", "NAME=VALUE"),
         ("mesh.mode=round", "'tracked', 'per_frame' or 'auto'"),
         ("prior.kind=crystal", "crystal"),
     ],

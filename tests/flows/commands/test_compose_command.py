@@ -93,7 +93,7 @@ def test_equal_scenes_are_equal_bytes_wherever_they_lie(shelf: Path, tmp_path: P
 
 def test_an_altered_file_is_named(shelf: Path) -> None:
     (shelf / "gem" / "splats" / "001.ply").write_bytes(b"other")
-    with pytest.raises(BadInput, match=r"gem is not as it was made: splats/001\.ply was altered"):
+    with pytest.raises(BadInput, match=r"gem is damaged: splats/001\.ply was altered"):
         compose([shelf / "gem"], shelf / "scene.glb")
     assert not (shelf / "scene.glb").exists()
 
@@ -106,7 +106,7 @@ def test_a_missing_file_is_named(shelf: Path) -> None:
 
 def test_a_folder_that_is_no_package_is_refused(shelf: Path) -> None:
     (shelf / "empty").mkdir()
-    with pytest.raises(BadInput, match="is no asset"):
+    with pytest.raises(BadInput, match="is not an asset"):
         compose([shelf / "gem", shelf / "empty"], shelf / "scene.glb")
 
 

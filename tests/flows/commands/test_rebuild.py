@@ -16,7 +16,6 @@ from waiting import retry_after
 from dg4d_lib.errors import BadInput
 from flows import home
 from flows.commands.rebuild import Rebuilt, rebuild
-from flows.convert import convert_job
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest, job_from_record
 from flows.inputs.package_record import record_of
 from flows.packages.verify import verify
@@ -190,7 +189,7 @@ def test_a_source_that_is_not_in_the_store_must_be_given_and_be_the_same(tmp_pat
     with pytest.raises(BadInput, match="give it with --source"):
         job_from_record(record, elsewhere)
     (tmp_path / "other.png").write_text(picture("other"))
-    with pytest.raises(BadInput, match="is not what this package was made from"):
+    with pytest.raises(BadInput, match="is not the source of this package"):
         job_from_record(record, elsewhere, tmp_path / "other.png")
     (tmp_path / "same.png").write_bytes(SOURCE)
     found = job_from_record(record, elsewhere, tmp_path / "same.png")

@@ -17,17 +17,9 @@ from prefect.states import Cancelled, Completed, Crashed, Failed, Pending, Runni
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows import home
 from flows.engine import item_runs, resources
-from flows.engine.item_runs import (
-    JOB_MEDIA_TYPE,
-    ItemDeployment,
-    ItemFailed,
-    code_version,
-    failure,
-    item_deployment,
-    read_job,
-)
+from flows.engine.item_runs import ItemDeployment, ItemFailed, code_version, failure, item_deployment
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest
-from flows.packages.delivery import Outcome, deliver, forget_shared, pack, read_outcome, write_outcome
+from flows.packages.delivery import Outcome, pack_package, read_outcome, remove_expired, unpack_package, write_outcome
 from flows.serving import registering
 from flows.serving.pools import read_pools
 from flows.serving.server import Server
@@ -65,7 +57,7 @@ def reference(job: ConversionJob) -> ArtifactRef:
 def package(tmp_path: Path) -> ArtifactRef:
     (tmp_path / "package").mkdir()
     (tmp_path / "package" / "asset.glb").write_bytes(b"glb")
-    return pack(tmp_path / "package", home.store())
+    return pack_package(tmp_path / "package", home.store())
 
 
 def test_an_item_is_begun_once_and_again_only_after_it_failed(
@@ -194,18 +186,18 @@ def test_a_failure_is_the_same_here_and_elsewhere(error: Exception, kind: str, m
 
 
 def test_a_package_travels_whole_or_not_at_all(job: ConversionJob, package: ArtifactRef, tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="no sound provenance"):
-        deliver(package, tmp_path / "out", home.store())
+    with pytest.raises(BadInput, match="no valid provenance"):
+        unpack_package(package, tmp_path / "out", home.store())
     assert not (tmp_path / "out").exists()
-    assert pack(tmp_path / "package", home.store()) == package  # equal folders, equal bytes
+    assert pack_package(tmp_path / "package", home.store()) == package  # equal folders, equal bytes
 
 
 def test_what_travelled_a_day_ago_is_forgotten(job: ConversionJob, monkeypatch: pytest.MonkeyPatch) -> None:
     store = home.store()
     write_outcome(store, "old", Outcome(kind="Crashed"))
-    forget_shared(store)
+    remove_expired(store)
     assert read_outcome(store, "old") is not None
     tomorrow = store.now() + timedelta(days=1, seconds=1).total_seconds()
     monkeypatch.setattr(type(store), "now", lambda self: tomorrow)
-    forget_shared(store)
+    remove_expired(store)
     assert read_outcome(store, "old") is None

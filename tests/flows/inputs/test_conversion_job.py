@@ -5,7 +5,7 @@ from fake_steps import PNG, bank_json, picture
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.rasterizer import choice
-from flows.inputs.conversion_job import ConversionJob, ConversionRequest, name_of
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest, name_from_text
 from steps.profiles import PREVIEW, revise
 from steps.store.artifact_store import ArtifactStore
 
@@ -113,7 +113,7 @@ def test_what_cannot_work_is_refused_before_any_work(tmp_path: Path) -> None:
         "does not exist;": request(good, tmp_path / "none.mp4"),
         "holds 1 picture;": request(good, frames(tmp_path / "single", 1)),
         "holds no pictures;": request(good, frames(tmp_path / "bare", 0)),
-        "needs the true views": request(good, **{"prior.kind": "oracle"}),
+        "needs ground-truth views": request(good, **{"prior.kind": "oracle"}),
         r"no file bank\.json": request(good, bank=bank, **{"prior.kind": "oracle"}),
     }
     for says, bad in cases.items():
@@ -189,7 +189,7 @@ def test_words_that_cannot_work_are_refused_before_any_work(weights: Path, tmp_p
     ],
 )
 def test_words_name_the_asset(text: str, name: str) -> None:
-    assert name_of(text) == name
+    assert name_from_text(text) == name
 
 
 def test_other_weights_are_another_order_and_their_place_does_not_count(

@@ -130,7 +130,7 @@ def test_other_addresses_are_refused(address: str) -> None:
 
 @pytest.mark.parametrize("address", ["http://[::1/a.png", "http://host:port/a.png", "http://host:99999/a.png"])
 def test_what_is_no_address_is_refused(address: str) -> None:
-    refused(address, "this one cannot be")
+    refused(address, "this one is invalid")
 
 
 @pytest.mark.parametrize("host", ["nowhere.invalid", "a..b", f"{'a' * 64}.invalid"])

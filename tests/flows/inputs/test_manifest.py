@@ -10,7 +10,7 @@ from tiny_s3 import BUCKET, TinyS3
 from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
 from flows.inputs import sources
 from flows.inputs.manifest import Item, items_of, parse_changes
-from flows.inputs.naming import distinct
+from flows.inputs.naming import unique_names
 
 
 def touch(folder: Path, *names: str) -> None:
@@ -37,7 +37,7 @@ def test_packages_and_the_output_folder_are_no_inputs(tmp_path: Path) -> None:
 def test_no_two_items_share_a_folder_and_none_lies_within_another(tmp_path: Path) -> None:
     touch(tmp_path, "a.png", "A.mp4", "b.png", "b/c.png", "d.png")
     assert [item.name for item in items(tmp_path)] == ["A-mp4", "a-png", "b/c", "b-png", "d"]
-    assert distinct([("x", ""), ("x", ""), ("x-2", "")]) == ["x", "x-2", "x-2-2"]
+    assert unique_names([("x", ""), ("x", ""), ("x-2", "")]) == ["x", "x-2", "x-2-2"]
 
 
 def test_a_csv_has_a_row_per_item_with_knobs_of_its_own(tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_values_are_json_where_they_can_be_and_kinds_come_first() -> None:
         "mesh.mode": "per_frame",
     }  # fmt: skip
     assert next(iter(changes)) == "prior.kind"
-    with pytest.raises(BadInput, match="knob=value"):
+    with pytest.raises(BadInput, match="NAME=VALUE"):
         parse_changes(["motion.iterations"])
 
 

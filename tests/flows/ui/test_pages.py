@@ -186,9 +186,9 @@ def test_a_picture_is_shown_as_large_as_its_bytes_allow(tmp_path: Path) -> None:
 
 
 def test_a_loss_that_cannot_be_drawn_is_left_out() -> None:
-    assert curves.picture({"title": "t", "x": [], "series": {"a": []}, "notes": []}) == ""
-    assert curves.picture({"title": "t", "x": [1, 2], "series": {"a": [float("nan")] * 2}, "notes": []}) == ""
-    assert "&lt;loss&gt; 3" in curves.picture(
+    assert curves.svg_picture({"title": "t", "x": [], "series": {"a": []}, "notes": []}) == ""
+    assert curves.svg_picture({"title": "t", "x": [1, 2], "series": {"a": [float("nan")] * 2}, "notes": []}) == ""
+    assert "&lt;loss&gt; 3" in curves.svg_picture(
         {"title": "t", "x": [1, 2], "series": {"<loss>": [2.0, 3.0]}, "notes": []}
     )
 
@@ -202,7 +202,7 @@ def _stored(store: ArtifactStore, picture: Image.Image) -> ArtifactRef:
 def test_counts_are_read_with_all_their_digits() -> None:
     values = [65536, 5000.0, 12.0, 2748.64, -123456.7, 0.0, float("nan"), float("inf")]
     said = ["65,536", "5,000", "12", "2749", "-1.235e+05", "0", "nan", "inf"]
-    assert [curves.amount(value) for value in values] == said
+    assert [curves.format_number(value) for value in values] == said
 
 
 def test_an_item_may_be_called_anything_and_is_shown_letter_by_letter(server: Server, place: Path) -> None:
