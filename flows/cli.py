@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flows.commands.checking import bench, rebuild, score, verify
-from flows.commands.endings import clear_ending
-from flows.commands.options import Changes, Commercial, Profile, Rate, Seed, Texture, Triangles, finite, knobs_of
+from flows.commands.endings import exit_on_error
+from flows.commands.options import Changes, Commercial, Profile, Rate, Seed, Texture, Triangles, finite, shortcut_settings
 from flows.commands.services import down, env, up, watch
 from flows.commands.settings import settings as list_settings
 from flows.commands.store import store
@@ -89,7 +89,7 @@ def make(
     """
     if picture is None and not text:
         raise typer.BadParameter("give a picture, a video, or --text WORDS")
-    with clear_ending():
+    with exit_on_error():
         from dg4d_lib.errors import BadInput
         from flows import home
         from flows.commands import terminal
@@ -103,7 +103,7 @@ def make(
         console = terminal.console()
         if pick and video:
             raise BadInput("--pick chooses a generated motion and cannot be combined with --video")
-        short = knobs_of(triangles, texture, fps) | ({"driving.pick": pick} if pick else {})
+        short = shortcut_settings(triangles, texture, fps) | ({"driving.pick": pick} if pick else {})
         item = (clean_name(picture.stem) or "asset") if picture else name_from_text(text)
         files = {"picture": picture, "text": text, "video": video, "bank": bank}
         request = _request(profile, changes, short, item=item, seed=seed, commercial_only=commercial_only, **files)
@@ -112,11 +112,11 @@ def make(
         job = request.to_job(home.store())
         cached = is_current(folder, job.digest())
         if not cached:
-            _, cached = terminal.with_steps(job, console, lambda: convert_job(job, folder))
+            _, cached = terminal.run_with_progress(job, console, lambda: convert_job(job, folder))
         if cached:
             console.print("nothing to do: every step was already done")
         written = (record_of(folder) or {"files": {}})["files"]
-        terminal.tell_where(console, folder, {name: fact["size_bytes"] for name, fact in written.items()})
+        terminal.print_package(console, folder, {name: fact["size_bytes"] for name, fact in written.items()})
         if (folder / "report.html").is_file():
             console.print(f"report: {folder / 'report.html'}", markup=False)
         if failing := failing_gates(folder):
@@ -141,7 +141,7 @@ def motions(
 
     `dg4d make PICTURE --pick K` uses motion K.
     """
-    with clear_ending():
+    with exit_on_error():
         from flows import home
         from flows.commands import terminal
         from flows.convert import rank_motions
@@ -156,7 +156,7 @@ def motions(
         folder = out or Path("out") / f"{item}-motions"
         check_writable(folder)
         job = request.to_job(home.store())
-        ranking = terminal.with_steps(job, console, lambda: rank_motions(job, folder))
+        ranking = terminal.run_with_progress(job, console, lambda: rank_motions(job, folder))
         for row in ranking["candidates"]:
             remarks = "; ".join(row["remarks"])
             console.print(f"{row['number']:>3}  {row['total']:.2f}  {row['name']}  {remarks}".rstrip(), markup=False)
@@ -225,7 +225,7 @@ def batch(
     columns: path or text, and optionally video, name, profile, seed, bank, priority (higher first), set ("a.b=c;
     d.e=f"), or any setting by its name.
     """
-    with clear_ending():
+    with exit_on_error():
         os.environ.update({name: str(n) for name, n in {"DG4D_GPUS": gpus, "DG4D_CPUS": cpus}.items() if n is not None})
         from flows.catalog_request import CatalogRequest, default_workers
         from flows.commands import terminal
@@ -238,7 +238,7 @@ def batch(
             inputs=inputs,
             out=out,
             profile=profile,
-            changes=parse_changes(changes or []) | knobs_of(triangles, texture, fps),
+            changes=parse_changes(changes or []) | shortcut_settings(triangles, texture, fps),
             seed=seed,
             workers=workers or default_workers(where),
             where=where,
@@ -266,7 +266,7 @@ def render(
     mesh: Annotated[bool, typer.Option("--mesh", help="render the textured mesh instead of the splats")] = False,
 ) -> None:
     """Render an asset from given azimuths as RGBA pictures."""
-    with clear_ending():
+    with exit_on_error():
         try:
             angles = [float(angle) for angle in azimuths.split(",")]
             if not all(map(math.isfinite, angles)):
@@ -289,7 +289,7 @@ def view(
     show: Annotated[bool, typer.Option("--open/--no-open", help="open the page in a browser")] = True,
 ) -> None:
     """Verify a package, open its viewer and print the page's path."""
-    with clear_ending():
+    with exit_on_error():
         from flows.packages.view import view as check_and_show
 
         typer.echo(check_and_show(package, show))
@@ -314,7 +314,7 @@ def compose(
 
     They stand side by side, or as a scene file places them.
     """
-    with clear_ending():
+    with exit_on_error():
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
         from flows.commands.compose import compose as compose_scene
         from flows.formatting.escaping import visible

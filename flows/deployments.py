@@ -21,7 +21,7 @@ from flows import home
 from flows.catalog_request import CatalogRequest
 from flows.commands.batch import batch, print_summary
 from flows.commands.benchmark import bench
-from flows.commands.options import knobs_of
+from flows.commands.options import shortcut_settings
 from flows.commands.terminal import console
 from flows.convert import connect, convert_job
 from flows.engine.item_runs import FLOW, failure, read_job
@@ -114,7 +114,7 @@ class Options(Frozen):
         Raises:
             BadInput: a setting is invalid.
         """
-        return parse_changes(list(self.settings)) | knobs_of(self.triangles, self.texture, self.fps)
+        return parse_changes(list(self.settings)) | shortcut_settings(self.triangles, self.texture, self.fps)
 
 
 class PictureOptions(Options):

@@ -1,4 +1,4 @@
-"""`dg4d store`: what the store holds, what refers to what, removing what nobody needs, checking every byte."""
+"""Commands `store ls`, `store show`, `store gc` and `store verify`."""
 
 import re
 import zipfile
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flows.commands.endings import clear_ending
+from flows.commands.endings import exit_on_error
 from flows.commands.options import finite
 from flows.exit_status import EXIT_BAD_INPUT
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from flows.engine.versions import Version
     from steps.store.artifact_store import ArtifactStore
 
-LEAST_DIGITS = 6  # of a digest, to be taken for one
+LEAST_DIGITS = 6  # of an abbreviated digest
 SHOWN_DIGITS = 12
 
 store = typer.Typer(
@@ -27,7 +27,7 @@ store = typer.Typer(
 @store.command("ls")
 def list_versions() -> None:
     """List items and versions, newest first, with their disk space."""
-    with clear_ending():
+    with exit_on_error():
         from rich.table import Column, Table
 
         from flows import home
@@ -65,7 +65,7 @@ def show(
     name: Annotated[str, typer.Argument(metavar="ITEM|DIGEST", help="an item, or a prefix of a digest")],
 ) -> None:
     """Show an item, a version, or the references to an artifact."""
-    with clear_ending():
+    with exit_on_error():
         from dg4d_lib.errors import BadInput
         from flows import home
         from flows.engine.versions import versions
@@ -81,13 +81,13 @@ def show(
             items = sorted({version.item for version in known})
             some = ", ".join(items[:5]) + (", ..." if len(items) > 5 else "")
             raise BadInput(
-                f"there is no item {name!r} ({some or 'none yet'}), and no digest of {LEAST_DIGITS} digits or more"
+                f"{name!r} is neither an item ({some or 'none yet'}) nor a digest of {LEAST_DIGITS} digits or more"
             )
         digest = f"sha256:{digits}"
         of_job = [version for version in known if version.order.startswith(digest)]
         artifacts = [entry for entry in place.artifacts() if entry.name.startswith(digest)]
         if not of_job and not artifacts:
-            raise BadInput(f"no version and no artifact in {place.address} begins with {digits}")
+            raise BadInput(f"no digest of a version or artifact in {place.address} begins with {digits}")
         for version in of_job:
             _show_version(version, place)
         for entry in artifacts:
@@ -108,7 +108,7 @@ def gc(
 
     Artifacts of kept versions and of running commands stay, so it is safe at any time.
     """
-    with clear_ending():
+    with exit_on_error():
         from flows import home
         from flows.engine.collecting import collect
         from flows.formatting.numbers import format_size
@@ -127,7 +127,7 @@ def gc(
 @store.command()
 def verify() -> None:
     """Verify every artifact; list damaged and missing ones."""
-    with clear_ending():
+    with exit_on_error():
         from flows import home
         from flows.engine.versions import faults, users, versions
 
@@ -145,7 +145,7 @@ def verify() -> None:
                 err=True,
             )
             raise typer.Exit(EXIT_BAD_INPUT)
-        typer.echo(f"{len(sizes)} artifacts of {len(known)} versions are whole")
+        typer.echo(f"{len(sizes)} artifacts of {len(known)} versions are intact")
 
 
 def _show_version(version: "Version", place: "ArtifactStore") -> None:
@@ -176,7 +176,7 @@ def _show_artifact(digest: str, size_bytes: int, known: list["Version"]) -> None
 
 
 def _echo(text: str) -> None:
-    """Print a line with names in it that this process did not choose."""
+    """Print a line that contains names of users, escaped."""
     from flows.formatting.escaping import visible
 
     typer.echo(visible(text))

@@ -268,10 +268,8 @@ def test_a_made_batch_needs_no_server_and_says_that_there_is_nothing_to_do(
     (tmp_path / "in" / "a.png").write_text(picture("x"))
     monkeypatch.setattr("flows.catalog_request.is_current", lambda folder, digest: True)
 
-    def no_server() -> None:
-        pytest.fail("nothing is to be made")
-
-    rows = batch(CatalogRequest(inputs=str(tmp_path / "in"), out=tmp_path / "out"), QUIET, connect=no_server)
+    monkeypatch.setattr("flows.convert.connect", lambda: pytest.fail("nothing is to be made"))
+    rows = batch(CatalogRequest(inputs=str(tmp_path / "in"), out=tmp_path / "out"), QUIET)
     assert [row.status for row in rows] == ["unchanged"]
 
 
@@ -306,7 +304,7 @@ def test_a_hundred_items_are_found_unchanged_in_a_moment_each(tmp_path: Path, mo
         ([Row(item="a", status="failed", kind="BadInput"), Row(item="b", status="done")], 1, "1 of 2 items"),
         ([Row(item="a", status="failed", kind="BadInput")], 65, "0 of 1 items"),
         ([Row(item="a", status="failed", kind="StepCrashed")], 1, "failed: a"),
-        ([Row(item="a", status="unchanged")], 0, "nothing to do"),
+        ([Row(item="a", status="unchanged")], 0, "nothing to do: every item is up to date"),
     ],
 )
 def test_the_exit_status_says_how_a_batch_ended(

@@ -15,7 +15,7 @@ from waiting import retry_after
 
 from dg4d_lib.errors import BadInput
 from flows import home
-from flows.commands.rebuild import Rebuilt, rebuild
+from flows.commands.rebuild import RebuildReport, rebuild
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest, job_from_record
 from flows.inputs.package_record import record_of
 from flows.packages.verify import verify
@@ -65,14 +65,14 @@ def job(words: str, folder: Path, name: str = "fake.png", **changes: object) -> 
     ).to_job(home.store())
 
 
-def again(folder: Path, out: Path | None = None, source: Path | None = None) -> Rebuilt:
+def again(folder: Path, out: Path | None = None, source: Path | None = None) -> RebuildReport:
     record = record_of(folder)
     assert record is not None
     return rebuild(folder, record, job_from_record(record, home.store(), source), out)
 
 
-def outcomes(rebuilt: Rebuilt) -> dict[str, str]:
-    return {likeness.name: likeness.outcome for likeness in rebuilt.likenesses}
+def outcomes(rebuilt: RebuildReport) -> dict[str, str]:
+    return {comparison.name: comparison.outcome for comparison in rebuilt.comparisons}
 
 
 def altered(
@@ -96,8 +96,8 @@ def test_every_step_runs_again_and_gives_the_same(fakes: Path, tmp_path: Path) -
     rebuilt = again(tmp_path / "out", tmp_path / "again")
     assert sorted(fakes.read_text().split()) == sorted(ran.split())
     assert set(outcomes(rebuilt).values()) == {"identical"}
-    assert len(rebuilt.likenesses) == len(ran.split()) + 4  # files
-    assert rebuilt.circumstances == ()
+    assert len(rebuilt.comparisons) == len(ran.split()) + 4  # files
+    assert rebuilt.environment_changes == ()
     assert list(rebuilt.rows())[-1] == ("4 files", "identical", "")
     assert rebuilt.exit_code == 0
     one, two = (record_of(tmp_path / name) for name in ("out", "again"))
@@ -144,7 +144,7 @@ def test_a_little_is_within_tolerance_more_is_different_and_what_is_lost_is_not_
 
     monkeypatch.setattr(fake_steps, "fit_motion", altered(plain, "curves", curves(1.001)))
     rebuilt = again(tmp_path / "out")
-    (near,) = [likeness for likeness in rebuilt.likenesses if likeness.outcome != "identical"]
+    (near,) = [comparison for comparison in rebuilt.comparisons if comparison.outcome != "identical"]
     assert (near.name, near.outcome) == ("fit_motion", "within tolerance")
     assert near.difference == pytest.approx(0.001 / math.sqrt(3), rel=0.02)
     assert "curves" in near.detail
@@ -159,10 +159,10 @@ def test_a_little_is_within_tolerance_more_is_different_and_what_is_lost_is_not_
     blob.unlink()
     monkeypatch.setattr(fake_steps, "fit_motion", altered(plain, "motion", lambda content: content + b"!"))
     rebuilt = again(tmp_path / "out")
-    found = {likeness.name: likeness for likeness in rebuilt.likenesses}
+    found = {comparison.name: comparison for comparison in rebuilt.comparisons}
     assert found["fit_motion"].outcome == "not compared"
     assert "motion" in found["fit_motion"].detail and "not in the store" in found["fit_motion"].detail
-    assert "no measure" in found["asset.glb"].detail  # a fake, which no reader reads
+    assert "no metric" in found["asset.glb"].detail  # a fake, which no reader reads
     assert rebuilt.exit_code == 0
 
 
@@ -179,8 +179,8 @@ def test_another_file_is_different_and_other_code_is_told(
     rebuilt = again(tmp_path / "out")
     assert outcomes(rebuilt)["contact_sheet.png"] == "different"
     assert rebuilt.exit_code == 1
-    assert "image: none then, dg4d/cpu:2 now" in rebuilt.circumstances
-    assert any(text.startswith("code: ") and text.endswith("+newer now") for text in rebuilt.circumstances)
+    assert "image: none then, dg4d/cpu:2 now" in rebuilt.environment_changes
+    assert any(text.startswith("code: ") and text.endswith("+newer now") for text in rebuilt.environment_changes)
 
 
 def test_a_source_that_is_not_in_the_store_must_be_given_and_be_the_same(tmp_path: Path) -> None:

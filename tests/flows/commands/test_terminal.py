@@ -10,9 +10,9 @@ from flows.commands.terminal import (
     batch_shown,
     console,
     numbers,
+    print_package,
+    print_rows,
     steps_shown,
-    tell_rows,
-    tell_where,
 )
 from flows.engine.events import StepEvent, emit
 
@@ -50,7 +50,7 @@ def test_what_the_library_has_to_say_is_shown():
 
 def test_rows_stand_in_columns_and_words_in_brackets_stay():
     screen = io.StringIO()
-    tell_rows(Console(file=screen, width=200), [("a", "whole", ""), ("asset.glb", "altered", "[why]")])
+    print_rows(Console(file=screen, width=200), [("a", "whole", ""), ("asset.glb", "altered", "[why]")])
     assert screen.getvalue() == "a          whole\nasset.glb  altered  [why]\n"
 
 
@@ -93,7 +93,7 @@ def test_names_and_messages_are_shown_letter_by_letter(capsys: pytest.CaptureFix
     assert SHOWN in screen.getvalue()
     terminal.print(table)
     assert screen.getvalue().count(SHOWN) >= 3
-    tell_where(terminal, Path(NASTY), {"[a] name that is as long as that of its folder": 1})
+    print_package(terminal, Path(NASTY), {"[a] name that is as long as that of its folder": 1})
     assert screen.getvalue().count(SHOWN) >= 4 and "[a] name" in screen.getvalue()
     assert "\x07" not in screen.getvalue() and "\x1b[31m" not in screen.getvalue()
 
