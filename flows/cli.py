@@ -17,7 +17,17 @@ import typer
 
 from flows.commands.checking import bench, rebuild, score, verify
 from flows.commands.endings import exit_on_error
-from flows.commands.options import Changes, Commercial, Profile, Rate, Seed, Texture, Triangles, finite, shortcut_settings
+from flows.commands.options import (
+    Changes,
+    Commercial,
+    Profile,
+    Rate,
+    Seed,
+    Texture,
+    Triangles,
+    finite,
+    shortcut_settings,
+)
 from flows.commands.services import down, env, up, watch
 from flows.commands.settings import settings as list_settings
 from flows.commands.store import store
