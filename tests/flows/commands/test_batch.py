@@ -203,7 +203,9 @@ def test_a_signal_ends_a_command_and_its_step_and_leaves_nothing_behind(
     command.send_signal(number)
     _, trouble = command.communicate(timeout=60)
     assert (command.returncode, "Traceback" in trouble) == (status, False), trouble
-    assert trouble.strip().endswith("dg4d: stopped; the same command goes on after the last finished step")
+    assert trouble.strip().endswith(
+        "dg4d: stopped; run the same command again to continue after the last finished step"
+    )
     assert time.monotonic() - begun < 30
     assert not (tmp_path / "out").exists()
     assert left_behind(tmp_path) == []

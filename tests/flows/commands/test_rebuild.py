@@ -16,6 +16,7 @@ from waiting import retry_after
 from dg4d_lib.errors import BadInput
 from flows import home
 from flows.commands.rebuild import RebuildReport, rebuild
+from flows.convert import convert_job
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest, job_from_record
 from flows.inputs.package_record import record_of
 from flows.packages.verify import verify

@@ -54,7 +54,7 @@ def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop
         assert other.returncode == 65 and f"reads {folder.parent}; `dg4d down` stops it" in other.stderr
     finally:
         stopped = dg4d("down")
-    assert (stopped.returncode, stopped.stdout) == (0, "ending worker process-cpu\nstopped\n")
+    assert (stopped.returncode, stopped.stdout) == (0, "stopping worker process-cpu\nstopped\n")
     assert running(folder) == []
     assert "stopped!" in log.read_text()  # it was not killed
     assert server.auth_string().partition(":")[2] not in stopped.stderr + log.read_text()

@@ -17,7 +17,15 @@ from prefect.states import Cancelled, Completed, Crashed, Failed, Pending, Runni
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows import home
 from flows.engine import item_runs, resources
-from flows.engine.item_runs import ItemDeployment, ItemFailed, code_version, failure, item_deployment
+from flows.engine.item_runs import (
+    JOB_MEDIA_TYPE,
+    ItemDeployment,
+    ItemFailed,
+    code_version,
+    failure,
+    item_deployment,
+    read_job,
+)
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.packages.delivery import Outcome, pack_package, read_outcome, remove_expired, unpack_package, write_outcome
 from flows.serving import registering
