@@ -166,7 +166,7 @@ def test_a_user_who_stops_a_batch_keeps_what_is_done(
     command.send_signal(number)
     _, trouble = command.communicate(timeout=120)
     assert command.returncode == status, trouble
-    assert "the same command goes on" in trouble
+    assert "run the same command again to continue" in trouble
     assert log.read_text().split().count("fit_motion") == 2  # what was stopped is not begun again
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert {row["item"]: row["status"] for row in summary["items"]} == {"a": "done", "b": "skipped", "c": "skipped"}

@@ -302,7 +302,7 @@ def test_the_check_names_what_is_damaged_or_missing_and_whose_it_is(run: Any) ->
     store = open_store()
     made = version(store, "cat", "one")
     orphan = store.put_bytes(b"orphan", "a/b")
-    assert run("verify").stdout == "4 artifacts of 1 versions are whole\n"
+    assert run("verify").stdout == "4 artifacts of 1 versions are intact\n"
     for ref in (made.package, orphan):
         path = store.root / object_name(ref.digest)
         path.chmod(0o644)
