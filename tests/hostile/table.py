@@ -354,9 +354,9 @@ SCENES: dict[str, Refused] = {
     "scene: an unknown key": Refused("tint"),
     "scene: a package above": Refused("leads outside"),
     "scene: a package of the root": Refused("leads outside"),
-    "scene: a package with a zero": Refused("package|no asset"),
-    "scene: a package of 5,000 letters": Refused("package|too long|no asset"),
-    "scene: a package that is gone": Refused("no asset"),
+    "scene: a package with a zero": Refused("package|not an asset"),
+    "scene: a package of 5,000 letters": Refused("package|too long|not an asset"),
+    "scene: a package that is gone": Refused("not an asset"),
     "scene: a package that is a number": Refused("items.0.package"),
     "scene: a position that is not a number": Refused("position|JSON"),
     "scene: an infinite position": Refused("position"),
@@ -371,14 +371,14 @@ SCENES: dict[str, Refused] = {
 }
 
 # What `dg4d verify` says: it refuses the folder, or names the record among the faults.
-NO_RECORD = Refused("no asset")
+NO_RECORD = Refused("not an asset")
 ALTERED = Refused("altered|missing")
 RECORDS: dict[str, Refused] = {
     "record: nothing": NO_RECORD,
     "record: no UTF-8": NO_RECORD,
     "record: brackets without end": NO_RECORD,
     "record: braces without end": NO_RECORD,
-    "record: a deep value": Refused("no asset|altered"),
+    "record: a deep value": Refused("not an asset|altered"),
     "record: a list": NO_RECORD,
     "record: null": NO_RECORD,
     "record: a number of 5,000 digits": NO_RECORD,
@@ -405,5 +405,5 @@ RECORDS: dict[str, Refused] = {
     "record: no signatures": ALTERED,
     "record: signatures above": ALTERED,
     "record: signatures of numbers": ALTERED,
-    "record: not a number": Refused("no asset|altered"),
+    "record: not a number": Refused("not an asset|altered"),
 }
