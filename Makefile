@@ -11,6 +11,7 @@ EMULATION := $(BIN)/python -m tests.emulation.build --arithmetic $(ARITHMETIC)
 GPU_TESTS := $(BIN)/python -m pytest -p tests.emulation.plugin --arithmetic $(ARITHMETIC) -m gpu
 
 TOOLS := out/tools
+AUDIT := timeout 300 $(TOOLS)/bin/pip-audit --no-deps --disable-pip -f json --progress-spinner off
 DOCS := out/docs
 SHAPE_PRIOR ?=
 UPGRADE ?=
@@ -47,10 +48,12 @@ $(TOOLS)/.ready: deploy/locks/tools.txt deploy/install.sh
 	$(PYTHON) -m venv $(TOOLS) && VENV=$(TOOLS) timeout 300 bash deploy/install.sh tools
 	touch $@
 
-# torch.txt names a build that the package index does not know; cuda.txt has the same version
+# torch.txt names a build that the package index does not know; cuda.txt has the same version. docs.txt is audited by
+# itself: pip-audit refuses two versions of a package in one call.
 audit: setup $(TOOLS)/.ready
-	timeout 300 $(TOOLS)/bin/pip-audit $(foreach lock,steps flows cuda dev meshopt tools,-r deploy/locks/$(lock).txt) \
-		--no-deps --disable-pip -f json --progress-spinner off | $(BIN)/python deploy/audit.py
+	$(AUDIT) $(foreach lock,steps flows cuda dev meshopt tools,-r deploy/locks/$(lock).txt) > out/audit.json; \
+	$(AUDIT) -r deploy/locks/docs.txt > out/audit-docs.json; \
+	$(BIN)/python deploy/audit.py out/audit.json out/audit-docs.json
 
 # Resolve pyproject.toml into deploy/locks. Versions stay unless UPGRADE="--upgrade" or "--upgrade-package NAME".
 lock: $(TOOLS)/.ready

@@ -1,13 +1,13 @@
-"""The paper's ablations on objects whose truth is known: `python -m benchmarks.ablations NAME ...`.
+"""Ablations of the paper on objects with ground truth: `python -m benchmarks.ablations NAME ...`.
 
-Every variant is a set of the pipeline's own settings. The prior is the oracle, which knows true views (never those that
-are scored); with `--imperfect` they are blurred, beside the view, and shifted and tinted otherwise in every frame.
-Objects are our own, or those of a data set (`--data DIR`): a folder per object with input/, view_AZIMUTH/ and bank/, as
-`dg4d bench --bank` reads them. The table has means over objects and seeds and, behind a +-, the standard deviation over
-them; the sentence below compares pairs: the same object, the same seed. `--quick` is a smoke test.
+Every variant changes settings of the pipeline. The prior is the oracle, a bank of ground-truth views that excludes the
+scored ones; `--imperfect` perturbs it with blur, pose noise, shift and gain per frame. Objects are our own, or those of
+a data set (`--data DIR`): a folder per object with input/, view_AZIMUTH/ and bank/, as `dg4d bench --bank` reads them.
+The table has means over objects and seeds, with the standard deviation after +-; the sentence below compares pairs of
+the same object and seed. `--quick` is a smoke test.
 
-An oracle is no diffusion model: it never disagrees with itself from one iteration to the next. What of the paper rests
-on that cannot be seen here, and is said so.
+Unlike a diffusion model, an oracle is consistent over iterations. Claims of the paper that depend on this cannot be
+tested here; their `caveat` states this.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from scipy.stats import t as student
 
 from benchmarks.fits import Figures, fits_per_frame, moving_fit, score, static_fit
 from benchmarks.measure import new_console, parser_of, write_rows
-from benchmarks.objects.specimens import OBJECTS, Specimen, made, read
+from benchmarks.objects.specimens import OBJECTS, Specimen, read_specimen, render_specimen
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from flows.inputs.manifest import parse_changes
@@ -34,11 +34,11 @@ from steps.profiles import PipelineSettings, revise
 
 DIGITS = {"psnr": 2, "psnr_obj": 2, "iou": 3, "terr": 3, "flicker": 2}
 LESS_IS_BETTER = {"terr", "flicker"}
-CONFIDENCE = 0.95  # of the interval that a gain lies in, by Student's t over the pairs
-SLIGHT = {"psnr": 0.1, "psnr_obj": 0.1, "iou": 0.005, "terr": 0.01}  # gains nobody would see
-SHARES = ("subject.max_frames", "deformation.temporal")  # a fraction of these is one of the frames there are
+CONFIDENCE = 0.95  # of the interval of a gain, by Student's t over the pairs
+NEGLIGIBLE = {"psnr": 0.1, "psnr_obj": 0.1, "iou": 0.005, "terr": 0.01}  # invisible gains (ours)
+SHARES = ("subject.max_frames", "deformation.temporal")  # fractions of these are fractions of the frames
 
-SMALL: dict[str, Any] = {  # the paper's schedule, scaled to seconds on a processor: fewer iterations, larger steps
+SMALL: dict[str, Any] = {  # the paper's schedule scaled to seconds on a CPU: fewer iterations, larger learning rates
     "prior.kind": "oracle",
     "static.iterations": 150,
     "static.views": 8,
@@ -58,11 +58,11 @@ SMOOTH: dict[str, Any] = {"deformation.smoothness_weight": 0.01}
 
 @dataclass(frozen=True)
 class Variant:
-    """One row of a table.
+    """Row of a table.
 
     Attributes:
-        changes: of the settings, dotted.
-        per_frame: every frame is fitted for itself, from a blob.
+        changes: of the settings, by dotted name.
+        per_frame: fit every frame separately, from a random ball.
     """
 
     changes: Mapping[str, Any] = field(default_factory=dict)
@@ -71,7 +71,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class Claim:
-    """One variant is better than another by a figure, or (`alike`) only slightly so."""
+    """Claim that one variant beats another in a metric, or (`alike`) by a negligible gain at most."""
 
     better: str
     other: str
@@ -81,17 +81,17 @@ class Claim:
 
 @dataclass(frozen=True)
 class Ablation:
-    """What is compared.
+    """Comparison of variants.
 
     Attributes:
-        says: the paper's claim in our words.
+        statement: claim of the paper, in our words.
         variants: by name, in the order of the table.
-        claims: what has to hold for it.
-        still: only the static stage.
-        caveat: why the oracle cannot decide all of it.
+        claims: conditions for the claim.
+        still: run the static stage only.
+        caveat: limitation of the oracle for this claim.
     """
 
-    says: str
+    statement: str
     variants: Mapping[str, Variant]
     claims: tuple[Claim, ...]
     still: bool = False
@@ -100,7 +100,7 @@ class Ablation:
 
 ABLATIONS: dict[str, Ablation] = {
     "static": Ablation(
-        "16 views before white (DreamGaussianHD) give a better static object than 1 view before black or white",
+        "16 views over white (DreamGaussianHD) give a better static object than 1 view over black or white",
         {
             "1 view, random": Variant({"static.views": 1, "static.background": "random"}),
             "1 view, white": Variant({"static.views": 1}),
@@ -113,11 +113,11 @@ ABLATIONS: dict[str, Ablation] = {
             Claim("16 views, white", "1 view, random", "psnr"),
         ),
         still=True,
-        caveat="the oracle's pictures are before white, as Zero-1-to-3's are: who renders before black learns a white "
-        "shell, which `psnr_obj` cannot see",
+        caveat="the oracle's images are over white, as Zero-1-to-3's are: renders over black learn a white "
+        "shell, which `psnr_obj` does not measure",
     ),
     "representation": Ablation(
-        "HexPlane moves better than an MLP and than a fit per frame, and a static start helps the latter",
+        "HexPlane gives better motion than an MLP and than a fit per frame, and a static start helps the latter",
         {
             "HexPlane": Variant(),
             "MLP": Variant({"deformation.kind": "mlp"}),
@@ -133,10 +133,10 @@ ABLATIONS: dict[str, Ablation] = {
             Claim("HexPlane", "every frame from a blob", "terr"),
             Claim("frame-wise, static start", "frame-wise, scattered", "psnr_obj"),
         ),
-        caveat="a perfect oracle says the same of every frame and leaves no flicker to regularize; --imperfect does",
+        caveat="a perfect oracle is consistent over frames and leaves no flicker to regularize; use --imperfect",
     ),
     "resolution": Ablation(
-        "32 cells of space and of time are best",
+        "a resolution of 32 in space and time is best",
         {
             "S 32, T 32": Variant(),
             "S 8, T 32": Variant({"deformation.spatial": 8}),
@@ -151,19 +151,19 @@ ABLATIONS: dict[str, Ablation] = {
         tuple(
             Claim("S 32, T 32", other, "psnr_obj") for other in ("S 8, T 32", "S 128, T 32", "S 32, T 4", "S 32, T 64")
         ),
-        caveat="planes finer than the motion cost nothing where the prior is consistent over time",
+        caveat="planes finer than the motion do no harm if the prior is consistent over time",
     ),
     "zero-start": Ablation(
         "heads that start at zero lead to a better motion than random ones",
         {"zero": Variant(), "random": Variant({"deformation.zero_start": False})},
         (Claim("zero", "random", "psnr_obj"),),
-        caveat="the oracle has one answer, so that no start can lead to another; zero heads only learn a little later",
+        caveat="the oracle has a unique optimum, which any start reaches; zero heads only start to learn later",
     ),
     "noise": Ablation(
         "in the dynamic stage T_max = 0.5 is better than 0.98",
-        {"T_max .5": Variant({"motion.t_max_start": 0.5}), "T_max .98": Variant({"motion.t_max_start": 0.98})},
-        (Claim("T_max .5", "T_max .98", "psnr_obj"),),
-        caveat="a denoiser that knows the picture does so at every timestep: T_max only weighs its gradient",
+        {"T_max 0.5": Variant({"motion.t_max_start": 0.5}), "T_max 0.98": Variant({"motion.t_max_start": 0.98})},
+        (Claim("T_max 0.5", "T_max 0.98", "psnr_obj"),),
+        caveat="an exact denoiser is exact at every timestep: T_max only scales its gradient",
     ),
     "fine-tuning": Ablation(
         "freezing the static Gaussians in the dynamic stage, the paper's default, costs nothing",
@@ -171,7 +171,7 @@ ABLATIONS: dict[str, Ablation] = {
         (Claim("fine-tuned", "frozen", "psnr_obj", alike=True),),
     ),
     "rigidity": Ablation(
-        "a loss of local rigidity over time brings no significant improvement",
+        "the local rigidity loss brings no significant improvement",
         {
             "off": Variant(),
             "weight 300": Variant({"motion.rigidity_weight": 300.0}),
@@ -191,16 +191,16 @@ ABLATIONS: dict[str, Ablation] = {
         (Claim("Ours", "Ours-Fast", "psnr_obj"), Claim("Ours", "Ours-Fast", "terr")),
     ),
     "regularizers": Ablation(
-        "ours, not the paper's: between the frames that were fitted, planes finer than these frames need smoothness",
+        "ours, not the paper's: time planes finer than the fitted frames need smoothness in between",
         {
             "off": Variant({"subject.max_frames": 0.5}),
-            "smoothness .01": Variant({"subject.max_frames": 0.5, **SMOOTH}),
+            "smoothness 0.01": Variant({"subject.max_frames": 0.5, **SMOOTH}),
             "smoothness 100": Variant({"subject.max_frames": 0.5, "deformation.smoothness_weight": 100.0}),
-            "variation .0001": Variant({"subject.max_frames": 0.5, "deformation.variation_weight": 1e-4}),
-            "sparsity .0001": Variant({"subject.max_frames": 0.5, "deformation.sparsity_weight": 1e-4}),
-            "T as the frames": Variant({"subject.max_frames": 0.5, "deformation.temporal": 0.5}),
+            "variation 0.0001": Variant({"subject.max_frames": 0.5, "deformation.variation_weight": 1e-4}),
+            "sparsity 0.0001": Variant({"subject.max_frames": 0.5, "deformation.sparsity_weight": 1e-4}),
+            "T = frames": Variant({"subject.max_frames": 0.5, "deformation.temporal": 0.5}),
         },
-        (Claim("smoothness .01", "off", "terr"), Claim("smoothness .01", "off", "psnr_obj")),
+        (Claim("smoothness 0.01", "off", "terr"), Claim("smoothness 0.01", "off", "psnr_obj")),
         caveat="half of the frames were fitted, all are scored",
     ),
     "recipe": Ablation(
@@ -225,7 +225,7 @@ ABLATIONS: dict[str, Ablation] = {
 
 @dataclass(frozen=True)
 class Row:
-    """One fit; its figures are a dataclass with names from `DIGITS`."""
+    """Result of one fit; figures are a dataclass with names from `DIGITS`."""
 
     ablation: str
     variant: str
@@ -235,20 +235,20 @@ class Row:
 
 
 def settings_of(changes: Mapping[str, Any], size: int, frames: int) -> PipelineSettings:
-    """The small schedule with changes, `SHARES` among them."""
-    ladder = [{"until": 1.0, "size": size}]
+    """Return the small schedule with changes; fractions of `SHARES` become numbers of frames."""
+    schedule = [{"until": 1.0, "size": size}]
     sizes = {
         f"{stage}.{name}": value
         for stage in ("static", "motion")
-        for name, value in (("resolution_schedule", ladder), ("reference_size", size))
+        for name, value in (("resolution_schedule", schedule), ("reference_size", size))
     }
-    wanted = {**SMALL, **sizes, "subject.max_frames": 1.0, **changes}
-    counts = {key: max(2, round(wanted[key] * frames)) for key in SHARES if isinstance(wanted.get(key), float)}
-    return revise(PipelineSettings(), {**wanted, **counts})
+    merged = {**SMALL, **sizes, "subject.max_frames": 1.0, **changes}
+    counts = {key: max(2, round(merged[key] * frames)) for key in SHARES if isinstance(merged.get(key), float)}
+    return revise(PipelineSettings(), {**merged, **counts})
 
 
 class Laboratory:
-    """Fits, and remembers what several variants share: static clouds, and figures of equal settings."""
+    """Runner of fits, with a cache of static clouds and of figures of equal settings."""
 
     def __init__(self, base: Mapping[str, Any], size: int) -> None:
         self.base, self.size = base, size
@@ -256,7 +256,7 @@ class Laboratory:
         self._figures: dict[tuple[str, int, bool, bool, str], Figures] = {}
 
     def figures(self, specimen: Specimen, variant: Variant, seed: int, still: bool) -> Figures:
-        """What a variant reaches."""
+        """Return the figures of a variant."""
         settings = settings_of({**self.base, **variant.changes}, self.size, len(specimen.cutouts))
         key = (specimen.name, seed, still, variant.per_frame, settings.model_dump_json())
         if key not in self._figures:
@@ -276,7 +276,7 @@ class Laboratory:
 
 
 def verdict(ablation: Ablation, rows: Sequence[Row]) -> str:
-    """One sentence: whether the claim holds here, and by how much."""
+    """Return a sentence: outcome of the claim, and the gains."""
     found = {(row.variant, row.specimen, row.seed): row.figures for row in rows}
     pairs = sorted({(row.specimen, row.seed) for row in rows})
     parts, outcomes = [], []
@@ -294,22 +294,22 @@ def verdict(ablation: Ablation, rows: Sequence[Row]) -> str:
     word = {"yes": "Reproduced", "open": "Not decided", "no": "Not reproduced"}
     outcome = word["no" if "no" in outcomes else "open" if "open" in outcomes else "yes"]
     caveat = f" (but {ablation.caveat})" if ablation.caveat else ""
-    return f"{outcome}{caveat}: {ablation.says}; gains: {'; '.join(parts)}."
+    return f"{outcome}{caveat}: {ablation.statement}; gains: {'; '.join(parts)}."
 
 
 def _outcome(claim: Claim, gain: float, error: float, pairs: int) -> str:
-    """Whether one claim holds; a single pair decides nothing."""
+    """Return the outcome of one claim; a single pair decides nothing."""
     if pairs < 2:
         return "open"
     reach = float(student.ppf((1 + CONFIDENCE) / 2, pairs - 1)) * error
-    bound = SLIGHT[claim.figure] if claim.alike else 0.0
+    bound = NEGLIGIBLE[claim.figure] if claim.alike else 0.0
     if gain - reach <= bound <= gain + reach:
         return "open"
     return "yes" if (gain > bound) != claim.alike else "no"
 
 
 def table(title: str, rows: Sequence[Row]) -> Table:
-    """Means and spread over objects and seeds."""
+    """Return means and standard deviations over objects and seeds."""
     names = [field.name for field in fields(rows[0].figures)]
     result = Table(Column("variant", no_wrap=True), *names, title=title)
     for variant in dict.fromkeys(row.variant for row in rows):
@@ -331,21 +331,21 @@ def main() -> None:
     parser = parser_of(__doc__, "one seed, four frames, a few iterations")
     parser.add_argument("names", nargs="+", choices=list(ABLATIONS), metavar="NAME", help=", ".join(ABLATIONS))
     parser.add_argument(
-        "--objects", nargs="+", metavar="NAME", help=f"of {', '.join(OBJECTS)}, or of DIR; default: all"
+        "--objects", nargs="+", metavar="NAME", help=f"{', '.join(OBJECTS)}, or objects of DIR; default: all"
     )
     parser.add_argument(
         "--data",
         type=Path,
         metavar="DIR",
-        help="a data set with banks, instead of our own objects; all ablations need videos but those of the static "
+        help="data set with banks, instead of our own objects; all ablations need videos but those of the static "
         f"stage ({', '.join(name for name, one in ABLATIONS.items() if one.still)}), which take pictures, too; "
         "those of the refinement: benchmarks.oracle_refinement, and with weights benchmarks.refinement",
     )
     parser.add_argument("--seeds", type=int, default=2, help="fits of every variant and object")
-    parser.add_argument("--frames", type=int, default=16, help="of the video, at most")
-    parser.add_argument("--size", type=int, default=96, help="pixels of what is fitted, and of our own objects' views")
-    parser.add_argument("--imperfect", action="store_true", help="an oracle with the flaws of a model")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of every variant")
+    parser.add_argument("--frames", type=int, default=16, help="largest number of frames")
+    parser.add_argument("--size", type=int, default=96, help="pixels of the fits and of our own objects' views")
+    parser.add_argument("--imperfect", action="store_true", help="perturb the oracle")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="setting of all variants")
     options = parser.parse_args()
     try:
         run(options, new_console())
@@ -354,7 +354,7 @@ def main() -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> None:
-    """Fit and print what the options ask for.
+    """Run the requested ablations and print their tables.
 
     Raises:
         BadInput: a data set, an object or a setting cannot be used.
@@ -371,7 +371,7 @@ def run(options: argparse.Namespace, console: Console) -> None:
     pictures = [specimen.name for specimen in specimens if len(specimen.cutouts) < 2]
     moving = [name for name in options.names if not ABLATIONS[name].still]
     if pictures and moving:
-        raise BadInput(f"{', '.join(moving)}: needs a video; of {', '.join(pictures)} there is one picture")
+        raise BadInput(f"{', '.join(moving)}: needs videos; {', '.join(pictures)} has one frame only")
     scale = f"{options.seeds} seeds, {len(specimens[0].cutouts)} frames, {options.size} px"
     about = f"{', '.join(specimen.name for specimen in specimens)}; {scale}"
     for name in options.names:
@@ -389,16 +389,16 @@ def run(options: argparse.Namespace, console: Console) -> None:
 
 
 def find_specimens(data: Path | None, names: Sequence[str] | None, frames: int, size: int) -> list[Specimen]:
-    """Our own objects, or those of a data set.
+    """Return our own objects, or those of a data set.
 
     Raises:
         BadInput: the data set cannot be used, or does not have all that are named.
     """
-    known: dict[str, Callable[[], Specimen]] = {name: partial(made, name, frames, size) for name in OBJECTS}
+    known: dict[str, Callable[[], Specimen]] = {name: partial(render_specimen, name, frames, size) for name in OBJECTS}
     if data is not None:
-        known = {truth.name: partial(read, truth, frames) for truth in find_ground_truths(data)}
+        known = {truth.name: partial(read_specimen, truth, frames) for truth in find_ground_truths(data)}
     if unknown := sorted(set(names or ()) - set(known)):
-        raise BadInput(f"there is no object {', '.join(unknown)}; there are: {', '.join(known)}")
+        raise BadInput(f"unknown objects {', '.join(unknown)}; choose from {', '.join(known)}")
     return [known[name]() for name in names or known]
 
 

@@ -1,10 +1,10 @@
-"""How large the files of an asset are, and what writing them costs: 14 frames, 20,000 vertices, a texture of 1024^2.
+"""File sizes and write times of an asset: 14 frames, 20,000 vertices, a texture of 1024 x 1024.
 
-Run with `python -m benchmarks.assets` (a minute; `--quick`: a small asset, some seconds; `--json FILE` keeps the rows).
-The asset is made up: a ball on which waves run, colored by noise at all scales, and splats on it that a HexPlane moves.
+Run with `python -m benchmarks.assets` (a minute; `--quick`: a small asset, seconds; `--json FILE` keeps the rows). The
+asset is synthetic: a ball with traveling waves, colored by noise at all scales, and splats on it that a HexPlane moves.
 Rows without splats do not depend on them. `.4dgs`, a container of moving splats, is a peer; `pip install --target DIR
-fourdgs` and `PYTHONPATH=DIR` add it, and it is given the PLY files. Goals are sizes, and 5 seconds for one file of
-every kind, written as many at a time as the step that packs them does.
+fourdgs` and `PYTHONPATH=DIR` add it; its input are the PLY files. Goals are sizes, and 5 seconds for one file of every
+kind, written in parallel as by the step pack_asset.
 """
 
 import math
@@ -54,19 +54,19 @@ GLTF = {
     "quantized": GltfSettings(quantized=True),
     "quantized, meshopt": GltfSettings(quantized=True, meshopt=True),
 }
-GOALS_MB = {"asset.glb, default": 8.0, "web splats": 0.4, "viewer page, empty": 1.0}  # with 5,000 splats
-GOAL_S = 5.0  # on two cores
+GOALS_MB = {"asset.glb, default": 8.0, "web splats": 0.4, "viewer page, empty": 1.0}  # goals (ours), with 5,000 splats
+GOAL_S = 5.0  # goal (ours), on two cores
 EVERY_KIND = (
     "asset.glb, default", "asset_rigged.glb", "viewer page, empty", "splats, PLY", "splats, SPZ", "web splats",
     "compact, exact", "asset.usdz, mesh and splats", "preview.mp4", "turntable.mp4", "preview.webp",
 )  # fmt: skip
 
-Write = Callable[[Path], object]  # into this empty folder
+Write = Callable[[Path], object]  # argument: an empty folder
 
 
 @dataclass(frozen=True)
 class Row:
-    """One writer; splats is None where they do not matter."""
+    """Result of one writer; `splats` is None if it does not depend on them."""
 
     writer: str
     splats: int | None
@@ -76,26 +76,26 @@ class Row:
 
 
 def waving_ball(rows: int, texels: int) -> Asset4D:
-    """A sphere by latitude and longitude with `2 rows^2` vertices, about."""
+    """Return a sphere by latitude and longitude with about `2 rows^2` vertices."""
     v, u = torch.meshgrid(torch.linspace(0, 1, rows + 1), torch.linspace(0, 1, 2 * rows + 1), indexing="ij")
     rest = on_ball(torch.stack([u, v], -1).reshape(-1, 2))
     index = torch.arange(len(rest)).reshape(u.shape)
     a, b, c, d = (part.flatten() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
     upper, lower = torch.stack([a, c, b], -1), torch.stack([b, c, d], -1)
-    faces = torch.cat([upper[2 * rows :], lower[: -2 * rows]])  # without those that the poles leave no area
+    faces = torch.cat([upper[2 * rows :], lower[: -2 * rows]])  # drops the degenerate ones at the poles
     mesh = TexturedMesh(rest, faces, torch.stack([u, v], -1).reshape(-1, 2), noise_picture(texels))
     moments = torch.arange(FRAMES)[:, None, None] / FRAMES
     return Asset4D(mesh, 0.05 * torch.sin(2 * math.pi * (moments + rest[:, [1, 2, 0]])), FPS)
 
 
 def on_ball(places: Tensor) -> Tensor:
-    """World points of texture coordinates."""
+    """Return the world points of texture coordinates."""
     around, polar = 2 * math.pi * places[:, 0], math.pi * places[:, 1]
     return 0.7 * torch.stack([polar.sin() * around.sin(), polar.cos(), polar.sin() * around.cos()], -1)
 
 
 def noise_picture(texels: int) -> Tensor:
-    """Colors whose contrast at a scale is proportional to it, as in pictures of things."""
+    """Return colors with a contrast proportional to scale, as in natural images."""
     generator, picture = torch.Generator().manual_seed(0), torch.full((1, 3, texels, texels), 0.5)
     for octave in range(2, round(math.log2(texels)) + 1):
         octave_noise = torch.rand(1, 3, 2**octave, 2**octave, generator=generator) - 0.5
@@ -104,10 +104,10 @@ def noise_picture(texels: int) -> Tensor:
 
 
 def waving_splats(count: int) -> CompactAsset:
-    """Flat splats on the ball, and a HexPlane in the sizes of the profile `preview` with waves in its planes."""
+    """Return flat splats on the ball, and a HexPlane of the profile `preview` with waves in its planes."""
     generator = torch.Generator().manual_seed(0)
     places = torch.rand(count, 2, generator=generator)
-    places[:, 1] = (1 - 2 * places[:, 1]).acos() / math.pi  # evenly over the ball
+    places[:, 1] = (1 - 2 * places[:, 1]).acos() / math.pi  # uniform on the ball
     means = on_ball(places)
     log_scales = (torch.tensor([0.03, 0.03, 0.01]) * (5_000 / count) ** 0.5).log().repeat(count, 1)
     log_scales = log_scales + 0.2 * torch.randn(count, 3, generator=generator)
@@ -174,14 +174,14 @@ def splat_writers(asset: Asset4D, splats: CompactAsset, pack: PackSettings) -> I
 
 
 def write_rig(path: Path, asset: Asset4D) -> None:
-    """Find the asset's rig and write it."""
+    """Fit and write the rig of the asset."""
     rig, _ = fit_asset_rig(asset, PackSettings().rig_bones, max_error=1)
     assert rig is not None
     path.write_bytes(write_rigged_glb(asset, rig, GltfSettings()))
 
 
 def fourdgs(folder: Path) -> Write:
-    """The peer, given a folder of PLY files.
+    """Return the peer, for a folder of PLY files.
 
     Raises:
         ImportError: it is not installed.
@@ -191,8 +191,8 @@ def fourdgs(folder: Path) -> Write:
     return lambda out: library.write(str(out / "a.4dgs"), *convert(str(folder), fps=FPS))
 
 
-def side_by_side(writers: Sequence[Write], folder: Path) -> None:
-    """Some at a time, as the step does."""
+def write_in_parallel(writers: Sequence[Write], folder: Path) -> None:
+    """Run some writers at a time, as the step does."""
     with ThreadPoolExecutor(WRITER_THREADS) as lanes:
         places = [folder / str(number) for number in range(len(writers))]
         for place in places:
@@ -201,8 +201,8 @@ def side_by_side(writers: Sequence[Write], folder: Path) -> None:
             written.result()
 
 
-def measured(writers: dict[str, Write], splats: int | None, rounds: int) -> list[Row]:
-    """Every writer, into a folder of its own that it fills again and again."""
+def measure_writers(writers: dict[str, Write], splats: int | None, rounds: int) -> list[Row]:
+    """Measure every writer, each in a folder that it overwrites."""
     with TemporaryDirectory() as scratch:
         folders = {name: Path(scratch) / str(i) for i, name in enumerate(writers)}
         for folder in folders.values():
@@ -222,7 +222,7 @@ def main() -> None:
     console, asset = new_console(), waving_ball(grid, texels)
     of_mesh = dict(mesh_writers(asset))
     of_splats = {count: dict(splat_writers(asset, waving_splats(count), pack)) for count in counts}
-    rows = measured(of_mesh, None, rounds)
+    rows = measure_writers(of_mesh, None, rounds)
     for count, writers in of_splats.items():
         with TemporaryDirectory() as scratch:
             writers["splats, PLY"](Path(scratch))
@@ -230,14 +230,14 @@ def main() -> None:
                 writers["splats, .4dgs"] = fourdgs(Path(scratch))
             except ImportError as error:
                 console.print(f"fourdgs is missing: {error}", markup=False, highlight=False)
-            rows += measured(writers, count, rounds)
+            rows += measure_writers(writers, count, rounds)
     title = f"{machine()}; {FRAMES} frames, {len(asset.mesh.vertices)} vertices, {texels} x {texels} texels"
     console.print(table(title, rows))
     every_writer = of_mesh | of_splats[counts[0]]
     seconds = {row.writer: row.wall_s for row in rows if row.splats in (None, counts[0])}
     longest_first = sorted(EVERY_KIND, key=seconds.__getitem__, reverse=True)
-    (whole,) = measured(
-        {"every kind": partial(side_by_side, [every_writer[name] for name in longest_first])}, None, rounds
+    (whole,) = measure_writers(
+        {"every kind": partial(write_in_parallel, [every_writer[name] for name in longest_first])}, None, rounds
     )
     console.print(
         f"one file of every kind, {counts[0]} splats: {sum(seconds[name] for name in EVERY_KIND):.2f} s one after the "
@@ -248,7 +248,7 @@ def main() -> None:
 
 
 def table(title: str, rows: list[Row]) -> Table:
-    """Rows as they are printed."""
+    """Return the rows as a table."""
     result = Table(Column("writer", no_wrap=True), "splats", "MB", "goal, MB", "s CPU", "s wall", title=title)
     for row in rows:
         goal = str(GOALS_MB.get(row.writer, "")) if row.splats in (None, 5_000) else ""

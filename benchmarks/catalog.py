@@ -1,13 +1,13 @@
-"""How many items an hour the engine can take: a batch of tiny pictures, each through two cheap real steps.
+"""Throughput of the engine in items per hour: a batch of tiny pictures through two cheap real steps.
 
 Run with `python -m benchmarks.catalog` (`--items 1000 --workers 2 --database sqlite --json FILE`). A picture is cut out
-and resized to 32 pixels (prepare_subject), a film of two frames is made of it and packed into a zip (drive_video), and
-that is published as a package with its record. Nothing is a stand-in: the batch, the tasks with their keys, locks and
-artifacts, the store, the server and its database are the product's; steps run in the process of the batch.
+and resized to 32 pixels (prepare_subject), a video of two frames is generated and packed into a zip (drive_video), and
+the zip is published as a package with its record. Batch, tasks, cache keys, locks, store, server and database are those
+of the product; steps run in the process of the batch.
 
-The catalog is made three times: `made` anew, `cached` into another folder from finished steps, `unchanged` into the
-first folder again. Lost is an item without its package or without a completed run in the database; duplicated, one with
-more than one. Memory is that of the process of the batch: the growth from a tenth of the way to the end.
+The catalog is processed three times: `made` from scratch, `cached` into another folder from finished steps, `unchanged`
+into the first folder again. An item is lost without a package or a completed run in the database, and duplicated with
+more than one run. Memory is that of the batch process: its growth from 10 % of the items to the end.
 """
 
 import argparse
@@ -35,8 +35,8 @@ from flows import home
 from flows.catalog import convert_all
 from flows.catalog_request import ready
 from flows.engine.step_tasks import finished_steps, flow_context, steps_of_flow
+from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.manifest import Item, items_of
-from flows.inputs.orders import Order
 from flows.inputs.package_record import RECORD
 from flows.packages import summary
 from flows.packages.flow_result import StepRun
@@ -49,13 +49,13 @@ from flows.tasks import drive_video, prepare_subject
 DATABASES = ("sqlite", "postgresql")
 STEPS = ("prepare_subject", "drive_video")
 KNOBS = {"subject.size": 32, "driving.frames": 2}
-SETTLE_S = 120.0  # the server writes what it was told in batches
-START_S = 600.0  # of a machine that is busy with other things
+SETTLE_S = 120.0  # the server writes events in batches
+START_S = 600.0  # generous, for busy machines
 
 
 @dataclass(frozen=True)
 class Row:
-    """One pass over the catalog; seconds, `cpu` of the process of the batch, `server_cpu` of server and database."""
+    """Pass over the catalog; seconds, `cpu` of the batch process, `server_cpu` of server and database."""
 
     database: str
     what: str
@@ -74,7 +74,9 @@ def main() -> None:
     parser.add_argument("--items", type=int, default=1000)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--database", choices=DATABASES, action="append", help="default: both")
-    parser.add_argument("--one", choices=DATABASES, help=argparse.SUPPRESS)  # in a process of its own: this one
+    parser.add_argument(
+        "--one", choices=DATABASES, help=argparse.SUPPRESS
+    )  # internal: run one database in this process
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
@@ -83,7 +85,7 @@ def main() -> None:
     rows = []
     for database in options.database or DATABASES:
         with tempfile.TemporaryDirectory(prefix="dg4d-catalog-", ignore_cleanup_errors=True) as name:
-            rows += measured(database, options.items, options.workers, Path(name))
+            rows += measure_database(database, options.items, options.workers, Path(name))
     console = new_console()
     console.print(machine())
     console.print(table(rows))
@@ -91,9 +93,9 @@ def main() -> None:
         write_rows(options.json, rows)
 
 
-def measured(database: str, items: int, workers: int, folder: Path) -> list[Row]:
-    """All passes with one database, in a process of their own, with a server of its own."""
-    folder.chmod(0o755)  # the database's user reads what lies in it
+def measure_database(database: str, items: int, workers: int, folder: Path) -> list[Row]:
+    """Run all passes with one database, in a separate process with its own server."""
+    folder.chmod(0o755)  # for the user of the database
     for i in range(items):
         draw(folder / "pictures" / f"{i:05d}.png", i)
     with ExitStack() as running:
@@ -112,7 +114,7 @@ def measured(database: str, items: int, workers: int, folder: Path) -> list[Row]
 
 
 def passes(database: str, count: int, workers: int, folder: Path) -> list[Row]:
-    """Make the catalog anew, from finished steps, and again; the environment names the server."""
+    """Process the catalog from scratch, from finished steps, and unchanged; the environment names the server."""
     rows, runs = [], 0
     for what, out in (("made", "one"), ("cached", "two"), ("unchanged", "one")):
         items = items_of(folder / "pictures", folder / out, "preview", KNOBS, 0)
@@ -141,58 +143,58 @@ def passes(database: str, count: int, workers: int, folder: Path) -> list[Row]:
 
 
 def run(items: list[Item], out: Path, workers: int, what: str) -> float:
-    """One pass; by how many MB the process grew after a tenth of it."""
+    """Run one pass; return its result and the memory growth after 10 % of the items, MB."""
     sizes: list[float] = []
 
     def settled(row: summary.Row) -> None:
         if row.status not in {"done", "unchanged"}:
             raise RuntimeError(f"{row.item}: {row.message}")
         sizes.append(memory_mb())
-        writer.write_sometimes(list(tally.rows.values()), tally.seconds)
+        writer.write_sometimes(list(progress.rows.values()), progress.seconds)
 
-    writer, tally = summary.Writer(out), summary.Tally(len(items), settled)
+    writer, progress = summary.Writer(out), summary.BatchProgress(len(items), settled)
     out.mkdir(exist_ok=True)
 
     @flow(name="catalog", flow_run_name=what, persist_result=False)
     def catalog() -> None:
         todo = (ready(item, out, strict=False) for item in items)
-        convert_all(todo, out, workers, f"{what}: {len(items)} items", tally, work=work)
+        convert_all(todo, out, workers, f"{what}: {len(items)} items", progress, work=run_steps)
 
     with flow_context():
         catalog()
-    writer.write(list(tally.rows.values()), tally.seconds)
+    writer.write(list(progress.rows.values()), progress.seconds)
     return sizes[-1] - sizes[len(sizes) // 10]
 
 
-def work(order: Order, folder: Path) -> tuple[Any, bool]:
-    """Resize, pack and publish; whether every step had been done before."""
-    packed, cached = resize_and_pack(order)
+def run_steps(job: ConversionJob, folder: Path) -> tuple[Any, bool]:
+    """Resize, pack and publish; return true if every step was cached."""
+    packed, cached = resize_and_pack(job)
 
     def finish(staging: Path, files: Files) -> Files:
-        (staging / RECORD).write_text(json.dumps({"order": order.digest(), "files": files}), encoding="utf-8")
+        (staging / RECORD).write_text(json.dumps({"order": job.digest(), "files": files}), encoding="utf-8")
         return files
 
     return publish(home.store().path(packed), folder, finish), cached
 
 
-def resize_and_pack(order: Order) -> tuple[Any, bool]:
-    """A flow of two steps."""
+def resize_and_pack(job: ConversionJob) -> tuple[Any, bool]:
+    """Run the two steps as a flow."""
     done: list[StepRun] = []
 
     @flow(name="resize_and_pack", flow_run_name="{item}", persist_result=False)
     def two_steps(item: str) -> None:
         with steps_of_flow():
-            conversion = conversion_of(order)
-            drive_video(prepare_subject(order.source, conversion), conversion)
+            conversion = conversion_of(job)
+            drive_video(prepare_subject(job.source, conversion), conversion)
             done.extend(finished_steps())
 
     with flow_context():
-        two_steps(order.item)
+        two_steps(job.item)
     return done[-1].result.outputs["driving_video"], all(step.cached for step in done)
 
 
 def completed(expected: int) -> Counter[str]:
-    """How many completed runs of the flow the database has by item, when all are there or time is up."""
+    """Return the number of completed runs by item, when all are recorded or after a timeout."""
     deadline = time.monotonic() + SETTLE_S
     while True:
         names: Counter[str] = Counter()
@@ -207,7 +209,7 @@ def completed(expected: int) -> Counter[str]:
 
 
 def draw(path: Path, number: int) -> None:
-    """A picture of 40 pixels unlike any other: a disc on nothing."""
+    """Draw a unique picture of 40 pixels: a disc on a transparent background."""
     path.parent.mkdir(exist_ok=True)
     picture = Image.new("RGBA", (40, 40))
     color = (number % 256, number // 256 % 256, 90, 255)
@@ -216,7 +218,7 @@ def draw(path: Path, number: int) -> None:
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """Of the batch and its server, without what the caller's shell says about others."""
+    """Return the environment of the batch and its server, without other variables of the caller."""
     inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PREFECT_", "DG4D_"))}
     secret = auth_string(folder / "home" / "server")
     return {
@@ -232,7 +234,7 @@ def environment(folder: Path) -> dict[str, str]:
 
 @contextmanager
 def server(folder: Path, address: str) -> Iterator[int]:
-    """The product's server; gives its port.
+    """Run the product's server; yield its port.
 
     Args:
         folder: where its database is, if it is a file.
@@ -249,7 +251,7 @@ def server(folder: Path, address: str) -> Iterator[int]:
         deadline = time.monotonic() + START_S
         while not answers(f"http://{HOST}:{port}", timeout_s=5.0):
             if process.poll() is not None or time.monotonic() > deadline:
-                raise RuntimeError("the server did not start")
+                raise RuntimeError(f"the server did not start within {START_S:.0f} s")
             time.sleep(0.2)
         yield port
     finally:
@@ -259,7 +261,7 @@ def server(folder: Path, address: str) -> Iterator[int]:
 
 @contextmanager
 def postgresql(folder: Path) -> Iterator[str]:
-    """A database server of its own; gives its address."""
+    """Run a PostgreSQL server; yield its address."""
     place = folder / "postgresql"
     place.mkdir()
     database = Database(place)
@@ -271,7 +273,7 @@ def postgresql(folder: Path) -> Iterator[str]:
 
 
 def server_seconds(folder: Path) -> float:
-    """What the server, and the database server where there is one, have used of all cores."""
+    """Return the CPU seconds of the Prefect server and the database server."""
     root = int((folder / "server.pid").read_text(encoding="ascii"))
     data = str(folder / "postgresql")
     ticks = 0
@@ -289,13 +291,13 @@ def server_seconds(folder: Path) -> float:
 
 
 def memory_mb() -> float:
-    """What this process holds, in MB."""
+    """Return the memory of this process, MB."""
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def table(rows: list[Row]) -> Table:
-    """Rows as they are printed."""
+    """Return the rows as a table."""
     steps = len(STEPS)
     shown = Table("database", "pass", "items", "wall s", "items/s", "CPU ms/item", "ms/step", "server CPU ms/item",
                   "growth MB", "lost", "duplicated")  # fmt: skip

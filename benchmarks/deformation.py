@@ -1,16 +1,16 @@
-"""How much faster the deformation field and SSIM are than their plain forms: CPU time, forward and backward.
+"""Speed of the deformation field and of SSIM against plain implementations: CPU time, forward and backward.
 
-Run with `python -m benchmarks.deformation` (a minute or two; `--quick`: some seconds; `--json FILE` keeps the rows).
-Times of the deformation are of one call for all moments, those of SSIM of one picture. Peers:
+Run with `python -m benchmarks.deformation` (1 to 2 minutes; `--quick`: seconds; `--json FILE` keeps the rows). Times of
+the deformation are per call for all timestamps, those of SSIM per image. Peers:
 
-`grid_sample`            all six planes sampled at every Gaussian and moment, as in the papers' code
-`grid_sample_once`       the three planes of space sampled once per Gaussian, those of time at every moment
-`grid_sample..._means`   the same with a gradient in the Gaussians' means too, as `motion.fine_tune` wants it
-`grid_sample..._heads`   the same with the network behind: trunk and residual heads one by one
-`conv2d`                 SSIM by convolutions, as in 3DGS's code
+`grid_sample`            all six planes sampled at every Gaussian and timestamp, as in the papers' code
+`grid_sample_once`       spatial planes sampled once per Gaussian, time planes at every timestamp
+`grid_sample..._means`   the same with a gradient in the Gaussians' means, as for `motion.fine_tune`
+`grid_sample..._heads`   the same with the network: trunk and separate residual heads
+`conv2d`                 SSIM by convolutions, as in the code of 3DGS
 
-Freed memory goes back to the system here. Steps keep it (`steps/main.py`), and that helps the peers more: to compare
-under their conditions set `MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=2147483647 MALLOC_TOP_PAD_=268435456`.
+Freed memory is returned to the system here. Steps keep it (`steps/main.py`), which favors the peers: to compare under
+their conditions set `MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=2147483647 MALLOC_TOP_PAD_=268435456`.
 """
 
 from collections.abc import Callable, Iterator
@@ -34,7 +34,7 @@ TIMES, PICTURES = 14, 4
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison with a peer; `size` in pixels, `views` are moments or pictures."""
+    """Comparison with a peer; `size` in pixels, `views` are timestamps or images."""
 
     peer: str
     gaussians: int | None
@@ -46,13 +46,13 @@ class Row:
 
 
 def sampled(plane: Tensor, places: Tensor) -> Tensor:
-    """One plane at places in [-1, 1], as "places channels"."""
+    """Sample one plane at positions in [-1, 1], as "positions channels"."""
     found = functional.grid_sample(plane[None], places[None, None], align_corners=True, padding_mode="border")
     return found[0, :, 0].T
 
 
 def naive_features(coordinates: Tensor, times: Tensor, space: Tensor, time: Tensor) -> Tensor:
-    """Product of six samples at every Gaussian and moment."""
+    """Return the product of six samples at every Gaussian and timestamp."""
     t, n = len(times), len(coordinates)
     everywhere = coordinates.expand(t, n, 3).reshape(-1, 3)
     moments = (2 * times - 1)[:, None].expand(t, n).reshape(-1)
@@ -65,7 +65,7 @@ def naive_features(coordinates: Tensor, times: Tensor, space: Tensor, time: Tens
 
 
 def features_with_space_once(coordinates: Tensor, times: Tensor, space: Tensor, time: Tensor) -> Tensor:
-    """The same; what does not depend on time is not sampled at every moment."""
+    """Return the same product with the spatial planes sampled only once."""
     t, n = len(times), len(coordinates)
     product = torch.ones(())
     for plane, axes in zip(space, SPATIAL_AXES, strict=True):
@@ -81,27 +81,27 @@ def fused_features(coordinates: Tensor, times: Tensor, space: Tensor, time: Tens
 
 
 def heads_one_by_one(field: HexPlane, features: Tensor) -> list[Tensor]:
-    """h = relu(trunk); B (h + A h + a) + b for means, scales and rotations."""
+    """Evaluate h = relu(trunk); B (h + A h + a) + b for means, scales and rotations."""
     hidden = functional.relu(field.trunk(features))
     heads = (field.heads.means, field.heads.log_scales, field.heads.quats)
     return [head.outer(hidden + head.inner(hidden)) for head in heads]
 
 
-def by_convolution(images: Tensor, truth: Tensor) -> Tensor:
-    """SSIM of "b c h w" pictures where the window lies inside."""
+def ssim_by_convolution(images: Tensor, ground_truth: Tensor) -> Tensor:
+    """Return the SSIM of "b c h w" images over positions of the window inside the image."""
     steps = torch.arange(WINDOW) - WINDOW // 2
     line = torch.exp(-steps.square() / (2 * SIGMA**2))
     window = (line[:, None] * line / line.sum() ** 2).expand(images.shape[1], 1, WINDOW, WINDOW)
     mean = partial(functional.conv2d, weight=window, groups=len(window))
-    mean_x, mean_y = mean(images), mean(truth)
-    variance_x, variance_y = mean(images * images) - mean_x**2, mean(truth * truth) - mean_y**2
-    covariance = mean(images * truth) - mean_x * mean_y
+    mean_x, mean_y = mean(images), mean(ground_truth)
+    variance_x, variance_y = mean(images * images) - mean_x**2, mean(ground_truth * ground_truth) - mean_y**2
+    covariance = mean(images * ground_truth) - mean_x * mean_y
     light = (2 * mean_x * mean_y + C1) / (mean_x**2 + mean_y**2 + C1)
     return (light * (2 * covariance + C2) / (variance_x + variance_y + C2)).mean((1, 2, 3))
 
 
-def of_deformation(count: int, settings: HexPlaneSettings, rounds: int) -> Iterator[Row]:
-    """Features alone, those of Gaussians that are fitted too, then with the network."""
+def measure_deformation(count: int, settings: HexPlaneSettings, rounds: int) -> Iterator[Row]:
+    """Measure the features, the features with trainable means, and the features with the network."""
     generator = torch.Generator().manual_seed(0)
     means = torch.rand(count, 3, generator=generator) * 2 - 1
     times = torch.linspace(0, 1, TIMES)
@@ -139,15 +139,17 @@ def of_deformation(count: int, settings: HexPlaneSettings, rounds: int) -> Itera
             yield Row(peer + suffix, count, None, TIMES, ours, measured.cpu_ms, measured.cpu_ms / ours)
 
 
-def of_ssim(size: int, rounds: int) -> Iterator[Row]:
-    """Value and gradient of noisy colors before white, as rasterizers give them: plane by plane."""
+def measure_ssim(size: int, rounds: int) -> Iterator[Row]:
+    """Measure value and gradient of noisy colors over white, stored channels first as renders are."""
     generator = torch.Generator().manual_seed(0)
-    truth = functional.interpolate(torch.rand(PICTURES, 3, 9, 9, generator=generator), (size, size), mode="bilinear")
-    truth[..., : size // 4] = 1
-    images = (truth + 0.05 * torch.randn(truth.shape, generator=generator)).clamp(0, 1).requires_grad_()
+    ground_truth = functional.interpolate(
+        torch.rand(PICTURES, 3, 9, 9, generator=generator), (size, size), mode="bilinear"
+    )
+    ground_truth[..., : size // 4] = 1
+    images = (ground_truth + 0.05 * torch.randn(ground_truth.shape, generator=generator)).clamp(0, 1).requires_grad_()
     functions: dict[str, Callable[[], object]] = {
-        "ours": lambda: torch.autograd.grad(ssim(images.movedim(1, -1), truth.movedim(1, -1)).sum(), images),
-        "conv2d": lambda: torch.autograd.grad(by_convolution(images, truth).sum(), images),
+        "ours": lambda: torch.autograd.grad(ssim(images.movedim(1, -1), ground_truth.movedim(1, -1)).sum(), images),
+        "conv2d": lambda: torch.autograd.grad(ssim_by_convolution(images, ground_truth).sum(), images),
     }
     taken = interleaved(functions, rounds)
     ours, peer = (taken[name].cpu_ms / PICTURES for name in functions)
@@ -161,17 +163,17 @@ def main() -> None:
     console, rows = new_console(), []
     for settings in (paper,) if options.quick else (paper, small):
         title = f"{machine()}; {settings.features} features, {settings.hidden} hidden units, {TIMES} moments"
-        found = [row for count in counts for row in of_deformation(count, settings, rounds)]
+        found = [row for count in counts for row in measure_deformation(count, settings, rounds)]
         console.print(table(title, found))
-        rows += found if settings is paper else []  # a row does not say how many features
-    found = [row for size in sizes for row in of_ssim(size, rounds)]
+        rows += found if settings is paper else []  # rows do not contain the number of features
+    found = [row for size in sizes for row in measure_ssim(size, rounds)]
     console.print(table(f"{machine()}; SSIM of a color picture", found))
     if options.json:
         write_rows(options.json, [*rows, *found])
 
 
 def table(title: str, rows: list[Row]) -> Table:
-    """Rows as they are printed."""
+    """Return the rows as a table."""
     result = Table(
         Column("peer", no_wrap=True), "Gaussians", "px", "ours, ms CPU", "peer, ms CPU", "ratio", title=title
     )

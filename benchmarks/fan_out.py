@@ -48,7 +48,7 @@ def main() -> None:
     options = parser.parse_args()
     rows: list[Row] = []
     for slots in options.slots or (1, 2):
-        parts, seconds = extracted(options.picture.resolve(), slots, options.frames)
+        parts, seconds = convert(options.picture.resolve(), slots, options.frames)
         rows.append(Row(slots, parts, round(seconds, 2), round((rows[0].seconds if rows else seconds) / seconds, 2)))
     console = new_console()
     console.print(machine())
@@ -57,7 +57,7 @@ def main() -> None:
         write_rows(options.json, rows)
 
 
-def extracted(picture: Path, slots: int, frames: int) -> tuple[int, float]:
+def convert(picture: Path, slots: int, frames: int) -> tuple[int, float]:
     """Convert a picture; return the number of parts of `extract_mesh` and the seconds they took together."""
     with tempfile.TemporaryDirectory(prefix="dg4d-fan-out-", ignore_cleanup_errors=True) as folder:
         environment = {**os.environ, "DG4D_HOME": f"{folder}/dg4d", "DG4D_CPUS": str(slots)}

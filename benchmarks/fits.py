@@ -1,4 +1,4 @@
-"""From what is true of an object to the figures of a fit: both stages of the pipeline, with its settings."""
+"""Both fits of the pipeline on objects with ground truth, and the metrics of their results."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ RASTERIZE = get_rasterizer("auto")
 
 @dataclass(frozen=True)
 class Figures:
-    """Means over views nobody fitted, and over frames; a still one has no `terr`."""
+    """Means over held-out views and frames; a static result has no `terr`."""
 
     psnr: float
     psnr_obj: float
@@ -38,7 +38,7 @@ class Figures:
 
 
 def static_fit(specimen: Specimen, settings: PipelineSettings, seed: int) -> Gaussians:
-    """The static stage, of the first frame."""
+    """Run the static stage on the first frame."""
     generator = torch.Generator().manual_seed(seed)
     subject = specimen.cutouts[0]
     kind = settings.static.start
@@ -49,10 +49,10 @@ def static_fit(specimen: Specimen, settings: PipelineSettings, seed: int) -> Gau
 
 
 def moving_fit(specimen: Specimen, rest: Gaussians, settings: PipelineSettings, seed: int) -> list[Gaussians]:
-    """The dynamic stage: the cloud at every frame, also at those that were not fitted."""
+    """Run the dynamic stage; return the cloud at every frame, including frames that were not fitted."""
     generator = torch.Generator().manual_seed(seed)
     frames = len(specimen.cutouts)
-    seen, stride = thinned(specimen, settings.subject.max_frames)
+    seen, stride = subsample_frames(specimen, settings.subject.max_frames)
     deformation = new_deformation(settings.deformation, rest, len(seen.cutouts), generator)
     prior = prior_of(seen.bank, settings, settings.motion)
     fitted = fit_motion(rest, deformation, seen.video, prior, RASTERIZE, settings.motion, generator)
@@ -63,21 +63,21 @@ def moving_fit(specimen: Specimen, rest: Gaussians, settings: PipelineSettings, 
 
 
 def fits_per_frame(specimen: Specimen, settings: PipelineSettings, seed: int) -> list[Gaussians]:
-    """The static stage of every frame for itself, as long as the dynamic stage: no motion, no common start."""
+    """Run the static stage on every frame separately, for as many iterations as the dynamic stage."""
     static = settings.static.model_copy(update={"iterations": settings.motion.iterations})
     alone = settings.model_copy(update={"static": static})
     return [static_fit(_moment(specimen, frame), alone, seed) for frame in range(len(specimen.cutouts))]
 
 
 def score(specimen: Specimen, states: Sequence[Gaussians]) -> Figures:
-    """States of the first frames against what the scorer's cameras see of them."""
+    """Compare the states of the first frames with the ground truth of the held-out cameras."""
     cutouts = specimen.views[:, : len(states)]
     with torch.no_grad():
         drawn = [RASTERIZE(state, specimen.cameras, torch.ones(3)) for state in states]
     films = torch.stack([picture.color.clamp(0, 1) for picture in drawn], 1)
-    coverage = torch.stack([picture.alpha for picture in drawn], 1)
+    alpha = torch.stack([picture.alpha for picture in drawn], 1)
     rows = []
-    for film, seen, cutout in zip(films, coverage, cutouts, strict=True):
+    for film, seen, cutout in zip(films, alpha, cutouts, strict=True):
         wanted, mask = over_white(cutout), cutout[..., 3:]
         either = ((seen > 0.5) | (mask > 0.5)).float()
         rows.append([psnr(film, wanted).mean(), psnr(film, wanted, either).mean(), iou(seen, mask).mean()])
@@ -88,14 +88,14 @@ def score(specimen: Specimen, states: Sequence[Gaussians]) -> Figures:
 
 
 def prior_of(bank: Bank, settings: PipelineSettings, stage: FitSettings) -> AnalyticPrior:
-    """The oracle, perfect or not, with the timesteps of a stage."""
+    """Return the oracle, perturbed or not, with the timestep schedule of a stage."""
     assert isinstance(settings.prior, OraclePriorSettings), "these fits are made with prior.kind = oracle"
     noise = TimestepSchedule(stage.t_max_start, stage.t_max_end, uniform=stage.noise_draw == "uniform")
     return make_oracle_prior(bank, settings.prior, noise)
 
 
-def thinned(specimen: Specimen, most: int) -> tuple[Specimen, int]:
-    """At most so many of the frames, and how far they are apart."""
+def subsample_frames(specimen: Specimen, most: int) -> tuple[Specimen, int]:
+    """Return at most this many of the frames, and their stride."""
     stride = -(-len(specimen.cutouts) // most)
     kept = [column for column, frame in enumerate(specimen.bank.frames) if frame % stride == 0]
     moments = tuple(specimen.bank.frames[column] // stride for column in kept)
@@ -104,7 +104,7 @@ def thinned(specimen: Specimen, most: int) -> tuple[Specimen, int]:
 
 
 def _moment(specimen: Specimen, frame: int) -> Specimen:
-    """One frame, as if there were no other; the nearest that the bank has."""
+    """Return a specimen of one frame, the nearest in the bank."""
     column = min(range(len(specimen.bank.frames)), key=lambda i: abs(specimen.bank.frames[i] - frame))
     bank = Bank(specimen.bank.cameras, (0,), specimen.bank.pictures[:, [column]])
     return replace(specimen, cutouts=specimen.cutouts[[frame]], bank=bank, views=specimen.views[:, [frame]])

@@ -1,13 +1,12 @@
-"""Items an hour of a catalog on one, two and three machines that share a store, and what a killed machine costs.
+"""Throughput of one, two and three machines that share a store, and the cost of a killed machine.
 
 Run with `python -m benchmarks.fleet` (`--items 60 --seconds 6 --workers 1 2 3 --json FILE`). Machines are workers with
-a home and an identity each, in processes of this machine; steps are the stand-ins of the tests, one of which sleeps, so
-that the figures tell what the fleet adds and not how many cores there are. The store is `$DG4D_TEST_S3` (with the usual
-AWS_* variables), else a folder. The last pass has all workers again, one of which is killed with everything that it
-runs when a third of the items is done, and never comes back: its runs go on elsewhere when the server has missed their
-heartbeats.
+separate homes and identities, in processes of this machine; steps are the stand-ins of the tests, one of which sleeps,
+so that the result does not depend on the number of cores. The store is `$DG4D_TEST_S3` (with the usual AWS_*
+variables), else a folder. In the last pass one of the workers is killed with all its processes after a third of the
+items and does not return: its runs continue elsewhere when the server has missed their heartbeats.
 
-Lost is an item without its package, done twice a step that two machines finished for one item.
+An item is lost without a package; a step is done twice if two machines finish it for one item.
 """
 
 import os
@@ -39,17 +38,17 @@ BEFORE_SLEEP = ("drive_video", "fit_gaussians")  # side by side; the next step o
 
 @dataclass(frozen=True)
 class Row:
-    """One catalog, made anew.
+    """Pass over the catalog, from scratch.
 
     Attributes:
-        workers: machines.
-        killed: of them, in the middle.
+        workers: number of machines.
+        killed: number of machines killed during the pass.
         items: of the catalog.
         wall_s: from the start of the command to its end.
-        per_hour: items.
+        per_hour: items per hour.
         lost: items without a package.
         twice: steps that were finished twice for one item.
-        shares: items that each machine finished.
+        shares: items finished by each machine.
     """
 
     workers: int
@@ -63,12 +62,12 @@ class Row:
 
 
 class Machine:
-    """A worker with a home and an identity of its own.
+    """Worker with its own home and identity.
 
     Args:
         name: of the machine.
-        folder: of everything that is its own.
-        variables: of the environment, shared with others.
+        folder: of its home and files.
+        variables: of the environment, shared with other machines.
     """
 
     def __init__(self, name: str, folder: Path, variables: dict[str, str]) -> None:
@@ -92,7 +91,7 @@ class Machine:
 
     @property
     def steps(self) -> list[str]:
-        """Steps that it finished, as STEP:ITEM."""
+        """Return the finished steps, as STEP:ITEM."""
         return self.log.read_text(encoding="utf-8").split() if self.log.exists() else []
 
     def sleeps(self) -> bool:
@@ -105,14 +104,14 @@ class Machine:
         return step in BEFORE_SLEEP and all(f"{each}:{item}" in before for each in BEFORE_SLEEP)
 
     def kill(self) -> None:
-        """End it as a loss of power does: the worker and all that it started, at once."""
+        """Kill the worker and all its processes at once, as a power failure does."""
         for pid in [self._worker.pid, *descendants(self._worker.pid)]:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         self._worker.wait()
 
     def stop(self) -> None:
-        """End it, unless it was killed."""
+        """Stop the worker, unless it was killed."""
         self._worker.terminate()
         try:
             self._worker.wait(30)
@@ -133,10 +132,10 @@ def main() -> None:
     rows = []
     with (
         tempfile.TemporaryDirectory(prefix="dg4d-fleet-", ignore_cleanup_errors=True) as name,
-        serving(Path(name)) as variables,
+        run_server(Path(name)) as variables,
     ):
         for number, (count, kill) in enumerate(passes):
-            rows.append(measured(Path(name) / f"{number}", variables, options.items, options.seconds, count, kill))
+            rows.append(measure_pass(Path(name) / f"{number}", variables, options.items, options.seconds, count, kill))
             new_console().print(rows[-1])
     console = new_console()
     console.print(machine())
@@ -145,8 +144,8 @@ def main() -> None:
         write_rows(options.json, rows)
 
 
-def measured(folder: Path, variables: dict[str, str], items: int, seconds: float, workers: int, kill: bool) -> Row:
-    """Make one catalog anew."""
+def measure_pass(folder: Path, variables: dict[str, str], items: int, seconds: float, workers: int, kill: bool) -> Row:
+    """Process the catalog once, from scratch."""
     draw_items(folder / "in", items, seconds)
     store = f"{os.environ['DG4D_TEST_S3']}/{os.getpid()}-{folder.name}" if "DG4D_TEST_S3" in os.environ else ""
     shared = {**variables, "DG4D_STORE": store or str(folder / "store"), "DG4D_CODE_VERSION": f"fleet-{folder.name}"}
@@ -165,7 +164,7 @@ def measured(folder: Path, variables: dict[str, str], items: int, seconds: float
     try:
         while command.poll() is None:
             time.sleep(LOOK_S)
-            if kill > killed and sum(map(finished, machines)) >= items / 3 and machines[-1].sleeps():
+            if kill > killed and sum(map(count_finished, machines)) >= items / 3 and machines[-1].sleeps():
                 machines[-1].kill()
                 killed = 1
         wall_s = time.monotonic() - begun
@@ -183,17 +182,17 @@ def measured(folder: Path, variables: dict[str, str], items: int, seconds: float
         per_hour=round(3600 * items / wall_s),
         lost=items - made,
         twice=sum(count - 1 for count in steps.values()),
-        shares=[finished(one) for one in machines],
+        shares=[count_finished(one) for one in machines],
     )
 
 
-def finished(one: Machine) -> int:
-    """Return how many items a machine finished."""
+def count_finished(one: Machine) -> int:
+    """Return the number of items that a machine finished."""
     return sum(step.startswith("check_asset:") for step in one.steps)
 
 
 def draw_items(folder: Path, count: int, seconds: float) -> None:
-    """Write sources that the stand-ins of steps obey."""
+    """Write the input files of the stand-in steps."""
     folder.mkdir(parents=True)
     for i in range(count):
         words = f"fit_motion=sleep:{seconds} named={i:03d} {folder}"
@@ -201,8 +200,8 @@ def draw_items(folder: Path, count: int, seconds: float) -> None:
 
 
 @contextmanager
-def serving(folder: Path) -> Iterator[dict[str, str]]:
-    """Start the product's server with the pool of fleets; gives the environment of its clients."""
+def run_server(folder: Path) -> Iterator[dict[str, str]]:
+    """Run the product's server with a work pool; yield the environment of its clients."""
     inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PREFECT_", "DG4D_"))}
     server = Server(folder / "server", folder / "prefect")
     with ExitStack() as running:
@@ -234,7 +233,7 @@ register(read_pools(), [{POOL!r}])
 
 
 def descendants(pid: int) -> list[int]:
-    """Return the processes that a process started, and those that these started."""
+    """Return the child processes of a process, recursively."""
     found: list[int] = []
     for children in Path(f"/proc/{pid}/task").glob("*/children"):
         with suppress(OSError):  # the thread has ended
@@ -244,7 +243,7 @@ def descendants(pid: int) -> list[int]:
 
 
 def table(rows: list[Row]) -> Table:
-    """Return the rows as they are printed."""
+    """Return the rows as a table."""
     shown = Table("machines", "killed", "items", "wall s", "items/hour", "lost", "done twice", "items by machine")
     for row in rows:
         shown.add_row(

@@ -1,7 +1,7 @@
-"""What the metric `flicker` rewards: true films that are seen a few degrees off, against films that stand still.
+"""Validity of the metric `flicker`: true videos seen from a few degrees off, against still videos.
 
-`python -m benchmarks.flicker` (`--json FILE` keeps the rows) draws our own objects from the four sides that are scored.
-`temporal_error` of the same films stands beside it: 0 is the true motion, 1 is none.
+Kept as evidence for reading `flicker` together with `temporal_error` (0 is the true motion, 1 is none).
+`python -m benchmarks.flicker` (`--json FILE` keeps the rows) renders our own objects from the four scored views.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from dg4d_lib.images import color_over_white
 from dg4d_lib.metrics.video import flicker, temporal_error
 
 AZIMUTHS_DEG = (-75, 15, 105, 195)
-ERRORS_DEG = (1, 2, 5, 10)  # of the side from which a true film is seen
+ERRORS_DEG = (1, 2, 5, 10)  # azimuth errors of the true videos
 FRONT = "the input view's first frame, held"
 OWN = "every view's true first frame, held"
 REPEATED = "the input at every view"
@@ -30,19 +30,19 @@ REPEATED = "the input at every view"
 
 @dataclass(frozen=True)
 class Film:
-    """Frames over white, and where the subject is."""
+    """Frames over white, and the alpha of the subject."""
 
     frames: Float[Tensor, "t h w 3"]
     region: Float[Tensor, "t h w 1"]
 
     def held(self) -> "Film":
-        """Its first frame, as long."""
+        """Return a still video of the first frame."""
         return Film(self.frames[:1].expand_as(self.frames), self.region[:1].expand_as(self.region))
 
 
 @dataclass(frozen=True)
 class Row:
-    """One film of one object, means over the sides."""
+    """Result of one video; means over the views."""
 
     object: str
     film: str
@@ -50,31 +50,33 @@ class Row:
     temporal_error: float
 
 
-def filmed(painted: Painted, azimuth_deg: float, frames: int, size: int) -> Film:
-    """One cycle of an object's motion from one side."""
+def render_cycle(painted: Painted, azimuth_deg: float, frames: int, size: int) -> Film:
+    """Render one cycle of an object's motion from one azimuth."""
     camera = OrbitCamera(azimuth_deg=azimuth_deg, width=size, height=size)
     cutouts = torch.cat([painted.draw(frame / frames, [camera]) for frame in range(frames)])
-    coverage = cutouts[..., 3:]
-    return Film(color_over_white(cutouts[..., :3], coverage), (coverage > 0.5).float())
+    alpha = cutouts[..., 3:]
+    return Film(color_over_white(cutouts[..., :3], alpha), (alpha > 0.5).float())
 
 
-def rows_of(name: str, frames: int, size: int) -> list[Row]:
-    """All films of one object."""
+def measure_object(name: str, frames: int, size: int) -> list[Row]:
+    """Return the results of all videos of one object."""
     painted = Painted(OBJECTS[name]())
-    front = filmed(painted, 0, frames, size)
+    front = render_cycle(painted, 0, frames, size)
     figures: dict[str, list[tuple[float, float]]] = {}
     for azimuth in AZIMUTHS_DEG:
-        truth = filmed(painted, azimuth, frames, size)
-        films = {f"the truth, {off} degrees off": filmed(painted, azimuth + off, frames, size) for off in ERRORS_DEG}
-        for film, made in {**films, OWN: truth.held(), FRONT: front.held(), REPEATED: front}.items():
-            region = torch.maximum(made.region, truth.region)
-            found = flicker(made.frames, truth.frames, region), temporal_error(made.frames, truth.frames)
+        ground_truth = render_cycle(painted, azimuth, frames, size)
+        films = {
+            f"ground truth, {off} degrees off": render_cycle(painted, azimuth + off, frames, size) for off in ERRORS_DEG
+        }
+        for film, made in {**films, OWN: ground_truth.held(), FRONT: front.held(), REPEATED: front}.items():
+            region = torch.maximum(made.region, ground_truth.region)
+            found = flicker(made.frames, ground_truth.frames, region), temporal_error(made.frames, ground_truth.frames)
             figures.setdefault(film, []).append((float(found[0]), float(found[1])))
     return [Row(name, film, *(fmean(column) for column in zip(*pairs, strict=True))) for film, pairs in figures.items()]
 
 
 def table(rows: Sequence[Row]) -> Table:
-    """A line per film: its flicker for every object, the mean, and the mean temporal error."""
+    """Return a line per video: its flicker for every object, the mean, and the mean temporal error."""
     objects, films = (list(dict.fromkeys(getattr(row, field) for row in rows)) for field in ("object", "film"))
     result = Table(Column("film", no_wrap=True), *objects, "mean flicker", "mean temporal error")
     for film in films:
@@ -87,7 +89,7 @@ def table(rows: Sequence[Row]) -> Table:
 def main() -> None:
     options = parser_of(__doc__, "one object, four frames of 48 pixels").parse_args()
     frames, size = (4, 48) if options.quick else (32, 256)
-    rows = [row for name in list(OBJECTS)[: 1 if options.quick else None] for row in rows_of(name, frames, size)]
+    rows = [row for name in list(OBJECTS)[: 1 if options.quick else None] for row in measure_object(name, frames, size)]
     new_console().print(table(rows))
     if options.json:
         write_rows(options.json, rows)

@@ -1,12 +1,12 @@
-"""Whether the gates tell good assets from spoiled ones: what every gate measures on both, and its bounds between them.
+"""Calibration of the quality gates: values on good and on degraded assets, and the bounds between them.
 
 Run with `python -m benchmarks.gates [PACKAGE ...] [--poor PACKAGE ...]` (minutes; `--json FILE` keeps the rows). A
-package is a folder that `dg4d make` wrote with a tracked mesh, whose steps are still kept in $DG4D_HOME: the driving
-video is taken from there. `--poor` are packages in which a person sees faults: none should be accepted. Three shapes
-of our own, whose splats lie on the surface of their mesh, are always among the good ones.
+package is a folder written by `dg4d make` with a tracked mesh, whose steps are still in $DG4D_HOME, which has the
+driving video. `--poor` are packages with visible faults; none should pass. Three shapes of our own, with splats on the
+surface of their mesh, are always among the good ones.
 
-Every good asset is spoiled in every way below, each meant for one gate. A gate separates if it passes every good asset
-and fails every one that is spoiled for it.
+Every good asset is degraded in every way below, each aimed at one gate. A gate separates if it passes every good asset
+and fails every asset degraded for it.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,7 +38,7 @@ from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.metrics.gates import Gate, evaluate_gates
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
-from flows.packages.publish import whole
+from flows.packages.publish import load_verified
 from steps.artifacts.media import read_frames, read_png
 from steps.artifacts.packages import SUBJECT, read_manifest
 from steps.artifacts.rendering import read_states, read_surface, states_between
@@ -47,22 +47,22 @@ from steps.contract import ArtifactRef
 from steps.store.artifact_store import ArtifactStore
 from steps.store.files import home
 
-FRAMES, SIZE, FPS = 12, 256, 12.0  # of our own shapes
-SOLID = 3.0  # logit of the opacity of their splats
-SPREAD = 0.6  # standard deviation of such a splat, in edges
-INSET = 0.97  # how far from the middle its center is, in distances of the surface
+FRAMES, SIZE, FPS = 12, 256, 12.0  # frames, pixels and frame rate of our own shapes
+SOLID = 3.0  # opacity logit of their splats
+SPREAD = 0.6  # standard deviation of their splats, in edge lengths
+INSET = 0.97  # distance of splat centers from the middle, relative to the surface
 
 
 @dataclass(frozen=True)
 class Sample:
-    """An asset in memory, with what it was made from.
+    """Asset in memory, with its inputs.
 
     Attributes:
         name: of the object.
-        states: the cloud at every frame.
-        surface: the mesh that moves.
-        video: the driving video.
-        cutout: the input picture.
+        states: cloud at every frame.
+        surface: deforming mesh.
+        video: driving video.
+        cutout: input picture.
     """
 
     name: str
@@ -74,7 +74,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Row:
-    """A way of spoiling, and the gate that it is meant for."""
+    """Degradation, and the gate that it is aimed at."""
 
     spoiled_by: str
     gate: str
@@ -91,7 +91,7 @@ class Row:
 
     @property
     def separates(self) -> bool:
-        """Whether all good ones pass and all spoiled ones fail."""
+        """True if all good assets pass and all degraded ones fail."""
         return self.good_passed == self.spoiled_failed == self.assets
 
 
@@ -99,12 +99,12 @@ Spoil = Callable[[Sample], Sample]
 
 
 def read_package(folder: Path) -> Sample:
-    """A package on disk.
+    """Read a package.
 
     Raises:
         BadInput: it is broken, has a mesh per frame, or its driving video is kept no more.
     """
-    record, manifest, store = whole(folder), read_manifest(folder), ArtifactStore(home() / "store")
+    record, manifest, store = load_verified(folder), read_manifest(folder), ArtifactStore(home() / "store")
     surface = read_surface(folder, manifest)
     if not isinstance(surface, Asset4D):
         raise BadInput(f"{folder} has a mesh per frame; give packages made with mesh.mode=tracked")
@@ -112,7 +112,9 @@ def read_package(folder: Path) -> Sample:
     digest = packing["inputs"]["driving_video"]
     sizes = {entry.name: entry.size_bytes for entry in store.artifacts()}
     if digest not in sizes:
-        raise BadInput(f"the driving video of {folder} is not in {store.root}; set DG4D_HOME to where it was made")
+        raise BadInput(
+            f"the driving video of {folder} is not in {store.root}; set DG4D_HOME to the home in which it was made"
+        )
     with TemporaryDirectory() as scratch:
         ref = ArtifactRef(digest=digest, media_type="application/zip", size_bytes=sizes[digest])
         video = read_frames(store.path(ref), Path(scratch))
@@ -120,8 +122,8 @@ def read_package(folder: Path) -> Sample:
     return Sample(folder.name, states, surface, video, read_png(folder / SUBJECT))
 
 
-def own(name: str) -> Sample:
-    """A closed shape of our own as if it had been made almost perfectly: as a mesh, and as splats on its surface."""
+def own_sample(name: str) -> Sample:
+    """Return a closed shape of our own as a nearly perfect asset: a mesh, and splats on its surface."""
     ball = icosphere(subdivisions=5, radius=1.0)
     ways, faces = torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces, dtype=torch.int64)
     turns = torch.arange(FRAMES) / FRAMES * 2 * torch.pi
@@ -138,12 +140,12 @@ def own(name: str) -> Sample:
     )
     blank = TexturedMesh(places[0], faces, torch.zeros(len(ways), 2), torch.zeros(1, 1, 3))
     surface = Asset4D(*_painted(blank, places - places[0], colors), FPS)
-    color, coverage = render_mesh(surface.mesh, [OrbitCamera(width=SIZE, height=SIZE)] * FRAMES, surface.offsets)
-    return Sample(name, states, surface, DrivingVideo(color, coverage, FPS), torch.cat([color, coverage], -1)[0])
+    color, alpha = render_mesh(surface.mesh, [OrbitCamera(width=SIZE, height=SIZE)] * FRAMES, surface.offsets)
+    return Sample(name, states, surface, DrivingVideo(color, alpha, FPS), torch.cat([color, alpha], -1)[0])
 
 
 def _bent(places: Tensor, amount: Tensor) -> Tensor:
-    """Sideways, the more the higher."""
+    """Bend sideways, increasingly with height."""
     return places + 2 * amount * places[:, 1:2].square() * torch.tensor([1.0, 0, 0])
 
 
@@ -152,7 +154,7 @@ def _breathing(places: Tensor, amount: Tensor) -> Tensor:
 
 
 def _twisted(places: Tensor, amount: Tensor) -> Tensor:
-    """About the upright axis, the more the higher."""
+    """Twist about the vertical axis, increasingly with height."""
     angle = 5 * amount * places[:, 1]
     x, y, z = places.unbind(1)
     return torch.stack([x * angle.cos() + z * angle.sin(), y, z * angle.cos() - x * angle.sin()], 1)
@@ -168,7 +170,7 @@ SHAPES: dict[str, tuple[Callable[[Tensor], Tensor], Callable[[Tensor, Tensor], T
 def _painted(
     mesh: TexturedMesh, offsets: Float[Tensor, "t v 3"], colors: Float[Tensor, "v 3"]
 ) -> tuple[TexturedMesh, Float[Tensor, "t w 3"]]:
-    """The mesh with a texel of its own for every triangle."""
+    """Return the mesh with one texel per triangle."""
     side = int(np.ceil(np.sqrt(len(mesh.faces))))
     texture = torch.zeros(side * side, 3)
     texture[: len(mesh.faces)] = colors[mesh.faces].mean(1)
@@ -185,7 +187,7 @@ def _noise(*shape: int) -> Tensor:
 
 
 def _recolored(sample: Sample, change: Callable[[Tensor], Tensor]) -> Sample:
-    """Splats and mesh with other colors."""
+    """Replace the colors of splats and mesh."""
     colors = rgb_to_sh(change(sh_to_rgb(sample.states.harmonics)).clamp(0, 1))
     states = replace(sample.states, harmonics=colors)
     return replace(_retextured(sample, change), states=states)
@@ -197,7 +199,7 @@ def _retextured(sample: Sample, change: Callable[[Tensor], Tensor]) -> Sample:
 
 
 def _moved(sample: Sample, change: Callable[[Tensor], Tensor]) -> Sample:
-    """Splats and mesh with a change to the places of all frames "t n 3"."""
+    """Change the positions "t n 3" of splats and mesh."""
     rest = sample.surface.mesh.vertices
     offsets = change(rest + sample.surface.offsets) - rest
     states = replace(sample.states, means=change(sample.states.means))
@@ -217,28 +219,28 @@ def _refaced(sample: Sample, faces: Tensor) -> Sample:
 
 
 def _blurred(texture: Float[Tensor, "h w 3"], texels: int) -> Float[Tensor, "h w 3"]:
-    """A texture that was saved much too small."""
+    """Replace the texture by one of very low resolution."""
     planes = texture.movedim(-1, 0)[None]
     small = resize_planes(planes, (texels, texels))
     return interpolate(small, texture.shape[:2], mode="bilinear")[0].movedim(0, -1)
 
 
 def _deepened(means: Float[Tensor, "t n 3"]) -> Float[Tensor, "t n 3"]:
-    """Scattered along the rays of the input camera: the same from there, a cloud from everywhere else."""
+    """Scatter splats along the rays of the input camera, which leaves the input view unchanged."""
     eye = torch.tensor([0.0, 0.0, 2.0])
     rays = torch.nn.functional.normalize(means - eye, dim=-1)
     return means + 0.1 * _noise(1, means.shape[1], 1) * rays
 
 
 def _scattered(means: Float[Tensor, "t n 3"]) -> Float[Tensor, "t n 3"]:
-    """One of a hundred is anywhere."""
+    """Move one of a hundred splats to a random position."""
     generator = torch.Generator().manual_seed(0)
     away = torch.rand(means.shape[1], 1, generator=generator) < 0.01
     return torch.where(away, torch.rand(means.shape[1], 3, generator=generator) * 1.6 - 0.8, means)
 
 
 def _torn(places: Float[Tensor, "t n 3"]) -> Float[Tensor, "t n 3"]:
-    """In one frame the right half stands a fifth of the subject higher."""
+    """Raise the right half in one frame by a fifth of the subject."""
     torn = places.clone()
     middle = places[len(places) // 2]
     torn[len(places) // 2, :, 1] += 0.3 * (middle[:, 0] > middle[:, 0].median())
@@ -246,7 +248,7 @@ def _torn(places: Float[Tensor, "t n 3"]) -> Float[Tensor, "t n 3"]:
 
 
 def _holed(sample: Sample) -> Sample:
-    """Nothing is left around one Gaussian."""
+    """Remove everything around one Gaussian."""
     means = sample.states.means[0]
     near = (means - means[len(means) // 2])[:, :2].norm(dim=-1) < 0.25
     return replace(sample, states=replace(sample.states, opacity_logits=sample.states.opacity_logits - 20.0 * near))
@@ -275,20 +277,20 @@ SPOILS: dict[str, tuple[str, Spoil]] = {
 }
 
 
-def measured(sample: Sample) -> dict[str, Gate]:
-    """Every gate by its name."""
+def measure_gates(sample: Sample) -> dict[str, Gate]:
+    """Return every gate by name."""
     parts = LoadedAsset(partial(states_between, sample.states), sample.surface, len(sample.surface.offsets))
     evidence = collect_evidence(parts, sample.video, sample.cutout, get_rasterizer("cpu"))
     return {gate.name: gate for gate in evaluate_gates(evidence, GateSettings())}
 
 
 def rows(samples: Sequence[Sample], tell: Callable[[str], None]) -> list[Row]:
-    """A row per way of spoiling."""
+    """Return a row per degradation."""
     good = []
     for sample in samples:
-        good.append(measured(sample))
+        good.append(measure_gates(sample))
         tell(f"{sample.name}: {_verdict(good[-1])}")
-    return [_row(name, gate, good, [measured(spoil(sample)) for sample in samples])
+    return [_row(name, gate, good, [measure_gates(spoil(sample)) for sample in samples])
             for name, (gate, spoil) in SPOILS.items()]  # fmt: skip
 
 
@@ -320,19 +322,19 @@ def _verdict(gates: dict[str, Gate]) -> str:
 def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("packages", nargs="*", type=Path, help="folders of good packages")
-    parser.add_argument("--poor", nargs="*", default=[], type=Path, help="folders of packages with faults one can see")
+    parser.add_argument("--poor", nargs="*", default=[], type=Path, help="folders of packages with visible faults")
     options = parser.parse_args()
     console = Console(width=WIDTH, soft_wrap=True, highlight=False)
-    found = rows([*map(read_package, options.packages), *map(own, SHAPES)], console.print)
+    found = rows([*map(read_package, options.packages), *map(own_sample, SHAPES)], console.print)
     for folder in options.poor:
-        console.print(f"{folder.name}, poor: {_verdict(measured(read_package(folder)))}")
+        console.print(f"{folder.name}, poor: {_verdict(measure_gates(read_package(folder)))}")
     console.print(table(found))
     if options.json:
         write_rows(options.json, found)
 
 
 def table(found: Sequence[Row]) -> Table:
-    """Rows as they are printed."""
+    """Return the rows as a table."""
     count = found[0].assets
     result = Table(
         Column("spoiled by", no_wrap=True), "gate", "bounds", "good", "spoiled", "separates", "also fails",

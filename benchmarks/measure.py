@@ -1,6 +1,6 @@
-"""Timing functions side by side, so that what else the machine does weighs on all of them.
+"""Interleaved timing of functions, so that other load of the machine affects all of them equally.
 
-CPU time (user and system, all threads of the process) is what to compare: wall time says more about the neighbors.
+Compare CPU time (user and system, all threads of the process); wall time depends on other processes.
 """
 
 import argparse
@@ -16,8 +16,8 @@ from typing import Any
 
 from rich.console import Console
 
-WIDTH = 150  # characters, of tables that go into a file
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # torch's idle threads would count as CPU time
+WIDTH = 150  # columns of tables written to a file
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # busy-waiting threads of torch would count as CPU time
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the steps
 
 
@@ -29,12 +29,12 @@ class Times:
     wall_ms: float
 
     def per(self, parts: float) -> "Times":
-        """The same for one of so many equal parts of a call."""
+        """Return the times of one of this many equal parts of a call."""
         return Times(self.cpu_ms / parts, self.wall_ms / parts)
 
 
 def interleaved(functions: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, Times]:
-    """Call every function once untimed, then all in turn `rounds` times; gives the medians of each.
+    """Call every function once untimed, then all in turn `rounds` times; return the medians of each.
 
     The order turns round from one round to the next, so that none always follows the same one.
     """
@@ -54,31 +54,31 @@ def interleaved(functions: Mapping[str, Callable[[], object]], rounds: int) -> d
 
 
 def machine() -> str:
-    """The processor, its cores and how busy they are: a line that belongs above every table of times."""
+    """Return a title for tables of times: processor, number of cores and load."""
     lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "processor")
     return f"{model}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"
 
 
 def new_console() -> Console:
-    """Where tables are printed: as wide as the terminal, or wide enough for all of them where there is none."""
+    """Return a console as wide as the terminal, or wide enough for all tables without one."""
     return Console(width=None if sys.stdout.isatty() else WIDTH)
 
 
 def parser_of(about: str | None, quick: str = "") -> argparse.ArgumentParser:
-    """Of a benchmark that can keep its rows (`--json`), and be quick.
+    """Return the argument parser of a benchmark with `--json` and, optionally, `--quick`.
 
     Args:
-        about: the docstring of its module; its first line is shown.
-        quick: what `--quick` does; empty: there is no such option.
+        about: docstring of its module; the first line is shown.
+        quick: description of `--quick`; empty: no such option.
     """
     parser = argparse.ArgumentParser(description=(about or "").partition("\n")[0])
     if quick:
         parser.add_argument("--quick", action="store_true", help=quick)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to FILE")
     return parser
 
 
 def write_rows(path: Path, rows: Iterable[Any]) -> None:
-    """Dataclasses of numbers as `{"rows": [...]}`."""
+    """Write dataclasses of numbers as `{"rows": [...]}`."""
     path.write_text(json.dumps({"rows": [asdict(row) for row in rows]}, indent=1) + "\n", encoding="utf-8")

@@ -1,18 +1,18 @@
-"""How much faster meshes are drawn than by casting rays, and what reading their texture costs: CPU time per frame.
+"""Speed of mesh rasterization against ray casting, and of texture sampling: CPU time per frame.
 
-Run with `python -m benchmarks.mesh` (a minute; `--quick`: some seconds; `--json FILE` keeps the rows). A mesh moves, so
-what a peer builds to find its triangles is built for every frame; its rays are made before. Peers that are not
-installed are named; `pip install --target DIR embreex open3d` and `PYTHONPATH=DIR` add them. Face and barycentric
-coordinates of every pixel:
+Run with `python -m benchmarks.mesh` (a minute; `--quick`: seconds; `--json FILE` keeps the rows). The mesh deforms, so
+acceleration structures of peers are built for every frame; rays are computed in advance. Missing peers are listed;
+`pip install --target DIR embreex open3d` and `PYTHONPATH=DIR` add them. Face and barycentric coordinates of every
+pixel:
 
 `embreex`      Intel's Embree
-`open3d`       Open3D's RaycastingScene, Embree inside
-`trimesh`      trimesh's `intersects_first`, Embree inside: face ids only
+`open3d`       Open3D's RaycastingScene, based on Embree
+`trimesh`      trimesh's `intersects_first`, based on Embree: face ids only
 
-One iteration on a texture, value and gradient, of all frames: ours is trilinear between mip levels, the peers bilinear.
+One iteration on a texture, value and gradient, of all frames; ours is trilinear between mip levels, the peers bilinear:
 
 `texture_list`      grid_sample at the covered pixels of all frames as one list
-`texture_frames`    grid_sample frame by frame in one call, the texture expanded
+`texture_frames`    grid_sample of all frames in one call, with the texture expanded
 """
 
 import math
@@ -38,14 +38,14 @@ from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
 
 FRAMES, TEXELS = 14, 1024
 
-Picture = NDArray[np.int64]  # face of every pixel, -1 where there is none
-Rays = tuple[NDArray[np.float32], ...]  # of a camera's pixels: origins, directions, and both beside each other
+Picture = NDArray[np.int64]  # face of every pixel, -1: none
+Rays = tuple[NDArray[np.float32], ...]  # of all pixels: origins, directions, and both concatenated
 Peer = Callable[[NDArray[np.float32], NDArray[np.int32], Rays], Picture]  # vertices, faces
 
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison with a peer; times per frame."""
+    """Comparison with a peer; times per frame."""
 
     peer: str
     faces: int
@@ -58,7 +58,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Finding:
-    """A row, and what is printed beside it: wall times, and the share of pixels in which the peer sees our triangle."""
+    """Row with additional columns: wall times, and the fraction of pixels with the same triangle as ours."""
 
     row: Row
     ours_wall_ms: float
@@ -68,13 +68,13 @@ class Finding:
 
 @dataclass(frozen=True)
 class Scene:
-    """A mesh that moves, a camera for every frame.
+    """Deforming mesh with a camera per frame.
 
     Attributes:
         states: vertices of every frame, "t v 3".
         faces: "f 3".
         uvs: "v 2".
-        cameras: t of them.
+        cameras: t cameras.
     """
 
     states: Tensor
@@ -84,7 +84,7 @@ class Scene:
 
 
 def bumpy_ball(faces: int, size: int, frames: int) -> Scene:
-    """A closed surface of about so many faces, by longitude and latitude; waves run through it."""
+    """Return a closed surface with waves and about this many faces, by longitude and latitude."""
     rows = round(math.sqrt(faces / 4))
     v, u = torch.meshgrid(torch.linspace(0, 1, rows + 1), torch.linspace(0, 1, 2 * rows + 1), indexing="ij")
     polar, around = math.pi * v, 2 * math.pi * u
@@ -136,7 +136,7 @@ def open3d() -> Peer:
 
 
 def trimesh() -> Peer:
-    import_module("embreex")  # without it, trimesh takes a minute for a picture
+    import_module("embreex")  # without it, trimesh takes a minute per image
     library: Any = import_module("trimesh")
 
     def cast(vertices: NDArray[np.float32], faces: NDArray[np.int32], cast_from: Rays) -> Picture:
@@ -146,8 +146,8 @@ def trimesh() -> Peer:
     return cast
 
 
-def installed() -> tuple[dict[str, Peer], dict[str, str]]:
-    """The peers that can be called here; and why the others cannot."""
+def available_peers() -> tuple[dict[str, Peer], dict[str, str]]:
+    """Return the available peers, and the reasons why others are missing."""
     found, missing = {}, {}
     for prepare in (embreex, open3d, trimesh):
         try:
@@ -208,7 +208,7 @@ def finding(scene: Scene, peer: str, ours: Times, theirs: Times, agreement: floa
 def main() -> None:
     options = parser_of(__doc__, "a small case, few rounds").parse_args()
     count, sizes, frames, rounds = (5_000, (128,), 3, 3) if options.quick else (50_000, (256, 512), FRAMES, 7)
-    console, (peers, missing) = new_console(), installed()
+    console, (peers, missing) = new_console(), available_peers()
     found = []
     for size in sizes:
         scene = bumpy_ball(count, size, frames)
@@ -221,7 +221,7 @@ def main() -> None:
 
 
 def table(title: str, found: list[Finding]) -> Table:
-    """Findings as they are printed."""
+    """Return findings as a table."""
     result = Table(
         Column("peer", no_wrap=True), "faces", "px", "ours CPU", "peer CPU", "ratio", "ours wall", "peer wall",
         "same face", title=title,

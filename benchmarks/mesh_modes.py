@@ -1,10 +1,10 @@
-"""One mesh that moves against a mesh per frame: how far the first is from the second, and how both look.
+"""Tracked mesh against a mesh per frame: surface distance and image quality.
 
-Run with `python -m benchmarks.mesh_modes PACKAGE ...` on packages with a tracked mesh (some seconds a frame; `--quick`:
-two frames; `--json FILE` keeps the rows). The surface of a frame is extracted from the Gaussians of that frame as the
-mode `per_frame` does it: cleaned, unwrapped and baked anew. Distances to it are in thousandths of a world unit; what it
-has to itself is due to the points with which surfaces are compared. Pictures are compared with the splats of the frame
-over white: PSNR at the pixels where either is seen, and intersection over union of the outlines.
+Run with `python -m benchmarks.mesh_modes PACKAGE ...` on packages with a tracked mesh (seconds per frame; `--quick`:
+two frames; `--json FILE` keeps the rows). The reference surface of a frame is extracted from its Gaussians as in the
+mode `per_frame`: cleaned, unwrapped and baked. Distances to it are in thousandths of a world unit; its distance to
+itself is the sampling error. Renders are compared with the splats of the frame over white: PSNR over the union of both
+silhouettes, and IoU of the silhouettes.
 """
 
 from collections.abc import Sequence
@@ -34,9 +34,9 @@ from dg4d_lib.settings import MeshSettings
 from steps.artifacts.packages import ASSET, COMPACT
 from steps.extract_mesh import textured_mesh
 
-AZIMUTHS_DEG = (0.0, 90.0)  # the input view, and the right side
+AZIMUTHS_DEG = (0.0, 90.0)  # the input view and the right side
 SIZE = 512  # pixels
-POINTS = 50_000  # on every surface
+POINTS = 50_000  # samples per surface
 SETTINGS = MeshSettings(max_faces=20000)  # as the profile `preview`
 PER_WORLD_UNIT = 1000
 MODES = "tracked", "per_frame"
@@ -45,7 +45,7 @@ FIGURES = "chamfer", "input_psnr", "input_iou", "side_psnr", "side_iou"
 
 @dataclass(frozen=True)
 class Row:
-    """A mode on one package, means over the frames; distances in thousandths of a world unit, PSNR in dB."""
+    """Mode on one package, means over frames; distances in thousandths of a world unit, PSNR in dB."""
 
     package: str
     mode: str
@@ -57,7 +57,7 @@ class Row:
     side_iou: float
 
 
-def of_package(folder: Path, count: int, rasterize: Rasterizer) -> list[Row]:
+def measure_package(folder: Path, count: int, rasterize: Rasterizer) -> list[Row]:
     asset = read_glb((folder / ASSET).read_bytes())
     fit = read_compact(folder / COMPACT)
     gaussians, deformation, frames = fit.gaussians, fit.deformation, fit.frames
@@ -69,11 +69,11 @@ def of_package(folder: Path, count: int, rasterize: Rasterizer) -> list[Row]:
     for i, frame in enumerate(chosen):
         extracted = textured_mesh(states.at(i), level, rasterize, SETTINGS)
         tracked = replace(asset.mesh, vertices=asset.mesh.vertices + asset.offsets[frame])
-        truth, generator = splats(states.at(i), rasterize), torch.Generator().manual_seed(frame)
+        ground_truth, generator = splats(states.at(i), rasterize), torch.Generator().manual_seed(frame)
         for mode, mesh in (("tracked", tracked), ("per_frame", extracted)):
             points = [sample_surface(each.vertices, each.faces, POINTS, generator) for each in (mesh, extracted)]
             apart = chamfer_distance(*points)
-            rows.append(Row(folder.name, mode, 1, PER_WORLD_UNIT * apart, *look(mesh, truth)))
+            rows.append(Row(folder.name, mode, 1, PER_WORLD_UNIT * apart, *compare_renders(mesh, ground_truth)))
     return [mean_row(folder.name, [row for row in rows if row.mode == mode]) for mode in MODES]
 
 
@@ -82,34 +82,34 @@ def cameras() -> list[OrbitCamera]:
 
 
 def splats(state: Gaussians, rasterize: Rasterizer) -> tuple[Tensor, Tensor]:
-    """Color over white, and coverage."""
+    """Return color over white, and alpha."""
     with torch.no_grad():
         drawn = rasterize(state, cameras(), torch.ones(3))
     return drawn.color, drawn.alpha
 
 
-def look(mesh: TexturedMesh, truth: tuple[Tensor, Tensor]) -> list[float]:
-    """PSNR and overlap in the first view, then in the second."""
-    color, coverage = render_mesh(mesh, cameras())
-    seen = ((coverage > 0.5) | (truth[1] > 0.5)).float()
-    pairs = torch.stack([psnr(color_over_white(color, coverage), truth[0], seen), iou(coverage, truth[1])], 1)
+def compare_renders(mesh: TexturedMesh, ground_truth: tuple[Tensor, Tensor]) -> list[float]:
+    """Return PSNR and IoU in the first view, then in the second."""
+    color, alpha = render_mesh(mesh, cameras())
+    seen = ((alpha > 0.5) | (ground_truth[1] > 0.5)).float()
+    pairs = torch.stack([psnr(color_over_white(color, alpha), ground_truth[0], seen), iou(alpha, ground_truth[1])], 1)
     return pairs.flatten().tolist()
 
 
 def mean_row(package: str, rows: Sequence[Row]) -> Row:
-    """Of rows with one mode."""
+    """Return the mean of rows with one mode."""
     means = [sum(getattr(row, name) for row in rows) / len(rows) for name in FIGURES]
     return Row(package, rows[0].mode, sum(row.frames for row in rows), *means)
 
 
 def main() -> None:
     parser = parser_of(__doc__, "two frames per package")
-    parser.add_argument("packages", type=Path, nargs="+", metavar="PACKAGE", help="folders that `dg4d make` wrote")
+    parser.add_argument("packages", type=Path, nargs="+", metavar="PACKAGE", help="folders written by `dg4d make`")
     parser.add_argument("--frames", type=int, default=4, help="frames per package, evenly spread")
     options = parser.parse_args()
     rasterize = get_rasterizer("auto")
     count = 2 if options.quick else options.frames
-    rows = [row for folder in options.packages for row in of_package(folder, count, rasterize)]
+    rows = [row for folder in options.packages for row in measure_package(folder, count, rasterize)]
     means = [mean_row("mean", [row for row in rows if row.mode == mode]) for mode in MODES]
     new_console().print(table(f"{machine()}; {SIZE} px, {POINTS} points a surface", [*rows, *means]))
     if options.json:
@@ -117,7 +117,7 @@ def main() -> None:
 
 
 def table(title: str, rows: list[Row]) -> Table:
-    """Rows as they are printed."""
+    """Return the rows as a table."""
     heads = "frames", "chamfer", "input PSNR", "input IoU", "side PSNR", "side IoU"
     result = Table(Column("package", no_wrap=True), Column("mode", no_wrap=True), *heads, title=title)
     for row in rows:

@@ -1,18 +1,18 @@
-"""Texture refinement on objects whose texture is known, with an oracle in place of the diffusion models.
+"""Texture refinement on objects with a known texture, with an oracle instead of diffusion models.
 
-Run with `python -m benchmarks.oracle_refinement`. Our own objects get a map, their paint as its texture, and a blurred
-copy of that as the texture to refine; shape and motion are true. The loop is the pipeline's own
-(`dg4d_lib.texture.refine`), and so are its noise levels. The oracle answers a picture x as a network would that
-believes in a normal distribution around a picture b of the object: with noise n of strength s added, and denoised,
+Kept as evidence for the noise level of the refinement. Run with `python -m benchmarks.oracle_refinement`. Our own
+objects are unwrapped, with their paint as the texture and a blurred copy as the texture to refine; shape and motion are
+exact. Loop (`dg4d_lib.texture.refine`) and noise levels are those of the pipeline. The oracle denoises an image x as a
+network would that models images as a normal distribution around an image b of the object: with noise n of strength s,
 
     b + trust / sqrt(trust^2 + s^2) (x + s n - b).
 
-b is the truth with stains in other colors, other ones in every iteration: what a model imagines. Whole videos have
-stains that stay on the surface from frame to frame, and little noise is left where t frames agree (n / sqrt(t)); single
-pictures have stains and noise of their own in every frame. So that whole videos agree with themselves is told to the
-oracle, not found; what is found is how much of either flaw the texture keeps, and which noise level restores most.
-PSNR is on the object, in the views that ablations score; flicker is the mean change of a texel from frame to frame, in
-levels of 255, and that of the truth is 0. With trained models: `benchmarks.refinement`.
+b is the ground truth with random color stains, which model hallucinations and change in every iteration. In whole
+videos the stains stay on the surface from frame to frame, and little noise remains where t frames agree (n / sqrt(t));
+single images have separate stains and noise in every frame. The consistency of whole videos is thus an assumption; the
+result is how much of either error the texture keeps, and which noise level restores most. PSNR is on the object, in the
+views that ablations score; flicker is the mean change of a texel from frame to frame, in levels of 255, and 0 for the
+ground truth. With trained models: `benchmarks.refinement`.
 """
 
 from collections.abc import Sequence
@@ -44,39 +44,37 @@ from dg4d_lib.settings import TextureSettings
 from dg4d_lib.texture.refine import MeshClip, RefinedTextures, refine_textures
 from dg4d_lib.video.driving import DrivingVideo
 
-SKIPPED = (0.6, 0.7, 0.75, 0.8)  # shares of the noise levels; the paper's "noise level" is .7
-STEPS = 25  # noise levels of the whole schedule
-UNIT = 0.25  # of latents, which have a spread of one, in colors
-SHRINKAGE = 8  # pixels of a side of a latent
-TRUST = 0.5  # in latents: how far a picture may be from what the oracle believes
-STAINS = 0.1  # their spread, in colors
-WAVES, WAVELENGTH = 8, 0.3  # of which a stain is made up; world units
-BLURRED_OVER = 0.02  # of all vertices: as many neighbors have a part in what is refined
+STRENGTHS = (0.4, 0.3, 0.25, 0.2)  # fractions of the noise levels; 0.3 is the paper's
+STEPS = 25  # noise levels of the full schedule
+UNIT = 0.25  # color units per latent standard deviation
+VAE_SCALE_FACTOR = 8  # pixels per latent and side
+TRUST = 0.5  # standard deviation of the oracle's distribution, latents
+STAINS = 0.1  # standard deviation of the color errors
+WAVES, WAVELENGTH = 8, 0.3  # number and length (world units) of the waves of a stain
+BLURRED_OVER = 0.02  # neighbors averaged by the blur, fraction of all vertices
 
 VARIANTS = {
     "before": Variant(),
-    **{f"video to video, {skipped:g} skipped": Variant({"skipped": skipped}) for skipped in SKIPPED},
-    "image to image, 0.7 skipped": Variant({"skipped": 0.7}, per_frame=True),
+    **{f"video to video, {strength:g}": Variant({"strength": strength}) for strength in STRENGTHS},
+    "image to image, 0.3": Variant({"strength": 0.3}, per_frame=True),
 }
 FLICKER = Ablation(
-    "whole videos flicker less than single pictures",
+    "whole videos flicker less than single images",
     VARIANTS,
-    (Claim("video to video, 0.7 skipped", "image to image, 0.7 skipped", "flicker"),),
-    caveat="that videos agree with themselves is told to the oracle",
+    (Claim("video to video, 0.3", "image to image, 0.3", "flicker"),),
+    caveat="the consistency of videos is an assumption of the oracle",
 )
 NOISE = Ablation(
-    "with .6 of the noise levels skipped textures are worse than with .7, and with .8, too",
+    "textures with a strength of 0.4 or 0.2 are worse than with 0.3",
     VARIANTS,
-    tuple(
-        Claim("video to video, 0.7 skipped", f"video to video, {other:g} skipped", "psnr_obj") for other in (0.6, 0.8)
-    ),
-    caveat="how much the oracle knows, and how far it is off, is made up",
+    tuple(Claim("video to video, 0.3", f"video to video, {other:g}", "psnr_obj") for other in (0.4, 0.2)),
+    caveat="the accuracy of the oracle is an assumption",
 )
 
 
 @dataclass(frozen=True)
 class Figures:
-    """Of a refined mesh."""
+    """Metrics of a refined mesh."""
 
     psnr_obj: float
     flicker: float
@@ -84,13 +82,13 @@ class Figures:
 
 @dataclass(frozen=True)
 class Model:
-    """A moving mesh whose texture is known.
+    """Deforming mesh with a known texture.
 
     Attributes:
-        mesh: at rest, with its true texture.
+        mesh: in the reference pose, with its true texture.
         offsets: of its vertices in every frame.
-        texels: where the texture's texels lie.
-        blurred: the texture to refine.
+        texels: positions of the texels.
+        blurred: texture to refine.
     """
 
     mesh: TexturedMesh
@@ -101,7 +99,7 @@ class Model:
     def draw(
         self, textures: Sequence[Float[Tensor, "_ _ 3"]], cameras: Sequence[OrbitCamera]
     ) -> Float[Tensor, "t h w 4"]:
-        """A frame after the other with its texture and its camera: over white, and what is covered."""
+        """Render every frame with its texture and camera; return color over white and alpha."""
         states = self.mesh.vertices + self.offsets
         pictures = []
         for state, texture, camera in zip(states, textures, cameras, strict=True):
@@ -116,7 +114,7 @@ class Model:
         return torch.stack(pictures)
 
     def stained(self, generator: torch.Generator) -> Float[Tensor, "n n 3"]:
-        """The true texture in colors that are off by `STAINS`, smoothly over the surface."""
+        """Return the true texture with smooth color errors of `STAINS`."""
         direction = torch.randn(3, 3, WAVES, generator=generator) * (2 * torch.pi / WAVELENGTH / 3**0.5)
         phase = 2 * torch.pi * torch.rand(3, 1, WAVES, generator=generator)
         waves = (self.texels.positions @ direction + phase).sin().sum(-1) * (2 / WAVES) ** 0.5  # by color and texel
@@ -125,8 +123,8 @@ class Model:
         return texture.clamp(0, 1)
 
 
-def model_of(name: str, frames: int, texels: int) -> Model:
-    """One of our own objects with a map of so many texels a side."""
+def unwrapped_model(name: str, frames: int, texels: int) -> Model:
+    """Return one of our own objects with a texture of this many texels per side."""
     painted = Painted(OBJECTS[name]())
     rest = painted.vertices(0.0)
     copied, corners, uvs = (torch.from_numpy(part) for part in unwrap(rest.numpy(), painted.faces.numpy(), texels))
@@ -137,15 +135,15 @@ def model_of(name: str, frames: int, texels: int) -> Model:
     def texture(neighbors: int) -> Float[Tensor, "n n 3"]:
         _, nearest = tree.query(places.positions.numpy(), neighbors)
         colors = painted.colors[torch.from_numpy(np.reshape(nearest, (-1, neighbors)))].mean(1)
-        return _filled(places, colors, texels)
+        return _fill_gaps(places, colors, texels)
 
     moved = torch.stack([painted.vertices(frame / frames)[copied.long()] for frame in range(frames)])
     mesh = TexturedMesh(vertices, corners, uvs, texture(1))
     return Model(mesh, moved - vertices, places, texture(max(2, round(BLURRED_OVER * len(rest)))))
 
 
-def _filled(places: Texels, colors: Float[Tensor, "p 3"], size: int) -> Float[Tensor, "n n 3"]:
-    """A texture whose gaps have the color of the nearest texel on the surface."""
+def _fill_gaps(places: Texels, colors: Float[Tensor, "p 3"], size: int) -> Float[Tensor, "n n 3"]:
+    """Fill the gaps of a texture with the color of the nearest texel on the surface."""
     picture, empty = torch.zeros(size, size, 3), np.ones((size, size), bool)
     picture[places.rows, places.columns] = colors
     empty[places.rows.numpy(), places.columns.numpy()] = False
@@ -154,7 +152,7 @@ def _filled(places: Texels, colors: Float[Tensor, "p 3"], size: int) -> Float[Te
 
 
 class Oracle:
-    """A refiner that knows the object, but for stains of its own."""
+    """Refiner with knowledge of the ground truth, plus random stains."""
 
     def __init__(self, model: Model, sigma: float, whole_videos: bool) -> None:
         self.model, self.sigma, self.whole_videos = model, sigma, whole_videos
@@ -166,22 +164,22 @@ class Oracle:
         progress: float,
         generator: torch.Generator,
     ) -> Float[Tensor, "t h w 3"]:
-        """As in the text above; progress does not matter."""
+        """Denoise as described in the module docstring; progress is ignored."""
         frames, height, width = video.shape[:3]
         stains = [self.model.stained(generator) for _ in range(1 if self.whole_videos else frames)]
         believed = self.model.draw(stains * (frames // len(stains)), cameras)[..., :3]
-        latents = torch.randn(frames, 3, height // SHRINKAGE, width // SHRINKAGE, generator=generator)
+        latents = torch.randn(frames, 3, height // VAE_SCALE_FACTOR, width // VAE_SCALE_FACTOR, generator=generator)
         noise = interpolate(latents, (height, width), mode="bilinear").movedim(1, -1)
         left = 1 / frames**0.5 if self.whole_videos else 1.0
         keep = TRUST / (TRUST**2 + self.sigma**2) ** 0.5
         return (believed + keep * (video + self.sigma * UNIT * left * noise - believed)).clamp(0, 1)
 
 
-def refined(model: Model, variant: Variant, settings: TextureSettings, seed: int) -> RefinedTextures:
-    """What the pipeline's loop makes of the blurred texture; the blurred texture itself without a noise level."""
+def refine_model(model: Model, variant: Variant, settings: TextureSettings, seed: int) -> RefinedTextures:
+    """Refine the blurred texture with the pipeline's loop; return it unchanged without a noise level."""
     if not variant.changes:
         return RefinedTextures(model.blurred)
-    sigma = karras_sigmas(STEPS)[start_index(STEPS, 1 - variant.changes["skipped"])]
+    sigma = karras_sigmas(STEPS)[start_index(STEPS, variant.changes["strength"])]
     front = [OrbitCamera(width=settings.size, height=settings.size)] * len(model.offsets)
     seen = model.draw([model.mesh.texture] * len(front), front)
     video = DrivingVideo(seen[..., :3], seen[..., 3:], FPS)
@@ -190,16 +188,16 @@ def refined(model: Model, variant: Variant, settings: TextureSettings, seed: int
     return refine_textures([clip], video, oracle, settings, torch.Generator().manual_seed(seed))[0]
 
 
-def figures_of(model: Model, made: RefinedTextures, size: int) -> Figures:
-    """Against the true texture."""
+def score_model(model: Model, made: RefinedTextures, size: int) -> Figures:
+    """Compare with the true texture."""
     count = len(model.offsets)
     textures = [made.texture] * count if made.frame_textures is None else list(made.frame_textures)
     colors = torch.stack(textures)[:, model.texels.rows, model.texels.columns]
     marks = []
     for azimuth in SCORED_AZIMUTHS_DEG:
         cameras = [OrbitCamera(azimuth_deg=azimuth, width=size, height=size)] * count
-        truth, ours = (model.draw(looks, cameras) for looks in ([model.mesh.texture] * count, textures))
-        marks.append(psnr(ours[..., :3], truth[..., :3], truth[..., 3:]).mean())
+        ground_truth, ours = (model.draw(looks, cameras) for looks in ([model.mesh.texture] * count, textures))
+        marks.append(psnr(ours[..., :3], ground_truth[..., :3], ground_truth[..., 3:]).mean())
     return Figures(float(torch.stack(marks).mean()), 255 * float(colors.diff(dim=0).abs().mean()))
 
 
@@ -208,8 +206,8 @@ def main() -> None:
     parser.add_argument("--objects", nargs="+", choices=list(OBJECTS), default=list(OBJECTS), metavar="NAME")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--frames", type=int, default=8)
-    parser.add_argument("--size", type=int, default=128, help="pixels of what is refined, and scored")
-    parser.add_argument("--texels", type=int, default=256, help="of a side of the texture")
+    parser.add_argument("--size", type=int, default=128, help="pixels of the refined and scored images")
+    parser.add_argument("--texels", type=int, default=256, help="texels per side of the texture")
     parser.add_argument("--iterations", type=int, default=TextureSettings().iterations)
     options = parser.parse_args()
     if options.quick:
@@ -219,15 +217,15 @@ def main() -> None:
         "a texture per frame": (options.texels, (FLICKER, NOISE)),
         "one texture": (0, (NOISE,)),  # which cannot flicker
     }
-    models = {name: model_of(name, options.frames, options.texels) for name in options.objects}
+    models = {name: unwrapped_model(name, options.frames, options.texels) for name in options.objects}
     for kind, (added, ablations) in kinds.items():
         settings = TextureSettings(size=options.size, iterations=options.iterations, frame_size=added)
         mine = list[Row]()
         for name, model in models.items():
             for seed in range(options.seeds):
                 for title, variant in VARIANTS.items():
-                    made = refined(model, variant, settings, seed)
-                    mine.append(Row(kind, title, name, seed, figures_of(model, made, options.size)))
+                    made = refine_model(model, variant, settings, seed)
+                    mine.append(Row(kind, title, name, seed, score_model(model, made, options.size)))
         scale = f"{options.seeds} seeds, {options.frames} frames, {options.size} px, {options.iterations} iterations"
         console.print(table(f"refinement, {kind}: {', '.join(models)}; {scale}", mine))
         for ablation in ablations:

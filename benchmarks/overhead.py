@@ -1,10 +1,9 @@
-"""What orchestration adds to a conversion: the product's command against its steps called one after the other.
+"""Overhead of the orchestration: the product's command against its steps called in sequence.
 
 Run with `python -m benchmarks.overhead PICTURE` (`--turns 2`, `--set KNOB=VALUE`, `--json FILE` keeps the rows). In
-every turn the same picture is converted three times in processes of their own, each with a store of its own: `first`,
-`dg4d make` where no server runs yet; `next`, `dg4d make` with that server; `steps`, a program that imports the steps
-and calls them, without Prefect, cache, pages or processes, and must give the same digests. Wall time, for that is what
-people wait for: let the machine do nothing else.
+every turn the same picture is converted three times in separate processes and stores: `first`, `dg4d make` without a
+running server; `next`, `dg4d make` with that server; `steps`, a program that imports and calls the steps without
+Prefect, cache, pages or subprocesses, and must give the same digests. Wall time is reported, so run nothing else.
 """
 
 import argparse
@@ -22,9 +21,9 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.measure import machine, new_console, parser_of, write_rows
-from flows.inputs.orders import Wish
+from flows.inputs.conversion_job import ConversionRequest
 from flows.inputs.package_record import RECORD
-from flows.packages.publish import whole
+from flows.packages.publish import load_verified
 from flows.serving.server import Server
 from steps.contract import StepFailure, StepRequest
 from steps.profiles import profile
@@ -38,12 +37,12 @@ WAYS = ("steps", "first", "next")
 
 @dataclass(frozen=True)
 class Row:
-    """One way to convert the picture, medians over the turns.
+    """Way of converting the picture; medians over the turns.
 
     Attributes:
         way: one of `WAYS`.
         wall_s: from the start of the process to its end.
-        orchestration: share of that in which `steps` are done already.
+        orchestration: fraction of that time beyond `steps`.
     """
 
     way: str
@@ -56,14 +55,16 @@ def main() -> None:
     parser.add_argument("picture", type=Path)
     parser.add_argument("--turns", type=int, default=2)
     parser.add_argument("--set", action="append", default=[], metavar="KNOB=VALUE", help="as `dg4d make --set`")
-    parser.add_argument("--again", nargs=2, type=Path, help=argparse.SUPPRESS)  # record and store: only the steps
+    parser.add_argument(
+        "--again", nargs=2, type=Path, help=argparse.SUPPRESS
+    )  # internal: record and store, runs only the steps
     options = parser.parse_args()
     if options.again:
-        in_order(options.picture, *options.again)
+        repeat_steps(options.picture, *options.again)
         return
     taken: dict[str, list[float]] = {way: [] for way in WAYS}
     for seed in range(options.turns):
-        for way, seconds in turn(options.picture.resolve(), options.set, seed).items():
+        for way, seconds in run_turn(options.picture.resolve(), options.set, seed).items():
             taken[way].append(seconds)
     plain = median(taken["steps"])
     rows = [Row(way, median(of), 1 - plain / median(of)) for way, of in taken.items()]
@@ -72,8 +73,8 @@ def main() -> None:
         write_rows(options.json, rows)
 
 
-def turn(picture: Path, knobs: list[str], seed: int) -> dict[str, float]:
-    """Seconds of each way with this seed."""
+def run_turn(picture: Path, knobs: list[str], seed: int) -> dict[str, float]:
+    """Return the seconds of each way with this seed."""
     changes = [word for knob in knobs for word in ("--set", knob)]
     with tempfile.TemporaryDirectory(prefix="dg4d-overhead-") as folder:
         homes = {way: str(Path(folder) / way) for way in WAYS}
@@ -82,8 +83,8 @@ def turn(picture: Path, knobs: list[str], seed: int) -> dict[str, float]:
         def command(way: str, **more: str) -> float:
             out = str(Path(folder) / f"{way}-out")
             make = [sys.executable, "-m", "flows.cli", "make", str(picture), "--seed", str(seed), "-o", out, *changes]
-            seconds = timed(make, DG4D_HOME=homes[way], **more)
-            whole(Path(out))
+            seconds = time_command(make, DG4D_HOME=homes[way], **more)
+            load_verified(Path(out))
             return seconds
 
         try:
@@ -92,14 +93,16 @@ def turn(picture: Path, knobs: list[str], seed: int) -> dict[str, float]:
                 "next", PREFECT_API_URL=server.wait(), PREFECT_API_AUTH_STRING=server.auth_string()
             )
             again = [str(Path(folder) / "first-out" / RECORD), homes["steps"]]
-            seconds["steps"] = timed([sys.executable, "-m", "benchmarks.overhead", str(picture), "--again", *again])
+            seconds["steps"] = time_command(
+                [sys.executable, "-m", "benchmarks.overhead", str(picture), "--again", *again]
+            )
         finally:
             server.stop()
     return seconds
 
 
-def timed(command: list[str], **environment: str) -> float:
-    """Seconds that a program takes, with this in its environment.
+def time_command(command: list[str], **environment: str) -> float:
+    """Return the seconds that a program takes with this environment.
 
     Raises:
         CalledProcessError: it failed.
@@ -109,16 +112,16 @@ def timed(command: list[str], **environment: str) -> float:
     return time.perf_counter() - start
 
 
-def in_order(picture: Path, record: Path, folder: Path) -> None:
-    """The steps of a finished conversion again, one after the other in this process.
+def repeat_steps(picture: Path, record: Path, folder: Path) -> None:
+    """Repeat the steps of a finished conversion in this process.
 
     Raises:
         ValueError: one of them gave something else.
     """
     prepare_process()
     store = ArtifactStore(folder)
-    wish = Wish(item=picture.stem, picture=picture, profile="preview", settings=profile("preview"))
-    source = wish.order(store).source
+    conversion = ConversionRequest(item=picture.stem, picture=picture, profile="preview", settings=profile("preview"))
+    source = conversion.to_job(store).source
     known = {source.digest: source}
     for done in json.loads(record.read_text(encoding="utf-8"))["steps"]:
         request = StepRequest(
@@ -130,12 +133,12 @@ def in_order(picture: Path, record: Path, folder: Path) -> None:
         )
         outcome, _ = perform(request, store)
         if isinstance(outcome, StepFailure) or {n: ref.digest for n, ref in outcome.outputs.items()} != done["outputs"]:
-            raise ValueError(f"{request.step} gave something else than in the flow: {outcome}")
+            raise ValueError(f"{request.step} gave another result than in the flow: {outcome}")
         known |= {ref.digest: ref for ref in outcome.outputs.values()}
 
 
 def show(rows: list[Row], console: Console) -> None:
-    """A table."""
+    """Print the rows as a table."""
     table = Table("way", "wall s", "orchestration", title=f"One conversion ({machine()})")
     for row in rows:
         table.add_row(row.way, f"{row.wall_s:.1f}", "" if row.way == "steps" else f"{row.orchestration:.1%} of it")

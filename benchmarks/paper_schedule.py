@@ -1,16 +1,15 @@
-"""How long the paper's schedule takes with full-size networks of random weights, against the floor of the arithmetic.
+"""Duration of the paper's schedule with full-size networks of random weights, against the arithmetic lower bound.
 
 Run with `python -m benchmarks.paper_schedule` on a machine with a CUDA device (`--json FILE` keeps the rows); nothing
-is downloaded. `--quick` runs the same code with tiny networks and small numbers anywhere, as a smoke test: its times
-say nothing. Columns:
+is downloaded. `--quick` is a smoke test with tiny networks on any device; its times mean nothing. Columns:
 
-`s`        seconds of the stage, first calls included, loading not
-`TFLOP`    operations of all networks, as the ledger of every run counts them
-`TFLOP/s`  how many of them a second
+`s`        seconds of the stage, including first calls, without loading
+`TFLOP`    operations of all networks, by the FLOP counter of every run
+`TFLOP/s`  operations per second
 `floor s`  the planned operations at 790 TFLOP/s (bf16, one H100)
-`/ floor`  seconds over that
-`GiB`      the highest GPU memory, weights included
-`outside`  share of the time that no network was at work: drawing, losses, optimizers
+`/ floor`  seconds over that bound
+`GiB`      peak GPU memory, weights included
+`outside`  fraction of the time without networks: rendering, losses, optimizers
 """
 
 import gc
@@ -44,7 +43,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.interface import GuidancePrior
-from dg4d_lib.guidance.zero123 import CAMERA_NUMBERS, Zero123
+from dg4d_lib.guidance.zero123 import POSE_DIM, Zero123
 from dg4d_lib.images import over_white
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
@@ -65,7 +64,12 @@ from steps.artifacts.motions import new_deformation
 from steps.fit_gaussians import BLOB_RADIUS
 from steps.profiles import PipelineSettings, profile, revise
 
-FLOORS_S = {"video": 1.2, "static": 9.1, "dynamic": 12.8, "refinement": 21.7}  # the profile's video is 512 x 512
+FLOORS_S = {
+    "video": 1.2,
+    "static": 9.1,
+    "dynamic": 12.8,
+    "refinement": 21.7,
+}  # planned TFLOP at 790 TFLOP/s; the video is 512 x 512
 LADDER = [{"until": 1.0, "size": 32}]
 QUICK = {
     "driving.frames": 2,
@@ -100,7 +104,7 @@ class Clip:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Of the networks: channels of the first level of every U-Net and VAE, and the image encoders."""
+    """Sizes of the networks: channels of the first level of every U-Net and VAE, and the image encoders."""
 
     unet: int = 32
     vae: int = 32
@@ -113,7 +117,7 @@ FULL = Sizes(320, 128, Clip(1024, 24, 16, 768), Clip(1280, 32, 16, 1024))
 
 @dataclass(frozen=True)
 class Row:
-    """One stage; without a GPU there is no memory to tell, and tiny networks have no floor."""
+    """Result of one stage; no memory without a GPU, no lower bound for tiny networks."""
 
     stage: str
     seconds: float
@@ -127,13 +131,13 @@ class Row:
 
 @dataclass
 class Clock:
-    """How long networks were at work."""
+    """Accumulated time of networks."""
 
     device: torch.device
     seconds: float = 0.0
 
     def watch(self, owner: object, *methods: str) -> None:
-        """Count the time within these methods."""
+        """Add the time within these methods."""
         for method in methods:
             object.__setattr__(owner, method, self._timed(getattr(owner, method)))  # some owners are frozen
 
@@ -155,12 +159,12 @@ class Clock:
 
 @dataclass(frozen=True)
 class Schedule:
-    """The paper's settings, and networks of a size.
+    """Settings of the paper, and networks of a size.
 
     Attributes:
         settings: of the whole pipeline.
         sizes: of the networks.
-        device: where they run.
+        device: of the networks.
     """
 
     settings: PipelineSettings
@@ -168,7 +172,7 @@ class Schedule:
     device: torch.device
 
     def rows(self) -> Iterator[Row]:
-        """Every stage after the other, each with what the one before made."""
+        """Run all stages in order, each on the result of the one before."""
         subject, clock = disc(self.settings.subject.size), Clock(self.device)
         driving, refiner, prior_settings = self.settings.driving, self.settings.refiner, self.settings.prior
         assert isinstance(driving, SvdSettings) and isinstance(refiner, VideoToVideoSettings)
@@ -189,7 +193,7 @@ class Schedule:
     def measured(self, stage: str, clock: Clock, work: Callable[[], Any]) -> tuple[Row, Any]:
         on_gpu = self.device.type == "cuda"
         if on_gpu:
-            forget_peak()
+            reset_peak_memory()
         clock.seconds, start = 0.0, clock.now()
         with count_flops() as flops:
             made = work()
@@ -210,7 +214,7 @@ class Schedule:
         static = self.settings.static
         assert isinstance(static.start, BlobStartSettings)
         start = blob(static.start.points, BLOB_RADIUS, seeded()).to(preferred_device("auto"))
-        prior = conditioned(model, subject[None], static, clock)
+        prior = load_prior(model, subject[None], static, clock)
         return fit_gaussians(start, subject, prior, get_rasterizer("auto"), static, seeded())
 
     def fit_motion(self, model: Zero123, gaussians: Gaussians, video: DrivingVideo, clock: Clock) -> None:
@@ -219,7 +223,7 @@ class Schedule:
             self.settings.deformation, gaussians.to(torch.device("cpu")), len(video), seeded()
         )
         deformation.to(gaussians.means.device)
-        prior = conditioned(model, torch.cat([video.frames, video.alpha], -1), dynamic, clock)
+        prior = load_prior(model, torch.cat([video.frames, video.alpha], -1), dynamic, clock)
         fit_motion(gaussians, deformation, video, prior, get_rasterizer("auto"), dynamic, seeded())
 
     def refine(self, settings: VideoToVideoSettings, model: VideoModel, video: DrivingVideo) -> None:
@@ -235,15 +239,15 @@ class Schedule:
         make = partial(self.network, settings.precision, channels_last=self.device.type == "cuda")
         return Zero123(
             vae=make(lambda: AutoencoderKL(up_block_types=("UpDecoderBlock2D",) * 4, **vae(sizes))),
-            unet=shorten_attention(make(lambda: picture_unet(sizes))),
+            unet=shorten_attention(make(lambda: zero123_unet(sizes))),
             image_encoder=make(lambda: image_encoder(sizes.clip)),
-            camera_projection=make(lambda: torch.nn.Linear(tokens + CAMERA_NUMBERS, tokens)),
+            camera_projection=make(lambda: torch.nn.Linear(tokens + POSE_DIM, tokens)),
             settings=settings,
         )
 
     def video_model(self, settings: Any, clock: Clock) -> VideoModel:
         make, sizes = partial(self.network, settings.precision), self.sizes
-        unet = shorten_attention(make(lambda: video_unet(sizes)))
+        unet = shorten_attention(make(lambda: svd_unet(sizes)))
         decoder = make(lambda: AutoencoderKLTemporalDecoder(**vae(sizes)))
         model = VideoModel(unet, decoder, make(lambda: image_encoder(sizes.eye)), settings, self.device)
         clock.watch(model, "encode_condition", "encode", "decode", "denoise")
@@ -255,25 +259,25 @@ class Schedule:
             return attach_flop_counter(frozen(build().to(placement.dtype), placement))
 
 
-def forget_peak() -> None:
-    """What is held now is the most memory of the GPU so far."""
-    gc.collect()  # networks that have a flop counter or hooks are part of a circle
+def reset_peak_memory() -> None:
+    """Reset the peak of the GPU memory to the current use."""
+    gc.collect()  # flop counters and hooks form reference cycles
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()
 
 
-def conditioned(
+def load_prior(
     model: Zero123, cutouts: torch.Tensor, stage: StaticSettings | MotionSettings, clock: Clock
 ) -> GuidancePrior:
-    """The prior that knows some frames, watched by the clock."""
+    """Return the prior conditioned on some frames, with timed methods."""
     clock.watch(
         prior := model.conditioned_on(over_white(cutouts), TimestepSchedule(stage.t_max_start, stage.t_max_end)), "loss"
     )
     return prior
 
 
-def picture_unet(sizes: Sizes) -> UNet2DConditionModel:
-    """Zero-1-to-3's."""
+def zero123_unet(sizes: Sizes) -> UNet2DConditionModel:
+    """Return the U-Net of Zero-1-to-3."""
     return UNet2DConditionModel(
         in_channels=2 * LATENT_CHANNELS,
         block_out_channels=levels(sizes.unet),
@@ -281,8 +285,8 @@ def picture_unet(sizes: Sizes) -> UNet2DConditionModel:
     )
 
 
-def video_unet(sizes: Sizes) -> UNetSpatioTemporalConditionModel:
-    """Stable Video Diffusion's."""
+def svd_unet(sizes: Sizes) -> UNetSpatioTemporalConditionModel:
+    """Return the U-Net of Stable Video Diffusion."""
     return UNetSpatioTemporalConditionModel(
         block_out_channels=levels(sizes.unet),
         num_attention_heads=tuple(max(1, channels // 64) for channels in levels(sizes.unet)),
@@ -322,14 +326,14 @@ def seeded() -> torch.Generator:
 
 
 def disc(size: int) -> torch.Tensor:
-    """A cut-out of a colored disc."""
+    """Return a cut-out of a colored disc."""
     rows, columns = torch.meshgrid(*[torch.linspace(-1, 1, size)] * 2, indexing="ij")
     inside = (rows.square() + columns.square() < 0.36).float()
     return torch.stack([(rows + 1) / 2, (columns + 1) / 2, 0.4 * inside, inside], -1)
 
 
 def ball(texture: int, device: torch.device, rows: int = 100, columns: int = 200) -> TexturedMesh:
-    """About as many triangles as an extracted mesh has, gray."""
+    """Return a gray sphere with about as many triangles as an extracted mesh."""
     down, around = torch.linspace(0, 1, rows), torch.linspace(0, 1, columns)
     v, u = (place.flatten() for place in torch.meshgrid(down, around, indexing="ij"))
     polar, azimuth = torch.pi * v, 2 * torch.pi * u
@@ -356,7 +360,7 @@ def main() -> None:
         about = torch.cuda.get_device_properties(device)
         settings = revise(settings, {"prior.memory_gb": max(6, about.total_memory // GIB)})
         name = f"{about.name}, {about.total_memory / GIB:.0f} GiB"
-    logging.set_verbosity_error()  # it is no mistake to cast a network
+    logging.set_verbosity_error()  # casting networks is intended
     console.print(
         f"{name}; torch {torch.__version__}; {'tiny' if options.quick else 'full-size'} networks, random weights"
     )
@@ -370,7 +374,7 @@ def main() -> None:
 
 
 def table(rows: list[Row]) -> Table:
-    """Rows as they are printed."""
+    """Return the rows as a table."""
     result = Table(Column("stage", no_wrap=True), "s", "TFLOP", "TFLOP/s", "floor s", "/ floor", "GiB", "outside")
     for row in rows:
         limits = (row.floor_s, row.over_floor, row.peak_gib)

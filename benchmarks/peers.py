@@ -1,4 +1,4 @@
-"""Other splatting programs behind the call of ours, and the pairs of pixel and Gaussian that every one has to blend."""
+"""Other splatting programs behind our rasterizer interface, and the pairs of pixel and Gaussian to blend."""
 
 import importlib
 import sys
@@ -20,11 +20,11 @@ WHITE = torch.ones(3)
 
 
 def gsplat_torch(cloud: Gaussians, camera: OrbitCamera) -> Callable[[], tuple[Tensor, Tensor]]:
-    """Gsplat's plain torch code as a function that draws color with depth, and alpha, over white.
+    """Return gsplat's plain torch code as a function that renders color with depth, and alpha, over white.
 
-    Its projection and its `accumulate` run as they are, as `_rasterize_to_pixels` would call them. Two things that they
-    take from CUDA are replaced: the pairs to blend are listed by a compiled loop (`blended_pairs`), and of nerfacc,
-    whose scans are for GPUs, the two functions that `accumulate` calls are written in torch (`_nerfacc`).
+    Its projection and its `accumulate` are called unchanged, as `_rasterize_to_pixels` does. Two CUDA dependencies are
+    replaced: the list of pairs to blend comes from a compiled loop (`blended_pairs`), and the two functions of nerfacc
+    that `accumulate` calls are written in torch (`_nerfacc`), because nerfacc's scans need a GPU.
 
     Raises:
         ImportError: gsplat is not installed.
@@ -55,12 +55,12 @@ def gsplat_torch(cloud: Gaussians, camera: OrbitCamera) -> Callable[[], tuple[Te
 
 @no_type_check
 def blended_pairs(centers, depths, conics, opacities, width, height):
-    """Pixels and Gaussians of one view's blended pairs: by pixels, front to back."""
+    """Return pixels and Gaussians of one view's blended pairs, by pixel, front to back."""
     order = np.argsort(depths, kind="stable")
     order = order[depths[order] > NEAR]
     counts = np.zeros(width * height, np.int64)
-    nobody = np.empty(0, np.int64)
-    _visit(centers, conics, opacities, order, width, height, counts, False, nobody, nobody)
+    empty = np.empty(0, np.int64)
+    _visit(centers, conics, opacities, order, width, height, counts, False, empty, empty)
     places = np.cumsum(counts) - counts
     pixels, members = np.empty((2, counts.sum()), np.int64)
     _visit(centers, conics, opacities, order, width, height, places, True, pixels, members)
@@ -96,7 +96,7 @@ def _visit(centers, conics, opacities, order, width, height, places, listing, pi
 
 
 def _nerfacc() -> ModuleType:
-    """What gsplat imports of nerfacc, for processors: the product along a ray is the exponential of a running sum."""
+    """Return CPU versions of the nerfacc functions that gsplat imports; products along rays use running sums."""
 
     def render_weight_from_alpha(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
         logs = torch.log1p(-alphas.double())

@@ -1,4 +1,4 @@
-"""A PostgreSQL server of one's own, for measurements and tests; it may crash and come back."""
+"""Temporary PostgreSQL server for measurements and tests, which can crash and restart."""
 
 import os
 import shutil
@@ -10,10 +10,10 @@ from dg4d_lib.errors import BackendUnavailable
 
 
 class Database:
-    """An empty database, not started; under the user `postgres` where this one is root.
+    """Empty database, not started; owned by the user `postgres` if this process is root.
 
     Args:
-        folder: where it lies, an empty one that others may look into.
+        folder: empty, and readable by other users.
 
     Raises:
         BackendUnavailable: PostgreSQL is not installed.
@@ -22,7 +22,7 @@ class Database:
     def __init__(self, folder: Path) -> None:
         control, creator = _program("pg_ctl"), _program("initdb")
         self._user: list[str] = []
-        if os.getuid() == 0:  # it does not run as root
+        if os.getuid() == 0:  # PostgreSQL refuses to run as root
             shutil.chown(folder, "postgres")
             self._user = ["setpriv", "--reuid=postgres", "--regid=postgres", "--clear-groups"]
         self._folder, self._port = folder, free_port()
@@ -31,16 +31,16 @@ class Database:
 
     @property
     def address(self) -> str:
-        """For a Prefect server."""
+        """Return the address for a Prefect server."""
         return f"postgresql+asyncpg://prefect@127.0.0.1:{self._port}/postgres"
 
     def start(self) -> None:
-        """Start it, and wait until it answers."""
+        """Start the server and wait until it answers."""
         options = f"-p {self._port} -k {self._folder} -c listen_addresses=127.0.0.1"
         self._run(*self._control, "-l", str(self._folder / "log"), "-o", options, "start")
 
     def crash(self) -> None:
-        """End it as a crash does: nobody is told, what is under way is lost."""
+        """Kill the server without a shutdown; transactions in progress are lost."""
         self._run(*self._control, "-m", "immediate", "stop")
 
     def _run(self, *command: str) -> None:
@@ -48,16 +48,16 @@ class Database:
 
 
 def free_port() -> int:
-    """A port of this machine that nobody uses."""
+    """Return a free port of this machine."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def _program(name: str) -> str:
-    """Of PostgreSQL, which Debian does not put on the path."""
+    """Return the path of a PostgreSQL program, which Debian does not put on PATH."""
     places = sorted(Path("/usr/lib/postgresql").glob(f"*/bin/{name}"))
     found = str(places[-1]) if places else shutil.which(name)
     if found is None:
-        raise BackendUnavailable(f"PostgreSQL's {name} is not here; on Debian: apt-get install postgresql")
+        raise BackendUnavailable(f"PostgreSQL's {name} is not installed; on Debian run `apt-get install postgresql`")
     return found

@@ -1,14 +1,14 @@
-"""How fast the processor's rasterizer is, forward and backward: against other programs, per phase, against the machine.
+"""Speed of the CPU rasterizer, forward and backward: against other programs, per phase, and against peak FLOP/s.
 
-Run with `python -m benchmarks.rasterizer` (some minutes; `--quick`: less than one; `--json FILE` keeps the rows).
-All programs of a cell run in turn in one process; times are CPU time per view. Peers:
+Run with `python -m benchmarks.rasterizer` (minutes; `--quick`: less than one; `--json FILE` keeps the rows). All
+programs of a cell run interleaved in one process; times are CPU time per view. Peers:
 
-`gsplat_torch`  gsplat's plain torch code (`benchmarks/peers.py`), where gsplat is installed; measured on one view, for
-                it draws one after the other
-`reference`     our definition in plain torch, every pixel against every Gaussian; measured on one view of 16 x 16
-                pixels, and multiplied by the ratio of the areas
+`gsplat_torch`  gsplat's plain torch code (`benchmarks/peers.py`), if gsplat is installed; measured on one view, because
+                it renders views one after the other
+`reference`     our reference in plain torch, every pixel against every Gaussian; measured on one view of 16 x 16
+                pixels, and scaled by the ratio of the areas
 
-The object is a bumpy closed surface of flat Gaussians that fills 65 % of the picture.
+The object is a bumpy closed surface of flat Gaussians that fills 65 % of the image.
 """
 
 import time
@@ -46,16 +46,16 @@ COUNTS, SIZES, VIEWS = (5_000, 20_000, 100_000), (128, 256, 512), (1, 16, 56)
 QUICK_COUNTS, QUICK_SIZES, QUICK_VIEWS = (5_000, 20_000), (128, 256), (1, 16)
 ROUNDS, QUICK_ROUNDS = 5, 3
 PEERS = ("gsplat_torch", "reference")
-RADIUS = 0.74  # world units: 65 % of the picture
-OWN_STATES = "own states"  # a cloud with a state per view, as the dynamic stage draws
-SMALL = 16  # pixels of a side of the picture that plain torch draws
+RADIUS = 0.74  # world units; fills 65 % of the image
+OWN_STATES = "own states"  # one state per view, as in the dynamic stage
+SMALL = 16  # pixels per side of the images of plain torch
 PHASES = ("project", "bin", "blend", "blend backward", "unproject")
-FLOPS_PER_PAIR = 93  # 33 forward, 60 backward, of which 11 each are the exponential; a fused multiply-add is two
+FLOPS_PER_PAIR = 93  # counted: 33 forward, 60 backward, including 11 each for the exponential; a multiply-add is two
 
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison with a peer."""
+    """Comparison with a peer."""
 
     peer: str
     gaussians: int
@@ -67,15 +67,17 @@ class Row:
 
 
 def bumpy_ball(count: int, states: int = 0) -> Gaussians:
-    """Flat Gaussians along a closed surface, as a fitted object has them; with `states`, that many poses of it."""
+    """Return flat Gaussians on a closed surface, similar to a fitted object, in `states` poses."""
     generator = torch.Generator().manual_seed(0)
     normal = partial(torch.randn, generator=generator)
     direction = torch.nn.functional.normalize(normal(count, 3), dim=-1)
     means = RADIUS * direction * (1 + 0.1 * torch.sin(5 * direction).prod(-1, keepdim=True))
-    spacing = 0.73 * (4 * torch.pi * RADIUS**2 / count) ** 0.5  # to the next three Gaussians
+    spacing = 0.73 * (4 * torch.pi * RADIUS**2 / count) ** 0.5  # mean distance to the three nearest neighbors
     scales = spacing * torch.tensor([1, 0.67, 0.25]) * torch.exp(0.35 * normal(count, 3))
-    x, y, z = (direction + 0.15 * normal(count, 3)).unbind(-1)  # outwards, more or less
-    turn = torch.stack(((x * x + y * y + z * z).sqrt() + z, -y, x, torch.zeros(count)), -1)  # from +z to there
+    x, y, z = (direction + 0.15 * normal(count, 3)).unbind(-1)  # roughly outward normals
+    turn = torch.stack(
+        ((x * x + y * y + z * z).sqrt() + z, -y, x, torch.zeros(count)), -1
+    )  # rotation from +z to the normal
     opacities = 0.1 + 0.89 * torch.rand(count, generator=generator)
     colors = 0.5 + 0.4 * torch.sin(9 * means + torch.tensor([0.0, 1.0, 2.0]))
     fields = {"means": means, "log_scales": scales.log(), "quats": turn}
@@ -87,19 +89,19 @@ def bumpy_ball(count: int, states: int = 0) -> Gaussians:
 
 
 def ring(size: int, views: int) -> list[OrbitCamera]:
-    """Cameras around the object."""
+    """Return cameras around the object."""
     return turntable(views, OrbitCamera(12.0, width=size, height=size))
 
 
 def draw(rasterizer: Rasterizer, cloud: Gaussians, cameras: Sequence[OrbitCamera], times: int = 1) -> None:
-    """Pictures and the gradients of all that is drawn."""
+    """Render, and compute the gradients of all parameters."""
     for _ in range(times):
         picture = rasterizer(cloud, cameras, WHITE)
         _backward(cloud, (picture.color, picture.alpha, picture.depth))
 
 
 def draw_peer(render: Callable[[], tuple[Tensor, Tensor]], cloud: Gaussians) -> None:
-    """The same for a peer."""
+    """Render with a peer, and compute the gradients."""
     _backward(cloud, render())
 
 
@@ -107,13 +109,13 @@ def _backward(cloud: Gaussians, pictures: Sequence[Tensor]) -> None:
     torch.autograd.grad(pictures, list(vars(cloud).values()), [torch.ones_like(picture) for picture in pictures])
 
 
-def cell(count: int, size: int, views: Sequence[int], rounds: int) -> tuple[dict[str, Times], list[str]]:
-    """Times per view of everything that draws this many Gaussians at this size, and the names of missing peers."""
+def measure_cell(count: int, size: int, views: Sequence[int], rounds: int) -> tuple[dict[str, Times], list[str]]:
+    """Return the times per view of all programs at one number of Gaussians and size, and the missing peers."""
     fast, plain = get_rasterizer("cpu"), get_rasterizer("reference")
     cloud, several, missing = bumpy_ball(count), views[1], []
     functions: dict[str, Callable[[], object]] = {}
     views_drawn: dict[str, float] = {}
-    for n in views:  # few views several times, so that every call takes long enough to be measured
+    for n in views:  # few views are repeated, so that a call takes long enough to measure
         times = max(1, several // n)
         functions[str(n)] = partial(draw, fast, cloud, ring(size, n), times)
         views_drawn[str(n)] = n * times
@@ -130,8 +132,8 @@ def cell(count: int, size: int, views: Sequence[int], rounds: int) -> tuple[dict
     return {name: times.per(views_drawn.get(name, 1)) for name, times in taken.items()}, missing
 
 
-def rows_of(count: int, size: int, views: Sequence[int], taken: dict[str, Times]) -> Iterator[Row]:
-    """Every peer against every number of views."""
+def comparison_rows(count: int, size: int, views: Sequence[int], taken: dict[str, Times]) -> Iterator[Row]:
+    """Compare every peer at every number of views."""
     for peer in PEERS:
         if peer in taken:
             for n in views:
@@ -140,7 +142,7 @@ def rows_of(count: int, size: int, views: Sequence[int], taken: dict[str, Times]
 
 
 def phases(count: int, size: int, rounds: int) -> tuple[dict[str, float], float]:
-    """Milliseconds of one thread in every phase of one view, the least of all rounds; and its millions of pairs."""
+    """Return the milliseconds of every phase of one view on one thread (minimum), and its millions of pairs."""
     cloud, camera = bumpy_ball(count), ring(size, 1)[0]
     state = [value.detach().numpy() for value in (cloud.means, cloud.quats, cloud.log_scales.exp())]
     coefficients = cloud.harmonics.detach()[:, 0].numpy()
@@ -182,7 +184,7 @@ def phases(count: int, size: int, rounds: int) -> tuple[dict[str, float], float]
 
 
 def peak_gflops() -> float:
-    """Fused multiply-adds that one core does on vectors in registers, 2 flops per lane."""
+    """Return the peak rate of vector fused multiply-adds of one core, 2 flops per lane."""
     turns = 1_000_000
     least = np.inf
     for _ in range(10):
@@ -192,17 +194,17 @@ def peak_gflops() -> float:
     return 2 * LANES * _CHAINS * turns / least / 1e9
 
 
-_CHAINS = 12  # that do not wait for each other: more than latency times throughput of any processor's
+_CHAINS = 12  # independent chains: more than latency times throughput of multiply-adds on any CPU
 
 
 @intrinsic
 @no_type_check
 def _chains(typing_context, turns):
-    """Twelve sums, each multiplied and added to `turns` times; gives a number that depends on all."""
+    """Compute twelve independent chains of multiply-adds; return a number that depends on all."""
 
     def generate(context, builder, signature, arguments):
         e = SimdBuilder(builder)
-        # all sums end near 1: numbers close to zero are slow on some processors
+        # all sums end near 1, because denormal numbers are slow on some CPUs
         factor, term = e.constant(0.999), e.constant([1e-3 * (1 + lane / LANES) for lane in range(LANES)])
         start = [e.constant(chain) for chain in range(_CHAINS)]
         ends = e.loop(ir.Constant(LONG, 0), arguments[0], start, lambda _, sums: [e.fma(x, factor, term) for x in sums])
@@ -217,15 +219,15 @@ def _multiply_add(turns: int) -> float:
 
 
 def compare(counts: Sequence[int], sizes: Sequence[int], views: Sequence[int], rounds: int) -> tuple[Table, list[Row]]:
-    """Times of everything, and the rows of the file."""
+    """Return all times and the rows of the file."""
     several = str(views[1])
     rows: list[Row] = []
     ours = [*(str(n) for n in views), OWN_STATES]
     headings = [*(f"V={name}" for name in ours), f"wall, V={several}", "one", "own"]
     table = Table("Gaussians", "pixels", *headings, *PEERS)
     for count, size in product(counts, sizes):
-        taken, missing = cell(count, size, views, rounds)
-        rows += rows_of(count, size, views, taken)
+        taken, missing = measure_cell(count, size, views, rounds)
+        rows += comparison_rows(count, size, views, taken)
         own = [f"{taken[name].cpu_ms:.2f}" for name in ours] + [f"{taken[several].wall_ms:.2f}"]
         ratios = [f"{taken[name].cpu_ms / taken[several].cpu_ms:.2f}" for name in (str(views[0]), OWN_STATES)]
         peers = [
@@ -238,8 +240,8 @@ def compare(counts: Sequence[int], sizes: Sequence[int], views: Sequence[int], r
     return table, rows
 
 
-def inside(counts: Sequence[int], sizes: Sequence[int], rounds: int) -> Table:
-    """The phases of one view, and what the blended pairs would take at the machine's peak."""
+def phase_table(counts: Sequence[int], sizes: Sequence[int], rounds: int) -> Table:
+    """Return the phases of one view, and the time of the blended pairs at the machine's peak."""
     peak = peak_gflops()
     table = Table("Gaussians", "pixels", *PHASES, "M pairs", "limit", "over it")
     for count, size in product(counts, sizes):
@@ -260,7 +262,7 @@ def main() -> None:
     console = new_console()
     console.print(f"{machine()}, {torch.get_num_threads()} threads")
     table, rows = compare(counts, sizes, views, rounds)
-    console.print(table, inside(counts, sizes, 5 * rounds))
+    console.print(table, phase_table(counts, sizes, 5 * rounds))
     if given.json:
         write_rows(given.json, rows)
 

@@ -1,12 +1,11 @@
-"""Texture refinement with diffusion models: noise levels, and whole videos against single pictures.
+"""Texture refinement with diffusion models: noise levels, and whole videos against single images.
 
-Run with `python -m benchmarks.refinement ASSET.glb FRAMES` where the weights svd and zero123-xl are (`dg4d weights
-pull`), best on a GPU; FRAMES is the folder of cut-outs of the asset's driving video. Every variant is the pipeline's
-own step with a texture per frame. Flicker is the mean change of a texel from frame to frame, in levels of 255, over the
-texels that were refined; sharpness is the mean step between neighboring texels there, in units of what it was before.
-The paper says: whole videos flicker less than single pictures; with .6 of the noise levels skipped textures come out
-too smooth, with .8 too noisy, .7 is best. What such models paint no stand-in knows; what the loop makes of pictures
-that are as consistent, or as inconsistent, as theirs is measured by `benchmarks.oracle_refinement`.
+Run with `python -m benchmarks.refinement ASSET.glb FRAMES` with the weights svd and zero123-xl (`dg4d weights pull`),
+preferably on a GPU; FRAMES is the folder of cut-outs of the asset's driving video. Every variant is the pipeline's own
+step with a texture per frame. Flicker is the mean change of a texel from frame to frame, in levels of 255, over refined
+texels; sharpness is their mean difference to neighboring texels, relative to the input. Claims of the paper: whole
+videos flicker less than single images; a strength of 0.4 gives too smooth textures, 0.2 too noisy ones, 0.3 is best.
+`benchmarks.oracle_refinement` measures the loop without trained models.
 """
 
 from dataclasses import dataclass
@@ -39,14 +38,14 @@ from steps.profiles import profile, step_settings
 from steps.refine_texture import run
 from steps.runtime.job import Job
 
-SKIPPED = (0.6, 0.7, 0.75, 0.8)  # shares of the noise levels; the paper's "noise level" is .7
-FRAME_TEXELS = 512  # of a side of the textures per frame
-NOTICEABLE = 0.5 / 255  # a texel that changed by less was not refined
+STRENGTHS = (0.4, 0.3, 0.25, 0.2)  # fractions of the noise levels; 0.3 is the paper's
+FRAME_TEXELS = 512  # texels per side of the per-frame textures
+MIN_CHANGE = 0.5 / 255  # texels that changed by less count as not refined
 
 
 @dataclass(frozen=True)
 class Row:
-    """One way to refine one asset."""
+    """Refinement of one asset by one variant."""
 
     variant: str
     flicker: float
@@ -54,11 +53,11 @@ class Row:
 
 
 def variants(texture: TextureSettings, svd: str, zero123: str) -> dict[str, RefinerSettings]:
-    """Whole videos with several noise levels, and picture by picture."""
+    """Return whole videos at several noise levels, and single images."""
     model = VideoModelSettings(weights=svd)
     videos: dict[str, RefinerSettings] = {
-        f"video to video, {skipped:g} skipped": VideoToVideoSettings(texture=texture, model=model, strength=1 - skipped)
-        for skipped in SKIPPED
+        f"video to video, {strength:g}": VideoToVideoSettings(texture=texture, model=model, strength=strength)
+        for strength in STRENGTHS
     }
     return {
         **videos,
@@ -66,11 +65,11 @@ def variants(texture: TextureSettings, svd: str, zero123: str) -> dict[str, Refi
     }
 
 
-def refined(asset: Asset4D, video: DrivingVideo, settings: RefinerSettings, seed: int) -> TrackedMesh:
-    """What the step makes of it.
+def run_refinement(asset: Asset4D, video: DrivingVideo, settings: RefinerSettings, seed: int) -> TrackedMesh:
+    """Run the refinement step.
 
     Raises:
-        BackendUnavailable: the weights are not here; says what gets them.
+        BackendUnavailable: the weights are missing; the message names the remedy.
     """
     with TemporaryDirectory() as scratch:
         folder = Path(scratch)
@@ -83,17 +82,17 @@ def refined(asset: Asset4D, video: DrivingVideo, settings: RefinerSettings, seed
         return read_tracked(folder / "after")
 
 
-def measured(variant: str, before: Float[Tensor, "h w 3"], textures: Float[Tensor, "t i j 3"]) -> Row:
-    """Flicker and sharpness of textures per frame."""
+def measure_textures(variant: str, before: Float[Tensor, "h w 3"], textures: Float[Tensor, "t i j 3"]) -> Row:
+    """Return flicker and sharpness of textures per frame."""
     start = resize(before[None], textures.shape[1:3])[0]
-    touched = ((textures - start).abs() > NOTICEABLE).any(-1).any(0)
+    touched = ((textures - start).abs() > MIN_CHANGE).any(-1).any(0)
     changes = textures.diff(dim=0).abs().mean((0, -1))[touched]
     steps = [_steps(picture)[touched].mean() for picture in (textures, start[None])]
     return Row(variant, 255 * float(changes.mean()), float(steps[0] / steps[1]))
 
 
 def _steps(pictures: Float[Tensor, "t i j 3"]) -> Float[Tensor, "i j"]:
-    """Mean difference to the texels below and to the right."""
+    """Return the mean difference to the texels below and to the right."""
     down, right = (pictures - pictures.roll(-1, axis) for axis in (1, 2))
     return (down.abs() + right.abs()).mean((0, -1))
 
@@ -113,9 +112,9 @@ def main() -> None:
     texture = TextureSettings(frame_size=FRAME_TEXELS, **quick)
     rows = []
     for name, settings in variants(texture, options.svd, options.zero123).items():
-        after = refined(asset, video, settings, options.seed)
+        after = run_refinement(asset, video, settings, options.seed)
         assert after.textures is not None, "frame_size gives every frame a texture"
-        rows.append(measured(name, asset.mesh.texture, after.textures))
+        rows.append(measure_textures(name, asset.mesh.texture, after.textures))
     table = Table(Column("variant", no_wrap=True), "flicker", "sharpness", title=machine())
     for row in rows:
         table.add_row(row.variant, f"{row.flicker:.2f}", f"{row.sharpness:.2f}")

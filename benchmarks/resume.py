@@ -1,8 +1,8 @@
-"""Conversions that are killed at random moments: does the next command end with the digests of an undisturbed one?
+"""Resumption after kills at random times: digests of the next run against those of an undisturbed one.
 
 Run with `python -m benchmarks.resume PICTURE` (`--kills 20`, `--seed 0`, `--json FILE` keeps the rows). Every trial has
-a store of its own: a small real conversion of the picture gets SIGKILL at a moment that is drawn evenly from the time
-that an undisturbed one takes, then the same command runs to its end. The status is 1 unless all end as they should.
+a store of its own: a small real conversion gets SIGKILL at a random time within the duration of an undisturbed one,
+then the same command runs to its end. The exit status is 1 unless all trials end with the same digests.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.measure import new_console, write_rows
-from flows.packages.publish import whole
+from flows.packages.publish import load_verified
 
 SMALL = {
     "subject.size": "64",
@@ -47,7 +47,7 @@ SMALL = {
 
 @dataclass(frozen=True)
 class Row:
-    """One trial: when it was killed, what it was at, and how the next command ended."""
+    """Trial: time of the kill, step in progress, and result of the next command."""
 
     killed_at_s: float
     during: str
@@ -58,13 +58,13 @@ class Row:
 
 
 class Place:
-    """A home and a server for all trials, and a store for each."""
+    """Home and server of all trials, and a store for each."""
 
     def __init__(self, folder: Path, picture: Path) -> None:
         self.folder, self.picture = folder, picture.resolve()
 
     def start(self, trial: str) -> "subprocess.Popen[str]":
-        """Begin the conversion."""
+        """Start the conversion."""
         knobs = [word for key, value in SMALL.items() for word in ("--set", f"{key}={value}")]
         return subprocess.Popen(
             [sys.executable, "-m", "flows.cli", "make", str(self.picture), *knobs, "-o", str(self.folder / trial)],
@@ -75,13 +75,13 @@ class Place:
         )
 
     def digests(self, trial: str) -> dict[str, object]:
-        """What must not depend on how often a conversion was begun."""
-        record = whole(self.folder / trial)
+        """Return the digests that must not depend on the number of attempts."""
+        record = load_verified(self.folder / trial)
         return {key: record[key] for key in ("order", "package", "files", "steps")}
 
     @property
     def environment(self) -> dict[str, str]:
-        """All that a command is told."""
+        """Return the environment of a command."""
         return {**os.environ, "DG4D_HOME": str(self.folder / "home")}
 
     def close(self) -> None:
@@ -89,11 +89,11 @@ class Place:
         subprocess.run([sys.executable, "-m", "flows.cli", "down"], env=self.environment, check=False)
 
 
-def measured(place: Place, kills: int, seed: int) -> list[Row]:
+def run_trials(place: Place, kills: int, seed: int) -> list[Row]:
     """Run an undisturbed conversion, then the trials."""
     moments = random.Random(seed)
     duration_s = 0.0
-    for trial in ("warm", "undisturbed"):  # kernels are compiled once
+    for trial in ("warm", "undisturbed"):  # the first run compiles kernels
         start = time.monotonic()
         said, _ = (command := place.start(trial)).communicate()
         duration_s = time.monotonic() - start
@@ -123,8 +123,8 @@ def measured(place: Place, kills: int, seed: int) -> list[Row]:
     return rows
 
 
-def shown(rows: list[Row], console: Console) -> None:
-    """The rows as a table."""
+def print_rows(rows: list[Row], console: Console) -> None:
+    """Return the rows as a table."""
     same = sum(row.same for row in rows)
     table = Table(title=f"{same} of {len(rows)} ended with the digests of an undisturbed run")
     for name in ("killed at", "during", "next run: steps kept", "took", "status", "same digests"):
@@ -151,10 +151,10 @@ def main(arguments: list[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="dg4d-resume-", ignore_cleanup_errors=True) as folder:
         place = Place(Path(folder), given.picture)
         try:
-            rows = measured(place, given.kills, given.seed)
+            rows = run_trials(place, given.kills, given.seed)
         finally:
             place.close()
-    shown(rows, new_console())
+    print_rows(rows, new_console())
     if given.json is not None:
         write_rows(given.json, rows)
     return 0 if all(row.same for row in rows) else 1

@@ -1,8 +1,8 @@
-"""The paper's time table: iterations and seconds of every stage, from the records of finished packages.
+"""Time table of the paper: iterations and seconds of every stage, from the records of finished packages.
 
-Run with `python -m benchmarks.times PACKAGE ...` (`--json FILE` keeps the rows). Packages of one profile, made by one
-machine with the same iterations, are averaged. Seconds are those in which a step was computed, now or before; a mesh
-per frame is extracted in parts, two at a time, and the parts are added up. The paper's own figures stand below.
+Run with `python -m benchmarks.times PACKAGE ...` (`--json FILE` keeps the rows). Packages with the same profile,
+machine and iterations are averaged. Seconds are those in which a step was computed, now or for an earlier package; the
+parts of a mesh extraction per frame, which run two at a time, are added up. The figures of the paper are listed below.
 """
 
 import json
@@ -16,7 +16,7 @@ from rich.table import Table
 
 from benchmarks.measure import new_console, parser_of, write_rows
 from flows.inputs.package_record import RECORD
-from flows.packages.publish import whole
+from flows.packages.publish import load_verified
 
 STAGES = {
     "prepare_subject": "subject",
@@ -33,12 +33,12 @@ ITERATIONS = {
     "fit_gaussians": ("static", "iterations"),
     "fit_motion": ("motion", "iterations"),
     "refine_texture": ("refiner", "texture", "iterations"),
-}  # where the settings of a step say how many
+}  # setting of the iterations of a step
 
 
 @dataclass(frozen=True)
 class Row:
-    """What one profile took on one machine, means over packages; seconds and iterations by stage."""
+    """Profile on one machine, means over packages; seconds and iterations by stage."""
 
     profile: str
     machine: str
@@ -67,17 +67,17 @@ PAPER_TOTALS = (
 )
 
 
-def of_package(folder: Path) -> Row:
-    """What the records of one package say."""
-    record = whole(folder)
+def read_package_times(folder: Path) -> Row:
+    """Read the records of one package."""
+    record = load_verified(folder)
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     seconds: dict[str, float] = {}
     machines = []
     for ran in record["run"]["steps"]:
-        stage = STAGES.get(ran["step"].partition(" ")[0])  # "extract_mesh 1/4" is a part
+        stage = STAGES.get(ran["step"].partition(" ")[0])  # "extract_mesh 1/4" is one part
         if stage is not None:
             seconds[stage] = seconds.get(stage, 0.0) + ran["duration_s"]
-            machines.append(described(ran.get("machine", {})))
+            machines.append(hardware_line(ran.get("machine", {})))
     return Row(
         profile=report["profile"],
         machine="; ".join(dict.fromkeys(machines)),
@@ -87,15 +87,15 @@ def of_package(folder: Path) -> Row:
     )
 
 
-def described(machine: dict[str, str]) -> str:
-    """The hardware in a line: the GPU where one was there, else the processor."""
+def hardware_line(machine: dict[str, str]) -> str:
+    """Return the hardware in a line: the GPU, or the processor without one."""
     if not machine:
         return "not recorded"
     return machine.get("gpu") or f"{machine.get('processor', 'processor')}, {machine.get('cores', '?')} cores"
 
 
 def iterations_in(steps: Sequence[dict[str, Any]]) -> dict[str, int]:
-    """How many iterations each stage was asked for; stages that did nothing are left out."""
+    """Return the iterations of each stage; stages without any are left out."""
     found = {}
     for step in steps:
         if step["step"] in ITERATIONS:
@@ -107,8 +107,8 @@ def iterations_in(steps: Sequence[dict[str, Any]]) -> dict[str, int]:
     return found
 
 
-def averaged(rows: Sequence[Row]) -> list[Row]:
-    """One row per profile, machine and iterations, in the order in which they first appear."""
+def average_rows(rows: Sequence[Row]) -> list[Row]:
+    """Return one row per profile, machine and iterations, in order of appearance."""
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row.profile, row.machine, json.dumps(row.iterations, sort_keys=True)), []).append(row)
@@ -125,7 +125,7 @@ def averaged(rows: Sequence[Row]) -> list[Row]:
 
 
 def table(rows: Sequence[Row]) -> Table:
-    """Rows as they are printed: seconds, and iterations in brackets."""
+    """Return the rows as a table: seconds, and iterations in brackets."""
     stages = [stage for stage in STAGES.values() if any(stage in row.seconds for row in rows)]
     result = Table("profile", "packages", *stages, "total", "machine", title="seconds (iterations)")
     for row in rows:
@@ -145,7 +145,7 @@ def main() -> None:
         "packages", type=Path, nargs="+", metavar="PACKAGE", help=f"folders with {RECORD}, as `dg4d make` writes them"
     )
     options = parser.parse_args()
-    rows = averaged([of_package(folder) for folder in options.packages])
+    rows = average_rows([read_package_times(folder) for folder in options.packages])
     console = new_console()
     console.print(table([*rows, *PAPER]))
     console.print(PAPER_TOTALS)

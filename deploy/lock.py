@@ -3,7 +3,7 @@
     out/tools/bin/python deploy/lock.py [OPTION OF uv ...]      # --upgrade, --upgrade-package NAME
 
 A single resolution of pyproject.toml for Python 3.11 and 3.12 fills all locks, so a package has the same version in
-each. Versions stay as they are unless an option says otherwise. PyTorch's own index is asked for the CPU build of
+each. Versions stay as they are unless an option says otherwise. PyTorch's own index is queried for the CPU build of
 torch only, and only when the version of torch changes. `make lock` runs this with the uv of deploy/locks/tools.txt.
 """
 

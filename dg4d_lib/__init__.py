@@ -1,1 +1,1 @@
-"""The numerical library of dg4d: tensors in, tensors out; it knows nothing of Prefect, steps or machines."""
+"""Numerical library of dg4d: tensors in, tensors out; independent of Prefect and of the steps."""

@@ -1,4 +1,4 @@
-"""Every knob of the files that leave the house, and of how assets are judged; in the form of settings.py."""
+"""Settings of delivered files, quality gates and scores, in the form of settings.py."""
 
 from typing import Annotated, Literal
 
@@ -8,105 +8,107 @@ from dg4d_lib.settings import NotNegative, Positive, Settings, Share
 
 
 class GltfSettings(Settings):
-    """How GLB files are written (ours); with the defaults a reader needs to know core glTF 2.0 and nothing else."""
+    """Options of GLB files (ours); with the defaults, readers need core glTF 2.0 only."""
 
     image: Literal["png", "jpeg", "webp"] = Field(
         "jpeg",
-        description="format of textures; png: exact, larger; webp: smallest, EXT_texture_webp, with a jpeg of 512 "
-        "pixels for other readers",
+        description="texture format; png: lossless, larger; webp: smallest (EXT_texture_webp), with a 512-pixel jpeg "
+        "as a fallback",
     )
-    quality: int = Field(
-        85, ge=1, le=100, description="of jpeg and webp; from 95 on, jpeg keeps colors as fine as brightness"
-    )
+    quality: int = Field(85, ge=1, le=100, description="of jpeg and webp; from 95, jpeg does not subsample chroma")
     quantized: bool = Field(
         False,
-        description="16 bits instead of 32, 8 for normals at rest: KHR_mesh_quantization; in USDZ, splats in half "
-        "floats",
+        description="16 instead of 32 bits, 8 for static normals (KHR_mesh_quantization); in USDZ, splats in half "
+        "precision",
     )
-    meshopt: bool = Field(
-        False, description="packed: EXT_meshopt_compression, which web players know and Blender does not"
-    )
-    interpolation: Literal["linear", "step"] = Field("linear", description="between frames: smooth, or held")
-    moving_normals: bool = Field(True, description="normals turn with the surface; half of a plain file")
+    meshopt: bool = Field(False, description="EXT_meshopt_compression; supported by web players, not by Blender")
+    interpolation: Literal["linear", "step"] = Field("linear", description="between frames")
+    moving_normals: bool = Field(True, description="animate normals; they take half of an uncompressed file")
     textures: Literal["pointer", "core"] = Field(
         "pointer",
-        description="textures that change; pointer: one atlas and KHR_animation_pointer (other readers show the first "
-        "frame's); core: a node and a picture per frame",
+        description="animated textures; pointer: one atlas and KHR_animation_pointer (other readers show the first "
+        "frame); core: one node and texture per frame",
     )
-    atlas_size: int = Field(4096, ge=64, le=8192, description="pixels of such an atlas, at most")
-    roughness: Share = Field(1.0, description="of the surface")
-    metallic: Share = Field(0.0, description="of the surface")
+    atlas_size: int = Field(4096, ge=64, le=8192, description="largest side of such an atlas, pixels")
+    roughness: Share = Field(1.0, description="roughness factor of the material")
+    metallic: Share = Field(0.0, description="metallic factor of the material")
 
 
 class GateSettings(Settings):
-    """What an asset must be like to be accepted; ours, calibrated by benchmarks/gates.py."""
+    """Acceptance criteria of an asset; ours, calibrated by benchmarks/gates.py."""
 
-    fidelity_least: float = Field(16.5, ge=0, le=60, description="PSNR on the subject at the input view, dB")
-    silhouette_least: Share = Field(0.85, description="overlap of its outline with the video's in the worst frame, IoU")
+    fidelity_least: float = Field(16.5, ge=0, le=60, description="PSNR on the subject from the input camera, dB")
+    silhouette_least: Share = Field(
+        0.85, description="overlap of the silhouette with the video's in the worst frame, IoU"
+    )
     consistency_least: Share = Field(
-        0.955, description="share of the points seen from one side that the next side does not contradict"
+        0.955, description="share of the points seen in one view that the next view does not contradict"
     )
     flicker_most: NotNegative = Field(
-        0.8, le=100, description="change over time that is not the video's; 1: a frozen asset"
+        0.8, le=100, description="error of the changes from frame to frame; 1: a frozen asset"
     )
-    floaters_most: Share = Field(0.02, description="share of what is seen that hangs apart, less the video's own")
-    flaws_most: NotNegative = Field(0.002, le=10, description="broken edges and triangles of the mesh, per triangle")
-    agreement_least: Share = Field(0.85, description="overlap of the outlines of mesh and splats, IoU")
-    sharpness_least: NotNegative = Field(0.75, le=10, description="color gradients, in those of the input picture")
-    sharpness_most: Positive = Field(1.25, le=10, description="color gradients, in those of the input picture")
-    motion_least: NotNegative = Field(0.6, le=10, description="change over time, in that of the video")
-    motion_most: Positive = Field(1.7, le=100, description="change over time, in that of the video")
+    floaters_most: Share = Field(
+        0.02, description="share of the alpha disconnected from the subject, minus the video's"
+    )
+    flaws_most: NotNegative = Field(0.002, le=10, description="defective edges and triangles of the mesh, per triangle")
+    agreement_least: Share = Field(0.85, description="overlap of the silhouettes of mesh and splats, IoU")
+    sharpness_least: NotNegative = Field(0.75, le=10, description="color gradients, relative to the input image")
+    sharpness_most: Positive = Field(1.25, le=10, description="color gradients, relative to the input image")
+    motion_least: NotNegative = Field(0.6, le=10, description="change over time, relative to the video")
+    motion_most: Positive = Field(1.7, le=100, description="change over time, relative to the video")
 
 
 class ScoreSettings(Settings):
-    """How an asset is compared with the truth; weights that are empty or not here leave their number out."""
+    """Comparison of an asset with ground truth; scores whose weights are empty or missing are left out."""
 
-    size: int = Field(
-        512, ge=32, le=2048, description="pixels of the pictures that LPIPS and CLIP see (Consistent4D: 512)"
-    )
-    vgg_weights: str = Field("vgg16", description="LPIPS: the network; a name of `dg4d weights list`, or a folder")
-    lpips_weights: str = Field("lpips-vgg", description="LPIPS: how much its channels count; a name or a folder")
+    size: int = Field(512, ge=32, le=2048, description="pixels of the images for LPIPS and CLIP (Consistent4D: 512)")
+    vgg_weights: str = Field("vgg16", description="LPIPS: network; a name from `dg4d weights list`, or a folder")
+    lpips_weights: str = Field("lpips-vgg", description="LPIPS: linear heads; a name or a folder")
     clip_weights: str = Field("clip-vit-b-32", description="CLIP; a name, or a folder in the layout of transformers")
     i3d_weights: str = Field("i3d", description="FVD; a name or a folder")
-    samples: int = Field(
-        10_000, ge=100, le=1_000_000, description="points on either surface, for the distance of meshes"
-    )
+    samples: int = Field(10_000, ge=100, le=1_000_000, description="points per surface, for the Chamfer distance")
 
 
 class PackSettings(Settings):
-    """What the package holds."""
+    """Contents of the package."""
 
     fps: float = Field(
         0.0,
         ge=0,
         le=240,
-        description="frames per second of what is written, 8, 12, 24, 30 or any: the motion is asked again at those "
-        "moments, from 1 on (paper's code: 4 times as many); 0: the driving video's; a mesh per frame keeps to that",
+        description="frame rate of the files, from 1; the motion is resampled (paper's code: 4 times the video's); "
+        "0: that of the driving video, which a mesh per frame always uses",
     )
     gltf: GltfSettings = GltfSettings()
     lods: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = Field(
-        (), max_length=8, description="shares of the triangles of the tracked mesh; a GLB each, say [0.5, 0.25]"
+        (),
+        max_length=8,
+        description="fractions of the triangles of the tracked mesh, one GLB each, for example [0.5, 0.25]",
     )
-    rig: bool = Field(True, description="a skinned GLB beside the morphed one, where a rig follows the motion")
-    rig_bones: int = Field(32, ge=1, le=255, description="of the rig, at most")
-    rig_error: Share = Field(0.35, description="part of the motion (rms) that the rig may miss; else it is left out")
-    usd: bool = Field(True, description="mesh and splats as USDZ")
-    splats: bool = Field(True, description="one standard PLY per frame")
-    spz: bool = Field(True, description="one SPZ per frame, a quarter of the size")
+    rig: bool = Field(
+        True, description="write a skinned GLB in addition to morph targets, if a rig can follow the motion"
+    )
+    rig_bones: int = Field(32, ge=1, le=255, description="largest number of bones")
+    rig_error: Share = Field(
+        0.35, description="largest RMS error of the rig, relative to the motion; else it is left out"
+    )
+    usd: bool = Field(True, description="write mesh and splats as USDZ")
+    splats: bool = Field(True, description="write one 3DGS PLY per frame")
+    spz: bool = Field(True, description="write one SPZ per frame, a quarter of the size")
     splat_gltf: Literal["none", "ratified", "rc1"] = Field(
-        "none", description="one GLB of splats per frame, by which text of KHR_gaussian_splatting"
+        "none", description="write one GLB of splats per frame, by this version of KHR_gaussian_splatting"
     )
     preview_size: int = Field(384, ge=64, le=2048, description="pixels of preview.mp4 (even)", multiple_of=2)
-    preview_turns: int = Field(3, ge=1, le=20, description="times the motion loops while the camera goes round once")
+    preview_turns: int = Field(3, ge=1, le=20, description="loops of the motion per orbit of the camera")
     sheet_size: int = Field(192, ge=32, le=1024, description="pixels of a tile of the contact sheet")
-    sheet_frames: int = Field(6, ge=1, le=32, description="columns: moments")
+    sheet_frames: int = Field(6, ge=1, le=32, description="columns: frames")
     sheet_azimuths_deg: tuple[Annotated[float, Field(ge=-360, le=360)], ...] = Field(
-        (0.0, -75.0, 15.0, 105.0, 195.0), min_length=1, description="rows: angles"
+        (0.0, -75.0, 15.0, 105.0, 195.0), min_length=1, description="rows: azimuths"
     )
 
     @field_validator("fps")
     @classmethod
-    def _fps_is_a_rate(cls, fps: float) -> float:
+    def _check_fps(cls, fps: float) -> float:
         if 0 < fps < 1:
-            raise ValueError("use 0 for the driving video's, or 1 to 240")
+            raise ValueError("use 0 for the frame rate of the driving video, or 1 to 240")
         return fps

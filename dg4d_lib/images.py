@@ -13,14 +13,14 @@ Filter = Literal["bilinear", "bicubic"]
 def resize(
     images: Float[Tensor, "b h w c"], size: Sequence[int], mode: Filter = "bilinear"
 ) -> Float[Tensor, "b i j c"]:
-    """Resize images to height and width, with a filter that is widened where they shrink, as Pillow's `resize`."""
+    """Resize images to (height, width) with antialiasing, as Pillow's `resize`."""
     return resize_planes(images.movedim(-1, 1), size, mode).movedim(1, -1)
 
 
 def resize_planes(
     planes: Float[Tensor, "b c h w"], size: Sequence[int], mode: Filter = "bilinear"
 ) -> Float[Tensor, "b c i j"]:
-    """Resize images whose channels come first, as `resize`; the bicubic filter may overshoot."""
+    """Resize channels-first images as `resize` does; the bicubic filter may overshoot."""
     return interpolate(planes, tuple(size), mode=mode, antialias=True, align_corners=False)
 
 
@@ -32,7 +32,7 @@ def over_background(
 
 
 def color_over_white(color: Float[Tensor, "*b h w 3"], alpha: Float[Tensor, "*b h w 1"]) -> Float[Tensor, "*b h w 3"]:
-    """Composite straight color over white; differs from `over_background` in rounding, on which digests depend."""
+    """Composite straight color over white; rounds differently from `over_background`, and digests depend on it."""
     return color * alpha + 1 - alpha
 
 

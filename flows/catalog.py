@@ -1,4 +1,4 @@
-"""Many orders in one run: a few at a time, each in a flow run of its own; a bad one stops no other."""
+"""Flows that convert many jobs, a few at a time; a failed one does not stop the others."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -16,193 +16,189 @@ from prefect.task_runners import TaskRunner
 
 from flows import home
 from flows.catalog_request import CatalogRequest, ready
-from flows.convert import make, save_pictures
+from flows.convert import convert_job, save_pictures
 from flows.engine.executors import stop_all
 from flows.engine.item_runs import failure, item_deployment
 from flows.engine.orphans import claim_run
 from flows.engine.runners import item_runner
 from flows.engine.step_tasks import flow_context
+from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.manifest import Item
-from flows.inputs.orders import Order
 from flows.inputs.places import parse_where
-from flows.packages.delivery import forget_shared
-from flows.packages.summary import Row, Tally, judged
+from flows.packages.delivery import remove_expired
+from flows.packages.summary import BatchProgress, Row, with_verdict
 from flows.ui.gallery import Gallery
 from steps.contract import ArtifactRef
 
-Make = Callable[[Order, Path], tuple[Any, bool]]
+Convert = Callable[[ConversionJob, Path], tuple[Any, bool]]
 Allow = Callable[[Item], None]
 
-ORDERS = "application/vnd.dg4d.orders+jsonl"
+JOBS_MEDIA_TYPE = "application/vnd.dg4d.orders+jsonl"
 
 
 @flow(name="catalog", flow_run_name="{title}", persist_result=False)
 def catalog(request: CatalogRequest, title: str) -> None:
-    """Make every item of a folder, a pattern, an object store or a manifest that is not made yet."""
+    """Convert every item of a folder, a pattern, an object store or a manifest that is not converted yet."""
     claim_run()
-    convert_catalog(request, title)
+    _convert_catalog(request, title)
 
 
-@flow(name="convert-orders", flow_run_name="{title}", persist_result=False)
-def convert_orders(orders: ArtifactRef, out: Path, workers: int, title: str) -> None:
-    """Make every order of a list in the store: JSON, one to a line."""
+@flow(name="convert-jobs", flow_run_name="{title}", persist_result=False)
+def convert_jobs(jobs: ArtifactRef, out: Path, workers: int, title: str) -> None:
+    """Convert every job of a list in the store: JSON, one per line."""
     claim_run()
-    _convert_list(orders, out, workers, title)
+    _convert_jobs(jobs, out, workers, title)
 
 
-def run_catalog(request: CatalogRequest, title: str, tally: Tally, allow: Allow | None = None) -> None:
-    """Make a catalog within the current flow run, or in a run of its own where there is none.
+def run_catalog(request: CatalogRequest, title: str, progress: BatchProgress, allow: Allow | None = None) -> None:
+    """Convert a catalog within the current flow run, or in a new run if there is none.
 
     Args:
         request: the catalog.
-        title: of a run of its own.
-        tally: knows rows of items that need no making, and is told all others.
-        allow: raises BadInput for an item that may not be made here; such items are checked in the current run only.
+        title: name of the new run.
+        progress: holds the rows of items that need no conversion, and receives all others.
+        allow: raises BadInput for an item that must not be converted here; used within the current run only.
 
     Raises:
-        KeyboardInterrupt: the user stopped it; what is done stays, and `tally` knows it.
+        KeyboardInterrupt: the user stopped the catalog; finished items stay, and `progress` has their rows.
     """
-    with flow_context(), _known(request.out, tally):
+    with flow_context(), _reporting(request.out, progress):
         if FlowRunContext.get() is None:
             catalog(request, title)
         else:
-            convert_catalog(request, title, allow)
+            _convert_catalog(request, title, allow)
 
 
-def run_orders(orders: list[Order], out: Path, workers: int, title: str, tally: Tally) -> None:
-    """Make orders as `run_catalog` makes a catalog."""
-    lines = "".join(f"{order.model_dump_json()}\n" for order in orders)
-    listed = home.store().put_bytes(lines.encode(), ORDERS)
-    with flow_context(), _known(out, tally):
-        if FlowRunContext.get() is None:
-            convert_orders(listed, out, workers, title)
-        else:
-            _convert_list(listed, out, workers, title)
-
-
-def convert_catalog(request: CatalogRequest, title: str, allow: Allow | None = None) -> None:
-    """Make a catalog within the current flow run; see `run_catalog`."""
-    items = request.items(allow)
-    tally = _tallies.get(request.out) or Tally(len(items))
-    todo = (ready(item, request.out, request.strict) for item in items if item.name not in tally.rows)
-    convert_all(todo, request.out, request.workers, title, tally, request.strict, request.where)
+def run_jobs(jobs: list[ConversionJob], out: Path, workers: int, title: str, progress: BatchProgress) -> None:
+    """Convert jobs as `run_catalog` converts a catalog."""
+    lines = "".join(f"{job.model_dump_json()}\n" for job in jobs)
+    listed = home.store().put_bytes(lines.encode(), JOBS_MEDIA_TYPE)
+    with flow_context(), _reporting(out, progress):
+        (convert_jobs if FlowRunContext.get() is None else _convert_jobs)(listed, out, workers, title)
 
 
 def convert_all(
-    todo: Iterable[Order | Row],
+    todo: Iterable[ConversionJob | Row],
     out: Path,
     workers: int,
     title: str,
-    tally: Tally,
+    progress: BatchProgress,
     strict: bool = False,
     where: str = "",
-    work: Make = make,
+    work: Convert = convert_job,
 ) -> None:
-    """Make items within the current flow run, `workers` at a time; what died is tried once more at the end.
+    """Convert items within the current flow run; retry crashed ones once at the end.
 
     Args:
-        todo: what to make, or what became of an item that needs no making; read one item ahead.
-        out: the folder of the packages.
+        todo: jobs, and rows of items that need no conversion; read one item ahead.
+        out: folder of the packages.
         workers: items at a time.
-        title: of the gallery in the UI.
-        tally: told the row of every item; again, if it is tried again.
-        strict: an item that a gate does not let pass counts as failed, and no other is begun after it.
-        where: where items are made, as `flows.engine.runners.parse_where` reads it.
-        work: makes an order into a folder on this machine or in its cluster, and says whether every step had been done
-            before.
+        title: title of the gallery in the UI.
+        progress: receives the row of every item, again after a retry.
+        strict: an item that a quality gate rejects counts as failed, and no other is started.
+        where: place where items run; see `flows.inputs.places.parse_where`.
+        work: converts a job into a folder, here or on the Dask cluster; returns true as second value if every step was
+            cached.
 
     Raises:
-        BadInput: `where` is no place for items.
-        KeyboardInterrupt: the user stopped it; what is done stays, and `tally` knows it.
+        BadInput: `where` is invalid.
+        KeyboardInterrupt: the user stopped the catalog; finished items stay, and `progress` has their rows.
     """
     place = parse_where(where)
     if place.kind == "deployment":
-        work = item_deployment(place.address, workers).make
-        forget_shared(home.store())
-    gallery = Gallery(title, tally, out)
+        work = item_deployment(place.address, workers).convert_job
+        remove_expired(home.store())
+    gallery = Gallery(title, progress, out)
     with item_runner(place, workers) as runner:
         try:
             for attempt in (1, 2):
-                todo = list(_rounds(todo, out, workers, tally, strict, work, gallery, runner, attempt))
-        except (KeyboardInterrupt, TerminationSignal):  # Prefect's own for SIGTERM, while a flow runs
+                todo = list(_attempt(attempt, todo, out, workers, progress, strict, work, gallery, runner))
+        except (KeyboardInterrupt, TerminationSignal):  # Prefect raises its own for SIGTERM
             stop_all()
             raise
     gallery.finish()
 
 
 @task(name="convert", task_run_name="convert {item}", cache_policy=NO_CACHE, persist_result=False)
-def convert(item: str, order: str, out: str, strict: bool, attempt: int, work: Make) -> tuple[dict[str, Any], bool]:
-    """Make one order, given as JSON: Prefect would look for futures in every knob, and runners for graphs.
+def convert(item: str, job: str, out: str, strict: bool, attempt: int, work: Convert) -> tuple[dict[str, Any], bool]:
+    """Convert one job; return its row, also of a failure, and true if a second attempt may succeed.
 
-    A failure is a row too. Also says whether the same again may go better.
+    The job is passed as JSON, since Prefect searches the fields of objects for futures.
     """
     start = time.monotonic()
-    row, may_heal = _converted(Order.model_validate_json(order), Path(out) / item, strict, work)
+    row, may_heal = _converted(ConversionJob.model_validate_json(job), Path(out) / item, strict, work)
     row = row.model_copy(update={"wall_s": round(time.monotonic() - start, 1), "attempts": attempt})
     return row.model_dump(mode="json"), may_heal
 
 
-_tallies: dict[Path, Tally] = {}
+_progress_of: dict[Path, BatchProgress] = {}  # by output folder
 
 
 @contextmanager
-def _known(out: Path, tally: Tally) -> Iterator[None]:
-    """Let the catalog of this process into `out` tell this tally while the block runs, and skip the rows it has.
+def _reporting(out: Path, progress: BatchProgress) -> Iterator[None]:
+    """Let the catalog of this process that writes to `out` report to `progress`, and skip the rows that it has.
 
-    A catalog is complete without: it would look at every item again.
+    Without it, as in a resumed flow run, the catalog checks every item again.
     """
-    _tallies[out] = tally
+    _progress_of[out] = progress
     try:
         yield
     finally:
-        del _tallies[out]
+        del _progress_of[out]
 
 
-def _convert_list(orders: ArtifactRef, out: Path, workers: int, title: str) -> None:
-    lines = home.store().path(orders).read_bytes().splitlines()
-    todo = (Order.model_validate_json(line) for line in lines)
-    convert_all(todo, out, workers, title, _tallies.get(out) or Tally(len(lines)))
+def _convert_catalog(request: CatalogRequest, title: str, allow: Allow | None = None) -> None:
+    items = request.items(allow)
+    progress = _progress_of.get(request.out) or BatchProgress(len(items))
+    todo = (ready(item, request.out, request.strict) for item in items if item.name not in progress.rows)
+    convert_all(todo, request.out, request.workers, title, progress, request.strict, request.where)
 
 
-def _rounds(
-    todo: Iterable[Order | Row],
+def _convert_jobs(jobs: ArtifactRef, out: Path, workers: int, title: str) -> None:
+    lines = home.store().path(jobs).read_bytes().splitlines()
+    todo = (ConversionJob.model_validate_json(line) for line in lines)
+    convert_all(todo, out, workers, title, _progress_of.get(out) or BatchProgress(len(lines)))
+
+
+def _attempt(
+    attempt: int,
+    todo: Iterable[ConversionJob | Row],
     out: Path,
     workers: int,
-    tally: Tally,
+    progress: BatchProgress,
     strict: bool,
-    work: Make,
+    work: Convert,
     gallery: Gallery,
     runner: TaskRunner[Any],
-    attempt: int,
-) -> Iterator[Order]:
-    """Make everything in `todo`; gives those that died and may live next time."""
-    running: dict[PrefectFuture[Any], Order] = {}
+) -> Iterator[ConversionJob]:
+    """Convert everything in `todo`; yield the jobs that crashed and may succeed in a second attempt."""
+    running: dict[PrefectFuture[Any], ConversionJob] = {}
     finished: SimpleQueue[PrefectFuture[Any]] = SimpleQueue()
 
-    def settled() -> Iterator[Order]:
+    def settled() -> Iterator[ConversionJob]:
         future = finished.get()
-        order = running.pop(future)
+        job = running.pop(future)
         content, may_heal = future.result()
         row = Row.model_validate(content)
         if may_heal and attempt == 1:
-            row = row.model_copy(update={"message": f"{row.message} (will be tried again at the end)"})
-            yield order
-        tally.settle(row)
+            row = row.model_copy(update={"message": f"{row.message} (will be retried at the end)"})
+            yield job
+        progress.settle(row)
         gallery.update()
 
     for one in todo:
         while len(running) >= workers or not finished.empty():
             yield from settled()
         if isinstance(one, Row):
-            tally.settle(one)
+            progress.settle(one)
             gallery.update()
-        elif strict and tally.refused:
-            reason = f"not begun: {tally.refused} was not accepted"
-            tally.settle(Row(item=one.item, source=one.source_name, status="skipped", message=reason))
+        elif strict and progress.refused:
+            reason = f"not started: {progress.refused} was not accepted"
+            progress.settle(Row(item=one.item, source=one.source_name, status="skipped", message=reason))
         else:
             parameters = {
                 "item": one.item,
-                "order": one.model_dump_json(),
+                "job": one.model_dump_json(),
                 "out": str(out),
                 "strict": strict,
                 "attempt": attempt,
@@ -215,14 +211,14 @@ def _rounds(
         yield from settled()
 
 
-def _converted(order: Order, folder: Path, strict: bool, work: Make) -> tuple[Row, bool]:
-    row = Row(item=order.item, source=order.source_name, status="failed")
+def _converted(job: ConversionJob, folder: Path, strict: bool, work: Convert) -> tuple[Row, bool]:
+    row = Row(item=job.item, source=job.source_name, status="failed")
     try:
-        _, cached = work(order, folder)
-    except Exception as error:  # whatever it is, it is this item's own
+        _, cached = work(job, folder)
+    except Exception as error:  # must not stop the other items
         outcome = failure(error)
-        pictures = [str(path) for path in save_pictures(order, error)]
-        told = {"message": outcome.message, "kind": outcome.kind, "pictures": pictures}
-        return row.model_copy(update=told), outcome.may_heal
+        pictures = [str(path) for path in save_pictures(job, error)]
+        facts = {"message": outcome.message, "kind": outcome.kind, "pictures": pictures}
+        return row.model_copy(update=facts), outcome.may_heal
     done = row.model_copy(update={"status": "done", "message": "every step was already done" if cached else ""})
-    return judged(done, folder, strict), False
+    return with_verdict(done, folder, strict), False

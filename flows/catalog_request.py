@@ -1,8 +1,8 @@
-"""Request of a catalog, and the orders of its items."""
+"""Request of a catalog, and conversion of its items to jobs."""
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import Field
 
@@ -10,34 +10,31 @@ from dg4d_lib.errors import DG4DError
 from flows import home
 from flows.formatting.escaping import visible
 from flows.inputs import naming
+from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.manifest import Item, admitted, items_of, only_commercial
-from flows.inputs.orders import Order
 from flows.inputs.places import parse_where
 from flows.packages.publish import check_folder, is_current
-from flows.packages.summary import Row, judged
+from flows.packages.summary import Row, with_verdict
 from steps.contract import Frozen
 
-if TYPE_CHECKING:
-    pass
-
-ITEMS_IN_FLIGHT = 16  # of a deployment; its pool and its workers may allow fewer
+ITEMS_IN_FLIGHT = 16  # of a deployment; pool and workers may allow fewer
 
 
 class CatalogRequest(Frozen):
-    """Request for a catalog: what to make, where it goes, where items run.
+    """Request for a catalog.
 
     Attributes:
-        inputs: a folder, a pattern, s3://BUCKET/PREFIX, or a manifest.
-        out: folder of the packages; made if it is not there.
-        profile: of items that do not name one.
-        changes: of its knobs.
-        seed: of items that do not have one.
+        inputs: folder, pattern, s3://BUCKET/PREFIX, or manifest.
+        out: folder of the packages; created if missing.
+        profile: profile of items that do not name one.
+        changes: settings that differ from the profile.
+        seed: seed of items that do not have one.
         workers: items at a time.
-        where: where items run, as `flows.engine.runners.parse_where` reads it.
+        where: place where items run; see `flows.inputs.places.parse_where`.
         commercial_only: refuse weights whose license forbids commercial use.
-        strict: an asset that a gate does not let pass is a failure, and ends the batch.
-        root: where a manifest's files are; None: beside it.
-        price_per_hour: of the machine, in any currency, for the summary.
+        strict: an asset that fails a quality gate is a failure, and ends the batch.
+        root: folder of a manifest's files; None: the manifest's own.
+        price_per_hour: price of the machine in any currency, for the summary.
     """
 
     inputs: str
@@ -56,7 +53,7 @@ class CatalogRequest(Frozen):
         """Return the items by priority and name.
 
         Args:
-            allow: raises BadInput for an item that may not be made here; it becomes a failed one.
+            allow: raises BadInput for an item that must not be converted here; the item counts as failed.
 
         Raises:
             BadInput: the batch as a whole cannot be used.
@@ -67,29 +64,29 @@ class CatalogRequest(Frozen):
 
 
 def default_workers(where: str) -> int:
-    """Return how many items are made at a time where nobody says: on this machine one, by a deployment more.
+    """Return the default number of items at a time: 1 on this machine, 16 for a deployment.
 
     Raises:
-        BadInput: `where` is no place for items.
+        BadInput: `where` is invalid.
     """
     return ITEMS_IN_FLIGHT if parse_where(where).kind == "deployment" else 1
 
 
-def ready(item: Item, out: Path, strict: bool) -> Order | Row:
-    """Return the order of an item, or what became of it already; whatever is wrong with it makes a row that failed."""
-    row = Row(item=item.name, source=visible(item.wish.source_name) if item.wish else "", status="unchanged")
+def ready(item: Item, out: Path, strict: bool) -> ConversionJob | Row:
+    """Return the job of an item, or its row if it is unchanged or invalid."""
+    row = Row(item=item.name, source=visible(item.request.source_name) if item.request else "", status="unchanged")
     failed = row.model_copy(update={"status": "failed"})
     try:
         naming.check_not_reserved(item.name)
-        if item.wish is not None:
-            item.wish.check_names()  # before a file of this name is fetched
-        with item.here() as wish:
-            wish.check()
+        if item.request is not None:
+            item.request.check_names()  # before a file is downloaded under this name
+        with item.fetch() as request:
+            request.check()
             check_folder(out / item.name)
-            order = wish.order(home.store())
-        return judged(row, out / item.name, strict) if is_current(out / item.name, order.digest()) else order
+            job = request.to_job(home.store())
+        return with_verdict(row, out / item.name, strict) if is_current(out / item.name, job.digest()) else job
     except DG4DError as error:
         return failed.model_copy(update={"kind": type(error).__name__, "message": visible(str(error))})
-    except Exception as error:  # it is this item's own
+    except Exception as error:  # must not stop the other items
         message = f"{type(error).__name__}: {visible(str(error))}"
         return failed.model_copy(update={"kind": "Crashed", "message": message})

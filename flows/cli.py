@@ -1,7 +1,7 @@
-"""The `dg4d` command line, the only module that receives paths from users.
+"""`dg4d` command line, the only module that receives paths from users.
 
-Exit codes: 0 done · 1 an item of a batch failed, or an internal error · 2 wrong usage · 65 bad input, or no space ·
-69 a library or server is missing · 130 interrupted, 129 by SIGHUP, 143 by SIGTERM.
+Exit codes: 0 done; 1 an item of a batch failed, or an internal error; 2 wrong usage; 65 bad input, or a full disk;
+69 a library or server is missing; 130 interrupted, 129 by SIGHUP, 143 by SIGTERM.
 Commands import their modules when they run, so that `--help` and completion are fast.
 """
 
@@ -11,22 +11,30 @@ import os
 import sys
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from flows.commands.checking import bench, rebuild, score, verify
-from flows.commands.endings import clear_ending
-from flows.commands.options import Changes, Commercial, Profile, Rate, Seed, Texture, Triangles, finite, knobs_of
+from flows.commands.endings import exit_on_error
+from flows.commands.options import (
+    Changes,
+    Commercial,
+    Profile,
+    Rate,
+    Seed,
+    Texture,
+    Triangles,
+    finite,
+    shortcut_settings,
+)
 from flows.commands.services import down, env, up, watch
 from flows.commands.settings import settings as list_settings
 from flows.commands.store import store
 from flows.commands.weights import weights
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-    from flows.inputs.orders import Order
+    from flows.inputs.conversion_job import ConversionRequest
 
 app = typer.Typer(
     name="dg4d",
@@ -91,49 +99,37 @@ def make(
     """
     if picture is None and not text:
         raise typer.BadParameter("give a picture, a video, or --text WORDS")
-    with clear_ending():
+    with exit_on_error():
         from dg4d_lib.errors import BadInput
         from flows import home
         from flows.commands import terminal
-        from flows.inputs.manifest import parse_changes
-        from flows.inputs.naming import clean
-        from flows.inputs.orders import Wish, name_of
+        from flows.convert import convert_job
+        from flows.inputs.conversion_job import name_from_text
+        from flows.inputs.naming import clean_name
         from flows.inputs.package_record import record_of
-        from flows.packages.acceptance import failing_in
+        from flows.packages.acceptance import failing_gates
         from flows.packages.publish import check_folder, is_current
-        from steps.profiles import profile as named
-        from steps.profiles import revise
 
         console = terminal.console()
         if pick and video:
             raise BadInput("--pick chooses a generated motion and cannot be combined with --video")
-        short = knobs_of(triangles, texture, fps) | ({"driving.pick": pick} if pick else {})
-        settings = revise(named(profile), parse_changes(changes or []) | short)
-        item = (clean(picture.stem) or "asset") if picture else name_of(text)
-        wish = Wish(
-            item=item,
-            picture=picture,
-            text=text,
-            video=video,
-            bank=bank,
-            profile=profile,
-            settings=settings,
-            seed=seed,
-            commercial_only=commercial_only,
-        )
-        wish.check()
+        short = shortcut_settings(triangles, texture, fps) | ({"driving.pick": pick} if pick else {})
+        item = (clean_name(picture.stem) or "asset") if picture else name_from_text(text)
+        files = {"picture": picture, "text": text, "video": video, "bank": bank}
+        request = _request(profile, changes, short, item=item, seed=seed, commercial_only=commercial_only, **files)
         folder = out or Path("out") / item
         check_folder(folder, item, force)
-        order = wish.order(home.store())
-        if is_current(folder, order.digest()):
+        job = request.to_job(home.store())
+        cached = is_current(folder, job.digest())
+        if not cached:
+            _, cached = terminal.run_with_progress(job, console, lambda: convert_job(job, folder))
+        if cached:
             console.print("nothing to do: every step was already done")
-            files = (record_of(folder) or {"files": {}})["files"]
-        else:
-            files = _made(order, folder, console)
-        terminal.tell_where(console, folder, {name: fact["size_bytes"] for name, fact in files.items()})
+        written = (record_of(folder) or {"files": {}})["files"]
+        terminal.print_package(console, folder, {name: fact["size_bytes"] for name, fact in written.items()})
         if (folder / "report.html").is_file():
             console.print(f"report: {folder / 'report.html'}", markup=False)
-        if failing := failing_in(folder):
+        if failing := failing_gates(folder):
             console.print(
                 f"not accepted: {', '.join(failing)}; the report says what to do", markup=False, style="yellow"
             )
@@ -155,34 +151,22 @@ def motions(
 
     `dg4d make PICTURE --pick K` uses motion K.
     """
-    with clear_ending():
+    with exit_on_error():
         from flows import home
         from flows.commands import terminal
-        from flows.convert import make_motions
-        from flows.inputs.manifest import parse_changes
-        from flows.inputs.naming import clean
-        from flows.inputs.orders import Wish
+        from flows.convert import rank_motions
+        from flows.inputs.naming import clean_name
         from flows.packages.publish import check_writable
-        from steps.profiles import profile as named
-        from steps.profiles import revise
 
         console = terminal.console()
         several = {"driving.candidates": candidates, "driving.pick": 0}
-        settings = revise(named(profile), parse_changes(changes or []) | several)
-        item = clean(picture.stem) or "asset"
-        wish = Wish(
-            item=item,
-            picture=picture,
-            profile=profile,
-            settings=settings,
-            seed=seed,
-            commercial_only=commercial_only,
-        )
-        wish.check()
+        item = clean_name(picture.stem) or "asset"
+        files = {"item": item, "picture": picture}
+        request = _request(profile, changes, several, seed=seed, commercial_only=commercial_only, **files)
         folder = out or Path("out") / f"{item}-motions"
         check_writable(folder)
-        order = wish.order(home.store())
-        ranking = terminal.with_steps(order, console, lambda: make_motions(order, folder))
+        job = request.to_job(home.store())
+        ranking = terminal.run_with_progress(job, console, lambda: rank_motions(job, folder))
         for row in ranking["candidates"]:
             remarks = "; ".join(row["remarks"])
             console.print(f"{row['number']:>3}  {row['total']:.2f}  {row['name']}  {remarks}".rstrip(), markup=False)
@@ -251,12 +235,12 @@ def batch(
     columns: path or text, and optionally video, name, profile, seed, bank, priority (higher first), set ("a.b=c;
     d.e=f"), or any setting by its name.
     """
-    with clear_ending():
+    with exit_on_error():
         os.environ.update({name: str(n) for name, n in {"DG4D_GPUS": gpus, "DG4D_CPUS": cpus}.items() if n is not None})
         from flows.catalog_request import CatalogRequest, default_workers
         from flows.commands import terminal
         from flows.commands.batch import batch as make_all
-        from flows.commands.batch import tell
+        from flows.commands.batch import print_summary
         from flows.inputs.manifest import parse_changes
 
         console = terminal.console()
@@ -264,7 +248,7 @@ def batch(
             inputs=inputs,
             out=out,
             profile=profile,
-            changes=parse_changes(changes or []) | knobs_of(triangles, texture, fps),
+            changes=parse_changes(changes or []) | shortcut_settings(triangles, texture, fps),
             seed=seed,
             workers=workers or default_workers(where),
             where=where,
@@ -273,7 +257,7 @@ def batch(
             root=root,
             price_per_hour=price_per_hour,
         )
-        if status := tell(make_all(request, console), out, console):
+        if status := print_summary(make_all(request, console), out, console):
             raise typer.Exit(status)
 
 
@@ -292,7 +276,7 @@ def render(
     mesh: Annotated[bool, typer.Option("--mesh", help="render the textured mesh instead of the splats")] = False,
 ) -> None:
     """Render an asset from given azimuths as RGBA pictures."""
-    with clear_ending():
+    with exit_on_error():
         try:
             angles = [float(angle) for angle in azimuths.split(",")]
             if not all(map(math.isfinite, angles)):
@@ -315,7 +299,7 @@ def view(
     show: Annotated[bool, typer.Option("--open/--no-open", help="open the page in a browser")] = True,
 ) -> None:
     """Verify a package, open its viewer and print the page's path."""
-    with clear_ending():
+    with exit_on_error():
         from flows.packages.view import view as check_and_show
 
         typer.echo(check_and_show(package, show))
@@ -340,7 +324,7 @@ def compose(
 
     They stand side by side, or as a scene file places them.
     """
-    with clear_ending():
+    with exit_on_error():
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
         from flows.commands.compose import compose as compose_scene
         from flows.formatting.escaping import visible
@@ -363,15 +347,24 @@ def main() -> None:
     app()
 
 
-def _made(order: "Order", folder: Path, console: "Console") -> dict[str, dict[str, int]]:
-    """Run the flow of an order with its steps on the terminal; the files of the package."""
-    from flows.commands import terminal
-    from flows.convert import make
+def _request(profile: str, changes: list[str] | None, short: dict[str, Any], **fields: Any) -> "ConversionRequest":
+    """Return a checked request.
 
-    files, cached = terminal.with_steps(order, console, lambda: make(order, folder))
-    if cached:
-        console.print("nothing to do: every step was already done")
-    return files
+    Args:
+        profile: name of the profile.
+        changes: values of `--set`.
+        short: settings of other options, which win.
+        fields: further fields of the request.
+    """
+    from flows.inputs.conversion_job import ConversionRequest
+    from flows.inputs.manifest import parse_changes
+    from steps.profiles import profile as named
+    from steps.profiles import revise
+
+    settings = revise(named(profile), parse_changes(changes or []) | short)
+    request = ConversionRequest(profile=profile, settings=settings, **fields)
+    request.check()
+    return request
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
-"""One order becomes one folder: connect to a server, run the flow, publish what it made."""
+"""Conversion of one job: connect to a server, run the flow, publish the package in a folder."""
 
 import importlib
+import json
 import os
 import urllib.error
 import urllib.request
@@ -11,35 +12,36 @@ from typing import TYPE_CHECKING, Any
 
 from flows import home
 from flows.engine.free_space import require_free_space
-from flows.inputs.orders import Order
+from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.package_record import record_of
 from flows.packages.publish import Files, is_current
 from flows.serving import background
 from flows.serving.server import ServerUnavailable
+from steps.artifacts.archives import unpack
 from steps.store.artifact_store import ArtifactMissing
 from steps.store.files import home as store_home
 
 if TYPE_CHECKING:
     from flows.packages.flow_result import FlowResult
 
-ANSWER_S = 10.0  # for a server of the user's own
+ANSWER_S = 10.0  # time limit of a health check of the user's own server
 
 
-def prepare(order: Order) -> None:
-    """Begin what the first step of an order would wait for, unless every step was done before."""
+def prepare(job: ConversionJob) -> None:
+    """Start the fork server for the first step of a job, unless the job was finished before."""
     from flows.engine import executors
     from flows.engine.versions import has_version
 
-    if not has_version(home.store(), order):
+    if not has_version(home.store(), job):
         executors.prepare()
 
 
 def connect() -> None:
-    """Have a Prefect server, and import Prefect and the flows while it starts.
+    """Connect to a Prefect server, by default the background server; import Prefect and the flows while it starts.
 
     Raises:
-        ServerUnavailable: there is none; says what to do.
-        DiskFull: there is no room for what a run keeps.
+        ServerUnavailable: the server does not answer.
+        DiskFull: the disk of the home folder is nearly full.
     """
     require_free_space(store_home())
     own = os.environ.get("PREFECT_API_URL")
@@ -50,55 +52,60 @@ def connect() -> None:
         server = background.background_server()
         server.start()
         background.set_own_server(server, server.wait_for_address())
-        importlib.import_module("flows.pipeline")  # takes seconds, and so does the server
+        importlib.import_module("flows.pipeline")  # takes seconds, as the start of the server does
         server.wait()
     from flows.engine.orphans import settle_orphans
 
     settle_orphans()
 
 
-def make(order: Order, folder: Path) -> tuple[Files, bool]:
-    """Run the flow of an order and put the package into `folder`, signed if a key is configured; keep it as a version.
+def convert_job(job: ConversionJob, folder: Path) -> tuple[Files, bool]:
+    """Run the flow of a job and publish the package in `folder`, signed if a key is configured.
 
-    What turns out to be damaged or gone on the way is made again. Another run that writes the same folder is waited
-    for; if it made the same package, there is nothing left to do.
+    Cached artifacts that turn out to be missing or damaged are computed again. A run that finds another one writing the
+    same folder waits for it, and reuses an equal package.
 
     Returns:
-        The files of the package, and whether every step had been done before.
+        Files of the package, and true if every step was cached.
 
     Raises:
-        StepError: a step did not finish; `folder` is as it was.
-        BadInput: the folder cannot be written, the disk is full, or the key cannot sign; it is as it was.
+        StepError: a step failed; `folder` is unchanged.
+        BadInput: the folder cannot be written, the disk is full, or the key cannot sign; `folder` is unchanged.
         BackendUnavailable: a key is configured, and signing is not installed.
     """
-    from flows.engine.events import StepEvent, tell
+    from flows.engine.events import StepEvent, emit
+    from flows.engine.leases import running
     from flows.engine.output_lock import output_lock
     from flows.step_errors import StepLost
 
     def waiting() -> None:
-        tell(StepEvent(order.item, "output", "remark", text=f"waiting for another run that writes {folder}"))
+        emit(StepEvent(job.item, "output", "remark", text=f"waiting for another run that writes {folder}"))
 
+    cached = True
     with output_lock(folder, waiting) as waited:
-        if waited and is_current(folder, order.digest()):
-            return _files_in(folder), True
-        try:
-            result = _make(order, folder)
-        except (ArtifactMissing, StepLost):  # it was dropped when it was found, and so was the result that named it
-            result = _make(order, folder)
-    return _files_in(folder), all(done.cached for done in result.steps)
+        if not (waited and is_current(folder, job.digest())):
+            with running(home.store(), job.item):
+                try:
+                    result = run_flow(job, folder)
+                except (ArtifactMissing, StepLost):  # the cache entry of the missing artifact was dropped
+                    result = run_flow(job, folder)
+            cached = all(done.cached for done in result.steps)
+    return (record_of(folder) or {"files": {}})["files"], cached
 
 
-def run(order: Order, folder: Path | None = None, refresh: bool = False, mesh_parts: int = 0) -> "FlowResult":
-    """Run the flow of an order.
+def run_flow(
+    job: ConversionJob, folder: Path | None = None, refresh: bool = False, mesh_parts: int = 0
+) -> "FlowResult":
+    """Run the flow of a job.
 
     Args:
-        order: request of the conversion.
+        job: job to convert.
         folder: output folder; None: the package stays in the store.
-        refresh: run every step, also those whose result exists.
+        refresh: run cached steps again.
         mesh_parts: number of tasks that extract a mesh per frame; 0: one per slot of this machine.
 
     Raises:
-        StepError: a step did not finish.
+        StepError: a step failed.
     """
     from prefect.settings import PREFECT_TASKS_REFRESH_CACHE
     from prefect.task_runners import ThreadPoolTaskRunner
@@ -106,53 +113,47 @@ def run(order: Order, folder: Path | None = None, refresh: bool = False, mesh_pa
     from flows import pipeline
     from flows.engine.resources import slots
 
-    flow = pipeline.text_to_4d if order.drawn else pipeline.video_to_4d if order.moving else pipeline.image_to_4d
+    flow = pipeline.text_to_4d if job.drawn else pipeline.video_to_4d if job.moving else pipeline.image_to_4d
     runner: Any = ThreadPoolTaskRunner(max_workers=slots())
-    with _surroundings(order, {PREFECT_TASKS_REFRESH_CACHE: refresh}):
-        return flow.with_options(task_runner=runner)(order, folder, mesh_parts)
+    with _flow_context(job, {PREFECT_TASKS_REFRESH_CACHE: refresh}):
+        return flow.with_options(task_runner=runner)(job, folder, mesh_parts)
 
 
-def _make(order: Order, folder: Path) -> "FlowResult":
-    from flows.engine.leases import running
-
-    with running(home.store(), order.item):
-        return run(order, folder)
-
-
-def _files_in(folder: Path) -> Files:
-    files: Files = (record_of(folder) or {"files": {}})["files"]
-    return files
-
-
-def make_motions(order: Order, folder: Path) -> dict[str, Any]:
-    """Hold the tournament of an order's motions and put sheet, ranking and films into `folder`; the ranking.
+def rank_motions(job: ConversionJob, folder: Path) -> dict[str, Any]:
+    """Generate and rank motions of a job's picture, write sheet, ranking and films into `folder`; return the ranking.
 
     Raises:
-        StepError: a step did not finish.
+        StepError: a step failed.
     """
-    from flows.motions import motions, unpack
+    from flows.pipeline import motions
 
-    with _surroundings(order):
-        outputs = motions(order)
-    return unpack(outputs, folder)
+    with _flow_context(job):
+        outputs = motions(job)
+    store = home.store()
+    folder.mkdir(parents=True, exist_ok=True)
+    store.get(outputs["candidates"], folder / "motions.png")
+    store.get(outputs["ranking"], folder / "motions.json")
+    unpack(store.path(outputs["films"]), folder, "the zip of films")
+    ranking: dict[str, Any] = json.loads((folder / "motions.json").read_text(encoding="utf-8"))
+    return ranking
 
 
 @contextmanager
-def _surroundings(order: Order, settings: dict[Any, Any] | None = None) -> Iterator[None]:
-    """What a flow of an order runs in, with these settings of Prefect beside those of every flow."""
+def _flow_context(job: ConversionJob, settings: dict[Any, Any] | None = None) -> Iterator[None]:
+    """Enter the context of a job's flow, tagged with its profile, with further settings of Prefect."""
     from prefect import tags
 
     from flows.engine.step_tasks import flow_context
 
-    with flow_context(settings), tags(order.profile):
+    with flow_context(settings), tags(job.profile):
         yield
 
 
-def save_pictures(order: Order, error: Exception) -> list[Path]:
-    """Keep the pictures that explain a failure where the user can look at them."""
+def save_pictures(job: ConversionJob, error: Exception) -> list[Path]:
+    """Copy the pictures that explain a failure to the folder of failures."""
     saved = []
     for name, ref in getattr(error, "pictures", {}).items():
-        path = home.failures() / f"{order.item.replace('/', '-')}-{getattr(error, 'step', 'step')}-{name}.png"
+        path = home.failures() / f"{job.item.replace('/', '-')}-{getattr(error, 'step', 'step')}-{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             home.store().get(ref, path)
@@ -167,6 +168,6 @@ def _check(api_url: str) -> None:
         urllib.request.urlopen(f"{api_url.rstrip('/')}/health", timeout=ANSWER_S).close()
     except (urllib.error.URLError, OSError, ValueError) as error:
         raise ServerUnavailable(
-            f"PREFECT_API_URL is {api_url} and nothing answers there ({error}); "
-            "start that server, or unset the variable to have one started"
+            f"PREFECT_API_URL is {api_url}, where no server answers ({error}); start that server, or unset the "
+            "variable to use the background server"
         ) from error

@@ -1,6 +1,6 @@
-"""Flows that a Prefect server runs by name with a filled-in form: the same work as the commands, on any worker.
+"""Flows of the deployments: the same work as the commands, started by a form of the Prefect UI on any worker.
 
-Paths are those of the worker's machine, below the roots that its user allows (flows/serving/roots.py);
+Paths are those of the worker's machine, below the roots that its user allows (flows/serving/roots.py).
 `deploy/prefect.yaml` lists the deployments.
 """
 
@@ -19,90 +19,80 @@ from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.settings import Motion
 from flows import home
 from flows.catalog_request import CatalogRequest
-from flows.commands.batch import batch, tell
+from flows.commands.batch import batch, print_summary
 from flows.commands.benchmark import bench
-from flows.commands.options import knobs_of
+from flows.commands.options import shortcut_settings
 from flows.commands.terminal import console
-from flows.convert import connect, make
-from flows.engine.item_runs import FLOW, failure, read_order
+from flows.convert import connect, convert_job
+from flows.engine.item_runs import FLOW, failure, read_job
 from flows.engine.orphans import claim_run
 from flows.engine.shared_results import sharing_results
-from flows.inputs.fetching import at_hand, without_secrets
+from flows.inputs.conversion_job import ConversionRequest
+from flows.inputs.fetching import local_copy, without_secrets
 from flows.inputs.manifest import parse_changes
-from flows.inputs.naming import clean
-from flows.inputs.orders import Wish
-from flows.packages.delivery import Outcome, pack, write_outcome
+from flows.inputs.naming import clean_name
+from flows.packages.delivery import Outcome, pack_package, write_outcome
 from flows.packages.publish import check_folder, is_current
 from flows.serving.roots import Roots
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen
 from steps.profiles import profile, revise
 
-WHERE = r"^(|local|dask|deployment(:[\w .-]+)?)$"  # a scheduler of Dask runs code here: only the worker's user names it
-BEGUN = 3  # times, at most, is a run begun whose process dies
+WHERE = r"^(|local|dask|deployment(:[\w .-]+)?)$"  # no address of a Dask scheduler, which runs code
+MOST_STARTS = 3  # of a run whose process dies
 
 
 def _title(text: str) -> dict[str, Any]:
-    """What stands above a field of a form; by Prefect it is the name of the parameter."""
+    """Return the schema extra that titles a field of a form; Prefect's default is the name of the parameter."""
     return {"title": text}
 
 
-def _may_stay_empty(schema: dict[str, Any]) -> None:
-    """One field that may stay empty, where a form would first ask "int or None"."""
-    schema |= schema.pop("anyOf")[0]
-    del schema["default"]
+def _optional(title: str, description: str, ge: float | None = None, le: float | None = None) -> Any:
+    """Return a field of a form that may stay empty; for None, Prefect's form would ask for the type first."""
+
+    def unwrap(schema: dict[str, Any]) -> None:
+        schema |= schema.pop("anyOf")[0]
+        del schema["default"]
+
+    return Field(None, title=title, description=description, json_schema_extra=unwrap, ge=ge, le=le)
 
 
-def _in_order(schema: dict[str, Any]) -> None:
-    """What matters most stands first; without a position some databases forget the order."""
+def _sort_fields(schema: dict[str, Any]) -> None:
+    """Put the most important fields first; databases may lose the order of fields without a position."""
     fields = schema["properties"]
     first = [name for name in ("profile", "motion") if name in fields]
     for position, name in enumerate(dict.fromkeys([*first, *fields])):
         fields[name]["position"] = position
 
 
-def _filled_in(options: "Options") -> dict[str, Any]:
-    """The fields of a form with options as they stand before anybody touches them."""
+def _options_field(options: "Options") -> dict[str, Any]:
+    """Return the schema extra of a parameter with options, filled in with their defaults."""
     return _title("How it is made") | {"default": options.model_dump(mode="json", exclude_none=True)}
 
 
 Text = Annotated[str, Field(min_length=1)]
-Folder = Annotated[Text, Field(json_schema_extra=_title("Folder for what is made"))]
+Folder = Annotated[Text, Field(json_schema_extra=_title("Output folder"))]
 Workers = Annotated[int, Field(ge=1, le=64, json_schema_extra=_title("Items at a time"))]
 Setting = Annotated[str, Field(pattern=r"^\s*[a-z_]+(\.[a-z_0-9]+)*\s*=", title="Setting")]
 
 
 class Options(Frozen):
-    """What every conversion can be asked for."""
+    """Options of every conversion."""
 
-    model_config = ConfigDict(json_schema_extra=_in_order)
+    model_config = ConfigDict(json_schema_extra=_sort_fields)
 
     profile: Literal["preview", "paper", "video", "video-fast", "reference", "quality"] = Field(
         "preview",
         title="Profile",
         description="`preview` takes minutes on any machine, without a pretrained model; others need a GPU and weights",
     )
-    triangles: int | None = Field(
-        None,
-        ge=100,
-        title="Triangles",
-        description="of the mesh at most, 100 or more; empty: as the profile says",
-        json_schema_extra=_may_stay_empty,
+    triangles: int | None = _optional(
+        "Triangles", "maximum number of the mesh, 100 or more; empty: as the profile says", ge=100
     )
-    texture: int | None = Field(
-        None,
-        ge=64,
-        le=8192,
-        title="Texture size",
-        description="pixels of a side, from 64 to 8192; empty: as the profile says",
-        json_schema_extra=_may_stay_empty,
+    texture: int | None = _optional(
+        "Texture size", "texels per side, from 64 to 8192; empty: as the profile says", ge=64, le=8192
     )
-    fps: float | None = Field(
-        None,
-        ge=1,
-        le=240,
-        title="Frames per second",
-        description="of the files, from 1 to 240; empty: as the video, or the profile",
-        json_schema_extra=_may_stay_empty,
+    fps: float | None = _optional(
+        "Frames per second", "of the files, from 1 to 240; empty: as the video, or the profile", ge=1, le=240
     )
     seed: int = Field(
         0,
@@ -119,97 +109,86 @@ class Options(Frozen):
     )
 
     def knobs(self) -> dict[str, Any]:
-        """Every change to the profile.
+        """Return the settings that differ from the profile.
 
         Raises:
-            BadInput: a setting that is none.
+            BadInput: a setting is invalid.
         """
-        return parse_changes(list(self.settings)) | knobs_of(self.triangles, self.texture, self.fps)
+        return parse_changes(list(self.settings)) | shortcut_settings(self.triangles, self.texture, self.fps)
 
 
 class PictureOptions(Options):
-    """What a conversion of a picture can be asked for too."""
+    """Options of a conversion of a picture."""
 
-    motion: Motion | None = Field(
-        None,
-        title="Motion",
-        description="how it moves, where no video model decides that (profile `preview`); empty: it sways",
-        json_schema_extra=_may_stay_empty,
+    motion: Motion | None = _optional(
+        "Motion", "used where no video model generates one (profile `preview`); empty: the subject sways"
     )
 
     def knobs(self) -> dict[str, Any]:
-        """Every change to the profile."""
+        """Return the settings that differ from the profile."""
         return super().knobs() | ({"driving.motion": self.motion} if self.motion else {})
 
 
-Wanted = Annotated[Options, Field(json_schema_extra=_filled_in(Options()))]
-WantedOfPictures = Annotated[PictureOptions, Field(json_schema_extra=_filled_in(PictureOptions()))]
+FormOptions = Annotated[Options, Field(json_schema_extra=_options_field(Options()))]
+FormPictureOptions = Annotated[PictureOptions, Field(json_schema_extra=_options_field(PictureOptions()))]
 
 
-@flow(name="picture-to-4d", flow_run_name=lambda: _name("picture"), persist_result=False)
+@flow(name="picture-to-4d", flow_run_name=lambda: _run_name("picture"), persist_result=False)
 def picture_to_4d(
     picture: Annotated[Text, Field(json_schema_extra=_title("Picture"))],
     out: Folder,
-    options: WantedOfPictures = PictureOptions(),  # noqa: B008 - frozen
+    options: FormPictureOptions = PictureOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """A picture becomes an animated 3D asset.
+    """Convert a picture to an animated 3D asset.
 
     Args:
         picture: a file on the worker's machine, as `/data/in/fox.png`; an address, as `https://host/fox.png`; or an
             object, as `s3://bucket/fox.png`. Cut-outs with a transparent background are best
         out: on the worker's machine, as `/data/out/fox`; open `report.html` there when it is done
-        options: as it stands it works on any machine
+        options: the defaults work on any machine
     """
-    _begin()
-    roots = Roots.of_this_process()
-    folder = roots.output(out)
-    with at_hand(roots.source(picture)) as path:
-        _make(picture, folder, options, roots, picture=path)
+    _convert(picture, out, options)
 
 
-@flow(name="video-to-4d", flow_run_name=lambda: _name("video"), persist_result=False)
+@flow(name="video-to-4d", flow_run_name=lambda: _run_name("video"), persist_result=False)
 def video_to_4d(
     video: Annotated[Text, Field(json_schema_extra=_title("Video"))],
     out: Folder,
-    options: Wanted = Options(),  # noqa: B008 - frozen
+    options: FormOptions = Options(),  # noqa: B008 - frozen
 ) -> None:
-    """A video becomes an animated 3D asset that moves as it does.
+    """Convert a video to an animated 3D asset that moves as the video does.
 
     Args:
         video: a file or a folder of frames on the worker's machine, as `/data/in/walk.mp4`; an address, as
             `https://host/walk.mp4`; or an object, as `s3://bucket/walk.mp4`
         out: on the worker's machine, as `/data/out/walk`; open `report.html` there when it is done
-        options: as it stands it works on any machine
+        options: the defaults work on any machine
     """
-    _begin()
-    roots = Roots.of_this_process()
-    folder = roots.output(out)
-    with at_hand(roots.source(video)) as path:
-        _make(video, folder, options, roots, picture=path, video=path)
+    _convert(video, out, options, is_video=True)
 
 
-@flow(name="catalog-to-4d", flow_run_name=lambda: _name("inputs"), persist_result=False)
+@flow(name="catalog-to-4d", flow_run_name=lambda: _run_name("inputs"), persist_result=False)
 def catalog_to_4d(
     inputs: Annotated[Text, Field(json_schema_extra=_title("Pictures and videos"))],
     out: Folder,
     workers: Workers = 1,
     where: Annotated[str, Field(pattern=WHERE, json_schema_extra=_title("Items run on"))] = "",
     strict: Annotated[bool, Field(json_schema_extra=_title("Stop at a faulty asset"))] = False,
-    options: WantedOfPictures = PictureOptions(),  # noqa: B008 - frozen
+    options: FormPictureOptions = PictureOptions(),  # noqa: B008 - frozen
 ) -> State[None]:
-    """Many pictures and videos become an asset each; those that are made already are left alone.
+    """Convert many pictures and videos to an asset each; finished ones are skipped.
 
     Args:
         inputs: on the worker's machine a folder, as `/data/in`, a pattern, as `/data/in/**/*.png`, or a list, as
             `/data/in/list.csv`; or a place in an object store, as `s3://bucket/in/`
         out: on the worker's machine, as `/data/out`; open `index.html` there when it is done
-        workers: from 1 to 64; more than one is quicker where there are cores, GPUs or machines for it
+        workers: from 1 to 64; more than one is faster with enough cores, GPUs or machines
         where: `local` is this machine; `deployment:POOL` are the machines whose workers serve that pool, as `fleet`,
             and share the store of this one; `dask` the cluster that this machine knows; empty: as `$DG4D_RUNNER` says
-        strict: an asset that fails a gate ends the batch; else it is marked, and the next one begins
-        options: where a line of a list says nothing else; as it stands it works on any machine
+        strict: an asset that fails a quality gate ends the batch; else it is marked, and the next one is started
+        options: for lines of a list that say nothing else; the defaults work on any machine
     """
-    _begin()
+    _start()
     roots = Roots.of_this_process()
     folder = roots.output(out)
     request = CatalogRequest(
@@ -224,7 +203,7 @@ def catalog_to_4d(
         strict=strict,
     )
     rows = batch(request, console(), allow=roots.check_item)
-    failed = tell(rows, folder, console())
+    failed = print_summary(rows, folder, console())
     text = f"{sum(row.made for row in rows)} of {len(rows)} items are in {folder}"
     return Failed(message=text) if failed else Completed(message=text)
 
@@ -232,19 +211,19 @@ def catalog_to_4d(
 @flow(name=FLOW, flow_run_name="{item}", persist_result=False)
 def item_to_4d(
     item: Annotated[Text, Field(json_schema_extra=_title("Item"))],
-    order: Annotated[ArtifactRef, Field(json_schema_extra=_title("Order"))],
+    job: Annotated[ArtifactRef, Field(json_schema_extra=_title("ConversionJob"))],
     code: Annotated[Text, Field(json_schema_extra=_title("Code"))],
     store: Annotated[Text, Field(json_schema_extra=_title("Store"))],
 ) -> State[None]:
-    """One item of a catalog becomes an asset in the store, from which the catalog fetches it.
+    """Convert one item of a catalog; the package goes into the store, from which the catalog fetches it.
 
     Args:
         item: name of the asset
-        order: what to make, in the store that catalog and worker share
-        code: digest of the steps of the catalog; a worker with others refuses the item
+        job: conversion job, in the store that catalog and worker share
+        code: digest of the steps of the catalog; a worker with other steps refuses the item
         store: address of the catalog's store, for messages
     """
-    outcome = _made_for_catalog(order, code, store)
+    outcome = _convert_item(job, code, store)
     write_outcome(home.store(), str(runtime.flow_run.id), outcome)
     if outcome.package is None:
         return Failed(message=f"{outcome.step}: {outcome.message}".removeprefix(": "))
@@ -256,23 +235,23 @@ def benchmark(
     dataset: Annotated[Text, Field(json_schema_extra=_title("Data set"))],
     out: Folder,
     limit: Annotated[int, Field(ge=0, json_schema_extra=_title("Objects at most"))] = 0,
-    mesh: Annotated[bool, Field(json_schema_extra=_title("Judge the meshes"))] = False,
-    bank: Annotated[bool, Field(json_schema_extra=_title("True views as the prior"))] = False,
+    mesh: Annotated[bool, Field(json_schema_extra=_title("Score the meshes"))] = False,
+    bank: Annotated[bool, Field(json_schema_extra=_title("Ground-truth views as the prior"))] = False,
     workers: Workers = 1,
-    options: Wanted = Options(),  # noqa: B008 - frozen
+    options: FormOptions = Options(),  # noqa: B008 - frozen
 ) -> State[None]:
-    """Make an asset of every object of a data set and judge all of them against the truth.
+    """Convert every object of a data set and score the assets against the ground truth.
 
     Args:
         dataset: a folder on the worker's machine with a folder per object, as `/data/objects`
         out: on the worker's machine, as `/data/out`; tables, films and packages
         limit: the first so many by name; 0 for all of them
-        mesh: the textured meshes are judged instead of the splats
-        bank: every object's own bank of true views is its prior; this measures the optimization alone
-        workers: from 1 to 64; more than one is quicker where there are cores, or GPUs, for it
+        mesh: score the textured meshes instead of the splats
+        bank: use each object's ground-truth views as the prior, which measures the optimization alone
+        workers: from 1 to 64; more than one is faster with enough cores or GPUs
         options: of every object
     """
-    _begin()
+    _start()
     roots = Roots.of_this_process()
     folder, place = roots.output(out), Path(roots.folder(dataset))
     pairs = [f"{knob}={json.dumps(value)}" for knob, value in _knobs(options, roots).items()]
@@ -282,58 +261,62 @@ def benchmark(
     return Failed(message=text) if results.failed else Completed(message=text)
 
 
-def _name(source: str) -> str:
-    """Of a run, by the parameter that says what it is made of."""
+def _run_name(source: str) -> str:
+    """Return the name of a run: the parameter that names its source."""
     return without_secrets(runtime.flow_run.parameters[source])
 
 
-def _begin() -> None:
-    """Claim the run for this process; fail one that was begun too often, for it may be what kills its process."""
+def _start() -> None:
+    """Claim the run for this process; fail a run that was started too often, since it may be what kills its process."""
     claim_run()
-    if runtime.flow_run.run_count > BEGUN:
+    if runtime.flow_run.run_count > MOST_STARTS:
         raise BackendUnavailable(
-            f"this run was begun {BEGUN} times and did not end: see whether something kills it, as a machine does that "
-            "has too little memory; then ask for a new run, which goes on after the last finished step"
+            f"this run was started {MOST_STARTS} times and did not end: find out what kills its process, for example "
+            "too little memory; then start a new run, which goes on after the last finished step"
         )
 
 
-def _made_for_catalog(order: ArtifactRef, code: str, address: str) -> Outcome:
-    """Make an order of a catalog into the store; a failure is an outcome too."""
+def _convert_item(job: ArtifactRef, code: str, address: str) -> Outcome:
+    """Convert a job of a catalog into the store; return an outcome also if it fails."""
     store = home.store()
     try:
-        _begin()
-        wanted = read_order(order, code, store, address)
+        _start()
+        wanted = read_job(job, code, store, address)
         Roots.of_this_process().check_weights(wanted.settings.model_dump(mode="json"))
         connect()
         with sharing_results(store), tempfile.TemporaryDirectory(prefix="dg4d-item-") as scratch:
             folder = Path(scratch) / "package"
-            _, cached = make(wanted, folder)
-            return Outcome(package=pack(folder, store), cached=cached)
-    except Exception as error:  # whatever it is, the catalog has to know
+            _, cached = convert_job(wanted, folder)
+            return Outcome(package=pack_package(folder, store), cached=cached)
+    except Exception as error:  # the catalog waits for an outcome
         return failure(error)
 
 
 def _knobs(options: Options, roots: Roots) -> dict[str, Any]:
-    """Return every change to the profile; raises BadInput for weights that may not be read."""
+    """Return the settings that differ from the profile; raise BadInput for weights that may not be read."""
     knobs = options.knobs()
     roots.check_knobs(knobs)
     return knobs
 
 
-def _make(address: str, folder: Path, options: Options, roots: Roots, **files: Path) -> None:
-    """Make an asset as `dg4d make` does: what is made already is left alone."""
-    settings = revise(profile(options.profile), _knobs(options, roots))
-    wish = Wish(
-        item=clean(PurePosixPath(urlsplit(address).path).stem) or "asset",
-        profile=options.profile,
-        settings=settings,
-        seed=options.seed,
-        commercial_only=options.commercial_only,
-        **files,
-    )
-    wish.check()
-    check_folder(folder, wish.item)
-    order = wish.order(home.store())
-    if not is_current(folder, order.digest()):
-        connect()
-        make(order, folder)
+def _convert(address: str, out: str, options: Options, is_video: bool = False) -> None:
+    """Convert a source as `dg4d make` does; do nothing if the folder holds its package already."""
+    _start()
+    roots = Roots.of_this_process()
+    folder = roots.output(out)
+    with local_copy(roots.source(address)) as path:
+        request = ConversionRequest(
+            item=clean_name(PurePosixPath(urlsplit(address).path).stem) or "asset",
+            picture=path,
+            video=path if is_video else None,
+            profile=options.profile,
+            settings=revise(profile(options.profile), _knobs(options, roots)),
+            seed=options.seed,
+            commercial_only=options.commercial_only,
+        )
+        request.check()
+        check_folder(folder, request.item)
+        job = request.to_job(home.store())
+        if not is_current(folder, job.digest()):
+            connect()
+            convert_job(job, folder)

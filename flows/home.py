@@ -1,4 +1,4 @@
-"""Places under `$DG4D_HOME`, private to the user, and the environment in which Prefect is imported."""
+"""Private folders under `$DG4D_HOME`, and the environment for the import of Prefect."""
 
 import os
 import stat
@@ -10,40 +10,40 @@ from steps.store.artifact_store import ArtifactStore
 from steps.store.files import home
 from steps.store.opening import open_store
 
-OTHERS = 0o077  # permissions of group and others
+OTHERS = 0o077  # permission bits of group and others
 CLIENT_SETTINGS = {
     "DO_NOT_TRACK": "1",
     "PREFECT_CLIENT_SERVER_VERSION_CHECK_ENABLED": "false",
     "PREFECT_TELEMETRY_ENABLE_RESOURCE_METRICS": "false",
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
     "PREFECT_CLI_PROMPT": "false",
-    "PREFECT_CLIENT_MAX_RETRIES": "7",  # four minutes: a database may be busy, a server begin again; 10: 34 minutes
-    "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "CRITICAL",  # the command says what matters; the rest goes to the server
+    "PREFECT_CLIENT_MAX_RETRIES": "7",  # 4 minutes, enough for a restart of the server; 10 are 34 minutes
+    "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "CRITICAL",  # commands print their own messages; logs go to the server
 }
 
 
 def store() -> ArtifactStore:
-    """Every artifact of this user: the folder `store` here, or what `$DG4D_STORE` names.
+    """Return the artifact store: `$DG4D_STORE`, by default the folder `store` under `$DG4D_HOME`.
 
     Raises:
-        BadInput: that is no address of a store.
+        BadInput: `$DG4D_STORE` is not the address of a store.
     """
     make_private(home())
     return open_store()
 
 
 def records() -> Path:
-    """The folder that says what each request gave."""
+    """Return the folder of the result records of steps."""
     return home() / "results"
 
 
 def locks() -> Path:
-    """The folder of the locks of requests."""
+    """Return the folder of lock files."""
     return home() / "locks"
 
 
 def failures() -> Path:
-    """The folder of pictures that explain why a step did not finish."""
+    """Return the folder of pictures that explain failures."""
     return home() / "failures"
 
 
@@ -53,10 +53,10 @@ def cutouts() -> Path:
 
 
 def make_private(folder: Path) -> None:
-    """Create a folder that only its owner can enter; close one that others can, with everything in it.
+    """Create a folder with mode 0700, or remove the permissions of others from an existing one and its content.
 
     Raises:
-        BadInput: it belongs to somebody else.
+        BadInput: it belongs to another user.
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     if not folder.stat().st_mode & OTHERS:
@@ -70,12 +70,12 @@ def make_private(folder: Path) -> None:
     if folder.stat().st_mode & OTHERS:
         return  # a file system without permissions
     for path in folder.rglob("*"):
-        with suppress(OSError):  # gone, or on a file system without permissions
+        with suppress(OSError):  # removed meanwhile, or a file system without permissions
             if not path.is_symlink():
                 path.chmod(stat.S_IMODE(path.stat().st_mode) & ~OTHERS)
 
 
 def set_environment(api_url: str) -> None:
-    """Set what Prefect reads when it is imported: its server, its own folder, no telemetry. What the user set stays."""
+    """Set Prefect's server, home folder and client settings before its import; variables set by the user win."""
     for name, value in {**CLIENT_SETTINGS, "PREFECT_HOME": str(home() / "prefect"), "PREFECT_API_URL": api_url}.items():
         os.environ.setdefault(name, value)

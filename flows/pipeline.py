@@ -8,10 +8,10 @@ from prefect.transactions import transaction
 
 from flows import home
 from flows.engine import resources
-from flows.engine.frames import divided, frames_in
+from flows.engine.frames import count_frames, divide_frames
 from flows.engine.publishing import keep_version, publish
 from flows.engine.step_tasks import Conversion, finished_steps, steps_of_flow
-from flows.inputs.orders import Order
+from flows.inputs.conversion_job import ConversionJob
 from flows.packages.flow_result import FlowResult, notes_of
 from flows.step_errors import StepBadInput
 from flows.tasks import (
@@ -34,14 +34,15 @@ from flows.tasks import (
 )
 from flows.ui.asset_page import show_asset
 from steps.artifacts.mesh_plan import read_plan
+from steps.contract import ArtifactRef
 
 
-@flow(name="image_to_4d", flow_run_name="{order.item}", persist_result=False)
-def image_to_4d(order: Order, folder: Path | None = None, mesh_parts: int = 0) -> FlowResult:
+@flow(name="image_to_4d", flow_run_name="{job.item}", persist_result=False)
+def image_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int = 0) -> FlowResult:
     """Turn a picture into an animated 3D asset; a video keeps its motion.
 
     Args:
-        order: source, settings and name of the asset.
+        job: source, settings and name of the asset.
         folder: output folder of the package; None: the package stays in the store.
         mesh_parts: number of tasks that extract a mesh per frame; 0: one per slot of this machine.
 
@@ -49,55 +50,70 @@ def image_to_4d(order: Order, folder: Path | None = None, mesh_parts: int = 0) -
         StepError: a step did not finish.
     """
     with steps_of_flow():
-        conversion = conversion_of(order, mesh_parts)
-        subject = prepare_subject(order.source, conversion)
-        return animate(subject, order, conversion, folder)
+        conversion = conversion_of(job, mesh_parts)
+        subject = prepare_subject(job.source, conversion)
+        return animate(subject, job, conversion, folder)
 
 
-@flow(name="video_to_4d", flow_run_name="{order.item}", persist_result=False)
-def video_to_4d(order: Order, folder: Path | None = None, mesh_parts: int = 0) -> FlowResult:
+@flow(name="video_to_4d", flow_run_name="{job.item}", persist_result=False)
+def video_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int = 0) -> FlowResult:
     """Turn a video into an animated 3D asset that moves as the video does.
 
     Raises:
         StepError: a step did not finish.
     """
     with steps_of_flow():
-        conversion = conversion_of(order, mesh_parts)
-        subject = prepare_subject(order.source, conversion)
+        conversion = conversion_of(job, mesh_parts)
+        subject = prepare_subject(job.source, conversion)
         if subject.footage is None:
             raise StepBadInput(
                 "prepare_subject", "this is a single picture, not a video: a video has two frames or more"
             )
-        return animate(subject, order, conversion, folder)
+        return animate(subject, job, conversion, folder)
 
 
-@flow(name="text_to_4d", flow_run_name="{order.item}", persist_result=False)
-def text_to_4d(order: Order, folder: Path | None = None, mesh_parts: int = 0) -> FlowResult:
+@flow(name="text_to_4d", flow_run_name="{job.item}", persist_result=False)
+def text_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int = 0) -> FlowResult:
     """Draw a picture from words and turn it into an animated 3D asset.
 
     Raises:
         StepError: a step did not finish.
     """
     with steps_of_flow():
-        conversion = conversion_of(order, mesh_parts)
-        picture = draw_picture(order.source, conversion)
+        conversion = conversion_of(job, mesh_parts)
+        picture = draw_picture(job.source, conversion)
         subject = prepare_subject(picture.picture, conversion)
-        return animate(subject, order, conversion, folder)
+        return animate(subject, job, conversion, folder)
 
 
-def conversion_of(order: Order, mesh_parts: int = 0) -> Conversion:
-    """Return the values that all steps of an order share."""
-    return Conversion(item=order.item, settings=order.settings, seed=order.seed, mesh_parts=mesh_parts)
+@flow(name="motions", flow_run_name="{job.item}", persist_result=False)
+def motions(job: ConversionJob) -> dict[str, ArtifactRef]:
+    """Generate and rank candidate motions of a picture; return the outputs of `drive_video`.
+
+    Raises:
+        StepError: a step did not finish.
+    """
+    with steps_of_flow():
+        conversion = conversion_of(job)
+        subject = prepare_subject(job.source, conversion)
+        if subject.footage is not None:
+            raise StepBadInput("prepare_subject", "this is a video and has its motion already; give a picture")
+        return drive_video(subject, conversion).outputs
 
 
-def animate(subject: Subject, order: Order, conversion: Conversion, folder: Path | None) -> FlowResult:
+def conversion_of(job: ConversionJob, mesh_parts: int = 0) -> Conversion:
+    """Return the parameters that all steps of a job share."""
+    return Conversion(item=job.item, settings=job.settings, seed=job.seed, mesh_parts=mesh_parts)
+
+
+def animate(subject: Subject, job: ConversionJob, conversion: Conversion, folder: Path | None) -> FlowResult:
     """Turn a subject into a package: driving video, static Gaussians, motion, mesh, texture, files, verdict."""
     filming = drive_video.submit(subject, conversion)
-    gaussians = fit_gaussians(subject, conversion, order.bank)  # in this thread, beside the driving video
+    gaussians = fit_gaussians(subject, conversion, job.bank)  # in this thread, parallel to the driving video
     driving_video = filming.result()
-    motion = fit_motion(subject, gaussians, driving_video, conversion, order.bank)
+    motion = fit_motion(subject, gaussians, driving_video, conversion, job.bank)
     mesh = mesh_over_time(gaussians, motion, driving_video, conversion)
-    if order.settings.refiner.kind != "identity":
+    if job.settings.refiner.kind != "identity":
         mesh = refine_texture(mesh, driving_video, conversion)
     notes = notes_of(done.result for done in finished_steps())
     package = pack_asset(subject, driving_video, gaussians, motion, mesh, notes, conversion)
@@ -108,21 +124,21 @@ def animate(subject: Subject, order: Order, conversion: Conversion, folder: Path
         flow_run=str(runtime.flow_run.id),
         wall_s=round((time.time_ns() - conversion.begun_ns) / 1e9, 3),
     )
-    show_asset(order.item, result.steps, result.package, home.store())
+    show_asset(job.item, result.steps, result.package, home.store())
     if folder is not None:
-        with transaction():  # folder and version change together, or neither does
-            publish(package, verdict, order, result, folder)
-            keep_version(order, result)
+        with transaction():  # a failed version restores the earlier content of the folder
+            publish(package, verdict, job, result, folder)
+            keep_version(job, result)
     return result
 
 
 def mesh_over_time(gaussians: Gaussians, motion: Motion, driving_video: DrivingVideo, conversion: Conversion) -> Mesh:
-    """Extract one mesh that follows the motion, or else a mesh per frame, its frames divided among the slots."""
+    """Extract one mesh that follows the motion, or a mesh per frame with the frames divided among the slots."""
     plan = plan_mesh(gaussians, motion, conversion)
     if read_plan(home.store().path(plan.plan)).mode == "tracked":
         return extract_mesh(gaussians, motion, plan, conversion)
-    frames = frames_in(driving_video.frames, home.store())
-    parts = divided(frames, conversion.mesh_parts or resources.cpus())
+    frames = count_frames(driving_video.frames, home.store())
+    parts = divide_frames(frames, conversion.mesh_parts or resources.cpus())
     every = map(unmapped, (gaussians, motion, plan, conversion))
     meshes = extract_mesh.map(*every, parts).result()
     return meshes[0] if len(meshes) == 1 else join_meshes(meshes, conversion)

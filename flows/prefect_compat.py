@@ -1,7 +1,6 @@
-"""Everything that depends on the inside of Prefect's server, pinned in `pyproject.toml`; only the server imports it.
+"""Adapters to internals of Prefect's server, whose version is pinned in `pyproject.toml`; imported by the server only.
 
-`PARTS` names what Prefect may change without notice. As `PREFECT_SERVER_EVENTS_CAUSAL_ORDERING` this module gives the
-server its order of events.
+`PARTS` lists the internals. The server loads this module as `PREFECT_SERVER_EVENTS_CAUSAL_ORDERING` too.
 """
 
 from collections.abc import AsyncGenerator, Callable
@@ -35,10 +34,10 @@ BEGAN = datetime.now(UTC)
 
 
 class OneWriter(configurations.AioSqliteConfiguration):
-    """SQLite whose transactions take the lock for writing when they begin.
+    """SQLite configuration whose transactions take the write lock when they begin.
 
-    A transaction that writes after it has read is refused if another has written in between; the server then answers
-    503, and the client waits two seconds and more before it asks again: half the time of a batch.
+    Otherwise a transaction that reads and then writes fails if another one has written in between; the server answers
+    503 and the client retries after two seconds or more, which took half the time of a batch.
     """
 
     @asynccontextmanager
@@ -51,17 +50,17 @@ class OneWriter(configurations.AioSqliteConfiguration):
 
 
 class CausalOrdering(memory.CausalOrdering):
-    """Order of events that does not wait for what a run did before this server was started.
+    """Causal ordering of events that does not wait for events from before the start of this server.
 
-    Prefect's forgets at its start what it has seen, and an event that follows an unseen one waits a quarter of an hour:
-    the run of a machine that was killed would go on that much later.
+    Prefect's own forgets seen events at a restart, and an event that follows an unseen one waits 15 minutes, which
+    would delay the restart of a crashed run.
     """
 
     async def wait_for_leader(self, event: ReceivedEvent) -> None:
         """Return when an event may be processed.
 
         Raises:
-            EventArrivedEarly: the event that it follows has not been seen.
+            EventArrivedEarly: the event that it follows was not processed yet.
         """
         leader = event.follows
         if leader is None or await self.event_has_been_seen(leader) or not await _is_from_before(leader):
@@ -69,7 +68,7 @@ class CausalOrdering(memory.CausalOrdering):
 
 
 async def _is_from_before(event: UUID) -> bool:
-    """Return whether an event tells of a state of a run, which has its number, from before this server was started."""
+    """Return true if an event belongs to a run state, which has its id, from before the start of this server."""
     database = provide_database_interface()
     async with database.session_context() as session:
         state = await session.get(database.FlowRunState, event)
@@ -77,7 +76,7 @@ async def _is_from_before(event: UUID) -> bool:
 
 
 def create_app() -> FastAPI:
-    """Build Prefect's application; it answers 503 (retryable) while its database is away."""
+    """Build Prefect's application; it answers 503 (retryable) while its database is unavailable."""
     database = PREFECT_API_DATABASE_CONNECTION_URL.value()
     if database.startswith("sqlite"):
         dependencies.MODELS_DEPENDENCIES["database_config"] = OneWriter(connection_url=database)
@@ -90,7 +89,7 @@ def create_app() -> FastAPI:
 
 
 def add_first(application: FastAPI, path: str, answer: Callable[..., object], **options: object) -> None:
-    """Add a route before the user interface, which answers to every address."""
+    """Add a route before that of the user interface, which matches every path."""
     routes = application.router.routes
     application.add_api_route(path, answer, response_class=Response, include_in_schema=False, **options)  # type: ignore[arg-type]
     routes.insert(0, routes.pop())
@@ -102,7 +101,7 @@ def database_away(request: Request, error: Exception) -> Response:
 
 
 async def _unavailable(request: Request, error: Exception) -> Response:
-    """Answer an error outside of the API: 503 if the request may be repeated, else 500."""
+    """Answer an error outside of the API with 503 if the request may be retried, else with 500."""
     if isinstance(error, ConnectionError):
         return database_away(request, error)
     return await server.custom_internal_exception_handler(request, error)

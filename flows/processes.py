@@ -1,19 +1,21 @@
-"""Which process is which, which one is alone with a file, which ends with another, and what it has from us."""
+"""Process identity, file locks, child environments and background guards."""
 
 import ctypes
 import fcntl
 import os
 import signal
 import socket
+import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 
 
 def start_of(pid: int) -> str:
-    """When a process began, in the kernel's ticks, for numbers are used again; empty if there is none."""
+    """Return the start time of a process in kernel ticks, since PIDs are reused; empty if there is no such process."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
     except OSError:
@@ -21,11 +23,8 @@ def start_of(pid: int) -> str:
     return stat.rpartition(")")[2].split()[19]
 
 
-def place() -> str:
-    """Return the identity of the machine, or container, whose processes this one sees.
-
-    It is `$DG4D_HOST_ID`, else host name and PID namespace: containers may share the name of their host.
-    """
+def host_id() -> str:
+    """Return `$DG4D_HOST_ID`, else host name and PID namespace: containers may share the name of their host."""
     if given := os.environ.get("DG4D_HOST_ID"):
         return given
     try:
@@ -40,24 +39,24 @@ def python(*arguments: str) -> list[str]:
 
 
 def without_prefect() -> dict[str, str]:
-    """The environment, for a process that is to have none of Prefect's settings, or its own."""
+    """Return the environment without Prefect's settings."""
     return {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
 
 
 def die_with_parent() -> None:
-    """Have the kernel end this process when the one that started it ends, however it does."""
+    """Have the kernel kill this process when its parent ends."""
     if sys.platform.startswith("linux"):
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
 @contextmanager
 def locked(path: Path, *, shared: bool = False, patience_s: float = 0.0) -> Iterator[bool]:
-    """Hold the lock of a file while the block runs; gives whether it could be had.
+    """Lock a file while the block runs; yield false if another process holds the lock.
 
     Args:
-        path: of the file; it is made.
-        shared: only look whether somebody holds it alone, and disturb nobody who also looks.
-        patience_s: seconds to try, for those who look hold it for a moment too.
+        path: path of the file; created if missing.
+        shared: take a shared lock, to see if another process holds an exclusive one.
+        patience_s: seconds to retry, since those who look hold a shared lock for a moment.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     deadline = time.monotonic() + patience_s
@@ -73,6 +72,45 @@ def locked(path: Path, *, shared: bool = False, patience_s: float = 0.0) -> Iter
                 return
             yield True
             return
+
+
+def spawn_guard(module: str, arguments: Sequence[str], log: Path, mode: str, env: Mapping[str, str]) -> None:
+    """Start `python -m MODULE`, which detaches a background process and exits.
+
+    Args:
+        module: forks, and exits in the parent.
+        arguments: command line arguments.
+        log: file for its output, in the folder that becomes its current one.
+        mode: "ab" to append to the log, "wb" to truncate it.
+        env: environment variables.
+    """
+    with log.open(mode) as output:
+        subprocess.run(
+            python("-m", module, *arguments),
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+            cwd=log.parent,
+            env=env,
+            start_new_session=True,
+            umask=0o077,  # database and logs contain what users asked for
+            check=False,
+        )
+
+
+def end(process: subprocess.Popen[bytes], grace_s: float) -> None:
+    """Terminate a process; kill it after `grace_s` seconds."""
+    process.terminate()
+    try:
+        process.wait(grace_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def exit_guard(number: int, frame: FrameType | None) -> None:
+    """Handle SIGTERM in a guard: exit, with its `finally` clauses."""
+    sys.exit(0)
 
 
 OWN_START = start_of(os.getpid())

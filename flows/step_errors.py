@@ -1,15 +1,15 @@
-"""Errors of steps that did not give a result, by what can be done about them."""
+"""Exceptions of failed steps."""
 
 from steps.contract import ArtifactRef
 
 
 class StepError(Exception):
-    """A step did not give a result.
+    """Failure of a step.
 
     Attributes:
-        step: its name.
-        message: why, for the user.
-        pictures: that explain it, in the store.
+        step: name of the step.
+        message: reason, for the user.
+        pictures: pictures in the store that explain it.
     """
 
     def __init__(self, step: str, message: str, pictures: dict[str, ArtifactRef] | None = None) -> None:
@@ -18,32 +18,32 @@ class StepError(Exception):
 
 
 class StepBadInput(StepError):
-    """What was given cannot be used; the same again will fail again."""
+    """Unusable input; a retry fails again."""
 
 
 class StepMissing(StepError):
-    """Something needed is not here: a library, a device, weights, an artifact."""
+    """Missing library, device, weights or artifact."""
 
 
 class StepLost(StepMissing):
-    """An artifact that it needs is gone or damaged; what made it will make it again."""
+    """Missing or damaged input artifact; running the conversion again restores it."""
 
 
 class StepUnreachable(StepMissing):
-    """The store does not answer at the moment."""
+    """Store that does not answer."""
 
 
 class StepDiverged(StepError):
-    """An optimization left the finite numbers; `pictures` show the last good state."""
+    """Optimization with non-finite values; `pictures` show the last finite state."""
 
 
 class StepOutOfMemory(StepError):
-    """There was not enough memory; there may be when other work has ended."""
+    """Out of memory; a retry may succeed when other work has ended."""
 
 
 class StepTimedOut(StepError):
-    """It took longer than its spec allows, and was killed."""
+    """Step killed after `timeout_s` of its spec."""
 
 
 class StepCrashed(StepError):
-    """Anything else."""
+    """Any other failure."""

@@ -1,4 +1,7 @@
-"""Tasks of the pipeline, one per step: typed, cached by the digest of their request, retried where that may help."""
+"""Tasks of the pipeline, one per step: typed, cached by the digest of their request, retried where that may help.
+
+The arguments of a task are the arguments of its step: `**locals()` passes all of them on by name.
+"""
 
 from prefect import task
 
@@ -26,7 +29,7 @@ class Subject(StepResult):
 
 
 class DrivingVideo(StepResult):
-    """Driving video; with its contact sheet, ranking and films where it was chosen among candidates."""
+    """Driving video; with contact sheet, ranking and films if it was selected among candidates."""
 
     @property
     def frames(self) -> ArtifactRef:
@@ -39,11 +42,11 @@ class Gaussians(StepResult):
 
 
 class Motion(StepResult):
-    """Deformation over time; with the Gaussians where they were fine-tuned together with it."""
+    """Deformation over time; with the Gaussians if they were fine-tuned together with it."""
 
 
 class Plan(StepResult):
-    """Kind of mesh that the motion gets, and the density of its surface."""
+    """Mesh mode for the motion, and the density threshold of the surface."""
 
     @property
     def plan(self) -> ArtifactRef:
@@ -75,25 +78,25 @@ class Scores(StepResult):
 @task(**CACHED, tags=[GPU])
 def draw_picture(text: ArtifactRef, conversion: Conversion) -> Picture:
     """Draw a picture from words."""
-    return run_step("draw_picture", Picture, text=text, conversion=conversion)
+    return run_step("draw_picture", Picture, **locals())
 
 
 @task(**CACHED, tags=[CPU])
 def prepare_subject(source: ArtifactRef, conversion: Conversion) -> Subject:
     """Read a picture or video, cut the subject out and center it."""
-    return run_step("prepare_subject", Subject, source=source, conversion=conversion)
+    return run_step("prepare_subject", Subject, **locals())
 
 
 @task(**CACHED, tags=[GPU])
 def drive_video(subject: Subject, conversion: Conversion) -> DrivingVideo:
     """Take the footage of the subject, or generate a video of it in motion."""
-    return run_step("drive_video", DrivingVideo, subject=subject, conversion=conversion)
+    return run_step("drive_video", DrivingVideo, **locals())
 
 
 @task(**CACHED, tags=[GPU])
 def fit_gaussians(subject: Subject, conversion: Conversion, bank: ArtifactRef | None = None) -> Gaussians:
     """Fit static 3D Gaussians to the picture (DreamGaussianHD)."""
-    return run_step("fit_gaussians", Gaussians, subject=subject, bank=bank, conversion=conversion)
+    return run_step("fit_gaussians", Gaussians, **locals())
 
 
 @task(**CACHED, tags=[GPU])
@@ -105,21 +108,13 @@ def fit_motion(
     bank: ArtifactRef | None = None,
 ) -> Motion:
     """Fit a HexPlane deformation to the driving video (paper, "Gaussian Deformation for Dynamic Generation")."""
-    return run_step(
-        "fit_motion",
-        Motion,
-        subject=subject,
-        gaussians=gaussians,
-        driving_video=driving_video,
-        bank=bank,
-        conversion=conversion,
-    )
+    return run_step("fit_motion", Motion, **locals())
 
 
 @task(**CACHED, tags=[CPU])
 def plan_mesh(gaussians: Gaussians, motion: Motion, conversion: Conversion) -> Plan:
     """Decide whether one mesh can follow the motion or every frame needs its own."""
-    return run_step("plan_mesh", Plan, gaussians=gaussians, motion=motion, conversion=conversion)
+    return run_step("plan_mesh", Plan, **locals())
 
 
 @task(**CACHED, tags=[CPU])
@@ -127,21 +122,19 @@ def extract_mesh(
     gaussians: Gaussians, motion: Motion, plan: Plan, conversion: Conversion, part: Part | None = None
 ) -> Mesh:
     """Extract one mesh that follows the motion, or a mesh per frame of a part of the frames."""
-    return run_step(
-        "extract_mesh", Mesh, gaussians=gaussians, motion=motion, plan=plan, part=part, conversion=conversion
-    )
+    return run_step("extract_mesh", Mesh, **locals())
 
 
 @task(**CACHED, tags=[CPU])
 def join_meshes(parts: list[Mesh], conversion: Conversion) -> Mesh:
     """Join the meshes of all parts."""
-    return run_step("join_meshes", Mesh, parts=parts, conversion=conversion)
+    return run_step("join_meshes", Mesh, **locals())
 
 
 @task(**CACHED, tags=[GPU])
 def refine_texture(mesh: Mesh, driving_video: DrivingVideo, conversion: Conversion) -> Mesh:
     """Refine the textures with a video-to-video diffusion model."""
-    return run_step("refine_texture", Mesh, mesh=mesh, driving_video=driving_video, conversion=conversion)
+    return run_step("refine_texture", Mesh, **locals())
 
 
 @task(**CACHED, tags=[CPU])
@@ -155,25 +148,13 @@ def pack_asset(
     conversion: Conversion,
 ) -> Package:
     """Write every delivery format into one package."""
-    return run_step(
-        "pack_asset",
-        Package,
-        subject=subject,
-        driving_video=driving_video,
-        gaussians=gaussians,
-        motion=motion,
-        mesh=mesh,
-        notes=notes,
-        conversion=conversion,
-    )
+    return run_step("pack_asset", Package, **locals())
 
 
 @task(**CACHED, tags=[CPU])
 def check_asset(package: Package, driving_video: DrivingVideo, subject: Subject, conversion: Conversion) -> Verdict:
     """Compare the package with the driving video and judge it by the quality gates."""
-    return run_step(
-        "check_asset", Verdict, package=package, driving_video=driving_video, subject=subject, conversion=conversion
-    )
+    return run_step("check_asset", Verdict, **locals())
 
 
 @task(**CACHED, tags=[GPU])
@@ -181,4 +162,4 @@ def score_asset(
     truth: ArtifactRef, settings: ScoreAssetSettings, conversion: Conversion, package: ArtifactRef | None = None
 ) -> Scores:
     """Score an asset, or the naive baselines, against the ground truth."""
-    return run_step("score_asset", Scores, truth=truth, package=package, settings=settings, conversion=conversion)
+    return run_step("score_asset", Scores, **locals())

@@ -125,9 +125,9 @@ def collect_evidence(
     return GateInputs(
         picture=_resized(cutout[None]),
         video=_resized(torch.cat([video.frames, video.alpha], -1)[frames.long()]),
-        seen=seen,
-        around=around,
-        turn=Turntable(turn[..., 3:4], turn[..., 4:], viewmats(ring), front.focal),
+        input_views=seen,
+        side_views=around,
+        turntable=Turntable(turn[..., 3:4], turn[..., 4:], viewmats(ring), front.focal),
         flaws=max(_flaws(asset.surface, timestamp) for timestamp in timestamps),
     )
 
@@ -152,12 +152,12 @@ def picture(evidence: GateInputs, seconds: Sequence[float]) -> Float[Tensor, "h 
         evidence: renders of the asset and frames of the video.
         seconds: timestamps of the frames.
     """
-    scores = torch.stack([fidelity(pictures, evidence.video) for pictures in evidence.seen.values()]).amin(0)
+    scores = torch.stack([fidelity(pictures, evidence.video) for pictures in evidence.input_views.values()]).amin(0)
     thirds = torch.arange(len(scores)).tensor_split(COLUMNS - 1)
     worst = [int(part[scores[part].argmin()]) for part in thirds if len(part)]
     columns = sorted({0, *worst})
     rows = {"input": evidence.video.color[columns]}
-    for form, pictures in evidence.seen.items():
+    for form, pictures in evidence.input_views.items():
         rows[form] = pictures.color[columns]
         rows[f"{form} off by"] = 1 - (pictures.color - evidence.video.color)[columns].abs()
     headings = [f"{seconds[column]:.2f} s: {scores[column]:.1f} dB" for column in columns]
@@ -187,6 +187,6 @@ def _resized(cutouts: Float[Tensor, "b h w 4"]) -> RgbaImages:
 def _flaws(surface: Surface, position: Float[Tensor, ""]) -> float:
     """Return the broken edges and triangles per triangle, plus the share of inverted components."""
     mesh = mesh_at(surface, position)
-    facts = check_topology(*weld_vertices(mesh.vertices.numpy(), mesh.faces.numpy()))
-    broken = facts.boundary_edges + facts.nonmanifold_edges + facts.inconsistent_edges + facts.degenerate_faces
-    return broken / max(1, facts.triangles) + facts.inverted_components / max(1, facts.components)
+    check = check_topology(*weld_vertices(mesh.vertices.numpy(), mesh.faces.numpy()))
+    broken = check.boundary_edges + check.nonmanifold_edges + check.inconsistent_edges + check.degenerate_faces
+    return broken / max(1, check.triangles) + check.inverted_components / max(1, check.components)

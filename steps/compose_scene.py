@@ -131,7 +131,7 @@ class SceneWriter:
         """Return center and radius of a sphere around the bounding boxes of all actors."""
         boxes = []
         for actor in self.actors:
-            low, high = (torch.from_numpy(corner) for corner in (actor.glb.low, actor.glb.high))
+            low, high = (torch.from_numpy(corner) for corner in (actor.glb.box_min, actor.glb.box_max))
             corners = torch.cartesian_prod(*torch.stack((low, high), 1))
             matrix = torch.from_numpy(actor.transform)
             boxes.append(corners @ matrix[:3, :3].mT + matrix[:3, 3])
@@ -149,10 +149,10 @@ class _MovingGaussians:
 
     def at(self, actor: Actor, times_s: Float[Tensor, " b"]) -> Gaussians:
         """Return the states at times of the scene, at the actor's place."""
-        played = torch.from_numpy(actor.seconds(times_s.numpy()))
+        played = torch.from_numpy(actor.animation_times(times_s.numpy()))
         fit, positions = self.fit, (played * self.fps).clamp(max=self.fit.frames)
         states = pose_gaussians(fit.gaussians, fit.deformation, fit.frames, positions)
-        quat = torch.from_numpy(actor.turn.as_quat(canonical=True))[[3, 0, 1, 2]]
+        quat = torch.from_numpy(actor.rotation.as_quat(canonical=True))[[3, 0, 1, 2]]
         return transform(states, quat, actor.item.scale, torch.from_numpy(actor.origin))
 
 

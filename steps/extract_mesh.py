@@ -53,7 +53,7 @@ def run(job: Job) -> StepReport:
         mesh = tracked.mesh
         notes = [
             f"one mesh for {frames} frames: {len(mesh.vertices)} vertices, {len(mesh.faces)} triangles",
-            f"at rest it is {_facts(mesh)}",
+            f"at rest it is {_check(mesh)}",
             f"it is the surface of frame {plan.reference_frame}, which follows the motion best "
             f"({plan.followed:.1%} IoU on trial)",
             f"its outlines agree with the Gaussians' to {ious.mean():.1%} (IoU), to {ious.min():.1%} at worst",
@@ -119,12 +119,12 @@ def _colored(
 
 
 def _soundness(meshes: dict[int, TexturedMesh]) -> list[str]:
-    facts = {frame: _facts(mesh) for frame, mesh in meshes.items()}
-    flawed = [f"the mesh of frame {frame} is {its}" for frame, its in facts.items() if not its.valid]
-    return [f"{len(facts) - len(flawed)} of {len(facts)} meshes from frame {min(facts)} on bound solids", *flawed]
+    checks = {frame: _check(mesh) for frame, mesh in meshes.items()}
+    flawed = [f"the mesh of frame {frame} is {check}" for frame, check in checks.items() if not check.valid]
+    return [f"{len(checks) - len(flawed)} of {len(checks)} meshes from frame {min(checks)} on bound solids", *flawed]
 
 
-def _facts(mesh: TexturedMesh) -> MeshTopology:
+def _check(mesh: TexturedMesh) -> MeshTopology:
     return check_topology(*weld_vertices(mesh.vertices.numpy(), mesh.faces.numpy()))
 
 

@@ -49,15 +49,11 @@ class PackageWriter:
     """Content of a package and its folder; the methods write files and return notes for the report.
 
     Attributes:
-        folder: folder of the package.
-        pack: settings of the package.
         notes: sentences that are stored in the files.
         surface: tracked mesh, or a mesh per state.
-        fit: Gaussians of the reference frame, their deformation and the frame rate of the driving video.
-        video: driving video.
+        fit: canonical Gaussians, their deformation, and the frame rate of the driving video.
         states: Gaussians at every written frame.
         fps: frame rate of the written frames.
-        rasterizer: rasterizer for the films.
         inputs: input files by port.
     """
 

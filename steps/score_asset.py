@@ -1,6 +1,5 @@
 """Step that compares an asset, or naive baselines without an asset, with ground truth."""
 
-import itertools
 import json
 import shutil
 import zipfile
@@ -23,7 +22,7 @@ from dg4d_lib.diffusion.components import default_device
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.images import over_background
 from dg4d_lib.metrics.clip import ClipModel, cosine_similarity
-from dg4d_lib.metrics.fvd import SHORTEST, fvd_consistent4d, load_i3d, logits
+from dg4d_lib.metrics.fvd import MIN_FRAMES, fvd_consistent4d, load_i3d, logits
 from dg4d_lib.metrics.image import iou, psnr, resize_square
 from dg4d_lib.metrics.lpips import Lpips, load_lpips
 from dg4d_lib.metrics.ssim import ssim
@@ -107,7 +106,7 @@ class MetricNetworks:
 
     def i3d_logits(self, frames: ViewFrames) -> Tensor | None:
         """Return I3D's logits; None if it is not installed or the frames are too few."""
-        if self.i3d is None or len(frames) < SHORTEST:
+        if self.i3d is None or len(frames) < MIN_FRAMES:
             return None
         return logits(self.i3d, frames.color, self.device)
 
@@ -123,18 +122,12 @@ def run(job: Job) -> StepReport:
         scratch = Path(folder)
         truth = find_ground_truth(_unpacked(job.inputs["truth"], scratch / "truth"))
         networks = MetricNetworks(settings.score)
-        done = itertools.count(1)
-
-        def advance(total: int) -> None:
-            job.progress(next(done), total, {})
-
         if "package" in job.inputs:
-            package = _unpacked(job.inputs["package"], scratch / "package")
-            report, films = _score_package(package, truth, settings, networks, scratch, job.seed, advance)
+            report, films = _score_package(job, truth, networks, scratch)
         else:
-            report, films = _score_baselines(truth, networks, advance)
-        if networks.i3d is not None and report["frames"] < SHORTEST:
-            shortage = f"I3D needs films of {SHORTEST} frames or more; these have {report['frames']}"
+            report, films = _score_baselines(job, truth, networks)
+        if networks.i3d is not None and report["frames"] < MIN_FRAMES:
+            shortage = f"I3D needs films of {MIN_FRAMES} frames or more; these have {report['frames']}"
             networks.missing["fvd_consistent4d"] = shortage
         _write_films(job.outputs["films"], films, scratch)
     text = json.dumps({**report, "missing": networks.missing}, allow_nan=False)
@@ -168,14 +161,10 @@ def compare(ours: ViewFrames, theirs: ViewFrames, networks: MetricNetworks) -> M
 
 
 def _score_package(
-    package: Path,
-    truth: GroundTruth,
-    settings: ScoreAssetSettings,
-    networks: MetricNetworks,
-    scratch: Path,
-    seed: int,
-    advance: Callable[[int], None],
+    job: Job, truth: GroundTruth, networks: MetricNetworks, scratch: Path
 ) -> tuple[dict[str, Any], dict[str, ViewFrames]]:
+    settings: ScoreAssetSettings = job.settings
+    package = _unpacked(job.inputs["package"], scratch / "package")
     given = _read(truth.inputs)
     size, total = given.color.shape[1], len(truth.views) + 2
 
@@ -194,29 +183,29 @@ def _score_package(
         embedded = networks.clip.embed(resize_square(ours.color, networks.size))
         wanted = networks.clip.embed(resize_square(given.color[:1], networks.size))
         of_input["clip_i"] = float(cosine_similarity(embedded, wanted.expand_as(embedded)).mean())
-    advance(total)
-    for view in truth.views:
+    job.progress(1, total, {})
+    for done, view in enumerate(truth.views, 2):
         theirs = _read(view.frames, size)
         films[f"view_{view.name}"] = rendered = render(view.azimuth_deg, len(theirs))
         views[view.name] = compare(rendered, theirs, networks)
         clips[view.name] = networks.i3d_logits(rendered)
-        advance(total)
+        job.progress(done, total, {})
     scores: Scores = {"input": of_input, "views": views, "mean": _mean(views)}
     if truth.mesh is not None:
-        scores["geometry"] = _geometry(package, truth.mesh, settings.score.samples, seed)
-    advance(total)
+        scores["geometry"] = _geometry(package, truth.mesh, settings.score.samples, job.seed)
+    job.progress(total, total, {})
     return _report(truth, size, {"asset": scores}, clips), films
 
 
 def _score_baselines(
-    truth: GroundTruth, networks: MetricNetworks, advance: Callable[[int], None]
+    job: Job, truth: GroundTruth, networks: MetricNetworks
 ) -> tuple[dict[str, Any], dict[str, ViewFrames]]:
     """Score three baselines per view: the input's frames, its first frame, and the first frame of the true view."""
     given = _read(truth.inputs)
     size = given.color.shape[1]
     films, clips = {"input": given}, {}
     baselines: dict[str, dict[str, Metrics]] = {}
-    for view in truth.views:
+    for done, view in enumerate(truth.views, 1):
         theirs = _read(view.frames, size)
         films[f"view_{view.name}"] = theirs
         still = [0] * len(theirs)
@@ -225,7 +214,7 @@ def _score_baselines(
         for name, frames in tried.items():
             baselines.setdefault(name, {})[view.name] = compare(frames, theirs, networks)
         clips[view.name] = networks.i3d_logits(theirs)
-        advance(len(truth.views))
+        job.progress(done, len(truth.views), {})
     rows = {name: {"views": views, "mean": _mean(views)} for name, views in baselines.items()}
     return _report(truth, size, rows, clips), films
 

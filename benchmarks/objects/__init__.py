@@ -1,1 +1,1 @@
-"""Ground truth of our own making: painted things that move and can be seen from anywhere at any time."""
+"""Synthetic ground truth: painted animated objects that can be rendered from any view at any time."""

@@ -1,7 +1,7 @@
-"""Pictures of painted things from many sides at once; their light is part of the paint and moves with them.
+"""Renderer of painted objects; light is baked into the paint and moves with it.
 
-What is seen of a point is the same from everywhere and at every time, as in renders of a model's base color: a motion
-of Gaussians that keep their colors can reach it.
+A point has the same color in every view and at every time, as in renders of a model's base color, so a motion of
+Gaussians with constant colors can reproduce it.
 """
 
 from collections.abc import Sequence
@@ -19,24 +19,24 @@ from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
 from examples.drawing import AMBIENT, KEY, Creature
 from examples.shapes import normals
 
-SAMPLES = 3  # a side of a pixel
-SKY, SUN = 0.10, 0.62  # shares of the light from above, and from where the sun stands
+SAMPLES = 3  # samples per pixel and side
+SKY, SUN = 0.10, 0.62  # fractions of ambient light from above and of directed light
 
 
 @dataclass(frozen=True)
 class Painted:
-    """A creature with a color at every vertex."""
+    """Creature with a color at every vertex."""
 
     creature: Creature
 
     @cached_property
     def faces(self) -> Int[Tensor, "f 3"]:
-        """The triangles, the same at every time."""
+        """Return the triangles, the same at every time."""
         return torch.from_numpy(self.creature.skin.faces.astype(np.int64))
 
     @cached_property
     def colors(self) -> Float[Tensor, "v 3"]:
-        """Paint under the light at rest, in [0, 1]."""
+        """Return the lit paint in the rest pose, in [0, 1]."""
         rest = self.creature.skin
         normal = normals(rest.points, rest.faces)
         sun = np.clip((normal @ KEY + 0.35) / 1.35, 0, 1)[:, None]
@@ -45,11 +45,11 @@ class Painted:
         return torch.from_numpy(paint.clip(0, 1).astype(np.float32))
 
     def vertices(self, moment: float) -> Float[Tensor, "v 3"]:
-        """Where they are, world units; 0 and 1 are the same moment."""
+        """Return the vertices at a time, world units; 0 and 1 are the same."""
         return torch.from_numpy(self.creature.at(moment).astype(np.float32))
 
     def draw(self, moment: float, cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b h w 4"]:
-        """Cut-outs from cameras of one size, straight alpha; nothing is black where nothing is."""
+        """Render cut-outs from cameras of one size, straight alpha; empty pixels are black."""
         fine = [replace(camera, width=SAMPLES * camera.width, height=SAMPLES * camera.height) for camera in cameras]
         fragments = rasterize_mesh(self.vertices(moment), self.faces, fine)
         covered = (fragments.faces >= 0)[..., None].float()

@@ -1,4 +1,4 @@
-"""An excavator that digs: stiff parts on hinges, each of which turns about the one before."""
+"""Digging excavator: rigid parts on a chain of hinges."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,13 +9,13 @@ from numpy import ndarray
 
 from examples.shapes import Field, Skin, ellipsoid, mix, skin, smooth_chain, step, turn_about_z, union
 
-PIVOT = np.array((-0.16, 0.0, 0.0))  # the house turns about the vertical through it
-BOOM = np.array((0.07, -0.19, -0.07))  # the hinge in the house
-STICK = np.array((0.50, 0.27, -0.07))  # the hinge at the end of the boom
-BUCKET = np.array((0.63, -0.09, -0.07))  # and at the end of the stick
-TURN, LIFT, CRANE, SCOOP = 0.55, 0.20, 0.34, 0.55  # radians to either side
-RISE = np.array((0.0, 0.10, 0.0))  # brings its middle to the origin
-SIZE = 0.92  # of the whole, so that it stays in the picture
+PIVOT = np.array((-0.16, 0.0, 0.0))  # vertical axis of the house
+BOOM = np.array((0.07, -0.19, -0.07))  # hinge at the house
+STICK = np.array((0.50, 0.27, -0.07))  # hinge at the end of the boom
+BUCKET = np.array((0.63, -0.09, -0.07))  # hinge at the end of the stick
+TURN, LIFT, CRANE, SCOOP = 0.55, 0.20, 0.34, 0.55  # amplitudes, radians
+RISE = np.array((0.0, 0.10, 0.0))  # centers it at the origin
+SIZE = 0.92  # scale, so that it stays in the frame
 
 YELLOW = np.array((0.960, 0.700, 0.060))
 ORANGE = np.array((0.900, 0.380, 0.060))
@@ -27,11 +27,11 @@ WHITE = np.array((0.950, 0.950, 0.930))
 
 @dataclass(frozen=True)
 class Excavator:
-    """The machine on its tracks."""
+    """Excavator on its tracks."""
 
     @cached_property
     def parts(self) -> list[Skin]:
-        """Tracks, house, boom, stick and bucket at rest, each closed."""
+        """Return tracks, house, boom, stick and bucket at rest, each closed."""
         boxes = (
             (_tracks, (-0.62, -0.56, -0.36), (0.34, -0.28, 0.36)),
             (_house, (-0.62, -0.40, -0.30), (0.20, 0.28, 0.30)),
@@ -43,12 +43,12 @@ class Excavator:
 
     @cached_property
     def part(self) -> ndarray:
-        """Which part every vertex belongs to, "v"."""
+        """Return the part of every vertex, "v"."""
         return np.repeat(np.arange(len(self.parts)), [len(part.points) for part in self.parts])
 
     @cached_property
     def skin(self) -> Skin:
-        """All parts at rest."""
+        """Return all parts at rest."""
         firsts = np.cumsum([0, *(len(part.points) for part in self.parts)])
         faces = [part.faces + first for part, first in zip(self.parts, firsts, strict=False)]
         points, openness = (
@@ -58,11 +58,11 @@ class Excavator:
 
     @cached_property
     def features(self) -> ndarray:
-        """The number of the part at every vertex, "v 1"; no triangle has two."""
+        """Return the part number of every vertex, "v 1"; no triangle has two."""
         return self.part[:, None].astype(float)
 
     def at(self, moment: float) -> ndarray:
-        """Vertices at a moment of the work; 0 and 1 are the same."""
+        """Return the vertices at a time of the cycle; 0 and 1 are the same."""
         phase = 2 * np.pi * moment
         house = _hinge(PIVOT, _turn_about_y(TURN * np.sin(phase)))
         boom = _chained(house, _hinge(BOOM, turn_about_z(LIFT * np.sin(phase + 1.3) - 0.05)))
@@ -73,7 +73,7 @@ class Excavator:
         return SIZE * (np.concatenate(placed) + RISE)
 
     def color(self, p: ndarray, features: ndarray) -> ndarray:
-        """Paint at points of the skin at rest, "p 3"."""
+        """Return the paint at points of the skin at rest, "p 3"."""
         painters = (_paint_tracks, _paint_house, _paint_arm, _paint_arm, _paint_bucket)
         paint, part = np.zeros_like(p), features[:, 0].round()
         for number, painter in enumerate(painters):
@@ -95,7 +95,7 @@ def _chained(outer: Callable[[ndarray], ndarray], inner: Callable[[ndarray], nda
 
 
 def _block(center: tuple[float, float, float], half: tuple[float, float, float], radius: float) -> Field:
-    """A box with round edges."""
+    """Return a box with rounded edges."""
 
     def field(p: ndarray) -> ndarray:
         q = np.abs(p - np.array(center)) - (np.array(half) - radius)

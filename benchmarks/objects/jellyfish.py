@@ -1,4 +1,4 @@
-"""A jellyfish that swims: a bell that closes and opens from the top down, tentacles that follow in waves."""
+"""Swimming jellyfish: a contracting bell, and tentacles that follow in waves."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,11 +8,11 @@ from numpy import ndarray
 
 from examples.shapes import Field, Skin, ellipsoid, mix, skin, smooth_chain, step, union
 
-APEX = 0.62  # height of the top
-RIM = 0.20  # height of the edge of the bell
+APEX = 0.62  # height of the top, object units
+RIM = 0.20  # height of the rim of the bell
 WALL = 0.05  # thickness
 TENTACLES = 8
-ARMS = 4  # the thick ones in the middle
+ARMS = 4  # number of thick arms in the middle
 
 ROSE = np.array((0.930, 0.300, 0.480))
 PLUM = np.array((0.420, 0.110, 0.520))
@@ -23,23 +23,23 @@ GOLD = np.array((0.980, 0.690, 0.180))
 
 @dataclass(frozen=True)
 class Jellyfish:
-    """The animal in open water; nothing in it is stiff."""
+    """Jellyfish without rigid parts."""
 
     @cached_property
     def skin(self) -> Skin:
-        """The surface at rest."""
+        """Return the surface at rest."""
         return skin(
             union([_bell, union([_tentacles(), _arms()], 0.02)], 0.03), (-0.56, -0.76, -0.56), (0.56, 0.66, 0.56)
         )
 
     @cached_property
     def features(self) -> ndarray:
-        """Distances to bell, tentacles and arms at every vertex, "v 3"."""
+        """Return the distances to bell, tentacles and arms at every vertex, "v 3"."""
         points = self.skin.points
         return np.stack([_bell(points), _tentacles()(points), _arms()(points)], 1)
 
     def at(self, moment: float) -> ndarray:
-        """Vertices at a moment of the stroke; 0 and 1 are the same."""
+        """Return the vertices at a time of the stroke; 0 and 1 are the same."""
         phase = 2 * np.pi * moment
         x, y, z = self.skin.points.T
         below = APEX - y
@@ -54,7 +54,7 @@ class Jellyfish:
         return np.stack([close * (c * x + s * z) + sway + lean * y, y + rise, close * (c * z - s * x) + 0.7 * sway], 1)
 
     def color(self, p: ndarray, features: ndarray) -> ndarray:
-        """Paint at points of the skin at rest, "p 3"."""
+        """Return the paint at points of the skin at rest, "p 3"."""
         bell, tentacle, arm = features.T
         around, height = np.arctan2(p[:, 0], p[:, 2]), p[:, 1]
         out = np.hypot(p[:, 0], p[:, 2])
@@ -73,7 +73,7 @@ class Jellyfish:
 
 
 def _bell(p: ndarray) -> ndarray:
-    """A dome, hollow from below."""
+    """Return a dome, hollow from below."""
     outer = ellipsoid((0, RIM, 0), (0.46, APEX - RIM, 0.46))(p)
     inner = ellipsoid((0, RIM, 0), (0.46 - WALL, APEX - RIM - 1.6 * WALL, 0.46 - WALL))(p)
     return np.maximum(np.maximum(outer, -inner), RIM - 0.03 * np.cos(8 * np.arctan2(p[:, 0], p[:, 2])) - p[:, 1])

@@ -1,4 +1,4 @@
-"""A macaw that flaps: wings of bones that bend along their length, a long tail that nods behind."""
+"""Flapping macaw: wings with chains of bones, and a nodding tail."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,10 +24,10 @@ WING = (  # center and radii of the flat parts of the right wing, from the shoul
 )
 FINGERS = (0.10, 0.02, -0.06, -0.14)  # z of the tips of the longest feathers
 JOINTS = np.linspace(0.10, 0.72, 9)  # x of the bones of a wing
-FLAP = 0.62  # radians to either side, of the whole wing at its tip
-LAG = 1.1  # radians of the phase by which the tip follows the shoulder
-DIVE = 0.45  # radians by which it looks down, so that the input camera sees its back
-REACH = 0.055  # how softly the bones share the skin
+FLAP = 0.62  # amplitude at the wing tip, radians
+LAG = 1.1  # phase lag of the tip behind the shoulder, radians
+DIVE = 0.45  # pitch, radians; shows its back to the input camera
+REACH = 0.055  # width of the transition between bones
 EYE = np.array((0.078, 0.180, 0.262))
 
 RED = np.array((0.860, 0.090, 0.080))
@@ -40,11 +40,11 @@ COAL = np.array((0.080, 0.070, 0.090))
 
 @dataclass(frozen=True)
 class Parrot:
-    """The bird in the air."""
+    """Macaw in flight."""
 
     @cached_property
     def skin(self) -> Skin:
-        """The surface at rest, wings spread."""
+        """Return the surface at rest, with spread wings."""
         body = union([smooth_chain(BODY, 24), smooth_chain(BEAK, 10)], 0.02)
         tail = union([_feather(TAIL, 0.05 * side) for side in (-1, 0, 1)], 0.02)
         whole = union([union([body, tail], 0.04), _wing(1), _wing(-1)], 0.035)
@@ -52,12 +52,12 @@ class Parrot:
 
     @cached_property
     def features(self) -> ndarray:
-        """Distance to the body without wings and tail at every vertex, "v 1"."""
+        """Return the distance to the body without wings and tail at every vertex, "v 1"."""
         return smooth_chain(BODY, 24)(self.skin.points)[:, None]
 
     @cached_property
     def bones(self) -> Bones:
-        """The body, the tail, and the bones of both wings."""
+        """Return the bones of body, tail and both wings."""
         points = self.skin.points
         wing = np.array([(x, 0.03, 0.0) for x in JOINTS])
         rests = np.concatenate([[(0, 0, 0.05), (0, -0.03, -0.24)], wing, wing * (-1, 1, 1)])
@@ -72,7 +72,7 @@ class Parrot:
         return Bones(total / total.sum(1, keepdims=True), rests)
 
     def at(self, moment: float) -> ndarray:
-        """Vertices at a moment of the beat; 0 and 1 are the same."""
+        """Return the vertices at a time of the wing beat; 0 and 1 are the same."""
         phase = 2 * np.pi * moment
         along = np.linspace(0, 1, len(JOINTS))
         angles = FLAP * (0.55 + 0.45 * along) * np.sin(phase - LAG * along) + 0.10
@@ -86,7 +86,7 @@ class Parrot:
         return (self.bones.pose(self.skin.points, places, turns) + middle) @ _about_x(DIVE).T
 
     def color(self, p: ndarray, features: ndarray) -> ndarray:
-        """Paint at points of the skin at rest, "p 3"."""
+        """Return the paint at points of the skin at rest, "p 3"."""
         beyond = features[:, 0]
         x, y, z = np.abs(p[:, 0]), p[:, 1], p[:, 2]
         back = 0.06 - 0.16 * x - z  # distance behind a line along the wing

@@ -1,4 +1,4 @@
-"""What is true of an object: the video of the input camera, the bank of a prior, and views for scoring alone."""
+"""Objects with ground truth: input video, view bank of the oracle, and held-out views for scoring."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,28 +21,28 @@ from steps.artifacts.ground_truth import GroundTruth
 from steps.artifacts.media import read_png
 from steps.fitting.priors import read_bank_folder
 
-OBJECTS: dict[str, Callable[[], Creature]] = {  # a walker, a flier, something soft, something stiff
+OBJECTS: dict[str, Callable[[], Creature]] = {  # walking, flying, soft and rigid motion
     "newt": Newt,
     "parrot": Parrot,
     "jellyfish": Jellyfish,
     "excavator": Excavator,
 }
-SCORED_AZIMUTHS_DEG = (-75, 15, 105, 195)  # of Consistent4D; none of them is in a bank
-BANK_AZIMUTHS = 16  # at equal steps
+SCORED_AZIMUTHS_DEG = (-75, 15, 105, 195)  # degrees, of Consistent4D; none of them is in a bank
+BANK_AZIMUTHS = 16  # number of views, at equal steps of azimuth
 BANK_ELEVATIONS_DEG = (-20.0, 0.0, 20.0)
 FPS = 12.0
 
 
 @dataclass(frozen=True)
 class Specimen:
-    """Everything that is true of an object.
+    """Ground truth of an object.
 
     Attributes:
         name: of the object.
-        cutouts: what the input camera sees, straight alpha.
-        bank: what the prior may know.
-        cameras: where nobody looks but the scorer.
-        views: what is seen from there, straight alpha, one row per camera.
+        cutouts: of the input camera, straight alpha.
+        bank: views of the oracle prior.
+        cameras: held out for scoring.
+        views: of these cameras, straight alpha, one row per camera.
     """
 
     name: str
@@ -53,12 +53,12 @@ class Specimen:
 
     @property
     def video(self) -> DrivingVideo:
-        """The driving video."""
+        """Return the driving video."""
         return DrivingVideo(self.cutouts[..., :3], self.cutouts[..., 3:], FPS)
 
 
-def made(name: str, frames: int, size: int) -> Specimen:
-    """One of our own objects: a loop of so many frames, pictures of `size` pixels.
+def render_specimen(name: str, frames: int, size: int) -> Specimen:
+    """Render one of our own objects: a loop of this many frames, `size` pixels.
 
     Raises:
         KeyError: there is no such object.
@@ -77,37 +77,37 @@ def made(name: str, frames: int, size: int) -> Specimen:
     return Specimen(name, pictures[0], bank, scored, pictures[1:first])
 
 
-def read(truth: GroundTruth, frames: int) -> Specimen:
-    """An object out of a data set.
+def read_specimen(ground_truth: GroundTruth, frames: int) -> Specimen:
+    """Read an object of a data set.
 
     Of a longer video every second, third ... frame is taken, whatever gives at most `frames`.
 
     Raises:
         BadInput: it has no bank, or one without the first frame; no views; or pictures that cannot be compared.
     """
-    if truth.bank is None:
-        raise BadInput(f"{truth.name} has no bank/ of true views, which the oracle prior needs")
-    if not truth.views:
-        raise BadInput(f"{truth.name} has no view_<azimuth>/ of true views, against which fits are scored")
-    stride = -(-len(truth.inputs) // frames)
-    whole = read_bank_folder(truth.bank)
-    kept = [column for column, frame in enumerate(whole.frames) if frame % stride == 0]
-    moments = tuple(whole.frames[column] // stride for column in kept)
+    if ground_truth.bank is None:
+        raise BadInput(f"{ground_truth.name} has no bank/ of ground-truth views; the oracle prior needs one")
+    if not ground_truth.views:
+        raise BadInput(f"{ground_truth.name} has no view_<azimuth>/ with ground-truth views; scores need at least one")
+    stride = -(-len(ground_truth.inputs) // frames)
+    full = read_bank_folder(ground_truth.bank)
+    kept = [column for column, frame in enumerate(full.frames) if frame % stride == 0]
+    moments = tuple(full.frames[column] // stride for column in kept)
     if 0 not in moments:
-        raise BadInput(f"the bank/ of {truth.name} does not have frame 0, of which the static object is fitted")
-    bank = Bank(whole.cameras, moments, whole.pictures[:, kept])
-    pictures = _pictures(truth, stride)
+        raise BadInput(f"the bank/ of {ground_truth.name} has no frame 0; the static stage needs it")
+    bank = Bank(full.cameras, moments, full.pictures[:, kept])
+    pictures = _pictures(ground_truth, stride)
     size = pictures.shape[2]
-    cameras = tuple(OrbitCamera(0, view.azimuth_deg, width=size, height=size) for view in truth.views)
-    return Specimen(truth.name, pictures[0], bank, cameras, pictures[1:])
+    cameras = tuple(OrbitCamera(0, view.azimuth_deg, width=size, height=size) for view in ground_truth.views)
+    return Specimen(ground_truth.name, pictures[0], bank, cameras, pictures[1:])
 
 
-def _pictures(truth: GroundTruth, stride: int) -> Float[Tensor, "v t s s 4"]:
-    """What the input camera sees, and then all views: as many frames of each."""
-    folders = [truth.inputs, *(view.frames for view in truth.views)]
-    rows = [[read_png(path) for path in folder[: len(truth.inputs) : stride]] for folder in folders]
+def _pictures(ground_truth: GroundTruth, stride: int) -> Float[Tensor, "v t s s 4"]:
+    """Return the frames of the input camera and of all views, as many of each."""
+    folders = [ground_truth.inputs, *(view.frames for view in ground_truth.views)]
+    rows = [[read_png(path) for path in folder[: len(ground_truth.inputs) : stride]] for folder in folders]
     shapes = {picture.shape for row in rows for picture in row}
     if len(shapes) > 1 or any(height != width or channels != 4 for height, width, channels in shapes):
         found = ", ".join(sorted(" x ".join(map(str, shape)) for shape in shapes))
-        raise BadInput(f"input and views of {truth.name} must be square, of one size and RGBA; found {found}")
+        raise BadInput(f"input and views of {ground_truth.name} must be square, of one size and RGBA; found {found}")
     return torch.stack([torch.stack(row) for row in rows])

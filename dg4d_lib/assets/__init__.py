@@ -1,1 +1,1 @@
-"""Files that leave the house: GLB, splats, previews."""
+"""Deliverable files: GLB, USDZ, splats, previews and the viewer page."""

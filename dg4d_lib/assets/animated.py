@@ -1,7 +1,7 @@
-"""The finished product as a value: one topology, moved. And what "between two frames" means for it.
+"""Animated assets, and interpolation between their frames.
 
-Animations are closed: after the last frame comes the first again. A position is a frame number that need not be whole;
-it lies in [0, frames], and from the last frame to `frames` it leads back to the first.
+Animations loop: the last frame is followed by the first. A position is a fractional frame number in [0, frames]; from
+the last frame to `frames` it interpolates back to the first frame.
 """
 
 from dataclasses import dataclass, field
@@ -18,15 +18,15 @@ from dg4d_lib.mesh.textured import TexturedMesh
 
 @dataclass(frozen=True)
 class Asset4D:
-    """A tracked mesh.
+    """Tracked mesh with a frame rate.
 
     Attributes:
-        mesh: at rest.
-        offsets: what to add to the vertices at every frame, world units.
+        mesh: the mesh at rest.
+        offsets: added to the vertices at every frame, world units.
         fps: frames per second.
-        extras: JSON that goes into the GLB untouched.
-        textures: the colors of every frame in [0, 1], where they change; None: always the mesh's own.
-        reference_frame: the position at which the moved mesh is the mesh at rest, but for what was corrected afterwards.
+        extras: JSON that is written to the GLB unchanged.
+        textures: colors of every frame in [0, 1]; None if all frames have the texture of `mesh`.
+        reference_frame: position at which the offsets are 0, up to later corrections.
     """
 
     mesh: TexturedMesh
@@ -40,26 +40,32 @@ class Asset4D:
 def pose_gaussians(
     gaussians: Gaussians, deformation: Deformation, frames: int, positions: Float[Tensor, " m"]
 ) -> Gaussians:
-    """The cloud at positions of an animation with this many frames, one state each, without gradients.
+    """Evaluate the cloud at positions of an animation, one state each, without gradients.
 
-    Between frames the deformation itself says where things are; only the way back from the last frame is linear.
+    Between frames the deformation is evaluated directly; only from the last frame back to the first is it linear.
+
+    Args:
+        gaussians: the canonical cloud.
+        deformation: its motion.
+        frames: number of frames of the animation.
+        positions: fractional frame numbers in [0, frames].
     """
     with torch.no_grad():
         times = positions.clamp(max=frames - 1) / max(1, frames - 1)
-        there = deformation.displace(gaussians.means, times.to(gaussians.means))
-        home = (positions - (frames - 1)).clamp(min=0.0).to(gaussians.means)[:, None, None]
-        if (home > 0).any():
+        displacement = deformation.displace(gaussians.means, times.to(gaussians.means))
+        weight = (positions - (frames - 1)).clamp(min=0.0).to(gaussians.means)[:, None, None]  # of the first frame
+        if (weight > 0).any():
             start = deformation.displace(gaussians.means, gaussians.means.new_zeros(1))
-            there = Displacement(
-                torch.lerp(there.means, start.means, home),
-                torch.lerp(there.log_scales, start.log_scales, home),
-                torch.lerp(there.quats, start.quats, home),
+            displacement = Displacement(
+                torch.lerp(displacement.means, start.means, weight),
+                torch.lerp(displacement.log_scales, start.log_scales, weight),
+                torch.lerp(displacement.quats, start.quats, weight),
             )
-        return there.apply(gaussians)
+        return displacement.apply(gaussians)
 
 
 def interpolate_frames(values: Float[Tensor, "t n c"], positions: Float[Tensor, " m"]) -> Float[Tensor, "m n c"]:
-    """Values given per frame, linear between frames, as a player shows a GLB."""
+    """Interpolate values per frame linearly, as players of a GLB do."""
     before = positions.floor().long()
     share = (positions - before).to(values)[:, None, None]
     return torch.lerp(values[before % len(values)], values[(before + 1) % len(values)], share)

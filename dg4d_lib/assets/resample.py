@@ -1,4 +1,4 @@
-"""Other frame rates: the motion is a function of time, so it can be asked at any moment."""
+"""Resampling of animations to other frame rates; the motion is a continuous function of time."""
 
 from dataclasses import replace
 
@@ -12,31 +12,31 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.tracking.skinning import skin_vertices
 
-MOST_STATES = 1000  # a GLB holds a morph target per state, and weights for all of them at every key
-STATES_AT_ONCE = 32  # bounds the memory
+MAX_STATES = 1000  # a GLB has a morph target per state, and weights of all of them at every key
+STATES_AT_ONCE = 32  # bounds memory
 
 
 def resampled_positions(frames: int, fps: float, wanted: float) -> Float[Tensor, " m"]:
-    """The positions of the states of a closed animation at another frame rate: round(frames * wanted / fps) of them.
+    """Return the positions of round(frames * wanted / fps) states of a loop at another frame rate.
 
-    They part the loop evenly and begin with the first frame. The loop lasts as long as before, to half a state.
+    They divide the loop evenly, starting at the first frame. The duration of the loop changes by half a state at most.
 
     Args:
-        frames: of the animation.
+        frames: number of frames of the animation.
         fps: its frames per second.
-        wanted: states per second.
+        wanted: states per second of the result.
 
     Returns:
-        In [0, frames); float64, so that frames are met exactly.
+        Fractional frame numbers in [0, frames); float64, so that whole frames are exact.
 
     Raises:
-        BadInput: there would be more than 1,000 states, and more than frames.
+        BadInput: the result would have more than 1,000 states and more states than frames.
     """
     count = max(1, round(frames * wanted / fps))
-    if count > max(MOST_STATES, frames):
+    if count > max(MAX_STATES, frames):
         raise BadInput(
-            f"{wanted:g} frames per second would be {count} states of this motion of {frames / fps:.3g} s; at most "
-            f"{MOST_STATES} are written: choose at most {MOST_STATES * fps / frames:.4g}"
+            f"{wanted:g} frames per second give {count} states for this motion of {frames / fps:.3g} s, at most "
+            f"{MAX_STATES} are allowed; set pack.fps to at most {MAX_STATES * fps / frames:.4g}"
         )
     return torch.arange(count, dtype=torch.float64) * frames / count
 
@@ -44,7 +44,7 @@ def resampled_positions(frames: int, fps: float, wanted: float) -> Float[Tensor,
 def pose_gaussians_in_chunks(
     gaussians: Gaussians, deformation: Deformation, frames: int, positions: Float[Tensor, " m"]
 ) -> Gaussians:
-    """What `pose_gaussians` gives, a few positions at a time: networks need far more memory than the states they make."""
+    """Call `pose_gaussians` on a few positions at a time, since deformation networks need much memory per position."""
     parts = [pose_gaussians(gaussians, deformation, frames, part) for part in positions.split(STATES_AT_ONCE)]
     return replace(
         gaussians,
@@ -55,46 +55,47 @@ def pose_gaussians_in_chunks(
 
 
 def resample_asset(asset: Asset4D, gaussians: Gaussians, deformation: Deformation, frames: int, fps: float) -> Asset4D:
-    """A tracked mesh at another frame rate.
+    """Resample a tracked mesh to another frame rate.
 
-    Between frames its vertices ride the Gaussians of that moment, as they did at the frames; what they were corrected
-    by at the frames goes over from one frame to the next linearly. So frames that are met are exactly as they were.
-    Textures that change are those of the nearest frame.
+    Between frames the vertices are skinned to the Gaussians, as at the frames; the corrections that followed skinning
+    at the frames are interpolated linearly. So states that coincide with frames equal them exactly. Textures per frame
+    are those of the nearest frame.
 
     Args:
-        asset: one offset per frame, at the clock of the frames.
-        gaussians: canonical.
-        deformation: of theirs.
-        frames: of the deformation.
+        asset: tracked mesh with one offset per frame of the motion.
+        gaussians: the canonical cloud.
+        deformation: its motion.
+        frames: number of frames of the motion.
         fps: states per second of the result.
 
     Raises:
-        BadInput: the mesh has another number of frames than the motion, or there would be too many states.
+        BadInput: mesh and motion have different numbers of frames, or the result would have too many states.
     """
     if len(asset.offsets) != frames:
-        raise BadInput(f"the mesh has {len(asset.offsets)} frames, its motion {frames}; extract the mesh again")
+        raise BadInput(f"the mesh has {len(asset.offsets)} frames, its motion has {frames}; extract the mesh again")
     if fps == asset.fps:
         return asset
     positions = resampled_positions(frames, asset.fps, fps)
     every = torch.arange(frames, dtype=torch.float64)
-    asked, places = torch.cat([every, positions]).unique(return_inverse=True)
-    carried = _carried(asset, gaussians, deformation, frames, asked)
-    at_frames, there = carried[places[:frames]], carried[places[frames:]]
+    unique, index = torch.cat([every, positions]).unique(return_inverse=True)
+    skinned = _skin(asset, gaussians, deformation, frames, unique)
+    at_frames, at_positions = skinned[index[:frames]], skinned[index[frames:]]
     nearest = positions.round().long() % frames
     return replace(
         asset,
-        offsets=interpolate_frames(asset.offsets, positions) + (there - interpolate_frames(at_frames, positions)),
+        offsets=interpolate_frames(asset.offsets, positions)
+        + (at_positions - interpolate_frames(at_frames, positions)),
         fps=fps,
         textures=None if asset.textures is None else asset.textures[nearest],
         reference_frame=asset.reference_frame * len(positions) / frames,
     )
 
 
-def _carried(
+def _skin(
     asset: Asset4D, gaussians: Gaussians, deformation: Deformation, frames: int, positions: Float[Tensor, " m"]
 ) -> Float[Tensor, "m v 3"]:
-    """How far the vertices have ridden from rest at these positions."""
+    """Skin the vertices to the Gaussians and return their offsets from rest at these positions."""
     rest = pose_gaussians(gaussians, deformation, frames, positions.new_tensor([asset.reference_frame])).at(0)
-    there = pose_gaussians_in_chunks(gaussians, deformation, frames, positions)
-    since_rest = Displacement(there.means - rest.means, there.log_scales - rest.log_scales, there.quats - rest.quats)
-    return skin_vertices(asset.mesh.vertices, rest, since_rest)
+    states = pose_gaussians_in_chunks(gaussians, deformation, frames, positions)
+    motion = Displacement(states.means - rest.means, states.log_scales - rest.log_scales, states.quats - rest.quats)
+    return skin_vertices(asset.mesh.vertices, rest, motion)

@@ -17,7 +17,7 @@ ROWS = 1 << 13  # Gaussians times timestamps per pass of the MLP on the CPU: the
 
 
 class ResidualHead(nn.Module):
-    """h = relu(x); y = h + A h + a; out = B y + b, with A, a, B, b zero at the start."""
+    """Residual head, zero-initialized: h = relu(x); y = h + A h + a; out = B y + b."""
 
     def __init__(self, hidden: int, outputs: int) -> None:
         super().__init__()
@@ -25,7 +25,7 @@ class ResidualHead(nn.Module):
         for parameter in self.parameters():
             nn.init.zeros_(parameter)
 
-    def folded(self) -> tuple[Float[Tensor, "outputs hidden"], Float[Tensor, "outputs 1"]]:
+    def fold(self) -> tuple[Float[Tensor, "outputs hidden"], Float[Tensor, "outputs 1"]]:
         """Return B (1 + A) and B a + b: the head is affine in h, so one matrix and one offset suffice."""
         a, b = self.inner, self.outer
         return torch.addmm(b.weight, b.weight, a.weight), torch.addmv(b.bias, b.weight, a.bias)[:, None]
@@ -45,7 +45,7 @@ class Heads(nn.Module):
         because a matrix with ten rows is faster there than one with ten columns.
         """
         heads = (self.means, self.log_scales, self.quats)
-        matrix, offset = (torch.cat(parts) for parts in zip(*(head.folded() for head in heads), strict=True))
+        matrix, offset = (torch.cat(parts) for parts in zip(*(head.fold() for head in heads), strict=True))
         times, count, _ = features.shape
         rows = features.flatten(0, 1)
         parts = rows.split(ROWS) if rows.device.type == "cpu" else [rows]

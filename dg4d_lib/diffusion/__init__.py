@@ -1,1 +1,1 @@
-"""What users of pretrained diffusion models share: loading their parts, and fitting batches into memory."""
+"""Pretrained diffusion models: components, schedules, samplers and micro-batching."""

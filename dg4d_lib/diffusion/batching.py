@@ -1,4 +1,4 @@
-"""How much goes through a large network at once: what a memory budget allows, and less when that was too much."""
+"""Micro-batching within a memory budget, with smaller batches after an out-of-memory error."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -11,46 +11,46 @@ Result = TypeVar("Result")
 
 
 class MicroBatches:
-    """Runs a function over a batch in pieces; a piece that does not fit into memory is halved and done again.
+    """Runner of a function over micro-batches; a micro-batch that runs out of memory is halved and repeated.
 
-    The smaller size is kept for everything that follows.
+    The smaller size is kept for all later calls.
 
     Attributes:
-        size: the most items of a piece.
+        size: largest number of items of a micro-batch.
     """
 
     def __init__(self, name: str, size: int) -> None:
-        """Begin with a size.
+        """Set the initial size.
 
         Args:
-            name: what goes through, for notes: "views of the prior".
-            size: at least 1.
+            name: of the items, for notes: "views of the prior".
+            size: number of items; at least 1.
         """
         self.name, self.size = name, max(1, size)
         self._halved_from: int | None = None
 
     @classmethod
     def within(cls, name: str, memory_gb: float, resident_gb: float, item_gb: float) -> "MicroBatches":
-        """As many items as a budget has room for, at least one.
+        """Return micro-batches of as many items as fit into a memory budget, at least one.
 
         Args:
-            name: as above.
-            memory_gb: the budget, GiB.
-            resident_gb: of it, what is taken before the first item: weights and everything else of the process.
-            item_gb: what one item takes while it goes through.
+            name: of the items.
+            memory_gb: budget, GiB.
+            resident_gb: memory in use without items: weights and the rest of the process, GiB.
+            item_gb: memory per item, GiB.
         """
         return cls(name, int((memory_gb - resident_gb) / item_gb))
 
     def run(self, function: Callable[[slice], Result], total: int, most: int | None = None) -> list[Result]:
-        """What `function` returns for consecutive slices of `range(total)`, in order.
+        """Return the results of `function` for consecutive slices of `range(total)`, in order.
 
         Args:
-            function: may be called for a slice again after it ran out of memory, so it must change nothing outside.
-            total: how many items there are.
-            most: of a piece of these items, where they are larger than others; at least 1.
+            function: without side effects: it is called again after a slice ran out of memory.
+            total: number of items.
+            most: additional bound on the size, for items that are larger than others; at least 1.
 
         Raises:
-            BackendUnavailable: there is no memory for a single item.
+            BackendUnavailable: a single item does not fit into memory.
         """
         results: list[Result] = []
         start = 0
@@ -64,22 +64,22 @@ class MicroBatches:
             else:
                 start = piece.stop
                 continue
-            self._halve(piece.stop - piece.start)  # here the error, and what its frames held, is gone
+            self._halve(piece.stop - piece.start)  # outside of `except`, so that the traceback no longer holds tensors
         return results
 
     def notes(self) -> tuple[str, ...]:
-        """A sentence for the report if memory ran out; nothing if it never did."""
+        """Return a sentence for the report if memory ran out, else nothing."""
         if self._halved_from is None:
             return ()
         return (
-            f"memory ran out with {self._halved_from} {self.name} at once; the rest was done with at most {self.size}; "
-            "a lower memory_gb avoids the attempt",
+            f"memory ran out with {self._halved_from} {self.name} at once; continued with at most {self.size}; "
+            "lower memory_gb to avoid the failed attempts",
         )
 
     def _halve(self, tried: int) -> None:
         if tried == 1:
             raise BackendUnavailable(
-                f"there is not enough memory for one of the {self.name}; close what else uses the device, or choose a "
+                f"not enough memory for one of the {self.name}; close other programs that use the device, or choose a "
                 "lower precision"
             )
         self._halved_from = self._halved_from or tried
@@ -89,5 +89,5 @@ class MicroBatches:
 
 
 def is_out_of_memory(error: RuntimeError) -> bool:
-    """Whether torch could not get memory, on a GPU or for the processor."""
+    """Return true if torch ran out of memory, on a GPU or on the CPU."""
     return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)

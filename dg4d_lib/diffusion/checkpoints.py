@@ -1,4 +1,4 @@
-"""Networks of this project filled with published tensors, whose names they carry."""
+"""Loading of published checkpoints into networks of this project, which use their tensor names."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -15,12 +15,12 @@ Network = TypeVar("Network", bound=nn.Module)
 
 
 def load_checkpoint(build: Callable[[dict[str, Tensor]], Network], file: Path, placement: Placement) -> Network:
-    """The network that `build` makes, with the tensors of a file, frozen; tensors it does not know are left out.
+    """Build a network and load the tensors of a file, frozen; extra tensors of the file are ignored.
 
     Args:
-        build: makes it for these tensors; called where new tensors take no memory.
+        build: creates the network for these tensors; called on the meta device.
         file: a safetensors file, or a pickle of tensors.
-        placement: where and how it lies.
+        placement: device, precision and memory format.
 
     Raises:
         BadInput: the file cannot be read, or tensors are missing or of another shape.
@@ -28,13 +28,13 @@ def load_checkpoint(build: Callable[[dict[str, Tensor]], Network], file: Path, p
     tensors = read_tensors(file)
     with torch.device("meta"):
         network = build(tensors)
-    wanted = {name: value.shape for name, value in network.state_dict().items()}
-    wrong = [name for name, shape in wanted.items() if name not in tensors or tensors[name].shape != shape]
+    expected = {name: value.shape for name, value in network.state_dict().items()}
+    wrong = [name for name, shape in expected.items() if name not in tensors or tensors[name].shape != shape]
     if wrong:
         raise BadInput(
-            f"{file} does not fit this {type(network).__name__}: {len(wrong)} of its {len(wanted)} tensors are missing "
+            f"{file} does not match {type(network).__name__}: {len(wrong)} of its {len(expected)} tensors are missing "
             f"or of another shape, the first is {wrong[0]}"
         )
-    network.load_state_dict({name: tensors[name].to(placement.dtype) for name in wanted}, assign=True)
+    network.load_state_dict({name: tensors[name].to(placement.dtype) for name in expected}, assign=True)
     loaded: Network = attach_flop_counter(frozen(network, placement))
     return loaded

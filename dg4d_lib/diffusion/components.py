@@ -1,4 +1,4 @@
-"""The parts of a pretrained pipeline, read from the folder of a model in diffusers' layout, frozen.
+"""Loading of pipeline components from a model folder in diffusers' layout, frozen.
 
     model/
       vae/           config.json, diffusion_pytorch_model.safetensors (or .fp16.safetensors, .bin, .fp16.bin)
@@ -6,7 +6,7 @@
       image_encoder/ config.json, model.safetensors (or .fp16.safetensors), pytorch_model.bin (or .fp16.bin)
       scheduler/     scheduler_config.json
 
-Nothing of a folder is executed: classes come from diffusers and transformers, tensors from the files.
+No code of a folder is executed: classes come from diffusers and transformers, tensors from the files.
 """
 
 from dataclasses import dataclass
@@ -26,18 +26,18 @@ from dg4d_lib.settings import Precision
 DTYPES: dict[Precision, torch.dtype] = {"fp16": torch.float16, "bf16": torch.bfloat16, "fp32": torch.float32}
 
 DIFFUSERS_FILE, TRANSFORMERS_FILES = "diffusion_pytorch_model", ("model", "pytorch_model")
-HALF = "fp16"  # the variant of a file whose tensors are stored in half precision
+HALF = "fp16"  # variant of files in half precision
 UNREADABLE = (OSError, EOFError, ValueError, KeyError, TypeError, RuntimeError, SafetensorError, UnpicklingError)
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where and how the weights of a part lie.
+    """Device, precision and memory format of a component.
 
     Attributes:
         device: of every tensor.
-        dtype: of every floating tensor.
-        channels_last: convolutions get their tensors with the channels innermost, as GPUs like it in half precision.
+        dtype: of every floating-point tensor.
+        channels_last: memory format of convolutions; faster on GPUs in half precision.
     """
 
     device: torch.device
@@ -46,42 +46,42 @@ class Placement:
 
 
 def compute_dtype(device: torch.device, precision: Precision) -> torch.dtype:
-    """The numbers that networks compute with: what the settings say, and fp32 on a processor, which is slow in half."""
+    """Return the dtype of networks: that of the settings, and float32 on CPUs, which are slow in half precision."""
     return torch.float32 if device.type == "cpu" else DTYPES[precision]
 
 
 def default_device() -> torch.device:
-    """Where networks run: the first CUDA device, or the processor."""
+    """Return the first CUDA device, or the CPU if there is none."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def load_vae(model: Path, placement: Placement) -> Any:
-    """The AutoencoderKL of `model`/vae.
+    """Load the AutoencoderKL of `model`/vae.
 
     Raises:
-        BadInput: a file is missing, damaged, or holds other tensors than its config says.
+        BadInput: a file is missing, damaged, or does not match its config.json.
         BackendUnavailable: diffusers is not installed.
     """
     return load_component(_diffusers().AutoencoderKL, model / "vae", placement)
 
 
 def load_unet(model: Path, placement: Placement) -> Any:
-    """The UNet2DConditionModel of `model`/unet; raises as `load_vae`."""
+    """Load the UNet2DConditionModel of `model`/unet; raises as `load_vae`."""
     return load_component(_diffusers().UNet2DConditionModel, model / "unet", placement)
 
 
 def load_temporal_vae(model: Path, placement: Placement) -> Any:
-    """The AutoencoderKLTemporalDecoder of `model`/vae, for videos; raises as `load_vae`."""
+    """Load the AutoencoderKLTemporalDecoder of `model`/vae, for videos; raises as `load_vae`."""
     return load_component(_diffusers().AutoencoderKLTemporalDecoder, model / "vae", placement)
 
 
 def load_temporal_unet(model: Path, placement: Placement) -> Any:
-    """The UNetSpatioTemporalConditionModel of `model`/unet, for videos; raises as `load_vae`."""
+    """Load the UNetSpatioTemporalConditionModel of `model`/unet, for videos; raises as `load_vae`."""
     return load_component(_diffusers().UNetSpatioTemporalConditionModel, model / "unet", placement)
 
 
 def load_image_encoder(model: Path, placement: Placement) -> Any:
-    """The CLIPVisionModelWithProjection of `model`/image_encoder; raises as `load_vae`."""
+    """Load the CLIPVisionModelWithProjection of `model`/image_encoder; raises as `load_vae`."""
     try:
         from transformers import CLIPVisionModelWithProjection  # noqa: PLC0415 - takes seconds
         from transformers.utils.logging import disable_progress_bar  # noqa: PLC0415
@@ -91,24 +91,24 @@ def load_image_encoder(model: Path, placement: Placement) -> Any:
     return load_component(CLIPVisionModelWithProjection, model / "image_encoder", placement, TRANSFORMERS_FILES)
 
 
-def load_component(kind: Any, folder: Path, placement: Placement, names: tuple[str, ...] = (DIFFUSERS_FILE,)) -> Any:
-    """A model of a class of diffusers or transformers, in evaluation mode and without weight gradients.
+def load_component(cls: Any, folder: Path, placement: Placement, names: tuple[str, ...] = (DIFFUSERS_FILE,)) -> Any:
+    """Load a model of a class of diffusers or transformers, in evaluation mode and without weight gradients.
 
     Args:
-        kind: the class.
-        folder: its config.json and its tensors.
-        placement: where and how it lies; the half-precision variant of a file is read where half precision is asked
-            for or there is no other.
-        names: what the file may be called, without variant and suffix.
+        cls: the class.
+        folder: with config.json and tensors.
+        placement: device, precision and memory format; the half-precision variant is read if half precision is
+            requested or if there is no other.
+        names: possible names of the file, without variant and suffix.
 
     Raises:
-        BadInput: a file is missing, damaged, or holds other tensors than its config says.
+        BadInput: a file is missing, damaged, or does not match its config.json.
     """
     if not (folder / "config.json").is_file():
-        raise BadInput(f"{folder} has no config.json; weights are expected in the layout of diffusers")
+        raise BadInput(f"{folder} has no config.json; give weights in the layout of diffusers")
     file = weights_file(folder, names, half=placement.dtype == torch.float16)
     try:
-        part, about = kind.from_pretrained(
+        component, info = cls.from_pretrained(
             folder,
             variant=HALF if file.stem.endswith(f".{HALF}") else None,
             use_safetensors=file.suffix == ".safetensors",
@@ -118,25 +118,25 @@ def load_component(kind: Any, folder: Path, placement: Placement, names: tuple[s
         )
     except UNREADABLE as error:
         raise BadInput(f"{file} cannot be read: {_first_line(error)}") from error
-    lacking = sorted(map(str, about["missing_keys"])) + sorted(map(str, about["mismatched_keys"]))
-    if lacking:
+    missing = sorted(map(str, info["missing_keys"])) + sorted(map(str, info["mismatched_keys"]))
+    if missing:
         raise BadInput(
-            f"{file} does not fit its config.json: {len(lacking)} tensors are missing or of another shape, "
-            f"the first is {lacking[0]}"
+            f"{file} does not match its config.json: {len(missing)} tensors are missing or of another shape, "
+            f"the first is {missing[0]}"
         )
-    return attach_flop_counter(frozen(part, placement))
+    return attach_flop_counter(frozen(component, placement))
 
 
 def weights_file(folder: Path, names: tuple[str, ...] = (DIFFUSERS_FILE,), half: bool = False) -> Path:
-    """The file of tensors to read: safetensors before pickles, and of the precision that is wanted if there is one.
+    """Return the file of tensors to read; safetensors are preferred to pickles, then the requested precision.
 
     Args:
-        folder: of the part.
-        names: what the file may be called, without variant and suffix.
-        half: whether the half-precision variant is preferred.
+        folder: of the component.
+        names: possible names of the file, without variant and suffix.
+        half: prefer the half-precision variant.
 
     Raises:
-        BadInput: there is none.
+        BadInput: there is no such file.
     """
     variants = (f".{HALF}", "") if half else ("", f".{HALF}")
     candidates = [
@@ -152,7 +152,7 @@ def weights_file(folder: Path, names: tuple[str, ...] = (DIFFUSERS_FILE,), half:
 
 
 def read_tensors(file: Path) -> dict[str, Tensor]:
-    """The tensors of a safetensors file, or of a pickle that holds nothing else.
+    """Read the tensors of a safetensors file, or of a pickle that holds only tensors.
 
     Raises:
         BadInput: the file cannot be read.
@@ -166,10 +166,10 @@ def read_tensors(file: Path) -> dict[str, Tensor]:
 
 
 def read_linear(folder: Path, name: str, placement: Placement) -> nn.Linear:
-    """A linear layer of any size out of NAME.weight and NAME.bias.
+    """Read a linear layer from the tensors NAME.weight and NAME.bias.
 
     Raises:
-        BadInput: no file, or one that holds something else.
+        BadInput: the file is missing, or holds no such layer.
     """
     file = weights_file(folder)
     tensors = read_tensors(file)
@@ -183,16 +183,16 @@ def read_linear(folder: Path, name: str, placement: Placement) -> nn.Linear:
 
 
 def missing_packages(error: ImportError) -> BackendUnavailable:
-    """What to raise where diffusers or transformers cannot be imported."""
+    """Return the error for a failed import of diffusers or transformers."""
     return BackendUnavailable(
         f"diffusion models need packages that are not installed ({error}); run `make setup CUDA=1`"
     )
 
 
-def frozen(part: Any, placement: Placement) -> Any:
-    """The part in evaluation mode, without weight gradients, at its place."""
-    part = part.eval().requires_grad_(False).to(placement.device)
-    return part.to(memory_format=torch.channels_last) if placement.channels_last else part
+def frozen(component: Any, placement: Placement) -> Any:
+    """Return the component in evaluation mode, without weight gradients, on its device."""
+    component = component.eval().requires_grad_(False).to(placement.device)
+    return component.to(memory_format=torch.channels_last) if placement.channels_last else component
 
 
 def _diffusers() -> Any:

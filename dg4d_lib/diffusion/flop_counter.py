@@ -1,6 +1,6 @@
-"""Floating-point operations of networks: measured once per input shape and added up at every call.
+"""FLOP counter of networks: measures once per input shape, adds up at every call.
 
-torch is imported with the first network, because `count_flops` is entered before (`steps/runtime/perform.py`).
+torch is imported with the first network, because `count_flops` is entered earlier (`steps/runtime/perform.py`).
 """
 
 from collections.abc import Callable, Hashable, Iterator
@@ -14,10 +14,10 @@ _OPEN: ContextVar[dict[str, int] | None] = ContextVar("flops", default=None)
 
 @contextmanager
 def count_flops() -> Iterator[dict[str, int]]:
-    """Count the floating-point operations of networks in the block, by the name of their class.
+    """Count the floating-point operations of networks in the block, by class name.
 
-    A multiplication and an addition are two. Only matrix products, convolutions and attention count, as
-    `torch.utils.flop_counter` has it; the rest is less than a hundredth of a diffusion network.
+    A multiply-add counts as two. Only matrix products, convolutions and attention count, as in
+    `torch.utils.flop_counter`; other operations are below 1 % of a diffusion network.
     """
     flops: dict[str, int] = {}
     token = _OPEN.set(flops)
@@ -28,9 +28,9 @@ def count_flops() -> Iterator[dict[str, int]]:
 
 
 def attach_flop_counter(network: Any) -> Any:
-    """Return the network with its calls counted inside `count_flops`.
+    """Make `count_flops` count the calls of a network, and return the network.
 
-    Encoder and decoder of a VAE, which is never called as a whole, are counted under its name. Where inputs have a
+    A VAE is never called as a whole, so its encoder and decoder are counted under its name. If an input requires a
     gradient, the backward pass is counted too: with frozen weights it costs as much as the forward pass.
     """
     name = type(network).__name__
@@ -41,10 +41,10 @@ def attach_flop_counter(network: Any) -> Any:
 
 def _counting(name: str, forward: Callable[..., Any]) -> Callable[..., Any]:
     """Return `forward`, counted under a name."""
-    import torch  # noqa: PLC0415 - see above
+    import torch  # noqa: PLC0415 - see the module docstring
     from torch.utils.flop_counter import FlopCounterMode  # noqa: PLC0415
 
-    of_one_call: dict[Hashable, int] = {}
+    flops_per_call: dict[Hashable, int] = {}
 
     @torch.compiler.disable(recursive=False)
     @wraps(forward)
@@ -54,15 +54,15 @@ def _counting(name: str, forward: Callable[..., Any]) -> Callable[..., Any]:
             return forward(*positional, **named)
         tensors = [value for value in (*positional, *named.values()) if isinstance(value, torch.Tensor)]
         shapes = tuple(value.shape for value in tensors)
-        if shapes not in of_one_call:  # a separate call, because the counter does not work with gradients
-            apart = {key: _detached(value) for key, value in named.items()}
+        if shapes not in flops_per_call:  # a separate call, because the counter fails with gradients
+            detached = {key: _detached(value) for key, value in named.items()}
             with torch.no_grad(), FlopCounterMode(display=False) as counter:
-                forward(*map(_detached, positional), **apart)
-            of_one_call[shapes] = counter.get_total_flops()
-        made = forward(*positional, **named)
+                forward(*map(_detached, positional), **detached)
+            flops_per_call[shapes] = counter.get_total_flops()
+        outputs = forward(*positional, **named)
         has_backward = torch.is_grad_enabled() and any(value.requires_grad for value in tensors)
-        flops[name] = flops.get(name, 0) + of_one_call[shapes] * (2 if has_backward else 1)
-        return made
+        flops[name] = flops.get(name, 0) + flops_per_call[shapes] * (2 if has_backward else 1)
+        return outputs
 
     return count
 

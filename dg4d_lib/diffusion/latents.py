@@ -1,4 +1,4 @@
-"""Latents of Stable Diffusion's VAE: images to their mode and back."""
+"""Encoding and decoding of images with Stable Diffusion's VAE."""
 
 from typing import Any
 
@@ -8,17 +8,17 @@ from torch import Tensor
 
 from dg4d_lib.images import resize_planes
 
-SIZE, LATENT_SIZE, LATENT_CHANNELS = 256, 32, 4  # pixels and numbers of a side, for Zero-1-to-3 and ImageDream
+SIZE, LATENT_SIZE, LATENT_CHANNELS = 256, 32, 4  # pixels and latents per side, of Zero-1-to-3 and ImageDream
 
 
 def encode_images(vae: Any, images: Float[Tensor, "b h w 3"]) -> Float[Tensor, "b 4 32 32"]:
-    """Return the unscaled mode of the latents of images in [0, 1], in the images' precision; differentiable."""
+    """Encode images in [0, 1] to the unscaled mode of their latents, in the images' precision; differentiable."""
     planes = resize_planes(images.permute(0, 3, 1, 2), (SIZE, SIZE))
     return vae.encode((2 * planes - 1).to(vae.dtype)).latent_dist.mode().to(images.dtype)
 
 
 def decode_images(vae: Any, latents: Float[Tensor, "b c i j"], dtype: torch.dtype) -> Float[Tensor, "b h w 3"]:
-    """Return the images in [0, 1] of unscaled latents in the precision of the VAE."""
+    """Decode unscaled latents, in the precision of the VAE, to images in [0, 1]."""
     return to_images(vae.decode(latents).sample.to(dtype))
 
 
@@ -28,5 +28,5 @@ def to_images(planes: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b h w 3"]:
 
 
 def at_least_float32(dtype: torch.dtype) -> torch.dtype:
-    """Return float32 for half precision, else the type itself."""
+    """Return float32 for half precision, else the given type."""
     return torch.promote_types(dtype, torch.float32)

@@ -1,4 +1,4 @@
-"""Stable Diffusion's noise schedule, and the DDIM sampler without fresh noise (Song et al. 2021)."""
+"""Noise schedule of Stable Diffusion, and the deterministic DDIM sampler (Song et al. 2021, eta = 0)."""
 
 import json
 import math
@@ -18,7 +18,7 @@ BETA_START, BETA_END = 0.00085, 0.012  # scaled-linear, Stable Diffusion v1
 
 @dataclass(frozen=True)
 class BetaSchedule:
-    """Noise schedule and prediction type of a model, with the values of diffusers."""
+    """Noise schedule and prediction type of a model, with the field names of diffusers."""
 
     beta_start: float
     beta_end: float
@@ -32,19 +32,19 @@ SCHEDULE = BetaSchedule(BETA_START, BETA_END, "scaled_linear", NUM_TRAIN_TIMESTE
 
 @cache
 def alphas_cumprod() -> Float[Tensor, " steps"]:
-    """Return the products of 1 - beta, float64, one per training timestep."""
+    """Return the cumulative products of 1 - beta, one per training timestep, float64."""
     betas = torch.linspace(BETA_START**0.5, BETA_END**0.5, NUM_TRAIN_TIMESTEPS, dtype=torch.float64).square()
     return (1 - betas).cumprod(0)
 
 
 def add_noise(latents: Float[Tensor, "*b"], noise: Float[Tensor, "*b"], timestep: int) -> Float[Tensor, "*b"]:
-    """Return clean latents with the noise of a timestep."""
+    """Add noise of a timestep to clean latents."""
     alpha = float(alphas_cumprod()[timestep])
     return alpha**0.5 * latents + (1 - alpha) ** 0.5 * noise
 
 
 def ddim_timesteps(num_inference_steps: int) -> tuple[int, ...]:
-    """Return evenly spaced timesteps from the noisiest to the cleanest: 981, 961, ..., 1 for 50 steps; 0 follows."""
+    """Return evenly spaced timesteps in descending order: 981, 961, ..., 1 for 50 steps, to be followed by 0."""
     stride = NUM_TRAIN_TIMESTEPS // num_inference_steps
     return tuple(stride * i + 1 for i in reversed(range(num_inference_steps)))
 
@@ -52,7 +52,7 @@ def ddim_timesteps(num_inference_steps: int) -> tuple[int, ...]:
 def ddim_step(
     noisy: Float[Tensor, "*b"], noise_pred: Float[Tensor, "*b"], timestep: int, next_timestep: int
 ) -> Float[Tensor, "*b"]:
-    """Denoise latents from one timestep to the next, given the noise that the network predicts."""
+    """Denoise latents from one timestep to the next, given the predicted noise."""
     alpha = float(alphas_cumprod()[timestep])
     clean = (noisy - (1 - alpha) ** 0.5 * noise_pred) / alpha**0.5
     return add_noise(clean, noise_pred, next_timestep)
@@ -62,33 +62,33 @@ def read_schedule(model: Path) -> BetaSchedule:
     """Read the noise schedule of `model`/scheduler.
 
     Raises:
-        BadInput: there is no such file, or it is no scheduler's.
+        BadInput: the file is missing or no scheduler configuration.
     """
     file = model / "scheduler" / "scheduler_config.json"
     try:
-        about = json.loads(file.read_text(encoding="utf-8"))
+        config = json.loads(file.read_text(encoding="utf-8"))
         return BetaSchedule(
-            beta_start=float(about["beta_start"]),
-            beta_end=float(about["beta_end"]),
-            beta_schedule=str(about["beta_schedule"]),
-            num_train_timesteps=int(about["num_train_timesteps"]),
-            prediction_type=str(about.get("prediction_type", "epsilon")),
+            beta_start=float(config["beta_start"]),
+            beta_end=float(config["beta_end"]),
+            beta_schedule=str(config["beta_schedule"]),
+            num_train_timesteps=int(config["num_train_timesteps"]),
+            prediction_type=str(config.get("prediction_type", "epsilon")),
         )
     except FileNotFoundError as error:
-        raise BadInput(f"{file} is missing; weights are expected in the layout of diffusers") from error
+        raise BadInput(f"{file} is missing; give weights in the layout of diffusers") from error
     except (ValueError, KeyError, TypeError) as error:
-        raise BadInput(f"{file} is no scheduler of diffusion models: {error!r}") from error
+        raise BadInput(f"{file} is no scheduler configuration of diffusers: {error!r}") from error
 
 
 def require_schedule(model: Path, expected: BetaSchedule) -> None:
     """Refuse a model whose noise schedule or prediction type is not the expected one.
 
     Raises:
-        BadInput: says what differs.
+        BadInput: the schedules differ.
     """
     given = read_schedule(model)
     betas = ((given.beta_start, expected.beta_start), (given.beta_end, expected.beta_end))
     same = all(math.isclose(ours, theirs, rel_tol=1e-6) for ours, theirs in betas)
     kept = replace(given, beta_start=expected.beta_start, beta_end=expected.beta_end)
     if not same or kept != expected:
-        raise BadInput(f"the scheduler of {model} is {given}; this model has to have {expected}")
+        raise BadInput(f"the scheduler of {model} is {given}; expected {expected}")

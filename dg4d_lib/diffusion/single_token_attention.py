@@ -1,8 +1,7 @@
-"""Cross-attention to a single token, without the attention.
+"""Cross-attention to a single token, computed without queries, keys and scores.
 
-Zero-1-to-3 and Stable Video Diffusion attend to one token per picture. The softmax over one key is 1 for any query, so
-that every pixel gets out(value(token)): it is computed once, without queries, keys and scores. The result is the same
-up to rounding.
+Zero-1-to-3 and Stable Video Diffusion attend to one token per image. The softmax over one key is 1 for any query, so
+every pixel gets out(value(token)), which is computed once. The result is the same up to rounding.
 """
 
 from typing import Any
@@ -11,30 +10,30 @@ from torch import Tensor
 
 
 def shorten_attention(unet: Any) -> Any:
-    """Return the network with shortened cross-attention to single tokens.
+    """Replace the cross-attention processors of a UNet, and return the UNet.
 
     Args:
-        unet: diffusers' UNet2DConditionModel or UNetSpatioTemporalConditionModel; no weight moves or changes its name.
+        unet: diffusers' UNet2DConditionModel or UNetSpatioTemporalConditionModel; its weights keep their names.
     """
     processors = unet.attn_processors.items()
     unet.set_attn_processor(
         {
-            name: SingleTokenProcessor(ordinary) if name.endswith("attn2.processor") else ordinary
-            for name, ordinary in processors
+            name: SingleTokenProcessor(fallback) if name.endswith("attn2.processor") else fallback
+            for name, fallback in processors
         }
     )
     return unet
 
 
 class SingleTokenProcessor:
-    """Processor of diffusers' `Attention`; shapes are not checked, because compilers trace it.
+    """Attention processor of diffusers; shapes are not checked, because torch.compile traces it.
 
     Args:
-        ordinary: processor for several tokens, a mask, or training with its dropout.
+        fallback: processor for several tokens, masks, or training with dropout.
     """
 
-    def __init__(self, ordinary: Any) -> None:
-        self.ordinary = ordinary
+    def __init__(self, fallback: Any) -> None:
+        self.fallback = fallback
 
     def __call__(
         self,
@@ -50,7 +49,7 @@ class SingleTokenProcessor:
             attn: the layer with its weights.
             hidden_states: queries, "b q c" or "b c h w".
             encoder_hidden_states: tokens, "b l d".
-            attention_mask: which tokens are seen.
+            attention_mask: of the tokens.
             temb: passed on.
 
         Returns:
@@ -58,7 +57,7 @@ class SingleTokenProcessor:
         """
         tokens = encoder_hidden_states
         if tokens is None or tokens.shape[1] != 1 or attention_mask is not None or attn.training:
-            return self.ordinary(attn, hidden_states, tokens, attention_mask, temb)
+            return self.fallback(attn, hidden_states, tokens, attention_mask, temb)
         if attn.norm_cross:
             tokens = attn.norm_encoder_hidden_states(tokens)
         output = attn.to_out[0](attn.to_v(tokens))
@@ -66,6 +65,6 @@ class SingleTokenProcessor:
             output = output.mT[..., None]
         if attn.residual_connection:
             output = output + hidden_states
-        if attn.rescale_output_factor != 1:  # a division less for nearly all layers
+        if attn.rescale_output_factor != 1:  # saves a division in nearly all layers
             output = output / attn.rescale_output_factor
         return output.expand_as(hidden_states)

@@ -1,4 +1,4 @@
-"""A picture out of words, by any text-to-image pipeline of diffusers that the user names."""
+"""Text-to-image generation with any pipeline of diffusers."""
 
 import inspect
 from collections.abc import Callable
@@ -23,21 +23,21 @@ def draw_picture(
     device: torch.device,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Float[Tensor, "h w 3"]:
-    """Draw one picture.
+    """Generate one image.
 
     Args:
-        model: folder of a pipeline in diffusers' layout, with its model_index.json; nothing of it is executed.
-        text: what to draw; `settings.suffix` is added.
-        settings: how.
-        generator: of the noise, on the processor: then devices agree.
-        device: where the networks work; on a processor they are fp32 whatever the settings say.
-        progress: told how many denoising steps are done.
+        model: folder of a pipeline in diffusers' layout, with model_index.json; no code of it is executed.
+        text: prompt; `settings.suffix` is appended.
+        settings: of the pipeline.
+        generator: of the noise; on the CPU, so that all devices get the same noise.
+        device: of the networks; on the CPU they use fp32.
+        progress: called with (denoising steps done, total).
 
     Returns:
-        sRGB in [0, 1], on the processor.
+        sRGB in [0, 1], on the CPU.
 
     Raises:
-        BadInput: the folder holds no such pipeline, or what came out is no picture.
+        BadInput: the folder holds no such pipeline, or the pipeline returned no valid image.
         BackendUnavailable: diffusers or transformers is not installed.
     """
     pipeline = _load(model, compute_dtype(device, settings.precision))
@@ -59,22 +59,22 @@ def draw_picture(
         "callback_on_step_end": _after_step(settings.num_inference_steps, progress),
     }
     known = inspect.signature(pipeline.__call__).parameters
-    made = pipeline(text + settings.suffix, **{name: value for name, value in options.items() if name in known})
-    if any(getattr(made, "nsfw_content_detected", None) or ()):
-        raise BadInput(f"the pipeline in {model} blanked its picture as unsafe; choose other words or another seed")
-    picture = torch.from_numpy(made.images[0]).float()
-    if not picture.isfinite().all():
+    result = pipeline(text + settings.suffix, **{name: value for name, value in options.items() if name in known})
+    if any(getattr(result, "nsfw_content_detected", None) or ()):
+        raise BadInput(f"the safety checker of {model} blanked the image; change the prompt or the seed")
+    image = torch.from_numpy(result.images[0]).float()
+    if not image.isfinite().all():
         raise BadInput(
-            f"the pipeline in {model} overflowed in {settings.precision}; choose --set text.precision=fp32 or bf16"
+            f"the pipeline in {model} overflowed in {settings.precision}; use --set text.precision=fp32 or bf16"
         )
-    return picture.clamp(0, 1)
+    return image.clamp(0, 1)
 
 
 def _load(model: Path, dtype: torch.dtype) -> Any:
-    """The pipeline that model_index.json names.
+    """Load the pipeline of model_index.json.
 
     Raises:
-        BadInput: there is none, it cannot be read, or it makes no pictures out of words.
+        BadInput: there is none, it cannot be read, or it is no text-to-image pipeline.
     """
     try:
         from diffusers import DiffusionPipeline  # noqa: PLC0415 - takes seconds
@@ -88,22 +88,23 @@ def _load(model: Path, dtype: torch.dtype) -> Any:
             model, dtype=dtype, variant=HALF if half else None, local_files_only=True
         )
     except ImportError as error:
-        raise BackendUnavailable(f"the pipeline in {model} needs a package that is not here: {error}") from error
-    except Exception as error:  # each class and format of file has errors of its own
+        raise BackendUnavailable(f"the pipeline in {model} needs a package that is not installed: {error}") from error
+    except Exception as error:  # every class and file format raises its own types
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise BadInput(f"the pipeline in {model} cannot be read: {reason}") from error
-    asked = inspect.signature(pipeline.__call__).parameters
-    other = [name for name, kind in asked.items() if kind.default is kind.empty and name not in ("prompt", "kwargs")]
-    if "prompt" not in asked or "image" in asked or other:
-        raise BadInput(f"{type(pipeline).__name__} in {model} does not make pictures out of words alone")
+    parameters = inspect.signature(pipeline.__call__).parameters
+    required = [name for name, parameter in parameters.items() if parameter.default is parameter.empty]
+    other = [name for name in required if name not in ("prompt", "kwargs")]
+    if "prompt" not in parameters or "image" in parameters or other:
+        raise BadInput(f"{type(pipeline).__name__} in {model} is no text-to-image pipeline; choose one that is")
     return pipeline
 
 
 def _after_step(total: int, progress: Callable[[int, int], None]) -> Callable[..., dict[str, Any]]:
-    """What diffusers calls after every step with the pipeline, the step's number, its time and tensors."""
+    """Return a `callback_on_step_end` of diffusers that reports progress."""
 
-    def told(_pipeline: Any, number: int, _time: Any, tensors: dict[str, Any]) -> dict[str, Any]:
+    def report(_pipeline: Any, number: int, _time: Any, tensors: dict[str, Any]) -> dict[str, Any]:
         progress(min(number + 1, total), total)
         return tensors
 
-    return told
+    return report

@@ -1,1 +1,1 @@
-"""Judges of pictures nobody took: score distillation and its priors."""
+"""Guidance priors and score distillation."""

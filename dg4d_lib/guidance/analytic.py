@@ -24,8 +24,8 @@ class AnalyticPrior:
     """Score distillation towards known pictures.
 
     Args:
-        clean: color over white and coverage of every view, at its camera's size.
-        noise: which timestep an iteration uses.
+        clean: color over white and alpha of every view, at its camera's size.
+        schedule: of the timestep.
         viewpoints: the only cameras `clean` knows; None is all.
         frames: the only frames `clean` knows; None is all.
         weight: factor on the loss.
@@ -34,24 +34,24 @@ class AnalyticPrior:
     def __init__(
         self,
         clean: CleanPictures,
-        noise: TimestepSchedule,
+        schedule: TimestepSchedule,
         viewpoints: tuple[OrbitCamera, ...] | None = None,
         frames: tuple[int, ...] | None = None,
         weight: float = 1.0,
     ) -> None:
-        self.clean, self.noise, self.weight = clean, noise, weight
+        self.clean, self.schedule, self.weight = clean, schedule, weight
         self.viewpoints, self.frames = viewpoints, frames
 
     def loss(
         self,
         images: Float[Tensor, "b h w 3"],
-        coverage: Float[Tensor, "b h w 1"],
+        alpha: Float[Tensor, "b h w 1"],
         views: Sequence[GuidanceView],
         progress: float,
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:
-        """Return the distance between renders and known pictures, with the weight of this moment of the annealing."""
-        timestep = self.noise.timestep(progress, generator)
+        """Return the weighted distance of the renders from the known images."""
+        timestep = self.schedule.timestep(progress, generator)
         alphabar = float(alphas_cumprod()[timestep])
         clean = self._encode(*self.clean(views)).to(images.device)
 
@@ -59,10 +59,10 @@ class AnalyticPrior:
             return (noisy - alphabar**0.5 * clean) / (1 - alphabar) ** 0.5
 
         pixels = 3 * images.shape[1] * images.shape[2]
-        loss = score_distillation(self._encode(images, coverage), predict_noise, timestep, generator)
+        loss = score_distillation(self._encode(images, alpha), predict_noise, timestep, generator)
         return loss * (self.weight * LATENT_NUMBERS / pixels)
 
-    def _encode(self, images: Float[Tensor, "b h w 3"], coverage: Float[Tensor, "b h w 1"]) -> Float[Tensor, "b c h w"]:
+    def _encode(self, images: Float[Tensor, "b h w 3"], alpha: Float[Tensor, "b h w 1"]) -> Float[Tensor, "b c h w"]:
         """Return pixels as they are diffused: color and alpha in [-1, 1]."""
-        channels = [2 * images - 1, 2 * coverage - 1]
+        channels = [2 * images - 1, 2 * alpha - 1]
         return torch.cat([channel.permute(0, 3, 1, 2) for channel in channels], 1)

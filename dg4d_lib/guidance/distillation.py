@@ -1,7 +1,7 @@
-"""Score distillation: one code path for every prior (Poole et al. 2023; paper section 3.1).
+"""Score distillation sampling (SDS) for all priors (Poole et al. 2023; paper section 3.1).
 
-alphabar is Stable Diffusion's schedule; z are clean latents (or pixels, for analytic denoisers), e the noise:
-x_t = sqrt(alphabar) z + sqrt(1 - alphabar) e;  grad = (1 - alphabar) (e_predicted - e);  d loss / d z = grad / images.
+alphabar is Stable Diffusion's schedule, z are clean latents (or pixels, for analytic denoisers), e is the noise:
+x_t = sqrt(alphabar) z + sqrt(1 - alphabar) e;  grad = (1 - alphabar) (noise_pred - e);  d loss / d z = grad / images.
 """
 
 from collections.abc import Callable
@@ -15,20 +15,20 @@ from torch import Tensor
 from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.diffusion.noise_schedule import NUM_TRAIN_TIMESTEPS, add_noise, alphas_cumprod
 
-T_MAX_END = 0.02  # share of the schedule at which the paper's annealing ends
-MIN_TIMESTEP, MAX_TIMESTEP = 20, 980  # timesteps
+T_MAX_END = 0.02  # fraction of the schedule at the end of the annealing (paper)
+MIN_TIMESTEP, MAX_TIMESTEP = 20, 980  # of 1000 (DreamFusion: 0.02 to 0.98)
 
 PredictNoise = Callable[[Float[Tensor, "b c h w"], int], Float[Tensor, "b c h w"]]
 
 
 @dataclass(frozen=True)
 class TimestepSchedule:
-    """Schedule of the timestep of an iteration, one for its whole batch.
+    """Annealed timestep, one per iteration for the whole batch.
 
     Attributes:
-        start: T_max at the beginning, share of the schedule; the paper's is 0.98, and 0.5 in the dynamic stage.
-        end: where it is going; the paper's is 0.02. The public code's schedule is from 1 to 0 in both stages.
-        uniform: draw the timestep evenly from 0.02 to T_max, rather than take T_max itself.
+        t_max_start: T_max at the start, fraction of the schedule; 0.98 in the paper, 0.5 in the dynamic stage.
+        t_max_end: T_max at the end; 0.02 in the paper. The public code anneals from 1 to 0 in both stages.
+        uniform: draw the timestep uniformly from 0.02 to T_max instead of using T_max itself.
     """
 
     t_max_start: float
@@ -44,15 +44,15 @@ class TimestepSchedule:
 
 
 def annealed_timestep(progress: float, t_max_start: float, t_max_end: float = T_MAX_END) -> int:
-    """Linear from `t_max_start` to `t_max_end` of the schedule, and never outside of 20 to 980.
+    """Interpolate linearly from `t_max_start` to `t_max_end` of the schedule, clamped to 20 to 980.
 
     Args:
-        progress: share of the optimization that is done, in [0, 1].
-        t_max_start: share of the schedule at progress 0.
-        t_max_end: and at progress 1.
+        progress: of the optimization, in [0, 1].
+        t_max_start: fraction of the schedule at progress 0.
+        t_max_end: fraction of the schedule at progress 1.
     """
-    share = t_max_start + (t_max_end - t_max_start) * progress
-    return min(max(round(NUM_TRAIN_TIMESTEPS * share), MIN_TIMESTEP), MAX_TIMESTEP)
+    fraction = t_max_start + (t_max_end - t_max_start) * progress
+    return min(max(round(NUM_TRAIN_TIMESTEPS * fraction), MIN_TIMESTEP), MAX_TIMESTEP)
 
 
 def sds_weight(timestep: int) -> float:
@@ -75,7 +75,7 @@ def distillation_loss(
 
     Args:
         latents: z, with gradient.
-        predict_noise: (x_t, t) -> predicted noise; called without gradient.
+        predict_noise: (x_t, t) -> noise_pred; called without gradient.
         timestep: t, one for the batch.
         noise: e.
     """
@@ -94,32 +94,31 @@ def distill_in_pieces(
     noise: Float[Tensor, "b c u v"],
     batches: MicroBatches,
 ) -> Float[Tensor, ""]:
-    """Return `distillation_loss` of encoded images, computed in micro-batches of any size with the same result.
+    """Return `distillation_loss` of encoded images; the result does not depend on the size of micro-batches.
 
-    The gradient of an image depends on no other image. So each piece is encoded, judged and differentiated at once:
-    only one piece's activations of the encoder are held at a time, and no forward pass is done twice (checkpoints, or
-    a second pass through the encoder after the loss, would repeat a third of the work). Backward only hands on the
-    gradient that is already there.
+    The gradient of an image depends on no other image, so each micro-batch is encoded, scored and differentiated at
+    once. Memory holds the encoder's activations of one micro-batch only, and no forward pass is repeated (gradient
+    checkpointing would repeat a third of the work). The backward pass returns the stored gradient.
 
     Args:
-        images: renders in [0, 1]; where they lie, the loss and the gradient lie.
-        encode: pictures to latents, with gradient.
-        predict_noise: (x_t, t, slice of the images) -> predicted noise.
+        images: renders in [0, 1]; loss and gradient are on their device.
+        encode: images to latents, differentiable.
+        predict_noise: (x_t, t, slice of the images) -> noise_pred.
         timestep: t, one for the batch.
         noise: e.
-        batches: how many images go through at once.
+        batches: micro-batches of images.
     """
 
-    def judge(piece: slice) -> tuple[Tensor, Tensor]:
+    def differentiate(piece: slice) -> tuple[Tensor, Tensor]:
         pixels = images[piece].detach().requires_grad_()
         with torch.enable_grad():
             latents = encode(pixels)
             noises = noise[piece].to(latents.device)
             mean = distillation_loss(latents, lambda noisy, t: predict_noise(noisy, t, piece), timestep, noises)
-            loss = mean * len(pixels)  # divided by their number at the end, where half precision cannot lose digits
+            loss = mean * len(pixels)  # divided at the end, so that half precision loses no digits
         return loss.detach().to(images.device), torch.autograd.grad(loss, pixels)[0]
 
-    losses, gradients = zip(*batches.run(judge, len(images)), strict=True)
+    losses, gradients = zip(*batches.run(differentiate, len(images)), strict=True)
     return _Differentiated.apply(images, torch.stack(losses).sum() / len(images), torch.cat(gradients) / len(images))
 
 

@@ -1,7 +1,7 @@
-"""ImageDream: how an object looks from four sides at once, given a picture of its front (Wang and Shi 2023).
+"""ImageDream: four consistent views of an object, conditioned on an image of its front (Wang and Shi 2023).
 
-It makes the views that LGM reconstructs, and can judge renders as a prior. Its conventions end
-here: a world with z up, an object whose front is seen from azimuth 90, cameras on the unit sphere.
+It generates the views that LGM reconstructs, and serves as a guidance prior. Only this module uses its conventions: z
+up, the front of the object at azimuth 90, cameras on the unit sphere.
 """
 
 import json
@@ -40,44 +40,44 @@ from dg4d_lib.guidance.imagedream_unet import MultiViewUnet, MultiViewUnetConfig
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.settings import ImageDreamPriorSettings, Precision
 
-RING = 4  # views that are denoised together, 90 degrees of azimuth apart
-FRONT_DEG = 90.0  # ImageDream's azimuth of the picture it is given
+RING = 4  # views denoised together, at azimuth steps of 90 degrees
+FRONT_DEG = 90.0  # ImageDream's azimuth of the conditioning image
 
-RESIDENT_GB = {"fp16": 6.0, "bf16": 6.0, "fp32": 10.0}  # weights (3.9 or 7.8), renders and what CUDA takes
-RING_GB = {"fp16": 2.0, "bf16": 2.0, "fp32": 4.0}  # what the VAE keeps of four views for its gradient, and workspace
+RESIDENT_GB = {"fp16": 6.0, "bf16": 6.0, "fp32": 10.0}  # measured: weights (3.9 or 7.8), renders, CUDA context
+RING_GB = {"fp16": 2.0, "bf16": 2.0, "fp32": 4.0}  # measured: VAE activations of four views, workspace
 
 
 @dataclass(frozen=True)
 class ImageDreamCondition:
-    """What the network is told about s objects.
+    """Conditioning on s objects.
 
     Attributes:
-        text: tokens of a description.
-        silence: tokens of no description, for classifier-free guidance.
-        features: of a picture, by CLIP.
-        latents: of the same picture, by the VAE; the network sees them as one more view.
+        prompt_embeds: tokens of the prompt.
+        negative_prompt_embeds: tokens of the empty prompt, for classifier-free guidance.
+        image_embeds: CLIP features of an image.
+        image_latents: of the same image, by the VAE; an additional view for the network.
     """
 
-    text: Float[Tensor, "s l d"]
-    silence: Float[Tensor, "s l d"]
-    features: Float[Tensor, "s m e"]
-    latents: Float[Tensor, "s 4 32 32"]
+    prompt_embeds: Float[Tensor, "s l d"]
+    negative_prompt_embeds: Float[Tensor, "s l d"]
+    image_embeds: Float[Tensor, "s m e"]
+    image_latents: Float[Tensor, "s 4 32 32"]
 
     def rows(self, objects: Sequence[int]) -> "ImageDreamCondition":
-        """Some of the objects, in this order."""
-        chosen = to_device_async(torch.tensor(list(objects)), self.latents.device)
-        return ImageDreamCondition(**{part.name: getattr(self, part.name)[chosen] for part in fields(self)})
+        """Return the conditioning of some objects, in this order."""
+        chosen = to_device_async(torch.tensor(list(objects)), self.image_latents.device)
+        return ImageDreamCondition(**{item.name: getattr(self, item.name)[chosen] for item in fields(self)})
 
 
 class ImageDream:
-    """The networks, frozen, on one device.
+    """Frozen networks of ImageDream on one device.
 
     Attributes:
         unet: predicts noise.
-        vae: pictures to latents and back.
-        image_encoder: CLIP's eye.
-        text_encoder: CLIP's reader.
-        tokenizer: cuts text for it.
+        vae: AutoencoderKL.
+        image_encoder: CLIPVisionModel.
+        text_encoder: CLIPTextModel.
+        tokenizer: CLIPTokenizer.
     """
 
     def __init__(self, unet: MultiViewUnet, vae: Any, image_encoder: Any, text_encoder: Any, tokenizer: Any) -> None:
@@ -90,11 +90,11 @@ class ImageDream:
 
         Args:
             model: the folder.
-            precision: of the networks, on a GPU; the processor computes in float32.
-            device: where they will run.
+            precision: of the networks on a GPU; CPUs use float32.
+            device: of the networks.
 
         Raises:
-            BadInput: a file is missing or damaged, or the model was trained with another noise.
+            BadInput: a file is missing or damaged, or the noise schedule is another.
             BackendUnavailable: diffusers or transformers is not installed.
         """
         try:
@@ -108,13 +108,13 @@ class ImageDream:
         placement = Placement(device, compute_dtype(device, precision), channels_last=device.type == "cuda")
         require_schedule(model, SCHEDULE)
         try:
-            shape = MultiViewUnetConfig.of(json.loads((model / "unet" / "config.json").read_text(encoding="utf-8")))
+            config = MultiViewUnetConfig.of(json.loads((model / "unet" / "config.json").read_text(encoding="utf-8")))
             tokenizer = CLIPTokenizer.from_pretrained(model / "tokenizer", local_files_only=True)
         except (OSError, ValueError, TypeError) as error:
-            raise BadInput(f"{model} is no ImageDream: {error}") from error
+            raise BadInput(f"{model} holds no ImageDream model: {error}") from error
         file = weights_file(model / "unet", half=placement.dtype == torch.float16)
         return cls(
-            load_checkpoint(lambda tensors: MultiViewUnet(shape), file, placement),
+            load_checkpoint(lambda tensors: MultiViewUnet(config), file, placement),
             load_vae(model, placement),
             load_component(CLIPVisionModel, model / "image_encoder", placement, TRANSFORMERS_FILES),
             load_component(CLIPTextModel, model / "text_encoder", placement, TRANSFORMERS_FILES),
@@ -122,42 +122,43 @@ class ImageDream:
         )
 
     @torch.no_grad()
-    def conditioned_on(self, pictures: Float[Tensor, "s h w 3"], text: str = "") -> ImageDreamCondition:
-        """What the network is to know.
+    def conditioned_on(self, images: Float[Tensor, "s h w 3"], prompt: str = "") -> ImageDreamCondition:
+        """Encode the conditioning on images.
 
         Args:
-            pictures: of the front of every object, over white, in [0, 1], square.
-            text: describes them; may be empty.
+            images: of the front of every object, over white, in [0, 1], square.
+            prompt: of all of them; may be empty.
         """
-        eye = clip_pixels(pictures).to(self.image_encoder.device, self.image_encoder.dtype)
-        features = self.image_encoder(eye, output_hidden_states=True).hidden_states[-2]
-        words, silence = (self._tokens(said).expand(len(pictures), -1, -1) for said in (text, ""))
-        return ImageDreamCondition(words, silence, features, self.encode(pictures))
+        pixels = clip_pixels(images).to(self.image_encoder.device, self.image_encoder.dtype)
+        image_embeds = self.image_encoder(pixels, output_hidden_states=True).hidden_states[-2]
+        positive, negative = (self._encode_prompt(text).expand(len(images), -1, -1) for text in (prompt, ""))
+        return ImageDreamCondition(positive, negative, image_embeds, self.encode(images))
 
     @torch.no_grad()
     def views(
         self,
         condition: ImageDreamCondition,
         generator: torch.Generator,
-        steps: int = 30,
-        guidance: float = 5.0,
+        num_inference_steps: int = 30,
+        guidance_scale: float = 5.0,
         elevation_deg: float = 0.0,
     ) -> Float[Tensor, "4 h w 3"]:
-        """Pictures from azimuth 0, 90, 180, 270, in [0, 1], by DDIM without fresh noise (Song et al. 2021).
+        """Sample images at azimuth 0, 90, 180, 270, in [0, 1], by deterministic DDIM (Song et al. 2021).
 
         Args:
             condition: of one object.
-            generator: the source of the first noise.
-            steps: of the sampler.
-            guidance: classifier-free.
-            elevation_deg: of the four cameras, above the object.
+            generator: of the initial noise.
+            num_inference_steps: of the sampler.
+            guidance_scale: classifier-free guidance.
+            elevation_deg: of the four cameras.
         """
         cameras = turntable(RING, OrbitCamera(elevation_deg))
         shape = (1, RING, LATENT_CHANNELS, LATENT_SIZE, LATENT_SIZE)
-        latents = torch.randn(shape, generator=generator, dtype=condition.latents.dtype).to(condition.latents.device)
-        for timestep, following in pairwise((*ddim_timesteps(steps), 0)):
-            noise = self.predict_noise(latents, timestep, [cameras], condition, guidance)
-            latents = ddim_step(latents, noise, timestep, following)
+        latents = torch.randn(shape, generator=generator, dtype=condition.image_latents.dtype)
+        latents = latents.to(condition.image_latents.device)
+        for timestep, next_timestep in pairwise((*ddim_timesteps(num_inference_steps), 0)):
+            noise_pred = self.predict_noise(latents, timestep, [cameras], condition, guidance_scale)
+            latents = ddim_step(latents, noise_pred, timestep, next_timestep)
         unscaled = latents[0].to(self.vae.dtype) / self.vae.config.scaling_factor
         return decode_images(self.vae, unscaled, at_least_float32(self.vae.dtype))
 
@@ -168,69 +169,71 @@ class ImageDream:
         timestep: int,
         rings: Sequence[Sequence[OrbitCamera]],
         condition: ImageDreamCondition,
-        guidance: float,
+        guidance_scale: float,
     ) -> Float[Tensor, "s v 4 32 32"]:
-        """The noise in s sets of v views, with classifier-free guidance: e_u + guidance (e_c - e_u).
+        """Predict the noise of s sets of v views with classifier-free guidance: e_u + guidance_scale (e_c - e_u).
 
-        Without guidance the network is told an empty text, a picture whose features and latents are zero.
+        The unconditional half has an empty prompt, and zero image embeddings and latents.
 
         Args:
-            latents: noisy.
-            timestep: how noisy, 0 to 999.
-            rings: the cameras of every set.
-            condition: of the object of every set.
-            guidance: classifier-free.
+            latents: noisy latents.
+            timestep: 0 to 999.
+            rings: cameras of every set.
+            condition: on the object of every set.
+            guidance_scale: classifier-free guidance.
         """
         like = next(self.unet.parameters())
-        text = torch.cat([condition.silence, condition.text]).to(like)
-        features, fronts = (
-            torch.cat([torch.zeros_like(told), told]).to(like) for told in (condition.features, condition.latents)
+        text = torch.cat([condition.negative_prompt_embeds, condition.prompt_embeds]).to(like)
+        image_embeds, image_latents = (
+            torch.cat([torch.zeros_like(value), value]).to(like)
+            for value in (condition.image_embeds, condition.image_latents)
         )
         poses = torch.stack([torch.stack([camera_to_world_rows(camera) for camera in ring]) for ring in rings])
-        poses = pad(poses, (0, 0, 0, 1)).repeat(2, 1, 1)  # the picture itself has no camera
+        poses = pad(poses, (0, 0, 0, 1)).repeat(2, 1, 1)  # the conditioning image has no camera
         poses = to_device_async(poses.to(like.dtype), like.device)
-        seen = torch.cat([latents.repeat(2, 1, 1, 1, 1).to(like), fronts[:, None]], 1)
-        without, told = self.unet(seen, timestep, poses, text, features)[:, :-1].to(latents).chunk(2)
-        return without + guidance * (told - without)
+        inputs = torch.cat([latents.repeat(2, 1, 1, 1, 1).to(like), image_latents[:, None]], 1)
+        noise_pred = self.unet(inputs, timestep, poses, text, image_embeds)[:, :-1].to(latents)
+        unconditional, conditional = noise_pred.chunk(2)
+        return unconditional + guidance_scale * (conditional - unconditional)
 
-    def encode(self, pictures: Float[Tensor, "b h w 3"]) -> Float[Tensor, "b 4 32 32"]:
-        """Scaled latents of pictures in [0, 1] (the mode, no sample), in their precision; with gradient."""
-        return self.vae.config.scaling_factor * encode_images(self.vae, pictures.to(self.vae.device))
+    def encode(self, images: Float[Tensor, "b h w 3"]) -> Float[Tensor, "b 4 32 32"]:
+        """Encode images in [0, 1] to the scaled mode of their latents, in the images' precision; differentiable."""
+        return self.vae.config.scaling_factor * encode_images(self.vae, images.to(self.vae.device))
 
-    def _tokens(self, text: str) -> Float[Tensor, "1 l d"]:
-        cut = self.tokenizer(
+    def _encode_prompt(self, text: str) -> Float[Tensor, "1 l d"]:
+        tokens = self.tokenizer(
             text,
             padding="max_length",
             max_length=self.tokenizer.model_max_length,
             truncation=True,
             return_tensors="pt",
         )
-        return self.text_encoder(cut.input_ids.to(self.text_encoder.device))[0]
+        return self.text_encoder(tokens.input_ids.to(self.text_encoder.device))[0]
 
 
 @dataclass(frozen=True)
 class ImageDreamPrior:
-    """A guidance prior: every ring of four renders is judged as views of one object.
+    """Guidance prior that scores rings of four renders as views of one object.
 
     Attributes:
         model: the networks.
-        condition: the object at every frame.
-        noise: which timestep an iteration uses.
+        condition: on the object at every frame.
+        schedule: of the timestep.
         settings: guidance, precision and memory.
-        ring: how many cameras it judges together, at equal steps of azimuth.
+        ring_size: number of cameras scored together, at equal steps of azimuth.
     """
 
     model: ImageDream
     condition: ImageDreamCondition
-    noise: TimestepSchedule
+    schedule: TimestepSchedule
     settings: ImageDreamPriorSettings
     viewpoints: tuple[OrbitCamera, ...] | None = field(default=None, init=False)
     frames: tuple[int, ...] | None = field(default=None, init=False)
-    ring: int = field(default=RING, init=False)
+    ring_size: int = field(default=RING, init=False)
 
     @cached_property
     def batches(self) -> MicroBatches:
-        """How many rings are judged at once."""
+        """Micro-batches of rings."""
         precision: Precision = self.settings.precision
         return MicroBatches.within(
             "rings of four views for the prior", self.settings.memory_gb, RESIDENT_GB[precision], RING_GB[precision]
@@ -239,29 +242,29 @@ class ImageDreamPrior:
     def loss(
         self,
         images: Float[Tensor, "b h w 3"],
-        coverage: Float[Tensor, "b h w 1"],
+        alpha: Float[Tensor, "b h w 1"],
         views: Sequence[GuidanceView],
         progress: float,
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:
-        """The distillation loss of the renders, each four of which are a ring; coverage is ignored.
+        """Return the distillation loss of the renders, of which every four form a ring; alpha is ignored.
 
         Raises:
             BadInput: the views form no rings.
-            BackendUnavailable: there is no memory for a single ring.
+            BackendUnavailable: a single ring does not fit into memory.
         """
         rings = [views[start : start + RING] for start in range(0, len(views), RING)]
         if not all(_is_ring(ring) for ring in rings):
             raise BadInput(
-                f"ImageDream judges {RING} views of a frame together, 90 degrees apart; given {len(views)} views that "
-                f"are not so; choose static.views and motion.views as multiples of {RING}"
+                f"ImageDream needs groups of {RING} views of a frame, 90 degrees apart; given {len(views)} views that "
+                f"form no such groups; set static.views and motion.views to multiples of {RING}"
             )
         condition = self.condition.rows([ring[0].frame for ring in rings])
         cameras = [[view.camera for view in ring] for ring in rings]
-        timestep = self.noise.timestep(progress, generator)
+        timestep = self.schedule.timestep(progress, generator)
         shape = (len(rings), RING * LATENT_CHANNELS, LATENT_SIZE, LATENT_SIZE)
         noise = to_device_async(
-            torch.randn(shape, dtype=images.dtype, generator=generator), self.condition.latents.device
+            torch.randn(shape, dtype=images.dtype, generator=generator), self.condition.image_latents.device
         )
 
         def encode(pixels: Float[Tensor, "p rows w 3"]) -> Float[Tensor, "p c 32 32"]:
@@ -269,19 +272,22 @@ class ImageDreamPrior:
             return latents.unflatten(0, (-1, RING)).flatten(1, 2)
 
         def predict_noise(noisy: Float[Tensor, "p c 32 32"], timestep: int, piece: slice) -> Float[Tensor, "p c 32 32"]:
-            told = condition.rows(range(len(rings))[piece])
+            of_piece = condition.rows(range(len(rings))[piece])
             ring = noisy.unflatten(1, (RING, LATENT_CHANNELS))
-            believed = self.model.predict_noise(ring, timestep, cameras[piece], told, self.settings.guidance_scale)
-            return believed.flatten(1, 2)
+            scale = self.settings.guidance_scale
+            noise_pred = self.model.predict_noise(ring, timestep, cameras[piece], of_piece, scale)
+            return noise_pred.flatten(1, 2)
 
-        stacked = images.unflatten(0, (-1, RING)).flatten(1, 2)  # a ring is one tall picture, so that it stays together
+        stacked = images.unflatten(0, (-1, RING)).flatten(
+            1, 2
+        )  # a ring becomes one tall image, so that micro-batches never split it
         return distill_in_pieces(stacked, encode, predict_noise, timestep, noise, self.batches) / RING
 
 
 def camera_to_world_rows(camera: OrbitCamera) -> Float[Tensor, "16"]:
-    """The camera as ImageDream is told: camera to world by rows, OpenGL axes, z up, at radius 1; float64."""
-    turned = OrbitCamera(camera.elevation_deg, camera.azimuth_deg + FRONT_DEG, radius=1.0)
-    pose = turned.viewmat().inverse() @ torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64).diag()
+    """Return ImageDream's camera vector: camera to world by rows, OpenGL axes, z up, radius 1; float64."""
+    rotated = OrbitCamera(camera.elevation_deg, camera.azimuth_deg + FRONT_DEG, radius=1.0)
+    pose = rotated.viewmat().inverse() @ torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64).diag()
     right, up, front, last = pose
     return torch.cat([right, -front, up, last])
 
@@ -289,6 +295,6 @@ def camera_to_world_rows(camera: OrbitCamera) -> Float[Tensor, "16"]:
 def _is_ring(views: Sequence[GuidanceView]) -> bool:
     first = views[0]
     same = all(v.frame == first.frame and v.camera.elevation_deg == first.camera.elevation_deg for v in views)
-    turns = [(view.camera.azimuth_deg - first.camera.azimuth_deg) % 360 for view in views]
-    even = all(math.isclose(turn, 360 / RING * i, abs_tol=1e-3) for i, turn in enumerate(turns))
+    angles = [(view.camera.azimuth_deg - first.camera.azimuth_deg) % 360 for view in views]
+    even = all(math.isclose(angle, 360 / RING * i, abs_tol=1e-3) for i, angle in enumerate(angles))
     return len(views) == RING and same and even

@@ -1,8 +1,8 @@
-"""ImageDream's network: a U-Net that denoises several views of one object together (Wang and Shi 2023).
+"""ImageDream's multi-view U-Net: joint denoising of several views of one object (Wang and Shi 2023).
 
-Three things are added to the U-Net of Stable Diffusion 2.1: self-attention runs over the pixels of all views of a set,
-the camera is added to the embedding of time, and cross-attention also sees tokens of the picture. Modules carry the
-names of the published weights (`input_blocks.1.1.transformer_blocks.0.attn2.to_k_ip.weight`), so a file loads as it is.
+Three changes to the U-Net of Stable Diffusion 2.1: self-attention over the pixels of all views of a set, a camera
+embedding added to the timestep embedding, and cross-attention to image tokens (IP-Adapter). Modules have the names of
+the published weights (`input_blocks.1.1.transformer_blocks.0.attn2.to_k_ip.weight`), so files load unchanged.
 """
 
 import math
@@ -14,32 +14,32 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-GROUPS = 32
-LONGEST_PERIOD = 10000.0  # of the sines that embed time
+GROUPS = 32  # of group normalization
+LONGEST_PERIOD = 10000.0  # of the sinusoidal timestep embedding
 RESAMPLER_LAYERS = 4
 RESAMPLER_HEAD = 64  # channels of a head
-EXPANSION = 4  # inner channels of a feed-forward layer, and of the embedding of time
+EXPANSION = 4  # hidden / input channels of feed-forward layers and of the timestep embedding
 
 
 @dataclass(frozen=True)
 class MultiViewUnetConfig:
-    """Sizes, under the names that `unet/config.json` has for them; the defaults are the published model's.
+    """Configuration with the keys of `unet/config.json`; the defaults are those of the published model.
 
     Attributes:
-        in_channels: of a latent.
-        out_channels: of a predicted noise.
+        in_channels: of the latents.
+        out_channels: of the predicted noise.
         model_channels: of the first level.
-        channel_mult: channels of every level, times `model_channels`.
-        num_res_blocks: per level on the way down; one more on the way up.
-        attention_resolutions: how many times smaller than the latent the levels with attention are.
+        channel_mult: channels of every level, as multiples of `model_channels`.
+        num_res_blocks: per level of the encoder; the decoder has one more.
+        attention_resolutions: downsampling factors of the levels with attention.
         num_head_channels: channels of an attention head.
-        transformer_depth: attention blocks in a row.
+        transformer_depth: transformer blocks per layer.
         context_dim: channels of a token.
-        camera_dim: numbers of a camera.
-        ip_dim: tokens of the picture.
-        ip_weight: of what the picture's tokens say, against the text's.
-        image_dim: channels of the picture's features (the published file does not name it: CLIP ViT-H/14).
-        image_heads: of the attention that makes the picture's tokens (the published file does not name it).
+        camera_dim: length of a camera vector.
+        ip_dim: number of image tokens.
+        ip_weight: of the attention to image tokens, relative to text tokens.
+        image_dim: channels of the image features (not in the published file: CLIP ViT-H/14).
+        image_heads: attention heads of the image resampler (not in the published file).
     """
 
     in_channels: int = 4
@@ -59,7 +59,7 @@ class MultiViewUnetConfig:
 
     @staticmethod
     def of(config: dict[str, Any]) -> "MultiViewUnetConfig":
-        """The sizes in a `config.json`; keys that are no sizes are ignored."""
+        """Read a `config.json`; unknown keys are ignored."""
         names = [field.name for field in fields(MultiViewUnetConfig) if field.name in config]
         sizes: dict[str, Any] = {
             name: tuple(config[name]) if isinstance(config[name], list) else config[name] for name in names
@@ -68,7 +68,7 @@ class MultiViewUnetConfig:
 
 
 class MultiViewUnet(nn.Module):
-    """Predicts the noise of sets of views.
+    """U-Net that predicts the noise of sets of views.
 
     Args:
         shape: the sizes.
@@ -90,7 +90,7 @@ class MultiViewUnet(nn.Module):
                 channels = multiple * width
                 kept.append(channels)
             if level < len(shape.channel_mult) - 1:
-                self.input_blocks.append(_Layers([_Shrink(channels)]))
+                self.input_blocks.append(_Layers([_Downsample(channels)]))
                 kept.append(channels)
         self.middle_block = _Layers(
             [
@@ -105,14 +105,14 @@ class MultiViewUnet(nn.Module):
                 layers = self._block(channels + kept.pop(), multiple * width, level)
                 channels = multiple * width
                 if level and i == shape.num_res_blocks:
-                    layers.append(_Grow(channels))
+                    layers.append(_Upsample(channels))
                 self.output_blocks.append(_Layers(layers))
         self.out = nn.Sequential(
             nn.GroupNorm(GROUPS, channels), nn.SiLU(), nn.Conv2d(width, shape.out_channels, 3, padding=1)
         )
 
     def _block(self, inputs: int, outputs: int, level: int) -> list[nn.Module]:
-        """The layers of one block of a level."""
+        """Create the layers of one block of a level."""
         layers: list[nn.Module] = [_Residual(inputs, outputs, EXPANSION * self.shape.model_channels)]
         if 2**level in self.shape.attention_resolutions:
             layers.append(_Transformer(outputs, self.shape))
@@ -126,31 +126,31 @@ class MultiViewUnet(nn.Module):
         text: Float[Tensor, "s l d"],
         image: Float[Tensor, "s m e"],
     ) -> Float[Tensor, "s v o h w"]:
-        """The noise in the latents.
+        """Predict the noise of latents.
 
         Args:
-            latents: s sets of v views; the views of a set see each other.
-            timestep: how noisy they are, 0 to 999.
-            cameras: of every view.
-            text: tokens of a set's text.
-            image: features of a set's picture.
+            latents: noisy latents of s sets of v views; the views of a set attend to each other.
+            timestep: 0 to 999.
+            cameras: camera vectors of every view.
+            text: text tokens of every set.
+            image: image features of every set.
         """
         sets, views = latents.shape[:2]
-        time = self.time_embed(_sines(timestep, self.shape.model_channels).to(latents))
+        time = self.time_embed(_timestep_embedding(timestep, self.shape.model_channels).to(latents))
         embedding = time + self.camera_embed(cameras.flatten(0, 1))
         tokens = torch.cat([text, self.image_embed(image)], 1).repeat_interleave(views, 0)
-        x, kept = latents.flatten(0, 1), []
+        x, skips = latents.flatten(0, 1), []
         for block in self.input_blocks:
             x = block(x, embedding, tokens, views)
-            kept.append(x)
+            skips.append(x)
         x = self.middle_block(x, embedding, tokens, views)
         for block in self.output_blocks:
-            x = block(torch.cat([x, kept.pop()], 1), embedding, tokens, views)
+            x = block(torch.cat([x, skips.pop()], 1), embedding, tokens, views)
         return self.out(x).unflatten(0, (sets, views))
 
 
 class _Layers(nn.ModuleList):
-    """Layers in a row; each gets what it needs."""
+    """Sequence of layers; each gets the inputs of its type."""
 
     def forward(self, x: Tensor, embedding: Tensor, tokens: Tensor, views: int) -> Tensor:
         for layer in self:
@@ -164,7 +164,7 @@ class _Layers(nn.ModuleList):
 
 
 class _Residual(nn.Module):
-    """Two convolutions beside a shortcut; the embedding is added between them."""
+    """Residual block of two convolutions, with the embedding added between them."""
 
     def __init__(self, inputs: int, outputs: int, embedding: int) -> None:
         super().__init__()
@@ -183,7 +183,7 @@ class _Residual(nn.Module):
 
 
 class _Transformer(nn.Module):
-    """Attention over the pixels of a set, then over tokens, beside a shortcut."""
+    """Residual transformer over the pixels of a set."""
 
     def __init__(self, channels: int, shape: MultiViewUnetConfig) -> None:
         super().__init__()
@@ -202,7 +202,7 @@ class _Transformer(nn.Module):
 
 
 class _TransformerBlock(nn.Module):
-    """What pixels tell each other, what the tokens tell them, and what they make of it."""
+    """Self-attention over all views of a set, cross-attention to tokens, and a feed-forward layer."""
 
     def __init__(self, channels: int, shape: MultiViewUnetConfig) -> None:
         super().__init__()
@@ -213,49 +213,51 @@ class _TransformerBlock(nn.Module):
         self.norm1, self.norm2, self.norm3 = (nn.LayerNorm(channels) for _ in range(3))
 
     def forward(self, pixels: Tensor, tokens: Tensor, views: int) -> Tensor:
-        of_set = self.norm1(pixels).unflatten(0, (-1, views)).flatten(1, 2)
-        pixels = pixels + self.attn1(of_set, of_set).unflatten(1, (views, -1)).flatten(0, 1)
+        set_pixels = self.norm1(pixels).unflatten(0, (-1, views)).flatten(1, 2)
+        pixels = pixels + self.attn1(set_pixels, set_pixels).unflatten(1, (views, -1)).flatten(0, 1)
         pixels = pixels + self.attn2(self.norm2(pixels), tokens)
         return pixels + self.ff(self.norm3(pixels))
 
 
 class _Attention(nn.Module):
-    """Softmax attention; the last `picture` tokens have keys, values and a sum of their own."""
+    """Softmax attention; the last `image_tokens` tokens have separate keys, values and softmax (IP-Adapter)."""
 
-    def __init__(self, channels: int, context: int, head: int, picture: int = 0, picture_weight: float = 1.0) -> None:
+    def __init__(
+        self, channels: int, context: int, head: int, image_tokens: int = 0, image_weight: float = 1.0
+    ) -> None:
         super().__init__()
-        self.heads, self.picture, self.picture_weight = channels // head, picture, picture_weight
+        self.heads, self.image_tokens, self.image_weight = channels // head, image_tokens, image_weight
         self.to_q = nn.Linear(channels, channels, bias=False)
         self.to_k, self.to_v = (nn.Linear(context, channels, bias=False) for _ in range(2))
-        if picture:
+        if image_tokens:
             self.to_k_ip, self.to_v_ip = (nn.Linear(context, channels, bias=False) for _ in range(2))
         self.to_out = nn.Sequential(nn.Linear(channels, channels))
 
     def forward(self, x: Tensor, tokens: Tensor) -> Tensor:
-        words = tokens[:, : tokens.shape[1] - self.picture]
+        text = tokens[:, : tokens.shape[1] - self.image_tokens]
         queries = self.to_q(x)
-        seen = attend(queries, self.to_k(words), self.to_v(words), self.heads)
-        if self.picture:
-            shown = tokens[:, -self.picture :]
-            about = attend(queries, self.to_k_ip(shown), self.to_v_ip(shown), self.heads)
-            seen = seen + self.picture_weight * about
-        return self.to_out(seen)
+        output = attend(queries, self.to_k(text), self.to_v(text), self.heads)
+        if self.image_tokens:
+            image = tokens[:, -self.image_tokens :]
+            image_output = attend(queries, self.to_k_ip(image), self.to_v_ip(image), self.heads)
+            output = output + self.image_weight * image_output
+        return self.to_out(output)
 
 
 class _FeedForward(nn.Module):
-    """A gated layer."""
+    """Feed-forward layer with GEGLU."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         inner = EXPANSION * channels
-        self.net = nn.Sequential(_Gated(channels, inner), nn.Identity(), nn.Linear(inner, channels))
+        self.net = nn.Sequential(_Geglu(channels, inner), nn.Identity(), nn.Linear(inner, channels))
 
     def forward(self, x: Tensor) -> Tensor:
         return self.net(x)
 
 
-class _Gated(nn.Module):
-    """Half of the channels open and close the other half."""
+class _Geglu(nn.Module):
+    """GEGLU: linear layer whose second half gates the first."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -267,7 +269,7 @@ class _Gated(nn.Module):
 
 
 class _Resampler(nn.Module):
-    """Features of a picture to a few tokens, which ask the features and each other."""
+    """Perceiver resampler: image features to a few tokens."""
 
     def __init__(self, shape: MultiViewUnetConfig) -> None:
         super().__init__()
@@ -277,27 +279,28 @@ class _Resampler(nn.Module):
         self.proj_out = nn.Linear(width, width)
         self.norm_out = nn.LayerNorm(width)
         self.layers = nn.ModuleList(
-            _Exchange([_Asking(width, shape.image_heads), _thinking(width)]) for _ in range(RESAMPLER_LAYERS)
+            _ResamplerLayer([_PerceiverAttention(width, shape.image_heads), _mlp(width)])
+            for _ in range(RESAMPLER_LAYERS)
         )
 
     def forward(self, features: Float[Tensor, "s m e"]) -> Float[Tensor, "s n d"]:
         features, tokens = self.proj_in(features), self.latents.expand(len(features), -1, -1)
-        for exchange in self.layers:
-            tokens = exchange(features, tokens)
+        for layer in self.layers:
+            tokens = layer(features, tokens)
         return self.norm_out(self.proj_out(tokens))
 
 
-class _Exchange(nn.ModuleList):
-    """Tokens ask, then think."""
+class _ResamplerLayer(nn.ModuleList):
+    """Attention and MLP of the resampler, both residual."""
 
     def forward(self, features: Tensor, tokens: Tensor) -> Tensor:
-        ask, think = self
-        tokens = tokens + ask(features, tokens)
-        return tokens + think(tokens)
+        attention, mlp = self
+        tokens = tokens + attention(features, tokens)
+        return tokens + mlp(tokens)
 
 
-class _Asking(nn.Module):
-    """Tokens attend to features and to themselves."""
+class _PerceiverAttention(nn.Module):
+    """Attention of tokens to features and tokens."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -313,8 +316,8 @@ class _Asking(nn.Module):
         return self.to_out(attend(self.to_q(tokens), keys, values, self.heads))
 
 
-class _Shrink(nn.Module):
-    """Half the size."""
+class _Downsample(nn.Module):
+    """Downsampling by 2."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -324,8 +327,8 @@ class _Shrink(nn.Module):
         return self.op(x)
 
 
-class _Grow(nn.Module):
-    """Twice the size."""
+class _Upsample(nn.Module):
+    """Upsampling by 2."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -338,7 +341,7 @@ class _Grow(nn.Module):
 def attend(
     queries: Float[Tensor, "b q c"], keys: Float[Tensor, "b k c"], values: Float[Tensor, "b k c"], heads: int
 ) -> Float[Tensor, "b q c"]:
-    """Softmax attention with the channels divided among the heads."""
+    """Compute multi-head softmax attention."""
     q, k, v = (x.unflatten(-1, (heads, -1)).transpose(1, 2) for x in (queries, keys, values))
     return functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
 
@@ -347,15 +350,15 @@ def _embedder(inputs: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(nn.Linear(inputs, outputs), nn.SiLU(), nn.Linear(outputs, outputs))
 
 
-def _thinking(width: int) -> nn.Sequential:
+def _mlp(width: int) -> nn.Sequential:
     inner = EXPANSION * width
     return nn.Sequential(
         nn.LayerNorm(width), nn.Linear(width, inner, bias=False), nn.GELU(), nn.Linear(inner, width, bias=False)
     )
 
 
-def _sines(timestep: int, channels: int) -> Float[Tensor, " channels"]:
-    """Cosines, then sines, of the timestep at falling frequencies."""
+def _timestep_embedding(timestep: int, channels: int) -> Float[Tensor, " channels"]:
+    """Return the sinusoidal embedding of a timestep: cosines, then sines, at decreasing frequencies."""
     half = channels // 2
     angles = timestep * torch.exp(-math.log(LONGEST_PERIOD) * torch.arange(half) / half)
     return torch.cat([angles.cos(), angles.sin()])

@@ -1,4 +1,4 @@
-"""What judges pictures that nobody took."""
+"""Guidance priors: score rendered views that have no ground truth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,11 +14,11 @@ from dg4d_lib.inflation.surface import InflatedSurface
 
 @dataclass(frozen=True)
 class GuidanceView:
-    """Where and when a picture is judged.
+    """Camera and frame of a scored render.
 
     Attributes:
-        camera: the pose and the size of the picture.
-        frame: which frame of the driving video, 0 for the static stage.
+        camera: pose and image size.
+        frame: index into the driving video; 0 in the static stage.
     """
 
     camera: OrbitCamera
@@ -27,32 +27,32 @@ class GuidanceView:
 
 @runtime_checkable
 class GuidancePrior(Protocol):
-    """One number to lower."""
+    """Loss on rendered views."""
 
     @property
     def viewpoints(self) -> tuple[OrbitCamera, ...] | None:
-        """The only cameras it can judge (their pixels do not matter); None is all of them."""
+        """Supported cameras (their image size is ignored); None: all."""
 
     @property
     def frames(self) -> tuple[int, ...] | None:
-        """The only frames it can judge; None is all of them."""
+        """Supported frames; None: all."""
 
     def loss(
         self,
         images: Float[Tensor, "b h w 3"],
-        coverage: Float[Tensor, "b h w 1"],
+        alpha: Float[Tensor, "b h w 1"],
         views: Sequence[GuidanceView],
         progress: float,
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:
-        """How unlikely these renders are, divided by their number.
+        """Return the loss of these renders, averaged over images.
 
         Args:
             images: renders over white, in [0, 1].
-            coverage: their alpha; priors that only know pictures ignore it.
+            alpha: of the renders; ignored by priors of opaque images.
             views: one per image.
-            progress: share of the optimization that is done, in [0, 1].
-            generator: the source of all randomness.
+            progress: of the optimization, in [0, 1].
+            generator: source of all randomness.
         """
         ...
 
@@ -71,18 +71,14 @@ class SubjectShapes(Protocol):
 
 @runtime_checkable
 class RingPrior(Protocol):
-    """What a prior has beside `GuidancePrior` if it judges several cameras of a moment together.
-
-    Attributes:
-        ring: how many; consecutive views, at equal steps of azimuth all around.
-    """
+    """Guidance prior that scores rings of cameras at one frame together."""
 
     @property
-    def ring(self) -> int:
-        """At least 1."""
+    def ring_size(self) -> int:
+        """Number of consecutive views, at equal steps of azimuth all around; at least 1."""
         ...
 
 
 def ring_size(prior: GuidancePrior) -> int:
-    """How many consecutive views the prior judges together; 1 if it judges each for itself."""
-    return prior.ring if isinstance(prior, RingPrior) else 1
+    """Return the number of consecutive views that the prior scores together; 1 if it scores them separately."""
+    return prior.ring_size if isinstance(prior, RingPrior) else 1

@@ -1,4 +1,4 @@
-"""A bank of true pictures: what an ideal prior would say, and what an perturb one. For tests and benchmarks."""
+"""Oracle prior for tests and benchmarks: a bank of ground-truth views, optionally perturbed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,11 +18,11 @@ from dg4d_lib.settings import OraclePriorSettings
 
 @dataclass(frozen=True)
 class Bank:
-    """True pictures.
+    """Ground-truth views.
 
     Attributes:
-        cameras: where they were taken.
-        frames: when: indices into the driving video.
+        cameras: of the rows.
+        frames: of the columns, indices into the driving video.
         pictures: RGBA, straight alpha, one row per camera, one column per frame.
     """
 
@@ -31,19 +31,19 @@ class Bank:
     pictures: UInt8[Tensor, "v t h w 4"]
 
     def clean(self, views: Sequence[GuidanceView]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
-        """Color over white and coverage of views that are in the bank, resampled to the camera's size.
+        """Return color over white and alpha of views in the bank, resized to the camera's size.
 
         Raises:
             BadInput: a view that is not in the bank.
         """
-        places = {_pose(camera): i for i, camera in enumerate(self.cameras)}
-        moments = {frame: i for i, frame in enumerate(self.frames)}
+        rows_by_pose = {_pose(camera): i for i, camera in enumerate(self.cameras)}
+        columns_by_frame = {frame: i for i, frame in enumerate(self.frames)}
         try:
-            rows = [places[_pose(view.camera)] for view in views]
-            columns = [moments[view.frame] for view in views]
+            rows = [rows_by_pose[_pose(view.camera)] for view in views]
+            columns = [columns_by_frame[view.frame] for view in views]
         except KeyError as missing:
             raise BadInput(
-                f"the bank has no picture of {missing}; it has {len(places)} poses, frames {self.frames}"
+                f"the bank has no view {missing}; it has {len(rows_by_pose)} poses and frames {self.frames}"
             ) from None
         cutouts = self.pictures[rows, columns].float() / 255
         alpha = cutouts[..., 3:]
@@ -56,20 +56,20 @@ class Bank:
 
 
 def perturb(bank: Bank, settings: OraclePriorSettings, generator: torch.Generator) -> Bank:
-    """What a prior says that knows less: blurred, a little beside the view, and in every frame otherwise.
+    """Perturb the view bank with blur, gain, shift and pose noise.
 
-    Everything is drawn once, so that the same question always has the same answer.
+    The perturbations are drawn once, so that the prior is the same in every iteration.
 
     Args:
-        bank: the truth.
-        settings: how perturb; with zeros the truth comes back.
-        generator: of gains, shifts and errors.
+        bank: ground-truth views.
+        settings: standard deviations; zeros return the bank unchanged.
+        generator: draws the perturbations.
     """
     pictures, cameras = bank.pictures, bank.cameras
     if settings.blur or settings.shift:
         shifts = settings.shift * torch.randn(*pictures.shape[:2], 2, generator=generator)
-        moved = [_misplaced(view, settings.blur, shift) for view, shift in zip(pictures, shifts, strict=True)]
-        pictures = torch.stack(moved)
+        shifted = [_blur_and_shift(view, settings.blur, shift) for view, shift in zip(pictures, shifts, strict=True)]
+        pictures = torch.stack(shifted)
     if settings.color_gain:
         gains = torch.exp(settings.color_gain * torch.randn(*pictures.shape[:2], 1, 1, 3, generator=generator))
         tinted = [(view[..., :3] * gain).clamp(0, 255).round() for view, gain in zip(pictures, gains, strict=True)]
@@ -83,15 +83,15 @@ def perturb(bank: Bank, settings: OraclePriorSettings, generator: torch.Generato
     return Bank(cameras, bank.frames, pictures)
 
 
-def _misplaced(
+def _blur_and_shift(
     pictures: UInt8[Tensor, "t h w 4"], sigma: float, shifts: Float[Tensor, "t 2"]
 ) -> UInt8[Tensor, "t h w 4"]:
-    """Cut-outs out of focus and out of place; nothing of the color behind them comes in."""
+    """Blur and shift cut-outs with premultiplied alpha, so that no background color bleeds in."""
     straight = pictures.float() / 255
     planes = torch.cat([straight[..., :3] * straight[..., 3:], straight[..., 3:]], -1).numpy()
     planes = gaussian_filter(planes, (0, sigma, sigma, 0), mode="constant")
-    placed = [shift(plane, (*by, 0), order=1) for plane, by in zip(planes, shifts.tolist(), strict=True)]
-    soft = torch.from_numpy(np.stack(placed))
+    shifted = [shift(plane, (*by, 0), order=1) for plane, by in zip(planes, shifts.tolist(), strict=True)]
+    soft = torch.from_numpy(np.stack(shifted))
     color = soft[..., :3] / soft[..., 3:].clamp(min=1e-6)
     return (torch.cat([color, soft[..., 3:]], -1).clamp(0, 1) * 255).round().to(torch.uint8)
 

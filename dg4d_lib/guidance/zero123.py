@@ -35,21 +35,21 @@ from dg4d_lib.guidance.distillation import TimestepSchedule, distill_in_pieces
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.settings import Precision, Zero123PriorSettings
 
-CAMERA_NUMBERS = 4
+POSE_DIM = 4  # length of the relative pose
 
-RESIDENT_GB = {"fp16": 5.0, "bf16": 5.0, "fp32": 8.0}  # weights (2.7 or 5.4), renders and what CUDA takes
-VIEW_GB = {"fp16": 0.5, "bf16": 0.5, "fp32": 1.0}  # what the VAE keeps for its gradient (.37 or .74), and workspace
+RESIDENT_GB = {"fp16": 5.0, "bf16": 5.0, "fp32": 8.0}  # measured: weights (2.7 or 5.4), renders, CUDA context
+VIEW_GB = {"fp16": 0.5, "bf16": 0.5, "fp32": 1.0}  # measured: VAE activations (0.37 or 0.74), workspace
 
 
 @dataclass(frozen=True)
 class Zero123:
-    """The frozen networks.
+    """Frozen networks of Zero-1-to-3.
 
     Attributes:
         vae: AutoencoderKL.
-        unet: UNet2DConditionModel: noisy latent and the input's latent in, noise out.
+        unet: UNet2DConditionModel; predicts noise from noisy latents and the input image's latents.
         image_encoder: CLIPVisionModelWithProjection.
-        camera_projection: CLIP embedding and camera to one token.
+        camera_projection: linear layer from CLIP embedding and relative pose to one token.
         settings: of the prior.
     """
 
@@ -66,10 +66,10 @@ class Zero123:
         Args:
             model: in diffusers' layout.
             settings: precision, memory and guidance.
-            device: where they will run; on a processor in fp32 whatever the settings say.
+            device: of the networks; CPUs use fp32.
 
         Raises:
-            BadInput: a file is missing or damaged, or the parts are not those of Zero-1-to-3.
+            BadInput: a file is missing or damaged, or the networks are not those of Zero-1-to-3.
             BackendUnavailable: diffusers is not installed.
         """
         placement = Placement(device, compute_dtype(device, settings.precision), channels_last=device.type == "cuda")
@@ -77,16 +77,16 @@ class Zero123:
         projection = read_linear(model / "clip_camera_projection", "proj", placement)
         encoder = load_image_encoder(model, placement)
         vae, unet = load_vae(model, placement), shorten_attention(load_unet(model, placement))
-        found = {
+        sizes = {
             "inputs of the UNet": (unet.config.in_channels, 2 * LATENT_CHANNELS),
             "outputs of the UNet": (unet.config.out_channels, LATENT_CHANNELS),
             "channels of the VAE": (vae.config.latent_channels, LATENT_CHANNELS),
-            "shrinking by the VAE": (2 ** (len(vae.config.block_out_channels) - 1), SIZE // LATENT_SIZE),
-            "inputs of the projection": (projection.in_features, encoder.config.projection_dim + CAMERA_NUMBERS),
+            "scale factor of the VAE": (2 ** (len(vae.config.block_out_channels) - 1), SIZE // LATENT_SIZE),
+            "inputs of the projection": (projection.in_features, encoder.config.projection_dim + POSE_DIM),
             "outputs of the projection": (projection.out_features, unet.config.cross_attention_dim),
         }
-        if wrong := [f"{name}: {have} instead of {want}" for name, (have, want) in found.items() if have != want]:
-            raise BadInput(f"{model} is no Zero-1-to-3 ({'; '.join(wrong)}); give weights of Zero-1-to-3")
+        if wrong := [f"{name}: {have}, expected {want}" for name, (have, want) in sizes.items() if have != want]:
+            raise BadInput(f"{model} holds no Zero-1-to-3 model ({'; '.join(wrong)}); give weights of Zero-1-to-3")
         if settings.compiled:
             unet.compile()
             vae.encoder.compile()
@@ -94,14 +94,14 @@ class Zero123:
 
     @torch.no_grad()
     def conditioned_on(
-        self, frames: Float[Tensor, "t h w 3"], noise: TimestepSchedule, input_camera: OrbitCamera | None = None
+        self, frames: Float[Tensor, "t h w 3"], schedule: TimestepSchedule, input_camera: OrbitCamera | None = None
     ) -> "ConditionedZero123":
-        """A prior that knows these frames; the image encoder is not part of it and may be freed.
+        """Return a prior conditioned on these frames; it does not use the image encoder, which may be freed.
 
         Args:
-            frames: what the input camera sees, over white, in [0, 1].
-            noise: which timestep an iteration uses.
-            input_camera: where the frames were taken from; the default is azimuth and elevation 0.
+            frames: of the input camera, over white, in [0, 1].
+            schedule: of the timestep.
+            input_camera: camera of the frames; the default is azimuth and elevation 0.
         """
         precision: Precision = self.settings.precision
         batches = MicroBatches.within(
@@ -109,9 +109,9 @@ class Zero123:
         )
 
         def embed(piece: slice) -> tuple[Tensor, Tensor]:
-            pictures = frames[piece].to(self.vae.device)
-            clip = clip_pixels(pictures).to(self.image_encoder.dtype)
-            return self.image_encoder(clip).image_embeds, encode_images(self.vae, pictures).to(self.unet.dtype)
+            images = frames[piece].to(self.vae.device)
+            pixels = clip_pixels(images).to(self.image_encoder.dtype)
+            return self.image_encoder(pixels).image_embeds, encode_images(self.vae, images).to(self.unet.dtype)
 
         embeddings, latents = (torch.cat(parts) for parts in zip(*batches.run(embed, len(frames)), strict=True))
         return ConditionedZero123(
@@ -121,7 +121,7 @@ class Zero123:
             settings=self.settings,
             embeddings=embeddings,
             latents=latents,
-            noise=noise,
+            schedule=schedule,
             input_camera=input_camera or OrbitCamera(),
             batches=batches,
         )
@@ -129,18 +129,18 @@ class Zero123:
 
 @dataclass(frozen=True)
 class ConditionedZero123:
-    """A guidance prior: every render is judged as another view of its frame.
+    """Guidance prior that scores every render as a novel view of its frame.
 
     Attributes:
         vae: as in `Zero123`.
         unet: as in `Zero123`.
         camera_projection: as in `Zero123`.
         settings: of the prior.
-        embeddings: CLIP's, of every frame.
-        latents: the VAE's, of every frame, not scaled.
-        noise: which timestep an iteration uses.
-        input_camera: where the frames were taken from.
-        batches: how many views are judged at once.
+        embeddings: CLIP embeddings of the frames.
+        latents: unscaled VAE latents of the frames.
+        schedule: of the timestep.
+        input_camera: camera of the frames.
+        batches: micro-batches of views.
     """
 
     vae: Any
@@ -149,7 +149,7 @@ class ConditionedZero123:
     settings: Zero123PriorSettings
     embeddings: Float[Tensor, "t e"]
     latents: Float[Tensor, "t 4 32 32"]
-    noise: TimestepSchedule
+    schedule: TimestepSchedule
     input_camera: OrbitCamera
     batches: MicroBatches
     viewpoints: tuple[OrbitCamera, ...] | None = field(default=None, init=False)
@@ -158,27 +158,27 @@ class ConditionedZero123:
     def loss(
         self,
         images: Float[Tensor, "b h w 3"],
-        coverage: Float[Tensor, "b h w 1"],
+        alpha: Float[Tensor, "b h w 1"],
         views: Sequence[GuidanceView],
         progress: float,
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:
-        """The distillation loss of the renders; coverage is ignored.
+        """Return the distillation loss of the renders; alpha is ignored.
 
         Raises:
-            BadInput: a view of a frame that it does not know.
-            BackendUnavailable: there is no memory for a single view.
+            BadInput: a view of an unknown frame.
+            BackendUnavailable: a single view does not fit into memory.
         """
-        timestep = self.noise.timestep(progress, generator)
+        timestep = self.schedule.timestep(progress, generator)
         shape = (len(images), LATENT_CHANNELS, LATENT_SIZE, LATENT_SIZE)
         noise = to_device_async(torch.randn(shape, dtype=images.dtype, generator=generator), self.vae.device)
-        tokens, pictures = self.tokens(views), self.latents[self._rows(views)]
+        tokens, image_latents = self.tokens(views), self.latents[self._rows(views)]
 
         def encode(pixels: Float[Tensor, "p h w 3"]) -> Float[Tensor, "p 4 32 32"]:
             return self.vae.config.scaling_factor * encode_images(self.vae, pixels.to(self.vae.device))
 
         def predict_noise(noisy: Float[Tensor, "p 4 32 32"], timestep: int, piece: slice) -> Float[Tensor, "p 4 32 32"]:
-            return self.predict_noise(noisy, timestep, pictures[piece], tokens[piece])
+            return self.predict_noise(noisy, timestep, image_latents[piece], tokens[piece])
 
         return distill_in_pieces(images, encode, predict_noise, timestep, noise, self.batches)
 
@@ -186,54 +186,54 @@ class ConditionedZero123:
         self,
         noisy: Float[Tensor, "b 4 32 32"],
         timestep: int,
-        pictures: Float[Tensor, "b 4 32 32"],
+        image_latents: Float[Tensor, "b 4 32 32"],
         tokens: Float[Tensor, "b 1 c"],
     ) -> Float[Tensor, "b 4 32 32"]:
-        """The UNet's noise with classifier-free guidance, in the precision of `noisy`.
+        """Predict the noise with classifier-free guidance, in the precision of `noisy`.
 
         Args:
             noisy: x_t.
             timestep: t.
-            pictures: latents of the frames; zero in the unconditional half.
-            tokens: of the cameras; zero in the unconditional half.
+            image_latents: of the frames; zero in the unconditional half.
+            tokens: of frames and poses; zero in the unconditional half.
         """
         context = torch.cat([torch.zeros_like(tokens), tokens])
-        condition = torch.cat([torch.zeros_like(pictures), pictures])
+        condition = torch.cat([torch.zeros_like(image_latents), image_latents])
         inputs = torch.cat([torch.cat([noisy, noisy]).to(condition.dtype), condition], 1)
         timesteps = torch.full((len(inputs),), timestep, device=inputs.device)
-        free, conditional = self.unet(inputs, timesteps, context).sample.to(noisy.dtype).chunk(2)
-        return free + self.settings.guidance_scale * (conditional - free)
+        unconditional, conditional = self.unet(inputs, timesteps, context).sample.to(noisy.dtype).chunk(2)
+        return unconditional + self.settings.guidance_scale * (conditional - unconditional)
 
     def tokens(self, views: Sequence[GuidanceView]) -> Float[Tensor, "b 1 c"]:
-        """What the cross-attention of the UNet reads: one token per view, out of its frame and its camera."""
-        told = self.settings.input_elevation_deg if self.settings.variant == "stable" else None
-        cameras = torch.stack([relative_pose(view.camera, self.input_camera, told) for view in views])
+        """Return the cross-attention token of every view, from its frame and relative pose."""
+        input_elevation = self.settings.input_elevation_deg if self.settings.variant == "stable" else None
+        poses = torch.stack([relative_pose(view.camera, self.input_camera, input_elevation) for view in views])
         embeddings = self.embeddings[self._rows(views)]
         with torch.no_grad():
-            placed = to_device_async(cameras.to(embeddings.dtype), embeddings.device)
-            return self.camera_projection(torch.cat([embeddings, placed], -1))[:, None]
+            poses = to_device_async(poses.to(embeddings.dtype), embeddings.device)
+            return self.camera_projection(torch.cat([embeddings, poses], -1))[:, None]
 
     def _rows(self, views: Sequence[GuidanceView]) -> Int64[Tensor, " b"]:
-        """Where the frames of some views stand."""
+        """Return the frame indices of some views."""
         known = len(self.embeddings)
         if wrong := [view.frame for view in views if not 0 <= view.frame < known]:
-            raise BadInput(f"frame {wrong[0]} was asked for; there are {known}, counted from 0")
+            raise BadInput(f"frame {wrong[0]} is not in the prior; it has frames 0 to {known - 1}")
         return to_device_async(torch.tensor([view.frame for view in views]), self.embeddings.device)
 
 
 def relative_pose(
     camera: OrbitCamera, input_camera: OrbitCamera, input_elevation_deg: float | None = None
 ) -> Float[Tensor, " 4"]:
-    """A camera as Zero-1-to-3 was trained to read it, relative to the input's: the one place of its conventions.
+    """Return the relative pose in Zero-1-to-3's convention.
 
-    It counts the polar angle from the pole above, so that a camera that moved up, for us a greater elevation, has a
-    negative difference; azimuths grow in the same direction as ours.
+    The polar angle is measured from the pole above, so a camera that moves up has a negative difference; azimuths
+    increase in the same direction as ours.
 
     Args:
-        camera: where the new picture is taken from.
-        input_camera: where the known one was taken from.
-        input_elevation_deg: for Stable-Zero123, whose last number is the known picture's polar angle; otherwise it is
-            the difference of the radii, world units.
+        camera: of the novel view.
+        input_camera: of the input image.
+        input_elevation_deg: for Stable-Zero123, whose last number is the polar angle of the input image; otherwise it
+            is the difference of the radii, world units.
 
     Returns:
         [polar difference in radians, sine and cosine of the azimuth difference, last number], float64.

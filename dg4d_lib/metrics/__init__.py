@@ -1,1 +1,1 @@
-"""How good a result is."""
+"""Quality metrics: with ground truth (PSNR, SSIM, LPIPS, CLIP, FVD, Chamfer) and without (gates)."""

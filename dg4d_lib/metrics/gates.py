@@ -1,8 +1,8 @@
-"""Whether an asset is good enough to be handed on, judged without knowing the truth.
+"""Quality gates: acceptance criteria of an asset that need no ground truth.
 
-Nine measures compare what was made with the picture and the video it was made from, and with itself from other sides.
-Their bounds, in `GateSettings`, are calibrated on good assets and on deliberately spoiled ones (benchmarks/gates.py).
-Most measures are taken of both forms of an asset, its splats and its mesh, and the worse one counts.
+Nine measures compare the asset with its input image and driving video, and with itself from other sides. Their bounds,
+in `GateSettings`, are calibrated on good assets and on deliberately degraded ones (benchmarks/gates.py). Most measures
+are taken of both forms of an asset, splats and mesh, and the worse one counts.
 """
 
 import math
@@ -19,25 +19,25 @@ from torch.nn.functional import grid_sample, max_pool2d
 
 from dg4d_lib.asset_settings import GateSettings
 from dg4d_lib.metrics.image import iou, psnr
-from dg4d_lib.metrics.video import NOTHING, temporal_error
+from dg4d_lib.metrics.video import EPS, temporal_error
 
-SUBJECT_ALPHA = 0.5  # alpha from which a pixel belongs to the subject
-FLOATER_ALPHA = 0.05  # alpha below which nobody sees a floater
-TOUCHING = np.ones((3, 3))  # pixels that share a corner hang together
-RIM = 3  # pixels inside the outline where sharpness is not measured: an outline is sharp by itself
-STILL = 0.002  # change per frame and pixel of the subject, colors in [0, 1], below which nothing seems to move
-PLAIN = 0.002  # color gradient per pixel below which there is nothing to be sharp
-SAME_PLACE = 0.05  # world units between the places of one point as two sides show it
+SUBJECT_ALPHA = 0.5  # pixels with a larger alpha belong to the subject
+FLOATER_ALPHA = 0.05  # fainter floaters are invisible (ours)
+CONNECTIVITY = np.ones((3, 3))  # 8-connected components
+RIM = 3  # pixels inside the silhouette that sharpness ignores, because a silhouette is always sharp
+STILL = 0.002  # imperceptible change per frame and subject pixel, colors in [0, 1] (ours)
+PLAIN = 0.002  # color gradient per pixel of an image without texture (ours)
+DEPTH_TOLERANCE = 0.05  # world units between the positions of one point in two views (ours)
 SPLATS, MESH = "splats", "mesh"  # the forms of an asset
 
 
 @dataclass(frozen=True)
 class RgbaImages:
-    """Square pictures of a subject.
+    """Square images of a subject.
 
     Attributes:
         color: over white, in [0, 1].
-        alpha: alpha in [0, 1].
+        alpha: in [0, 1].
     """
 
     color: Float[Tensor, "b s s 3"]
@@ -46,54 +46,54 @@ class RgbaImages:
 
 @dataclass(frozen=True)
 class Turntable:
-    """Seen from all around at one moment: neighbors beside each other, the last beside the first.
+    """Renders of one frame from a closed ring of cameras, in order.
 
     Attributes:
-        alpha: alpha in [0, 1], a picture per camera.
-        depth: camera z of what is seen, world units; any number where nothing is.
-        cameras: world to camera, OpenCV axes.
-        focal: of all of them, pixels.
+        alpha: in [0, 1], one image per camera.
+        depth: camera z of the surface, world units; arbitrary where alpha is 0.
+        viewmats: world to camera, OpenCV axes.
+        focal: of all cameras, pixels.
     """
 
     alpha: Float[Tensor, "b s s 1"]
     depth: Float[Tensor, "b s s 1"]
-    cameras: Float[Tensor, "b 4 4"]
+    viewmats: Float[Tensor, "b 4 4"]
     focal: float
 
 
 @dataclass(frozen=True)
 class GateInputs:
-    """All that the gates look at; every picture has the same size.
+    """Images that the gates compare, all of the same size.
 
     Attributes:
-        picture: the input, one picture: the first moment.
+        picture: the input image, a batch of one.
         video: frames of the driving video.
-        seen: the asset from the input camera at the moments of these frames, by its form.
-        around: pairs of a side and a moment, the same ones for every form.
-        turn: the splats from all around.
-        flaws: of the mesh: broken edges and triangles, per triangle.
+        input_views: the asset from the input camera at these frames, by form.
+        side_views: the asset from other sides and at other frames, the same ones for every form.
+        turntable: the splats from all around.
+        flaws: broken edges and triangles of the mesh, per triangle.
     """
 
     picture: RgbaImages
     video: RgbaImages
-    seen: Mapping[str, RgbaImages]
-    around: Mapping[str, RgbaImages]
-    turn: Turntable
+    input_views: Mapping[str, RgbaImages]
+    side_views: Mapping[str, RgbaImages]
+    turntable: Turntable
     flaws: float
 
 
 @dataclass(frozen=True)
 class Gate:
-    """A measure and its bounds.
+    """Measure with its bounds.
 
     Attributes:
-        name: by which it is listed.
-        values: by the form of the asset that was measured; finite.
-        least: no value may be below; None: nothing is too small.
-        most: nor above; None: nothing is too large.
-        unit: of the values; empty for ratios and shares.
-        meaning: what is measured, in one line.
-        advice: what to do where it fails.
+        name: in reports.
+        values: by form of the asset; finite.
+        least: lower bound; None: unbounded.
+        most: upper bound; None: unbounded.
+        unit: of the values; empty for ratios.
+        meaning: description in one line.
+        advice: remedy for a failed gate.
     """
 
     name: str
@@ -106,197 +106,196 @@ class Gate:
 
     @property
     def form(self) -> str:
-        """The form of the asset that is worse."""
-        return min(self.values, key=lambda form: self._room(self.values[form]))
+        """Form of the asset with the worst value."""
+        return min(self.values, key=lambda form: self._margin(self.values[form]))
 
     @property
     def value(self) -> float:
-        """Of the worse form."""
+        """Worst value of all forms."""
         return self.values[self.form]
 
     @property
     def passed(self) -> bool:
-        """Whether every value lies within the bounds, which belong to them."""
-        return self._room(self.value) >= 0
+        """True if all values are within the bounds, ends included."""
+        return self._margin(self.value) >= 0
 
-    def _room(self, value: float) -> float:
-        """How far a value is from the nearest bound; negative beyond it."""
+    def _margin(self, value: float) -> float:
+        """Return the distance of a value to the nearest bound; negative outside."""
         below = math.inf if self.least is None else value - self.least
         above = math.inf if self.most is None else self.most - value
         return min(below, above)
 
 
-def evaluate_gates(evidence: GateInputs, settings: GateSettings) -> list[Gate]:
-    """Every gate, in the order of a report."""
-    video, seen, around = evidence.video, evidence.seen, evidence.around
-    own = float(floaters(video).mean())
+def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
+    """Evaluate all gates, in the order of the report."""
+    video, input_views, side_views = inputs.video, inputs.input_views, inputs.side_views
+    video_floaters = float(floaters(video).mean())
     return [
         Gate(
             "fidelity",
-            {form: float(fidelity(pictures, video).mean()) for form, pictures in seen.items()},
+            {form: float(fidelity(images, video).mean()) for form, images in input_views.items()},
             settings.fidelity_least,
             None,
             "dB",
-            "how well it shows the video from the input view: PSNR on the subject, mean over frames",
-            "raise static.iterations, motion.iterations or mesh.render_size; the picture says which",
+            "agreement with the video from the input camera: PSNR on the subject, mean over frames",
+            "raise static.iterations, motion.iterations or mesh.render_size; the report's image shows which",
         ),
         Gate(
             "silhouette",
-            {form: float(iou(pictures.alpha, video.alpha).min()) for form, pictures in seen.items()},
+            {form: float(iou(images.alpha, video.alpha).min()) for form, images in input_views.items()},
             settings.silhouette_least,
             None,
             "",
-            "overlap of its outline with the video's from the input view, in the worst frame: one torn frame is enough",
-            "a limb or a spike in one frame: raise motion.iterations; everywhere: is background left in the cut-out?",
+            "overlap of the silhouette with the video's from the input camera, in the worst frame",
+            "if single frames fail, raise motion.iterations; if all do, check the cut-out for remaining background",
         ),
         Gate(
             "consistency",
-            {SPLATS: consistency(evidence.turn)},
+            {SPLATS: consistency(inputs.turntable)},
             settings.consistency_least,
             None,
             "",
-            "share of the points seen from one side that the next side, 15 degrees on, does not contradict",
-            "the shape falls apart when it is turned: more static.iterations and static.views, or another seed",
+            "share of the points seen from one side that the next view, 15 degrees further, does not contradict",
+            "the shape falls apart from other sides: raise static.iterations and static.views, or try another seed",
         ),
         Gate(
             "flicker",
-            {form: flicker(pictures, video) for form, pictures in seen.items()},
+            {form: flicker(images, video) for form, images in input_views.items()},
             None,
             settings.flicker_most,
             "",
-            "changes from frame to frame that are not the video's; 0 is the video itself, 1 a frozen asset",
-            "more motion.iterations, or a smoother deformation (deformation.smoothness_weight=0.01)",
+            "error of the changes from frame to frame; 0 is the video itself, 1 a frozen asset",
+            "raise motion.iterations, or smooth the deformation (deformation.smoothness_weight=0.01)",
         ),
         Gate(
             "floaters",
-            {form: max(0.0, float(floaters(pictures).mean()) - own) for form, pictures in around.items()},
+            {form: max(0.0, float(floaters(images).mean()) - video_floaters) for form, images in side_views.items()},
             None,
             settings.floaters_most,
             "",
-            "share of what is seen that hangs apart from the subject, over sides and moments, less the video's own",
+            "share of the alpha that is disconnected from the subject, over sides and frames, minus the video's share",
             "raise static.prune_opacity or mesh.min_component; remove specks from the cut-out",
         ),
         Gate(
             "flaws",
-            {MESH: evidence.flaws},
+            {MESH: inputs.flaws},
             None,
             settings.flaws_most,
             "",
-            "edges on rims and between wrong sides, triangles without area, parts turned inside out: per triangle",
-            "extract again with another mesh.density_threshold or a finer mesh.grid",
+            "boundary and non-manifold edges, degenerate and inverted triangles: per triangle",
+            "extract again with another mesh.density_threshold or a larger mesh.grid",
         ),
         Gate(
             "agreement",
-            {MESH: float(iou(around[MESH].alpha, around[SPLATS].alpha).mean())},
+            {MESH: float(iou(side_views[MESH].alpha, side_views[SPLATS].alpha).mean())},
             settings.agreement_least,
             None,
             "",
-            "overlap of the outlines of mesh and splats, over sides and moments",
-            "lower mesh.density_threshold for thin parts, or take mesh.mode=per_frame for motions no mesh can follow",
+            "overlap of the silhouettes of mesh and splats, over sides and frames",
+            "lower mesh.density_threshold for thin parts, or use mesh.mode=per_frame for complex motions",
         ),
         Gate(
             "sharpness",
-            {form: sharpness(_first(pictures), evidence.picture) for form, pictures in seen.items()},
+            {form: sharpness(_first(images), inputs.picture) for form, images in input_views.items()},
             settings.sharpness_least,
             settings.sharpness_most,
             "",
-            "color gradients inside the subject, in units of the input picture's: low is blurred, high is noise",
-            "blurred: raise mesh.texture_size, mesh.render_size, static.iterations; noisy: lower static.color_lr",
+            "color gradients inside the subject, relative to the input image; low: blurred, high: noisy",
+            "if low, raise mesh.texture_size, mesh.render_size or static.iterations; if high, lower static.color_lr",
         ),
         Gate(
             "motion",
-            {form: motion(pictures, video) for form, pictures in seen.items()},
+            {form: motion(images, video) for form, images in input_views.items()},
             settings.motion_least,
             settings.motion_most,
             "",
-            "how much changes from frame to frame, in units of the video's: near 0 is frozen, far above 1 explodes",
-            "raise motion.iterations if too little moves; lower motion.plane_lr or motion.network_lr if too much",
+            "amount of change from frame to frame, relative to the video; near 0: frozen",
+            "if too low, raise motion.iterations; if too high, lower motion.plane_lr or motion.network_lr",
         ),
     ]
 
 
-def fidelity(pictures: RgbaImages, video: RgbaImages) -> Float[Tensor, " b"]:
-    """PSNR where either of two pictures shows the subject, dB."""
-    region = torch.maximum(pictures.alpha, video.alpha) > SUBJECT_ALPHA
-    return psnr(pictures.color, video.color, region.to(video.alpha))
+def fidelity(images: RgbaImages, video: RgbaImages) -> Float[Tensor, " b"]:
+    """Return the PSNR in dB over the union of the silhouettes."""
+    region = torch.maximum(images.alpha, video.alpha) > SUBJECT_ALPHA
+    return psnr(images.color, video.color, region.to(video.alpha))
 
 
-def flicker(pictures: RgbaImages, video: RgbaImages) -> float:
-    """The temporal error, in units of the video's changes or of what seems still, whichever there is."""
+def flicker(images: RgbaImages, video: RgbaImages) -> float:
+    """Return the temporal error relative to the video's changes plus imperceptible ones."""
     if len(video.color) < 2:
         return 0.0
-    changes = max(NOTHING, _changes(video))
-    return float(temporal_error(pictures.color, video.color)) * changes / (changes + _still(video))
+    changes = max(EPS, _changes(video))
+    return float(temporal_error(images.color, video.color)) * changes / (changes + _still(video))
 
 
-def motion(pictures: RgbaImages, video: RgbaImages) -> float:
-    """How much changes in all, in units of the video's changes; nothing in nothing is 1."""
-    return (_changes(pictures) + _still(video)) / (_changes(video) + _still(video))
+def motion(images: RgbaImages, video: RgbaImages) -> float:
+    """Return the total change relative to the video's; 1 if both are still."""
+    return (_changes(images) + _still(video)) / (_changes(video) + _still(video))
 
 
-def floaters(pictures: RgbaImages) -> Float[Tensor, " b"]:
-    """Share of the alpha in pieces away from the largest one; 0 where there is nothing."""
-    return torch.tensor([_apart(alpha) for alpha in pictures.alpha[..., 0].cpu().numpy()])
+def floaters(images: RgbaImages) -> Float[Tensor, " b"]:
+    """Return the share of the alpha outside the largest connected component; 0 for an empty image."""
+    return torch.tensor([_disconnected(alpha) for alpha in images.alpha[..., 0].cpu().numpy()])
 
 
-def consistency(turn: Turntable) -> float:
-    """How solid something is: share of the points seen from one side that the next side does not contradict.
+def consistency(views: Turntable) -> float:
+    """Return the share of points seen in one view that the next view does not contradict; 0 if nothing is seen.
 
-    Every pixel of the subject is a point in space by its depth. The neighbor may see something in front of that point:
-    then it says nothing about it. If it sees through the point, or past it, the two contradict each other: so do faces
-    that are painted at a depth of their own for every side, and clouds that only look like the subject from the front.
-    0 where nothing is seen.
+    The depth of a pixel gives a point in space. If the next view sees a surface in front of it, the point is occluded
+    and does not count. If it sees through the point or behind it, the views contradict each other, as they do for
+    surfaces at another depth in every view and for clouds that resemble the subject only from the front.
     """
-    size = turn.depth.shape[1]
-    points = _rays(size, turn.focal).to(turn.depth) * turn.depth
-    onward = torch.linalg.solve(turn.cameras, turn.cameras.roll(-1, 0), left=False).to(points)
-    there = points @ onward[:, None, :3, :3].mT + onward[:, None, None, :3, 3]
-    depth = there[..., 2:]
-    places = there[..., :2] / depth * (2 * turn.focal / size)
-    neighbor = torch.cat([turn.alpha, turn.depth], -1).roll(-1, 0).movedim(-1, 1)
-    alpha, found = grid_sample(neighbor, places, align_corners=False).movedim(1, -1).split(1, -1)
+    size = views.depth.shape[1]
+    points = _rays(size, views.focal).to(views.depth) * views.depth
+    to_next = torch.linalg.solve(views.viewmats, views.viewmats.roll(-1, 0), left=False).to(points)
+    moved = points @ to_next[:, None, :3, :3].mT + to_next[:, None, None, :3, 3]
+    depth = moved[..., 2:]
+    positions = moved[..., :2] / depth * (2 * views.focal / size)
+    next_view = torch.cat([views.alpha, views.depth], -1).roll(-1, 0).movedim(-1, 1)
+    alpha, seen_depth = grid_sample(next_view, positions, align_corners=False).movedim(1, -1).split(1, -1)
     solid = alpha > SUBJECT_ALPHA
-    asked = (turn.alpha > SUBJECT_ALPHA) & ~(solid & (found < depth - SAME_PLACE))
-    agreed = asked & solid & (found <= depth + SAME_PLACE)
-    return float(agreed.sum() / asked.sum().clamp_min(1))
+    counted = (views.alpha > SUBJECT_ALPHA) & ~(solid & (seen_depth < depth - DEPTH_TOLERANCE))
+    agreed = counted & solid & (seen_depth <= depth + DEPTH_TOLERANCE)
+    return float(agreed.sum() / counted.sum().clamp_min(1))
 
 
-def sharpness(pictures: RgbaImages, truth: RgbaImages) -> float:
-    """Color gradients inside the subject, in units of the truth's; nothing in nothing is 1."""
-    outside = torch.minimum(pictures.alpha, truth.alpha) <= SUBJECT_ALPHA
+def sharpness(images: RgbaImages, reference: RgbaImages) -> float:
+    """Return the color gradients inside the subject relative to the reference's; 1 if both are plain."""
+    outside = torch.minimum(images.alpha, reference.alpha) <= SUBJECT_ALPHA
     inside = max_pool2d(outside.movedim(-1, 1).float(), 2 * RIM + 1, 1, RIM)[:, 0] == 0
-    ours, theirs = (_gradient(each.color, inside) for each in (pictures, truth))
+    ours, theirs = (_gradient(each.color, inside) for each in (images, reference))
     return (ours + PLAIN) / (theirs + PLAIN)
 
 
-def _first(pictures: RgbaImages) -> RgbaImages:
-    return RgbaImages(pictures.color[:1], pictures.alpha[:1])
+def _first(images: RgbaImages) -> RgbaImages:
+    return RgbaImages(images.color[:1], images.alpha[:1])
 
 
-def _changes(pictures: RgbaImages) -> float:
-    return float(pictures.color.diff(dim=0).abs().mean(-1).sum())
+def _changes(images: RgbaImages) -> float:
+    return float(images.color.diff(dim=0).abs().mean(-1).sum())
 
 
 def _still(video: RgbaImages) -> float:
-    """The changes of a video in which nothing seems to move."""
-    return STILL * float(video.alpha[1:].sum()) + NOTHING
+    """Return the total of imperceptible changes of a video."""
+    return STILL * float(video.alpha[1:].sum()) + EPS
 
 
-def _apart(alpha: NDArray[np.float32]) -> float:
-    pieces, count = label(alpha > FLOATER_ALPHA, TOUCHING)
-    masses = np.bincount(pieces.ravel(), alpha.ravel(), count + 1)[1:]
+def _disconnected(alpha: NDArray[np.float32]) -> float:
+    components, count = label(alpha > FLOATER_ALPHA, CONNECTIVITY)
+    masses = np.bincount(components.ravel(), alpha.ravel(), count + 1)[1:]
     return 1 - float(masses.max() / masses.sum()) if count else 0.0
 
 
 def _rays(size: int, focal: float) -> Float[Tensor, "s s 3"]:
-    """From the camera through the middles of the pixels to depth 1."""
+    """Return the rays through the pixel centers, of depth 1."""
     line = (torch.arange(size) + 0.5 - size / 2) / focal
     y, x = torch.meshgrid(line, line, indexing="ij")
     return torch.stack([x, y, torch.ones_like(x)], -1)
 
 
 def _gradient(color: Float[Tensor, "b s s 3"], inside: Bool[Tensor, "b s s"]) -> float:
-    """The mean length of the color's gradient where a pixel and its neighbors are inside."""
+    """Return the mean norm of the color gradient over pixels inside the mask."""
     across, down = color.diff(dim=2)[:, :-1], color.diff(dim=1)[:, :, :-1]
     lengths = (across.square() + down.square()).sum(-1).sqrt()
     counted = inside[:, :-1, :-1]

@@ -1,7 +1,7 @@
-"""LPIPS with VGG16 (Zhang et al. 2018, version 0.1): how differently a trained network sees two pictures.
+"""LPIPS with VGG16: perceptual distance of images (Zhang et al. 2018, version 0.1).
 
-The network is read from published files: the convolutions of VGG16 as torchvision names them, and the weights of its
-five stages (`lin0.model.1.weight` ...) as the authors' package has them.
+Weights are read from the published files: the convolutions of VGG16 under torchvision's names, and the linear heads of
+its five stages (`lin0.model.1.weight` ...) as in the authors' package.
 """
 
 from dataclasses import dataclass
@@ -15,55 +15,57 @@ from torch.nn import functional as F
 
 from dg4d_lib.errors import BadInput
 
-STAGES = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))  # numbers of VGG16's convolutions
-SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of colors in [-1, 1] (the authors' code)
-SMALLEST_NORM = 1e-10
-PICTURES_AT_ONCE = 4  # of 512 pixels they take half a gigabyte
-FORMATS = (".safetensors", ".pth", ".bin")  # wanted most first
+STAGES = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))  # indices of VGG16's convolutions
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of colors in [-1, 1] (authors' code)
+NORM_EPS = 1e-10  # authors' code
+BATCH = 4  # images; 0.5 GB at 512 pixels
+FORMATS = (".safetensors", ".pth", ".bin")  # preferred first
 
 Convolution = tuple[Tensor, Tensor]  # weight, bias
 
 
 @dataclass(frozen=True)
 class Lpips:
-    """The distance; call it with pictures in [0, 1].
+    """LPIPS distance, callable on images in [0, 1].
 
     Attributes:
-        stages: the convolutions before every place where pictures are compared.
-        heads: how much every channel counts there; a vector per stage.
+        stages: convolutions of every stage of VGG16.
+        heads: weights of the channels, a vector per stage.
     """
 
     stages: tuple[tuple[Convolution, ...], ...]
     heads: tuple[Tensor, ...]
 
-    def __call__(self, images: Float[Tensor, "b h w 3"], truth: Float[Tensor, "b h w 3"]) -> Float[Tensor, " b"]:
-        """The distance of every pair, 0 for equal ones; on the device of the network, without gradients."""
-        parts = zip(images.split(PICTURES_AT_ONCE), truth.split(PICTURES_AT_ONCE), strict=True)
+    def __call__(self, images: Float[Tensor, "b h w 3"], ground_truth: Float[Tensor, "b h w 3"]) -> Float[Tensor, " b"]:
+        """Return the distance of every pair, 0 for equal images; on the device of the network, without gradients."""
+        parts = zip(images.split(BATCH), ground_truth.split(BATCH), strict=True)
         with torch.no_grad():
             return torch.cat([self._distance(ours, theirs) for ours, theirs in parts])
 
-    def _distance(self, images: Float[Tensor, "b h w 3"], truth: Float[Tensor, "b h w 3"]) -> Float[Tensor, " b"]:
-        pictures = torch.cat([images, truth]).to(self.heads[0]).movedim(-1, 1)
-        shift, scale = (pictures.new_tensor(values)[:, None, None] for values in (SHIFT, SCALE))
-        features = (2 * pictures - 1 - shift) / scale
+    def _distance(
+        self, images: Float[Tensor, "b h w 3"], ground_truth: Float[Tensor, "b h w 3"]
+    ) -> Float[Tensor, " b"]:
+        planes = torch.cat([images, ground_truth]).to(self.heads[0]).movedim(-1, 1)
+        shift, scale = (planes.new_tensor(values)[:, None, None] for values in (SHIFT, SCALE))
+        features = (2 * planes - 1 - shift) / scale
         total = features.new_zeros(len(images))
         for number, (stage, head) in enumerate(zip(self.stages, self.heads, strict=True)):
             features = F.max_pool2d(features, 2) if number else features
             for weight, bias in stage:
                 features = F.conv2d(features, weight, bias, padding=1).relu()
-            directions = features / (features.norm(dim=1, keepdim=True) + SMALLEST_NORM)
+            directions = features / (features.norm(dim=1, keepdim=True) + NORM_EPS)
             ours, theirs = directions.chunk(2)
             total = total + ((ours - theirs).square() * head[:, None, None]).sum(1).mean((1, 2))
         return total
 
 
 def load_lpips(vgg: Path, heads: Path, device: torch.device) -> Lpips:
-    """The distance with published weights.
+    """Load LPIPS with published weights.
 
     Args:
-        vgg: the tensors of VGG16, as torchvision's `vgg16-397923af.pth` has them; a file, or a folder with one.
-        heads: the weights of its stages, as `vgg.pth` of the package lpips has them; a file, or a folder with one.
-        device: where to compute.
+        vgg: VGG16 with the tensor names of torchvision's `vgg16-397923af.pth`; a file, or a folder with one.
+        heads: linear heads with the names of `vgg.pth` of the package lpips; a file, or a folder with one.
+        device: of the networks.
 
     Raises:
         BadInput: a file cannot be read, or lacks tensors.
@@ -81,19 +83,19 @@ def load_lpips(vgg: Path, heads: Path, device: torch.device) -> Lpips:
             heads=tuple(weights[f"lin{k}.model.1.weight"].flatten().to(device) for k in range(len(STAGES))),
         )
     except KeyError as error:
-        raise BadInput(f"{vgg} and {heads} are not VGG16 and its LPIPS weights: there is no tensor {error}") from error
+        raise BadInput(f"{vgg} and {heads} are not VGG16 and its LPIPS heads: tensor {error} is missing") from error
 
 
-def _tensors(place: Path) -> dict[str, Tensor]:
-    file = place
-    if place.is_dir():
-        found = [path for suffix in FORMATS for path in sorted(place.glob(f"*{suffix}"))]
-        if not found:
-            raise BadInput(f"{place} has no tensors ({', '.join(FORMATS)})")
-        file = found[0]
+def _tensors(path: Path) -> dict[str, Tensor]:
+    file = path
+    if path.is_dir():
+        files = [file for suffix in FORMATS for file in sorted(path.glob(f"*{suffix}"))]
+        if not files:
+            raise BadInput(f"{path} has no tensors ({', '.join(FORMATS)})")
+        file = files[0]
     try:
         if file.suffix == ".safetensors":
             return load_file(file)
         return dict(torch.load(file, map_location="cpu", weights_only=True))
-    except Exception as error:  # whatever a damaged file makes a reader raise
+    except Exception as error:  # readers raise many types for damaged files
         raise BadInput(f"{file} cannot be read: {type(error).__name__}: {error}".splitlines()[0]) from error

@@ -1,4 +1,4 @@
-"""Structural similarity and its gradient, in one pass over the rows of every picture."""
+"""SSIM and its gradient, compiled, in one pass over the rows of every image."""
 
 from functools import partial
 from typing import Any, no_type_check
@@ -13,40 +13,42 @@ from torch.autograd.function import once_differentiable
 from dg4d_lib.errors import BadInput
 from dg4d_lib.kernels.workers import run_parallel
 
-WINDOW, SIGMA = 11, 1.5  # pixels, of the Gaussian (Wang et al. 2004)
-C1, C2 = 0.01**2, 0.03**2  # stabilizers of brightness and of contrast, for pictures in [0, 1]
-TURN = 32  # floats that one turn of a vectorized loop takes at most
-# Sums keep their order: in another one, variances of flat places are 1e-5 off
+WINDOW, SIGMA = 11, 1.5  # pixels, Gaussian window (Wang et al. 2004)
+C1, C2 = 0.01**2, 0.03**2  # stabilizers of luminance and contrast for images in [0, 1] (Wang et al. 2004)
+CHUNK = 32  # floats; rows are padded to multiples of it, so that vectorized loops have no remainder
+# No reassociation of sums: in another order, variances of flat regions are off by 1e-5
 EXACT = {"fastmath": {"contract"}, "nogil": True, "cache": True, "error_model": "numpy"}
 
 
-def ssim(images: Float[Tensor, "b h w c"], truth: Float[Tensor, "b h w c"]) -> Float[Tensor, " b"]:
-    """Structural similarity of pictures in [0, 1] (Wang et al. 2004): Gaussian window of 11 x 11, sigma 1.5.
+def ssim(images: Float[Tensor, "b h w c"], ground_truth: Float[Tensor, "b h w c"]) -> Float[Tensor, " b"]:
+    """Return the structural similarity of images in [0, 1] (Wang et al. 2004): 11 x 11 Gaussian window, sigma 1.5.
 
-    Population covariances; the mean is taken over channels and the places where the window lies inside. 1 is equal.
-    Computed on the processor, in the precision of the images (float32: 2e-6); differentiable once, in the images.
+    Population covariances; mean over channels and all positions of the window inside the image. 1 is equal. Computed on
+    the CPU in the precision of the images (float32: accurate to 2e-6); differentiable once, in the images.
 
     Raises:
-        BadInput: pictures with fewer than 11 pixels on a side.
-        ValueError: the truth wants a gradient.
+        BadInput: images with fewer than 11 pixels on a side.
+        ValueError: the ground truth requires a gradient.
     """
     if min(images.shape[1:3]) < WINDOW:
-        raise BadInput(f"SSIM needs pictures of at least {WINDOW} x {WINDOW} pixels; given {tuple(images.shape[1:3])}")
-    if truth.requires_grad:
-        raise ValueError("SSIM has no gradient in the truth; detach it")
-    similarity: Tensor = _Ssim.apply(*(pictures.movedim(-1, 1).cpu() for pictures in (images, truth.to(images.dtype))))
+        raise BadInput(f"SSIM needs images of at least {WINDOW} x {WINDOW} pixels; given {tuple(images.shape[1:3])}")
+    if ground_truth.requires_grad:
+        raise ValueError("SSIM has no gradient in the ground truth; detach it")
+    pair = (images, ground_truth.to(images.dtype))
+    similarity: Tensor = _Ssim.apply(*(planes.movedim(-1, 1).cpu() for planes in pair))
     return similarity.to(images)
 
 
 class _Ssim(torch.autograd.Function):
-    """The bridge to autograd: the gradient is found with the value, and only scaled later."""
+    """Autograd function; the forward pass computes the gradient too, and the backward pass scales it."""
 
     @staticmethod
-    def forward(ctx: Any, images: Tensor, truth: Tensor) -> Tensor:
+    def forward(ctx: Any, images: Tensor, ground_truth: Tensor) -> Tensor:
         batch, channels, height, width = images.shape
-        wanted = ctx.needs_input_grad[0]
-        planes = [pictures.detach().contiguous().numpy().reshape(-1, height, width) for pictures in (images, truth)]
-        gradient = torch.empty(images.shape if wanted else (batch, channels, 0, 0), dtype=images.dtype)
+        needed = ctx.needs_input_grad[0]
+        pair = (images, ground_truth)
+        planes = [batch.detach().contiguous().numpy().reshape(-1, height, width) for batch in pair]
+        gradient = torch.empty(images.shape if needed else (batch, channels, 0, 0), dtype=images.dtype)
         gradients = gradient.numpy().reshape(batch * channels, *gradient.shape[2:])
         sums = np.empty(batch * channels)
         steps = np.arange(WINDOW) - WINDOW // 2
@@ -54,65 +56,65 @@ class _Ssim(torch.autograd.Function):
         weights = (weights / weights.sum()).astype(gradients.dtype)
         jobs = zip(*planes, gradients, sums.reshape(-1, 1), strict=True)
         run_parallel([partial(_compare, *job, weights) for job in jobs])
-        ctx.gradient, ctx.places = gradient, channels * (height - WINDOW + 1) * (width - WINDOW + 1)
-        return torch.from_numpy(sums.reshape(batch, channels).sum(1) / ctx.places).to(images.dtype)
+        ctx.gradient, ctx.count = gradient, channels * (height - WINDOW + 1) * (width - WINDOW + 1)
+        return torch.from_numpy(sums.reshape(batch, channels).sum(1) / ctx.count).to(images.dtype)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, incoming: Tensor) -> tuple[Tensor, None]:
-        return ctx.gradient * (incoming / ctx.places)[:, None, None, None], None
+        return ctx.gradient * (incoming / ctx.count)[:, None, None, None], None
 
 
 @njit(**EXACT)
 @no_type_check
-def _compare(image, truth, gradient, total, weights):
-    """The sum of one channel's similarities, and its gradient in the image if there is room for it.
+def _compare(image, ground_truth, gradient, total, weights):
+    """Sum the similarities of one channel; compute the gradient in the image unless `gradient` is empty.
 
-    Rows go through once. The last eleven rows of five moments, filtered along the row, are kept to be filtered across;
-    a row of similarities then gives three derivatives, which go the same way back: the window is symmetric. Rows have
-    zeros at the end, so that loops have no remainder.
+    Every row is read once. A ring buffer keeps the last eleven rows of five moments, filtered horizontally, for the
+    vertical filter. A row of similarities gives three derivatives, which pass through the same filters, because the
+    window is symmetric. Rows are zero-padded, so that loops have no remainder.
     """
     height, width = image.shape
     size = len(weights)
-    across, down, wanted = width - size + 1, height - size + 1, gradient.size > 0
-    padded = -(-across // TURN) * TURN
-    spread = -(-width // TURN) * TURN
+    across, down, needed = width - size + 1, height - size + 1, gradient.size > 0
+    padded = -(-across // CHUNK) * CHUNK
+    padded_width = -(-width // CHUNK) * CHUNK
     moments = np.zeros((5, padded + size - 1), image.dtype)
     rows = np.zeros((size, 5, padded), image.dtype)
     means = np.empty((5, padded), image.dtype)
     similarity = np.empty(padded, image.dtype)
-    slopes = np.zeros((3, size - 1 + max(padded, spread)), image.dtype)
-    slope_rows = np.zeros((size, 3, spread), image.dtype)
-    back = np.empty((3, spread), image.dtype)
-    found = 0.0
+    slopes = np.zeros((3, size - 1 + max(padded, padded_width)), image.dtype)
+    slope_rows = np.zeros((size, 3, padded_width), image.dtype)
+    back = np.empty((3, padded_width), image.dtype)
+    sum_of_similarities = 0.0
     for row in range(height + size - 1):
         if row < height:
-            _moments(image[row], truth[row], moments)
+            _moments(image[row], ground_truth[row], moments)
             for k in range(5):
                 _along(moments[k], weights, rows[row % size, k])
-        first = row - size + 1  # the window's first row, whose gradient is complete after this one
+        first = row - size + 1  # first row of the window; its gradient is complete after this row
         if first < 0:
             continue
         if first < down:
             _across(rows, weights, row + 1, means)
             _similarity(means, similarity, slopes[:, size - 1 :])
             for column in range(across):
-                found += similarity[column]
+                sum_of_similarities += similarity[column]
             slopes[:, size - 1 + across :] = 0
         else:
             slopes[:] = 0
-        if wanted:
+        if needed:
             for k in range(3):
                 _along(slopes[k], weights, slope_rows[first % size, k])
             _across(slope_rows, weights, first + 1, back)
-            _gradient(image[first], truth[first], back, gradient[first])
-    total[0] = found
+            _gradient(image[first], ground_truth[first], back, gradient[first])
+    total[0] = sum_of_similarities
 
 
 @njit(**EXACT, forceinline=True)
 @no_type_check
 def _moments(x, y, moments):
-    """Of values counted from 1/2, so that variances are differences of smaller numbers."""
+    """Compute moments of values minus 1/2, so that variances are differences of smaller numbers."""
     half = x.dtype.type(0.5)
     for i in range(len(x)):
         a, b = x[i] - half, y[i] - half
@@ -126,7 +128,7 @@ def _moments(x, y, moments):
 @njit(**EXACT, forceinline=True)
 @no_type_check
 def _along(values, weights, sums):
-    """Weighted sums of eleven neighbors in a row."""
+    """Filter a row horizontally."""
     a, b, c, d, e, f = weights[0], weights[1], weights[2], weights[3], weights[4], weights[5]
     v1, v2, v3, v4, v5 = values[1:], values[2:], values[3:], values[4:], values[5:]
     v6, v7, v8, v9, v10 = values[6:], values[7:], values[8:], values[9:], values[10:]
@@ -138,7 +140,7 @@ def _along(values, weights, sums):
 @njit(**EXACT, forceinline=True)
 @no_type_check
 def _across(rows, weights, oldest, sums):
-    """Weighted sums of eleven rows that follow each other in a ring."""
+    """Filter the rows of a ring buffer vertically."""
     size, flat = len(weights), sums.reshape(-1)
     weight, middle = weights[size // 2], rows[(oldest + size // 2) % size].reshape(-1)
     for i in range(len(flat)):
@@ -153,7 +155,7 @@ def _across(rows, weights, oldest, sums):
 @njit(**EXACT, forceinline=True)
 @no_type_check
 def _similarity(means, similarity, slopes):
-    """Similarities of a row, and their derivatives in the mean, the mean square and the mean product."""
+    """Compute the similarities of a row and their derivatives in the mean, mean square and mean product."""
     kind = means.dtype.type
     half, one, two, c1, c2 = kind(0.5), kind(1), kind(2), kind(C1), kind(C2)
     for i in range(len(similarity)):
@@ -176,7 +178,7 @@ def _similarity(means, similarity, slopes):
 @njit(**EXACT, forceinline=True)
 @no_type_check
 def _gradient(x, y, back, gradient):
-    """From derivatives in the moments to those in the pixels of a row."""
+    """Propagate from the moments to the pixels of a row."""
     half, two = x.dtype.type(0.5), x.dtype.type(2)
     for i in range(len(gradient)):
         gradient[i] = back[0, i] + two * (x[i] - half) * back[1, i] + (y[i] - half) * back[2, i]

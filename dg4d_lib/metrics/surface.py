@@ -1,4 +1,4 @@
-"""How far surfaces are apart."""
+"""Chamfer distance of surfaces, by point samples."""
 
 import numpy as np
 import torch
@@ -21,12 +21,12 @@ def chamfer_distance(a: Float[Tensor, "n 3"], b: Float[Tensor, "m 3"]) -> float:
 
 
 def align_bounding_boxes(points: Float[Tensor, "t n 3"], target: Float[Tensor, "t m 3"]) -> Float[Tensor, "t n 3"]:
-    """A moving crowd after one translation and one uniform scale for all moments, which match its box to the target's.
+    """Align moving points by one translation and one uniform scale for all frames, which match their bounding boxes.
 
-    A box holds 96 % of the points along every axis: its ends leave out the 2 % farthest on either side.
+    A box holds 96 % of the points along every axis; it leaves out the 2 % at either end.
     """
-    (center, size), (wanted, wanted_size) = (_box(crowd.flatten(0, 1)) for crowd in (points, target))
-    return (points - center) * (wanted_size / size.clamp_min(torch.finfo(size.dtype).tiny)) + wanted
+    (center, size), (target_center, target_size) = (_box(cloud.flatten(0, 1)) for cloud in (points, target))
+    return (points - center) * (target_size / size.clamp_min(torch.finfo(size.dtype).tiny)) + target_center
 
 
 def sample_surface(
@@ -36,14 +36,14 @@ def sample_surface(
     generator: torch.Generator,
     weights: Float[Tensor, " f"] | None = None,
 ) -> Float[Tensor, "samples 3"]:
-    """Points evenly spread over the area of triangles, in double precision on the processor.
+    """Sample points uniformly on a surface, in double precision on the CPU.
 
     Args:
         vertices: of the surface.
-        faces: its triangles.
-        samples: how many points.
-        generator: draws them; of the processor.
-        weights: how much the area of every triangle counts, say 0 for hidden ones; None is all the same.
+        faces: triangles.
+        samples: number of points.
+        generator: draws them; a CPU generator.
+        weights: factors on the areas of the triangles, for example 0 for hidden ones; None is 1.
 
     Raises:
         BadInput: the triangles have no area.
@@ -53,15 +53,15 @@ def sample_surface(
     areas = torch.linalg.cross(first, second).norm(dim=-1)
     ends = (areas if weights is None else areas * weights.cpu().double()).cumsum(0)
     if len(faces) == 0 or not 0 < float(ends[-1]) < torch.inf:
-        raise BadInput(f"a surface of {len(faces)} triangles has no area to put points on")
-    place, u, v = torch.rand(3, samples, generator=generator, dtype=torch.float64)
-    chosen = torch.searchsorted(ends, place * ends[-1], right=True).clamp(max=len(faces) - 1)
-    outside = u + v > 1  # the other half of the parallelogram, turned back
+        raise BadInput(f"a surface of {len(faces)} triangles has no area and cannot be sampled")
+    position, u, v = torch.rand(3, samples, generator=generator, dtype=torch.float64)
+    chosen = torch.searchsorted(ends, position * ends[-1], right=True).clamp(max=len(faces) - 1)
+    outside = u + v > 1  # the other half of the parallelogram, mirrored back
     u, v = torch.where(outside, 1 - u, u), torch.where(outside, 1 - v, v)
     return corners[chosen, 0] + u[:, None] * first[chosen] + v[:, None] * second[chosen]
 
 
 def _box(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, " 3"], Float[Tensor, ""]]:
-    """The center and the diagonal of the box of most points."""
+    """Return center and diagonal of the box of most points."""
     low, high = (torch.from_numpy(np.percentile(points.numpy(), share, axis=0)) for share in (2, 98))
     return (low + high) / 2, (high - low).norm()

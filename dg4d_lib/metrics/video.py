@@ -1,44 +1,44 @@
-"""How alike two films of one view are over time, and how much moves in them; frames in [0, 1], over one background."""
+"""Temporal metrics of two videos of one view; frames in [0, 1], over the same background."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-BLUR_SHARE = 1 / 32  # of the height of a frame: how far a change may lie from where it should be
-NOTHING = 1e-9  # of change; divides where the truth stands still
+BLUR_SHARE = 1 / 32  # of the frame height: tolerance for misplaced changes (ours)
+EPS = 1e-9  # avoids division by zero for a still ground truth
 
 
 def flicker(
-    frames: Float[Tensor, "t h w c"], truth: Float[Tensor, "t h w c"], region: Float[Tensor, "t h w 1"]
+    frames: Float[Tensor, "t h w c"], ground_truth: Float[Tensor, "t h w c"], region: Float[Tensor, "t h w 1"]
 ) -> Float[Tensor, ""]:
-    """How differently pixels change from frame to frame, in levels of 255; 0 is best.
+    """Return the mean difference of the changes from frame to frame, in levels of 255; 0 is best.
 
-    A view that is a few degrees off flickers more than one that stands still: read it beside `temporal_error`.
+    A view that is a few degrees off scores worse than a still one; read it together with `temporal_error`.
 
     Args:
-        frames: what is judged, two frames or more.
-        truth: what it should be.
-        region: 1 where either film shows the subject; a change counts where the subject is before or after it.
+        frames: to compare, two or more.
+        ground_truth: reference frames.
+        region: 1 where either video shows the subject; a change counts if the subject is there before or after it.
     """
     counted = torch.maximum(region[1:], region[:-1])
-    difference = (frames.diff(dim=0) - truth.diff(dim=0)).abs().mean(-1, keepdim=True)
+    difference = (frames.diff(dim=0) - ground_truth.diff(dim=0)).abs().mean(-1, keepdim=True)
     return 255 * (difference * counted).sum() / counted.sum().clamp_min(1)
 
 
-def temporal_error(frames: Float[Tensor, "t h w c"], truth: Float[Tensor, "t h w c"]) -> Float[Tensor, ""]:
-    """How much changes where and when, with tolerance for changes that are a little misplaced.
+def temporal_error(frames: Float[Tensor, "t h w c"], ground_truth: Float[Tensor, "t h w c"]) -> Float[Tensor, ""]:
+    """Return the error of the amount, place and time of changes, with tolerance for small misplacements.
 
-    The absolute changes of both films are blurred by a Gaussian of 1/32 of the height, and their differences are summed
-    up in units of the truth's changes: 0 is the true motion, 1 is none at all, more is worse than none. Both films have
-    two frames or more. Where the truth stands still there is no unit, and the slightest change gives a huge number.
+    The absolute changes of both videos (two frames or more) are blurred by a Gaussian with sigma 1/32 of the height;
+    the result is the L1 norm of their difference, relative to the ground truth's changes. 0 is the true motion, 1 a
+    still video, more is worse than still. For a still ground truth the slightest change gives a huge value.
     """
-    ours, theirs = (_blurred(film.diff(dim=0).abs().mean(-1)) for film in (frames, truth))
-    return (ours - theirs).abs().sum() / theirs.sum().clamp_min(NOTHING)
+    ours, theirs = (_blurred(video.diff(dim=0).abs().mean(-1)) for video in (frames, ground_truth))
+    return (ours - theirs).abs().sum() / theirs.sum().clamp_min(EPS)
 
 
-def motion_amount(frames: Float[Tensor, "t h w c"], truth: Float[Tensor, "t h w c"]) -> Float[Tensor, ""]:
-    """How much changes in all, in units of the truth's changes: 1 is as much, 0 is a still film."""
-    return frames.diff(dim=0).abs().sum() / truth.diff(dim=0).abs().sum().clamp_min(NOTHING)
+def motion_amount(frames: Float[Tensor, "t h w c"], ground_truth: Float[Tensor, "t h w c"]) -> Float[Tensor, ""]:
+    """Return the total change relative to the ground truth's: 1 is equal, 0 a still video."""
+    return frames.diff(dim=0).abs().sum() / ground_truth.diff(dim=0).abs().sum().clamp_min(EPS)
 
 
 def _blurred(planes: Float[Tensor, "t h w"]) -> Float[Tensor, "t h w"]:
@@ -48,10 +48,10 @@ def _blurred(planes: Float[Tensor, "t h w"]) -> Float[Tensor, "t h w"]:
 
 
 def _blur(size: int, sigma: float, like: Tensor) -> Float[Tensor, "n n"]:
-    """The Gaussian filter of a row as a matrix: cut off after four sigma, and beyond its ends the row is mirrored."""
+    """Return the Gaussian filter of a row as a matrix, truncated at four sigma, with mirrored ends."""
     reach = int(4 * sigma + 0.5)
     steps = torch.arange(-reach, reach + 1, device=like.device)
     weights = torch.exp(-(steps / sigma).square() / 2).to(like)
-    places = (torch.arange(size, device=like.device)[:, None] + steps) % (2 * size)
-    mirrored = torch.where(places < size, places, 2 * size - 1 - places)
+    positions = (torch.arange(size, device=like.device)[:, None] + steps) % (2 * size)
+    mirrored = torch.where(positions < size, positions, 2 * size - 1 - positions)
     return like.new_zeros(size, size).scatter_add_(1, mirrored, (weights / weights.sum()).expand(size, -1).contiguous())

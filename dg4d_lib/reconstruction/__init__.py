@@ -1,1 +1,1 @@
-"""From pictures to Gaussians in one pass of a network, without optimization."""
+"""Feed-forward reconstruction of Gaussians from images."""

@@ -1,6 +1,6 @@
-"""LGM's network: an asymmetric U-Net that looks at four views at once (Tang et al. 2024, "LGM", section 3.3).
+"""LGM's asymmetric U-Net with attention across four views (Tang et al. 2024, "LGM", section 3.3).
 
-Modules carry the names of the published weights (`unet.down_blocks.3.attns.0.attn.qkv.weight`): a file loads as it is.
+Modules have the names of the published weights (`unet.down_blocks.3.attns.0.attn.qkv.weight`), so files load unchanged.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 VIEWS = 4
-LAYERS = 2  # residual blocks of a level on the way down; one more on the way up
+LAYERS = 2  # residual blocks per encoder level; decoder levels have one more
 HEADS = 16
 GROUPS = 32
 SKIP_SCALE = 0.5**0.5  # keeps the variance of a sum of two
@@ -19,13 +19,13 @@ SKIP_SCALE = 0.5**0.5  # keeps the variance of a sum of two
 
 @dataclass(frozen=True)
 class UnetConfig:
-    """Channels of every level, and which levels exchange what the views see; the defaults are the published "big".
+    """Channels and cross-view attention of every level; the defaults are those of the published "big" model.
 
     Attributes:
-        down_channels: multiples of 32; every level but the last halves the size.
-        down_attention: one per level.
-        up_channels: multiples of 32; every level but the last doubles the size.
-        up_attention: one per level.
+        down_channels: encoder, multiples of 32; every level but the last halves the size.
+        down_attention: encoder levels with attention.
+        up_channels: decoder, multiples of 32; every level but the last doubles the size.
+        up_attention: decoder levels with attention.
     """
 
     down_channels: tuple[int, ...] = (64, 128, 256, 512, 1024, 1024)
@@ -35,32 +35,32 @@ class UnetConfig:
 
 
 class Unet(nn.Module):
-    """Features of four views to features of four views.
+    """U-Net over sets of four views.
 
     Args:
         inputs: channels of a view.
         outputs: channels of a view.
-        shape: of the levels.
+        config: of the levels.
     """
 
-    def __init__(self, inputs: int, outputs: int, shape: UnetConfig) -> None:
+    def __init__(self, inputs: int, outputs: int, config: UnetConfig) -> None:
         super().__init__()
-        down, up = shape.down_channels, shape.up_channels
+        down, up = config.down_channels, config.up_channels
         self.conv_in = nn.Conv2d(inputs, down[0], 3, padding=1)
         self.down_blocks = nn.ModuleList(
-            _Down(down[max(i - 1, 0)], down[i], shape.down_attention[i], shrink=i < len(down) - 1)
+            _Down(down[max(i - 1, 0)], down[i], config.down_attention[i], shrink=i < len(down) - 1)
             for i in range(len(down))
         )
         self.mid_block = _Middle(down[-1])
         self.up_blocks = nn.ModuleList(
-            _Up(up[max(i - 1, 0)], down[-2 - i], up[i], shape.up_attention[i], grow=i < len(up) - 1)
+            _Up(up[max(i - 1, 0)], down[-2 - i], up[i], config.up_attention[i], grow=i < len(up) - 1)
             for i in range(len(up))
         )
         self.norm_out = _norm(up[-1])
         self.conv_out = nn.Conv2d(up[-1], outputs, 3, padding=1)
 
     def forward(self, views: Float[Tensor, "b c h w"]) -> Float[Tensor, "b o i j"]:
-        """Four consecutive images are the views of one object."""
+        """Process views; four consecutive ones show one object."""
         x = self.conv_in(views)
         skips = [x]
         for block in self.down_blocks:
@@ -72,17 +72,17 @@ class Unet(nn.Module):
 
 
 class _Down(nn.Module):
-    """A level on the way down; everything it computes is kept for the way up."""
+    """Encoder level; all its outputs become skip connections."""
 
     def __init__(self, inputs: int, outputs: int, attention: bool, shrink: bool) -> None:
         super().__init__()
         self.nets = nn.ModuleList(_Residual(outputs if i else inputs, outputs) for i in range(LAYERS))
-        self.attns = nn.ModuleList(_exchange(outputs, attention) for _ in range(LAYERS))
+        self.attns = nn.ModuleList(_view_attention(outputs, attention) for _ in range(LAYERS))
         self.downsample = nn.Conv2d(outputs, outputs, 3, stride=2, padding=1) if shrink else None
 
     def forward(self, x: Tensor, skips: list[Tensor]) -> Tensor:
-        for net, exchange in zip(self.nets, self.attns, strict=True):
-            x = exchange(net(x))
+        for net, attention in zip(self.nets, self.attns, strict=True):
+            x = attention(net(x))
             skips.append(x)
         if self.downsample is not None:
             x = self.downsample(x)
@@ -91,7 +91,7 @@ class _Down(nn.Module):
 
 
 class _Middle(nn.Module):
-    """The deepest level."""
+    """Bottleneck."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -103,7 +103,7 @@ class _Middle(nn.Module):
 
 
 class _Up(nn.Module):
-    """A level on the way up; takes back one kept feature per residual block, the last of them from the level above."""
+    """Decoder level; takes one skip connection per residual block, the last from the level above."""
 
     def __init__(self, inputs: int, skip: int, outputs: int, attention: bool, grow: bool) -> None:
         super().__init__()
@@ -111,19 +111,19 @@ class _Up(nn.Module):
             _Residual((outputs if i else inputs) + (skip if i == LAYERS else outputs), outputs)
             for i in range(LAYERS + 1)
         )
-        self.attns = nn.ModuleList(_exchange(outputs, attention) for _ in range(LAYERS + 1))
+        self.attns = nn.ModuleList(_view_attention(outputs, attention) for _ in range(LAYERS + 1))
         self.upsample = nn.Conv2d(outputs, outputs, 3, padding=1) if grow else None
 
     def forward(self, x: Tensor, skips: list[Tensor]) -> Tensor:
-        for net, exchange in zip(self.nets, self.attns, strict=True):
-            x = exchange(net(torch.cat([x, skips.pop()], 1)))
+        for net, attention in zip(self.nets, self.attns, strict=True):
+            x = attention(net(torch.cat([x, skips.pop()], 1)))
         if self.upsample is not None:
             x = self.upsample(functional.interpolate(x, scale_factor=2.0, mode="nearest"))
         return x
 
 
 class _Residual(nn.Module):
-    """Two convolutions beside a shortcut."""
+    """Residual block of two convolutions."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -139,7 +139,7 @@ class _Residual(nn.Module):
 
 
 class _ViewAttention(nn.Module):
-    """Every pixel of the four views looks at every other."""
+    """Self-attention over the pixels of all four views."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -154,7 +154,7 @@ class _ViewAttention(nn.Module):
 
 
 class _Attention(nn.Module):
-    """Softmax attention of tokens with themselves."""
+    """Softmax self-attention."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -167,7 +167,7 @@ class _Attention(nn.Module):
         return self.proj(seen.transpose(1, 2).flatten(2))
 
 
-def _exchange(channels: int, attention: bool) -> nn.Module:
+def _view_attention(channels: int, attention: bool) -> nn.Module:
     return _ViewAttention(channels) if attention else nn.Identity()
 
 

@@ -94,17 +94,17 @@ def estimate_saliency(lab: Float[ndarray, "h w 3"]) -> Float[ndarray, "h w"]:
     sizes = np.bincount(labels.ravel(), minlength=regions).astype(np.float64)
     means = np.stack([np.bincount(labels.ravel(), lab[..., c].ravel(), regions) / sizes for c in range(3)], 1)
     rows, columns = np.mgrid[-1 : 1 : lab.shape[0] * 1j, -1 : 1 : lab.shape[1] * 1j]
-    places = np.stack([np.bincount(labels.ravel(), axis.ravel(), regions) / sizes for axis in (columns, rows)], 1)
-    apart = np.linalg.norm(means[:, None] - means[None], axis=-1)
+    positions = np.stack([np.bincount(labels.ravel(), axis.ravel(), regions) / sizes for axis in (columns, rows)], 1)
+    distances = np.linalg.norm(means[:, None] - means[None], axis=-1)
     pairs = _neighbors(labels)
     edge = np.isin(np.arange(regions), np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
 
-    background = _background(apart, pairs, edge)
-    near = np.exp(-((places[:, None] - places[None]) ** 2).sum(-1) / 2 / (2 * NEIGHBORHOOD) ** 2)
-    contrast = (apart * near * background).sum(1) * np.exp(-((places / CENTER) ** 2).sum(1) / 4)
+    background = _background(distances, pairs, edge)
+    near = np.exp(-((positions[:, None] - positions[None]) ** 2).sum(-1) / 2 / (2 * NEIGHBORHOOD) ** 2)
+    contrast = (distances * near * background).sum(1) * np.exp(-((positions / CENTER) ** 2).sum(1) / 4)
     contrast = (contrast - contrast.min()) / max(float(np.ptp(contrast)), 1e-9)
 
-    links = np.exp(-(apart[pairs[:, 0], pairs[:, 1]] ** 2) / (2 * GEODESIC**2)) + 0.1
+    links = np.exp(-(distances[pairs[:, 0], pairs[:, 1]] ** 2) / (2 * GEODESIC**2)) + 0.1
     laplacian = _laplacian(pairs, links, regions)
     solved = spsolve((laplacian + sparse.diags(background + contrast + 1e-6)).tocsc(), contrast)
     solved = (solved - solved.min()) / max(float(np.ptp(solved)), 1e-9)
@@ -157,10 +157,10 @@ def random_walk(lab: Float[ndarray, "h w 3"], prior: Float[ndarray, "h w"]) -> F
     return smooth.clip(0, 1)
 
 
-def _background(apart: Float[ndarray, "r r"], pairs: Int[ndarray, "e 2"], edge: ndarray) -> Float[ndarray, " r"]:
+def _background(distances: Float[ndarray, "r r"], pairs: Int[ndarray, "e 2"], edge: ndarray) -> Float[ndarray, " r"]:
     """Return the probability that each region is background, from its boundary connectivity."""
     regions = len(edge)
-    costs = np.maximum(apart[pairs[:, 0], pairs[:, 1]] - SAME_COLOR, 0) + 1e-6
+    costs = np.maximum(distances[pairs[:, 0], pairs[:, 1]] - SAME_COLOR, 0) + 1e-6
     graph = sparse.coo_matrix((costs, (pairs[:, 0], pairs[:, 1])), (regions, regions)).tocsr()
     reach = np.exp(-(csgraph.dijkstra(graph, directed=False) ** 2) / (2 * GEODESIC**2))
     connectivity = reach[:, edge].sum(1) / np.sqrt(reach.sum(1))

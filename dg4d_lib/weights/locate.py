@@ -34,7 +34,7 @@ def find_weights(name_or_folder: str | Path, home: Path | None = None) -> Path:
     if (path := given_folder(name_or_folder)) is not None:
         return path
     if CONTENT_MARK in name:
-        return _called_by_content(name, home)
+        return _linked_folder(name, home)
     weights = lookup_weights(name)
     if home is not None and (folder := home / folder_name(weights)).exists():
         locked = read_lock(home).get(weights.name)
@@ -170,7 +170,7 @@ def hub_cache_snapshot(weights: Weights) -> Path | None:
     return next((snapshot for snapshot in snapshots if snapshot.is_dir()), None)
 
 
-def _called_by_content(name: str, home: Path | None) -> Path:
+def _linked_folder(name: str, home: Path | None) -> Path:
     link = home / name if home is not None else Path(name)
     if not link.exists():
         raise BackendUnavailable(f"the folder of the weights {name} no longer exists; give its new path")

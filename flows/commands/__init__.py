@@ -1,1 +1,1 @@
-"""What each command of `dg4d` does, and how it looks on a terminal."""
+"""Commands of `dg4d` and their terminal output."""

@@ -1,4 +1,4 @@
-"""`dg4d batch`: many assets out of a folder, a pattern, an object store or a manifest; what is made is left alone."""
+"""Conversion of a folder, a pattern, an object store or a manifest; behind `dg4d batch`."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,61 +12,53 @@ from flows.engine import resources
 from flows.inputs.manifest import Item
 from flows.inputs.places import parse_where
 from flows.packages.publish import check_writable
-from flows.packages.summary import BAD_INPUT, Row, Tally, Writer
+from flows.packages.summary import BAD_INPUT, BatchProgress, Row, Writer
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 
-def batch(
-    request: CatalogRequest,
-    console: "Console",
-    connect: Callable[[], None] | None = None,
-    allow: Callable[[Item], None] | None = None,
-) -> list[Row]:
-    """Make every item of a catalog that is not made yet; return a row for each, in the order in which they are made.
+def batch(request: CatalogRequest, console: "Console", allow: Callable[[Item], None] | None = None) -> list[Row]:
+    """Convert every item of a catalog that is not finished; return a result for each, in order of conversion.
 
-    OUT gets a folder per item, summary.json, summary.csv and index.html. Items are read and prepared one ahead of
-    those at work, so that a batch of thousands begins at once.
+    Writes a folder per item, summary.json, summary.csv and index.html. Items are prepared one ahead of the running
+    ones, so that a batch of thousands starts at once.
 
     Args:
         request: the catalog.
-        console: where to show progress.
-        connect: finds a Prefect server, when the first item needs one; default: as every command does.
-        allow: raises BadInput for an item that may not be made here; it becomes a failed one.
+        console: for progress.
+        allow: raises BadInput for an item that may not be made here, which then counts as failed.
 
     Raises:
         BadInput: the batch as a whole cannot be used, or `out` cannot be written.
-        BackendUnavailable: something that all of it needs is missing.
-        KeyboardInterrupt: the user stopped it; what is done stays, and the summary says what was not.
+        BackendUnavailable: something that all items need is missing.
+        KeyboardInterrupt: the user stopped it; finished items stay, and the summary lists the others as skipped.
     """
     out = request.out
     parse_where(request.where)
     items = request.items(allow)
-    resources.cpus(), resources.gpus()  # wrong numbers are refused before any work
+    resources.cpus(), resources.gpus()  # validate $DG4D_CPUS and $DG4D_GPUS before any work
     check_writable(out)
     out.mkdir(parents=True, exist_ok=True)
     writer = Writer(out, request.commercial_only, request.price_per_hour)
     with terminal.batch_shown(console, [item.name for item in items]) as table:
 
         def show(row: Row) -> None:
-            table.settle(row.item, row.status, row.message)
-            if not console.is_terminal:
-                console.print(f"{row.item}: {row.status} {row.message}".rstrip(), markup=False)
-            writer.write_sometimes(list(tally.rows.values()), tally.seconds)
+            table.show(row, console)
+            writer.write_sometimes(list(progress.rows.values()), progress.seconds)
 
-        tally = Tally(len(items), show)
+        progress = BatchProgress(len(items), show)
         try:
-            _make_all(request, items, tally, connect, allow)
+            _convert(request, items, progress, allow)
         finally:
-            stopped = (Row(item=item.name, status="skipped", message="not begun, or stopped") for item in items)
-            rows = [tally.rows.get(row.item, row) for row in stopped]
-            writer.write(rows, tally.seconds)
+            stopped = (Row(item=item.name, status="skipped", message="not started, or stopped") for item in items)
+            rows = [progress.rows.get(row.item, row) for row in stopped]
+            writer.write(rows, progress.seconds)
     return rows
 
 
-def tell(rows: list[Row], out: Path, console: "Console") -> int:
-    """Say how a batch ended; the exit status of the command."""
+def print_summary(rows: list[Row], out: Path, console: "Console") -> int:
+    """Print how a batch ended and return the exit status of the command."""
     failed = [row for row in rows if row.status == "failed"]
     for row in failed:
         console.print(f"failed: {row.item}: {row.message}", markup=False, style="red")
@@ -74,7 +66,7 @@ def tell(rows: list[Row], out: Path, console: "Console") -> int:
         if row.failing and row.status != "failed":
             console.print(f"not accepted: {row.item}: {', '.join(row.failing)}", markup=False, style="yellow")
     if all(row.status == "unchanged" for row in rows):
-        console.print("nothing to do: every item was already done")
+        console.print("nothing to do: every item is up to date")
     console.print(f"{sum(row.made for row in rows)} of {len(rows)} items are in {out}", markup=False)
     console.print(f"overview: {out / 'index.html'}", markup=False)
     if not failed:
@@ -82,23 +74,19 @@ def tell(rows: list[Row], out: Path, console: "Console") -> int:
     return EXIT_BAD_INPUT if all(row.kind in BAD_INPUT for row in rows) else EXIT_FAILED
 
 
-def _make_all(
-    request: CatalogRequest,
-    items: list[Item],
-    tally: Tally,
-    connect: Callable[[], None] | None,
-    allow: Callable[[Item], None] | None,
+def _convert(
+    request: CatalogRequest, items: list[Item], progress: BatchProgress, allow: Callable[[Item], None] | None
 ) -> None:
-    """Settle the items before the first that has to be made, which takes no server; then run the catalog."""
+    """Skip finished items without a server, then run the catalog from the first unfinished one."""
     for item in items:
         first = ready(item, request.out, request.strict)
         if isinstance(first, Row):
-            tally.settle(first)
+            progress.settle(first)
             continue
         if parse_where(request.where).kind == "local":
             convert.prepare(first)
-        (connect or convert.connect)()
+        convert.connect()
         from flows.catalog import run_catalog
 
-        run_catalog(request, f"{Path(request.inputs).name}: {len(items)} items", tally, allow)
+        run_catalog(request, f"{Path(request.inputs).name}: {len(items)} items", progress, allow)
         return

@@ -1,9 +1,7 @@
-"""`dg4d score` and `dg4d bench`: assets against ground truth, with every result in files."""
+"""Evaluation of assets against ground truth; behind `dg4d score` and `dg4d bench`."""
 
 import json
-import tempfile
-import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,14 +11,15 @@ from dg4d_lib.asset_settings import ScoreSettings
 from dg4d_lib.errors import BadInput, DG4DError
 from flows import home
 from flows.commands import terminal
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.manifest import parse_changes
-from flows.inputs.orders import Order, Wish
+from flows.inputs.sources import put_zip
 from flows.packages import scores
-from flows.packages.publish import check_folder, check_writable, is_current, whole
+from flows.packages.publish import check_folder, check_writable, is_current, load_verified
 from flows.packages.scores import Results
-from flows.packages.summary import BAD_INPUT, Row, Tally
+from flows.packages.summary import BAD_INPUT, BatchProgress, Row
 from flows.step_errors import StepError, StepMissing
-from steps.artifacts.archives import add_entry, unpack
+from steps.artifacts.archives import unpack
 from steps.artifacts.ground_truth import GroundTruth, find_ground_truth, find_ground_truths
 from steps.catalog import PACKAGE, TRUTH
 from steps.contract import ArtifactRef
@@ -33,11 +32,11 @@ from steps.store.files import room_for, write_atomically
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from flows.judge import Entry, Judged
+    from flows.benchmark import BenchmarkEntry, BenchmarkResult
 
-NEEDED = ("asset.json", "asset.glb", "splats/", "meshes/", "canonical/")  # of a package, to draw it
-OWN = "score."  # before the knobs of scoring
-MISSING = frozenset(["StepMissing", "StepLost", "StepUnreachable"])  # kinds of failure for which something is not here
+NEEDED = ("asset.json", "asset.glb", "splats/", "meshes/", "canonical/")  # files of a package for rendering
+SCORE = "score."  # prefix of the settings of scores
+MISSING = frozenset(["StepMissing", "StepLost", "StepUnreachable"])  # kinds of failure that the user can mend
 ASSETS, FILMS = "assets", "films"  # folders of a benchmark
 
 
@@ -49,42 +48,45 @@ def score(
     changes: list[str] | None = None,
     out: Path | None = None,
 ) -> Results:
-    """Judge one finished asset.
+    """Score one asset.
 
     Args:
-        package: its folder.
-        truth: a folder in a layout of steps/artifacts/ground_truth.py, or a picture, where other sides are unknown.
-        console: where to show how far it is.
-        mesh: judge the textured mesh instead of the splats.
-        changes: "score.KNOB=VALUE", knobs of `ScoreSettings`.
-        out: a file to write the results to, as JSON.
+        package: folder of the asset.
+        truth: folder in a layout of steps/artifacts/ground_truth.py, or a picture if other views are unknown.
+        console: for progress.
+        mesh: score the textured mesh instead of the splats.
+        changes: "score.NAME=VALUE", settings of `ScoreSettings`.
+        out: JSON file for the results.
 
     Raises:
-        BadInput: the asset, the truth or a setting cannot be used, or `out` cannot be written.
-        StepError: the step did not finish.
+        BadInput: the asset, the ground truth or a setting cannot be used, or `out` cannot be written.
+        StepError: the step failed.
     """
     found, (pipeline, settings) = find_ground_truth(truth), _settings(changes, mesh)
     if pipeline:
-        raise BadInput(f"the asset is finished: only knobs that begin with {OWN!r} can be set; given {min(pipeline)}")
-    record = whole(package)
+        raise BadInput(f"only settings that begin with {SCORE!r} apply to a finished asset; given {min(pipeline)}")
+    record = load_verified(package)
     if out is not None:
         check_writable(out.parent)
     from flows.convert import connect
 
     connect()
-    from flows.judge import Entry, judge
+    from flows.benchmark import BenchmarkEntry, score_assets
+    from flows.engine.step_tasks import flow_context
 
-    entry = Entry(
+    entry = BenchmarkEntry(
         name=found.name,
         truth=put_truth(found, home.store()),
         package=put_package(package, record, home.store()),
         seconds=_seconds(record),
     )
-    with terminal.steps_shown(console):
-        judged = judge([entry], settings, f"{package.absolute().name} against {found.name}", package.absolute().name)
+    with terminal.steps_shown(console), flow_context():
+        judged = score_assets(
+            [entry], settings, f"{package.absolute().name} against {found.name}", package.absolute().name
+        )
     for one in judged.results.failed:
         if one.kind in BAD_INPUT:
-            raise BadInput(f"{package} cannot be judged against {truth}: {one.error}")
+            raise BadInput(f"{package} cannot be scored against {truth}: {one.error}")
         raise (StepMissing if one.kind in MISSING else StepError)("score_asset", one.error)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -105,80 +107,83 @@ def bench(
     workers: int = 1,
     allow: Callable[[Iterable[Path]], None] | None = None,
 ) -> Results:
-    """Make an asset of every object of a data set, judge all, and write what was found; what is done is left alone.
+    """Convert and score every object of a data set; finished objects are not converted again.
 
-    OUT gets results.json, results.csv, table.md, index.html, films/ and the packages in assets/.
+    Writes results.json, results.csv, table.md, index.html, films/ and the packages in assets/.
 
     Args:
-        dataset: a folder per object, in a layout of steps/artifacts/ground_truth.py.
-        out: made if it is not there.
-        console: where to show how far it is.
+        dataset: folder per object, in a layout of steps/artifacts/ground_truth.py.
+        out: output folder, created if necessary.
+        console: for progress.
         profile_name: of the conversion.
-        changes: "KNOB=VALUE" of the conversion, "score.KNOB=VALUE" of scoring.
-        seed: of everything random.
-        mesh: judge the textured meshes instead of the splats.
-        bank: every object's own bank of true views is its prior.
-        limit: only so many objects, the first by name.
-        workers: objects at a time.
+        changes: "NAME=VALUE" of the conversion, "score.NAME=VALUE" of scores.
+        seed: of all random numbers.
+        mesh: score the textured meshes instead of the splats.
+        bank: use each object's ground-truth views as the prior.
+        limit: number of objects, the first by name.
+        workers: objects converted at a time.
         allow: raises BadInput for files that may not be read here.
 
     Raises:
         BadInput: the data set or a setting cannot be used, or `out` cannot be written.
-        BackendUnavailable: what the profile needs is not here.
+        BackendUnavailable: something that the profile needs is missing.
     """
     truths = find_ground_truths(dataset)[:limit]
     for truth in truths:
         if allow:
             allow(truth.files)
         check_truth(truth)
-    knobs, settings = _settings(changes, mesh)
+    given, settings = _settings(changes, mesh)
     if bank:
-        knobs = {"prior.kind": "oracle", **knobs}
+        given = {"prior.kind": "oracle", **given}
         if without := [truth.name for truth in truths if truth.bank is None]:
-            raise BadInput(f"--bank: these objects have no bank of true views: {', '.join(without)}")
-    pipeline = revise(profile(profile_name), knobs)
+            raise BadInput(f"--bank needs ground-truth views, which these objects lack: {', '.join(without)}")
+    pipeline = revise(profile(profile_name), given)
     settings = settings.model_copy(update={"rasterizer": pipeline.rasterizer})
     settings = ScoreAssetSettings.model_validate(settings.model_dump(mode="json"))
     check_writable(out)
-    wishes = [_wish(truth, bank, profile=profile_name, settings=pipeline, seed=seed) for truth in truths]
-    for wish in wishes:
-        wish.check()
-        check_folder(out / ASSETS / wish.item)
+    requests = [_request(truth, bank, profile=profile_name, settings=pipeline, seed=seed) for truth in truths]
+    for request in requests:
+        request.check()
+        check_folder(out / ASSETS / request.item)
     from flows.convert import connect
 
     connect()
-    rows = _converted([wish.order(home.store()) for wish in wishes], out / ASSETS, workers, console, dataset.name)
-    from flows.judge import judge
+    rows = _converted(
+        [request.to_job(home.store()) for request in requests], out / ASSETS, workers, console, dataset.name
+    )
+    from flows.benchmark import score_assets
+    from flows.engine.step_tasks import flow_context
 
     entries = [_entry(truth, out / ASSETS / truth.name, rows[truth.name]) for truth in truths]
-    title = f"{dataset.absolute().name}, {profile_name}{', true views as prior' if bank else ''}"
-    with terminal.batch_shown(console, [truth.name for truth in truths]) as table:
-        judged = judge(entries, settings, title, profile_name, seed)
+    title = f"{dataset.absolute().name}, {profile_name}{', ground-truth views as prior' if bank else ''}"
+    with terminal.batch_shown(console, [truth.name for truth in truths]) as table, flow_context():
+        judged = score_assets(entries, settings, title, profile_name, seed)
         for one in judged.results.objects:
             table.settle(one.object, "failed" if one.error else "done", one.error)
-    results = judged.results.model_copy(update={"settings": {**judged.results.settings, "changes": knobs}})
+    results = judged.results.model_copy(update={"settings": {**judged.results.settings, "changes": given}})
     write(results, judged, out)
     return results
 
 
-def write(results: Results, judged: "Judged", out: Path) -> None:
+def write(results: Results, judged: "BenchmarkResult", out: Path) -> None:
     """Write the files of a benchmark; raises DiskFull."""
-    shown = _put_films(judged, out)
+    films = _unpack_films(judged, out)
     texts = {
         "results.json": _json(results),
         "results.csv": scores.csv_text(results),
         "table.md": scores.markdown(results),
-        "index.html": scores.page(results, shown),
+        "index.html": scores.scores_page(results, films),
     }
     for name, text in texts.items():
         write_atomically(out / name, text)
 
 
 def check_truth(truth: GroundTruth) -> None:
-    """Refuse a ground truth with files that are no pictures, or a mesh that is no NumPy archive.
+    """Refuse ground truth with invalid pictures or an invalid mesh archive.
 
     Raises:
-        BadInput: says which file.
+        BadInput: names the file.
     """
     for path in truth.pictures:
         check_still(path)
@@ -187,11 +192,11 @@ def check_truth(truth: GroundTruth) -> None:
 
 
 def put_truth(truth: GroundTruth, store: ArtifactStore) -> ArtifactRef:
-    """Keep a ground truth in our own layout; equal pictures give equal bytes, whatever layout they had.
+    """Store ground truth in our own layout; equal pictures give equal bytes, whatever their layout was.
 
     Raises:
-        BadInput: a file is no picture, or the mesh no NumPy archive.
-        DiskFull: there is no room.
+        BadInput: a file is not a picture, or the mesh is not a NumPy archive.
+        DiskFull: the disk is full.
     """
     check_truth(truth)
     files = {f"input/{i:03d}{path.suffix.lower()}": path for i, path in enumerate(truth.inputs)}
@@ -199,33 +204,33 @@ def put_truth(truth: GroundTruth, store: ArtifactStore) -> ArtifactRef:
         files |= {f"view_{view.name}/{i:03d}{path.suffix.lower()}": path for i, path in enumerate(view.frames)}
     if truth.mesh is not None:
         files["mesh.npz"] = truth.mesh
-    return _put(files, TRUTH.media_type, store)
+    return put_zip(files, TRUTH.media_type, store)
 
 
 def put_package(folder: Path, record: Mapping[str, Any], store: ArtifactStore) -> ArtifactRef:
-    """Keep what is needed to draw the package in a folder, whose provenance is `record`."""
+    """Store the files of a package that rendering needs; `record` is its provenance."""
     names = [name for name in sorted(record["files"]) if name.startswith(NEEDED)]
-    return _put({name: folder / name for name in names}, PACKAGE.media_type, store)
+    return put_zip({name: folder / name for name in names}, PACKAGE.media_type, store)
 
 
 def _settings(changes: list[str] | None, mesh: bool) -> tuple[dict[str, Any], ScoreAssetSettings]:
-    """The knobs of the conversion that were set, and the settings of scoring."""
+    """Return the changed settings of the conversion, and the settings of scores."""
     given = parse_changes(changes or [])
-    own = {key.removeprefix(OWN): value for key, value in given.items() if key.startswith(OWN)}
+    own = {key.removeprefix(SCORE): value for key, value in given.items() if key.startswith(SCORE)}
     try:
         tree = ScoreSettings.model_validate(own).model_dump(mode="json")
         settings = ScoreAssetSettings(rasterizer="auto", mesh=mesh, score=ScoreSettings(**without_paths(tree)))
     except ValidationError as error:
-        lines = [f"{OWN}{'.'.join(map(str, e['loc']))} = {e['input']!r}: {e['msg']}" for e in error.errors()]
-        known = ", ".join(f"{OWN}{name}" for name in ScoreSettings.model_fields)
-        raise BadInput(f"settings refused: {'; '.join(lines)}; there are: {known}") from error
-    return {key: value for key, value in given.items() if not key.startswith(OWN)}, settings
+        lines = [f"{SCORE}{'.'.join(map(str, e['loc']))} = {e['input']!r}: {e['msg']}" for e in error.errors()]
+        known = ", ".join(f"{SCORE}{name}" for name in ScoreSettings.model_fields)
+        raise BadInput(f"settings refused: {'; '.join(lines)}; use: {known}") from error
+    return {key: value for key, value in given.items() if not key.startswith(SCORE)}, settings
 
 
-def _wish(truth: GroundTruth, bank: bool, **asked: Any) -> Wish:
-    """What `dg4d make` would be asked for: the input film is followed, or the input picture is made to move."""
+def _request(truth: GroundTruth, bank: bool, **asked: Any) -> ConversionRequest:
+    """Return the request of `dg4d make`: follow the input video, or animate the input picture."""
     folder = truth.inputs[0].parent
-    return Wish(
+    return ConversionRequest(
         item=truth.name,
         picture=truth.inputs[0],
         video=folder if len(truth.inputs) > 1 else None,
@@ -234,42 +239,36 @@ def _wish(truth: GroundTruth, bank: bool, **asked: Any) -> Wish:
     )
 
 
-def _converted(orders: list[Order], folder: Path, workers: int, console: "Console", name: str) -> dict[str, Row]:
-    """Make what is not made yet; what became of every object."""
-    from flows.catalog import run_orders
+def _converted(jobs: list[ConversionJob], folder: Path, workers: int, console: "Console", name: str) -> dict[str, Row]:
+    """Convert the unfinished objects; return the result of each."""
+    from flows.catalog import run_jobs
 
-    rows = {order.item: Row(item=order.item, status="unchanged") for order in orders}
-    waiting = [order for order in orders if not is_current(folder / order.item, order.digest())]
+    rows = {job.item: Row(item=job.item, status="unchanged") for job in jobs}
+    waiting = [job for job in jobs if not is_current(folder / job.item, job.digest())]
     if not waiting:
         return rows
-    with terminal.batch_shown(console, [order.item for order in waiting]) as table:
-
-        def show(row: Row) -> None:
-            table.settle(row.item, row.status, row.message)
-            if not console.is_terminal:
-                console.print(f"{row.item}: {row.status} {row.message}", markup=False)
-
-        tally = Tally(len(waiting), show)
-        run_orders(waiting, folder, workers, f"{name}: {len(waiting)} objects", tally)
-    return rows | tally.rows
+    with terminal.batch_shown(console, [job.item for job in waiting]) as table:
+        progress = BatchProgress(len(waiting), lambda row: table.show(row, console))
+        run_jobs(waiting, folder, workers, f"{name}: {len(waiting)} objects", progress)
+    return rows | progress.rows
 
 
-def _entry(truth: GroundTruth, folder: Path, row: Row) -> "Entry":
-    from flows.judge import Entry
+def _entry(truth: GroundTruth, folder: Path, row: Row) -> "BenchmarkEntry":
+    from flows.benchmark import BenchmarkEntry
 
     ref = put_truth(truth, home.store())
     if row.status == "failed":
-        return Entry(name=truth.name, truth=ref, error=row.message, kind=row.kind)
+        return BenchmarkEntry(name=truth.name, truth=ref, error=row.message, kind=row.kind)
     try:
-        record = whole(folder)
+        record = load_verified(folder)
         package = put_package(folder, record, home.store())
     except DG4DError as error:
-        return Entry(name=truth.name, truth=ref, error=str(error), kind=type(error).__name__)
-    return Entry(name=truth.name, truth=ref, package=package, seconds=_seconds(record))
+        return BenchmarkEntry(name=truth.name, truth=ref, error=str(error), kind=type(error).__name__)
+    return BenchmarkEntry(name=truth.name, truth=ref, package=package, seconds=_seconds(record))
 
 
 def _seconds(record: Mapping[str, Any]) -> float:
-    """What the steps of a package took to compute, now or before."""
+    """Return the compute time of a package's steps, including cached ones."""
     steps = record.get("run", {}).get("steps", [])
     return round(sum(float(step.get("duration_s", 0.0)) for step in steps), 1)
 
@@ -278,8 +277,8 @@ def _json(results: Results) -> str:
     return json.dumps(results.model_dump(mode="json"), indent=1, ensure_ascii=False) + "\n"
 
 
-def _put_films(judged: "Judged", out: Path) -> dict[str, dict[str, dict[str, str]]]:
-    """Unpack every film below OUT; where each lies, by object, whose it is, and view."""
+def _unpack_films(judged: "BenchmarkResult", out: Path) -> dict[str, dict[str, dict[str, str]]]:
+    """Unpack every video below OUT; return their paths by object, source and view."""
     shown: dict[str, dict[str, dict[str, str]]] = {}
     for name, refs in judged.films.items():
         for whose, ref in refs.items():
@@ -290,21 +289,3 @@ def _put_films(judged: "Judged", out: Path) -> dict[str, dict[str, dict[str, str
             views = {Path(film).stem: f"{FILMS}/{name}/{whose}/{film}" for film in films}
             shown.setdefault(name, {})[whose] = views
     return shown
-
-
-def _put(files: Mapping[str, Path], media_type: str, store: ArtifactStore) -> ArtifactRef:
-    """A stored zip; equal files under equal names give equal bytes."""
-    with tempfile.TemporaryDirectory(prefix="dg4d-score-") as scratch, room_for(Path(scratch)):
-        path = Path(scratch) / "files.zip"
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
-            for name, content in _contents(files):
-                add_entry(archive, name, content)
-        return store.put(path, media_type)
-
-
-def _contents(files: Mapping[str, Path]) -> Iterator[tuple[str, bytes]]:
-    for name, path in files.items():
-        try:
-            yield name, path.read_bytes()
-        except OSError as error:
-            raise BadInput(f"{path} cannot be read: {error.strerror}") from error

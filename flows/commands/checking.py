@@ -1,20 +1,20 @@
-"""Commands for evaluation and verification: score, bench, verify, rebuild."""
+"""Commands `score`, `bench`, `verify` and `rebuild`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flows.commands.endings import clear_ending
-from flows.commands.options import Changes, Profile, Seed
+from flows.commands.endings import exit_on_error
+from flows.commands.options import AsJson, Changes, Package, Profile, Seed
 
 if TYPE_CHECKING:
-    from flows.commands.rebuild import Rebuilt
-    from flows.packages.verify import Verdict
+    from flows.commands.rebuild import RebuildReport
+    from flows.packages.verify import Verification
 
 
 def score(
-    asset: Annotated[Path, typer.Argument(metavar="PACKAGE", help="folder of an asset")],
+    package: Package,
     truth: Annotated[Path, typer.Option(metavar="PATH", help="ground-truth views and meshes, or one picture")],
     mesh: Annotated[bool, typer.Option("--mesh", help="score the textured mesh instead of the splats")] = False,
     changes: Annotated[
@@ -25,13 +25,13 @@ def score(
     ] = None,
 ) -> None:
     """Score an asset and two trivial baselines against ground truth."""
-    with clear_ending():
+    with exit_on_error():
         from flows.commands import terminal
-        from flows.commands.benchmark import score as judge_one
+        from flows.commands.benchmark import score as score_asset
         from flows.packages.scores import markdown
 
         console = terminal.console()
-        results = judge_one(asset, truth, console, mesh, changes, out)
+        results = score_asset(package, truth, console, mesh, changes, out)
         console.print(markdown(results), markup=False)
 
 
@@ -50,13 +50,13 @@ def bench(
 
     Writes the paper's table as JSON, CSV and HTML.
     """
-    with clear_ending():
+    with exit_on_error():
         from flows.commands import terminal
-        from flows.commands.benchmark import bench as judge_all
+        from flows.commands.benchmark import bench as run_benchmark
         from flows.packages.scores import markdown
 
         console = terminal.console()
-        results = judge_all(dataset, out, console, profile, changes, seed, mesh, bank, limit, workers)
+        results = run_benchmark(dataset, out, console, profile, changes, seed, mesh, bank, limit, workers)
         if len(results.failed) < len(results.objects):
             console.print(markdown(results), markup=False)
         for one in results.failed:
@@ -67,60 +67,60 @@ def bench(
 
 
 def verify(
-    package: Annotated[Path, typer.Argument(metavar="PACKAGE", help="folder of an asset")],
+    package: Package,
     trust: Annotated[
         Path | None,
         typer.Option(metavar="PEM", help="trusted CA certificates; requires every file to be signed"),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Verify every digest and signature of a package.
 
     Lists altered, missing and added files.
     """
-    with clear_ending():
+    with exit_on_error():
         from flows.packages.verify import verify as check
 
-        _tell(check(package, trust), as_json)
+        _print_result(check(package, trust), as_json)
 
 
 def rebuild(
-    package: Annotated[Path, typer.Argument(metavar="PACKAGE", help="folder of an asset")],
+    package: Package,
     source: Annotated[
         Path | None, typer.Option(metavar="PATH", help="source file, if the store no longer has it")
     ] = None,
     bank: Annotated[Path | None, typer.Option(metavar="DIR", help="ground-truth views, likewise")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", metavar="DIR", help="keep the new package in DIR")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Make a package again from its record and compare every step."""
-    with clear_ending():
+    with exit_on_error():
         from flows import home
         from flows.commands import terminal
-        from flows.inputs.orders import order_again
-        from flows.packages.publish import check_folder, whole
+        from flows.inputs.conversion_job import job_from_record
+        from flows.packages.publish import check_folder, load_verified
 
-        record = whole(package)
+        record = load_verified(package)
         if out is not None:
             check_folder(out)
-        order = order_again(record, home.store(), source, bank)
+        job = job_from_record(record, home.store(), source, bank)
         console = terminal.console(stderr=as_json)
 
-        def work() -> "Rebuilt":
-            from flows.commands.rebuild import rebuild as do_again
+        def work() -> "RebuildReport":
+            from flows.commands.rebuild import rebuild as rebuild_package
 
-            return do_again(package, record, order, out)
+            return rebuild_package(package, record, job, out)
 
-        _tell(terminal.with_steps(order, console, work), as_json)
+        _print_result(terminal.run_with_progress(job, console, work), as_json)
 
 
-def _tell(found: "Verdict | Rebuilt", as_json: bool) -> None:
-    """What was found, as JSON or as a table, and the exit status that says so."""
+def _print_result(found: "Verification | RebuildReport", as_json: bool) -> None:
+    """Print a result as JSON or as a table, and exit with its status."""
     from flows.commands import terminal
 
     if as_json:
         typer.echo(found.model_dump_json(indent=1))
     else:
-        terminal.tell_rows(terminal.console(), found.rows())
+        terminal.print_rows(terminal.console(), found.rows())
     if found.exit_code:
         raise typer.Exit(found.exit_code)

@@ -1,4 +1,4 @@
-"""Packages become one animated scene; behind `dg4d compose`."""
+"""Composition of packages to one animated scene; behind `dg4d compose`."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from dg4d_lib.assets.scenes.scene import Scene, SceneItem
 from dg4d_lib.errors import BadInput
 from flows.inputs.package_record import record_of
-from flows.packages.publish import check_writable, whole
+from flows.packages.publish import check_writable, load_verified
 from steps.store.files import room_for
 
 SUFFIXES = (".glb", ".usdz")
@@ -23,28 +23,28 @@ def compose(
     preview: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[str, ...]:
-    """Write a scene of packages: side by side on the ground, or as a scene file says.
+    """Write a scene of packages: side by side on the ground, or as a scene file places them.
 
     Args:
-        packages: folders, in the order in which they stand from left to right; none with a scene file.
-        out: the scene, ending in .glb or .usdz; it is written whole or not at all.
-        scene: a scene file, JSON (`Scene`).
-        spacing: room between neighbors without a scene file, world units.
-        preview: also write a film, beside the scene and under its name.
-        progress: called with pictures of the film done and their number.
+        packages: folders, from left to right; none with a scene file.
+        out: scene, ending in .glb or .usdz; written atomically.
+        scene: scene file, JSON (`Scene`).
+        spacing: between neighbors without a scene file, world units.
+        preview: also render a video, beside the scene and under its name.
+        progress: called with the number of rendered frames and their total.
 
     Returns:
         Notes for the user.
 
     Raises:
-        BadInput: neither or both of packages and scene file, a broken scene file, a package with missing or altered
-            files (says which), or an output that cannot be written.
-        BackendUnavailable: something needed is not installed.
-        DiskFull: there is no room.
+        BadInput: neither or both of packages and scene file, an invalid scene file, a package with missing or altered
+            files, or an output that cannot be written.
+        BackendUnavailable: a library is not installed.
+        DiskFull: the disk is full.
     """
     _check_out(out)
     if bool(packages) == (scene is not None):
-        raise BadInput("give the folders of packages, or a scene file with --scene, and not both")
+        raise BadInput("give either the folders of packages, or a scene file with --scene")
     if scene is not None:
         plan = read_scene(scene)
         folders = [scene.parent / item.package for item in plan.items]
@@ -52,10 +52,11 @@ def compose(
         plan = Scene(items=tuple(SceneItem(package=str(folder)) for folder in packages))
         folders = list(packages)
     for folder in dict.fromkeys(folders):
-        whole(folder)
+        load_verified(folder)
     from steps.compose_scene import SceneWriter
 
-    cast = SceneWriter(folders, plan.items, _names(folders, plan.items))
+    names = [item.name or folder.resolve().name for folder, item in zip(folders, plan.items, strict=True)]
+    cast = SceneWriter(folders, plan.items, _unique(names))
     if scene is None:
         cast.in_a_row(spacing)
     write = cast.write_glb if out.suffix.lower() == ".glb" else cast.write_usdz
@@ -66,10 +67,10 @@ def compose(
 
 
 def read_scene(path: Path) -> Scene:
-    """A scene file.
+    """Read a scene file.
 
     Raises:
-        BadInput: it cannot be read, or something in it is wrong; says what and where.
+        BadInput: it cannot be read, or a field is invalid.
     """
     try:
         scene = Scene.model_validate_json(path.read_bytes())
@@ -98,9 +99,8 @@ def _check_out(out: Path) -> None:
     check_writable(out.parent)
 
 
-def _names(folders: Sequence[Path], items: Sequence[SceneItem]) -> list[str]:
-    """A name of its own for every item: the given one or that of its folder, with a number if it is taken."""
-    wanted = [item.name or folder.resolve().name for folder, item in zip(folders, items, strict=True)]
+def _unique(wanted: list[str]) -> list[str]:
+    """Append numbers to names that occur twice."""
     names: list[str] = []
     for name in wanted:
         candidate, number = name, 1
@@ -112,7 +112,7 @@ def _names(folders: Sequence[Path], items: Sequence[SceneItem]) -> list[str]:
 
 
 def _written(out: Path, write: Callable[[Path], tuple[str, ...] | None]) -> tuple[str, ...]:
-    """What `write` gives, which writes a file that appears whole or not at all."""
+    """Write a file atomically by `write`, and return its notes."""
     draft = out.with_name(f".{os.getpid()}.{out.name}")
     try:
         with room_for(out):

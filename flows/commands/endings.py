@@ -1,4 +1,4 @@
-"""End of a command: every error and every signal becomes one message and an exit status."""
+"""Conversion of errors and signals to one message and an exit status."""
 
 import errno
 import signal
@@ -21,15 +21,15 @@ from flows.exit_status import (
     EXIT_TERMINATED,
 )
 
-__all__ = ["EXIT_BAD_INPUT", "EXIT_FAILED", "Terminated", "clear_ending"]
+__all__ = ["EXIT_BAD_INPUT", "EXIT_FAILED", "Terminated", "exit_on_error"]
 
-UNREACHABLE = {errno.EACCES, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR}  # of paths that were given
+UNREACHABLE = {errno.EACCES, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR}  # errors of given paths
 CODES = {signal.SIGHUP: EXIT_HANGUP, signal.SIGTERM: EXIT_TERMINATED}
-STOPPED = "stopped; the same command goes on after the last finished step"
+STOPPED = "stopped; run the same command again to continue after the last finished step"
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM or SIGHUP arrived; it ends a command as Ctrl-C does.
+    """SIGTERM or SIGHUP, handled like Ctrl-C.
 
     Args:
         number: of the signal.
@@ -41,8 +41,8 @@ class Terminated(KeyboardInterrupt):
 
 
 @contextmanager
-def clear_ending() -> Iterator[None]:
-    """Turn every error into one message and an exit status, and SIGTERM and SIGHUP into what Ctrl-C is."""
+def exit_on_error() -> Iterator[None]:
+    """Exit with one message and a status on any error; treat SIGTERM and SIGHUP like Ctrl-C."""
     with _signals() as received:
         try:
             yield
@@ -52,23 +52,23 @@ def clear_ending() -> Iterator[None]:
             _stop_steps()
             _end(STOPPED, CODES[error.number] if isinstance(error, Terminated) else EXIT_INTERRUPTED)
         except Exception as error:
-            if received:  # a terminal that is gone cannot be written to, for example
+            if received:  # the error may be a consequence, such as a write to a closed terminal
                 _stop_steps()
                 _end(STOPPED, CODES[received[0]])
-            _end(*_verdict(error))
+            _end(*_describe(error))
 
 
 @contextmanager
 def _signals() -> Iterator[list[signal.Signals]]:
-    """Raise `Terminated` for the first SIGTERM or SIGHUP while the block runs; gives the signals that arrived.
+    """Raise `Terminated` for the first SIGTERM or SIGHUP; yield the received signals.
 
-    A signal that the parent has ignored, as `nohup` does with SIGHUP, stays ignored.
+    A signal that the parent ignores, as `nohup` does with SIGHUP, stays ignored.
     """
     received: list[signal.Signals] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
         received.append(signal.Signals(number))
-        if len(received) == 1:  # cleaning up is not interrupted
+        if len(received) == 1:  # later ones must not interrupt the cleanup
             raise Terminated(received[0])
 
     before = {}
@@ -83,7 +83,7 @@ def _signals() -> Iterator[list[signal.Signals]]:
             signal.signal(number, handler)
 
 
-def _verdict(error: Exception) -> tuple[str, int]:
+def _describe(error: Exception) -> tuple[str, int]:
     from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
     from flows.serving.server import ServerUnavailable
     from flows.step_errors import StepBadInput, StepDiverged, StepError, StepMissing
@@ -101,12 +101,12 @@ def _verdict(error: Exception) -> tuple[str, int]:
         case StepError():
             return str(error), EXIT_FAILED
         case OSError() if error.errno in {*NO_SPACE, errno.EROFS, *UNREACHABLE}:
-            advice = "choose another place" if error.errno in UNREACHABLE else "free some space and try again"
+            advice = "choose another path" if error.errno in UNREACHABLE else "free some space and try again"
             return f"{error.strerror}: {error.filename or 'the disk'}; {advice}", EXIT_BAD_INPUT
-    return f"something broke ({type(error).__name__}: {error}); details: {_saved_traceback(error)}", EXIT_FAILED
+    return f"internal error ({type(error).__name__}: {error}); traceback: {_save_traceback(error)}", EXIT_FAILED
 
 
-def _saved_traceback(error: Exception) -> str:
+def _save_traceback(error: Exception) -> str:
     from steps.store.files import home
 
     path = home() / "last-error.txt"
@@ -128,6 +128,6 @@ def _stop_steps() -> None:
 def _end(message: str, status: int) -> NoReturn:
     from flows.formatting.escaping import visible
 
-    with suppress(OSError):  # nobody may be there to read it
+    with suppress(OSError):  # the terminal may be closed
         typer.echo(f"dg4d: {visible(message)}", err=True)
     raise typer.Exit(status)

@@ -1,34 +1,44 @@
 """Options that several commands share."""
 
 import math
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 
 def finite(value: float | None) -> float | None:
-    """Refuse NaN, which lies in every range because no comparison with it is true, and infinity."""
+    """Refuse NaN, which passes range checks because all comparisons with it are false, and infinity."""
     if value is not None and not math.isfinite(value):
         raise typer.BadParameter(f"{value} is not a finite number")
     return value
 
 
-PROFILES = ("preview", "paper", "video", "video-fast", "reference", "quality")  # as in steps/profiles.py; see SEED_MAX
-MOTIONS = ("sway", "bend", "breathe", "bounce", "wave", "turn")  # as in dg4d_lib/settings.py, likewise
+PROFILES = (
+    "preview",
+    "paper",
+    "video",
+    "video-fast",
+    "reference",
+    "quality",
+)  # as in steps/profiles.py
+MOTIONS = ("sway", "bend", "breathe", "bounce", "wave", "turn")  # as in dg4d_lib/settings.py
 
 
 def complete_profile(incomplete: str) -> list[str]:
-    """Return the profiles that begin with what was typed, for shell completion."""
+    """Return the profiles with a prefix, for shell completion."""
     return [name for name in PROFILES if name.startswith(incomplete)]
 
 
 def complete_setting(incomplete: str) -> list[str]:
-    """Return the settings that begin with what was typed, for shell completion."""
+    """Return the settings with a prefix, for shell completion."""
     from flows.inputs.setting_reference import all_settings
 
     return sorted({f"{one.name}=" for one in all_settings() if one.name.startswith(incomplete)})
 
 
+Package = Annotated[Path, typer.Argument(metavar="PACKAGE", help="folder of an asset")]
+AsJson = Annotated[bool, typer.Option("--json", help="print JSON")]
 Profile = Annotated[
     str,
     typer.Option(metavar="NAME", help=f"preset: {', '.join(PROFILES)}", autocompletion=complete_profile),
@@ -45,7 +55,7 @@ Changes = Annotated[
 Commercial = Annotated[
     bool, typer.Option("--commercial-only", help="refuse weights whose license forbids commercial use")
 ]
-SEED_MAX = 2**63 - 1  # as in steps/contract.py, whose import would load pydantic and slow down --help
+SEED_MAX = 2**63 - 1  # as in steps/contract.py, whose import would slow down --help
 Seed = Annotated[
     int,
     typer.Option(min=0, max=SEED_MAX, metavar="N", help="seed of all random numbers; equal seeds give equal bytes"),
@@ -70,7 +80,7 @@ Rate = Annotated[
 ]
 
 
-def knobs_of(triangles: int | None, texture: int | None, fps: float | None) -> dict[str, Any]:
-    """Return the settings that these options abbreviate."""
+def shortcut_settings(triangles: int | None, texture: int | None, fps: float | None) -> dict[str, Any]:
+    """Return the settings that these options stand for."""
     given = {"mesh.max_faces": triangles, "mesh.texture_size": texture, "pack.fps": fps}
-    return {knob: value for knob, value in given.items() if value is not None}
+    return {name: value for name, value in given.items() if value is not None}

@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
-from flows.commands.endings import clear_ending
+from flows.commands.endings import exit_on_error
 from flows.commands.options import finite
 
-LOOK_S = 1.0  # between two looks at a watched folder
+POLL_S = 1.0  # between two scans of a watched folder
 
 
 def up(
@@ -39,7 +39,7 @@ def up(
     Prints the address that signs a browser in. Server and worker run until `dg4d down`. With $PREFECT_API_URL set,
     pools and deployments are registered on that server.
     """
-    with clear_ending():
+    with exit_on_error():
         from dg4d_lib.errors import BadInput
         from dg4d_lib.rasterizer.backends import cuda_device_count
         from flows.convert import connect
@@ -50,14 +50,16 @@ def up(
         known = read_pools()
         chosen = pools or ["process-cpu", *(["process-gpu"] if cuda_device_count() else [])]
         if unknown := [name for name in chosen if name not in known]:
-            raise BadInput(f"there is no pool {unknown[0]!r} in deploy/pools.yaml; there are: {', '.join(known)}")
+            raise BadInput(f"unknown pool {unknown[0]!r}; deploy/pools.yaml has: {', '.join(known)}")
         server = background.background_server()
         variables = roots.environment(sources or ())
         limits = {name: limit(known[name].per_worker) for name in chosen}
         own = [Worker(name, server.folder) for name in chosen] if workers else []
         for worker in own:
             if sources and worker.is_there() and worker.sources != variables[roots.SOURCES]:
-                raise BadInput(f"the worker of {worker.pool} runs and reads {worker.sources}; `dg4d down` stops it")
+                raise BadInput(
+                    f"the worker of {worker.pool} runs with --sources {worker.sources}; stop it: `dg4d down`"
+                )
         if "PREFECT_API_URL" not in os.environ:
             server.start()
             server.keep()
@@ -77,7 +79,7 @@ def up(
 
 def down() -> None:
     """Stop the server and the workers of this machine."""
-    with clear_ending():
+    with exit_on_error():
         from flows.serving import background
         from flows.serving.workers import running
 
@@ -85,10 +87,10 @@ def down() -> None:
         stopped = []
         for worker in running(server.folder):
             runs = worker.runs()
-            typer.echo(f"ending worker {worker.pool}" + (f" and its {runs} run{'s' * (runs > 1)}" if runs else ""))
+            typer.echo(f"stopping worker {worker.pool}" + (f" and its {runs} run{'s' * (runs > 1)}" if runs else ""))
             stopped.append(worker.stop())
         if server.address() is not None and server.is_used():
-            typer.echo("ending the server, which a running command uses: the command will start it again")
+            typer.echo("stopping the server, which a running command uses and will start again")
         typer.echo("stopped" if server.stop() or stopped else "nothing was running")
 
 
@@ -97,13 +99,13 @@ def env() -> None:
 
     Use: eval "$(dg4d env)"
     """
-    with clear_ending():
+    with exit_on_error():
         from flows.serving import background
         from flows.serving.server import ServerUnavailable
 
         server = background.background_server()
         if (address := server.address()) is None:
-            raise ServerUnavailable("No server runs; start one with `dg4d up`.")
+            raise ServerUnavailable("no server is running; start one with `dg4d up`")
         typer.echo(f"export PREFECT_API_URL={address}/api")
         typer.echo(f"export PREFECT_API_AUTH_STRING={shlex.quote(server.auth_string())}")
 
@@ -124,7 +126,7 @@ def watch(
 
     Uses the deployment "Catalog to 4D", and runs until it is stopped.
     """
-    with clear_ending():
+    with exit_on_error():
         from flows.convert import connect
         from flows.packages.publish import check_writable
         from flows.serving import background
@@ -143,5 +145,5 @@ def watch(
                 if (digest := watcher.look(time.monotonic())) is not None:
                     announce(watcher.folder, watcher.out, digest)
                     watcher.told(digest)
-                    typer.echo(f"told the server: {digest}")
-                time.sleep(LOOK_S)
+                    typer.echo(f"sent to the server: {digest}")
+                time.sleep(POLL_S)

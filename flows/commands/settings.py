@@ -1,11 +1,11 @@
-"""`dg4d settings`: names, values, allowed ranges and meanings of all settings."""
+"""Command `settings`."""
 
 import textwrap
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flows.commands.endings import clear_ending
+from flows.commands.endings import exit_on_error
 from flows.commands.options import Profile
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ def settings(
 
     Without NAME, only names and values. Change one with --set NAME=VALUE.
     """
-    with clear_ending():
+    with exit_on_error():
         from flows.inputs.setting_reference import all_settings, find_settings, value_in
         from steps.profiles import profile as find_profile
 

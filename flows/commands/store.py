@@ -1,4 +1,4 @@
-"""`dg4d store`: what the store holds, what refers to what, removing what nobody needs, checking every byte."""
+"""Commands `store ls`, `store show`, `store gc` and `store verify`."""
 
 import re
 import zipfile
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flows.commands.endings import clear_ending
+from flows.commands.endings import exit_on_error
 from flows.commands.options import finite
 from flows.exit_status import EXIT_BAD_INPUT
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from flows.engine.versions import Version
     from steps.store.artifact_store import ArtifactStore
 
-LEAST_DIGITS = 6  # of a digest, to be taken for one
+LEAST_DIGITS = 6  # of an abbreviated digest
 SHOWN_DIGITS = 12
 
 store = typer.Typer(
@@ -27,13 +27,13 @@ store = typer.Typer(
 @store.command("ls")
 def list_versions() -> None:
     """List items and versions, newest first, with their disk space."""
-    with clear_ending():
+    with exit_on_error():
         from rich.table import Column, Table
 
         from flows import home
         from flows.commands import terminal
         from flows.engine.versions import versions
-        from flows.formatting.sizes import readable
+        from flows.formatting.numbers import format_size
 
         place = home.store()
         sizes = {entry.name: entry.size_bytes for entry in place.artifacts()}
@@ -48,15 +48,15 @@ def list_versions() -> None:
                 _short(version.order),
                 _when(version),
                 version.profile,
-                readable(version.package.size_bytes),
-                readable(sum(sizes.get(digest, 0) for digest in version.artifacts())),
+                format_size(version.package.size_bytes),
+                format_size(sum(sizes.get(digest, 0) for digest in version.artifacts())),
             )
             before = version.item
         out = terminal.console()
         if known:
             out.print(table)
         items = len({version.item for version in known})
-        total = f"{len(sizes)} artifacts, {readable(sum(sizes.values()))}"
+        total = f"{len(sizes)} artifacts, {format_size(sum(sizes.values()))}"
         out.print(f"{items} items, {len(known)} versions, {total} in {place.address}", markup=False)
 
 
@@ -65,7 +65,7 @@ def show(
     name: Annotated[str, typer.Argument(metavar="ITEM|DIGEST", help="an item, or a prefix of a digest")],
 ) -> None:
     """Show an item, a version, or the references to an artifact."""
-    with clear_ending():
+    with exit_on_error():
         from dg4d_lib.errors import BadInput
         from flows import home
         from flows.engine.versions import versions
@@ -81,14 +81,14 @@ def show(
             items = sorted({version.item for version in known})
             some = ", ".join(items[:5]) + (", ..." if len(items) > 5 else "")
             raise BadInput(
-                f"there is no item {name!r} ({some or 'none yet'}), and no digest of {LEAST_DIGITS} digits or more"
+                f"{name!r} is neither an item ({some or 'none yet'}) nor a digest of {LEAST_DIGITS} digits or more"
             )
         digest = f"sha256:{digits}"
-        of_order = [version for version in known if version.order.startswith(digest)]
+        of_job = [version for version in known if version.order.startswith(digest)]
         artifacts = [entry for entry in place.artifacts() if entry.name.startswith(digest)]
-        if not of_order and not artifacts:
-            raise BadInput(f"no version and no artifact in {place.address} begins with {digits}")
-        for version in of_order:
+        if not of_job and not artifacts:
+            raise BadInput(f"no digest of a version or artifact in {place.address} begins with {digits}")
+        for version in of_job:
             _show_version(version, place)
         for entry in artifacts:
             _show_artifact(entry.name, entry.size_bytes, known)
@@ -108,16 +108,16 @@ def gc(
 
     Artifacts of kept versions and of running commands stay, so it is safe at any time.
     """
-    with clear_ending():
+    with exit_on_error():
         from flows import home
         from flows.engine.collecting import collect
-        from flows.formatting.sizes import readable
+        from flows.formatting.numbers import format_size
 
         place = home.store()
         gone = collect(place, home.records(), keep, dry_run, grace_hours * 3600)
         for version in gone.versions:
             _echo(f"version {_short(version.order)} of {version.item}, {_when(version)}")
-        size = readable(sum(entry.size_bytes for entry in gone.artifacts))
+        size = format_size(sum(entry.size_bytes for entry in gone.artifacts))
         verb = "would be removed" if dry_run else "were removed"
         typer.echo(
             f"{len(gone.versions)} versions and {len(gone.artifacts)} artifacts ({size}) {verb} from {place.address}"
@@ -127,7 +127,7 @@ def gc(
 @store.command()
 def verify() -> None:
     """Verify every artifact; list damaged and missing ones."""
-    with clear_ending():
+    with exit_on_error():
         from flows import home
         from flows.engine.versions import faults, users, versions
 
@@ -145,30 +145,30 @@ def verify() -> None:
                 err=True,
             )
             raise typer.Exit(EXIT_BAD_INPUT)
-        typer.echo(f"{len(sizes)} artifacts of {len(known)} versions are whole")
+        typer.echo(f"{len(sizes)} artifacts of {len(known)} versions are intact")
 
 
 def _show_version(version: "Version", place: "ArtifactStore") -> None:
-    from flows.formatting.sizes import readable
+    from flows.formatting.numbers import format_size
 
     sizes = {entry.name: entry.size_bytes for entry in place.artifacts()}
     _echo(f"{version.item}  version {version.order}")
     _echo(f"  finished  {_when(version)}, profile {version.profile}, seed {version.seed}")
     for digest, what in version.artifacts().items():
-        size = readable(sizes[digest]) if digest in sizes else "missing"
+        size = format_size(sizes[digest]) if digest in sizes else "missing"
         _echo(f"  {_short(digest)}  {size:>9}  {what}")
     if version.package.digest in sizes:
         with zipfile.ZipFile(place.path(version.package)) as package:
             _echo("  files of the package")
             for entry in package.infolist():
-                _echo(f"  {'':{SHOWN_DIGITS}}  {readable(entry.file_size):>9}  {entry.filename}")
+                _echo(f"  {'':{SHOWN_DIGITS}}  {format_size(entry.file_size):>9}  {entry.filename}")
 
 
 def _show_artifact(digest: str, size_bytes: int, known: list["Version"]) -> None:
     from flows.engine.versions import users
-    from flows.formatting.sizes import readable
+    from flows.formatting.numbers import format_size
 
-    _echo(f"{digest}  {readable(size_bytes)}")
+    _echo(f"{digest}  {format_size(size_bytes)}")
     for version, what in users(known).get(digest, []):
         _echo(f"  {what} of {version.item}, version {_short(version.order)}")
     if digest not in users(known):
@@ -176,7 +176,7 @@ def _show_artifact(digest: str, size_bytes: int, known: list["Version"]) -> None
 
 
 def _echo(text: str) -> None:
-    """Print a line with names in it that this process did not choose."""
+    """Print a line that contains names of users, escaped."""
     from flows.formatting.escaping import visible
 
     typer.echo(visible(text))

@@ -1,4 +1,4 @@
-"""How a run looks on a terminal, and in a log file where there is none."""
+"""Progress of runs: live on a terminal, as lines in a log file."""
 
 import sys
 import threading
@@ -15,57 +15,57 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 from rich.table import Table
 
 from flows.engine.events import StepEvent, listening
-from flows.formatting.curves import amount
 from flows.formatting.escaping import visible
-from flows.formatting.sizes import readable
+from flows.formatting.numbers import format_number, format_size
 
 if TYPE_CHECKING:
-    from flows.inputs.orders import Order
+    from flows.inputs.conversion_job import ConversionJob
+    from flows.packages.summary import Row
 
 Result = TypeVar("Result")
 
-LINE_EVERY_S = 10.0  # between two lines about one step, where there is no terminal
-WIDE = 130  # columns, from which all values of a step fit beside its bar
+LINE_EVERY_S = 10.0  # between two progress lines of a step, without a terminal
+WIDE = 130  # columns from which all values of a step fit beside its bar
 ROWS_SHOWN = 30  # of a batch
-SHORT_S = 0.5  # waiting that is not worth a word
-COUNTED = 1  # totals up to this say nothing as a fraction
+SHORT_S = 0.5  # waiting times below this are not shown
+COUNTED = 1  # totals up to this are not shown as a fraction
 
 
 def console(stderr: bool = False) -> Console:
-    """Where people read: standard output, or standard error where that is for machines."""
+    """Return a console on standard output, or on standard error if programs read standard output."""
     stream = sys.stderr if stderr else sys.stdout
     return _Terminal(stderr=stderr, highlight=False, soft_wrap=not stream.isatty())
 
 
 class _Terminal(Console):
-    """A console that writes out what a terminal would obey, in every text that is printed."""
+    """Console that escapes control characters in all printed text."""
 
     def print(self, *objects: Any, **options: Any) -> None:
         super().print(*(visible(one) if isinstance(one, str) else one for one in objects), **options)
 
 
-def with_steps(order: "Order", out: Console, work: Callable[[], Result]) -> Result:
-    """What `work` gives, which runs a flow of this order, with its steps on the terminal."""
+def run_with_progress(job: "ConversionJob", out: Console, work: Callable[[], Result]) -> Result:
+    """Return the result of `work`, which runs the flow of a job, and show its steps."""
     from flows.convert import connect, prepare, save_pictures
     from flows.step_errors import StepBadInput
 
     with out.status("starting") if out.is_terminal else nullcontext():
-        prepare(order)
+        prepare(job)
         connect()
     try:
         with steps_shown(out):
             return work()
-    except StepBadInput as error:  # a step knows files by their content, the user by their names
-        raise StepBadInput(error.step, f"{order.source_name}: {error.message}", error.pictures) from error
+    except StepBadInput as error:  # a step knows no file names
+        raise StepBadInput(error.step, f"{job.source_name}: {error.message}", error.pictures) from error
     except Exception as error:
-        for path in save_pictures(order, error):
-            sys.stderr.write(f"the last good state: {path}\n")
+        for path in save_pictures(job, error):
+            sys.stderr.write(f"last valid state: {path}\n")
         raise
 
 
 @contextmanager
 def steps_shown(out: Console) -> Iterator[None]:
-    """Show every step while the block runs: bars on a terminal, lines elsewhere."""
+    """Show the steps that run in the block: bars on a terminal, lines elsewhere."""
     if out.is_terminal:
         bars = StepBars(out)
         with bars.progress, listening(bars), listening(Remarks(out)):
@@ -76,7 +76,7 @@ def steps_shown(out: Console) -> Iterator[None]:
 
 
 class StepBars:
-    """A bar per step: how far, the current numbers, the time."""
+    """Progress bar per step, with values and time."""
 
     def __init__(self, out: Console) -> None:
         self.progress = Progress(
@@ -88,7 +88,7 @@ class StepBars:
             console=out,
         )
         self._bars: dict[str, TaskID] = {}
-        self._values = None if out.width >= WIDE else 1  # a narrow terminal has room for the loss
+        self._values = None if out.width >= WIDE else 1  # a narrow terminal has room for the loss only
 
     def __call__(self, event: StepEvent) -> None:
         """Show an event."""
@@ -111,7 +111,7 @@ class StepBars:
 
 
 class Remarks:
-    """Lines above bars and tables, which stay."""
+    """Permanent lines above bars and tables."""
 
     def __init__(self, out: Console, with_item: bool = False) -> None:
         self._out, self._with_item = out, with_item
@@ -124,7 +124,7 @@ class Remarks:
 
 
 class StepLines:
-    """A line when a step starts, every few seconds, and when it ends."""
+    """Line when a step starts, every few seconds, and when it ends."""
 
     def __init__(self, out: Console, with_item: bool = False) -> None:
         self._out, self._with_item = out, with_item
@@ -132,7 +132,7 @@ class StepLines:
         self._lock = threading.Lock()
 
     def __call__(self, event: StepEvent) -> None:
-        """Print an event, unless there was a line a moment ago."""
+        """Print an event, but progress only every `LINE_EVERY_S` seconds."""
         with self._lock:
             key = event.item, event.step
             now = time.monotonic()
@@ -155,13 +155,13 @@ class StepLines:
 
 
 def _took(event: StepEvent) -> str:
-    """Return how long a step took, without the time in which it waited for its turn."""
+    """Return the time that a step took, with waiting apart."""
     waiting = f" after {event.waited_s:.1f} s of waiting" if event.waited_s >= SHORT_S else ""
     return f"done in {event.seconds - event.waited_s:.1f} s{waiting}"
 
 
 class BatchTable:
-    """A table with a row per item, alive while the batch runs."""
+    """Live table of a batch with a row per item."""
 
     def __init__(self, items: list[str]) -> None:
         self.status: dict[str, str] = dict.fromkeys(items, "waiting")
@@ -170,25 +170,31 @@ class BatchTable:
         self._took: dict[str, float] = {}
 
     def __call__(self, event: StepEvent) -> None:
-        """Note what an item is doing."""
+        """Update the activity of an item."""
         if event.item not in self.status or event.kind == "remark":
             return
         self._since.setdefault(event.item, time.monotonic())
-        self._took.pop(event.item, None)  # it may be tried again
+        self._took.pop(event.item, None)  # it may be a second attempt
         self.status[event.item] = "running"
         detail = numbers(event) if event.kind == "progress" else event.text or event.kind
         self._doing[event.item] = f"{event.step}: {detail}"
 
     def settle(self, item: str, status: str, message: str) -> None:
-        """An item ended."""
+        """Record the end of an item."""
         self.status[item], self._doing[item] = status, message
         self._took[item] = time.monotonic() - self._since.get(item, time.monotonic())
 
+    def show(self, row: "Row", out: Console) -> None:
+        """Record the result of an item, and print it where there is no terminal."""
+        self.settle(row.item, row.status, row.message)
+        if not out.is_terminal:
+            out.print(f"{row.item}: {row.status} {row.message}".rstrip(), markup=False)
+
     def __rich__(self) -> Table:
-        """The table as it is; long batches show what is running and what failed last."""
+        """Return the table; in long batches only running items and the latest failures."""
         done = sum(status in INK and status not in {"waiting", "running"} for status in self.status.values())
         table = Table(title=f"{done} of {len(self.status)}", title_justify="left", expand=False)
-        for heading in ("item", "status", "time", "what"):
+        for heading in ("item", "status", "time", "activity"):
             table.add_column(heading, overflow="ellipsis", no_wrap=True, max_width=72)
         shown = list(self.status)
         if len(shown) > ROWS_SHOWN:
@@ -208,7 +214,7 @@ INK = {"waiting": "dim", "skipped": "dim", "running": "cyan", "done": "green", "
 
 @contextmanager
 def batch_shown(out: Console, items: list[str]) -> Iterator[BatchTable]:
-    """Show a batch while the block runs: a live table on a terminal, lines elsewhere."""
+    """Show the batch that runs in the block: a live table on a terminal, lines elsewhere."""
     table = BatchTable(items)
     if out.is_terminal:
         with Live(table, console=out, refresh_per_second=4), listening(table), listening(Remarks(out, with_item=True)):
@@ -219,18 +225,18 @@ def batch_shown(out: Console, items: list[str]) -> Iterator[BatchTable]:
 
 
 def numbers(event: StepEvent, most: int | None = None) -> str:
-    """How far a step is, and its current values, at most the first `most` of them."""
+    """Return the progress of a step and its current values, at most `most` of them."""
     parts = [f"{event.done}/{event.total}"] if event.total > COUNTED else []
-    return "  ".join([*parts, *(f"{name} {amount(value)}" for name, value in list(event.values.items())[:most])])
+    return "  ".join([*parts, *(f"{name} {format_number(value)}" for name, value in list(event.values.items())[:most])])
 
 
 def plain(text: str) -> str:
-    """Return text for a place in which rich reads markup, so that it is shown letter by letter."""
+    """Escape text for rich markup and for terminals."""
     return escape(visible(text))
 
 
-def tell_where(out: Console, folder: Path, sizes: dict[str, int]) -> None:
-    """Everything in a package with its size."""
+def print_package(out: Console, folder: Path, sizes: dict[str, int]) -> None:
+    """Print the files and folders of a package with their sizes."""
     table = Table(title=plain(str(folder)), title_justify="left", show_header=False, box=None, title_style="bold")
     table.add_column()
     table.add_column(justify="right")
@@ -240,17 +246,14 @@ def tell_where(out: Console, folder: Path, sizes: dict[str, int]) -> None:
         count, total = groups.get(group, (0, 0))
         groups[group] = count + 1, total + size
     for group, (count, total) in groups.items():
-        table.add_row(plain(group) + (f" ({_files(count)})" if group.endswith("/") else ""), readable(total))
+        files = f" ({count} file{'s' * (count != 1)})" if group.endswith("/") else ""
+        table.add_row(plain(group) + files, format_size(total))
     out.print(table)
 
 
-def tell_rows(out: Console, rows: Iterable[tuple[str, str, str]]) -> None:
-    """What, how it is, and why, a line each, in columns."""
+def print_rows(out: Console, rows: Iterable[tuple[str, str, str]]) -> None:
+    """Print name, state and detail in columns, a line each."""
     lines = list(rows)
     widths = [max((len(line[column]) for line in lines), default=0) for column in (0, 1)]
-    for what, state, why in lines:
-        out.print(f"{what:<{widths[0]}}  {state:<{widths[1]}}  {why}".rstrip(), markup=False)
-
-
-def _files(count: int) -> str:
-    return "1 file" if count == 1 else f"{count} files"
+    for name, state, detail in lines:
+        out.print(f"{name:<{widths[0]}}  {state:<{widths[1]}}  {detail}".rstrip(), markup=False)

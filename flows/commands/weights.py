@@ -1,4 +1,4 @@
-"""`dg4d weights`: which weights there are, getting them, checking them."""
+"""Commands `weights list`, `weights pull` and `weights check`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flows.commands.endings import clear_ending
+from flows.commands.endings import exit_on_error
 
 if TYPE_CHECKING:
     from dg4d_lib.weights.lock import LockEntry
@@ -18,10 +18,10 @@ weights = typer.Typer(
     no_args_is_help=True,
 )
 
-NOT_COMPARED = "there is nothing to compare it with"
+NOT_COMPARED = "there are no published digests to compare with"
 Names = Annotated[
     list[str],
-    typer.Argument(metavar="NAME...", help="a name from `dg4d weights list`, or an id of the Hugging Face hub"),
+    typer.Argument(metavar="NAME...", help="a name from `dg4d weights list`, or the id of a Hugging Face repository"),
 ]
 
 
@@ -30,7 +30,7 @@ def show(
     files: Annotated[bool, typer.Option("--files", help="also list every file: SHA-256, bytes, name")] = False,
 ) -> None:
     """List known and pulled weights with license, size and state."""
-    with clear_ending():
+    with exit_on_error():
         from dg4d_lib.weights.lock import read_lock
         from flows.formatting.escaping import visible
         from steps.runtime.weights import weights_home
@@ -44,7 +44,7 @@ def show(
             for text in (license_text, one.purpose, one.hub_id):  # below the row, so that no name is broken
                 typer.echo(f"    {visible(text)}")
         typer.echo(f"folder: {weights_home()}; a setting may name another folder instead")
-        typer.echo("the first pull records revision and digests; later uses are compared with them")
+        typer.echo("the first pull records revision and digests; later uses are checked against them")
         for one in _all_of_them() if files else ():
             for path, sha256, size in _files_of(one, locks.get(one.name)):
                 typer.echo(f"{sha256}  {size:>12}  {one.name}/{path}")
@@ -56,7 +56,7 @@ def pull(names: Names) -> None:
 
     Weights that are present are skipped.
     """
-    with clear_ending():
+    with exit_on_error():
         from dg4d_lib.errors import BadInput
         from dg4d_lib.weights.locate import given_folder
         from dg4d_lib.weights.pull import pull as get
@@ -65,7 +65,9 @@ def pull(names: Names) -> None:
 
         for name in names:
             if given_folder(name) is not None:
-                raise BadInput(f"{name} is a folder on this machine; name weights, or an id of the Hugging Face hub")
+                raise BadInput(
+                    f"{name} is a folder on this machine; give a name, or the id of a Hugging Face repository"
+                )
             home = weights_home()
             home.mkdir(parents=True, exist_ok=True)
             locked = get(lookup_weights(name), home)
@@ -77,7 +79,7 @@ def check(
     names: Annotated[list[str] | None, typer.Argument(metavar="NAME...", help="default: all that are present")] = None,
 ) -> None:
     """Verify every file against recorded or published digests."""
-    with clear_ending():
+    with exit_on_error():
         from dg4d_lib.errors import BackendUnavailable
         from dg4d_lib.weights.locate import find_problems, find_unpublished, find_weights
         from dg4d_lib.weights.lock import read_lock
@@ -89,7 +91,7 @@ def check(
         broken = []
         wanted = names or [one.name for one in _all_of_them() if _place(one) is not None]
         if not wanted:
-            typer.echo("no weights are here, so there is nothing to check")
+            typer.echo("nothing to check: no weights are on this machine")
         for name in wanted:
             one = lookup_weights(name)
             folder = _place(one) or find_weights(name, home)
@@ -102,14 +104,14 @@ def check(
             elif locked is None:
                 known = sum((folder / file).is_file() for file in one.published)
                 typer.echo(
-                    f"{name}: complete; it was not pulled by this command: "
-                    + (f"{known} of its files {'is' if known == 1 else 'are'} as published" if known else NOT_COMPARED)
+                    f"{name}: complete, but not pulled by this command: "
+                    + (f"{known} file{'s' * (known != 1)} as published" if known else NOT_COMPARED)
                 )
             else:
                 count = f"{len(locked.files)} file{'s' * (len(locked.files) != 1)}"
-                typer.echo(f"{name}: whole, {count}, {_size(locked)} GB")
+                typer.echo(f"{name}: intact, {count}, {_size(locked)} GB")
         if broken:
-            raise BackendUnavailable(f"not whole; `dg4d weights pull {' '.join(broken)}` gets it again")
+            raise BackendUnavailable(f"damaged or incomplete; download again: `dg4d weights pull {' '.join(broken)}`")
 
 
 def _all_of_them() -> list["Weights"]:
@@ -122,7 +124,7 @@ def _all_of_them() -> list["Weights"]:
 
 
 def _place(one: "Weights") -> Path | None:
-    """Where weights lie, whole or not; None where they are not here."""
+    """Return the folder of weights, complete or not; None if they are not on this machine."""
     from dg4d_lib.weights.locate import folder_name, hub_cache_snapshot
     from steps.runtime.weights import weights_home
 
@@ -131,7 +133,7 @@ def _place(one: "Weights") -> Path | None:
 
 
 def _columns(texts: Sequence[str], width: int) -> str:
-    """Return a line of the list; names have `width` letters."""
+    """Return a line of the list; names are padded to `width` characters."""
     name, here, size, revision, commercial = texts
     return f"{name:<{width}}  {here:<7}  {size:<5}  {revision:<10}  {commercial}".rstrip()
 
@@ -152,7 +154,7 @@ def _row(one: "Weights", locked: "LockEntry | None") -> list[str]:
 
 
 def _files_of(one: "Weights", locked: "LockEntry | None") -> list[tuple[str, str, str]]:
-    """Path, sha256 and bytes of what was pulled, else of what is known to be published."""
+    """Return path, sha256 and bytes of the pulled files, else of the published ones."""
     if locked:
         return [(path, file.sha256, str(file.size)) for path, file in locked.files.items()]
     return [(path, sha256, "-") for path, sha256 in one.published.items()]

@@ -1,1 +1,1 @@
-"""How a step becomes a cached, retried task, and where and when it runs."""
+"""Execution of steps as cached, retried Prefect tasks: requests, executors, slots, leases, versions."""

@@ -1,6 +1,7 @@
-"""Cache policy of steps: results are used again by the digest of their request, while their artifacts exist.
+"""Cache policy of steps: request digests as keys, checked against the artifacts in the store.
 
-Prefect's own policies hash arguments and source text and miss what matters; its lock files outlive their process.
+Prefect's own policies hash arguments and source text, which miss weights and code of the step; its lock files outlive
+their process.
 """
 
 import asyncio
@@ -22,11 +23,11 @@ from flows.engine.shared_results import fetch_result
 from steps.contract import StepRequest, StepResult
 from steps.store.artifact_store import ArtifactStore, StoreUnreachable
 
-POLL_S = 0.1  # between two looks at a lock that another process holds
+POLL_S = 0.1  # between two attempts to take a lock
 
 
 def recorded(path: Path, store: ArtifactStore) -> StepResult | None:
-    """Return the result in a record that Prefect wrote, if it can be read and all its artifacts are there and sound.
+    """Return the result in a record, if all its artifacts are in the store and intact; else None.
 
     Raises:
         StoreUnreachable: the store does not answer.
@@ -52,14 +53,14 @@ class RequestPolicy(CachePolicy):
         assert self.request_for is not None  # the base class has defaults, so this field needs one
         key = record_key(self.request_for(task_ctx.task.name, inputs))
         record = home.records() / key
-        with suppress(StoreUnreachable):  # the record is good until the contrary is known
+        with suppress(StoreUnreachable):  # a record that cannot be checked is used
             fetch_result(key, record)
             if record.exists() and recorded(record, home.store()) is None:
                 self._drop(record, key)
         return key
 
     def _drop(self, record: Path, key: str) -> None:
-        """Remove a broken record, unless it is being written at this moment."""
+        """Remove a broken record, unless another process is writing it."""
         lock = self.lock_manager
         holder = f"heal-{threading.get_ident()}"
         if not isinstance(lock, FileLocks):
@@ -108,15 +109,15 @@ class FileLocks:
         self._held.pop(key)[1].release()
 
     def is_locked(self, key: str) -> bool:
-        """Return whether anybody holds the lock, in this process or another."""
+        """Return true if a process holds the lock, this one or another."""
         return not self.wait_for_lock(key, 0)
 
     def is_lock_holder(self, key: str, holder: str) -> bool:
-        """Return whether this holder has the lock."""
+        """Return true if this holder has the lock."""
         return self._held.get(key, ("", None))[0] == holder
 
     def wait_for_lock(self, key: str, timeout: float | None = None) -> bool:
-        """Wait until nobody holds the lock; return false after `timeout` seconds."""
+        """Wait until the lock is free; return false after `timeout` seconds."""
         if (lock := self._waited_for(key, timeout)) is not None:
             lock.release()
         return lock is not None

@@ -1,4 +1,4 @@
-"""Removing from a store what no version and no run needs; behind `dg4d store gc`."""
+"""Garbage collection of a store (`dg4d store gc`)."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -10,18 +10,13 @@ from flows.engine.records import read_record
 from flows.engine.versions import Version, versions
 from steps.store.artifact_store import ArtifactStore, Entry
 
-GRACE_S = 24 * 3600.0  # what is younger, or was young when the oldest run began, may be needed by somebody
-BATCH = 500  # artifacts that are removed before a sign of life
+GRACE_S = 24 * 3600.0  # younger artifacts, counted from the start of the oldest run, may belong to a running step
+BATCH = 500  # artifacts removed between two refreshes of the lock
 
 
 @dataclass(frozen=True)
 class Collected:
-    """What was removed, or would be.
-
-    Attributes:
-        versions: those beyond the newest few of their item.
-        artifacts: those that nothing needs.
-    """
+    """Versions and artifacts that a collection removed, or would remove."""
 
     versions: list[Version]
     artifacts: list[Entry]
@@ -30,21 +25,20 @@ class Collected:
 def collect(
     store: ArtifactStore, records: Path, keep: int | None = None, dry_run: bool = False, grace_s: float = GRACE_S
 ) -> Collected:
-    """Remove what no version and no run needs.
+    """Remove old versions, and artifacts that neither a version nor a run needs.
 
-    Records of versions go before their artifacts, so that a stop at any moment leaves whole versions and some that are
-    not there; results of steps whose artifacts are gone go last.
+    Records of versions are removed before their artifacts and cached results of steps last, so that an interruption
+    leaves no version with missing artifacts.
 
     Args:
-        store: where to remove.
-        records: the folder of this machine that says what each request gave.
-        keep: so many of the newest versions of each item stay; all without it.
+        store: store to collect.
+        records: folder of the cached results of steps on this machine.
+        keep: number of versions kept per item, the newest; None: all.
         dry_run: remove nothing.
-        grace_s: what was written less than this long ago stays; so does what was written less than this long before
-            the oldest run began.
+        grace_s: minimum age of removed artifacts, in seconds before now and before the start of the oldest run.
 
     Raises:
-        BadInput: somebody else is at it.
+        BadInput: another process collects this store.
         StoreUnreachable: the store does not answer.
     """
     with leases.collecting(store) as alive:
@@ -66,7 +60,7 @@ def collect(
 
 
 def _divided(known: list[Version], keep: int | None) -> tuple[list[Version], list[Version]]:
-    """The newest few versions of each item, and the others."""
+    """Return the newest `keep` versions of each item, and the others."""
     kept: list[Version] = []
     old: list[Version] = []
     count: Counter[str] = Counter()
@@ -77,7 +71,7 @@ def _divided(known: list[Version], keep: int | None) -> tuple[list[Version], lis
 
 
 def _forget_results(records: Path, here: set[str], before: float) -> None:
-    """Remove old results of steps that refer to artifacts which are gone, or that cannot be read."""
+    """Remove cached results that are older than `before` and unreadable, or that refer to missing artifacts."""
     if not records.is_dir():
         return
     for path in records.iterdir():
@@ -86,6 +80,6 @@ def _forget_results(records: Path, here: set[str], before: float) -> None:
 
 
 def _outputs(record: Path) -> set[str]:
-    """Return the artifacts that a result refers to; an artifact that no store has where the record is unreadable."""
+    """Return the digests that a result refers to; one that no store has if the record is unreadable."""
     result = read_record(record)
     return {"unreadable"} if result is None else {ref.digest for ref in result.outputs.values()}

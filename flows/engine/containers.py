@@ -1,8 +1,8 @@
-"""A step in a container: what docker or podman is told, so that it reaches its own files and nothing else.
+"""Docker or Podman command lines that run a step with access to its own files only.
 
-Every folder has the same path inside as outside: the store, the scratch folder of this step, compiled kernels, and the
-weights that the request names, which may only be read. The rest of the container cannot be written to. Secrets that
-a store asks for are handed over by name in the environment; no other variable of the caller gets in.
+Folders have the same path inside and outside: the store, the scratch folder of the step, compiled kernels, and the
+weights that the request names, which are read-only like the rest of the container. Credentials of an object store are
+passed by name in the environment; no other variable of the caller is visible.
 """
 
 import functools
@@ -25,22 +25,22 @@ from steps.store.endpoints import ENDPOINTS, LOOPBACK
 from steps.store.files import home
 
 ENGINES = ("docker", "podman")
-IMAGES = {  # for steps that use a resource: which variable names the image, and what deploy/containers.sh calls it
+IMAGES = {  # by resource: environment variable that names the image, and its name in deploy/containers.sh
     "cpu": ("DG4D_IMAGE_CPU", "dg4d/cpu"),
     "gpu": ("DG4D_IMAGE_CUDA", "dg4d/cuda"),
 }
-ANSWER_S = 60.0  # for an engine to answer a question
+ANSWER_S = 60.0  # time limit of a query to the engine
 HANDED_ON = ("DG4D_CODE_VERSION", "OMP_NUM_THREADS")
 
 
 @dataclass(frozen=True)
 class Container:
-    """One container that is about to run a step.
+    """Container of a step.
 
     Attributes:
-        command: runs it in the foreground; the arguments of `steps.main` follow.
+        command: command line that runs it in the foreground; the arguments of `steps.main` are appended.
         engine: docker or podman.
-        name: of the container.
+        name: name of the container.
     """
 
     command: list[str]
@@ -48,20 +48,20 @@ class Container:
     name: str
 
     def remove(self) -> None:
-        """End it at once, if it runs."""
+        """Kill and remove the container."""
         subprocess.run([self.engine, "rm", "--force", self.name], capture_output=True, timeout=ANSWER_S, check=False)
 
 
 def container(request: StepRequest, folder: Path, store: str) -> Container:
-    """The container of one step.
+    """Return the container for a step.
 
     Args:
-        request: what it will do; whether it needs a GPU says which image.
-        folder: its scratch folder, with `request.json`; `result.json` will be there.
-        store: address of the artifacts.
+        request: request of the step; a step that needs a GPU runs in the CUDA image.
+        folder: its scratch folder, with `request.json`; the step writes `result.json` there.
+        store: address of the artifact store.
 
     Raises:
-        BackendUnavailable: there is no engine, or no such image.
+        BackendUnavailable: the engine or the image is missing.
     """
     binary, resource = engine(), resource_of(request)
     variable, usual = IMAGES[resource]
@@ -83,10 +83,10 @@ def container(request: StepRequest, folder: Path, store: str) -> Container:
 
 
 def engine() -> str:
-    """The program that runs containers: `$DG4D_ENGINE`, else docker where its daemon answers, else podman.
+    """Return the container engine: `$DG4D_ENGINE`, else docker if its daemon answers, else podman.
 
     Raises:
-        BackendUnavailable: there is none.
+        BackendUnavailable: neither runs containers here.
     """
     if given := os.environ.get("DG4D_ENGINE"):
         if Path(given).name not in ENGINES or shutil.which(given) is None:
@@ -107,8 +107,8 @@ def _answering_engine() -> str:
 
 @dataclass(frozen=True)
 class _Image:
-    id: str  # what is run: a name could come to mean another image in between
-    reference: str  # for the record: NAME@sha256:..., where a registry knows it by its own digest
+    id: str  # a tag could move to another image between query and run
+    reference: str  # for the record: NAME@sha256:..., the registry's digest where it has one
 
     @property
     def key(self) -> str:
@@ -116,7 +116,7 @@ class _Image:
 
 
 def _image(binary: str, name: str) -> _Image:
-    """The image that a name means now."""
+    """Look an image up by its name."""
     answer = _ask([binary, "image", "inspect", name])
     if answer is None:
         raise BackendUnavailable(
@@ -130,7 +130,7 @@ def _image(binary: str, name: str) -> _Image:
 
 
 def _ask(command: list[str]) -> str | None:
-    """What an engine answers; None if it refuses or does not answer."""
+    """Return the output of an engine command; None if it fails or times out."""
     try:
         done = subprocess.run(
             command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=ANSWER_S, check=False
@@ -141,7 +141,7 @@ def _ask(command: list[str]) -> str | None:
 
 
 def _as_caller(binary: str) -> Iterator[str]:
-    """The caller's numbers mean the caller: a podman without root would map them to others."""
+    """Keep the caller's user and group ids, which rootless podman would map to others."""
     if Path(binary).name == "podman" and os.getuid() != 0:
         yield from ("--userns", "keep-id")
 
@@ -154,7 +154,7 @@ def _limits(binary: str, resource: Resource) -> Iterator[str]:
 
 
 def _network(store: str) -> Iterator[str]:
-    """None, but what an object store needs; one on this machine is reached through the machine's own network."""
+    """Disable the network, unless the store is remote; a store on this machine needs the host network."""
     if "://" not in store:
         yield from ("--network", "none")
     elif any(urlsplit(os.environ.get(name, "")).hostname in LOOPBACK for name in ENDPOINTS):
@@ -171,7 +171,7 @@ def _mounts(request: StepRequest, folder: Path, store: str, kernels: Path) -> It
 
 
 def _weights(request: StepRequest) -> list[Path]:
-    """The folder of all weights and, of those that the request names, what lies elsewhere."""
+    """Return the folder of all weights and the folders of requested weights outside of it."""
     if not request.weights:
         return []
     every = weights_home()
@@ -181,7 +181,7 @@ def _weights(request: StepRequest) -> list[Path]:
 
 
 def _hub_repository(place: Path) -> Path:
-    """A snapshot of the Hugging Face cache is links to files in a folder beside it."""
+    """Return the folder to mount: a snapshot of the Hugging Face cache links to files beside its parent."""
     return place.parent.parent if place.parent.name == "snapshots" else place
 
 
@@ -201,10 +201,10 @@ def _environment(store: str, folder: Path, image: _Image, kernels: Path) -> Iter
     secrets = [name for name in os.environ if name.startswith("AWS_")] if "://" in store else []
     for name in (*HANDED_ON, *secrets):
         if name in os.environ:
-            yield from ("--env", name)  # without its value, which everyone could read in the list of processes
+            yield from ("--env", name)  # without the value, which `ps` would show to every user
 
 
 def _hub_cache() -> Path:
-    """Where other programs keep what they downloaded from the Hugging Face hub."""
+    """Return the cache of the Hugging Face hub."""
     cache = os.environ.get("HF_HOME") or Path.home() / ".cache" / "huggingface"
     return Path(os.environ.get("HF_HUB_CACHE") or Path(cache) / "hub")

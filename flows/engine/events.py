@@ -1,4 +1,4 @@
-"""What happens while steps run, told to whoever listens in this process: the terminal, for one."""
+"""Events of running steps for listeners in this process, such as the terminal."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -8,15 +8,15 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class StepEvent:
-    """One thing that happened to one step of one item.
+    """Event of one step of one item.
 
     Attributes:
         item: name of the asset.
-        step: name of the step, with the part of the work it does where it was divided.
-        kind: what happened; `finished` has `cached` and `seconds`, `progress` has `done`, `total` and `values`,
-            `note` has `text`, and so has `remark`, which stays on the screen.
-        cached: whether the result was there already.
-        waited_s: seconds of `seconds` in which the step waited for its turn.
+        step: label of the step, with its part if its frames are divided.
+        kind: `finished` sets `cached`, `seconds` and `waited_s`; `progress` sets `done`, `total` and `values`; `note`
+            sets `text`, and so does `remark`, which stays on the screen.
+        cached: true if the result existed before.
+        waited_s: share of `seconds` spent waiting for a slot.
     """
 
     item: str
@@ -37,7 +37,7 @@ _listeners: list[Listener] = []
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Tell `listener` every event while the block runs; it is called from the threads that run steps."""
+    """Call `listener` with every event while the block runs, from the threads that run steps."""
     _listeners.append(listener)
     try:
         yield
@@ -45,7 +45,7 @@ def listening(listener: Listener) -> Iterator[None]:
         _listeners.remove(listener)
 
 
-def tell(event: StepEvent) -> None:
-    """Tell every listener."""
+def emit(event: StepEvent) -> None:
+    """Call every listener with an event."""
     for listener in tuple(_listeners):
         listener(event)

@@ -1,6 +1,6 @@
-"""How a step runs: in a process of its own, in a container, or in this process. `$DG4D_EXECUTOR` chooses by name.
+"""Executors of steps: child process, container, or this process, as `$DG4D_EXECUTOR` names them.
 
-An executor is a function `(spec, request, on_progress) -> StepResult` that raises one of the errors below.
+An executor is a function `(spec, request, on_progress, say) -> StepResult` that raises a `StepError`.
 """
 
 import fcntl
@@ -12,11 +12,9 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from dg4d_lib.errors import BackendUnavailable
 from flows.engine import forks, resources
@@ -35,10 +33,8 @@ from flows.step_errors import (
     StepUnreachable,
 )
 from steps.contract import (
-    EXIT_BAD_INPUT,
-    EXIT_DIVERGED,
-    EXIT_MISSING,
     EXIT_OUT_OF_MEMORY,
+    EXIT_STATUS,
     StepFailure,
     StepRequest,
     StepResult,
@@ -53,11 +49,12 @@ Say = Callable[[str], None]
 Execute = Callable[[StepSpec, StepRequest, Progress, Say], StepResult]
 
 TAIL_BYTES = 4000  # of standard error, for the message of a crash
-IN_USE = "in-use"  # the locked file of a scratch folder
-KILL_GRACE_S = 5.0  # between asking a step to end and ending it
+IN_USE = "in-use"  # locked file of a scratch folder
+OUTCOME: TypeAdapter[StepResult | StepFailure] = TypeAdapter(StepResult | StepFailure)
+KILL_GRACE_S = 5.0  # for a killed process to be reaped
 
 
-_ERRORS: dict[str, type[StepError]] = {
+_ERRORS: dict[str, type[StepError]] = {  # by the kind of a `StepFailure`
     "bad_input": StepBadInput,
     "missing": StepMissing,
     "lost": StepLost,
@@ -66,19 +63,13 @@ _ERRORS: dict[str, type[StepError]] = {
     "out_of_memory": StepOutOfMemory,
     "crashed": StepCrashed,
 }
-_ERRORS_BY_STATUS: dict[int, type[StepError]] = {
-    EXIT_BAD_INPUT: StepBadInput,
-    EXIT_MISSING: StepMissing,
-    EXIT_DIVERGED: StepDiverged,
-    EXIT_OUT_OF_MEMORY: StepOutOfMemory,
-}
-KILLED = (  # nobody else kills a step without a word
+KILLED = (  # SIGKILL without a failure report is nearly always the kernel's out-of-memory killer
     "it was killed, most likely because memory ran out: end other programs, or choose smaller settings"
 )
 
 
-def in_process(spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say = lambda text: None) -> StepResult:
-    """Run a step here; for tests and debuggers. Neither its time nor its memory is bounded."""
+def in_process(spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say) -> StepResult:
+    """Run a step in this process, without limits of time and memory; for tests and debuggers."""
     with notes_to(say):
         outcome, error = perform(request, store(), on_progress)
     if isinstance(outcome, StepFailure):
@@ -86,68 +77,57 @@ def in_process(spec: StepSpec, request: StepRequest, on_progress: Progress, say:
     return outcome
 
 
-def in_subprocess(
-    spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say = lambda text: None
-) -> StepResult:
-    """Run a step in a process of its own, which ends with this one and is killed after `spec.timeout_s`."""
-    with _scratch() as folder:
-
-        def start(stderr: BinaryIO) -> forks.Fork:
-            environment = {"TMPDIR": str(folder), **resources.environment()}
-            begun = forks.fork(_arguments(folder), environment, stderr, resources.handles())
-            if begun is None:
-                raise StepCrashed(
-                    spec.name, "the fork server exited twice; run `python -m steps.runtime.fork_server 0` to see why"
-                )
-            return begun
-
-        return _result_of(_Program(start, end=lambda: None), folder, spec, request, on_progress, say)
+def in_subprocess(spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say) -> StepResult:
+    """Run a step in a child process, which ends with this process and is killed after `spec.timeout_s`."""
+    with _scratch(request) as folder:
+        environment = {"TMPDIR": str(folder), **resources.environment()}
+        with (folder / "stderr").open("wb") as stderr:
+            process = forks.fork(_arguments(folder), environment, stderr, resources.handles())
+        if process is None:
+            raise StepCrashed(
+                spec.name, "the fork server exited twice; run `python -m steps.runtime.fork_server 0` to see why"
+            )
+        return _result_of(process, lambda: None, folder, spec, on_progress, say)
 
 
-def in_container(
-    spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say = lambda text: None
-) -> StepResult:
-    """Run a step in a container of its own, which ends with this process and is removed after `spec.timeout_s`."""
-    with _scratch() as folder:
+def in_container(spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say) -> StepResult:
+    """Run a step in a container, which ends with this process and is removed after `spec.timeout_s`."""
+    with _scratch(request) as folder:
         try:
             run = container(request, folder, store().address)
         except BackendUnavailable as error:
             raise StepMissing(spec.name, str(error)) from error
-
-        def start(stderr: BinaryIO) -> subprocess.Popen[str]:
-            return subprocess.Popen(
+        with (folder / "stderr").open("wb") as stderr:
+            process = subprocess.Popen(
                 [*run.command, *_arguments(folder), "--parent", "-"],
-                stdin=subprocess.PIPE,  # open for as long as this process lives
+                stdin=subprocess.PIPE,  # the step ends when it is closed, which it is when this process ends
                 stdout=subprocess.PIPE,
                 stderr=stderr,
-                env={**without_prefect(), **resources.environment()},  # an engine may hand on what it has
+                env={**without_prefect(), **resources.environment()},  # an engine may pass its own environment on
                 pass_fds=resources.handles(),
                 start_new_session=True,
                 text=True,
             )
-
-        return _result_of(_Program(start, end=run.remove), folder, spec, request, on_progress, say)
+        return _result_of(process, run.remove, folder, spec, on_progress, say)
 
 
 Process = forks.Fork | subprocess.Popen[str]
 
 
-@dataclass(frozen=True)
-class _Program:
-    """What runs a step outside of this process: what starts it, told its standard error, and what ends the rest."""
-
-    start: Callable[[BinaryIO], Process]
-    end: Callable[[], None]
-
-
 def _result_of(
-    program: _Program, folder: Path, spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say
+    process: Process, remove: Callable[[], None], folder: Path, spec: StepSpec, on_progress: Progress, say: Say
 ) -> StepResult:
-    """Run a program that reads the request and writes the result in a folder; its result, or the error it means."""
-    (folder / "request.json").write_text(request.model_dump_json(), encoding="utf-8")
-    with (folder / "stderr").open("wb") as stderr:
-        process = program.start(stderr)
-    status, timed_out = _watched(process, program.end, spec.timeout_s, on_progress, say)
+    """Follow a process to its end and return the result that it wrote into a folder, or raise its error.
+
+    Args:
+        process: of the step.
+        remove: called when the process is killed, to end the processes that it started elsewhere.
+        folder: with `result.json` and `stderr` of the step.
+        spec: of the step.
+        on_progress: called with every progress message.
+        say: called with every note.
+    """
+    status, timed_out = _watched(process, remove, spec.timeout_s, on_progress, say)
     if timed_out:
         raise StepTimedOut(spec.name, f"no result after {spec.timeout_s:g} s, so it was stopped")
     outcome = _outcome(folder / "result.json")
@@ -158,8 +138,9 @@ def _result_of(
     if status in (-signal.SIGKILL, EXIT_OUT_OF_MEMORY):
         raise StepOutOfMemory(spec.name, KILLED)
     tail = _tail(folder / "stderr")
-    if status in _ERRORS_BY_STATUS:
-        raise _ERRORS_BY_STATUS[status](spec.name, tail or f"the process ended with status {status}")
+    kind = next((kind for kind, code in EXIT_STATUS.items() if code == status), "crashed")
+    if kind != "crashed":
+        raise _ERRORS[kind](spec.name, tail or f"the process ended with status {status}")
     reason = f"killed by signal {-status}" if status < 0 else f"ended with status {status}"
     raise StepCrashed(spec.name, f"{reason} and no result" + (f": {tail}" if tail else ""))
 
@@ -167,11 +148,11 @@ def _result_of(
 EXECUTORS: dict[str, Execute] = {"subprocess": in_subprocess, "container": in_container, "in_process": in_process}
 
 
-def chosen() -> Execute:
-    """The executor that `$DG4D_EXECUTOR` names; `subprocess` without it.
+def configured_executor() -> Execute:
+    """Return the executor that `$DG4D_EXECUTOR` names, by default `subprocess`.
 
     Raises:
-        StepMissing: there is none of that name.
+        StepMissing: the name is unknown.
     """
     name = os.environ.get("DG4D_EXECUTOR", "subprocess")
     if name not in EXECUTORS:
@@ -180,8 +161,8 @@ def chosen() -> Execute:
 
 
 def prepare() -> None:
-    """Begin what the first step would wait for; for who is about to run one."""
-    if chosen() is in_subprocess:
+    """Start the fork server, whose imports the first step would otherwise wait for."""
+    if configured_executor() is in_subprocess:
         forks.prepare()
 
 
@@ -189,21 +170,21 @@ _running: dict[Process, Callable[[], None]] = {}
 
 
 def stop_all() -> None:
-    """End every step that runs for this process, at once, and begin no other; their callers get an error."""
+    """Kill every step of this process and start no other; the callers of the steps get an error."""
     resources.stopping.set()
     for process, end in tuple(_running.items()):
         _stop(process, end)
 
 
 def _arguments(folder: Path) -> list[str]:
-    """What `steps.main` is told."""
+    """Return the arguments of `steps.main`."""
     return [str(folder / "request.json"), str(folder / "result.json"), "--store", store().address]
 
 
 def _watched(
     process: Process, end: Callable[[], None], timeout_s: float, on_progress: Progress, say: Say
 ) -> tuple[int, bool]:
-    """Follow a step to its end: its exit status, and whether it was stopped for its time."""
+    """Return the exit status of a step, and true if it was killed after `timeout_s`."""
     timed_out = threading.Event()
 
     def stop() -> None:
@@ -242,7 +223,7 @@ def _relay(line: str, on_progress: Progress, say: Say) -> None:
 
 
 def _stop(process: Process, end: Callable[[], None]) -> None:
-    """Kill a program, with every process that it started here, and what it started elsewhere."""
+    """Kill the process group of a step, and what it started elsewhere."""
     if process.poll() is None:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
@@ -250,13 +231,9 @@ def _stop(process: Process, end: Callable[[], None]) -> None:
 
 
 def _outcome(path: Path) -> StepResult | StepFailure | None:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        return None
-    for kind in (StepResult, StepFailure):
-        with suppress(ValidationError):
-            return kind.model_validate_json(text)
+    """Return what the step wrote; None if it wrote nothing that can be read."""
+    with suppress(FileNotFoundError, ValidationError):
+        return OUTCOME.validate_json(path.read_bytes())
     return None
 
 
@@ -266,25 +243,25 @@ def _tail(path: Path) -> str:
 
 
 @contextmanager
-def _scratch() -> Iterator[Path]:
-    """A folder for one step; it also removes those of commands that were killed.
+def _scratch(request: StepRequest) -> Iterator[Path]:
+    """Yield a scratch folder with the request of a step; remove folders that killed commands left behind.
 
-    Who uses a folder holds the lock of a file in it: commands in several containers may share them, and none of these
-    sees the processes of another.
+    A folder in use has a locked file: containers may share the parent folder and do not see each other's processes.
     """
     scratch = home() / "scratch"
     scratch.mkdir(parents=True, exist_ok=True)
-    with (scratch.parent / "scratch.lock").open("a") as one_look:
-        fcntl.flock(one_look, fcntl.LOCK_EX)  # a folder without a lock is one that was left
+    with (scratch.parent / "scratch.lock").open("a") as mutex:
+        fcntl.flock(mutex, fcntl.LOCK_EX)  # between the creation of a folder and its lock
         for old in scratch.iterdir():
-            with suppress(FileNotFoundError), locked(old / IN_USE) as left:  # it may go at this moment
-                if left:
+            with suppress(FileNotFoundError), locked(old / IN_USE) as unused:  # another command may remove it meanwhile
+                if unused:
                     remove_tree(old)
         folder = Path(tempfile.mkdtemp(dir=scratch))
         in_use = (folder / IN_USE).open("a")
         fcntl.flock(in_use, fcntl.LOCK_EX)
     with in_use:
         try:
+            (folder / "request.json").write_text(request.model_dump_json(), encoding="utf-8")
             yield folder
         finally:
             remove_tree(folder)

@@ -1,4 +1,4 @@
-"""Processes of steps, forked from one that has imported what they need (`steps/runtime/fork_server.py`)."""
+"""Client of the fork server, which starts steps without their import time (`steps/runtime/fork_server.py`)."""
 
 import json
 import os
@@ -14,67 +14,61 @@ from typing import IO, BinaryIO
 from flows.processes import python, without_prefect
 from steps.runtime.fork_server import ANSWER_BYTES
 
-SET_BY_IMPORTS = "OpenImageIO_ROOT"  # by a library, for its own programs
-ATTEMPTS = 2  # a server may have been killed since its last step
+SET_BY_IMPORTS = "OpenImageIO_ROOT"  # variable that importing OpenImageIO sets
+ATTEMPTS = 2  # the server may have been killed since its last step
 
 
 def prepare() -> None:
-    """Begin to import what steps need, so that the first step does not wait for it."""
+    """Start the fork server, so that the first step does not wait for its imports."""
     _server()
 
 
 class Fork:
-    """Process of a step, with the part of `subprocess.Popen` that executors use.
-
-    Attributes:
-        pid: of the process and of its group.
-        stdin: none; it reads from /dev/null.
-        stdout: what it prints.
-    """
+    """Process of a step, with the part of the interface of `subprocess.Popen` that executors use."""
 
     stdin = None
 
     def __init__(self, server: "ForkServer", pid: int, answers: socket.socket, stdout: IO[str]) -> None:
         self.pid, self.stdout, self._answers = pid, stdout, answers
-        self._server = server  # ends when nothing refers to it
+        self._server = server  # a server ends when it is garbage-collected
         weakref.finalize(self, answers.close)
 
     def poll(self) -> int | None:
-        """Return its exit status, or the negative number of a signal; None while it runs."""
+        """Return the exit status as `Popen.poll` does."""
         try:
             return self.wait(0)
         except TimeoutError:
             return None
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait for its exit status, or the negative number of a signal.
+        """Return the exit status as `Popen.wait` does.
 
         Raises:
-            TimeoutError: it still runs after so many seconds.
+            TimeoutError: the process still runs after `timeout` seconds.
         """
         answer = select.poll()
         answer.register(self._answers, select.POLLIN)
         if not answer.poll(None if timeout is None else 1000 * timeout):
             raise TimeoutError
-        said = self._answers.recv(ANSWER_BYTES, socket.MSG_PEEK)  # it stays there for other threads
-        return int(said) if said else -signal.SIGKILL  # without an answer: it ended with its server
+        status = self._answers.recv(ANSWER_BYTES, socket.MSG_PEEK)  # stays readable for other threads
+        return int(status) if status else -signal.SIGKILL  # the server was killed, and the step with it
 
 
 def fork(
     arguments: Sequence[str], environment: dict[str, str], stderr: BinaryIO, handles: Sequence[int]
 ) -> Fork | None:
-    """Begin a step as `ForkServer.fork` does; None if no server stays alive for it."""
+    """Fork a step from the server of this environment; None if the server exited repeatedly."""
     for _ in range(ATTEMPTS):
-        if (begun := _server().fork(arguments, environment, stderr, handles)) is not None:
-            return begun
+        if (process := _server().fork(arguments, environment, stderr, handles)) is not None:
+            return process
     return None
 
 
 class ForkServer:
-    """Forks the processes of steps; ends with this process, or when nothing refers to it, and they with it.
+    """Server process that forks steps; it and they end with this process, or when it is garbage-collected.
 
     Args:
-        environment: of all its steps.
+        environment: environment variables of all its steps.
     """
 
     def __init__(self, environment: dict[str, str]) -> None:
@@ -95,24 +89,24 @@ class ForkServer:
     def fork(
         self, arguments: Sequence[str], environment: dict[str, str], stderr: BinaryIO, handles: Sequence[int]
     ) -> Fork | None:
-        """Begin a step.
+        """Fork a step.
 
         Args:
-            arguments: of `steps.main`; that it ends with the server is added.
-            environment: beside that of the server.
-            stderr: where the step's standard error goes.
-            handles: file descriptors that the step holds open.
+            arguments: arguments of `steps.main`; `--parent` is added.
+            environment: variables beside those of the server.
+            stderr: file for the standard error of the step.
+            handles: descriptors that the step inherits.
 
         Returns:
-            Its process; None if this server has ended.
+            Process of the step; None if the server has ended.
         """
-        told = [*arguments, "--parent", str(self.process.pid)]
-        order = json.dumps({"arguments": told, "environment": environment}).encode()
+        arguments = [*arguments, "--parent", str(self.process.pid)]
+        message = json.dumps({"arguments": arguments, "environment": environment}).encode()
         (answers, their_answers), (output, their_output) = socket.socketpair(type=socket.SOCK_SEQPACKET), os.pipe()
         stdout = os.fdopen(output, encoding="utf-8", errors="replace")
         try:
-            socket.send_fds(self._control, [order], [their_answers.fileno(), their_output, stderr.fileno(), *handles])
-        except OSError:  # it has ended
+            socket.send_fds(self._control, [message], [their_answers.fileno(), their_output, stderr.fileno(), *handles])
+        except OSError:  # the server has ended, which the empty answer below says
             pass
         finally:
             their_answers.close()
@@ -125,26 +119,26 @@ class ForkServer:
 
 
 def base_environment() -> dict[str, str]:
-    """Return what a process of steps has of this one's environment: Prefect is nothing to it."""
+    """Return the environment of steps: that of this process without Prefect's variables."""
     own = {name: value for name, value in without_prefect().items() if name != SET_BY_IMPORTS}
     return {"DO_NOT_TRACK": "1", **own}
 
 
 _current: list[ForkServer] = []  # one at most
-_one_look = threading.Lock()
+_mutex = threading.Lock()
 
 
 def _server() -> ForkServer:
-    """Return the server for the environment of this moment; one for another ends with its last step."""
+    """Return the server for the present environment; one for an earlier environment ends with its last step."""
     now = base_environment()
-    with _one_look:
+    with _mutex:
         if not _current or _current[0].environment != now or _current[0].process.poll() is not None:
             _current[:] = [ForkServer(now)]
         return _current[0]
 
 
 def _end(process: subprocess.Popen[bytes], control: socket.socket) -> None:
-    """End a server, and every step of it that still runs."""
+    """Kill a server and its steps."""
     control.close()
     process.kill()
     process.wait()

@@ -1,4 +1,4 @@
-"""Frames of a driving video, and their division among tasks."""
+"""Division of the frames of a driving video among tasks."""
 
 import math
 import zipfile
@@ -8,13 +8,13 @@ from steps.contract import ArtifactRef
 from steps.store.artifact_store import ArtifactStore
 
 
-def frames_in(frames: ArtifactRef, store: ArtifactStore) -> int:
+def count_frames(frames: ArtifactRef, store: ArtifactStore) -> int:
     """Return the number of frames of a `frames` artifact."""
     with zipfile.ZipFile(store.path(frames)) as archive:
         return sum(name.endswith(".png") for name in archive.namelist())
 
 
-def divided(frames: int, tasks: int) -> list[Part]:
+def divide_frames(frames: int, tasks: int) -> list[Part]:
     """Divide frames into parts whose sizes differ by at most one; no more parts than frames."""
     count = max(1, min(frames, tasks))
     ends = [math.ceil(frames * number / count) for number in range(count + 1)]

@@ -1,6 +1,6 @@
-"""Items of a catalog as flow runs of a deployment: begun once, waited for, and found again after a catalog was killed.
+"""Items of a catalog as flow runs of a deployment, found again by their idempotency key after a catalog was killed.
 
-An item travels by reference: its order and source lie in the store, and so does what comes back.
+Items are passed by reference: job, source and outcome are in the store that catalog and workers share.
 """
 
 import itertools
@@ -27,12 +27,12 @@ from prefect.states import Cancelled, Scheduled
 from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
 from flows import home
 from flows.engine import resources
-from flows.engine.events import StepEvent, tell
+from flows.engine.events import StepEvent, emit
 from flows.engine.leases import hold, running
 from flows.engine.output_lock import output_lock
-from flows.inputs.orders import Order
+from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.package_record import record_of
-from flows.packages.delivery import Outcome, deliver, read_outcome
+from flows.packages.delivery import Outcome, read_outcome, unpack_package
 from flows.packages.publish import Files
 from flows.step_errors import StepCrashed, StepError, StepOutOfMemory, StepTimedOut, StepUnreachable
 from steps.contract import ArtifactRef, digest_of
@@ -40,23 +40,23 @@ from steps.runtime.installed_code import catalog, request_version
 from steps.store.artifact_store import ArtifactMissing, ArtifactStore, StoreUnreachable
 
 FLOW = "item-to-4d"
-ORDER = "application/vnd.dg4d.order+json"
-STEP = "item"  # the name under which events of a waiting item are shown
-POLL_S = 1.0  # between two looks at a run
-POLLS_PER_S = 20  # of all waiting items of a catalog together
+JOB_MEDIA_TYPE = "application/vnd.dg4d.order+json"
+STEP = "item"  # step name in the events of a waiting item
+POLL_S = 1.0  # between two queries of a run
+POLLS_PER_S = 20  # queries of all waiting items of a catalog together
 MAY_HEAL = (StepCrashed, StepOutOfMemory, StepTimedOut, StepUnreachable, StoreUnreachable, ArtifactMissing)
-WORKER_LABEL = "prefect.worker.name"  # of a run that a worker took
-PENDING_S = 120.0  # between a worker that takes a run and the first word of the run; images may have to be pulled
-CRASHED_S = 60.0  # the server begins a crashed run again after ten seconds; then it never does
+WORKER_LABEL = "prefect.worker.name"  # of a run that a worker has taken
+PENDING_S = 120.0  # longest time in Pending; an image may have to be pulled
+CRASHED_S = 60.0  # the automation of `registering.py` restarts a crashed run after 10 s, or never
 
 
 class ItemFailed(DG4DError):
-    """An item that another machine could not make.
+    """Failure of an item on another machine.
 
     Attributes:
-        outcome: what that machine said.
-        step: that failed.
-        pictures: that explain the failure, in the store.
+        outcome: outcome reported by that machine.
+        step: failed step.
+        pictures: pictures that explain the failure, in the store.
     """
 
     def __init__(self, outcome: Outcome) -> None:
@@ -65,49 +65,49 @@ class ItemFailed(DG4DError):
 
 
 class ItemDeployment(NamedTuple):
-    """Deployment that makes items.
+    """Deployment that converts items.
 
     Attributes:
-        name: the full one, FLOW/NAME.
-        pool: whose workers execute its runs.
-        poll_s: seconds between two looks at a run.
+        name: full name, FLOW/NAME.
+        pool: work pool that executes its runs.
+        poll_s: seconds between two queries of a run.
     """
 
     name: str
     pool: str
     poll_s: float = POLL_S
 
-    def make(self, order: Order, folder: Path) -> tuple[Files, bool]:
-        """Have a worker make an order, and put the package into `folder`, as `flows.convert.make` does here.
+    def convert_job(self, job: ConversionJob, folder: Path) -> tuple[Files, bool]:
+        """Run a job on a worker and put the package into `folder`, as `flows.convert.convert_job` does on this machine.
 
         Raises:
-            ItemFailed: the worker could not make it, or died.
+            ItemFailed: the conversion failed, or the worker died.
             BadInput: the folder cannot be written.
         """
         store = home.store()
-        ref = store.put_bytes(order.model_dump_json().encode(), ORDER)
-        with running(store, order.item):
-            hold(store, order.item, [ref.digest, *(needed.digest for needed in (order.source, order.bank) if needed)])
-            outcome = self._outcome(order, ref, store)
+        ref = store.put_bytes(job.model_dump_json().encode(), JOB_MEDIA_TYPE)
+        with running(store, job.item):
+            hold(store, job.item, [ref.digest, *(needed.digest for needed in (job.source, job.bank) if needed)])
+            outcome = self._outcome(job, ref, store)
             if outcome.package is None:
                 raise ItemFailed(outcome)
             with output_lock(folder, lambda: None):
-                files = deliver(outcome.package, folder, store)
-        if (record_of(folder) or {}).get("order") != order.digest():
-            note = "made with other weights, another rasterizer or another signing key than this machine has"
-            tell(StepEvent(order.item, STEP, "remark", text=note))
+                files = unpack_package(outcome.package, folder, store)
+        if (record_of(folder) or {}).get("order") != job.digest():
+            note = "converted with weights, a rasterizer or a signing key that differ from those of this machine"
+            emit(StepEvent(job.item, STEP, "remark", text=note))
         return files, outcome.cached
 
-    def _outcome(self, order: Order, ref: ArtifactRef, store: ArtifactStore) -> Outcome:
+    def _outcome(self, job: ConversionJob, ref: ArtifactRef, store: ArtifactStore) -> Outcome:
         with get_client(sync_client=True) as client:
-            run = self._begin(client, order, ref, store)
-            run = self._wait(client, run, order.item)
+            run = self._begin(client, job, ref, store)
+            run = self._wait(client, run, job.item)
         return _outcome_of(run, store)
 
-    def _begin(self, client: SyncPrefectClient, order: Order, ref: ArtifactRef, store: ArtifactStore) -> FlowRun:
-        """Begin the run of an item, or return the one that was begun before and is at work or has its package."""
+    def _begin(self, client: SyncPrefectClient, job: ConversionJob, ref: ArtifactRef, store: ArtifactStore) -> FlowRun:
+        """Create the run of an item, or return an earlier one that is active or has produced the package."""
         for number in itertools.count():
-            key = digest_of([order.digest(), ref.digest, self.name, number])
+            key = digest_of([job.digest(), ref.digest, self.name, number])
             found = client.read_flow_runs(
                 flow_run_filter=FlowRunFilter(idempotency_key=FlowRunFilterIdempotencyKey(any_=[key]))
             )
@@ -116,45 +116,45 @@ class ItemDeployment(NamedTuple):
             if _is_at_work(found[0]) or _has_package(found[0], store):
                 return found[0]
         parameters: dict[str, Any] = {
-            "item": order.item,
-            "order": ref.model_dump(mode="json"),
+            "item": job.item,
+            "job": ref.model_dump(mode="json"),
             "code": code_version(),
             "store": store.address,
         }
-        begun = run_deployment(self.name, parameters=parameters, timeout=0, tags=[order.profile], idempotency_key=key)
-        assert isinstance(begun, FlowRun)
-        return begun
+        run = run_deployment(self.name, parameters=parameters, timeout=0, tags=[job.profile], idempotency_key=key)
+        assert isinstance(run, FlowRun)
+        return run
 
     def _wait(self, client: SyncPrefectClient, run: FlowRun, item: str) -> FlowRun:
-        """Wait until a run has ended for good."""
-        said = ""
+        """Wait until a run has ended and will not be restarted."""
+        shown = ""
         while _is_at_work(run):
             name = run.state.name if run.state else ""
-            if name != said:
-                said = str(name)
-                tell(StepEvent(item, STEP, "note", text=f"{said.lower()} in {self.pool}"))
+            if name != shown:
+                shown = str(name)
+                emit(StepEvent(item, STEP, "note", text=f"{shown.lower()} in {self.pool}"))
             if resources.stopping.wait(self.poll_s):
                 _give_up(client, run)
-                raise resources.Stopped(f"stopped while {item} was made in {self.pool}")
+                raise resources.Stopped(f"stopped while {item} was converted in {self.pool}")
             try:
                 run = client.read_flow_run(run.id)
                 if _is_stranded(client, run, self.pool):
                     again: State[Any] = Scheduled(name="AwaitingRetry", message="its worker died before it began")
                     client.set_flow_run_state(run.id, again, force=True)
             except (httpx.TransportError, PrefectHTTPStatusError):
-                continue  # the server may come back, and what it runs goes on
+                continue  # the run goes on while the server is away
         return run
 
 
 def item_deployment(pool: str, workers: int) -> ItemDeployment:
-    """Find the deployment that makes items in a pool.
+    """Find the deployment that converts items in a pool.
 
     Args:
         pool: name of the pool; empty: the only one that has such a deployment.
         workers: items at a time.
 
     Raises:
-        BadInput: there is none, or several and none was named; or items would wait for the run that waits for them.
+        BadInput: no such deployment, or several without a given pool; or the catalog itself fills the pool.
     """
     with get_client(sync_client=True) as client:
         found = client.read_deployments(flow_filter=FlowFilter(name=FlowFilterName(any_=[FLOW])))
@@ -162,13 +162,12 @@ def item_deployment(pool: str, workers: int) -> ItemDeployment:
         if (not pool and len(pools) != 1) or (pool and pool not in pools):
             there = ", ".join(sorted(pools)) or "none"
             raise BadInput(
-                f"--where deployment{f':{pool}' if pool else ''}: name a pool that takes items; there are: {there}; "
+                f"--where deployment{f':{pool}' if pool else ''}: give a pool that takes items, one of: {there}; "
                 "`dg4d up --pool POOL` adds one"
             )
-        chosen = pools[pool or next(iter(pools))]
-        _require_another_place(client, str(chosen.work_pool_name))
-    name = f"{FLOW}/{chosen.name}"
-    return ItemDeployment(name, str(chosen.work_pool_name), max(POLL_S, workers / POLLS_PER_S))
+        pool = pool or next(iter(pools))
+        _require_free_place(client, pool)
+    return ItemDeployment(f"{FLOW}/{pools[pool].name}", pool, max(POLL_S, workers / POLLS_PER_S))
 
 
 def failure(error: Exception) -> Outcome:
@@ -178,7 +177,9 @@ def failure(error: Exception) -> Outcome:
     known = isinstance(error, StepError | DG4DError)
     return Outcome(
         kind=type(error).__name__ if known else "Crashed",
-        message=error.message if isinstance(error, StepError) else str(error) if known else _described(error),
+        message=error.message
+        if isinstance(error, StepError)
+        else f"{'' if known else f'{type(error).__name__}: '}{error}",
         step=getattr(error, "step", ""),
         pictures=getattr(error, "pictures", {}),
         may_heal=isinstance(error, MAY_HEAL) or not known,
@@ -186,58 +187,54 @@ def failure(error: Exception) -> Outcome:
 
 
 def code_version() -> str:
-    """Return a digest of the code of all steps, by which a worker of another version is recognized."""
+    """Return a digest of the code of all steps."""
     return digest_of({name: request_version(spec) for name, spec in catalog().items()})
 
 
-def read_order(order: ArtifactRef, code: str, store: ArtifactStore, address: str) -> Order:
-    """Read an order that a catalog put into the store.
+def read_job(job: ArtifactRef, code: str, store: ArtifactStore, address: str) -> ConversionJob:
+    """Read a job that a catalog put into the store.
 
     Args:
-        order: its reference.
-        code: the code of the catalog, by `code_version`.
-        store: of this machine.
-        address: of the catalog's store.
+        job: reference of the job.
+        code: `code_version` of the catalog's machine.
+        store: store of this machine.
+        address: address of the catalog's store.
 
     Raises:
-        BackendUnavailable: this machine has another version of the code, or another store.
+        BackendUnavailable: code or store of this machine differ.
     """
     if code != code_version():
         raise BackendUnavailable(
             "this worker runs another version of dg4d than the catalog; install the same on all machines"
         )
-    if not store.has(order):
+    if not store.has(job):
         raise BackendUnavailable(
-            f"the order {order.digest} is not in the store of this worker, {store.address}; the catalog put it into "
+            f"the job {job.digest} is not in the store of this worker, {store.address}; the catalog put it into "
             f"{address}: set $DG4D_STORE of both to one store"
         )
-    return Order.model_validate_json(store.path(order).read_bytes())
-
-
-def _described(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"
+    return ConversionJob.model_validate_json(store.path(job).read_bytes())
 
 
 def _is_at_work(run: FlowRun) -> bool:
-    """Return whether a run may still end well; a crashed one may be begun again by the server."""
+    """Return true if a run may still complete; the server may restart a crashed one."""
     if run.state is None or not run.state.is_final():
         return True
     return run.state.is_crashed() and _age_s(run) < CRASHED_S
 
 
 def _outcome_of(run: FlowRun, store: ArtifactStore) -> Outcome:
-    """Return what a run that has ended says, or what is known of one that could not say anything."""
+    """Return the outcome of an ended run, or one made from its state if it wrote none."""
     if run.state is not None and run.state.is_cancelled():
         return Outcome(kind="Cancelled", message="its run was cancelled")
     outcome = read_outcome(store, str(run.id))
     if outcome is not None:
         return outcome
-    message = str(run.state.message or run.state.name) if run.state else "nothing is known of its run"
+    message = str(run.state.message or run.state.name) if run.state else "its run has no state"
     return Outcome(kind="Crashed", message=message, may_heal=True)
 
 
 def _is_stranded(client: SyncPrefectClient, run: FlowRun, pool: str) -> bool:
-    """Return whether a worker took a run and died before the run began, which no heartbeat tells the server."""
+    """Return true if the worker of a pending run died; runs send heartbeats only after they have started."""
     if run.state is None or not run.state.is_pending() or _age_s(run) < PENDING_S:
         return False
     workers = client.read_workers_for_work_pool(pool)
@@ -246,7 +243,7 @@ def _is_stranded(client: SyncPrefectClient, run: FlowRun, pool: str) -> bool:
 
 
 def _age_s(run: FlowRun) -> float:
-    """Return the seconds since a run got its state."""
+    """Return the age of the state of a run in seconds."""
     return 0.0 if run.state is None else (datetime.now(UTC) - run.state.timestamp).total_seconds()
 
 
@@ -258,14 +255,14 @@ def _has_package(run: FlowRun, store: ArtifactStore) -> bool:
 
 
 def _give_up(client: SyncPrefectClient, run: FlowRun) -> None:
-    """Cancel a run that no worker has begun; one that is at work goes on, and the same catalog finds it again."""
+    """Cancel a scheduled run; a running one goes on, and the same catalog finds it again."""
     if run.state is not None and run.state.is_scheduled():
-        with suppress(httpx.HTTPError, PrefectHTTPStatusError):  # the server is away; the run is found again
+        with suppress(httpx.HTTPError, PrefectHTTPStatusError):  # a run that is not cancelled is found again
             client.set_flow_run_state(run.id, Cancelled(message="the catalog was stopped"))
 
 
-def _require_another_place(client: SyncPrefectClient, pool: str) -> None:
-    """Refuse a pool whose only place is taken by the run that would wait for its items."""
+def _require_free_place(client: SyncPrefectClient, pool: str) -> None:
+    """Refuse a pool whose concurrency limit the current run already fills."""
     run_id = runtime.flow_run.id
     own = client.read_flow_run(UUID(run_id)) if run_id else None
     if own is None or own.work_pool_name != pool:
@@ -273,5 +270,6 @@ def _require_another_place(client: SyncPrefectClient, pool: str) -> None:
     limit = client.read_work_pool(pool).concurrency_limit
     if limit is not None and limit < 2:
         raise BadInput(
-            f"the pool {pool} has one place, which this catalog takes: its items would wait for ever; name another pool"
+            f"the pool {pool} has concurrency limit 1, which this catalog takes: its items would never start; give "
+            "another pool, or raise the limit"
         )

@@ -1,7 +1,7 @@
-"""Who is at work in a store: runs, with what they need of it, and the one that removes what nobody needs.
+"""Leases of running conversions on artifacts of a store, and the lock of the garbage collection.
 
-running/KEY.json    a lease per item that is being made
-collecting/         a lock, there while `dg4d store gc` removes things
+running/KEY.json    lease of an item that is being converted
+collecting/         lock, present while `dg4d store gc` removes artifacts
 """
 
 import hashlib
@@ -16,43 +16,43 @@ from pathlib import PurePosixPath
 from pydantic import Field, ValidationError
 
 from dg4d_lib.errors import BadInput
-from flows.processes import OWN_START, place, start_of
+from flows.processes import OWN_START, host_id, start_of
 from steps.contract import Digest, Frozen
 from steps.store.artifact_store import ArtifactStore, Entry
 
 FOLDER = "running"
 LOCK = "collecting/lock.json"
-LOCK_S = 900.0  # without a sign of life, on another machine, the one that removes things has died
+LOCK_S = 900.0  # a lock of another machine is stale if it is not refreshed for so long
 POLL_S = 0.2
-LONGEST_RUN_S = 7 * 24 * 3600.0  # of a run on another machine, whose end cannot be seen from here
+LONGEST_RUN_S = 7 * 24 * 3600.0  # a lease of another machine is stale after this time
 _BEGAN = time.monotonic()
 
 
 class Holder(Frozen):
-    """Process that works in a store.
+    """Identity of a process that uses a store.
 
     Attributes:
-        host: the machine, or its container.
-        pid: the process.
-        start: when it began, in the ticks of its kernel.
+        host: identity of its machine or container.
+        pid: process id.
+        start: start time in kernel ticks, since process ids are reused.
     """
 
-    host: str = Field(default_factory=place)
+    host: str = Field(default_factory=host_id)
     pid: int = Field(default_factory=os.getpid)
     start: str = OWN_START
 
     def is_gone(self, silent_s: float, patience_s: float) -> bool:
-        """Return whether it has ended; on another machine, whether it was silent for longer than the patience."""
-        return start_of(self.pid) != self.start if self.host == place() else silent_s > patience_s
+        """Return true if the process has ended, or, on another machine, was silent for longer than `patience_s`."""
+        return start_of(self.pid) != self.start if self.host == host_id() else silent_s > patience_s
 
 
 class Lease(Holder):
-    """What one process needs for one item.
+    """Artifacts that one process needs for one item.
 
     Attributes:
-        item: what is being made.
-        age_s: how long the process had been at work when it wrote this.
-        artifacts: results of earlier runs that it uses; those it makes are protected by their age.
+        item: name of the asset.
+        age_s: age of the process when it wrote the lease.
+        artifacts: cached results that it uses; new ones are protected by their age.
     """
 
     item: str
@@ -61,14 +61,14 @@ class Lease(Holder):
 
 
 class Collecting(Holder):
-    """The process that removes what nobody needs."""
+    """Process that collects garbage."""
 
     token: str
 
 
 @contextmanager
 def running(store: ArtifactStore, item: str) -> Iterator[None]:
-    """Say that an item is being made, as long as the block runs.
+    """Hold a lease for an item while the block runs.
 
     Raises:
         StoreUnreachable: the store does not answer.
@@ -86,12 +86,12 @@ def running(store: ArtifactStore, item: str) -> Iterator[None]:
                 del _users[item]
                 _held.pop((store.address, item), None)
         if last:
-            with suppress(Exception):  # a lease that stays ends with this process
+            with suppress(Exception):  # a lease that remains is stale when this process ends
                 store.remove([_name(item)])
 
 
 def hold(store: ArtifactStore, item: str, artifacts: Iterable[str]) -> None:
-    """Add artifacts to what this process needs for an item.
+    """Add artifacts to the lease of this process for an item.
 
     Raises:
         StoreUnreachable: the store does not answer.
@@ -107,9 +107,9 @@ def hold(store: ArtifactStore, item: str, artifacts: Iterable[str]) -> None:
 
 
 def needed(store: ArtifactStore, now: float) -> tuple[set[str], float]:
-    """What all runs need, and since when the oldest of them is at work (`now` if there are none).
+    """Return the artifacts of all leases, and the start of the oldest run (`now` if there is none).
 
-    Leases of processes that are gone are removed.
+    Stale leases are removed.
 
     Raises:
         StoreUnreachable: the store does not answer.
@@ -128,16 +128,18 @@ def needed(store: ArtifactStore, now: float) -> tuple[set[str], float]:
 
 @contextmanager
 def collecting(store: ArtifactStore) -> Iterator[Callable[[], None]]:
-    """Be the only one that removes things; gives what to call now and then as a sign of life.
+    """Hold the lock of the garbage collection; yield a function that refreshes it.
 
     Raises:
-        BadInput: another one is at it.
+        BadInput: another process holds it.
         StoreUnreachable: the store does not answer.
     """
     text = Collecting(token=uuid.uuid4().hex).model_dump_json()
-    while not store.create(LOCK, text) and store.read(LOCK) != text.encode():  # a repeated request may find its own
+    while not store.create(LOCK, text) and store.read(LOCK) != text.encode():  # a retried request finds its own lock
         if _is_collecting(store):
-            raise BadInput(f"somebody else is removing things from {store.address} at the moment; try again later")
+            raise BadInput(
+                f"another `dg4d store gc` is removing artifacts from {store.address}; try again when it has ended"
+            )
         store.remove([LOCK])
     try:
         yield lambda: store.write(LOCK, text)
@@ -146,7 +148,7 @@ def collecting(store: ArtifactStore) -> Iterator[Callable[[], None]]:
 
 
 def wait_for_collecting(store: ArtifactStore) -> bool:
-    """Wait until nobody removes things; whether somebody did.
+    """Wait until no garbage collection runs; return true if one did.
 
     Raises:
         StoreUnreachable: the store does not answer.
@@ -164,7 +166,7 @@ _mutex = threading.Lock()
 
 
 def _name(item: str) -> str:
-    key = hashlib.sha256(f"{place()} {os.getpid()} {OWN_START} {item}".encode()).hexdigest()
+    key = hashlib.sha256(f"{host_id()} {os.getpid()} {OWN_START} {item}".encode()).hexdigest()
     return f"{FOLDER}/{key[:32]}.json"
 
 
@@ -176,12 +178,12 @@ def _read(store: ArtifactStore, entry: Entry) -> Lease | None:
 
 
 def _is_collecting(store: ArtifactStore) -> bool:
-    """Return whether the lock is held by somebody who is alive."""
+    """Return true if a live process holds the lock."""
     if (content := store.read(LOCK)) is None:
         return False
     written = next((entry.modified for entry in store.entries(PurePosixPath(LOCK).parent.as_posix())), None)
-    silent_s = 0.0 if written is None else abs(store.now() - written)  # clocks may differ, either way
+    silent_s = 0.0 if written is None else abs(store.now() - written)  # clocks of machines differ
     try:
         return not Collecting.model_validate_json(content).is_gone(silent_s, LOCK_S)
-    except ValidationError:  # it is being written
+    except ValidationError:  # the holder is writing it
         return silent_s <= LOCK_S

@@ -1,6 +1,6 @@
-"""Flow runs whose process was killed: nobody told the server, so the next command on the same machine does.
+"""Orphaned flow runs: the server shows them as running, but their process was killed.
 
-A run that is at work carries the identity of its process in a label, which no page of the UI shows.
+The next command on the same machine marks them as crashed. A run carries the identity of its process in a label.
 """
 
 import os
@@ -12,9 +12,9 @@ from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterState, Fl
 from prefect.client.schemas.objects import FlowRun, StateType
 from prefect.states import Crashed
 
-from flows.processes import place, start_of
+from flows.processes import host_id, start_of
 
-LABEL = "dg4d.process"  # of a flow run: machine, number of the process, its start
+LABEL = "dg4d.process"  # of a flow run: HOST:PID:START
 PAGE = 200  # runs in one answer of the server
 
 
@@ -27,9 +27,9 @@ def claim_run() -> None:
 
 
 def process_identity(pid: int | None = None) -> str:
-    """Return the identity of a process, this one by default; no later process with its number has the same."""
+    """Return HOST:PID:START of a process, by default this one; a later process with the same PID differs in START."""
     pid = pid or os.getpid()
-    return f"{place()}:{pid}:{start_of(pid)}"
+    return f"{host_id()}:{pid}:{start_of(pid)}"
 
 
 def settle_orphans() -> int:
@@ -44,7 +44,7 @@ def settle_orphans() -> int:
 
 
 def _running(client: SyncPrefectClient) -> list[FlowRun]:
-    """Return every run that the server takes for running."""
+    """Return every run in the state Running."""
     wanted = FlowRunFilter(state=FlowRunFilterState(type=FlowRunFilterStateType(any_=[StateType.RUNNING])))
     runs: list[FlowRun] = []
     while page := client.read_flow_runs(flow_run_filter=wanted, limit=PAGE, offset=len(runs)):
@@ -53,6 +53,6 @@ def _running(client: SyncPrefectClient) -> list[FlowRun]:
 
 
 def _is_orphan(identity: str) -> bool:
-    """Return whether a process belongs to this machine and has ended."""
+    """Return true if a process belongs to this machine and has ended."""
     machine, _, process = identity.rpartition(":")[0].rpartition(":")
-    return machine == place() and process.isdigit() and process_identity(int(process)) != identity
+    return machine == host_id() and process.isdigit() and process_identity(int(process)) != identity

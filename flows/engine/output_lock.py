@@ -22,7 +22,7 @@ def output_lock(folder: Path, waiting: Callable[[], None]) -> Iterator[bool]:
         waiting: called once if another run of this user holds the lock.
 
     Yields:
-        Whether another run held the lock before.
+        True if another run held the lock before.
 
     Raises:
         Stopped: the user stopped the command meanwhile.

@@ -1,4 +1,4 @@
-"""Tasks at the end of a conversion: the package into the output folder, the version into the store."""
+"""Tasks that publish the package in the output folder and record the version in the store."""
 
 from pathlib import Path
 
@@ -8,8 +8,8 @@ from prefect.transactions import Transaction, get_transaction
 
 from flows import home
 from flows.engine import versions
-from flows.inputs.orders import Order
-from flows.packages.credentials import configured
+from flows.inputs.conversion_job import ConversionJob
+from flows.packages.credentials import configured_signer
 from flows.packages.flow_result import FlowResult
 from flows.packages.publish import Swap
 from flows.packages.report import deliver
@@ -18,24 +18,24 @@ from steps.contract import StepResult
 SWAP = "swap"  # key of the swap in the transaction
 
 
-@task(name="publish", task_run_name="publish: {order.item}", cache_policy=NO_CACHE, persist_result=False)
-def publish(package: StepResult, verdict: StepResult, order: Order, result: FlowResult, folder: Path) -> None:
-    """Write the reports, sign the files if a key is configured, and put the package into the output folder.
+@task(name="publish", task_run_name="publish: {job.item}", cache_policy=NO_CACHE, persist_result=False)
+def publish(package: StepResult, verdict: StepResult, job: ConversionJob, result: FlowResult, folder: Path) -> None:
+    """Write the reports, sign the files if a key is configured_signer, and put the package into the output folder.
 
     In a transaction the package that was there comes back if a later task of the transaction fails.
 
     Args:
         package: result of `pack_asset`.
         verdict: result of `check_asset`.
-        order: request of the conversion.
-        result: of the conversion.
+        job: request of the conversion.
+        result: result of the conversion.
         folder: output folder.
 
     Raises:
         BadInput: the folder cannot be written, the disk is full, or the key cannot sign; the folder is as it was.
-        BackendUnavailable: a key is configured, and signing is not installed.
+        BackendUnavailable: a key is configured_signer, and signing is not installed.
     """
-    swap = deliver(order, result, folder, configured())
+    swap = deliver(job, result, folder, configured_signer())
     transaction = get_transaction()
     if transaction is None:
         swap.keep()
@@ -59,12 +59,12 @@ def discard(transaction: Transaction) -> None:
         swap.keep()
 
 
-@task(name="keep_version", task_run_name="keep_version: {order.item}", cache_policy=NO_CACHE, persist_result=False)
-def keep_version(order: Order, result: FlowResult) -> None:
+@task(name="keep_version", task_run_name="keep_version: {job.item}", cache_policy=NO_CACHE, persist_result=False)
+def keep_version(job: ConversionJob, result: FlowResult) -> None:
     """Record the version in the store; `dg4d store gc` keeps its artifacts from now on.
 
     Raises:
-        ArtifactMissing: an artifact was removed meanwhile; the same order again makes it again.
+        ArtifactMissing: an artifact was removed meanwhile; the same job again makes it again.
         StoreUnreachable: the store does not answer.
     """
-    versions.keep_version(home.store(), order, result)
+    versions.keep_version(home.store(), job, result)

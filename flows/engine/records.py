@@ -1,4 +1,4 @@
-"""Records in which Prefect keeps results of steps, checked before Prefect decodes them.
+"""Result records of steps as Prefect stores them, checked before Prefect decodes them.
 
 A record names the serializer and the classes that decode it, and Prefect imports both. Records are exchanged through
 shared stores, so only those are read that Prefect's JSON serializer wrote and that hold the result of a step.
@@ -45,7 +45,7 @@ def read_record(path: Path) -> StepResult | None:
 
 
 def _names_a_class(value: Any) -> bool:
-    """Return whether a value has an object, at any depth, that Prefect's decoder would turn into an instance."""
+    """Return true if a value contains an object that Prefect's decoder would turn into an instance."""
     if isinstance(value, dict):
         return not DECODED.isdisjoint(value) or any(map(_names_a_class, value.values()))
     return isinstance(value, list) and any(map(_names_a_class, value))

@@ -1,4 +1,4 @@
-"""Remarks on a result that a user should read before the rest of the run, with a picture to look at."""
+"""Remarks on a cut-out that the user should read before the conversion goes on, with a picture."""
 
 import os
 import re
@@ -7,29 +7,29 @@ from contextlib import suppress
 from pathlib import Path
 
 from flows import home
-from flows.engine.events import StepEvent, tell
+from flows.engine.events import StepEvent, emit
 from steps.contract import ArtifactRef, StepResult
 from steps.store.artifact_store import ArtifactMissing, StoreUnreachable
 from steps.store.files import DiskFull
 
-REMARKED = "prepare_subject"  # cuts subjects out, which may be a guess
+REMARKED = "prepare_subject"  # the matte may be a guess
 NAME_LENGTH = 80  # characters of an item in the name of a picture
 DIGITS = 12  # of a digest in it
-MOST_PICTURES = 200  # files that are kept, the newest; each shows what a user handed in
+MOST_PICTURES = 200  # kept files, the newest; they show private input
 
 
 def remark(item: str, label: str, result: StepResult) -> None:
-    """Emit the notes of a cut-out, and a file in which source, matte and cut-out stand side by side."""
+    """Emit the notes of a cut-out with the path of a picture of source, matte and cut-out."""
     notes = result.provenance.notes
     if result.provenance.step != REMARKED or not notes:
         return
     picture = _saved(item, result.outputs["picture"]) if "picture" in result.outputs else None
     look = [f"Source, matte and cut-out: {picture}"] if picture else []
-    tell(StepEvent(item, label, "remark", text=" ".join([*notes, *look])))
+    emit(StepEvent(item, label, "remark", text=" ".join([*notes, *look])))
 
 
 def _saved(item: str, ref: ArtifactRef) -> Path | None:
-    """Write a picture where its owner can open it by its name; None if that fails."""
+    """Write a picture under a readable name; None if that fails."""
     name = re.sub(r"[^\w.-]+", "-", item)[:NAME_LENGTH]
     path = home.cutouts() / f"{name}-{ref.digest.rpartition(':')[2][:DIGITS]}.png"
     try:
@@ -45,7 +45,7 @@ def _saved(item: str, ref: ArtifactRef) -> Path | None:
 
 
 def _fetch(ref: ArtifactRef, path: Path) -> None:
-    """Copy an artifact into a file that only its owner can read; a reader sees all of it or nothing."""
+    """Copy an artifact atomically into a file with mode 0600."""
     descriptor, name = tempfile.mkstemp(dir=path.parent)  # mode 0600
     os.close(descriptor)
     scratch = Path(name)
@@ -57,7 +57,7 @@ def _fetch(ref: ArtifactRef, path: Path) -> None:
 
 
 def _prune(folder: Path) -> None:
-    """Remove all but the newest pictures; other processes may do the same at the same time."""
+    """Remove all but the newest pictures; another process may be removing the same ones."""
     ages: list[tuple[int, Path]] = []
     for path in folder.iterdir():
         with suppress(OSError):

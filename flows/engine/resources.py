@@ -1,7 +1,7 @@
-"""Slots of this machine: its GPUs, each for one step at a time, and turns on its processor; first come, first served.
+"""GPU and CPU slots of this machine, shared by all commands of a user, first come, first served.
 
-A slot is the lock of a file under `$DG4D_HOME/slots`, so that all commands of a user share them. The kernel frees it
-when the last process that holds it has ended: this one, and that of the step where it has one of its own.
+A slot is a locked file under `$DG4D_HOME/slots`. The kernel frees it when the last process that holds the file has
+ended: this process and the child process of the step.
 """
 
 import fcntl
@@ -24,18 +24,18 @@ from steps.store.files import home
 
 Resource = Literal["cpu", "gpu"]
 
-POLL_S = 0.05  # between two looks at the queue and at slots that are taken
-CORES_PER_STEP = 4  # a step uses every core most of the time; on many it leaves gaps
+POLL_S = 0.05  # between two attempts to take a slot
+CORES_PER_STEP = 4  # a step does not keep more cores busy all the time
 SHOWN_GPUS = "CUDA_VISIBLE_DEVICES"
-stopping = threading.Event()  # set when the user stops the command: nothing more is begun
+stopping = threading.Event()  # set when the user stops the command: no other step is started
 
 
 class Slot(NamedTuple):
-    """What a step holds.
+    """Slot held by a step.
 
     Attributes:
-        device: the GPU, as `$CUDA_VISIBLE_DEVICES` calls it; empty for a turn on the processor.
-        handle: of the locked file; a process that inherits it holds the slot too.
+        device: GPU as named in `$CUDA_VISIBLE_DEVICES`; empty for a CPU slot.
+        handle: descriptor of the locked file; a process that inherits it holds the slot too.
     """
 
     device: str
@@ -46,8 +46,8 @@ class Turn(NamedTuple):
     """Place of a step in the queue.
 
     Attributes:
-        begun_ns: when its item was begun, in nanoseconds since the epoch; items that were begun earlier go first.
-        holder: what those who wait behind it are told.
+        begun_ns: start of the conversion, nanoseconds since the epoch; earlier conversions go first.
+        holder: name shown to steps that wait behind it.
     """
 
     begun_ns: int
@@ -55,11 +55,11 @@ class Turn(NamedTuple):
 
 
 class Stopped(Exception):
-    """The user stopped the command while a step waited for its slot."""
+    """Raised to a step that waits for its slot when the user stops the command."""
 
 
 def resource_of(request: StepRequest) -> Resource:
-    """What a step waits for: a GPU, where it is one of those that fill one, its settings ask for it and one is here."""
+    """Return "gpu" for a step of the catalog that fills one, if its settings ask for CUDA and a GPU is available."""
     if catalog()[request.step].resource == "cpu" or not gpus():
         return "cpu"
     return "gpu" if request.weights or request.settings.get("rasterizer") == CUDA else "cpu"
@@ -70,22 +70,22 @@ def slot(resource: Resource, waiting: Callable[[str], None], turn: Turn | None =
     """Hold a slot while the block runs.
 
     Args:
-        resource: of which kind.
-        waiting: told what is waited for, and behind whom, if it is not free.
-        turn: place in the queue; default: behind everything that was begun before.
+        resource: kind of slot.
+        waiting: called once with a message if no slot is free.
+        turn: place in the queue; default: behind all that wait.
 
     Yields:
-        Seconds of waiting.
+        Seconds spent waiting.
 
     Raises:
         Stopped: the user stopped the command.
-        BadInput: `$DG4D_GPUS` or `$DG4D_CPUS` is no number of slots.
+        BadInput: `$DG4D_GPUS` or `$DG4D_CPUS` is invalid.
     """
     folder = home() / "slots"
     folder.mkdir(parents=True, exist_ok=True)
     devices = gpus() if resource == "gpu" else tuple(map(str, range(cpus())))
     turn = turn or Turn(time.time_ns(), "another step")
-    begun, told = time.monotonic(), False
+    start, reported = time.monotonic(), False
     with ticket(folder / f"queue-{resource}", *turn) as own:
         while True:
             if stopping.is_set():
@@ -94,8 +94,8 @@ def slot(resource: Resource, waiting: Callable[[str], None], turn: Turn | None =
             handle, device = (None, "") if ahead else _free(folder, resource, devices)
             if handle is not None:
                 break
-            if not told:
-                told = True
+            if not reported:
+                reported = True
                 behind = ahead or _holder(folder, resource, devices)
                 waiting(f"waiting for {_WORDS[resource]}" + (f", behind {behind}" if behind else ""))
             stopping.wait(POLL_S)
@@ -103,29 +103,29 @@ def slot(resource: Resource, waiting: Callable[[str], None], turn: Turn | None =
     os.write(handle, turn.holder.encode(errors="replace"))
     token = _held.set(Slot(device if resource == "gpu" else "", handle))
     try:
-        yield time.monotonic() - begun
+        yield time.monotonic() - start
     finally:
         _held.reset(token)
         os.close(handle)
 
 
 def environment() -> dict[str, str]:
-    """What the process of a step must have in its environment, so that it uses what this thread holds."""
+    """Return the environment variables that make a child process use the GPU held by this thread."""
     held = _held.get()
     return {SHOWN_GPUS: held.device} if held is not None and held.device else {}
 
 
 def handles() -> tuple[int, ...]:
-    """What the process of a step must inherit, so that a slot is not free before it has ended."""
+    """Return the descriptors that a child process must inherit, so that the slot stays taken until it has ended."""
     held = _held.get()
     return () if held is None else (held.handle,)
 
 
 def gpus() -> tuple[str, ...]:
-    """The GPUs that may be used, as `$CUDA_VISIBLE_DEVICES` calls them: the first `$DG4D_GPUS` of those that are here.
+    """Return the first `$DG4D_GPUS` visible GPUs, as named in `$CUDA_VISIBLE_DEVICES`.
 
     Raises:
-        BadInput: `$DG4D_GPUS` is no whole number.
+        BadInput: `$DG4D_GPUS` is not a whole number.
     """
     shown = os.environ.get(SHOWN_GPUS)
     here = _devices() if shown is None else tuple(name.strip() for name in shown.split(",") if name.strip())
@@ -133,19 +133,19 @@ def gpus() -> tuple[str, ...]:
 
 
 def cpus() -> int:
-    """How many steps may compute on the processor at a time: `$DG4D_CPUS`, else one per four cores, at least one.
+    """Return the number of CPU slots: `$DG4D_CPUS`, else one per four cores, at least one.
 
     Raises:
-        BadInput: `$DG4D_CPUS` is no number of steps.
+        BadInput: `$DG4D_CPUS` is not a whole number from 1 on.
     """
     return _number("DG4D_CPUS", max(1, len(os.sched_getaffinity(0)) // CORES_PER_STEP), least=1)
 
 
 def slots() -> int:
-    """Return how many steps may run on this machine at a time, on GPUs and processors together.
+    """Return the number of GPU and CPU slots together.
 
     Raises:
-        BadInput: `$DG4D_GPUS` or `$DG4D_CPUS` is no number of slots.
+        BadInput: `$DG4D_GPUS` or `$DG4D_CPUS` is invalid.
     """
     return len(gpus()) + cpus()
 
@@ -160,7 +160,7 @@ def _devices() -> tuple[str, ...]:
 
 
 def _free(folder: Path, resource: Resource, devices: tuple[str, ...]) -> tuple[int | None, str]:
-    """The lock of a slot that is free, and which it is."""
+    """Lock a free slot; return its descriptor and device, or None if all are taken."""
     for device in devices:
         handle = os.open(_lock_file(folder, resource, device), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
@@ -178,7 +178,7 @@ def _lock_file(folder: Path, resource: Resource, device: str) -> Path:
 
 
 def _holder(folder: Path, resource: Resource, devices: tuple[str, ...]) -> str:
-    """Return who wrote itself into the first slot; empty if nobody did."""
+    """Return the name that the holder of the first slot wrote into its file; empty if there is none."""
     with suppress(OSError, IndexError):
         return _lock_file(folder, resource, devices[0]).read_text(encoding="utf-8", errors="replace")
     return ""
@@ -189,5 +189,5 @@ def _number(variable: str, otherwise: int, least: int) -> int:
     if not text:
         return otherwise
     if not text.isdecimal() or int(text) < least:
-        raise BadInput(f"${variable} is {text!r}; give a whole number from {least} on")
+        raise BadInput(f"${variable} is {text!r}; set it to a whole number from {least} on, or unset it")
     return int(text)

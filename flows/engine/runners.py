@@ -15,8 +15,8 @@ def item_runner(where: Where, workers: int) -> TaskRunner[Any]:
     each. An item of a deployment has a thread here that waits for its run.
 
     Args:
-        where: where the items run.
-        workers: items at a time, of threads.
+        where: parsed `--where` option.
+        workers: number of threads.
 
     Raises:
         BackendUnavailable: prefect-dask is not installed.

@@ -1,7 +1,7 @@
-"""Results of steps in the store, so that machines that share it do no step twice.
+"""Exchange of step results between machines through a shared store.
 
-A machine keeps the results of its steps in its own home. When one dies in the middle of an item, the machine that takes
-the item over finds here what was finished.
+A machine caches results in its own home folder. If it dies in the middle of an item, the machine that takes the item
+over reuses the finished steps from here.
 
 results/KEY    a record as Prefect keeps it, by the name of `record_key`
 """
@@ -20,13 +20,13 @@ from steps.store.files import write_atomically
 
 @contextmanager
 def sharing_results(store: ArtifactStore) -> Iterator[None]:
-    """Exchange the results of steps with other machines while the block runs."""
+    """Share the results of steps with other machines while the block runs."""
     keys: set[str] = set()
     _sharing.append((store, keys))
 
     def put(event: StepEvent) -> None:
         if event.kind == "finished":
-            with suppress(StoreUnreachable):  # another machine would do the step again, nothing worse
+            with suppress(StoreUnreachable):  # at worst another machine runs the step again
                 _put(store, keys)
 
     try:
@@ -37,7 +37,7 @@ def sharing_results(store: ArtifactStore) -> Iterator[None]:
 
 
 def fetch_result(key: str, record: Path) -> None:
-    """Write the record of a result that another machine shares, unless there is one; note the key for sharing it.
+    """Fetch the record of a result that another machine shares, unless it exists here; else share it once it exists.
 
     A record that `parse_record` refuses is replaced after its step has run again.
     """
@@ -57,6 +57,6 @@ _sharing: list[tuple[ArtifactStore, set[str]]] = []
 
 def _put(store: ArtifactStore, keys: set[str]) -> None:
     for key in sorted(keys):
-        with suppress(FileNotFoundError):  # a step beside this one, which is still at work
+        with suppress(FileNotFoundError):  # of a parallel step that has not finished
             store.write(f"{RESULTS}/{key}", (home.records() / key).read_text(encoding="utf-8"))
             keys.discard(key)

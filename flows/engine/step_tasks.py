@@ -10,7 +10,7 @@ from uuid import UUID
 
 import httpx
 from prefect import runtime
-from prefect.artifacts import create_markdown_artifact, create_progress_artifact, update_progress_artifact
+from prefect.artifacts import create_progress_artifact, update_progress_artifact
 from prefect.client.schemas.objects import State, TaskRun
 from prefect.context import FlowRunContext
 from prefect.exceptions import TerminationSignal
@@ -25,17 +25,17 @@ from dg4d_lib.settings import Settings
 from flows import home
 from flows.engine import resources
 from flows.engine.caching import FileLocks, RequestPolicy
-from flows.engine.events import StepEvent, tell
-from flows.engine.executors import chosen, stop_all
+from flows.engine.events import StepEvent, emit
+from flows.engine.executors import configured_executor, stop_all
 from flows.engine.leases import hold
 from flows.engine.orphans import claim_run
 from flows.engine.remarks import remark
-from flows.formatting.curves import amount
 from flows.formatting.escaping import markdown
+from flows.formatting.numbers import format_number
 from flows.packages.flow_result import StepRun
 from flows.step_errors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable
 from flows.ui import pages
-from flows.ui.showing import revive, show
+from flows.ui.showing import create_page, revive
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen, StepRequest, StepResult
 from steps.profiles import PipelineSettings, step_settings
 from steps.runtime.installed_code import catalog, request_version
@@ -55,8 +55,8 @@ class Conversion(Frozen):
 
     Attributes:
         item: name of the asset.
-        settings: of the whole pipeline; a step reads its sections.
-        seed: of every step.
+        settings: settings of the whole pipeline; a step reads its sections.
+        seed: seed of every step.
         begun_ns: start of the conversion, nanoseconds since the epoch; earlier conversions go first on a machine.
         mesh_parts: number of tasks that extract a mesh per frame; 0: one per slot of this machine.
     """
@@ -130,36 +130,37 @@ def run_step(step: str, result_type: type[Result], **arguments: Any) -> Result:
 
     Args:
         step: name in the catalog, and of the task.
-        result_type: of the result.
-        arguments: of the task, by name; see `request_for`.
+        result_type: class of the result.
+        arguments: arguments of the task by name; see `request_for`.
 
     Raises:
         StepError: the step did not finish.
     """
     request, conversion = request_for(step, arguments), arguments["conversion"]
     item, label = conversion.item, label_of(step, arguments)
-    progress = _Progress(item, label)
-    tell(StepEvent(item, label, "started"))
+    key = pages.key(label, item)
+    progress = _Progress(f"progress-{key}", f"{label} of {markdown(item)}")
+    emit(StepEvent(item, label, "started"))
 
     def on_progress(done: int, total: int, values: dict[str, float]) -> None:
-        tell(StepEvent(item, label, "progress", done=done, total=total, values=values))
+        emit(StepEvent(item, label, "progress", done=done, total=total, values=values))
         progress.update(done, total, values)
 
     def say(text: str) -> None:
-        tell(StepEvent(item, label, "note", text=text))
+        emit(StepEvent(item, label, "note", text=text))
 
     try:
         turn = resources.Turn(conversion.begun_ns, f"{label} of {item}")
         with resources.slot(resources.resource_of(request), say, turn) as waited_s:
             _waited[runtime.task_run.id] = waited_s
-            result = chosen()(catalog()[step], request, on_progress, say)
+            result = configured_executor()(catalog()[step], request, on_progress, say)
     except StepError as error:
-        _show_page(item, label, pages.failure_page(label, item, error, home.store()), f"{label} of {item} failed")
+        create_page(key, pages.failure_page(label, item, error, home.store()), markdown(f"{label} of {item} failed"))
         raise
     progress.update(1, 1, {})
     for note in (*result.provenance.notes, *result.provenance.run_notes):
         get_run_logger().info(note)
-    _show_page(item, label, pages.step_page(label, item, result, home.store()), f"{label} of {item}")
+    create_page(key, pages.step_page(label, item, result, home.store()), markdown(f"{label} of {item}"))
     return result_type.model_validate(result.model_dump())
 
 
@@ -176,7 +177,7 @@ def task_run_name() -> str:
 
 
 def should_retry(_task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
-    """Return whether a failed task run may succeed now: memory may be free, the store back; a crash gets one retry.
+    """Return true if a failed task run may succeed now: memory or the store may be available, a crash gets one retry.
 
     A run that the user stopped is not retried.
     """
@@ -189,12 +190,12 @@ def should_retry(_task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool
 
 
 def note_end(task: Task[..., Any], run: TaskRun, state: State[Any]) -> None:
-    """Record the end of a task run, computed, cached or failed, and tell the listeners of this process."""
+    """Record the end of a task run, computed, cached or failed, and emit its event."""
     label, _, item = run.name.partition(": ")
     seconds = (datetime.now(UTC) - run.start_time).total_seconds() if run.start_time else 0.0
     waited_s = _waited.pop(str(run.id), 0.0)
     if not state.is_completed():
-        tell(StepEvent(item, label, "failed", seconds=seconds))
+        emit(StepEvent(item, label, "failed", seconds=seconds))
         return
     result = state.result(raise_on_failure=False)
     assert isinstance(result, StepResult) and run.flow_run_id  # tasks of steps return one, and run in flows
@@ -205,7 +206,7 @@ def note_end(task: Task[..., Any], run: TaskRun, state: State[Any]) -> None:
         StepRun(label=label, cached=cached, wall_s=round(seconds, 3), waited_s=round(waited_s, 3), result=result)
     )
     remark(item, label, result)
-    tell(StepEvent(item, label, "finished", seconds=seconds, waited_s=waited_s, cached=cached))
+    emit(StepEvent(item, label, "finished", seconds=seconds, waited_s=waited_s, cached=cached))
 
 
 def finished_steps() -> list[StepRun]:
@@ -221,13 +222,13 @@ def finished_steps() -> list[StepRun]:
 
 @contextmanager
 def steps_of_flow() -> Iterator[None]:
-    """Label the current flow run with its process, and end its steps with it: at once if the user stops it."""
+    """Label the current flow run with its process; kill its steps if the user stops it."""
     flow_run = UUID(runtime.flow_run.id)
     claim_run()
     try:
         yield
     except (KeyboardInterrupt, TerminationSignal):
-        stop_all()  # steps in other threads would be waited for
+        stop_all()  # Prefect waits for tasks in other threads
         raise
     finally:
         _finished.pop(flow_run, None)
@@ -240,7 +241,7 @@ def flow_context(settings: Mapping[Any, Any] | None = None) -> Iterator[None]:
     A flow takes the storage of its results from the flow that calls it, so the current flow run gets that storage too.
 
     Args:
-        settings: of Prefect, beside these.
+        settings: further settings of Prefect.
     """
     records = home.records()
     records.mkdir(parents=True, exist_ok=True)
@@ -272,15 +273,11 @@ CACHED: dict[str, Any] = {
 }  # options of every task that runs a step
 
 
-def _show_page(item: str, label: str, page: str, description: str) -> None:
-    show(create_markdown_artifact, key=pages.key(label, item), markdown=page, description=markdown(description))
-
-
 class _Progress:
     """Progress artifact of a step, updated every few seconds."""
 
-    def __init__(self, item: str, label: str) -> None:
-        self._key, self._what = f"progress-{pages.key(label, item)}", f"{label} of {markdown(item)}"
+    def __init__(self, key: str, title: str) -> None:
+        self._key, self._title = key, title
         self._artifact: Any = None
         self._last = 0.0
 
@@ -289,12 +286,11 @@ class _Progress:
         if now - self._last < PROGRESS_EVERY_S and done < total:
             return
         self._last = now
-        text = ", ".join(
-            [f"{self._what}: {done}/{total}", *(f"{name} {amount(value)}" for name, value in values.items())]
-        )
+        figures = "".join(f", {name} {format_number(value)}" for name, value in values.items())
+        text, percent = f"{self._title}: {done}/{total}{figures}", 100 * done / max(total, 1)
         revive()
         with suppress(httpx.TransportError):  # the step goes on while the server is away
             if self._artifact is None:
-                self._artifact = create_progress_artifact(100 * done / max(total, 1), key=self._key, description=text)
+                self._artifact = create_progress_artifact(percent, key=self._key, description=text)
             else:
-                update_progress_artifact(self._artifact, 100 * done / max(total, 1), description=text)
+                update_progress_artifact(self._artifact, percent, description=text)

@@ -18,12 +18,12 @@ _numbers = itertools.count()
 
 @contextmanager
 def ticket(folder: Path, begun_ns: int, holder: str) -> Iterator[Path]:
-    """Stand in a queue as long as the block runs.
+    """Hold a place in a queue while the block runs.
 
     Args:
-        folder: of the queue; it is made.
-        begun_ns: when the work began that the holder is a part of, in nanoseconds since the epoch: earlier goes first.
-        holder: what others are told who wait behind.
+        folder: folder of the queue; created if missing.
+        begun_ns: start of the conversion, nanoseconds since the epoch; earlier goes first.
+        holder: name shown to those who wait behind.
 
     Yields:
         The ticket.
@@ -34,7 +34,7 @@ def ticket(folder: Path, begun_ns: int, holder: str) -> Iterator[Path]:
     own = folder / f"{begun_ns:020d}-{time.time_ns():020d}-{os.getpid()}-{next(_numbers)}.ticket"
     with locked(Path(name)):
         Path(name).write_text(holder, encoding="utf-8", errors="replace")
-        Path(name).rename(own)  # seen by others when it is locked
+        Path(name).rename(own)  # visible to others only when it is locked
         try:
             yield own
         finally:
@@ -51,7 +51,7 @@ def first_ahead(own: Path) -> str | None:
             return None
         with locked(other, shared=True) as ended:
             if not ended:
-                with suppress(OSError):  # it has just been served
+                with suppress(OSError):  # its holder has just left the queue
                     return other.read_text(encoding="utf-8") or other.stem
         if ended:
             other.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""What was made of an item, version by version: a record of every finished order, beside its artifacts in the store."""
+"""Versions of items: records of finished jobs, beside their artifacts in the store."""
 
 import hashlib
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from dg4d_lib.errors import BadInput
 from flows.engine.leases import wait_for_collecting
-from flows.inputs.orders import Order
+from flows.inputs.conversion_job import ConversionJob
 from flows.packages.flow_result import FlowResult
 from steps.contract import ArtifactRef, Digest, Frozen
 from steps.store.artifact_store import ArtifactMissing, ArtifactStore
@@ -16,15 +16,8 @@ from steps.store.artifact_store import ArtifactMissing, ArtifactStore
 FOLDER = "versions"
 
 
-class StepDone(Frozen):
-    """One step of a version.
-
-    Attributes:
-        label: the step, and the part of its work where it was divided.
-        record: digest of its provenance record.
-        inputs: by port.
-        outputs: by port.
-    """
+class VersionStep(Frozen):
+    """Digests of one step of a version: its provenance record, and its inputs and outputs by port."""
 
     label: str
     record: Digest
@@ -33,16 +26,16 @@ class StepDone(Frozen):
 
 
 class Version(Frozen):
-    """One finished order.
+    """Finished job.
 
     Attributes:
         item: name of the asset.
-        order: digest of what was asked for; the same order again is the same version.
-        package: what came out.
-        finished: when it was last made or found to be made, ISO 8601 in UTC.
-        source: the picture, video or words.
-        bank: true views, if there were any.
-        steps: in the order in which they were asked for.
+        order: digest of the job; the same job again is the same version.
+        package: result of the conversion.
+        finished: time of the last run that made or found it, ISO 8601 in UTC.
+        source: picture, video or text.
+        bank: ground-truth views, if given.
+        steps: in pipeline order.
     """
 
     item: str
@@ -53,15 +46,15 @@ class Version(Frozen):
     seed: int
     source: ArtifactRef
     bank: ArtifactRef | None = None
-    steps: tuple[StepDone, ...]
+    steps: tuple[VersionStep, ...]
 
     @property
     def name(self) -> str:
-        """Its place in the store: a folder per item, a file per order."""
+        """Name of its file in the store: a folder per item, a file per job."""
         return _name(self.item, self.order)
 
     def artifacts(self) -> dict[str, str]:
-        """What the version needs, by digest: what it is to the version."""
+        """Return the digests of all artifacts of the version with their role."""
         found = {self.package.digest: "package", self.source.digest: "source"}
         if self.bank is not None:
             found.setdefault(self.bank.digest, "bank")
@@ -74,25 +67,25 @@ class Version(Frozen):
         return found
 
 
-def keep_version(store: ArtifactStore, order: Order, result: FlowResult) -> Version:
-    """Record that an order is finished; from now on nothing removes what it needs.
+def keep_version(store: ArtifactStore, job: ConversionJob, result: FlowResult) -> Version:
+    """Write the version of a finished job, which protects its artifacts from garbage collection.
 
     Raises:
-        ArtifactMissing: something it needs was removed at this very moment; the same order again makes it again.
+        ArtifactMissing: a collection removed an artifact meanwhile; run the job again.
         StoreUnreachable: the store does not answer.
         DiskFull: there is no room.
     """
     version = Version(
-        item=order.item,
-        order=order.digest(),
+        item=job.item,
+        order=job.digest(),
         package=result.package,
         finished=datetime.now(UTC).isoformat(timespec="seconds"),
-        profile=order.profile,
-        seed=order.seed,
-        source=order.source,
-        bank=order.bank,
+        profile=job.profile,
+        seed=job.seed,
+        source=job.source,
+        bank=job.bank,
         steps=tuple(
-            StepDone(
+            VersionStep(
                 label=done.label,
                 record=done.result.provenance.digest(),
                 inputs=done.result.provenance.inputs,
@@ -102,29 +95,31 @@ def keep_version(store: ArtifactStore, order: Order, result: FlowResult) -> Vers
         ),
     )
     store.write(version.name, version.model_dump_json(indent=1) + "\n")
-    if wait_for_collecting(store):  # it may have read the records before this one was there
+    if wait_for_collecting(store):  # it may have listed the versions before this one was written
         here = {entry.name for entry in store.artifacts()}
         if gone := [what for digest, what in version.artifacts().items() if digest not in here]:
             store.remove([version.name])
-            raise ArtifactMissing(f"{', '.join(gone)} of {order.item} was removed from {store.address} meanwhile")
-        store.write(version.name, version.model_dump_json(indent=1) + "\n")  # an older one of this name may have gone
+            raise ArtifactMissing(f"{', '.join(gone)} of {job.item} was removed from {store.address} meanwhile")
+        store.write(
+            version.name, version.model_dump_json(indent=1) + "\n"
+        )  # the collection may have removed an older file of this name
     return version
 
 
-def has_version(store: ArtifactStore, order: Order) -> bool:
-    """Whether this order was finished before.
+def has_version(store: ArtifactStore, job: ConversionJob) -> bool:
+    """Return true if the job was finished before.
 
     Raises:
         StoreUnreachable: the store does not answer.
     """
-    return store.read(_name(order.item, order.digest())) is not None
+    return store.read(_name(job.item, job.digest())) is not None
 
 
 def versions(store: ArtifactStore) -> list[Version]:
-    """Every version: items by name, the newest of each first.
+    """Return all versions: items by name, the newest of each first.
 
     Raises:
-        BadInput: a record cannot be read, so that nobody knows what it needs.
+        BadInput: a version cannot be read, so the artifacts it needs are unknown.
         StoreUnreachable: the store does not answer.
     """
     found = []
@@ -134,15 +129,15 @@ def versions(store: ArtifactStore) -> list[Version]:
             found += [] if content is None else [Version.model_validate_json(content)]
         except ValidationError as error:
             raise BadInput(
-                f"the record {entry.name} in {store.address} is damaged, or of another version of dg4d: use that one, "
-                "or remove the record if nobody needs what it was about"
+                f"the record {entry.name} in {store.address} is damaged, or of another version of dg4d: use that "
+                "version, or remove the record if its asset is not needed"
             ) from error
     newest_first = sorted(found, key=lambda version: (version.finished, version.order), reverse=True)
     return sorted(newest_first, key=lambda version: version.item)
 
 
 def users(of: list[Version]) -> dict[str, list[tuple[Version, str]]]:
-    """Which of these versions need an artifact, by digest, and what it is to each."""
+    """Return the versions that need an artifact, with its role in each, by digest."""
     found: dict[str, list[tuple[Version, str]]] = {}
     for version in of:
         for digest, what in version.artifacts().items():
@@ -151,12 +146,12 @@ def users(of: list[Version]) -> dict[str, list[tuple[Version, str]]]:
 
 
 def faults(store: ArtifactStore, of: list[Version], sizes: Mapping[str, int]) -> dict[str, str]:
-    """Read every artifact again: what is damaged, and what versions need and is not there, by digest.
+    """Read every artifact again and return the damaged and missing ones by digest.
 
     Args:
-        store: where they are.
-        of: the versions that must be whole.
-        sizes: of the artifacts that are there, by digest.
+        store: store to check.
+        of: versions whose artifacts must exist.
+        sizes: existing artifacts, by digest.
 
     Raises:
         StoreUnreachable: the store does not answer.
@@ -166,11 +161,11 @@ def faults(store: ArtifactStore, of: list[Version], sizes: Mapping[str, int]) ->
     return wrong
 
 
-def _name(item: str, order: Digest) -> str:
-    return f"{FOLDER}/{_key(item)}/{order.removeprefix('sha256:')}.json"
+def _name(item: str, job: Digest) -> str:
+    return f"{FOLDER}/{_key(item)}/{job.removeprefix('sha256:')}.json"
 
 
 def _key(item: str) -> str:
-    """A folder's name that differs for different items, whatever is in their names."""
+    """Return a folder name for an item, unique for any characters in its name."""
     slug = "".join(letter if letter.isascii() and letter.isalnum() else "-" for letter in item)[:40]
     return f"{slug}-{hashlib.sha256(item.encode()).hexdigest()[:12]}"

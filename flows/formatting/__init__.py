@@ -1,1 +1,1 @@
-"""Text for people: escaped, shortened, drawn."""
+"""Text for people: escaping, numbers, drawings."""

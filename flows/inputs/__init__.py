@@ -1,1 +1,1 @@
-"""What is asked for: files, manifests and settings become orders."""
+"""User inputs: files, manifests and settings as conversion requests."""

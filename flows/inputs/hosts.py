@@ -16,18 +16,18 @@ Address = IPv4Address | IPv6Address
 
 
 def resolve(host: str, port: int) -> list[str]:
-    """Return the addresses of a host, every one of which may be connected to.
+    """Return the addresses of a host, all of which are allowed.
 
     Args:
-        host: a name or an address, in any notation that the resolver knows.
+        host: name or address, in any notation that the resolver accepts.
         port: of the server.
 
     Raises:
-        BadInput: an address is of this machine or of a private network, and `$DG4D_FETCH_ALLOW` does not have it.
+        BadInput: an address belongs to this machine or a private network and is not in `$DG4D_FETCH_ALLOW`.
         OSError: the name cannot be resolved.
     """
     found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, proto=socket.IPPROTO_TCP)
-    addresses = list(dict.fromkeys(str(place[0]) for *_, place in found))
+    addresses = list(dict.fromkeys(str(sockaddr[0]) for *_, sockaddr in found))
     if not addresses:
         raise OSError("the host has no address")
     names, networks = _allowed()
@@ -35,24 +35,24 @@ def resolve(host: str, port: int) -> list[str]:
         return addresses
     for text in addresses:
         address = ipaddress.ip_address(text)
-        if not is_public(address) and not any(_plain(address) in network for network in networks):
+        if not is_public(address) and not any(_embedded_ipv4(address) in network for network in networks):
             raise BadInput(
-                f"{host} is on this machine, in a private network or reserved, and nothing is fetched from there; give "
-                f"the path of a file, or set {ALLOW} of the worker to the host or its network"
+                f"{host} is on this machine, in a private network or reserved, which is not allowed; give the path of "
+                f"a file, or set {ALLOW} of the worker to the host or its network"
             )
     return addresses
 
 
 def is_public(address: Address) -> bool:
-    """Return whether anybody on the internet can have this address; an IPv4 address inside one of IPv6 counts."""
-    plain = _plain(address)
+    """Return True for globally reachable addresses; an IPv4 address embedded in IPv6 counts as itself."""
+    plain = _embedded_ipv4(address)
     if isinstance(plain, IPv6Address) and (plain not in UNICAST or plain in SIX_TO_FOUR):
         return False
     return plain.is_global and not plain.is_multicast
 
 
-def _plain(address: Address) -> Address:
-    """Return the IPv4 address that an IPv6 address stands for, else the same."""
+def _embedded_ipv4(address: Address) -> Address:
+    """Return the IPv4 address embedded in an IPv6 address, else the same address."""
     if isinstance(address, IPv6Address):
         if address.ipv4_mapped:
             return address.ipv4_mapped
@@ -62,12 +62,11 @@ def _plain(address: Address) -> Address:
 
 
 def _allowed() -> tuple[set[str], list[ipaddress.IPv4Network | ipaddress.IPv6Network]]:
-    """Return the host names and the networks of `$DG4D_FETCH_ALLOW`."""
+    """Parse `$DG4D_FETCH_ALLOW` into host names and networks."""
     names, networks = set(), []
-    for entry in os.environ.get(ALLOW, "").split(","):
-        text = entry.strip()
+    for text in filter(None, map(str.strip, os.environ.get(ALLOW, "").split(","))):
         try:
-            networks += [ipaddress.ip_network(text, strict=False)] if text else []
+            networks.append(ipaddress.ip_network(text, strict=False))
         except ValueError as error:
             if "/" in text or ":" in text:
                 raise BadInput(

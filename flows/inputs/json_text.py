@@ -1,4 +1,4 @@
-"""JSON that somebody else wrote: bounded in depth, without NaN, lone surrogates and repeated keys."""
+"""Untrusted JSON: bounded in depth, without NaN, lone surrogates and repeated keys."""
 
 import json
 import math
@@ -6,23 +6,25 @@ from typing import Any
 
 from flows.formatting.escaping import quoted
 
-DEEPEST = 100  # brackets within brackets; a provenance record has about ten
-MOST_DIGITS = 100  # of a whole number; Python itself refuses more than 4300
+DEEPEST = 100  # nested brackets; a provenance record has about ten
+MOST_DIGITS = 100  # of an integer; Python itself refuses more than 4300
 
 
 class UnfitJSON(ValueError):
-    """JSON that is well-formed and still cannot be used; says why."""
+    """Well-formed JSON that cannot be used."""
 
 
 def loads(text: str) -> Any:
     """Parse JSON.
 
     Raises:
-        UnfitJSON: it is nested too deeply, repeats a key, or holds a number or a text that no file could hold.
-        ValueError: it is no JSON.
+        UnfitJSON: it is nested too deeply, repeats a key, or holds a number or a text that cannot be stored.
+        ValueError: it is not JSON.
     """
     try:
-        value = json.loads(text, object_pairs_hook=_object, parse_int=_integer)
+        value = json.loads(
+            text, object_pairs_hook=_object, parse_int=_integer, parse_float=_finite, parse_constant=_finite
+        )
     except RecursionError:
         raise UnfitJSON(f"brackets are nested more than {DEEPEST} deep") from None
     _check(value)
@@ -33,33 +35,30 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
         names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise UnfitJSON(f"the key {quoted(twice)} is there twice")
+        repeated = next(name for name in names if names.count(name) > 1)
+        raise UnfitJSON(f"the key {quoted(repeated)} is there twice")
     return found
 
 
 def _integer(digits: str) -> int:
     if len(digits) > MOST_DIGITS:
-        raise UnfitJSON(f"a number has {len(digits)} digits; at most {MOST_DIGITS} are read")
+        raise UnfitJSON(f"a number has {len(digits)} digits; at most {MOST_DIGITS} are allowed")
     return int(digits)
 
 
-def _check(value: Any) -> None:
-    """Look at everything in a value, without recursion."""
-    waiting = [(value, 1)]
-    while waiting:
-        one, depth = waiting.pop()
-        if depth > DEEPEST:
-            raise UnfitJSON(f"brackets are nested more than {DEEPEST} deep")
-        match one:
-            case dict():
-                waiting += [(key, depth) for key in one]
-                waiting += [(inner, depth + 1) for inner in one.values()]
-            case list():
-                waiting += [(inner, depth + 1) for inner in one]
-            case str() if not one.isascii() and any("\ud800" <= letter <= "\udfff" for letter in one):
-                raise UnfitJSON("a text holds half a character (a lone surrogate)")
-            case float() if not math.isfinite(one):
-                raise UnfitJSON("a number is NaN, infinite, or too large; leave it out, or write null")
-            case _:
-                pass
+def _finite(text: str) -> float:
+    if not math.isfinite(value := float(text)):
+        raise UnfitJSON("a number is NaN, infinite, or too large; leave it out, or write null")
+    return value
+
+
+def _check(value: Any, depth: int = 1) -> None:
+    """Refuse deep nesting and lone surrogates."""
+    if depth > DEEPEST:
+        raise UnfitJSON(f"brackets are nested more than {DEEPEST} deep")
+    if isinstance(value, str) and not value.isascii() and any("\ud800" <= letter <= "\udfff" for letter in value):
+        raise UnfitJSON("a text holds half a character (a lone surrogate)")
+    if isinstance(value, dict):
+        value = [*value, *value.values()]
+    for inner in value if isinstance(value, list) else ():
+        _check(inner, depth + 1)

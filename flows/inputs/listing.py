@@ -1,4 +1,4 @@
-"""The files of a batch that has no manifest: in a folder, by a pattern, or in an object store."""
+"""Pictures and videos of a batch without a manifest: in a folder, by a pattern, or in an object store."""
 
 import functools
 import tempfile
@@ -16,19 +16,19 @@ from steps.store.opening import open_store
 if TYPE_CHECKING:
     from steps.store.bucket import BucketStore
 
-WANTED = sources.PICTURES | sources.VIDEOS
-WILD = frozenset("*?[")
+SUFFIXES = sources.PICTURES | sources.VIDEOS
+WILDCARDS = frozenset("*?[")
 BUCKET = "s3://"
 
 
 class Found(NamedTuple):
-    """A picture or a video.
+    """Picture or video.
 
     Attributes:
-        name: its place below what was given, with slashes and suffix.
-        path: where it is; of an object in a store, its last name.
-        remote: the address of such an object.
-        error: why it cannot be used; empty if nothing is known against it.
+        name: path relative to the given folder, with slashes and suffix.
+        path: local path; of an object in a store, its last name.
+        remote: key of such an object.
+        error: reason why it cannot be used; empty if none is known.
     """
 
     name: str
@@ -37,34 +37,34 @@ class Found(NamedTuple):
     error: str = ""
 
 
-def in_folder(folder: Path, out: Path) -> list[Found]:
-    """Everything in a folder and its folders, by name, but for packages, hidden files and `out`."""
-    return _wanted(folder, folder.rglob("*"), out)
+def list_folder(folder: Path, out: Path) -> list[Found]:
+    """List a folder recursively, by name, without packages, hidden files and `out`."""
+    return _media(folder, folder.rglob("*"), out)
 
 
-def by_pattern(pattern: str, out: Path) -> list[Found]:
-    """What a pattern such as photos/**/*.png matches; named from its first folder without a wildcard on.
+def list_pattern(pattern: str, out: Path) -> list[Found]:
+    """List the matches of a pattern such as photos/**/*.png, named relative to its last plain folder.
 
     Raises:
-        BadInput: that folder does not exist.
+        BadInput: that folder does not exist, or the pattern is invalid.
     """
     parts = Path(pattern).parts
-    first = next(i for i, part in enumerate(parts) if WILD & set(part))
+    first = next(i for i, part in enumerate(parts) if WILDCARDS & set(part))
     base = Path(*parts[:first])
     if not base.is_dir():
         raise BadInput(f"{base}, where the pattern {pattern!r} begins, is not a folder")
     try:
-        return _wanted(base, base.glob("/".join(parts[first:])), out)
+        return _media(base, base.glob("/".join(parts[first:])), out)
     except ValueError as error:
         raise BadInput(f"{pattern!r} is not a pattern such as 'photos/**/*.png': {error}") from error
 
 
-def in_bucket(address: str) -> list[Found]:
-    """Everything below `s3://BUCKET/PREFIX`, by name; nothing is fetched.
+def list_bucket(address: str) -> list[Found]:
+    """List everything below `s3://BUCKET/PREFIX`, by name, without fetching it.
 
     Raises:
-        BadInput: there is no such bucket, or that is no address of one.
-        BackendUnavailable: it refuses access, or does not answer.
+        BadInput: the bucket does not exist, or the address is malformed.
+        BackendUnavailable: the store refuses access, or does not answer.
     """
     try:
         entries = sorted(_bucket(address).entries(""))
@@ -73,36 +73,36 @@ def in_bucket(address: str) -> list[Found]:
     found = []
     for entry in entries:
         name = PurePosixPath(entry.name)
-        if name.suffix.lower() not in WANTED or any(part.startswith(".") and part != ".." for part in name.parts):
+        if name.suffix.lower() not in SUFFIXES or any(part.startswith(".") and part != ".." for part in name.parts):
             continue
-        trouble = ""
+        fault = ""
         if not stays_inside(entry.name):
-            trouble = f"the object {entry.name!r} is named as if it lay outside of {address}"
+            fault = f"the name of the object {entry.name!r} leads out of {address}"
         elif entry.size_bytes > sources.LARGEST_FILE_BYTES:
-            trouble = f"{entry.name} has {entry.size_bytes} bytes; at most {sources.LARGEST_FILE_BYTES} are read"
-        found.append(Found(entry.name, Path(name.name), entry.name, trouble))
+            fault = f"{entry.name} has {entry.size_bytes} bytes; at most {sources.LARGEST_FILE_BYTES} are read"
+        found.append(Found(entry.name, Path(name.name), entry.name, fault))
     return found
 
 
 @contextmanager
-def fetched(address: str, found: str, name: str) -> Iterator[Path]:
-    """An object as a file called `name`, as long as the block runs.
+def fetch_object(address: str, key: str, name: str) -> Iterator[Path]:
+    """Yield an object as a temporary file.
 
     Args:
-        address: as given to `in_bucket`.
-        found: the object, `Found.remote`.
+        address: as given to `list_bucket`.
+        key: of the object, relative to the address.
         name: of the file.
 
     Raises:
-        BadInput: it is not there any more, or there is no room.
+        BadInput: the object is gone, or the disk is full.
         BackendUnavailable: the store refuses access, or does not answer.
     """
     with tempfile.TemporaryDirectory(prefix="dg4d-object-") as folder:
         path = Path(folder) / name
         try:
-            _bucket(address).fetch(found, path, sources.LARGEST_FILE_BYTES)
+            _bucket(address).fetch(key, path, sources.LARGEST_FILE_BYTES)
         except FileNotFoundError as error:
-            raise BadInput(f"{found} is not in {address} any more") from error
+            raise BadInput(f"{key} is not in {address} any more") from error
         yield path
 
 
@@ -112,18 +112,18 @@ def _bucket(address: str) -> "BucketStore":
     return cast("BucketStore", open_store(address.rstrip("/")))
 
 
-def _wanted(folder: Path, paths: Iterable[Path], out: Path) -> list[Found]:
+def _media(folder: Path, paths: Iterable[Path], out: Path) -> list[Found]:
     own = {out.absolute(), out.resolve()}
     is_package = functools.cache(lambda place: record_of(place) is not None)
     found = []
     for path in sorted(set(paths)):
         name = path.relative_to(folder)
-        if path.suffix.lower() not in WANTED or not path.is_file() or any(part.startswith(".") for part in name.parts):
+        if path.suffix.lower() not in SUFFIXES or not path.is_file() or any(part[0] == "." for part in name.parts):
             continue
         if own & {*path.parents, *path.absolute().parents} or any(is_package(folder / up) for up in name.parents):
             continue
         try:
-            found.append(Found(name.as_posix(), sources.inside(folder, name.as_posix(), "the file")))
+            found.append(Found(name.as_posix(), sources.resolve_inside(folder, name.as_posix(), "the file")))
         except BadInput as error:
             found.append(Found(name.as_posix(), path, error=str(error)))
     return found

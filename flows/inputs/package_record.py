@@ -13,8 +13,8 @@ FORMAT = 2  # of the record
 def record_of(folder: Path) -> dict[str, Any] | None:
     """Return the provenance of the package in a folder.
 
-    None if there is no package, or its record cannot be used: names in it lead out of the folder or are too long for a
-    file, or it is nested too deeply.
+    None if there is no package, or the record cannot be used: a name in it leads out of the folder or is too long for
+    a file, or it is nested too deeply.
     """
     try:
         record = loads((folder / RECORD).read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Choice of where the items of a catalog run: threads, a Dask cluster, or flow runs of a deployment."""
+"""Choice of the machines that convert the items of a catalog: threads, a Dask cluster, or a Prefect deployment."""
 
 import os
 from typing import Literal, NamedTuple
@@ -10,7 +10,7 @@ GRAMMAR = "local, dask://HOST:PORT, deployment, or deployment:POOL"
 
 
 class Where(NamedTuple):
-    """Place where items run.
+    """Choice of where items run.
 
     Attributes:
         kind: threads of this process, workers of a Dask cluster, or workers of a work pool.
@@ -25,10 +25,10 @@ def parse_where(given: str = "") -> Where:
     """Parse `local`, `dask`, `dask://HOST:PORT`, `deployment` or `deployment:POOL`.
 
     Args:
-        given: empty: what `$DG4D_RUNNER` says, else `local`; `dask` alone: the scheduler that `$DG4D_RUNNER` names.
+        given: empty: `$DG4D_RUNNER`, else `local`; `dask` alone: the scheduler in `$DG4D_RUNNER`.
 
     Raises:
-        BadInput: it is something else.
+        BadInput: it is none of these.
     """
     preset = os.environ.get(VARIABLE, "")
     text, source = (given, "--where") if given else (preset, f"${VARIABLE}")
@@ -42,4 +42,4 @@ def parse_where(given: str = "") -> Where:
         return Where("deployment", pool)
     if text.startswith("dask://") and (address := text.removeprefix("dask://")):
         return Where("dask", address)
-    raise BadInput(f"{source} is {text!r}; items run where one of these says: {GRAMMAR}")
+    raise BadInput(f"{source} is {text!r}; use one of: {GRAMMAR}")

@@ -1,4 +1,4 @@
-"""Rows of a manifest (CSV, JSON, JSON Lines, Parquet), each read for itself: a bad one spoils no other."""
+"""Rows of a manifest (CSV, JSON, JSON Lines, Parquet), read independently: a faulty row does not affect others."""
 
 import csv
 import io
@@ -16,25 +16,25 @@ from flows.inputs.json_text import loads
 
 COLUMNS = (
     "path", "text", "video", "name", "profile", "seed", "bank", "priority", "set",
-)  # and any dotted knob, as mesh.grid  # fmt: skip
+)  # and any setting, such as mesh.grid  # fmt: skip
 MANIFESTS = (".csv", ".json", ".jsonl", ".parquet")
 LARGEST_MANIFEST_BYTES = 256 * 2**20
-LARGEST_TABLE_BYTES = 2**30  # of a Parquet table when it is unpacked
-ROWS_AT_ONCE = 1024  # of Parquet, in which one long text may stand for many cells
+LARGEST_TABLE_BYTES = 2**30  # of a Parquet table after decompression
+ROWS_AT_ONCE = 1024  # of Parquet, where a dictionary may repeat one long text in many cells
 MOST_ROWS = 1_000_000
-NOT_UTF8 = "it holds bytes that are not UTF-8; save the manifest as UTF-8"
+NOT_UTF8 = "it is not valid UTF-8; save the manifest as UTF-8"
 
 _TOKEN = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"|[\[\]{},]', re.DOTALL)
 _SURROGATE = re.compile("[\ud800-\udfff]")
 
 
-class Row(NamedTuple):
-    """One row of a manifest.
+class ManifestRow(NamedTuple):
+    """ManifestRow of a manifest.
 
     Attributes:
-        place: its number, as messages and unnamed items have it: "row 3"; of JSON Lines the line.
+        place: its number, for messages and unnamed items: "row 3"; in JSON Lines "line 3".
         cells: by column, without empty ones.
-        error: why it cannot be used; empty if nothing is known against it.
+        error: reason why it cannot be used; empty if none is known.
     """
 
     place: str
@@ -42,16 +42,16 @@ class Row(NamedTuple):
     error: str = ""
 
 
-def read_rows(file: Path) -> list[Row]:
+def read_rows(file: Path) -> list[ManifestRow]:
     """Read the rows of a manifest.
 
     Raises:
-        BadInput: it is no table at all, has columns that mean nothing, or is too large.
-        BackendUnavailable: reading Parquet is not installed.
+        BadInput: it is not a table, has unknown columns, or is too large.
+        BackendUnavailable: Parquet support is not installed.
     """
     try:
         if (size := file.stat().st_size) > LARGEST_MANIFEST_BYTES:
-            raise BadInput(f"{file} has {size} bytes; a manifest has at most {LARGEST_MANIFEST_BYTES}: divide it")
+            raise BadInput(f"{file} has {size} bytes; at most {LARGEST_MANIFEST_BYTES} are read: divide it")
         rows = _table(file)
     except (OSError, ValueError, csv.Error) as error:
         raise BadInput(f"{file} cannot be read as a manifest: {error}") from error
@@ -62,7 +62,7 @@ def read_rows(file: Path) -> list[Row]:
     return rows
 
 
-def _table(file: Path) -> list[Row]:
+def _table(file: Path) -> list[ManifestRow]:
     kind = file.suffix.lower()
     if kind == ".parquet":
         return _parquet(file)
@@ -75,11 +75,11 @@ def _table(file: Path) -> list[Row]:
     return _of_json((f"row {number}", element) for number, element in enumerate(_elements(text), 1))
 
 
-def _csv(text: str) -> list[Row]:
+def _csv(text: str) -> list[ManifestRow]:
     reader = csv.reader(io.StringIO(text, newline=""))
     columns = next(reader, [])
     _check_columns(columns)
-    rows: list[Row] = []
+    rows: list[ManifestRow] = []
     while True:
         place = f"row {len(rows) + 1}"
         try:
@@ -87,20 +87,20 @@ def _csv(text: str) -> list[Row]:
         except StopIteration:
             return rows
         except csv.Error as error:
-            rows.append(Row(place, {}, f"it cannot be read: {error}"))
+            rows.append(ManifestRow(place, {}, f"it cannot be read: {error}"))
             continue
         if not cells:
             continue
         if len(cells) > len(columns):
-            rows.append(Row(place, {}, f"it has {len(cells)} cells, and there are {len(columns)} columns"))
+            rows.append(ManifestRow(place, {}, f"it has {len(cells)} cells, and there are {len(columns)} columns"))
         elif any(map(_SURROGATE.search, cells)):
-            rows.append(Row(place, {}, NOT_UTF8))
+            rows.append(ManifestRow(place, {}, NOT_UTF8))
         else:
             rows.append(_row(place, dict(zip(columns, cells, strict=False))))
 
 
-def _of_json(texts: Iterable[tuple[str, str]]) -> list[Row]:
-    """Rows of JSON objects, each of which is a text of its own.
+def _of_json(texts: Iterable[tuple[str, str]]) -> list[ManifestRow]:
+    """Parse rows that are JSON objects.
 
     Raises:
         ValueError: none of them is one.
@@ -111,30 +111,30 @@ def _of_json(texts: Iterable[tuple[str, str]]) -> list[Row]:
     return rows
 
 
-def _object(place: str, text: str) -> Row:
+def _object(place: str, text: str) -> ManifestRow:
     if _SURROGATE.search(text):
-        return Row(place, {}, NOT_UTF8)
+        return ManifestRow(place, {}, NOT_UTF8)
     try:
         value = loads(text)
     except ValueError as error:
-        return Row(place, {}, f"it cannot be read: {error}")
+        return ManifestRow(place, {}, f"it cannot be read: {error}")
     if not isinstance(value, dict):
-        return Row(place, {}, 'it is no object in braces, as {"path": "fox.png"}')
+        return ManifestRow(place, {}, 'it is not an object such as {"path": "fox.png"}')
     if unknown := _unknown(value):
-        return Row(place, value, unknown)
+        return ManifestRow(place, value, unknown)
     return _row(place, value)
 
 
 def _elements(text: str) -> Iterator[str]:
-    """Divide a JSON list into the texts of its elements.
+    """Split a JSON list into the texts of its elements, so that a malformed one does not affect the others.
 
     Raises:
-        ValueError: it is no list, or has no end.
+        ValueError: it is not a list, or is not closed.
     """
     text = text.strip()
     if not text.startswith("["):
         loads(text)
-        raise ValueError("it should hold a list of rows, each with at least a path or a text")
+        raise ValueError("give a JSON list of rows, each with at least a path or a text")
     depth, start = 0, 1
     for token in _TOKEN.finditer(text):
         letter = token.group()[0]
@@ -143,15 +143,15 @@ def _elements(text: str) -> Iterator[str]:
             if (last := text[start : token.start()]).strip() or start > 1:
                 yield last
             if text[token.end() :].strip():
-                raise ValueError("something follows the list")
+                raise ValueError("text follows the list")
             return
         if letter == "," and depth == 1:
             yield text[start : token.start()]
             start = token.end()
-    raise ValueError("the list has no end")
+    raise ValueError("the list is not closed")
 
 
-def _parquet(file: Path) -> list[Row]:
+def _parquet(file: Path) -> list[ManifestRow]:
     if find_spec("pyarrow") is None:
         raise BackendUnavailable(f"{file} is Parquet, which needs pyarrow; run `make setup`, or give a .csv")
     arrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
@@ -169,21 +169,18 @@ def _parquet(file: Path) -> list[Row]:
                 content += batch.to_pylist()
     except (arrow.ArrowException, NotImplementedError, ArithmeticError) as error:
         raise ValueError(str(error)) from error
-    # Parquet written from data frames has NaN in the empty cells of columns of numbers
-    return [
-        _row(f"row {number}", {column: value for column, value in cells.items() if not _is_nan(value)})
-        for number, cells in enumerate(content, 1)
-    ]
+    return [_row(f"row {number}", cells) for number, cells in enumerate(content, 1)]
 
 
-def _row(place: str, cells: dict[str, Any]) -> Row:
-    filled = {column: value for column, value in cells.items() if value is not None and value != ""}
+def _row(place: str, cells: dict[str, Any]) -> ManifestRow:
+    # NaN: an empty cell of a number column in Parquet files that data frames wrote; JSON with NaN is refused before
+    filled = {column: value for column, value in cells.items() if value not in (None, "") and value == value}  # noqa: PLR0124
     error = "" if filled.get("path") or filled.get("text") else "neither a path nor a text"
-    return Row(place, filled, error)
+    return ManifestRow(place, filled, error)
 
 
 def _check_columns(columns: list[str]) -> None:
-    """Refuse columns that all rows have; raises BadInput."""
+    """Refuse unknown and repeated columns of a table; raises BadInput."""
     if unknown := _unknown(columns):
         raise BadInput(f"the manifest has an {unknown}")
     if twice := [column for column, count in Counter(columns).items() if count > 1]:
@@ -191,14 +188,7 @@ def _check_columns(columns: list[str]) -> None:
 
 
 def _unknown(columns: Iterable[str]) -> str:
-    """Describe what is wrong with the columns; empty if nothing is."""
+    """Return a message about the first unknown column; empty if all are known."""
     unknown = sorted(column for column in columns if column not in COLUMNS and "." not in column)
-    if not unknown:
-        return ""
-    return (
-        f"unknown column {quoted(unknown[0])}; there are: {', '.join(COLUMNS)}, and any knob such as motion.iterations"
-    )
-
-
-def _is_nan(value: Any) -> bool:
-    return isinstance(value, float) and value != value  # noqa: PLR0124
+    known = f"{', '.join(COLUMNS)}, and any setting such as motion.iterations"
+    return f"unknown column {quoted(unknown[0])}; use: {known}" if unknown else ""

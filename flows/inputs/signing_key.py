@@ -1,4 +1,4 @@
-"""Key and certificate with which packages are signed, as the environment names them."""
+"""Signing key and certificate from the environment."""
 
 import base64
 import hashlib
@@ -10,16 +10,16 @@ from dg4d_lib.errors import BadInput
 KEY, CERTIFICATE = "DG4D_SIGNING_KEY", "DG4D_SIGNING_CERTIFICATE"
 
 
-def certificate() -> str | None:
-    """Return the SHA-256 of the configured certificate, which stands for the signer; None if nobody signs.
+def certificate_digest() -> str | None:
+    """Return the SHA-256 of the signer's certificate; None if neither variable is set.
 
     Raises:
-        BadInput: only one of key and certificate is named, or the certificate cannot be read.
+        BadInput: only one of key and certificate is set, or the certificate cannot be read.
     """
     if not os.environ.get(KEY) and not os.environ.get(CERTIFICATE):
         return None
-    pem(KEY)
-    text = pem(CERTIFICATE).decode("ascii", "replace")
+    read_pem(KEY)
+    text = read_pem(CERTIFICATE).decode("ascii", "replace")
     body = text.partition("-----BEGIN CERTIFICATE-----")[2].partition("-----END CERTIFICATE-----")[0]
     try:
         content = base64.b64decode("".join(body.split()), validate=True)
@@ -30,12 +30,12 @@ def certificate() -> str | None:
     return f"sha256:{hashlib.sha256(content).hexdigest()}"
 
 
-def pem(name: str) -> bytes:
+def read_pem(name: str) -> bytes:
     """Return the content of the file that an environment variable names."""
-    place = os.environ.get(name)
-    if not place:
-        raise BadInput(f"${KEY} and ${CERTIFICATE} go together, and ${name} is not set; set both, or neither")
+    path = os.environ.get(name)
+    if not path:
+        raise BadInput(f"${name} is not set; ${KEY} and ${CERTIFICATE} go together: set both, or neither")
     try:
-        return Path(place).expanduser().read_bytes()
+        return Path(path).expanduser().read_bytes()
     except OSError as error:
-        raise BadInput(f"${name} names {place}, which cannot be read: {error.strerror}") from error
+        raise BadInput(f"${name} names {path}, which cannot be read: {error.strerror}") from error

@@ -1,11 +1,13 @@
-"""Admission of users' pictures, videos, frames, words and banks to the store: checked by content first."""
+"""Admission of users' pictures, videos, frames, texts and view banks to the store, checked by content."""
 
+import shutil
 import tempfile
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 
 from dg4d_lib.errors import BadInput
-from steps.artifacts.archives import add_entry
+from steps.artifacts.archives import EPOCH
 from steps.catalog import BANK, SOURCE, TEXT
 from steps.contract import ArtifactRef
 from steps.sources.banks import BANK_JSON, check_sheet, read_index
@@ -15,18 +17,18 @@ from steps.store.files import room_for
 
 PICTURES = frozenset(PICTURE_SUFFIXES)
 VIDEOS = frozenset([".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif"])
-ALWAYS_MOVING = VIDEOS - {".gif"}  # a GIF may be one picture
+ALWAYS_MOVING = VIDEOS - {".gif"}  # a GIF may hold a single picture
 LONGEST_TEXT = 1000  # characters
 LARGEST_FILE_BYTES = 8 * 2**30  # of a picture or a video, which is copied into the store before it is decoded
 
 
-def inside(folder: Path, name: str, what: str) -> Path:
-    """A file or folder that somebody else's list names, in or below the folder of that list.
+def resolve_inside(folder: Path, name: str, what: str) -> Path:
+    """Return the path of a file or folder that a manifest names, in or below the manifest's folder.
 
     Args:
-        folder: of the list.
-        name: as the list has it.
-        what: how messages call it.
+        folder: of the manifest.
+        name: as written in the manifest.
+        what: kind of the name, for messages.
 
     Raises:
         BadInput: it leads out of the folder, by "..", as an absolute path, or by a link.
@@ -38,17 +40,17 @@ def inside(folder: Path, name: str, what: str) -> Path:
         stays = False
     if not stays:
         raise BadInput(
-            f"{what} {name!r} leads out of the folder {folder}: what it names must lie there or below, and links may "
-            "not lead out; copy the file there"
+            f"{what} {name!r} leads out of the folder {folder}; only files in or below it are allowed, also through "
+            "links: copy the file there"
         )
     return path
 
 
 def check_file(path: Path) -> None:
-    """Refuse what is no picture, video or zip of frames, before any work.
+    """Refuse files that are not a picture, a video or a zip of frames.
 
     Raises:
-        BadInput: says what it is and what to give.
+        BadInput: says what the file is and what to give.
     """
     if not path.exists():
         raise BadInput(f"{path} does not exist; give a picture or a video")
@@ -59,10 +61,11 @@ def check_file(path: Path) -> None:
         )
     if not path.is_file():
         raise BadInput(f"{path} is not a regular file; give a picture or a video")
-    if path.stat().st_size == 0:
+    size = path.stat().st_size
+    if size == 0:
         raise BadInput(f"{path} is empty (0 bytes); give a picture or a video")
-    if path.stat().st_size > LARGEST_FILE_BYTES:
-        raise BadInput(f"{path} has {path.stat().st_size} bytes; at most {LARGEST_FILE_BYTES} are read: shorten it")
+    if size > LARGEST_FILE_BYTES:
+        raise BadInput(f"{path} has {size} bytes; at most {LARGEST_FILE_BYTES} are read: shorten it")
     try:
         check_media(path)
     except BadInput as error:
@@ -70,17 +73,17 @@ def check_file(path: Path) -> None:
 
 
 def check_video(path: Path) -> None:
-    """Refuse what is no video: a file as above, or a folder with at least two pictures.
+    """Refuse files as `check_file` does, and folders with fewer than two frames.
 
     Raises:
-        BadInput: says what it is and what to give.
+        BadInput: says what is wrong and what to give.
     """
     if not path.is_dir():
         check_file(path)
-    elif len(frames := frames_of(path)) < 2:
+    elif len(frames := list_frames(path)) < 2:
         raise BadInput(
             f"{path} holds {len(frames) or 'no'} picture{'s' * (len(frames) != 1)}; a folder of frames needs two or "
-            "more, numbered in the order in which they play"
+            "more, numbered in playing order"
         )
     else:
         _check_files(path, frames)
@@ -88,17 +91,8 @@ def check_video(path: Path) -> None:
             check_still(frame)
 
 
-def check_bank(path: Path) -> None:
-    """Refuse a folder without a sound `bank.json`, or without the sheets that it names.
-
-    Raises:
-        BadInput: says what is missing or wrong.
-    """
-    _files_of_bank(path)
-
-
 def check_text(text: str) -> None:
-    """Refuse words that say nothing, or too many.
+    """Refuse an empty or a long prompt.
 
     Raises:
         BadInput: says what to give.
@@ -109,57 +103,77 @@ def check_text(text: str) -> None:
         raise BadInput(f"--text has {len(text)} characters; give at most {LONGEST_TEXT}, models read about 60 words")
 
 
-def frames_of(folder: Path) -> list[Path]:
-    """The pictures directly in a folder, by name."""
+def list_frames(folder: Path) -> list[Path]:
+    """List the pictures directly in a folder, by name."""
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in PICTURES and p.is_file() and p.name[0] != ".")
 
 
 def put_source(path: Path, store: ArtifactStore) -> ArtifactRef:
-    """Keep a picture, a video, or the pictures in a folder of frames; nothing else enters the store.
+    """Store a picture, a video, or a folder of frames.
 
     Raises:
         BadInput: it is none of these.
-        DiskFull: there is no room.
+        DiskFull: the disk is full.
     """
     check_video(path)
     if path.is_dir():
-        return _put_files(frames_of(path), path, SOURCE.media_type, store)
+        return put_zip({frame.name: frame for frame in list_frames(path)}, SOURCE.media_type, store)
     return store.put(path, SOURCE.media_type)
 
 
 def put_text(text: str, store: ArtifactStore) -> ArtifactRef:
-    """Keep words, as `plain` gives them.
-
-    Raises:
-        DiskFull: there is no room.
-    """
-    return store.put_bytes(plain(text).encode(), TEXT.media_type)
+    """Store a prompt, with single spaces between its words."""
+    return store.put_bytes(single_spaced(text).encode(), TEXT.media_type)
 
 
-def plain(text: str) -> str:
-    """Words with single spaces between them."""
+def single_spaced(text: str) -> str:
+    """Join words with single spaces."""
     return " ".join(text.split())
 
 
 def put_bank(path: Path, store: ArtifactStore) -> ArtifactRef:
-    """Keep a bank as a stored zip: its `bank.json` and the pictures that it names, and nothing else of the folder.
+    """Store a bank of ground-truth views as a zip of `bank.json` and the pictures that it names.
 
     Raises:
-        BadInput: it is no bank.
-        DiskFull: there is no room.
+        BadInput: it is not a bank.
+        DiskFull: the disk is full.
     """
-    return _put_files(_files_of_bank(path), path, BANK.media_type, store)
+    files = check_bank(path)
+    return put_zip({file.relative_to(path).as_posix(): file for file in files}, BANK.media_type, store)
 
 
-def _files_of_bank(folder: Path) -> list[Path]:
+def put_zip(files: Mapping[str, Path], media_type: str, store: ArtifactStore) -> ArtifactRef:
+    """Store files as an uncompressed zip, in their order; equal files under equal names give equal bytes.
+
+    Raises:
+        BadInput: a file cannot be read.
+        DiskFull: the disk is full.
+    """
+    with tempfile.TemporaryDirectory(prefix="dg4d-zip-") as scratch, room_for(Path(scratch)):
+        path = Path(scratch) / "files.zip"
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, file in files.items():
+                entry = zipfile.ZipInfo(name, EPOCH)
+                entry.external_attr = 0o644 << 16
+                try:
+                    entry.file_size = file.stat().st_size  # decides on ZIP64
+                    source = file.open("rb")
+                except OSError as error:
+                    raise BadInput(f"{file} cannot be read: {error.strerror}") from error
+                with source, archive.open(entry, "w") as target:
+                    shutil.copyfileobj(source, target)
+        return store.put(path, media_type)
+
+
+def check_bank(folder: Path) -> list[Path]:
     """Return `bank.json` and every picture that it names, by name.
 
     Raises:
-        BadInput: one is missing, leads out of the folder, or is something else.
+        BadInput: one is missing, leads out of the folder, or has another format.
     """
     about = folder / BANK_JSON
     if not about.is_file():
-        raise BadInput(f"{folder} is not a bank of true views: it has no file {BANK_JSON}")
+        raise BadInput(f"{folder} is not a bank of ground-truth views: it has no file {BANK_JSON}")
     _check_files(folder, [about])
     index = read_index(about)
     sheets = {folder / view.file for view in index.views}
@@ -173,19 +187,9 @@ def _files_of_bank(folder: Path) -> list[Path]:
 
 
 def _check_files(folder: Path, files: list[Path]) -> None:
-    """Refuse links that lead out of a folder, and more than can be meant."""
+    """Refuse links that lead out of a folder, and more bytes than are read."""
     for file in files:
-        inside(folder, file.relative_to(folder).as_posix(), "the file")
+        resolve_inside(folder, file.relative_to(folder).as_posix(), "the file")
     size = sum(file.stat().st_size for file in files)
     if size > LARGEST_FILE_BYTES:
         raise BadInput(f"the files in {folder} have {size} bytes together; at most {LARGEST_FILE_BYTES} are read")
-
-
-def _put_files(files: list[Path], folder: Path, media_type: str, store: ArtifactStore) -> ArtifactRef:
-    """Equal files under equal names give equal bytes."""
-    with tempfile.TemporaryDirectory(prefix="dg4d-source-") as scratch, room_for(Path(scratch)):
-        path = Path(scratch) / "files.zip"
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
-            for file in files:
-                add_entry(archive, file.relative_to(folder).as_posix(), file.read_bytes())
-        return store.put(path, media_type)

@@ -1,1 +1,1 @@
-"""What a run leaves: packages, their records, reports and versions."""
+"""Packages with their records, reports and signatures."""

@@ -1,7 +1,7 @@
-"""Content credentials (C2PA): signatures that say what made a file, and that it has not changed since.
+"""Content credentials (C2PA): signed statements on the origin of a file, which also detect changes.
 
-Pictures and films carry theirs inside; for formats that cannot, and for the crate, which holds the digest of every
-file of the package, it lies beside as a file. Nothing is fetched from or sent to anybody: there are no time stamps.
+They are embedded in pictures and videos; other formats, and the crate, which holds the digest of every file of the
+package, have a sidecar file. Nothing is fetched or sent over the network; there are no time stamps.
 """
 
 import io
@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from flows.inputs.signing_key import CERTIFICATE, KEY, certificate, pem
-from flows.packages.publish import Files, fact_of
+from flows.inputs.signing_key import CERTIFICATE, KEY, certificate_digest, read_pem
+from flows.packages.publish import Files, file_digest
 
-EMBEDDED = {".mp4": "video/mp4", ".png": "image/png"}  # formats that carry credentials, and what they are called
-BESIDE = (".glb", ".usdz")  # a USDZ that carries some breaks the rule that every entry starts at a multiple of 64 bytes
+EMBEDDED = {".mp4": "video/mp4", ".png": "image/png"}  # formats with embedded credentials
+BESIDE = (".glb", ".usdz")  # embedded credentials would break the 64-byte alignment of USDZ entries
 ANY_BYTES = "application/octet-stream"
 SOURCE_TYPES = "http://cv.iptc.org/newscodes/digitalsourcetype/"
 TRAINED, ALGORITHMIC = f"{SOURCE_TYPES}trainedAlgorithmicMedia", f"{SOURCE_TYPES}algorithmicMedia"
@@ -27,7 +27,7 @@ ALGORITHMS = {
     "secp521r1": "es512",
     "RSAPrivateKey": "ps256",
     "Ed25519PrivateKey": "ed25519",
-}  # by curve, or by class where there is none
+}  # by curve, or by class of the key
 SETTINGS = {
     "builder": {"thumbnail": {"enabled": False}},
     "verify": {"remote_manifest_fetch": False, "ocsp_fetch": False},
@@ -38,10 +38,10 @@ State = Literal["trusted", "untrusted", "invalid", "missing"]
 
 @dataclass(frozen=True)
 class Claim:
-    """What is signed.
+    """Claim that is signed.
 
     Attributes:
-        trained: whether a generative model made some of it.
+        trained: True if a generative model made some of the asset.
         about: one or two sentences for people.
     """
 
@@ -49,7 +49,7 @@ class Claim:
     about: str
 
     def manifest(self, name: str) -> str:
-        """The claim about a file, in the form that C2PA reads."""
+        """Return the claim about a file as a C2PA manifest."""
         agent = {"name": "dg4d", "version": version("dg4d")}
         action = {
             "action": "c2pa.created",
@@ -63,12 +63,12 @@ class Claim:
 
 @dataclass(frozen=True)
 class Signature:
-    """What a signature is worth.
+    """Result of checking a signature.
 
     Attributes:
-        state: "untrusted": it holds, but nobody here vouches for who signed.
-        signer: the name in the certificate.
-        detail: why it is invalid.
+        state: "untrusted": valid, but the signer is not among the trusted certificates.
+        signer: subject of the certificate.
+        detail: reason why it is invalid.
     """
 
     state: State
@@ -78,13 +78,13 @@ class Signature:
 
 @dataclass(frozen=True)
 class Signer:
-    """A key, and the certificates that say whose it is.
+    """Signing key with its certificates.
 
     Attributes:
         key: PEM, PKCS #8.
         chain: certificates in PEM, the key's own first.
-        algorithm: as C2PA calls it.
-        subject: the name in the certificate.
+        algorithm: name in C2PA.
+        subject: of the certificate.
     """
 
     key: bytes = field(repr=False)
@@ -93,19 +93,19 @@ class Signer:
     subject: str
 
     def sign_package(self, folder: Path, files: Files, claim: Claim) -> tuple[Files, dict[str, dict[str, Any]]]:
-        """Sign what people take out of a package: pictures, films and assets at its top.
+        """Sign the top-level files of a package: pictures, videos and assets.
 
         Args:
             folder: of the files, which may change.
-            files: their facts.
-            claim: what to say of them.
+            files: their digests.
+            claim: to sign.
 
         Returns:
-            The facts as they are now, those of sidecars included; and for every signed file its facts before it was
-            signed, or the name of its sidecar.
+            Digests after signing, with sidecars; and for every signed file its digest before signing, or the name of
+            its sidecar.
 
         Raises:
-            BadInput: the certificate is not good for signing.
+            BadInput: the certificate cannot be used for signing.
         """
         now, signed = dict(files), dict[str, dict[str, Any]]()
         for name in files:
@@ -115,20 +115,20 @@ class Signer:
             if path.suffix in EMBEDDED:
                 self._embed(path, claim)
                 signed[name] = {"unsigned": files[name]}
-                now[name] = fact_of(path)
+                now[name] = file_digest(path)
             elif path.suffix in BESIDE:
-                sidecar = self.sign_beside(path, claim)
+                sidecar = self.sign_sidecar(path, claim)
                 signed[name] = {"sidecar": sidecar.name}
-                now[sidecar.name] = fact_of(sidecar)
+                now[sidecar.name] = file_digest(sidecar)
         return now, signed
 
-    def sign_beside(self, path: Path, claim: Claim) -> Path:
-        """Write credentials of a file beside it, under `sidecar_of` its name.
+    def sign_sidecar(self, path: Path, claim: Claim) -> Path:
+        """Write the credentials of a file to its sidecar; return its path.
 
         Raises:
-            BadInput: the certificate is not good for signing.
+            BadInput: the certificate cannot be used for signing.
         """
-        sidecar = path.with_name(sidecar_of(path.name))
+        sidecar = path.with_name(sidecar_name(path.name))
         with path.open("rb") as source:
             sidecar.write_bytes(self._signed(path, claim, ANY_BYTES, source, io.BytesIO(), embed=False))
         return sidecar
@@ -142,7 +142,7 @@ class Signer:
     def _signed(
         self, path: Path, claim: Claim, media_type: str, source: BinaryIO, target: BinaryIO, embed: bool = True
     ) -> bytes:
-        """Copy a file with credentials inside, or only compute them; the credentials."""
+        """Copy a file with embedded credentials, or only compute them; return the credentials."""
         library = _library()
         info = library.C2paSignerInfo(self.algorithm.encode(), self.chain, self.key, None)
         try:
@@ -158,21 +158,21 @@ class Signer:
         return content
 
 
-def configured() -> Signer | None:
-    """Who signs: what `$DG4D_SIGNING_KEY` and `$DG4D_SIGNING_CERTIFICATE` name; None where neither is set.
+def configured_signer() -> Signer | None:
+    """Return the signer of `$DG4D_SIGNING_KEY` and `$DG4D_SIGNING_CERTIFICATE`; None if neither is set.
 
     Raises:
-        BadInput: one of them is not set, cannot be read, or is no key or certificate, or they do not belong together.
+        BadInput: one of them is not set, cannot be read or has the wrong format, or they do not match.
         BackendUnavailable: signing is not installed.
     """
-    if certificate() is None:
+    if certificate_digest() is None:
         return None
     _library()
     serialization: Any = import_module("cryptography.hazmat.primitives.serialization")
     x509: Any = import_module("cryptography.x509")
-    chain = pem(CERTIFICATE)
+    chain = read_pem(CERTIFICATE)
     try:
-        key = serialization.load_pem_private_key(pem(KEY), None)
+        key = serialization.load_pem_private_key(read_pem(KEY), None)
         own = x509.load_pem_x509_certificates(chain)[0]
     except (ValueError, TypeError) as error:
         raise BadInput(
@@ -181,27 +181,27 @@ def configured() -> Signer | None:
         ) from error
     kind = getattr(getattr(key, "curve", None), "name", type(key).__name__)
     if kind not in ALGORITHMS:
-        raise BadInput(f"a key of the kind {kind} cannot sign; use one of: {', '.join(ALGORITHMS)}")
+        raise BadInput(f"a key of type {kind} cannot sign; use one of: {', '.join(ALGORITHMS)}")
     if key.public_key() != own.public_key():
-        raise BadInput(f"the key in ${KEY} is not that of the first certificate in ${CERTIFICATE}")
+        raise BadInput(f"the key in ${KEY} does not match the first certificate in ${CERTIFICATE}; give its own")
     plain = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
     return Signer(plain, chain, ALGORITHMS[kind], own.subject.rfc4514_string())
 
 
-def sidecar_of(name: str) -> str:
-    """The name of the credentials beside a file: asset.glb has asset.c2pa, other files their whole name and .c2pa."""
+def sidecar_name(name: str) -> str:
+    """Return the name of a file's sidecar: asset.c2pa for asset.glb, NAME.c2pa for other files."""
     return f"{name.removesuffix('.glb')}.c2pa"
 
 
-def signature_of(path: Path, sidecar: Path | None = None, anchors: str = "") -> Signature:
-    """What the signature of a file is worth.
+def check_signature(path: Path, sidecar: Path | None = None, anchors: str = "") -> Signature:
+    """Check the signature of a file.
 
     Args:
-        path: the file.
-        sidecar: where its credentials are; None: inside.
-        anchors: certificates in PEM of those who are trusted to vouch for signers.
+        path: signed file.
+        sidecar: file with its credentials; None: they are embedded.
+        anchors: trusted CA certificates in PEM.
 
     Raises:
         BackendUnavailable: signing is not installed.

@@ -1,4 +1,4 @@
-"""HTML pages beside packages, from the Jinja templates in `templates/`; whatever is put into them is escaped."""
+"""HTML pages from the Jinja templates in `templates/`, with autoescaping."""
 
 from functools import cache
 
@@ -6,7 +6,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 
 def render(template: str, **values: object) -> str:
-    """Return the page of a template in `templates/` filled with values."""
+    """Fill a template of `templates/`."""
     return _environment().get_template(template).render(values) + "\n"
 
 

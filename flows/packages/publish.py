@@ -1,12 +1,13 @@
-"""The one place that writes to the user's folder: a package appears there whole, or not at all."""
+"""Atomic replacement of the package in an output folder."""
 
 import errno
+import glob
 import hashlib
 import os
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +24,15 @@ Finish = Callable[[Path, Files], Files]
 
 
 def check_folder(folder: Path, item: str = "", force: bool = False) -> None:
-    """Refuse a folder that cannot be written to, or that holds something else than a package of this item.
+    """Refuse an output folder that cannot be written, or that holds anything but a package of this item.
 
     Args:
-        folder: where a package goes.
-        item: name of its asset; empty: of any.
-        force: a package of another item may be replaced.
+        folder: output folder.
+        item: name of the asset; empty: of any.
+        force: allow to replace a package of another item.
 
     Raises:
-        BadInput: says what is in the way and what to do.
+        BadInput: says what the folder holds and what to do.
     """
     check_folder_name(folder)
     if folder.exists() and not folder.is_dir():
@@ -42,21 +43,20 @@ def check_folder(folder: Path, item: str = "", force: bool = False) -> None:
             f"{folder} holds the asset {record['item']!r}, and this run makes {item!r}; choose another folder with -o, "
             "or replace it with --force"
         )
-    if folder.is_dir() and record is None:
-        others = sorted(p.name for p in folder.iterdir() if not p.name.startswith("."))
-        if others:
-            raise BadInput(
-                f"{folder} holds other files ({', '.join(others[:3])}{', ...' if len(others) > 3 else ''}); "
-                "choose a new or empty folder with -o"
-            )
+    others = sorted(p.name for p in folder.glob("[!.]*")) if record is None else []
+    if others:
+        raise BadInput(
+            f"{folder} holds other files ({', '.join(others[:3])}{', ...' if len(others) > 3 else ''}); "
+            "choose a new or empty folder with -o"
+        )
     check_writable(folder)
 
 
 def check_writable(folder: Path) -> None:
-    """Refuse a folder in which nothing can be made.
+    """Refuse a folder that cannot be written or created.
 
     Raises:
-        BadInput: says which folder and why.
+        BadInput: says why.
     """
     place = folder.absolute()
     try:
@@ -70,62 +70,62 @@ def check_writable(folder: Path) -> None:
         ) from error
 
 
-def is_current(folder: Path, order: str) -> bool:
-    """Whether a folder holds the package of an order (its digest), with every byte as it was written.
+def is_current(folder: Path, job_digest: str) -> bool:
+    """Return True if a folder holds the unaltered package of a job, given by its digest.
 
-    What lies beside the package, the reports for example, must be there, as whatever it is.
+    Files beside the package, such as the reports, must exist, but may be altered.
     """
     record = record_of(folder)
-    if record is None or record.get("order") != order:
+    if record is None or record.get("order") != job_digest:
         return False
     try:
-        unchanged = all(fact_of(folder / name) == fact for name, fact in record["files"].items())
+        unchanged = all(file_digest(folder / name) == fact for name, fact in record["files"].items())
         return unchanged and all((folder / name).is_file() for name in record.get("beside", ()))
     except OSError:
         return False
 
 
-def whole(folder: Path) -> dict[str, Any]:
-    """The provenance of the package in a folder, whose files are all there with every byte as it was written.
+def load_verified(folder: Path) -> dict[str, Any]:
+    """Return the provenance of the package in a folder after checking the digests of its files.
 
     Raises:
-        BadInput: there is no package, or files of it are missing or altered; says which.
+        BadInput: there is no package, or files of it are missing or altered; names them.
     """
     record = record_of(folder)
     if record is None:
-        raise BadInput(f"{folder} is no asset: it has no sound {RECORD}; give a folder that `dg4d make` wrote")
+        raise BadInput(f"{folder} is not an asset: it has no valid {RECORD}; give a folder that `dg4d make` wrote")
     if not _is_complete(record):
-        raise BadInput(f"{folder} cannot be used: its {RECORD} has another form than `dg4d make` writes; make it again")
+        raise BadInput(f"{folder} cannot be used: its {RECORD} has an unknown format; make the asset again")
     faults = [f"{name} {fault}" for name, fact in record["files"].items() if (fault := _fault(folder / name, fact))]
     if faults:
         more = f" and {len(faults) - 3} more" if len(faults) > 3 else ""
-        raise BadInput(f"{folder} is not as it was made: {', '.join(faults[:3])}{more}; make it again")
+        raise BadInput(f"{folder} is damaged: {', '.join(faults[:3])}{more}; make the asset again")
     return record
 
 
 def publish(package: Path, folder: Path, finish: Finish) -> Files:
-    """Replace the package in a folder for good; see `replace_package`."""
+    """Replace the package in a folder without a way back; see `replace_package`."""
     swap = replace_package(package, folder, finish)
     swap.keep()
     return swap.files
 
 
 def replace_package(package: Path, folder: Path, finish: Finish) -> "Swap":
-    """Unpack a package beside `folder`, finish it, and put it in the place of the package there.
+    """Unpack a package beside `folder`, finish it, and replace the package in `folder`.
 
     Files in `folder` that no package brought stay. If anything fails, `folder` is as it was.
 
     Args:
-        package: the zip that `pack_asset` made.
+        package: zip of `pack_asset`.
         folder: output folder.
-        finish: is given the unpacked folder and the facts of its files; adds what goes with the package, the record
-            above all, and returns the facts of the package's files as they are then.
+        finish: called with the unpacked folder and the digests of its files; adds record and reports, and returns the
+            digests of the package's files after that.
 
     Returns:
         The finished swap; call `keep` or `undo` on it.
 
     Raises:
-        DiskFull: there is no room.
+        DiskFull: the disk is full.
         BadInput: the folder cannot be written.
     """
     folder = folder.resolve()
@@ -133,46 +133,48 @@ def replace_package(package: Path, folder: Path, finish: Finish) -> "Swap":
     try:
         with room_for(folder):
             try:
-                return _publish(package, folder, finish)
+                return replace(_publish(package, folder, finish), first_made=missing)
             except OSError as error:
                 if error.errno not in CANNOT_SWAP or not folder.is_dir():
                     raise
-                return _publish(package, folder, finish, in_place=True)
-    except OSError as error:
-        _tidy(missing)
-        raise BadInput(f"the output folder {folder} cannot be written: {error.strerror or error}") from error
-    except BaseException:
-        _tidy(missing)
+                return replace(_publish(package, folder, finish, in_place=True), first_made=missing)
+    except BaseException as error:
+        _remove_empty(missing)
+        if isinstance(error, OSError):
+            raise BadInput(f"the output folder {folder} cannot be written: {error.strerror or error}") from error
         raise
 
 
 @dataclass(frozen=True)
 class Swap:
-    """Package that took the place of another one, which is kept beside it for the time being.
+    """Replacement of a package that can be undone.
 
     Attributes:
         folder: output folder.
-        files: facts of the files of the new package.
-        before: folder with what was there; it does not exist if nothing was.
-        moved_in: files of the new package where it was moved in file by file; else None.
+        files: digests of the files of the new package.
+        before: folder with the earlier content; it does not exist if there was none.
+        moved_in: files of the new package if they were moved in one by one; else None.
+        first_made: outermost parent folder that was created for the package; None if none was.
     """
 
     folder: Path
     files: Files
     before: Path
     moved_in: tuple[Path, ...] | None = None
+    first_made: Path | None = None
 
     def keep(self) -> None:
-        """Remove the earlier package; files of the user move over from its folder."""
+        """Remove the earlier package, and move the user's files over from its folder."""
         if self.before.exists():
             _carry_over(_foreign(self.before) if self.moved_in is None else [], self.before, self.folder)
 
     def undo(self) -> None:
-        """Restore the folder as it was."""
+        """Restore the folder as it was, and remove parent folders that were created for it."""
         if self.moved_in is None:
             remove_tree(self.folder)
             if self.before.exists():
                 self.before.replace(self.folder)
+            _remove_empty(self.first_made)
             return
         for name in self.moved_in:
             (self.folder / name).unlink(missing_ok=True)
@@ -182,16 +184,16 @@ class Swap:
 
 
 def unpacked(package: Path, folder: Path) -> Files:
-    """Unpack a package into a folder; the facts of its files.
+    """Unpack a package into a folder; return the digests of its files.
 
     Raises:
-        BadInput: an entry leads out of the folder, or the package is broken.
+        BadInput: an entry leads out of the folder, or the package is damaged.
     """
-    return {name: fact_of(folder / name) for name in unpack(package, folder, "the package")}
+    return {name: file_digest(folder / name) for name in unpack(package, folder, "the package")}
 
 
-def fact_of(path: Path) -> dict[str, Any]:
-    """The digest and the size of a file."""
+def file_digest(path: Path) -> dict[str, Any]:
+    """Return digest and size of a file."""
     with path.open("rb") as file:
         return {
             "digest": f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}",
@@ -199,13 +201,13 @@ def fact_of(path: Path) -> dict[str, Any]:
         }
 
 
-def fact_of_bytes(content: bytes) -> dict[str, Any]:
-    """As `fact_of`, of what a file will hold."""
+def bytes_digest(content: bytes) -> dict[str, Any]:
+    """Return digest and size as `file_digest` does, of the content of a file."""
     return {"digest": f"sha256:{hashlib.sha256(content).hexdigest()}", "size_bytes": len(content)}
 
 
 def _publish(package: Path, folder: Path, finish: Finish, in_place: bool = False) -> Swap:
-    if folder.exists() and not folder.is_dir():  # it may have come since the output was checked
+    if folder.exists() and not folder.is_dir():  # created since the output was checked
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(folder))
     place = folder if in_place else folder.parent
     place.mkdir(parents=True, exist_ok=True)
@@ -216,7 +218,7 @@ def _publish(package: Path, folder: Path, finish: Finish, in_place: bool = False
     try:
         staging.mkdir()
         files = finish(staging, unpacked(package, staging))
-        if in_place or _contains(folder, Path.cwd()):
+        if in_place or Path.cwd().is_relative_to(folder):
             return Swap(folder, files, before, tuple(_move_in(staging, folder, before)))
         _swap(staging, folder, before)
         return Swap(folder, files, before)
@@ -225,7 +227,7 @@ def _publish(package: Path, folder: Path, finish: Finish, in_place: bool = False
 
 
 def _is_complete(record: dict[str, Any]) -> bool:
-    """Check that a record has the form that its readers count on."""
+    """Return True if a record has the fields that its readers use."""
     try:
         steps = [*record.get("steps", ()), *record.get("run", {}).get("steps", ())]
         return (
@@ -240,9 +242,9 @@ def _is_complete(record: dict[str, Any]) -> bool:
 
 
 def _fault(path: Path, fact: dict[str, Any]) -> str:
-    """What is wrong with a file; empty if nothing is."""
+    """Return the fault of a file; "" if it has none."""
     try:
-        return "" if fact_of(path) == fact else "was altered"
+        return "" if file_digest(path) == fact else "was altered"
     except FileNotFoundError:
         return "is missing"
     except OSError as error:
@@ -251,14 +253,13 @@ def _fault(path: Path, fact: dict[str, Any]) -> str:
 
 def _swap(staging: Path, folder: Path, before: Path) -> None:
     """Rename the old folder to `before` and the new one to `folder`."""
-    if not folder.exists():
-        staging.replace(folder)
-        return
-    folder.replace(before)
+    if folder.exists():
+        folder.replace(before)
     try:
         staging.replace(folder)
     except OSError:
-        before.replace(folder)
+        if before.exists():
+            before.replace(folder)
         raise
 
 
@@ -272,8 +273,8 @@ def _carry_over(names: list[Path], outgoing: Path, folder: Path) -> None:
 
 
 def _recover(folder: Path, place: Path) -> None:
-    """Clear up after commands that were killed while they published."""
-    for left in sorted(place.glob(f".{_literal(folder.name)}.*-*")):
+    """Clean up after commands that were killed while they published."""
+    for left in sorted(place.glob(f".{glob.escape(folder.name)}.*-*")):
         kind, _, pid = left.name.removeprefix(f".{folder.name}.").partition("-")
         if kind not in {"incoming", "outgoing"} or not pid.isdigit() or Path(f"/proc/{pid}").exists():
             continue
@@ -286,9 +287,9 @@ def _recover(folder: Path, place: Path) -> None:
 
 
 def _move_in(staging: Path, folder: Path, before: Path) -> list[Path]:
-    """Move the new files in one by one, where the folder cannot be renamed, and the old ones to `before`.
+    """Move the old files to `before` and the new ones in, one by one, for folders that cannot be renamed.
 
-    The record goes last, so that a half-finished swap is recognized as one.
+    The record goes last, so that an interrupted swap is recognized.
     """
     new = sorted(p.relative_to(staging) for p in staging.rglob("*") if p.is_file())
     new.sort(key=lambda name: name == Path(RECORD))
@@ -303,39 +304,30 @@ def _move_in(staging: Path, folder: Path, before: Path) -> list[Path]:
 
 
 def _foreign(folder: Path) -> list[Path]:
-    """Files that no package brought, relative to the folder."""
+    """List the files that no package brought, relative to the folder."""
     ours = _ours(folder)
     files = (p.relative_to(folder) for p in folder.rglob("*") if p.is_file() or p.is_symlink())
     return sorted(f for f in files if f.as_posix() not in ours)
 
 
 def _ours(folder: Path) -> set[str]:
-    """The files that the package in a folder brought."""
+    """Return the files that the package in a folder brought."""
     record = record_of(folder)
     return set() if record is None else {*record["files"], *record.get("beside", ()), RECORD}
 
 
 def _first_missing(folder: Path) -> Path | None:
-    """The outermost folder that would have to be made."""
+    """Return the outermost folder that has to be created; None if there is none."""
     missing = None
     while not folder.exists():
         missing, folder = folder, folder.parent
     return missing
 
 
-def _tidy(made: Path | None) -> None:
-    """Remove the folders that were made on the way to a failure; they are empty."""
+def _remove_empty(made: Path | None) -> None:
+    """Remove the empty folders that a failed run created."""
     if made is None:
         return
     for folder in [*sorted((p for p in made.rglob("*") if p.is_dir()), reverse=True), made]:
         with suppress(OSError):
             folder.rmdir()
-
-
-def _contains(folder: Path, other: Path) -> bool:
-    return other == folder or folder in other.parents
-
-
-def _literal(name: str) -> str:
-    """A name for use in a glob pattern."""
-    return "".join(f"[{c}]" if c in "*?[" else c for c in name)

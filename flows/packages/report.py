@@ -1,4 +1,4 @@
-"""What goes with a package: `report.json` and `report.html` for people, `provenance.json` for checking it."""
+"""Files beside a package: report, provenance record, viewer and crate."""
 
 import base64
 import json
@@ -9,106 +9,108 @@ from types import MappingProxyType
 from typing import Any
 
 from flows import home
-from flows.formatting import curves
-from flows.formatting.sizes import readable
-from flows.inputs.orders import Order
+from flows.formatting.curves import svg_picture
+from flows.formatting.numbers import format_size
+from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.package_record import FORMAT, RECORD
-from flows.inputs.signing_key import certificate
+from flows.inputs.signing_key import certificate_digest
 from flows.packages import acceptance
-from flows.packages.acceptance import picture_of, verdict_of
+from flows.packages.acceptance import load_picture, load_verdict
 from flows.packages.crate import CRATE, crate_text
-from flows.packages.credentials import Claim, Signer, sidecar_of
+from flows.packages.credentials import Claim, Signer, sidecar_name
 from flows.packages.flow_result import FlowResult, StepRun
 from flows.packages.html_pages import render
-from flows.packages.publish import Files, Swap, fact_of_bytes, replace_package
-from flows.packages.view import VIEWER, page_of
-from steps.contract import RUN_ONLY, StepResult
+from flows.packages.publish import Files, Swap, bytes_digest, replace_package
+from flows.packages.view import VIEWER, viewer_html
+from steps.contract import RUN_ONLY
 from steps.store.artifact_store import ArtifactStore
 
 BESIDE = ("report.json", "report.html", VIEWER, CRATE)
-GENERATIVE = ("draw_picture", "drive_video", "fit_gaussians", "fit_motion", "refine_texture")  # where they use weights
+GENERATIVE = ("draw_picture", "drive_video", "fit_gaussians", "fit_motion", "refine_texture")  # if they use weights
 UNSIGNED: Mapping[str, Any] = MappingProxyType({})
 
 
-def deliver(order: Order, result: FlowResult, folder: Path, signer: Signer | None) -> Swap:
-    """Put the package of a conversion into a folder, with reports and record; see `replace_package`."""
+def deliver(job: ConversionJob, result: FlowResult, folder: Path, signer: Signer | None) -> Swap:
+    """Put the package of a conversion with reports and record into a folder; see `replace_package`."""
     store = home.store()
     return replace_package(
         store.path(result.package),
         folder,
-        lambda staging, files: complete(staging, files, order, result, store, signer),
+        lambda staging, files: finish_package(staging, files, job, result, store, signer),
     )
 
 
-def complete(
-    folder: Path, files: Files, order: Order, result: FlowResult, store: ArtifactStore, signer: Signer | None
+def finish_package(
+    folder: Path, files: Files, job: ConversionJob, result: FlowResult, store: ArtifactStore, signer: Signer | None
 ) -> Files:
-    """Sign the files of a package if there is a signer, and write what goes with them; their facts as they are then."""
+    """Sign a package if there is a signer, write the files beside it, and return the digests of its files."""
     signatures = UNSIGNED
-    claim = Claim(_used_weights(result, *GENERATIVE), f"{banner(order, result)} Package {result.package.digest}.")
+    claim = Claim(result.used_weights(*GENERATIVE), f"{banner(job, result)} Package {result.package.digest}.")
     if signer is not None:
         files, signed = signer.sign_package(folder, files, claim)
-        signatures = {"certificate": certificate(), "subject": signer.subject, "files": signed}
-    for name, text in texts(order, result, files, store, folder, signatures).items():
+        signatures = {"certificate": certificate_digest(), "subject": signer.subject, "files": signed}
+    for name, text in render_records(job, result, files, store, folder, signatures).items():
         (folder / name).write_text(text, encoding="utf-8")
     if signer is not None:
-        signer.sign_beside(folder / CRATE, claim)  # it holds the digest of every other file
+        signer.sign_sidecar(folder / CRATE, claim)  # the crate holds the digest of every other file
     return files
 
 
-def texts(
-    order: Order,
+def render_records(
+    job: ConversionJob,
     result: FlowResult,
     files: Files,
     store: ArtifactStore,
     folder: Path,
     signatures: Mapping[str, Any] = UNSIGNED,
 ) -> dict[str, str]:
-    """The texts that go with the package in a folder, by name of file."""
-    report = report_of(order, result, files, store)
-    record = provenance(order, result, files, signatures)
+    """Return the texts of the files beside the package in a folder, by file name."""
+    report = build_report(job, result, files, store)
+    record = provenance(job, result, files, signatures)
     written = json.dumps(record, indent=1, ensure_ascii=False, sort_keys=True) + "\n"
     beside = {
-        VIEWER: page_of(json.loads(written), lambda name: (folder / name).read_bytes()),  # as `dg4d view` will see it
+        VIEWER: viewer_html(
+            json.loads(written), lambda name: (folder / name).read_bytes()
+        ),  # as `dg4d view` will see it
         "report.json": json.dumps(report, indent=1, ensure_ascii=False) + "\n",
-        "report.html": page(report, picture_of(_results(result), store)),
+        "report.html": report_page(report, load_picture(result.results, store)),
         RECORD: written,
     }
-    facts = {name: fact_of_bytes(text.encode()) for name, text in beside.items()}
-    return {**beside, CRATE: crate_text(record, facts, banner(order, result))}
+    facts = {name: bytes_digest(text.encode()) for name, text in beside.items()}
+    return {**beside, CRATE: crate_text(record, facts, banner(job, result))}
 
 
 def provenance(
-    order: Order, result: FlowResult, files: Files, signatures: Mapping[str, Any] = UNSIGNED
+    job: ConversionJob, result: FlowResult, files: Files, signatures: Mapping[str, Any] = UNSIGNED
 ) -> dict[str, Any]:
-    """Every step's record, every file's digest, and the recipe; what belongs to one run only stands under `run`.
+    """Return the provenance record: steps, file digests and recipe; facts of a single run are under `run`.
 
-    Signatures never come out twice the same: where there are any, `files` and `signatures` belong to one run as well.
+    Signatures differ in every run: in a signed package `files` and `signatures` are facts of a single run, too.
     """
-    records = [done.result.provenance for done in result.steps]
     outputs = [ref for done in result.steps for ref in done.result.outputs.values()]
-    artifacts = [ref for ref in (order.source, order.bank, *outputs) if ref is not None]
+    artifacts = [ref for ref in (job.source, job.bank, *outputs) if ref is not None]
     return {
         "format": FORMAT,
-        "order": order.digest(),
-        "item": order.item,
-        "profile": order.profile,
-        "source": order.source.digest,
-        "seed": order.seed,
-        "commercial_only": order.commercial_only,
-        "recipe": order.recipe(),
-        "licenses": licenses(result),
+        "order": job.digest(),
+        "item": job.item,
+        "profile": job.profile,
+        "source": job.source.digest,
+        "seed": job.seed,
+        "commercial_only": job.commercial_only,
+        "recipe": job.recipe(),
+        "licenses": result.licenses,
         "package": result.package.digest,
         "artifacts": {ref.digest: ref.model_dump(mode="json", exclude={"digest"}) for ref in artifacts},
         "files": files,
         "signatures": dict(signatures),
-        "beside": [*BESIDE, *([sidecar_of(CRATE)] if signatures else [])],
+        "beside": [*BESIDE, *([sidecar_name(CRATE)] if signatures else [])],
         "steps": [
-            {"digest": record.digest(), **record.model_dump(mode="json", exclude=set(RUN_ONLY))} for record in records
+            {"digest": record.digest(), **record.model_dump(mode="json", exclude=set(RUN_ONLY))}
+            for record in result.records
         ],
         "run": {
             "flow_run": result.flow_run,
-            "names": {"source_name": order.source_name, "picture_name": order.picture_name},
+            "names": {"source_name": job.source_name, "picture_name": job.picture_name},
             "steps": [
                 {
                     "step": done.label,
@@ -121,61 +123,55 @@ def provenance(
     }
 
 
-def report_of(order: Order, result: FlowResult, files: Files, store: ArtifactStore) -> dict[str, Any]:
-    """Stages, times, curves, notes and settings as JSON."""
+def build_report(job: ConversionJob, result: FlowResult, files: Files, store: ArtifactStore) -> dict[str, Any]:
+    """Return stages, times, curves, notes and settings as JSON."""
     return {
-        "item": order.item,
-        "source": order.source_name,
-        "profile": order.profile,
-        "seed": order.seed,
-        "commercial_only": order.commercial_only,
-        "banner": banner(order, result),
-        "notes": notes(order, result),
+        "item": job.item,
+        "source": job.source_name,
+        "profile": job.profile,
+        "seed": job.seed,
+        "commercial_only": job.commercial_only,
+        "banner": banner(job, result),
+        "notes": notes(job, result),
         "wall_s": round(result.wall_s, 1),
-        "compute_s": round(sum(done.result.provenance.duration_s for done in result.steps), 1),
-        "peak_memory_mb": max(done.result.provenance.peak_memory_mb for done in result.steps),
-        "acceptance": verdict_of(_results(result), store),
+        "compute_s": round(sum(record.duration_s for record in result.records), 1),
+        "peak_memory_mb": max(record.peak_memory_mb for record in result.records),
+        "acceptance": load_verdict(result.results, store),
         "steps": [_stage(done, store) for done in result.steps],
-        "licenses": licenses(result),
+        "licenses": result.licenses,
         "files": {name: fact["size_bytes"] for name, fact in files.items()},
-        "settings": order.settings.model_dump(mode="json"),
+        "settings": job.settings.model_dump(mode="json"),
     }
 
 
-def banner(order: Order, result: FlowResult) -> str:
-    """One honest sentence: what of this asset was seen and what was guessed."""
+def banner(job: ConversionJob, result: FlowResult) -> str:
+    """Say in one sentence which parts of the asset were observed and which were generated."""
     given = any("footage" in done.result.outputs for done in result.steps)
-    imagined = "the motion was made up by a model" if _used_weights(result, "drive_video") else "the motion was made up"
-    motion = "the motion follows the video" if given else imagined
-    if order.settings.prior.kind == "oracle":
-        return f"Test of the optimization: the true views were known; {motion}."
-    drawn = "the picture was drawn by a model; " if order.drawn else ""
-    weights = _used_weights(result, "fit_gaussians", "fit_motion")
-    shape = "guessed by a model" if weights else "guessed without a model, from the outline of one picture"
-    return f"{order.profile.capitalize()}: {drawn}{motion}; shape and the sides nobody saw were {shape}."
+    by_model = " by a model" if result.used_weights("drive_video") else ""
+    motion = "the motion follows the video" if given else f"the motion was generated{by_model}"
+    if job.settings.prior.kind == "oracle":
+        return f"Test of the optimization: ground-truth views were given; {motion}."
+    drawn = "the picture was generated from text; " if job.drawn else ""
+    weights = result.used_weights("fit_gaussians", "fit_motion")
+    shape = "by a model" if weights else "without a model, from the silhouette of one picture"
+    return f"{job.profile.capitalize()}: {drawn}{motion}; shape and unseen sides were guessed {shape}."
 
 
-def licenses(result: FlowResult) -> dict[str, str]:
-    """The licenses that follow the asset, by what they are of; empty where no weights were used."""
-    return {name: terms for done in result.steps for name, terms in done.result.provenance.licenses.items()}
-
-
-def notes(order: Order, result: FlowResult) -> list[str]:
-    """What the user should know, each sentence once."""
+def notes(job: ConversionJob, result: FlowResult) -> list[str]:
+    """Return the notes for the user, each once."""
     own = []
-    if order.picture_name:
-        own.append(f"The subject is the first frame of {order.source_name}; {order.picture_name} only names the asset.")
-    records = [done.result.provenance for done in result.steps]
-    theirs = (note for record in records for note in (*record.notes, *record.run_notes))
+    if job.picture_name:
+        own.append(f"The subject is the first frame of {job.source_name}; {job.picture_name} only names the asset.")
+    theirs = (note for record in result.records for note in (*record.notes, *record.run_notes))
     return list(dict.fromkeys([*own, *theirs]))
 
 
-def page(report: dict[str, Any], shortcomings: bytes | None = None) -> str:
-    """Return the report as one page that shows the files of the package beside it.
+def report_page(report: dict[str, Any], shortcomings: bytes | None = None) -> str:
+    """Render the report as a page that shows the files of the package.
 
     Args:
-        report: of `report_of`.
-        shortcomings: picture of the worst moments, PNG; it is embedded.
+        report: of `build_report`.
+        shortcomings: picture of the worst frames, PNG; it is embedded.
     """
     folders: dict[str, list[int]] = {}
     for name, size in report["files"].items():
@@ -189,21 +185,12 @@ def page(report: dict[str, Any], shortcomings: bytes | None = None) -> str:
         viewer=VIEWER,
         acceptance=acceptance,
         shortcomings=base64.b64encode(shortcomings or b"").decode(),
-        arithmetic=arithmetic,
-        curves=curves,
-        readable=readable,
+        format_flops=format_flops,
+        svg_picture=svg_picture,
+        format_size=format_size,
         folders=folders,
         settings=json.dumps(report["settings"], indent=1),
     )
-
-
-def _results(result: FlowResult) -> list[StepResult]:
-    return [done.result for done in result.steps]
-
-
-def _used_weights(result: FlowResult, *steps: str) -> bool:
-    records = [done.result.provenance for done in result.steps]
-    return any(record.weights for record in records if record.step in steps)
 
 
 def _stage(done: StepRun, store: ArtifactStore) -> dict[str, Any]:
@@ -227,12 +214,11 @@ def _stage(done: StepRun, store: ArtifactStore) -> dict[str, Any]:
     }
 
 
-def arithmetic(flops: dict[str, int]) -> str:
-    """What each network did, for people: "UNet2DConditionModel 15.3 TFLOP"."""
-    return ", ".join(f"{name} {_scaled(count)}FLOP" for name, count in flops.items())
+def format_flops(flops: dict[str, int]) -> str:
+    """Return the operations of each network, such as "UNet2DConditionModel 15.3 TFLOP"."""
+    return ", ".join(f"{name} {_with_prefix(count)}FLOP" for name, count in flops.items())
 
 
-def _scaled(count: float) -> str:
-    """With the prefix of the unit."""
+def _with_prefix(count: float) -> str:
     power = min(max(int(math.log10(max(count, 1))) // 3, 2), 5)
     return f"{count / 1000**power:,.1f} {'..MGTP'[power]}"

@@ -1,17 +1,16 @@
-"""Scores of many objects as people read them: tables in the paper's form, CSV, a page with the films side by side."""
+"""Scores of a benchmark as tables in the paper's form, as CSV, and as a page with videos side by side."""
 
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from statistics import fmean
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 from urllib.parse import quote
 
 from pydantic import BaseModel
 
 from flows.exit_status import EXIT_BAD_INPUT, EXIT_FAILED
-from flows.formatting.escaping import cell
+from flows.formatting.escaping import csv_cell
 from flows.formatting.escaping import markdown as escaped
 from flows.packages.html_pages import render
 from flows.packages.summary import BAD_INPUT
@@ -19,13 +18,12 @@ from flows.packages.summary import BAD_INPUT
 Figures = dict[str, float]
 
 
-@dataclass(frozen=True)
-class Metric:
-    """How a number is shown.
+class Metric(NamedTuple):
+    """Column of a table of scores.
 
     Attributes:
-        heading: with an arrow to where it is better.
-        digits: after the point.
+        heading: with an arrow towards better values.
+        digits: after the decimal point.
     """
 
     heading: str
@@ -54,9 +52,9 @@ METRICS = {
     "clip_i": Metric("CLIP-I ↑", 3),
 }
 GUESSES = {
-    "input_repeated": "the input at every view",
-    "input_frozen": "its first frame at every view",
-    "truth_frozen": "every view's true first frame",
+    "input_repeated": "input at every view",
+    "input_frozen": "first input frame at every view",
+    "truth_frozen": "first ground-truth frame of every view",
 }
 PUBLISHED = (
     ("D-NeRF", "0.51", "0.68", "2327.83", "-"),
@@ -65,21 +63,22 @@ PUBLISHED = (
     ("Consistent4D", "0.16", "0.87", "1133.44", "2 h"),
     ("DreamGaussian4D, fast", "0.13", "0.91", "775.90", "5 min"),
     ("DreamGaussian4D", "0.12", "0.92", "729.74", "15 min"),
-)  # method, LPIPS, CLIP, FVD, time (Ren et al. 2024, table "Quantitative Results for Video-to-4D")
+)  # Ren et al. 2024, table "Quantitative Results for Video-to-4D"
+PUBLISHED_HEADINGS = ("method", "LPIPS ↓", "CLIP ↑", "FVD ↓", "time ↓")
 NONE = "-"
 
 
 class ObjectScores(BaseModel):
-    """One object.
+    """Scores of one object.
 
     Attributes:
-        object: its name.
-        error: why there are no scores; empty where there are.
-        kind: of that failure, the name of its exception.
-        seconds: that the steps of the asset took to compute.
-        frames: of every view.
+        object: name.
+        error: reason why there are no scores; empty if there are.
+        kind: name of the exception of that failure.
+        seconds: compute time of the asset's steps.
+        frames: number per view.
         size: of a frame, pixels.
-        rows: for every method, figures of the input view, of every view, their mean, and of the mesh.
+        rows: for every method, values of the input view, of every view, their mean, and of the mesh.
     """
 
     object: str
@@ -93,15 +92,15 @@ class ObjectScores(BaseModel):
 
 
 class Results(BaseModel):
-    """What a benchmark found.
+    """Results of a benchmark.
 
     Attributes:
-        title: what was judged.
-        ours: the method of the assets, a name of `rows` like the naive guesses' names.
-        drawn: which form of the assets was judged.
+        title: name of the data set and profile.
+        ours: method of the assets, a key of `rows` like those of the baselines.
+        drawn: evaluated form of the assets.
         objects: in the order of the data set.
-        mean: of every method over the objects that have the figure.
-        missing: for every metric that was not computed, why, and what mends it.
+        mean: of every method over the objects that have the value.
+        missing: for every metric that was not computed, the reason and the remedy.
     """
 
     format: Literal[1] = 1
@@ -120,7 +119,7 @@ class Results(BaseModel):
 
     @property
     def exit_code(self) -> int:
-        """0 if every object has scores, 65 if none has and bad input is to blame for all, else 1."""
+        """Exit status: 0 if every object has scores, 65 if all failed because of bad input, else 1."""
         if not self.failed:
             return 0
         bad = all(one.error and one.kind in BAD_INPUT for one in self.objects)
@@ -128,15 +127,14 @@ class Results(BaseModel):
 
 
 def figures_of(judgment: Mapping[str, Any]) -> Figures:
-    """The figures of a method on one object: means of the views, of the mesh, and how well the input view is met."""
-    found: Figures = {**judgment.get("mean", {}), **judgment.get("geometry", {})}
-    of_input = judgment.get("input", {})
-    found |= {f"input_{name}": of_input[name] for name in ("psnr", "iou") if name in of_input}
-    return found | ({"clip_i": of_input["clip_i"]} if "clip_i" in of_input else {})
+    """Return the values of a method on one object: means of the views, of the mesh, and of the input view."""
+    names = {"psnr": "input_psnr", "iou": "input_iou", "clip_i": "clip_i"}
+    of_input = {names[name]: value for name, value in judgment.get("input", {}).items() if name in names}
+    return {**judgment.get("mean", {}), **judgment.get("geometry", {}), **of_input}
 
 
 def averaged(objects: list[ObjectScores], ours: str) -> dict[str, Figures]:
-    """The mean of every method over the objects, naive guesses first."""
+    """Return the mean of every method over the objects, baselines first."""
     found: dict[str, Figures] = {}
     for method in (*GUESSES, ours):
         every = [figures_of(one.rows[method]) for one in objects if method in one.rows]
@@ -150,16 +148,12 @@ def averaged(objects: list[ObjectScores], ours: str) -> dict[str, Figures]:
 
 
 def table(results: Results) -> list[dict[str, str]]:
-    """A row per method with its means; for the Prefect UI."""
-    shown = PAPER_METRICS | _present(results, METRICS)
-    return [
-        {"method": called(method), **{metric.heading: _cell(figures, name, results) for name, metric in shown.items()}}
-        for method, figures in results.mean.items()
-    ]
+    """Return a row per method with its means, for the page and the Prefect UI."""
+    return _rows(PAPER_METRICS | _present(results, METRICS), _means(results), results)
 
 
 def csv_text(results: Results) -> str:
-    """A row per object, method and view; `mean` is over the views, `input` the input view."""
+    """Return a row per object, method and view; `mean` is over the views, `input` the input view."""
     names = [name for name in {**PAPER_METRICS, **METRICS} if not name.startswith("input_")]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -171,16 +165,17 @@ def csv_text(results: Results) -> str:
             whole |= _time(one, method == results.ours)
             for view, figures in {**views, "mean": whole}.items():
                 if figures:
-                    writer.writerow([cell(one.object), cell(method), view, *(figures.get(name, "") for name in names)])
+                    writer.writerow(
+                        [csv_cell(one.object), csv_cell(method), view, *(figures.get(name, "") for name in names)]
+                    )
     return text.getvalue()
 
 
 def markdown(results: Results) -> str:
-    """The tables: the paper's columns, the others, every object, what is missing, what was published."""
+    """Return tables of the paper's metrics, the others, every object, and published values."""
     scored = len(results.objects) - len(results.failed)
     several = "One object" if scored == 1 else f"Means over {scored} objects"
-    more = _present(results, METRICS)
-    means = [(called(method), figures) for method, figures in results.mean.items()]
+    more, means = _present(results, METRICS), _means(results)
     every = [
         (f"{escaped(one.object)}: {called(method)}", figures_of(judgment) | _time(one, method == results.ours))
         for one in results.objects
@@ -191,27 +186,27 @@ def markdown(results: Results) -> str:
     missing = [f"- {metric}: {why}" for metric, why in results.missing.items()]
     parts = [
         [f"# {escaped(results.title)}"],
-        [f"{several}, {results.drawn}; all frames and views weigh the same."],
-        _lines(PAPER_METRICS, means, results),
-        _lines(more, means, results),
+        [f"{several}, {results.drawn}; all frames and views have equal weight."],
+        _markdown_table(_rows(PAPER_METRICS, means, results)),
+        _markdown_table(_rows(more, means, results)),
         *([["## Missing"], missing] if missing else []),
         *([failures] if failures else []),
         *([notes] if notes else []),
         ["## Every object"],
-        _lines({**_present(results, PAPER_METRICS), **more}, every, results),
+        _markdown_table(_rows({**_present(results, PAPER_METRICS), **more}, every, results)),
         ["## Published"],
-        ["On Consistent4D's seven videos (Ren et al. 2024): other data, other figures."],
-        _table_lines(["method", "LPIPS ↓", "CLIP ↑", "FVD ↓", "time ↓"], [list(row) for row in PUBLISHED]),
+        ["On the seven videos of Consistent4D (Ren et al. 2024), so not comparable: other data."],
+        _markdown_table([dict(zip(PUBLISHED_HEADINGS, row, strict=True)) for row in PUBLISHED]),
     ]
     return "\n\n".join("\n".join(part) for part in parts) + "\n"
 
 
-def page(results: Results, films: Mapping[str, Mapping[str, Mapping[str, str]]]) -> str:
-    """The tables and, for every object, the films of the truth above those of the asset.
+def scores_page(results: Results, films: Mapping[str, Mapping[str, Mapping[str, str]]]) -> str:
+    """Render the tables and, for every object, the ground-truth videos above those of the asset.
 
     Args:
-        results: what to show.
-        films: by object, by whose they are ("truth", "ours") and by view: where the film lies, relative to the page.
+        results: of the benchmark.
+        films: paths of the videos relative to the page, by object, by source ("truth", "ours") and by view.
     """
     return render(
         "scores.html",
@@ -226,12 +221,12 @@ def page(results: Results, films: Mapping[str, Mapping[str, Mapping[str, str]]])
 
 
 def called(method: str) -> str:
-    """What people call a method."""
+    """Return the displayed name of a method."""
     return GUESSES.get(method, method)
 
 
 def _section(one: ObjectScores, ours: str, films: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:
-    """Return what the page shows of an object."""
+    """Return the values of an object for the page."""
     figures = figures_of(one.rows.get(ours, {}))
     return {
         "name": one.object,
@@ -245,7 +240,7 @@ def _section(one: ObjectScores, ours: str, films: Mapping[str, Mapping[str, str]
 
 
 def _present(results: Results, metrics: Mapping[str, Metric]) -> dict[str, Metric]:
-    """Those that some method has."""
+    """Return the metrics that some method has."""
     return {name: metric for name, metric in metrics.items() if any(name in one for one in results.mean.values())}
 
 
@@ -259,11 +254,20 @@ def _time(one: ObjectScores, ours: bool) -> Figures:
     return {"seconds": one.seconds} if ours and one.seconds else {}
 
 
-def _lines(metrics: Mapping[str, Metric], rows: Sequence[tuple[str, Figures]], results: Results) -> list[str]:
-    """Methods and their figures as a table of Markdown."""
-    heads = ["method", *(metric.heading for metric in metrics.values())]
-    return _table_lines(heads, [[name, *(_cell(figures, key, results) for key in metrics)] for name, figures in rows])
+def _means(results: Results) -> list[tuple[str, Figures]]:
+    return [(called(method), figures) for method, figures in results.mean.items()]
 
 
-def _table_lines(heads: list[str], rows: list[list[str]]) -> list[str]:
-    return [f"| {' | '.join(cells)} |" for cells in (heads, ["---"] * len(heads), *rows)]
+def _rows(
+    metrics: Mapping[str, Metric], methods: Sequence[tuple[str, Figures]], results: Results
+) -> list[dict[str, str]]:
+    """Return a row per method, by heading."""
+    return [
+        {"method": name, **{metric.heading: _cell(figures, key, results) for key, metric in metrics.items()}}
+        for name, figures in methods
+    ]
+
+
+def _markdown_table(rows: list[dict[str, str]]) -> list[str]:
+    heads = list(rows[0]) if rows else ["method"]
+    return [f"| {' | '.join(cells)} |" for cells in (heads, ["---"] * len(heads), *(row.values() for row in rows))]

@@ -1,1 +1,1 @@
-"""Servers, workers, deployments: what stays when a command has ended."""
+"""Background server, workers, pools and deployments, which outlive a command."""

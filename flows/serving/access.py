@@ -15,8 +15,8 @@ from flows.serving.auth import SESSION_S, Sessions, is_authorized
 from flows.serving.server import LOGIN
 
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]")
-HOSTS_VARIABLE = "DG4D_SERVER_HOSTS"  # further names of this server, separated by commas
-PREFIX = "/dg4d/"  # of every route that is not Prefect's
+HOSTS_VARIABLE = "DG4D_SERVER_HOSTS"  # further host names of this server, separated by commas
+PREFIX = "/dg4d/"  # of all routes beside Prefect's
 SESSION = "/dg4d/session"
 READING = frozenset(["GET", "HEAD", "OPTIONS"])
 OWN_SITES = frozenset(["same-origin", "none"])  # Sec-Fetch-Site of our own pages, and of a typed address
@@ -82,7 +82,7 @@ class SameOriginMiddleware:
 
 
 def is_foreign(headers: Headers, method: str) -> bool:
-    """Tell whether a request was made by a page of another origin.
+    """Return true if a request was made by a page of another origin.
 
     The scheme is not compared: a proxy may add TLS in front of this server.
 

@@ -1,4 +1,4 @@
 """Paths of the background server beside those of Prefect."""
 
 ARTIFACT_ADDRESS = "/dg4d/artifacts/"  # files of the store
-VIEWER_ADDRESS = "/dg4d/viewer/"  # pages that play an asset
+VIEWER_ADDRESS = "/dg4d/viewer/"  # viewer pages of packages

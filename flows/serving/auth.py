@@ -1,7 +1,7 @@
 """Authentication of the background server: its secret, and sessions of browsers that download artifacts.
 
-The secret is Prefect's `PREFECT_SERVER_API_AUTH_STRING`. Whoever knows it may run code as the user, so it lies in a
-file that only the user can read and never in an address that a browser sends.
+The secret is Prefect's `PREFECT_SERVER_API_AUTH_STRING`. It allows to run code as the user, so it is kept in a file
+that only the user can read, and is never part of an address that a browser sends.
 """
 
 import base64
@@ -16,7 +16,7 @@ from pathlib import Path
 
 USER = "dg4d"  # Prefect's secret has the form NAME:PASSWORD
 SECRET_BYTES = 32
-SESSION_S = 12 * 3600  # of a browser; renewed without a question by the page that signs in
+SESSION_S = 12 * 3600  # of a browser; the sign-in page renews it silently
 
 
 def auth_string(folder: Path) -> str:
@@ -30,12 +30,12 @@ def auth_string(folder: Path) -> str:
         path.chmod(0o600)
         if secret := path.read_text(encoding="ascii").strip():
             return secret
-        path.unlink()  # left empty by a full disk
+        path.unlink()  # empty: the disk was full
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile("w", dir=folder, prefix=".auth-", encoding="ascii") as file:  # mode 0600
         file.write(f"{USER}:{secrets.token_urlsafe(SECRET_BYTES)}")
         file.flush()
-        with suppress(FileExistsError):  # another command was quicker; all use the same
+        with suppress(FileExistsError):  # another command was faster; all use its secret
             os.link(file.name, path)
     return path.read_text(encoding="ascii").strip()
 

@@ -1,4 +1,4 @@
-"""The background server that the commands of a user share."""
+"""Background server of this user."""
 
 import os
 
@@ -8,12 +8,12 @@ from steps.store.files import home
 
 
 def background_server() -> Server:
-    """The server that commands share unless PREFECT_API_URL names another."""
+    """Return the server that commands share unless PREFECT_API_URL names another."""
     make_private(home())
     return Server(home() / "server", home() / "prefect")
 
 
 def set_own_server(server: Server, address: str) -> None:
-    """As `set_environment`, for the background server, with its secret; a secret of another server does not count."""
+    """Call `set_environment` for the background server, with its secret in place of that of another server."""
     os.environ["PREFECT_API_AUTH_STRING"] = server.auth_string()
     set_environment(f"{address}/api")

@@ -1,6 +1,6 @@
-"""New database for Prefect's server, made once per installation: its migrations take seconds of every new home.
+"""Database template for Prefect's server, created once per installation, since migrations take seconds per new home.
 
-`python -m flows.serving.database_template` makes it beside the interpreter, for servers that start without a database.
+`python -m flows.serving.database_template` writes it below `sys.prefix`; new servers start from a copy.
 """
 
 import shutil
@@ -18,29 +18,29 @@ NAME = "prefect.db"  # in PREFECT_HOME
 
 
 def template() -> Path:
-    """Return where the new database of this Prefect is, if it was made."""
+    """Return the path of the template for this version of Prefect; it need not exist."""
     return Path(sys.prefix) / "share" / "dg4d" / f"prefect-{version('prefect')}.db"
 
 
-def make(path: Path) -> None:
-    """Have Prefect make a new database, and write it as one file.
+def write_template(path: Path) -> None:
+    """Run Prefect's migrations on an empty database and write it as one file.
 
     Raises:
-        CalledProcessError: Prefect cannot.
-        OSError: there is no room, or the folder cannot be written.
+        CalledProcessError: the migrations failed.
+        OSError: the disk is full, or the folder cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".new-") as folder:
         command = python("-m", "prefect", "server", "database", "upgrade", "--yes")
         subprocess.run(command, env=without_prefect() | {"PREFECT_HOME": folder}, stdout=subprocess.DEVNULL, check=True)
-        whole = Path(folder) / "whole.db"
+        vacuumed = Path(folder) / "vacuumed.db"
         with closing(sqlite3.connect(Path(folder) / NAME)) as database:
-            database.execute("VACUUM INTO ?", [str(whole)])
-        whole.replace(path)
+            database.execute("VACUUM INTO ?", [str(vacuumed)])
+        vacuumed.replace(path)
 
 
 def copy_to(prefect_home: Path) -> None:
-    """Give a server without a database a copy; without a template the server makes its own."""
+    """Copy the template for a server without a database; without a template the server creates its own."""
     if (prefect_home / NAME).exists() or not template().exists():
         return
     with tempfile.TemporaryDirectory(dir=prefect_home, prefix=".new-") as folder:
@@ -48,4 +48,4 @@ def copy_to(prefect_home: Path) -> None:
 
 
 if __name__ == "__main__" and not template().exists():
-    make(template())
+    write_template(template())

@@ -1,4 +1,4 @@
-"""Work pools and deployments as `deploy/` describes them."""
+"""Work pools and deployments as described in `deploy/`."""
 
 import copy
 import sys
@@ -19,15 +19,15 @@ Json = dict[str, Any]
 
 
 class Pool(Frozen):
-    """A work pool.
+    """Work pool.
 
     Attributes:
-        type: the kind of its workers.
-        limit: runs at a time, of all workers together.
-        per_worker: runs at a time of one worker; None: as many as the pool allows.
-        description: for people.
-        variables: defaults of the job variables.
-        job: each is put over the job that such a worker makes.
+        type: type of its workers.
+        limit: concurrency limit of the pool.
+        per_worker: concurrency limit of one worker; None: that of the pool.
+        description: text for the UI.
+        variables: defaults of job variables.
+        job: patches merged into the job configuration of the worker type.
     """
 
     type: Literal["process", "docker", "kubernetes"]
@@ -38,13 +38,13 @@ class Pool(Frozen):
     job: tuple[dict[str, Any], ...] = ()
 
     def template(self, default: Json) -> Json:
-        """The base job template.
+        """Return the base job template.
 
         Args:
-            default: that of the kind of worker.
+            default: template of the worker type.
 
         Raises:
-            BadInput: a variable is not one of the worker's.
+            BadInput: the worker type does not have a variable.
         """
         template = copy.deepcopy(default)
         known = template["variables"]["properties"]
@@ -53,15 +53,15 @@ class Pool(Frozen):
         for name, value in self.variables.items():
             known[name]["default"] = value
         for patch in self.job:
-            _put_over(template["job_configuration"], patch)
+            _merge(template["job_configuration"], patch)
         return template
 
 
 def read_pools(file: Path = DEPLOY / "pools.yaml") -> dict[str, Pool]:
-    """The pools by name.
+    """Return the pools by name.
 
     Raises:
-        BadInput: the file is not there, or says something else.
+        BadInput: the file is missing or invalid.
     """
     try:
         return TypeAdapter(dict[str, Pool]).validate_python(_read(file))
@@ -85,14 +85,14 @@ def _read(file: Path) -> Json:
     return content
 
 
-def _put_over(tree: Json, patch: Json) -> None:
-    """Merge `patch` into `tree`, the items of a list that is there already one by one."""
+def _merge(tree: Json, patch: Json) -> None:
+    """Merge `patch` into `tree`; lists of the same key are merged item by item."""
     for key, value in patch.items():
         below = tree.get(key)
         if isinstance(value, dict) and isinstance(below, dict):
-            _put_over(below, value)
+            _merge(below, value)
         elif isinstance(value, list) and isinstance(below, list):
             for item, change in zip(below, value, strict=True):
-                _put_over(item, change)
+                _merge(item, change)
         else:
             tree[key] = copy.deepcopy(value)

@@ -1,4 +1,4 @@
-"""Work pools, deployments and automations put on a Prefect server, again and again with the same result."""
+"""Idempotent registration of work pools, deployments and automations on a Prefect server."""
 
 import subprocess
 from collections.abc import Mapping
@@ -16,8 +16,8 @@ from flows.processes import python
 from flows.serving.pools import DEPLOYMENTS, Json, Pool, read_deployments
 from flows.serving.workers import HEARTBEAT_S
 
-MISSED = 3  # heartbeats, before a run is taken for dead
-SAID_S = 10  # after a process died; by then its worker has said so, which workers of processes do twice
+MISSED = 3  # heartbeats before a run counts as crashed
+REPORTED_S = 10  # a process worker reports a crash twice within this time
 ALIVE = "prefect.flow-run.heartbeat"
 CRASHED = "prefect.flow-run.Crashed"
 ENDINGS = {f"prefect.flow-run.{ending}" for ending in ("Completed", "Failed", "Cancelled")}
@@ -25,7 +25,7 @@ BEGINNINGS = {f"prefect.flow-run.{beginning}" for beginning in ("AwaitingRetry",
 
 
 def _trigger(after: str, expect: set[str], within_s: float) -> EventTrigger:
-    """What does not happen to the run of a deployment, which nobody watches, after something else did."""
+    """Return a trigger for runs of deployments that see none of the expected events within a time after an event."""
     return EventTrigger(
         after={after},
         expect=expect,
@@ -41,7 +41,7 @@ def _trigger(after: str, expect: set[str], within_s: float) -> EventTrigger:
 AUTOMATIONS = (
     AutomationCore(
         name="dg4d: runs whose process died",
-        description="A worker or a whole machine that dies reports nothing; its runs would stay Running for ever.",
+        description="Marks runs as crashed whose worker or machine died without a report.",
         trigger=_trigger(ALIVE, {ALIVE, CRASHED, *ENDINGS}, MISSED * HEARTBEAT_S),
         actions=[
             ChangeFlowRunState(
@@ -53,29 +53,27 @@ AUTOMATIONS = (
     ),
     AutomationCore(
         name="dg4d: runs that died go on",
-        description="After their last finished step, on any worker; a run that dies again and again fails.",
-        trigger=_trigger(CRASHED, BEGINNINGS | ENDINGS, SAID_S),
+        description="Resumes crashed runs on any worker; a run that crashes repeatedly fails.",
+        trigger=_trigger(CRASHED, BEGINNINGS | ENDINGS, REPORTED_S),
         actions=[ChangeFlowRunState(state=StateType.SCHEDULED, name="AwaitingRetry", message="its process died")],
     ),
 )
 
 
 def register(pools: Mapping[str, Pool], chosen: list[str]) -> list[str]:
-    """Have the chosen pools, their deployments, and automations that notice runs whose process died, and go on.
+    """Create pools, their deployments, and the automations that restart crashed runs; return the deployments' names.
 
     Args:
-        pools: every pool that there may be, by name.
-        chosen: the names of those to make.
-
-    Returns:
-        The full names of the deployments.
+        pools: all known pools by name.
+        chosen: names of the pools to create.
 
     Raises:
-        BadInput: a pool that cannot be; nothing was changed.
-        BackendUnavailable: the server did not take the deployments.
+        BadInput: a pool is invalid; nothing was changed.
+        BackendUnavailable: the server rejected the deployments.
     """
     with get_client(sync_client=True) as client:
-        defaults = default_templates(client)
+        workers = {kind: worker for types in client.read_worker_metadata().values() for kind, worker in types.items()}
+        defaults = {kind: worker["default_base_job_configuration"] for kind, worker in workers.items()}
         templates = {name: pools[name].template(defaults[pools[name].type]) for name in chosen}
         for name, template in templates.items():
             pool = pools[name]
@@ -93,7 +91,7 @@ def register(pools: Mapping[str, Pool], chosen: list[str]) -> list[str]:
         there = {f"{client.read_flow(found.flow_id).name}/{found.name}" for found in client.read_deployments()}
     names = [f"{_flow_of(one)}/{one['name']}" for one in deployments]
     if missing := [name for name in names if name not in there]:
-        raise BackendUnavailable(f"the Prefect server did not take the deployments {', '.join(missing)}")
+        raise BackendUnavailable(f"the Prefect server did not register the deployments {', '.join(missing)}")
     return names
 
 
@@ -102,18 +100,8 @@ def _flow_of(deployment: Json) -> str:
     return str(deployment["entrypoint"]).rpartition(".")[2].replace("_", "-")
 
 
-def default_templates(client: SyncPrefectClient) -> dict[str, Json]:
-    """The base job template of every kind of worker."""
-    collections = client.read_worker_metadata().values()
-    return {
-        kind: worker["default_base_job_configuration"]
-        for collection in collections
-        for kind, worker in collection.items()
-    }
-
-
 def _deploy(names: list[str]) -> None:
-    """Prefect's own reading of the file, so that it means here what it means elsewhere."""
+    """Run `prefect deploy`, so that the file means the same as with Prefect's own command."""
     chosen = [word for name in names for word in ("--name", name)]
     done = subprocess.run(
         python("-m", "prefect", "--no-prompt", "deploy", "--prefect-file", str(DEPLOYMENTS), *chosen),
@@ -131,10 +119,10 @@ def _automate(client: SyncPrefectClient) -> None:
         known = client.find_automation(automation.name)
         if known is None:
             client.create_automation(automation)
-        elif _content(known) != _content(automation):  # a server forgets the runs that it follows for one that changes
+        elif _content(known) != _content(automation):  # an update resets the runs that a trigger follows
             client.update_automation(known.id, automation)
 
 
 def _content(automation: AutomationCore) -> Json:
-    """What an automation does, without what a server adds."""
+    """Return an automation without the fields that the server adds."""
     return automation.model_dump(include=set(AutomationCore.model_fields))

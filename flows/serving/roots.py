@@ -1,7 +1,7 @@
-"""Folders and prefixes of object stores that deployments may read, and folders that they may write.
+"""Allow-lists of the folders and object store prefixes that deployments may read and write.
 
-Whoever reaches the server fills in the forms; which folders they may name, the user of the worker's machine says:
-`$DG4D_SOURCES` and `$DG4D_OUTPUTS` of the worker, and what a `dg4d watch` of the same user watches at the moment.
+Every user of the server can fill in the forms. The user of the worker's machine decides which folders they may name:
+`$DG4D_SOURCES` and `$DG4D_OUTPUTS` of the worker, and the folders of a running `dg4d watch` of the same user.
 """
 
 import json
@@ -16,7 +16,7 @@ from urllib.parse import unquote
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.weights.registry import KNOWN
-from flows.inputs.listing import BUCKET, WILD
+from flows.inputs.listing import BUCKET, WILDCARDS
 from flows.inputs.manifest import Item
 from flows.processes import locked
 from flows.serving import background
@@ -25,26 +25,21 @@ from steps.runtime.weights import weights_home, weights_in
 from steps.store.files import home as home_folder
 
 SOURCES, OUTPUTS = "DG4D_SOURCES", "DG4D_OUTPUTS"
-SEPARATOR = re.compile(rf"{re.escape(os.pathsep)}(?!//)")  # not the one in s3://BUCKET
+SEPARATOR = re.compile(rf"{re.escape(os.pathsep)}(?!//)")  # except in s3://BUCKET
 
 
 class Roots(Frozen):
-    """Places that a deployment may read and write, links resolved.
-
-    Attributes:
-        sources: folders, and `s3://BUCKET/PREFIX`.
-        outputs: folders.
-    """
+    """Folders and `s3://BUCKET/PREFIX` that deployments may read, and folders they may write; links are resolved."""
 
     sources: tuple[str, ...]
     outputs: tuple[str, ...]
 
     @classmethod
     def of_this_process(cls) -> "Roots":
-        """Read the environment, and the folders that are watched at the moment.
+        """Return the roots from the environment, and those of running `dg4d watch` commands.
 
-        Without `$DG4D_SOURCES` it is the current folder, which Prefect makes anew, and empty, for each run of a process
-        worker; without `$DG4D_OUTPUTS`, the folders among the sources.
+        Default of `$DG4D_SOURCES` is the current folder, which is new and empty in each run of a process worker; the
+        default of `$DG4D_OUTPUTS` are the folders among the sources.
         """
         sources = _places(os.environ.get(SOURCES) or str(Path.cwd()))
         outputs = _places(os.environ.get(OUTPUTS, "")) or _folders(sources)
@@ -55,10 +50,10 @@ class Roots(Frozen):
         )
 
     def source(self, address: str) -> str:
-        """Return the address of a source that may be read; of web servers, fetching checks the host.
+        """Return the address of a source that may be read; hosts of web addresses are checked on download.
 
         Raises:
-            BadInput: it lies elsewhere.
+            BadInput: it is outside of the roots.
         """
         return address if "://" in address and not address.startswith(BUCKET) else self.folder(address)
 
@@ -66,10 +61,10 @@ class Roots(Frozen):
         """Return a folder, a manifest, a pattern or a prefix of an object store that may be read.
 
         Raises:
-            BadInput: it lies elsewhere.
+            BadInput: it is outside of the roots.
         """
         parts = Path(given).parts
-        first = next((i for i, part in enumerate(parts) if WILD & set(part)), len(parts))
+        first = next((i for i, part in enumerate(parts) if WILDCARDS & set(part)), len(parts))
         if given.startswith(BUCKET) or first == len(parts) or _exists(given):
             return self.folder(given)
         if ".." in parts[first:]:
@@ -80,7 +75,7 @@ class Roots(Frozen):
         """Return a path, or a place in an object store, that may be read.
 
         Raises:
-            BadInput: it lies elsewhere.
+            BadInput: it is outside of the roots.
         """
         if given.startswith(BUCKET):
             if not any(_is_below_prefix(given, root) for root in self.sources if root.startswith(BUCKET)):
@@ -92,15 +87,15 @@ class Roots(Frozen):
         """Return a folder that may be written.
 
         Raises:
-            BadInput: it lies elsewhere.
+            BadInput: it is outside of the roots.
         """
         return _inside(given, self.outputs, _refusal(given, "write", self.outputs, OUTPUTS))
 
     def check_files(self, paths: Iterable[Path]) -> None:
-        """Refuse files that may not be read; links lead where they lead.
+        """Refuse files outside of the sources, after links are resolved.
 
         Raises:
-            BadInput: says which.
+            BadInput: a file is outside.
         """
         for path in paths:
             self.folder(str(path))
@@ -109,28 +104,28 @@ class Roots(Frozen):
         """Refuse an item of a batch whose files or weights may not be read.
 
         Raises:
-            BadInput: says which.
+            BadInput: a file or folder is outside.
         """
-        if item.wish is None:
+        if item.request is None:
             return
-        files = (None if item.remote else item.wish.picture, item.wish.video, item.wish.bank)
+        files = (None if item.remote else item.request.picture, item.request.video, item.request.bank)
         self.check_files(file for file in files if file is not None)
-        self.check_weights(item.wish.settings.model_dump(mode="json"))
+        self.check_weights(item.request.settings.model_dump(mode="json"))
 
     def check_knobs(self, knobs: Mapping[str, Any]) -> None:
-        """Refuse knobs, as `prior.weights`, that name folders of weights which may not be read.
+        """Refuse settings such as `prior.weights` that name folders of weights which may not be read.
 
         Raises:
-            BadInput: says which.
+            BadInput: a folder is outside.
         """
-        for knob, value in knobs.items():
-            self.check_weights({knob.rpartition(".")[2]: value})
+        for name, value in knobs.items():
+            self.check_weights({name.rpartition(".")[2]: value})
 
     def check_weights(self, tree: Mapping[str, Any]) -> None:
-        """Refuse a dumped settings tree that names folders of weights which may not be read.
+        """Refuse a settings tree that names folders of weights which may not be read.
 
         Raises:
-            BadInput: says which.
+            BadInput: a folder is outside.
         """
         for name in weights_in(tree):
             if name not in KNOWN and _may_be_path(name):
@@ -139,20 +134,20 @@ class Roots(Frozen):
 
 
 def environment(given: Iterable[str] = ()) -> dict[str, str]:
-    """Return the variables of a worker whose deployments may read, and write, these places.
+    """Return the environment variables that grant a worker these roots.
 
     Args:
-        given: folders, or `s3://BUCKET/PREFIX`; default: `$DG4D_SOURCES`, else the current folder.
+        given: folders or `s3://BUCKET/PREFIX`; default: `$DG4D_SOURCES`, else the current folder.
 
     Raises:
-        BadInput: one is no folder, or cannot be named in a variable.
+        BadInput: one is not a folder, or contains the separator.
     """
     chosen = tuple(given)
     for place in chosen:
         if not place.startswith(BUCKET) and not Path(place).is_dir():
-            raise BadInput(f"--sources {place} is no folder; give one, or s3://BUCKET/PREFIX")
+            raise BadInput(f"--sources {place} is not a folder; give one, or s3://BUCKET/PREFIX")
         if SEPARATOR.search(place):
-            raise BadInput(f"--sources {place} has {os.pathsep!r} in its name, which separates folders; give another")
+            raise BadInput(f"--sources {place} contains {os.pathsep!r}, which separates folders; rename the folder")
     sources = _resolved(chosen) or _places(os.environ.get(SOURCES) or str(Path.cwd()))
     outputs = _places(os.environ.get(OUTPUTS, "")) or _folders(sources)
     return {SOURCES: os.pathsep.join(sources), OUTPUTS: os.pathsep.join(outputs)}
@@ -160,9 +155,9 @@ def environment(given: Iterable[str] = ()) -> dict[str, str]:
 
 @contextmanager
 def granted(folder: Path, out: Path) -> Iterator[None]:
-    """Let deployments of this user read one folder, and write another, as long as the block runs.
+    """Let deployments of this user read one folder and write another while the block runs.
 
-    A file says so, which only this user can write; its lock ends with this process, however that ends.
+    The grant is a locked file that only this user can write; the lock ends with this process.
     """
     _grants().mkdir(mode=0o700, parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix="watch-", suffix=".new", dir=_grants())  # mode 0600
@@ -179,7 +174,7 @@ def granted(folder: Path, out: Path) -> Iterator[None]:
 
 
 def _granted() -> Iterator[Roots]:
-    """Read what others grant at the moment, and remove what is left of those who have ended."""
+    """Yield the grants of running processes; remove those of processes that have ended."""
     for file in sorted(_grants().glob("*.json")):
         with locked(file, shared=True) as ended:
             if ended:
@@ -193,7 +188,7 @@ def _grants() -> Path:
 
 
 def _places(text: str) -> tuple[str, ...]:
-    """Split a variable into places."""
+    """Split the value of a variable into resolved roots."""
     return _resolved(place for place in SEPARATOR.split(text) if place)
 
 
@@ -208,10 +203,10 @@ def _folders(places: Iterable[str]) -> tuple[str, ...]:
 
 
 def _inside(given: str, roots: Iterable[str], refusal: BadInput) -> Path:
-    """Return a path without links; raise the refusal unless it lies in or below a root, and not in our own folder."""
+    """Resolve a path; raise the refusal unless it is in or below a root and outside of `$DG4D_HOME`."""
     try:
         path = Path(given).expanduser().resolve()
-    except (OSError, RuntimeError, ValueError) as error:  # a circle of links, nobody's home, a NUL
+    except (OSError, RuntimeError, ValueError) as error:  # circular links, an unknown user, a NUL
         raise refusal from error
     own = home_folder().resolve()
     for root in map(Path, roots):

@@ -1,9 +1,8 @@
-"""Prefect server in the background, shared by all commands of a user; it ends when nobody has used it for a while.
+"""Background Prefect server, shared by all commands of a user; it ends when it was not used for a while.
 
-`python -m flows.serving.server FOLDER PREFECT_HOME` leaves a guard behind: it starts the server, writes its address to
-FOLDER/server.json, and watches it. The server listens on the loopback interface only and asks for the secret in
-FOLDER/auth.
-Commands hold a shared lock on FOLDER/in-use while they run; the kernel frees it when they end, however they end.
+`python -m flows.serving.server FOLDER PREFECT_HOME` detaches a guard, which starts the server, writes its address to
+FOLDER/server.json and watches it. The server listens on the loopback interface only and asks for the secret in
+FOLDER/auth. A command holds a shared lock on FOLDER/in-use while it runs, which the kernel frees at its end.
 """
 
 import fcntl
@@ -17,20 +16,21 @@ import sys
 import time
 from contextlib import suppress
 from pathlib import Path
-from types import FrameType
 from typing import IO
 from urllib.parse import quote
 
-from flows.processes import die_with_parent, locked, python, without_prefect
+from flows.processes import die_with_parent, end, exit_guard, locked, python, spawn_guard, without_prefect
 from flows.serving import auth, database_template
+from steps.store.files import write_atomically
 
 HOST = "127.0.0.1"  # never another interface: the traffic is not encrypted
 LOGIN = "/dg4d/login"
 START_TIMEOUT_S = 120.0
-STARTS = 3  # before giving up on a server that ends
-GUARD_START_S = 20.0  # a bare interpreter
-IDLE_S = 1800.0  # without a command before the server ends; $DG4D_SERVER_IDLE_S
-LOOK_S = 1.0  # between two looks of the guard
+STARTS = 3  # attempts with a server that exits
+GUARD_START_S = 20.0  # start of a bare interpreter
+IDLE_S = 1800.0  # time without a command before the server ends; $DG4D_SERVER_IDLE_S
+LOOK_S = 1.0  # between two checks of the guard
+GRACE_S = 8.0  # between SIGTERM and SIGKILL
 
 SETTINGS = {
     "DO_NOT_TRACK": "1",
@@ -45,23 +45,23 @@ SETTINGS = {
     "PREFECT_SERVER_SERVICES_TASK_RUN_RECORDER_FLUSH_INTERVAL": "1",
     "PREFECT_SERVER_SERVICES_EVENT_PERSISTER_BATCH_SIZE": "500",
     "PREFECT_SERVER_SERVICES_EVENT_PERSISTER_READ_BATCH_SIZE": "200",
-    # a slot that a killed run held is free again, also after the server was started anew
+    # slots of a killed run become free, also after a restart of the server
     "PREFECT_SERVER_CONCURRENCY_LEASE_STORAGE": "prefect.server.concurrency.lease_storage.filesystem",
-    # and a run that was killed goes on then
+    # a killed run is resumed after a restart
     "PREFECT_SERVER_EVENTS_CAUSAL_ORDERING": "flows.prefect_compat",
 }
 
 
 class ServerUnavailable(Exception):
-    """The server could not be started, or did not answer; says where its log is."""
+    """Server that cannot be started or does not answer; the message names its log."""
 
 
 class Server:
-    """The background server whose state is in `folder`.
+    """Background server whose state is in `folder`.
 
     Args:
-        folder: of the lock files, the log and `server.json`.
-        prefect_home: of the database; handed to the server as PREFECT_HOME.
+        folder: folder of lock files, log and `server.json`.
+        prefect_home: folder of the database; the PREFECT_HOME of the server.
     """
 
     def __init__(self, folder: Path, prefect_home: Path) -> None:
@@ -70,28 +70,19 @@ class Server:
 
     @property
     def log(self) -> Path:
-        """What the server and its guard print."""
+        """Output of the server and its guard."""
         return self.folder / "server.log"
 
     def start(self) -> None:
-        """Start it unless it runs, without waiting for it. From here on this command counts as a user."""
+        """Start the server in the background unless it runs; it stays while this process uses it."""
         self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        self.auth_string()  # before anything can ask for it
+        self.auth_string()  # creates the secret
         if self._in_use is None:
             self._in_use = (self.folder / "in-use").open("a")
-            fcntl.flock(self._in_use, fcntl.LOCK_SH)  # waits for a guard that is just ending its server
+            fcntl.flock(self._in_use, fcntl.LOCK_SH)  # waits for a guard that is ending its server
         if not self.is_guarded():
-            with self.log.open("ab") as log:
-                subprocess.run(
-                    python("-m", "flows.serving.server", str(self.folder), str(self.prefect_home)),
-                    stdin=subprocess.DEVNULL,
-                    stdout=log,
-                    stderr=log,
-                    cwd=self.folder,
-                    start_new_session=True,
-                    umask=0o077,  # the database and the logs have what users asked for
-                    check=False,
-                )
+            arguments = (str(self.folder), str(self.prefect_home))
+            spawn_guard("flows.serving.server", arguments, self.log, "ab", os.environ)
 
     def auth_string(self) -> str:
         """Return the secret that the server asks for, NAME:PASSWORD."""
@@ -102,10 +93,10 @@ class Server:
         return f"{address}{LOGIN}#{quote(self.auth_string(), safe=':')}"
 
     def wait_for_address(self) -> str:
-        """Where it will be; known before it answers.
+        """Return the address of the server, which is known before it answers.
 
         Raises:
-            ServerUnavailable: its guard did not start.
+            ServerUnavailable: the guard did not start.
         """
         deadline = time.monotonic() + GUARD_START_S
         while time.monotonic() < deadline:
@@ -113,13 +104,13 @@ class Server:
                 return address
             time.sleep(0.02)
         self.release()
-        raise ServerUnavailable(f"the guard of the Prefect server did not start; what it said is in {self.log}")
+        raise ServerUnavailable(f"the guard of the Prefect server did not start; see {self.log}")
 
     def wait(self, timeout_s: float = START_TIMEOUT_S) -> str:
-        """Wait until it answers; the address of its API.
+        """Wait until the server answers; return the address of its API.
 
         Raises:
-            ServerUnavailable: it did not within `timeout_s`, or it ended.
+            ServerUnavailable: it did not answer within `timeout_s`, or exited.
         """
         deadline = time.monotonic() + timeout_s
         starts = 1
@@ -134,31 +125,31 @@ class Server:
             time.sleep(0.1)
         self.release()
         raise ServerUnavailable(
-            f"the Prefect server did not answer within {timeout_s:g} s; what it said is in {self.log}. "
+            f"the Prefect server did not answer within {timeout_s:g} s; see {self.log}. "
             "Set PREFECT_API_URL to use a server of your own."
         )
 
     def address(self) -> str | None:
-        """Where it is, or will be when it has started; None when it does not run."""
+        """Return the address of the server, also while it starts; None if it does not run."""
         state = self._state()
         return f"http://{HOST}:{state['port']}" if state and self.is_guarded() else None
 
     def is_at(self, api_url: str) -> bool:
-        """Whether this is the address of its API, or was when it last ran."""
+        """Return true if this is the present or last address of its API."""
         try:
             return api_url == f"http://{HOST}:{(self.folder / 'port').read_text(encoding='ascii')}/api"
         except OSError:
             return False
 
     def keep(self) -> None:
-        """Do not end it for want of users."""
+        """Keep the server running when no command uses it."""
         (self.folder / "keep").touch()
 
     def stop(self, timeout_s: float = 20.0) -> bool:
-        """End it; whether it was running.
+        """Stop the server; return false if it was not running.
 
         Raises:
-            ServerUnavailable: it is still there after `timeout_s`.
+            ServerUnavailable: it still runs after `timeout_s`.
         """
         (self.folder / "keep").unlink(missing_ok=True)
         state = self._state()
@@ -174,7 +165,7 @@ class Server:
         return True
 
     def release(self) -> None:
-        """This command does not use it any more."""
+        """Stop using the server in this process."""
         if self._in_use is not None:
             self._in_use.close()
             self._in_use = None
@@ -187,18 +178,18 @@ class Server:
             return None
 
     def is_used(self) -> bool:
-        """Return whether a command uses it."""
+        """Return true if a command uses the server."""
         with locked(self.folder / "in-use") as unused:
             return not unused
 
     def is_guarded(self) -> bool:
-        """Whether its guard is there: it runs, or starts."""
+        """Return true if its guard runs."""
         with locked(self.folder / "guard", shared=True) as free:
             return not free
 
 
 def answers(address: str, timeout_s: float) -> bool:
-    """Whether a Prefect server at `address` says that it is well."""
+    """Return true if a Prefect server at `address` reports that it is healthy."""
     host, _, port = address.removeprefix("http://").partition(":")
     connection = http.client.HTTPConnection(host, int(port), timeout=timeout_s)
     try:
@@ -211,10 +202,10 @@ def answers(address: str, timeout_s: float) -> bool:
 
 
 def guard(folder: Path, prefect_home: Path) -> int:
-    """Run the server until it is told to stop, ends by itself, or nobody uses it."""
+    """Run the server until it is stopped, exits, or is idle for `$DG4D_SERVER_IDLE_S`."""
     with locked(folder / "guard", patience_s=1.0) as alone:
         if not alone:
-            return 0  # another guard was quicker
+            return 0  # another guard was faster
         state = folder / "server.json"
         state.unlink(missing_ok=True)
         os.truncate(folder / "server.log", 0)
@@ -222,34 +213,31 @@ def guard(folder: Path, prefect_home: Path) -> int:
         listener = _listener(state)
         port = int(listener.getsockname()[1])
         process = _serve(listener, folder, prefect_home)
-        signal.signal(signal.SIGTERM, leave)
+        signal.signal(signal.SIGTERM, exit_guard)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:
-            scratch = state.with_suffix(".new")
-            scratch.write_text(json.dumps({"guard": os.getpid(), "port": port}), encoding="utf-8")
-            scratch.replace(state)
+            write_atomically(state, json.dumps({"guard": os.getpid(), "port": port}))
             return _watch(process, folder, idle_s)
         finally:
             state.unlink(missing_ok=True)
-            end(process)
+            end(process, GRACE_S)
 
 
 def _watch(process: subprocess.Popen[bytes], folder: Path, idle_s: float) -> int:
+    """Return when the server has exited, or was ended because no command used it for `idle_s` seconds."""
     last_use = time.monotonic()
     while True:
-        try:
+        with suppress(subprocess.TimeoutExpired):
             return process.wait(LOOK_S)
-        except subprocess.TimeoutExpired:
-            pass
         if (folder / "keep").exists():
             last_use = time.monotonic()
             continue
-        with locked(folder / "in-use") as unused:
+        with locked(folder / "in-use") as unused:  # until the server has ended, so that new commands wait for that
             if not unused:
                 last_use = time.monotonic()
             elif time.monotonic() - last_use > idle_s:
                 (folder / "server.json").unlink(missing_ok=True)
-                end(process)
+                end(process, GRACE_S)
                 return 0
 
 
@@ -273,25 +261,10 @@ def _serve(listener: socket.socket, folder: Path, prefect_home: Path) -> subproc
     )
 
 
-def end(process: subprocess.Popen[bytes]) -> None:
-    """End a process, gently first."""
-    process.terminate()
-    try:
-        process.wait(8.0)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-
-
-def leave(number: int, frame: FrameType | None) -> None:
-    """What a guard does when it is told to stop."""
-    sys.exit(0)
-
-
 def _listener(state: Path) -> socket.socket:
-    """Bind the port of last time, so that addresses stay, or one that is free.
+    """Bind the last port, so that addresses stay valid, or else a free one.
 
-    The guard keeps the socket: nobody else can take the port and be asked for the secret while the server starts.
+    The guard keeps the socket, so no other process can take the port and receive the secret while the server starts.
     """
     before = 0
     with suppress(OSError, ValueError):
@@ -306,10 +279,10 @@ def _listener(state: Path) -> socket.socket:
             continue
         (state.parent / "port").write_text(str(listener.getsockname()[1]), encoding="ascii")
         return listener
-    raise ServerUnavailable(f"No port is free on {HOST}.")
+    raise ServerUnavailable(f"no port is free on {HOST}: end other programs")
 
 
 if __name__ == "__main__":
     if os.fork():
-        os._exit(0)  # whoever started the guard does not wait for it
+        os._exit(0)  # the caller waits for this process only
     sys.exit(guard(Path(sys.argv[1]), Path(sys.argv[2])))

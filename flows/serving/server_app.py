@@ -8,22 +8,22 @@ import sys
 from pathlib import Path, PurePath
 
 import uvicorn
-from fastapi import Depends, Response
-from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse
+from fastapi import Depends, HTTPException, Response
+from fastapi.responses import FileResponse, HTMLResponse
 from prefect.settings import PREFECT_SERVER_API_AUTH_STRING
 from pydantic import ValidationError
 from starlette.types import ASGIApp
 
 from dg4d_lib.errors import BadInput
 from flows import home, prefect_compat
-from flows.packages.view import page_of_package
+from flows.packages.view import viewer_of_package
 from flows.prefect_compat import add_first
 from flows.serving.access import SESSION, SignIn, protect
 from flows.serving.addresses import ARTIFACT_ADDRESS, VIEWER_ADDRESS
 from flows.serving.server import LOGIN
 from steps.contract import ArtifactRef
 
-SHOWN = {".png": "image/png", ".json": "application/json"}  # what a browser shows; the rest is saved to disk
+SHOWN = {".png": "image/png", ".json": "application/json"}  # inline; other files are downloads
 
 
 def create_app() -> ASGIApp:
@@ -35,7 +35,7 @@ def create_app() -> ASGIApp:
     secret = PREFECT_SERVER_API_AUTH_STRING.value()
     if not secret:
         raise RuntimeError(
-            "PREFECT_SERVER_API_AUTH_STRING is not set: whoever reaches this server could run code on its workers. Set "
+            "PREFECT_SERVER_API_AUTH_STRING is not set: every client of this server could run code on its workers. Set "
             "it to NAME:PASSWORD here, and PREFECT_API_AUTH_STRING to the same for clients and workers."
         )
     application = prefect_compat.create_app()
@@ -50,18 +50,15 @@ def create_app() -> ASGIApp:
 
 
 def serve(listener: socket.socket) -> None:
-    """Serve the application on a bound socket until the process is told to stop."""
+    """Serve the application on a bound socket until the process is stopped."""
     uvicorn.Server(uvicorn.Config(create_app(), log_level="warning")).run(sockets=[listener])
 
 
 def artifact(digest: str, size: int, name: str) -> Response:
     """Return a file of the store, by the address that `pages.address` gives."""
-    path = _path(digest, size)
-    if isinstance(path, Response):
-        return path
     kind = SHOWN.get(PurePath(name).suffix)
     return FileResponse(
-        path,
+        _path(digest, size),
         media_type=kind or "application/octet-stream",
         filename=PurePath(name).name,
         content_disposition_type="inline" if kind else "attachment",
@@ -70,25 +67,26 @@ def artifact(digest: str, size: int, name: str) -> Response:
 
 def viewer(digest: str, size: int, name: str) -> Response:
     """Return the page that plays a package of the store, in an origin of its own: it cannot read the secret."""
-    path = _path(digest, size)
-    if isinstance(path, Response):
-        return path
     try:
-        page = page_of_package(path, PurePath(name).stem)
-        return HTMLResponse(page, headers={"Content-Security-Policy": "sandbox allow-scripts allow-downloads"})
+        page = viewer_of_package(_path(digest, size), PurePath(name).stem)
     except BadInput as error:
-        return PlainTextResponse(str(error), 404)
+        raise HTTPException(404, str(error)) from error
+    return HTMLResponse(page, headers={"Content-Security-Policy": "sandbox allow-scripts allow-downloads"})
 
 
-def _path(digest: str, size: int) -> Path | Response:
-    """Return the file of an artifact, or a 404."""
+def _path(digest: str, size: int) -> Path:
+    """Return the file of an artifact.
+
+    Raises:
+        HTTPException: 404; it is not in the store.
+    """
     try:
         ref = ArtifactRef(digest=f"sha256:{digest}", media_type="application/octet-stream", size_bytes=size)
-    except ValidationError:
-        return PlainTextResponse("no such artifact", 404)
+    except ValidationError as error:
+        raise HTTPException(404, "this is not the address of an artifact") from error
     store = home.store()
     if not store.has(ref):
-        return PlainTextResponse("this artifact is not in the store; run the same command again to renew it", 404)
+        raise HTTPException(404, "this artifact is not in the store; run the same command again to renew it")
     return store.path(ref)
 
 

@@ -1,4 +1,4 @@
-"""A folder into which people drop files: the server is told when what is in it is new and has come to rest."""
+"""Watched folder: sends an event to the server when its files have changed and come to rest."""
 
 import hashlib
 from pathlib import Path
@@ -11,34 +11,34 @@ from dg4d_lib.errors import BadInput
 from steps.contract import digest_of
 from steps.store.files import write_atomically
 
-CHANGED = "dg4d.folder.changed"  # the event that the trigger in deploy/prefect.yaml waits for
+CHANGED = "dg4d.folder.changed"  # event of the trigger in deploy/prefect.yaml
 
 Stamps = dict[str, tuple[int, int]]
 
 
 class Watcher:
-    """Looks at a folder now and then.
+    """Watcher of a folder.
 
     Args:
-        folder: with its folders, without hidden files.
-        out: whose files do not count.
-        rest_s: seconds for which nothing may change before it counts: a large file takes time to arrive.
-        memory: a file that keeps the digest of what was told last, so that nothing is told twice.
+        folder: watched folder with its subfolders; hidden files do not count.
+        out: output folder; its files do not count.
+        rest_s: seconds without a change before files count as complete.
+        memory: file with the last announced digest, so that no state is announced twice.
     """
 
     def __init__(self, folder: Path, out: Path, rest_s: float, memory: Path) -> None:
         if not folder.is_dir():
-            raise BadInput(f"{folder} is no folder; give one into which pictures, videos or a manifest are dropped")
+            raise BadInput(f"{folder} is not a folder; give one into which pictures, videos or a manifest are dropped")
         self.folder, self.out, self.rest_s, self.memory = folder.resolve(), out.resolve(), rest_s, memory
         self._stamps: Stamps = {}
         self._since = 0.0
         self._contents: dict[tuple[str, int, int], str] = {}
 
     def look(self, now: float) -> str | None:
-        """The digest of what is in the folder if it is at rest and was not told yet; None otherwise.
+        """Return the digest of the folder if it is at rest and was not announced yet; else None.
 
         Args:
-            now: seconds of a clock that only goes forward.
+            now: time of a monotonic clock in seconds.
         """
         stamps = self._stamp()
         if stamps != self._stamps:
@@ -47,12 +47,12 @@ class Watcher:
             return None
         try:
             digest = digest_of({name: self._content(name, *stamp) for name, stamp in stamps.items()})
-        except OSError:  # it went away while it was read
+        except OSError:  # a file was removed meanwhile
             return None
         return None if self.memory.exists() and self.memory.read_text(encoding="ascii") == digest else digest
 
     def told(self, digest: str) -> None:
-        """Remember that the server knows."""
+        """Remember that a digest was announced."""
         self.memory.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(self.memory, digest)
 
@@ -76,7 +76,7 @@ class Watcher:
 
 
 def announce(folder: Path, out: Path, digest: str) -> None:
-    """Tell the server that a folder has changed; raises what its client raises when it does not take it."""
+    """Send the event that a folder has changed; raise the client's error if the server rejects it."""
     event = Event(
         id=uuid4(),
         event=CHANGED,

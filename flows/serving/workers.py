@@ -1,7 +1,7 @@
-"""One Prefect worker for each work pool that this machine serves, in the background and started again when it ends.
+"""Background Prefect workers, one per work pool that this machine serves, restarted when they exit.
 
-`python -m flows.serving.workers POOL FOLDER API_URL` leaves a guard behind, which holds a lock on
-FOLDER/worker-POOL.lock. It ends with the server whose state is in FOLDER, if that is the one at API_URL.
+`python -m flows.serving.workers POOL FOLDER API_URL` detaches a guard, which locks FOLDER/worker-POOL.lock. It ends
+with the server whose state is in FOLDER, if that is the one at API_URL.
 """
 
 import os
@@ -14,25 +14,25 @@ from contextlib import suppress
 from pathlib import Path
 
 from dg4d_lib.errors import BadInput
-from flows.processes import die_with_parent, locked, python, start_of
+from flows.processes import die_with_parent, end, exit_guard, locked, python, spawn_guard, start_of
 from flows.serving.roots import SOURCES
-from flows.serving.server import LOOK_S, Server, leave
+from flows.serving.server import LOOK_S, Server
 from steps.store.files import write_atomically
 
-RESTART_S = 5.0  # between two starts of a worker
-GRACE_S = 10.0  # for a worker and its runs to end
-QUERY_S = 2.0  # between two looks at the pool; Prefect's own is 10
+RESTART_S = 5.0  # between exit and restart of a worker
+GRACE_S = 10.0  # between SIGTERM and SIGKILL of a worker
+QUERY_S = 2.0  # between two queries of the pool; Prefect's default is 10
 LIMIT = "DG4D_WORKER_LIMIT"  # runs of a worker at a time
-HEARTBEAT_S = 30  # of runs; what misses three of them is dead
-RUN_VARIABLE = b"PREFECT__FLOW_RUN_ID="  # in the environment of the process of a run
+HEARTBEAT_S = 30  # of runs; `registering.py` marks a run as crashed when it misses three
+RUN_VARIABLE = b"PREFECT__FLOW_RUN_ID="  # in the environment of a run's process
 
 
 class Worker:
-    """The worker of a pool on this machine.
+    """Worker of a pool on this machine.
 
     Args:
-        pool: its name.
-        folder: of the server's state; the worker's lock and log are there too.
+        pool: name of the pool.
+        folder: folder of the server's state, and of the lock and log of the worker.
     """
 
     def __init__(self, pool: str, folder: Path) -> None:
@@ -40,64 +40,54 @@ class Worker:
 
     @property
     def log(self) -> Path:
-        """What the worker and its runs print."""
+        """Output of the worker and its runs."""
         return self.folder / f"worker-{self.pool}.log"
 
     def is_there(self) -> bool:
-        """Whether its guard runs."""
-        with locked(self._place("lock"), shared=True) as free:
+        """Return true if its guard runs."""
+        with locked(self._file("lock"), shared=True) as free:
             return not free
 
     @property
     def sources(self) -> str:
-        """Places that its runs may read, as `$DG4D_SOURCES` had them when it was started; empty: never started."""
-        place = self._place("sources")
-        return place.read_text(encoding="utf-8") if place.exists() else ""
+        """Value of `$DG4D_SOURCES` when the worker was started; empty if it never was."""
+        file = self._file("sources")
+        return file.read_text(encoding="utf-8") if file.exists() else ""
 
     def start(self, api_url: str, variables: Mapping[str, str] | None = None) -> None:
-        """Start it with the environment of this process and these variables, unless it runs."""
+        """Start the worker unless it runs, with the environment of this process and these variables."""
         if self.is_there():
             return
         child = {**os.environ, **(variables or {})}
-        write_atomically(self._place("sources"), child.get(SOURCES, ""))
-        with self.log.open("wb") as log:
-            subprocess.run(
-                python("-m", "flows.serving.workers", self.pool, str(self.folder), api_url),
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                cwd=self.folder,
-                env=child,
-                start_new_session=True,
-                check=False,
-            )
+        write_atomically(self._file("sources"), child.get(SOURCES, ""))
+        spawn_guard("flows.serving.workers", (self.pool, str(self.folder), api_url), self.log, "wb", child)
 
     def runs(self) -> int:
-        """Return the number of runs that it executes at this moment."""
-        with suppress(OSError, ValueError):  # it may just be ending
-            guard = int(self._place("pid").read_text(encoding="ascii"))
+        """Return the number of its active runs."""
+        with suppress(OSError, ValueError):  # the guard may be exiting
+            guard = int(self._file("pid").read_text(encoding="ascii"))
             return sum(_is_run(child) for worker in _children(guard) for child in _children(int(worker)))
         return 0
 
     def stop(self) -> bool:
-        """End it and the runs that it started; whether it was there."""
+        """Stop the worker and its runs; return false if it was not running."""
         if not self.is_there():
             return False
         deadline = time.monotonic() + 2 * GRACE_S
         while self.is_there() and time.monotonic() < deadline:
-            with suppress(OSError, ValueError):  # it may just be starting, or ending
-                os.kill(int(self._place("pid").read_text(encoding="ascii")), signal.SIGTERM)
+            with suppress(OSError, ValueError):  # the guard may be starting or exiting
+                os.kill(int(self._file("pid").read_text(encoding="ascii")), signal.SIGTERM)
             time.sleep(0.1)
         return True
 
     def guard(self, api_url: str) -> int:
-        """Keep a worker running until told to stop, or until the server of this machine is gone, if it is of that."""
-        with locked(self._place("lock"), patience_s=1.0) as alone:
+        """Restart the worker until SIGTERM, or until the background server ends if the worker belongs to it."""
+        with locked(self._file("lock"), patience_s=1.0) as alone:
             if not alone:
-                return 0  # another guard was quicker
-            signal.signal(signal.SIGTERM, leave)
-            signal.signal(signal.SIGINT, lambda *_: None)  # SIG_IGN would be the worker's too, which ends by it
-            self._place("pid").write_text(str(os.getpid()), encoding="ascii")
+                return 0  # another guard was faster
+            signal.signal(signal.SIGTERM, exit_guard)
+            signal.signal(signal.SIGINT, lambda *_: None)  # the worker would inherit SIG_IGN, and SIGINT stops it
+            self._file("pid").write_text(str(os.getpid()), encoding="ascii")
             server = Server(self.folder, self.folder)
             own = server.is_at(api_url)
             try:
@@ -105,13 +95,14 @@ class Worker:
                     self._run(api_url, server if own else None)
                     time.sleep(RESTART_S)
             finally:
-                self._place("pid").unlink(missing_ok=True)
+                self._file("pid").unlink(missing_ok=True)
             return 0
 
     def _run(self, api_url: str, server: Server | None) -> None:
-        """Run a worker until it ends by itself, or the server of this machine does."""
+        """Run a worker until it exits, or the background server ends."""
+        limited = ("--limit", given) if (given := os.environ.get(LIMIT)) else ()
         process = subprocess.Popen(
-            python("-m", "prefect", "worker", "start", "--pool", self.pool, *_limited()),
+            python("-m", "prefect", "worker", "start", "--pool", self.pool, *limited),
             env={**os.environ, **environment(api_url)},
             cwd=self.folder,
             start_new_session=True,
@@ -125,15 +116,15 @@ class Worker:
         finally:
             _end(process)
 
-    def _place(self, suffix: str) -> Path:
+    def _file(self, suffix: str) -> Path:
         return self.folder / f"worker-{self.pool}.{suffix}"
 
 
 def environment(api_url: str) -> dict[str, str]:
-    """What a worker and its runs need to know."""
+    """Return the environment variables of a worker and its runs."""
     return {
         "PREFECT_API_URL": api_url,
-        "PYTHONSAFEPATH": "1",  # for the processes of runs too
+        "PYTHONSAFEPATH": "1",  # as `-P`, for runs too
         "PREFECT_WORKER_QUERY_SECONDS": f"{QUERY_S:g}",
         "PREFECT_FLOWS_HEARTBEAT_FREQUENCY": str(HEARTBEAT_S),
         "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "INFO",
@@ -144,7 +135,7 @@ def limit(per_worker: int | None) -> dict[str, str]:
     """Return the variable that limits the runs of a worker: `$DG4D_WORKER_LIMIT`, else the limit of its pool, if any.
 
     Raises:
-        BadInput: the variable is not a number of runs.
+        BadInput: the variable is not a whole number from 1 on.
     """
     given = os.environ.get(LIMIT) or str(per_worker or "")
     if given and not (given.isdecimal() and int(given) > 0):
@@ -153,26 +144,15 @@ def limit(per_worker: int | None) -> dict[str, str]:
 
 
 def running(folder: Path) -> list[Worker]:
-    """The workers of this machine, by their pools."""
+    """Return the running workers of this machine, sorted by pool."""
     workers = [Worker(lock.stem.removeprefix("worker-"), folder) for lock in sorted(folder.glob("worker-*.lock"))]
     return [worker for worker in workers if worker.is_there()]
 
 
-def _limited() -> list[str]:
-    """Return the option of a worker that limits its runs."""
-    given = os.environ.get(LIMIT)
-    return ["--limit", given] if given else []
-
-
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a worker, gently first, and every run that it started: each is a session of its own."""
+    """End a worker, then kill its runs, which are sessions of their own."""
     runs = {int(pid): start_of(int(pid)) for pid in _children(process.pid)}
-    process.terminate()
-    try:
-        process.wait(GRACE_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+    end(process, GRACE_S)
     for pid, start in runs.items():
         if start and start_of(pid) == start:
             with suppress(ProcessLookupError):
@@ -180,7 +160,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _children(pid: int) -> list[str]:
-    """The processes that any thread of a process started."""
+    """Return the child processes of all threads of a process."""
     found: list[str] = []
     for children in Path(f"/proc/{pid}/task").glob("*/children"):
         with suppress(OSError):  # the thread has ended
@@ -189,7 +169,7 @@ def _children(pid: int) -> list[str]:
 
 
 def _is_run(pid: str) -> bool:
-    """Return whether a process executes a flow run; a worker also starts short helpers."""
+    """Return true if a process executes a flow run; workers also start helper processes."""
     with suppress(OSError):  # it has ended
         return RUN_VARIABLE in Path(f"/proc/{pid}/environ").read_bytes()
     return False
@@ -197,5 +177,5 @@ def _is_run(pid: str) -> bool:
 
 if __name__ == "__main__":
     if os.fork():
-        os._exit(0)  # whoever started the guard does not wait for it
+        os._exit(0)  # the caller waits for this process only
     sys.exit(Worker(sys.argv[1], Path(sys.argv[2])).guard(sys.argv[3]))

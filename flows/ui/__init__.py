@@ -1,1 +1,1 @@
-"""What the Prefect UI shows."""
+"""Pages and galleries in the Prefect UI."""

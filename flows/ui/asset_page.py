@@ -4,49 +4,43 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-from prefect.artifacts import create_markdown_artifact
-
 from flows.formatting import curves
 from flows.formatting.escaping import markdown
 from flows.packages import acceptance
 from flows.packages.flow_result import StepRun
 from flows.serving.addresses import VIEWER_ADDRESS
 from flows.ui import pages
-from flows.ui.showing import show
+from flows.ui.showing import create_page
 from steps.contract import ArtifactRef
 from steps.store.artifact_store import ArtifactStore
 
 PICTURES = {
     ("pack_asset", "sheet"): "Contact sheet",
-    ("draw_picture", "picture"): "Drawn from the words",
+    ("draw_picture", "picture"): "Drawn from the text",
     ("prepare_subject", "picture"): "Input, matte, cut-out",
     ("drive_video", "picture"): "Driving video",
     ("fit_gaussians", "picture"): "At rest, from all around",
     ("fit_motion", "picture"): "In motion, from the front and from the side",
     ("extract_mesh", "picture"): "Mesh, from all around",
-    ("check_asset", "picture"): "The worst moments: input, splats, mesh",
+    ("check_asset", "picture"): "Worst timestamps: input, splats, mesh",
 }
 
 
 def show_asset(item: str, finished: Sequence[StepRun], package: ArtifactRef, store: ArtifactStore) -> None:
-    """Create the page of an asset, a new version under the same key as the last time.
+    """Create the page of an asset; Prefect keeps one version for each conversion under the same key.
 
     Args:
         item: name of the asset.
         finished: its steps, in order.
-        package: what came out.
-        store: where all of it is.
+        package: the package.
+        store: with all artifacts of the steps.
     """
-    show(
-        create_markdown_artifact,
-        key=pages.key("asset", item),
-        markdown=asset_page(item, finished, package, store),
-        description=f"{markdown(item)}: everything on one page",
-    )
+    page = asset_page(item, finished, package, store)
+    create_page(pages.key("asset", item), page, f"{markdown(item)}: everything on one page")
 
 
 def asset_page(item: str, finished: Sequence[StepRun], package: ArtifactRef, store: ArtifactStore) -> str:
-    """Pictures, curves, gates, notes and steps of an asset as Markdown."""
+    """Return the page: pictures, loss curves, gates, notes and a table of steps."""
     links = [f"[{label}]({address})" for label, address in addresses(item, package).items()]
     lines = [f"# {markdown(item)}", "", " · ".join([*links, f"`{package.digest}`"]), ""]
     first = {done.result.provenance.step: done.result.outputs for done in reversed(finished)}
@@ -57,7 +51,7 @@ def asset_page(item: str, finished: Sequence[StepRun], package: ArtifactRef, sto
         for ref in result.outputs.values():
             if ref.media_type.endswith("curves+json"):
                 lines += curve_picture(json.loads(store.path(ref).read_text(encoding="utf-8")))
-    verdict = acceptance.verdict_of((done.result for done in finished), store)
+    verdict = acceptance.load_verdict((done.result for done in finished), store)
     if verdict is not None:
         lines += ["## Gates", "", *acceptance.markdown(verdict)]
     notes = dict.fromkeys(note for done in finished for note in done.result.provenance.notes)
@@ -69,7 +63,7 @@ def asset_page(item: str, finished: Sequence[StepRun], package: ArtifactRef, sto
 
 
 def addresses(item: str, package: ArtifactRef) -> dict[str, str]:
-    """Where the background server has the package and the page that plays it."""
+    """Return the paths of the package and of its viewer on the background server."""
     name = pages.key("asset", item)
     return {
         "package": pages.address(name, package, ".zip"),
@@ -78,7 +72,7 @@ def addresses(item: str, package: ArtifactRef) -> dict[str, str]:
 
 
 def timings(finished: Sequence[StepRun]) -> list[dict[str, str]]:
-    """A row per step: where its result came from, how long it took, and the digests that say what was done."""
+    """Return a row per step: cached or computed, times, memory, request digest and record digest."""
     return [
         {
             "step": done.label,
@@ -95,7 +89,7 @@ def timings(finished: Sequence[StepRun]) -> list[dict[str, str]]:
 
 
 def curve_picture(values: dict[str, Any]) -> list[str]:
-    """A loss curve as lines of Markdown; none if there is nothing to draw."""
-    drawn = curves.picture(values)
+    """Return a loss curve as lines of Markdown; none if it has no values to draw."""
+    drawn = curves.svg_picture(values)
     title = f"Losses of the {values['title']}"
     return [f"## {title}", "", pages.embedded(title, "image/svg+xml", drawn.encode()), ""] if drawn else []

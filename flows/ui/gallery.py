@@ -1,18 +1,16 @@
 """Gallery of a catalog in the Prefect UI: a progress bar while it runs, then one page with small pictures."""
 
-import io
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-from prefect.artifacts import create_markdown_artifact, create_progress_artifact, update_progress_artifact
+from prefect.artifacts import create_progress_artifact, update_progress_artifact
 
 from flows.formatting.escaping import markdown
-from flows.packages.summary import Row, Tally
+from flows.packages.summary import BatchProgress, Row
 from flows.ui import pages
-from flows.ui.showing import show
+from flows.ui.showing import create_page
 
 ROWS_SHOWN = 100  # of the page, which the server keeps in its database
 PICTURES_BYTES = 60_000  # of all pictures of a page; as base64 they take a third more
@@ -26,43 +24,43 @@ class Gallery:
     """Progress bar and page of a catalog, attached to the current flow run.
 
     Args:
-        title: of the catalog; what follows a colon is left out.
-        tally: what became of its items.
+        title: of the catalog; a colon and the text behind it are left out.
+        progress: outcomes of its items.
         out: the folder of their packages.
     """
 
-    def __init__(self, title: str, tally: Tally, out: Path) -> None:
-        self._name, self._tally, self._out = title.partition(":")[0], tally, out
+    def __init__(self, title: str, progress: BatchProgress, out: Path) -> None:
+        self._name, self._progress, self._out = title.partition(":")[0], progress, out
         self._key = pages.key("catalog", self._name)
         self._bar: Any = create_progress_artifact(0.0, key=f"progress-{self._key}", description=self._text())
         self._next = 0.0
 
     def update(self) -> None:
-        """Show the progress, unless that was a moment ago."""
+        """Update the progress bar, at most every `UPDATE_EVERY_S` seconds."""
         if time.monotonic() >= self._next:
-            update_progress_artifact(self._bar, 100 * self._tally.share, description=self._text())
+            update_progress_artifact(self._bar, 100 * self._progress.share, description=self._text())
             self._next = time.monotonic() + UPDATE_EVERY_S
 
     def finish(self) -> None:
-        """Show the end, and the page."""
+        """Complete the progress bar and create the page."""
         self._next = 0.0
         self.update()
-        rows = list(self._tally.rows.values())
-        page = gallery_page(self._name, self._tally.line(), rows, self._out)
-        show(create_markdown_artifact, key=self._key, markdown=page, description=self._text())
+        rows = list(self._progress.rows.values())
+        page = gallery_page(self._name, self._progress.line(), rows, self._out)
+        create_page(self._key, page, self._text())
 
     def _text(self) -> str:
-        return f"{markdown(self._name)}: {self._tally.line()}"
+        return f"{markdown(self._name)}: {self._progress.line()}"
 
 
 def gallery_page(name: str, line: str, rows: list[Row], out: Path) -> str:
-    """Return the page: failed items first, then those that are not accepted; no more rows than can be read.
+    """Return the page: failed items first, then those that a gate rejects; at most `ROWS_SHOWN` rows.
 
     Args:
-        name: of the catalog.
-        line: the numbers of it, in one line.
-        rows: of its items.
-        out: the folder of their packages.
+        name: name of the catalog.
+        line: its counts in one line.
+        rows: its items.
+        out: folder of their packages.
     """
     ordered = sorted(rows, key=lambda row: (row.status != "failed", not row.failing))
     shown = ordered[:ROWS_SHOWN]
@@ -86,28 +84,13 @@ def _lines(rows: list[Row], out: Path) -> Iterator[str]:
 
 
 def verdict(row: Row) -> str:
-    """Return what became of an item in a word or two."""
+    """Return the outcome of an item in a word or two."""
     if not row.made:
         return row.status
     return "not accepted" if row.failing else "made" if row.failing is None else "accepted"
 
 
 def small_picture(folder: Path) -> bytes | None:
-    """Return a picture of the package in a folder as a small WebP; None if there is none that can be read."""
-    for name in PICTURES:
-        if (folder / name).is_file():
-            return _shrunk(folder / name)
-    return None
-
-
-def _shrunk(path: Path) -> bytes | None:
-    """Return the first frame of a picture."""
-    try:
-        with Image.open(path) as picture:
-            small = picture.convert("RGBA")
-            small.thumbnail((PICTURE_SIZE, PICTURE_SIZE))
-    except (OSError, ValueError):  # an item is not worth less for a picture that cannot be read
-        return None
-    content = io.BytesIO()
-    small.save(content, "WEBP", quality=PICTURE_QUALITY)
-    return content.getvalue()
+    """Return a picture of the package in a folder as a small WebP; None if none can be read."""
+    picture = next((folder / name for name in PICTURES if (folder / name).is_file()), None)
+    return pages.small_webp(picture, PICTURES_BYTES, (PICTURE_SIZE,), (PICTURE_QUALITY,)) if picture else None

@@ -1,18 +1,18 @@
-"""What the Prefect UI shows of a step: Markdown with small pictures inside, tables of numbers."""
+"""Pages of steps in the Prefect UI: Markdown with embedded thumbnails and tables of numbers."""
 
 import base64
 import hashlib
+import io
 import json
 import re
-import tempfile
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import OpenImageIO as oiio
+from PIL import Image
 
 from flows.formatting.escaping import markdown
-from flows.formatting.sizes import readable
+from flows.formatting.numbers import format_size
 from flows.packages import acceptance
 from flows.serving.addresses import ARTIFACT_ADDRESS
 from flows.step_errors import StepError
@@ -21,20 +21,20 @@ from steps.runtime.installed_code import catalog
 from steps.store.artifact_store import ArtifactMissing, ArtifactStore
 
 THUMBNAIL_SIZES = (960, 640, 320)  # pixels of the longer side
-WEBP_METHOD = 4  # libwebp's own; with OpenImageIO's, 6, alpha takes a hundred times as long
+QUALITIES = (80, 50, 20)  # of WebP
 THUMBNAIL_BYTES = 30_000  # the server keeps pages in its database
-THUMBNAILS_KEPT = 32  # the page of an asset shows those of its steps again
+THUMBNAILS_KEPT = 32  # the page of an asset repeats those of its steps
 ROWS_OF_A_CURVE = 8
 
 
 def key(label: str, item: str) -> str:
-    """A key as Prefect wants it: lower case, digits and dashes; different names give different keys."""
+    """Return an artifact key in Prefect's alphabet (lower case, digits, dashes), unique for label and item."""
     slug = re.sub(r"[^a-z0-9]+", "-", f"{label} {item}".lower()).strip("-")[:80]
     return f"{slug}-{hashlib.sha256(f'{label}/{item}'.encode()).hexdigest()[:6]}"
 
 
 def address(name: str, ref: ArtifactRef, suffix: str, place: str = ARTIFACT_ADDRESS) -> str:
-    """Where the background server has a file of the store, or a page made of it; relative to the server."""
+    """Return the path on the background server of an artifact, or of a page made from it."""
     return f"{place}{ref.digest.removeprefix('sha256:')}/{ref.size_bytes}/{name}{suffix}"
 
 
@@ -63,20 +63,20 @@ def step_page(label: str, item: str, result: StepResult, store: ArtifactStore) -
     suffixes = {name: port.suffix for name, port in catalog()[record.step].outputs.items()}
     lines += [
         f"| [{name}{suffixes[name]}]({address(name, ref, suffixes[name])}) | {ref.media_type} "
-        f"| {readable(ref.size_bytes)} | `{ref.digest[7:19]}` |"
+        f"| {format_size(ref.size_bytes)} | `{ref.digest[7:19]}` |"
         for name, ref in result.outputs.items()
     ]
     return "\n".join(lines) + "\n"
 
 
 def failure_page(label: str, item: str, error: StepError, store: ArtifactStore) -> str:
-    """The message of a step that failed, and the pictures that explain it."""
+    """Return the page of a failed step: its message and the pictures that explain it."""
     lines = [f"# {label}: {markdown(item)}", "", f"**{type(error).__name__}**", "", markdown(error.message), ""]
     return "\n".join([*lines, *(f"{image}\n" for image in pictures_of(error.pictures, store))])
 
 
 def pictures_of(outputs: dict[str, ArtifactRef], store: ArtifactStore) -> list[str]:
-    """Every PNG among the outputs, small and inside the Markdown."""
+    """Return every PNG among the outputs as an embedded thumbnail."""
     return [
         embedded(name, "image/webp", small)
         for name, ref in outputs.items()
@@ -85,56 +85,52 @@ def pictures_of(outputs: dict[str, ArtifactRef], store: ArtifactStore) -> list[s
 
 
 def embedded(name: str, media_type: str, content: bytes) -> str:
-    """A picture inside the Markdown."""
+    """Return the Markdown of a picture with its content in a data URL."""
     return f"![{name}](data:{media_type};base64,{base64.b64encode(content).decode()})"
 
 
 def thumbnail(ref: ArtifactRef, store: ArtifactStore, most_bytes: int = THUMBNAIL_BYTES) -> bytes | None:
-    """A picture as a WebP of at most so many bytes, as large and as good as fits.
-
-    Returns:
-        None if it cannot be made, for a page is not worth a failed step.
-    """
+    """Return a picture of the store as `small_webp`; None if it is missing."""
     try:
-        return _small(store.path(ref), most_bytes)
+        return _thumbnail(store.path(ref), most_bytes)
     except ArtifactMissing:
         return None
 
 
-@lru_cache(THUMBNAILS_KEPT)
-def _small(path: Path, most_bytes: int) -> bytes | None:
-    """As `thumbnail`, of a file that never changes."""
-    with tempfile.TemporaryDirectory(prefix="dg4d-page-") as folder:
-        named = Path(folder) / "picture.png"  # files of the store have no suffix, by which a reader is found
-        named.symlink_to(path)
-        picture = oiio.ImageBuf(str(named))
-        if not picture.read() or not picture.spec().width:
-            picture.geterror()  # it was taken note of
-            return None
-        target = Path(folder) / "small.webp"
-        small = picture
-        for size in THUMBNAIL_SIZES:
-            small = _shrunk(small, size)
-            for quality in (80, 50, 20):
-                small.specmod().attribute("Compression", f"webp:{quality}")
-                small.specmod().attribute("webp:method", WEBP_METHOD)
-                if not small.write(str(target)):
-                    return None
-                if target.stat().st_size <= most_bytes:
-                    return target.read_bytes()
+def small_webp(
+    path: Path, most_bytes: int, sizes: tuple[int, ...] = THUMBNAIL_SIZES, qualities: tuple[int, ...] = QUALITIES
+) -> bytes | None:
+    """Return the first frame of a picture as a WebP, as large and as good as `most_bytes` allows.
+
+    Args:
+        path: of the picture.
+        most_bytes: of the result.
+        sizes: longer side in pixels, the first choice first.
+        qualities: of WebP, tried for each size.
+
+    Returns:
+        None if the picture cannot be read or no size fits: a page is not worth a failed step.
+    """
+    try:
+        with Image.open(path) as picture:
+            small = picture.convert("RGBA")
+    except (OSError, ValueError):
+        return None
+    for size in sizes:
+        small.thumbnail((size, size))
+        for quality in qualities:
+            content = io.BytesIO()
+            small.save(content, "WEBP", quality=quality)
+            if content.tell() <= most_bytes:
+                return content.getvalue()
     return None
 
 
-def _shrunk(picture: oiio.ImageBuf, size: int) -> oiio.ImageBuf:
-    """With no side longer than `size` pixels."""
-    width, height, channels = picture.spec().width, picture.spec().height, picture.nchannels
-    scale = min(1.0, size / max(width, height))
-    region = oiio.ROI(0, max(1, round(width * scale)), 0, max(1, round(height * scale)), 0, 1, 0, channels)
-    return oiio.ImageBufAlgo.resize(picture, filtername="triangle", roi=region)
+_thumbnail = lru_cache(THUMBNAILS_KEPT)(small_webp)  # for files of the store, which never change
 
 
 def curve_table(curves: dict[str, Any]) -> list[str]:
-    """A few rows of a loss curve, from first to last."""
+    """Return a table with `ROWS_OF_A_CURVE` samples of a loss curve, the first and the last among them."""
     names, x = list(curves["series"]), curves["x"]
     if not x:
         return []

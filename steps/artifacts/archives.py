@@ -4,12 +4,11 @@ import errno
 import lzma
 import os
 import re
-import shutil
 import stat
 import zipfile
 import zlib
 from collections.abc import Callable
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from dg4d_lib.errors import BadInput
 
@@ -74,11 +73,7 @@ def unpack(path: Path, folder: Path, what: str, wanted: Callable[[str], bool] = 
     try:
         with zipfile.ZipFile(path) as archive:
             entries = [entry for entry in _checked_entries(archive, what) if wanted(entry.filename)]
-            for entry in entries:
-                target = folder / PurePosixPath(entry.filename)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                with archive.open(entry) as source, target.open("wb") as file:
-                    shutil.copyfileobj(source, file)
+            archive.extractall(folder, entries)
     except ZIP_ERRORS as error:
         raise BadInput(f"{what} is broken, encrypted, or no zip: {error}") from error
     except OSError as error:

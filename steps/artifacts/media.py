@@ -1,8 +1,8 @@
-"""Readers and writers of pictures, frames, tensors and loss curves; equal content gives equal bytes."""
+"""Readers and writers of pictures, frames and tensors; equal content gives equal bytes."""
 
 import json
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,6 @@ from torch import Tensor
 from dg4d_lib.errors import BadInput
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.archives import add_entry, unpack
-
-CURVES_POINTS = 200  # approximate number of points of a stored curve
 
 
 def write_png(path: Path, picture: Float[Tensor, "h w c"]) -> None:
@@ -90,13 +88,3 @@ def read_tensors(path: Path, key: str) -> tuple[dict[str, Any], dict[str, Tensor
     with safe_open(path, "pt") as file:
         about = json.loads((file.metadata() or {})[key])
         return about, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no dict)
-
-
-def write_curves(
-    path: Path, title: str, x: Sequence[int], series: Mapping[str, Sequence[float]], notes: Sequence[str]
-) -> None:
-    """Write losses over iterations as JSON, subsampled to about `CURVES_POINTS` points."""
-    step = max(1, len(x) // CURVES_POINTS)
-    thin = {name: [round(float(v), 6) for v in values[::step]] for name, values in series.items()}
-    text = json.dumps({"title": title, "x": list(x[::step]), "series": thin, "notes": list(notes)})
-    path.write_bytes(text.encode())

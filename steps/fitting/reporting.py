@@ -1,5 +1,6 @@
 """Loss curves and renders of fits."""
 
+import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,11 +13,12 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.losses import Diverged
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer.interface import Rasterizer
-from steps.artifacts.media import write_curves, write_png
+from steps.artifacts.media import write_png
 from steps.runtime.job import Job, Progress
 
 TURNAROUND_AZIMUTHS_DEG = (0.0, 45.0, 90.0, 180.0, -90.0, -45.0)
 PICTURE_SIZE = 192  # pixels
+CURVE_POINTS = 200
 
 
 class LossCurves:
@@ -40,8 +42,11 @@ class LossCurves:
         self.progress(iteration, self.total, values)
 
     def write(self, path: Path, title: str, notes: Sequence[str]) -> None:
-        """Write the `curves` artifact."""
-        write_curves(path, title, self.iterations, self.series, notes)
+        """Write the `curves` artifact, subsampled to about `CURVE_POINTS` points."""
+        step = max(1, len(self.iterations) // CURVE_POINTS)
+        series = {name: [round(float(v), 6) for v in values[::step]] for name, values in self.series.items()}
+        curves = {"title": title, "x": self.iterations[::step], "series": series, "notes": list(notes)}
+        path.write_text(json.dumps(curves), encoding="utf-8")
 
 
 @contextmanager

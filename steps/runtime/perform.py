@@ -93,17 +93,13 @@ def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scr
         outputs={name: ref.digest for name, ref in outputs.items()},
         settings=request.settings,
         seed=request.seed,
-        backend=report.backend,
-        weights=report.weights,
-        licenses=report.licenses,
-        notes=report.notes,
-        run_notes=report.run_notes,
         flops=flops,
         started=started,
         duration_s=round(time.perf_counter() - start, 3),
         cpu_s=round(cpu_seconds() - cpu_before, 3),
         peak_memory_mb=round(peak_memory_mb(), 1),
         machine=environment_info(),
+        **vars(report),
     )
     return StepResult(outputs=outputs, provenance=record)
 

@@ -85,19 +85,19 @@ class Clip:
         fps: frames per second.
     """
 
-    def __init__(self, path: Path, container: str, limit: DecodeLimit, what: str = "the video") -> None:
-        self._path, self._container, self._limit, self._what = path, container, limit, what
+    def __init__(self, path: Path, container: str, limit: DecodeLimit) -> None:
+        self._path, self._container, self._limit = path, container, limit
         times = [frame.time for frame in self._frames()]
         self.count = len(times)
         if self.announced > 0 and self.count == 0:
             raise BadInput(
-                f"{what} is cut off or broken: none of its {self.announced} frames can be read; copy it again"
+                f"the video is cut off or broken: none of its {self.announced} frames can be read; copy it again"
             )
         self.fps = self._rate(times)
 
     def read(self, indices: Sequence[int]) -> tuple[Float[Tensor, "t h w 4"], bool]:
         """Return the frames of these ascending indices, and True if the codec carries alpha."""
-        kept, has_alpha = KeptFrames(indices, self._what), False
+        kept, has_alpha = KeptFrames(indices, "the video"), False
         for i, frame in enumerate(self._frames()):
             if i in kept:
                 has_alpha = has_alpha or any(part.is_alpha for part in frame.format.components)
@@ -109,13 +109,13 @@ class Clip:
             with av.open(str(self._path), format=self._container, metadata_errors="replace") as container:
                 if not container.streams.video:
                     found = "holds only sound or other tracks" if len(container.streams) else "is cut off or broken"
-                    raise BadInput(f"{self._what} {found}: there are no pictures in it; give another file")
+                    raise BadInput(f"the video {found}: there are no pictures in it; give another file")
                 stream = container.streams.video[0]
                 context = stream.codec_context
                 if context is None:
-                    raise BadInput(f"{self._what} uses a codec that is not known here; export it as H.264 mp4")
+                    raise BadInput("the video uses a codec that is not known here; export it as H.264 mp4")
                 if context.width and context.height:
-                    check_size(context.width, context.height, self._what)
+                    check_size(context.width, context.height, "the video")
                     self._require(context.width, context.height, context.pix_fmt)
                 self.announced = stream.frames
                 self._header_rate = float(stream.average_rate or 0)
@@ -126,29 +126,27 @@ class Clip:
                 yield from self._bounded(frames)
         except FFmpegError as error:
             raise BadInput(
-                f"{self._what} is cut off or broken ({error.strerror}); copy it again, or export it as H.264 mp4"
+                f"the video is cut off or broken ({error.strerror}); copy it again, or export it as H.264 mp4"
             ) from error
 
     def _require(self, width: int, height: int, pixel_format: str | None) -> None:
         """Refuse frames that are too large for the memory; formats have 12 to 32 bits per pixel, mostly."""
         bits = av.VideoFormat(pixel_format, width, height).padded_bits_per_pixel if pixel_format else 12
-        self._limit.require(HELD_FRAMES * width * height * bits / 8, f"a frame of {self._what}", width, height)
+        self._limit.require(HELD_FRAMES * width * height * bits / 8, "a frame of the video", width, height)
 
     def _bounded(self, frames: Iterable[av.VideoFrame]) -> Iterator[av.VideoFrame]:
         """Yield the frames of one pass; raise when their number, size or time exceeds the limits."""
         start, pixels = time.monotonic(), 0
         for number, frame in enumerate(frames, 1):
-            check_size(frame.width, frame.height, self._what)
+            check_size(frame.width, frame.height, "the video")
             pixels += frame.width * frame.height
             if number > MOST_FRAMES or pixels > MOST_DECODED:
                 raise BadInput(
-                    f"{self._what} has more than {MOST_FRAMES} frames, or more than {MOST_DECODED // 10**9} billion "
+                    f"the video has more than {MOST_FRAMES} frames, or more than {MOST_DECODED // 10**9} billion "
                     "pixels in all; cut it to the part that should become an animation, or export it smaller"
                 )
             if time.monotonic() - start > MOST_DECODING_S:
-                raise BadInput(
-                    f"{self._what} takes more than {MOST_DECODING_S:g} s to read; cut it, or export it smaller"
-                )
+                raise BadInput(f"the video takes more than {MOST_DECODING_S:g} s to read; cut it, or export it smaller")
             yield frame
 
     def _rate(self, times: Sequence[float | None]) -> float:

@@ -24,13 +24,7 @@ class DecodeLimit:
     gb: float
 
     def require(self, needed: float, what: str, width: int, height: int) -> None:
-        """Refuse a picture that needs more, before it is decoded.
-
-        Args:
-            needed: estimate, bytes.
-            what: name of the file in messages.
-            width: pixels.
-            height: pixels.
+        """Refuse a picture that needs more bytes, before it is decoded; `what` names it in messages.
 
         Raises:
             BadInput: says size, estimate, setting and remedy.

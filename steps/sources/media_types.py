@@ -36,12 +36,7 @@ BMP_HEADERS = {12, 40, 52, 56, 64, 108, 124}  # bytes, at offset 14
 CLIPS = (  # offset of a signature, the signature, FFmpeg's name of the container
     (0, b"GIF8", "gif"),
     (0, b"\x1aE\xdf\xa3", "matroska"),
-    (4, b"ftyp", "mov"),
-    (4, b"moov", "mov"),
-    (4, b"mdat", "mov"),
-    (4, b"wide", "mov"),
-    (4, b"free", "mov"),
-    (4, b"skip", "mov"),
+    *((4, box, "mov") for box in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")),
     (8, b"AVI ", "avi"),
     (0, b"FLV\x01", "flv"),
     (0, b"OggS", "ogg"),

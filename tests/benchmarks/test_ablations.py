@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from benchmarks.ablations import ABLATIONS, IMPERFECT, QUICK, Ablation, Claim, Row, Variant, main, settings_of, verdict
-from benchmarks.fits import Figures, fits_per_frame, moving_fit, score, static_fit, thinned
+from benchmarks.fits import Figures, fits_per_frame, moving_fit, score, static_fit, subsample_frames
 from benchmarks.objects.specimens import Specimen
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.initialize import isotropic
@@ -71,12 +71,12 @@ def test_every_frame_can_be_fitted_for_itself(specimen):
 
 
 def test_half_of_the_frames_are_every_second_one(specimen):
-    half, stride = thinned(specimen, 2)
+    half, stride = subsample_frames(specimen, 2)
     assert stride == 2 and len(half.cutouts) == 2 and half.bank.frames == (0, 1)
     assert torch.equal(half.cutouts[1], specimen.cutouts[2])
     assert torch.equal(half.bank.pictures[:, 1], specimen.bank.pictures[:, 2])
     sparse = replace(specimen, bank=replace(specimen.bank, frames=(0, 3), pictures=specimen.bank.pictures[:, [0, 3]]))
-    assert thinned(sparse, 2)[0].bank.frames == (0,)
+    assert subsample_frames(sparse, 2)[0].bank.frames == (0,)
 
 
 @pytest.mark.parametrize("name", ABLATIONS)
@@ -164,9 +164,9 @@ def test_a_data_set_is_fitted_and_scored_as_the_objects_are(dataset, specimen, m
 
 def test_what_cannot_be_run_is_refused_with_what_can(dataset, monkeypatch, capsys):
     for words, message in (
-        (["noise", f"--data={dataset}", "--objects", "cat"], "there is no object cat; there are: balls, picture"),
-        (["static", "--objects", "cat"], "there is no object cat; there are: newt, parrot, jellyfish, excavator"),
-        (["static", "noise", f"--data={dataset}"], "noise: needs a video; of picture there is one picture"),
+        (["noise", f"--data={dataset}", "--objects", "cat"], "unknown objects cat; choose from balls, picture"),
+        (["static", "--objects", "cat"], "unknown objects cat; choose from newt, parrot, jellyfish, excavator"),
+        (["static", "noise", f"--data={dataset}"], "noise: needs videos; picture has one frame only"),
         (["static", f"--data={dataset / 'nowhere'}"], "is no data set"),
     ):
         with pytest.raises(SystemExit) as ended:

@@ -3,7 +3,7 @@ import torch
 
 from benchmarks import oracle_refinement
 from benchmarks.ablations import Variant
-from benchmarks.oracle_refinement import FLICKER, NOISE, VARIANTS, Model, Oracle, figures_of, refined
+from benchmarks.oracle_refinement import FLICKER, NOISE, VARIANTS, Model, Oracle, refine_model, score_model
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.bake import locate_texels
@@ -63,12 +63,12 @@ def test_stains_have_their_spread_and_lie_on_the_surface(board: Model) -> None:
 def test_the_loop_restores_what_the_oracle_knows(board: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(oracle_refinement, "STAINS", 0.0)
     settings = TextureSettings(size=SIZE, iterations=60, azimuth_step_deg=0.0)
-    variant = VARIANTS["video to video, 0.6 skipped"]
+    variant = VARIANTS["video to video, 0.4"]
     before, after = (
-        figures_of(board, made, SIZE)
-        for made in (RefinedTextures(board.blurred), refined(board, variant, settings, seed=0))
+        score_model(board, made, SIZE)
+        for made in (RefinedTextures(board.blurred), refine_model(board, variant, settings, seed=0))
     )
-    assert refined(board, Variant(), settings, seed=0).texture is board.blurred
+    assert refine_model(board, Variant(), settings, seed=0).texture is board.blurred
     assert after.psnr_obj > before.psnr_obj + 10
     assert before.flicker == 0 and after.flicker == 0  # one texture for all frames
 

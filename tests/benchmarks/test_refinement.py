@@ -5,7 +5,7 @@ import torch
 from tiny_svd import save_tiny_svd
 from tiny_weights import write_zero123
 
-from benchmarks.refinement import measured, refined, variants
+from benchmarks.refinement import measure_textures, run_refinement, variants
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.mesh.textured import TexturedMesh
@@ -30,26 +30,26 @@ def test_every_variant_runs_and_gives_a_texture_per_frame(tmp_path: Path) -> Non
     svd, zero123 = save_tiny_svd(tmp_path / "svd"), write_zero123(tmp_path / "zero123")
     chosen = variants(TEXTURE, str(svd), str(zero123))
     for name in (next(iter(chosen)), "image to image"):
-        after = refined(asset, video, chosen[name], 0)
+        after = run_refinement(asset, video, chosen[name], 0)
         assert after.textures is not None and after.textures.shape == (FRAMES, 8, 8, 3)
 
 
 def test_missing_weights_are_named_with_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DG4D_WEIGHTS", str(tmp_path))
     with pytest.raises(BackendUnavailable, match="dg4d weights pull svd"):
-        refined(*board(), next(iter(variants(TEXTURE, "svd", "zero123-xl").values())), 0)
+        run_refinement(*board(), next(iter(variants(TEXTURE, "svd", "zero123-xl").values())), 0)
 
 
 def test_flicker_is_the_mean_change_of_what_was_refined() -> None:
     before = torch.full((8, 8, 3), 0.5)
     textures = before.repeat(4, 1, 1, 1)
     textures[:, :4] += 0.1  # refined, and still
-    assert measured("still", before, textures).flicker == 0
+    assert measure_textures("still", before, textures).flicker == 0
     textures[1::2, :4] += 10 / 255
-    assert measured("flickering", before, textures).flicker == pytest.approx(10.0, rel=1e-4)
+    assert measure_textures("flickering", before, textures).flicker == pytest.approx(10.0, rel=1e-4)
 
 
 def test_sharpness_counts_in_units_of_what_it_was() -> None:
     before = 0.5 + 0.05 * torch.eye(8)[..., None].expand(8, 8, 3)
     textures = (0.5 + 3 * (before - 0.5)).repeat(2, 1, 1, 1)
-    assert measured("sharper", before, textures).sharpness == pytest.approx(3.0)
+    assert measure_textures("sharper", before, textures).sharpness == pytest.approx(3.0)

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from benchmarks.objects.drawing import Painted
-from benchmarks.objects.specimens import OBJECTS, SCORED_AZIMUTHS_DEG, made, read
+from benchmarks.objects.specimens import OBJECTS, SCORED_AZIMUTHS_DEG, read_specimen, render_specimen
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from steps.artifacts.ground_truth import GroundTruth, TrueView
 from steps.artifacts.media import read_png, write_png
 
-SIZE = 8  # of made-up pictures
+SIZE = 8  # pixels of synthetic pictures
 EVERY_OBJECT = pytest.mark.parametrize("name", OBJECTS)
 
 
@@ -65,7 +65,7 @@ def test_parts_of_the_excavator_are_stiff():
 
 
 def test_what_is_scored_is_not_in_the_bank_and_the_bank_tells_the_truth():
-    specimen = made("excavator", 2, 24)
+    specimen = render_specimen("excavator", 2, 24)
     azimuths = {camera.azimuth_deg % 360 for camera in specimen.bank.cameras}
     assert not azimuths & {camera.azimuth_deg % 360 for camera in specimen.cameras}
     front = specimen.bank.pictures[specimen.bank.cameras.index(OrbitCamera(0, 0, width=24, height=24))]
@@ -108,18 +108,18 @@ def truth(tmp_path: Path) -> GroundTruth:
 
 
 def test_of_a_data_set_every_second_frame_is_taken_and_what_the_bank_knows_of_it(truth):
-    half = read(truth, 3)
+    half = read_specimen(truth, 3)
     assert torch.equal(half.cutouts, torch.stack([read_png(path) for path in truth.inputs[::2]]))
     assert torch.equal(half.views[0], torch.stack([read_png(path) for path in truth.views[0].frames[::2]]))
     assert half.cameras == (OrbitCamera(0, 15, width=SIZE, height=SIZE),)
     assert half.bank.frames == (0, 1, 2) and half.bank.cameras[0].azimuth_deg == 90
     assert (half.bank.pictures[0].float() / 255 + half.cutouts - 1).abs().max() < 1.01 / 255
-    assert read(truth, 6).bank.frames == (0, 2, 4)
-    assert read(truth, 2).bank.frames == (0,)
+    assert read_specimen(truth, 6).bank.frames == (0, 2, 4)
+    assert read_specimen(truth, 2).bank.frames == (0,)
 
 
 def test_of_a_picture_the_first_frame_of_every_view_is_taken(truth):
-    still = read(truth.model_copy(update={"inputs": truth.inputs[:1]}), 3)
+    still = read_specimen(truth.model_copy(update={"inputs": truth.inputs[:1]}), 3)
     assert len(still.cutouts) == 1 and still.views.shape == (1, 1, SIZE, SIZE, 4)
 
 
@@ -135,4 +135,4 @@ def test_a_data_set_that_lacks_something_is_refused(truth, tmp_path):
         ({"inputs": opaque}, "8 x 8 x 3, 8 x 8 x 4"),
     ):
         with pytest.raises(BadInput, match=message):
-            read(truth.model_copy(update=change), 3)
+            read_specimen(truth.model_copy(update=change), 3)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.times import PAPER, averaged, described, of_package, table
+from benchmarks.times import PAPER, average_rows, hardware_line, read_package_times, table
 
 CPU = {"processor": "A Processor", "cores": "2", "system": "Linux"}
 GPU = {**CPU, "gpu": "A GPU"}
@@ -42,32 +42,32 @@ def package(folder: Path, seconds: float, iterations: int = 200, machine: dict[s
 
 
 def test_seconds_are_by_stage_and_parts_are_added_up(tmp_path: Path) -> None:
-    row = of_package(package(tmp_path / "a", 10.0))
+    row = read_package_times(package(tmp_path / "a", 10.0))
     assert row.seconds == {"static": 10, "dynamic": 20, "mesh": 4, "refinement": 5}
     assert row.total == 39
     assert row.profile == "paper"
 
 
 def test_iterations_are_those_that_were_asked_for(tmp_path: Path) -> None:
-    assert of_package(package(tmp_path / "a", 1.0)).iterations == {"static": 500, "dynamic": 200}
-    assert of_package(package(tmp_path / "b", 1.0, machine=GPU)).iterations["refinement"] == 50
+    assert read_package_times(package(tmp_path / "a", 1.0)).iterations == {"static": 500, "dynamic": 200}
+    assert read_package_times(package(tmp_path / "b", 1.0, machine=GPU)).iterations["refinement"] == 50
 
 
 def test_machines_are_named_by_their_gpu_where_there_is_one(tmp_path: Path) -> None:
-    assert described(GPU) == "A GPU"
-    assert described(CPU) == "A Processor, 2 cores"
-    assert described({}) == "not recorded"
-    assert of_package(package(tmp_path / "a", 1.0, machine=GPU)).machine == "A GPU; A Processor, 2 cores"
+    assert hardware_line(GPU) == "A GPU"
+    assert hardware_line(CPU) == "A Processor, 2 cores"
+    assert hardware_line({}) == "not recorded"
+    assert read_package_times(package(tmp_path / "a", 1.0, machine=GPU)).machine == "A GPU; A Processor, 2 cores"
 
 
 def test_packages_of_a_kind_are_averaged_and_others_are_not(tmp_path: Path) -> None:
     rows = [
-        of_package(package(tmp_path / "a", 10.0)),
-        of_package(package(tmp_path / "b", 30.0)),
-        of_package(package(tmp_path / "c", 50.0, iterations=100)),
-        of_package(package(tmp_path / "d", 70.0, machine=GPU)),
+        read_package_times(package(tmp_path / "a", 10.0)),
+        read_package_times(package(tmp_path / "b", 30.0)),
+        read_package_times(package(tmp_path / "c", 50.0, iterations=100)),
+        read_package_times(package(tmp_path / "d", 70.0, machine=GPU)),
     ]
-    found = averaged(rows)
+    found = average_rows(rows)
     assert [row.packages for row in found] == [2, 1, 1]
     assert found[0].seconds["static"] == pytest.approx(20)
     assert table([*found, *PAPER]).row_count == 4

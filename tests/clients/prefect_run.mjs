@@ -30,7 +30,7 @@ try {
   await page.getByRole("button", { name: "Run", exact: true }).click(LONGEST);
   await page.getByText("Custom run").click();
   await page.getByLabel("Picture").fill(picture);
-  await page.getByLabel("Folder for what is made").fill(out);
+  await page.getByLabel("Output folder").fill(out);
   const created = page.waitForResponse((response) => response.url().endsWith("/create_flow_run"));
   await page.getByRole("button", { name: "Submit" }).click();
   const { id } = await (await created).json();

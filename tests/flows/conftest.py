@@ -43,7 +43,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 @pytest.fixture(scope="module")
 def place(server: Server) -> Iterator[None]:
-    """Fake steps under the home folder of the server, for this process and those that it starts."""
+    """Fake steps in the home folder of the server, for this process and its children."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DG4D_HOME", str(server.folder.parent))
         patch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
@@ -54,7 +54,7 @@ def place(server: Server) -> Iterator[None]:
 
 @pytest.fixture
 def log(place: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where fake steps say that they ran; steps run in this process, and nobody waits before trying again."""
+    """Log of fake steps, which run in this process; retries have no delay."""
     monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
     monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
     retry_after(0.01, monkeypatch)
@@ -63,7 +63,7 @@ def log(place: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def dg4d(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
-    """The command in this process, which is connected already."""
+    """Command `dg4d`, run in this process, which is connected to the server."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("flows.convert.connect", lambda: None)
     return lambda *arguments: CliRunner().invoke(cli.app, arguments)

@@ -1,4 +1,4 @@
-"""Orders of fake steps, and what they did."""
+"""Jobs of fake steps, the steps that ran, and the files that they wrote."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,7 +7,8 @@ from fake_steps import picture
 from typer.testing import Result
 
 from flows import home
-from flows.inputs.orders import Order, Wish
+from flows.engine.versions import faults, versions
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from steps.profiles import PREVIEW, revise
 
 Run = Callable[..., Result]  # the command `dg4d`, in this process
@@ -24,9 +25,17 @@ def ran(log: Path) -> list[str]:
     return steps
 
 
-def order(words: str, folder: Path, *, name: str = "fake.png", item: str = "fake", **changes: object) -> Order:
+def job(words: str, folder: Path, *, name: str = "fake.png", item: str = "fake", **changes: object) -> ConversionJob:
     (folder / name).write_text(picture(words))
-    return Wish(item=item, picture=folder / name, settings=revise(PREVIEW, dict(changes))).order(home.store())
+    return ConversionRequest(item=item, picture=folder / name, settings=revise(PREVIEW, dict(changes))).to_job(
+        home.store()
+    )
+
+
+def store_is_sound() -> bool:
+    """Return true if all artifacts of all versions are in the store and intact."""
+    store = home.store()
+    return not faults(store, versions(store), {entry.name: entry.size_bytes for entry in store.artifacts()})
 
 
 def tree(folder: Path, *but: str) -> dict[str, bytes]:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.inputs.orders import Order
-from flows.packages.credentials import configured
+from flows.inputs.conversion_job import ConversionJob
+from flows.packages.credentials import configured_signer
 from flows.packages.flow_result import FlowResult, StepRun
 from flows.packages.publish import publish
-from flows.packages.report import complete
+from flows.packages.report import finish_package
 from steps.contract import ArtifactRef, ProvenanceRecord, StepResult
 from steps.profiles import PREVIEW
 from steps.store.artifact_store import ArtifactStore
@@ -33,19 +33,19 @@ STEPS = ("prepare_subject", "drive_video", "fit_gaussians", "pack_asset")
 
 
 def made_package(folder: Path, *, weights: dict[str, str] | None = None, item: str = "red fox") -> Path:
-    """A package in `folder`/fox, signed if a key is configured; `weights` drew the driving video."""
+    """A package in `folder`/fox, signed if a key is configured_signer; `weights` drew the driving video."""
     store = ArtifactStore(folder / "store")
     source = store.put_bytes(SOURCE, "application/octet-stream")
     package = store.put_bytes(_zip(), "application/vnd.dg4d.package+zip")
-    order = Order(item=item, source=source, profile="preview", settings=PREVIEW, seed=3, source_name="fox.png")
+    job = ConversionJob(item=item, source=source, profile="preview", settings=PREVIEW, seed=3, source_name="fox.png")
     made = FlowResult(package=package, steps=_steps(source, package, store, weights or {}), flow_run="run")
-    signer = configured()
+    signer = configured_signer()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DG4D_CODE_VERSION", "test")  # quicker than reading the source
         publish(
             store.path(package),
             folder / "fox",
-            lambda staging, files: complete(staging, files, order, made, store, signer),
+            lambda staging, files: finish_package(staging, files, job, made, store, signer),
         )
     return folder / "fox"
 

@@ -5,19 +5,19 @@ import signal
 from pathlib import Path
 
 import pytest
-from conversions import EVERY_STEP, RUN_FACTS, Run, order, ran, tree
+from conversions import EVERY_STEP, RUN_FACTS, Run, job, ran, tree
 from fake_steps import picture
 from inside import inside_a_flow
 from waiting import start, wait_until
 
 from flows import home
 from flows.catalog import convert_all
-from flows.convert import make, make_motions, save_pictures
+from flows.convert import convert_job, rank_motions, save_pictures
 from flows.engine.events import StepEvent, listening
 from flows.engine.orphans import settle_orphans
-from flows.inputs.orders import Wish
-from flows.packages.publish import whole
-from flows.packages.summary import NOT_ACCEPTED, Row, Tally
+from flows.inputs.conversion_job import ConversionRequest
+from flows.packages.publish import load_verified
+from flows.packages.summary import NOT_ACCEPTED, BatchProgress, Row
 from flows.serving import background
 from flows.serving.server import Server
 from flows.step_errors import StepBadInput, StepCrashed, StepDiverged, StepError, StepMissing, StepOutOfMemory
@@ -25,11 +25,11 @@ from steps.profiles import PREVIEW, revise
 
 
 def test_a_flow_runs_every_step_once_and_then_none(log: Path, tmp_path: Path) -> None:
-    wanted = order("twice", tmp_path)
-    _, cached = make(wanted, tmp_path / "one")
+    wanted = job("twice", tmp_path)
+    _, cached = convert_job(wanted, tmp_path / "one")
     assert sorted(ran(log)) == sorted(EVERY_STEP)
     assert not cached
-    _, cached = make(wanted, tmp_path / "two")
+    _, cached = convert_job(wanted, tmp_path / "two")
     assert ran(log) == []
     assert cached
     assert tree(tmp_path / "one", *RUN_FACTS) == tree(tmp_path / "two", *RUN_FACTS)
@@ -40,14 +40,14 @@ def test_a_flow_runs_every_step_once_and_then_none(log: Path, tmp_path: Path) ->
 
 
 def test_a_changed_knob_runs_its_step_and_what_follows(log: Path, tmp_path: Path) -> None:
-    make(order("knob", tmp_path), tmp_path / "out")
+    convert_job(job("knob", tmp_path), tmp_path / "out")
     ran(log)
-    make(order("knob", tmp_path, **{"mesh.grid": 64}), tmp_path / "out")
+    convert_job(job("knob", tmp_path, **{"mesh.grid": 64}), tmp_path / "out")
     assert ran(log) == ["plan_mesh", "extract_mesh"]  # their outputs did not change, so what follows was there already
 
 
 def test_gaussians_that_were_fine_tuned_take_the_place_of_the_others(log: Path, tmp_path: Path) -> None:
-    make(order("tuned", tmp_path, **{"motion.fine_tune": True}), tmp_path / "out")
+    convert_job(job("tuned", tmp_path, **{"motion.fine_tune": True}), tmp_path / "out")
     record = json.loads((tmp_path / "out" / "provenance.json").read_text())
     steps = {step["step"]: step for step in record["steps"]}
     better = steps["fit_motion"]["outputs"]["gaussians"]
@@ -56,39 +56,39 @@ def test_gaussians_that_were_fine_tuned_take_the_place_of_the_others(log: Path, 
 
 
 def test_a_lost_artifact_is_made_again(log: Path, tmp_path: Path) -> None:
-    wanted = order("lost", tmp_path)
-    make(wanted, tmp_path / "out")
+    wanted = job("lost", tmp_path)
+    convert_job(wanted, tmp_path / "out")
     ran(log)
     record = json.loads((tmp_path / "out" / "provenance.json").read_text())
     motion = next(step for step in record["steps"] if step["step"] == "fit_motion")["outputs"]["motion"]
     (blob,) = (home.store().root / "sha256").rglob(motion.removeprefix("sha256:"))
     blob.unlink()
-    make(wanted, tmp_path / "out")
+    convert_job(wanted, tmp_path / "out")
     assert set(ran(log)) >= {"fit_motion"}
     assert blob.exists()
 
 
 def test_a_video_moves_the_asset_and_a_picture_is_no_video(log: Path, tmp_path: Path) -> None:
-    make(order("moving film", tmp_path, name="film.mp4"), tmp_path / "out")
+    convert_job(job("moving film", tmp_path, name="film.mp4"), tmp_path / "out")
     assert "the motion follows the video" in (tmp_path / "out" / "report.json").read_text()
     with pytest.raises(StepBadInput, match="single picture"):
-        make(order("still", tmp_path, name="still.mp4"), tmp_path / "still")
+        convert_job(job("still", tmp_path, name="still.mp4"), tmp_path / "still")
     assert not (tmp_path / "still").exists()
 
 
 def test_words_become_a_picture_first(log: Path, tmp_path: Path) -> None:
     settings = revise(PREVIEW, {"text.weights": "somebody/pictures"})
-    wish = Wish(item="words", text="a  red\ndragon", settings=settings)
-    make(wish.order(home.store()), tmp_path / "out")
+    request = ConversionRequest(item="words", text="a  red\ndragon", settings=settings)
+    convert_job(request.to_job(home.store()), tmp_path / "out")
     assert sorted(ran(log)) == sorted(["draw_picture", *EVERY_STEP])
     report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert report["banner"].startswith("Preview: the picture was drawn by a model; the motion was made up;")
+    assert report["banner"].startswith("Preview: the picture was generated from text; the motion was generated;")
     assert report["licenses"] == {"fake": "fake license: <free>"}
     assert "fake license: &lt;free&gt;" in (tmp_path / "out" / "report.html").read_text()
     record = json.loads((tmp_path / "out" / "provenance.json").read_text())
     assert record["licenses"] == report["licenses"]
     assert record["steps"][0]["weights"] == {"fake/unet.safetensors": "sha256:" + "e" * 64}
-    make(wish.model_copy(update={"text": "a red dragon"}).order(home.store()), tmp_path / "again")
+    convert_job(request.model_copy(update={"text": "a red dragon"}).to_job(home.store()), tmp_path / "again")
     assert ran(log) == []
 
 
@@ -105,9 +105,9 @@ def test_words_become_a_picture_first(log: Path, tmp_path: Path) -> None:
 def test_only_what_may_heal_is_tried_again(
     log: Path, tmp_path: Path, word: str, error: type[StepError], attempts: int
 ) -> None:
-    wanted = order(f"fit_motion={word}", tmp_path)
+    wanted = job(f"fit_motion={word}", tmp_path)
     with pytest.raises(error) as caught:
-        make(wanted, tmp_path / "out")
+        convert_job(wanted, tmp_path / "out")
     assert ran(log).count("fit_motion") == attempts
     assert not (tmp_path / "out").exists()
     pictures = save_pictures(wanted, caught.value)
@@ -115,7 +115,7 @@ def test_only_what_may_heal_is_tried_again(
 
 
 def test_memory_that_is_free_again_is_enough(log: Path, tmp_path: Path) -> None:
-    make(order("fit_motion=memory-once", tmp_path), tmp_path / "out")
+    convert_job(job("fit_motion=memory-once", tmp_path), tmp_path / "out")
     assert ran(log).count("fit_motion") == 2
 
 
@@ -134,7 +134,7 @@ def test_a_killed_command_goes_on_where_it_was_and_gives_the_same_bytes(log: Pat
     assert command.returncode == 0, trouble
     assert ran(log) == EVERY_STEP[3:]
     assert "prepare_subject: cached" in said
-    make(order("undisturbed", tmp_path), tmp_path / "other")
+    convert_job(job("undisturbed", tmp_path), tmp_path / "other")
     assert set(tree(tmp_path / "out")) == set(tree(tmp_path / "other"))
 
 
@@ -156,7 +156,7 @@ def test_two_runs_into_one_folder_take_turns_and_the_second_finds_it_done(log: P
     assert sorted(ran(log)) == sorted(EVERY_STEP)
     assert sum("waiting for another run" in text for text in said) == 1
     assert sum("nothing to do" in text for text in said) == 1
-    whole(tmp_path / "out")
+    load_verified(tmp_path / "out")
 
 
 def test_a_package_of_another_asset_is_replaced_only_by_force(dg4d: Run, log: Path, tmp_path: Path) -> None:
@@ -277,10 +277,10 @@ def test_there_is_one_server(place: None, server: Server) -> None:
 
 def test_a_strict_batch_begins_nothing_after_an_item_that_is_not_accepted(log: Path, tmp_path: Path) -> None:
     names = ("first", "torn", "last")
-    orders = [order(f"strict {name}", tmp_path, name=f"{name}.png", item=name) for name in names]
-    tally = Tally(3)
-    inside_a_flow(convert_all, orders, tmp_path / "out", 1, "strict", tally, strict=True)
-    rows = list(tally.rows.values())
+    jobs = [job(f"strict {name}", tmp_path, name=f"{name}.png", item=name) for name in names]
+    progress = BatchProgress(3)
+    inside_a_flow(convert_all, jobs, tmp_path / "out", 1, "strict", progress, strict=True)
+    rows = list(progress.rows.values())
     assert [(row.item, row.status, row.failing) for row in rows] == [
         ("first", "done", []),
         ("torn", "failed", ["silhouette"]),
@@ -290,17 +290,17 @@ def test_a_strict_batch_begins_nothing_after_an_item_that_is_not_accepted(log: P
     assert (tmp_path / "out" / "torn" / "report.html").exists()
     assert not (tmp_path / "out" / "last").exists()
     made_before = Row(item="torn", status="failed", kind=NOT_ACCEPTED, failing=["silhouette"])
-    tally = Tally(2)
-    inside_a_flow(convert_all, [made_before, orders[2]], tmp_path / "out", 1, "refused before", tally, strict=True)
-    assert [row.status for row in tally.rows.values()] == ["failed", "skipped"]
-    tally = Tally(3)
-    inside_a_flow(convert_all, orders, tmp_path / "out", 1, "lenient", tally)
-    rows = list(tally.rows.values())
+    progress = BatchProgress(2)
+    inside_a_flow(convert_all, [made_before, jobs[2]], tmp_path / "out", 1, "refused before", progress, strict=True)
+    assert [row.status for row in progress.rows.values()] == ["failed", "skipped"]
+    progress = BatchProgress(3)
+    inside_a_flow(convert_all, jobs, tmp_path / "out", 1, "lenient", progress)
+    rows = list(progress.rows.values())
     assert [(row.status, row.failing) for row in rows] == [("done", []), ("done", ["silhouette"]), ("done", [])]
 
 
 def test_the_report_says_what_the_gates_say(log: Path, tmp_path: Path) -> None:
-    make(order("torn thing", tmp_path), tmp_path / "out")
+    convert_job(job("torn thing", tmp_path), tmp_path / "out")
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["acceptance"]["failing"] == ["silhouette"]
     assert "fit it &lt;again&gt;" in (tmp_path / "out" / "report.html").read_text()
@@ -308,7 +308,7 @@ def test_the_report_says_what_the_gates_say(log: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", ["make", "motions"])
 def test_the_cut_out_can_be_looked_at_while_the_next_step_runs(command: str, log: Path, tmp_path: Path) -> None:
-    wanted = order(f"guess {command}", tmp_path, item="fox/red", **{"driving.candidates": 2})
+    wanted = job(f"guess {command}", tmp_path, item="fox/red", **{"driving.candidates": 2})
     happened: list[tuple[str, str, bool]] = []
 
     def listen(event: StepEvent) -> None:
@@ -318,7 +318,7 @@ def test_the_cut_out_can_be_looked_at_while_the_next_step_runs(command: str, log
             assert Path(event.text.rpartition(": ")[2]).read_bytes().startswith(b"\x89PNG")
 
     with listening(listen):
-        (make if command == "make" else make_motions)(wanted, tmp_path / "out")
+        (convert_job if command == "make" else rank_motions)(wanted, tmp_path / "out")
     assert happened.index(("prepare_subject", "remark", True)) < happened.index(("drive_video", "started", True))
     for saved in home.cutouts().glob("fox-red-*.png"):
         saved.unlink()

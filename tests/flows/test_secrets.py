@@ -13,8 +13,8 @@ from signing import identity
 from waiting import retry_after
 
 from flows import home
-from flows.convert import make
-from flows.inputs.orders import Wish
+from flows.convert import convert_job
+from flows.inputs.conversion_job import ConversionRequest
 from flows.serving.auth import basic
 from flows.serving.server import Server
 from flows.step_errors import StepCrashed
@@ -42,9 +42,9 @@ def place(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
 def left_by(words: str, place: Path) -> dict[str, bytes]:
     """Everything that is on disk after a run with these words: the package, records, artifacts, logs, the database."""
     (place / "secret.png").write_text(picture(words))
-    wish = Wish(item="secret", picture=place / "secret.png", settings=PREVIEW)
+    request = ConversionRequest(item="secret", picture=place / "secret.png", settings=PREVIEW)
     try:
-        make(wish.order(home.store()), place / "out")
+        convert_job(request.to_job(home.store()), place / "out")
     except StepCrashed:
         assert "crash" in words
     APILogHandler().flush()

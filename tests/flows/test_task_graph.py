@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conversions import Run, order, ran, tree
+from conversions import Run, job, ran, tree
 from fake_steps import picture
 from prefect.client.orchestration import get_client
 from waiting import wait_until
 
 from flows import home
-from flows.convert import make
+from flows.convert import convert_job
 from flows.engine import executors
 from flows.engine.events import StepEvent, listening
-from flows.inputs.orders import Wish
+from flows.inputs.conversion_job import ConversionRequest
 from flows.packages import publish
 from steps.profiles import PREVIEW, revise
 from steps.store.artifact_store import StoreUnreachable
@@ -26,10 +26,10 @@ from steps.store.artifact_store import StoreUnreachable
 def test_a_mesh_per_frame_is_made_in_as_many_parts_as_the_machine_has_slots(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    wanted = order("parts", tmp_path, **{"mesh.mode": "per_frame"})
+    wanted = job("parts", tmp_path, **{"mesh.mode": "per_frame"})
     for slots, parts in ((3, 3), (1, 1), (8, 5)):  # of five frames
         monkeypatch.setenv("DG4D_CPUS", str(slots))
-        make(wanted, tmp_path / str(parts))
+        convert_job(wanted, tmp_path / str(parts))
         report = json.loads((tmp_path / str(parts) / "report.json").read_text())
         assert sum(stage["step"].startswith("extract_mesh") for stage in report["steps"]) == parts
     assert len({(tmp_path / name / "asset.glb").read_bytes() for name in "135"}) == 1
@@ -37,7 +37,7 @@ def test_a_mesh_per_frame_is_made_in_as_many_parts_as_the_machine_has_slots(
 
 def test_the_run_graph_has_every_edge(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DG4D_CPUS", "3")
-    make(order("linked", tmp_path, **{"mesh.mode": "per_frame"}), tmp_path / "out")
+    convert_job(job("linked", tmp_path, **{"mesh.mode": "per_frame"}), tmp_path / "out")
     record = json.loads((tmp_path / "out" / "provenance.json").read_text())
     maker, wanted = {record["recipe"]["source"]["digest"]: ""}, set()
     for step, run in zip(record["steps"], record["run"]["steps"], strict=True):
@@ -62,10 +62,10 @@ def test_every_frame_gets_a_mesh_where_one_cannot_follow(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DG4D_CPUS", "2")
-    make(order("flutters", tmp_path, **{"mesh.mode": "auto"}), tmp_path / "out")
+    convert_job(job("flutters", tmp_path, **{"mesh.mode": "auto"}), tmp_path / "out")
     steps = ran(log)
     assert (steps.count("plan_mesh"), steps.count("extract_mesh")) == (1, 2)  # five frames in two parts
-    make(order("flutters", tmp_path, **{"mesh.mode": "tracked"}), tmp_path / "one")
+    convert_job(job("flutters", tmp_path, **{"mesh.mode": "tracked"}), tmp_path / "one")
     assert ran(log).count("extract_mesh") == 1
 
 
@@ -75,7 +75,10 @@ def test_parts_side_by_side_take_less_time_on_the_clock_than_to_compute(
     monkeypatch.setenv("DG4D_CPUS", "16")
     settings = revise(PREVIEW, {"mesh.mode": "per_frame"})
     (tmp_path / "a.png").write_text(picture("side by side extract_mesh=sleep:1"))
-    make(Wish(item="parts", picture=tmp_path / "a.png", settings=settings).order(home.store()), tmp_path / "out")
+    convert_job(
+        ConversionRequest(item="parts", picture=tmp_path / "a.png", settings=settings).to_job(home.store()),
+        tmp_path / "out",
+    )
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     parts = [stage for stage in report["steps"] if stage["step"].startswith("extract_mesh")]
     assert len(parts) == 5 and all(part["compute_s"] >= 1 for part in parts)
@@ -98,7 +101,7 @@ def test_independent_steps_and_the_meshes_of_all_frames_run_side_by_side(
 
     words = "wide drive_video=sleep:1 fit_gaussians=sleep:1 extract_mesh=sleep:2 drive_video=frames:16"
     with listening(watch):
-        make(order(words, tmp_path, **{"mesh.mode": "per_frame"}), tmp_path / "out")
+        convert_job(job(words, tmp_path, **{"mesh.mode": "per_frame"}), tmp_path / "out")
     assert max(most["drive_video"], most["fit_gaussians"]) == 2
     assert most["extract_mesh"] == ran(log).count("extract_mesh") == 16
 
@@ -106,7 +109,7 @@ def test_independent_steps_and_the_meshes_of_all_frames_run_side_by_side(
 def test_a_version_that_cannot_be_kept_brings_the_earlier_package_back(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    make(order("before", tmp_path), tmp_path / "out")
+    convert_job(job("before", tmp_path), tmp_path / "out")
     (tmp_path / "out" / "mine.txt").write_text("of the user")
     before = tree(tmp_path / "out")
 
@@ -114,17 +117,17 @@ def test_a_version_that_cannot_be_kept_brings_the_earlier_package_back(
         assert json.loads((tmp_path / "out" / "report.json").read_text())["seed"] == 1  # it is there already
         raise StoreUnreachable("the store is away")
 
-    wish = Wish(item="fake", picture=tmp_path / "fake.png", settings=PREVIEW, seed=1)
+    request = ConversionRequest(item="fake", picture=tmp_path / "fake.png", settings=PREVIEW, seed=1)
     with monkeypatch.context() as patch:
         patch.setattr("flows.engine.publishing.versions.keep_version", unreachable)
         with pytest.raises(StoreUnreachable):
-            make(wish.order(home.store()), tmp_path / "out")
+            convert_job(request.to_job(home.store()), tmp_path / "out")
     assert tree(tmp_path / "out") == before
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
     with get_client(sync_client=True) as client:
         (newest,) = client.read_flow_runs(limit=1, sort="START_TIME_DESC")  # type: ignore[arg-type]
     assert newest.state is not None and newest.state.is_failed()
-    make(wish.order(home.store()), tmp_path / "out")
+    convert_job(request.to_job(home.store()), tmp_path / "out")
     assert json.loads((tmp_path / "out" / "report.json").read_text())["seed"] == 1
     assert (tmp_path / "out" / "mine.txt").read_text() == "of the user"
 
@@ -166,5 +169,5 @@ def test_a_picture_passes_few_modules_on_its_way_to_the_steps_and_into_the_folde
 
 
 def test_textures_are_refined_by_a_step_only_where_a_model_is_asked_for(log: Path, tmp_path: Path) -> None:
-    make(order("refined", tmp_path), tmp_path / "out")
+    convert_job(job("refined", tmp_path), tmp_path / "out")
     assert "refine_texture" not in ran(log)

@@ -165,9 +165,9 @@ def _read_as_manifest(suffix: str) -> Callable[[Path, Path], tuple[Kind, int]]:
         items = items_of(manifest, scratch / "out", "preview", {}, 0)
         for item in items:
             item.model_dump_json()
-            if item.wish is not None:
+            if item.request is not None:
                 with contextlib.suppress(DG4DError):
-                    item.wish.check()
+                    item.request.check()
         return "done", len(items)
 
     return read
@@ -193,7 +193,7 @@ def read_as_scene(path: Path, scratch: Path) -> tuple[Kind, int]:
 
 def read_as_record(path: Path, scratch: Path) -> tuple[Kind, int]:
     """Check a package whose record somebody else wrote, and ask for the order that it names."""
-    from flows.inputs.orders import order_again
+    from flows.inputs.conversion_job import job_from_record
     from flows.inputs.package_record import RECORD, record_of
     from flows.packages.publish import is_current
     from flows.packages.verify import verify
@@ -204,7 +204,7 @@ def read_as_record(path: Path, scratch: Path) -> tuple[Kind, int]:
     is_current(scratch, "sha256:0")
     checks = verify(scratch).checks
     if record is not None:
-        order_again(record, ArtifactStore(scratch / "store"))
+        job_from_record(record, ArtifactStore(scratch / "store"))
     return "done", len(checks)
 
 

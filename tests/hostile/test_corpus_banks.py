@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from flows.catalog_request import ready
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.manifest import Item
-from flows.inputs.orders import Order, Wish
 from flows.packages.summary import Row
 from steps.profiles import profile, revise
 from steps.store.artifact_store import ArtifactStore
@@ -29,13 +29,13 @@ def decoder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Decoder]:
         yield child
 
 
-def ordered(place: Place, bank: Path) -> Order | Row:
+def ordered(place: Place, bank: Path) -> ConversionJob | Row:
     """Prepare an item with a bank as a batch does."""
     picture = place.work / "cat.png"
     picture.write_bytes(sound_png())
     settings = revise(profile("preview"), {"prior.kind": "oracle"})
-    wish = Wish(item="cat", picture=picture, bank=bank, settings=settings)
-    return ready(Item(name="cat", wish=wish), place.work / "out", strict=False)
+    request = ConversionRequest(item="cat", picture=picture, bank=bank, settings=settings)
+    return ready(Item(name="cat", request=request), place.work / "out", strict=False)
 
 
 def test_every_bank_is_in_the_table() -> None:
@@ -48,7 +48,7 @@ def test_a_bank_gets_what_the_table_says_at_the_door_or_in_the_step(name: str, p
     path = place.work / "bank"
     CASES[name](path)
     found = ordered(place, path)
-    if isinstance(found, Order):
+    if isinstance(found, ConversionJob):
         assert found.bank is not None
         blob = ArtifactStore(place.home / "store").path(found.bank)
         with zipfile.ZipFile(blob) as archive:

@@ -8,9 +8,9 @@ import pytest
 
 from dg4d_lib.errors import BadInput
 from flows.commands.compose import compose
-from flows.inputs.orders import order_again
+from flows.inputs.conversion_job import job_from_record
 from flows.inputs.package_record import RECORD, record_of
-from flows.packages.publish import check_folder, is_current, whole
+from flows.packages.publish import check_folder, is_current, load_verified
 from flows.packages.verify import verify
 from steps.store.artifact_store import ArtifactStore
 from tests.hostile import table
@@ -47,14 +47,14 @@ def test_a_record_breaks_no_command_that_reads_one(name: str, place: Place) -> N
     record = record_of(place.work)
     assert record is None or isinstance(record["files"], dict)
     assert not is_current(place.work, "sha256:0")
-    for command in (whole, check_folder):
+    for command in (load_verified, check_folder):
         try:
             command(place.work)
         except BadInput as error:
             assert len(str(error)) < 10_000
     if record is not None:
         with pytest.raises(BadInput):
-            order_again(record, ArtifactStore(place.home / "store"))
+            job_from_record(record, ArtifactStore(place.home / "store"))
 
 
 def verdict(name: str, folder: Path) -> str:

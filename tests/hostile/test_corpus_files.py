@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from flows.catalog_request import ready
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.manifest import Item
-from flows.inputs.orders import Order, Wish
 from steps.profiles import profile
 from tests.hostile.archives import UNPACKED, ZIPS
 from tests.hostile.conftest import Place
@@ -77,9 +77,9 @@ def test_what_is_no_source_never_enters_the_store(name: str, place: Place) -> No
         PLACES[name](path)
     else:
         path.write_bytes(CASES[name]())
-    wish = Wish(item="cat", picture=path, settings=profile("preview"))
-    row = ready(Item(name="cat", wish=wish), place.work / "out", strict=False)
-    assert not isinstance(row, Order)
+    request = ConversionRequest(item="cat", picture=path, settings=profile("preview"))
+    row = ready(Item(name="cat", request=request), place.work / "out", strict=False)
+    assert not isinstance(row, ConversionJob)
     expected = SAID[name] if name in PLACES else UNKNOWN
     assert (row.status, row.kind) == ("failed", "BadInput")
     assert re.search(expected.says, row.message), row.message

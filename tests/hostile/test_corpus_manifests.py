@@ -8,8 +8,8 @@ import pytest
 
 from dg4d_lib.errors import DG4DError
 from flows.catalog_request import ready
+from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.manifest import Item, items_of
-from flows.inputs.orders import Order
 from flows.packages.summary import Row
 from tests.hostile.conftest import Place
 from tests.hostile.manifests import ROWS, SOUND, WHOLE
@@ -32,28 +32,28 @@ def pictures(place: Place, monkeypatch: pytest.MonkeyPatch) -> Place:
     return place
 
 
-def prepared(items: list[Item]) -> tuple[list[Order], list[Row]]:
+def prepared(items: list[Item]) -> tuple[list[ConversionJob], list[Row]]:
     """Prepare items as a batch does."""
     found = [ready(item, OUT, strict=False) for item in items]
-    return [one for one in found if isinstance(one, Order)], [one for one in found if isinstance(one, Row)]
+    return [one for one in found if isinstance(one, ConversionJob)], [one for one in found if isinstance(one, Row)]
 
 
-def check(items: list[Item], made: int, says: str) -> list[Order]:
+def check(items: list[Item], made: int, says: str) -> list[ConversionJob]:
     """Assert how many items can be made, and that every other one is a failed row with a sentence."""
-    orders, rows = prepared(items)
-    assert len(orders) == made, rows
+    jobs, rows = prepared(items)
+    assert len(jobs) == made, rows
     for row in rows:
         assert (row.status, row.kind) == ("failed", "BadInput")
         assert re.search(says, row.message), row.message
         assert len(row.message) < 3000 and "\n" not in row.message
-    for one in [*orders, *rows]:
+    for one in [*jobs, *rows]:
         one.model_dump_json()  # the summary and the server are given it
         assert one.item
-    for name in (order.item for order in orders):
+    for name in (job.item for job in jobs):
         assert (OUT / name).resolve().is_relative_to(OUT.resolve()) and Path(name) != Path(), name
         assert all(len(os.fsencode(part)) <= 255 for part in Path(name).parts), name
     assert not OUT.exists() or list(OUT.rglob("*")) == []
-    return orders
+    return jobs
 
 
 def test_every_manifest_is_in_the_table() -> None:

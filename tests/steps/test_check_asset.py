@@ -128,8 +128,8 @@ def test_an_asset_at_another_frame_rate_is_seen_at_the_moments_of_the_video() ->
     twice = seen(parts_of(6, fast))
     once = seen(parts_of(3, replace(fast, offsets=fast.offsets[::2])))
     for form in ("splats", "mesh"):
-        assert torch.allclose(twice.seen[form].color, once.seen[form].color, atol=1e-5)
-        assert torch.allclose(twice.around[form].alpha, once.around[form].alpha, atol=1e-5)
+        assert torch.allclose(twice.input_views[form].color, once.input_views[form].color, atol=1e-5)
+        assert torch.allclose(twice.side_views[form].alpha, once.side_views[form].alpha, atol=1e-5)
 
 
 def test_a_mesh_that_was_filmed_is_seen_as_it_was_filmed() -> None:
@@ -137,7 +137,7 @@ def test_a_mesh_that_was_filmed_is_seen_as_it_was_filmed() -> None:
     camera = OrbitCamera(width=128, height=128)
     color, coverage = render_mesh(asset.mesh, [camera] * FRAMES, asset.offsets)
     found = seen(parts_of(FRAMES, asset), DrivingVideo(color, coverage, 24.0))
-    assert torch.allclose(found.seen["mesh"].color, found.video.color, atol=1e-5)
+    assert torch.allclose(found.input_views["mesh"].color, found.video.color, atol=1e-5)
     gates = {gate.name: gate.values for gate in evaluate_gates(found, GateSettings())}
     assert gates["fidelity"]["mesh"] > 50
     assert gates["silhouette"]["mesh"] == 1

@@ -24,7 +24,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def cast_of(package: Path, *items: Item) -> SceneWriter:
+def cast_of(package: Path, *items: SceneItem) -> SceneWriter:
     return SceneWriter([package] * len(items), items, [item.name for item in items])
 
 
@@ -47,8 +47,8 @@ def test_a_glb_holds_every_asset_where_it_was_put(package: Path, tmp_path: Path)
     assert cast.write_glb(tmp_path / "scene.glb", None) == ()
     scene = AnimatedGlb((tmp_path / "scene.glb").read_bytes())
     width = REACH + 2 * tracked().mesh.vertices[:, 0].max().item()
-    np.testing.assert_allclose((scene.low[0], scene.high[0]), (-1 - width / 2, 1 + width), atol=1e-5)
-    assert scene.low[1] == pytest.approx(0, abs=1e-6)
+    np.testing.assert_allclose((scene.box_min[0], scene.box_max[0]), (-1 - width / 2, 1 + width), atol=1e-5)
+    assert scene.box_min[1] == pytest.approx(0, abs=1e-6)
 
 
 def test_a_usdz_agrees_with_the_glb(package: Path, tmp_path: Path) -> None:
@@ -120,5 +120,5 @@ def test_a_film_has_an_end(package: Path, tmp_path: Path) -> None:
 
 def test_a_broken_asset_is_named(tmp_path: Path) -> None:
     (tmp_path / "asset.glb").write_bytes(b"no GLB")
-    with pytest.raises(BadInput, match=r"asset\.glb: this is no GLB"):
+    with pytest.raises(BadInput, match=r"asset\.glb: this is not a GLB"):
         SceneWriter([tmp_path], [item("a")], ["a"])

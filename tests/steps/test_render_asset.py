@@ -145,7 +145,7 @@ def without(name: str) -> Callable[[Path], None]:
         (lambda folder: (folder / "asset.json").write_text("{"), False, "cannot be used"),
         (without("splats/002.ply"), False, "2 frames, the package 3"),
         (without("asset.glb"), True, r"asset\.glb cannot be read"),
-        (lambda folder: (folder / "asset.glb").write_bytes(b"glTF"), True, "GLB is broken"),
+        (lambda folder: (folder / "asset.glb").write_bytes(b"glTF"), True, "GLB is corrupt"),
     ],
 )
 def test_a_damaged_package_is_refused(

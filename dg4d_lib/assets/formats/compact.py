@@ -1,11 +1,10 @@
-"""The exact compact form of an asset: the Gaussians at rest and what moves them, in one safetensors file.
+"""Lossless compact format: canonical Gaussians and their deformation in one safetensors file.
 
-Metadata, under the key `asset4d`, is JSON: `format` and `version`; `settings` of the deformation, of which `kind` says
-how it works; `frames`, `fps`, `gaussians`; `last_time`, where the last frame lies on the deformation's axis of time
-from 0 to 1; `tensors`, which says what each is. Tensors: those of the Gaussians under `gaussians.`, those of the
-deformation under `deformation.`. What a deformation gives is added to means, log scales and quaternions as they are
-stored; after the last frame they go back to the first in a straight line. `examples/load_compact.py` reads it without
-this library.
+The metadata key `asset4d` holds JSON: `format` and `version`; `settings` of the deformation, of which `kind` selects
+the model; `frames`, `fps`, `gaussians`; `last_time`, the time of the last frame on the deformation's axis from 0 to
+1; `tensors`, a description of each. Tensors of the Gaussians are stored under `gaussians.`, those of the deformation
+under `deformation.`. The output of a deformation is added to means, log scales and quaternions as stored; after the
+last frame they are interpolated linearly to the first. `examples/load_compact.py` reads the file without this library.
 """
 
 import json
@@ -24,7 +23,7 @@ from dg4d_lib.gaussians.ply import check_storable
 from dg4d_lib.settings import DeformationSettings
 
 KEY = "asset4d"
-FORM = {"format": "dg4d-compact", "version": 1}
+FORMAT = {"format": "dg4d-compact", "version": 1}
 GAUSSIANS, DEFORMATION = "gaussians.", "deformation."
 TENSORS = {
     "gaussians.means": "n 3; at rest, world units: right-handed, y up, the front looks along +z",
@@ -44,13 +43,13 @@ TENSORS = {
 
 @dataclass(frozen=True)
 class CompactAsset:
-    """What a file holds.
+    """Content of a compact file.
 
     Attributes:
-        gaussians: at rest.
-        deformation: what moves them.
-        settings: its kind and sizes.
-        frames: of the animation.
+        gaussians: the canonical cloud.
+        deformation: its motion.
+        settings: kind and sizes of the deformation.
+        frames: number of frames of the animation.
         fps: frames per second.
     """
 
@@ -62,7 +61,7 @@ class CompactAsset:
 
 
 def write_compact(path: Path, asset: CompactAsset) -> None:
-    """Write one file; equal assets give equal bytes.
+    """Write a compact file; equal assets give equal bytes.
 
     Raises:
         BadInput: the Gaussians carry a batch, color of a higher degree, or numbers that are not finite.
@@ -72,7 +71,7 @@ def write_compact(path: Path, asset: CompactAsset) -> None:
     tensors = {GAUSSIANS + name: value.detach().cpu().contiguous() for name, value in vars(asset.gaussians).items()}
     tensors |= {DEFORMATION + name: value for name, value in deformation_tensors(asset.deformation).items()}
     about = {
-        **FORM,
+        **FORMAT,
         "settings": asset.settings.model_dump(mode="json"),
         "frames": asset.frames,
         "fps": asset.fps,
@@ -84,17 +83,21 @@ def write_compact(path: Path, asset: CompactAsset) -> None:
 
 
 def read_compact(path: Path) -> CompactAsset:
-    """Read what `write_compact` wrote: everything comes back exactly.
+    """Read the output of `write_compact`, losslessly.
 
     Raises:
-        BadInput: the file is missing, broken or of another form.
+        BadInput: the file is missing, corrupt or of another format.
     """
     try:
         with safe_open(path, "pt") as file:
             about: dict[str, Any] = json.loads((file.metadata() or {})[KEY])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no dict)
-        if {name: about[name] for name in FORM} != FORM:
-            raise BadInput(f"{path.name} is a compact asset of another version; this program reads version 1")
+        found = {name: about[name] for name in FORMAT}
+        if found != FORMAT:
+            raise BadInput(
+                f"{path.name} has the format {found['format']} version {found['version']}; this program reads "
+                f"{FORMAT['format']} version {FORMAT['version']}: pack the asset again"
+            )
         settings: DeformationSettings = TypeAdapter(DeformationSettings).validate_python(about["settings"])
         parts = {
             prefix: {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
@@ -104,4 +107,4 @@ def read_compact(path: Path) -> CompactAsset:
         deformation = from_state_dict(settings, parts[DEFORMATION], about["frames"], len(gaussians))
         return CompactAsset(gaussians, deformation, settings, about["frames"], about["fps"])
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, ValidationError, RuntimeError) as error:
-        raise BadInput(f"{path.name} is no compact asset: {error}") from error
+        raise BadInput(f"{path.name} is not a compact asset ({error}); pack the asset again") from error

@@ -1,8 +1,8 @@
-"""Animated textured meshes as one file: core glTF 2.0, unless the settings ask for extensions.
+"""Animated textured meshes as GLB: core glTF 2.0, unless the settings select extensions.
 
 A tracked mesh becomes one mesh with a morph target per frame and weights that are one-hot at every frame; very long
-animations, and changing textures in core glTF, are cut into several nodes that share everything else. Meshes per frame
-become one node each, shown and hidden by its scale. Everything has a name. The baked color is the base color of a
+animations, and textures per frame in core glTF, are split into several nodes that share all other data. Meshes per
+frame become one node each, shown and hidden by its scale. All items are named. The baked color is the base color of a
 rough dielectric.
 """
 
@@ -30,17 +30,17 @@ from dg4d_lib.mesh.textured import TexturedMesh
 DEFAULTS = GltfSettings()
 NAME = "subject"
 OFFSET_POINTER = "/materials/0/pbrMetallicRoughness/baseColorTexture/extensions/KHR_texture_transform/offset"
-MAX_POSES = 128  # of a node; players keep a weight of each in the 256 registers that every GPU has
-_FOREIGN = (KeyError, IndexError, TypeError, ValueError, ArithmeticError, OSError)  # what another form runs into
+MAX_POSES = 128  # per node; players keep their weights in uniforms, of which every GPU has at least 256
+_FOREIGN = (KeyError, IndexError, TypeError, ValueError, ArithmeticError, OSError)  # raised by files of other layouts
 
 
 def write_glb(asset: Asset4D, settings: GltfSettings = DEFAULTS) -> bytes:
-    """A GLB of a tracked mesh.
+    """Encode a tracked mesh as GLB.
 
     Raises:
-        BadInput: no triangles, no frames, an fps that is not positive, numbers that are not finite, parts that do not
-            fit each other, or a texture too large for its format.
-        BackendUnavailable: the package for compression is missing.
+        BadInput: no triangles, no frames, an fps that is not positive, numbers that are not finite, arrays of
+            inconsistent sizes, or a texture too large for its format.
+        BackendUnavailable: meshoptimizer is missing.
     """
     _check_asset(asset)
     document = GltfDocument(asset.extras, compressed=settings.meshopt)
@@ -48,7 +48,7 @@ def write_glb(asset: Asset4D, settings: GltfSettings = DEFAULTS) -> bytes:
     offsets, atlas = _floats(asset.offsets), None
     if asset.textures is not None and settings.textures == "pointer":
         atlas = Atlas.of(asset.textures, settings.atlas_size)
-        animation.point(OFFSET_POINTER, "texture offset", atlas.offsets())
+        animation.add_pointer(OFFSET_POINTER, "texture offset", atlas.offsets())
     materials = _add_materials(document, asset, atlas, settings)
     cube = QuantizationCube.around([_floats(asset.mesh.vertices)], offsets) if settings.quantized else None
     shape = _add_shape(document, NAME, asset.mesh, cube, atlas)
@@ -61,9 +61,9 @@ def write_glb(asset: Asset4D, settings: GltfSettings = DEFAULTS) -> bytes:
         primitive = _primitive(shape, materials[span.first if len(materials) > 1 else 0])
         name = NAME if len(spans) == 1 else _frame_name(span.first)
         nodes.append(_add_posed_node(document, name, span, {**primitive, "targets": [poses[i] for i in span.poses]}))
-        animation.morph(nodes[-1], name, span, settings.interpolation.upper())
+        animation.add_morph(nodes[-1], name, span, settings.interpolation.upper())
         if len(spans) > 1:
-            animation.show(nodes[-1], name, span)
+            animation.add_visibility(nodes[-1], name, span)
     animation.finish()
     return _finish(document, nodes, cube)
 
@@ -74,12 +74,12 @@ def write_frames_glb(
     extras: dict[str, Any] | None = None,
     settings: GltfSettings = DEFAULTS,
 ) -> bytes:
-    """A GLB of unrelated meshes, one per frame, each shown at its time (scale 1) and hidden else (scale 0).
+    """Encode unrelated meshes, one per frame, as GLB; each is shown at its frame (scale 1) and else hidden (scale 0).
 
     Raises:
         BadInput: no meshes, a mesh without triangles, an fps that is not positive, numbers that are not finite, or a
             texture too large for its format.
-        BackendUnavailable: a package for compression is missing.
+        BackendUnavailable: meshoptimizer is missing.
     """
     if not meshes:
         raise BadInput("an animated asset needs at least one mesh; given none")
@@ -93,67 +93,73 @@ def write_frames_glb(
     for frame, mesh in enumerate(meshes):
         name = f"frame_{frame:03d}"
         nodes.append(document.add("nodes", name=name, mesh=_add_mesh(document, name, mesh, cube, settings)))
-        animation.show(nodes[-1], name, Span(frame, frame + 1, len(meshes)))
+        animation.add_visibility(nodes[-1], name, Span(frame, frame + 1, len(meshes)))
     animation.finish()
     return _finish(document, nodes, cube)
 
 
 def write_mesh_glb(mesh: TexturedMesh, settings: GltfSettings = DEFAULTS) -> bytes:
-    """A GLB of one still mesh.
+    """Encode one static mesh as GLB.
 
     Raises:
         BadInput: no triangles, numbers that are not finite, or a texture too large for its format.
-        BackendUnavailable: a package for compression is missing.
+        BackendUnavailable: meshoptimizer is missing.
     """
     _check(mesh)
     document = GltfDocument({}, compressed=settings.meshopt)
     cube = QuantizationCube.around([_floats(mesh.vertices)]) if settings.quantized else None
-    return _finish(
-        document, [document.add("nodes", name=NAME, mesh=_add_mesh(document, NAME, mesh, cube, settings))], cube
-    )
+    node = document.add("nodes", name=NAME, mesh=_add_mesh(document, NAME, mesh, cube, settings))
+    return _finish(document, [node], cube)
 
 
 def read_glb(content: bytes) -> Asset4D:
-    """Read a GLB of one mesh whose morph targets are its frames, as `write_glb` makes it with any settings.
+    """Read a GLB of one mesh whose morph targets are its frames, as `write_glb` encodes it with any settings.
 
-    Positions, texture coordinates and offsets come back exactly unless they were quantized, fps to six digits,
-    pictures as their format kept them. With changing textures, those of the first frame become the mesh's own.
+    Positions, texture coordinates and offsets are exact unless they were quantized, fps to six digits; images are as
+    exact as their format. With textures per frame, that of the first frame becomes the texture of the mesh.
 
     Raises:
-        BadInput: it is broken or has another form; says what is missing.
-        BackendUnavailable: it is compressed, and the package that unpacks it is missing.
+        BadInput: the file is corrupt or has another layout.
+        BackendUnavailable: the file is compressed and meshoptimizer is missing.
     """
     parsed = GlbReader(content)
     try:
         nodes = _mesh_nodes(parsed)
         primitives = [_primitive_of(parsed, node) for node in nodes]
         if not all(primitive.get("targets") for primitive in primitives) or "animations" not in parsed.tree:
-            raise BadInput("this GLB has no morph targets with an animation; only animated tracked meshes can be read")
+            raise BadInput("this GLB has no animated morph targets; give the GLB of a tracked mesh that dg4d wrote")
         mesh = _read_mesh(parsed, nodes)
         frames, fps = _read_frames(parsed, nodes)
         scale, _ = _placement(parsed, nodes[0])
         offsets = np.stack([parsed.accessor(target["POSITION"]) for target, _ in frames]) * np.float32(scale)
         if offsets.shape[1:] != mesh.vertices.shape:
-            raise BadInput("the morph targets of this GLB do not have as many rows as the mesh has vertices")
+            raise BadInput(
+                f"the morph targets of this GLB have {offsets.shape[1]} rows, the mesh has {len(mesh.vertices)} "
+                "vertices; export it again"
+            )
         textures = _read_textures(parsed, [material for _, material in frames])
         extras = parsed.tree["asset"].get("extras", {})
         return Asset4D(mesh, torch.from_numpy(offsets), fps, extras, textures)
     except _FOREIGN as error:
-        raise BadInput(f"this GLB has not the form of an animated tracked mesh: {error!r}") from error
+        raise BadInput(
+            f"this GLB does not have the form of an animated tracked mesh ({error!r}); give one that dg4d wrote"
+        ) from error
 
 
 def read_mesh_glb(content: bytes) -> TexturedMesh:
-    """Read the one mesh of a GLB, as `write_mesh_glb` makes it; morph targets are left aside.
+    """Read a GLB of one mesh, as `write_mesh_glb` encodes it; morph targets are ignored.
 
     Raises:
-        BadInput: it is broken or has another form.
-        BackendUnavailable: it is compressed, and the package that unpacks it is missing.
+        BadInput: the file is corrupt or has another layout.
+        BackendUnavailable: the file is compressed and meshoptimizer is missing.
     """
     parsed = GlbReader(content)
     try:
         return _read_mesh(parsed, _mesh_nodes(parsed))
     except _FOREIGN as error:
-        raise BadInput(f"this GLB has not the form of one textured mesh: {error!r}") from error
+        raise BadInput(
+            f"this GLB does not have the form of one textured mesh ({error!r}); give one that dg4d wrote"
+        ) from error
 
 
 def _frame_name(frame: int) -> str:
@@ -167,11 +173,13 @@ def _check_asset(asset: Asset4D) -> None:
     _check(asset.mesh)
     _check_fps(asset.fps)
     if asset.offsets.shape[1] != vertices:
-        raise BadInput(f"the mesh has {vertices} vertices, and offsets for {asset.offsets.shape[1]}")
+        raise BadInput(
+            f"the mesh has {vertices} vertices, but offsets for {asset.offsets.shape[1]}; extract the mesh again"
+        )
     if not _finite(asset.offsets):
-        raise BadInput("the offsets of the mesh hold numbers that are not finite")
+        raise BadInput("the offsets of the mesh hold numbers that are not finite; extract the mesh again")
     if asset.textures is not None and not _finite(asset.textures):
-        raise BadInput("the textures of the frames hold numbers that are not finite")
+        raise BadInput("the textures of the frames hold numbers that are not finite; refine the texture again")
 
 
 def _check_fps(fps: float) -> None:
@@ -181,17 +189,19 @@ def _check_fps(fps: float) -> None:
 
 def _check(mesh: TexturedMesh) -> None:
     if len(mesh.faces) == 0:
-        raise BadInput("a mesh without triangles cannot be written as GLB")
+        raise BadInput("a mesh without triangles cannot be written as GLB; extract the mesh again")
     if mesh.texture.numel() == 0:
-        raise BadInput("a mesh needs a texture of at least one pixel")
+        raise BadInput(f"a mesh needs a texture of at least one pixel; given shape {tuple(mesh.texture.shape)}")
     if not all(_finite(values) for values in (mesh.vertices, mesh.uvs, mesh.texture)):
-        raise BadInput("the mesh holds numbers that are not finite")
+        raise BadInput("the mesh holds numbers that are not finite; extract the mesh again")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
-        raise BadInput(f"the triangles of the mesh name vertices beyond its {len(mesh.vertices)}")
+        raise BadInput(
+            f"the triangles refer to vertices beyond the {len(mesh.vertices)} of the mesh; extract the mesh again"
+        )
 
 
 def _finite(values: Tensor) -> bool:
-    return all(math.isfinite(bound) for bound in torch.aminmax(values))  # in one pass: textures are large
+    return all(math.isfinite(bound) for bound in torch.aminmax(values))  # one pass, because textures are large
 
 
 def _floats(values: Tensor) -> NDArray[np.float32]:
@@ -199,9 +209,9 @@ def _floats(values: Tensor) -> NDArray[np.float32]:
 
 
 def _add_materials(document: GltfDocument, asset: Asset4D, atlas: Atlas | None, settings: GltfSettings) -> list[int]:
-    """One for all frames, or one for each."""
+    """Add the material of all frames, or one per frame; return their indices."""
     if atlas is not None and asset.textures is not None:
-        pictures = {NAME: atlas.join(asset.textures)}
+        pictures = {NAME: atlas.pack(asset.textures)}
     elif asset.textures is not None:
         pictures = {_frame_name(frame): to_uint8(texture) for frame, texture in enumerate(asset.textures)}
     else:
@@ -215,7 +225,7 @@ def _add_materials(document: GltfDocument, asset: Asset4D, atlas: Atlas | None, 
 def _add_mesh(
     document: GltfDocument, name: str, mesh: TexturedMesh, cube: QuantizationCube | None, settings: GltfSettings
 ) -> int:
-    """A mesh that does not move, with its material. Returns its number."""
+    """Add a static mesh with its material; return its index."""
     texture = add_texture(document, name, to_uint8(mesh.texture), settings)
     shape = _add_shape(document, name, mesh, cube)
     primitive = _primitive(shape, add_material(document, name, texture, settings))
@@ -225,7 +235,7 @@ def _add_mesh(
 def _add_shape(
     document: GltfDocument, name: str, mesh: TexturedMesh, cube: QuantizationCube | None, atlas: Atlas | None = None
 ) -> MeshPrimitive:
-    uvs = _floats(mesh.uvs) if atlas is None else atlas.inside(_floats(mesh.uvs))
+    uvs = _floats(mesh.uvs) if atlas is None else atlas.to_atlas_uvs(_floats(mesh.uvs))
     return MeshPrimitive(document, name, _floats(mesh.vertices), mesh.faces.cpu().numpy(), uvs, cube)
 
 
@@ -234,7 +244,7 @@ def _primitive(shape: MeshPrimitive, material: int) -> dict[str, Any]:
 
 
 def _add_posed_node(document: GltfDocument, name: str, span: Span, primitive: dict[str, Any]) -> int:
-    """A node with the poses of a span, the first of them shown. Returns its number."""
+    """Add a node with the poses of a span as morph targets, the first one active; return its index."""
     mesh = document.add(
         "meshes",
         name=name,
@@ -246,23 +256,23 @@ def _add_posed_node(document: GltfDocument, name: str, span: Span, primitive: di
 
 
 def _finish(document: GltfDocument, nodes: list[int], cube: QuantizationCube | None) -> bytes:
-    """One root: the only node, or a parent of all; it carries the cube."""
+    """Encode the document with a single root node, which holds the transform of the quantization cube."""
     root = nodes[0] if len(nodes) == 1 else document.add("nodes", name=NAME, children=nodes)
     if cube is not None:
-        document.tree["nodes"][root] |= {**cube.placement(), "extras": {"largestError": cube.largest_error}}
+        document.tree["nodes"][root] |= {**cube.node_transform(), "extras": {"largestError": cube.max_error}}
     document.tree["scene"] = document.add("scenes", name="asset", nodes=[root])
     return document.to_bytes()
 
 
 def _mesh_nodes(parsed: GlbReader) -> list[int]:
-    """The nodes that show the one mesh of a file."""
+    """Return the nodes that show the single mesh of a file."""
     nodes = [number for number, node in enumerate(parsed.tree["nodes"]) if "mesh" in node]
     shapes = []
     for number in nodes:
         primitives = parsed.tree["meshes"][parsed.tree["nodes"][number]["mesh"]]["primitives"]
         shapes += [(primitive["attributes"], primitive["indices"]) for primitive in primitives]
     if not nodes or any(shape != shapes[0] for shape in shapes) or len(shapes) > len(nodes):
-        raise BadInput(f"this GLB shows {len(shapes)} meshes; only one mesh with one material can be read")
+        raise BadInput(f"this GLB shows {len(shapes)} meshes; give a file with one mesh and one material")
     return nodes
 
 
@@ -272,11 +282,11 @@ def _primitive_of(parsed: GlbReader, node: int) -> dict[str, Any]:
 
 
 def _read_mesh(parsed: GlbReader, nodes: list[int]) -> TexturedMesh:
-    """The mesh at rest, with the texture of the first node."""
+    """Read the mesh at rest, with the texture of the first node."""
     primitive = _primitive_of(parsed, nodes[0])
     attributes, indices = primitive["attributes"], parsed.accessor(primitive["indices"])
     if indices.dtype.kind != "u":
-        raise BadInput("the triangles of this GLB are not given by whole numbers")
+        raise BadInput("the triangle indices of this GLB are not unsigned integers; export it again")
     scale, shift = _placement(parsed, nodes[0])
     vertices = (parsed.accessor(attributes["POSITION"]) * scale + shift).astype(np.float32)
     pixels, atlas = _read_picture(parsed, primitive["material"])
@@ -284,34 +294,34 @@ def _read_mesh(parsed: GlbReader, nodes: list[int]) -> TexturedMesh:
     mesh = TexturedMesh(
         torch.from_numpy(vertices),
         torch.from_numpy(indices.astype(np.int64).reshape(-1, 3)),
-        torch.from_numpy(uvs.copy() if atlas is None else atlas.outside(uvs)),
-        _colors(pixels if atlas is None else atlas.split(pixels)[0]),
+        torch.from_numpy(uvs.copy() if atlas is None else atlas.from_atlas_uvs(uvs)),
+        _colors(pixels if atlas is None else atlas.unpack(pixels)[0]),
     )
     if len(mesh.uvs) != len(mesh.vertices) or not (mesh.faces < len(mesh.vertices)).all():
-        raise BadInput("the triangles or texture coordinates of this GLB do not fit its vertices")
+        raise BadInput("the triangles or texture coordinates of this GLB do not match its vertices; export it again")
     return mesh
 
 
 def _placement(parsed: GlbReader, node: int) -> tuple[float, NDArray[np.float64]]:
-    """The scale of a node in the world, and where its origin lies; a scale that shows and hides it counts as 1."""
+    """Return world scale and origin of a node; an animated scale (which shows and hides nodes) counts as 1."""
     tree, scale, shift = parsed.tree, 1.0, np.zeros(3)
     targets = [channel["target"] for animation in tree.get("animations", []) for channel in animation["channels"]]
     shown = {target["node"] for target in targets if target["path"] == "scale"}
     parents = {child: number for number, item in enumerate(tree["nodes"]) for child in item.get("children", ())}
-    place: int | None = node
-    while place is not None:
-        item = tree["nodes"][place]
-        scales = [1.0] * 3 if place in shown else item.get("scale", [1.0] * 3)
+    current: int | None = node
+    while current is not None:
+        item = tree["nodes"][current]
+        scales = [1.0] * 3 if current in shown else item.get("scale", [1.0] * 3)
         if {"matrix", "rotation"} & item.keys() or len(set(scales)) > 1:
-            raise BadInput("the mesh of this GLB stands under a transform; apply the transform and export it again")
+            raise BadInput("the mesh of this GLB has a transform; apply the transform and export it again")
         shift = shift * scales[0] + item.get("translation", np.zeros(3))
         scale *= scales[0]
-        place = parents.get(place)
+        current = parents.get(current)
     return scale, shift
 
 
 def _read_frames(parsed: GlbReader, nodes: list[int]) -> tuple[list[tuple[dict[str, int], int]], float]:
-    """The morph target and the material of every frame, and the frames per second."""
+    """Return morph target and material of every frame, and the frames per second."""
     (animation,) = parsed.tree["animations"]
     tracks = {
         channel["target"]["node"]: animation["samplers"][channel["sampler"]]
@@ -326,26 +336,26 @@ def _read_frames(parsed: GlbReader, nodes: list[int]) -> tuple[list[tuple[dict[s
         weights = parsed.accessor(tracks[node]["output"]).reshape(len(seconds), len(primitive["targets"]))
         poses = weights.argmax(1)
         if not np.array_equal(weights, np.eye(weights.shape[1])[poses]):
-            raise BadInput("the animation of this GLB does not show one morph target per key; use one written by dg4d")
+            raise BadInput("the animation of this GLB blends morph targets; give a GLB that dg4d wrote")
         for second, pose in zip(seconds[:-1], poses, strict=False):
             frames[round(float(second * fps))] = (primitive["targets"][pose], primitive["material"])
     if sorted(frames) != list(range(len(frames))):
-        raise BadInput("the animation of this GLB leaves frames out; use one written by dg4d")
+        raise BadInput("the animation of this GLB omits frames; give a GLB that dg4d wrote")
     return [frames[frame] for frame in range(len(frames))], fps
 
 
 def _read_textures(parsed: GlbReader, materials: list[int]) -> Float[Tensor, "t h w 3"] | None:
-    """The textures of every frame, where they change."""
+    """Read the textures of all frames; None if there is only one."""
     pixels, atlas = _read_picture(parsed, materials[0])
     if atlas is not None:
-        return _colors(atlas.split(pixels))
+        return _colors(atlas.unpack(pixels))
     if len(set(materials)) == 1:
         return None
     return _colors(np.stack([_read_picture(parsed, material)[0] for material in materials]))
 
 
 def _read_picture(parsed: GlbReader, material: int) -> tuple[NDArray[np.uint8], Atlas | None]:
-    """The color of a material, and how frames lie in it."""
+    """Read the base color image of a material, and its atlas layout if it is an atlas."""
     tree = parsed.tree
     item = tree["materials"][material]
     texture = tree["textures"][item["pbrMetallicRoughness"]["baseColorTexture"]["index"]]

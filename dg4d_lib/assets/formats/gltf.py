@@ -1,4 +1,4 @@
-"""The GLB container: a tree of plain JSON in the words of the glTF 2.0 specification, and the bytes it points to."""
+"""GLB container: the glTF 2.0 JSON tree and its binary buffer, written and read."""
 
 import json
 import struct
@@ -12,10 +12,10 @@ from dg4d_lib.errors import BadInput
 
 VERTEX_DATA = 34962  # buffer view targets
 INDEX_DATA = 34963
-MAX_LENGTH = 2**32 - 1  # bytes of a GLB
+MAX_LENGTH = 2**32 - 1  # maximum size of a GLB, bytes
 
 _MAGIC, _JSON, _BINARY = b"glTF", b"JSON", b"BIN\0"
-_ALIGNMENT = 4  # bytes; of vertices and of views
+_ALIGNMENT = 4  # of vertices and buffer views, bytes
 _COMPONENTS: dict[int, np.dtype[Any]] = {
     5120: np.dtype("i1"),
     5121: np.dtype("u1"),
@@ -26,74 +26,74 @@ _COMPONENTS: dict[int, np.dtype[Any]] = {
 }
 _COMPONENT_OF = {dtype: number for number, dtype in _COMPONENTS.items()}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-_KIND_OF = {width: kind for kind, width in _WIDTHS.items()}
+_TYPE_OF = {width: kind for kind, width in _WIDTHS.items()}
 
 
 class GltfDocument:
-    """A glTF document under construction; what is added later may refer to what was added before, by its number.
+    """glTF document under construction; items refer to earlier items by index.
 
     Attributes:
-        tree: the JSON.
-        binary: the bytes of the buffer; every view starts at a multiple of four.
+        tree: the JSON tree.
+        binary: the buffer; every view starts at a multiple of four bytes.
     """
 
     def __init__(self, extras: dict[str, Any], *, compressed: bool = False) -> None:
-        """An empty document.
+        """Create an empty document.
 
         Args:
-            extras: JSON that says more about the file.
-            compressed: vertices and triangles are packed as EXT_meshopt_compression says.
+            extras: additional JSON about the asset.
+            compressed: True to compress vertices and triangles with EXT_meshopt_compression.
         """
         self.tree: dict[str, Any] = {"asset": {"version": "2.0", "generator": "dg4d"}}
         if extras:
             self.tree["asset"]["extras"] = extras
         self.binary = bytearray()
         self._compressed = compressed
-        self._unpacked = 0  # bytes that the packed views have when they are unpacked
+        self._unpacked = 0  # decompressed size of the compressed views, bytes
 
     def add(self, collection: str, **item: Any) -> int:
-        """Append to `nodes`, `meshes`, ...; a property that is None is left out. Returns its number."""
+        """Append an item to `nodes`, `meshes`, ... and return its index; properties that are None are omitted."""
         items = self.tree.setdefault(collection, [])
         items.append({key: value for key, value in item.items() if value is not None})
         return len(items) - 1
 
-    def use(self, extension: str, *, required: bool = False) -> None:
-        """Announce an extension; required: readers that do not know it shall give up."""
+    def use_extension(self, extension: str, *, required: bool = False) -> None:
+        """Declare an extension as used, and as required if readers without it must reject the file."""
         for collection in ("extensionsUsed", "extensionsRequired") if required else ("extensionsUsed",):
             names = self.tree.setdefault(collection, [])
             if extension not in names:
                 names.append(extension)
 
     def add_view(self, name: str, content: bytes, target: int | None = None, stride: int | None = None) -> int:
-        """Append bytes to the buffer. Returns the number of their view."""
+        """Append bytes to the buffer; return the index of their view."""
         start = len(self.binary)
         self.binary += content + bytes(-len(content) % _ALIGNMENT)
-        place = {"buffer": 0, "byteOffset": start, "byteLength": len(content)}
-        return self.add("bufferViews", name=name, **place, byteStride=stride, target=target)
+        location = {"buffer": 0, "byteOffset": start, "byteLength": len(content)}
+        return self.add("bufferViews", name=name, **location, byteStride=stride, target=target)
 
     def add_view_of(self, other: "GlbReader", index: int) -> int:
-        """Append a view of another file as it is, packed or not. Returns its number."""
+        """Append a view of another file without decompressing it; return its index."""
         view: dict[str, Any] = {**other.tree["bufferViews"][index]}
         packed = view.get("extensions", {}).get(meshopt.EXTENSION)
-        content = other.stored(index)
-        place = {"buffer": 0, "byteOffset": len(self.binary)}
+        content = other.raw_view(index)
+        location = {"buffer": 0, "byteOffset": len(self.binary)}
         self.binary += content + bytes(-len(content) % _ALIGNMENT)
         if packed is None:
-            return self.add("bufferViews", **{**view, **place})
-        view |= {"buffer": 1, "byteOffset": self._unpacked, "extensions": {meshopt.EXTENSION: {**packed, **place}}}
+            return self.add("bufferViews", **{**view, **location})
+        view |= {"buffer": 1, "byteOffset": self._unpacked, "extensions": {meshopt.EXTENSION: {**packed, **location}}}
         self._unpacked += view["byteLength"] + -view["byteLength"] % _ALIGNMENT
         return self.add("bufferViews", **view)
 
     def add_accessor(
         self, name: str, values: NDArray[Any], target: int | None = None, *, normalized: bool = False
     ) -> int:
-        """Append rows of numbers ("n" or "n k") with their true bounds. Returns the accessor's number.
+        """Append rows of numbers ("n" or "n k") with their bounds; return the accessor's index.
 
         Args:
             name: of the accessor and its view.
-            values: in a type that glTF knows.
-            target: what the numbers are for; vertices are padded to whole words.
-            normalized: whole numbers stand for shares of the largest one.
+            values: of a type that glTF supports.
+            target: buffer view target; vertex data is padded to whole words.
+            normalized: True if integers stand for fractions of the largest integer.
         """
         rows = values.reshape(len(values), -1)
         add = self._add_packed_view if self._compressed and target is not None else self._add_plain_view
@@ -104,16 +104,16 @@ class GltfDocument:
             componentType=_COMPONENT_OF[rows.dtype],
             normalized=normalized or None,
             count=len(rows),
-            type=_KIND_OF[rows.shape[1]],
+            type=_TYPE_OF[rows.shape[1]],
             min=rows.min(0).tolist(),
             max=rows.max(0).tolist(),
         )
 
     def to_bytes(self) -> bytes:
-        """The finished GLB.
+        """Encode the document as GLB.
 
         Raises:
-            BadInput: it would be larger than a GLB can be.
+            BadInput: the file would exceed the maximum size of a GLB.
         """
         buffers: list[dict[str, Any]] = [{"byteLength": len(self.binary)}]
         if self._unpacked:
@@ -127,8 +127,8 @@ class GltfDocument:
         length = 12 + len(chunks)
         if length > MAX_LENGTH:
             raise BadInput(
-                f"this GLB would have {length / 2**30:.1f} GiB, and a GLB ends at 4: fewer frames or vertices, smaller "
-                "textures, pack.gltf.quantized or pack.gltf.meshopt make it smaller"
+                f"this GLB would have {length / 2**30:.1f} GiB, at most 4 GiB are allowed; use fewer frames or "
+                "vertices or smaller textures, or set pack.gltf.quantized or pack.gltf.meshopt to true"
             )
         return _MAGIC + struct.pack("<II", 2, length) + chunks
 
@@ -138,8 +138,8 @@ class GltfDocument:
         return self.add_view(name, padded.tobytes(), target, stride)
 
     def _add_packed_view(self, name: str, rows: NDArray[Any], target: int | None) -> int:
-        """A view of a buffer that is nowhere, and where its packed bytes are."""
-        self.use(meshopt.EXTENSION, required=True)
+        """Append a compressed view: a view of the fallback buffer, and the location of the compressed bytes."""
+        self.use_extension(meshopt.EXTENSION, required=True)
         vertices = target == VERTEX_DATA
         padded = _padded(rows) if vertices else rows
         content = meshopt.pack_vertices(padded) if vertices else meshopt.pack_triangles(padded)
@@ -157,32 +157,35 @@ class GltfDocument:
 
 
 class GlbReader:
-    """A GLB that was read: its JSON and its buffer.
+    """GLB in memory: its JSON tree and its buffer.
 
     Raises:
-        BadInput: the container is broken.
+        BadInput: the container is corrupt.
     """
 
     def __init__(self, content: bytes) -> None:
         if content[:4] != _MAGIC:
-            raise BadInput(f"this is no GLB: it must begin with {_MAGIC!r}, and begins with {content[:4]!r}")
+            raise BadInput(f"this is not a GLB: it starts with {content[:4]!r} instead of {_MAGIC!r}")
         try:
             version, length = struct.unpack_from("<II", content, 4)
             (text_length,) = struct.unpack_from("<I", content, 12)
             self.tree: dict[str, Any] = json.loads(content[20 : 20 + text_length])
             (binary_length,) = struct.unpack_from("<I", content, 20 + text_length)
         except (struct.error, ValueError) as error:
-            raise BadInput(f"this GLB is broken: {error}") from error
+            raise BadInput(f"this GLB is corrupt ({error}); export it again") from error
         start = 28 + text_length
         if version != 2 or length != len(content) or start + binary_length > len(content):
-            raise BadInput(f"this GLB is broken: version {version}, {length} bytes announced, {len(content)} there")
+            raise BadInput(
+                f"this GLB is corrupt: version {version} (2 expected), {length} bytes declared, {len(content)} found; "
+                "export it again"
+            )
         self.binary = content[start : start + binary_length]
 
     def view(self, index: int) -> bytes:
-        """The bytes of a buffer view, unpacked.
+        """Return the bytes of a buffer view, decompressed.
 
         Raises:
-            BackendUnavailable: they are packed, and the package that unpacks them is missing.
+            BackendUnavailable: the view is compressed and meshoptimizer is missing.
         """
         view = self.tree["bufferViews"][index]
         packed = view.get("extensions", {}).get(meshopt.EXTENSION)
@@ -191,13 +194,13 @@ class GlbReader:
         unpack = {"ATTRIBUTES": meshopt.unpack_vertices, "TRIANGLES": meshopt.unpack_triangles}[packed["mode"]]
         return unpack(self._bytes(packed), packed["count"], packed["byteStride"])
 
-    def stored(self, index: int) -> bytes:
-        """The bytes of a buffer view as they are in the file, packed or not."""
+    def raw_view(self, index: int) -> bytes:
+        """Return the bytes of a buffer view as stored, compressed or not."""
         view = self.tree["bufferViews"][index]
         return self._bytes(view.get("extensions", {}).get(meshopt.EXTENSION, view))
 
     def accessor(self, index: int) -> NDArray[Any]:
-        """Rows of numbers, "n k"; shares given by whole numbers come as float32."""
+        """Return rows of numbers, "n k"; normalized integers are converted to float32."""
         accessor = self.tree["accessors"][index]
         dtype, width = _COMPONENTS[accessor["componentType"]], _WIDTHS[accessor["type"]]
         stride = self.tree["bufferViews"][accessor["bufferView"]].get("byteStride", width * dtype.itemsize)
@@ -212,12 +215,12 @@ class GlbReader:
             return rows
         return np.maximum(rows / np.float32(np.iinfo(dtype).max), np.float32(-1))
 
-    def _bytes(self, place: dict[str, Any]) -> bytes:
-        start = place.get("byteOffset", 0)
-        return self.binary[start : start + place["byteLength"]]
+    def _bytes(self, location: dict[str, Any]) -> bytes:
+        start = location.get("byteOffset", 0)
+        return self.binary[start : start + location["byteLength"]]
 
 
 def _padded(rows: NDArray[Any]) -> NDArray[Any]:
-    """Rows that fill whole words, with zeros at the end."""
+    """Pad rows with zeros to whole words."""
     missing = -rows[0].nbytes % _ALIGNMENT // rows.itemsize
     return np.pad(rows, ((0, 0), (0, missing))) if missing else rows

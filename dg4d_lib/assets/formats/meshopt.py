@@ -1,4 +1,4 @@
-"""EXT_meshopt_compression: vertices and triangles packed without loss, by the library that defines the format."""
+"""EXT_meshopt_compression: lossless compression of vertices and triangles with the reference library."""
 
 from types import ModuleType
 from typing import Any
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from dg4d_lib.errors import BackendUnavailable, BadInput
 
 EXTENSION = "EXT_meshopt_compression"
-VERTEX_FORMAT, INDEX_FORMAT = 0, 1  # versions that the extension prescribes
+VERTEX_FORMAT, INDEX_FORMAT = 0, 1  # codec versions that the extension prescribes
 
 
 def pack_vertices(rows: NDArray[Any]) -> bytes:
-    """Pack rows whose bytes are a multiple of four, at most 256.
+    """Compress rows of vertex data; a row has a multiple of 4 bytes, at most 256.
 
     Raises:
         BackendUnavailable: meshoptimizer is missing.
@@ -24,21 +24,21 @@ def pack_vertices(rows: NDArray[Any]) -> bytes:
 
 
 def unpack_vertices(content: bytes, count: int, stride: int) -> bytes:
-    """What `pack_vertices` packed.
+    """Decompress the output of `pack_vertices`.
 
     Raises:
         BackendUnavailable: meshoptimizer is missing.
-        BadInput: the content is broken.
+        BadInput: the content is corrupt.
     """
     library = _library()
     try:
         return library.decode_vertex_buffer(count, stride, content, np.dtype((np.void, stride))).tobytes()
     except RuntimeError as error:
-        raise BadInput(f"vertices of this GLB cannot be unpacked: {error}") from error
+        raise BadInput(f"the vertices of this GLB cannot be decompressed ({error}); export the file again") from error
 
 
 def pack_triangles(indices: NDArray[Any]) -> bytes:
-    """Pack three indices per triangle; they may come back turned, (1, 2, 0) for (0, 1, 2).
+    """Compress three indices per triangle; decompression may rotate them, (1, 2, 0) for (0, 1, 2).
 
     Raises:
         BackendUnavailable: meshoptimizer is missing.
@@ -49,25 +49,25 @@ def pack_triangles(indices: NDArray[Any]) -> bytes:
 
 
 def unpack_triangles(content: bytes, count: int, size: int) -> bytes:
-    """What `pack_triangles` packed, as unsigned numbers of 2 or 4 bytes.
+    """Decompress the output of `pack_triangles` to unsigned integers of 2 or 4 bytes.
 
     Raises:
         BackendUnavailable: meshoptimizer is missing.
-        BadInput: the content is broken.
+        BadInput: the content is corrupt.
     """
     library = _library()
     try:
         return library.decode_index_buffer(count, np.uint32().nbytes, content).astype(f"<u{size}").tobytes()
     except RuntimeError as error:
-        raise BadInput(f"triangles of this GLB cannot be unpacked: {error}") from error
+        raise BadInput(f"the triangles of this GLB cannot be decompressed ({error}); export the file again") from error
 
 
 def _library() -> ModuleType:
     try:
-        import meshoptimizer  # noqa: PLC0415 (an optional package)
+        import meshoptimizer  # noqa: PLC0415 (optional dependency)
     except ImportError as error:
         raise BackendUnavailable(
             f"{EXTENSION} needs the package meshoptimizer; run `deploy/install.sh meshopt`, "
-            "or write without pack.gltf.meshopt"
+            "or set pack.gltf.meshopt=false"
         ) from error
     return meshoptimizer

@@ -1,6 +1,6 @@
-"""A moment of a splat sequence as glTF: points with the Khronos extension KHR_gaussian_splatting.
+"""Splats of one frame as GLB, with the Khronos extension KHR_gaussian_splatting.
 
-A viewer that does not know the extension shows colored points. Axes and units are glTF's own, as the world's are.
+Viewers without the extension show colored points. World axes and units equal those of glTF.
 """
 
 from typing import Literal
@@ -14,7 +14,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import check_storable
 
 EXTENSION = "KHR_gaussian_splatting"
-POINTS = 0  # the mode of the primitive
+POINTS = 0  # primitive mode
 KERNEL = {
     "kernel": "ellipse",
     "colorSpace": "srgb_rec709_display",
@@ -22,13 +22,13 @@ KERNEL = {
     "projection": "perspective",
 }
 
-# Which text of the extension is followed: the ratified one (June 2026), or the release candidate of February 2026,
-# whose scales are logarithms. A file does not say which; readers of today expect the first.
+# Version of the extension: the ratified one (June 2026), or the release candidate of February 2026, whose scales are
+# logarithms. Files do not record the version; current readers expect the ratified one.
 SplatGlbVersion = Literal["ratified", "rc1"]
 
 
 def write_splat_glb(gaussians: Gaussians, version: SplatGlbVersion = "ratified") -> bytes:
-    """A GLB of one cloud (no leading batch, color of degree 0); equal clouds give equal bytes.
+    """Encode one cloud (no leading batch, color of degree 0) as GLB; equal clouds give equal bytes.
 
     Raises:
         BadInput: no Gaussians, a batch, color of a higher degree, or numbers that are not finite.
@@ -37,18 +37,18 @@ def write_splat_glb(gaussians: Gaussians, version: SplatGlbVersion = "ratified")
     if len(gaussians) == 0:
         raise BadInput("a splat GLB needs at least one Gaussian; given none")
     scales = gaussians.scales if version == "ratified" else gaussians.log_scales
-    turned = torch.nn.functional.normalize(gaussians.quats, dim=-1).roll(-1, -1)  # xyzw
-    shown = torch.cat([_linear(gaussians.colors), gaussians.opacities[:, None]], 1)
+    quats = torch.nn.functional.normalize(gaussians.quats, dim=-1).roll(-1, -1)  # xyzw
+    rgba = torch.cat([_srgb_to_linear(gaussians.colors), gaussians.opacities[:, None]], 1)
     columns = {
         "POSITION": gaussians.means,
-        "COLOR_0": shown,
-        f"{EXTENSION}:ROTATION": turned,
+        "COLOR_0": rgba,
+        f"{EXTENSION}:ROTATION": quats,
         f"{EXTENSION}:SCALE": scales,
         f"{EXTENSION}:OPACITY": gaussians.opacities,
         f"{EXTENSION}:SH_DEGREE_0_COEF_0": gaussians.harmonics[:, 0],
     }
     document = GltfDocument({})
-    document.use(EXTENSION)
+    document.use_extension(EXTENSION)
     attributes = {
         name: document.add_accessor(name, values.detach().cpu().numpy().astype("<f4"), VERTEX_DATA)
         for name, values in columns.items()
@@ -60,6 +60,6 @@ def write_splat_glb(gaussians: Gaussians, version: SplatGlbVersion = "ratified")
     return document.to_bytes()
 
 
-def _linear(colors: Float[torch.Tensor, "n 3"]) -> Float[torch.Tensor, "n 3"]:
-    """Light of sRGB values: what glTF wants the colors of points to be."""
+def _srgb_to_linear(colors: Float[torch.Tensor, "n 3"]) -> Float[torch.Tensor, "n 3"]:
+    """Convert sRGB to linear light, which glTF prescribes for vertex colors."""
     return torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)

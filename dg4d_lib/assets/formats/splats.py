@@ -1,4 +1,4 @@
-"""Moving splats as one file per frame: standard PLY, SPZ, or glTF."""
+"""Splat sequences with one file per frame: standard PLY, SPZ or glTF."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -26,14 +26,14 @@ def write_spz_frames(folder: Path, states: Gaussians) -> list[Path]:
     """Write every state of a batch as FOLDER/NNN.spz; the folder must exist.
 
     Raises:
-        BadInput: numbers that are not finite, or centers thousands of units away.
+        BadInput: numbers that are not finite, or means outside the range of SPZ (see `write_spz`).
         OSError: a file could not be written.
     """
     return _write(folder, states, "spz", write_spz)
 
 
 def write_splat_glb_frames(folder: Path, states: Gaussians, version: SplatGlbVersion = "ratified") -> list[Path]:
-    """Write every state of a batch as FOLDER/NNN.glb, which holds splats; the folder must exist.
+    """Write every state of a batch as a splat GLB, FOLDER/NNN.glb; the folder must exist.
 
     Raises:
         BadInput: no Gaussians, or numbers that are not finite.
@@ -43,21 +43,24 @@ def write_splat_glb_frames(folder: Path, states: Gaussians, version: SplatGlbVer
 
 
 def read_splats(folder: Path) -> Gaussians:
-    """Read what `write_splats` wrote, as a batch with one state per frame.
+    """Read the output of `write_splats` as a batch with one state per frame.
 
     Raises:
-        BadInput: no frames, a gap in the numbering, a broken file, or frames that are not states of one cloud.
+        BadInput: no frames, a gap in the numbering, a corrupt file, or frames that are not states of one cloud.
     """
     paths = sorted(folder.glob("*.ply"))
     if not paths or [path.name for path in paths] != [f"{frame:03d}.ply" for frame in range(len(paths))]:
         given = f"{paths[0].name} to {paths[-1].name}, {len(paths)} files" if paths else "none"
-        raise BadInput(f"{folder.name}/ must hold 000.ply, 001.ply, ... without gaps; given {given}")
+        raise BadInput(f"{folder.name}/ must contain 000.ply, 001.ply, ... without gaps; given {given}")
     clouds = [read_ply(path) for path in paths]
     first = clouds[0]
     for path, cloud in zip(paths, clouds, strict=True):
         same = torch.equal(cloud.opacity_logits, first.opacity_logits) and torch.equal(cloud.harmonics, first.harmonics)
         if not same:
-            raise BadInput(f"{path.name} is no state of the cloud in {paths[0].name}: opacity or color differ")
+            raise BadInput(
+                f"{path.name} and {paths[0].name} are not frames of one sequence: opacity or color differ; "
+                "write the sequence again"
+            )
     return Gaussians(
         torch.stack([cloud.means for cloud in clouds]),
         torch.stack([cloud.log_scales for cloud in clouds]),

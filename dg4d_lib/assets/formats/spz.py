@@ -1,7 +1,7 @@
-"""Splats in a sixth of the bytes: SPZ, the quantized format of Niantic (version 3: one gzip stream).
+"""SPZ writer: Niantic's quantized splat format (version 3, one gzip stream), a sixth of the size of a PLY.
 
-A header of 16 bytes, then all positions, opacities, colors, scales and rotations, each as whole numbers. Its axes are
-ours (x right, y up, z towards the viewer), so nothing is turned.
+A header of 16 bytes is followed by all positions, opacities, colors, scales and rotations as integers. The axes equal
+ours (x right, y up, z towards the viewer).
 """
 
 import gzip
@@ -20,27 +20,29 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import check_storable
 
 MAGIC, VERSION = b"NGSP", 3
-FRACTION_BITS = 12  # of positions, as other writers choose; with more, the steps of the scales decide the error
-FARTHEST = (2**23 - 1) / 2**FRACTION_BITS  # world units: 24 bits with a sign
+FRACTION_BITS = 12  # of positions, as in other writers; with more bits, the error of the scales dominates
+FARTHEST = (2**23 - 1) / 2**FRACTION_BITS  # world units; positions are signed 24-bit integers
 LEVEL = 9  # of gzip
-LARGEST = 2**9 - 1  # the size of a small component of a rotation, without its sign
+LARGEST = 2**9 - 1  # largest magnitude of a quantized quaternion component, without its sign
 
 
 def write_spz(path: Path, gaussians: Gaussians) -> None:
     """Write one cloud (no leading batch, color of degree 0); equal clouds give equal bytes.
 
-    What comes back differs by no more than 1/8192 world units in positions, 1/32 in the logarithms of scales (3 %;
-    they end at -10 and 5.94), 1/510 in opacities, 1/76 in harmonics (0.4 % of the full range of color, which ends at
-    -0.44 and 1.44) and a rotation of 0.3 degrees.
+    Quantization errors are at most 1/8192 world units in positions, 1/32 in log scales (3 %; range -10 to 5.94), 1/510
+    in opacities, 1/76 in harmonics (0.4 % of the range of colors, -0.44 to 1.44) and 0.3 degrees in rotations.
 
     Raises:
-        BadInput: a batch, color of a higher degree, numbers that are not finite, or a center 2048 units away.
+        BadInput: a batch, color of a higher degree, numbers that are not finite, or a mean 2048 units away.
         OSError: the file could not be written.
     """
     check_storable(gaussians, "an SPZ")
     means, log_scales, harmonics = (_array(x) for x in (gaussians.means, gaussians.log_scales, gaussians.harmonics))
     if np.abs(means).max(initial=0.0) > FARTHEST:
-        raise BadInput(f"an SPZ holds centers within {FARTHEST:.0f} world units; given {np.abs(means).max():.4g}")
+        raise BadInput(
+            f"an SPZ stores means within {FARTHEST:.0f} world units; given {np.abs(means).max():.4g}: "
+            "scale the cloud down, or set pack.spz=false"
+        )
     sections = (
         np.rint(means * 2**FRACTION_BITS).astype("<i4")[..., None].view(np.uint8)[..., :3],
         _bytes(255 * _array(gaussians.opacities)),
@@ -62,9 +64,9 @@ def _bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def _smallest_three(quats: Float[np.ndarray, "n 4"]) -> UInt8[np.ndarray, "n 4"]:
-    """Rotations as 32 bits: which of x, y, z, w is the largest (2), then the others as a sign and a size (1 + 9).
+    """Encode rotations in 32 bits: index of the largest of x, y, z, w (2), sign and magnitude of the others (1 + 9).
 
-    The largest is made positive and left out: the length of the quaternion gives it.
+    The largest component is made positive and omitted; the unit norm determines it.
     """
     unit = np.roll(quats, -1, axis=1) / np.linalg.norm(quats, axis=1, keepdims=True)
     rows, largest = np.arange(len(unit)), np.abs(unit).argmax(1)

@@ -1,8 +1,8 @@
-"""Animations of a glTF document that show frames one after another.
+"""glTF animation tracks: morph weights, node visibility and animated properties.
 
-All are closed: a last key, one frame after the last frame, shows the first frame again, so a player that loops has no
-jump and the animation lasts as long as the video. Nodes are shown by scale 1 and hidden by scale 0, in steps: core
-glTF has nothing else for it.
+All tracks loop: a key one frame after the last frame repeats the first frame, so a looping player does not jump and the
+animation lasts as long as the video. Nodes are shown with scale 1 and hidden with scale 0, in steps, because core glTF
+has no visibility.
 """
 
 from dataclasses import dataclass
@@ -18,46 +18,46 @@ POINTER = "KHR_animation_pointer"
 
 @dataclass(frozen=True)
 class Span:
-    """Consecutive frames that one node shows.
+    """Consecutive frames shown by one node.
 
     Attributes:
-        first: the first of them.
-        end: the first that is not one of them.
-        of: frames of the whole animation.
+        first: first frame.
+        end: frame after the last one.
+        total: frames of the whole animation.
     """
 
     first: int
     end: int
-    of: int
+    total: int
 
     @property
     def keys(self) -> list[int]:
-        """Its frames and the one that it leads to; that may be `of`, which stands for frame 0."""
+        """Frames of the span and the next one; the latter may be `total`, which stands for frame 0."""
         return list(range(self.first, self.end + 1))
 
     @property
     def poses(self) -> list[int]:
-        """The frames that are seen at its keys, each once."""
-        return list(dict.fromkeys(key % self.of for key in self.keys))
+        """Frames shown at the keys, each once."""
+        return list(dict.fromkeys(key % self.total for key in self.keys))
 
     def weights(self) -> NDArray[np.float32]:
-        """The weights of its poses at its keys: one is 1."""
-        return np.array([[pose == key % self.of for pose in self.poses] for key in self.keys], "<f4")
+        """Return the one-hot weights of the poses at the keys."""
+        return np.array([[pose == key % self.total for pose in self.poses] for key in self.keys], "<f4")
 
-    def shown(self) -> tuple[list[int], NDArray[np.float32]]:
-        """Where it appears and disappears: keys, and the scale of its node from each on."""
-        keys = sorted({0, self.first, self.end, self.of})
-        visible = [self.first <= key % self.of < self.end for key in keys]
+    def visibility(self) -> tuple[list[int], NDArray[np.float32]]:
+        """Return the keys at which the node appears or disappears, and its scale from each key on."""
+        keys = sorted({0, self.first, self.end, self.total})
+        visible = [self.first <= key % self.total < self.end for key in keys]
         return keys, np.repeat(np.array(visible, "<f4")[:, None], 3, axis=1)
 
 
 def split_into_spans(frames: int, longest: int) -> list[Span]:
-    """Spans of an animation, one after another, none longer than `longest` frames."""
+    """Split an animation into consecutive spans of at most `longest` frames."""
     return [Span(first, min(first + longest, frames), frames) for first in range(0, frames, longest)]
 
 
 class Animation:
-    """Tracks that are played together."""
+    """glTF animation under construction."""
 
     def __init__(self, document: GltfDocument, fps: float) -> None:
         self._document, self._fps = document, fps
@@ -65,24 +65,24 @@ class Animation:
         self._channels: list[dict[str, Any]] = []
         self._times: dict[tuple[int, ...], int] = {}
 
-    def morph(self, node: int, name: str, span: Span, interpolation: str) -> None:
-        """A node shows the poses of its span, one at each key."""
+    def add_morph(self, node: int, name: str, span: Span, interpolation: str) -> None:
+        """Animate the morph weights of a node, so that it shows the poses of its span."""
         self._add(name, span.keys, span.weights().ravel(), interpolation, {"node": node, "path": "weights"})
 
-    def show(self, node: int, name: str, span: Span) -> None:
-        """A node is there in its span only; in readers that play nothing, the node of frame 0 is."""
-        keys, scales = span.shown()
+    def add_visibility(self, node: int, name: str, span: Span) -> None:
+        """Show a node during its span only; readers without animation show the node of frame 0."""
+        keys, scales = span.visibility()
         self._document.tree["nodes"][node]["scale"] = scales[0].tolist()
         self._add(f"{name} shown", keys, scales, "STEP", {"node": node, "path": "scale"})
 
-    def point(self, pointer: str, name: str, values: NDArray[np.float32]) -> None:
-        """Something that is no node has a value at every frame; readers that do not know the extension leave it."""
-        self._document.use(POINTER)
+    def add_pointer(self, pointer: str, name: str, values: NDArray[np.float32]) -> None:
+        """Animate any property with a value per frame; readers without KHR_animation_pointer ignore it."""
+        self._document.use_extension(POINTER)
         target = {"path": "pointer", "extensions": {POINTER: {"pointer": pointer}}}
         self._add(name, list(range(len(values) + 1)), np.concatenate((values, values[:1])), "STEP", target)
 
     def finish(self) -> None:
-        """Add it to the document."""
+        """Add the animation to the document."""
         self._document.add("animations", name="motion", samplers=self._samplers, channels=self._channels)
 
     def _add(
@@ -94,8 +94,8 @@ class Animation:
         self._samplers.append(sampler)
 
     def _seconds(self, keys: list[int]) -> int:
-        wanted = tuple(keys)
-        if wanted not in self._times:
+        index = tuple(keys)
+        if index not in self._times:
             seconds = (np.array(keys) / self._fps).astype("<f4")
-            self._times[wanted] = self._document.add_accessor("times", seconds)
-        return self._times[wanted]
+            self._times[index] = self._document.add_accessor("times", seconds)
+        return self._times[index]

@@ -1,21 +1,21 @@
-"""Animated meshes and moving splats as one USDZ, and several of them as one scene.
+"""Animated meshes and splats as USDZ, and scenes of several assets.
 
-Frame i stands at time code i, and the stage has as many time codes per second as the asset has frames. Animations are
-closed as in the GLB: one more key after the last frame shows the first again; without a time, everything is as in the
-first. A package holds one layer, `/asset` in it, and the textures:
+Frame i is at time code i, and the stage has as many time codes per second as the asset has frames. Animations loop as
+in the GLB: one key after the last frame repeats the first; default values are those of the first frame. A package
+contains one layer with the prim `/asset`, and the textures:
 
-    /asset                      variant set "representation": "mesh" (chosen) or "splats"
+    /asset                      variant set "representation": "mesh" (default) or "splats"
     /asset/mesh/subject         the tracked mesh; or /asset/mesh/frame_000, ... for meshes per frame
-    /asset/mesh/materials/...   a UsdPreviewSurface for each: the baked color of a rough dielectric
-    /asset/splats               only in the variant "splats", which switches /asset/mesh off
+    /asset/mesh/materials/...   UsdPreviewSurface materials: the baked color of a rough dielectric
+    /asset/splats               only in the variant "splats", which deactivates /asset/mesh
 
-So nothing draws both on top of one another, and a reader that knows no variants or no splats finds the mesh. A mesh of
-a single frame is a mesh without points at all other times, since Blender ignores visibility that changes. Readers that
-ignore textures that change over time (Blender does) show the texture of the first frame.
+So no reader draws both on top of each other, and readers without variants or splats show the mesh. A mesh per frame
+has no points at other times, because Blender ignores animated visibility. Readers that ignore animated textures, such
+as Blender, show the texture of the first frame.
 
-Splats are `ParticleField3DGaussianSplat` of OpenUSD's UsdVol: linear scales and opacities, unit quaternions, and
-harmonics of sRGB colors, which the color space says. What moves is in floats, or in the schema's attributes of half
-floats, which not every reader looks for.
+Splats use the schema `ParticleField3DGaussianSplat` of OpenUSD's UsdVol: linear scales and opacities, unit quaternions,
+and spherical harmonics of sRGB colors, as declared by the color space. Animated values are float32, or half floats in
+the schema's separate attributes, which not every reader supports.
 """
 
 import itertools
@@ -44,9 +44,9 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.textured import TexturedMesh
 
 DEFAULTS = GltfSettings()
-ABOUT = "dg4d"  # key of the layer's custom data: what the writer wants to say, as JSON
-EXTENT_SIGMAS = 3.0  # standard deviations of a Gaussian that its bounds hold
-LEAST_HALF = 2.0**-14  # world units; smaller numbers have less than eleven bits as half floats, or become 0
+ABOUT = "dg4d"  # key of the layer's custom data with the asset's JSON
+EXTENT_SIGMAS = 3.0  # standard deviations of a Gaussian inside its bounds
+MIN_HALF = 2.0**-14  # smallest normal half float; smaller scales would lose precision or become 0
 
 
 def write_usdz(
@@ -57,19 +57,19 @@ def write_usdz(
     about: Mapping[str, Any] | None = None,
     settings: GltfSettings = DEFAULTS,
 ) -> None:
-    """Write a tracked mesh, or a mesh per frame, and the cloud's states beside it; equal input gives equal bytes.
+    """Write a tracked mesh or a mesh per frame, optionally with splats, as USDZ; equal input gives equal bytes.
 
     Args:
-        path: of the file, `.usdz`.
-        surface: what moves; the frame rate of an `Asset4D` is not used.
+        path: output file, `.usdz`.
+        surface: the animated mesh; the frame rate of an `Asset4D` is ignored.
         fps: frames per second.
         states: one state of the cloud per frame.
-        about: JSON about the asset, kept as text in the layer's custom data; its `name` is the asset's display name.
-        settings: image (USDZ knows no webp, so jpeg stands for it), quality, quantized (of splats), moving_normals,
-            roughness and metallic.
+        about: JSON about the asset, stored as text in the layer's custom data; `name` becomes the display name.
+        settings: image (jpeg replaces webp, which USDZ does not support), quality, quantized (for splats),
+            moving_normals, roughness and metallic.
 
     Raises:
-        BadInput: no frames, no triangles, another number of states than frames, an fps that is not positive, or
+        BadInput: no frames, no triangles, different numbers of states and frames, an fps that is not positive, or
             numbers that are not finite.
         OSError: the file could not be written.
     """
@@ -93,14 +93,14 @@ def write_usdz(
 
 @dataclass(frozen=True)
 class UsdPlacement:
-    """Where and when an asset stands in a scene.
+    """Placement of an asset in space and time.
 
     Attributes:
-        name: shown to users, any text.
-        file: a USDZ that `write_usdz` wrote.
+        name: display name, any text.
+        file: output of `write_usdz`.
         transform: asset to scene, acts on column vectors.
-        start_s: when its first frame is shown, seconds; before that it stands still.
-        speed: how much faster than recorded it plays, above 0.
+        start_s: start of the animation, seconds; the asset stands still before.
+        speed: playback speed relative to the recording, above 0.
     """
 
     name: str
@@ -111,13 +111,12 @@ class UsdPlacement:
 
 
 def compose_usdz(path: Path, placements: Sequence[UsdPlacement]) -> None:
-    """Write a scene of several assets; every asset's file is in it once, however often it is placed.
+    """Write a scene of several assets as USDZ; every file is stored once, however often it is placed.
 
-    The scene is as fast as its fastest asset and ends when the last one ends; an asset that is done stands still.
+    The scene has the frame rate of its fastest asset and ends with the last one; finished assets stand still.
 
     Raises:
-        BadInput: no placements, a file that is no USDZ with a default prim, or a time, speed or transform that makes no
-            sense.
+        BadInput: no placements, a file that is not a USDZ with a default prim, or an invalid time, speed or transform.
         OSError: the file could not be written.
     """
     if not placements:
@@ -129,15 +128,15 @@ def compose_usdz(path: Path, placements: Sequence[UsdPlacement]) -> None:
     end_s = max(p.start_s + packages[p.file].duration_s / p.speed for p in placements)
     stage = _new_stage("/scene", "assembly", "scene", fps, end_s * fps)
     names = _identifiers([placement.name for placement in placements])
-    places = list(zip(placements, names, strict=True))
-    folders = {placement.file: name for placement, name in reversed(places)}  # an asset's first name
-    for placement, name in places:
-        place = UsdGeom.Xform.Define(stage, f"/scene/{name}")
-        place.AddTransformOp().Set(Gf.Matrix4d(placement.transform.T.tolist()))  # USD multiplies rows
-        place.GetPrim().SetDisplayName(placement.name)
+    named = list(zip(placements, names, strict=True))
+    folders = {placement.file: name for placement, name in reversed(named)}  # the first name of every file
+    for placement, name in named:
+        xform = UsdGeom.Xform.Define(stage, f"/scene/{name}")
+        xform.AddTransformOp().Set(Gf.Matrix4d(placement.transform.T.tolist()))  # USD transforms row vectors
+        xform.GetPrim().SetDisplayName(placement.name)
         layer = f"./{folders[placement.file]}/{packages[placement.file].layer}"
-        when = Sdf.LayerOffset(placement.start_s * fps, 1 / placement.speed)
-        place.GetPrim().GetPayloads().AddPayload(layer, Sdf.Path(), when)
+        offset = Sdf.LayerOffset(placement.start_s * fps, 1 / placement.speed)
+        xform.GetPrim().GetPayloads().AddPayload(layer, Sdf.Path(), offset)
     files = {
         f"{folders[file]}/{name}": content
         for file, package in packages.items()
@@ -161,7 +160,7 @@ def _check(
     if isinstance(surface, Asset4D):
         values += [surface.offsets] if surface.textures is None else [surface.offsets, surface.textures]
     if any(len(mesh.faces) == 0 for mesh in meshes):
-        raise BadInput("a mesh without triangles cannot be written as USDZ")
+        raise BadInput("a mesh without triangles cannot be written as USDZ; extract the mesh again")
     if states is not None:
         if states.means.dim() != 3 or len(states.means) != frames:
             given = f"means of shape {tuple(states.means.shape)}"
@@ -181,8 +180,8 @@ def _check_placement(placement: UsdPlacement) -> None:
 
 
 def _new_stage(root: str, kind: str, name: str, fps: float, end: float) -> Usd.Stage:
-    """A stage with nothing but its default prim."""
-    stage = Usd.Stage.CreateInMemory(load=Usd.Stage.LoadNone)  # payloads are found in the package only
+    """Create a stage with a default prim."""
+    stage = Usd.Stage.CreateInMemory(load=Usd.Stage.LoadNone)  # payloads exist in the package only
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.LinearUnits.meters)
     stage.SetTimeCodesPerSecond(fps)
@@ -199,7 +198,7 @@ def _new_stage(root: str, kind: str, name: str, fps: float, end: float) -> Usd.S
 
 
 def _add_tracked(stage: Usd.Stage, asset: Asset4D, settings: GltfSettings) -> dict[str, bytes]:
-    """Define a mesh of one topology. Returns its pictures by name in the package."""
+    """Define a tracked mesh; return its images by name in the package."""
     _, texture = _add_mesh(stage, "subject", asset.mesh, asset.mesh.vertices + asset.offsets, settings)
     if asset.textures is None:
         pictures = [_picture("subject", asset.mesh.texture, settings)]
@@ -211,7 +210,7 @@ def _add_tracked(stage: Usd.Stage, asset: Asset4D, settings: GltfSettings) -> di
 
 
 def _add_frames(stage: Usd.Stage, meshes: Sequence[TexturedMesh], settings: GltfSettings) -> dict[str, bytes]:
-    """Define a mesh per frame, each there at its time only. Returns their pictures by name in the package."""
+    """Define a mesh per frame, each present at its frame only; return their images by name in the package."""
     pictures = {}
     for frame, textured in enumerate(meshes):
         name = f"frame_{frame:03d}"
@@ -226,9 +225,9 @@ def _add_frames(stage: Usd.Stage, meshes: Sequence[TexturedMesh], settings: Gltf
 def _add_mesh(
     stage: Usd.Stage, name: str, textured: TexturedMesh, states: Float[Tensor, "t v 3"], settings: GltfSettings
 ) -> tuple[UsdGeom.Mesh, Usd.Attribute]:
-    """Define a mesh with a material. Returns it, and the attribute that names its texture."""
+    """Define a mesh with a material; return it and the attribute of its texture file."""
     corners = textured.faces.cpu().numpy()
-    points, point_of = _welded(_array(states))
+    points, point_of = _weld(_array(states))
     faces = point_of[corners]
     normals_of = SmoothNormals(points[0], faces)
     mesh = UsdGeom.Mesh.Define(stage, f"/asset/mesh/{name}")
@@ -244,22 +243,22 @@ def _add_mesh(
     kind, per_corner = Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying
     st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", kind, per_corner)
     u, v = _array(textured.uvs).T
-    st.Set(Vt.Vec2fArray.FromNumpy(np.stack((u, 1 - v), axis=1)))  # v upwards
+    st.Set(Vt.Vec2fArray.FromNumpy(np.stack((u, 1 - v), axis=1)))  # in USD, v points up
     st.SetIndices(_integers(corners))
     return mesh, _add_material(stage, mesh, name, settings)
 
 
-def _welded(states: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Vertices that are at one place at all times become one point: the points "t p 3", and every vertex's point."""
-    paths = np.ascontiguousarray(states.swapaxes(0, 1).reshape(states.shape[1], -1)) + 0.0  # -0 is the same place
+def _weld(states: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Merge vertices that coincide in all states; return the points "t p 3" and the point of every vertex."""
+    paths = np.ascontiguousarray(states.swapaxes(0, 1).reshape(states.shape[1], -1)) + 0.0  # turns -0 into 0
     keys = paths.view(f"V{paths.itemsize * paths.shape[1]}")[:, 0]
     _, first, group = np.unique(keys, return_index=True, return_inverse=True)
-    kept, point_of_group = np.unique(first, return_inverse=True)  # in the order of the vertices
+    kept, point_of_group = np.unique(first, return_inverse=True)  # sorted by vertex index
     return paths[kept].reshape(len(kept), *states.shape[::2]).swapaxes(0, 1), point_of_group[group]
 
 
 def _empty_except_at(mesh: UsdGeom.Mesh, frame: int, frames: int) -> None:
-    """Take a mesh's points and triangles away at every time but a frame's own."""
+    """Remove a mesh's points and triangles at all frames but its own."""
     keys = {0: False, frame: True, frame + 1: False}
     if frame == 0:
         keys[frames] = True
@@ -269,12 +268,12 @@ def _empty_except_at(mesh: UsdGeom.Mesh, frame: int, frames: int) -> None:
         value = attribute.Get(0)
         attribute.Clear()
         attribute.Set(value if frame == 0 else type(value)())
-        for time, there in sorted(keys.items()):
-            attribute.Set(value if there else type(value)(), time)
+        for time, present in sorted(keys.items()):
+            attribute.Set(value if present else type(value)(), time)
 
 
 def _add_material(stage: Usd.Stage, mesh: UsdGeom.Mesh, name: str, settings: GltfSettings) -> Usd.Attribute:
-    """Give a mesh a rough dielectric. Returns the attribute that names its texture."""
+    """Bind a UsdPreviewSurface material to a mesh; return the attribute of its texture file."""
     path = f"/asset/mesh/materials/{name}"
     material = UsdShade.Material.Define(stage, path)
     surface = _add_shader(stage, f"{path}/surface", "UsdPreviewSurface")
@@ -304,7 +303,7 @@ def _add_shader(stage: Usd.Stage, path: str, kind: str) -> UsdShade.Shader:
 
 
 def _add_splats(stage: Usd.Stage, states: Gaussians, half: bool) -> None:
-    """Offer splats instead of the mesh, which stays what is shown at first."""
+    """Add the variants "mesh" (default) and "splats"."""
     choice = stage.GetDefaultPrim().GetVariantSets().AddVariantSet("representation")
     for name in ("mesh", "splats"):
         choice.AddVariant(name)
@@ -321,17 +320,18 @@ def _define_splats(stage: Usd.Stage, states: Gaussians, half: bool) -> None:
     quats = _array(torch.nn.functional.normalize(states.quats, dim=-1))
     reach = EXTENT_SIGMAS * np.sqrt(_array(states.covariances.diagonal(dim1=-2, dim2=-1)))
     _animate(splats.CreateExtentAttr(), [_bounds(m - r, m + r) for m, r in zip(means, reach, strict=True)])
-    places, turns, sizes = splats.CreatePositionsAttr, splats.CreateOrientationsAttr, splats.CreateScalesAttr
     if half:
-        places, turns, sizes = splats.CreatePositionshAttr, splats.CreateOrientationshAttr, splats.CreateScaleshAttr
-        means, quats, scales = (values.astype("<f2") for values in (means, quats, scales.clip(LEAST_HALF)))
-    _animate(places(), [_vectors(mean) for mean in means])
-    _animate(turns(), [_quaternions(quat) for quat in quats])
-    _animate(sizes(), [_vectors(scale) for scale in scales])
+        means, quats, scales = (values.astype("<f2") for values in (means, quats, scales.clip(MIN_HALF)))
+        create = splats.CreatePositionshAttr, splats.CreateOrientationshAttr, splats.CreateScaleshAttr
+    else:
+        create = splats.CreatePositionsAttr, splats.CreateOrientationsAttr, splats.CreateScalesAttr
+    _animate(create[0](), [_vectors(mean) for mean in means])
+    _animate(create[1](), [_quaternions(quat) for quat in quats])
+    _animate(create[2](), [_vectors(scale) for scale in scales])
     splats.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(_array(states.opacities)))
     splats.CreateRadianceSphericalHarmonicsDegreeAttr(round(harmonics.shape[1] ** 0.5) - 1)
     colors = splats.CreateRadianceSphericalHarmonicsCoefficientsAttr(_vectors(harmonics.reshape(-1, 3)))
-    colors.SetMetadata("interpolation", UsdGeom.Tokens.vertex)  # the schema does not need it, Omniverse does
+    colors.SetMetadata("interpolation", UsdGeom.Tokens.vertex)  # not required by the schema, but by Omniverse
     colors.SetMetadata("elementSize", harmonics.shape[1])
     splats.CreateProjectionModeHintAttr(UsdVol.Tokens.perspective)
     splats.CreateSortingModeHintAttr(UsdVol.Tokens.zDepth)
@@ -339,7 +339,7 @@ def _define_splats(stage: Usd.Stage, states: Gaussians, half: bool) -> None:
 
 
 def _animate(attribute: Usd.Attribute, values: Sequence[Any]) -> None:
-    """Set a value per frame, the first again one frame after the last, and for those who name no time."""
+    """Set a value per frame, the first value again one frame after the last, and as default value."""
     for time, value in enumerate((*values, values[0])):
         attribute.Set(value, time)
     attribute.Set(values[0])
@@ -355,7 +355,7 @@ def _vectors(rows: NDArray[Any]) -> Vt.Vec3fArray | Vt.Vec3hArray:
 
 def _quaternions(wxyz: NDArray[Any]) -> Vt.QuatfArray | Vt.QuathArray:
     kind = Vt.QuathArray if wxyz.dtype == np.float16 else Vt.QuatfArray
-    return kind.FromNumpy(np.roll(wxyz, -1, axis=-1))  # in memory the real part stands last
+    return kind.FromNumpy(np.roll(wxyz, -1, axis=-1))  # USD's memory layout is xyzw
 
 
 def _integers(values: NDArray[Any]) -> Vt.IntArray:
@@ -367,14 +367,14 @@ def _bounds(low: NDArray[Any], high: NDArray[Any]) -> Vt.Vec3fArray:
 
 
 def _reference(file: str) -> Sdf.AssetPath:
-    """To a file beside the layer."""
+    """Return the asset path of a file beside the layer."""
     return Sdf.AssetPath(f"./{file}")
 
 
 def _picture(name: str, pixels: Float[Tensor, "h w 3"], settings: GltfSettings) -> tuple[str, bytes]:
-    """A picture's name in the package, and the picture.
+    """Encode an image; return its name in the package and its content.
 
-    A digest in the name tells pictures of several assets apart: Blender takes files of one name for one picture.
+    The name contains a digest, because Blender treats files of equal names in different assets as one image.
     """
     kind, suffix = ("png", "png") if settings.image == "png" else ("jpeg", "jpg")
     content = encode_image(to_uint8(pixels), kind, settings.quality)
@@ -382,12 +382,12 @@ def _picture(name: str, pixels: Float[Tensor, "h w 3"], settings: GltfSettings) 
 
 
 def _identifiers(names: Sequence[str]) -> list[str]:
-    """A valid prim name of its own for each of these texts."""
-    taken: set[str] = set()
-    found = []
+    """Return a unique valid prim name for each text."""
+    used: set[str] = set()
+    identifiers = []
     for name in names:
         plain = re.sub("_+", "_", Tf.MakeValidIdentifier(name)).rstrip("_") or "asset"
-        tries = itertools.chain([plain], (f"{plain}_{number}" for number in itertools.count(2)))
-        found.append(next(candidate for candidate in tries if candidate not in taken))
-        taken.add(found[-1])
-    return found
+        candidates = itertools.chain([plain], (f"{plain}_{number}" for number in itertools.count(2)))
+        identifiers.append(next(candidate for candidate in candidates if candidate not in used))
+        used.add(identifiers[-1])
+    return identifiers

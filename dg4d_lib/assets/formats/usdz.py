@@ -1,4 +1,4 @@
-"""The USDZ container: a stored zip with fixed dates, a layer first, and every file at a multiple of 64 bytes."""
+"""USDZ container: an uncompressed zip with fixed dates, the layer first, and files aligned to 64 bytes."""
 
 import io
 import struct
@@ -11,21 +11,21 @@ from pxr import Tf, Usd
 
 from dg4d_lib.errors import BadInput
 
-ALIGNMENT = 64  # bytes; the content of every file begins at a multiple (USDZ specification)
+ALIGNMENT = 64  # bytes; alignment of every file's content (USDZ specification)
 HEADER = 30  # bytes of a local file header before the name
 EXTRA_HEADER = 4  # bytes of an extra field before its content
-PADDING = 0x1986  # the kind of extra field with which OpenUSD fills up to the next multiple
-UNIX = 3  # the system that made the zip, said to be the same everywhere
+PADDING = 0x1986  # id of the extra field that OpenUSD uses for padding
+UNIX = 3  # "created by" system of the zip, fixed so that all platforms write equal bytes
 
 
 def write_usdz_package(path: Path, stage: Usd.Stage, layer: str, files: Mapping[str, bytes]) -> None:
-    """Write a stage's own layer and what it names; equal input gives equal bytes.
+    """Write a stage's root layer and its files as USDZ; equal input gives equal bytes.
 
     Args:
-        path: of the file, `.usdz`.
-        stage: its layer refers to `files` by paths relative to the package.
-        layer: its name in the package, `.usdc`.
-        files: content by name in the package.
+        path: output file, `.usdz`.
+        stage: stage whose root layer refers to `files` by paths relative to the package.
+        layer: name of the root layer in the package, `.usdc`.
+        files: contents by name in the package.
 
     Raises:
         OSError: the file could not be written.
@@ -46,20 +46,20 @@ def write_usdz_package(path: Path, stage: Usd.Stage, layer: str, files: Mapping[
 
 
 class UsdzPackage:
-    """A USDZ that was read.
+    """USDZ file in memory.
 
     Attributes:
-        files: content by name; the first is the layer.
-        layer: its name.
+        files: contents by name; the first is the root layer.
+        layer: name of the root layer.
         fps: time codes per second.
-        duration_s: when its last time code is reached.
+        duration_s: time of the last time code, seconds.
     """
 
     def __init__(self, path: Path) -> None:
-        """Read it.
+        """Read a USDZ.
 
         Raises:
-            BadInput: it is missing, no USDZ, or has no default prim that a scene could refer to.
+            BadInput: the file is missing, not a USDZ, or has no default prim.
         """
         try:
             with zipfile.ZipFile(path) as package:
@@ -68,7 +68,7 @@ class UsdzPackage:
         except OSError as error:
             raise BadInput(f"{path} cannot be read: {error.strerror}") from error
         except (zipfile.BadZipFile, Tf.ErrorException) as error:
-            raise BadInput(f"{path} is no USDZ: {error}".strip()) from error
+            raise BadInput(f"{path} is not a USDZ; give a file that dg4d wrote: {error}".strip()) from error
         if not stage.HasDefaultPrim():
             raise BadInput(f"{path} has no default prim, so a scene cannot refer to it; give a file that dg4d wrote")
         self.layer = next(iter(self.files))

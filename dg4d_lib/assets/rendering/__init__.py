@@ -1,1 +1,1 @@
-"""Preview films, contact sheets and the viewer page."""
+"""Preview videos, contact sheets and the viewer page."""

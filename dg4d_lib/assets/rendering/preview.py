@@ -1,4 +1,4 @@
-"""Short films of an asset: it moves while the camera goes round it once, or holds still and is turned."""
+"""Preview videos: an animated asset with an orbiting camera, or a turntable of a static one."""
 
 from collections.abc import Callable, Sequence
 from fractions import Fraction
@@ -21,17 +21,17 @@ from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer.interface import Rasterizer
 
-SMOOTH_FPS = 20  # slower motions are sampled between their frames, so that the turn looks smooth
-MOST_PICTURES = 600  # sampling between frames stops here; a long video still has all its own frames
-ELEVATION_DEG = 10.0  # of the camera: a little from above
-TURN_S = 5  # seconds in which a subject that holds still is turned once
-BATCH = 8  # pictures of one rasterizer call, bounds the memory
-CODECS = {  # best first; without `cpu-independent`, x264's look ahead gave other bytes in one of ten equal films
+SMOOTH_FPS = 20  # slower motions are also sampled between their frames, so that the orbit looks smooth
+MAX_PICTURES = 600  # limit for sampling between frames; longer videos still have all their own frames
+ELEVATION_DEG = 10.0  # of the camera
+TURN_S = 5  # duration of a turntable, seconds
+BATCH = 8  # images per rasterizer call; bounds memory
+CODECS = {  # best first; without `cpu-independent`, x264's lookahead changed the bytes of one video in ten
     "libx264": {"crf": "18", "preset": "medium", "x264-params": "cpu-independent=1"},
     "mpeg4": {"qscale": "3"},
 }
 BT709 = 1  # color primaries, transfer and matrix, as numbered in H.273
-CENTER, CORNER = (0.975, 0.975, 0.98), (0.84, 0.85, 0.87)  # of the background
+CENTER, CORNER = (0.975, 0.975, 0.98), (0.84, 0.85, 0.87)  # colors of the background
 
 
 def write_preview(
@@ -44,34 +44,34 @@ def write_preview(
     settings: PackSettings,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[str, ...]:
-    """Write a silent MP4 (H.264, yuv420p) in which the motion loops `preview_turns` times during one turn.
+    """Write a silent MP4 (H.264, yuv420p) in which the motion loops `preview_turns` times during one orbit.
 
     Equal arguments give equal bytes.
 
     Args:
-        path: of the file, ending in .mp4.
-        gaussians: at rest.
-        deformation: their motion.
-        frames: of the motion.
+        path: output file, ending in .mp4.
+        gaussians: the canonical cloud.
+        deformation: its motion.
+        frames: number of frames of the motion.
         fps: frames per second of the motion.
-        rasterizer: draws the pictures.
+        rasterizer: the splatting backend.
         settings: size and number of loops.
-        progress: called with pictures done and their number.
+        progress: called with finished images and their total number.
 
     Returns:
-        Sentences for the report: empty, or which codec had to stand in.
+        Notes for the report: empty, or the name of the fallback codec.
 
     Raises:
-        BackendUnavailable: this build of FFmpeg can write no MP4 codec we know.
+        BackendUnavailable: this build of FFmpeg has no supported MP4 codec.
         OSError: the file could not be written.
     """
-    repeats = max(1, min(ceil(SMOOTH_FPS / fps), MOST_PICTURES // (frames * settings.preview_turns)))
+    repeats = max(1, min(ceil(SMOOTH_FPS / fps), MAX_PICTURES // (frames * settings.preview_turns)))
     positions = torch.arange(frames * repeats).repeat(settings.preview_turns) / repeats
 
     def states(part: slice) -> Gaussians:
         return pose_gaussians(gaussians, deformation, frames, positions[part])
 
-    return _round(path, states, len(positions), fps * repeats, rasterizer, settings, progress)
+    return _write_orbit(path, states, len(positions), fps * repeats, rasterizer, settings, progress)
 
 
 def write_turntable(
@@ -81,28 +81,28 @@ def write_turntable(
     settings: PackSettings,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[str, ...]:
-    """Write a silent MP4 (H.264, yuv420p) of one state of an asset, turned once; it begins with the input view's side.
+    """Write a silent MP4 (H.264, yuv420p) of one orbit around a single state, starting at the input view's azimuth.
 
     Equal arguments give equal bytes.
 
     Args:
-        path: of the file, ending in .mp4.
+        path: output file, ending in .mp4.
         gaussians: one state.
-        rasterizer: draws the pictures.
+        rasterizer: the splatting backend.
         settings: size.
-        progress: called with pictures done and their number.
+        progress: called with finished images and their total number.
 
     Returns:
-        Sentences for the report: empty, or which codec had to stand in.
+        Notes for the report: empty, or the name of the fallback codec.
 
     Raises:
-        BackendUnavailable: this build of FFmpeg can write no MP4 codec we know.
+        BackendUnavailable: this build of FFmpeg has no supported MP4 codec.
         OSError: the file could not be written.
     """
-    return _round(path, lambda part: gaussians, TURN_S * SMOOTH_FPS, SMOOTH_FPS, rasterizer, settings, progress)
+    return _write_orbit(path, lambda part: gaussians, TURN_S * SMOOTH_FPS, SMOOTH_FPS, rasterizer, settings, progress)
 
 
-def _round(
+def _write_orbit(
     path: Path,
     states: Callable[[slice], Gaussians],
     count: int,
@@ -111,54 +111,56 @@ def _round(
     settings: PackSettings,
     progress: Callable[[int, int], None],
 ) -> tuple[str, ...]:
-    """Write a film in which the camera goes round once; `states` are those of a range of its pictures."""
+    """Write a video of one orbit; `states` returns the states of a range of its images."""
     cameras = turntable(count, OrbitCamera(ELEVATION_DEG, width=settings.preview_size, height=settings.preview_size))
     background = studio_background(settings.preview_size)
     codec = _codec()
-    with Mp4Writer(path, codec, fps, settings.preview_size) as film:
+    with Mp4Writer(path, codec, fps, settings.preview_size) as video:
         for start in range(0, count, BATCH):
             part = slice(start, start + BATCH)
-            film.add(render_over(background, states(part), cameras[part], rasterizer))
+            video.add(render_over(background, states(part), cameras[part], rasterizer))
             progress(min(start + BATCH, count), count)
-    return () if codec == "libx264" else (f"{path.name} is written with {codec}, since libx264 is not in this FFmpeg",)
+    return () if codec == "libx264" else (f"{path.name} is encoded with {codec}, since this FFmpeg lacks libx264",)
 
 
 def write_mp4(path: Path, pictures: Float[Tensor, "t s s 3"], fps: float) -> None:
-    """Write pictures in [0, 1] with an even number of pixels a side as a silent MP4.
+    """Write images in [0, 1] with an even number of pixels a side as a silent MP4.
 
     Raises:
-        BackendUnavailable: this build of FFmpeg can write no MP4 codec we know.
+        BackendUnavailable: this build of FFmpeg has no supported MP4 codec.
         OSError: the file could not be written.
     """
-    with Mp4Writer(path, _codec(), fps, pictures.shape[1]) as film:
-        film.add(pictures)
+    with Mp4Writer(path, _codec(), fps, pictures.shape[1]) as video:
+        video.add(pictures)
 
 
 def _codec() -> str:
     codec = next((name for name in CODECS if name in av.codecs_available), None)
     if codec is None:
-        raise BackendUnavailable(f"this FFmpeg has none of {', '.join(CODECS)}; run `pip install --force-reinstall av`")
+        raise BackendUnavailable(
+            f"this FFmpeg has none of the codecs {', '.join(CODECS)}; run `pip install --force-reinstall av`"
+        )
     return codec
 
 
 def render_over(
     background: Float[Tensor, "h w 3"], states: Gaussians, cameras: Sequence[OrbitCamera], rasterizer: Rasterizer
 ) -> Float[Tensor, "b h w 3"]:
-    """Every state from its camera, over a background picture, without gradients."""
+    """Render every state from its camera over a background image, without gradients."""
     with torch.no_grad():
-        drawn = rasterizer(states, cameras, states.means.new_zeros(3))
-        return torch.addcmul(drawn.color, 1 - drawn.alpha, background.to(drawn.color)).clamp_(0, 1)
+        render = rasterizer(states, cameras, states.means.new_zeros(3))
+        return torch.addcmul(render.color, 1 - render.alpha, background.to(render.color)).clamp_(0, 1)
 
 
 def studio_background(size: int) -> Float[Tensor, "h w 3"]:
-    """A soft light background, brightest in the middle."""
+    """Return a light background image with a radial gradient."""
     line = torch.linspace(-1, 1, size)
     distance = (line[:, None].square() + line.square()).div(2).clamp(max=1)[..., None]
     return torch.lerp(torch.tensor(CENTER), torch.tensor(CORNER), distance)
 
 
 class Mp4Writer:
-    """An MP4 that is being written; nothing in it depends on time, host or number of cores."""
+    """Context manager that encodes an MP4; its bytes do not depend on time, host or number of cores."""
 
     def __init__(self, path: Path, codec: str, fps: float, size: int) -> None:
         self._container = av.open(str(path), "w", options={"movflags": "+faststart", "fflags": "+bitexact"})
@@ -181,7 +183,7 @@ class Mp4Writer:
         self._container.close()
 
     def add(self, pictures: Float[Tensor, "b h w 3"]) -> None:
-        """Append pictures in [0, 1]."""
+        """Append images in [0, 1]."""
         for pixels in (pictures.detach().cpu() * 255).round().to(torch.uint8).numpy():
             frame = av.VideoFrame.from_ndarray(pixels, "rgb24")
             frame = frame.reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG)

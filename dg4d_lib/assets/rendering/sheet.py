@@ -1,4 +1,4 @@
-"""A contact sheet: what an asset looks like from several sides at several moments, on one page."""
+"""Contact sheets: tiles of an asset from several azimuths at several frames, and of driving videos."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,9 +20,9 @@ from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 
 PAGE, PANEL, INK = (255, 255, 255), (0.945, 0.948, 0.955), (70, 74, 82)
-GAP = 1 / 24  # between tiles and around them, in tiles
+GAP = 1 / 24  # between and around tiles, in tiles
 FONT = 1 / 12  # height of the captions, in tiles
-SMALLEST_FONT = 9  # pixels; below it nobody can read
+SMALLEST_FONT = 9  # minimum readable height, pixels
 
 
 def draw_contact_sheet(
@@ -32,54 +32,54 @@ def draw_contact_sheet(
     rasterizer: Rasterizer,
     settings: PackSettings,
 ) -> Float[Tensor, "h w 3"]:
-    """The sheet as a picture in [0, 1].
+    """Draw the contact sheet of an asset as an image in [0, 1].
 
-    Columns are moments, evenly spread from the first to the last frame. The first row is the driving video, then comes
-    a row per azimuth of `sheet_azimuths_deg`, seen at elevation 0.
+    Columns are frames, evenly spaced from the first to the last. The first row shows the driving video, the others one
+    azimuth of `sheet_azimuths_deg` each, at elevation 0.
 
     Args:
-        gaussians: at rest.
-        deformation: their motion.
-        video: that they were fitted to; says the number of frames and the frame rate.
-        rasterizer: draws the tiles.
+        gaussians: the canonical cloud.
+        deformation: its motion.
+        video: driving video; determines the number of frames and the frame rate.
+        rasterizer: the splatting backend.
         settings: size of a tile, columns and rows.
     """
     columns = min(settings.sheet_frames, len(video))
     frames = torch.linspace(0, len(video) - 1, columns).round().long()
     panel = torch.tensor(PANEL).expand(settings.sheet_size, settings.sheet_size, 3)
-    rows = [_footage(video, frames, settings.sheet_size)]
+    rows = [_video_tiles(video, frames, settings.sheet_size)]
     states = pose_gaussians(gaussians, deformation, len(video), frames.float())
     for azimuth_deg in settings.sheet_azimuths_deg:
         camera = OrbitCamera(azimuth_deg=azimuth_deg, width=settings.sheet_size, height=settings.sheet_size)
         tiles = [
-            render_over(panel, _part(states, part), [camera] * len(part), rasterizer)
+            render_over(panel, _select_states(states, part), [camera] * len(part), rasterizer)
             for part in torch.arange(columns).split(BATCH)
         ]
         rows.append(torch.cat(tiles))
     names = ["input", *(f"{azimuth_deg:g}°" for azimuth_deg in settings.sheet_azimuths_deg)]
-    return draw_tiles(torch.stack(rows), names, _moments(frames, video.fps))
+    return draw_tiles(torch.stack(rows), names, _timestamps(frames, video.fps))
 
 
 def draw_video_sheet(
     videos: Sequence[DrivingVideo], names: Sequence[str], size: int, columns: int
 ) -> Float[Tensor, "h w 3"]:
-    """Several videos below each other as a picture in [0, 1]; columns are moments, from the first frame to the last.
+    """Draw several videos in rows as an image in [0, 1]; columns are frames, from the first to the last.
 
     Args:
-        videos: all of one length and rate.
-        names: of the rows.
-        size: pixels of a tile.
-        columns: moments, at most.
+        videos: videos of equal length and frame rate.
+        names: captions of the rows.
+        size: side of a tile, pixels.
+        columns: maximum number of frames.
     """
     frames = torch.linspace(0, len(videos[0]) - 1, min(columns, len(videos[0]))).round().long()
-    rows = torch.stack([_footage(video, frames, size) for video in videos])
-    return draw_tiles(rows, names, _moments(frames, videos[0].fps))
+    rows = torch.stack([_video_tiles(video, frames, size) for video in videos])
+    return draw_tiles(rows, names, _timestamps(frames, videos[0].fps))
 
 
 def draw_tiles(
     tiles: Float[Tensor, "r m s s 3"], names: Sequence[str], headings: Sequence[str]
 ) -> Float[Tensor, "h w 3"]:
-    """Tiles in [0, 1] on a white page, rows named on the left, columns above."""
+    """Draw tiles in [0, 1] on a white page, with row names on the left and headings above the columns."""
     size = tiles.shape[2]
     gap = max(2, round(size * GAP))
     font = ImageFont.load_default(max(SMALLEST_FONT, round(size * FONT)))
@@ -98,15 +98,15 @@ def draw_tiles(
     return torch.from_numpy(np.array(sheet)).float() / 255
 
 
-def _moments(frames: Tensor, fps: float) -> list[str]:
+def _timestamps(frames: Tensor, fps: float) -> list[str]:
     return [f"{frame / fps:.2f} s" for frame in frames.tolist()]
 
 
-def _part(states: Gaussians, wanted: Tensor) -> Gaussians:
-    return replace(states, means=states.means[wanted], log_scales=states.log_scales[wanted], quats=states.quats[wanted])
+def _select_states(states: Gaussians, index: Tensor) -> Gaussians:
+    return replace(states, means=states.means[index], log_scales=states.log_scales[index], quats=states.quats[index])
 
 
-def _footage(video: DrivingVideo, frames: Tensor, size: int) -> Float[Tensor, "m size size 3"]:
-    """Frames of the driving video over the panel, resampled to the size of a tile."""
+def _video_tiles(video: DrivingVideo, frames: Tensor, size: int) -> Float[Tensor, "m size size 3"]:
+    """Composite frames of the video over the panel color and resize them to tiles."""
     over = DrivingVideo(video.frames[frames], video.alpha[frames], video.fps).over(torch.tensor(PANEL))
     return resize(over, (size, size)).clamp(0, 1)

@@ -1,4 +1,4 @@
-"""A small moving picture for web pages and tables: the motion from the input side, while the camera sways a little."""
+"""Animated WebP thumbnail: the motion from the input view with a slightly swaying camera."""
 
 import io
 import math
@@ -17,12 +17,12 @@ from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer.interface import Rasterizer
 
-LARGEST = 256  # pixels of a side
-FPS = 12  # pictures per second
-SWAY_S, SWAY_DEG = 4.0, 20.0  # the camera goes to both sides and back; whole loops of the motion, at least this long
-MOST_PICTURES = 96  # a longer motion shows fewer pictures per second
-MOST_BYTES = 1_000_000
-QUALITIES = (90, 70, 50, 30)  # the first that keeps the file below `MOST_BYTES`, else the last
+LARGEST = 256  # maximum side, pixels
+FPS = 12  # images per second
+SWAY_S, SWAY_DEG = 4.0, 20.0  # minimum period (whole loops of the motion) and amplitude of the camera's sway
+MAX_PICTURES = 96  # longer motions have fewer images per second
+MAX_BYTES = 1_000_000
+QUALITIES = (90, 70, 50, 30)  # tried in this order until the file is below `MAX_BYTES`
 
 
 def write_webp(
@@ -35,49 +35,49 @@ def write_webp(
     settings: PackSettings,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """Write an animated WebP without end, up to 256 pixels a side.
+    """Write an endlessly looping animated WebP of up to 256 pixels a side.
 
     Equal arguments give equal bytes.
 
     Args:
-        path: of the file.
-        gaussians: at rest.
-        deformation: their motion.
-        frames: of the motion.
+        path: output file.
+        gaussians: the canonical cloud.
+        deformation: its motion.
+        frames: number of frames of the motion.
         fps: frames per second of the motion.
-        rasterizer: draws the pictures.
+        rasterizer: the splatting backend.
         settings: size of the previews.
-        progress: called with pictures done and their number.
+        progress: called with finished images and their total number.
 
     Raises:
         OSError: the file could not be written.
     """
     duration_s = frames / fps
     loops = max(1, math.ceil(SWAY_S / duration_s))
-    count = min(MOST_PICTURES, round(loops * duration_s * FPS))
-    share = torch.arange(count, dtype=torch.float64) / count
-    positions = share * loops * frames % frames
+    count = min(MAX_PICTURES, round(loops * duration_s * FPS))
+    phases = torch.arange(count, dtype=torch.float64) / count
+    positions = phases * loops * frames % frames
     size = min(LARGEST, settings.preview_size)
-    middle, background = OrbitCamera(width=size, height=size), studio_background(size)
-    cameras = [replace(middle, azimuth_deg=SWAY_DEG * math.sin(math.tau * turn)) for turn in share.tolist()]
+    front, background = OrbitCamera(width=size, height=size), studio_background(size)
+    cameras = [replace(front, azimuth_deg=SWAY_DEG * math.sin(math.tau * phase)) for phase in phases.tolist()]
     pictures: list[Image.Image] = []
     for start in range(0, count, BATCH):
         part = slice(start, start + BATCH)
         states = pose_gaussians(gaussians, deformation, frames, positions[part])
-        drawn = render_over(background, states, cameras[part], rasterizer)
-        pictures += [Image.fromarray(pixels) for pixels in (drawn.cpu() * 255).round().to(torch.uint8).numpy()]
+        renders = render_over(background, states, cameras[part], rasterizer)
+        pictures += [Image.fromarray(pixels) for pixels in (renders.cpu() * 255).round().to(torch.uint8).numpy()]
         progress(len(pictures), count)
     ends_ms = [round(1000 * loops * duration_s * (i + 1) / count) for i in range(count)]
-    path.write_bytes(_encoded(pictures, [end - start for start, end in zip([0, *ends_ms], ends_ms, strict=False)]))
+    path.write_bytes(_encode(pictures, [end - start for start, end in zip([0, *ends_ms], ends_ms, strict=False)]))
 
 
-def _encoded(pictures: Sequence[Image.Image], durations_ms: list[int]) -> bytes:
+def _encode(pictures: Sequence[Image.Image], durations_ms: list[int]) -> bytes:
     content = io.BytesIO()
     for quality in QUALITIES:
         content = io.BytesIO()
         pictures[0].save(
             content, "WEBP", save_all=True, append_images=pictures[1:], duration=durations_ms, loop=0, quality=quality
         )
-        if content.tell() <= MOST_BYTES:
+        if content.tell() <= MAX_BYTES:
             break
     return content.getvalue()

@@ -1,1 +1,1 @@
-"""Scenes composed of several animated assets."""
+"""Scenes of several animated assets."""

@@ -1,9 +1,8 @@
-"""Several animated GLBs as one: placed, turned, scaled and timed in a scene.
+"""Composition of several animated GLBs into one, with placement, rotation, scale and timing.
 
-What the files hold (vertices, pictures, materials, extensions) is taken over as it is; a file that is used twice is
-stored once. Every asset hangs under a node of its name, and one animation, which lasts as long as the scene, moves
-all of them: players play one at a time. An asset shows its first frame until it starts, and its last key after it is
-done.
+Vertices, images, materials and extensions are copied unchanged; data of a file that is used twice is stored once. Every
+asset is the child of a node with its name. A single animation of the scene's duration moves all assets, because players
+play one animation at a time. An asset shows its first frame until it starts, and its last key after its end.
 """
 
 import math
@@ -25,59 +24,61 @@ from dg4d_lib.assets.scenes.scene import SceneItem
 from dg4d_lib.errors import BadInput
 
 ANIMATION = "scene"
-SHORTEST_S = 1e-4  # keys that lie closer to each other are one
-MOST_ROUNDS = 10_000  # of an animation that loops: each repeats its keys in the file
+SHORTEST_S = 1e-4  # minimum distance of keys, seconds; closer keys are merged
+MAX_LOOPS = 10_000  # of an animation; each loop repeats its keys in the file
 Vector = Float[np.ndarray, " 3"]
-_FOREIGN = (KeyError, IndexError, TypeError, ValueError, ArithmeticError)  # what a file of another form runs into
+_FOREIGN = (KeyError, IndexError, TypeError, ValueError, ArithmeticError)  # raised by files of other layouts
 
 
 class AnimatedGlb:
-    """An animated GLB that can stand in a scene.
+    """Animated GLB with its bounding box and duration.
 
     Attributes:
-        file: the GLB.
-        low: of the box that it never leaves, world units.
-        high: of that box.
-        foot: what it stands on: below the middle of the box, as low as its first frame reaches.
-        duration_s: of its animation; 0 if it has none.
+        file: the parsed GLB.
+        box_min: lower corner of the bounding box over all frames, world units.
+        box_max: upper corner of the bounding box over all frames, world units.
+        foot: standing point: below the center of the box, at the lowest point of the first frame.
+        duration_s: duration of the animation, seconds; 0 if there is none.
     """
 
     def __init__(self, content: bytes) -> None:
-        """Read it.
+        """Parse a GLB.
 
         Raises:
-            BadInput: it is no GLB, or has no mesh or a form that dg4d does not write.
-            BackendUnavailable: it is compressed, and the package that unpacks it is missing.
+            BadInput: the file is not a GLB, has no mesh, or has a layout that dg4d does not write.
+            BackendUnavailable: the file is compressed and meshoptimizer is missing.
         """
         self.file = GlbReader(content)
         try:
             poses = [pose for root in self.roots for pose in self._poses(root, np.eye(4))]
             if not poses:
-                raise BadInput("this GLB shows no mesh; give an asset that `dg4d make` wrote")
-            self.low: Vector = np.min([pose.min(0) for pose in poses], axis=0)
-            self.high: Vector = np.max([pose.max(0) for pose in poses], axis=0)
-            middle = (self.low + self.high) / 2
+                raise BadInput("this GLB has no mesh; give an asset that `dg4d make` wrote")
+            self.box_min: Vector = np.min([pose.min(0) for pose in poses], axis=0)
+            self.box_max: Vector = np.max([pose.max(0) for pose in poses], axis=0)
+            middle = (self.box_min + self.box_max) / 2
             self.foot: Vector = np.array((middle[0], poses[0][:, 1].min(), middle[2]))
             self.duration_s = max((float(self.file.accessor(s["input"])[-1, 0]) for s in self._samplers), default=0.0)
         except _FOREIGN as error:
-            raise BadInput(f"this GLB has not the form of an animated asset: {error!r}") from error
+            raise BadInput(
+                f"this GLB is not an animated asset ({error!r}); give an asset that `dg4d make` wrote"
+            ) from error
 
     @property
     def roots(self) -> list[int]:
-        """The nodes of its scene."""
+        """Root nodes of its scene."""
         tree = self.file.tree
         return list(tree["scenes"][tree.get("scene", 0)]["nodes"])
 
     @property
     def animation(self) -> dict[str, Any]:
-        """Its only animation; without samplers and channels if there is none.
+        """Its only animation; an empty one if there is none.
 
         Raises:
-            BadInput: there are several.
+            BadInput: the file has several animations.
         """
         animations = self.file.tree.get("animations", [])
         if len(animations) > 1:
-            raise BadInput(f"this GLB has {len(animations)} animations; an asset has one")
+            raise BadInput(f"this GLB has {len(animations)} animations, at most one is allowed; export it with one")
         return animations[0] if animations else {"samplers": [], "channels": []}
 
     @property
@@ -85,15 +86,15 @@ class AnimatedGlb:
         return list(self.animation["samplers"])
 
     @cached_property
-    def _blinking(self) -> set[int]:
+    def _toggled(self) -> set[int]:
         """Nodes that an animated scale shows and hides; they count as shown."""
         targets = (channel["target"] for channel in self.animation["channels"])
         return {target["node"] for target in targets if target["path"] == "scale"}
 
-    def _poses(self, number: int, above: Float[np.ndarray, "4 4"]) -> list[Float[np.ndarray, "v 3"]]:
-        """The vertices under a node in all their poses."""
+    def _poses(self, number: int, parent: Float[np.ndarray, "4 4"]) -> list[Float[np.ndarray, "v 3"]]:
+        """Return the world positions of all vertices below a node, in all poses."""
         node = self.file.tree["nodes"][number]
-        matrix = above @ _local_matrix(node, shown=number in self._blinking)
+        matrix = parent @ _local_matrix(node, ignore_scale=number in self._toggled)
         poses = [pose for child in node.get("children", ()) for pose in self._poses(child, matrix)]
         if "mesh" in node:
             for primitive in self.file.tree["meshes"][node["mesh"]]["primitives"]:
@@ -105,12 +106,12 @@ class AnimatedGlb:
 
 @dataclass(frozen=True)
 class Actor:
-    """A body in a scene.
+    """Asset placed in a scene.
 
     Attributes:
-        name: of its node; no other has it.
-        glb: the animated mesh it shows.
-        item: where and when.
+        name: unique name of its node.
+        glb: the animated mesh.
+        item: placement and timing.
     """
 
     name: str
@@ -118,46 +119,46 @@ class Actor:
     item: SceneItem
 
     @property
-    def turn(self) -> Rotation:
-        """How it is turned."""
+    def rotation(self) -> Rotation:
+        """Rotation in the scene."""
         return Rotation.from_euler("xyz", self.item.rotation_deg, degrees=True)
 
     @property
     def origin(self) -> Vector:
-        """Where the asset's own origin comes to lie, world units."""
-        return np.array(self.item.position) - self.turn.apply(self.glb.foot) * self.item.scale
+        """Position of the asset's origin in the scene, world units."""
+        return np.array(self.item.position) - self.rotation.apply(self.glb.foot) * self.item.scale
 
     @property
     def transform(self) -> Float[np.ndarray, "4 4"]:
-        """Asset to scene, acts on column vectors."""
+        """Matrix from asset to scene; acts on column vectors."""
         matrix = np.eye(4)
-        matrix[:3, :3] = self.turn.as_matrix() * self.item.scale
+        matrix[:3, :3] = self.rotation.as_matrix() * self.item.scale
         matrix[:3, 3] = self.origin
         return matrix
 
     @property
     def end_s(self) -> float:
-        """When it has played once."""
+        """Time at which the animation has played once, seconds."""
         return self.item.start_s + self.glb.duration_s / self.item.speed
 
-    def seconds(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Times of the scene as times of its animation."""
+    def animation_times(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Convert times of the scene to times of the asset's animation."""
         played = (times_s - self.item.start_s).clip(0) * self.item.speed
         if self.item.loop and self.glb.duration_s > 0:
             return played % self.glb.duration_s
         return played.clip(max=self.glb.duration_s)
 
 
-def line_up(bodies: Sequence[AnimatedGlb], spacing: float) -> list[tuple[float, float, float]]:
-    """Positions of feet on the ground, side by side, with this much room between the boxes; the middle is at x = 0."""
-    widths = [float(body.high[0] - body.low[0]) for body in bodies]
+def line_up(glbs: Sequence[AnimatedGlb], spacing: float) -> list[tuple[float, float, float]]:
+    """Return foot positions of assets side by side along x, centered at 0, with a spacing between their boxes."""
+    widths = [float(glb.box_max[0] - glb.box_min[0]) for glb in glbs]
     starts = np.cumsum([0.0, *(width + spacing for width in widths)])
-    middle = (starts[-1] - spacing) / 2
-    return [(float(start + width / 2 - middle), 0.0, 0.0) for start, width in zip(starts, widths, strict=False)]
+    center = (starts[-1] - spacing) / 2
+    return [(float(start + width / 2 - center), 0.0, 0.0) for start, width in zip(starts, widths, strict=False)]
 
 
 def scene_duration(actors: Sequence[Actor], duration_s: float | None) -> float:
-    """Seconds of a scene: as asked for, or until every asset has played once.
+    """Return the duration of a scene in seconds: as given, or until every asset has played once.
 
     Raises:
         BadInput: an asset would start after the end.
@@ -165,19 +166,22 @@ def scene_duration(actors: Sequence[Actor], duration_s: float | None) -> float:
     length = max(actor.end_s for actor in actors) if duration_s is None else duration_s
     for actor in actors:
         if actor.glb.duration_s > 0 and actor.item.start_s + SHORTEST_S >= length:
-            raise BadInput(f"{actor.name} starts at {actor.item.start_s} s, when the scene of {length} s is over")
+            raise BadInput(
+                f"{actor.name} starts at {actor.item.start_s} s, after the end of the scene at {length} s; lower its "
+                "start_s or raise duration_s"
+            )
     return length
 
 
 def compose_glb(actors: Sequence[Actor], duration_s: float | None = None) -> bytes:
-    """A GLB of a scene.
+    """Encode a scene as GLB.
 
     Args:
-        actors: bodies with names of their own.
-        duration_s: of the animation; None: until every asset has played once.
+        actors: assets with unique names.
+        duration_s: duration of the animation; None: until every asset has played once.
 
     Raises:
-        BadInput: no actors, one that starts after the end, or one of a form that dg4d does not write.
+        BadInput: no actors, one that starts after the end, or one with a layout that dg4d does not write.
     """
     if not actors:
         raise BadInput("a scene needs at least one asset; given none")
@@ -193,7 +197,9 @@ def compose_glb(actors: Sequence[Actor], duration_s: float | None = None) -> byt
             nodes.append(transfer.add_node())
             _add_tracks(transfer, length, samplers, channels)
         except _FOREIGN as error:
-            raise BadInput(f"{actor.name} has not the form of an animated asset: {error!r}") from error
+            raise BadInput(
+                f"{actor.name} is not an animated asset ({error!r}); give an asset that `dg4d make` wrote"
+            ) from error
     if channels:
         document.add("animations", name=ANIMATION, samplers=samplers, channels=channels)
     document.tree["scene"] = document.add("scenes", name=ANIMATION, nodes=nodes)
@@ -201,7 +207,7 @@ def compose_glb(actors: Sequence[Actor], duration_s: float | None = None) -> byt
 
 
 class _Transfer:
-    """Copies what an actor needs into a document: each thing once, data once for all actors with the same body."""
+    """Copier of an actor's glTF items into a document: each item once, data once for all actors with the same GLB."""
 
     def __init__(self, document: GltfDocument, actor: Actor, shared: dict[tuple[str, int], int]) -> None:
         self.document, self.actor = document, actor
@@ -209,40 +215,40 @@ class _Transfer:
         self._own: dict[tuple[str, int], int] = {}
         required = self._file.tree.get("extensionsRequired", [])
         for extension in self._file.tree.get("extensionsUsed", []):
-            document.use(extension, required=extension in required)
+            document.use_extension(extension, required=extension in required)
 
     def add_node(self) -> int:
-        """The actor's node with everything below it. Returns its number."""
+        """Add the actor's node with all its descendants; return its index."""
         return self.document.add(
             "nodes",
             name=self.actor.name,
             translation=self.actor.origin.tolist(),
-            rotation=self.actor.turn.as_quat(canonical=True).tolist(),
+            rotation=self.actor.rotation.as_quat(canonical=True).tolist(),
             scale=[self.actor.item.scale] * 3,
             children=[self.node(root) for root in self.actor.glb.roots],
             extras=self._file.tree["asset"].get("extras"),
         )
 
     def node(self, number: int) -> int:
-        """The copy of a node, with its children."""
+        """Copy a node with its children, if not done before; return its index in the document."""
 
-        def changed(node: dict[str, Any]) -> None:
+        def change(node: dict[str, Any]) -> None:
             if "mesh" in node:
                 node["mesh"] = self._copy("meshes", node["mesh"], self._change_mesh)
             if "children" in node:
                 node["children"] = [self.node(child) for child in node["children"]]
             if {"skin", "camera"} & node.keys():
-                raise BadInput(f"{self.actor.name} has a skin or a camera, which scenes do not take; use asset.glb")
+                raise BadInput(f"{self.actor.name} has a skin or a camera, which scenes do not support; use asset.glb")
 
-        return self._copy("nodes", number, changed)
+        return self._copy("nodes", number, change)
 
     def pointer(self, text: str) -> str:
-        """A path of KHR_animation_pointer in the words of the document."""
+        """Translate a path of KHR_animation_pointer to the indices of the document."""
         _, collection, number, rest = re.split(r"^/(\w+)/(\d+)", text)
         return f"/{collection}/{self._own[collection, int(number)]}{rest}"
 
     def _copy(self, collection: str, number: int, change: Callable[[dict[str, Any]], None]) -> int:
-        """The number of a thing of the actor's own, copied when it is first asked for."""
+        """Copy an item that the actor does not share, if not done before; return its index in the document."""
         key = (collection, number)
         if key not in self._own:
             item = deepcopy(self._file.tree[collection][number])
@@ -268,7 +274,7 @@ class _Transfer:
             holder["source"] = self._data("images", holder["source"])
 
     def _data(self, collection: str, number: int) -> int:
-        """The number of something heavy, copied when a body of this file first asks for it."""
+        """Copy an item that all actors of this GLB share, if not done before; return its index in the document."""
         key = (collection, number)
         if key not in self._shared:
             item = {**self._file.tree[collection][number]}
@@ -287,7 +293,7 @@ class _Transfer:
 def _add_tracks(
     transfer: _Transfer, length: float, samplers: list[dict[str, Any]], channels: list[dict[str, Any]]
 ) -> None:
-    """The animation of an actor at its times, as samplers and channels of the scene's."""
+    """Append an actor's animation, shifted and scaled in time, to the samplers and channels of the scene."""
     actor, document, animation = transfer.actor, transfer.document, transfer.actor.glb.animation
     inputs: dict[bytes, int] = {}
     for channel in animation["channels"]:
@@ -300,7 +306,7 @@ def _add_tracks(
         keys = actor.glb.file.accessor(sampler["input"])[:, 0].astype(np.float64)
         output = actor.glb.file.accessor(sampler["output"])
         rows = output.reshape(len(keys), -1)
-        times, values = _timed(actor, keys, rows, length, sampler.get("interpolation", "LINEAR"))
+        times, values = _retime(actor, keys, rows, length, sampler.get("interpolation", "LINEAR"))
         content = times.tobytes()
         if content not in inputs:
             inputs[content] = document.add_accessor(f"{actor.name} times", times)
@@ -310,20 +316,20 @@ def _add_tracks(
         samplers.append({**sampler, "input": inputs[content], "output": number})
 
 
-def _timed(
+def _retime(
     actor: Actor, keys: NDArray[np.float64], rows: NDArray[Any], length: float, interpolation: str
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Keys and values of a track at an actor's times: from its start to the very end of the scene."""
+    """Return keys and values of a track at the actor's times, from its start to the end of the scene."""
     if interpolation == "CUBICSPLINE":
-        raise BadInput(f"{actor.name} is animated by cubic splines, which scenes do not take")
+        raise BadInput(f"{actor.name} is animated by cubic splines, which scenes do not support; use asset.glb")
     period, speed = actor.glb.duration_s, actor.item.speed
-    keys, rows = _from_to(keys, rows, period)
-    rounds = math.ceil((length - actor.item.start_s) * speed / period) if actor.item.loop else 1
-    if rounds > MOST_ROUNDS:
-        raise BadInput(f"{actor.name} would play {rounds} times, at most {MOST_ROUNDS} are allowed; lower its speed")
-    times = np.concatenate([actor.item.start_s + (keys + period * turn) / speed for turn in range(rounds)])
-    values = np.concatenate([rows] * rounds).astype(np.float64)
-    kept = np.append(np.diff(times) > SHORTEST_S, True)  # the end of a round is the beginning of the next
+    keys, rows = _cover_period(keys, rows, period)
+    loops = math.ceil((length - actor.item.start_s) * speed / period) if actor.item.loop else 1
+    if loops > MAX_LOOPS:
+        raise BadInput(f"{actor.name} would play {loops} times, at most {MAX_LOOPS} are allowed; lower its speed")
+    times = np.concatenate([actor.item.start_s + (keys + period * loop) / speed for loop in range(loops)])
+    values = np.concatenate([rows] * loops).astype(np.float64)
+    kept = np.append(np.diff(times) > SHORTEST_S, True)  # the end of a loop is the start of the next
     times, values = times[kept], values[kept]
     inside = times < length - SHORTEST_S
     after = int(inside.sum())
@@ -335,8 +341,10 @@ def _timed(
     return times.astype("<f4"), values.astype("<f4")
 
 
-def _from_to(keys: NDArray[np.float64], rows: NDArray[Any], period: float) -> tuple[NDArray[np.float64], NDArray[Any]]:
-    """A track with keys at both ends of the animation, as players hold the first and the last value."""
+def _cover_period(
+    keys: NDArray[np.float64], rows: NDArray[Any], period: float
+) -> tuple[NDArray[np.float64], NDArray[Any]]:
+    """Add keys at both ends of the animation, because players hold the first and the last value."""
     if keys[0] > SHORTEST_S:
         keys, rows = np.append(0.0, keys), np.append(rows[:1], rows, axis=0)
     if keys[-1] < period - SHORTEST_S:
@@ -344,12 +352,12 @@ def _from_to(keys: NDArray[np.float64], rows: NDArray[Any], period: float) -> tu
     return keys, rows
 
 
-def _local_matrix(node: dict[str, Any], shown: bool) -> Float[np.ndarray, "4 4"]:
-    """A node to its parent; shown: its own scale is 1."""
+def _local_matrix(node: dict[str, Any], ignore_scale: bool) -> Float[np.ndarray, "4 4"]:
+    """Return the matrix from a node to its parent."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     matrix = np.eye(4)
-    scale = np.ones(3) if shown else np.array(node.get("scale", (1.0, 1.0, 1.0)))
+    scale = np.ones(3) if ignore_scale else np.array(node.get("scale", (1.0, 1.0, 1.0)))
     matrix[:3, :3] = Rotation.from_quat(node.get("rotation", (0.0, 0.0, 0.0, 1.0))).as_matrix() * scale
     matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
     return matrix

@@ -1,4 +1,4 @@
-"""A small cloud that moves, shared by the tests of this folder."""
+"""Small animated cloud for the tests of this folder."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Between two frames, and from the last frame back to the first."""
+"""Interpolation between frames and from the last frame to the first."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""The compact form: everything comes back, it describes itself, broken files are refused."""
+"""Compact format: lossless round trip, self-description, corrupt files."""
 
 import json
 from dataclasses import replace
@@ -82,13 +82,13 @@ def test_numbers_that_are_not_finite_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_missing_or_broken_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="a is no compact asset"):
+    with pytest.raises(BadInput, match="a is not a compact asset"):
         read_compact(tmp_path / "a")
     write_compact(tmp_path / "a", asset())
     content = (tmp_path / "a").read_bytes()
     for damaged in (content[:-1], b"", content.replace(b"asset4d", b"asset5d"), content.replace(b"quats", b"qutas")):
         (tmp_path / "a").write_bytes(damaged)
-        with pytest.raises(BadInput, match="a is no compact asset"):
+        with pytest.raises(BadInput, match="a is not a compact asset"):
             read_compact(tmp_path / "a")
 
 
@@ -96,5 +96,5 @@ def test_another_version_is_refused(tmp_path: Path) -> None:
     write_compact(tmp_path / "a", asset())
     content = (tmp_path / "a").read_bytes()
     (tmp_path / "a").write_bytes(content.replace(b'\\"version\\": 1', b'\\"version\\": 2'))
-    with pytest.raises(BadInput, match="another version; this program reads version 1"):
+    with pytest.raises(BadInput, match="this program reads dg4d-compact version 1"):
         read_compact(tmp_path / "a")

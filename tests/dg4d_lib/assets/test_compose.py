@@ -1,4 +1,4 @@
-"""Composed scenes: what others read in them stands where it should, when it should."""
+"""Composed scenes: placement and timing as third-party readers see them."""
 
 import math
 from itertools import pairwise
@@ -126,7 +126,7 @@ def test_the_times_of_an_actor_are_those_of_its_track() -> None:
     one = actor("one", tracked(), start_s=0.2, speed=2.0)
     file = pygltflib.GLTF2.load_from_bytes(compose_glb([one], 1.5))
     for seconds in (0.1, 0.21, 0.4, 0.77, 1.1):
-        (played,) = one.seconds(np.array([seconds]))
+        (played,) = one.animation_times(np.array([seconds]))
         np.testing.assert_allclose(shown_at(file, "one", seconds), expected_at(one, played * FPS), atol=2e-5)
 
 
@@ -206,9 +206,9 @@ def test_compressed_assets_stay_compressed_and_valid(tmp_path: Path) -> None:
     assert report["errors"] == 0, report["messages"]
     again = AnimatedGlb(content)
     assert "EXT_meshopt_compression" in again.file.tree["extensionsRequired"]
-    boxes = [np.stack((each.glb.low, each.glb.high)) + each.origin for each in (one, two)]
-    np.testing.assert_allclose(again.low[0], boxes[0].min(0)[0], atol=1e-5)
-    np.testing.assert_allclose(again.high[0], boxes[1].max(0)[0], atol=1e-5)
+    boxes = [np.stack((each.glb.box_min, each.glb.box_max)) + each.origin for each in (one, two)]
+    np.testing.assert_allclose(again.box_min[0], boxes[0].min(0)[0], atol=1e-5)
+    np.testing.assert_allclose(again.box_max[0], boxes[1].max(0)[0], atol=1e-5)
 
 
 def test_extensions_are_announced_as_in_the_assets() -> None:
@@ -244,7 +244,7 @@ def test_a_row_leaves_the_room_asked_for_and_has_its_middle_at_the_origin() -> N
     actors = [
         actor(str(i), body, position=p) for i, (body, p) in enumerate(zip(bodies, line_up(bodies, 0.2), strict=True))
     ]
-    edges = [(a.glb.low[0] + a.origin[0], a.glb.high[0] + a.origin[0]) for a in actors]
+    edges = [(a.glb.box_min[0] + a.origin[0], a.glb.box_max[0] + a.origin[0]) for a in actors]
     for (_, end), (start, _) in pairwise(edges):
         assert start - end == pytest.approx(0.2)
     assert edges[0][0] + edges[-1][1] == pytest.approx(0.0)
@@ -252,9 +252,9 @@ def test_a_row_leaves_the_room_asked_for_and_has_its_middle_at_the_origin() -> N
 
 def test_a_box_holds_all_poses_also_of_frames_that_are_hidden() -> None:
     np.testing.assert_allclose(
-        per_frame().high, trimesh.creation.icosphere(subdivisions=1, radius=0.3).bounds[1], atol=1e-6
+        per_frame().box_max, trimesh.creation.icosphere(subdivisions=1, radius=0.3).bounds[1], atol=1e-6
     )
-    assert tracked().high[1] > hopping().mesh.vertices[:, 1].max() + 0.5
+    assert tracked().box_max[1] > hopping().mesh.vertices[:, 1].max() + 0.5
 
 
 def test_a_scene_ends_when_every_asset_has_played_once() -> None:
@@ -263,7 +263,7 @@ def test_a_scene_ends_when_every_asset_has_played_once() -> None:
 
 
 def test_an_asset_that_starts_after_the_end_is_refused() -> None:
-    with pytest.raises(BadInput, match=r"late starts at 3.0 s, when the scene of 2.0 s is over"):
+    with pytest.raises(BadInput, match=r"late starts at 3.0 s, after the end of the scene at 2.0 s"):
         compose_glb([actor("early", tracked()), actor("late", tracked(), start_s=3.0)], 2.0)
 
 
@@ -285,7 +285,7 @@ def test_a_file_without_a_mesh_is_refused() -> None:
 
 
 def test_a_file_of_another_form_is_refused() -> None:
-    with pytest.raises(BadInput, match="has not the form"):
+    with pytest.raises(BadInput, match="not an animated asset"):
         AnimatedGlb(GltfDocument({}).to_bytes())
 
 

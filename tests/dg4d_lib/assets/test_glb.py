@@ -1,4 +1,4 @@
-"""Animated meshes as GLB: what is written is valid, comes back, and is read the same by others."""
+"""Animated GLB: validity, round trip, third-party readers."""
 
 import io
 import json
@@ -256,15 +256,15 @@ def swapped(content: bytes, old: bytes, new: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        (b"", "no GLB"),
-        (b"PK\x03\x04 a zip", "no GLB"),
-        (WRITTEN["tracked"]()[:16], "broken"),
-        (WRITTEN["tracked"]()[:-1], "broken"),
+        (b"", "not a GLB"),
+        (b"PK\x03\x04 a zip", "not a GLB"),
+        (WRITTEN["tracked"]()[:16], "corrupt"),
+        (WRITTEN["tracked"]()[:-1], "corrupt"),
         (swapped(WRITTEN["tracked"](), b'"POSITION"', b'"POSITIOM"'), "form"),
         (swapped(WRITTEN["tracked"](), b'"targets"', b'"tergets"'), "morph targets"),
         (swapped(WRITTEN["tracked"](), b'"mesh":0', b'"mush":0'), "shows 0 meshes"),
         (swapped(WRITTEN["tracked"](), b"IHDR", b"IHDX"), "form"),
-        (swapped(WRITTEN["tracked"](), b'"indices":3', b'"indices":0'), "whole numbers"),
+        (swapped(WRITTEN["tracked"](), b'"indices":3', b'"indices":0'), "integers"),
         (WRITTEN["still"](), "morph targets"),
         (WRITTEN["per frame"](), "shows 3 meshes"),
     ],

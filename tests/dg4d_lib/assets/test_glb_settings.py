@@ -1,4 +1,4 @@
-"""GLB files written in other ways than the plain one: what comes back, and what others read."""
+"""GLB with other settings than the defaults: round trip and third-party readers."""
 
 import io
 import sys
@@ -296,5 +296,5 @@ def test_broken_packing_is_refused() -> None:
 
 def test_a_file_beyond_what_a_glb_can_hold_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gltf, "MAX_LENGTH", 10_000)
-    with pytest.raises(BadInput, match="a GLB ends at 4"):
+    with pytest.raises(BadInput, match="at most 4 GiB"):
         write_glb(turning_ball())

@@ -1,4 +1,4 @@
-"""The GLB container by itself."""
+"""GLB container."""
 
 import struct
 

@@ -1,4 +1,4 @@
-"""Normals by themselves."""
+"""Smooth normals."""
 
 import numpy as np
 import trimesh

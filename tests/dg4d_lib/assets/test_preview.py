@@ -1,4 +1,4 @@
-"""The films: they play, they show the object where it is, and equal assets give equal films."""
+"""Preview videos: playback, position of the object, determinism."""
 
 import struct
 from collections.abc import Sequence
@@ -69,7 +69,7 @@ def test_browsers_can_play_it_and_begin_before_all_is_loaded(written: Path) -> N
 def test_a_slow_motion_is_not_sampled_without_end(
     tmp_path: Path, red_dot: Gaussians, slide: Framewise, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(preview, "MOST_PICTURES", 25)
+    monkeypatch.setattr(preview, "MAX_PICTURES", 25)
     write_preview(tmp_path / "a.mp4", red_dot, slide, FRAMES, 0.5, rasterize, SETTINGS)
     pictures, rate = film(tmp_path / "a.mp4")
     assert (len(pictures), rate) == (24, 2)

@@ -1,4 +1,4 @@
-"""Other frame rates: what is asked between frames is what the motion does there."""
+"""Resampling to other frame rates: states between frames follow the motion."""
 
 import math
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 
 from dg4d_lib.assets.animated import Asset4D, interpolate_frames, pose_gaussians
 from dg4d_lib.assets.resample import (
-    MOST_STATES,
+    MAX_STATES,
     STATES_AT_ONCE,
     pose_gaussians_in_chunks,
     resample_asset,
@@ -69,7 +69,7 @@ def cloud() -> Gaussians:
 
 
 def ridden(vertices: Tensor, positions: Tensor) -> Tensor:
-    """Where the turning takes vertices that are as they are at `REST`; the way home from the last frame is not told."""
+    """Return the vertices rotated from their positions at `REST`; undefined between the last frame and the first."""
     return vertices @ turns(STEP * (positions.float() - REST)).mT - vertices
 
 
@@ -108,7 +108,7 @@ def test_a_rate_of_too_many_states_is_refused_but_all_frames_never_are() -> None
     with pytest.raises(BadInput, match=r"1001 states .* at most 7$"):
         resampled_positions(1000, 7.0, 7.007)
     assert len(resampled_positions(2000, 7.0, 7.0)) == 2000
-    assert len(resampled_positions(1000, 7.0, 7.0)) == MOST_STATES
+    assert len(resampled_positions(1000, 7.0, 7.0)) == MAX_STATES
 
 
 def test_states_in_parts_are_the_states(cloud: Gaussians) -> None:
@@ -163,5 +163,5 @@ def test_at_its_own_rate_nothing_changes(asset: Asset4D, cloud: Gaussians) -> No
 
 
 def test_a_mesh_of_another_motion_is_refused(asset: Asset4D, cloud: Gaussians) -> None:
-    with pytest.raises(BadInput, match="the mesh has 5 frames, its motion 9"):
+    with pytest.raises(BadInput, match="the mesh has 5 frames, its motion has 9"):
         resample_asset(asset, cloud, Turning(), 9, 24.0)

@@ -1,4 +1,4 @@
-"""Skinned GLBs: read by others, they move as the rig says."""
+"""Skinned GLB: motion of the rig as third-party readers see it."""
 
 import math
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The contact sheet: tiles in their places, the footage on top, captions that can be read."""
+"""Contact sheets: layout, driving video in the first row, readable captions."""
 
 import pytest
 import torch

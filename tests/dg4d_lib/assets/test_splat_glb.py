@@ -1,4 +1,4 @@
-"""Splats as glTF: what three.js and the Khronos validator say, and what comes back."""
+"""Splats as glTF: three.js, the Khronos validator and round trips."""
 
 from dataclasses import replace
 from pathlib import Path

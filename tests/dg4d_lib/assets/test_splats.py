@@ -1,4 +1,4 @@
-"""Splat sequences: every frame is a standard PLY, and the sequence comes back."""
+"""Splat sequences: standard PLY per frame, round trip."""
 
 from pathlib import Path
 
@@ -63,5 +63,5 @@ def test_a_foreign_frame_is_refused(tmp_path: Path, states: Gaussians) -> None:
     first = states.at(0)
     stranger = Gaussians(first.means, first.log_scales, first.quats, first.opacity_logits + 1, first.harmonics)
     write_ply(tmp_path / "001.ply", stranger)
-    with pytest.raises(BadInput, match=r"001\.ply is no state"):
+    with pytest.raises(BadInput, match=r"001\.ply and 000\.ply are not frames of one sequence"):
         read_splats(tmp_path)

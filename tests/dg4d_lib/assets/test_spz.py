@@ -1,4 +1,4 @@
-"""SPZ: what another reader sees, how far it may be from what was given, and what is refused."""
+"""SPZ: third-party reader, quantization error, refused input."""
 
 import gzip
 import math

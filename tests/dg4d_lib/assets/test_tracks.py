@@ -1,4 +1,4 @@
-"""Spans of frames."""
+"""Spans of animation tracks."""
 
 import numpy as np
 import pytest
@@ -27,8 +27,8 @@ def test_a_whole_animation_comes_back_to_its_first_pose_without_a_pose_more() ->
 
 @pytest.mark.parametrize("span", [Span(0, 1, 1), Span(0, 2, 5), Span(2, 4, 5), Span(3, 5, 5), Span(0, 5, 5)])
 def test_a_node_is_shown_in_its_span_and_in_the_next_round(span: Span) -> None:
-    keys, scales = span.shown()
-    for frame in range(span.of + 1):
+    keys, scales = span.visibility()
+    for frame in range(span.total + 1):
         shown = scales[np.searchsorted(keys, frame, side="right") - 1]
-        assert (shown == float(span.first <= frame % span.of < span.end)).all()
-    assert (keys[0], keys[-1]) == (0, span.of)
+        assert (shown == float(span.first <= frame % span.total < span.end)).all()
+    assert (keys[0], keys[-1]) == (0, span.total)

@@ -1,4 +1,4 @@
-"""Animated meshes and splats as USDZ: valid, and others read what we meant."""
+"""Animated meshes and splats as USDZ: validity and third-party readers."""
 
 import io
 import json
@@ -88,7 +88,7 @@ def pictures(path: Path, layer_name: str = "/asset/mesh/materials/subject/color"
 
 
 def faults(stage: Usd.Stage) -> list[str]:
-    """What any validator of OpenUSD says."""
+    """Return the findings of all OpenUSD validators."""
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert len(validators) >= 25
     return [error.GetMessage() for error in UsdValidation.ValidationContext(validators).Validate(stage)]
@@ -387,7 +387,7 @@ def test_a_scene_can_stand_in_a_scene(path: Path) -> None:
         ({"start_s": -1.0}, "start must be 0"),
         ({"transform": torch.full((4, 4), NAN)}, "not finite"),
         ({"file": Path("nowhere.usdz")}, "cannot be read"),
-        ({"file": Path(__file__)}, "is no USDZ"),
+        ({"file": Path(__file__)}, "is not a USDZ"),
     ],
 )
 def test_a_placement_without_sense_is_refused(change: dict[str, Any], says: str, path: Path) -> None:

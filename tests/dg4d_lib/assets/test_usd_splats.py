@@ -1,4 +1,4 @@
-"""Moving splats in USDZ: the states, in floats or half floats, and never drawn with the mesh."""
+"""Animated splats in USDZ: states in float and half, variants."""
 
 import math
 from dataclasses import replace

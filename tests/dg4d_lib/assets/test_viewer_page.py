@@ -1,4 +1,4 @@
-"""The page around the data: what goes in can be read out again, and does nothing else."""
+"""Viewer page: embedded data can be read back, and nothing else is active."""
 
 import base64
 import json

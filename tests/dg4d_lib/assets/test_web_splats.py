@@ -1,4 +1,4 @@
-"""Moving splats for the web: what is lost is as little as the docstring says, and the rest comes back."""
+"""Web splats: round trip within the documented errors."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ def cloud(frames: int = 6, count: int = 50, seed: int = 0) -> Gaussians:
 
 
 def back(states: Gaussians, fps: float = 12.0) -> Gaussians:
-    """What comes back, in the order in which it was given."""
+    """Decode the file and restore the order of the Gaussians."""
     read, _ = read_web_splats(write_web_splats(states, fps))
     colors = (read.colors * 255).round().long()
     order = torch.argsort(colors[:, 0] + 256 * colors[:, 1])
@@ -125,8 +125,8 @@ def test_a_cloud_in_one_point_comes_back() -> None:
 @pytest.mark.parametrize(
     ("faulty", "word"),
     [
-        (cloud().at(0), "t n 3"),
-        (cloud().states([]), "none empty"),
+        (cloud().at(0), r"\(t, n, 3\)"),
+        (cloud().states([]), "at least one"),
         (replace(cloud(), means=torch.full((6, 50, 3), torch.nan)), "finite"),
         (replace(cloud(), opacity_logits=torch.full((50,), torch.inf)), "finite"),
     ],

@@ -1,4 +1,4 @@
-"""The small moving picture: it loops in real time, stays small, and shows the motion from the input side."""
+"""Animated WebP: real-time loop, file size, input view."""
 
 import math
 from collections.abc import Sequence
@@ -111,7 +111,7 @@ def test_what_would_be_too_large_is_packed_harder(
         return rendering_of(torch.rand(len(cameras), 64, 64, 3, generator=torch.Generator().manual_seed(0)))
 
     def size(limit: int) -> int:
-        monkeypatch.setattr(webp, "MOST_BYTES", limit)
+        monkeypatch.setattr(webp, "MAX_BYTES", limit)
         write_webp(tmp_path / "a.webp", red_dot, slide, 2, 1.0, noise, SETTINGS)
         return (tmp_path / "a.webp").stat().st_size
 

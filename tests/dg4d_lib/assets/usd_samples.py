@@ -1,4 +1,4 @@
-"""Small things that move, for tests of USDZ."""
+"""Small animated assets for tests of USDZ."""
 
 from dataclasses import replace
 

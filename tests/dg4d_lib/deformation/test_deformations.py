@@ -1,4 +1,4 @@
-"""What every deformation must do, whichever it is."""
+"""Contract of all deformation models."""
 
 from copy import deepcopy
 

@@ -11,7 +11,7 @@ AXES = ((0, 1), (0, 2), (1, 2))
 
 
 def in_plain_torch(coordinates, planes, lines):
-    """Each sample from `grid_sample`, a line as a plane of one row."""
+    """Sample every plane with `grid_sample`, a line as a plane of one row."""
     product = 1
     for plane, axes in zip(planes, AXES, strict=True):
         grid = coordinates[None, None, :, list(axes)]

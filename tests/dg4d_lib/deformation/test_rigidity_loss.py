@@ -32,7 +32,7 @@ def test_stretching_costs():
 
 
 def pairs(times: int) -> tuple[torch.Tensor, ...]:
-    """Random places and turns of 300 Gaussians, and their neighbors, in float64."""
+    """Return random positions and rotations of 300 Gaussians, and their neighbors, in float64."""
     generator = torch.Generator().manual_seed(1)
     means = torch.rand(300, 3, generator=generator, dtype=torch.float64)
     moved = means + 0.1 * torch.rand(times, 300, 3, generator=generator, dtype=torch.float64)

@@ -6,7 +6,7 @@ from dg4d_lib.errors import BackendUnavailable
 
 
 class Memory:
-    """A function that has room for so many items, and remembers the pieces that it did and refused."""
+    """Function with room for a number of items that records accepted and refused slices."""
 
     def __init__(self, room: int, error: RuntimeError | None = None) -> None:
         self.room, self.error = room, error or torch.OutOfMemoryError("simulated")

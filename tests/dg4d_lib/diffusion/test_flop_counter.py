@@ -1,4 +1,4 @@
-"""The ledger against torch's own counter around a loop written by hand, and against a convolution by hand."""
+"""FLOP counter against torch's counter around a manual loop, and against a hand-counted convolution."""
 
 from collections.abc import Callable
 from typing import Any

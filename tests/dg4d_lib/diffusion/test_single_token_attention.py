@@ -1,4 +1,4 @@
-"""The short way against diffusers' own attention."""
+"""Single-token shortcut against the attention of diffusers."""
 
 import copy
 from pathlib import Path

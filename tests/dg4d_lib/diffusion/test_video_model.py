@@ -141,7 +141,7 @@ def test_a_budget_says_how_much_goes_through_at_once(
     weights = [part.parameters() for part in (model.unet, model.vae, model.image_encoder)]
     taken = sum(4 * value.numel() for part in weights for value in part) / 2**30
     picture = 4 * SIDE**2 / 1e6
-    monkeypatch.setattr(video_model, "OUTSIDE_GB", 6 - taken - 1)
+    monkeypatch.setattr(video_model, "OVERHEAD_GB", 6 - taken - 1)
     monkeypatch.setattr(video_model, "ENCODER_GB", 0.4 / picture)
     monkeypatch.setattr(video_model, "DECODER_GB", 0.7 / picture)
     monkeypatch.setattr(video_model, "UNET_GB", 0.3 / picture / FRAMES)

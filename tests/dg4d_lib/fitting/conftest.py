@@ -1,4 +1,4 @@
-"""A known object that moves, and a prior that knows it."""
+"""Moving object with known images, and its exact prior."""
 
 from collections.abc import Sequence
 
@@ -20,7 +20,7 @@ LADDER = (ResolutionStage(until=1.0, size=SIZE),)
 
 
 class KnownObject:
-    """A few dozen colored balls that slide along x."""
+    """A few dozen colored Gaussians that move along x."""
 
     def __init__(self) -> None:
         generator = torch.Generator().manual_seed(4)

@@ -1,4 +1,4 @@
-"""Fits run where their cloud lies.
+"""Fits on the device of their cloud.
 
 Without a GPU: on torch's `meta` device tensors have shapes and no numbers, and an operation on tensors of two devices
 is refused, so what makes a tensor on the processor by accident is caught. With one: the fits themselves, and how often
@@ -94,7 +94,7 @@ def test_clouds_stay_on_the_device_of_their_points():
 
 @pytest.fixture
 def drawn_here_and_there(known) -> dict[str, tuple[torch.device, Rasterizer]]:
-    """The device and the rasterizer of the processor, and those of gsplat."""
+    """Return device and rasterizer of the CPU, and those of gsplat."""
     try:
         gsplat = get_rasterizer("cuda_gsplat")
     except BackendUnavailable as missing:
@@ -139,13 +139,13 @@ def test_the_motion_fit_on_a_gpu_ends_where_the_processor_ends(kind, known, moti
 
 @pytest.fixture
 def on_gpu(known, emulated_gpu: Emulated, tmp_path: Path) -> ConditionedZero123:
-    """A tiny Zero-1-to-3 that knows the video."""
+    """Return a tiny Zero-1-to-3 conditioned on the video."""
     model = Zero123.load(write_zero123(tmp_path / "zero123"), Zero123PriorSettings(), preferred_device("cuda_gsplat"))
     return model.conditioned_on(known.video().frames, TimestepSchedule(0.98))
 
 
 def waits_of_an_iteration(gpu: Emulated, fit: Callable[[Callable[..., None]], object]) -> dict[str, int]:
-    """What the fourth iteration waits for: by then all is there that is made once."""
+    """Return the synchronizations of the fourth iteration, after one-time setup."""
     counts = []
     fit(lambda *_: counts.append(gpu.waits))
     return dict(counts[3] - counts[2])

@@ -1,4 +1,4 @@
-"""Priors that judge several cameras together get them together."""
+"""Camera rings for priors that score several views together."""
 
 import pytest
 import torch
@@ -12,12 +12,12 @@ from dg4d_lib.settings import MotionSettings, StaticSettings
 class Judge:
     viewpoints, frames = None, None
 
-    def loss(self, images, coverage, views, progress, generator):
+    def loss(self, images, alpha, views, progress, generator):
         return images.sum()
 
 
 class RingJudge(Judge):
-    ring = 4
+    ring_size = 4
 
 
 def turns(cameras) -> list[float]:

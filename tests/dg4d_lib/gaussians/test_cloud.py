@@ -1,4 +1,4 @@
-"""The cloud as a value; what draws it is tested elsewhere."""
+"""Properties of the cloud as a value."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""The splat PLY: exact, equal bytes, readable by others, clear about broken files."""
+"""Splat PLY files: exact round trip, equal bytes, third-party readers, error messages."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -74,7 +74,7 @@ def test_damaged_folders_are_refused_by_name(folder: Path, tmp_path: Path) -> No
         ImageDream.load(copy, "fp32", CPU)
     copy = broken("config")
     (copy / "unet" / "config.json").unlink()
-    with pytest.raises(BadInput, match="is no ImageDream"):
+    with pytest.raises(BadInput, match="holds no ImageDream model"):
         ImageDream.load(copy, "fp32", CPU)
     copy = broken("schedule")
     (copy / "scheduler" / "scheduler_config.json").write_text(
@@ -116,7 +116,7 @@ def test_views_are_what_the_usual_sampler_makes_of_the_same_noise(
         noise = model.predict_noise(latents, int(timestep), [ring(10)], one, 5.0)
         latents = sampler.step(noise, timestep, latents, eta=0.0).prev_sample
     expected = (model.vae.decode(latents[0] / 0.18215).sample / 2 + 0.5).clamp(0, 1).permute(0, 2, 3, 1)
-    views = model.views(one, seeded(), steps=2, guidance=5.0, elevation_deg=10.0)
+    views = model.views(one, seeded(), num_inference_steps=2, guidance_scale=5.0, elevation_deg=10.0)
     assert views.shape == (4, 256, 256, 3)
     torch.testing.assert_close(views, expected, atol=2e-4, rtol=0)
     assert torch.equal(views, model.views(one, seeded(), 2, 5.0, 10.0))
@@ -155,15 +155,15 @@ def test_guidance_goes_from_what_is_believed_without_the_picture(
     one = condition.rows([0])
     without, told, strong = (model.predict_noise(noisy(1), 300, [ring()], one, scale) for scale in (0.0, 1.0, 5.0))
     torch.testing.assert_close(strong, without + 5 * (told - without), atol=1e-5, rtol=1e-4)
-    silence = model.conditioned_on(pictures(1)).text
-    blank = ImageDreamCondition(silence, silence, one.features * 0, one.latents * 0)
+    silence = model.conditioned_on(pictures(1)).prompt_embeds
+    blank = ImageDreamCondition(silence, silence, one.image_embeds * 0, one.image_latents * 0)
     torch.testing.assert_close(without, model.predict_noise(noisy(1), 300, [ring()], blank, 3.0), atol=1e-5, rtol=1e-4)
 
 
 def test_text_is_heard(model: ImageDream) -> None:
     told, untold = model.conditioned_on(pictures(1), "a cat"), model.conditioned_on(pictures(1))
-    assert not torch.equal(told.text, untold.text)
-    assert torch.equal(told.silence, untold.text)
+    assert not torch.equal(told.prompt_embeds, untold.prompt_embeds)
+    assert torch.equal(told.negative_prompt_embeds, untold.prompt_embeds)
     noise = model.predict_noise(noisy(1), 300, [ring()], untold, 5.0)
     assert not torch.equal(model.predict_noise(noisy(1), 300, [ring()], told, 5.0), noise)
 
@@ -226,12 +226,12 @@ def test_loss_and_gradient_are_those_of_the_formulas_in_double_precision(folder:
         told = condition.rows([frame])
         with torch.no_grad():
             x = alphabar.sqrt() * z + (1 - alphabar).sqrt() * e[i]
-            five = torch.cat([torch.stack([x, x]), torch.cat([0 * told.latents, told.latents])[:, None]], 1)
+            five = torch.cat([torch.stack([x, x]), torch.cat([0 * told.image_latents, told.image_latents])[:, None]], 1)
             poses = torch.stack(
                 [*(camera_to_world_rows(view.camera) for view in VIEWS[4 * i : 4 * i + 4]), torch.zeros(16)]
             )
-            text = torch.cat([exact.conditioned_on(pictures(1).double()).text, told.text])
-            features = torch.cat([0 * told.features, told.features])
+            text = torch.cat([exact.conditioned_on(pictures(1).double()).prompt_embeds, told.prompt_embeds])
+            features = torch.cat([0 * told.image_embeds, told.image_embeds])
             free, conditional = exact.unet(five, 500, torch.stack([poses, poses]), text, features)[:, :4]
             slope = (1 - alphabar) * (free + 5 * (conditional - free) - e[i])
         total += 0.5 * float(slope.square().sum()) / 8

@@ -38,7 +38,7 @@ def test_pictures_come_at_the_size_of_the_camera():
 
 @pytest.mark.parametrize("view", [GuidanceView(OrbitCamera(1, 0)), GuidanceView(CAMERAS[0], 1)])
 def test_a_view_it_does_not_have_is_refused(view: GuidanceView):
-    with pytest.raises(BadInput, match="the bank has no picture"):
+    with pytest.raises(BadInput, match="the bank has no view"):
         bank().clean([view])
 
 

@@ -42,7 +42,7 @@ def networks(model: Path) -> Zero123:
 
 @pytest.fixture(scope="module")
 def exact(model: Path) -> Zero123:
-    """The same networks in double precision."""
+    """Return the networks in double precision."""
     z = Zero123.load(model, SETTINGS, CPU)
     parts = {name: getattr(z, name).double() for name in ("vae", "unet", "image_encoder", "camera_projection")}
     return dataclasses.replace(z, **parts)
@@ -61,7 +61,7 @@ def seeded(seed: int = 11) -> torch.Generator:
 def judged(
     prior: ConditionedZero123, images: torch.Tensor, views: Sequence[GuidanceView] = VIEWS, progress: float = 0.5
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Loss and gradient."""
+    """Return loss and gradient."""
     images = images.clone().requires_grad_()
     loss = prior.loss(images, torch.ones_like(images[..., :1]), views, progress, seeded())
     loss.backward()
@@ -71,7 +71,7 @@ def judged(
 def by_the_formulas(
     z: Zero123, frames: torch.Tensor, images: torch.Tensor, timestep: int, last: float | None
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Loss and gradient of SDS written out, image by image, sharing only the networks with the product."""
+    """Return loss and gradient of SDS written out per image, with the networks of the product."""
     beta = torch.linspace(math.sqrt(0.00085), math.sqrt(0.012), 1000, dtype=torch.float64) ** 2
     alphabar = torch.cumprod(1 - beta, 0)[timestep]
     noise = torch.randn((len(images), 4, 32, 32), generator=seeded(), dtype=images.dtype)
@@ -139,7 +139,7 @@ def test_stable_zero123_is_told_the_angle_of_the_input_from_the_pole(exact: Zero
 
 
 def trained_numbers(condition: torch.Tensor, target: torch.Tensor) -> list[float]:
-    """What the training of Zero-1-to-3 computed from two camera positions, z up: differences of spherical coordinates.
+    """Return the pose as in the training code of Zero-1-to-3, from two camera positions with z up.
 
     Theta is the angle from the pole (arctan2 of the distance from the axis and z), azimuth arctan2 of y and x.
     """
@@ -285,7 +285,7 @@ def test_another_frame_is_another_condition(networks: Zero123) -> None:
 @pytest.mark.parametrize("frame", [-1, 2])
 def test_a_frame_that_is_not_there_is_refused(networks: Zero123, frame: int) -> None:
     prior = networks.conditioned_on(pictures(2, 64), PAPER)
-    with pytest.raises(BadInput, match="there are 2"):
+    with pytest.raises(BadInput, match="it has frames 0 to 1"):
         judged(prior, pictures(1, 96), [GuidanceView(OrbitCamera(), frame)])
 
 
@@ -304,7 +304,7 @@ def test_networks_of_something_else_are_refused(model: Path, tmp_path: Path) -> 
     other = Path(shutil.copytree(model, tmp_path / "model"))
     shutil.rmtree(other / "unet")
     tiny_weights.tiny_unet(in_channels=4).save_pretrained(other / "unet")
-    with pytest.raises(BadInput, match="inputs of the UNet: 4 instead of 8"):
+    with pytest.raises(BadInput, match="inputs of the UNet: 4, expected 8"):
         Zero123.load(other, SETTINGS, CPU)
 
 
@@ -319,7 +319,7 @@ def test_a_projection_of_another_width_is_refused(model: Path, tmp_path: Path) -
     file = other / "clip_camera_projection" / "diffusion_pytorch_model.safetensors"
     tensors = load_file(file)
     save_file({**tensors, "proj.weight": tensors["proj.weight"][:, :-1].contiguous()}, file)
-    with pytest.raises(BadInput, match="inputs of the projection: 27 instead of 28"):
+    with pytest.raises(BadInput, match="inputs of the projection: 27, expected 28"):
         Zero123.load(other, SETTINGS, CPU)
 
 

@@ -1,4 +1,4 @@
-"""Clouds and meshes whose shape is known."""
+"""Clouds and meshes of known shape."""
 
 import math
 from collections.abc import Callable

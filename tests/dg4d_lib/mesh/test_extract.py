@@ -10,7 +10,7 @@ import trimesh
 from dg4d_lib.errors import FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import DensityField, density_field
-from dg4d_lib.mesh.extraction.extract import best_level, usable_level
+from dg4d_lib.mesh.extraction.extract import extract_surface, select_level, usable_level
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
 
@@ -110,7 +110,7 @@ def test_the_best_level_has_the_outline_of_the_gaussians() -> None:
 def test_a_faint_model_still_gets_a_surface() -> None:
     gaussians = replace(ball(), opacity_logits=torch.tensor([-2.0]))
     field = density_field(gaussians, SMALL)
-    level, agreement = best_level(field, gaussians, get_rasterizer("auto"), 0.5)
+    level, agreement = select_level(field, gaussians, get_rasterizer("auto"), 0.5)
     assert level < gaussians.opacities.item()
     assert agreement == 0.0, "nothing of it is more opaque than one half"
     assert len(extract_surface(field, level)[1]) > 0

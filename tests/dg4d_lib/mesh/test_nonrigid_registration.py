@@ -4,7 +4,7 @@ import trimesh
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import isotropic
 from dg4d_lib.mesh.extraction.density import density_field
-from dg4d_lib.mesh.extraction.extract import surface
+from dg4d_lib.mesh.extraction.extract import extract_surface
 from dg4d_lib.mesh.tracking.nonrigid_registration import register_nonrigid
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
@@ -30,7 +30,7 @@ def test_vertices_that_were_left_behind_come_to_the_outlines_and_others_stay():
         **both,
     )
     rasterize = get_rasterizer("cpu")
-    vertices, faces = (torch.from_numpy(a) for a in surface(density_field(rest, SETTINGS), LEVEL))
+    vertices, faces = (torch.from_numpy(a) for a in extract_surface(density_field(rest, SETTINGS), LEVEL))
     nothing = torch.zeros(2, len(vertices), 3)
     offsets, agreed = register_nonrigid(vertices, nothing, faces, states, LEVEL, rasterize, SETTINGS)
     outlines = render_silhouettes(states, [0, 1], rasterize)

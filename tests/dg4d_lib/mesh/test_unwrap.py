@@ -16,14 +16,14 @@ SIZE = 256
 
 
 def charts(faces: np.ndarray) -> np.ndarray:
-    """Which connected piece of the flat map a face belongs to."""
+    """Return the chart index of every face."""
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]]).T
     graph = coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(faces.max() + 1,) * 2)
     return connected_components(graph, directed=False)[1][faces[:, 0]]
 
 
 def drawn(faces: np.ndarray, uvs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How many triangles hold a texel's center well inside, and the last one's chart."""
+    """Return the number of triangles that contain each texel center, and the chart of the last one."""
     count, chart = np.zeros((SIZE, SIZE), int), np.full((SIZE, SIZE), -1)
     places, names = uvs.astype(np.float64) * SIZE - 0.5, charts(faces)
     for face, name in zip(faces, names, strict=True):

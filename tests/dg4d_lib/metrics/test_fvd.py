@@ -1,4 +1,4 @@
-"""Distances of films against formulas, SciPy's matrix root, and NumPy's old covariance of one row."""
+"""Video distances against formulas, SciPy's matrix root, and NumPy's old covariance of one row."""
 
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from scipy.linalg import sqrtm
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.metrics.fvd import SHORTEST, frechet_distance, fvd, fvd_consistent4d, load_i3d, logits
+from dg4d_lib.metrics.fvd import MIN_FRAMES, frechet_distance, fvd, fvd_consistent4d, load_i3d, logits
 
 CPU = torch.device("cpu")
 
@@ -58,24 +58,24 @@ def test_the_distance_is_that_with_a_matrix_root() -> None:
 
 def test_as_many_films_as_numbers_are_too_few() -> None:
     assert frechet_distance(random(7, 6), random(7, 6, seed=1)) > 0
-    with pytest.raises(BadInput, match="more than 6 on either side; given 7 and 6"):
+    with pytest.raises(BadInput, match="more than 6 on each side; given 7 and 6"):
         frechet_distance(random(7, 6), random(6, 6))
 
 
 def test_the_network_sees_colors_between_minus_one_and_one(i3d: Any) -> None:
-    gray = torch.full((SHORTEST, 32, 32, 3), 0.75)
+    gray = torch.full((MIN_FRAMES, 32, 32, 3), 0.75)
     expected = tiny_judges.TinyI3d()(torch.full((1, 3, 2, 2, 2), 0.5), False, False, True)
     torch.testing.assert_close(logits(i3d, gray, CPU), expected[0], atol=1e-5, rtol=1e-4)
 
 
 def test_a_film_is_seen_whole_and_as_it_is(i3d: Any) -> None:
-    film = torch.rand(SHORTEST, 224, 224, 3, generator=torch.Generator().manual_seed(4))
+    film = torch.rand(MIN_FRAMES, 224, 224, 3, generator=torch.Generator().manual_seed(4))
     expected = tiny_judges.TinyI3d()(2 * film.permute(3, 0, 1, 2)[None] - 1, False, False, True)
     torch.testing.assert_close(logits(i3d, film, CPU), expected[0], atol=1e-4, rtol=1e-3)
 
 
 def test_a_short_film_is_refused(i3d: Any) -> None:
-    with pytest.raises(BadInput, match="10 frames or more; this one has 9"):
+    with pytest.raises(BadInput, match="10 frames or more; given 9"):
         logits(i3d, torch.zeros(9, 32, 32, 3), CPU)
 
 

@@ -29,7 +29,7 @@ SIZE = 64
 
 
 def disk(x: float = 0.0, radius: float = 0.5, gray: float = 0.3) -> RgbaImages:
-    """A striped disk at x, in halves of the picture."""
+    """Return a striped disk at x, in halves of the image."""
     line = (torch.arange(SIZE) + 0.5) / SIZE * 2 - 1
     v, u = torch.meshgrid(line, line, indexing="ij")
     inside = (((u - x) ** 2 + v**2) < radius**2).float()[None, ..., None]
@@ -43,7 +43,7 @@ def film(places: list[float]) -> RgbaImages:
 
 
 def ball_turn(radius: float = 0.5, count: int = 24) -> Turntable:
-    """A ball around the origin, whose depth is known in closed form."""
+    """Return a ball around the origin with depth in closed form."""
     cameras = turntable(count, OrbitCamera(width=SIZE, height=SIZE))
     focal = cameras[0].focal
     line = (torch.arange(SIZE) + 0.5 - SIZE / 2) / focal
@@ -112,7 +112,7 @@ def test_one_torn_frame_is_enough_for_the_silhouette() -> None:
 
 def test_the_worse_form_counts() -> None:
     still = film([0.0] * 8)
-    mixed = replace(evidence(SWAYING, SWAYING), seen={SPLATS: SWAYING, MESH: still})
+    mixed = replace(evidence(SWAYING, SWAYING), input_views={SPLATS: SWAYING, MESH: still})
     found = {gate.name: gate for gate in evaluate_gates(mixed, GateSettings())}
     assert (found["motion"].form, found["motion"].passed) == (MESH, False)
     assert found["motion"].values[SPLATS] == 1

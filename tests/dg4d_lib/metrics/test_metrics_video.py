@@ -1,4 +1,4 @@
-"""Films whose flicker and motion are known, and the filter of SciPy as a twin."""
+"""Videos with known flicker and motion; SciPy's filter as a twin."""
 
 import pytest
 import torch

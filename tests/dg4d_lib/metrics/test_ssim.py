@@ -1,4 +1,4 @@
-"""Structural similarity: closed forms, its definition by convolutions in float64, and scikit-image."""
+"""SSIM: closed forms, its definition by convolutions in float64, and scikit-image."""
 
 import pytest
 import torch

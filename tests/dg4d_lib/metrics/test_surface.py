@@ -1,4 +1,4 @@
-"""The distance of surfaces against distances that are known."""
+"""Chamfer distances against known values."""
 
 import math
 

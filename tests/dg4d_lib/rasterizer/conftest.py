@@ -9,7 +9,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.harmonics import rgb_to_sh
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.rasterizer.interface import Rasterizer, Rendering, get_rasterizer
 
 COLORFUL = torch.tensor([0.9, 0.1, 0.4])

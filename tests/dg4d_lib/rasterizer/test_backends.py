@@ -1,4 +1,4 @@
-"""Which backend a name stands for, and what is said where it cannot run."""
+"""Resolution of backend names, and messages for unavailable backends."""
 
 import ctypes
 import importlib.util

@@ -1,4 +1,4 @@
-"""The processor's rasterizer on other processors, with other threads, and over many calls."""
+"""CPU rasterizer on other CPUs, with other threads, and over many calls."""
 
 import os
 import subprocess
@@ -63,7 +63,7 @@ def test_memory_stays_the_same_over_many_calls_of_many_sizes(random_cloud, forwa
 
 def test_memory_that_is_kept_has_a_limit(monkeypatch):
     monkeypatch.setattr(workers, "_IDLE", type(workers._IDLE)(list))
-    monkeypatch.setattr(workers, "_IDLE_BYTES", 3 << 20)
+    monkeypatch.setattr(workers, "_MAX_IDLE_BYTES", 3 << 20)
     scratch = workers.Scratch()
     for _ in range(5):
         scratch.empty((1 << 20,), "uint8")

@@ -1,4 +1,4 @@
-"""The adapter to gsplat without a GPU: its stand-in is as strict about shapes, and draws by the definition."""
+"""gsplat adapter without a GPU: the stand-in checks shapes and renders by the reference."""
 
 import sys
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ WHITE = torch.ones(3)
 
 @dataclass(frozen=True)
 class Pinhole(OrbitCamera):
-    """A camera as gsplat is told: world to camera with OpenCV's axes, and intrinsics in pixels."""
+    """Camera as gsplat receives it: world to camera with OpenCV axes, and intrinsics in pixels."""
 
     pose: Tensor | None = None
     lens: float = 0.0
@@ -38,7 +38,7 @@ class Pinhole(OrbitCamera):
 
 
 class StandIn(ModuleType):
-    """gsplat 1.5.3 as far as the adapter knows it."""
+    """Stand-in for the parts of gsplat 1.5.3 that the adapter uses."""
 
     def __init__(self) -> None:
         super().__init__("gsplat")
@@ -78,7 +78,7 @@ class StandIn(ModuleType):
         centers = torch.stack([view.means2d for view in splats]).reshape(*batch, views, n, 2)
         for view, own in zip(splats, centers.reshape(-1, n, 2), strict=True):
             view.means2d = own
-        pictures = [reference._picture(view, behind, height, width) for view, behind in zip(splats, backs, strict=True)]
+        pictures = [reference._render(view, behind, height, width) for view, behind in zip(splats, backs, strict=True)]
         color, alpha, depth, visible = (torch.stack(part).float() for part in zip(*pictures, strict=True))
         radii = (4 * visible).int()[..., None].expand(-1, -1, 2).reshape(centers.shape)
         shape = (*batch, views, height, width)

@@ -1,4 +1,4 @@
-"""The processor's rasterizer against itself; see test_rasterizers.py for what it has to give."""
+"""CPU rasterizer against itself; test_rasterizers.py compares it with the reference."""
 
 from dataclasses import replace
 

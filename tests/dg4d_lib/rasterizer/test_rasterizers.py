@@ -1,4 +1,4 @@
-"""What every rasterizer must give: the closed forms where the answer is known, the definition in float64 elsewhere."""
+"""Contract of all rasterizers: closed forms, and the reference in float64."""
 
 import re
 from dataclasses import replace

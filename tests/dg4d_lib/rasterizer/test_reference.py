@@ -1,4 +1,4 @@
-"""The definition's own gradients against differences, in float64."""
+"""Gradients of the reference rasterizer against finite differences, in float64."""
 
 import pytest
 import torch

@@ -18,11 +18,11 @@ from dg4d_lib.reconstruction.lgm import (
     LGM_RADIUS,
     Lgm,
     decode_gaussians,
+    drop_faint,
     infer_unet_config,
     load_lgm,
     ray_embedding,
     reconstruct,
-    visible,
 )
 from dg4d_lib.reconstruction.lgm_unet import UnetConfig
 
@@ -94,7 +94,7 @@ def test_a_file_that_does_not_fit_is_refused_by_name(tmp_path: Path):
     save_file(tiny().state_dict(), file)
     state = load_file(file)
     save_file({name: value for name, value in state.items() if "up_blocks" not in name}, file)
-    with pytest.raises(BadInput, match=r"no weights of LGM: levels down \(32, 32, 64\), up \(\)"):
+    with pytest.raises(BadInput, match=r"no weights of LGM: found levels down \(32, 32, 64\), up \(\)"):
         load_lgm(file, CPU)
     del state["unet.mid_block.attns.0.attn.proj.bias"]
     save_file(state, file)
@@ -243,7 +243,7 @@ def test_the_picture_at_our_radius_is_lgms_own():
 
 def test_the_faintest_are_left_out():
     numbers = raw(100)
-    kept = visible(decode_gaussians(numbers))
+    kept = drop_faint(decode_gaussians(numbers))
     assert 0 < len(kept) == int((numbers[:, 3].sigmoid() >= 0.005).sum()) < 100
 
 
@@ -253,7 +253,7 @@ def test_the_second_pass_sees_the_first_from_the_side_of_the_picture(monkeypatch
     monkeypatch.setattr(lgm, "best_azimuth", lambda gaussians, picture, rasterize: 37.0)
     model.register_forward_pre_hook(lambda module, given: seen.append(given[0]))
     result = reconstruct(model, pictures(), torch.ones(32, 32, 3), rasterize)
-    first = visible(decode_gaussians(model(pictures())))
+    first = drop_faint(decode_gaussians(model(pictures())))
     cameras = [OrbitCamera(0, 37.0 + turn, width=32, height=32) for turn in (0, 90, 180, 270)]
     torch.testing.assert_close(seen[1], rasterize(first, cameras, torch.ones(3)).color)
-    torch.testing.assert_close(result.means, visible(decode_gaussians(model(seen[1]))).means, rtol=0, atol=0)
+    torch.testing.assert_close(result.means, drop_faint(decode_gaussians(model(seen[1]))).means, rtol=0, atol=0)

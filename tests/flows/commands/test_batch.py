@@ -23,11 +23,11 @@ from waiting import wait_until
 from flows import home
 from flows.catalog import convert_all
 from flows.catalog_request import CatalogRequest, ready
-from flows.commands.batch import batch, tell
+from flows.commands.batch import batch, print_summary
 from flows.engine import resources
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.manifest import items_of
-from flows.inputs.orders import Order, Wish
-from flows.packages.summary import NOT_ACCEPTED, Row, Tally, Writer
+from flows.packages.summary import NOT_ACCEPTED, BatchProgress, Row, Writer
 from flows.processes import locked
 from flows.serving.server import Server
 from flows.step_errors import StepBadInput, StepCrashed, StepOutOfMemory
@@ -47,19 +47,19 @@ def place(server: Server) -> Iterator[None]:
         yield
 
 
-def orders(folder: Path, *names: str) -> list[Order]:
+def jobs(folder: Path, *names: str) -> list[ConversionJob]:
     for name in names:
         (folder / f"{name}.png").write_text(picture(f"batch {name}"))
-    wishes = [Wish(item=name, picture=folder / f"{name}.png", settings=PREVIEW) for name in names]
-    return [wish.order(home.store()) for wish in wishes]
+    requests = [ConversionRequest(item=name, picture=folder / f"{name}.png", settings=PREVIEW) for name in names]
+    return [request.to_job(home.store()) for request in requests]
 
 
 def test_what_died_is_tried_once_more_at_the_end_and_bad_input_is_not(place: None, tmp_path: Path) -> None:
     begun: list[str] = []
 
-    def work(order: Order, folder: Path) -> tuple[None, bool]:
-        begun.append(order.item)
-        match order.item:
+    def work(job: ConversionJob, folder: Path) -> tuple[None, bool]:
+        begun.append(job.item)
+        match job.item:
             case "dies" if begun.count("dies") == 1:
                 raise StepOutOfMemory("fit_motion", "killed")
             case "hopeless":
@@ -69,36 +69,36 @@ def test_what_died_is_tried_once_more_at_the_end_and_bad_input_is_not(place: Non
         return None, False
 
     names = ("dies", "bad", "hopeless", "fine")
-    tally = Tally(4)
-    inside_a_flow(convert_all, orders(tmp_path, *names), tmp_path, 1, "retries", tally, work=work)
+    progress = BatchProgress(4)
+    inside_a_flow(convert_all, jobs(tmp_path, *names), tmp_path, 1, "retries", progress, work=work)
     assert begun == [*names, "dies", "hopeless"]
-    assert {row.item: (row.status, row.attempts) for row in tally.rows.values()} == {
+    assert {row.item: (row.status, row.attempts) for row in progress.rows.values()} == {
         "dies": ("done", 2),
         "bad": ("failed", 1),
         "hopeless": ("failed", 2),
         "fine": ("done", 1),
     }
-    assert "again" not in tally.rows["hopeless"].message
+    assert "again" not in progress.rows["hopeless"].message
 
 
 def test_items_are_prepared_one_ahead_of_those_at_work(place: None, tmp_path: Path) -> None:
     finished, ahead = 0, []
 
-    def work(order: Order, folder: Path) -> tuple[None, bool]:
+    def work(job: ConversionJob, folder: Path) -> tuple[None, bool]:
         nonlocal finished
         time.sleep(0.05)
         finished += 1
         return None, False
 
-    def todo() -> Iterator[Order]:
-        for drawn, order in enumerate(orders(tmp_path, *"abcdefgh"), 1):
+    def todo() -> Iterator[ConversionJob]:
+        for drawn, job in enumerate(jobs(tmp_path, *"abcdefgh"), 1):
             ahead.append(drawn - finished)
-            yield order
+            yield job
 
-    tally = Tally(8)
-    inside_a_flow(convert_all, todo(), tmp_path, 2, "ahead", tally, work=work)
+    progress = BatchProgress(8)
+    inside_a_flow(convert_all, todo(), tmp_path, 2, "ahead", progress, work=work)
     assert max(ahead) <= 3
-    assert [row.status for row in tally.rows.values()] == ["done"] * 8
+    assert [row.status for row in progress.rows.values()] == ["done"] * 8
 
 
 def test_meshing_of_one_item_overlaps_fitting_of_the_next_and_fits_never_overlap(
@@ -109,37 +109,37 @@ def test_meshing_of_one_item_overlaps_fitting_of_the_next_and_fits_never_overlap
     fits, second_fit, mutex = 0, threading.Event(), threading.Lock()
     most = 0
 
-    def work(order: Order, folder: Path) -> tuple[None, bool]:
+    def work(job: ConversionJob, folder: Path) -> tuple[None, bool]:
         nonlocal fits, most
         with resources.slot("gpu", lambda text: None):
             with mutex:
                 fits += 1
                 most = max(most, fits)
-            if order.item == "second":
+            if job.item == "second":
                 second_fit.set()
             time.sleep(0.2)
             with mutex:
                 fits -= 1
         with resources.slot("cpu", lambda text: None):
-            if order.item == "first":
+            if job.item == "first":
                 assert second_fit.wait(30), "nothing is fitted while a mesh is made"
         return None, False
 
-    tally = Tally(2)
-    inside_a_flow(convert_all, orders(tmp_path, "first", "second"), tmp_path, 2, "overlap", tally, work=work)
-    assert [row.status for row in tally.rows.values()] == ["done", "done"]
+    progress = BatchProgress(2)
+    inside_a_flow(convert_all, jobs(tmp_path, "first", "second"), tmp_path, 2, "overlap", progress, work=work)
+    assert [row.status for row in progress.rows.values()] == ["done", "done"]
     assert most == 1
 
 
 def test_the_server_shows_how_far_a_batch_is_and_a_page_that_can_be_read(place: None, tmp_path: Path) -> None:
     rows = [Row(item=f"{i:04d}", status="unchanged") for i in range(3 * ROWS_SHOWN)]
-    (one,) = orders(tmp_path, "zebra")
+    (one,) = jobs(tmp_path, "zebra")
 
-    def work(order: Order, folder: Path) -> tuple[None, bool]:
+    def work(job: ConversionJob, folder: Path) -> tuple[None, bool]:
         raise StepBadInput("prepare_subject", "ugly")
 
-    tally = Tally(len(rows) + 1)
-    inside_a_flow(convert_all, [*rows, one], tmp_path, 1, "many: 301 items", tally, work=work)
+    progress = BatchProgress(len(rows) + 1)
+    inside_a_flow(convert_all, [*rows, one], tmp_path, 1, "many: 301 items", progress, work=work)
     with get_client(sync_client=True) as client:
         wanted = {"artifacts": {"key": {"like_": "catalog-many-"}}, "limit": 10}
         pages: list[Any] = client.request("POST", "/artifacts/latest/filter", json=wanted).json()
@@ -166,7 +166,7 @@ def test_a_user_who_stops_a_batch_keeps_what_is_done(
     command.send_signal(number)
     _, trouble = command.communicate(timeout=120)
     assert command.returncode == status, trouble
-    assert "the same command goes on" in trouble
+    assert "run the same command again to continue" in trouble
     assert log.read_text().split().count("fit_motion") == 2  # what was stopped is not begun again
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert {row["item"]: row["status"] for row in summary["items"]} == {"a": "done", "b": "skipped", "c": "skipped"}
@@ -203,7 +203,9 @@ def test_a_signal_ends_a_command_and_its_step_and_leaves_nothing_behind(
     command.send_signal(number)
     _, trouble = command.communicate(timeout=60)
     assert (command.returncode, "Traceback" in trouble) == (status, False), trouble
-    assert trouble.strip().endswith("dg4d: stopped; the same command goes on after the last finished step")
+    assert trouble.strip().endswith(
+        "dg4d: stopped; run the same command again to continue after the last finished step"
+    )
     assert time.monotonic() - begun < 30
     assert not (tmp_path / "out").exists()
     assert left_behind(tmp_path) == []
@@ -268,10 +270,8 @@ def test_a_made_batch_needs_no_server_and_says_that_there_is_nothing_to_do(
     (tmp_path / "in" / "a.png").write_text(picture("x"))
     monkeypatch.setattr("flows.catalog_request.is_current", lambda folder, digest: True)
 
-    def no_server() -> None:
-        pytest.fail("nothing is to be made")
-
-    rows = batch(CatalogRequest(inputs=str(tmp_path / "in"), out=tmp_path / "out"), QUIET, connect=no_server)
+    monkeypatch.setattr("flows.convert.connect", lambda: pytest.fail("nothing is to be made"))
+    rows = batch(CatalogRequest(inputs=str(tmp_path / "in"), out=tmp_path / "out"), QUIET)
     assert [row.status for row in rows] == ["unchanged"]
 
 
@@ -285,9 +285,9 @@ def test_a_hundred_items_are_found_unchanged_in_a_moment_each(tmp_path: Path, mo
     found = items_of(tmp_path / "in", tmp_path / "out", "preview", {}, 0)
     ready(found[0], tmp_path / "out", strict=False)  # reads the source
     for item in found:
-        order = ready(item, tmp_path / "out", strict=False)
-        assert isinstance(order, Order)
-        record = {"order": order.digest(), "files": {}}
+        job = ready(item, tmp_path / "out", strict=False)
+        assert isinstance(job, ConversionJob)
+        record = {"order": job.digest(), "files": {}}
         (tmp_path / "out" / item.name / "provenance.json").write_text(json.dumps(record))
     start = time.process_time()
     rows = [ready(item, tmp_path / "out", strict=False) for item in found]
@@ -306,13 +306,13 @@ def test_a_hundred_items_are_found_unchanged_in_a_moment_each(tmp_path: Path, mo
         ([Row(item="a", status="failed", kind="BadInput"), Row(item="b", status="done")], 1, "1 of 2 items"),
         ([Row(item="a", status="failed", kind="BadInput")], 65, "0 of 1 items"),
         ([Row(item="a", status="failed", kind="StepCrashed")], 1, "failed: a"),
-        ([Row(item="a", status="unchanged")], 0, "nothing to do"),
+        ([Row(item="a", status="unchanged")], 0, "nothing to do: every item is up to date"),
     ],
 )
 def test_the_exit_status_says_how_a_batch_ended(
     rows: list[Row], status: int, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert tell(rows, tmp_path, Console(soft_wrap=True)) == status
+    assert print_summary(rows, tmp_path, Console(soft_wrap=True)) == status
     assert says in capsys.readouterr().out
 
 
@@ -361,14 +361,14 @@ def test_a_batch_of_thousands_is_summed_up_now_and_then_and_its_page_loads_what_
 
 
 def test_a_line_says_how_far_a_batch_is_and_when_it_will_be_done(monkeypatch: pytest.MonkeyPatch) -> None:
-    tally = Tally(103)
+    progress = BatchProgress(103)
     for i in range(3):
-        tally.settle(Row(item=f"old {i}", status="unchanged"))
-    assert tally.line() == "3 of 103 items, 0 failed"
+        progress.settle(Row(item=f"old {i}", status="unchanged"))
+    assert progress.line() == "3 of 103 items, 0 failed"
     for i in range(10):
-        tally.settle(Row(item=f"{i}", status="failed" if i == 4 else "done"))
-    monkeypatch.setattr(Tally, "seconds", property(lambda self: 600.0))
-    assert tally.line() == "13 of 103 items, 1 failed, 60 an hour, about 90 min left"
+        progress.settle(Row(item=f"{i}", status="failed" if i == 4 else "done"))
+    monkeypatch.setattr(BatchProgress, "seconds", property(lambda self: 600.0))
+    assert progress.line() == "13 of 103 items, 1 failed, 60 an hour, about 90 min left"
 
 
 def test_formulas_in_a_summary_are_text_and_numbers_are_numbers(tmp_path: Path) -> None:

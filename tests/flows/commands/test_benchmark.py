@@ -93,7 +93,7 @@ def test_a_benchmark_makes_judges_and_writes_everything_and_a_second_one_does_no
     assert (out / "assets" / "a" / "provenance.json").is_file()
     with get_client(sync_client=True) as client:
         (artifact,) = client.read_artifacts(artifact_filter=ArtifactFilter(key=ArtifactFilterKey(any_=["benchmark"])))
-    assert [row["method"] for row in json.loads(str(artifact.data))] == ["its first frame at every view", "preview"]
+    assert [row["method"] for row in json.loads(str(artifact.data))] == ["first input frame at every view", "preview"]
 
     made = ran(log, "pack_asset"), ran(log, "score_asset")
     assert made == (2, 4)
@@ -139,7 +139,7 @@ def test_a_finished_asset_is_judged_and_nothing_is_made(tmp_path: Path, log: Pat
 
 def test_true_views_are_the_prior_where_the_bank_is_asked_for(tmp_path: Path) -> None:
     folder = thing(tmp_path / "data" / "newt", "with a bank")
-    with pytest.raises(BadInput, match=r"no bank of true views: newt"):
+    with pytest.raises(BadInput, match=r"ground-truth views, which these objects lack: newt"):
         run(tmp_path / "data", tmp_path / "out", bank=True)
     (folder / "bank").mkdir()
     (folder / "bank" / "bank.json").write_text(bank_json("a.png"))
@@ -171,9 +171,9 @@ def test_a_wrong_setting_is_refused_before_any_work(tmp_path: Path, log: Path, c
 
 def test_a_finished_asset_takes_no_knobs_of_the_conversion(tmp_path: Path) -> None:
     thing(tmp_path / "newt", "x")
-    with pytest.raises(BadInput, match=r"only knobs that begin with 'score\.'.*motion\.views"):
+    with pytest.raises(BadInput, match=r"only settings that begin with 'score\.'.*motion\.views"):
         score(tmp_path, tmp_path / "newt", Console(), changes=["motion.views=1"])
-    with pytest.raises(BadInput, match="is no asset"):
+    with pytest.raises(BadInput, match="is not an asset"):
         score(tmp_path, tmp_path / "newt", Console())
 
 

@@ -84,7 +84,7 @@ def test_an_unknown_profile() -> None:
         ("motion.iteration=5", "motion.iteration"),
         ("motion.iterations=0", "greater than or equal to 1"),
         ("motion.iterations=many", "many"),
-        ("motion.iterations", "knob=value"),
+        ("motion.iterations", "NAME=VALUE"),
         ("mesh.mode=round", "'tracked', 'per_frame' or 'auto'"),
         ("prior.kind=crystal", "crystal"),
     ],
@@ -315,7 +315,7 @@ def test_a_record_that_is_nested_or_of_another_form(command: tuple[str, ...], te
     Path("asset/provenance.json").write_text(text)
     result = dg4d(command[0], "asset", *command[1:])
     assert result.exit_code == 65, result.output
-    assert "Traceback" not in result.output and "something broke" not in result.output
+    assert "Traceback" not in result.output and "internal error" not in result.output
 
 
 @pytest.mark.parametrize(
@@ -355,9 +355,9 @@ def test_a_data_set_with_nothing_in_it() -> None:
 @pytest.mark.parametrize(
     ("code", "status", "says"),
     [
-        (errno.EACCES, 65, "Permission denied: a; choose another place"), (errno.ENAMETOOLONG, 65, "choose another"),
+        (errno.EACCES, 65, "Permission denied: a; choose another path"), (errno.ENAMETOOLONG, 65, "choose another"),
         (errno.ENOSPC, 65, "free some space"), (errno.EROFS, 65, "free some space"),
-        (errno.EPIPE, 1, "something broke"),
+        (errno.EPIPE, 1, "internal error"),
     ],
 )  # fmt: skip
 def test_what_the_system_refuses_is_said_in_a_line(

@@ -9,7 +9,7 @@ from flows import home
 from flows.convert import prepare
 from flows.engine import executors
 from flows.engine.versions import has_version, keep_version
-from flows.inputs.orders import Wish
+from flows.inputs.conversion_job import ConversionRequest
 from steps.profiles import PREVIEW
 
 
@@ -20,15 +20,17 @@ def test_processes_for_steps_begin_only_where_the_order_was_not_finished_before(
     begun: list[str] = []
     monkeypatch.setattr(executors, "prepare", lambda: begun.append("processes"))
     Image.new("RGBA", (8, 8)).save(tmp_path / "a.png")
-    orders = [
-        Wish(item="a", picture=tmp_path / "a.png", profile="preview", settings=PREVIEW, seed=seed).order(home.store())
+    jobs = [
+        ConversionRequest(item="a", picture=tmp_path / "a.png", profile="preview", settings=PREVIEW, seed=seed).to_job(
+            home.store()
+        )
         for seed in range(2)
     ]
-    prepare(orders[0])
+    prepare(jobs[0])
     assert len(begun) == 1
     made: Any = SimpleNamespace(package=home.store().put_bytes(b"package", "a/b"), steps=[])
-    keep_version(home.store(), orders[0], made)
-    assert [has_version(home.store(), order) for order in orders] == [True, False]
-    for order in orders:
-        prepare(order)
+    keep_version(home.store(), jobs[0], made)
+    assert [has_version(home.store(), job) for job in jobs] == [True, False]
+    for job in jobs:
+        prepare(job)
     assert len(begun) == 2

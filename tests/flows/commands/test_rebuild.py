@@ -1,4 +1,4 @@
-"""Packages made again: fake steps for the verdicts, real ones with small numbers for the truth; one server for all."""
+"""Rebuild of packages: outcomes with fake steps, digests with real steps and small settings."""
 
 import json
 import math
@@ -15,9 +15,9 @@ from waiting import retry_after
 
 from dg4d_lib.errors import BadInput
 from flows import home
-from flows.commands.rebuild import Rebuilt, rebuild
-from flows.convert import make
-from flows.inputs.orders import Order, Wish, order_again
+from flows.commands.rebuild import RebuildReport, rebuild
+from flows.convert import convert_job
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest, job_from_record
 from flows.inputs.package_record import record_of
 from flows.packages.verify import verify
 from flows.serving.server import Server
@@ -51,7 +51,7 @@ TINY = {
 
 @pytest.fixture
 def fakes(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where fake steps say that they ran."""
+    """Log of fake steps."""
     monkeypatch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
     monkeypatch.setenv("DG4D_CODE_VERSION", "test")
     monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
@@ -60,25 +60,27 @@ def fakes(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     return tmp_path / "ran"
 
 
-def order(words: str, folder: Path, name: str = "fake.png", **changes: object) -> Order:
+def job(words: str, folder: Path, name: str = "fake.png", **changes: object) -> ConversionJob:
     (folder / name).write_text(picture(words))
-    return Wish(item="fake", picture=folder / name, settings=revise(PREVIEW, dict(changes)), seed=5).order(home.store())
+    return ConversionRequest(
+        item="fake", picture=folder / name, settings=revise(PREVIEW, dict(changes)), seed=5
+    ).to_job(home.store())
 
 
-def again(folder: Path, out: Path | None = None, source: Path | None = None) -> Rebuilt:
+def again(folder: Path, out: Path | None = None, source: Path | None = None) -> RebuildReport:
     record = record_of(folder)
     assert record is not None
-    return rebuild(folder, record, order_again(record, home.store(), source), out)
+    return rebuild(folder, record, job_from_record(record, home.store(), source), out)
 
 
-def outcomes(rebuilt: Rebuilt) -> dict[str, str]:
-    return {likeness.name: likeness.outcome for likeness in rebuilt.likenesses}
+def outcomes(rebuilt: RebuildReport) -> dict[str, str]:
+    return {comparison.name: comparison.outcome for comparison in rebuilt.comparisons}
 
 
 def altered(
     step: Callable[[Job], StepReport], port: str, change: Callable[[bytes], bytes]
 ) -> Callable[[Job], StepReport]:
-    """A step whose output comes out otherwise."""
+    """Step whose output is changed."""
 
     def run(job: Job) -> StepReport:
         facts = step(job)
@@ -89,15 +91,15 @@ def altered(
 
 
 def test_every_step_runs_again_and_gives_the_same(fakes: Path, tmp_path: Path) -> None:
-    wanted = order("same", tmp_path)
-    make(wanted, tmp_path / "out")
+    wanted = job("same", tmp_path)
+    convert_job(wanted, tmp_path / "out")
     ran = fakes.read_text()
     fakes.unlink()
     rebuilt = again(tmp_path / "out", tmp_path / "again")
     assert sorted(fakes.read_text().split()) == sorted(ran.split())
     assert set(outcomes(rebuilt).values()) == {"identical"}
-    assert len(rebuilt.likenesses) == len(ran.split()) + 4  # files
-    assert rebuilt.circumstances == ()
+    assert len(rebuilt.comparisons) == len(ran.split()) + 4  # files
+    assert rebuilt.environment_changes == ()
     assert list(rebuilt.rows())[-1] == ("4 files", "identical", "")
     assert rebuilt.exit_code == 0
     one, two = (record_of(tmp_path / name) for name in ("out", "again"))
@@ -112,12 +114,14 @@ def test_words_and_meshes_per_frame_are_rebuilt_too(
 ) -> None:
     settings = revise(PREVIEW, {"text.weights": "somebody/pictures", "mesh.mode": "per_frame"})
     monkeypatch.setenv("DG4D_CPUS", "3")
-    make(Wish(item="words", text="a red  fox", settings=settings).order(home.store()), tmp_path / "out")
+    convert_job(
+        ConversionRequest(item="words", text="a red  fox", settings=settings).to_job(home.store()), tmp_path / "out"
+    )
     record = record_of(tmp_path / "out")
     assert record is not None
     assert record["recipe"]["text"] == "a red fox"
     monkeypatch.setenv("DG4D_CPUS", "1")  # another machine, which divides the frames as the first one did
-    found = outcomes(rebuild(tmp_path / "out", record, order_again(record, ArtifactStore(home.store().root))))
+    found = outcomes(rebuild(tmp_path / "out", record, job_from_record(record, ArtifactStore(home.store().root))))
     assert set(found.values()) == {"identical"}
     assert {"draw_picture", "extract_mesh 1/3", "extract_mesh 3/3"} <= set(found)
 
@@ -134,7 +138,7 @@ def curves(factor: float) -> Callable[[bytes], bytes]:
 def test_a_little_is_within_tolerance_more_is_different_and_what_is_lost_is_not_compared(
     fakes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    make(order("near", tmp_path), tmp_path / "out")
+    convert_job(job("near", tmp_path), tmp_path / "out")
     record = record_of(tmp_path / "out")
     assert record is not None
     (motion,) = [step["outputs"]["motion"] for step in record["steps"] if step["step"] == "fit_motion"]
@@ -142,7 +146,7 @@ def test_a_little_is_within_tolerance_more_is_different_and_what_is_lost_is_not_
 
     monkeypatch.setattr(fake_steps, "fit_motion", altered(plain, "curves", curves(1.001)))
     rebuilt = again(tmp_path / "out")
-    (near,) = [likeness for likeness in rebuilt.likenesses if likeness.outcome != "identical"]
+    (near,) = [comparison for comparison in rebuilt.comparisons if comparison.outcome != "identical"]
     assert (near.name, near.outcome) == ("fit_motion", "within tolerance")
     assert near.difference == pytest.approx(0.001 / math.sqrt(3), rel=0.02)
     assert "curves" in near.detail
@@ -157,17 +161,17 @@ def test_a_little_is_within_tolerance_more_is_different_and_what_is_lost_is_not_
     blob.unlink()
     monkeypatch.setattr(fake_steps, "fit_motion", altered(plain, "motion", lambda content: content + b"!"))
     rebuilt = again(tmp_path / "out")
-    found = {likeness.name: likeness for likeness in rebuilt.likenesses}
+    found = {comparison.name: comparison for comparison in rebuilt.comparisons}
     assert found["fit_motion"].outcome == "not compared"
     assert "motion" in found["fit_motion"].detail and "not in the store" in found["fit_motion"].detail
-    assert "no measure" in found["asset.glb"].detail  # a fake, which no reader reads
+    assert "no metric" in found["asset.glb"].detail  # a fake, which no reader reads
     assert rebuilt.exit_code == 0
 
 
 def test_another_file_is_different_and_other_code_is_told(
     fakes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    make(order("code", tmp_path), tmp_path / "out")
+    convert_job(job("code", tmp_path), tmp_path / "out")
     monkeypatch.setenv("DG4D_CODE_VERSION", "newer")
     monkeypatch.setenv("DG4D_IMAGE", "dg4d/cpu:2")
     noise = np.random.default_rng(0).integers(0, 255, (6, 8, 3), np.uint8)
@@ -177,20 +181,20 @@ def test_another_file_is_different_and_other_code_is_told(
     rebuilt = again(tmp_path / "out")
     assert outcomes(rebuilt)["contact_sheet.png"] == "different"
     assert rebuilt.exit_code == 1
-    assert "image: none then, dg4d/cpu:2 now" in rebuilt.circumstances
-    assert any(text.startswith("code: ") and text.endswith("+newer now") for text in rebuilt.circumstances)
+    assert "image: none then, dg4d/cpu:2 now" in rebuilt.environment_changes
+    assert any(text.startswith("code: ") and text.endswith("+newer now") for text in rebuilt.environment_changes)
 
 
 def test_a_source_that_is_not_in_the_store_must_be_given_and_be_the_same(tmp_path: Path) -> None:
     record = record_in(made_package(tmp_path))
     elsewhere = ArtifactStore(tmp_path / "elsewhere")
     with pytest.raises(BadInput, match="give it with --source"):
-        order_again(record, elsewhere)
+        job_from_record(record, elsewhere)
     (tmp_path / "other.png").write_text(picture("other"))
-    with pytest.raises(BadInput, match="is not what this package was made from"):
-        order_again(record, elsewhere, tmp_path / "other.png")
+    with pytest.raises(BadInput, match="is not the source of this package"):
+        job_from_record(record, elsewhere, tmp_path / "other.png")
     (tmp_path / "same.png").write_bytes(SOURCE)
-    found = order_again(record, elsewhere, tmp_path / "same.png")
+    found = job_from_record(record, elsewhere, tmp_path / "same.png")
     assert found.recipe() == record["recipe"]
     assert (found.item, found.source_name, found.profile, found.seed) == ("red fox", "fox.png", "preview", 3)
 
@@ -200,7 +204,7 @@ def test_a_record_of_another_version_is_refused(tmp_path: Path, damage: str) -> 
     record = record_in(made_package(tmp_path))
     del record[damage]
     with pytest.raises(BadInput, match="another version"):
-        order_again(record, ArtifactStore(tmp_path / "store"))
+        job_from_record(record, ArtifactStore(tmp_path / "store"))
 
 
 @pytest.mark.slow
@@ -209,9 +213,11 @@ def test_real_steps_give_equal_bytes_again(server: Server, tmp_path: Path, monke
     inside = (rows / 0.7) ** 2 + (columns / 0.5) ** 2 < 1
     egg = np.stack([inside * (rows + 1) / 2, inside * 0.4, inside * (columns + 1) / 2, inside], -1)
     Image.fromarray((egg * 255).astype(np.uint8)).save(tmp_path / "egg.png")
-    wanted = Wish(item="egg", picture=tmp_path / "egg.png", settings=revise(PREVIEW, dict(TINY))).order(home.store())
+    wanted = ConversionRequest(item="egg", picture=tmp_path / "egg.png", settings=revise(PREVIEW, dict(TINY))).to_job(
+        home.store()
+    )
     monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
-    make(wanted, tmp_path / "egg")
+    convert_job(wanted, tmp_path / "egg")
     assert verify(tmp_path / "egg").exit_code == 0
     rebuilt = again(tmp_path / "egg")
     assert {name: outcome for name, outcome in outcomes(rebuilt).items() if outcome != "identical"} == {}

@@ -1,4 +1,4 @@
-"""Flows and their store, with a real server and steps that do next to nothing: damage, removal, an absent bucket."""
+"""Flows and their store, with a real server and fake steps: damage, garbage collection, unreachable buckets."""
 
 import json
 import os
@@ -8,27 +8,23 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fake_steps import picture
+from conversions import RUN_FACTS, job, ran, store_is_sound, tree
 from tiny_s3 import BUCKET, TinyS3
 from waiting import retry_after
 
 from flows import home
-from flows.convert import make
+from flows.convert import convert_job
 from flows.engine.collecting import collect
-from flows.engine.versions import Version, faults, versions
-from flows.inputs.orders import Order, Wish
-from flows.packages.publish import whole
+from flows.engine.versions import Version, versions
+from flows.packages.publish import load_verified
 from flows.serving.server import Server
 from flows.step_errors import StepLost, StepUnreachable
-from steps.profiles import PREVIEW, revise
 from steps.store.artifact_store import object_name
-
-RUN_FACTS = ("report.json", "report.html", "provenance.json", "ro-crate-metadata.json")  # these say when and how long
 
 
 @pytest.fixture
 def log(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where fake steps say that they ran; each test has records and a store of its own."""
+    """Log of fake steps; each test has its own records and store."""
     monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
     monkeypatch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
     monkeypatch.setenv("DG4D_CODE_VERSION", "test")
@@ -40,29 +36,13 @@ def log(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
 
 @pytest.fixture
 def bucket(log: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TinyS3]:
-    """The store is in a bucket."""
+    """S3-compatible store of the test."""
     running = TinyS3()
     for name, value in running.environment.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setenv("DG4D_STORE", f"s3://{BUCKET}/{time.monotonic_ns()}")
     yield running
     running.stop()
-
-
-def ran(log: Path) -> list[str]:
-    steps = log.read_text().split() if log.exists() else []
-    log.unlink(missing_ok=True)
-    return steps
-
-
-def order(words: str, folder: Path) -> Order:
-    (folder / "fake.png").write_text(picture(words))
-    return Wish(item="fake", picture=folder / "fake.png", settings=revise(PREVIEW, {})).order(home.store())
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name not in RUN_FACTS)
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def damage(digest: str, how: str) -> None:
@@ -83,48 +63,43 @@ def the_version() -> Version:
     return version
 
 
-def is_whole() -> bool:
-    store = home.store()
-    return not faults(store, versions(store), {entry.name: entry.size_bytes for entry in store.artifacts()})
-
-
 def test_a_finished_order_is_a_version_and_the_same_order_again_is_the_same(log: Path, tmp_path: Path) -> None:
-    wanted = order("version", tmp_path)
-    make(wanted, tmp_path / "out")
+    wanted = job("version", tmp_path)
+    convert_job(wanted, tmp_path / "out")
     made = the_version()
     record = json.loads((tmp_path / "out" / "provenance.json").read_text())
     assert (made.item, made.order, made.package.digest) == ("fake", record["order"], record["package"])
     assert [step.record for step in made.steps] == [step["digest"] for step in record["steps"]]
-    assert is_whole()
-    make(wanted, tmp_path / "again")
+    assert store_is_sound()
+    convert_job(wanted, tmp_path / "again")
     assert the_version().steps == made.steps
-    make(order("another version", tmp_path), tmp_path / "out")
+    convert_job(job("another version", tmp_path), tmp_path / "out")
     assert len(versions(home.store())) == 2
     assert list(home.store().entries("running")) == []
 
 
 @pytest.mark.parametrize("how", ["gone", "flipped", "short"])
 def test_whatever_is_damaged_between_two_runs_is_made_again(log: Path, tmp_path: Path, how: str) -> None:
-    make(order("damage", tmp_path), tmp_path / "one")
+    convert_job(job("damage", tmp_path), tmp_path / "one")
     every = ran(log)
     assert len(set(every)) == len(every) > 5
     for digest in the_version().artifacts():
         damage(digest, how)
-    make(order("damage", tmp_path), tmp_path / "two")
+    convert_job(job("damage", tmp_path), tmp_path / "two")
     again = ran(log)  # what one step makes anew another may share
     assert again and set(again) <= set(every)
-    assert is_whole()
-    assert content(tmp_path / "one") == content(tmp_path / "two")
-    whole(tmp_path / "two")
+    assert store_is_sound()
+    assert tree(tmp_path / "one", *RUN_FACTS) == tree(tmp_path / "two", *RUN_FACTS)
+    load_verified(tmp_path / "two")
     only = next(step for step in the_version().steps if step.label == "fit_motion").outputs["motion"]
     damage(only, how)
-    make(order("damage", tmp_path), tmp_path / "three")
+    convert_job(job("damage", tmp_path), tmp_path / "three")
     assert ran(log) == ["fit_motion"]
-    assert content(tmp_path / "one") == content(tmp_path / "three")
+    assert tree(tmp_path / "one", *RUN_FACTS) == tree(tmp_path / "three", *RUN_FACTS)
 
 
 def test_what_is_damaged_while_a_flow_runs_is_made_again(log: Path, tmp_path: Path) -> None:
-    wanted = order("midway fit_motion=sleep-once:1", tmp_path)
+    wanted = job("midway fit_motion=sleep-once:1", tmp_path)
 
     def spoil() -> None:
         while not log.exists() or "fit_motion" not in log.read_text():
@@ -134,29 +109,29 @@ def test_what_is_damaged_while_a_flow_runs_is_made_again(log: Path, tmp_path: Pa
 
     spoiler = threading.Thread(target=spoil)
     spoiler.start()
-    make(wanted, tmp_path / "out")
+    convert_job(wanted, tmp_path / "out")
     spoiler.join()
     assert sorted(set(ran(log))) != ["prepare_subject"]
-    assert is_whole()
-    whole(tmp_path / "out")
+    assert store_is_sound()
+    load_verified(tmp_path / "out")
 
 
 def test_a_source_that_is_gone_is_an_error_and_not_a_loop(log: Path, tmp_path: Path) -> None:
-    wanted = order("gone", tmp_path)
+    wanted = job("gone", tmp_path)
     damage(wanted.source.digest, "gone")
     with pytest.raises(StepLost, match="run the same command again"):
-        make(wanted, tmp_path / "out")
-    make(order("gone", tmp_path), tmp_path / "out")
+        convert_job(wanted, tmp_path / "out")
+    convert_job(job("gone", tmp_path), tmp_path / "out")
 
 
 def test_removing_all_the_time_harms_no_run(log: Path, tmp_path: Path) -> None:
-    make(order("busy", tmp_path), tmp_path / "one")
+    convert_job(job("busy", tmp_path), tmp_path / "one")
     ran(log)
     store = home.store()
     store.remove([the_version().name])
     for entry in store.entries("sha256"):  # all is old, and no version needs it
         os.utime(store.root / entry.name, (0, 0))
-    wanted, done, removed = order("busy", tmp_path), threading.Event(), []
+    wanted, done, removed = job("busy", tmp_path), threading.Event(), []
 
     def remove() -> None:
         while not done.is_set():
@@ -165,43 +140,43 @@ def test_removing_all_the_time_harms_no_run(log: Path, tmp_path: Path) -> None:
 
     remover = threading.Thread(target=remove)
     remover.start()
-    make(wanted, tmp_path / "two")
+    convert_job(wanted, tmp_path / "two")
     done.set()
     remover.join()
     assert len(removed) > 1
     assert sum(removed) > 0
-    assert is_whole()
-    assert content(tmp_path / "one") == content(tmp_path / "two")
+    assert store_is_sound()
+    assert tree(tmp_path / "one", *RUN_FACTS) == tree(tmp_path / "two", *RUN_FACTS)
 
 
 def test_a_bucket_gives_the_same_as_a_folder(bucket: TinyS3, log: Path, tmp_path: Path) -> None:
-    make(order("bucket", tmp_path), tmp_path / "one")
+    convert_job(job("bucket", tmp_path), tmp_path / "one")
     every = ran(log)
     assert set(the_version().artifacts()) == {entry.name for entry in home.store().artifacts()}
     for path in (tmp_path / "home" / "copies").rglob("*"):
         if path.is_file():
             path.unlink()
-    make(order("bucket", tmp_path), tmp_path / "two")
+    convert_job(job("bucket", tmp_path), tmp_path / "two")
     assert ran(log) == []
-    assert content(tmp_path / "one") == content(tmp_path / "two")
+    assert tree(tmp_path / "one", *RUN_FACTS) == tree(tmp_path / "two", *RUN_FACTS)
     os.environ.pop("DG4D_STORE")
-    make(order("bucket", tmp_path), tmp_path / "three")
+    convert_job(job("bucket", tmp_path), tmp_path / "three")
     again = ran(log)
     assert again and set(again) <= set(every)
-    assert content(tmp_path / "one") == content(tmp_path / "three")
+    assert tree(tmp_path / "one", *RUN_FACTS) == tree(tmp_path / "three", *RUN_FACTS)
 
 
 def test_a_bucket_that_goes_away_for_a_while_delays_a_flow_and_no_more(
     bucket: TinyS3, log: Path, tmp_path: Path
 ) -> None:
-    wanted = order("away fit_motion=sleep-once:0.5", tmp_path)
+    wanted = job("away fit_motion=sleep-once:0.5", tmp_path)
     absence = threading.Thread(target=_absent, args=(bucket, log, "fit_motion", 1.5))
     absence.start()
-    make(wanted, tmp_path / "out")
+    convert_job(wanted, tmp_path / "out")
     absence.join()
     done = ran(log)
     assert len(set(done)) == len(done)  # the result was there and waited
-    assert is_whole()
+    assert store_is_sound()
 
 
 def test_a_step_that_lost_patience_with_the_bucket_is_tried_again(
@@ -209,34 +184,34 @@ def test_a_step_that_lost_patience_with_the_bucket_is_tried_again(
 ) -> None:
     monkeypatch.setattr("steps.store.opening.PATIENCE_S", 0.1)
     retry_after(3.0, monkeypatch)
-    wanted = order("patience fit_motion=sleep-once:0.3", tmp_path)
+    wanted = job("patience fit_motion=sleep-once:0.3", tmp_path)
     absence = threading.Thread(target=_absent, args=(bucket, log, "fit_motion", 2.0))
     absence.start()
-    make(wanted, tmp_path / "out")
+    convert_job(wanted, tmp_path / "out")
     absence.join()
     assert sorted(ran(log)).count("fit_motion") == 2
-    assert is_whole()
+    assert store_is_sound()
 
 
 def test_a_bucket_that_stays_away_is_a_clear_error_and_the_next_run_goes_on(
     bucket: TinyS3, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("steps.store.opening.PATIENCE_S", 0.1)
-    wanted = order("stays-away fit_motion=sleep-once:0.3", tmp_path)
+    wanted = job("stays-away fit_motion=sleep-once:0.3", tmp_path)
     absence = threading.Thread(target=_absent, args=(bucket, log, "fit_motion", 0))
     absence.start()
     with pytest.raises(StepUnreachable, match="does not answer"):
-        make(wanted, tmp_path / "out")
+        convert_job(wanted, tmp_path / "out")
     absence.join()
     assert not (tmp_path / "out").exists()
     ran(log)
     bucket.start()
-    make(wanted, tmp_path / "out")
+    convert_job(wanted, tmp_path / "out")
     assert ran(log)[:2] == ["fit_motion", "plan_mesh"]
 
 
 def _absent(bucket: TinyS3, log: Path, step: str, seconds: float) -> None:
-    """Stop the server when a step begins; start it again after so many seconds, if any."""
+    """Stop the server when a step starts; restart it after some seconds, if given."""
     while not log.exists() or step not in log.read_text():
         time.sleep(0.02)
     bucket.stop()

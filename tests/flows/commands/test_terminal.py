@@ -10,11 +10,11 @@ from flows.commands.terminal import (
     batch_shown,
     console,
     numbers,
+    print_package,
+    print_rows,
     steps_shown,
-    tell_rows,
-    tell_where,
 )
-from flows.engine.events import StepEvent, tell
+from flows.engine.events import StepEvent, emit
 
 EVENT = StepEvent("newt", "fit_gaussians", "progress", done=114, total=250, values={"loss": 9.437, "reference": 12.57})
 
@@ -44,13 +44,13 @@ def test_what_the_library_has_to_say_is_shown():
     for interactive in (True, False):
         screen = io.StringIO()
         with steps_shown(Console(file=screen, width=100, force_terminal=interactive, color_system=None)):
-            tell(note)
+            emit(note)
         assert "compiling kernels" in screen.getvalue()
 
 
 def test_rows_stand_in_columns_and_words_in_brackets_stay():
     screen = io.StringIO()
-    tell_rows(Console(file=screen, width=200), [("a", "whole", ""), ("asset.glb", "altered", "[why]")])
+    print_rows(Console(file=screen, width=200), [("a", "whole", ""), ("asset.glb", "altered", "[why]")])
     assert screen.getvalue() == "a          whole\nasset.glb  altered  [why]\n"
 
 
@@ -93,7 +93,7 @@ def test_names_and_messages_are_shown_letter_by_letter(capsys: pytest.CaptureFix
     assert SHOWN in screen.getvalue()
     terminal.print(table)
     assert screen.getvalue().count(SHOWN) >= 3
-    tell_where(terminal, Path(NASTY), {"[a] name that is as long as that of its folder": 1})
+    print_package(terminal, Path(NASTY), {"[a] name that is as long as that of its folder": 1})
     assert screen.getvalue().count(SHOWN) >= 4 and "[a] name" in screen.getvalue()
     assert "\x07" not in screen.getvalue() and "\x1b[31m" not in screen.getvalue()
 
@@ -111,8 +111,8 @@ REMARK = StepEvent("newt", "prepare_subject", "remark", text="This is a guess. S
 def test_a_remark_stays_on_the_screen_in_one_piece(interactive: bool):
     screen = io.StringIO()
     with steps_shown(narrow(screen, interactive)):
-        tell(REMARK)
-        tell(StepEvent("newt", "prepare_subject", "finished", seconds=1.0))
+        emit(REMARK)
+        emit(StepEvent("newt", "prepare_subject", "finished", seconds=1.0))
     assert "prepare_subject: This is a guess. Source, matte and cut-out: /a/b.png\n" in screen.getvalue()
 
 
@@ -120,6 +120,6 @@ def test_a_remark_stays_on_the_screen_in_one_piece(interactive: bool):
 def test_a_batch_shows_remarks_with_their_item(interactive: bool):
     screen = io.StringIO()
     with batch_shown(narrow(screen, interactive), ["newt"]) as table:
-        tell(REMARK)
+        emit(REMARK)
     assert f"newt: prepare_subject: {REMARK.text}\n" in screen.getvalue()
     assert table.status["newt"] == "waiting"

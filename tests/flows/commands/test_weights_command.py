@@ -87,7 +87,7 @@ def test_check_reads_every_file_again(home: Path) -> None:
     file = pulled(home)
     good = dg4d("weights", "check", "lgm")
     assert good.exit_code == 0, good.output
-    assert "lgm: whole, 1 file," in good.stdout
+    assert "lgm: intact, 1 file," in good.stdout
     times = file.stat().st_atime_ns, file.stat().st_mtime_ns
     file.write_bytes(b"tensorz" * 1000)
     os.utime(file, ns=times)  # as a disk that forgets does
@@ -114,9 +114,9 @@ def test_weights_that_were_copied_are_compared_with_what_was_published(
     assert f"lgm: {LGM} differs from the published file at revision 1c28a2fd3b" in other.stdout
     told = replace(KNOWN["lgm"], published={LGM: hashlib.sha256(b"tensors").hexdigest(), "more": "0" * 64})
     monkeypatch.setitem(KNOWN, "lgm", told)
-    assert "lgm: complete; it was not pulled by this command: 1 of its files is as published" in check()
+    assert "lgm: complete, but not pulled by this command: 1 file as published" in check()
     monkeypatch.setitem(KNOWN, "lgm", replace(told, published={}))
-    assert "there is nothing to compare it with" in check()
+    assert "there are no published digests to compare with" in check()
 
 
 def check() -> str:

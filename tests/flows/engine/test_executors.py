@@ -10,7 +10,7 @@ import pytest
 import stand_in_engine
 
 from flows.engine.containers import container
-from flows.engine.executors import Execute, chosen, in_container, in_process, in_subprocess
+from flows.engine.executors import Execute, configured_executor, in_container, in_process, in_subprocess
 from flows.step_errors import (
     StepBadInput,
     StepCrashed,
@@ -50,14 +50,14 @@ def ask(place: Path, words: str) -> tuple[StepSpec, StepRequest]:
     )
 
 
-def ignore(done: int, total: int, values: dict[str, float]) -> None:
+def ignore(*_: object) -> None:
     pass
 
 
 @pytest.mark.parametrize("execute", OUTSIDE)
 def test_a_process_or_container_gives_the_same_digests_as_this_process(place: Path, execute: Execute) -> None:
     spec, request = ask(place, "hello moving")
-    here, there = in_process(spec, request, ignore), execute(spec, request, ignore)
+    here, there = in_process(spec, request, ignore, ignore), execute(spec, request, ignore, ignore)
     assert here.outputs == there.outputs
     assert here.provenance.digest() == there.provenance.digest()
 
@@ -70,7 +70,7 @@ def test_code_in_the_current_folder_is_not_run(place: Path, monkeypatch: pytest.
     monkeypatch.chdir(foreign)
     monkeypatch.setenv("DG4D_CODE_VERSION", "foreign folder")  # another environment, so another process of steps
     spec, request = ask(place, "hello")
-    assert in_subprocess(spec, request, ignore).outputs
+    assert in_subprocess(spec, request, ignore, ignore).outputs
     assert not (place / "run").exists()
 
 
@@ -95,9 +95,9 @@ def test_what_the_library_logs_is_handed_on(place: Path, execute: Execute) -> No
 def test_all_executors_raise_the_same_error(place: Path, word: str, error: type[StepError], execute: Execute) -> None:
     spec, request = ask(place, f"prepare_subject={word}")
     with pytest.raises(error) as here:
-        in_process(spec, request, ignore)
+        in_process(spec, request, ignore, ignore)
     with pytest.raises(error) as there:
-        execute(spec, request, ignore)
+        execute(spec, request, ignore, ignore)
     assert here.value.message == there.value.message
     assert here.value.pictures == there.value.pictures
     assert bool(here.value.pictures) == (error is StepDiverged)
@@ -106,7 +106,7 @@ def test_all_executors_raise_the_same_error(place: Path, word: str, error: type[
 @pytest.mark.parametrize("execute", OUTSIDE)
 def test_a_step_that_is_killed_from_outside_ran_out_of_memory(place: Path, execute: Execute) -> None:
     with pytest.raises(StepOutOfMemory, match="memory"):
-        execute(*ask(place, "prepare_subject=die"), ignore)
+        execute(*ask(place, "prepare_subject=die"), ignore, ignore)
 
 
 @pytest.mark.parametrize("execute", OUTSIDE)
@@ -114,7 +114,7 @@ def test_a_step_that_takes_too_long_is_stopped(place: Path, execute: Execute) ->
     spec, request = ask(place, "prepare_subject=sleep:60")
     start = time.monotonic()
     with pytest.raises(StepTimedOut, match=r"no result after 1\.5 s"):
-        execute(spec.model_copy(update={"timeout_s": 1.5}), request, ignore)
+        execute(spec.model_copy(update={"timeout_s": 1.5}), request, ignore, ignore)
     assert time.monotonic() - start < 20
     assert _steps_of(place) == []
     assert list((place / "home" / "scratch").iterdir()) == []
@@ -131,7 +131,7 @@ def test_a_step_is_killed_when_the_command_is(place: Path, execute: Execute) -> 
     while child in _processes() and time.monotonic() < deadline:
         time.sleep(0.02)
     assert child not in _processes()
-    in_subprocess(*ask(place, "fine"), ignore)  # the next command clears up
+    in_subprocess(*ask(place, "fine"), ignore, ignore)  # the next command clears up
     assert list((place / "home" / "scratch").iterdir()) == []
 
 
@@ -156,7 +156,7 @@ def test_a_container_sees_its_own_files_and_no_network_and_no_secret(
     for name in ("AWS_SECRET_ACCESS_KEY", "HF_TOKEN", "DG4D_SIGNING_KEY"):
         monkeypatch.setenv(name, "a secret")
     monkeypatch.setenv("DG4D_MEMORY", "2g")
-    in_container(*ask(place, "hello"), ignore)
+    in_container(*ask(place, "hello"), ignore, ignore)
     (words,) = (words for words in stand_in_engine.asked(place) if words[0] == "run")
     home = place / "home"
     folders = [Path(word.split("target=")[1]) for word in words if word.startswith("type=bind")]
@@ -179,26 +179,26 @@ def test_the_keys_of_a_bucket_are_handed_over_by_name_only(
 
 
 def test_the_record_names_the_image(place: Path) -> None:
-    done = in_container(*ask(place, "hello"), ignore)
+    done = in_container(*ask(place, "hello"), ignore, ignore)
     assert done.provenance.machine["image"] == f"dg4d/cpu@sha256:{stand_in_engine.CONTENT}"
 
 
 def test_an_image_that_is_not_here_is_named(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DG4D_IMAGE_CPU", "registry.example/other:1")
     with pytest.raises(StepMissing, match=r"registry\.example/other:1.*containers\.sh"):
-        in_container(*ask(place, "hello"), ignore)
+        in_container(*ask(place, "hello"), ignore, ignore)
 
 
 def test_an_engine_that_is_not_here_is_refused(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DG4D_ENGINE", "/nowhere/podman")
     with pytest.raises(StepMissing, match="docker or podman"):
-        in_container(*ask(place, "hello"), ignore)
+        in_container(*ask(place, "hello"), ignore, ignore)
 
 
 def test_an_executor_that_does_not_exist_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DG4D_EXECUTOR", "rocket")
     with pytest.raises(StepMissing, match="subprocess, container, in_process"):
-        chosen()
+        configured_executor()
 
 
 def _processes() -> list[int]:
@@ -213,7 +213,7 @@ def _command(place: Path, execute: Execute, words: str, *before: str) -> "subpro
         from flows.engine.executors import {execute.__name__}
         from steps.contract import StepRequest
         request = StepRequest.model_validate_json({request.model_dump_json()!r})
-        {execute.__name__}(STEPS[{spec.name!r}], request, lambda *_: None)
+        {execute.__name__}(STEPS[{spec.name!r}], request, lambda *_: None, lambda _: None)
     """
     return subprocess.Popen([*before, sys.executable, "-c", textwrap.dedent(program)])
 

@@ -1,4 +1,4 @@
-"""What goes wrong for real, with a real server and steps that do next to nothing: whatever it is, work goes on."""
+"""Fault injection with a real server and fake steps: killed processes, full disks, lost databases."""
 
 import json
 import os
@@ -12,6 +12,7 @@ from pathlib import Path
 
 import fake_steps
 import pytest
+from conversions import EVERY_STEP, RUN_FACTS, job, ran, store_is_sound, tree
 from fake_steps import picture
 from postgresql import server_on_postgresql
 from prefect.client.orchestration import get_client
@@ -23,36 +24,28 @@ from dg4d_lib.errors import BadInput
 from flows import home
 from flows.catalog_request import CatalogRequest
 from flows.commands.batch import batch
-from flows.convert import make
+from flows.convert import convert_job
 from flows.engine import leases
 from flows.engine.collecting import collect
 from flows.engine.orphans import settle_orphans
 from flows.engine.step_tasks import RETRIES
-from flows.engine.versions import faults, versions
-from flows.inputs.orders import Order, Wish
-from flows.packages.publish import whole
+from flows.packages.publish import load_verified
 from flows.serving.server import Server, answers
 from flows.step_errors import StepBadInput, StepOutOfMemory, StepTimedOut
-from steps.profiles import PREVIEW
 from steps.store.artifact_store import ArtifactStore
 
-EVERY_STEP = [
-    "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "plan_mesh", "extract_mesh", "pack_asset",
-    "check_asset",
-]  # fmt: skip
-STAGES = [EVERY_STEP[:1], EVERY_STEP[1:3], *([step] for step in EVERY_STEP[3:])]  # of steps that run side by side
-RUN_FACTS = ("report.json", "report.html", "provenance.json", "ro-crate-metadata.json")  # these say when and how long
+STAGES = [EVERY_STEP[:1], EVERY_STEP[1:3], *([step] for step in EVERY_STEP[3:])]  # of parallel steps
 DAY_S = 86400.0
-AWAY_S = 3.0  # a database that starts anew
+AWAY_S = 3.0  # restart of a database
 
 
 @pytest.fixture
 def log(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where fake steps say that they ran, in this process and in those that it starts, under the server's home."""
+    """Log of fake steps in this process and its children; they use the home folder of the server."""
     monkeypatch.setenv("DG4D_HOME", str(server.folder.parent))
     monkeypatch.setenv("DG4D_STORE", str(tmp_path / "store"))
     monkeypatch.setenv("DG4D_CATALOG", "fake_steps:STEPS")
-    monkeypatch.setenv("DG4D_CODE_VERSION", tmp_path.name)  # nobody has done it before
+    monkeypatch.setenv("DG4D_CODE_VERSION", tmp_path.name)  # no cached results
     monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
     monkeypatch.setenv("FAKE_LOG", str(tmp_path / "ran"))
@@ -62,7 +55,7 @@ def log(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
-    """A disk of 256 KiB."""
+    """Folder on a disk of 256 KiB."""
     place = tmp_path / "disk"
     place.mkdir()
     if _mount("-t", "tmpfs", "-o", "size=256k", "tmpfs", place) != 0:
@@ -71,24 +64,8 @@ def disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", str(place)], check=True)
 
 
-def ran(log: Path) -> list[str]:
-    steps = log.read_text().split() if log.exists() else []
-    log.unlink(missing_ok=True)
-    return steps
-
-
-def order(words: str, folder: Path) -> Order:
-    (folder / "fake.png").write_text(picture(words))
-    return Wish(item="fake", picture=folder / "fake.png", settings=PREVIEW).order(home.store())
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name not in RUN_FACTS)
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
-
-
 def during(step: str, log: Path, do: Callable[[], None]) -> threading.Thread:
-    """Do something as soon as a step runs."""
+    """Call a function in a thread as soon as a step runs."""
 
     def wait_and_do() -> None:
         wait_until(lambda: log.exists() and step in log.read_text())
@@ -97,11 +74,6 @@ def during(step: str, log: Path, do: Callable[[], None]) -> threading.Thread:
     thread = threading.Thread(target=wait_and_do)
     thread.start()
     return thread
-
-
-def is_whole() -> bool:
-    store = home.store()
-    return not faults(store, versions(store), {entry.name: entry.size_bytes for entry in store.artifacts()})
 
 
 def test_a_command_killed_in_every_stage_ends_with_the_bytes_of_an_undisturbed_one(
@@ -121,13 +93,13 @@ def test_a_command_killed_in_every_stage_ends_with_the_bytes_of_an_undisturbed_o
         assert not (tmp_path / "out").exists()
         before = stage
     assert settle_orphans() == 1  # every command settles the one before
-    make(order(words, tmp_path), tmp_path / "out")
+    convert_job(job(words, tmp_path), tmp_path / "out")
     assert ran(log) == EVERY_STEP[-1:]
     monkeypatch.delenv("DG4D_STORE")
     monkeypatch.setenv("DG4D_HOME", str(tmp_path / "fresh"))  # where nothing is done yet
-    make(order(words, tmp_path), tmp_path / "other")
+    convert_job(job(words, tmp_path), tmp_path / "other")
     assert sorted(ran(log)) == sorted(EVERY_STEP)
-    assert content(tmp_path / "out") == content(tmp_path / "other")
+    assert tree(tmp_path / "out", *RUN_FACTS) == tree(tmp_path / "other", *RUN_FACTS)
 
 
 def test_two_batches_of_the_same_folder_at_once_do_the_work_once(log: Path, tmp_path: Path) -> None:
@@ -140,11 +112,11 @@ def test_two_batches_of_the_same_folder_at_once_do_the_work_once(log: Path, tmp_
         assert command.returncode == 0, trouble
     assert sorted(ran(log)) == sorted(EVERY_STEP * 2)
     for name in ("a", "b"):
-        whole(tmp_path / "out" / name)
+        load_verified(tmp_path / "out" / name)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert sorted(row["item"] for row in summary["items"]) == ["a", "b"]
     assert [path.name for path in (tmp_path / "out").iterdir() if path.name.startswith(".")] == []
-    assert is_whole()
+    assert store_is_sound()
 
 
 def test_a_server_killed_during_a_run_is_started_again_and_the_run_goes_on(
@@ -161,14 +133,14 @@ def test_a_server_killed_during_a_run_is_started_again_and_the_run_goes_on(
         wait_until(lambda: not server.is_guarded())
 
     killer = during("fit_motion", log, kill)
-    make(order("server fit_motion=sleep-once:2", tmp_path), tmp_path / "out")
+    convert_job(job("server fit_motion=sleep-once:2", tmp_path), tmp_path / "out")
     killer.join()
     assert sorted(ran(log)) == sorted(EVERY_STEP)
     assert server.address() == address and answers(address, timeout_s=10)
     with get_client(sync_client=True) as client:
         (newest,) = client.read_flow_runs(limit=1, sort="START_TIME_DESC")  # type: ignore[arg-type]
     assert newest.name == "fake" and newest.state is not None and newest.state.is_completed()
-    whole(tmp_path / "out")
+    load_verified(tmp_path / "out")
 
 
 def test_a_database_that_is_locked_for_a_while_delays_a_run_and_no_more(
@@ -187,11 +159,11 @@ def test_a_database_that_is_locked_for_a_while_delays_a_run_and_no_more(
 
     holder = during("prepare_subject", log, hold)
     began = time.monotonic()
-    make(order("locked prepare_subject=sleep-once:0.5", tmp_path), tmp_path / "out")
+    convert_job(job("locked prepare_subject=sleep-once:0.5", tmp_path), tmp_path / "out")
     holder.join()
     assert time.monotonic() - began > locked_s
     assert sorted(ran(log)) == sorted(EVERY_STEP)
-    whole(tmp_path / "out")
+    load_verified(tmp_path / "out")
 
 
 def test_a_database_that_crashes_during_a_batch_and_comes_back_loses_and_doubles_nothing(
@@ -222,25 +194,25 @@ def test_a_database_that_crashes_during_a_batch_and_comes_back_loses_and_doubles
     assert sorted(run.name for run in runs if run.name in names) == names
     assert {run.state.name for run in runs if run.state is not None} == {"Completed"}
     for name in names:
-        whole(tmp_path / "out" / name)
-    assert is_whole()
+        load_verified(tmp_path / "out" / name)
+    assert store_is_sound()
 
 
 def test_a_full_disk_is_a_clear_message_and_with_more_room_the_run_goes_on(
     log: Path, disk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DG4D_STORE", str(disk / "store"))
-    wanted = order("x" * 60_000, tmp_path)  # every artifact is as large
+    wanted = job("x" * 60_000, tmp_path)  # every artifact is as large
     with pytest.raises(StepBadInput, match=r"disk.* full"):
-        make(wanted, tmp_path / "out")
+        convert_job(wanted, tmp_path / "out")
     done = ran(log)
     assert 1 <= len(done) < len(EVERY_STEP)
     assert not (tmp_path / "out").exists()
     assert list((disk / "store" / "incoming").glob("*")) == []
     assert _mount("-o", "remount,size=64m", disk) == 0
-    make(wanted, tmp_path / "out")
+    convert_job(wanted, tmp_path / "out")
     assert {*done, *ran(log)} == set(EVERY_STEP)
-    assert is_whole()
+    assert store_is_sound()
 
 
 def test_a_step_whose_memory_is_limited_is_tried_again_and_then_says_so(
@@ -248,7 +220,7 @@ def test_a_step_whose_memory_is_limited_is_tried_again_and_then_says_so(
 ) -> None:
     monkeypatch.setenv("DG4D_EXECUTOR", "subprocess")
     with pytest.raises(StepOutOfMemory, match="memory ran out: end other programs, or choose smaller settings"):
-        make(order("prepare_subject=hoard", tmp_path), tmp_path / "out")
+        convert_job(job("prepare_subject=hoard", tmp_path), tmp_path / "out")
     assert ran(log) == EVERY_STEP[:1] * (1 + RETRIES)
 
 
@@ -259,45 +231,45 @@ def test_a_step_that_hangs_is_killed_and_the_next_run_begins_with_it(
     patient = fake_steps.STEPS["drive_video"]
     with monkeypatch.context() as hasty:
         hasty.setitem(fake_steps.STEPS, "drive_video", patient.model_copy(update={"timeout_s": 8.0}))
-        wanted = order("drive_video=sleep-once:300", tmp_path)
+        wanted = job("drive_video=sleep-once:300", tmp_path)
         began = time.monotonic()
         with pytest.raises(StepTimedOut, match="no result after 8 s, so it was stopped"):
-            make(wanted, tmp_path / "out")
+            convert_job(wanted, tmp_path / "out")
     assert time.monotonic() - began < 200
     assert ran(log).count("drive_video") == 1  # the same again would hang again
     monkeypatch.setenv("DG4D_EXECUTOR", "in_process")
-    make(wanted, tmp_path / "out")
+    convert_job(wanted, tmp_path / "out")
     assert "prepare_subject" not in (again := ran(log)) and "drive_video" in again
 
 
 @pytest.mark.parametrize("skew_s", [-400 * DAY_S, 400 * DAY_S])
 def test_results_are_used_whatever_the_clock_said_when_they_were_made(log: Path, tmp_path: Path, skew_s: float) -> None:
-    make(order("skew", tmp_path), tmp_path / "one")
+    convert_job(job("skew", tmp_path), tmp_path / "one")
     assert sorted(ran(log)) == sorted(EVERY_STEP)
     for folder in (home.store().root, home.records()):
         for path in folder.rglob("*"):
             os.utime(path, times=(time.time() + skew_s,) * 2)
-    _, cached = make(order("skew", tmp_path), tmp_path / "two")
+    _, cached = convert_job(job("skew", tmp_path), tmp_path / "two")
     assert cached and ran(log) == []
-    assert content(tmp_path / "one") == content(tmp_path / "two")
+    assert tree(tmp_path / "one", *RUN_FACTS) == tree(tmp_path / "two", *RUN_FACTS)
 
 
 @pytest.mark.parametrize("skew_s", [-400 * DAY_S, 400 * DAY_S])
 def test_a_clock_that_jumps_during_a_run_makes_nothing_needed_go(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, skew_s: float
 ) -> None:
-    make(order("jump", tmp_path), tmp_path / "one")
+    convert_job(job("jump", tmp_path), tmp_path / "one")
     store, true_time = home.store(), time.time
     unwanted = store.put_bytes(b"of nobody", "text/plain")
     with leases.running(store, "fake"):
         needed = store.put_bytes(b"made by this run", "text/plain")
         monkeypatch.setattr(time, "time", lambda: true_time() + skew_s)
         collect(store, home.records())
-        assert store.has(needed) and is_whole()
+        assert store.has(needed) and store_is_sound()
         with leases.collecting(store), pytest.raises(BadInput, match="at the moment"), leases.collecting(store):
             pass
     collect(store, home.records())
-    assert is_whole()
+    assert store_is_sound()
     assert store.has(unwanted) == (skew_s < 0)  # what is from the future is not old
 
 

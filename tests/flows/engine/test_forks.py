@@ -140,7 +140,9 @@ def test_a_step_goes_on_when_the_environment_changes_and_its_server_ends_with_it
     spec = fake_steps.STEPS["prepare_subject"]
     server = forks._server().process
     with ThreadPoolExecutor(1) as side:
-        step = side.submit(in_subprocess, spec, _request(place, "prepare_subject=sleep:1"), lambda *_: None)
+        step = side.submit(
+            in_subprocess, spec, _request(place, "prepare_subject=sleep:1"), lambda *_: None, lambda _: None
+        )
         wait_until((place / "log").exists)
         monkeypatch.setenv("DG4D_STORE", str(place / "elsewhere"))
         assert forks._server().process is not server
@@ -154,7 +156,7 @@ def test_a_server_that_was_killed_is_followed_by_another(place: Path) -> None:
     spec = fake_steps.STEPS["prepare_subject"]
 
     def run(words: str) -> None:
-        in_subprocess(spec, _request(place, words), lambda *_: None)
+        in_subprocess(spec, _request(place, words), lambda *_: None, lambda _: None)
 
     run("fine")
     forks._server().process.kill()

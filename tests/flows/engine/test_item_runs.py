@@ -17,9 +17,17 @@ from prefect.states import Cancelled, Completed, Crashed, Failed, Pending, Runni
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows import home
 from flows.engine import item_runs, resources
-from flows.engine.item_runs import ORDER, ItemDeployment, ItemFailed, code_version, failure, item_deployment, read_order
-from flows.inputs.orders import Order, Wish
-from flows.packages.delivery import Outcome, deliver, forget_shared, pack, read_outcome, write_outcome
+from flows.engine.item_runs import (
+    JOB_MEDIA_TYPE,
+    ItemDeployment,
+    ItemFailed,
+    code_version,
+    failure,
+    item_deployment,
+    read_job,
+)
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
+from flows.packages.delivery import Outcome, pack_package, read_outcome, remove_expired, unpack_package, write_outcome
 from flows.serving import registering
 from flows.serving.pools import read_pools
 from flows.serving.server import Server
@@ -43,30 +51,30 @@ def client(server: Server) -> Iterator[SyncPrefectClient]:
 
 
 @pytest.fixture
-def order(client: SyncPrefectClient, tmp_path: Path) -> Order:
+def job(client: SyncPrefectClient, tmp_path: Path) -> ConversionJob:
     (tmp_path / "fox.png").write_text(picture(f"item {tmp_path}"))
-    return Wish(item="fox", picture=tmp_path / "fox.png", settings=PREVIEW).order(home.store())
+    return ConversionRequest(item="fox", picture=tmp_path / "fox.png", settings=PREVIEW).to_job(home.store())
 
 
 @pytest.fixture
-def reference(order: Order) -> ArtifactRef:
-    return home.store().put_bytes(order.model_dump_json().encode(), ORDER)
+def reference(job: ConversionJob) -> ArtifactRef:
+    return home.store().put_bytes(job.model_dump_json().encode(), JOB_MEDIA_TYPE)
 
 
 @pytest.fixture
 def package(tmp_path: Path) -> ArtifactRef:
     (tmp_path / "package").mkdir()
     (tmp_path / "package" / "asset.glb").write_bytes(b"glb")
-    return pack(tmp_path / "package", home.store())
+    return pack_package(tmp_path / "package", home.store())
 
 
 def test_an_item_is_begun_once_and_again_only_after_it_failed(
-    client: SyncPrefectClient, order: Order, reference: ArtifactRef, package: ArtifactRef
+    client: SyncPrefectClient, job: ConversionJob, reference: ArtifactRef, package: ArtifactRef
 ) -> None:
     fleet, store = item_deployment("fleet", 4), home.store()
 
     def begin() -> FlowRun:
-        return fleet._begin(client, order, reference, store)
+        return fleet._begin(client, job, reference, store)
 
     def end(run: FlowRun, state: State[Any]) -> None:
         client.set_flow_run_state(run.id, state, force=True)
@@ -76,11 +84,12 @@ def test_an_item_is_begun_once_and_again_only_after_it_failed(
     for state in (Pending(), Running()):
         end(first, state)
         assert begin().id == first.id
-    renamed = order.model_copy(update={"item": "another name of it"})
+    renamed = job.model_copy(update={"item": "another name of it"})
     assert (
-        fleet._begin(client, renamed, store.put_bytes(renamed.model_dump_json().encode(), ORDER), store).id != first.id
+        fleet._begin(client, renamed, store.put_bytes(renamed.model_dump_json().encode(), JOB_MEDIA_TYPE), store).id
+        != first.id
     )
-    assert item_deployment("process-cpu", 4)._begin(client, order, reference, store).id != first.id
+    assert item_deployment("process-cpu", 4)._begin(client, job, reference, store).id != first.id
     end(first, Completed())
     write_outcome(store, str(first.id), Outcome(package=package))
     assert begin().id == first.id  # its package is there
@@ -95,10 +104,10 @@ def test_an_item_is_begun_once_and_again_only_after_it_failed(
 
 
 def test_a_crashed_run_is_waited_for_until_the_server_would_have_begun_it_again(
-    client: SyncPrefectClient, order: Order, reference: ArtifactRef, monkeypatch: pytest.MonkeyPatch
+    client: SyncPrefectClient, job: ConversionJob, reference: ArtifactRef, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fleet = ItemDeployment(item_deployment("fleet", 1).name, "fleet", poll_s=0.02)
-    run = fleet._begin(client, order, reference, home.store())
+    run = fleet._begin(client, job, reference, home.store())
     client.set_flow_run_state(run.id, Running(), force=True)
     client.set_flow_run_state(run.id, Crashed(), force=True)
     ended: list[FlowRun] = []
@@ -118,10 +127,10 @@ def test_a_crashed_run_is_waited_for_until_the_server_would_have_begun_it_again(
 
 
 def test_a_run_whose_worker_died_before_it_began_is_scheduled_again(
-    client: SyncPrefectClient, order: Order, reference: ArtifactRef, monkeypatch: pytest.MonkeyPatch
+    client: SyncPrefectClient, job: ConversionJob, reference: ArtifactRef, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fleet = item_deployment("fleet", 1)
-    run = fleet._begin(client, order, reference, home.store())
+    run = fleet._begin(client, job, reference, home.store())
     client.set_flow_run_state(run.id, Pending(), force=True)
     client.send_worker_heartbeat("fleet", "alive", 30.0)
 
@@ -135,15 +144,15 @@ def test_a_run_whose_worker_died_before_it_began_is_scheduled_again(
 
 
 def test_a_user_who_stops_takes_back_what_no_worker_has_begun(
-    client: SyncPrefectClient, order: Order, reference: ArtifactRef, tmp_path: Path
+    client: SyncPrefectClient, job: ConversionJob, reference: ArtifactRef, tmp_path: Path
 ) -> None:
     fleet = item_deployment("fleet", 1)
-    run = fleet._begin(client, order, reference, home.store())
+    run = fleet._begin(client, job, reference, home.store())
     resources.stopping.set()
     with pytest.raises(resources.Stopped):
         fleet._wait(client, run, "fox")
     assert client.read_flow_run(run.id).state_name == "Cancelled"
-    again = fleet._begin(client, order, reference, home.store())
+    again = fleet._begin(client, job, reference, home.store())
     client.set_flow_run_state(again.id, Running(), force=True)
     with pytest.raises(resources.Stopped):
         fleet._wait(client, client.read_flow_run(again.id), "fox")
@@ -153,19 +162,19 @@ def test_a_user_who_stops_takes_back_what_no_worker_has_begun(
 def test_a_pool_of_items_is_named_unless_there_is_only_one(client: SyncPrefectClient) -> None:
     assert item_deployment("fleet", 64) == ("item-to-4d/Item to 4D on a fleet", "fleet", 64 / item_runs.POLLS_PER_S)
     for pool in ("", "flet"):
-        with pytest.raises(BadInput, match="there are: fleet, process-cpu"):
+        with pytest.raises(BadInput, match="one of: fleet, process-cpu"):
             item_deployment(pool, 1)
 
 
 def test_a_worker_with_other_code_or_another_store_refuses_an_item(
-    order: Order, reference: ArtifactRef, tmp_path: Path
+    job: ConversionJob, reference: ArtifactRef, tmp_path: Path
 ) -> None:
     store = home.store()
-    assert read_order(reference, code_version(), store, "") == order
+    assert read_job(reference, code_version(), store, "") == job
     with pytest.raises(BackendUnavailable, match="another version of dg4d"):
-        read_order(reference, "sha256:" + "0" * 64, store, "")
+        read_job(reference, "sha256:" + "0" * 64, store, "")
     with pytest.raises(BackendUnavailable, match="s3://theirs: set"):
-        read_order(reference.model_copy(update={"digest": "sha256:" + "0" * 64}), code_version(), store, "s3://theirs")
+        read_job(reference.model_copy(update={"digest": "sha256:" + "0" * 64}), code_version(), store, "s3://theirs")
 
 
 @pytest.mark.parametrize(
@@ -184,19 +193,19 @@ def test_a_failure_is_the_same_here_and_elsewhere(error: Exception, kind: str, m
     assert failure(ItemFailed(travelled)) == outcome
 
 
-def test_a_package_travels_whole_or_not_at_all(order: Order, package: ArtifactRef, tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="no sound provenance"):
-        deliver(package, tmp_path / "out", home.store())
+def test_a_package_travels_whole_or_not_at_all(job: ConversionJob, package: ArtifactRef, tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="no valid provenance"):
+        unpack_package(package, tmp_path / "out", home.store())
     assert not (tmp_path / "out").exists()
-    assert pack(tmp_path / "package", home.store()) == package  # equal folders, equal bytes
+    assert pack_package(tmp_path / "package", home.store()) == package  # equal folders, equal bytes
 
 
-def test_what_travelled_a_day_ago_is_forgotten(order: Order, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_travelled_a_day_ago_is_forgotten(job: ConversionJob, monkeypatch: pytest.MonkeyPatch) -> None:
     store = home.store()
     write_outcome(store, "old", Outcome(kind="Crashed"))
-    forget_shared(store)
+    remove_expired(store)
     assert read_outcome(store, "old") is not None
     tomorrow = store.now() + timedelta(days=1, seconds=1).total_seconds()
     monkeypatch.setattr(type(store), "now", lambda self: tomorrow)
-    forget_shared(store)
+    remove_expired(store)
     assert read_outcome(store, "old") is None

@@ -13,7 +13,7 @@ from prefect.states import Running
 
 from flows.engine import orphans
 from flows.engine.orphans import LABEL, claim_run, process_identity, settle_orphans
-from flows.processes import place
+from flows.processes import host_id
 from flows.serving.server import Server
 
 Begin = Callable[[str], FlowRun]
@@ -60,8 +60,8 @@ def test_runs_of_dead_processes_of_this_machine_are_crashed_and_no_others(
         "mine": begin(process_identity()),
         "dead": begin(dead),
         "dead too": begin(dead),
-        "number used again": begin(f"{place()}:{os.getpid()}:1"),
-        "elsewhere": begin(dead.replace(place(), "another")),
+        "number used again": begin(f"{host_id()}:{os.getpid()}:1"),
+        "elsewhere": begin(dead.replace(host_id(), "another")),
         "nobody": begin(""),
         "strange": begin("no:identity"),
     }

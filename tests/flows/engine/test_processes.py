@@ -5,9 +5,9 @@ import sys
 
 import pytest
 
-from flows.processes import OWN_START, place, start_of
+from flows.processes import OWN_START, host_id, start_of
 
-HOSTNAME_TOO = "import socket; from flows.processes import place; print(socket.gethostname(), place())"
+HOSTNAME_TOO = "import socket; from flows.processes import host_id; print(socket.gethostname(), host_id())"
 
 
 def _said(*before: str) -> list[str]:
@@ -18,13 +18,13 @@ def _said(*before: str) -> list[str]:
 
 
 def test_a_process_on_this_machine_is_in_the_same_place() -> None:
-    assert _said()[1] == place()
+    assert _said()[1] == host_id()
 
 
 def test_a_container_with_the_name_of_its_host_is_another_place() -> None:
     name, elsewhere = _said("unshare", "--pid", "--fork")
     assert name == _said()[0]
-    assert elsewhere != place()
+    assert elsewhere != host_id()
 
 
 def test_the_start_of_a_process_is_known_as_long_as_it_lives() -> None:

@@ -9,10 +9,10 @@ from prefect import flow
 from records import record_of, result_with
 
 from flows import home
-from flows.convert import make
+from flows.convert import convert_job
 from flows.engine.records import record_key
 from flows.engine.shared_results import fetch_result, sharing_results
-from flows.inputs.orders import Order, Wish
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.packages.delivery import RESULTS
 from flows.serving.server import Server
 from steps.contract import StepRequest
@@ -40,12 +40,12 @@ def test_a_machine_takes_over_what_another_finished(
         monkeypatch.setenv("DG4D_HOME", str(tmp_path / machine))
         log.unlink(missing_ok=True)
         with sharing_results(home.store()) if shares else nullcontext():
-            make(order(), tmp_path / machine / "out")
+            convert_job(job(), tmp_path / machine / "out")
         return len(log.read_text().split()) if log.exists() else 0
 
-    def order() -> Order:
+    def job() -> ConversionJob:
         (tmp_path / "fox.png").write_text(picture(f"shared {shares}"))
-        return Wish(item="fox", picture=tmp_path / "fox.png", settings=PREVIEW).order(home.store())
+        return ConversionRequest(item="fox", picture=tmp_path / "fox.png", settings=PREVIEW).to_job(home.store())
 
     assert make_on("first") == STEPS
     assert make_on("second") == again
@@ -58,7 +58,10 @@ def test_a_conversion_within_another_flow_keeps_its_records_under_home(log: Path
 
     @flow(persist_result=False)
     def outer() -> None:
-        make(Wish(item="fox", picture=tmp_path / "fox.png", settings=PREVIEW).order(home.store()), tmp_path / "out")
+        convert_job(
+            ConversionRequest(item="fox", picture=tmp_path / "fox.png", settings=PREVIEW).to_job(home.store()),
+            tmp_path / "out",
+        )
 
     before = set(home.records().iterdir()) if home.records().exists() else set()
     outer()

@@ -48,7 +48,7 @@ def message_of(name: str) -> str:
     )
     request = StepRequest(step=name, version="1", inputs={}, settings={}, seed=0)
     with pytest.raises(StepCrashed) as caught:
-        in_subprocess(spec, request, lambda *_: None)
+        in_subprocess(spec, request, lambda *_: None, lambda _: None)
     return caught.value.message
 
 

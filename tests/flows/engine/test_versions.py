@@ -17,7 +17,7 @@ from dg4d_lib.errors import BadInput
 from flows.commands.store import store as command
 from flows.engine import leases
 from flows.engine.collecting import collect
-from flows.engine.versions import StepDone, Version, faults, versions
+from flows.engine.versions import Version, VersionStep, faults, versions
 from steps.contract import ArtifactRef
 from steps.store.artifact_store import ArtifactStore, object_name
 from steps.store.bucket import BucketStore
@@ -46,7 +46,9 @@ def version(store: ArtifactStore, item: str, words: str, finished: str = "2026-0
         profile="preview",
         seed=0,
         source=source,
-        steps=(StepDone(label="fit_motion", record=outputs["motion"], inputs={"x": source.digest}, outputs=outputs),),
+        steps=(
+            VersionStep(label="fit_motion", record=outputs["motion"], inputs={"x": source.digest}, outputs=outputs),
+        ),
     )
     store.drop([made.order])
     store.write(made.name, made.model_dump_json())
@@ -165,7 +167,7 @@ def test_a_lease_ends_with_its_process_however_that_ends(tmp_path: Path) -> None
 def test_one_removes_things_at_a_time_and_one_that_was_killed_is_in_nobodys_way(tmp_path: Path) -> None:
     store = ArtifactStore(tmp_path / "store")
     process = other_process(store, "collect")
-    with pytest.raises(BadInput, match="somebody else is removing"):
+    with pytest.raises(BadInput, match="another `dg4d store gc`"):
         collect(store, tmp_path / "results")
     killed(process)
     assert not leases.wait_for_collecting(store)
@@ -178,7 +180,7 @@ def test_a_lock_of_another_machine_is_believed_as_long_as_it_gives_signs_of_life
 ) -> None:
     lock = {"host": "elsewhere", "pid": 1, "start": "1", "token": "t"}
     store.write(leases.LOCK, json.dumps(lock))
-    with pytest.raises(BadInput, match="somebody else"):
+    with pytest.raises(BadInput, match="another `dg4d store gc`"):
         collect(store, tmp_path / "results")
     monkeypatch.setattr(leases, "LOCK_S", -1.0)
     collect(store, tmp_path / "results")
@@ -193,7 +195,7 @@ def test_a_version_that_is_recorded_while_things_are_removed_is_whole_or_not_the
     template = version(store, "cat", "one")
     store.remove([template.name])
 
-    class Order:  # as much of one as is asked
+    class ConversionJob:  # as much of one as is asked
         item, profile, seed, source, bank = "cat", "preview", 0, template.source, None
 
         def digest(self) -> str:
@@ -202,7 +204,7 @@ def test_a_version_that_is_recorded_while_things_are_removed_is_whole_or_not_the
     class Made:
         package, steps = template.package, []
 
-    order: Any = Order()
+    job: Any = ConversionJob()
     made: Any = Made()
     removing, recorded = threading.Event(), threading.Event()
     results: list[Any] = []
@@ -219,7 +221,7 @@ def test_a_version_that_is_recorded_while_things_are_removed_is_whole_or_not_the
 
     def keep() -> None:
         try:
-            results.append(keep_version(store, order, made))
+            results.append(keep_version(store, job, made))
         except Exception as error:
             results.append(error)
 
@@ -233,7 +235,7 @@ def test_a_version_that_is_recorded_while_things_are_removed_is_whole_or_not_the
     assert "package of cat was removed" in str(results[0])
     assert versions(store) == []
     store.put_bytes(b"package one", "a/b")
-    keep_version(store, order, made)
+    keep_version(store, job, made)
     assert [v.item for v in versions(store)] == ["cat"]
 
 
@@ -300,7 +302,7 @@ def test_the_check_names_what_is_damaged_or_missing_and_whose_it_is(run: Any) ->
     store = open_store()
     made = version(store, "cat", "one")
     orphan = store.put_bytes(b"orphan", "a/b")
-    assert run("verify").stdout == "4 artifacts of 1 versions are whole\n"
+    assert run("verify").stdout == "4 artifacts of 1 versions are intact\n"
     for ref in (made.package, orphan):
         path = store.root / object_name(ref.digest)
         path.chmod(0o644)

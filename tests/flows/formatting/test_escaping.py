@@ -5,7 +5,7 @@ import io
 
 import pytest
 
-from flows.formatting.escaping import cell, markdown, visible
+from flows.formatting.escaping import csv_cell, markdown, visible
 
 NASTY = (
     "![](http://tracker) | <img src=x onerror=alert(1)>\n# `a` *b* _c_ [d](e) ~~f~~ www.g.com h@i.com 1. -j \\ &amp;"
@@ -13,7 +13,7 @@ NASTY = (
 
 
 def test_a_terminal_gets_nothing_that_it_would_obey() -> None:
-    assert visible("a\x1b[31mb\rc\x07d\x9b2Je\u202ef\udce9\0") == r"a\x1b[31mb\x0dc\x07d\x9b2Je\u202ef\udce9\x00"
+    assert visible("a\x1b[31mb\rc\x07d\x9b2Je\u202ef\udce9\0") == r"a\x1b[31mb\rc\x07d\x9b2Je\u202ef\udce9\x00"
     assert visible("Tab\tund Zeile\nbleiben, 猫 🦎 é auch") == "Tab\tund Zeile\nbleiben, 猫 🦎 é auch"
     for code in (*range(32), 127, *range(128, 160), 0xD800, 0xDFFF):
         shown = visible(chr(code))
@@ -22,12 +22,12 @@ def test_a_terminal_gets_nothing_that_it_would_obey() -> None:
 
 @pytest.mark.parametrize("text", ["=cmd|calc!A1", "@SUM(1)", "+1", "-1", "\tx", "\r=1", "\uff1d1"])
 def test_a_formula_becomes_text(text: str) -> None:
-    assert cell(text) == f"'{text}"
+    assert csv_cell(text) == f"'{text}"
 
 
 @pytest.mark.parametrize("value", [-1, -1.5, 0, None, "", "a=b", "1", True])
 def test_what_is_no_formula_stays(value: object) -> None:
-    assert cell(value) is value
+    assert csv_cell(value) is value
 
 
 def test_markdown_has_no_letter_left_that_means_something() -> None:
@@ -51,6 +51,6 @@ def test_markdown_leaves_what_means_nothing_where_it_stands(text: str, shown: st
 
 def test_a_table_with_a_nasty_cell_has_the_cells_that_it_should_have() -> None:
     lines = io.StringIO()
-    csv.writer(lines).writerow([cell(NASTY), cell("=1"), cell(2.5)])
+    csv.writer(lines).writerow([csv_cell(NASTY), csv_cell("=1"), csv_cell(2.5)])
     (row,) = csv.reader(io.StringIO(lines.getvalue(), newline=""))
     assert row == [NASTY, "'=1", "2.5"]

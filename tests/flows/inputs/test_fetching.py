@@ -20,7 +20,7 @@ from fake_steps import PNG
 
 from dg4d_lib.errors import BadInput
 from flows.inputs import fetching, hosts
-from flows.inputs.fetching import at_hand
+from flows.inputs.fetching import local_copy
 
 
 class Site:
@@ -97,18 +97,18 @@ def at(site: Site, path: str = "/a%20b.png", host: str = "127.0.0.1") -> str:
 
 
 def refused(address: str, says: str) -> str:
-    with pytest.raises(BadInput, match=says) as caught, at_hand(address):
+    with pytest.raises(BadInput, match=says) as caught, local_copy(address):
         pass
     return str(caught.value)
 
 
 def test_a_path_stays_where_it_is(tmp_path: Path) -> None:
-    with at_hand(str(tmp_path / "a.png")) as path:
+    with local_copy(str(tmp_path / "a.png")) as path:
         assert path == tmp_path / "a.png"
 
 
 def test_a_file_of_a_web_server_is_here_under_its_name_for_a_while(site: Site) -> None:
-    with at_hand(at(site, "/a%20b.png?signature=1")) as path:
+    with local_copy(at(site, "/a%20b.png?signature=1")) as path:
         assert path.name == "a b.png" and path.read_bytes() == PNG
     assert not path.exists()
     assert [place for place, _ in site.asked] == ["/a%20b.png?signature=1"]
@@ -116,7 +116,7 @@ def test_a_file_of_a_web_server_is_here_under_its_name_for_a_while(site: Site) -
 
 def test_name_and_password_of_an_address_are_for_its_host_only(site: Site) -> None:
     site.leads["/first.png"] = at(site)
-    with at_hand(at(site, "/first.png", "user:pass%20word@127.0.0.1")):
+    with local_copy(at(site, "/first.png", "user:pass%20word@127.0.0.1")):
         pass
     sent = [headers.get("Authorization") for _, headers in site.asked]
     assert sent == ["Basic dXNlcjpwYXNzIHdvcmQ=", None]
@@ -130,7 +130,7 @@ def test_other_addresses_are_refused(address: str) -> None:
 
 @pytest.mark.parametrize("address", ["http://[::1/a.png", "http://host:port/a.png", "http://host:99999/a.png"])
 def test_what_is_no_address_is_refused(address: str) -> None:
-    refused(address, "this one cannot be")
+    refused(address, "this one is invalid")
 
 
 @pytest.mark.parametrize("host", ["nowhere.invalid", "a..b", f"{'a' * 64}.invalid"])
@@ -198,7 +198,7 @@ def known(monkeypatch: pytest.MonkeyPatch, names: dict[str, list[str]]) -> list[
 def test_the_address_that_was_checked_is_the_one_that_is_asked(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     names = {"rebind.test": ["127.0.0.1"]}
     looked_up = known(monkeypatch, names)
-    with at_hand(at(site, host="rebind.test")) as path:
+    with local_copy(at(site, host="rebind.test")) as path:
         assert path.read_bytes() == PNG
     assert looked_up == ["rebind.test"]  # a second answer of the name server would not be checked
     assert site.asked[0][1]["Host"] == f"rebind.test:{site.port}"
@@ -222,7 +222,7 @@ def test_a_redirect_to_another_scheme_is_refused(site: Site, leads: str) -> None
 
 def test_five_redirects_are_followed_and_a_sixth_is_not(site: Site) -> None:
     site.leads |= {f"/{i}.png": f"{i - 1}.png" for i in range(2, 7)} | {"/1.png": "a%20b.png"}
-    with at_hand(at(site, "/5.png")) as path:
+    with local_copy(at(site, "/5.png")) as path:
         assert path.read_bytes() == PNG
     refused(at(site, "/6.png"), "redirected more than 5 times")
 
@@ -230,7 +230,7 @@ def test_five_redirects_are_followed_and_a_sixth_is_not(site: Site) -> None:
 @pytest.mark.parametrize("allow", ["localhost", "LocalHost.", "127.0.0.1", "10.0.0.0/8, 127.0.0.0/8", "127.0.0.1/8"])
 def test_what_is_allowed_is_fetched(private: Site, monkeypatch: pytest.MonkeyPatch, allow: str) -> None:
     monkeypatch.setenv(hosts.ALLOW, allow)
-    with at_hand(at(private, host="localhost")) as path:
+    with local_copy(at(private, host="localhost")) as path:
         assert path.read_bytes() == PNG
 
 
@@ -253,7 +253,7 @@ def test_an_allow_list_that_cannot_be_read_is_refused(
 
 def test_proxies_of_the_environment_are_not_used(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
-    with at_hand(at(site)) as path:
+    with local_copy(at(site)) as path:
         assert path.read_bytes() == PNG
 
 
@@ -339,7 +339,7 @@ def test_certificates_are_checked_against_the_name(tmp_path: Path, monkeypatch: 
         address = f"https://pictures.test:{site.port}/a%20b.png"
         refused(address, "CERTIFICATE_VERIFY_FAILED")
         monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
-        with at_hand(address) as path:
+        with local_copy(address) as path:
             assert path.read_bytes() == PNG
         refused(address.replace("pictures", "other"), "CERTIFICATE_VERIFY_FAILED.*other.test")
         assert len(site.asked) == 1

@@ -10,7 +10,7 @@ from tiny_s3 import BUCKET, TinyS3
 from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
 from flows.inputs import sources
 from flows.inputs.manifest import Item, items_of, parse_changes
-from flows.inputs.naming import distinct
+from flows.inputs.naming import unique_names
 
 
 def touch(folder: Path, *names: str) -> None:
@@ -37,7 +37,7 @@ def test_packages_and_the_output_folder_are_no_inputs(tmp_path: Path) -> None:
 def test_no_two_items_share_a_folder_and_none_lies_within_another(tmp_path: Path) -> None:
     touch(tmp_path, "a.png", "A.mp4", "b.png", "b/c.png", "d.png")
     assert [item.name for item in items(tmp_path)] == ["A-mp4", "a-png", "b/c", "b-png", "d"]
-    assert distinct([("x", ""), ("x", ""), ("x-2", "")]) == ["x", "x-2", "x-2-2"]
+    assert unique_names([("x", ""), ("x", ""), ("x-2", "")]) == ["x", "x-2", "x-2-2"]
 
 
 def test_a_csv_has_a_row_per_item_with_knobs_of_its_own(tmp_path: Path) -> None:
@@ -47,22 +47,27 @@ def test_a_csv_has_a_row_per_item_with_knobs_of_its_own(tmp_path: Path) -> None:
         "p/dog.png,p/run.mp4,hero,7,motion.views=2; pack.splats=false,64\n"
     )
     cat, dog = items(tmp_path / "m.csv", **{"static.iterations": 9})
-    assert cat.wish is not None
-    assert dog.wish is not None
-    assert (cat.name, cat.wish.picture, cat.wish.seed, cat.wish.video) == ("cat", tmp_path / "p/cat.png", 3, None)
-    assert (dog.name, dog.wish.video, dog.wish.seed) == ("hero", tmp_path / "p/run.mp4", 7)
-    settings = dog.wish.settings
+    assert cat.request is not None
+    assert dog.request is not None
+    assert (cat.name, cat.request.picture, cat.request.seed, cat.request.video) == (
+        "cat",
+        tmp_path / "p/cat.png",
+        3,
+        None,
+    )
+    assert (dog.name, dog.request.video, dog.request.seed) == ("hero", tmp_path / "p/run.mp4", 7)
+    settings = dog.request.settings
     assert (settings.motion.views, settings.pack.splats, settings.mesh.grid) == (2, False, 64)
-    assert cat.wish.settings.mesh.grid != 64
-    assert settings.static.iterations == cat.wish.settings.static.iterations == 9
+    assert cat.request.settings.mesh.grid != 64
+    assert settings.static.iterations == cat.request.settings.static.iterations == 9
 
 
 def test_a_json_manifest_says_the_same(tmp_path: Path) -> None:
     rows = [{"path": "p/cat.png", "set": {"mesh.grid": 32}, "name": "../../cat"}]
     (tmp_path / "m.json").write_text(json.dumps(rows))
     (cat,) = items(tmp_path / "m.json")
-    assert cat.wish is not None
-    assert (cat.name, cat.wish.picture, cat.wish.settings.mesh.grid) == ("cat", tmp_path / "p/cat.png", 32)
+    assert cat.request is not None
+    assert (cat.name, cat.request.picture, cat.request.settings.mesh.grid) == ("cat", tmp_path / "p/cat.png", 32)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".json"])
@@ -83,7 +88,7 @@ def test_words_may_stand_in_place_of_a_path(tmp_path: Path, suffix: str) -> None
             table.writerows(rows)
     found = items(file)
     assert [item.name for item in found] == ["a-red-red-dragon", "deep/second", "a-red-red-dragon-2", "a"]
-    first, _, _, picture = (item.wish for item in found)
+    first, _, _, picture = (item.request for item in found)
     assert first is not None and picture is not None
     assert (first.picture, first.text, first.seed) == (None, "A red, red dragon!", 7)
     assert first.settings.text.weights == "some/pictures"
@@ -106,9 +111,9 @@ def test_words_that_nothing_can_be_made_of_are_refused_before_any_work(
     touch(tmp_path, "fox.png", "fox.mp4")
     (tmp_path / "m.json").write_text(json.dumps([row]))
     (item,) = items(tmp_path / "m.json")
-    assert item.wish is not None
+    assert item.request is not None
     with pytest.raises(DG4DError, match=re.escape(says)):
-        item.wish.check()
+        item.request.check()
 
 
 def test_a_bad_row_is_a_bad_item_and_no_more(tmp_path: Path) -> None:
@@ -120,7 +125,7 @@ def test_a_bad_row_is_a_bad_item_and_no_more(tmp_path: Path) -> None:
     ]
     (tmp_path / "m.json").write_text(json.dumps(rows))
     found = items(tmp_path / "m.json")
-    assert [bool(item.wish) for item in found] == [False, False, True, False]
+    assert [bool(item.request) for item in found] == [False, False, True, False]
     assert "mesh.grit" in found[0].error
 
 
@@ -165,7 +170,7 @@ def test_values_are_json_where_they_can_be_and_kinds_come_first() -> None:
         "mesh.mode": "per_frame",
     }  # fmt: skip
     assert next(iter(changes)) == "prior.kind"
-    with pytest.raises(BadInput, match="knob=value"):
+    with pytest.raises(BadInput, match="NAME=VALUE"):
         parse_changes(["motion.iterations"])
 
 
@@ -178,7 +183,7 @@ def test_what_leads_out_of_the_folder_of_a_list_is_a_bad_item(tmp_path: Path, co
     row = {"path": "p/cat.png", column: name, "name": "bad"}
     (tmp_path / "list/m.json").write_text(json.dumps([row, {"path": "p/cat.png", "name": "good"}]))
     bad, good = items(tmp_path / "list/m.json")
-    assert (bad.wish, good.error) == (None, "")
+    assert (bad.request, good.error) == (None, "")
     assert re.search(f"{column} .* leads out of the folder", bad.error)
 
 
@@ -196,7 +201,7 @@ def test_a_link_that_leads_out_of_a_folder_is_a_bad_item(tmp_path: Path) -> None
 def test_a_pattern_gives_what_it_matches_named_from_its_first_plain_folder(tmp_path: Path) -> None:
     touch(tmp_path, "in/a.png", "in/deep/b.png", "in/deep/c.jpg", "in/.d.png", "in/out/e.png", "f.png")
     found = items(f"{tmp_path}/in/**/*.png", f"{tmp_path}/in/out")
-    assert [(item.name, item.wish and item.wish.picture) for item in found] == [
+    assert [(item.name, item.request and item.request.picture) for item in found] == [
         ("a", tmp_path / "in/a.png"),
         ("deep/b", tmp_path / "in/deep/b.png"),
     ]
@@ -245,9 +250,9 @@ def test_every_kind_of_manifest_says_the_same_and_higher_priority_comes_first(tm
     found = items(file)
     assert [item.name for item in found] == ["urgent", "first", "second", "low"]
     assert all(item.error == "" for item in found)
-    settings = [item.wish.settings.mesh.grid for item in found if item.wish]
+    settings = [item.request.settings.mesh.grid for item in found if item.request]
     assert settings[0] == 64 != settings[1]
-    assert found[0].wish is not None and found[0].wish.seed == 3  # the seed of the batch
+    assert found[0].request is not None and found[0].request.seed == 3  # the seed of the batch
 
 
 def test_without_pyarrow_a_parquet_manifest_says_what_to_install(
@@ -263,15 +268,15 @@ def test_without_pyarrow_a_parquet_manifest_says_what_to_install(
 def test_a_number_that_is_none_is_a_bad_item(tmp_path: Path, column: str, value: object) -> None:
     (tmp_path / "m.json").write_text(json.dumps([{"path": "a.png", column: value}]))
     (item,) = items(tmp_path / "m.json")
-    assert item.wish is None and column in item.error
+    assert item.request is None and column in item.error
 
 
 def test_the_files_of_a_manifest_may_lie_below_a_root_and_nowhere_else(tmp_path: Path) -> None:
     touch(tmp_path, "pictures/a.png", "lists/b.png")
     (tmp_path / "lists/m.json").write_text(json.dumps([{"path": "a.png"}, {"path": "../lists/b.png"}]))
     a, b = items_of(tmp_path / "lists/m.json", Path("out"), "preview", {}, 0, root=tmp_path / "pictures")
-    assert a.wish is not None and a.wish.picture == tmp_path / "pictures/a.png"
-    assert b.wish is None and "leads out of the folder" in b.error
+    assert a.request is not None and a.request.picture == tmp_path / "pictures/a.png"
+    assert b.request is None and "leads out of the folder" in b.error
     with pytest.raises(BadInput, match="--root"):
         items_of(tmp_path / "pictures", Path("out"), "preview", {}, 0, root=tmp_path)
     with pytest.raises(BadInput, match="is not a folder"):
@@ -280,7 +285,7 @@ def test_the_files_of_a_manifest_may_lie_below_a_root_and_nowhere_else(tmp_path:
 
 def test_rows_that_want_the_same_share_their_settings(tmp_path: Path) -> None:
     (tmp_path / "m.json").write_text(json.dumps([{"path": f"{i}.png", "mesh.grid": 64} for i in range(50)]))
-    assert len({id(item.wish.settings) for item in items(tmp_path / "m.json") if item.wish}) == 1
+    assert len({id(item.request.settings) for item in items(tmp_path / "m.json") if item.request}) == 1
 
 
 @pytest.fixture
@@ -300,16 +305,16 @@ def test_a_prefix_of_an_object_store_gives_its_pictures_which_are_fetched_in_the
         bucket.objects[key] = (f"bytes of {key}".encode(), 0.0)
     found = items(f"s3://{BUCKET}/in/")
     assert [item.name for item in found] == ["b", "deep/a"]
-    with found[1].here() as wish:
-        assert wish.picture is not None and wish.source_name == "a.mp4"
-        assert wish.picture.read_bytes() == b"bytes of in/deep/a.mp4"
-    assert not wish.picture.exists()
+    with found[1].fetch() as request:
+        assert request.picture is not None and request.source_name == "a.mp4"
+        assert request.picture.read_bytes() == b"bytes of in/deep/a.mp4"
+    assert not request.picture.exists()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sources, "LARGEST_FILE_BYTES", 5)
-        with pytest.raises(BadInput, match="at most 5 are read"), found[1].here():
+        with pytest.raises(BadInput, match="at most 5 are read"), found[1].fetch():
             pass
     del bucket.objects["in/b.png"]
-    with pytest.raises(BadInput, match=r"not in .* any more"), found[0].here():
+    with pytest.raises(BadInput, match=r"not in .* any more"), found[0].fetch():
         pass
     with pytest.raises(BadInput, match="holds no pictures"):
         items(f"s3://{BUCKET}/empty/")
@@ -319,7 +324,7 @@ def test_objects_that_are_named_as_if_they_lay_outside_are_bad_items(bucket: Tin
     bucket.objects["in/a\\..\\up.png"] = (b"x", 0.0)
     bucket.objects["in/a.png"] = (b"x", 0.0)
     found = items(f"s3://{BUCKET}/in")
-    assert sorted((bool(item.error), item.wish is None) for item in found) == [(False, False), (True, True)]
+    assert sorted((bool(item.error), item.request is None) for item in found) == [(False, False), (True, True)]
 
 
 def test_an_object_store_that_does_not_answer_is_named(bucket: TinyS3, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from flows.inputs.naming import (
     check_name,
     check_not_reserved,
     check_path,
-    distinct,
+    unique_names,
 )
 
 
@@ -31,7 +31,7 @@ def test_every_name_that_is_allowed_leaves_room_for_the_names_of_scratch_folders
 
 @pytest.mark.parametrize("name", ["", "..", "/", "a\nb", "a\x1b[31mb", "a\u202eb", "a\0b"])
 def test_a_name_of_letters_that_cannot_be_seen_is_refused(name: str) -> None:
-    with pytest.raises(BadInput, match="choose"):
+    with pytest.raises(BadInput, match="use printable characters"):
         check_name(name)
 
 
@@ -72,11 +72,11 @@ def test_output_folders_that_leave_no_room_are_refused() -> None:
 def test_names_differ_on_every_file_system() -> None:
     composed, decomposed = (unicodedata.normalize(form, "café") for form in ("NFC", "NFD"))
     assert composed != decomposed
-    names = distinct([(composed, "png"), (decomposed, "jpg"), ("STRASSE", "png"), ("straße", "jpg")])
+    names = unique_names([(composed, "png"), (decomposed, "jpg"), ("STRASSE", "png"), ("straße", "jpg")])
     assert names == [f"{composed}-png", f"{decomposed}-jpg", "STRASSE-png", "straße-jpg"]
 
 
 def test_thousands_of_equal_names_are_numbered_in_a_moment() -> None:
     start = time.process_time()
-    assert distinct([("x", "")] * 20_000)[-1] == "x-20000"
+    assert unique_names([("x", "")] * 20_000)[-1] == "x-20000"
     assert time.process_time() - start < 2  # measured 0.1 s; every pair compared would take minutes

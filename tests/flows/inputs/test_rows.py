@@ -23,7 +23,7 @@ def in_between(file: Path, content: str | bytes) -> tuple[str, str]:
     file.write_bytes(content if isinstance(content, bytes) else content.encode())
     first, bad, last = items(file)
     assert (first.name, first.error, last.name, last.error) == ("a", "", "z", "")
-    assert first.wish is not None and last.wish is not None and bad.wish is None
+    assert first.request is not None and last.request is not None and bad.request is None
     return bad.name, bad.error
 
 
@@ -36,12 +36,12 @@ def in_between(file: Path, content: str | bytes) -> tuple[str, str]:
         (f'"set": "mesh.grid={DEEP}"', "nested more than 100 deep"),
         ('"set": {"mesh.grid": ' + DEEP + "}", "nested more than 100 deep"),
         ('"mesh.grid": ' + DEEP, "nested more than 100 deep"),
-        ('"name": ["b"]', "name ['b'] is no text"),
-        ('"name": 1.5', "name 1.5 is no text"),
-        ('"name": true', "name True is no text"),
+        ('"name": ["b"]', "name ['b'] is not text"),
+        ('"name": 1.5', "name 1.5 is not text"),
+        ('"name": true', "name True is not text"),
         ('"profile": 7', "unknown profile '7'"),
-        ('"profile": {}', "profile {} is no text"),
-        ('"text": {"a": 1}', "text {'a': 1} is no text"),
+        ('"profile": {}', "profile {} is not text"),
+        ('"text": {"a": 1}', "text {'a': 1} is not text"),
         ('"seed": NaN', "is NaN"),
         ('"seed": 1e400', "too large"),
         ('"seed": true', "seed True is not a whole number"),
@@ -79,9 +79,9 @@ def test_a_bad_cell_of_json_fails_its_row_alone(tmp_path: Path, kind: str, cells
         ("{", "cannot be read"),
         ("", "cannot be read"),
         ('{"path": "b.png"', "cannot be read"),
-        ("7", "no object"),
-        ('["path"]', "no object"),
-        ("null", "no object"),
+        ("7", "not an object"),
+        ('["path"]', "not an object"),
+        ("null", "not an object"),
         (DEEP, "nested more than 100 deep"),
         ('{"name": "b"}', "neither a path nor a text"),
         ('{"path": ""}', "neither a path nor a text"),
@@ -106,12 +106,12 @@ def test_an_element_that_is_no_row_is_an_item_named_by_its_number(tmp_path: Path
     ("line", "says"),
     [
         (b"b.png,1,,,more", "5 cells"),
-        (b"caf\xe9.png,1,,", "not UTF-8"),
+        (b"caf\xe9.png,1,,", "not valid UTF-8"),
         (b"b.png,NaN,,", "seed 'NaN' is not a whole number"),
         (b"b.png,1e400,,", "seed '1e400' is not a whole number"),
         (b"b.png,,mesh.grid=" + DEEP.encode() + b",", "nested more than 100 deep"),
         (b"b.png,,mesh.grid=NaN,", "is NaN"),
-        (b"b.png,,mesh.grid,", "knob=value"),
+        (b"b.png,,mesh.grid,", "NAME=VALUE"),
         (b"b.png,,,0.5", "1 to 240"),
         (b"x" * 200_000 + b".png,1,,", "field limit"),
         (b"b\0.png,,,", "leads out of the folder"),
@@ -126,7 +126,7 @@ def test_a_bad_line_of_csv_fails_its_row_alone(tmp_path: Path, line: bytes, says
 def test_line_breaks_in_quotes_belong_to_their_cell(tmp_path: Path) -> None:
     (tmp_path / "m.csv").write_text('path,text,text.weights\n,"a red\nfox\x0band more",some/pictures\nb.png,,\n')
     fox, b = items(tmp_path / "m.csv")
-    assert fox.wish is not None and fox.wish.text == "a red\nfox\x0band more"
+    assert fox.request is not None and fox.request.text == "a red\nfox\x0band more"
     assert b.name == "b"
 
 
@@ -142,7 +142,7 @@ def test_a_file_that_is_no_manifest_is_refused_as_a_whole(tmp_path: Path, kind: 
 
 @pytest.mark.parametrize(
     ("text", "says"),
-    [('[{"path": "a"}', "no end"), ('[{"path": "a"}]]', "follows"), ("{}", "list of rows"), ("[]", "no rows")],
+    [('[{"path": "a"}', "not closed"), ('[{"path": "a"}]]', "follows"), ("{}", "list of rows"), ("[]", "no rows")],
 )
 def test_a_list_that_does_not_end_where_it_should_is_refused(tmp_path: Path, text: str, says: str) -> None:
     (tmp_path / "m.json").write_text(text)
@@ -160,8 +160,8 @@ def test_nan_is_an_empty_cell_in_parquet_alone(tmp_path: Path) -> None:
     ]
     parquet.write_table(arrow.Table.from_pylist(content), tmp_path / "m.parquet")
     bee, a, c = items(tmp_path / "m.parquet")
-    assert a.wish is not None and (a.name, a.wish.seed) == ("a", 3)  # the seed of the batch
-    assert bee.wish is not None and (bee.name, bee.wish.seed, bee.priority) == ("bee", 7, 2)
+    assert a.request is not None and (a.name, a.request.seed) == ("a", 3)  # the seed of the batch
+    assert bee.request is not None and (bee.name, bee.request.seed, bee.priority) == ("bee", 7, 2)
     assert "row 3: seed 7.5 is not a whole number" in c.error
 
 
@@ -200,7 +200,7 @@ def test_whatever_else_goes_wrong_with_a_row_is_its_own(tmp_path: Path, monkeypa
 def test_a_seed_may_be_written_as_tables_write_whole_numbers(tmp_path: Path, value: object, seed: int) -> None:
     (tmp_path / "m.json").write_text(json.dumps([{"path": "a.png", "seed": value}]))
     (item,) = items(tmp_path / "m.json")
-    assert item.wish is not None and item.wish.seed == seed
+    assert item.request is not None and item.request.seed == seed
 
 
 @pytest.mark.parametrize("name", [5, "5"])

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from flows.packages import acceptance, report
-from flows.packages.summary import NOT_ACCEPTED, Row, Writer, judged
+from flows.packages.summary import NOT_ACCEPTED, Row, Writer, with_verdict
 from steps.contract import ArtifactRef, ProvenanceRecord, StepResult
 from steps.store.artifact_store import ArtifactStore
 
@@ -55,15 +55,15 @@ def test_the_verdict_and_its_picture_are_found_among_the_steps(store: ArtifactSt
     }
     other = result("fit_gaussians", picture=store.put_bytes(b"another picture", "image/png"))
     results = [other, result("check_asset", **kept)]
-    assert acceptance.verdict_of(results, store) == verdict("floaters")
-    assert acceptance.picture_of(results, store) == b"the right picture"
-    assert acceptance.verdict_of([other], store) is None
-    assert acceptance.picture_of([other], store) is None
+    assert acceptance.load_verdict(results, store) == verdict("floaters")
+    assert acceptance.load_picture(results, store) == b"the right picture"
+    assert acceptance.load_verdict([other], store) is None
+    assert acceptance.load_picture([other], store) is None
 
 
 def test_a_verdict_whose_file_is_gone_is_none(store: ArtifactStore) -> None:
     gone = ArtifactRef(digest="sha256:" + "0" * 64, media_type="application/vnd.dg4d.gates+json", size_bytes=1)
-    assert acceptance.verdict_of([result("check_asset", gates=gone)], store) is None
+    assert acceptance.load_verdict([result("check_asset", gates=gone)], store) is None
 
 
 BARE = {
@@ -73,19 +73,19 @@ BARE = {
 
 
 def test_only_gates_that_fail_give_advice() -> None:
-    page = report.page({**BARE, "acceptance": verdict("floaters")}, b"png")
+    page = report.report_page({**BARE, "acceptance": verdict("floaters")}, b"png")
     assert page.count("try &lt;again&gt;") == 1
     assert page.count("how &lt;well&gt;") == 2
     assert "floaters failed, 1 of 2 gates passed" in page
     assert "data:image/png;base64,cG5n" in page
-    accepted = report.page({**BARE, "acceptance": verdict()})
+    accepted = report.report_page({**BARE, "acceptance": verdict()})
     assert "Accepted: all 2 gates passed." in accepted
     assert "again" not in accepted and "<img" not in accepted
 
 
 def test_the_report_has_a_section_on_gates_only_where_there_is_a_verdict() -> None:
-    assert "<h2>Acceptance" in report.page({**BARE, "acceptance": verdict()})
-    assert "<h2>Acceptance" not in report.page(BARE)
+    assert "<h2>Acceptance" in report.report_page({**BARE, "acceptance": verdict()})
+    assert "<h2>Acceptance" not in report.report_page(BARE)
 
 
 def test_markdown_has_a_row_per_gate() -> None:
@@ -98,26 +98,26 @@ def test_markdown_has_a_row_per_gate() -> None:
     [(1.0, None, "at least 1 dB"), (None, 0.02, "at most 0.02 dB"), (0.75, 1.25, "0.75 to 1.25 dB")],
 )
 def test_bounds_are_said_as_they_are(least: float | None, most: float | None, text: str) -> None:
-    assert acceptance.bounds(gate("any", 1.0, least, most, passed=True)) == text
+    assert acceptance.format_bounds(gate("any", 1.0, least, most, passed=True)) == text
 
 
 @pytest.mark.parametrize("content", [None, "", "{}", "[]", '{"acceptance": null}'])
 def test_a_package_without_a_verdict_has_no_list_of_failing_gates(tmp_path: Path, content: str | None) -> None:
     if content is not None:
         (tmp_path / "report.json").write_text(content)
-    assert acceptance.failing_in(tmp_path) is None
+    assert acceptance.failing_gates(tmp_path) is None
     row = Row(item="a", status="done")
-    assert judged(row, tmp_path, strict=True) == row
+    assert with_verdict(row, tmp_path, strict=True) == row
 
 
 def test_only_a_strict_batch_makes_a_failure_of_a_failing_gate(tmp_path: Path) -> None:
     row = Row(item="a", status="unchanged")
     bad, good = package(tmp_path / "bad", "floaters"), package(tmp_path / "good")
-    lenient, strict = (judged(row, bad, strict) for strict in (False, True))
+    lenient, strict = (with_verdict(row, bad, strict) for strict in (False, True))
     assert (lenient.status, lenient.failing) == ("unchanged", ["floaters"])
     assert (strict.status, strict.kind, strict.failing) == ("failed", NOT_ACCEPTED, ["floaters"])
     assert "floaters" in strict.message
-    assert judged(row, good, strict=True) == row.model_copy(update={"failing": []})
+    assert with_verdict(row, good, strict=True) == row.model_copy(update={"failing": []})
 
 
 def test_the_overview_marks_what_is_not_accepted_and_links_it_all_the_same(tmp_path: Path) -> None:

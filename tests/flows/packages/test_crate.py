@@ -11,7 +11,7 @@ from made_package import MACHINE, STEPS, WEIGHTS, made_package, record_in
 from rocrate.rocrate import ROCrate
 from signing import identity
 
-from flows.packages.crate import CRATE, crate_text, files_in, own_digest, rendered
+from flows.packages.crate import CRATE, crate_digest, crate_text, files_in, render_crate
 
 
 @pytest.fixture(scope="module")
@@ -137,10 +137,10 @@ def test_equal_runs_give_equal_crates(folder: Path, tmp_path: Path) -> None:
 
 def test_a_crate_names_its_own_digest(folder: Path) -> None:
     crate = document(folder)
-    assert crate["@graph"][0]["sha256"] == own_digest(crate)
-    assert rendered(crate) == (folder / CRATE).read_text()
+    assert crate["@graph"][0]["sha256"] == crate_digest(crate)
+    assert render_crate(crate) == (folder / CRATE).read_text()
     crate["@graph"][1]["name"] = "blue fox"
-    assert crate["@graph"][0]["sha256"] != own_digest(crate)
+    assert crate["@graph"][0]["sha256"] != crate_digest(crate)
 
 
 def test_a_package_without_weights_says_so_and_names_no_license_of_a_model(tmp_path: Path) -> None:

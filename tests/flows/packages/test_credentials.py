@@ -11,8 +11,16 @@ from signing import MAKERS, Identity, identity
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows.packages import credentials
-from flows.packages.credentials import ALGORITHMIC, TRAINED, Claim, Signer, configured, sidecar_of, signature_of
-from flows.packages.publish import fact_of
+from flows.packages.credentials import (
+    ALGORITHMIC,
+    TRAINED,
+    Claim,
+    Signer,
+    check_signature,
+    configured_signer,
+    sidecar_name,
+)
+from flows.packages.publish import file_digest
 
 CLAIM = Claim(trained=False, about="Preview: a guess. Order sha256:1.")
 
@@ -25,7 +33,7 @@ def company(tmp_path_factory: pytest.TempPathFactory) -> Identity:
 @pytest.fixture
 def signer(company: Identity) -> Signer:
     with company.configured():
-        found = configured()
+        found = configured_signer()
     assert found is not None
     return found
 
@@ -38,15 +46,15 @@ def picture(tmp_path: Path) -> Path:
 
 
 def signed(signer: Signer, path: Path, claim: Claim = CLAIM) -> Path:
-    _, marks = signer.sign_package(path.parent, {path.name: fact_of(path)}, claim)
+    _, marks = signer.sign_package(path.parent, {path.name: file_digest(path)}, claim)
     assert path.name in marks
     return path
 
 
 def test_nobody_signs_without_a_key(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert configured() is None
+    assert configured_signer() is None
     monkeypatch.setattr(credentials, "import_module", None)  # nothing of signing is even looked for
-    assert configured() is None
+    assert configured_signer() is None
 
 
 @pytest.mark.parametrize("kind", MAKERS)
@@ -55,26 +63,26 @@ def test_a_picture_signed_with_any_kind_of_key_is_trusted_by_those_who_trust_the
 ) -> None:
     who = identity(tmp_path / kind, kind)
     with who.configured():
-        signer = configured()
+        signer = configured_signer()
     assert signer is not None
     assert signer.algorithm == kind
     pixels = np.asarray(Image.open(picture)).copy()
-    found = signature_of(signed(signer, picture), anchors=who.root.read_text())
+    found = check_signature(signed(signer, picture), anchors=who.root.read_text())
     assert (found.state, found.signer) == ("trusted", "Test studio, Test company")
     assert np.array_equal(np.asarray(Image.open(picture)), pixels)
 
 
 def test_who_is_vouched_for_by_nobody_here_is_untrusted(signer: Signer, picture: Path, tmp_path: Path) -> None:
-    assert signature_of(signed(signer, picture)).state == "untrusted"
+    assert check_signature(signed(signer, picture)).state == "untrusted"
     stranger = identity(tmp_path / "stranger")
-    assert signature_of(picture, anchors=stranger.root.read_text()).state == "untrusted"
+    assert check_signature(picture, anchors=stranger.root.read_text()).state == "untrusted"
 
 
 def test_who_vouches_for_himself_is_untrusted(picture: Path, tmp_path: Path) -> None:
     with identity(tmp_path / "own", own=True).configured():
-        alone = configured()
+        alone = configured_signer()
     assert alone is not None
-    assert signature_of(signed(alone, picture)).state == "untrusted"
+    assert check_signature(signed(alone, picture)).state == "untrusted"
 
 
 def test_one_flipped_bit_of_the_picture_is_noticed(signer: Signer, picture: Path) -> None:
@@ -84,7 +92,7 @@ def test_one_flipped_bit_of_the_picture_is_noticed(signer: Signer, picture: Path
     for place in (0, *places.tolist(), len(content) - 1):
         content[place] ^= 4
         picture.write_bytes(content)
-        assert signature_of(picture).state == "invalid", place
+        assert check_signature(picture).state == "invalid", place
         content[place] ^= 4
 
 
@@ -93,22 +101,22 @@ def test_a_file_that_cannot_carry_credentials_has_them_beside_it(
 ) -> None:
     asset = tmp_path / "asset.glb"
     asset.write_bytes(b"mesh" * 1000)
-    files, marks = signer.sign_package(tmp_path, {"asset.glb": fact_of(asset)}, CLAIM)
+    files, marks = signer.sign_package(tmp_path, {"asset.glb": file_digest(asset)}, CLAIM)
     assert asset.read_bytes() == b"mesh" * 1000
     assert marks == {"asset.glb": {"sidecar": "asset.c2pa"}}
-    assert files["asset.c2pa"] == fact_of(tmp_path / "asset.c2pa")
+    assert files["asset.c2pa"] == file_digest(tmp_path / "asset.c2pa")
     root = company.root.read_text()
-    assert signature_of(asset, tmp_path / "asset.c2pa", root).state == "trusted"
+    assert check_signature(asset, tmp_path / "asset.c2pa", root).state == "trusted"
     asset.write_bytes(b"mesh" * 999 + b"mash")
-    found = signature_of(asset, tmp_path / "asset.c2pa", root)
+    found = check_signature(asset, tmp_path / "asset.c2pa", root)
     assert (found.state, found.detail) == ("invalid", "assertion.dataHash.mismatch")
     (tmp_path / "asset.c2pa").write_bytes(b"no credentials")
-    assert signature_of(asset, tmp_path / "asset.c2pa", root).state == "invalid"
+    assert check_signature(asset, tmp_path / "asset.c2pa", root).state == "invalid"
 
 
 def test_the_two_assets_of_a_package_have_sidecars_of_different_names() -> None:
-    assert sidecar_of("asset.glb") == "asset.c2pa"
-    assert sidecar_of("asset.usdz") == "asset.usdz.c2pa"
+    assert sidecar_name("asset.glb") == "asset.c2pa"
+    assert sidecar_name("asset.usdz") == "asset.usdz.c2pa"
 
 
 def test_only_files_at_the_top_are_signed_and_their_facts_before_are_kept(signer: Signer, picture: Path) -> None:
@@ -117,12 +125,12 @@ def test_only_files_at_the_top_are_signed_and_their_facts_before_are_kept(signer
     shutil.copy(picture, inner)
     (picture.parent / "asset.json").write_text("{}")
     names = ("contact_sheet.png", "input/subject.png", "asset.json")
-    before = {name: fact_of(picture.parent / name) for name in names}
+    before = {name: file_digest(picture.parent / name) for name in names}
     after, marks = signer.sign_package(picture.parent, before, CLAIM)
     assert marks == {"contact_sheet.png": {"unsigned": before["contact_sheet.png"]}}
-    assert after == {**before, "contact_sheet.png": fact_of(picture)}
+    assert after == {**before, "contact_sheet.png": file_digest(picture)}
     assert after != before
-    assert signature_of(inner).state == "missing"
+    assert check_signature(inner).state == "missing"
 
 
 @pytest.mark.parametrize(("trained", "kind"), [(True, TRAINED), (False, ALGORITHMIC)])
@@ -152,9 +160,9 @@ def test_a_key_in_another_form_of_pem_signs_too(company: Identity, picture: Path
     )
     (tmp_path / "old.pem").write_bytes(old)
     with Identity(tmp_path / "old.pem", company.chain, company.root).configured():
-        signer = configured()
+        signer = configured_signer()
     assert signer is not None
-    assert signature_of(signed(signer, picture)).state == "untrusted"
+    assert check_signature(signed(signer, picture)).state == "untrusted"
 
 
 def test_what_cannot_sign_is_refused_with_the_reason_and_without_the_key(
@@ -163,20 +171,20 @@ def test_what_cannot_sign_is_refused_with_the_reason_and_without_the_key(
     other = identity(tmp_path / "other")
     (tmp_path / "broken.pem").write_text(company.key.read_text()[:80])
     cases = {
-        "is not that of the first certificate": Identity(other.key, company.chain, company.root),
+        "does not match the first certificate": Identity(other.key, company.chain, company.root),
         "one of them is something else": Identity(tmp_path / "broken.pem", company.chain, company.root),
         "without a certificate": Identity(company.key, company.key, company.root),
         "cannot be read: No such file": Identity(tmp_path / "none.pem", company.chain, company.root),
     }
     for says, who in cases.items():
         with who.configured(), pytest.raises(BadInput, match=says) as caught:
-            configured()
+            configured_signer()
         assert company.key.read_text().splitlines()[1] not in str(caught.value)
     monkeypatch.setenv("DG4D_SIGNING_KEY", str(company.key))
     with pytest.raises(BadInput, match="go together"):
-        configured()
+        configured_signer()
     with identity(tmp_path / "useless", usage=False).configured():
-        useless = configured()
+        useless = configured_signer()
     assert useless is not None
     with pytest.raises(BadInput, match="emailProtection"):
         signed(useless, picture)
@@ -185,4 +193,4 @@ def test_what_cannot_sign_is_refused_with_the_reason_and_without_the_key(
 def test_without_the_library_one_is_told_what_to_install(company: Identity, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "c2pa", None)
     with company.configured(), pytest.raises(BackendUnavailable, match="c2pa-python; run `make setup`"):
-        configured()
+        configured_signer()

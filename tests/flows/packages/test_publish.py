@@ -8,7 +8,7 @@ import pytest
 
 from dg4d_lib.errors import BadInput
 from flows.inputs.package_record import record_of
-from flows.packages.publish import Files, check_folder, is_current, publish
+from flows.packages.publish import Files, check_folder, is_current, publish, replace_package
 from flows.packages.verify import verify
 from steps.store.files import DiskFull
 
@@ -133,6 +133,16 @@ def test_a_folder_that_cannot_be_renamed_is_filled_in_place(
     assert out.stat().st_ino == inode
     assert set(tree(out)) == {"asset.glb", "provenance.json", "report.html"}
     assert is_current(out, "o1")
+
+
+@pytest.mark.parametrize("others", [False, True], ids=["alone", "beside a file of the user"])
+def test_undo_removes_the_parent_folders_that_were_created(package: Path, tmp_path: Path, others: bool) -> None:
+    swap = replace_package(package, tmp_path / "made" / "too" / "out", finish)
+    if others:
+        (tmp_path / "made" / "notes.txt").write_text("mine")
+    swap.undo()
+    assert (tmp_path / "made").exists() == others
+    assert not (tmp_path / "made" / "too").exists()
 
 
 def test_what_a_killed_command_left_is_cleared_up_or_put_back(package: Path, tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from io import StringIO
 
 import pytest
 
-from flows.packages.scores import ObjectScores, Results, averaged, csv_text, figures_of, markdown, page, table
+from flows.packages.scores import ObjectScores, Results, averaged, csv_text, figures_of, markdown, scores_page, table
 
 
 def row(psnr: float, **more: float) -> dict[str, object]:
@@ -61,7 +61,7 @@ def test_the_first_table_has_the_papers_columns_and_missing_is_no_number() -> No
         "method": "video", "LPIPS ↓": "missing", "CLIP ↑": "-", "FVD (Consistent4D) ↓": "-", "time, s ↓": "15",
     }  # fmt: skip
     assert cells(text, "video", "PSNR, dB ↑")["PSNR, dB ↑"] == "22.00"
-    assert cells(text, "its first frame at every view", "PSNR, dB ↑")["chamfer ↓"] == "-"
+    assert cells(text, "first input frame at every view", "PSNR, dB ↑")["chamfer ↓"] == "-"
     assert "- lpips: `dg4d weights pull vgg16` gets it" in text
     assert r"- eel failed: it \<slipped\> away" in text
     assert "Means over 2 objects" in text
@@ -89,7 +89,7 @@ def test_every_view_is_a_row_of_the_csv() -> None:
 
 def test_the_artifact_has_a_row_per_method() -> None:
     rows = table(results(missing={"clip": "no"}))
-    assert [one["method"] for one in rows] == ["its first frame at every view", "video"]
+    assert [one["method"] for one in rows] == ["first input frame at every view", "video"]
     assert rows[1]["PSNR, dB ↑"] == "22.00"
     assert rows[1]["CLIP ↑"] == "missing"
 
@@ -103,7 +103,7 @@ def films() -> dict[str, dict[str, dict[str, str]]]:
 def test_the_page_shows_films_side_by_side_and_escapes_what_others_wrote(
     films: dict[str, dict[str, dict[str, str]]],
 ) -> None:
-    text = page(results(title="<three> animals", missing={"clip": "get <it>"}), films)
+    text = scores_page(results(title="<three> animals", missing={"clip": "get <it>"}), films)
     assert text.count("<video") == 4
     assert text.index("films/fox/truth/view_-75.mp4") < text.index("films/fox/ours/view_-75.mp4")
     assert "<th>-75°" in text
@@ -114,7 +114,7 @@ def test_the_page_shows_films_side_by_side_and_escapes_what_others_wrote(
 
 def test_a_page_without_any_scores_says_why() -> None:
     nothing = [ObjectScores(object="eel", error="it slipped away")]
-    text = page(results(objects=nothing, mean={}), {})
+    text = scores_page(results(objects=nothing, mean={}), {})
     assert "it slipped away" in text
     assert "<th>method<th>LPIPS" in text
 
@@ -124,7 +124,7 @@ def test_objects_may_be_called_anything() -> None:
     one = results(
         objects=[ObjectScores(object=name, error="[a](http://b)"), ObjectScores(object="-1", rows={"video": ours(2.0)})]
     )
-    assert "<img" not in page(one, {}) and "&lt;img src=x&gt;" in page(one, {})
+    assert "<img" not in scores_page(one, {}) and "&lt;img src=x&gt;" in scores_page(one, {})
     assert r"- =1" not in markdown(
         one
     ) and r"\|\<img src=x\>!\[\](http\://tracker) failed: \[a\](http\://b)" in markdown(one)

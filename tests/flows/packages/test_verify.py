@@ -11,9 +11,9 @@ from made_package import WEIGHTS, made_package, record_in
 from signing import Identity, identity
 
 from dg4d_lib.errors import BadInput
-from flows.packages.crate import CRATE, own_digest, rendered
-from flows.packages.publish import fact_of_bytes
-from flows.packages.verify import Verdict, verify
+from flows.packages.crate import CRATE, crate_digest, render_crate
+from flows.packages.publish import bytes_digest
+from flows.packages.verify import Verification, verify
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def signed(tmp_path: Path, company: Identity) -> Path:
         return made_package(tmp_path)
 
 
-def faults(verdict: Verdict) -> dict[str, str]:
+def faults(verdict: Verification) -> dict[str, str]:
     return {check.name: check.state for check in verdict.checks if check.fault}
 
 
@@ -54,7 +54,7 @@ def test_a_changed_byte_in_any_file_is_noticed_and_the_file_named(package: Path)
                 verdict = verify(package)
             except BadInput as error:
                 assert name == "provenance.json", place  # broken JSON
-                assert re.search("no sound provenance.json|provenance.json of format", str(error))
+                assert re.search("no valid provenance.json|provenance.json of format", str(error))
             else:
                 assert faults(verdict).get(name) == "altered", (name, place)
                 assert verdict.exit_code == 65
@@ -74,7 +74,7 @@ def test_a_file_that_nobody_recorded_is_named_and_no_fault(package: Path) -> Non
     (package / "mine").mkdir()
     (package / "mine" / "notes.txt").write_text("mine")
     verdict = verify(package)
-    assert ("mine/notes.txt", "extra", "no record names it") in list(verdict.rows())
+    assert ("mine/notes.txt", "extra", "not in any record") in list(verdict.rows())
     assert verdict.exit_code == 0
 
 
@@ -93,11 +93,11 @@ def with_new_crate(package: Path, change: Callable[[dict[str, Any]], None]) -> N
     text = json.dumps(record)
     (package / "provenance.json").write_text(text)
     crate = json.loads((package / CRATE).read_text())
-    fact = fact_of_bytes(text.encode())
+    fact = bytes_digest(text.encode())
     (entity,) = [entity for entity in crate["@graph"] if entity["@id"] == "provenance.json"]
     entity |= {"sha256": fact["digest"].removeprefix("sha256:"), "contentSize": str(fact["size_bytes"])}
-    crate["@graph"][0]["sha256"] = own_digest(crate)
-    (package / CRATE).write_text(rendered(crate))
+    crate["@graph"][0]["sha256"] = crate_digest(crate)
+    (package / CRATE).write_text(render_crate(crate))
 
 
 def test_records_that_contradict_each_other_are_named(package: Path) -> None:
@@ -130,7 +130,7 @@ def test_a_record_of_another_version_is_named_as_that(package: Path) -> None:
 
 
 def test_a_folder_without_a_package_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="is no asset"):
+    with pytest.raises(BadInput, match="is not an asset"):
         verify(tmp_path)
 
 

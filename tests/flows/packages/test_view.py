@@ -16,7 +16,7 @@ from flows.inputs.package_record import RECORD
 from flows.packages import view as module
 from flows.packages.publish import Files, publish
 from flows.packages.verify import verify
-from flows.packages.view import VIEWER, facts_of, page_of, view
+from flows.packages.view import VIEWER, view, viewer_facts, viewer_html
 from steps.artifacts import packages
 
 CONTENT = {"asset.json": b"{}", "asset.glb": b"glTF", "splats/moving.websplats": b"D4WS", "input/subject.png": b"png"}
@@ -67,9 +67,9 @@ def test_a_page_that_is_right_is_left_alone(package: Path) -> None:
 
 def test_the_page_does_not_depend_on_the_run(package: Path) -> None:
     known = json.loads((package / RECORD).read_text())
-    page = page_of(known, CONTENT.__getitem__)
-    assert page_of(known | {"run": {"flow_run": "tomorrow"}}, CONTENT.__getitem__) == page
-    assert page_of(known | {"seed": 4}, CONTENT.__getitem__) != page
+    page = viewer_html(known, CONTENT.__getitem__)
+    assert viewer_html(known | {"run": {"flow_run": "tomorrow"}}, CONTENT.__getitem__) == page
+    assert viewer_html(known | {"seed": 4}, CONTENT.__getitem__) != page
 
 
 @pytest.mark.parametrize("signed", [False, True])
@@ -81,7 +81,7 @@ def test_looking_at_a_package_does_not_change_it(tmp_path: Path, signed: bool) -
 
 
 def test_every_step_and_every_file_is_among_the_facts(package: Path) -> None:
-    facts = facts_of(json.loads((package / RECORD).read_text()))
+    facts = viewer_facts(json.loads((package / RECORD).read_text()))
     assert facts["Provenance"]["profile"] == "preview"
     assert list(facts["Steps"]) == ["1. fit_gaussians", "2. fit_gaussians"]
     assert facts["Steps"]["1. fit_gaussians"] == {
@@ -118,7 +118,7 @@ def test_many_faults_are_counted(package: Path) -> None:
 
 
 def test_a_folder_that_is_no_package_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="is no asset"):
+    with pytest.raises(BadInput, match="is not an asset"):
         view(tmp_path / "nowhere", open_browser=False)
 
 

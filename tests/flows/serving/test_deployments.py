@@ -17,7 +17,7 @@ from waiting import wait_until
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows import deployments
-from flows.packages.publish import whole
+from flows.packages.publish import load_verified
 from flows.serving import registering
 from flows.serving.pools import read_pools
 from flows.serving.roots import SOURCES
@@ -42,12 +42,12 @@ def test_the_form_offers_every_profile() -> None:
 @pytest.mark.parametrize(
     ("name", "titles"),
     [
-        ("picture-to-4d", ["Picture", "Folder for what is made", "How it is made"]),
-        ("video-to-4d", ["Video", "Folder for what is made", "How it is made"]),
-        ("catalog-to-4d", ["Pictures and videos", "Folder for what is made", "Items at a time", "Items run on",
+        ("picture-to-4d", ["Picture", "Output folder", "How it is made"]),
+        ("video-to-4d", ["Video", "Output folder", "How it is made"]),
+        ("catalog-to-4d", ["Pictures and videos", "Output folder", "Items at a time", "Items run on",
                            "Stop at a faulty asset", "How it is made"]),
-        ("benchmark", ["Data set", "Folder for what is made", "Objects at most", "Judge the meshes",
-                       "True views as the prior", "Items at a time", "How it is made"]),
+        ("benchmark", ["Data set", "Output folder", "Objects at most", "Score the meshes",
+                       "Ground-truth views as the prior", "Items at a time", "How it is made"]),
     ],
 )  # fmt: skip
 def test_a_form_has_a_plain_field_for_everything_in_a_sensible_order(
@@ -194,7 +194,7 @@ def test_a_run_whose_process_was_killed_goes_on_after_its_last_finished_step(
     assert steps[0] == "prepare_subject"
     assert {*steps[1:3]} == {"drive_video", "fit_gaussians"}  # side by side
     assert steps[3:] == ["fit_motion", "fit_motion", "plan_mesh", "extract_mesh", "pack_asset", "check_asset"]
-    whole(tmp_path / "out")
+    load_verified(tmp_path / "out")
 
 
 def test_a_worker_knows_how_many_runs_would_end_with_it(
@@ -212,8 +212,8 @@ def test_a_worker_knows_how_many_runs_would_end_with_it(
 
 
 def test_a_run_that_was_begun_too_often_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PREFECT__RUNTIME__FLOW_RUN__RUN_COUNT", str(deployments.BEGUN + 1))
-    with pytest.raises(BackendUnavailable, match="begun 3 times"):
+    monkeypatch.setenv("PREFECT__RUNTIME__FLOW_RUN__RUN_COUNT", str(deployments.MOST_STARTS + 1))
+    with pytest.raises(BackendUnavailable, match="started 3 times"):
         deployments.picture_to_4d.fn("in.png", "out")
 
 

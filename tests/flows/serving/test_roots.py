@@ -275,7 +275,7 @@ def test_a_worker_is_told_the_folders_of_the_option_else_of_the_variable_else_th
     assert told() == [f"{place}/in", f"{place}/away"]
     monkeypatch.delenv(SOURCES)
     assert told() == [str(place), f"{place}/away"]
-    refused(lambda: told("nowhere"), "--sources nowhere is no folder")
+    refused(lambda: told("nowhere"), "--sources nowhere is not a folder")
     (place / "a:b").mkdir()
     refused(lambda: told("a:b"), "separates folders")
 

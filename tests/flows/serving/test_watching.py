@@ -62,5 +62,5 @@ def test_packages_hidden_files_and_links_do_not_count(folder: Path) -> None:
 
 
 def test_what_is_no_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="is no folder"):
+    with pytest.raises(BadInput, match="is not a folder"):
         watcher(tmp_path / "nothing")

@@ -1,4 +1,4 @@
-"""What the Prefect server keeps and shows of an item: asked of its API, and looked at in a browser."""
+"""Artifacts of an item on the Prefect server, read through its API and seen in a browser."""
 
 import base64
 import io
@@ -13,30 +13,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_steps import picture
+from conversions import EVERY_STEP, job
 from PIL import Image
 from prefect.client.orchestration import get_client
 from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL
 from waiting import retry_after, wait_until
 
-from flows import home
-from flows.convert import make
+from flows.convert import convert_job
 from flows.formatting import curves
-from flows.inputs.orders import Order, Wish
 from flows.serving.auth import basic
 from flows.serving.server import Server
 from flows.step_errors import StepDiverged
 from flows.ui import pages
 from flows.ui.asset_page import PICTURES
 from steps.contract import ArtifactRef
-from steps.profiles import PREVIEW
 from steps.store.artifact_store import ArtifactStore
 from tests.clients.node import run_node
 
-EVERY_STEP = [
-    "prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "plan_mesh", "extract_mesh", "pack_asset",
-    "check_asset",
-]  # fmt: skip
 TITLES = [title for (step, _), title in PICTURES.items() if step in EVERY_STEP]
 LOSSES = 2  # drawings of losses, of the two fits
 
@@ -53,13 +46,8 @@ def place(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     return tmp_path
 
 
-def order(words: str, folder: Path, item: str) -> Order:
-    (folder / "fake.png").write_text(picture(words))
-    return Wish(item=item, picture=folder / "fake.png", settings=PREVIEW).order(home.store())
-
-
 def artifacts(item: str, path: str = "/artifacts/latest/filter") -> dict[str, list[dict[str, Any]]]:
-    """What the server keeps of an item, by the key without the item, the newest first."""
+    """Return the artifacts of an item by key without the item, the newest first."""
     wanted = {"artifacts": {"key": {"like_": f"-{item}-"}}, "limit": 200}
     with get_client(sync_client=True) as client:
         found: list[dict[str, Any]] = client.request("POST", path, json=wanted).json()
@@ -92,7 +80,7 @@ def drawn_in_browser(server: Server, version: dict[str, Any], screenshot: Path) 
 
 
 def test_an_item_leaves_a_page_per_step_and_one_with_everything(place: Path) -> None:
-    _, cached = make(order("pages", place, "paged"), place / "out")
+    _, cached = convert_job(job("pages", place, item="paged"), place / "out")
     assert not cached
     kept = {key: latest[0] for key, latest in artifacts("paged").items()}
     labels = {step.replace("_", "-") for step in EVERY_STEP}
@@ -119,7 +107,7 @@ def test_an_item_leaves_a_page_per_step_and_one_with_everything(place: Path) -> 
 
 
 def test_files_and_the_viewer_are_a_link_away(place: Path) -> None:
-    make(order("links", place, "linked"), place / "out")
+    convert_job(job("links", place, item="linked"), place / "out")
     kept = {key: latest[0]["data"] for key, latest in artifacts("linked").items()}
     to = {key: re.findall(r"/dg4d/[^)\s\]]+", str(data)) for key, data in kept.items()}
     kind, subject = fetched(to["prepare-subject"][0])
@@ -143,9 +131,9 @@ def test_files_and_the_viewer_are_a_link_away(place: Path) -> None:
 
 
 def test_the_same_item_again_is_a_new_version_under_the_same_keys(place: Path) -> None:
-    make(order("version one", place, "versioned"), place / "out")
-    make(order("version two", place, "versioned"), place / "out")
-    make(order("version two", place, "versioned"), place / "out")
+    convert_job(job("version one", place, item="versioned"), place / "out")
+    convert_job(job("version two", place, item="versioned"), place / "out")
+    convert_job(job("version two", place, item="versioned"), place / "out")
     every, latest = artifacts("versioned", "/artifacts/filter"), artifacts("versioned")
     assert {key: len(versions) for key, versions in every.items() if key in ("asset", "fit-motion")} == {
         "asset": 3, "fit-motion": 2,
@@ -157,14 +145,14 @@ def test_the_same_item_again_is_a_new_version_under_the_same_keys(place: Path) -
 
 def test_a_step_that_failed_leaves_its_reason_and_its_last_good_state(place: Path) -> None:
     with pytest.raises(StepDiverged):
-        make(order("fit_motion=diverge", place, "diverged"), place / "out")
+        convert_job(job("fit_motion=diverge", place, item="diverged"), place / "out")
     kept = {key: latest[0]["data"] for key, latest in artifacts("diverged").items()}
     assert "iteration 7" in kept["fit-motion"] and "![last_good](data:image/webp;base64," in kept["fit-motion"]
     assert "asset" not in kept and "package" not in kept
 
 
 def test_a_browser_draws_every_picture_of_the_page(server: Server, place: Path) -> None:
-    make(order("drawn", place, "drawn"), place / "out")
+    convert_job(job("drawn", place, item="drawn"), place / "out")
     (version,) = artifacts("drawn", "/artifacts/filter")["asset"]
     seen = drawn_in_browser(server, version, place / "page.png")
     assert [shown["name"] for shown in seen["pictures"]] == [*TITLES, *["Losses of the fake"] * LOSSES]
@@ -198,9 +186,9 @@ def test_a_picture_is_shown_as_large_as_its_bytes_allow(tmp_path: Path) -> None:
 
 
 def test_a_loss_that_cannot_be_drawn_is_left_out() -> None:
-    assert curves.picture({"title": "t", "x": [], "series": {"a": []}, "notes": []}) == ""
-    assert curves.picture({"title": "t", "x": [1, 2], "series": {"a": [float("nan")] * 2}, "notes": []}) == ""
-    assert "&lt;loss&gt; 3" in curves.picture(
+    assert curves.svg_picture({"title": "t", "x": [], "series": {"a": []}, "notes": []}) == ""
+    assert curves.svg_picture({"title": "t", "x": [1, 2], "series": {"a": [float("nan")] * 2}, "notes": []}) == ""
+    assert "&lt;loss&gt; 3" in curves.svg_picture(
         {"title": "t", "x": [1, 2], "series": {"<loss>": [2.0, 3.0]}, "notes": []}
     )
 
@@ -214,12 +202,12 @@ def _stored(store: ArtifactStore, picture: Image.Image) -> ArtifactRef:
 def test_counts_are_read_with_all_their_digits() -> None:
     values = [65536, 5000.0, 12.0, 2748.64, -123456.7, 0.0, float("nan"), float("inf")]
     said = ["65,536", "5,000", "12", "2749", "-1.235e+05", "0", "nan", "inf"]
-    assert [curves.amount(value) for value in values] == said
+    assert [curves.format_number(value) for value in values] == said
 
 
 def test_an_item_may_be_called_anything_and_is_shown_letter_by_letter(server: Server, place: Path) -> None:
     name = "{0} {item} ![x](http:tracker) |b| <img src=x> *c*"
-    make(order("nasty", place, name), place / "out")
+    convert_job(job("nasty", place, item=name), place / "out")
     with get_client(sync_client=True) as client:
         wanted = {"artifacts": {"key": {"like_": "-0-item-x-http-tracker-b-img-src-x-c-"}}, "limit": 200}
         found: list[dict[str, Any]] = client.request("POST", "/artifacts/filter", json=wanted).json()

@@ -1,4 +1,4 @@
-// Draws a cloud of Gaussians as the product's rasterizers do: one square each, projected (EWA), blended far to near.
+// Gaussian splat renderer, consistent with the library's rasterizers: one quad per splat, EWA projection, back to front.
 import {
   BufferAttribute, CustomBlending, DataTexture, DynamicDrawUsage, FloatType, GLSL3, InstancedBufferAttribute,
   InstancedBufferGeometry, Mesh, OneFactor, OneMinusSrcAlphaFactor, RGBAFormat, RawShaderMaterial, UnsignedByteType,
@@ -8,7 +8,7 @@ import vertexShader from "./cloud.vert";
 import fragmentShader from "./cloud.frag";
 import { farToNear } from "./order.js";
 
-const PER_LINE = 1024; // Gaussians in a line of a texture; as in the shader
+const PER_LINE = 1024; // Gaussians per texture row; same value as in the shader
 const CORNERS = [-1, -1, 0, 1, -1, 0, 1, 1, 0, -1, 1, 0];
 
 export class Cloud {
@@ -56,7 +56,7 @@ export class Cloud {
     this.motion.needsUpdate = true;
   }
 
-  /** Has to run before every picture: order and size of the squares depend on the view. */
+  /** Updates depth order and quad sizes, which depend on the view; call before every frame. */
   look(camera, { width, height }) {
     farToNear(this.rows, 12, this.count, camera.matrixWorldInverse.elements, this.order.array);
     this.order.needsUpdate = true;

@@ -1,7 +1,7 @@
-// Buttons, scrub bar and keys.
+// Buttons, scrub bar and keyboard shortcuts.
 import { SPEEDS } from "./player.js";
 
-const VIDEO_DRIFT = 0.12; // seconds that the film may be off before it is set right
+const VIDEO_DRIFT = 0.12; // seconds; larger offsets of the video are corrected by seeking
 const byId = (id) => document.getElementById(id);
 
 export class Controls {
@@ -24,7 +24,7 @@ export class Controls {
     this.darken(matchMedia("(prefers-color-scheme: dark)").matches);
   }
 
-  /** Shows the state of the clock; runs after every picture. */
+  /** Shows the state of the clock; called after every frame. */
   update(mode) {
     const { player } = this;
     for (const button of this.buttons) button.setAttribute("aria-pressed", button.dataset.show === mode);
@@ -38,7 +38,7 @@ export class Controls {
     this.follow();
   }
 
-  /** Keeps the driving video at the moment that is shown. */
+  /** Synchronizes the driving video with the clock. */
   follow() {
     const { player, video } = this;
     if (!video || !(video.duration > 0)) return;
@@ -47,7 +47,7 @@ export class Controls {
     const drift = Math.min(off, video.duration - off);
     if (drift > (player.playing ? VIDEO_DRIFT * Math.max(1, player.speed) : 0.01) && !video.seeking) video.currentTime = wanted;
     video.playbackRate = player.speed;
-    if (player.playing && video.paused) video.play().catch(() => {}); // a browser may refuse; it then follows by seeking
+    if (player.playing && video.paused) video.play().catch(() => {}); // if the browser refuses autoplay, the video follows by seeking
     if (!player.playing && !video.paused) video.pause();
   }
 
@@ -62,7 +62,7 @@ export class Controls {
 
   scrub(seconds) {
     this.player.playing = false;
-    this.player.seek(Math.min(seconds, this.player.duration * (1 - 1e-6))); // the end of the bar is not the beginning
+    this.player.seek(Math.min(seconds, this.player.duration * (1 - 1e-6))); // so that the end of the bar does not wrap to the start
   }
 
   darken(dark = document.documentElement.dataset.theme !== "dark") {

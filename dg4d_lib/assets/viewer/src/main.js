@@ -1,4 +1,4 @@
-// Puts the page together: what it was filled with, the stage, the clock, the controls. `window.dg4d` drives it from code.
+// Entry point: connects embedded data, stage, clock and controls. `window.dg4d` is the scripting interface.
 import { bytesOf, facts } from "./embedded.js";
 import { Cloud } from "./cloud.js";
 import { Controls } from "./controls.js";
@@ -13,7 +13,7 @@ const NO_WEBGL =
 
 const stageElement = document.getElementById("stage");
 
-/** What there is to show, by the modes it has. */
+/** Loads the embedded representations, keyed by display mode. */
 async function read() {
   const mesh = await readMesh(await bytesOf("glb"));
   const packed = await bytesOf("splats");
@@ -74,7 +74,7 @@ async function start() {
   animate(player, stage, draw);
 }
 
-/** Draws when something changed: the time, the view or the size. */
+/** Redraws when time, view or size changed. */
 function animate(player, stage, draw) {
   let last = performance.now();
   const tick = (now) => {
@@ -99,7 +99,7 @@ function refuse(error) {
   console.error(error);
 }
 
-// `ready` is fulfilled with the first picture, and rejected if there will be none.
+// `ready` resolves with the first frame and rejects if loading fails.
 window.dg4d = { ready: null };
 window.dg4d.ready = start();
 window.dg4d.ready.catch(refuse);

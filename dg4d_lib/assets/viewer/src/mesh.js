@@ -1,4 +1,4 @@
-// The animated mesh of a GLB, with its baked colors as they are, or as clay with its edges.
+// Animated mesh of a GLB, unlit with its baked colors, or as a clay model with wireframe.
 import { AnimationMixer, DoubleSide, Mesh, MeshBasicMaterial, MeshLambertMaterial } from "three";
 import { GLTFLoader } from "three/examples/jsm/loaders/GLTFLoader.js";
 import { MeshoptDecoder } from "three/examples/jsm/libs/meshopt_decoder.module.js";
@@ -8,7 +8,7 @@ import { pointersOf } from "./pointers.js";
 const CLAY = { color: 0xc9ced8, side: DoubleSide, flatShading: true, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 };
 const EDGES = { color: 0x1f3a7a, wireframe: true, transparent: true, opacity: 0.38 };
 
-/** Reads a GLB; the first animation is the one that plays. */
+/** Parses a GLB; its first animation is played. */
 export async function readMesh(bytes) {
   const loader = new GLTFLoader().setMeshoptDecoder(MeshoptDecoder);
   const gltf = await loader.parseAsync(bytes.buffer, "");
@@ -28,7 +28,7 @@ class AnimatedMesh {
     this.pointers.connect(this.parts.map((part) => part.material), this.colored);
     this.edges = this.parts.map((part) => new Mesh(part.geometry, edges));
     this.edges.forEach((lines, i) => this.parts[i].add(lines));
-    for (const drawn of [...this.parts, ...this.edges]) drawn.frustumCulled = false; // bounds do not follow the motion
+    for (const drawn of [...this.parts, ...this.edges]) drawn.frustumCulled = false; // bounding spheres do not include the morph targets
     const [clip] = gltf.animations;
     this.duration = Math.max(clip?.duration ?? 0, pointers.duration);
     const keys = [...(clip?.tracks ?? []), ...pointers.tracks].map(({ times }) => times);
@@ -39,7 +39,7 @@ class AnimatedMesh {
     this.seek(0);
   }
 
-  /** "mesh" or "wireframe"; anything else hides it. */
+  /** Selects "mesh" or "wireframe"; any other mode hides the mesh. */
   show(what) {
     this.object.visible = what === "mesh" || what === "wireframe";
     this.parts.forEach((part, i) => (part.material = what === "wireframe" ? this.clay : this.colored[i]));
@@ -56,12 +56,12 @@ class AnimatedMesh {
   }
 }
 
-/** Seconds between two neighboring keys, at least; infinite for a single one. */
+/** Returns the shortest interval between keys in seconds; infinite for a single key. */
 function shortest(times) {
   return Math.min(Infinity, ...Array.from(times.subarray(1), (time, i) => time - times[i]));
 }
 
-/** A material that shows the color as it is. */
+/** Creates an unlit material. */
 function flat(material) {
   const { name, map, color, side, transparent, opacity, alphaTest, vertexColors } = material;
   return new MeshBasicMaterial({ name, map, color, side, transparent, opacity, alphaTest, vertexColors, toneMapped: false });

@@ -1,8 +1,8 @@
-// Morph targets, summed up on the processor: any number of frames works, and only those with a weight cost anything.
+// Morph targets evaluated on the CPU: supports any number of frames, and only those of non-zero weight cost time.
 import { BufferAttribute } from "three";
 
 export class Morph {
-  /** Takes over the morph targets of a mesh. */
+  /** Replaces three.js's morphing of a mesh. */
   constructor(mesh) {
     const { geometry } = mesh;
     this.weights = mesh.morphTargetInfluences; // the animation writes into it
@@ -32,7 +32,7 @@ export class Morph {
   }
 }
 
-/** Rows of three numbers, whatever they were packed as. */
+/** Converts an attribute of any component type to rows of three floats. */
 function floats(attribute) {
   const rows = new Float32Array(3 * attribute.count);
   for (let i = 0; i < attribute.count; i++) {

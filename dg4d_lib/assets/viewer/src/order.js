@@ -1,4 +1,4 @@
-// Sorting by depth, by counting: 65,536 layers, equal ones in their given order.
+// Stable counting sort by depth into 65,536 layers.
 
 const LAYERS = 65536;
 const starts = new Uint32Array(LAYERS + 1);
@@ -6,10 +6,10 @@ let layers = new Uint16Array(0);
 let depths = new Float32Array(0);
 
 /**
- * Numbers of points from far to near.
- * @param {Float32Array} rows - points stand at the beginning of every `stride` numbers.
- * @param {number[]} view - world to camera, column by column; the camera looks along -z.
- * @param {Uint32Array} order - is filled.
+ * Sorts the indices of points from far to near.
+ * @param {Float32Array} rows - rows of `stride` numbers that start with a position.
+ * @param {number[]} view - world-to-camera matrix, column-major; the camera looks along -z.
+ * @param {Uint32Array} order - output.
  */
 export function farToNear(rows, stride, count, view, order) {
   if (layers.length < count) [layers, depths] = [new Uint16Array(count), new Float32Array(count)];

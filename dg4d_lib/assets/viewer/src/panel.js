@@ -1,9 +1,9 @@
-// What stands beside the stage: the input, the film that drives it, and where all of it came from.
+// Side panel: input picture, driving video and provenance.
 import { addressOf } from "./embedded.js";
 
 const LONG = 28; // characters; longer words are cut until they are clicked
 
-/** Fills the panel; gives the element of the driving video, or null. */
+/** Fills the panel; returns the element of the driving video, or null. */
 export function fillPanel(facts, picture, video) {
   if (picture) shown("picture", picture, typeOf(picture));
   document.getElementById("facts").append(...Object.entries(facts).map(([name, value], i) => group(name, value, i === 0)));
@@ -17,7 +17,7 @@ function shown(id, bytes, type) {
   return figure.firstElementChild;
 }
 
-/** PNG, JPEG or WebP, by the first bytes. */
+/** Detects PNG, JPEG or WebP by the first bytes. */
 function typeOf(bytes) {
   return { 0x89: "image/png", 0xff: "image/jpeg" }[bytes[0]] ?? "image/webp";
 }
@@ -28,7 +28,7 @@ function group(name, value, open) {
   return details;
 }
 
-/** Nested facts: tables in tables. */
+/** Renders nested facts as nested tables. */
 function content(value) {
   if (value === null || typeof value !== "object") return word(value);
   if (Array.isArray(value)) return element("ul", "", ...value.map((item) => element("li", "", content(item))));

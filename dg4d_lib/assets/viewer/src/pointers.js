@@ -1,9 +1,9 @@
-// KHR_animation_pointer, as far as it moves KHR_texture_transform of a base color: textures that change over time.
+// KHR_animation_pointer for KHR_texture_transform of base color textures, which animates textures per frame.
 
 const POINTER =
   /^\/materials\/(\d+)\/pbrMetallicRoughness\/baseColorTexture\/extensions\/KHR_texture_transform\/(offset|scale|rotation)$/;
 
-/** The tracks of a glTF's first animation that three.js leaves aside. */
+/** Returns the pointer tracks of a glTF's first animation, which three.js ignores. */
 export async function pointersOf(gltf) {
   const { json } = gltf.parser;
   const animation = json.animations?.[0] ?? { channels: [] };
@@ -44,7 +44,7 @@ class Pointers {
   }
 }
 
-/** The value of a track at a time, STEP or LINEAR. */
+/** Evaluates a STEP or LINEAR track at a time. */
 function sample({ times, values, step }, time) {
   const width = values.length / times.length;
   const row = (key) => Array.from(values.subarray(key * width, (key + 1) * width));

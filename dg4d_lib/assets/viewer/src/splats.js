@@ -1,9 +1,9 @@
-// Moving splats out of their compact form; the writer, and what the numbers mean: dg4d_lib/assets/formats/web_splats.py.
+// Decoder of animated splats; the format is documented in dg4d_lib/assets/formats/web_splats.py.
 import { inflate } from "./embedded.js";
 
 const MAGIC = "D4WS";
 
-/** Reads a file; gives a `MovingSplats`. */
+/** Decodes a file to `MovingSplats`. */
 export async function readSplats(bytes) {
   const { buffer, byteOffset } = bytes;
   if (new TextDecoder().decode(bytes.subarray(0, 4)) !== MAGIC) throw new Error("these are no splats for the web");
@@ -24,7 +24,7 @@ class MovingSplats {
     this.states = new Map(); // the frames that were asked for last
   }
 
-  /** Writes a moment into rows of twelve: position and 0, rotation xyzw, logarithms of the scales and 0. */
+  /** Writes the state at a time into rows of 12 numbers: position and 0, quaternion xyzw, log scales and 0. */
   at(seconds, rows) {
     const position = (seconds * this.fps) % this.frames;
     const before = Math.floor(position);
@@ -42,7 +42,7 @@ class MovingSplats {
     }
   }
 
-  /** One whole frame, in rows as above. */
+  /** Returns the rows of one frame. */
   state(frame) {
     const kept = this.states.get(frame);
     if (kept) return kept;
@@ -68,7 +68,7 @@ class MovingSplats {
   }
 }
 
-/** The numbers behind low and high bytes of zigzag differences: over Gaussians first, then over frames. */
+/** Decodes low and high bytes of zigzag differences, over Gaussians first and then over frames. */
 function undone(bytes, frames, count) {
   const size = frames * 3 * count;
   const values = new Int16Array(size); // wraps around, as the writer's does

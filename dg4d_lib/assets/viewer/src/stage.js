@@ -1,4 +1,4 @@
-// Canvas, camera and the hand that turns it. The canvas is transparent: the page's background shows through.
+// Canvas, camera and orbit controls. The canvas is transparent, so the page's background shows through.
 import { DirectionalLight, HemisphereLight, PerspectiveCamera, Scene, WebGLRenderer } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 
@@ -9,7 +9,7 @@ const NEAREST = 0.3;
 const FARTHEST = 12;
 const MOST_PIXELS_PER_POINT = 2; // sharper screens would only be slower
 
-/** Whether this browser can draw at all. */
+/** Returns true if the browser supports WebGL 2. */
 export function canDraw() {
   return Boolean(document.createElement("canvas").getContext("webgl2"));
 }
@@ -30,10 +30,10 @@ export class Stage {
     this.resize();
   }
 
-  /** Back to the view of the input picture. */
+  /** Resets the camera to the input view. */
   reset() {
     this.controls.enableDamping = false;
-    this.controls.update(); // ends what is still turning
+    this.controls.update(); // stops the damped rotation
     this.controls.enableDamping = true;
     this.controls.target.set(0, 0, 0);
     this.camera.position.set(0, 0, RADIUS);
@@ -41,7 +41,7 @@ export class Stage {
     this.stale = true;
   }
 
-  /** The scene as it is now, drawn at once. */
+  /** Renders the scene immediately. */
   draw(before) {
     this.camera.updateMatrixWorld();
     before(this.camera, this.pixels);

@@ -5,7 +5,7 @@ from fake_steps import PNG, bank_json, picture
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.rasterizer import backends
-from flows.inputs.orders import Order, Wish, name_of
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest, name_from_text
 from steps.profiles import PREVIEW, revise
 from steps.store.artifact_store import ArtifactStore
 
@@ -20,13 +20,13 @@ def code(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DG4D_CODE_VERSION", "test")
 
 
-def wish(path: Path, video: Path | None = None, bank: Path | None = None, **changes: object) -> Wish:
-    return Wish(item="x", picture=path, video=video, bank=bank, settings=revise(PREVIEW, dict(changes)))
+def request(path: Path, video: Path | None = None, bank: Path | None = None, **changes: object) -> ConversionRequest:
+    return ConversionRequest(item="x", picture=path, video=video, bank=bank, settings=revise(PREVIEW, dict(changes)))
 
 
-def order(wish: Wish, store: ArtifactStore) -> Order:
-    wish.check()
-    return wish.order(store)
+def job(request: ConversionRequest, store: ArtifactStore) -> ConversionJob:
+    request.check()
+    return request.to_job(store)
 
 
 def frames(folder: Path, count: int) -> Path:
@@ -41,12 +41,12 @@ def test_names_do_not_count_but_content_settings_and_seed_do(tmp_path: Path, sto
     (tmp_path / "a.png").write_text(picture("picture"))
     (tmp_path / "b.png").write_text(picture("picture"))
     (tmp_path / "c.png").write_text(picture("another"))
-    first = order(wish(tmp_path / "a.png"), store)
-    assert order(wish(tmp_path / "b.png"), store).digest() == first.digest()
+    first = job(request(tmp_path / "a.png"), store)
+    assert job(request(tmp_path / "b.png"), store).digest() == first.digest()
     assert first.model_copy(update={"item": "y", "profile": "p"}).digest() == first.digest()
     others = [
-        order(wish(tmp_path / "c.png"), store),
-        order(wish(tmp_path / "a.png", **{"mesh.grid": 64}), store),
+        job(request(tmp_path / "c.png"), store),
+        job(request(tmp_path / "a.png", **{"mesh.grid": 64}), store),
         first.model_copy(update={"seed": 1}),
         first.model_copy(update={"moving": True}),
     ]
@@ -55,7 +55,7 @@ def test_names_do_not_count_but_content_settings_and_seed_do(tmp_path: Path, sto
 
 def test_other_code_is_another_order(tmp_path: Path, store: ArtifactStore, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.png").write_text(picture("picture"))
-    one = order(wish(tmp_path / "a.png"), store)
+    one = job(request(tmp_path / "a.png"), store)
     before = one.digest()
     monkeypatch.setenv("DG4D_CODE_VERSION", "other")
     assert one.digest() != before
@@ -68,15 +68,15 @@ def test_another_backend_is_another_order(
     digests = []
     for lack in ("no GPU", ""):
         monkeypatch.setattr(backends, "gsplat_unavailable_reason", lambda lack=lack: lack)
-        digests.append(order(wish(tmp_path / "a.png"), store).digest())
+        digests.append(job(request(tmp_path / "a.png"), store).digest())
     assert digests[0] != digests[1]
 
 
 def test_a_rasterizer_that_cannot_run_is_refused_before_any_work(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_text(picture("picture"))
     with pytest.raises(BadInput, match="rasterizer = 'gpu'"):
-        wish(tmp_path / "a.png", rasterizer="gpu")
-    gsplat = wish(tmp_path / "a.png", rasterizer="cuda_gsplat")
+        request(tmp_path / "a.png", rasterizer="gpu")
+    gsplat = request(tmp_path / "a.png", rasterizer="cuda_gsplat")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(backends, "gsplat_unavailable_reason", lambda: "no GPU")
         with pytest.raises(BackendUnavailable, match="no GPU; or choose rasterizer=cpu"):
@@ -87,18 +87,18 @@ def test_a_rasterizer_that_cannot_run_is_refused_before_any_work(tmp_path: Path)
 
 def test_a_folder_of_frames_is_a_video_and_equal_frames_are_equal_sources(tmp_path: Path, store: ArtifactStore) -> None:
     (tmp_path / "a.png").write_text(picture("picture"))
-    one = order(wish(tmp_path / "a.png", frames(tmp_path / "one", 3)), store)
-    two = order(wish(tmp_path / "a.png", frames(tmp_path / "two", 3)), store)
+    one = job(request(tmp_path / "a.png", frames(tmp_path / "one", 3)), store)
+    two = job(request(tmp_path / "a.png", frames(tmp_path / "two", 3)), store)
     assert one.source == two.source
     assert one.moving
     assert (one.source_name, one.picture_name) == ("one", "a.png")
-    assert order(wish(tmp_path / "a.png", frames(tmp_path / "one", 4)), store).source != one.source
+    assert job(request(tmp_path / "a.png", frames(tmp_path / "one", 4)), store).source != one.source
 
 
 @pytest.mark.parametrize(("name", "moving"), [("a.mp4", True), ("a.WEBM", True), ("a.gif", False), ("a.png", False)])
 def test_a_video_can_be_the_main_argument(tmp_path: Path, store: ArtifactStore, name: str, moving: bool) -> None:
     (tmp_path / name).write_text(picture("x"))
-    assert order(wish(tmp_path / name), store).moving == moving
+    assert job(request(tmp_path / name), store).moving == moving
 
 
 def test_what_cannot_work_is_refused_before_any_work(tmp_path: Path) -> None:
@@ -107,23 +107,23 @@ def test_what_cannot_work_is_refused_before_any_work(tmp_path: Path) -> None:
     (tmp_path / "empty.png").touch()
     bank = frames(tmp_path / "bank", 1)
     cases = {
-        "does not exist": wish(tmp_path / "none.png"),
-        "is a folder; give one file": wish(tmp_path),
-        "empty": wish(tmp_path / "empty.png"),
-        "does not exist;": wish(good, tmp_path / "none.mp4"),
-        "holds 1 picture;": wish(good, frames(tmp_path / "single", 1)),
-        "holds no pictures;": wish(good, frames(tmp_path / "bare", 0)),
-        "needs the true views": wish(good, **{"prior.kind": "oracle"}),
-        r"no file bank\.json": wish(good, bank=bank, **{"prior.kind": "oracle"}),
+        "does not exist": request(tmp_path / "none.png"),
+        "is a folder; give one file": request(tmp_path),
+        "empty": request(tmp_path / "empty.png"),
+        "does not exist;": request(good, tmp_path / "none.mp4"),
+        "holds 1 picture;": request(good, frames(tmp_path / "single", 1)),
+        "holds no pictures;": request(good, frames(tmp_path / "bare", 0)),
+        "needs ground-truth views": request(good, **{"prior.kind": "oracle"}),
+        r"no file bank\.json": request(good, bank=bank, **{"prior.kind": "oracle"}),
     }
     for says, bad in cases.items():
         with pytest.raises(BadInput, match=says):
             bad.check()
     (bank / "bank.json").write_text(bank_json("000.png"))
     (bank / "000.png").write_bytes(PNG)
-    wish(good, bank=bank, **{"prior.kind": "oracle"}).check()
+    request(good, bank=bank, **{"prior.kind": "oracle"}).check()
     with pytest.raises(BadInput, match=r"prior\.kind=oracle"):
-        wish(good, bank=bank).check()
+        request(good, bank=bank).check()
 
 
 TEXT = {"text.weights": "somebody/pictures"}
@@ -143,23 +143,23 @@ def pipeline(folder: Path) -> Path:
     return folder
 
 
-def words(text: str, **changes: object) -> Wish:
-    return Wish(item="x", text=text, settings=revise(PREVIEW, {**TEXT, **changes}))
+def words(text: str, **changes: object) -> ConversionRequest:
+    return ConversionRequest(item="x", text=text, settings=revise(PREVIEW, {**TEXT, **changes}))
 
 
 def test_words_are_a_source_whatever_the_spaces_between_them(weights: Path, store: ArtifactStore) -> None:
-    one = order(words("a red dragon"), store)
+    one = job(words("a red dragon"), store)
     assert one.drawn
     assert not one.moving
     assert one.source_name == '"a red dragon"'
-    assert order(words(" a  red\ndragon "), store).digest() == one.digest()
-    assert order(words("a red newt"), store).digest() != one.digest()
-    assert order(words("a red dragon", **{"text.num_inference_steps": 3}), store).digest() != one.digest()
+    assert job(words(" a  red\ndragon "), store).digest() == one.digest()
+    assert job(words("a red newt"), store).digest() != one.digest()
+    assert job(words("a red dragon", **{"text.num_inference_steps": 3}), store).digest() != one.digest()
 
 
 def test_a_file_that_holds_the_same_words_is_another_order(weights: Path, tmp_path: Path, store: ArtifactStore) -> None:
     (tmp_path / "a.png").write_text("#?RADIANCE dragon")
-    assert order(wish(tmp_path / "a.png", **TEXT), store).digest() != order(words("#?RADIANCE dragon"), store).digest()
+    assert job(request(tmp_path / "a.png", **TEXT), store).digest() != job(words("#?RADIANCE dragon"), store).digest()
 
 
 def test_words_that_cannot_work_are_refused_before_any_work(weights: Path, tmp_path: Path) -> None:
@@ -169,7 +169,7 @@ def test_words_that_cannot_work_are_refused_before_any_work(weights: Path, tmp_p
         "has 1001 characters": words("x" * 1001),
         "not both": words("a newt").model_copy(update={"picture": tmp_path / "a.png"}),
         "--set text.weights": words("a newt", **{"text.weights": ""}),
-        "nothing to make": Wish(item="x", settings=PREVIEW),
+        "nothing to make": ConversionRequest(item="x", settings=PREVIEW),
     }
     for says, bad in cases.items():
         with pytest.raises(BadInput, match=says):
@@ -189,22 +189,22 @@ def test_words_that_cannot_work_are_refused_before_any_work(weights: Path, tmp_p
     ],
 )
 def test_words_name_the_asset(text: str, name: str) -> None:
-    assert name_of(text) == name
+    assert name_from_text(text) == name
 
 
 def test_other_weights_are_another_order_and_their_place_does_not_count(
     weights: Path, tmp_path: Path, store: ArtifactStore
 ) -> None:
     one, two = pipeline(tmp_path / "one" / "mine"), pipeline(tmp_path / "two" / "mine")
-    first = order(words("a newt", **{"text.weights": str(one)}), store)
-    second = order(words("a newt", **{"text.weights": str(two)}), store)
+    first = job(words("a newt", **{"text.weights": str(one)}), store)
+    second = job(words("a newt", **{"text.weights": str(two)}), store)
     assert first.digest() == second.digest()
     assert str(tmp_path) not in first.model_dump_json()
     (two / "unet" / "model.safetensors").write_bytes(b"changed")
-    assert order(words("a newt", **{"text.weights": str(two)}), store).digest() != first.digest()
-    named = order(words("a newt"), store).digest()
+    assert job(words("a newt", **{"text.weights": str(two)}), store).digest() != first.digest()
+    named = job(words("a newt"), store).digest()
     (weights / "somebody--pictures" / "unet" / "model.safetensors").write_bytes(b"changed")
-    assert order(words("a newt"), store).digest() != named
+    assert job(words("a newt"), store).digest() != named
 
 
 def test_weights_that_no_step_will_load_need_not_be_here(weights: Path, tmp_path: Path) -> None:
@@ -212,19 +212,19 @@ def test_weights_that_no_step_will_load_need_not_be_here(weights: Path, tmp_path
     (tmp_path / "a.mp4").write_text(picture("x"))
     (tmp_path / "a.gif").write_text(picture("x"))
     animated = {"driving.kind": "svd"}
-    wish(tmp_path / "a.png", **{"text.weights": "not/here"}).check()
-    wish(tmp_path / "a.mp4", **animated).check()
-    wish(tmp_path / "a.gif", **animated).check()  # whether it moves, its content says
-    wish(tmp_path / "a.png", video=tmp_path / "a.mp4", **animated).check()
+    request(tmp_path / "a.png", **{"text.weights": "not/here"}).check()
+    request(tmp_path / "a.mp4", **animated).check()
+    request(tmp_path / "a.gif", **animated).check()  # whether it moves, its content says
+    request(tmp_path / "a.png", video=tmp_path / "a.mp4", **animated).check()
     with pytest.raises(BackendUnavailable, match="`dg4d weights pull svd`"):
-        wish(tmp_path / "a.png", **animated).check()
+        request(tmp_path / "a.png", **animated).check()
 
 
 def test_only_weights_that_allow_commercial_use_pass_where_that_is_asked_for(weights: Path, tmp_path: Path) -> None:
     (tmp_path / "a.png").write_text(picture("x"))
 
-    def strict(**changes: object) -> Wish:
-        return wish(tmp_path / "a.png", **changes).model_copy(update={"commercial_only": True})
+    def strict(**changes: object) -> ConversionRequest:
+        return request(tmp_path / "a.png", **changes).model_copy(update={"commercial_only": True})
 
     strict().check_licenses()
     strict(**{"driving.kind": "svd"}).check_licenses()
@@ -238,7 +238,7 @@ def test_only_weights_that_allow_commercial_use_pass_where_that_is_asked_for(wei
 
 def test_whether_licenses_mattered_is_part_of_the_order(tmp_path: Path, store: ArtifactStore) -> None:
     (tmp_path / "a.png").write_text(picture("x"))
-    free = wish(tmp_path / "a.png")
+    free = request(tmp_path / "a.png")
     strict = free.model_copy(update={"commercial_only": True})
-    assert order(strict, store).commercial_only
-    assert order(strict, store).digest() != order(free, store).digest()
+    assert job(strict, store).commercial_only
+    assert job(strict, store).digest() != job(free, store).digest()

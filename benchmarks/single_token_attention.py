@@ -1,12 +1,13 @@
-"""What cross-attention to one token costs, and without the attention (`dg4d_lib/diffusion/single_token_attention.py`).
+"""Cost of cross-attention to one token, with and without the shortcut of `diffusion/single_token_attention.py`.
 
-Run with `python -m benchmarks.one_token` (a quarter of an hour, 8 GB; `--quick`: tiny networks, some seconds; `--json
-FILE` keeps the rows). U-Nets of the published sizes with random weights, float32, one thread, no GPU. Columns:
+Kept as evidence for the shortcut. Run with `python -m benchmarks.single_token_attention` (15 minutes, 8 GB; `--quick`:
+tiny networks, seconds; `--json FILE` keeps the rows). U-Nets of the published sizes with random weights, float32, one
+thread, no GPU. Columns:
 
-`TFLOP`       of one call, as `torch.utils.flop_counter` counts, attention included; nothing is computed for it
-`launches`    operations of a call that are no views: about the kernels of a GPU
-`s CPU`       of one call, medians of calls in turn; "-" where the rounds would take hours
-`difference`  the largest of any output, over the outputs' deviation: rounding
+`TFLOP`       per call, counted by `torch.utils.flop_counter` with attention, without computing anything
+`launches`    operations per call other than views, approximately the kernel launches of a GPU
+`s CPU`       per call, medians of interleaved calls; "-" if the rounds would take hours
+`difference`  largest difference of outputs over their standard deviation: rounding
 """
 
 from collections.abc import Callable, Iterator
@@ -24,14 +25,14 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.paper_schedule import FULL, Sizes, picture_unet, video_unet
+from benchmarks.paper_schedule import FULL, Sizes, svd_unet, zero123_unet
 from dg4d_lib.diffusion.latents import LATENT_CHANNELS, LATENT_SIZE
 from dg4d_lib.diffusion.single_token_attention import shorten_attention
 
 
 @dataclass(frozen=True)
 class Row:
-    """One network and one size of its inputs; frames are those of every video of the batch."""
+    """Network with one input size; frames are per video of the batch."""
 
     network: str
     batch: int
@@ -48,7 +49,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Case:
-    """Inputs of a network; size is that of the latents."""
+    """Inputs of a network; `size` is that of the latents."""
 
     batch: int
     size: int
@@ -57,7 +58,7 @@ class Case:
 
     @torch.no_grad()
     def call(self, unet: Any) -> Tensor:
-        """The network's answer to noise and tokens, equal at every call, other ones for each of the batch."""
+        """Call the network on fixed noise and tokens, different for each item of the batch."""
         generator = torch.Generator().manual_seed(0)
         draw = partial(torch.randn, generator=generator)
         tokens = draw(self.batch, 1, unet.config.cross_attention_dim)
@@ -69,7 +70,7 @@ class Case:
 
 
 class Launches(TorchDispatchMode):
-    """Counts operations that compute something."""
+    """Counter of operations that compute something."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -82,12 +83,12 @@ class Launches(TorchDispatchMode):
 
 
 def rows(build: Callable[[], Any], cases: list[Case], rounds: int) -> Iterator[Row]:
-    """A network as diffusers has it against itself with the short way, the weights being the same tensors."""
+    """Compare a network of diffusers with its shortcut, sharing the weights."""
     before = build().eval().requires_grad_(False)
     with torch.device("meta"):
         after = shorten_attention(build().eval().requires_grad_(False))
     after.load_state_dict(before.state_dict(), assign=True)
-    with FakeTensorMode() as nothing:  # tensors without numbers
+    with FakeTensorMode() as nothing:  # tensors without data
         drafts = build().eval(), shorten_attention(build().eval())
     for case in cases:
         (tflop_before, launches_before), (tflop, launches) = (cost(case, draft, nothing) for draft in drafts)
@@ -104,10 +105,10 @@ def rows(build: Callable[[], Any], cases: list[Case], rounds: int) -> Iterator[R
 
 
 def cost(case: Case, draft: Any, nothing: FakeTensorMode) -> tuple[float, int]:
-    """TFLOP and launches of a call."""
+    """Return TFLOP and launches of a call."""
     with nothing, Launches() as launches:
         case.call(draft)
-    # the counter does not know a processor's fused attention, but the products that it is made of
+    # the counter does not support fused attention on CPUs, but its matrix products
     with nothing, sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as flops:
         case.call(draft)
     return flops.get_total_flops() / 1e12, launches.count
@@ -124,7 +125,7 @@ def main() -> None:
     sizes, rounds = (Sizes(), 3) if options.quick else (FULL, 7)
     console, found = new_console(), []
     console.print(f"{machine()}; torch {torch.__version__}, one thread; before / after")
-    for build, cases in ((picture_unet, pictures), (video_unet, videos)):
+    for build, cases in ((zero123_unet, pictures), (svd_unet, videos)):
         found += list(rows(partial(build, sizes), cases, rounds))
     console.print(table(found))
     if options.json:
@@ -132,7 +133,7 @@ def main() -> None:
 
 
 def table(rows: list[Row]) -> Table:
-    """Rows as they are printed."""
+    """Return the rows as a table."""
     result = Table(
         Column("network", no_wrap=True),
         "batch",
@@ -158,7 +159,7 @@ def table(rows: list[Row]) -> Table:
 
 
 def side_by_side(before: float | None, after: float | None, form: str) -> str:
-    """Before, after, and the change."""
+    """Return before, after and the change."""
     if before is None or after is None:
         return "-"
     return f"{before:{form}} / {after:{form}} ({after / before - 1:+.1%})"

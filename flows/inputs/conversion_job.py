@@ -1,4 +1,4 @@
-"""What a user asks for, with the files already in the store: enough to make an asset, and to know if it is made."""
+"""Conversion requests by path, and conversion jobs by content."""
 
 import re
 from collections.abc import Mapping
@@ -11,26 +11,26 @@ from pydantic import Field, ValidationError
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.rasterizer.backends import backend_name, require_backend
 from flows.inputs import naming, sources
-from flows.inputs.signing_key import certificate
+from flows.inputs.signing_key import certificate_digest
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen, digest_of
 from steps.profiles import PipelineSettings
 from steps.runtime.installed_code import catalog, request_version
 from steps.runtime.weights import identities, license_of, open_weights, weights_in, without_paths
 from steps.store.artifact_store import ArtifactStore
 
-LONGEST_NAME = 60  # characters of a name made out of words
-NAMES = {"item", "profile", "source_name", "picture_name"}  # of an order: for people, no part of its digest
+LONGEST_NAME = 60  # characters of a name made from a prompt
+NAMES = {"item", "profile", "source_name", "picture_name"}  # for people; not part of the digest
 
 
-class Wish(Frozen):
-    """What a user asks for, by paths.
+class ConversionRequest(Frozen):
+    """Conversion request of a user, by paths.
 
     Attributes:
         item: name of the asset.
-        picture: a picture or a video; None where `text` says what to make.
-        text: words, of which a picture is drawn.
-        video: a video or a folder of frames that the asset follows; then `picture` only names it.
-        bank: a folder of true views, for the oracle prior.
+        picture: picture or video; None with `text`.
+        text: prompt for a text-to-image model.
+        video: driving video or folder of frames; then `picture` only names the asset.
+        bank: folder of ground-truth views, for the oracle prior.
         commercial_only: refuse weights whose license forbids commercial use.
     """
 
@@ -46,16 +46,15 @@ class Wish(Frozen):
 
     @property
     def source_name(self) -> str:
-        """What people call the source."""
-        footage = self._footage()
-        return footage.name if footage else f'"{self.text}"'
+        """Name of the source, for people."""
+        return self._footage.name if self._footage else f'"{self.text}"'
 
     def check(self) -> None:
-        """Refuse what cannot work, before any work.
+        """Validate the request before any work.
 
         Raises:
             BadInput: says what is wrong and what to do.
-            BackendUnavailable: the rasterizer that was asked for cannot run here, or weights are missing.
+            BackendUnavailable: the chosen rasterizer cannot run here, or weights are missing.
         """
         self.check_names()
         if not 0 <= self.seed <= LARGEST_SEED:
@@ -68,33 +67,31 @@ class Wish(Frozen):
             sources.check_bank(self.bank)
         oracle = self.settings.prior.kind == "oracle"
         if oracle and self.bank is None:
-            raise BadInput("prior.kind=oracle needs the true views: --bank DIR")
+            raise BadInput("prior.kind=oracle needs ground-truth views: --bank DIR")
         if not oracle and self.bank is not None:
-            raise BadInput("--bank is read by the oracle prior only: add --set prior.kind=oracle")
+            raise BadInput("only the oracle prior reads --bank: add --set prior.kind=oracle")
         self.check_licenses()
         for name in self._weights():
             open_weights(name)
 
     def check_names(self) -> None:
-        """Refuse names that folders, records or pages could not hold.
+        """Refuse names that folders, records or pages cannot hold.
 
         Raises:
             BadInput: says which and why.
         """
-        for path in (self.picture, self.video):
-            if path is not None:
-                naming.check_text(path.name, "the file name")
-        for path in (self.picture, self.video, self.bank):
-            if path is not None:
-                naming.check_path(path)
+        for path in filter(None, (self.picture, self.video)):
+            naming.check_text(path.name, "the file name")
+        for path in filter(None, (self.picture, self.video, self.bank)):
+            naming.check_path(path)
         naming.check_text(self.text, "the text")
         naming.check_name(self.item, "rename the file" if self.picture else "choose a shorter name")
 
     def check_licenses(self) -> None:
-        """Refuse weights that forbid commercial use, where only what allows it is wanted.
+        """Refuse weights that forbid commercial use if `commercial_only` is set.
 
         Raises:
-            BadInput: says which, and what their licenses are.
+            BadInput: names them and their licenses.
         """
         licenses = {name: license_of(name) for name in self._weights()} if self.commercial_only else {}
         if refused := [f"{name} ({its})" for name, its in licenses.items() if not its.allows_commercial_use]:
@@ -102,19 +99,19 @@ class Wish(Frozen):
                 f"--commercial-only: the settings name weights that may not be used commercially: {'; '.join(refused)}"
             )
 
-    def order(self, store: ArtifactStore) -> "Order":
-        """Put the files into the store.
+    def to_job(self, store: ArtifactStore) -> "ConversionJob":
+        """Put the files into the store and return the job.
 
         Raises:
-            BadInput: a file cannot be read, or there is no room.
+            BadInput: a file cannot be read, or the disk is full.
         """
-        footage = self._footage()
+        footage = self._footage
         try:
-            return Order(
+            return ConversionJob(
                 item=self.item,
                 source=sources.put_source(footage, store) if footage else sources.put_text(self.text, store),
-                text=sources.plain(self.text),
-                moving=self._suffix() in sources.ALWAYS_MOVING or self.video is not None,
+                text=sources.single_spaced(self.text),
+                moving=self._suffix in sources.ALWAYS_MOVING or self.video is not None,
                 bank=sources.put_bank(self.bank, store) if self.bank is not None else None,
                 profile=self.profile,
                 settings=PipelineSettings.model_validate(without_paths(self.settings.model_dump(mode="json"))),
@@ -126,23 +123,24 @@ class Wish(Frozen):
         except OSError as error:
             raise BadInput(f"{footage} cannot be read: {error.strerror or error}") from error
 
+    @property
     def _footage(self) -> Path | None:
-        """The file or folder that is looked at."""
+        """File or folder that is read."""
         return self.video or self.picture
 
+    @property
     def _suffix(self) -> str:
-        footage = self._footage()
-        return footage.suffix.lower() if footage else ""
+        return self._footage.suffix.lower() if self._footage else ""
 
     def _check_source(self) -> None:
         if self.text:
             sources.check_text(self.text)
             if self.picture is not None or self.video is not None:
-                raise BadInput("--text makes the picture; give words, or a picture or video, not both")
+                raise BadInput("--text makes the picture; give a prompt, or a picture or video, not both")
             if not self.settings.text.weights:
                 raise BadInput(
                     "--text needs a text-to-image pipeline: --set text.weights=FOLDER (in the layout of diffusers), or "
-                    "an id of the Hugging Face hub"
+                    "the id of a Hugging Face repository"
                 )
             return
         if self.picture is None:
@@ -152,22 +150,22 @@ class Wish(Frozen):
             sources.check_video(self.video)
 
     def _weights(self) -> list[str]:
-        """The weights that some step will load: those for words and for made-up motions only where there are any."""
+        """Return the weights that some step will load: text and driving models only if a step uses them."""
         tree = self.settings.model_dump(mode="json")
         if not self.text:
             del tree["text"]
-        if self.video is not None or self._suffix() in sources.VIDEOS:
+        if self.video is not None or self._suffix in sources.VIDEOS:
             del tree["driving"]
         return list(weights_in(tree))
 
 
-class Order(Frozen):
-    """What a user asks for, by content; names are for people and do not count.
+class ConversionJob(Frozen):
+    """Conversion job, by content; names are for people and not part of its digest.
 
     Attributes:
-        source: a picture, a video, the frames of one; words if `drawn`.
-        text: those words.
-        moving: whether `source` is a video for certain.
+        source: picture, video, or frames; the prompt if `drawn`.
+        text: that prompt.
+        moving: True if `source` is certainly a video.
     """
 
     item: str
@@ -184,76 +182,69 @@ class Order(Frozen):
 
     @property
     def drawn(self) -> bool:
-        """Whether a model draws the picture out of words."""
+        """True if a text-to-image model draws the picture."""
         return bool(self.text)
 
     def recipe(self) -> dict[str, Any]:
-        """Everything that the same code needs to make the same package, as JSON; names for people are left out."""
+        """Return all inputs that determine the package with given code, as JSON, without names for people."""
         recipe = self.model_dump(mode="json", exclude=NAMES)
         return recipe | {"settings": {**recipe["settings"], "rasterizer": backend_name(self.settings.rasterizer)}}
 
     def digest(self) -> str:
-        """Equal for orders that give the same package with the code and the signing key that are here."""
+        """Return a digest that is equal for jobs with the same package under the installed code and signing key."""
         recipe = self.recipe()
         return digest_of(
             {
                 **recipe,
                 "weights": identities(weights_in(recipe["settings"])),
                 "steps": {name: request_version(spec) for name, spec in catalog().items()},
-                "certificate": certificate(),
+                "certificate": certificate_digest(),
             }
         )
 
 
-def order_again(
+def job_from_record(
     record: Mapping[str, Any], store: ArtifactStore, source: Path | None = None, bank: Path | None = None
-) -> Order:
-    """The order that a package was made from.
+) -> ConversionJob:
+    """Return the job that made a package.
 
     Args:
-        record: the provenance of the package.
-        store: where the source is, or goes.
-        source: the picture, the video or the folder of frames; needed where the store does not have it.
-        bank: the folder of true views; likewise.
+        record: provenance of the package.
+        store: has the source, or receives it.
+        source: picture, video or folder of frames; needed if the store no longer has it.
+        bank: folder of ground-truth views; likewise.
 
     Raises:
-        BadInput: the record is of another version, something is needed, or what was given is something else; says what.
+        BadInput: the record has another format, a file is needed, or a given file differs from the recorded one.
     """
     try:
         names = {name: record[name] for name in NAMES & set(record)}
-        order = Order.model_validate({**record["recipe"], **record["run"].get("names", {}), **names})
+        job = ConversionJob.model_validate({**record["recipe"], **record["run"].get("names", {}), **names})
     except (KeyError, TypeError, AttributeError, ValidationError) as error:
         reason = f"{type(error).__name__}: {error}"
         if isinstance(error, ValidationError):
             reason = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
         raise BadInput(
-            f"the record of this package was written by another version of dg4d ({reason}); "
-            "make the asset again from its source"
+            f"the record of this package was written by another version of dg4d ({reason}); make the asset again from "
+            "its source"
         ) from error
-    require_backend(order.settings.rasterizer)
-    if order.text:
-        sources.put_text(order.text, store)
-    if source is not None:
-        sources.check_video(source)
-        _require_same(source, sources.put_source(source, store), order.source)
-    if bank is not None and order.bank is not None:
-        sources.check_bank(bank)
-        _require_same(bank, sources.put_bank(bank, store), order.bank)
-    for option, ref in (("--source", order.source), ("--bank", order.bank)):
-        if ref is not None and not store.has(ref):
-            raise BadInput(f"what this package was made from ({ref.digest}) is not in the store: give it with {option}")
-    return order
+    require_backend(job.settings.rasterizer)
+    if job.text:
+        sources.put_text(job.text, store)
+    for option, path, ref, put in (
+        ("--source", source, job.source, sources.put_source),
+        ("--bank", bank, job.bank, sources.put_bank),
+    ):
+        if ref is None:
+            continue
+        if path is not None and (given := put(path, store).digest) != ref.digest:
+            raise BadInput(f"{path} is not the source of this package: its digest is {given}, recorded {ref.digest}")
+        if not store.has(ref):
+            raise BadInput(f"the source of this package ({ref.digest}) is not in the store: give it with {option}")
+    return job
 
 
-def _require_same(path: Path, given: ArtifactRef, recorded: ArtifactRef) -> None:
-    if given.digest != recorded.digest:
-        raise BadInput(
-            f"{path} is not what this package was made from: its digest is {given.digest}, "
-            f"that in the record {recorded.digest}"
-        )
-
-
-def name_of(text: str) -> str:
-    """A name of an asset, and of its folder, out of words: "A red dragon!" becomes a-red-dragon."""
+def name_from_text(text: str) -> str:
+    """Return a name for an asset and its folder: "A red dragon!" becomes a-red-dragon."""
     name = "-".join(re.findall(r"\w+", text.lower()))[:LONGEST_NAME].strip("-")
     return name or "asset"
