@@ -172,7 +172,7 @@ class LearnedPriorSettings(Settings):
         1.2,
         ge=0.25,
         le=16,
-        description="factor on the log-odds of matter: more gives sharper unseen sides, on average farther from the truth",
+        description="factor on the log-odds of matter: more gives sharper unseen sides, farther from the truth",
     )
     level: float = Field(
         0.35,

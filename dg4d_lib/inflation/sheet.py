@@ -36,7 +36,7 @@ class Sheet:
 
 
 def triangulate(mask: Bool[np.ndarray, "h w"], alpha: Float64[np.ndarray, "h w"]) -> Sheet:
-    """Triangulate by marching squares over the pixel centers; the outline is where alpha is 0.5, forced to the mask's side."""
+    """Triangulate by marching squares over pixel centers; the outline, alpha 0.5, is forced to the mask's side."""
     inside = np.pad(mask, 1)  # the picture's border cuts the subject off
     level = np.pad(np.where(mask, np.maximum(alpha, 0.501), np.minimum(alpha, 0.499)), 1)
     height, width = inside.shape

@@ -152,7 +152,7 @@ def _two_sheets(
 def _hidden_share(
     sheet: Sheet, plane: Float64[np.ndarray, " k"], bulge: Float64[np.ndarray, " k"]
 ) -> Float64[np.ndarray, " k"]:
-    """Return the share by which the back sheet must stay out to be hidden: 0 is as far in as the front, 1 on its ray."""
+    """Return the share by which the back sheet must stay out to be hidden: 0 as far in as the front, 1 on its ray."""
     share, hidden = np.ones(len(bulge)), np.ones(len(bulge), bool)
     for step in SLIDES:
         reach = (RADIUS - plane + (2 * step - 1) * bulge) / (RADIUS - plane + bulge)  # where the input view sees it

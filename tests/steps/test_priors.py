@@ -8,8 +8,10 @@ import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BackendUnavailable, BadInput
+from dg4d_lib.guidance.analytic import AnalyticPrior
 from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.interface import GuidanceView
+from dg4d_lib.inflation.surface import inflate
 from dg4d_lib.settings import (
     GeometricPriorSettings,
     LearnedPriorSettings,
@@ -20,7 +22,16 @@ from dg4d_lib.settings import (
 )
 from dg4d_lib.shape_prior import packaged
 from steps.artifacts.media import write_png, write_zip
-from steps.fitting.priors import LoadedPrior, make_oracle_prior, make_prior, read_bank, read_bank_folder
+from steps.artifacts.pose import Pose, write_pose
+from steps.fitting.priors import (
+    LoadedPrior,
+    make_oracle_prior,
+    make_prior,
+    read_bank,
+    read_bank_folder,
+    subject_shapes,
+    subject_turn,
+)
 
 CUTOUTS = [torch.rand(64, 64, 4, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1)]
 
@@ -161,3 +172,19 @@ def test_the_report_tells_how_much_of_an_unsure_shape_is_inflated(
     assert len(choice.report("cpu").notes) == 1  # nothing was asked yet
     choice.shapes.clean([GuidanceView(OrbitCamera(10, 40, width=32, height=32))])
     assert "100% of its shape is the inflated silhouette" in choice.report("cpu").notes[1]
+
+
+def test_footage_turns_the_inflation_and_hints_turn_every_prior(tmp_path: Path) -> None:
+    write_pose(tmp_path / "pose.json", Pose(turn_deg=12.0))
+    for settings, found in ((GeometricPriorSettings(), 12.0), (LearnedPriorSettings(), 0.0)):
+        assert subject_turn(settings, tmp_path / "pose.json", 0.0) == found
+        assert subject_turn(settings, tmp_path / "pose.json", -5.0) == -5
+        assert subject_turn(settings, None, 0.0) == 0
+
+
+def test_the_geometric_prior_starts_and_judges_as_the_inflation_does(tmp_path: Path) -> None:
+    settings = GeometricPriorSettings(size=32)
+    shapes, expected = subject_shapes(settings, CUTOUTS, 10.0).surface(1), inflate(CUTOUTS[1], 32, 10.0)
+    assert torch.equal(shapes.vertices, expected.vertices) and torch.equal(shapes.colors, expected.colors)
+    prior = make_prior(settings, CUTOUTS, StaticSettings(), None, tmp_path).prior
+    assert isinstance(prior, AnalyticPrior) and prior.weight == 1

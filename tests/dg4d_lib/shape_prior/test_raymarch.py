@@ -48,7 +48,7 @@ def test_a_block_appears_where_its_place_projects_to():
     for azimuth in (0, 60, 90, 180, -120):
         camera = OrbitCamera(10, azimuth, width=96, height=96)
         _, alpha = rendered(block, camera)
-        x, y, z, _ = (camera.world_to_camera() @ point).tolist()
+        x, y, z, _ = (camera.viewmat() @ point).tolist()
         rows, columns = torch.meshgrid(torch.arange(96) + 0.5, torch.arange(96) + 0.5, indexing="ij")
         middle = [float((alpha * axis).sum() / alpha.sum()) for axis in (columns, rows)]
         assert middle == pytest.approx([48 + camera.focal * x / z, 48 + camera.focal * y / z], abs=0.5)
@@ -84,7 +84,7 @@ def test_absorption_agrees_with_denser_samples(camera):
 
 def plain(density: torch.Tensor, camera: OrbitCamera) -> torch.Tensor:
     """Alpha by samples four times as dense, everywhere."""
-    matrix = camera.world_to_camera()
+    matrix = camera.viewmat()
     steps = torch.arange(0.3, 3.6, STRIDE * CELL / 4, dtype=torch.float64)
     places = (torch.arange(camera.width) + 0.5 - camera.width / 2) / camera.focal
     rays = torch.stack([*torch.meshgrid(places, places, indexing="xy"), torch.ones(camera.height, camera.width)], -1)

@@ -210,7 +210,7 @@ def test_views_show_the_matter_where_their_cameras_see_it() -> None:
         points = np.column_stack([x, y, RADIUS - depth, np.ones_like(x)])
         for azimuth, view in zip(azimuths, views, strict=True):
             camera = OrbitCamera(0, azimuth, width=SIZE, height=SIZE)
-            seen = points @ camera.world_to_camera().numpy().T
+            seen = points @ camera.viewmat().numpy().T
             at = (SIZE / 2 + camera.focal * seen[:, :2] / seen[:, 2:3]).astype(int).clip(0, SIZE - 1)
             grown = ndimage.maximum_filter(view[..., 3], 5)  # matter is known on pixels of the input camera only
             assert (grown[at[:, 1], at[:, 0]] > 0).mean() > 0.99
