@@ -21,7 +21,7 @@ from dg4d_lib.assets.rendering.preview import write_mp4
 from dg4d_lib.diffusion.components import default_device
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.images import over_background
-from dg4d_lib.metrics.clip import ClipModel, cosine_similarity
+from dg4d_lib.metrics.clip import ClipModel, cosine_similarity, load_clip
 from dg4d_lib.metrics.fvd import MIN_FRAMES, fvd_consistent4d, load_i3d, logits
 from dg4d_lib.metrics.image import iou, psnr, resize_square
 from dg4d_lib.metrics.lpips import Lpips, load_lpips
@@ -80,7 +80,7 @@ class MetricNetworks:
         self.missing: dict[str, str] = {}
         self.digests: dict[str, str] = {}
         self.lpips: Lpips | None = self._load("lpips", load_lpips, settings.vgg_weights, settings.lpips_weights)
-        self.clip: ClipModel | None = self._load("clip", cosine_similarity, settings.clip_weights)
+        self.clip: ClipModel | None = self._load("clip", load_clip, settings.clip_weights)
         self.i3d: Any = self._load("fvd_consistent4d", load_i3d, settings.i3d_weights)
 
     def _load(self, metric: str, make: Callable[..., Any], *names: str) -> Any:

@@ -66,7 +66,7 @@ class VideoToVideo:
         progress: float,
         generator: torch.Generator,
     ) -> Float[Tensor, "t h w 3"]:
-        """The denoised video; viewpoints and progress do not matter."""
+        """Return the denoised video; `cameras` and `progress` are not used."""
         condition = self.model.encode_condition(resize(self._picture[None], video.shape[1:3])[0], [generator])
         latents = self.model.encode(video)[None]
         noisy = latents + self.sigmas[0] * self.model.sample_noise(latents.shape, [generator])

@@ -113,7 +113,7 @@ def sliding(frames: int) -> Gaussians:
 
 def seen(asset: LoadedAsset, video: DrivingVideo | None = None) -> GateInputs:
     footage = video or DrivingVideo(torch.zeros(FRAMES, 32, 32, 3), torch.ones(FRAMES, 32, 32, 1), 24.0)
-    cutout = torch.cat([footage.frames, footage.coverage], -1)[0]
+    cutout = torch.cat([footage.frames, footage.alpha], -1)[0]
     return collect_evidence(asset, footage, cutout, get_rasterizer("reference"))
 
 

@@ -125,7 +125,7 @@ def test_progress_ends_at_the_number_of_pictures(package: Path, tmp_path: Path) 
         ({"size": 8}, "size"),
         ({"size": 5000}, "size"),
         ({"frames": 0}, "at least one frame"),
-        ({"rasterizer": "none"}, "not known"),
+        ({"rasterizer": "none"}, "unknown rasterizer"),
     ],
 )
 def test_numbers_out_of_range_are_refused(package: Path, tmp_path: Path, changes: dict[str, object], says: str) -> None:

@@ -77,7 +77,7 @@ def test_the_file_says_how_it_moves_and_how_fast(tmp_path: Path) -> None:
 def test_numbers_that_are_not_finite_are_refused(tmp_path: Path) -> None:
     given = asset()
     broken = replace(given.gaussians, means=given.gaussians.means / 0)
-    with pytest.raises(BadInput, match="a compact asset holds finite numbers; given others in means"):
+    with pytest.raises(BadInput, match="a compact asset cannot hold non-finite numbers; given some in means"):
         write_compact(tmp_path / "a", replace(given, gaussians=broken))
 
 

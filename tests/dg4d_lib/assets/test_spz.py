@@ -95,5 +95,5 @@ def test_a_center_that_the_format_cannot_hold_is_refused(tmp_path: Path) -> None
 @pytest.mark.parametrize("broken", ["means", "log_scales", "quats", "opacity_logits", "harmonics"])
 def test_numbers_that_are_not_finite_are_refused_by_name(tmp_path: Path, broken: str) -> None:
     given = cloud(2)
-    with pytest.raises(BadInput, match=f"an SPZ holds finite numbers; given others in {broken};"):
+    with pytest.raises(BadInput, match=f"an SPZ cannot hold non-finite numbers; given some in {broken};"):
         write_spz(tmp_path / "a.spz", replace(given, **{broken: vars(given)[broken] * math.nan}))

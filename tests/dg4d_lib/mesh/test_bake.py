@@ -7,7 +7,7 @@ from scipy import ndimage
 from torch.nn.functional import max_pool2d
 
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.mesh.texturing.bake import locate_texels, vertex_normals
+from dg4d_lib.mesh.texturing.bake import bake_texture, locate_texels, vertex_normals
 from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
@@ -36,8 +36,8 @@ def baked(sphere: Mesh, sphere_of_gaussians: Cloud) -> tuple[torch.Tensor, ...]:
     vertices = np.concatenate([sphere[0], 0.6 * sphere[0]])
     mesh = flattened(vertices, np.concatenate([sphere[1], sphere[1] + len(sphere[0])]))
     gaussians = sphere_of_gaussians(2500, 0.5, red_and_blue)
-    texture = bake(*mesh, gaussians, get_rasterizer("auto"), SETTINGS)
-    texels = texels_of(*mesh, SETTINGS.texture_size)
+    texture = bake_texture(*mesh, gaussians, get_rasterizer("auto"), SETTINGS)
+    texels = locate_texels(*mesh, SETTINGS.texture_size)
     where = torch.stack([texels.rows, texels.columns])
     return texture[texels.rows, texels.columns], texels.positions, texture, where
 
@@ -90,7 +90,7 @@ def test_a_transparent_cloud_leaves_the_texture_gray(sphere: Mesh, sphere_of_gau
     faint = Gaussians(
         gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.opacity_logits - 9, gaussians.harmonics
     )
-    texture = bake(*flattened(*sphere), faint, get_rasterizer("auto"), SETTINGS)
+    texture = bake_texture(*flattened(*sphere), faint, get_rasterizer("auto"), SETTINGS)
     assert (texture == 0.5).all()
 
 

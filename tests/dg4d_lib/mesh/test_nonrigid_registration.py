@@ -5,7 +5,8 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import isotropic
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface
-from dg4d_lib.mesh.tracking.nonrigid_registration import register_nonrigid
+from dg4d_lib.mesh.extraction.silhouettes import render_silhouettes, silhouette_iou
+from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU, register_nonrigid
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
 
