@@ -25,8 +25,8 @@ def packaged_network() -> ShapePriorNetwork:
         found = hashlib.sha256(WEIGHTS.read_bytes()).hexdigest()
     except FileNotFoundError:
         raise BackendUnavailable(
-            f"The weights of the shape prior are missing: {WEIGHTS}. Install dg4d again, train them with "
-            "`make shape-prior`, or use --set prior.kind=geometric."
+            f"The weights of the shape prior are missing: {WEIGHTS}. Install a version of dg4d that has them, or use "
+            "--set prior.kind=geometric."
         ) from None
     if found != SHA256:
         raise BadInput(
