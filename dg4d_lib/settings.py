@@ -66,10 +66,7 @@ class SubjectSettings(Settings):
         0.0, ge=-60, le=60, description="rotation of the subject away from the camera; a user's hint"
     )
     ground_turn: float = Field(
-        0.6,
-        ge=0,
-        le=1,
-        description="factor on the turn found from the ground line of footage, where `turn_deg` is 0; 0: none",
+        0.6, ge=0, le=1, description="factor on the turn that the ground line of footage gives if `turn_deg` is 0"
     )
     max_frames: int = Field(32, ge=2, le=512, description="largest number of frames; longer videos are sampled evenly")
     max_decode_gb: float = Field(
@@ -163,22 +160,13 @@ class LearnedPriorSettings(Settings):
 
     kind: Literal["learned"] = "learned"
     weight: float = Field(
-        0.5,
-        ge=0,
-        le=10,
-        description="factor on the guidance loss: expected views are soft, and half of it leaves the input view sharp",
+        0.5, ge=0, le=10, description="factor on the guidance loss; a smaller one leaves the input view sharper"
     )
     contrast: float = Field(
-        1.2,
-        ge=0.25,
-        le=16,
-        description="factor on the log-odds of matter: more gives sharper unseen sides, farther from the truth",
+        1.2, ge=0.25, le=16, description="factor on the log-odds of matter; a larger one gives sharper unseen sides"
     )
     level: float = Field(
-        0.35,
-        ge=0.05,
-        le=0.95,
-        description="probability of matter at which the surface lies that the static fit starts on",
+        0.35, ge=0.05, le=0.95, description="probability of matter on the surface that the static fit starts from"
     )
 
 
