@@ -129,7 +129,7 @@ def test_a_data_set_that_lacks_something_is_refused(truth, tmp_path):
     opaque = frames(tmp_path / "opaque", torch.ones(6, SIZE, SIZE, 3))
     for change, message in (
         ({"bank": None}, "cat has no bank/"),
-        ({"bank": late}, "does not have frame 0"),
+        ({"bank": late}, "has no frame 0"),
         ({"views": ()}, "cat has no view_<azimuth>/"),
         ({"views": (TrueView(azimuth_deg=15, frames=large),)}, "16 x 16 x 4, 8 x 8 x 4"),
         ({"inputs": opaque}, "8 x 8 x 3, 8 x 8 x 4"),

@@ -122,6 +122,7 @@ def read_as_source(path: Path, scratch: Path) -> tuple[Kind, int]:
     outputs = {
         "subject": scratch / "subject.png",
         "footage": scratch / "footage.zip",
+        "pose": scratch / "pose.json",
         "picture": scratch / "picture.png",
     }
     settings = step_settings("prepare_subject", revise(PREVIEW, {"subject.size": SIZE}))

@@ -60,7 +60,7 @@ COMMANDS: dict[str, tuple[Prepare, list[bytes], str]] = {
     "command: a nested record": (
         lambda work: (work / "provenance.json").write_bytes(RECORDS["record: braces without end"]()),
         [b"verify", b"."],
-        "no asset",
+        "not an asset",
     ),
     "command: a nested scene": (
         lambda work: (work / "scene.json").write_bytes(SCENES["scene: braces without end"]()),

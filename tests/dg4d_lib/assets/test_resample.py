@@ -39,10 +39,10 @@ class Turning:
     def parameters(self) -> Iterator[nn.Parameter]:
         return iter(())
 
-    def planes(self) -> list[nn.Parameter]:
+    def grid_parameters(self) -> list[nn.Parameter]:
         return []
 
-    def roughness(self) -> Float[Tensor, ""]:
+    def regularization_loss(self) -> Float[Tensor, ""]:
         return torch.zeros(())
 
 

@@ -55,7 +55,7 @@ def test_what_is_pulled_is_written_down_and_checked(hub: TinyHub, home: Path) ->
     assert [path for method, path, _ in hub.asked if method == "GET" and "/resolve/" in path] == [
         f"/{REPOSITORY}/resolve/{COMMIT}/unet/config.json"
     ]
-    assert "whole, 3 files" in dg4d(hub, home, "check", REPOSITORY).stdout
+    assert "intact, 3 files" in dg4d(hub, home, "check", REPOSITORY).stdout
 
 
 def test_a_download_that_breaks_off_goes_on_where_it_was(hub: TinyHub, home: Path) -> None:
