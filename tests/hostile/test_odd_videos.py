@@ -1,5 +1,6 @@
 """Videos that are right and unusual: what is done with them, beyond that they are read."""
 
+import os
 import struct
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 
 from steps.sources.reader import Source, read_source
 from tests.hostile.formats import opaque, patched
-from tests.hostile.videos import film, no_durations, walk
+from tests.hostile.videos import VIDEOS, film, no_durations, walk
 
 
 def read(folder: Path, content: bytes) -> Source:
@@ -30,3 +31,9 @@ def test_the_rotation_of_a_phone_is_undone(degrees: int, matrix: tuple[int, ...]
     upright = np.rot90(opaque(walk(1)[0])[:48], -degrees // 90)
     assert frames.shape[1:3] == upright.shape[:2]
     assert np.abs(frames[0, ..., :3].numpy() - upright / 255).mean() < 0.05  # the loss of the codec
+
+
+def test_encoding_av1_leaves_the_scheduling_of_this_process() -> None:
+    before = os.sched_getscheduler(0)
+    assert VIDEOS["mp4: AV1"]()
+    assert os.sched_getscheduler(0) == before

@@ -56,20 +56,14 @@ def film(
     muxer: tuple[tuple[str, str], ...] = (),
 ) -> bytes:
     """Encode the walk with PyAV; from the second frame on, times are stretched."""
+    policy = os.sched_getscheduler(0)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "film"
-        _encode(
-            path,
-            container,
-            codec,
-            walk(count, max(width, height)),
-            pixels,
-            (width, height),
-            fps,
-            stretch,
-            options,
-            muxer,
-        )
+        frames, sizes = walk(count, max(width, height)), (width, height)
+        try:
+            _encode(path, container, codec, frames, pixels, sizes, fps, stretch, options, muxer)
+        finally:  # SVT-AV1 gives root's thread the policy SCHED_FIFO, which starves all other processes
+            os.sched_setscheduler(0, policy, os.sched_param(0))
         return path.read_bytes()
 
 
