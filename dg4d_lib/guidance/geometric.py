@@ -65,7 +65,7 @@ class InflatedSurfaces:
             views: b cameras of one size, each with its frame.
 
         Returns:
-            Colors over white and coverage, in [0, 1].
+            Colors over white and alpha, in [0, 1].
 
         Raises:
             BadInput: no views, views of different sizes, or a frame that is not there.
@@ -75,9 +75,9 @@ class InflatedSurfaces:
         surfaces = [self.surface(view.frame) for view in views]
         cameras = [view.camera for view in views]
         fine = max(camera.height for camera in cameras) > LARGE * self._settings.size
-        color, coverage = render_surface(surfaces, cameras, supersample=1 if fine else 2)
-        white = over_background(color, coverage, 1.0)
-        both = torch.cat([white.movedim(-1, 1), coverage.movedim(-1, 1)], 1).movedim(1, -1)  # plane by plane
+        color, alpha = render_surface(surfaces, cameras, supersample=1 if fine else 2)
+        white = over_background(color, alpha, 1.0)
+        both = torch.cat([white.movedim(-1, 1), alpha.movedim(-1, 1)], 1).movedim(1, -1)  # plane by plane
         if self._settings.depth_sigma:
             both = averaged_over_depth(both, cameras, self._settings.depth_sigma)
         return both[..., :3], both[..., 3:]

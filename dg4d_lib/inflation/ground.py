@@ -16,7 +16,7 @@ NEAREST_HORIZON = 0.02  # of the picture's height: depth is unbounded there
 LARGEST_DEG = 25.0
 
 
-def ground_turn(coverage: Float[Tensor, "t h w 1"], trust: float) -> float:
+def ground_turn(alpha: Float[Tensor, "t h w 1"], trust: float) -> float:
     """Return the turn of the subject's plane about the vertical, degrees; see `inflate`.
 
     The feet of all frames stand on one plane. Seen from elevation 0, the depth of a point on it is inversely
@@ -24,14 +24,14 @@ def ground_turn(coverage: Float[Tensor, "t h w 1"], trust: float) -> float:
     hull of all silhouettes that lies under their centroid.
 
     Args:
-        coverage: alpha of the footage, in [0, 1].
+        alpha: alpha of the footage, in [0, 1].
         trust: factor on the angle, in [0, 1]; the result is clipped to 25 degrees.
 
     Returns:
         0 where the line says nothing: few frames, a short line, a solid base, or feet at the horizon.
     """
-    shown = (coverage[..., 0] > SUBJECT).any(0).cpu().numpy()
-    if len(coverage) < FEWEST_FRAMES or not shown.any():
+    shown = (alpha[..., 0] > SUBJECT).any(0).cpu().numpy()
+    if len(alpha) < FEWEST_FRAMES or not shown.any():
         return 0.0
     height, width = shown.shape
     columns = np.flatnonzero(shown.any(0))

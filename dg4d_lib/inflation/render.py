@@ -29,7 +29,7 @@ def render_surface(
         supersample: samples per pixel and axis.
 
     Returns:
-        Straight color in [0, 1] (0 where nothing is) and coverage in [0, 1].
+        Straight color in [0, 1] (0 where nothing is) and alpha in [0, 1].
 
     Raises:
         BadInput: cameras of different sizes, none, or another number of surfaces than cameras.
@@ -66,7 +66,7 @@ def render_surface(
 @njit(nogil=True, cache=True)
 @no_type_check
 def _shade(ids, weights, faces, colors, supersample, planes):
-    """Interpolate the corners' colors and average the samples of every pixel; the last plane is coverage."""
+    """Interpolate the corners' colors and average the samples of every pixel; the last plane is alpha."""
     for row in range(planes.shape[1]):
         for column in range(planes.shape[2]):
             red = green = blue = 0.0
