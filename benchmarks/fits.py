@@ -21,7 +21,7 @@ from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import FitSettings, LgmStartSettings, OraclePriorSettings
 from steps.artifacts.motions import new_deformation
 from steps.fit_gaussians import initial_gaussians
-from steps.fitting.priors import make_oracle_prior
+from steps.fitting.priors import make_oracle_prior, subject_shapes
 from steps.profiles import PipelineSettings
 
 RASTERIZE = get_rasterizer("auto")
@@ -43,7 +43,7 @@ def static_fit(specimen: Specimen, settings: PipelineSettings, seed: int) -> Gau
     subject = specimen.cutouts[0]
     kind = settings.static.start
     assert not isinstance(kind, LgmStartSettings), "these fits start without LGM"
-    start = initial_gaussians(subject, kind, settings.prior, settings.subject.turn_deg, generator)
+    start = initial_gaussians(kind, subject_shapes(settings.prior, [subject], settings.subject.turn_deg), generator)
     prior = prior_of(specimen.bank, settings, settings.static)
     return fit_gaussians(start, subject, prior, RASTERIZE, settings.static, generator)
 

@@ -112,7 +112,7 @@ def score_fit(subject: Subject, settings: PipelineSettings, seed: int = 0) -> tu
     cutouts, _ = prepare_subject(subject.footage, True, settings.subject)
     turn_deg, start_settings = _turn(cutouts, settings), settings.static.start
     assert not isinstance(start_settings, LgmStartSettings), "these fits start without LGM"
-    start = initial_gaussians(cutouts[0], start_settings, settings.prior, turn_deg, generator)
+    start = initial_gaussians(start_settings, subject_shapes(settings.prior, [cutouts[0]], turn_deg), generator)
     prior = make_prior(settings.prior, [cutouts[0]], settings.static, None, Path(), turn_deg).prior
     rest = fit_gaussians(start, cutouts[0], prior, rasterize, settings.static, generator)
     prior = make_prior(settings.prior, list(cutouts), settings.motion, None, Path(), turn_deg).prior

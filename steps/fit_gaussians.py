@@ -1,13 +1,12 @@
 """Step that fits static 3D Gaussians to one cut-out picture."""
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from dg4d_lib.fitting.static import fit_gaussians
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import blob, on_surface
 from dg4d_lib.gaussians.ply import write_ply
+from dg4d_lib.guidance.interface import SubjectShapes
 from dg4d_lib.inflation.surface import sample_surface
 from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
 from dg4d_lib.settings import (
@@ -36,12 +35,15 @@ def run(job: Job) -> StepReport:
     rasterize = get_rasterizer(backend)
     device = preferred_device(backend)
     reconstruction = None
-    if isinstance(static.start, LgmStartSettings):
+    if isinstance(static.start, LgmStartSettings):  # before the prior, so that two networks are not in memory at once
         reconstruction = reconstruct_subject(subject.to(device), static.start, rasterize, generator)
-        start, static = reconstruction.gaussians, fine_tuning_settings(static)
-    else:
-        start = initial_gaussians(subject, static.start, prior, turn_deg, generator).to(device)
+        static = fine_tuning_settings(static)
     chosen = make_prior(prior, [subject], static, job.inputs.get("bank"), job.pictures, turn_deg)
+    if reconstruction:
+        start = reconstruction.gaussians
+    else:
+        shapes = chosen.shapes or subject_shapes(prior, [subject], turn_deg)
+        start = initial_gaussians(job.settings.static.start, shapes, generator).to(device)
     curves = LossCurves(static.iterations, job.progress)
     with picture_of_divergence(job, rasterize):
         gaussians = fit_gaussians(start, subject, chosen.prior, rasterize, static, generator, curves.add)
@@ -59,15 +61,10 @@ def fine_tuning_settings(static: StaticSettings) -> StaticSettings:
 
 
 def initial_gaussians(
-    subject: Float[Tensor, "h w 4"],
-    start: BlobStartSettings | SurfaceStartSettings,
-    prior: PriorSettings,
-    turn_deg: float,
-    generator: torch.Generator,
+    start: BlobStartSettings | SurfaceStartSettings, shapes: SubjectShapes, generator: torch.Generator
 ) -> Gaussians:
-    """Initialize Gaussians as a random blob, or as points on the surface of the prior."""
+    """Initialize Gaussians as a random blob, or as points on the surface of the first frame."""
     if isinstance(start, BlobStartSettings):
         return blob(start.points, BLOB_RADIUS, generator)
-    surface = subject_shapes(prior, [subject], turn_deg).surface(0)
-    points, _, colors, area = sample_surface(surface, start.points, generator)
+    points, _, colors, area = sample_surface(shapes.surface(0), start.points, generator)
     return on_surface(points, colors, area)

@@ -16,8 +16,7 @@ from numba import njit
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
-from dg4d_lib.errors import BadInput
-from dg4d_lib.guidance.interface import GuidanceView
+from dg4d_lib.guidance.interface import GuidanceView, check_frame, check_views
 from dg4d_lib.images import over_background
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import InflatedSurface, inflate
@@ -52,8 +51,7 @@ class InflatedSurfaces:
         Raises:
             BadInput: there is no such frame, or its picture shows no subject.
         """
-        if not 0 <= frame < len(self._cutouts):
-            raise BadInput(f"frame {frame} was asked for; there are {len(self._cutouts)}, counted from 0")
+        check_frame(frame, len(self._cutouts))
         if frame not in self._surfaces:
             self._surfaces[frame] = inflate(self._cutouts[frame], self._settings.size, self._turn_deg)
         return self._surfaces[frame]
@@ -70,8 +68,7 @@ class InflatedSurfaces:
         Raises:
             BadInput: no views, views of different sizes, or a frame that is not there.
         """
-        if not views:
-            raise BadInput("the prior was asked for no view at all; ask for at least one")
+        check_views(views, len(self._cutouts))
         surfaces = [self.surface(view.frame) for view in views]
         cameras = [view.camera for view in views]
         fine = max(camera.height for camera in cameras) > LARGE * self._settings.size
@@ -103,7 +100,7 @@ def averaged_over_depth(
 
 
 def _gaussian(sigma: float) -> Float32[np.ndarray, " taps"]:
-    """Weights of the neighbors within five sigma, with sum 1; a sigma of zero is the identity."""
+    """Return the weights of the neighbors within five sigma, with sum 1; a sigma of zero is the identity."""
     sigma = max(sigma, SHARPEST)
     places = np.arange(-math.ceil(5 * sigma), math.ceil(5 * sigma) + 1)
     weights = np.exp(-np.square(places) / (2 * sigma**2))

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.errors import BadInput
 from dg4d_lib.inflation.surface import InflatedSurface
 
 
@@ -23,6 +24,27 @@ class GuidanceView:
 
     camera: OrbitCamera
     frame: int = 0
+
+
+def check_views(views: Sequence[GuidanceView], frames: int) -> None:
+    """Refuse views that shapes of some frames cannot answer together.
+
+    Raises:
+        BadInput: no views, views of different sizes, or a frame that is not there.
+    """
+    if not views:
+        raise BadInput("the prior was asked for no view at all; ask for at least one")
+    sizes = sorted({(view.camera.height, view.camera.width) for view in views})
+    if len(sizes) > 1:
+        raise BadInput(f"views of one drawing must have one size; given {sizes}")
+    for view in views:
+        check_frame(view.frame, frames)
+
+
+def check_frame(frame: int, frames: int) -> None:
+    """Refuse a frame that is not there."""
+    if not 0 <= frame < frames:
+        raise BadInput(f"frame {frame} was asked for; there are {frames}, counted from 0")
 
 
 @runtime_checkable

@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dg4d_lib.errors import BadInput
-from dg4d_lib.guidance.interface import GuidanceView
+from dg4d_lib.guidance.interface import GuidanceView, check_frame, check_views
 from dg4d_lib.images import resize
 from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.settings import LearnedPriorSettings
@@ -44,6 +43,7 @@ class LearnedShapes:
         self._settings = settings
         self._volumes: dict[int, ShapeVolume] = {}
         self._inflated: dict[int, float] = {}
+        self._last: tuple[int, ShapeField] | None = None  # one: a field has 17 MB
 
     @property
     def inflated_share(self) -> float:
@@ -67,16 +67,13 @@ class LearnedShapes:
         Raises:
             BadInput: no views, views of different sizes, or a frame that is not there.
         """
-        if not views:
-            raise BadInput("the prior was asked for no view at all; ask for at least one")
-        sizes = sorted({(view.camera.height, view.camera.width) for view in views})
-        if len(sizes) > 1:
-            raise BadInput(f"views of one drawing must have one size; given {sizes}")
-        coarse = _coarse(sizes[0])
+        check_views(views, len(self._fields))
+        size = views[0].camera.height, views[0].camera.width
+        coarse = _coarse(size)
         cameras = [replace(view.camera, height=coarse[0], width=coarse[1]) for view in views]
         color, alpha = render_volumes([self._volume(view.frame) for view in views], cameras)
         both = torch.cat([color + 1 - alpha, alpha], -1)
-        both = resize(both, sizes[0], "bicubic").clamp(0, 1)
+        both = resize(both, size, "bicubic").clamp(0, 1)
         return both[..., :3], both[..., 3:]
 
     def _volume(self, frame: int) -> ShapeVolume:
@@ -85,9 +82,10 @@ class LearnedShapes:
         return self._volumes[frame]
 
     def _field(self, frame: int) -> ShapeField:
-        if not 0 <= frame < len(self._fields):
-            raise BadInput(f"frame {frame} was asked for; there are {len(self._fields)}, counted from 0")
-        field = self._fields.predict(frame)
+        check_frame(frame, len(self._fields))
+        if self._last is None or self._last[0] != frame:
+            self._last = frame, self._fields.predict(frame)
+        field = self._last[1]
         self._inflated[frame] = field.inflated_share
         return field
 

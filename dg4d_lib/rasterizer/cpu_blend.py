@@ -50,7 +50,7 @@ _MIN_LOG_ALPHA = float(np.log2(MIN_ALPHA))
 
 @intrinsic
 @no_type_check
-def cover(typing_context, records, g, left, top, positions, us, vs, length):  # noqa: PLR0915
+def cover(typing_context, records, g, left, top, positions, us, vs, length):  # noqa: PLR0915 - code of one intrinsic
     """Append the vectors that cover Gaussian g's ellipse inside a tile; return the new length.
 
     A vector is the position of its first pixel in a plane and its whitened coordinates (u, v). Eight row pairs are

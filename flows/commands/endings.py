@@ -1,6 +1,8 @@
 """Conversion of errors and signals to one message and an exit status."""
 
 import errno
+import os
+import select
 import signal
 import sys
 import threading
@@ -18,6 +20,7 @@ from flows.exit_status import (
     EXIT_HANGUP,
     EXIT_INTERRUPTED,
     EXIT_MISSING,
+    EXIT_PIPE,
     EXIT_TERMINATED,
 )
 
@@ -55,6 +58,8 @@ def exit_on_error() -> Iterator[None]:
             if received:  # the error may be a consequence, such as a write to a closed terminal
                 _stop_steps()
                 _end(STOPPED, CODES[received[0]])
+            if isinstance(error, BrokenPipeError) and _output_closed():
+                raise typer.Exit(EXIT_PIPE) from None  # as `dg4d settings | head`
             _end(*_describe(error))
 
 
@@ -116,6 +121,20 @@ def _save_traceback(error: Exception) -> str:
     except OSError:
         return "could not be written"
     return str(path)
+
+
+def _output_closed() -> bool:
+    """Return whether nobody reads standard output any more; if so, discard what waits to be written."""
+    try:
+        number = sys.stdout.fileno()
+    except (AttributeError, OSError, ValueError):  # no standard output, or one of a test
+        return False
+    poll = select.poll()
+    poll.register(number, 0)
+    closed = any(events & select.POLLERR for _, events in poll.poll(0))
+    if closed:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+    return closed
 
 
 def _stop_steps() -> None:

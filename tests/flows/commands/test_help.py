@@ -1,5 +1,7 @@
 """Help texts: complete, in 80 columns, and true to the program."""
 
+import subprocess
+import sys
 from typing import get_args
 
 import pytest
@@ -65,3 +67,12 @@ def test_settings_prints_value_range_and_meaning() -> None:
 def test_settings_refuses_a_misspelt_name_with_the_nearest() -> None:
     done = CliRunner().invoke(app, ["settings", "motion.iteration"], env=NARROW)
     assert done.exit_code == 65 and "did you mean motion.iterations?" in done.output
+
+
+def test_output_that_nobody_reads_ends_the_command_without_a_message() -> None:
+    program = [sys.executable, "-P", "-m", "flows.cli", "settings"]
+    with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as started:
+        assert started.stdout is not None and started.stderr is not None
+        started.stdout.close()
+        said = started.stderr.read()
+    assert (started.returncode, said) == (141, "")
