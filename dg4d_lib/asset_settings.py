@@ -51,6 +51,9 @@ class GateSettings(Settings):
         0.02, description="share of the alpha disconnected from the subject, minus the video's"
     )
     flaws_most: NotNegative = Field(0.002, le=10, description="defective edges and triangles of the mesh, per triangle")
+    folds_most: Share = Field(
+        0.002, description="share of the triangles that cross others, are flipped or folded, in the worst frame"
+    )
     agreement_least: Share = Field(0.85, description="overlap of the silhouettes of mesh and splats, IoU")
     sharpness_least: NotNegative = Field(0.75, le=10, description="color gradients, relative to the input image")
     sharpness_most: Positive = Field(1.25, le=10, description="color gradients, relative to the input image")

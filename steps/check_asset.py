@@ -7,17 +7,20 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.asset_settings import GateSettings
+from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.rendering.sheet import draw_tiles
 from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.fitting.losses import resize_cutouts
 from dg4d_lib.images import color_over_white
 from dg4d_lib.mesh.extraction.topology import check_topology, weld_vertices
+from dg4d_lib.mesh.folds import defective_faces
 from dg4d_lib.metrics.gates import MESH, SPLATS, Gate, GateInputs, RgbaImages, Turntable, evaluate_gates, fidelity
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
@@ -129,6 +132,7 @@ def collect_evidence(
         side_views=around,
         turntable=Turntable(turn[..., 3:4], turn[..., 4:], viewmats(ring), front.focal),
         flaws=max(_flaws(asset.surface, timestamp) for timestamp in timestamps),
+        folds=max(_folds(asset.surface, timestamp) for timestamp in timestamps),
     )
 
 
@@ -190,3 +194,12 @@ def _flaws(surface: Surface, position: Float[Tensor, ""]) -> float:
     check = check_topology(*weld_vertices(mesh.vertices.numpy(), mesh.faces.numpy()))
     broken = check.boundary_edges + check.nonmanifold_edges + check.inconsistent_edges + check.degenerate_faces
     return broken / max(1, check.triangles) + check.inverted_components / max(1, check.components)
+
+
+def _folds(surface: Surface, position: Float[Tensor, ""]) -> float:
+    """Return the share of triangles that cross others, are flipped or folded; a mesh per frame has none flipped."""
+    mesh = mesh_at(surface, position)
+    rest = surface.mesh.vertices if isinstance(surface, Asset4D) else mesh.vertices
+    _, first, index = np.unique(rest.numpy(), axis=0, return_index=True, return_inverse=True)  # joins texture seams
+    faces = index.ravel()[mesh.faces.numpy()]
+    return float(defective_faces(mesh.vertices.numpy()[first], faces, rest.numpy()[first]).mean())
