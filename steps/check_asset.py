@@ -7,7 +7,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -19,7 +18,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.fitting.losses import resize_cutouts
 from dg4d_lib.images import color_over_white
-from dg4d_lib.mesh.extraction.topology import check_topology, weld_vertices
+from dg4d_lib.mesh.extraction.topology import check_topology, join_seams, weld_vertices
 from dg4d_lib.mesh.folds import defective_faces
 from dg4d_lib.metrics.gates import MESH, SPLATS, Gate, GateInputs, RgbaImages, Turntable, evaluate_gates, fidelity
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
@@ -200,6 +199,5 @@ def _folds(surface: Surface, position: Float[Tensor, ""]) -> float:
     """Return the share of triangles that cross others, are flipped or folded; a mesh per frame has none flipped."""
     mesh = mesh_at(surface, position)
     rest = surface.mesh.vertices if isinstance(surface, Asset4D) else mesh.vertices
-    _, first, index = np.unique(rest.numpy(), axis=0, return_index=True, return_inverse=True)  # joins texture seams
-    faces = index.ravel()[mesh.faces.numpy()]
-    return float(defective_faces(mesh.vertices.numpy()[first], faces, rest.numpy()[first]).mean())
+    joined, faces = join_seams(rest.numpy(), mesh.faces.numpy())
+    return float(defective_faces(mesh.vertices.numpy()[joined], faces, rest.numpy()[joined]).mean())

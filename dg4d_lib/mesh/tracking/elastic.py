@@ -81,8 +81,9 @@ class _ElasticBody:
     ) -> Float64[np.ndarray, "v 3"]:
         """Minimize the energy over the free vertices, all of them if None."""
         moved, rotations, forces = start.copy(), np.empty((len(start), 3, 3)), np.empty_like(start)
+        rows: slice | Int[np.ndarray, " n"] = slice(None)
         if free is None:
-            solve, rows = self._whole.solve, slice(None)
+            solve = self._whole.solve
         else:
             rows = np.flatnonzero(free)
             solve = _factors(self.laplacian[rows][:, rows], pull[rows]).solve
