@@ -106,7 +106,10 @@ class PackSettings(Settings):
     sheet_size: int = Field(192, ge=32, le=1024, description="pixels of a tile of the contact sheet")
     sheet_frames: int = Field(6, ge=1, le=32, description="columns: frames")
     sheet_azimuths_deg: tuple[Annotated[float, Field(ge=-360, le=360)], ...] = Field(
-        (0.0, -75.0, 15.0, 105.0, 195.0), min_length=1, description="rows: azimuths"
+        (0.0, -75.0, 15.0, 105.0, 195.0), min_length=1, description="rows: azimuths of the splats"
+    )
+    sheet_mesh_azimuths_deg: tuple[Annotated[float, Field(ge=-360, le=360)], ...] = Field(
+        (30.0, 195.0), description="further rows: azimuths of the lit mesh"
     )
 
     @field_validator("fps")
