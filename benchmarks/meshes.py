@@ -1,4 +1,4 @@
-"""Defects of the meshes of packages: crossings, flips, folds, creases and handles, at rest and in every frame.
+"""Defects of packaged meshes, at rest and in every frame: crossings, flips, folds, creases and handles.
 
 Run with `python -m benchmarks.meshes PACKAGE ...` (`--json FILE` keeps the rows). A mesh per frame has no rest shape:
 its frames are counted one by one, and nothing is flipped.
