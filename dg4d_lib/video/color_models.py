@@ -39,9 +39,7 @@ class Mixture:
         return np.log(self.shares) + self.log_norms - 0.5 * np.stack(distances, 1)
 
 
-def foreground_log_odds(
-    colors: Float[ndarray, "p 3"], probability: Float[ndarray, " p"]
-) -> Float[ndarray, " p"]:
+def foreground_log_odds(colors: Float[ndarray, "p 3"], probability: Float[ndarray, " p"]) -> Float[ndarray, " p"]:
     """Return how much more likely a color is in the foreground, as bounded log odds.
 
     Args:

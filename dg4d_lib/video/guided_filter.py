@@ -11,7 +11,11 @@ from dg4d_lib.images import resize_planes
 
 
 def guide_to_edges(
-    values: Float[ndarray, "h w"], guide: Float[ndarray, "h w 3"], large: Float[Tensor, "h2 w2 3"], radius: int, eps: float
+    values: Float[ndarray, "h w"],
+    guide: Float[ndarray, "h w 3"],
+    large: Float[Tensor, "h2 w2 3"],
+    radius: int,
+    eps: float,
 ) -> Float[Tensor, "h2 w2"]:
     """Smooth a map within the color edges of a guide, at the size of a larger version of the guide.
 

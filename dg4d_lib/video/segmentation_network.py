@@ -68,7 +68,7 @@ class SegmentationNetwork:
         return resize_planes(torch.from_numpy(found)[None, None], (height, width))[0, 0].clamp(0, 1)
 
 
-def load_network(content: bytes, what: str, preprocessing: Preprocessing = Preprocessing()) -> SegmentationNetwork:  # noqa: B008 - frozen
+def load_network(content: bytes, what: str, preprocessing: Preprocessing = Preprocessing()) -> SegmentationNetwork:
     """Load a network from the bytes of an ONNX file.
 
     Args:

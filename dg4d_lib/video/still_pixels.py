@@ -1,5 +1,7 @@
 """Temporal averaging where a video stands still, so that a matte does not flicker."""
 
+from itertools import pairwise
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -9,9 +11,7 @@ STILL = 0.04  # change of color, in [0, 1], at which the weight of the neighbori
 NOISE_WINDOW = 3  # pixels over which colors are averaged before they are compared, against noise
 
 
-def average_still_pixels(
-    values: Float[Tensor, "t h w"], frames: Float[Tensor, "t h w 3"]
-) -> Float[Tensor, "t h w"]:
+def average_still_pixels(values: Float[Tensor, "t h w"], frames: Float[Tensor, "t h w 3"]) -> Float[Tensor, "t h w"]:
     """Average a map over all frames that a pixel's color connects without a change; moving pixels keep their values.
 
     A recursive filter, forward and backward: the weight of another frame is the product of the weights of all steps
@@ -19,7 +19,7 @@ def average_still_pixels(
     """
     if len(values) < 2:
         return values
-    weights = torch.stack([_stillness(one, other) for one, other in zip(frames[:-1], frames[1:], strict=True)])
+    weights = torch.stack([_stillness(one, other) for one, other in pairwise(frames)])
     forward = _accumulate(values, weights)
     backward = [each.flip(0) for each in _accumulate(values.flip(0), weights.flip(0))]
     totals = forward[0] + backward[0] - values
