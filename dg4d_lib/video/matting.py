@@ -20,7 +20,7 @@ from dg4d_lib.video.backdrop import Backdrop, border_ring, cut_out, fit_backdrop
 from dg4d_lib.video.color_models import foreground_log_odds
 from dg4d_lib.video.guided_filter import guide_to_edges
 from dg4d_lib.video.segmentation_network import SegmentationNetwork
-from dg4d_lib.video.soft_edges import free_colors
+from dg4d_lib.video.soft_edges import free_colors, unmix
 from dg4d_lib.video.still_pixels import average_still_pixels
 
 Method = Literal["backdrop", "uneven backdrop", "network"]
@@ -32,7 +32,8 @@ MIN_AREA = 0.005  # minimum share of the first frame that the subject covers
 MAX_AREA = 0.95  # maximum share of the first frame that the subject covers
 MAX_BORDER = 0.85  # maximum share of the border that the subject touches
 PART = 0.02  # minimum area of a part relative to the largest one; smaller parts are dropped
-AGREED = 0.75  # overlap (IoU) from which backdrop and network are taken to have found the same subject
+AGREED = 0.9  # overlap (IoU) from which backdrop and network are taken to have found the same subject
+BAND = 2  # half of the band along an outline before a plain backdrop, pixels of the segmentation
 BORDER_MARGIN = 0.02  # share of the border by which the network may touch more of it and still be preferred
 SURE = 0.02  # distance of probabilities from 0 and 1 that log odds are bounded by
 COLOR_SHARE = 0.5  # weight of the color models in the log odds; the rest is the segmentation's
@@ -86,10 +87,17 @@ def matte(
     """
     found = _segment(frames, method, load)
     _check(found.probability[0].numpy() > 0.5)
-    likelihood = _refine(frames, average_still_pixels(found.probability, _resized(frames, found.probability)))
     cutouts = frames.new_empty(*frames.shape[:3], 4)  # filled one by one, since frames may take 0.5 GB
-    for cutout, frame, alpha in zip(cutouts, frames, likelihood, strict=True):
-        cutout[:] = free_colors(frame, alpha)
+    if found.is_exact:
+        scale = max(frames.shape[1:3]) / max(found.probability.shape[1:])
+        for cutout, frame, mask in zip(cutouts, frames, found.probability, strict=True):
+            large = resize_planes(mask[None, None], frames.shape[1:3], "bicubic")[0, 0] > 0.5
+            cutout[:] = unmix(frame, large.numpy(), max(2, round(BAND * max(1.0, scale))))
+        cutouts[..., 3] = average_still_pixels(cutouts[..., 3], frames)
+    else:
+        likelihood = _refine(frames, average_still_pixels(found.probability, _resized(frames, found.probability)))
+        for cutout, frame, alpha in zip(cutouts, frames, likelihood, strict=True):
+            cutout[:] = free_colors(frame, alpha)
     _check(cutouts[0, ..., 3].cpu().numpy() > 0.5)
     return Matte(cutouts, found.method, found.agreement, found.used_network)
 
@@ -121,12 +129,19 @@ def matte_from_first_alpha(frames: Float[Tensor, "t h w 3"], first: Float[Tensor
 
 @dataclass(frozen=True)
 class _Segmentation:
-    """Probability of the subject at reduced size, and what is known about it; see `Matte`."""
+    """Segmentation of all frames.
+
+    Attributes:
+        probability: of the subject, at reduced size.
+        is_exact: True for masks by a plain backdrop's color that no other method contradicts.
+        method, agreement, used_network: see `Matte`.
+    """
 
     probability: Float[Tensor, "t h w"]
     method: Method
     agreement: float | None
     used_network: bool
+    is_exact: bool = False
 
 
 def _segment(frames: Float[Tensor, "t h w 3"], method: str, load: NetworkLoader) -> _Segmentation:
@@ -139,7 +154,7 @@ def _segment(frames: Float[Tensor, "t h w 3"], method: str, load: NetworkLoader)
     masks = _by_backdrop(lab, backdrop)
     name: Method = "backdrop" if backdrop.is_even else "uneven backdrop"
     if method == "backdrop":
-        return _Segmentation(masks, name, None, False)
+        return _Segmentation(masks, name, None, False, is_exact=True)
     network = load()
     checked = _spread(len(frames))
     second = torch.stack([network.probability(frames[i]) for i in checked])
@@ -147,9 +162,7 @@ def _segment(frames: Float[Tensor, "t h w 3"], method: str, load: NetworkLoader)
     agreement = min(overlap(masks[i] > 0.5, other > 0.5) for i, other in zip(checked, second, strict=True))
     if agreement < AGREED and border_contact(second > 0.5) <= border_contact(masks[checked] > 0.5) + BORDER_MARGIN:
         return _by_network(frames, network)
-    if agreement >= AGREED and len(frames) == len(checked):  # else frames would differ in how they were segmented
-        masks = (masks + second) / 2
-    return _Segmentation(masks, name, agreement, True)
+    return _Segmentation(masks, name, agreement, True, is_exact=agreement >= AGREED)
 
 
 def overlap(one: Bool[Tensor, "*s"], other: Bool[Tensor, "*s"]) -> float:

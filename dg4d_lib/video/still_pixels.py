@@ -28,7 +28,7 @@ def average_still_pixels(values: Float[Tensor, "t h w"], frames: Float[Tensor, "
 
 def _stillness(one: Float[Tensor, "h w 3"], other: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
     change = (other - one).permute(2, 0, 1)[None]
-    smooth = avg_pool2d(change, NOISE_WINDOW, 1, NOISE_WINDOW // 2, count_include_pad=False)[0]
+    smooth: Tensor = avg_pool2d(change, NOISE_WINDOW, 1, NOISE_WINDOW // 2, count_include_pad=False)[0]
     return torch.exp(-(smooth.abs().amax(0) / STILL).square())
 
 
