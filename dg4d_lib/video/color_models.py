@@ -10,6 +10,7 @@ MIXTURE = 5  # Gaussians per color model, as in GrabCut
 SAMPLES = 8000  # pixels per mixture fit
 EM_STEPS = 12
 MIN_VARIANCE = 2.0  # of a Gaussian, squared Lab units
+MIN_SPREAD = 1e-6  # weighted variance below which a cluster is one color, squared Lab units
 MAX_LOG_ODDS = 4.0  # bound of the log odds of a color
 
 
@@ -64,6 +65,8 @@ def fit_mixture(colors: Float[ndarray, "p 3"], weights: Float[ndarray, " p"]) ->
             else 0.0
             for j in range(k)
         ]
+        if max(spreads) < MIN_SPREAD:  # fewer colors than Gaussians: the others keep no share
+            break
         widest = owners == int(np.argmax(spreads))
         centered = colors[widest] - np.average(colors[widest], axis=0, weights=weights[widest])
         axis = np.linalg.eigh((centered * weights[widest, None]).T @ centered)[1][:, -1]
