@@ -128,7 +128,8 @@ def read_preprocessing(path: Path) -> Preprocessing:
     """
     try:
         config: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        mean, std = (0.0,) * 3, (1.0,) * 3
+        mean: tuple[float, ...] = (0.0,) * 3
+        std: tuple[float, ...] = (1.0,) * 3
         if config.get("do_normalize", True):
             mean = tuple(float(value) for value in config.get("image_mean", IMAGENET_MEAN))
             std = tuple(float(value) for value in config.get("image_std", IMAGENET_STD))
