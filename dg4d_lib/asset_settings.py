@@ -40,7 +40,7 @@ class CutoutGateSettings(Settings):
     pieces_most: Share = Field(0.1, description="share of the cut-out outside of its largest piece")
     holes_most: Share = Field(0.12, description="share of the filled cut-out that is holes")
     border_most: Share = Field(0.5, description="share of the picture's border that the cut-out touches")
-    agreement_least: Share = Field(0.75, description="overlap of the cut-outs of two methods, IoU")
+    agreement_least: Share = Field(0.5, description="overlap of the cut-outs of two methods, IoU")
 
 
 class GateSettings(Settings):

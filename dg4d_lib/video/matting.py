@@ -213,8 +213,27 @@ def _refine(frames: Float[Tensor, "t h w 3"], probability: Float[Tensor, "t h2 w
         current = filtered.double().numpy()
     likelihood = average_still_pixels(filtered, frames.cpu())
     alpha = (0.5 + STEEPNESS * (likelihood - 0.5)).clamp(0, 1)
-    kept = np.stack([ndimage.binary_dilation(_parts(each.numpy() > 0.5, PART), iterations=2) for each in alpha])
-    return (alpha * torch.from_numpy(kept)).to(frames)
+    large = resize_planes(probability[None], alpha.shape[1:])[0]
+    reach = 2 * max(2, round(FILTER_RADIUS * max(alpha.shape[1:])))
+    whole = [_without_false_holes(a.numpy(), p.cpu().numpy() > 0.5, reach) for a, p in zip(alpha, large, strict=True)]
+    return torch.from_numpy(np.stack(whole)).to(frames)
+
+
+def _without_false_holes(
+    alpha: Float[ndarray, "h w"], segmented: Bool[ndarray, "h w"], reach: int
+) -> Float[ndarray, "h w"]:
+    """Remove specks, and make solid what the segmentation has and the outline encloses, such as highlights.
+
+    Args:
+        alpha: refined by colors, which know no inside.
+        segmented: mask of the segmentation.
+        reach: distance from the outline from which alpha is solid, pixels.
+    """
+    mask = _parts(alpha > 0.5, PART)
+    filled = mask | (ndimage.binary_fill_holes(mask) & segmented)
+    deep = ndimage.binary_erosion(filled, iterations=reach, border_value=1) & segmented
+    solid = (filled & ~mask) | deep
+    return np.where(solid, np.ones_like(alpha), alpha * ndimage.binary_dilation(mask, iterations=2))
 
 
 def _lab(frames: Float[Tensor, "t h w 3"], longest: int, blur: float = 0.6) -> Float[ndarray, "t h2 w2 3"]:
