@@ -330,3 +330,11 @@ def test_a_moving_subject_leaves_no_trail_when_the_first_frame_is_known():
 def test_plain_backdrops_are_no_guess(backdrop, cut):
     truth = torch.cat([torch.zeros(cut, SIZE), ragged()[: SIZE - cut]])
     assert by_backdrop(over(truth, texture(), backdrop())[None]).method == "backdrop"
+
+
+def test_a_highlight_of_the_background_s_color_inside_the_subject_is_no_hole():
+    truth, front = ragged(), orange()
+    picture = over(truth, front, busy()).clamp(0, 1)
+    picture[70:90, 70:90] = busy()[10:30, 10:30].clamp(0, 1)
+    result = matte(picture[None], "network", lambda: Answering(coarse(truth), picture))
+    assert result.frames[0, 65:95, 65:95, 3].min() == 1
