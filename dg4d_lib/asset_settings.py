@@ -34,8 +34,19 @@ class GltfSettings(Settings):
     metallic: Share = Field(0.0, description="metallic factor of the material")
 
 
+class CutoutGateSettings(Settings):
+    """Acceptance criteria of an estimated cut-out; ours, not calibrated: wide bounds that shreds fail."""
+
+    pieces_most: Share = Field(0.1, description="share of the cut-out outside of its largest piece")
+    holes_most: Share = Field(0.12, description="share of the filled cut-out that is holes")
+    border_most: Share = Field(0.5, description="share of the picture's border that the cut-out touches")
+    agreement_least: Share = Field(0.5, description="overlap of the cut-outs of two methods, IoU")
+
+
 class GateSettings(Settings):
     """Acceptance criteria of an asset; ours, calibrated by benchmarks/gates.py."""
+
+    cutout: CutoutGateSettings = CutoutGateSettings()
 
     fidelity_least: float = Field(16.5, ge=0, le=60, description="PSNR on the subject from the input camera, dB")
     silhouette_least: Share = Field(

@@ -5,7 +5,7 @@ The defaults are the paper's; profiles change them (steps/profiles.py). "Ours" m
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -50,9 +50,26 @@ class TextSettings(Settings):
     low_memory: bool = Field(False, description="keep only the network in use on the GPU; slower")
 
 
+MATTING_METHODS = ("auto", "u2netp", "backdrop", "none")  # other names are weights
+BOX_FORM = "a box is X,Y,W,H in pixels: left and upper edge, width and height, both at least 1"
+
+
 class SubjectSettings(Settings):
     """Conversion of any picture or video to cut-outs in one square frame."""
 
+    matting: str = Field(
+        "auto",
+        min_length=1,
+        description="cut-out of the subject. auto: the picture's alpha channel, else `backdrop` where the backdrop is "
+        "plain, else `u2netp`; backdrop: by the color of a plain backdrop; u2netp: by U2-Netp; none: the alpha channel "
+        "alone; or another network by a name from `dg4d weights list`, or a folder with onnx/model.onnx",
+    )
+    box: tuple[Annotated[int, Field(ge=0, le=1_000_000)], ...] = Field(
+        (),
+        max_length=4,
+        description="[X, Y, width, height] of the subject in pixels of the upright picture; what is outside is "
+        "transparent; []: the whole picture",
+    )
     size: int = Field(512, ge=32, le=2048, description="pixels of the square frame")
     framing: Literal["auto", "center", "keep"] = Field(
         "auto",
@@ -72,6 +89,14 @@ class SubjectSettings(Settings):
     max_decode_gb: float = Field(
         1.0, ge=0.125, le=256, description="GiB of memory for decoding the source, including decoded frames; ours"
     )
+
+    @field_validator("box")
+    @classmethod
+    def _check_box(cls, box: tuple[int, ...]) -> tuple[int, ...]:
+        """Refuse boxes that are incomplete or empty."""
+        if box and (len(box) != 4 or min(box[2:]) < 1):
+            raise ValueError(BOX_FORM)
+        return box
 
 
 class VideoModelSettings(Settings):

@@ -18,8 +18,10 @@ import typer
 from flows.commands.checking import bench, rebuild, score, verify
 from flows.commands.endings import exit_on_error
 from flows.commands.options import (
+    Box,
     Changes,
     Commercial,
+    Mask,
     Profile,
     Rate,
     Seed,
@@ -89,6 +91,8 @@ def make(
     bank: Annotated[
         Path | None, typer.Option(metavar="DIR", help="ground-truth views, for --set prior.kind=oracle")
     ] = None,
+    mask: Mask = None,
+    box: Box = "",
     commercial_only: Commercial = False,
     force: Annotated[bool, typer.Option("--force", help="replace another asset in the output folder")] = False,
     pick: Annotated[int | None, typer.Option(min=1, max=16, metavar="K", help="use motion K of `dg4d motions`")] = None,
@@ -113,9 +117,9 @@ def make(
         console = terminal.console()
         if pick and video:
             raise BadInput("--pick chooses a generated motion and cannot be combined with --video")
-        short = shortcut_settings(triangles, texture, fps) | ({"driving.pick": pick} if pick else {})
+        short = shortcut_settings(triangles, texture, fps, box) | ({"driving.pick": pick} if pick else {})
         item = (clean_name(picture.stem) or "asset") if picture else name_from_text(text)
-        files = {"picture": picture, "text": text, "video": video, "bank": bank}
+        files = {"picture": picture, "text": text, "video": video, "bank": bank, "mask": mask}
         request = _request(profile, changes, short, item=item, seed=seed, commercial_only=commercial_only, **files)
         folder = out or Path("out") / item
         check_folder(folder, item, force)
@@ -141,6 +145,8 @@ def motions(
     profile: Profile = "preview",
     changes: Changes = None,
     seed: Seed = 0,
+    mask: Mask = None,
+    box: Box = "",
     commercial_only: Commercial = False,
     candidates: Annotated[int, typer.Option(min=2, max=16, metavar="N", help="number of motions")] = 6,
     out: Annotated[
@@ -159,9 +165,9 @@ def motions(
         from flows.packages.publish import check_writable
 
         console = terminal.console()
-        several = {"driving.candidates": candidates, "driving.pick": 0}
+        several = shortcut_settings(None, None, None, box) | {"driving.candidates": candidates, "driving.pick": 0}
         item = clean_name(picture.stem) or "asset"
-        files = {"item": item, "picture": picture}
+        files = {"item": item, "picture": picture, "mask": mask}
         request = _request(profile, changes, several, seed=seed, commercial_only=commercial_only, **files)
         folder = out or Path("out") / f"{item}-motions"
         check_writable(folder)
@@ -232,7 +238,7 @@ def batch(
     """Make many assets.
 
     Finished items are skipped; a failed item does not stop the others. A manifest has one row per item with these
-    columns: path or text, and optionally video, name, profile, seed, bank, priority (higher first), set ("a.b=c;
+    columns: path or text, and optionally video, name, profile, seed, bank, mask, priority (higher first), set ("a.b=c;
     d.e=f"), or any setting by its name.
     """
     with exit_on_error():

@@ -51,7 +51,7 @@ def image_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int 
     """
     with steps_of_flow():
         conversion = conversion_of(job, mesh_parts)
-        subject = prepare_subject(job.source, conversion)
+        subject = prepare_subject(job.source, conversion, job.mask)
         return animate(subject, job, conversion, folder)
 
 
@@ -64,7 +64,7 @@ def video_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int 
     """
     with steps_of_flow():
         conversion = conversion_of(job, mesh_parts)
-        subject = prepare_subject(job.source, conversion)
+        subject = prepare_subject(job.source, conversion, job.mask)
         if subject.footage is None:
             raise StepBadInput(
                 "prepare_subject", "this is a single picture, not a video: a video has two frames or more"
@@ -95,7 +95,7 @@ def motions(job: ConversionJob) -> dict[str, ArtifactRef]:
     """
     with steps_of_flow():
         conversion = conversion_of(job)
-        subject = prepare_subject(job.source, conversion)
+        subject = prepare_subject(job.source, conversion, job.mask)
         if subject.footage is not None:
             raise StepBadInput("prepare_subject", "this is a video and has its motion already; give a picture")
         return drive_video(subject, conversion).outputs

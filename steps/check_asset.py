@@ -1,11 +1,9 @@
 """Step that checks a package against the quality gates."""
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -20,10 +18,11 @@ from dg4d_lib.fitting.losses import resize_cutouts
 from dg4d_lib.images import color_over_white
 from dg4d_lib.mesh.extraction.topology import check_topology, join_seams, weld_vertices
 from dg4d_lib.mesh.folds import defective_faces
-from dg4d_lib.metrics.gates import MESH, SPLATS, Gate, GateInputs, RgbaImages, Turntable, evaluate_gates, fidelity
+from dg4d_lib.metrics.gates import MESH, SPLATS, GateInputs, RgbaImages, Turntable, evaluate_gates, fidelity
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.archives import unpack
+from steps.artifacts.gates import gates_as_json, read_rows, write_gates
 from steps.artifacts.media import read_frames, read_png, write_png
 from steps.artifacts.packages import ASSET, COMPACT, MANIFEST, MESHES, read_manifest
 from steps.artifacts.packages import SPLATS as SPLATS_FOLDER
@@ -36,8 +35,6 @@ TIMESTAMPS = 4  # number of frames that are rendered from other sides
 SIDES = ((0.0, 45.0), (10.0, 90.0), (0.0, 180.0), (10.0, 270.0))  # elevation and azimuth, degrees
 TURN = 24  # renders of one turn
 COLUMNS = 4  # frames in the picture
-DIGITS = 4  # decimals of every number
-GATE_FIELDS = ("name", "passed", "value", "unit", "least", "most", "form", "values", "meaning", "advice")
 
 
 @dataclass(frozen=True)
@@ -69,8 +66,9 @@ def run(job: Job) -> StepReport:
         video = read_frames(job.inputs["driving_video"], folder)
     rasterizer = get_rasterizer(job.settings.rasterizer)
     evidence = collect_evidence(asset, video, read_png(job.inputs["subject"]), rasterizer)
-    answer = gates_as_json(evaluate_gates(evidence, bounds))
-    job.outputs["gates"].write_text(json.dumps(answer, ensure_ascii=False, allow_nan=False), encoding="utf-8")
+    earlier = job.inputs.get("cutout_gates")
+    answer = gates_as_json(evaluate_gates(evidence, bounds), read_rows(earlier) if earlier else ())
+    write_gates(job.outputs["gates"], answer)
     write_png(job.outputs["picture"], picture(evidence, (_spread(len(video), MOST_FRAMES) / video.fps).tolist()))
     failing = answer["failing"]
     notes = (f"Not accepted: {', '.join(failing)}. The report says what to do.",) if failing else ()
@@ -133,17 +131,6 @@ def collect_evidence(
         flaws=max(_flaws(asset.surface, timestamp) for timestamp in timestamps),
         folds=max(_folds(asset.surface, timestamp) for timestamp in timestamps),
     )
-
-
-def gates_as_json(gates: Sequence[Gate]) -> dict[str, Any]:
-    """Return the gates as JSON, with rounded values."""
-    rows = []
-    for gate in gates:
-        values = {form: round(value, DIGITS) for form, value in gate.values.items()}
-        rows.append({name: getattr(gate, name) for name in GATE_FIELDS})
-        rows[-1] |= {"value": round(gate.value, DIGITS), "values": values}
-    failing = [gate.name for gate in gates if not gate.passed]
-    return {"accepted": not failing, "failing": failing, "gates": rows}
 
 
 def picture(evidence: GateInputs, seconds: Sequence[float]) -> Float[Tensor, "h w 3"]:

@@ -13,6 +13,7 @@ from dg4d_lib.weights.locate import (
     digests,
     find_problems,
     folder_name,
+    is_part,
 )
 from dg4d_lib.weights.lock import LockedFile, LockEntry, read_lock, write_lock
 from dg4d_lib.weights.registry import Weights
@@ -94,7 +95,7 @@ def needed(names: Iterable[str], parts: tuple[str, ...] = ()) -> list[str]:
         hidden = any(part.startswith(".") for part in path.parts)
         duplicate = "model_index.json" in everything and len(path.parts) == 1 and path.suffix in TENSOR_SUFFIXES
         other = ".non_ema." in name or path.name.startswith("openvino")
-        wanted = path.parts[0] in parts or path.name == "model_index.json" if parts else not duplicate
+        wanted = is_part(path, parts) or path.name == "model_index.json" if parts else not duplicate
         if wanted and path.suffix in READABLE_SUFFIXES and not hidden and not other:
             folders[path.parent].append(name)
     return sorted(name for files in folders.values() for name in _one_format(files))
