@@ -206,6 +206,8 @@ def _with_defaults(tree: dict[str, Any]) -> dict[str, Any]:
         return tree
 
 
+LGM_SCALE = 4 / 3  # our camera radius over LGM's, as WORLD_SCALE in dg4d_lib/reconstruction/lgm.py, which imports torch
+SMOOTHNESS = 0.01 / 3  # a third of the public code's weight: measured as a mean over the three time planes
 PREVIEW_SCHEDULE = [ResolutionStage(until=1.0, size=128).model_dump()]
 
 PREVIEW = revise(
@@ -219,7 +221,7 @@ PREVIEW = revise(
         "deformation.features": 16,
         "deformation.hidden": 32,
         "deformation.spatial": 64,
-        "deformation.smoothness_weight": 0.01,
+        "deformation.smoothness_weight": SMOOTHNESS,
         "motion.iterations": 250,
         "motion.views": 1,
         "motion.frames_per_iteration": 12,
@@ -245,6 +247,23 @@ PAPER = revise(
 VIDEO = revise(PAPER, {"subject.max_frames": 32, "motion.iterations": 500})
 VIDEO_FAST = revise(VIDEO, {"subject.max_frames": 16, "motion.views": 1})
 
+RELEASE = revise(
+    PAPER,
+    {
+        "static.t_max_start": 1.0,
+        "static.t_max_end": 0.0,
+        "deformation.spatial": 64,
+        "deformation.temporal": 25,
+        "deformation.scales": [1, 2, 4, 8],
+        "deformation.half_side": 1.6,
+        "motion.t_max_start": 1.0,
+        "motion.t_max_end": 0.0,
+        "motion.t_max_limit": 0.5,
+        "motion.guidance_weight": 4.0,
+        "motion.alpha_weight": 0.0,
+    },
+)
+
 REFERENCE = revise(
     PAPER,
     {
@@ -255,12 +274,13 @@ REFERENCE = revise(
         "static.t_max_start": 1.0,
         "static.t_max_end": 0.0,
         "deformation.temporal": 12,
-        "deformation.half_side": 1.6,
+        "deformation.half_side": LGM_SCALE * 1.6,
         "deformation.endpoint": False,
         "motion.iterations": 500,
         "motion.t_max_start": 1.0,
         "motion.t_max_end": 0.0,
         "motion.fine_tune": True,
+        "motion.length_scale": LGM_SCALE,
     },
 )
 
@@ -269,7 +289,7 @@ QUALITY = revise(
     {
         "driving.candidates": 4,
         "deformation.scales": [1, 4],
-        "deformation.smoothness_weight": 0.01,
+        "deformation.smoothness_weight": SMOOTHNESS,
         "motion.iterations": 500,
         "motion.fine_tune": True,
         "mesh.mode": "tracked",
@@ -282,6 +302,7 @@ PROFILES: dict[str, PipelineSettings] = {
     "paper": PAPER,
     "video": VIDEO,
     "video-fast": VIDEO_FAST,
+    "release": RELEASE,
     "reference": REFERENCE,
     "quality": QUALITY,
 }
