@@ -127,6 +127,7 @@ class ScoreAssetSettings(Settings):
 
     rasterizer: Backend
     mesh: bool = Field(False, description="the textured mesh is judged instead of the splats")
+    actionbench: bool = Field(False, description="compare meshes by the metrics of ActionBench, too")
     score: ScoreSettings = ScoreSettings()
 
 
