@@ -207,6 +207,7 @@ def _with_defaults(tree: dict[str, Any]) -> dict[str, Any]:
         return tree
 
 
+PUBLIC_BOX = 1.6  # half side of the planes' box in the public code, over which the paper chose a resolution of 32
 LGM_SCALE = 4 / 3  # our camera radius over LGM's, as WORLD_SCALE in dg4d_lib/reconstruction/lgm.py, which imports torch
 SMOOTHNESS = 0.01 / 3  # a third of the public code's weight: measured as a mean over the three time planes
 PREVIEW_SCHEDULE = [ResolutionStage(until=1.0, size=128).model_dump()]
@@ -241,6 +242,7 @@ PAPER = revise(
     {
         "driving.kind": "svd",
         "prior.kind": "zero123",
+        "deformation.half_side": PUBLIC_BOX,
         "mesh.mode": "per_frame",
         "refiner.kind": "video_to_video",
     },
@@ -256,7 +258,6 @@ RELEASE = revise(
         "deformation.spatial": 64,
         "deformation.temporal": 25,
         "deformation.scales": [1, 2, 4, 8],
-        "deformation.half_side": 1.6,
         "motion.t_max_start": 1.0,
         "motion.t_max_end": 0.0,
         "motion.t_max_limit": 0.5,
@@ -275,7 +276,7 @@ REFERENCE = revise(
         "static.t_max_start": 1.0,
         "static.t_max_end": 0.0,
         "deformation.temporal": 12,
-        "deformation.half_side": LGM_SCALE * 1.6,
+        "deformation.half_side": LGM_SCALE * PUBLIC_BOX,
         "deformation.endpoint": False,
         "motion.iterations": 500,
         "motion.t_max_start": 1.0,
@@ -289,6 +290,7 @@ QUALITY = revise(
     PAPER,
     {
         "driving.candidates": 4,
+        "deformation.half_side": 0.0,
         "deformation.scales": [1, 4],
         "deformation.smoothness_weight": SMOOTHNESS,
         "motion.iterations": 500,

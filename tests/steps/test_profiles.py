@@ -25,7 +25,7 @@ PAPER = {"static.iterations": 500, "static.views": 16, "static.t_max_start": 0.9
          "motion.iterations": 200, "motion.views": 4, "motion.t_max_start": 0.5, "motion.t_max_end": 0.02,
          "static.t_max_limit": 0.98, "motion.t_max_limit": 0.98, "motion.guidance_weight": 1.0,
          "motion.color_weight": 10000.0, "motion.alpha_weight": 1000.0, "static.alpha_weight": 1000.0,
-         "motion.length_scale": 1.0, "deformation.half_side": 0.0, "deformation.scales": (1,),
+         "motion.length_scale": 1.0, "deformation.half_side": 1.6, "deformation.scales": (1,),
          "motion.frames_per_iteration": 0, "static.start.points": 5000,
          "deformation.temporal": 32, "deformation.spatial": 32, "deformation.features": 32,
          "deformation.endpoint": True, "motion.fine_tune": False,
@@ -40,8 +40,7 @@ DIFFERENCES = {
     "release": {"static.t_max_start": 1.0, "static.t_max_end": 0.0,
                 "motion.t_max_start": 1.0, "motion.t_max_end": 0.0, "motion.t_max_limit": 0.5,
                 "motion.guidance_weight": 4.0, "motion.alpha_weight": 0.0,
-                "deformation.spatial": 64, "deformation.temporal": 25, "deformation.scales": (1, 2, 4, 8),
-                "deformation.half_side": 1.6},
+                "deformation.spatial": 64, "deformation.temporal": 25, "deformation.scales": (1, 2, 4, 8)},
     "reference": {"static.start.points": None, "motion.iterations": 500,
                   "static.t_max_start": 1.0, "static.t_max_end": 0.0,
                   "motion.t_max_start": 1.0, "motion.t_max_end": 0.0, "deformation.temporal": 12,
@@ -72,6 +71,11 @@ def test_every_profile_but_the_preview_has_a_trained_prior() -> None:
 
 def test_the_scale_of_lgm_is_that_of_the_library() -> None:
     assert value_of("reference", "motion.length_scale") == pytest.approx(WORLD_SCALE)
+
+
+@pytest.mark.parametrize("name", ["preview", "quality"])
+def test_our_own_profiles_fit_the_planes_to_the_gaussians(name: str) -> None:
+    assert value_of(name, "deformation.half_side") == 0
 
 
 def test_the_preview_keeps_the_strength_of_its_smoothness() -> None:

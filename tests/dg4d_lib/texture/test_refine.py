@@ -277,8 +277,8 @@ def test_black_texels_can_become_gray_within_the_papers_iterations() -> None:
     (begun,) = refine_textures(
         [MeshClip(black, torch.zeros(1, 4, 3))], driving_of([gray]), Satisfied(), settings, rng()
     )
-    first = torch.tensor(1 / 512).logit() + SETTINGS.lr
-    torch.testing.assert_close(begun.texture[8:24, 8:24], first.sigmoid().expand(16, 16, 3), rtol=1e-3, atol=0)
+    step = begun.texture[8:24, 8:24].logit() - torch.tensor(1 / 512).logit()
+    assert (step > 0.1).all() and (step < SETTINGS.lr + 1e-4).all()  # Adam's epsilon takes a part of small gradients
 
 
 def test_another_number_of_frames_is_refused() -> None:
