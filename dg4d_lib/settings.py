@@ -366,13 +366,13 @@ class HexPlaneSettings(Settings):
         (1,), min_length=1, description="multi-resolution: factors on `spatial`; features are concatenated"
     )
     variation_weight: NotNegative = Field(
-        0.0, description="second differences of the spatial planes, summed over the planes (public code: 1e-4)"
+        0.0, description="second differences over space, per plane (public code: 1e-4)"
     )
     smoothness_weight: NotNegative = Field(
-        0.0, description="second differences over time, summed over the planes (public code: 0.01)"
+        0.0, description="second differences over time, per plane (public code: 0.01)"
     )
     sparsity_weight: NotNegative = Field(
-        0.0, description="L1 distance of the time planes from one, summed over the planes (public code: 1e-4)"
+        0.0, description="L1 distance from one over time, per plane (public code: 1e-4)"
     )
 
 

@@ -19,9 +19,9 @@ NONE = "-"
 
 
 def doctor(profile: Profile = "preview", as_json: AsJson = False) -> None:
-    """Show what this machine has, what each profile needs, and the command that gets it.
+    """Check this machine against the needs of each profile.
 
-    The exit status is 0 if the profile can run, else 69.
+    Shows hardware, packages and weights, and the one command that gets what is missing. The exit status is 0 if the profile can run, else 69.
     """
     with exit_on_error():
         from flows.commands import terminal
