@@ -365,15 +365,9 @@ class HexPlaneSettings(Settings):
     scales: tuple[Annotated[int, Field(ge=1, le=16)], ...] = Field(
         (1,), min_length=1, description="multi-resolution: factors on `spatial`; features are concatenated"
     )
-    variation_weight: NotNegative = Field(
-        0.0, description="second differences over space, per plane (public code: 1e-4)"
-    )
-    smoothness_weight: NotNegative = Field(
-        0.0, description="second differences over time, per plane (public code: 0.01)"
-    )
-    sparsity_weight: NotNegative = Field(
-        0.0, description="L1 distance from one over time, per plane (public code: 1e-4)"
-    )
+    variation_weight: NotNegative = Field(0.0, description="second differences over space, per plane (typical: 1e-4)")
+    smoothness_weight: NotNegative = Field(0.0, description="second differences over time, per plane (typical: 0.01)")
+    sparsity_weight: NotNegative = Field(0.0, description="L1 distance of time planes from one, each (typical: 1e-4)")
 
 
 class MlpSettings(Settings):
