@@ -21,7 +21,8 @@ NONE = "-"
 def doctor(profile: Profile = "preview", as_json: AsJson = False) -> None:
     """Check this machine against the needs of each profile.
 
-    Shows hardware, packages and weights, and the one command that gets what is missing. The exit status is 0 if the profile can run, else 69.
+    Shows hardware, packages and weights, and the one command that gets what is missing. The exit status is 0 if the
+    profile can run, else 69.
     """
     with exit_on_error():
         from flows.commands import terminal
