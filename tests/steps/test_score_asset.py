@@ -127,11 +127,11 @@ def test_the_metrics_of_actionbench_forgive_the_pose_and_not_the_motion(
     assert all(0 < same[name] < 2 * spacing for name in ("cd_3d", "cd_4d", "cd_m")), same
     larger = actionbench(small_truth(tmp_path / "b", truth, lambda v: 1.5 * v + 0.3), package, tmp_path / "b/out")
     assert larger["chamfer"] > 0.3
-    assert larger["cd_3d"] < 0.12  # of so even a gem, other poses may fit the first frame as well as the true one
+    assert larger["cd_3d"] < 0.12  # CD-4D: so even a gem also fits the first frame in other poses
     still = actionbench(
         small_truth(tmp_path / "c", truth, lambda v: np.repeat(v[:1], 3, 0)), package, tmp_path / "c/out"
     )
-    assert still["cd_3d"] < 0.12 < still["cd_4d"] < still["cd_m"]
+    assert still["cd_3d"] < 0.2 and 0.4 < still["cd_4d"] < still["cd_m"], still
     reach = 0.4 / 0.3  # of the motion, in halves of the gem's size, which is the box
     assert still["cd_m"] == pytest.approx(2 * reach * (0 + 0.5 + 1) / 3, rel=0.15)
 
