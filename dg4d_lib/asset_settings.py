@@ -81,6 +81,12 @@ class ScoreSettings(Settings):
     clip_weights: str = Field("clip-vit-b-32", description="CLIP; a name, or a folder in the layout of transformers")
     i3d_weights: str = Field("i3d", description="FVD; a name or a folder")
     samples: int = Field(10_000, ge=100, le=1_000_000, description="points per surface, for the Chamfer distance")
+    actionbench_points: int = Field(
+        100_000, ge=100, le=1_000_000, description="ActionBench: points per surface (published: 100,000)"
+    )
+    icp_points: int = Field(
+        1000, ge=100, le=100_000, description="ActionBench: points for the alignment of a frame (published: 10,000)"
+    )
 
 
 class PackSettings(Settings):

@@ -328,6 +328,9 @@ class FitSettings(Settings):
     t_max_end: Share = Field(
         0.02, description="T_max at the end (paper; the public code anneals from 1 to 0, clamped at 0.02)"
     )
+    t_max_limit: float = Field(
+        0.98, gt=0.02, le=0.98, description="T_max is clipped to this (first release, dynamic stage: 0.5)"
+    )
     noise_draw: NoiseDraw = Field(
         "annealed", description="timestep of an iteration; annealed: T_max; uniform: drawn below T_max"
     )
@@ -387,9 +390,9 @@ class HexPlaneSettings(Settings):
     scales: tuple[Annotated[int, Field(ge=1, le=16)], ...] = Field(
         (1,), min_length=1, description="multi-resolution: factors on `spatial`; features are concatenated"
     )
-    variation_weight: NotNegative = Field(0.0, description="total variation of the spatial planes (typical: 1e-4)")
-    smoothness_weight: NotNegative = Field(0.0, description="second differences over time (typical: 0.01)")
-    sparsity_weight: NotNegative = Field(0.0, description="L1 distance of the time planes from one (typical: 1e-4)")
+    variation_weight: NotNegative = Field(0.0, description="second differences over space, per plane (typical: 1e-4)")
+    smoothness_weight: NotNegative = Field(0.0, description="second differences over time, per plane (typical: 0.01)")
+    sparsity_weight: NotNegative = Field(0.0, description="L1 distance of time planes from one, each (typical: 1e-4)")
 
 
 class MlpSettings(Settings):
@@ -432,6 +435,11 @@ class MotionSettings(FitSettings):
     means_lr: Positive = Field(0.001, description="learning rate of the canonical means at the start (public code)")
     means_lr_end: Positive = Field(
         2e-5, description="learning rate of the canonical means at the end, log-linear (public code)"
+    )
+    length_scale: Positive = Field(
+        1.0,
+        description="factor on learning rates of lengths: of the canonical means and of the layer that predicts their "
+        "displacement; 4/3 for Gaussians by LGM, whose rates belong to cameras at radius 1.5",
     )
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flows.commands.checking import bench, rebuild, score, verify
+from flows.commands.doctor import doctor
 from flows.commands.endings import exit_on_error
 from flows.commands.options import (
     Box,
@@ -340,7 +341,7 @@ def compose(
         typer.echo(out)
 
 
-for command in (score, bench, verify, rebuild, up, down, env, watch):
+for command in (score, bench, verify, rebuild, doctor, up, down, env, watch):
     app.command()(command)
 app.command("settings")(list_settings)
 

@@ -17,6 +17,9 @@ def score(
     package: Package,
     truth: Annotated[Path, typer.Option(metavar="PATH", help="ground-truth views and meshes, or one picture")],
     mesh: Annotated[bool, typer.Option("--mesh", help="score the textured mesh instead of the splats")] = False,
+    actionbench: Annotated[
+        bool, typer.Option("--actionbench", help="also compare the meshes by ActionBench's CD-3D, CD-4D and CD-M")
+    ] = False,
     changes: Annotated[
         list[str] | None, typer.Option("--set", metavar="score.NAME=VALUE", help="change a setting; may be repeated")
     ] = None,
@@ -31,7 +34,7 @@ def score(
         from flows.packages.scores import markdown
 
         console = terminal.console()
-        results = score_asset(package, truth, console, mesh, changes, out)
+        results = score_asset(package, truth, console, mesh, changes, out, actionbench)
         console.print(markdown(results), markup=False)
 
 

@@ -20,6 +20,7 @@ PROFILES = (
     "paper",
     "video",
     "video-fast",
+    "release",
     "reference",
     "quality",
 )  # as in steps/profiles.py
