@@ -8,15 +8,14 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt16
-from numpy.typing import NDArray
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.gltf import VERTEX_DATA, GltfDocument
+from dg4d_lib.assets.formats.joint_motion import close_loop, relative_motion, rest_arms
 from dg4d_lib.assets.formats.materials import add_material, add_texture, to_uint8
 from dg4d_lib.assets.formats.primitives import MeshPrimitive
 from dg4d_lib.errors import BadInput
-from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
 from dg4d_lib.mesh.tracking.rig import Rig, fit_rig
 
 NAME = "subject"
@@ -98,11 +97,11 @@ def _quantize_weights(weights: Float[np.ndarray, "v 4"]) -> UInt16[np.ndarray, "
 
 def _add_joints(document: GltfDocument, rig: Rig) -> tuple[int, list[int]]:
     """Add the joint nodes in the rest pose; return the index of the skeleton's root node and those of the joints."""
-    parents, rest = rig.parents.tolist(), rig.rest_positions.double().cpu().numpy()
-    joints = []
-    for bone, parent in enumerate(parents):
-        arm = rest[bone] - (rest[parent] if parent >= 0 else 0)
-        joints.append(document.add("nodes", name=f"joint_{bone:03d}", translation=arm.tolist()))
+    parents = rig.parents.tolist()
+    joints = [
+        document.add("nodes", name=f"joint_{bone:03d}", translation=arm)
+        for bone, arm in enumerate(rest_arms(rig).tolist())
+    ]
     nodes = document.tree["nodes"]
     for bone, parent in enumerate(parents):
         if parent >= 0:
@@ -122,28 +121,17 @@ def _add_bind_matrices(document: GltfDocument, rest: Float[np.ndarray, "b 3"]) -
 
 def _add_motion(document: GltfDocument, rig: Rig, joints: list[int], fps: float, interpolation: str) -> None:
     """Add an animation with the rotations and translations of all joints relative to their parents."""
-    quats, positions = rig.quats.double().cpu(), rig.positions.double().cpu()
-    parents = rig.parents[1:]
-    inverse = quats[:, parents] * quats.new_tensor((1, -1, -1, -1))
-    arms = positions[:, 1:] - positions[:, parents]
-    rotations, translations = quats.clone(), positions.clone()
-    rotations[:, 1:] = quat_multiply(inverse, quats[:, 1:])
-    translations[:, 1:] = (quat_to_rotmat(inverse) @ arms[..., None])[..., 0]
+    rotations, translations = relative_motion(rig)
     samplers: list[dict[str, Any]] = []
     channels = []
-    times = document.add_accessor("times", (np.arange(len(quats) + 1) / fps).astype("<f4"))
-    for joint, rotation, translation in zip(joints, rotations.unbind(1), translations.unbind(1), strict=True):
+    times = document.add_accessor("times", (np.arange(len(rotations) + 1) / fps).astype("<f4"))
+    for number, joint in enumerate(joints):
         name = document.tree["nodes"][joint]["name"]
-        for path, values in (("rotation", rotation.numpy()[:, [1, 2, 3, 0]]), ("translation", translation.numpy())):
-            output = document.add_accessor(f"{name} {path}", _close_loop(values))
+        for path, values in (
+            ("rotation", rotations[:, number][:, [1, 2, 3, 0]]),
+            ("translation", translations[:, number]),
+        ):
+            output = document.add_accessor(f"{name} {path}", close_loop(values))
             channels.append({"sampler": len(samplers), "target": {"node": joint, "path": path}})
             samplers.append({"input": times, "output": output, "interpolation": interpolation})
     document.add("animations", name="motion", samplers=samplers, channels=channels)
-
-
-def _close_loop(values: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Append the first value; a quaternion with the sign nearest to the last one."""
-    first = values[:1]
-    if values.shape[1] == 4 and (first * values[-1:]).sum() < 0:
-        first = -first
-    return np.concatenate((values, first)).astype("<f4")
