@@ -8,7 +8,7 @@ from dg4d_lib.settings import NotNegative, Positive, Settings, Share
 
 
 class GltfSettings(Settings):
-    """Options of GLB files (ours); with the defaults, readers need core glTF 2.0 only."""
+    """Options of GLB files (ours); readers need glTF 2.0 with KHR_mesh_quantization, or without it if not quantized."""
 
     image: Literal["png", "jpeg", "webp"] = Field(
         "jpeg",
@@ -17,11 +17,18 @@ class GltfSettings(Settings):
     )
     quality: int = Field(85, ge=1, le=100, description="of jpeg and webp; from 95, jpeg does not subsample chroma")
     quantized: bool = Field(
-        False,
-        description="16 instead of 32 bits, 8 for static normals (KHR_mesh_quantization); in USDZ, splats in half "
-        "precision",
+        True, description="16 bits for positions and 8 for normals instead of 32 (KHR_mesh_quantization)"
     )
-    meshopt: bool = Field(False, description="EXT_meshopt_compression; supported by web players, not by Blender")
+    meshopt: bool = Field(
+        False,
+        description="EXT_meshopt_compression with 14 bits for positions; supported by web players, not by Blender",
+    )
+    components: int = Field(
+        0,
+        ge=0,
+        le=128,
+        description="number of principal components as morph targets instead of one target per frame; 0: one per frame",
+    )
     interpolation: Literal["linear", "step"] = Field("linear", description="between frames")
     moving_normals: bool = Field(True, description="animate normals; they take half of an uncompressed file")
     textures: Literal["pointer", "core"] = Field(
