@@ -86,6 +86,17 @@ class PackSettings(Settings):
         description="frame rate of the files, from 1; the motion is resampled (paper's code: 4 times the video's); "
         "0: that of the driving video, which a mesh per frame always uses",
     )
+    height_m: float = Field(
+        0.0,
+        ge=0,
+        le=1000,
+        description="height of the first frame, meters; 0: one meter per unit of the fit, about 1.5 m",
+    )
+    ground: bool = Field(
+        True,
+        description="put the lowest point of the animation on y = 0 and its center above the origin; false: the origin "
+        "is where the camera looks",
+    )
     gltf: GltfSettings = GltfSettings()
     lods: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = Field(
         (),
@@ -99,7 +110,9 @@ class PackSettings(Settings):
     rig_error: Share = Field(
         0.35, description="largest RMS error of the rig, relative to the motion; else it is left out"
     )
-    usd: bool = Field(True, description="write mesh and splats as USDZ")
+    usd: bool = Field(
+        True, description="write a skeleton animation as USDZ, and exact point samples and splats as another one"
+    )
     splats: bool = Field(True, description="write one 3DGS PLY per frame")
     spz: bool = Field(True, description="write one SPZ per frame, a quarter of the size")
     splat_gltf: Literal["none", "ratified", "rc1"] = Field(

@@ -20,6 +20,9 @@ from flows.commands.endings import exit_on_error
 from flows.commands.options import (
     Changes,
     Commercial,
+    Compress,
+    Ground,
+    Height,
     Profile,
     Rate,
     Seed,
@@ -82,6 +85,9 @@ def make(
     triangles: Triangles = None,
     texture: Texture = None,
     fps: Rate = None,
+    height_m: Height = None,
+    ground: Ground = None,
+    compress: Compress = False,
     seed: Seed = 0,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", metavar="DIR", help="output folder  [default: out/NAME]")
@@ -113,7 +119,9 @@ def make(
         console = terminal.console()
         if pick and video:
             raise BadInput("--pick chooses a generated motion and cannot be combined with --video")
-        short = shortcut_settings(triangles, texture, fps) | ({"driving.pick": pick} if pick else {})
+        short = shortcut_settings(triangles, texture, fps, height_m, ground, compress) | (
+            {"driving.pick": pick} if pick else {}
+        )
         item = (clean_name(picture.stem) or "asset") if picture else name_from_text(text)
         files = {"picture": picture, "text": text, "video": video, "bank": bank}
         request = _request(profile, changes, short, item=item, seed=seed, commercial_only=commercial_only, **files)
@@ -189,6 +197,9 @@ def batch(
     triangles: Triangles = None,
     texture: Texture = None,
     fps: Rate = None,
+    height_m: Height = None,
+    ground: Ground = None,
+    compress: Compress = False,
     seed: Seed = 0,
     workers: Annotated[
         int | None,
@@ -248,7 +259,8 @@ def batch(
             inputs=inputs,
             out=out,
             profile=profile,
-            changes=parse_changes(changes or []) | shortcut_settings(triangles, texture, fps),
+            changes=parse_changes(changes or [])
+            | shortcut_settings(triangles, texture, fps, height_m, ground, compress),
             seed=seed,
             workers=workers or default_workers(where),
             where=where,

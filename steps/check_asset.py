@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.asset_settings import GateSettings
+from dg4d_lib.assets.placement import Surface
 from dg4d_lib.assets.rendering.sheet import draw_tiles
 from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.cameras.viewpoints import turntable
@@ -25,7 +26,7 @@ from steps.artifacts.archives import unpack
 from steps.artifacts.media import read_frames, read_png, write_png
 from steps.artifacts.packages import ASSET, COMPACT, MANIFEST, MESHES, read_manifest
 from steps.artifacts.packages import SPLATS as SPLATS_FOLDER
-from steps.artifacts.rendering import BATCH, States, Surface, mesh_at, mesh_renderer, read_states, read_surface
+from steps.artifacts.rendering import BATCH, States, mesh_at, mesh_renderer, read_states, read_surface
 from steps.runtime.job import Job, StepReport
 
 SIZE = 128  # pixels of a side of the renders; the bounds of the gates were calibrated at this size

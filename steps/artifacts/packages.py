@@ -5,6 +5,7 @@ from typing import Literal
 
 from pydantic import Field, ValidationError
 
+from dg4d_lib.assets.placement import Placement
 from dg4d_lib.cameras.orbit import FOV_Y_DEG, RADIUS
 from dg4d_lib.errors import BadInput
 from steps.contract import Frozen
@@ -13,6 +14,7 @@ MANIFEST = "asset.json"
 ASSET = "asset.glb"
 RIGGED = "asset_rigged.glb"
 USD = "asset.usdz"
+USD_SPLATS = "asset_splats.usdz"
 SPLATS = "splats"
 WEB_SPLATS = "splats/moving.websplats"
 MESHES = "meshes"
@@ -29,7 +31,8 @@ SHEET = "contact_sheet.png"
 ABOUT = {
     ASSET: "animated textured mesh, glTF 2.0",
     RIGGED: "the same mesh on a skeleton, glTF 2.0",
-    USD: "animated mesh, and as a variant moving splats, USDZ",
+    USD: "animated mesh, on a skeleton if one follows the motion, USDZ",
+    USD_SPLATS: "moving splats, and as a variant point samples of the mesh, USDZ",
     WEB_SPLATS: "moving splats for the viewer",
     GAUSSIANS: "Gaussians at rest, 3DGS PLY",
     COMPACT: "Gaussians and their deformation over time, safetensors",
@@ -49,17 +52,35 @@ ABOUT_FOLDERS = {
 }
 
 
+class PackagePlacement(Frozen):
+    """Map from the coordinates of canonical/ to those of all other files: x to `scale` * x + `translation`."""
+
+    scale: float = Field(1.0, gt=0)
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def placement(self) -> Placement:
+        """The same as the library's class."""
+        return Placement(self.scale, self.translation)
+
+
 class Camera(Frozen):
     """Camera of the input picture, and the convention of its angles."""
 
     elevation_deg: float = 0.0
     azimuth_deg: float = 0.0
     radius: float = RADIUS
+    target: tuple[float, float, float] = (0.0, 0.0, 0.0)
     fov_y_deg: float = FOV_Y_DEG
     convention: str = (
-        "right-handed world, y up, the front looks along +z; the camera looks at the origin from `radius` world units; "
-        "azimuth 0 is on +z, 90 on +x; positive elevation is above"
+        "right-handed world in meters, y up, the front looks along +z; the camera looks at `target` from a distance of "
+        "`radius`; azimuth 0 is on +z, 90 on +x; positive elevation is above"
     )
+
+    @classmethod
+    def placed(cls, placement: Placement) -> "Camera":
+        """Return the camera in the coordinates of the files."""
+        return cls(radius=RADIUS * placement.scale, target=placement.translation)
 
 
 class Manifest(Frozen):
@@ -78,6 +99,7 @@ class Manifest(Frozen):
     gaussians: int = Field(ge=0)
     vertices: tuple[int, ...] = Field(description="of the tracked mesh, or of every frame's mesh")
     triangles: tuple[int, ...] = Field(description="of the tracked mesh, or of every frame's mesh")
+    placement: PackagePlacement = PackagePlacement()
     camera: Camera = Camera()
     files: dict[str, str] = Field(description="description of every file, by its name in the package")
     notes: tuple[str, ...] = ()

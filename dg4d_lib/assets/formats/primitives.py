@@ -169,7 +169,7 @@ class MeshPrimitive:
         target = {"POSITION": self._add_offsets(name, offsets)}
         if changes is not None:
             fits = self._cube is not None and np.abs(changes).max(initial=0.0) <= 1
-            target["NORMAL"] = self._add(f"{name} normals", _normalized(changes, 32767, "<i2") if fits else changes)
+            target["NORMAL"] = self._add(f"{name} normals", _normalized(changes, _BYTE, "i1") if fits else changes)
         return target
 
     def turn_normals(self, offsets: Floats) -> Floats:

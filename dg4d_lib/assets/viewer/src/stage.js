@@ -2,11 +2,12 @@
 import { DirectionalLight, HemisphereLight, PerspectiveCamera, Scene, WebGLRenderer } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 
-// The camera of the input picture: on +z, looking at the origin; as in dg4d_lib/cameras/orbit.py.
+// The camera of the input picture, as in dg4d_lib/cameras/orbit.py; lengths are those of an asset at scale 1.
 const FOV_DEG = 49.1; // of the shorter side
 const RADIUS = 2;
 const NEAREST = 0.3;
 const FARTHEST = 12;
+const CLIPPING = [0.02, 100];
 const MOST_PIXELS_PER_POINT = 2; // sharper screens would only be slower
 
 /** Returns true if the browser supports WebGL 2. */
@@ -15,13 +16,16 @@ export function canDraw() {
 }
 
 export class Stage {
-  constructor(element) {
+  /** `view`: distance `radius` of the input camera on +z, and the `target` that it looks at. */
+  constructor(element, { radius = RADIUS, target = [0, 0, 0] } = {}) {
     this.element = element;
+    this.view = { radius, target };
+    const scale = radius / RADIUS;
     this.renderer = new WebGLRenderer({ canvas: element.querySelector("canvas"), antialias: true, alpha: true });
     this.scene = new Scene();
-    this.camera = new PerspectiveCamera(FOV_DEG, 1, 0.02, 100);
+    this.camera = new PerspectiveCamera(FOV_DEG, 1, ...CLIPPING.map((distance) => distance * scale));
     this.controls = new OrbitControls(this.camera, this.renderer.domElement);
-    Object.assign(this.controls, { enableDamping: true, minDistance: NEAREST, maxDistance: FARTHEST });
+    Object.assign(this.controls, { enableDamping: true, minDistance: NEAREST * scale, maxDistance: FARTHEST * scale });
     this.stale = true;
     this.controls.addEventListener("change", () => (this.stale = true));
     new ResizeObserver(() => this.resize()).observe(element);
@@ -35,8 +39,9 @@ export class Stage {
     this.controls.enableDamping = false;
     this.controls.update(); // stops the damped rotation
     this.controls.enableDamping = true;
-    this.controls.target.set(0, 0, 0);
-    this.camera.position.set(0, 0, RADIUS);
+    const { radius, target } = this.view;
+    this.controls.target.set(...target);
+    this.camera.position.set(target[0], target[1], target[2] + radius);
     this.controls.update();
     this.stale = true;
   }
