@@ -132,7 +132,7 @@ class PackageWriter:
         if pack.splats:
             write_splats(folder, states)
         if pack.spz:
-            write_spz_frames(folder, states)
+            write_spz_frames(folder, states, pack.spz_version)
         if pack.splat_gltf != "none":
             write_splat_glb_frames(folder, states, pack.splat_gltf)
 

@@ -1,35 +1,36 @@
 """Splat sequences with one file per frame: standard PLY, SPZ or glTF."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
 
 from dg4d_lib.assets.formats.splat_glb import SplatGlbVersion, write_splat_glb
-from dg4d_lib.assets.formats.spz import write_spz
+from dg4d_lib.assets.formats.spz import SpzVersion, write_spz
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply, write_ply
 
 
 def write_splats(folder: Path, states: Gaussians) -> list[Path]:
-    """Write every state of a batch as FOLDER/NNN.ply; the folder must exist.
+    """Write every state of a batch as FOLDER/NNN.ply, in the axes of other programs; the folder must exist.
 
     Raises:
         BadInput: numbers that are not finite.
         OSError: a file could not be written.
     """
-    return _write(folder, states, "ply", write_ply)
+    return _write(folder, states, "ply", partial(write_ply, y_down=True))
 
 
-def write_spz_frames(folder: Path, states: Gaussians) -> list[Path]:
+def write_spz_frames(folder: Path, states: Gaussians, version: SpzVersion = 3) -> list[Path]:
     """Write every state of a batch as FOLDER/NNN.spz; the folder must exist.
 
     Raises:
         BadInput: numbers that are not finite, or means outside the range of SPZ (see `write_spz`).
         OSError: a file could not be written.
     """
-    return _write(folder, states, "spz", write_spz)
+    return _write(folder, states, "spz", partial(write_spz, version=version))
 
 
 def write_splat_glb_frames(folder: Path, states: Gaussians, version: SplatGlbVersion = "ratified") -> list[Path]:
