@@ -26,8 +26,8 @@ from steps.pack_asset import run
 
 COMMON = {
     "asset.json", "asset.glb", "asset.usdz", "asset_splats.usdz", "preview.mp4", "preview.webp", "turntable.mp4",
-    "contact_sheet.png", "canonical/gaussians.ply", "canonical/asset4d.safetensors", "input/subject.png", "input/driving.mp4",
-    "splats/moving.websplats",
+    "contact_sheet.png", "canonical/gaussians.ply", "canonical/asset4d.safetensors", "input/subject.png",
+    "input/driving.mp4", "splats/moving.websplats",
 }  # fmt: skip
 SPLATS = {f"splats/{i:03d}.{form}" for i in range(FRAMES) for form in ("ply", "spz")}
 RIGGED = {"asset_rigged.glb"}

@@ -29,7 +29,7 @@ async function start() {
   const stage = new Stage(stageElement, camera());
   const modes = ["mesh", ...(cloud ? ["splats"] : []), "wireframe"];
   const shown = [mesh, cloud].filter(Boolean);
-  stage.scene.add(...shown.map(({ object }) => object));
+  stage.world.add(...shown.map(({ object }) => object));
   let mode;
 
   const show = (what) => {

@@ -1,13 +1,12 @@
 // Canvas, camera and orbit controls. The canvas is transparent, so the page's background shows through.
-import { DirectionalLight, HemisphereLight, PerspectiveCamera, Scene, WebGLRenderer } from "three";
+import { DirectionalLight, Group, HemisphereLight, PerspectiveCamera, Scene, WebGLRenderer } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 
-// The camera of the input picture, as in dg4d_lib/cameras/orbit.py; lengths are those of an asset at scale 1.
+// The camera of the input picture: on +z, looking at the origin; as in dg4d_lib/cameras/orbit.py.
 const FOV_DEG = 49.1; // of the shorter side
 const RADIUS = 2;
 const NEAREST = 0.3;
 const FARTHEST = 12;
-const CLIPPING = [0.02, 100];
 const MOST_PIXELS_PER_POINT = 2; // sharper screens would only be slower
 
 /** Returns true if the browser supports WebGL 2. */
@@ -16,16 +15,18 @@ export function canDraw() {
 }
 
 export class Stage {
-  /** `view`: distance `radius` of the input camera on +z, and the `target` that it looks at. */
+  /** `view`: distance `radius` of the input camera and the `target` that it looks at, in the coordinates of the asset. */
   constructor(element, { radius = RADIUS, target = [0, 0, 0] } = {}) {
     this.element = element;
-    this.view = { radius, target };
-    const scale = radius / RADIUS;
     this.renderer = new WebGLRenderer({ canvas: element.querySelector("canvas"), antialias: true, alpha: true });
     this.scene = new Scene();
-    this.camera = new PerspectiveCamera(FOV_DEG, 1, ...CLIPPING.map((distance) => distance * scale));
+    this.world = new Group(); // shows assets of any size and place as the input camera saw them
+    this.world.scale.setScalar(RADIUS / radius);
+    this.world.position.set(...target).multiplyScalar(-RADIUS / radius);
+    this.scene.add(this.world);
+    this.camera = new PerspectiveCamera(FOV_DEG, 1, 0.02, 100);
     this.controls = new OrbitControls(this.camera, this.renderer.domElement);
-    Object.assign(this.controls, { enableDamping: true, minDistance: NEAREST * scale, maxDistance: FARTHEST * scale });
+    Object.assign(this.controls, { enableDamping: true, minDistance: NEAREST, maxDistance: FARTHEST });
     this.stale = true;
     this.controls.addEventListener("change", () => (this.stale = true));
     new ResizeObserver(() => this.resize()).observe(element);
@@ -39,9 +40,8 @@ export class Stage {
     this.controls.enableDamping = false;
     this.controls.update(); // stops the damped rotation
     this.controls.enableDamping = true;
-    const { radius, target } = this.view;
-    this.controls.target.set(...target);
-    this.camera.position.set(target[0], target[1], target[2] + radius);
+    this.controls.target.set(0, 0, 0);
+    this.camera.position.set(0, 0, RADIUS);
     this.controls.update();
     this.stale = true;
   }
