@@ -44,9 +44,9 @@ ABOUT = {
     SHEET: "moments by angles",
 }
 ABOUT_FOLDERS = {
-    (SPLATS, ".ply"): "Gaussians of one moment, 3DGS PLY",
-    (SPLATS, ".spz"): "Gaussians of one moment, SPZ",
-    (SPLATS, ".glb"): "Gaussians of one moment, glTF with KHR_gaussian_splatting",
+    (SPLATS, ".ply"): "Gaussians of one frame, 3DGS PLY in OpenCV axes (y down)",
+    (SPLATS, ".spz"): "Gaussians of one frame, SPZ (y up)",
+    (SPLATS, ".glb"): "Gaussians of one frame, glTF with KHR_gaussian_splatting",
     (MESHES, ".glb"): "textured mesh of one frame, glTF 2.0",
     (LEVELS, ".glb"): "the animated mesh with fewer triangles, glTF 2.0",
 }
