@@ -240,7 +240,12 @@ def _add_components(
     components, weights = principal_components(offsets, settings.components)
     changes: Sequence[NDArray[np.float32] | None] = [None] * len(components)
     if settings.moving_normals:
-        changes = list(fit_components(np.stack([shape.turn_normals(pose) for pose in offsets]), weights))
+        turned = fit_components(np.stack([shape.turn_normals(pose) for pose in offsets]), weights)
+        reach = (
+            np.abs(turned).max((1, 2)).clip(1)
+        )  # integers stand for changes in [-1, 1]; larger weights make up for it
+        components, turned = (rows / reach[:, None, None] for rows in (components, turned))
+        weights, changes = weights * reach, list(turned)
     names = [f"component_{number:03d}" for number in range(len(components))]
     targets = [
         shape.add_component(name, component, change)
