@@ -210,6 +210,7 @@ def run(job: Job) -> StepReport:
             triangles=tuple(len(mesh.faces) for mesh in package.meshes),
             placement=PackagePlacement(scale=package.placement.scale, translation=package.placement.translation),
             camera=Camera.placed(package.placement),
+            ply_axes="y_down",
             files={name: packages.about(name) for name in names},
             notes=(*package.notes, *notes),
         )

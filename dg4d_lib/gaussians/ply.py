@@ -4,8 +4,8 @@ Binary little endian, one float32 row per Gaussian: x y z, nx ny nz (zeros), f_d
 (natural logarithm), rot_0..3 (wxyz). These are the raw parameters, so the round trip is exact.
 
 3DGS trains on cameras of COLMAP, so other programs expect its files in OpenCV axes: x right, y down, z away from the
-viewer. Files for them are written in these axes, half a turn around x from ours, and say so in a comment; files without
-the comment, which are ours alone, have y up.
+viewer. Files for them are written in these axes, half a turn around x from ours. Nothing in a file names its axes:
+Niantic's reader refuses a header with a comment.
 """
 
 from dataclasses import replace
@@ -24,8 +24,6 @@ OPACITY = ("opacity",)
 SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 COLUMNS = (*MEANS, *NORMALS, *COLORS, *OPACITY, *SCALES, *QUATS)
-
-Y_DOWN = "comment axes x_right y_down z_forward"  # header line of files in the axes of other programs
 
 MAX_HEADER = 65536  # bytes; bounds the search for `end_header`
 _TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1"}
@@ -57,13 +55,16 @@ def write_ply(path: Path, gaussians: Gaussians, *, y_down: bool = False) -> None
     )
     rows = torch.cat(columns, 1).detach().cpu().numpy().astype("<f4")
     properties = "".join(f"property float {name}\n" for name in COLUMNS)
-    note = f"{Y_DOWN}\n" if y_down else ""  # last, because some readers expect the elements in fixed lines
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}{note}end_header\n"
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
     path.write_bytes(header.encode("ascii") + rows.tobytes())
 
 
-def read_ply(path: Path) -> Gaussians:
+def read_ply(path: Path, *, y_down: bool = False) -> Gaussians:
     """Read a cloud, y up; columns may be in any order, unknown ones are ignored.
+
+    Args:
+        path: input file.
+        y_down: the file is in the axes that other programs expect of 3DGS.
 
     Raises:
         BadInput: the file is missing, damaged, no splat PLY, or has view-dependent color or non-finite numbers.
@@ -92,7 +93,7 @@ def read_ply(path: Path) -> Gaussians:
         raise BadInput(f"{path.name} has non-finite numbers; export it again")
     means, log_scales, quats, opacity, colors = parts
     cloud = Gaussians(means, log_scales, quats, opacity[:, 0], colors[:, None])
-    return _turn(cloud, -1) if f"\n{Y_DOWN}\n".encode() in content[:start] else cloud
+    return _turn(cloud, -1) if y_down else cloud
 
 
 def _turn(gaussians: Gaussians, sign: int) -> Gaussians:

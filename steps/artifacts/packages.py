@@ -101,6 +101,9 @@ class Manifest(Frozen):
     triangles: tuple[int, ...] = Field(description="of the tracked mesh, or of every frame's mesh")
     placement: PackagePlacement = PackagePlacement()
     camera: Camera = Camera()
+    ply_axes: Literal["y_up", "y_down"] = Field(
+        "y_up", description="of splats/*.ply; y_down: x right, y down, z forward, as other programs expect"
+    )
     files: dict[str, str] = Field(description="description of every file, by its name in the package")
     notes: tuple[str, ...] = ()
 

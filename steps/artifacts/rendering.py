@@ -97,7 +97,7 @@ def read_states(folder: Path, manifest: Manifest) -> States:
         BadInput: files are missing or broken, or have another number of frames than the package.
     """
     if any((folder / SPLATS).glob("*.ply")):
-        stored = read_splats(folder / SPLATS)
+        stored = read_splats(folder / SPLATS, y_down=manifest.ply_axes == "y_down")
         _check_frames(SPLATS, len(stored.means), manifest)
         return partial(states_between, manifest.placement.placement.inverse.gaussians(stored))
     fit = read_compact(folder / COMPACT)

@@ -43,8 +43,12 @@ def write_splat_glb_frames(folder: Path, states: Gaussians, version: SplatGlbVer
     return _write(folder, states, "glb", lambda path, state: path.write_bytes(write_splat_glb(state, version)))
 
 
-def read_splats(folder: Path) -> Gaussians:
+def read_splats(folder: Path, *, y_down: bool = True) -> Gaussians:
     """Read the output of `write_splats` as a batch with one state per frame.
+
+    Args:
+        folder: folder of the files.
+        y_down: False for files of earlier versions, which had y up.
 
     Raises:
         BadInput: no frames, a gap in the numbering, a corrupt file, or frames that are not states of one cloud.
@@ -53,7 +57,7 @@ def read_splats(folder: Path) -> Gaussians:
     if not paths or [path.name for path in paths] != [f"{frame:03d}.ply" for frame in range(len(paths))]:
         given = f"{paths[0].name} to {paths[-1].name}, {len(paths)} files" if paths else "none"
         raise BadInput(f"{folder.name}/ must contain 000.ply, 001.ply, ... without gaps; given {given}")
-    clouds = [read_ply(path) for path in paths]
+    clouds = [read_ply(path, y_down=y_down) for path in paths]
     first = clouds[0]
     for path, cloud in zip(paths, clouds, strict=True):
         same = torch.equal(cloud.opacity_logits, first.opacity_logits) and torch.equal(cloud.harmonics, first.harmonics)
