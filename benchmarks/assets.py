@@ -158,10 +158,7 @@ def splat_writers(asset: Asset4D, splats: CompactAsset, pack: PackSettings) -> I
     yield "web splats", lambda folder: (folder / "a.bin").write_bytes(write_web_splats(states, FPS))
     yield "compact, exact", lambda folder: write_compact(folder / "a.safetensors", splats)
     yield "asset.usdz, mesh and splats", lambda folder: write_usdz(folder / "a.usdz", asset, FPS, states)
-    yield (
-        "asset.usdz, quantized",
-        lambda folder: write_usdz(folder / "a.usdz", asset, FPS, states, settings=GltfSettings(quantized=True)),
-    )
+    yield "asset.usdz, quantized", lambda folder: write_usdz(folder / "a.usdz", asset, FPS, states, half=True)
     yield (
         "preview.mp4",
         lambda folder: write_preview(folder / "a.mp4", cloud, field, FRAMES, FPS, rasterizer, pack),

@@ -17,9 +17,8 @@ import torch  # isort: skip
 from rich.table import Column, Table
 from torch import Tensor
 
-from dg4d_lib.assets.animated import pose_gaussians
+from dg4d_lib.assets.animated import Asset4D, pose_gaussians
 from dg4d_lib.assets.formats.compact import read_compact
-from dg4d_lib.assets.formats.glb import read_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.images import color_over_white
@@ -31,7 +30,8 @@ from dg4d_lib.metrics.image import iou, psnr
 from dg4d_lib.metrics.surface import chamfer_distance, sample_surface
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.settings import MeshSettings
-from steps.artifacts.packages import ASSET, COMPACT
+from steps.artifacts.packages import COMPACT, read_manifest
+from steps.artifacts.rendering import read_surface
 from steps.extract_mesh import textured_mesh
 
 AZIMUTHS_DEG = (0.0, 90.0)  # the input view and the right side
@@ -58,7 +58,9 @@ class Row:
 
 
 def measure_package(folder: Path, count: int, rasterize: Rasterizer) -> list[Row]:
-    asset = read_glb((folder / ASSET).read_bytes())
+    asset = read_surface(folder, read_manifest(folder))
+    if not isinstance(asset, Asset4D):
+        raise SystemExit(f"{folder} has a mesh per frame; give a package of a tracked mesh")
     fit = read_compact(folder / COMPACT)
     gaussians, deformation, frames = fit.gaussians, fit.deformation, fit.frames
     first = pose_gaussians(gaussians, deformation, frames, torch.zeros(1)).at(0)

@@ -8,7 +8,7 @@ from dg4d_lib.settings import NotNegative, Positive, Settings, Share
 
 
 class GltfSettings(Settings):
-    """Options of GLB files (ours); with the defaults, readers need core glTF 2.0 only."""
+    """Options of GLB files (ours); readers need glTF 2.0 with KHR_mesh_quantization, or without it if not quantized."""
 
     image: Literal["png", "jpeg", "webp"] = Field(
         "jpeg",
@@ -17,11 +17,18 @@ class GltfSettings(Settings):
     )
     quality: int = Field(85, ge=1, le=100, description="of jpeg and webp; from 95, jpeg does not subsample chroma")
     quantized: bool = Field(
-        False,
-        description="16 instead of 32 bits, 8 for static normals (KHR_mesh_quantization); in USDZ, splats in half "
-        "precision",
+        True, description="16 bits for positions and 8 for normals instead of 32 (KHR_mesh_quantization)"
     )
-    meshopt: bool = Field(False, description="EXT_meshopt_compression; supported by web players, not by Blender")
+    meshopt: bool = Field(
+        False,
+        description="EXT_meshopt_compression with 14 bits for positions; supported by web players, not by Blender",
+    )
+    components: int = Field(
+        0,
+        ge=0,
+        le=128,
+        description="number of principal components as morph targets instead of one target per frame; 0: one per frame",
+    )
     interpolation: Literal["linear", "step"] = Field("linear", description="between frames")
     moving_normals: bool = Field(True, description="animate normals; they take half of an uncompressed file")
     textures: Literal["pointer", "core"] = Field(
@@ -99,6 +106,17 @@ class PackSettings(Settings):
         description="frame rate of the files, from 1; the motion is resampled (paper's code: 4 times the video's); "
         "0: that of the driving video, which a mesh per frame always uses",
     )
+    height_m: float = Field(
+        0.0,
+        ge=0,
+        le=1000,
+        description="height of the first frame, meters; 0: one meter per unit of the fit, about 1.5 m",
+    )
+    ground: bool = Field(
+        True,
+        description="put the lowest point of the animation on y = 0 and its center above the origin; false: the origin "
+        "is where the camera looks",
+    )
     gltf: GltfSettings = GltfSettings()
     lods: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = Field(
         (),
@@ -112,9 +130,14 @@ class PackSettings(Settings):
     rig_error: Share = Field(
         0.35, description="largest RMS error of the rig, relative to the motion; else it is left out"
     )
-    usd: bool = Field(True, description="write mesh and splats as USDZ")
+    usd: bool = Field(
+        True, description="write a skeleton animation as USDZ, and exact point samples and splats as another one"
+    )
     splats: bool = Field(True, description="write one 3DGS PLY per frame")
     spz: bool = Field(True, description="write one SPZ per frame, a quarter of the size")
+    spz_version: Literal[3, 4] = Field(
+        3, description="version of SPZ; fewer programs read 4, and its streams are not compressed here"
+    )
     splat_gltf: Literal["none", "ratified", "rc1"] = Field(
         "none", description="write one GLB of splats per frame, by this version of KHR_gaussian_splatting"
     )

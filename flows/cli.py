@@ -23,6 +23,9 @@ from flows.commands.options import (
     Changes,
     Commercial,
     Mask,
+    Compress,
+    Ground,
+    Height,
     Profile,
     Rate,
     Seed,
@@ -85,6 +88,9 @@ def make(
     triangles: Triangles = None,
     texture: Texture = None,
     fps: Rate = None,
+    height_m: Height = None,
+    ground: Ground = None,
+    compress: Compress = False,
     seed: Seed = 0,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", metavar="DIR", help="output folder  [default: out/NAME]")
@@ -118,7 +124,9 @@ def make(
         console = terminal.console()
         if pick and video:
             raise BadInput("--pick chooses a generated motion and cannot be combined with --video")
-        short = shortcut_settings(triangles, texture, fps, box) | ({"driving.pick": pick} if pick else {})
+        short = shortcut_settings(
+            triangles, texture, fps, box=box, height_m=height_m, ground=ground, compress=compress
+        ) | ({"driving.pick": pick} if pick else {})
         item = (clean_name(picture.stem) or "asset") if picture else name_from_text(text)
         files = {"picture": picture, "text": text, "video": video, "bank": bank, "mask": mask}
         request = _request(profile, changes, short, item=item, seed=seed, commercial_only=commercial_only, **files)
@@ -166,7 +174,7 @@ def motions(
         from flows.packages.publish import check_writable
 
         console = terminal.console()
-        several = shortcut_settings(None, None, None, box) | {"driving.candidates": candidates, "driving.pick": 0}
+        several = shortcut_settings(None, None, None, box=box) | {"driving.candidates": candidates, "driving.pick": 0}
         item = clean_name(picture.stem) or "asset"
         files = {"item": item, "picture": picture, "mask": mask}
         request = _request(profile, changes, several, seed=seed, commercial_only=commercial_only, **files)
@@ -196,6 +204,9 @@ def batch(
     triangles: Triangles = None,
     texture: Texture = None,
     fps: Rate = None,
+    height_m: Height = None,
+    ground: Ground = None,
+    compress: Compress = False,
     seed: Seed = 0,
     workers: Annotated[
         int | None,
@@ -255,7 +266,8 @@ def batch(
             inputs=inputs,
             out=out,
             profile=profile,
-            changes=parse_changes(changes or []) | shortcut_settings(triangles, texture, fps),
+            changes=parse_changes(changes or [])
+            | shortcut_settings(triangles, texture, fps, height_m=height_m, ground=ground, compress=compress),
             seed=seed,
             workers=workers or default_workers(where),
             where=where,

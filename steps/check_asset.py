@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dg4d_lib.asset_settings import GateSettings
 from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.assets.placement import Surface
 from dg4d_lib.assets.rendering.sheet import draw_tiles
 from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.cameras.viewpoints import turntable
@@ -26,7 +27,7 @@ from steps.artifacts.gates import gates_as_json, read_rows, write_gates
 from steps.artifacts.media import read_frames, read_png, write_png
 from steps.artifacts.packages import ASSET, COMPACT, MANIFEST, MESHES, read_manifest
 from steps.artifacts.packages import SPLATS as SPLATS_FOLDER
-from steps.artifacts.rendering import BATCH, States, Surface, mesh_at, mesh_renderer, read_states, read_surface
+from steps.artifacts.rendering import BATCH, States, mesh_at, mesh_renderer, read_states, read_surface
 from steps.runtime.job import Job, StepReport
 
 SIZE = 128  # pixels of a side of the renders; the bounds of the gates were calibrated at this size

@@ -145,13 +145,15 @@ class _MovingGaussians:
 
     def __init__(self, folder: Path) -> None:
         self.fit = read_compact(folder / COMPACT)
-        self.fps = self.fit.frames / read_manifest(folder).duration_s  # frames of the fit, not of the files
+        manifest = read_manifest(folder)
+        self.fps = self.fit.frames / manifest.duration_s  # frames of the fit, not of the files
+        self.placement = manifest.placement.placement
 
     def at(self, actor: Actor, times_s: Float[Tensor, " b"]) -> Gaussians:
         """Return the states at times of the scene, at the actor's place."""
         played = torch.from_numpy(actor.animation_times(times_s.numpy()))
         fit, positions = self.fit, (played * self.fps).clamp(max=self.fit.frames)
-        states = pose_gaussians(fit.gaussians, fit.deformation, fit.frames, positions)
+        states = self.placement.gaussians(pose_gaussians(fit.gaussians, fit.deformation, fit.frames, positions))
         quat = torch.from_numpy(actor.rotation.as_quat(canonical=True))[[3, 0, 1, 2]]
         return transform(states, quat, actor.item.scale, torch.from_numpy(actor.origin))
 

@@ -13,13 +13,14 @@ from typing import Any
 import torch
 
 from dg4d_lib.asset_settings import PackSettings
-from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.assets.animated import Asset4D, pose_gaussians
 from dg4d_lib.assets.formats.compact import CompactAsset, write_compact
 from dg4d_lib.assets.formats.glb import write_frames_glb, write_glb, write_mesh_glb
 from dg4d_lib.assets.formats.rigged import fit_asset_rig, write_rigged_glb
 from dg4d_lib.assets.formats.splats import write_splat_glb_frames, write_splats, write_spz_frames
-from dg4d_lib.assets.formats.usd import write_usdz
+from dg4d_lib.assets.formats.usd import write_skinned_usdz, write_usdz
 from dg4d_lib.assets.formats.web_splats import write_web_splats
+from dg4d_lib.assets.placement import Placement, Surface, place
 from dg4d_lib.assets.rendering.preview import write_mp4, write_preview, write_turntable
 from dg4d_lib.assets.rendering.sheet import draw_contact_sheet
 from dg4d_lib.assets.rendering.webp import write_webp
@@ -36,8 +37,8 @@ from steps.artifacts import packages
 from steps.artifacts.media import read_frames, write_png, write_zip
 from steps.artifacts.meshes import read_meshes, read_tracked
 from steps.artifacts.motions import read_motion
-from steps.artifacts.packages import MANIFEST, Manifest
-from steps.artifacts.rendering import Surface, mesh_at
+from steps.artifacts.packages import MANIFEST, Camera, Manifest, PackagePlacement
+from steps.artifacts.rendering import mesh_at
 from steps.profiles import PackNotes
 from steps.runtime.job import Job, StepReport
 
@@ -50,9 +51,10 @@ class PackageWriter:
 
     Attributes:
         notes: sentences that are stored in the files.
-        surface: tracked mesh, or a mesh per state.
+        placement: from the coordinates of the fit to those of the files.
+        surface: tracked mesh, or a mesh per state, placed.
         fit: canonical Gaussians, their deformation, and the frame rate of the driving video.
-        states: Gaussians at every written frame.
+        states: Gaussians at every written frame, placed.
         fps: frame rate of the written frames.
         inputs: input files by port.
     """
@@ -60,6 +62,7 @@ class PackageWriter:
     folder: Path
     pack: PackSettings
     notes: tuple[str, ...]
+    placement: Placement
     surface: Surface
     fit: CompactAsset
     video: DrivingVideo
@@ -102,20 +105,25 @@ class PackageWriter:
         return notes
 
     def write_rig(self) -> Sequence[str]:
-        """Write the tracked mesh with a skeleton, if one reproduces its motion."""
-        pack, surface = self.pack, self.surface
-        if not pack.rig or not isinstance(surface, Asset4D):
-            return ()
-        rig, note = fit_asset_rig(surface, pack.rig_bones, pack.rig_error)
-        if rig is not None:
+        """Write the tracked mesh with a skeleton, if one reproduces its motion; without, the USDZ has point samples."""
+        pack, surface, rig, notes = self.pack, self.surface, None, tuple[str, ...]()
+        about = _extras(self.notes)
+        if pack.rig and isinstance(surface, Asset4D):
+            rig, note = fit_asset_rig(surface, pack.rig_bones, pack.rig_error)
+            notes = (note,)
+        if isinstance(surface, Asset4D) and rig is not None:
             self.path(packages.RIGGED).write_bytes(write_rigged_glb(surface, rig, pack.gltf))
-        return (note,)
+            if pack.usd:
+                write_skinned_usdz(self.path(packages.USD), surface, rig, about, pack.gltf)
+        elif pack.usd:
+            write_usdz(self.path(packages.USD), surface, self.fps, None, about, pack.gltf)
+        return notes
 
-    def write_usd(self) -> None:
-        """Write mesh and splats as one USDZ."""
+    def write_usd_splats(self) -> None:
+        """Write point samples of the mesh, and the splats, as one USDZ."""
         if self.pack.usd:
-            path = self.path(packages.USD)
-            write_usdz(path, self.surface, self.fps, self.states, _extras(self.notes), self.pack.gltf)
+            path, about = self.path(packages.USD_SPLATS), _extras(self.notes)
+            write_usdz(path, self.surface, self.fps, self.states, about, self.pack.gltf, open_pbr=True, half=True)
 
     def write_splats(self) -> None:
         """Write the Gaussians of every frame in the requested formats, and for the viewer."""
@@ -125,7 +133,7 @@ class PackageWriter:
         if pack.splats:
             write_splats(folder, states)
         if pack.spz:
-            write_spz_frames(folder, states)
+            write_spz_frames(folder, states, pack.spz_version)
         if pack.splat_gltf != "none":
             write_splat_glb_frames(folder, states, pack.splat_gltf)
 
@@ -152,7 +160,9 @@ class PackageWriter:
 
     def write_turntable(self) -> Sequence[str]:
         """Write the film of the first frame on a turntable."""
-        return write_turntable(self.path(packages.TURNTABLE), self.states.at(0), self.rasterizer, self.pack)
+        fit = self.fit
+        first = pose_gaussians(fit.gaussians, fit.deformation, fit.frames, torch.zeros(1)).at(0)
+        return write_turntable(self.path(packages.TURNTABLE), first, self.rasterizer, self.pack)
 
     def write_sheet(self) -> None:
         """Write the contact sheet."""
@@ -163,9 +173,10 @@ class PackageWriter:
         write_png(self.path(packages.SHEET), sheet)
 
     def _mesh_at_frame(self, frame: int) -> TexturedMesh:
-        """Return the mesh at a frame of the driving video, which may have another rate."""
-        frames = len(self.surface.offsets) if isinstance(self.surface, Asset4D) else len(self.surface)
-        return mesh_at(self.surface, torch.tensor(frame * frames / len(self.video), dtype=torch.float64))
+        """Return the mesh, as it was fitted, at a frame of the driving video, which may have another rate."""
+        surface = self.placement.inverse.surface(self.surface)
+        frames = len(surface.offsets) if isinstance(surface, Asset4D) else len(surface)
+        return mesh_at(surface, torch.tensor(frame * frames / len(self.video), dtype=torch.float64))
 
 
 def run(job: Job) -> StepReport:
@@ -182,7 +193,7 @@ def run(job: Job) -> StepReport:
             package.write_preview,
             package.write_rig,
             package.write_moving_picture,
-            package.write_usd,
+            package.write_usd_splats,
             package.write_meshes,
             package.write_turntable,
             package.write_levels,
@@ -206,6 +217,9 @@ def run(job: Job) -> StepReport:
             gaussians=len(package.fit.gaussians),
             vertices=tuple(len(mesh.vertices) for mesh in package.meshes),
             triangles=tuple(len(mesh.faces) for mesh in package.meshes),
+            placement=PackagePlacement(scale=package.placement.scale, translation=package.placement.translation),
+            camera=Camera.placed(package.placement),
+            ply_axes="y_down",
             files={name: packages.about(name) for name in names},
             notes=(*package.notes, *notes),
         )
@@ -233,14 +247,17 @@ def _read_inputs(job: Job, scratch: Path) -> PackageWriter:
             f"a mesh per frame has the frames of the driving video, {video.fps:g} a second; {fps:g} are asked for: "
             "leave pack.fps at 0, or choose mesh.mode=tracked"
         )
+    placement = place(surface, pack.height_m, pack.ground)
+    states = pose_gaussians_in_chunks(gaussians, deformation, frames, resampled_positions(frames, video.fps, fps))
     return PackageWriter(
         folder=scratch / "package",
         pack=pack,
         notes=about.notes,
-        surface=surface,
+        placement=placement,
+        surface=placement.surface(surface),
         fit=CompactAsset(gaussians, deformation, settings, frames, video.fps),
         video=video,
-        states=pose_gaussians_in_chunks(gaussians, deformation, frames, resampled_positions(frames, video.fps, fps)),
+        states=placement.gaussians(states),
         fps=fps,
         rasterizer=get_rasterizer(job.settings.rasterizer),
         inputs=job.inputs,

@@ -2,8 +2,13 @@
 
 Binary little endian, one float32 row per Gaussian: x y z, nx ny nz (zeros), f_dc_0..2, opacity (logit), scale_0..2
 (natural logarithm), rot_0..3 (wxyz). These are the raw parameters, so the round trip is exact.
+
+3DGS trains on cameras of COLMAP, so other programs expect its files in OpenCV axes: x right, y down, z away from the
+viewer. Files for them are written in these axes, half a turn around x from ours. Nothing in a file names its axes:
+Niantic's reader refuses a header with a comment.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,14 +30,21 @@ _TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "
 _TYPES |= {"int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "short": "<i2", "ushort": "<u2", "char": "i1"}
 
 
-def write_ply(path: Path, gaussians: Gaussians) -> None:
+def write_ply(path: Path, gaussians: Gaussians, *, y_down: bool = False) -> None:
     """Write one cloud (no batch axis, color of degree 0); equal clouds give equal bytes.
+
+    Args:
+        path: output file.
+        gaussians: the cloud, y up.
+        y_down: write it in the axes that other programs expect of 3DGS.
 
     Raises:
         BadInput: the cloud has a batch axis, color of a higher degree or non-finite numbers.
         OSError: the file could not be written.
     """
     check_storable(gaussians, "a PLY")
+    if y_down:
+        gaussians = _turn(gaussians, 1)
     columns = (
         gaussians.means,
         torch.zeros_like(gaussians.means),
@@ -47,8 +59,12 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
     path.write_bytes(header.encode("ascii") + rows.tobytes())
 
 
-def read_ply(path: Path) -> Gaussians:
-    """Read a cloud; columns may be in any order, unknown ones are ignored.
+def read_ply(path: Path, *, y_down: bool = False) -> Gaussians:
+    """Read a cloud, y up; columns may be in any order, unknown ones are ignored.
+
+    Args:
+        path: input file.
+        y_down: the file is in the axes that other programs expect of 3DGS.
 
     Raises:
         BadInput: the file is missing, damaged, no splat PLY, or has view-dependent color or non-finite numbers.
@@ -76,7 +92,18 @@ def read_ply(path: Path) -> Gaussians:
     if not all(part.isfinite().all() for part in parts):
         raise BadInput(f"{path.name} has non-finite numbers; export it again")
     means, log_scales, quats, opacity, colors = parts
-    return Gaussians(means, log_scales, quats, opacity[:, 0], colors[:, None])
+    cloud = Gaussians(means, log_scales, quats, opacity[:, 0], colors[:, None])
+    return _turn(cloud, -1) if y_down else cloud
+
+
+def _turn(gaussians: Gaussians, sign: int) -> Gaussians:
+    """Turn a cloud with view-independent color around x by `sign` times 180 degrees; the two signs cancel exactly.
+
+    The quaternion of the turn, (0, sign, 0, 0), times (w, x, y, z) is sign times (-x, w, -z, y).
+    """
+    w, x, y, z = gaussians.quats.unbind(-1)
+    means = gaussians.means * gaussians.means.new_tensor((1, -1, -1))
+    return replace(gaussians, means=means, quats=sign * torch.stack((-x, w, -z, y), -1))
 
 
 def check_storable(gaussians: Gaussians, form: str) -> None:

@@ -114,7 +114,49 @@ def parse_box(text: str) -> tuple[int, ...] | None:
     return tuple(map(int, parts))
 
 
-def shortcut_settings(triangles: int | None, texture: int | None, fps: float | None, box: str = "") -> dict[str, Any]:
+Height = Annotated[
+    float | None,
+    typer.Option(
+        "--height-m",
+        min=0.001,
+        max=1000,
+        metavar="N",
+        callback=finite,
+        help="height in meters; short for --set pack.height_m=N",
+    ),
+]
+Ground = Annotated[
+    bool | None,
+    typer.Option(
+        "--ground/--no-ground",
+        help="put the lowest point on y = 0; short for --set pack.ground=true or false  [default: ground]",
+        show_default=False,
+    ),
+]
+Compress = Annotated[
+    bool,
+    typer.Option("--compress", help="compress GLB files for web players; short for --set pack.gltf.meshopt=true"),
+]
+
+
+def shortcut_settings(
+    triangles: int | None,
+    texture: int | None,
+    fps: float | None,
+    *,
+    box: str = "",
+    height_m: float | None = None,
+    ground: bool | None = None,
+    compress: bool = False,
+) -> dict[str, Any]:
     """Return the settings that these options stand for."""
-    given = {"mesh.max_faces": triangles, "mesh.texture_size": texture, "pack.fps": fps, "subject.box": parse_box(box)}
+    given = {
+        "mesh.max_faces": triangles,
+        "mesh.texture_size": texture,
+        "pack.fps": fps,
+        "subject.box": parse_box(box),
+        "pack.height_m": height_m,
+        "pack.ground": ground,
+        "pack.gltf.meshopt": compress or None,
+    }
     return {name: value for name, value in given.items() if value is not None}

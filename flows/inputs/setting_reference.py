@@ -141,7 +141,7 @@ def _summary(schema: Schema) -> str:
 
 def _allowed(field: Schema, items: Schema | None) -> str:
     if "enum" in field:
-        return ", ".join(field["enum"])
+        return ", ".join(map(str, field["enum"]))
     if items is None:
         kind = TYPES[field["type"]]
     elif "properties" in items:

@@ -16,7 +16,7 @@ from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows.inputs.signing_key import CERTIFICATE, KEY, certificate_digest, read_pem
 from flows.packages.publish import Files, file_digest
 
-EMBEDDED = {".mp4": "video/mp4", ".png": "image/png"}  # formats with embedded credentials
+EMBEDDED = {".mp4": "video/mp4", ".png": "image/png", ".webp": "image/webp"}  # formats with embedded credentials
 BESIDE = (".glb", ".usdz")  # embedded credentials would break the 64-byte alignment of USDZ entries
 ANY_BYTES = "application/octet-stream"
 SOURCE_TYPES = "http://cv.iptc.org/newscodes/digitalsourcetype/"

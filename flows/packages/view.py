@@ -1,5 +1,6 @@
 """Viewer page of a package; behind `dg4d view`."""
 
+import json
 import os
 import sys
 import webbrowser
@@ -17,6 +18,7 @@ from steps.store.files import room_for
 
 VIEWER = "viewer.html"
 # files of a package, as in steps/artifacts/packages.py, whose import would load torch
+MANIFEST = "asset.json"
 ASSET = "asset.glb"
 WEB_SPLATS = "splats/moving.websplats"
 SUBJECT = "input/subject.png"
@@ -92,7 +94,8 @@ def viewer_facts(record: Mapping[str, Any]) -> dict[str, Any]:
 
 def _page(title: str, names: Container[str], read: Callable[[str], bytes], facts: dict[str, Any]) -> str:
     splats, picture, video = (read(name) if name in names else None for name in (WEB_SPLATS, SUBJECT, DRIVING))
-    return build_viewer_page(title, read(ASSET), splats, picture, video, facts)
+    camera = json.loads(read(MANIFEST)).get("camera", {}) if MANIFEST in names else {}
+    return build_viewer_page(title, read(ASSET), splats, picture, video, facts, camera)
 
 
 def _write(page: Path, text: str) -> None:

@@ -5,6 +5,7 @@ from typing import Literal
 
 from pydantic import Field, ValidationError
 
+from dg4d_lib.assets.placement import Placement
 from dg4d_lib.cameras.orbit import FOV_Y_DEG, RADIUS
 from dg4d_lib.errors import BadInput
 from steps.contract import Frozen
@@ -13,6 +14,7 @@ MANIFEST = "asset.json"
 ASSET = "asset.glb"
 RIGGED = "asset_rigged.glb"
 USD = "asset.usdz"
+USD_SPLATS = "asset_splats.usdz"
 SPLATS = "splats"
 WEB_SPLATS = "splats/moving.websplats"
 MESHES = "meshes"
@@ -29,7 +31,8 @@ SHEET = "contact_sheet.png"
 ABOUT = {
     ASSET: "animated textured mesh, glTF 2.0",
     RIGGED: "the same mesh on a skeleton, glTF 2.0",
-    USD: "animated mesh, and as a variant moving splats, USDZ",
+    USD: "animated mesh, on a skeleton if one follows the motion, USDZ",
+    USD_SPLATS: "moving splats, and as a variant point samples of the mesh, USDZ",
     WEB_SPLATS: "moving splats for the viewer",
     GAUSSIANS: "Gaussians at rest, 3DGS PLY",
     COMPACT: "Gaussians and their deformation over time, safetensors",
@@ -41,12 +44,24 @@ ABOUT = {
     SHEET: "moments by angles",
 }
 ABOUT_FOLDERS = {
-    (SPLATS, ".ply"): "Gaussians of one moment, 3DGS PLY",
-    (SPLATS, ".spz"): "Gaussians of one moment, SPZ",
-    (SPLATS, ".glb"): "Gaussians of one moment, glTF with KHR_gaussian_splatting",
+    (SPLATS, ".ply"): "Gaussians of one frame, 3DGS PLY in OpenCV axes (y down)",
+    (SPLATS, ".spz"): "Gaussians of one frame, SPZ (y up)",
+    (SPLATS, ".glb"): "Gaussians of one frame, glTF with KHR_gaussian_splatting",
     (MESHES, ".glb"): "textured mesh of one frame, glTF 2.0",
     (LEVELS, ".glb"): "the animated mesh with fewer triangles, glTF 2.0",
 }
+
+
+class PackagePlacement(Frozen):
+    """Map from the coordinates of canonical/ to those of all other files: x to `scale` * x + `translation`."""
+
+    scale: float = Field(1.0, gt=0)
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def placement(self) -> Placement:
+        """The same as the library's class."""
+        return Placement(self.scale, self.translation)
 
 
 class Camera(Frozen):
@@ -55,11 +70,17 @@ class Camera(Frozen):
     elevation_deg: float = 0.0
     azimuth_deg: float = 0.0
     radius: float = RADIUS
+    target: tuple[float, float, float] = (0.0, 0.0, 0.0)
     fov_y_deg: float = FOV_Y_DEG
     convention: str = (
-        "right-handed world, y up, the front looks along +z; the camera looks at the origin from `radius` world units; "
-        "azimuth 0 is on +z, 90 on +x; positive elevation is above"
+        "right-handed world in meters, y up, the front looks along +z; the camera looks at `target` from a distance of "
+        "`radius`; azimuth 0 is on +z, 90 on +x; positive elevation is above"
     )
+
+    @classmethod
+    def placed(cls, placement: Placement) -> "Camera":
+        """Return the camera in the coordinates of the files."""
+        return cls(radius=RADIUS * placement.scale, target=placement.translation)
 
 
 class Manifest(Frozen):
@@ -78,7 +99,11 @@ class Manifest(Frozen):
     gaussians: int = Field(ge=0)
     vertices: tuple[int, ...] = Field(description="of the tracked mesh, or of every frame's mesh")
     triangles: tuple[int, ...] = Field(description="of the tracked mesh, or of every frame's mesh")
+    placement: PackagePlacement = PackagePlacement()
     camera: Camera = Camera()
+    ply_axes: Literal["y_up", "y_down"] = Field(
+        "y_up", description="of splats/*.ply; y_down: x right, y down, z forward, as other programs expect"
+    )
     files: dict[str, str] = Field(description="description of every file, by its name in the package")
     notes: tuple[str, ...] = ()
 

@@ -14,6 +14,7 @@ from dg4d_lib.assets.animated import Asset4D, interpolate_frames, pose_gaussians
 from dg4d_lib.assets.formats.compact import read_compact
 from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb
 from dg4d_lib.assets.formats.splats import read_splats
+from dg4d_lib.assets.placement import Surface
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -27,7 +28,6 @@ BATCH = 8  # pictures per rasterizer call, bounds the memory
 SMALLEST, LARGEST = 16, 4096  # pixels of a side
 
 States = Callable[[Float[Tensor, " b"]], Gaussians]  # Gaussians at positions of the animation, in frames
-Surface = Asset4D | list[TexturedMesh]  # tracked mesh, or a mesh per frame
 Renderer = Callable[[Float[Tensor, " b"], Sequence[OrbitCamera]], Float[Tensor, "b h w 4"]]
 
 
@@ -91,13 +91,15 @@ def frame_positions(count: int, manifest: Manifest) -> Float[Tensor, " n"]:
 def read_states(folder: Path, manifest: Manifest) -> States:
     """Return the stored Gaussians of all frames, or those of the fitted motion if a package has no splats.
 
+    They are in the coordinates of the fit, which the cameras orbit.
+
     Raises:
         BadInput: files are missing or broken, or have another number of frames than the package.
     """
     if any((folder / SPLATS).glob("*.ply")):
-        stored = read_splats(folder / SPLATS)
+        stored = read_splats(folder / SPLATS, y_down=manifest.ply_axes == "y_down")
         _check_frames(SPLATS, len(stored.means), manifest)
-        return partial(states_between, stored)
+        return partial(states_between, manifest.placement.placement.inverse.gaussians(stored))
     fit = read_compact(folder / COMPACT)
     return lambda positions: pose_gaussians(
         fit.gaussians, fit.deformation, fit.frames, positions * fit.frames / manifest.frames
@@ -116,16 +118,18 @@ def states_between(states: Gaussians, positions: Float[Tensor, " b"]) -> Gaussia
 
 
 def read_surface(folder: Path, manifest: Manifest) -> Surface:
-    """Read the tracked mesh, or the mesh of every frame, of an unpacked package.
+    """Read the tracked mesh, or the mesh of every frame, of an unpacked package, in the coordinates of the fit.
 
     Raises:
         BadInput: files are missing or broken, or have another number of frames than the package.
     """
+    to_fit = manifest.placement.placement.inverse
     if manifest.mode == "per_frame":
-        return [read_mesh_glb(read_file(folder, f"{MESHES}/{i:03d}.glb")) for i in range(manifest.frames)]
+        meshes = [read_mesh_glb(read_file(folder, f"{MESHES}/{i:03d}.glb")) for i in range(manifest.frames)]
+        return to_fit.surface(meshes)
     asset = read_glb(read_file(folder, ASSET))
     _check_frames(ASSET, len(asset.offsets), manifest)
-    return asset
+    return to_fit.surface(asset)
 
 
 def mesh_renderer(surface: Surface) -> Renderer:

@@ -17,7 +17,7 @@ import sys
 import tempfile
 import venv
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from PIL import Image
 
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb
+from dg4d_lib.assets.placement import Placement
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
@@ -79,15 +80,17 @@ def install() -> None:
 def compare(package: Path, pictures: Path) -> list[Shot]:
     """Render every animated file of a package in Blender, and compare with our render of its GLB."""
     states, fps = _our_meshes(package)
+    manifest = json.loads((package / "asset.json").read_text())
+    placement = Placement(**manifest.get("placement", {}))
     shots = []
     for file in ("asset.glb", "asset.usdz"):
         if (package / file).exists():
-            shots += _compare_file(package / file, states, fps, pictures)
+            shots += _compare_file(package / file, states, fps, pictures, placement)
     return shots
 
 
 def _our_meshes(package: Path) -> tuple[list[tuple[TexturedMesh, Any]], float]:
-    """The mesh and its offsets at every frame, and frames per second."""
+    """The mesh and its offsets at every frame, in the coordinates of the files, and frames per second."""
     fps = json.loads((package / "asset.json").read_text())["fps"]
     singles = sorted((package / "meshes").glob("*.glb"))
     if singles:
@@ -96,7 +99,11 @@ def _our_meshes(package: Path) -> tuple[list[tuple[TexturedMesh, Any]], float]:
     return [(asset.mesh, offsets) for offsets in asset.offsets], asset.fps
 
 
-def _compare_file(file: Path, states: Sequence[tuple[TexturedMesh, Any]], fps: float, pictures: Path) -> list[Shot]:
+def _compare_file(
+    file: Path, states: Sequence[tuple[TexturedMesh, Any]], fps: float, pictures: Path, placement: Placement
+) -> list[Shot]:
+    """Compare one file; a USDZ plays in a scene of 24 frames per second, a GLB in one of its own rate."""
+    rate = 24.0 if file.suffix == ".usdz" else fps
     wanted = [
         (
             name,
@@ -109,13 +116,13 @@ def _compare_file(file: Path, states: Sequence[tuple[TexturedMesh, Any]], fps: f
     ]
     job = {
         "file": str(file.resolve()),
-        "fps": fps,
+        "fps": rate,
         "size": SIZE,
         "samples": SAMPLES,
         "shots": [
             {
-                "frame": frame,
-                "camera_to_world": _camera_to_world(camera),
+                "frame": frame * rate / fps,
+                "camera_to_world": _camera_to_world(camera, placement),
                 "fov_y_deg": camera.fov_y_deg,
                 "picture": str(picture.resolve()),
             }
@@ -130,7 +137,9 @@ def _compare_file(file: Path, states: Sequence[tuple[TexturedMesh, Any]], fps: f
     shots = []
     for name, camera, frame, picture in wanted:
         mesh, offsets = states[frame]
-        color, coverage = render_mesh(mesh, [camera], offsets)
+        moved = mesh.vertices if offsets is None else mesh.vertices + offsets
+        placed = replace(mesh, vertices=placement.inverse.points(moved))
+        color, coverage = render_mesh(placed, [camera], None)
         ours = torch.cat((color, coverage), -1)[0].numpy()
         theirs = np.asarray(Image.open(picture)).astype(np.float32) / 255
         shots.append(Shot(file.name, name, frame, *_agreement(ours, theirs)))
@@ -138,9 +147,11 @@ def _compare_file(file: Path, states: Sequence[tuple[TexturedMesh, Any]], fps: f
     return shots
 
 
-def _camera_to_world(camera: OrbitCamera) -> list[list[float]]:
-    """Of a camera that looks along its -z with +y up."""
-    return (torch.linalg.inv(camera.viewmat()) @ torch.diag(torch.tensor([1.0, -1, -1, 1]).double())).tolist()
+def _camera_to_world(camera: OrbitCamera, placement: Placement) -> list[list[float]]:
+    """Of a camera that looks along its -z with +y up, in the coordinates of the files."""
+    matrix = torch.linalg.inv(camera.viewmat()) @ torch.diag(torch.tensor([1.0, -1, -1, 1]).double())
+    matrix[:3, 3] = placement.points(matrix[:3, 3])
+    return matrix.tolist()
 
 
 def _agreement(ours: NDArray[Any], theirs: NDArray[Any]) -> tuple[float, float]:

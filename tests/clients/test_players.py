@@ -14,9 +14,11 @@ from PIL import Image
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D, interpolate_frames
 from dg4d_lib.assets.formats.glb import write_frames_glb, write_glb, write_mesh_glb
+from dg4d_lib.assets.formats.rigged import write_rigged_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.mesh.tracking.rig import fit_rig, rig_offsets
 from tests.clients.node import run_node
 
 FPS = 8.0
@@ -163,3 +165,20 @@ def test_normals_turn_with_the_surface_and_stay_where_asked(quantized: bool, tmp
             found.append(float(np.abs(normals - truth)[(coverage == 1) & (there == 1)].mean()))
     assert max(errors["moving"]) < 0.005
     assert min(errors["resting"][1:]) > 0.05
+
+
+@pytest.mark.parametrize("player", PLAYERS)
+def test_players_undo_the_quantization_of_a_skin(player: str, tmp_path: Path) -> None:
+    asset, frames = fish(6), (0.0, 2.0, 5.0)
+    rig = fit_rig(asset.mesh.vertices, asset.offsets, 0.02, 12)
+    skinned = replace(asset, offsets=rig_offsets(rig, asset.mesh.vertices))
+    case = Case(b"", skinned, frames)
+    shows = {
+        name: (write_rigged_glb(asset, rig, settings), [frame / FPS for frame in frames])
+        for name, settings in (("quantized", GltfSettings()), ("compressed", COMPACT))
+    }
+    folders = play(player, tmp_path, shows, "color")
+    for name, folder in folders.items():
+        for number, (_, coverage) in enumerate(expected(case, player)):
+            ours, theirs = coverage > 0.5, picture(folder / f"{number:03d}.png")[1] > 0.5
+            assert (ours & theirs).sum() / (ours | theirs).sum() > 0.95, name

@@ -19,6 +19,7 @@ from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D, interpolate_frames
 from dg4d_lib.assets.formats.glb import write_frames_glb, write_glb
 from dg4d_lib.assets.formats.web_splats import write_web_splats
+from dg4d_lib.assets.placement import Placement
 from dg4d_lib.assets.rendering.preview import write_mp4
 from dg4d_lib.assets.rendering.viewer_page import build_viewer_page
 from dg4d_lib.cameras.orbit import OrbitCamera
@@ -99,11 +100,12 @@ def tried(tmp_path: Path) -> Try:
         video: bytes | None = None,
         facts: dict[str, Any] | None = None,
         shots: tuple[tuple[str, float], ...] = (),
+        view: dict[str, Any] | None = None,
         **request: Any,
     ) -> Tried:
         packed = None if cloud is None else write_web_splats(cloud, FPS)
         page = tmp_path / "viewer with ümlaut.html"
-        page.write_text(build_viewer_page("Egg", glb, packed, None, video, facts or {}), encoding="utf-8")
+        page.write_text(build_viewer_page("Egg", glb, packed, None, video, facts or {}, view or {}), encoding="utf-8")
         files = {shot: tmp_path / f"{number}.png" for number, shot in enumerate(shots)}
         asked = [{"show": show, "time": time, "file": str(files[show, time])} for show, time in shots]
         said = run_node("view.mjs", json.dumps({"page": str(page), "shots": asked, **WINDOW, **request}))
@@ -126,6 +128,18 @@ def overlap(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
 
 def psnr(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
     return float(-10 * np.log10(np.square(first - second).mean()))
+
+
+@pytest.mark.parametrize("placement", [Placement(0.02, (0.0, 0.01, 0.3)), Placement(40.0, (3.0, 20.0, 0.0))])
+def test_the_input_camera_follows_a_placed_asset(placement: Placement, tried: Try) -> None:
+    """Show a tiny and a huge asset as the one in the coordinates of the fit."""
+    view = {"radius": 2 * placement.scale, "target": placement.translation}
+    shots = (("mesh", 0.375), ("splats", 0.375))
+    plain = tried(write_glb(egg()), splats(), shots=shots)
+    asset = placement.surface(egg())
+    placed = tried(write_glb(asset), placement.gaussians(splats()), view=view, shots=shots)
+    for shot in shots:
+        assert psnr(over_white(placed.pictures[shot]), over_white(plain.pictures[shot])) > 40
 
 
 def test_splats_look_as_our_rasterizer_draws_them(tried: Try) -> None:

@@ -5,24 +5,29 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import small_package
 import torch
+from pxr import Usd, UsdGeom
 from small_package import FPS, FRAMES, NOTE, REACH, cloud, extracted, gem, inputs, job, packed, tracked
 
-from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb
+from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.assets.formats.glb import read_glb
 from dg4d_lib.assets.formats.splats import read_splats
 from dg4d_lib.errors import BadInput
+from dg4d_lib.gaussians.cloud import Gaussians
 from steps.artifacts.archives import EPOCH
 from steps.artifacts.media import read_png
 from steps.artifacts.meshes import write_tracked
-from steps.artifacts.packages import read_manifest
+from steps.artifacts.packages import PackagePlacement, read_manifest
+from steps.artifacts.rendering import read_states, read_surface
 from steps.pack_asset import run
 
 COMMON = {
-    "asset.json", "asset.glb", "asset.usdz", "preview.mp4", "preview.webp", "turntable.mp4", "contact_sheet.png",
-    "canonical/gaussians.ply", "canonical/asset4d.safetensors", "input/subject.png", "input/driving.mp4",
-    "splats/moving.websplats",
+    "asset.json", "asset.glb", "asset.usdz", "asset_splats.usdz", "preview.mp4", "preview.webp", "turntable.mp4",
+    "contact_sheet.png", "canonical/gaussians.ply", "canonical/asset4d.safetensors", "input/subject.png",
+    "input/driving.mp4", "splats/moving.websplats",
 }  # fmt: skip
 SPLATS = {f"splats/{i:03d}.{form}" for i in range(FRAMES) for form in ("ply", "spz")}
 RIGGED = {"asset_rigged.glb"}
@@ -37,6 +42,20 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def per_frame(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return packed(tmp_path_factory.mktemp("per_frame"), "per_frame", splats=False, spz=False)
+
+
+def surface(folder: Path) -> Asset4D:
+    """Return the tracked mesh in the coordinates of the fit."""
+    return read_surface(folder, read_manifest(folder))
+
+
+def poses(asset: Asset4D) -> torch.Tensor:
+    return asset.mesh.vertices + asset.offsets
+
+
+def stored_states(folder: Path, frames: int) -> Gaussians:
+    """Return the splats of a package in the coordinates of the fit."""
+    return read_states(folder, read_manifest(folder))(torch.arange(frames, dtype=torch.float64))
 
 
 def files(folder: Path) -> set[str]:
@@ -64,8 +83,8 @@ def test_the_manifest_says_what_is_there(package: Path, per_frame: Path) -> None
 
 
 def test_the_glb_moves_as_the_tracked_mesh_and_says_how_it_was_made(package: Path) -> None:
-    asset = read_glb((package / "asset.glb").read_bytes())
-    assert torch.equal(asset.offsets, tracked().offsets)
+    asset = surface(package)
+    torch.testing.assert_close(poses(asset), poses(tracked()), atol=3e-5, rtol=0)  # 16 bits
     assert asset.fps == FPS
     assert asset.extras["notes"] == [NOTE]
     assert asset.extras["generator"].startswith("dg4d ")
@@ -75,15 +94,15 @@ def test_another_frame_rate_keeps_the_length_and_the_frames(tmp_path: Path) -> N
     folder = packed(tmp_path, fps=2 * FPS)
     manifest, asset, states = (
         read_manifest(folder),
-        read_glb((folder / "asset.glb").read_bytes()),
-        read_splats(folder / "splats"),
+        surface(folder),
+        stored_states(folder, 2 * FRAMES),
     )
     assert (manifest.frames, manifest.fps) == (len(asset.offsets), asset.fps) == (2 * FRAMES, 2 * FPS)
     assert manifest.duration_s == pytest.approx(FRAMES / FPS)
     assert len(states.means) == 2 * FRAMES
-    torch.testing.assert_close(asset.offsets[::2], tracked().offsets, atol=1e-6, rtol=0)
+    torch.testing.assert_close(poses(asset)[::2], poses(tracked()), atol=3e-5, rtol=0)
     torch.testing.assert_close(states.means[::2, 0, 0], torch.linspace(0, REACH, FRAMES))
-    assert states.means[1, 0, 0].item() == pytest.approx(REACH / 4)
+    assert states.means[1, 0, 0].item() == pytest.approx(REACH / 4, abs=1e-6)
 
 
 def test_a_mesh_per_frame_keeps_the_rate_of_the_driving_video(tmp_path: Path) -> None:
@@ -101,20 +120,54 @@ def test_levels_of_detail_have_their_share_of_the_triangles(tmp_path: Path) -> N
 
 def test_what_is_not_wanted_is_not_written(tmp_path: Path) -> None:
     folder = packed(tmp_path, usd=False, spz=False, rig=False, splats=False, splat_gltf="ratified")
-    assert files(folder) == COMMON - {"asset.usdz"} | {f"splats/{i:03d}.glb" for i in range(FRAMES)}
+    assert files(folder) == COMMON - {"asset.usdz", "asset_splats.usdz"} | {
+        f"splats/{i:03d}.glb" for i in range(FRAMES)
+    }
 
 
 def test_the_splats_move_as_the_motion_says(package: Path) -> None:
-    states = read_splats(package / "splats")
-    torch.testing.assert_close(states.means[-1], cloud().means + torch.tensor([REACH, 0, 0]))
-    torch.testing.assert_close(states.means[0], cloud().means)
+    states = stored_states(package, FRAMES)
+    expected = cloud().means
+    torch.testing.assert_close(states.means[-1], expected + torch.tensor([REACH, 0, 0]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(states.means[0], expected, atol=1e-6, rtol=0)
+
+
+def test_every_file_stands_on_the_ground_at_its_height(tmp_path: Path) -> None:
+    folder = packed(tmp_path, height_m=0.12)
+    manifest = read_manifest(folder)
+    asset = read_glb((folder / "asset.glb").read_bytes())
+    glb = poses(asset)
+    low, high = glb.amin((0, 1)), glb.amax((0, 1))
+    assert low[1].item() == pytest.approx(0.0, abs=1e-5)
+    assert (glb[0, :, 1].max() - glb[0, :, 1].min()).item() == pytest.approx(0.12, abs=1e-5)
+    torch.testing.assert_close((low + high)[::2], torch.zeros(2), atol=1e-5, rtol=0)
+    center = glb[0].mean(0)  # of the gem and of the cloud
+    torch.testing.assert_close(read_splats(folder / "splats").means[0].mean(0), center, atol=1e-5, rtol=0)
+    web = (folder / "splats/moving.websplats").read_bytes()
+    header = json.loads(web[8 : 8 + int.from_bytes(web[4:8], "little")])
+    assert header["corner"][1] == pytest.approx(center[1].item() - 0.15 * manifest.placement.scale, abs=1e-5)
+    stage = Usd.Stage.Open(str(folder / "asset.usdz"))
+    extent = UsdGeom.Boundable(stage.GetPrimAtPath("/asset/mesh")).GetExtentAttr()
+    torch.testing.assert_close(torch.tensor(np.array(extent.Get(0))[0]), glb[0].amin(0), atol=1e-3, rtol=0)
+    camera = manifest.camera
+    assert camera.radius == pytest.approx(2 * manifest.placement.scale)
+    assert camera.target == manifest.placement.translation
+    assert camera.target[1] == pytest.approx(center[1].item(), abs=1e-5)  # the gem surrounds the point it looks at
+
+
+def test_the_manifest_leads_back_to_the_fit(package: Path, tmp_path: Path) -> None:
+    """Renders do not depend on height and ground, because cameras orbit the coordinates of the fit."""
+    plain = packed(tmp_path, ground=False)
+    assert read_manifest(plain).placement == PackagePlacement()
+    torch.testing.assert_close(poses(surface(package)), poses(surface(plain)), atol=3e-5, rtol=0)
+    ours, theirs = stored_states(package, FRAMES), stored_states(plain, FRAMES)
+    torch.testing.assert_close(ours.means, theirs.means, atol=1e-6, rtol=0)
 
 
 def test_every_frame_has_its_own_mesh(per_frame: Path) -> None:
-    radii = [
-        read_mesh_glb((per_frame / name).read_bytes()).vertices.norm(dim=1).max().item() for name in sorted(MESHES)
-    ]
-    assert radii == pytest.approx([0.2, 0.3, 0.4])
+    meshes = read_surface(per_frame, read_manifest(per_frame))
+    radii = [mesh.vertices.norm(dim=1).max().item() for mesh in meshes]
+    assert radii == pytest.approx([0.2, 0.3, 0.4], abs=3e-5)
 
 
 def test_inputs_are_handed_on_byte_by_byte(package: Path) -> None:

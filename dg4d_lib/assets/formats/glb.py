@@ -1,14 +1,15 @@
 """Animated textured meshes as GLB: core glTF 2.0, unless the settings select extensions.
 
-A tracked mesh becomes one mesh with a morph target per frame and weights that are one-hot at every frame; very long
-animations, and textures per frame in core glTF, are split into several nodes that share all other data. Meshes per
-frame become one node each, shown and hidden by its scale. All items are named. The baked color is the base color of a
-rough dielectric.
+A tracked mesh becomes one mesh whose base is frame 0, with a morph target per further frame, or with principal
+components as morph targets. Very long animations, and textures per frame in core glTF, are split into several nodes
+that share all other data. Meshes per frame become one node each, shown and hidden by its scale. All items are named.
+The baked color is the base color of a rough dielectric.
 """
 
 import io
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,12 +23,13 @@ from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.gltf import GlbReader, GltfDocument
 from dg4d_lib.assets.formats.materials import WEBP, Atlas, add_material, add_texture, to_uint8
-from dg4d_lib.assets.formats.primitives import MeshPrimitive, QuantizationCube
+from dg4d_lib.assets.formats.morph_components import fit_components, principal_components
+from dg4d_lib.assets.formats.primitives import MeshPrimitive, QuantizationCube, quantization_cube, reorder_mesh
 from dg4d_lib.assets.formats.tracks import Animation, Span, split_into_spans
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.textured import TexturedMesh
 
-DEFAULTS = GltfSettings()
+DEFAULTS = GltfSettings(quantized=False)  # exact
 NAME = "subject"
 OFFSET_POINTER = "/materials/0/pbrMetallicRoughness/baseColorTexture/extensions/KHR_texture_transform/offset"
 MAX_POSES = 128  # per node; players keep their weights in uniforms, of which every GPU has at least 256
@@ -45,23 +47,30 @@ def write_glb(asset: Asset4D, settings: GltfSettings = DEFAULTS) -> bytes:
     _check_asset(asset)
     document = GltfDocument(asset.extras, compressed=settings.meshopt)
     animation = Animation(document, asset.fps)
-    offsets, atlas = _floats(asset.offsets), None
+    asset, atlas = _rebase(_reordered(asset) if settings.meshopt else asset), None
+    offsets = _floats(asset.offsets)
     if asset.textures is not None and settings.textures == "pointer":
         atlas = Atlas.of(asset.textures, settings.atlas_size)
         animation.add_pointer(OFFSET_POINTER, "texture offset", atlas.offsets())
     materials = _add_materials(document, asset, atlas, settings)
-    cube = QuantizationCube.around([_floats(asset.mesh.vertices)], offsets) if settings.quantized else None
+    cube = quantization_cube([_floats(asset.mesh.vertices)], offsets, settings)
     shape = _add_shape(document, NAME, asset.mesh, cube, atlas)
-    poses = [
-        shape.add_pose(_frame_name(frame), pose, normals=settings.moving_normals) for frame, pose in enumerate(offsets)
-    ]
+    if settings.components and len(materials) == 1:
+        node = _add_components(document, animation, shape, materials[0], offsets, settings)
+        animation.finish()
+        return _finish(document, [node], cube)
+    poses = {
+        frame: shape.add_pose(_frame_name(frame), pose, normals=settings.moving_normals)
+        for frame, pose in enumerate(offsets)
+        if frame > 0 or len(offsets) == 1
+    }
     nodes = []
-    spans = split_into_spans(len(poses), MAX_POSES if len(materials) == 1 else 1)
+    spans = split_into_spans(len(offsets), MAX_POSES if len(materials) == 1 else 1)
     for span in spans:
         primitive = _primitive(shape, materials[span.first if len(materials) > 1 else 0])
         name = NAME if len(spans) == 1 else _frame_name(span.first)
         nodes.append(_add_posed_node(document, name, span, {**primitive, "targets": [poses[i] for i in span.poses]}))
-        animation.add_morph(nodes[-1], name, span, settings.interpolation.upper())
+        animation.add_morph(nodes[-1], name, span.keys, span.weights(), settings.interpolation.upper())
         if len(spans) > 1:
             animation.add_visibility(nodes[-1], name, span)
     animation.finish()
@@ -87,7 +96,9 @@ def write_frames_glb(
     for mesh in meshes:
         _check(mesh)
     document = GltfDocument(extras or {}, compressed=settings.meshopt)
-    cube = QuantizationCube.around([_floats(mesh.vertices) for mesh in meshes]) if settings.quantized else None
+    if settings.meshopt:
+        meshes = [reorder_mesh(mesh)[0] for mesh in meshes]
+    cube = quantization_cube([_floats(mesh.vertices) for mesh in meshes], (), settings)
     animation = Animation(document, fps)
     nodes = []
     for frame, mesh in enumerate(meshes):
@@ -107,7 +118,9 @@ def write_mesh_glb(mesh: TexturedMesh, settings: GltfSettings = DEFAULTS) -> byt
     """
     _check(mesh)
     document = GltfDocument({}, compressed=settings.meshopt)
-    cube = QuantizationCube.around([_floats(mesh.vertices)]) if settings.quantized else None
+    if settings.meshopt:
+        mesh, _ = reorder_mesh(mesh)
+    cube = quantization_cube([_floats(mesh.vertices)], (), settings)
     node = document.add("nodes", name=NAME, mesh=_add_mesh(document, NAME, mesh, cube, settings))
     return _finish(document, [node], cube)
 
@@ -131,12 +144,7 @@ def read_glb(content: bytes) -> Asset4D:
         mesh = _read_mesh(parsed, nodes)
         frames, fps = _read_frames(parsed, nodes)
         scale, _ = _placement(parsed, nodes[0])
-        offsets = np.stack([parsed.accessor(target["POSITION"]) for target, _ in frames]) * np.float32(scale)
-        if offsets.shape[1:] != mesh.vertices.shape:
-            raise BadInput(
-                f"the morph targets of this GLB have {offsets.shape[1]} rows, the mesh has {len(mesh.vertices)} "
-                "vertices; export it again"
-            )
+        offsets = np.stack([_blend(parsed, targets, mesh) for targets, _ in frames]) * np.float32(scale)
         textures = _read_textures(parsed, [material for _, material in frames])
         extras = parsed.tree["asset"].get("extras", {})
         return Asset4D(mesh, torch.from_numpy(offsets), fps, extras, textures)
@@ -208,6 +216,49 @@ def _floats(values: Tensor) -> NDArray[np.float32]:
     return np.ascontiguousarray(values.detach().cpu().numpy().astype("<f4"))
 
 
+def _rebase(asset: Asset4D) -> Asset4D:
+    """Make frame 0 the mesh, so that its offsets are 0."""
+    first = asset.offsets[0]
+    mesh = replace(asset.mesh, vertices=asset.mesh.vertices + first)
+    return replace(asset, mesh=mesh, offsets=asset.offsets - first)
+
+
+def _reordered(asset: Asset4D) -> Asset4D:
+    mesh, order = reorder_mesh(asset.mesh)
+    return replace(asset, mesh=mesh, offsets=asset.offsets[:, order])
+
+
+def _add_components(
+    document: GltfDocument,
+    animation: Animation,
+    shape: MeshPrimitive,
+    material: int,
+    offsets: NDArray[np.float32],
+    settings: GltfSettings,
+) -> int:
+    """Add a node with principal components as morph targets; return its index."""
+    components, weights = principal_components(offsets, settings.components)
+    changes: Sequence[NDArray[np.float32] | None] = [None] * len(components)
+    if settings.moving_normals:
+        turned = fit_components(np.stack([shape.turn_normals(pose) for pose in offsets]), weights)
+        reach = (
+            np.abs(turned).max((1, 2)).clip(1)
+        )  # integers stand for changes in [-1, 1]; larger weights make up for it
+        components, turned = (rows / reach[:, None, None] for rows in (components, turned))
+        weights, changes = weights * reach, list(turned)
+    names = [f"component_{number:03d}" for number in range(len(components))]
+    targets = [
+        shape.add_component(name, component, change)
+        for name, component, change in zip(names, components, changes, strict=True)
+    ]
+    primitive = {**_primitive(shape, material), "targets": targets}
+    keys = list(range(len(offsets) + 1))
+    track = np.concatenate((weights, weights[:1]))
+    node = _add_morphed_node(document, NAME, primitive, weights[0].tolist(), names)
+    animation.add_morph(node, NAME, keys, track, settings.interpolation.upper())
+    return node
+
+
 def _add_materials(document: GltfDocument, asset: Asset4D, atlas: Atlas | None, settings: GltfSettings) -> list[int]:
     """Add the material of all frames, or one per frame; return their indices."""
     if atlas is not None and asset.textures is not None:
@@ -244,14 +295,15 @@ def _primitive(shape: MeshPrimitive, material: int) -> dict[str, Any]:
 
 
 def _add_posed_node(document: GltfDocument, name: str, span: Span, primitive: dict[str, Any]) -> int:
-    """Add a node with the poses of a span as morph targets, the first one active; return its index."""
-    mesh = document.add(
-        "meshes",
-        name=name,
-        primitives=[primitive],
-        weights=span.weights()[0].tolist(),
-        extras={"targetNames": [_frame_name(pose) for pose in span.poses]},
-    )
+    """Add a node with the poses of a span as morph targets, in its first pose; return its index."""
+    names = [_frame_name(pose) for pose in span.poses]
+    return _add_morphed_node(document, name, primitive, span.weights()[0].tolist(), names)
+
+
+def _add_morphed_node(
+    document: GltfDocument, name: str, primitive: dict[str, Any], weights: list[float], names: list[str]
+) -> int:
+    mesh = document.add("meshes", name=name, primitives=[primitive], weights=weights, extras={"targetNames": names})
     return document.add("nodes", name=name, mesh=mesh)
 
 
@@ -320,8 +372,22 @@ def _placement(parsed: GlbReader, node: int) -> tuple[float, NDArray[np.float64]
     return scale, shift
 
 
-def _read_frames(parsed: GlbReader, nodes: list[int]) -> tuple[list[tuple[dict[str, int], int]], float]:
-    """Return morph target and material of every frame, and the frames per second."""
+def _blend(parsed: GlbReader, targets: dict[int, float], mesh: TexturedMesh) -> NDArray[np.float32]:
+    """Return the offsets of a frame: accessors of morph targets times their weights."""
+    offsets = np.zeros(mesh.vertices.shape, np.float32)
+    for number, weight in targets.items():
+        rows = parsed.accessor(number)
+        if rows.shape != offsets.shape:
+            raise BadInput(
+                f"the morph targets of this GLB have {len(rows)} rows, the mesh has {len(offsets)} vertices; "
+                "export it again"
+            )
+        offsets += rows * np.float32(weight)
+    return offsets
+
+
+def _read_frames(parsed: GlbReader, nodes: list[int]) -> tuple[list[tuple[dict[int, float], int]], float]:
+    """Return positions and weights of the morph targets and the material of every frame, and the frames per second."""
     (animation,) = parsed.tree["animations"]
     tracks = {
         channel["target"]["node"]: animation["samplers"][channel["sampler"]]
@@ -330,15 +396,14 @@ def _read_frames(parsed: GlbReader, nodes: list[int]) -> tuple[list[tuple[dict[s
     }
     times = [parsed.accessor(tracks[node]["input"])[:, 0] for node in nodes]
     fps = float(f"{1 / (times[0][1] - times[0][0]):.6g}")
-    frames: dict[int, tuple[dict[str, int], int]] = {}
+    frames: dict[int, tuple[dict[int, float], int]] = {}
     for node, seconds in zip(nodes, times, strict=True):
         primitive = _primitive_of(parsed, node)
-        weights = parsed.accessor(tracks[node]["output"]).reshape(len(seconds), len(primitive["targets"]))
-        poses = weights.argmax(1)
-        if not np.array_equal(weights, np.eye(weights.shape[1])[poses]):
-            raise BadInput("the animation of this GLB blends morph targets; give a GLB that dg4d wrote")
-        for second, pose in zip(seconds[:-1], poses, strict=False):
-            frames[round(float(second * fps))] = (primitive["targets"][pose], primitive["material"])
+        positions = [target["POSITION"] for target in primitive["targets"]]
+        weights = parsed.accessor(tracks[node]["output"]).reshape(len(seconds), len(positions))
+        for second, row in zip(seconds[:-1], weights, strict=False):
+            blend = {position: float(weight) for position, weight in zip(positions, row, strict=True) if weight}
+            frames[round(float(second * fps))] = (blend, primitive["material"])
     if sorted(frames) != list(range(len(frames))):
         raise BadInput("the animation of this GLB omits frames; give a GLB that dg4d wrote")
     return [frames[frame] for frame in range(len(frames))], fps

@@ -35,6 +35,7 @@ class GltfDocument:
     Attributes:
         tree: the JSON tree.
         binary: the buffer; every view starts at a multiple of four bytes.
+        compressed: True if vertices and triangles are compressed with EXT_meshopt_compression.
     """
 
     def __init__(self, extras: dict[str, Any], *, compressed: bool = False) -> None:
@@ -48,7 +49,7 @@ class GltfDocument:
         if extras:
             self.tree["asset"]["extras"] = extras
         self.binary = bytearray()
-        self._compressed = compressed
+        self.compressed = compressed
         self._unpacked = 0  # decompressed size of the compressed views, bytes
 
     def add(self, collection: str, **item: Any) -> int:
@@ -96,7 +97,7 @@ class GltfDocument:
             normalized: True if integers stand for fractions of the largest integer.
         """
         rows = values.reshape(len(values), -1)
-        add = self._add_packed_view if self._compressed and target is not None else self._add_plain_view
+        add = self._add_packed_view if self.compressed and target is not None else self._add_plain_view
         return self.add(
             "accessors",
             name=name,

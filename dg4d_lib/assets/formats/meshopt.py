@@ -62,6 +62,32 @@ def unpack_triangles(content: bytes, count: int, size: int) -> bytes:
         raise BadInput(f"the triangles of this GLB cannot be decompressed ({error}); export the file again") from error
 
 
+def order_for_compression(
+    faces: NDArray[np.integer[Any]], vertices: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Sort triangles by the vertices they share, and vertices by the triangles that use them.
+
+    Args:
+        faces: indices of the vertices, a row per triangle.
+        vertices: number of vertices.
+
+    Returns:
+        The old index of every vertex in the new order, and the triangles in the new order with new indices.
+
+    Raises:
+        BackendUnavailable: meshoptimizer is missing.
+    """
+    library = _library()
+    indices = np.ascontiguousarray(faces.ravel(), np.uint32)
+    library.optimize_vertex_cache(indices, indices.copy(), indices.size, vertices)
+    uses = np.unique(indices, return_index=True)
+    order = uses[0][np.argsort(uses[1])].astype(np.int64)  # by first use
+    order = np.concatenate((order, np.setdiff1d(np.arange(vertices), order)))
+    new_index = np.empty(vertices, np.int64)
+    new_index[order] = np.arange(vertices)
+    return order, new_index[indices.astype(np.int64)].reshape(-1, 3)
+
+
 def _library() -> ModuleType:
     try:
         import meshoptimizer  # noqa: PLC0415 (optional dependency)

@@ -1,26 +1,38 @@
 """Triangles and morph targets as glTF accessors, in float32 or quantized.
 
-Quantization (KHR_mesh_quantization) uses 8 bits for normals at rest and 16 bits for the rest. Positions are integer
-points of a cube around all poses, and the node's transform scales the cube. A position and its displacement are rounded
-together, so moved vertices are as exact as vertices at rest: half a step of the cube on each axis. Morph targets of
-normals must lie in [-1, 1]; where a change is larger, the target is a shorter normal of the right direction, which
-players normalize. Poses in which many normals have turned too far for that keep float32.
+Quantization (KHR_mesh_quantization) uses 8 bits for normals and 16 bits for positions, 14 of them in compressed files.
+Positions are integer points of a cube around all poses, and the node's transform scales the cube: plain integers, not
+fractions of the largest one, because some readers ignore that flag of an accessor. For the same reason texture
+coordinates are float32 unless the file is compressed. A position and its displacement are rounded together, so moved
+vertices are as exact as vertices of the base: half a step of the cube on each axis. Morph targets of normals must lie
+in [-1, 1]; where a change is larger, the target is a shorter normal of the right direction, which players normalize.
+Poses in which many normals have turned too far for that have 16 bits, or float32.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Int
 from numpy.typing import NDArray
+from torch import Tensor
 
+from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.formats.gltf import INDEX_DATA, VERTEX_DATA, GltfDocument
+from dg4d_lib.assets.formats.meshopt import order_for_compression
 from dg4d_lib.assets.formats.normals import SmoothNormals
+from dg4d_lib.mesh.textured import TexturedMesh
 
 QUANTIZATION = "KHR_mesh_quantization"
 MAX_SHORT_INDEX = 65534  # glTF forbids index 65535, the primitive restart value
-_SHORT, _BYTE, _UNSIGNED_SHORT = 32767, 127, 65535
-SHORTEST = 1e-3  # minimum length of a turned normal; shorter ones have too few bits for their direction
+STEPS, COMPRESSED_STEPS = 32767, 8191  # of half the side of a cube; fewer steps compress better
+_BYTE, _UNSIGNED_SHORT = 127, 65535
+_NORMAL_TYPES = (  # integer type of turned normals, its largest value, and the length below which a normal of this type
+    ("i1", 127, 0.1),  # has too few bits for its direction
+    ("<i2", 32767, 1e-3),
+)
 LOST = 0.01  # share of normals that may be shorter, which is noise of thin parts; more would be visible
 _ROOM = 1.0001  # margin of the cube around the largest displacement, which is rounded twice
 
@@ -29,37 +41,65 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class QuantizationCube:
-    """Cube that 16-bit integer positions are relative to.
+    """Cube that integer positions are relative to.
 
     Attributes:
         center: world units.
-        half_side: world units, the integer 32767.
+        half_side: world units, the integer `steps`.
+        steps: largest integer.
     """
 
     center: NDArray[np.float64]
     half_side: float
+    steps: int = STEPS
 
     @classmethod
-    def around(cls, positions: Sequence[Floats], displacements: Iterable[Floats] = ()) -> "QuantizationCube":
+    def around(
+        cls, positions: Sequence[Floats], displacements: Iterable[Floats] = (), steps: int = STEPS
+    ) -> "QuantizationCube":
         """Create a cube that contains all positions and is at least as large as any displacement."""
         low = np.min([rows.min(0) for rows in positions], axis=0).astype(np.float64)
         high = np.max([rows.max(0) for rows in positions], axis=0).astype(np.float64)
         farthest = max((float(np.abs(rows).max()) for rows in displacements), default=0.0)
         side = max(float((high - low).max()) / 2, farthest) * _ROOM
-        return cls((low + high) / 2, side or 1.0)
+        return cls((low + high) / 2, side or 1.0, steps)
+
+    @property
+    def step(self) -> float:
+        """Distance of neighboring integer points, world units."""
+        return self.half_side / self.steps
 
     @property
     def max_error(self) -> float:
         """Maximum error of a vertex along an axis, world units."""
-        return self.half_side / _SHORT / 2
+        return self.step / 2
 
     def quantize(self, positions: Floats) -> NDArray[np.int32]:
-        """Round positions to integer points of the cube; positions outside exceed 16 bits."""
-        return np.rint((positions - self.center) * (_SHORT / self.half_side)).astype(np.int32)
+        """Round positions to integer points of the cube; those of positions outside exceed `steps`."""
+        return np.rint((positions - self.center) / self.step).astype(np.int32)
 
     def node_transform(self) -> dict[str, list[float]]:
         """Return the node properties that map integer points to the world."""
-        return {"translation": self.center.tolist(), "scale": [self.half_side] * 3}
+        return {"translation": self.center.tolist(), "scale": [self.step] * 3}
+
+
+def quantization_cube(
+    positions: Sequence[Floats], displacements: Iterable[Floats], settings: GltfSettings
+) -> QuantizationCube | None:
+    """Return the cube around all positions, as in `QuantizationCube.around`; None if the file is not quantized."""
+    if not settings.quantized:
+        return None
+    return QuantizationCube.around(positions, displacements, COMPRESSED_STEPS if settings.meshopt else STEPS)
+
+
+def reorder_mesh(mesh: TexturedMesh) -> tuple[TexturedMesh, Int[Tensor, " v"]]:
+    """Sort vertices and triangles for compression; return the old index of every vertex, too.
+
+    Raises:
+        BackendUnavailable: meshoptimizer is missing.
+    """
+    order, faces = map(torch.from_numpy, order_for_compression(mesh.faces.cpu().numpy(), len(mesh.vertices)))
+    return replace(mesh, vertices=mesh.vertices[order], faces=faces, uvs=mesh.uvs[order]), order
 
 
 class MeshPrimitive:
@@ -79,7 +119,7 @@ class MeshPrimitive:
         uvs: Floats,
         cube: QuantizationCube | None,
     ) -> None:
-        """Add a mesh at rest.
+        """Add a mesh in its base pose.
 
         Args:
             document: document to extend.
@@ -96,7 +136,9 @@ class MeshPrimitive:
         if cube is not None:
             document.use_extension(QUANTIZATION, required=True)
             normals, positions = _normalized(self._normals, _BYTE, "i1"), cube.quantize(vertices).astype("<i2")
-            rows = (positions, normals, _normalized(uvs.clip(0, 1), _UNSIGNED_SHORT, "<u2"))
+            rows = (positions, normals, uvs)
+            if document.compressed:
+                rows = (positions, normals, _normalized(uvs.clip(0, 1), _UNSIGNED_SHORT, "<u2"))
             self._normals = (normals / _BYTE).astype(np.float32)  # as readers decode them
         names = {"POSITION": "positions", "NORMAL": "normals", "TEXCOORD_0": "texture coordinates"}
         self.attributes = {
@@ -111,32 +153,53 @@ class MeshPrimitive:
         Args:
             name: prefix of the accessor names.
             offsets: of the vertices, world units.
-            normals: True if normals follow the surface; else they keep their values at rest.
+            normals: True if normals follow the surface; else they keep those of the base.
         """
-        moved = self._vertices + offsets
-        if self._cube is None:
-            target = {"POSITION": self._add(f"{name} positions", offsets)}
-        else:
-            steps = self._cube.quantize(moved) - self._cube.quantize(self._vertices)
-            target = {"POSITION": self._add(f"{name} positions", steps.astype("<i2"))}
+        target = {"POSITION": self._add_offsets(name, offsets)}
         if normals:
-            turned = self._normals_of(moved)
+            turned = self._normals_of(self._vertices + offsets)
             changes: NDArray[Any] = turned - self._normals
-            lengths = _max_lengths(turned, self._normals)
-            if self._cube is not None and (lengths <= SHORTEST).mean() <= LOST:
-                changes = _normalized(lengths * turned - self._normals, _SHORT, "<i2")
+            if self._cube is not None:
+                changes = self._quantize_turned(turned, changes)
             target["NORMAL"] = self._add(f"{name} normals", changes)
         return target
 
+    def add_component(self, name: str, offsets: Floats, changes: Floats | None) -> dict[str, int]:
+        """Add a morph target with given changes of normals, if any; return its accessor indices."""
+        target = {"POSITION": self._add_offsets(name, offsets)}
+        if changes is not None:
+            fits = self._cube is not None and np.abs(changes).max(initial=0.0) <= 1
+            target["NORMAL"] = self._add(f"{name} normals", _normalized(changes, _BYTE, "i1") if fits else changes)
+        return target
+
+    def turn_normals(self, offsets: Floats) -> Floats:
+        """Return the changes of the normals when the vertices move by offsets."""
+        return self._normals_of(self._vertices + offsets) - self._normals
+
+    def _add_offsets(self, name: str, offsets: Floats) -> int:
+        if self._cube is None:
+            return self._add(f"{name} positions", offsets)
+        steps = self._cube.quantize(self._vertices + offsets) - self._cube.quantize(self._vertices)
+        return self._add(f"{name} positions", steps.astype("<i2"))
+
+    def _quantize_turned(self, turned: Floats, changes: Floats) -> NDArray[Any]:
+        """Quantize the changes that lead to turned normals, if few normals get too short by that."""
+        lengths = _max_lengths(turned, self._normals)
+        for dtype, largest, shortest in _NORMAL_TYPES:
+            if (lengths <= shortest).mean() <= LOST:
+                return _normalized(lengths * turned - self._normals, largest, dtype)
+        return changes
+
     def _add(self, name: str, rows: NDArray[Any]) -> int:
-        return self._document.add_accessor(name, rows, VERTEX_DATA, normalized=rows.dtype.kind in "iu")
+        normalized = rows.dtype.kind in "iu" and not name.endswith("positions")
+        return self._document.add_accessor(name, rows, VERTEX_DATA, normalized=normalized)
 
 
 def _max_lengths(turned: Floats, normals: Floats) -> Floats:
     """Return the maximum lengths, up to 1, of the turned normals at which their changes stay in [-1, 1]."""
     with np.errstate(divide="ignore"):
         reach = (1 + np.sign(turned) * normals) / np.abs(turned)
-    return np.min(reach, axis=1, keepdims=True).clip(SHORTEST, 1).astype(np.float32)
+    return np.min(reach, axis=1, keepdims=True).clip(_NORMAL_TYPES[-1][2], 1).astype(np.float32)
 
 
 def _normalized(values: Floats, largest: int, dtype: str) -> NDArray[Any]:

@@ -7,23 +7,22 @@ animation loops like that of the morphed mesh. Textures per frame are not writte
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt16
-from numpy.typing import NDArray
+from jaxtyping import Float, UInt
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.gltf import VERTEX_DATA, GltfDocument
+from dg4d_lib.assets.formats.joint_motion import close_loop, relative_motion, rest_arms
 from dg4d_lib.assets.formats.materials import add_material, add_texture, to_uint8
-from dg4d_lib.assets.formats.primitives import MeshPrimitive
+from dg4d_lib.assets.formats.primitives import MeshPrimitive, QuantizationCube, quantization_cube, reorder_mesh
 from dg4d_lib.errors import BadInput
-from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
 from dg4d_lib.mesh.tracking.rig import Rig, fit_rig
 
 NAME = "subject"
 TARGET_ERROR = 0.05  # share of the motion; no bones are added below it, as the rest is hardly visible
 MAX_BONES = 255  # joint indices are bytes
 FLOAT = 5126  # glTF component type
-WEIGHT_ONE = 65535  # integer that stands for the weight 1
+WEIGHT_ONE, QUANTIZED_ONE = 65535, 255  # integer that stands for the weight 1
 
 
 def fit_asset_rig(asset: Asset4D, max_bones: int, max_error: float) -> tuple[Rig | None, str]:
@@ -51,13 +50,13 @@ def write_rigged_glb(asset: Asset4D, rig: Rig, settings: GltfSettings) -> bytes:
     Args:
         asset: mesh, frames per second and extras.
         rig: the rig of this asset.
-        settings: image, quality, meshopt, interpolation, roughness and metallic.
+        settings: image, quality, quantized, meshopt, interpolation, roughness and metallic.
 
     Raises:
         BadInput: the rig belongs to another mesh or has too many bones, or the texture is too large for its format.
         BackendUnavailable: meshoptimizer is missing.
     """
-    mesh = asset.mesh
+    mesh, bones, shares = asset.mesh, rig.bones.cpu(), rig.weights.cpu()
     if len(rig.weights) != len(mesh.vertices) or len(rig.rest_positions) > MAX_BONES:
         raise BadInput(
             f"the rig must have at most {MAX_BONES} bones and the {len(mesh.vertices)} vertices of the mesh; given "
@@ -66,19 +65,23 @@ def write_rigged_glb(asset: Asset4D, rig: Rig, settings: GltfSettings) -> bytes:
     document = GltfDocument(asset.extras, compressed=settings.meshopt)
     texture = add_texture(document, NAME, to_uint8(mesh.texture), settings)
     material = add_material(document, NAME, texture, settings)
+    if settings.meshopt:
+        mesh, order = reorder_mesh(mesh)
+        bones, shares = bones[order], shares[order]
     vertices, uvs = (values.detach().cpu().numpy().astype("<f4") for values in (mesh.vertices, mesh.uvs))
-    shape = MeshPrimitive(document, NAME, vertices, mesh.faces.cpu().numpy(), uvs, None)
-    weights = _quantize_weights(rig.weights.double().cpu().numpy())
-    bones = np.where(weights > 0, rig.bones.cpu().numpy(), 0).astype("u1")
+    cube = quantization_cube([vertices], (), settings)
+    shape = MeshPrimitive(document, NAME, vertices, mesh.faces.cpu().numpy(), uvs, cube)
+    weights = _quantize_weights(shares.double().numpy(), WEIGHT_ONE if cube is None else QUANTIZED_ONE)
+    joints_of = np.where(weights > 0, bones.numpy(), 0).astype("u1")
     attributes = {
         **shape.attributes,
-        "JOINTS_0": document.add_accessor(f"{NAME} joints", bones, VERTEX_DATA),
+        "JOINTS_0": document.add_accessor(f"{NAME} joints", joints_of, VERTEX_DATA),
         "WEIGHTS_0": document.add_accessor(f"{NAME} weights", weights, VERTEX_DATA, normalized=True),
     }
     primitive = {"attributes": attributes, "indices": shape.indices, "material": material, "mode": 4}
     number = document.add("meshes", name=NAME, primitives=[primitive])
     skeleton, joints = _add_joints(document, rig)
-    bind_matrices = _add_bind_matrices(document, rig.rest_positions.double().cpu().numpy())
+    bind_matrices = _add_bind_matrices(document, rig.rest_positions.double().cpu().numpy(), cube)
     skin = document.add("skins", name="rig", inverseBindMatrices=bind_matrices, skeleton=skeleton, joints=joints)
     node = document.add("nodes", name=NAME, mesh=number, skin=skin)
     _add_motion(document, rig, joints, asset.fps, settings.interpolation.upper())
@@ -86,23 +89,23 @@ def write_rigged_glb(asset: Asset4D, rig: Rig, settings: GltfSettings) -> bytes:
     return document.to_bytes()
 
 
-def _quantize_weights(weights: Float[np.ndarray, "v 4"]) -> UInt16[np.ndarray, "v 4"]:
-    """Quantize weights to integers whose rows sum to exactly 65535, by the largest remainder method."""
-    exact = weights / weights.sum(1, keepdims=True) * WEIGHT_ONE
+def _quantize_weights(weights: Float[np.ndarray, "v 4"], one: int) -> UInt[np.ndarray, "v 4"]:
+    """Quantize weights to integers whose rows sum to exactly `one`, by the largest remainder method."""
+    exact = weights / weights.sum(1, keepdims=True) * one
     floors = np.floor(exact)
-    missing = np.rint(WEIGHT_ONE - floors.sum(1, keepdims=True))
+    missing = np.rint(one - floors.sum(1, keepdims=True))
     order = np.argsort(floors - exact, axis=1, kind="stable")
     np.put_along_axis(floors, order, np.take_along_axis(floors, order, 1) + (np.arange(4) < missing), 1)
-    return floors.astype("<u2")
+    return floors.astype("<u2" if one > QUANTIZED_ONE else "u1")
 
 
 def _add_joints(document: GltfDocument, rig: Rig) -> tuple[int, list[int]]:
     """Add the joint nodes in the rest pose; return the index of the skeleton's root node and those of the joints."""
-    parents, rest = rig.parents.tolist(), rig.rest_positions.double().cpu().numpy()
-    joints = []
-    for bone, parent in enumerate(parents):
-        arm = rest[bone] - (rest[parent] if parent >= 0 else 0)
-        joints.append(document.add("nodes", name=f"joint_{bone:03d}", translation=arm.tolist()))
+    parents = rig.parents.tolist()
+    joints = [
+        document.add("nodes", name=f"joint_{bone:03d}", translation=arm)
+        for bone, arm in enumerate(rest_arms(rig).tolist())
+    ]
     nodes = document.tree["nodes"]
     for bone, parent in enumerate(parents):
         if parent >= 0:
@@ -110,10 +113,17 @@ def _add_joints(document: GltfDocument, rig: Rig) -> tuple[int, list[int]]:
     return document.add("nodes", name="skeleton", children=[joints[0]]), joints
 
 
-def _add_bind_matrices(document: GltfDocument, rest: Float[np.ndarray, "b 3"]) -> int:
-    """Add the inverse bind matrices, from the mesh to every joint at rest; return the accessor's index."""
-    matrices = np.tile(np.eye(4, dtype="<f4"), (len(rest), 1, 1))
+def _add_bind_matrices(document: GltfDocument, rest: Float[np.ndarray, "b 3"], cube: QuantizationCube | None) -> int:
+    """Add the inverse bind matrices, from the mesh to every joint at rest; return the accessor's index.
+
+    They also undo quantization, because the transform of a node with a skin has no effect.
+    """
+    matrices = np.tile(np.eye(4), (len(rest), 1, 1))
     matrices[:, 3, :3] = -rest  # column-major
+    if cube is not None:
+        matrices[:, :3, :3] *= cube.step
+        matrices[:, 3, :3] += cube.center
+    matrices = matrices.astype("<f4")
     view = document.add_view("joints at rest", matrices.tobytes())
     return document.add(
         "accessors", name="joints at rest", bufferView=view, componentType=FLOAT, count=len(rest), type="MAT4"
@@ -122,28 +132,17 @@ def _add_bind_matrices(document: GltfDocument, rest: Float[np.ndarray, "b 3"]) -
 
 def _add_motion(document: GltfDocument, rig: Rig, joints: list[int], fps: float, interpolation: str) -> None:
     """Add an animation with the rotations and translations of all joints relative to their parents."""
-    quats, positions = rig.quats.double().cpu(), rig.positions.double().cpu()
-    parents = rig.parents[1:]
-    inverse = quats[:, parents] * quats.new_tensor((1, -1, -1, -1))
-    arms = positions[:, 1:] - positions[:, parents]
-    rotations, translations = quats.clone(), positions.clone()
-    rotations[:, 1:] = quat_multiply(inverse, quats[:, 1:])
-    translations[:, 1:] = (quat_to_rotmat(inverse) @ arms[..., None])[..., 0]
+    rotations, translations = relative_motion(rig)
     samplers: list[dict[str, Any]] = []
     channels = []
-    times = document.add_accessor("times", (np.arange(len(quats) + 1) / fps).astype("<f4"))
-    for joint, rotation, translation in zip(joints, rotations.unbind(1), translations.unbind(1), strict=True):
+    times = document.add_accessor("times", (np.arange(len(rotations) + 1) / fps).astype("<f4"))
+    for number, joint in enumerate(joints):
         name = document.tree["nodes"][joint]["name"]
-        for path, values in (("rotation", rotation.numpy()[:, [1, 2, 3, 0]]), ("translation", translation.numpy())):
-            output = document.add_accessor(f"{name} {path}", _close_loop(values))
+        for path, values in (
+            ("rotation", rotations[:, number][:, [1, 2, 3, 0]]),
+            ("translation", translations[:, number]),
+        ):
+            output = document.add_accessor(f"{name} {path}", close_loop(values))
             channels.append({"sampler": len(samplers), "target": {"node": joint, "path": path}})
             samplers.append({"input": times, "output": output, "interpolation": interpolation})
     document.add("animations", name="motion", samplers=samplers, channels=channels)
-
-
-def _close_loop(values: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Append the first value; a quaternion with the sign nearest to the last one."""
-    first = values[:1]
-    if values.shape[1] == 4 and (first * values[-1:]).sum() < 0:
-        first = -first
-    return np.concatenate((values, first)).astype("<f4")

@@ -1,14 +1,16 @@
-"""SPZ writer: Niantic's quantized splat format (version 3, one gzip stream), a sixth of the size of a PLY.
+"""SPZ writer: Niantic's quantized splat format, in version 3 a sixth of the size of a PLY.
 
-A header of 16 bytes is followed by all positions, opacities, colors, scales and rotations as integers. The axes equal
-ours (x right, y up, z towards the viewer).
+All positions, opacities, colors, scales and rotations are integers, in this order. Version 3 is one gzip stream of a
+header of 16 bytes and these sections. Version 4 has a header of 32 bytes, a table of the sizes of its streams, and a
+Zstandard frame per section; ours hold the bytes as they are, because Python has no Zstandard before 3.14, so that these
+files are larger. The axes equal ours (x right, y up, z towards the viewer).
 """
 
 import gzip
 import math
 import struct
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -19,40 +21,68 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import check_storable
 
-MAGIC, VERSION = b"NGSP", 3
+SpzVersion = Literal[3, 4]
+
+MAGIC = b"NGSP"
 FRACTION_BITS = 12  # of positions, as in other writers; with more bits, the error of the scales dominates
-FARTHEST = (2**23 - 1) / 2**FRACTION_BITS  # world units; positions are signed 24-bit integers
+SMALL = 0.5  # meters; smaller clouds get more bits, so that positions remain as exact relative to their size
+MAX_BITS = 20
+LARGEST_POSITION = 2**23 - 1  # positions are signed 24-bit integers
+SPZ4_HEADER = 32  # bytes
+ZSTD_MAGIC, ZSTD_HEADER = 0xFD2FB528, 0xE0  # a frame of one segment with its size in 8 bytes
+ZSTD_BLOCK = 2**17  # maximum size of a block, bytes
 LEVEL = 9  # of gzip
 LARGEST = 2**9 - 1  # largest magnitude of a quantized quaternion component, without its sign
 
 
-def write_spz(path: Path, gaussians: Gaussians) -> None:
+def write_spz(path: Path, gaussians: Gaussians, version: SpzVersion = 3) -> None:
     """Write one cloud (no leading batch, color of degree 0); equal clouds give equal bytes.
 
-    Quantization errors are at most 1/8192 world units in positions, 1/32 in log scales (3 %; range -10 to 5.94), 1/510
-    in opacities, 1/76 in harmonics (0.4 % of the range of colors, -0.44 to 1.44) and 0.3 degrees in rotations.
+    Quantization errors are at most 1/8192 meters in positions (less in small clouds), 1/32 in log scales (3 %; range
+    -10 to 5.94), 1/510 in opacities, 1/76 in harmonics (0.4 % of the range of colors, -0.44 to 1.44) and 0.3 degrees in
+    rotations.
 
     Raises:
-        BadInput: a batch, color of a higher degree, numbers that are not finite, or a mean 2048 units away.
+        BadInput: a batch, color of a higher degree, numbers that are not finite, or a mean 2048 meters away.
         OSError: the file could not be written.
     """
     check_storable(gaussians, "an SPZ")
     means, log_scales, harmonics = (_array(x) for x in (gaussians.means, gaussians.log_scales, gaussians.harmonics))
-    if np.abs(means).max(initial=0.0) > FARTHEST:
+    farthest = float(np.abs(means).max(initial=0.0))
+    bits = FRACTION_BITS + max(0, math.ceil(math.log2(SMALL / farthest))) if farthest > 0 else FRACTION_BITS
+    bits = min(bits, MAX_BITS)
+    if farthest * 2**bits > LARGEST_POSITION:
         raise BadInput(
-            f"an SPZ stores means within {FARTHEST:.0f} world units; given {np.abs(means).max():.4g}: "
-            "scale the cloud down, or set pack.spz=false"
+            f"an SPZ stores means within {LARGEST_POSITION / 2**bits:.0f} meters; given {farthest:.4g}: "
+            "lower pack.height_m, or set pack.spz=false"
         )
     sections = (
-        np.rint(means * 2**FRACTION_BITS).astype("<i4")[..., None].view(np.uint8)[..., :3],
+        np.rint(means * 2**bits).astype("<i4")[..., None].view(np.uint8)[..., :3],
         _bytes(255 * _array(gaussians.opacities)),
         _bytes(255 * (0.15 * harmonics + 0.5)),
         _bytes(16 * (log_scales + 10)),
         _smallest_three(_array(gaussians.quats)),
     )
-    header = struct.pack("<4sIIBBBB", MAGIC, VERSION, len(gaussians), 0, FRACTION_BITS, 0, 0)
-    content = header + b"".join(section.tobytes() for section in sections)
-    path.write_bytes(gzip.compress(content, LEVEL, mtime=0))
+    streams = [section.tobytes() for section in sections]
+    common = struct.pack("<4sIIBBB", MAGIC, version, len(gaussians), 0, bits, 0)
+    if version == 3:
+        path.write_bytes(gzip.compress(common + bytes(1) + b"".join(streams), LEVEL, mtime=0))
+        return
+    frames = [_zstd_frame(stream) for stream in streams]
+    table = b"".join(struct.pack("<QQ", len(frame), len(stream)) for frame, stream in zip(frames, streams, strict=True))
+    header = common + struct.pack("<BI12x", len(streams), SPZ4_HEADER)
+    path.write_bytes(header + table + b"".join(frames))
+
+
+def _zstd_frame(content: bytes) -> bytes:
+    """Wrap bytes as a Zstandard frame (RFC 8878) of raw blocks."""
+    starts = range(0, max(1, len(content)), ZSTD_BLOCK)
+    parts = [struct.pack("<IBQ", ZSTD_MAGIC, ZSTD_HEADER, len(content))]
+    for start in starts:
+        block = content[start : start + ZSTD_BLOCK]
+        is_last = start == starts[-1]
+        parts += [(len(block) << 3 | is_last).to_bytes(3, "little"), block]
+    return b"".join(parts)
 
 
 def _array(values: torch.Tensor) -> NDArray[Any]:

@@ -37,11 +37,14 @@ class Span:
 
     @property
     def poses(self) -> list[int]:
-        """Frames shown at the keys, each once."""
-        return list(dict.fromkeys(key % self.total for key in self.keys))
+        """Frames shown at the keys that need a morph target, each once; frame 0 is the base, which needs none.
+
+        An animation of frame 0 alone has it as a pose that does not move, because glTF wants one morph target or more.
+        """
+        return [frame for frame in dict.fromkeys(key % self.total for key in self.keys) if frame > 0] or [0]
 
     def weights(self) -> NDArray[np.float32]:
-        """Return the one-hot weights of the poses at the keys."""
+        """Return the weights of the poses at the keys: one-hot, or zeros for the base."""
         return np.array([[pose == key % self.total for pose in self.poses] for key in self.keys], "<f4")
 
     def visibility(self) -> tuple[list[int], NDArray[np.float32]]:
@@ -65,9 +68,11 @@ class Animation:
         self._channels: list[dict[str, Any]] = []
         self._times: dict[tuple[int, ...], int] = {}
 
-    def add_morph(self, node: int, name: str, span: Span, interpolation: str) -> None:
-        """Animate the morph weights of a node, so that it shows the poses of its span."""
-        self._add(name, span.keys, span.weights().ravel(), interpolation, {"node": node, "path": "weights"})
+    def add_morph(
+        self, node: int, name: str, keys: list[int], weights: NDArray[np.float32], interpolation: str
+    ) -> None:
+        """Animate the morph weights of a node; `weights` has a row per key, which is a frame number."""
+        self._add(name, keys, weights.ravel(), interpolation, {"node": node, "path": "weights"})
 
     def add_visibility(self, node: int, name: str, span: Span) -> None:
         """Show a node during its span only; readers without animation show the node of frame 0."""

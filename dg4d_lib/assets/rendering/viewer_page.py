@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.resources import files
+from types import MappingProxyType
 from typing import Any
 
 FLOAT = 5126  # glTF component type of float32
@@ -28,6 +29,7 @@ def build_viewer_page(
     picture: bytes | None,
     video: bytes | None,
     facts: Mapping[str, Any],
+    camera: Mapping[str, Any] = MappingProxyType({}),
 ) -> str:
     """Build the page of one asset; equal arguments give equal text.
 
@@ -41,6 +43,7 @@ def build_viewer_page(
         video: the driving video as MP4, played in sync with the asset.
         facts: provenance as nested mappings and lists of strings, numbers and None. Every entry becomes a section; the
             first one is expanded.
+        camera: `radius` and `target` of the input camera, as in `asset.json`; 2 and the origin if missing.
 
     Raises:
         TypeError, ValueError: the facts cannot be represented as JSON.
@@ -50,8 +53,10 @@ def build_viewer_page(
         for name, content in (("glb", _zero_unused(glb)), ("splats", splats), ("picture", picture), ("video", video))
         if content is not None
     ]
-    text = json.dumps(facts, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
-    blocks.append(_block("facts", "application/json", text.replace("<", r"\u003c")))
+    view = {name: camera[name] for name in ("radius", "target") if name in camera}
+    for name, values in (("facts", facts), ("camera", view)):
+        text = json.dumps(values, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+        blocks.append(_block(name, "application/json", text.replace("<", r"\u003c")))
     before, data, after = _template().partition(_DATA)
     if not data:
         raise AssertionError(f"viewer/page.html lacks the placeholder {_DATA}; run `npm run build` in viewer/")

@@ -99,9 +99,27 @@ class AnimatedGlb:
         if "mesh" in node:
             for primitive in self.file.tree["meshes"][node["mesh"]]["primitives"]:
                 rest = self.file.accessor(primitive["attributes"]["POSITION"]).astype(np.float64)
-                targets = [self.file.accessor(target["POSITION"]) for target in primitive.get("targets", ())]
-                poses += [(rest + offsets) @ matrix[:3, :3].T + matrix[:3, 3] for offsets in targets or [np.zeros(3)]]
+                poses += [
+                    (rest + offsets) @ matrix[:3, :3].T + matrix[:3, 3] for offsets in self._offsets(number, primitive)
+                ]
         return poses
+
+    def _offsets(self, number: int, primitive: dict[str, Any]) -> list[NDArray[np.float64]]:
+        """Return the offsets of a node's vertices at every key of its weights."""
+        targets = [self.file.accessor(target["POSITION"]) for target in primitive.get("targets", ())]
+        tracks = [
+            self._samplers[channel["sampler"]]
+            for channel in self.animation["channels"]
+            if channel["target"].get("node") == number and channel["target"]["path"] == "weights"
+        ]
+        if not targets or not tracks:
+            return [np.zeros(3)]
+        rows = self.file.accessor(tracks[0]["output"]).reshape(-1, len(targets)).astype(np.float64)
+        unique = dict.fromkeys(map(tuple, rows.tolist()))  # the first key first
+        return [
+            np.sum([weight * target for weight, target in zip(row, targets, strict=True) if weight] or [np.zeros(3)], 0)
+            for row in unique
+        ]
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,10 @@ FRAMES, FPS = 4, 8.0
 KINDS = {5123: "<u2", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 SETTINGS = {
-    "plain": GltfSettings(),
+    "plain": GltfSettings(quantized=False),
     "quantized": GltfSettings(quantized=True),
-    "webp": GltfSettings(image="webp", moving_normals=False),
-    "held": GltfSettings(interpolation="step"),
+    "webp": GltfSettings(image="webp", moving_normals=False, quantized=False),
+    "held": GltfSettings(interpolation="step", quantized=False),
 }
 
 
@@ -170,17 +170,16 @@ def test_others_find_the_vertices_at_rest_where_they_were_placed(name: str, tmp_
     scene = trimesh.load(tmp_path / "scene.glb", process=False)
     (node,) = (node for node in scene.graph.nodes_geometry if node.startswith("one"))
     matrix, geometry = scene.graph[node]
-    unit = 32767 if name == "quantized" else 1  # trimesh leaves shares as the whole numbers that stand for them
-    found = trimesh.transform_points(scene.geometry[geometry].vertices / unit, matrix)
+    found = trimesh.transform_points(scene.geometry[geometry].vertices, matrix)
     np.testing.assert_allclose(found, trimesh.transform_points(hopping().mesh.vertices, one.transform), atol=1e-4)
 
 
 def mixed() -> list[Actor]:
-    pointed = AnimatedGlb(write_glb(hopping(changing=True), GltfSettings(textures="pointer")))
+    pointed = AnimatedGlb(write_glb(hopping(changing=True), GltfSettings(textures="pointer", quantized=False)))
     return [
         actor("plain", tracked(), position=(1, 0, 0)),
         actor("frames", per_frame(), start_s=0.5, speed=2.0),
-        actor("core", AnimatedGlb(write_glb(hopping(changing=True), GltfSettings(textures="core")))),
+        actor("core", AnimatedGlb(write_glb(hopping(changing=True), GltfSettings(textures="core", quantized=False)))),
         actor("pointed", pointed, **TURNED),
         actor("pointed again", pointed, start_s=0.1),
         *(actor(name, tracked(settings)) for name, settings in SETTINGS.items() if name != "plain"),
@@ -198,7 +197,8 @@ def test_the_khronos_validator_finds_nothing_in_a_scene_of_every_kind(tmp_path: 
 def test_compressed_assets_stay_compressed_and_valid(tmp_path: Path) -> None:
     pytest.importorskip("meshoptimizer", reason="meshoptimizer is not installed: make clients")
     one, two = (
-        actor(name, tracked(GltfSettings(meshopt=True)), position=(x, 0, 0)) for name, x in (("a", 0), ("b", 1))
+        actor(name, tracked(GltfSettings(meshopt=True, quantized=False)), position=(x, 0, 0))
+        for name, x in (("a", 0), ("b", 1))
     )
     content = compose_glb([one, actor("c", tracked()), two])
     (tmp_path / "scene.glb").write_bytes(content)
@@ -255,6 +255,24 @@ def test_a_box_holds_all_poses_also_of_frames_that_are_hidden() -> None:
         per_frame().box_max, trimesh.creation.icosphere(subdivisions=1, radius=0.3).bounds[1], atol=1e-6
     )
     assert tracked().box_max[1] > hopping().mesh.vertices[:, 1].max() + 0.5
+
+
+def test_a_foot_is_that_of_frame_0_in_files_with_a_target_for_it() -> None:
+    document = GltfDocument({})
+    rest = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4")
+    shape = {
+        "attributes": {"POSITION": document.add_accessor("p", rest, 34962)},
+        "indices": document.add_accessor("i", np.arange(3, dtype="<u2"), 34963),
+        "targets": [{"POSITION": document.add_accessor("t", rest * 0 + height, 34962)} for height in (2.0, 1.0)],
+    }
+    node = document.add("nodes", name="n", mesh=document.add("meshes", name="m", primitives=[shape]))
+    times = document.add_accessor("s", np.array([0, 1, 2], "<f4"))
+    weights = document.add_accessor("w", np.array([1, 0, 0, 1, 1, 0], "<f4"))
+    channel = {"sampler": 0, "target": {"node": node, "path": "weights"}}
+    document.add("animations", name="a", samplers=[{"input": times, "output": weights}], channels=[channel])
+    document.tree["scene"] = document.add("scenes", name="s", nodes=[node])
+    body = AnimatedGlb(document.to_bytes())
+    assert (body.foot[1], body.box_min[1]) == (2.0, 1.0)
 
 
 def test_a_scene_ends_when_every_asset_has_played_once() -> None:

@@ -16,11 +16,12 @@ from PIL import Image
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb, write_frames_glb, write_glb, write_mesh_glb
+from dg4d_lib.assets.formats.gltf import GlbReader, GltfDocument
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.textured import TexturedMesh
 
 FRAMES, FPS = 5, 7.0
-PNG = GltfSettings(image="png")
+PNG = GltfSettings(image="png", quantized=False)
 COMPONENTS = {5126: "<f4", 5125: "<u4", 5123: "<u2"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
 
@@ -103,14 +104,38 @@ def test_other_readers_load_it(kind: str) -> None:
     assert len(theirs.meshes) == len(scene.geometry)
 
 
-def test_a_tracked_mesh_comes_back() -> None:
+def test_a_tracked_mesh_comes_back_with_frame_0_as_its_base() -> None:
     given = moving_ball()
     back = read_glb(write_glb(given, PNG))
-    for name in ("vertices", "faces", "uvs"):
+    for name in ("faces", "uvs"):
         assert torch.equal(getattr(back.mesh, name), getattr(given.mesh, name))
     torch.testing.assert_close(back.mesh.texture, given.mesh.texture, atol=1e-7, rtol=0)
-    assert torch.equal(back.offsets, given.offsets)
+    assert torch.equal(back.mesh.vertices, given.mesh.vertices + given.offsets[0])
+    assert torch.equal(back.offsets, given.offsets - given.offsets[0])
     assert back.extras == given.extras
+
+
+def test_a_file_with_a_target_for_every_frame_comes_back() -> None:
+    """Earlier versions wrote the mesh of the reference frame as base, and one-hot weights at every frame."""
+    document, given = GltfDocument({}), moving_ball()
+    exact = GlbReader(write_glb(given, PNG))
+    tree = exact.tree
+    for accessor in tree["accessors"]:
+        view = document.add_view_of(exact, accessor["bufferView"])
+        document.add("accessors", **{**accessor, "bufferView": view})
+    primitive = tree["meshes"][0]["primitives"][0]
+    rest = document.add_accessor("rest", given.mesh.vertices.numpy(), 34962)
+    targets = [{"POSITION": document.add_accessor("t", pose.numpy(), 34962)} for pose in given.offsets]
+    weights = document.add_accessor("w", np.eye(FRAMES, dtype="<f4")[[*range(FRAMES), 0]].ravel())
+    primitive |= {"attributes": {**primitive["attributes"], "POSITION": rest}, "targets": targets}
+    tree["animations"][0]["samplers"][0]["output"] = weights
+    for image in tree["images"]:
+        image["bufferView"] = document.add_view_of(exact, image["bufferView"])
+    for name in ("meshes", "nodes", "materials", "textures", "images", "samplers", "animations", "scenes"):
+        document.tree[name] = tree[name]
+    back = read_glb(document.to_bytes())
+    assert torch.equal(back.mesh.vertices, given.mesh.vertices)
+    assert torch.equal(back.offsets, given.offsets)
 
 
 @pytest.mark.parametrize("fps", [7.0, 23.976, 29.97, 120.0, 0.5])
@@ -119,7 +144,9 @@ def test_the_frame_rate_comes_back(fps: float) -> None:
 
 
 def test_a_single_frame_comes_back() -> None:
-    assert torch.equal(read_glb(write_glb(moving_ball(frames=1))).offsets, moving_ball(frames=1).offsets)
+    given = moving_ball(frames=1)
+    back = read_glb(write_glb(given))
+    assert torch.equal(back.mesh.vertices + back.offsets[0], given.mesh.vertices + given.offsets[0])
 
 
 def test_each_key_shows_one_frame_and_the_last_key_shows_the_first() -> None:
@@ -129,9 +156,9 @@ def test_each_key_shows_one_frame_and_the_last_key_shows_the_first() -> None:
     assert sampler["interpolation"] == "LINEAR"
     assert animation["channels"] == [{"sampler": 0, "target": {"node": 0, "path": "weights"}}]
     np.testing.assert_allclose(rows(tree, binary, sampler["input"])[:, 0], np.arange(FRAMES + 1) / FPS, rtol=1e-6)
-    weights = rows(tree, binary, sampler["output"]).reshape(FRAMES + 1, FRAMES)
-    assert np.array_equal(weights, np.eye(FRAMES)[[*range(FRAMES), 0]])
-    assert tree["meshes"][0]["weights"] == [1, 0, 0, 0, 0]
+    weights = rows(tree, binary, sampler["output"]).reshape(FRAMES + 1, FRAMES - 1)
+    assert np.array_equal(weights, np.eye(FRAMES)[[*range(FRAMES), 0], 1:])  # frame 0 is the base
+    assert tree["meshes"][0]["weights"] == [0, 0, 0, 0]
 
 
 def test_a_mesh_per_frame_is_shown_alone_at_its_time() -> None:
@@ -152,7 +179,7 @@ def test_a_mesh_per_frame_is_shown_alone_at_its_time() -> None:
 def test_a_thousand_frames_come_back_and_no_node_holds_more_than_a_player_can() -> None:
     given = moving_ball(frames=1000)
     content = write_glb(given, PNG)
-    assert torch.equal(read_glb(content).offsets, given.offsets)
+    assert torch.equal(read_glb(content).offsets, given.offsets - given.offsets[0])
     assert max(len(mesh["weights"]) for mesh in unpack(content)[0]["meshes"]) <= 129
     assert len(content) < 1000 * len(given.mesh.vertices) * 24 * 1.3  # what nodes share is written once
 

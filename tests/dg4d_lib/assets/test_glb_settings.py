@@ -64,15 +64,23 @@ def scale_of(content: bytes) -> float:
 @pytest.mark.parametrize("settings", [GltfSettings(quantized=True), COMPACT], ids=["quantized", "packed"])
 def test_quantized_places_are_within_half_a_step_in_every_pose(settings: GltfSettings) -> None:
     content = write_glb(turning_ball(), settings)
-    half_step = scale_of(content) / 32767 / 2
-    worst = (placed(read_glb(content)) - placed(turning_ball())).abs().max()
+    half_step = scale_of(content) / 2
+    reach = turning_ball().offsets.abs().max() if settings.meshopt else 0
+    assert not settings.meshopt or half_step == pytest.approx(float(reach) * 1.0001 / 8191 / 2, rel=0.3)
+    found, expected = placed(read_glb(content)), placed(turning_ball())
+    if settings.meshopt:  # which changes the order of the vertices
+        nearest = torch.cdist(found[0], expected[0]).argmin(1)
+        expected = expected[:, nearest]
+    worst = (found - expected).abs().max()
     assert 0 < worst <= half_step + 1e-7
     assert GlbReader(content).tree["nodes"][0]["extras"]["largestError"] == pytest.approx(half_step)
 
 
-def test_quantized_texture_coordinates_are_within_half_a_step() -> None:
-    back = read_mesh_glb(write_mesh_glb(ball(), GltfSettings(quantized=True)))
-    torch.testing.assert_close(back.uvs, ball().uvs, atol=0.51 / 65535, rtol=0)
+def test_texture_coordinates_are_exact_unless_compressed() -> None:
+    assert torch.equal(read_mesh_glb(write_mesh_glb(ball(), GltfSettings())).uvs, ball().uvs)
+    back = read_mesh_glb(write_mesh_glb(ball(), COMPACT)).uvs
+    distances = torch.cdist(back, ball().uvs, compute_mode="donot_use_mm_for_euclid_dist").amin(1)
+    assert distances.max() <= 0.51 * 2**0.5 / 65535
 
 
 def test_a_mesh_without_extent_can_be_quantized() -> None:
@@ -81,13 +89,18 @@ def test_a_mesh_without_extent_can_be_quantized() -> None:
     torch.testing.assert_close(back.vertices, point.vertices)
 
 
+def corners(asset: Asset4D) -> torch.Tensor:
+    """Return all triangles with the positions of their corners at all frames, in an order that no writer changes."""
+    rows = placed(asset)[:, asset.mesh.faces].movedim(0, 2).flatten(2)  # f 3 t*3
+    first = rows[..., 0].argmin(1)
+    turned = torch.stack([row.roll(-int(turn), 0) for row, turn in zip(rows, first, strict=True)]).flatten(1)
+    return turned[np.lexsort(turned.T.numpy())]
+
+
 def test_packing_loses_nothing() -> None:
-    given = turning_ball()
-    back = read_glb(write_glb(given, GltfSettings(meshopt=True)))
-    assert torch.equal(back.mesh.vertices, given.mesh.vertices)
-    assert torch.equal(back.offsets, given.offsets)
-    turned = torch.stack([given.mesh.faces.roll(-turn, 1) for turn in range(3)], 1)
-    assert (back.mesh.faces[:, None] == turned).all(2).any(1).all()
+    given = tilted(turning_ball())
+    back = read_glb(write_glb(given, GltfSettings(meshopt=True, quantized=False)))
+    torch.testing.assert_close(corners(back), corners(given), atol=1e-6, rtol=0)
 
 
 def test_each_way_to_write_less_makes_the_file_smaller() -> None:
@@ -95,7 +108,7 @@ def test_each_way_to_write_less_makes_the_file_smaller() -> None:
     sizes = [
         len(write_glb(asset, settings))
         for settings in (
-            GltfSettings(),
+            GltfSettings(quantized=False),
             GltfSettings(quantized=True),
             COMPACT,
             GltfSettings(quantized=True, meshopt=True, moving_normals=False),
@@ -108,7 +121,7 @@ def normals_shown(content: bytes, frame: int) -> np.ndarray:
     parsed = GlbReader(content)
     primitive = parsed.tree["meshes"][0]["primitives"][0]
     base = parsed.accessor(primitive["attributes"]["NORMAL"])
-    changes = parsed.accessor(primitive["targets"][frame]["NORMAL"])
+    changes = parsed.accessor(primitive["targets"][frame - 1]["NORMAL"]) if frame else 0
     shown = base + changes
     return shown / np.linalg.norm(shown, axis=1, keepdims=True)
 
@@ -126,46 +139,47 @@ def test_normals_are_those_of_the_moved_surface(given: Asset4D, quantized: bool)
     content = write_glb(given, GltfSettings(quantized=quantized))
     normals_of = SmoothNormals(given.mesh.vertices.numpy(), given.mesh.faces.numpy())
     for frame, pose in enumerate(placed(given)):
-        assert (normals_shown(content, frame) * normals_of(pose.numpy())).sum(1).min() > 0.9999
+        cosine = (normals_shown(content, frame) * normals_of(pose.numpy())).sum(1).min()
+        assert cosine > (0.9995 if quantized else 0.9999)  # 8 bits: at most 1.8 degrees
 
 
-def test_normals_along_an_axis_that_turn_over_keep_their_floats() -> None:
+def test_normals_that_turn_over_get_more_bits() -> None:
     def kinds(asset: Asset4D) -> list[int]:
         tree = GlbReader(write_glb(asset, GltfSettings(quantized=True))).tree
         targets = tree["meshes"][0]["primitives"][0]["targets"]
         return [tree["accessors"][target["NORMAL"]]["componentType"] for target in targets]
 
-    short, floating = 5122, 5126
-    assert kinds(turning_ball()) == [short, short, floating, floating, short]  # 0, 72, 144, 216, 288 degrees
-    assert kinds(tilted(turning_ball())) == [short] * FRAMES
+    byte, short, floating = 5120, 5122, 5126
+    assert kinds(turning_ball()) == [byte, floating, floating, byte]  # 72, 144, 216, 288 degrees, along the axes
+    assert set(kinds(tilted(turning_ball()))) <= {byte, short}
 
 
 def test_without_moving_normals_targets_have_places_only() -> None:
-    tree = GlbReader(write_glb(turning_ball(), GltfSettings(moving_normals=False))).tree
+    tree = GlbReader(write_glb(turning_ball(), GltfSettings(moving_normals=False, quantized=False))).tree
     assert all(set(target) == {"POSITION"} for target in tree["meshes"][0]["primitives"][0]["targets"])
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "step"])
 def test_frames_are_joined_as_asked(interpolation: Any) -> None:
-    tree = GlbReader(write_glb(turning_ball(), GltfSettings(interpolation=interpolation))).tree
+    tree = GlbReader(write_glb(turning_ball(), GltfSettings(interpolation=interpolation, quantized=False))).tree
     assert tree["animations"][0]["samplers"][0]["interpolation"] == interpolation.upper()
 
 
 def test_the_surface_is_as_rough_and_metallic_as_asked() -> None:
-    tree = GlbReader(write_mesh_glb(ball(), GltfSettings(roughness=0.4, metallic=0.75))).tree
+    tree = GlbReader(write_mesh_glb(ball(), GltfSettings(roughness=0.4, metallic=0.75, quantized=False))).tree
     surface = tree["materials"][0]["pbrMetallicRoughness"]
     assert (surface["roughnessFactor"], surface["metallicFactor"]) == (0.4, 0.75)
 
 
 @pytest.mark.parametrize(("image", "worst"), [("png", 0.51), ("jpeg", 8.0), ("webp", 12.0)])
 def test_pictures_come_back_as_their_format_keeps_them(image: Any, worst: float) -> None:
-    content = write_mesh_glb(ball(), GltfSettings(image=image))
+    content = write_mesh_glb(ball(), GltfSettings(image=image, quantized=False))
     torch.testing.assert_close(read_mesh_glb(content).texture, ball().texture, atol=worst / 255, rtol=0)
     assert GlbReader(content).tree["images"][0]["mimeType"] == f"image/{image}"
 
 
 def test_a_reader_without_webp_finds_the_same_picture_as_jpeg() -> None:
-    parsed = GlbReader(write_mesh_glb(ball(), GltfSettings(image="webp")))
+    parsed = GlbReader(write_mesh_glb(ball(), GltfSettings(image="webp", quantized=False)))
     assert "extensionsRequired" not in parsed.tree
     image = parsed.tree["images"][parsed.tree["textures"][0]["source"]]
     with Image.open(io.BytesIO(parsed.view(image["bufferView"]))) as picture:
@@ -177,7 +191,7 @@ def test_a_reader_without_webp_finds_the_same_picture_as_jpeg() -> None:
 def test_a_picture_too_large_for_webp_is_refused() -> None:
     mesh = replace(ball(), texture=torch.zeros(1, 16384, 3))
     with pytest.raises(BadInput, match="16384 pixels cannot be webp"):
-        write_mesh_glb(mesh, GltfSettings(image="webp"))
+        write_mesh_glb(mesh, GltfSettings(image="webp", quantized=False))
 
 
 @pytest.mark.parametrize("textures", ["pointer", "core"])
@@ -194,13 +208,13 @@ def test_changing_textures_come_back(textures: Any, compact: bool) -> None:
 
 
 def test_changing_textures_need_no_extension_in_core() -> None:
-    tree = GlbReader(write_glb(flickering_ball(), GltfSettings(textures="core"))).tree
+    tree = GlbReader(write_glb(flickering_ball(), GltfSettings(textures="core", quantized=False))).tree
     assert "extensionsUsed" not in tree
     assert len(tree["materials"]) == FRAMES
 
 
 def test_who_knows_no_extension_sees_the_first_texture() -> None:
-    content = write_glb(flickering_ball(), GltfSettings(image="png"))
+    content = write_glb(flickering_ball(), GltfSettings(image="png", quantized=False))
     assert "extensionsRequired" not in GlbReader(content).tree
     (mesh,) = trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()
     seen = mesh.visual.to_color().vertex_colors[:, :3].mean(0)
@@ -223,9 +237,9 @@ def test_the_offset_of_the_texture_steps_with_the_frames_and_returns() -> None:
 
 
 SETTINGS = [
-    GltfSettings(image="png"),
+    GltfSettings(image="png", quantized=False),
     GltfSettings(quantized=True),
-    GltfSettings(interpolation="step", moving_normals=False),
+    GltfSettings(interpolation="step", moving_normals=False, quantized=False),
 ]
 
 
@@ -252,15 +266,35 @@ def test_pygltflib_reads_the_same_values(settings: GltfSettings) -> None:
         stride = view.byteStride or width * dtype.itemsize
         shape, strides = (accessor.count, width), (stride, dtype.itemsize)
         raw = np.ndarray(shape, dtype, blob, view.byteOffset, strides)
-        return raw / np.iinfo(dtype).max if accessor.normalized else raw
+        return raw / np.iinfo(dtype).max if accessor.normalized else raw.astype(float)
 
     node, primitive = theirs.nodes[0], theirs.meshes[0].primitives[0]
     scale = np.array(node.scale or 1.0)
     rest = values(primitive.attributes.POSITION)
-    for target, pose in zip(primitive.targets, placed(given), strict=True):
-        moved = (rest + values(target["POSITION"])) * scale + np.array(node.translation or 0.0)
+    base = [np.zeros(3)]
+    targets = [values(target["POSITION"]) for target in primitive.targets]
+    for offsets, pose in zip(base + targets, placed(given), strict=True):
+        moved = (rest + offsets) * scale + np.array(node.translation or 0.0)
         np.testing.assert_allclose(moved, pose, atol=2e-5)
     np.testing.assert_allclose(values(primitive.attributes.TEXCOORD_0), given.mesh.uvs, atol=1e-5)
+
+
+@pytest.mark.parametrize("settings", [GltfSettings(components=2), GltfSettings(components=2, quantized=False)])
+def test_components_reproduce_a_motion_that_they_span(settings: GltfSettings) -> None:
+    """A turn around an axis lies in a plane of poses: cos x + sin z."""
+    asset = turning_ball(12)
+    asset = replace(asset, offsets=asset.offsets * torch.tensor([1.0, 0.0, 1.0]))
+    content = write_glb(asset, settings)
+    assert GlbReader(content).tree["meshes"][0]["extras"]["targetNames"] == ["component_000", "component_001"]
+    torch.testing.assert_close(placed(read_glb(content)), placed(asset), atol=1e-4, rtol=0)
+    assert len(content) < len(write_glb(asset, settings.model_copy(update={"components": 0}))) / 2
+
+
+def test_trimesh_places_quantized_vertices_and_their_texture() -> None:
+    scene = trimesh.load(io.BytesIO(write_glb(turning_ball(), GltfSettings(image="png"))), file_type="glb")
+    (seen,) = scene.dump()
+    np.testing.assert_allclose(seen.vertices, ball().vertices, atol=2e-5)
+    np.testing.assert_allclose(seen.visual.uv, ball().uvs.numpy() * (1, -1) + (0, 1), atol=1e-6)
 
 
 def test_meshes_per_frame_share_one_cube() -> None:
@@ -271,7 +305,9 @@ def test_meshes_per_frame_share_one_cube() -> None:
     assert extents[1] == pytest.approx(2 * extents[0], rel=1e-3)
 
 
-@pytest.mark.parametrize("settings", [COMPACT, GltfSettings(image="webp", textures="core")], ids=["packed", "core"])
+@pytest.mark.parametrize(
+    "settings", [COMPACT, GltfSettings(image="webp", textures="core", quantized=False)], ids=["packed", "core"]
+)
 def test_equal_assets_give_equal_bytes_with_any_settings(settings: GltfSettings) -> None:
     assert write_glb(flickering_ball(), settings) == write_glb(flickering_ball(), settings)
 

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.glb import write_glb
+from dg4d_lib.assets.formats.gltf import GlbReader
 from dg4d_lib.assets.formats.rigged import fit_asset_rig, write_rigged_glb
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.textured import TexturedMesh
@@ -42,7 +43,7 @@ def swaying(frames: int = 7) -> Asset4D:
 def rigged() -> tuple[Asset4D, Rig, bytes]:
     asset = swaying()
     rig = fit_rig(asset.mesh.vertices, asset.offsets, 0.02, 8)
-    return asset, rig, write_rigged_glb(asset, rig, GltfSettings(image="png"))
+    return asset, rig, write_rigged_glb(asset, rig, GltfSettings(image="png", quantized=False))
 
 
 def rows(file: pygltflib.GLTF2, index: int) -> np.ndarray:
@@ -90,7 +91,7 @@ def morphed(content: bytes) -> np.ndarray:
     file = pygltflib.GLTF2.load_from_bytes(content)
     primitive = file.meshes[0].primitives[0]
     rest = rows(file, primitive.attributes.POSITION)
-    return np.stack([rest + rows(file, target["POSITION"]) for target in primitive.targets])
+    return np.stack([rest, *(rest + rows(file, target["POSITION"]) for target in primitive.targets)])
 
 
 def test_the_skin_in_the_file_misses_the_morphed_file_by_what_the_rig_says(
@@ -138,7 +139,14 @@ def test_others_see_the_mesh_at_rest(rigged: tuple[Asset4D, Rig, bytes], tmp_pat
     np.testing.assert_allclose(mesh.vertices, asset.mesh.vertices, atol=1e-6)
 
 
-@pytest.mark.parametrize("settings", [GltfSettings(), GltfSettings(image="webp"), GltfSettings(interpolation="step")])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        GltfSettings(quantized=False),
+        GltfSettings(image="webp", quantized=False),
+        GltfSettings(interpolation="step", quantized=False),
+    ],
+)
 def test_the_khronos_validator_finds_nothing(
     settings: GltfSettings, rigged: tuple[Asset4D, Rig, bytes], tmp_path: Path
 ) -> None:
@@ -151,16 +159,45 @@ def test_the_khronos_validator_finds_nothing(
 def test_compressed_skins_are_valid_and_smaller(rigged: tuple[Asset4D, Rig, bytes], tmp_path: Path) -> None:
     pytest.importorskip("meshoptimizer", reason="meshoptimizer is not installed: make clients")
     asset, rig, content = rigged
-    packed = write_rigged_glb(asset, rig, GltfSettings(image="png", meshopt=True))
+    packed = write_rigged_glb(asset, rig, GltfSettings(image="png", meshopt=True, quantized=False))
     (tmp_path / "a.glb").write_bytes(packed)
     assert len(packed) < len(content)
     report = run_node("validate.mjs", str(tmp_path / "a.glb"))
     assert report["errors"] == 0, report["messages"]
 
 
+@pytest.mark.parametrize("meshopt", [False, True])
+def test_a_quantized_skin_moves_as_the_exact_one(rigged: tuple[Asset4D, Rig, bytes], meshopt: bool) -> None:
+    """Compare vertices by the words of the specification; 8-bit weights move a vertex by up to 1/255 of the motion."""
+    asset, rig, content = rigged
+    small = write_rigged_glb(asset, rig, GltfSettings(image="png", meshopt=meshopt))
+    assert len(small) < 0.8 * len(content)
+    parsed, exact = GlbReader(small), GlbReader(content)
+    assert parsed.tree["extensionsRequired"][0] == "KHR_mesh_quantization"
+    attributes = parsed.tree["meshes"][0]["primitives"][0]["attributes"]
+    weights = parsed.accessor(attributes["WEIGHTS_0"])
+    np.testing.assert_allclose(weights.sum(1), 1, atol=1e-6)
+    skin = parsed.tree["skins"][0]
+    binding = np.frombuffer(parsed.view(parsed.tree["accessors"][skin["inverseBindMatrices"]]["bufferView"]), "<f4")
+    vertices = parsed.accessor(attributes["POSITION"]).astype(float)
+    matrix = binding.reshape(-1, 4, 4)[0].T
+    placed = vertices @ matrix[:3, :3].T + matrix[:3, 3] + rig.rest_positions[0].numpy()
+    first = exact.tree["meshes"][0]["primitives"][0]["attributes"]["POSITION"]
+    given = exact.accessor(first)
+    distances = np.linalg.norm(placed[:, None] - given[None], axis=-1).min(1)
+    assert distances.max() < 2e-4
+
+
+def test_the_validator_finds_nothing_in_a_quantized_skin(rigged: tuple[Asset4D, Rig, bytes], tmp_path: Path) -> None:
+    asset, rig, _ = rigged
+    (tmp_path / "a.glb").write_bytes(write_rigged_glb(asset, rig, GltfSettings()))
+    report = run_node("validate.mjs", str(tmp_path / "a.glb"))
+    assert (report["errors"], report["warnings"]) == (0, 0), report["messages"]
+
+
 def test_equal_rigs_give_equal_bytes(rigged: tuple[Asset4D, Rig, bytes]) -> None:
     asset, rig, content = rigged
-    assert write_rigged_glb(asset, rig, GltfSettings(image="png")) == content
+    assert write_rigged_glb(asset, rig, GltfSettings(image="png", quantized=False)) == content
 
 
 def test_a_rig_that_misses_too_much_is_left_out_with_the_reason() -> None:
@@ -181,4 +218,4 @@ def test_a_rig_of_another_mesh_is_refused(rigged: tuple[Asset4D, Rig, bytes]) ->
     asset, rig, _ = rigged
     other = TexturedMesh(asset.mesh.vertices[:-1], asset.mesh.faces, asset.mesh.uvs[:-1], asset.mesh.texture)
     with pytest.raises(BadInput, match="vertices"):
-        write_rigged_glb(Asset4D(other, asset.offsets[:, :-1], FPS), rig, GltfSettings())
+        write_rigged_glb(Asset4D(other, asset.offsets[:, :-1], FPS), rig, GltfSettings(quantized=False))

@@ -29,7 +29,7 @@ def test_a_sequence_comes_back_exactly(tmp_path: Path, states: Gaussians) -> Non
 
 def test_every_file_is_the_cloud_at_its_frame(tmp_path: Path, states: Gaussians) -> None:
     write_splats(tmp_path, states)
-    assert torch.equal(read_ply(tmp_path / "002.ply").means, states.means[2])
+    assert torch.equal(read_ply(tmp_path / "002.ply", y_down=True).means, states.means[2])
 
 
 def test_every_spz_is_the_cloud_at_its_frame(tmp_path: Path, states: Gaussians) -> None:

@@ -88,7 +88,7 @@ def test_an_empty_cloud_is_a_header(tmp_path: Path) -> None:
 
 
 def test_a_center_that_the_format_cannot_hold_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="within 2048 world units; given 3000"):
+    with pytest.raises(BadInput, match="within 2048 meters; given 3000"):
         write_spz(tmp_path / "a.spz", replace(cloud(1), means=torch.tensor([[0.0, -3000.0, 0.0]])))
 
 
@@ -97,3 +97,27 @@ def test_numbers_that_are_not_finite_are_refused_by_name(tmp_path: Path, broken:
     given = cloud(2)
     with pytest.raises(BadInput, match=f"an SPZ cannot hold non-finite numbers; given some in {broken};"):
         write_spz(tmp_path / "a.spz", replace(given, **{broken: vars(given)[broken] * math.nan}))
+
+
+@pytest.mark.parametrize("count", [0, 1, 200, 20_000])
+def test_version_four_has_the_sections_of_version_three_as_zstandard_frames(tmp_path: Path, count: int) -> None:
+    pyarrow = pytest.importorskip("pyarrow", reason="a reader of Zstandard")
+    write_spz(tmp_path / "3.spz", cloud(count))
+    write_spz(tmp_path / "4.spz", cloud(count), 4)
+    three, four = gzip.decompress((tmp_path / "3.spz").read_bytes()), (tmp_path / "4.spz").read_bytes()
+    magic, version, points, degree, bits, flags, streams, table = struct.unpack_from("<4sIIBBBBI", four)
+    assert (magic, version, points, degree, bits, flags, streams, table) == (b"NGSP", 4, count, 0, 12, 0, 5, 32)
+    sizes = [struct.unpack_from("<QQ", four, table + 16 * stream) for stream in range(streams)]
+    start, sections = table + 16 * streams, []
+    for stored, size in sizes:
+        sections.append(pyarrow.decompress(four[start : start + stored], size, "zstd", asbytes=True) if size else b"")
+        start += stored
+    assert start == len(four)
+    assert b"".join(sections) == three[16:]
+
+
+def test_positions_of_a_small_cloud_are_as_exact_relative_to_its_size(tmp_path: Path) -> None:
+    small = replace(cloud(), means=cloud().means / 64)
+    write_spz(tmp_path / "a.spz", small)
+    seen = gsply.read_spz(str(tmp_path / "a.spz"))
+    assert np.abs(seen.means - small.means.numpy()).max() <= small.means.abs().max() / 2**12

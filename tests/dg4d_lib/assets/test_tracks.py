@@ -15,14 +15,19 @@ def test_every_frame_is_in_one_span(frames: int, longest: int) -> None:
 
 def test_a_span_ends_with_the_first_pose_of_the_next() -> None:
     first, second = split_into_spans(4, 2)
-    assert (first.keys, first.poses) == ([0, 1, 2], [0, 1, 2])
-    assert (second.keys, second.poses) == ([2, 3, 4], [2, 3, 0])
+    assert (first.keys, first.poses) == ([0, 1, 2], [1, 2])
+    assert (second.keys, second.poses) == ([2, 3, 4], [2, 3])
 
 
-def test_a_whole_animation_comes_back_to_its_first_pose_without_a_pose_more() -> None:
+def test_a_whole_animation_starts_and_ends_at_the_base() -> None:
     (span,) = split_into_spans(3, 8)
-    assert span.poses == [0, 1, 2]
-    assert np.array_equal(span.weights(), np.eye(3)[[0, 1, 2, 0]])
+    assert span.poses == [1, 2]
+    assert np.array_equal(span.weights(), [[0, 0], [1, 0], [0, 1], [0, 0]])
+
+
+def test_a_single_frame_has_a_pose_because_gltf_wants_one() -> None:
+    (span,) = split_into_spans(1, 8)
+    assert span.poses == [0]
 
 
 @pytest.mark.parametrize("span", [Span(0, 1, 1), Span(0, 2, 5), Span(2, 4, 5), Span(3, 5, 5), Span(0, 5, 5)])

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 from pxr import Gf, Usd, UsdGeom, UsdVol
-from usd_samples import FPS, FRAMES, HALF, cloud, growing_ball
+from usd_samples import FPS, FRAMES, cloud, growing_ball
 
-from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.formats.usd import write_usdz
 from dg4d_lib.geometry.quaternion import quat_to_rotmat
 
@@ -26,11 +25,10 @@ def test_splats_are_the_states(path: Path) -> None:
     states = cloud()
     write_usdz(path, growing_ball(), FPS, states)
     stage = Usd.Stage.Open(str(path))
-    stage.GetDefaultPrim().GetVariantSet("representation").SetVariantSelection("splats")
     splats = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/asset/splats"))
     assert not any(splats.GetPrim().GetAttribute(f"{name}h").HasAuthoredValue() for name in MOVING)
-    for time in range(FRAMES + 1):
-        state = states.at(time % FRAMES)
+    for frame in range(FRAMES + 1):
+        time, state = 24 * frame / FPS, states.at(frame % FRAMES)
         assert np.array_equal(splats.GetPositionsAttr().Get(time), state.means.numpy())
         scales = np.array(splats.GetScalesAttr().Get(time))
         np.testing.assert_allclose(scales, state.log_scales.exp(), rtol=1e-6)
@@ -53,13 +51,12 @@ def test_splats_are_the_states(path: Path) -> None:
 
 def test_half_splats_are_the_states_to_eleven_bits(path: Path) -> None:
     states = replace(cloud(), log_scales=torch.linspace(-20, 1, FRAMES * 15).reshape(FRAMES, 5, 3))
-    write_usdz(path, growing_ball(), FPS, states, settings=HALF)
+    write_usdz(path, growing_ball(), FPS, states, half=True)
     stage = Usd.Stage.Open(str(path))
-    stage.GetDefaultPrim().GetVariantSet("representation").SetVariantSelection("splats")
     splats = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/asset/splats"))
     assert not any(splats.GetPrim().GetAttribute(name).HasAuthoredValue() for name in MOVING)  # or they would win
-    for time in range(FRAMES):
-        state = states.at(time)
+    for frame in range(FRAMES):
+        time, state = 24 * frame / FPS, states.at(frame)
         np.testing.assert_allclose(splats.GetPositionshAttr().Get(time), state.means, rtol=2**-11)
         np.testing.assert_allclose(splats.GetScaleshAttr().Get(time), state.scales.clamp(min=2**-14), rtol=2**-11)
         quats = [(q.GetReal(), *q.GetImaginary()) for q in splats.GetOrientationshAttr().Get(time)]
@@ -69,8 +66,8 @@ def test_half_splats_are_the_states_to_eleven_bits(path: Path) -> None:
 
 def test_half_splats_take_half_the_bytes(path: Path) -> None:
     sizes = []
-    for states, settings in ((None, GltfSettings()), (cloud(8, 5000), GltfSettings()), (cloud(8, 5000), HALF)):
-        write_usdz(path, growing_ball(8), FPS, states, settings=settings)
+    for states, half in ((None, False), (cloud(8, 5000), False), (cloud(8, 5000), True)):
+        write_usdz(path, growing_ball(8), FPS, states, half=half)
         sizes.append(path.stat().st_size)
     mesh, floats, halves = sizes
     assert 0.5 <= (halves - mesh) / (floats - mesh) < 0.62  # opacities and colors stay floats: .55 expected
@@ -80,7 +77,6 @@ def test_orientations_of_usd_turn_as_ours(path: Path) -> None:
     quarter = torch.tensor([[[math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4)]]])  # around z: x becomes y
     write_usdz(path, growing_ball(1), FPS, replace(cloud(1, 1, 1), quats=quarter))
     stage = Usd.Stage.Open(str(path))
-    stage.GetDefaultPrim().GetVariantSet("representation").SetVariantSelection("splats")
     (quat,) = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/asset/splats")).GetOrientationsAttr().Get(0)
     assert Gf.IsClose(quat.Transform(Gf.Vec3f(1, 0, 0)), Gf.Vec3f(0, 1, 0), 1e-6)
 
@@ -93,4 +89,4 @@ def test_mesh_and_splats_are_never_shown_together(path: Path) -> None:
         if choice:
             stage.GetDefaultPrim().GetVariantSet("representation").SetVariantSelection(choice)
         shown[choice] = [prim.GetName() for prim in stage.Traverse() if prim.IsA(UsdGeom.Gprim)]
-    assert shown == {None: ["subject"], "splats": ["splats"], "mesh": ["subject"]}
+    assert shown == {None: ["splats"], "splats": ["splats"], "mesh": ["subject"]}

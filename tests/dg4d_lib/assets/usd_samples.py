@@ -5,13 +5,11 @@ from dataclasses import replace
 import torch
 import trimesh
 
-from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.textured import TexturedMesh
 
 FRAMES, FPS = 4, 12.0
-HALF = GltfSettings(quantized=True)
 
 
 def ball(subdivisions: int = 1) -> TexturedMesh:

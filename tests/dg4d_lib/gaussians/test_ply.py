@@ -30,6 +30,26 @@ def test_a_cloud_comes_back_exactly(tmp_path: Path, count: int) -> None:
         assert torch.equal(back, given)
 
 
+@pytest.mark.parametrize("count", [0, 7])
+def test_a_cloud_in_the_axes_of_other_programs_comes_back_exactly(tmp_path: Path, count: int) -> None:
+    write_ply(tmp_path / "a.ply", cloud(count), y_down=True)
+    for back, given in zip(fields(read_ply(tmp_path / "a.ply", y_down=True)), fields(cloud(count)), strict=True):
+        assert torch.equal(back, given)
+
+
+def test_another_reader_sees_the_cloud_with_y_down(tmp_path: Path) -> None:
+    """Turn positions and covariances by 180 degrees around x: y and z change their signs."""
+    write_ply(tmp_path / "a.ply", cloud(), y_down=True)
+    header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0]
+    assert b"comment" not in header  # which Niantic's reader refuses
+    seen, given = gsply.plyread(str(tmp_path / "a.ply")), cloud()
+    flip = np.array([1, -1, -1])
+    assert np.array_equal(seen.means, given.means.numpy() * flip)
+    theirs = replace(given, quats=torch.from_numpy(np.array(seen.quats)))
+    expected = given.covariances.numpy() * np.outer(flip, flip)
+    np.testing.assert_allclose(theirs.covariances.numpy(), expected, rtol=1e-4, atol=1e-5)
+
+
 def test_equal_clouds_give_equal_bytes(tmp_path: Path) -> None:
     for name in ("a.ply", "b.ply"):
         write_ply(tmp_path / name, cloud())

@@ -251,6 +251,7 @@ def test_a_row_that_breaks_what_nobody_thought_of_fails_alone(place: Path, monke
     [
         ("--seed", "99999999999999999999999"), ("--seed", str(2**63)), ("--fps", "0"), ("--fps", "241"),
         ("--fps", "0.5"), ("--fps", "nan"), ("--fps", "inf"), ("--fps", "-1"),
+        ("--height-m", "0"), ("--height-m", "nan"), ("--height-m", "2000"),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("command", [("make", "cat.png"), ("batch", ".")])

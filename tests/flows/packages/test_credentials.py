@@ -72,6 +72,22 @@ def test_a_picture_signed_with_any_kind_of_key_is_trusted_by_those_who_trust_the
     assert np.array_equal(np.asarray(Image.open(picture)), pixels)
 
 
+def test_an_animated_webp_keeps_its_frames_when_it_is_signed(signer: Signer, company: Identity, tmp_path: Path) -> None:
+    path, frames = tmp_path / "preview.webp", [Image.new("RGB", (16, 16), color) for color in ("red", "green", "blue")]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=100, loop=0, lossless=True)
+    assert check_signature(signed(signer, path), anchors=company.root.read_text()).state == "trusted"
+    with Image.open(path) as shown:
+        assert shown.n_frames == 3
+        shown.seek(2)
+        shown.load()
+        assert shown.info["duration"] == 100
+        assert shown.convert("RGB").getpixel((0, 0)) == (0, 0, 255)
+    content = bytearray(path.read_bytes())
+    content[content.index(b"ANMF") + 20] ^= 4
+    path.write_bytes(content)
+    assert check_signature(path).state == "invalid"
+
+
 def test_who_is_vouched_for_by_nobody_here_is_untrusted(signer: Signer, picture: Path, tmp_path: Path) -> None:
     assert check_signature(signed(signer, picture)).state == "untrusted"
     stranger = identity(tmp_path / "stranger")

@@ -22,6 +22,11 @@ export function facts() {
   return JSON.parse(document.getElementById("data-facts").textContent);
 }
 
+/** Returns `radius` and `target` of the input camera; empty in pages without them. */
+export function camera() {
+  return JSON.parse(document.getElementById("data-camera")?.textContent ?? "{}");
+}
+
 /** Returns an object URL for bytes. */
 export function addressOf(bytes, type) {
   return URL.createObjectURL(new Blob([bytes], { type }));

@@ -1,5 +1,5 @@
 // Entry point: connects embedded data, stage, clock and controls. `window.dg4d` is the scripting interface.
-import { bytesOf, facts } from "./embedded.js";
+import { bytesOf, camera, facts } from "./embedded.js";
 import { Cloud } from "./cloud.js";
 import { Controls } from "./controls.js";
 import { readMesh } from "./mesh.js";
@@ -26,10 +26,10 @@ async function start() {
   if (!canDraw()) throw new Error(NO_WEBGL);
   const { mesh, cloud } = await read();
   const player = new Player(Math.max(mesh.duration, cloud?.splats.duration ?? 0), cloud?.splats.fps || mesh.fps || 1);
-  const stage = new Stage(stageElement);
+  const stage = new Stage(stageElement, camera());
   const modes = ["mesh", ...(cloud ? ["splats"] : []), "wireframe"];
   const shown = [mesh, cloud].filter(Boolean);
-  stage.scene.add(...shown.map(({ object }) => object));
+  stage.world.add(...shown.map(({ object }) => object));
   let mode;
 
   const show = (what) => {

@@ -1,5 +1,5 @@
 // Canvas, camera and orbit controls. The canvas is transparent, so the page's background shows through.
-import { DirectionalLight, HemisphereLight, PerspectiveCamera, Scene, WebGLRenderer } from "three";
+import { DirectionalLight, Group, HemisphereLight, PerspectiveCamera, Scene, WebGLRenderer } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 
 // The camera of the input picture: on +z, looking at the origin; as in dg4d_lib/cameras/orbit.py.
@@ -15,10 +15,15 @@ export function canDraw() {
 }
 
 export class Stage {
-  constructor(element) {
+  /** `view`: distance `radius` of the input camera and the `target` that it looks at, in the coordinates of the asset. */
+  constructor(element, { radius = RADIUS, target = [0, 0, 0] } = {}) {
     this.element = element;
     this.renderer = new WebGLRenderer({ canvas: element.querySelector("canvas"), antialias: true, alpha: true });
     this.scene = new Scene();
+    this.world = new Group(); // shows assets of any size and place as the input camera saw them
+    this.world.scale.setScalar(RADIUS / radius);
+    this.world.position.set(...target).multiplyScalar(-RADIUS / radius);
+    this.scene.add(this.world);
     this.camera = new PerspectiveCamera(FOV_DEG, 1, 0.02, 100);
     this.controls = new OrbitControls(this.camera, this.renderer.domElement);
     Object.assign(this.controls, { enableDamping: true, minDistance: NEAREST, maxDistance: FARTHEST });
