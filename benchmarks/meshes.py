@@ -14,10 +14,11 @@ import torch  # isort: skip
 from rich.table import Table
 
 from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.assets.placement import Surface
 from dg4d_lib.mesh.extraction.topology import join_seams
 from dg4d_lib.mesh.folds import SurfaceDefects, genus, surface_defects
 from steps.artifacts.packages import read_manifest
-from steps.artifacts.rendering import Surface, mesh_at, read_surface
+from steps.artifacts.rendering import mesh_at, read_surface
 
 PERCENT = 100
 
