@@ -1,6 +1,6 @@
 """Static stage: optimization of canonical Gaussians, DreamGaussianHD (paper section 3.1)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,6 +17,7 @@ from dg4d_lib.gaussians.density_control import DensifyResult, Grad2dStats, densi
 from dg4d_lib.guidance.interface import GuidancePrior, GuidanceView, ring_size
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import FitSettings, StaticSettings
+from dg4d_lib.visual_hull.known import KnownView
 
 Report = Callable[[int, dict[str, float]], None]
 ADVICE = "lower the learning rates (static.*_lr) or the weights"
@@ -68,6 +69,7 @@ def fit_gaussians(
     generator: torch.Generator,
     report: Report = lambda iteration, values: None,
     input_camera: OrbitCamera | None = None,
+    known: Sequence[KnownView] = (),
 ) -> Gaussians:
     """Fit a cloud to one image, with a guidance prior for unseen views.
 
@@ -80,6 +82,7 @@ def fit_gaussians(
         generator: source of all randomness.
         report: called after every iteration with (iterations done, named losses).
         input_camera: camera of the image; the default is azimuth and elevation 0.
+        known: further images and their cameras; an iteration compares one of them, with the weight of the image.
 
     Raises:
         FitDiverged: the loss became non-finite, or (almost) no Gaussian is left.
@@ -88,6 +91,7 @@ def fit_gaussians(
     device = start.means.device
     color, alpha = resize_cutouts(subject[None].to(device), settings.reference_size)
     white = torch.tensor(WHITE, device=device)
+    others = [resize_cutouts(view.cutout[None].to(device), settings.reference_size) for view in known]
     cloud = _Cloud.of(start, learning_rates(settings))
     grad2d = Grad2dStats.zeros(len(start), device)
     for step in range(1, settings.iterations + 1):
@@ -95,11 +99,17 @@ def fit_gaussians(
         cloud.adam.param_groups[0]["lr"] = log_linear(settings.means_lr, settings.means_lr_end, progress)
         gaussians = cloud.gaussians
 
-        offsets = [torch.zeros(1, len(gaussians), 2, device=device, requires_grad=True)]
-        rendering = rasterize(gaussians, [camera], white, offsets[0])
+        cameras, colors, alphas = [camera], color, alpha
+        if known:
+            chosen = int(torch.randint(len(known), (), generator=generator))
+            side = settings.reference_size
+            cameras = [camera, replace(known[chosen].camera, width=side, height=side)]
+            colors, alphas = torch.cat([color, others[chosen][0]]), torch.cat([alpha, others[chosen][1]])
+        offsets = [torch.zeros(len(cameras), len(gaussians), 2, device=device, requires_grad=True)]
+        rendering = rasterize(gaussians, cameras, white, offsets[0])
         rendered = [(rendering.visible, settings.reference_size)]
-        reference = reference_loss(
-            rendering, color, alpha, settings.color_weight, settings.alpha_weight, settings.ssim_weight
+        reference = len(cameras) * reference_loss(
+            rendering, colors, alphas, settings.color_weight, settings.alpha_weight, settings.ssim_weight
         )
         loss = progress * reference
         guidance = torch.zeros((), device=device)
