@@ -8,6 +8,7 @@ from dg4d_lib.fitting.static import fit_gaussians
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import blob, on_surface
 from dg4d_lib.gaussians.ply import write_ply
+from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.inflation.surface import sample_surface
 from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
 from dg4d_lib.settings import (
@@ -18,7 +19,7 @@ from dg4d_lib.settings import (
     SurfaceStartSettings,
 )
 from steps.artifacts.media import read_png, write_png
-from steps.fitting.priors import make_prior, subject_shapes, subject_turn
+from steps.fitting.priors import known_views, make_prior, read_known_views, subject_shapes, subject_turn
 from steps.fitting.reconstruction import reconstruct_subject
 from steps.fitting.reporting import LossCurves, picture_of_divergence, render_turnaround
 from steps.runtime.job import Job, StepReport
@@ -35,16 +36,18 @@ def run(job: Job) -> StepReport:
     generator = torch.Generator().manual_seed(job.seed)
     rasterize = get_rasterizer(backend)
     device = preferred_device(backend)
+    known = read_known_views(job)
     reconstruction = None
     if isinstance(static.start, LgmStartSettings):
         reconstruction = reconstruct_subject(subject.to(device), static.start, rasterize, generator)
         start, static = reconstruction.gaussians, fine_tuning_settings(static)
     else:
-        start = initial_gaussians(subject, static.start, prior, turn_deg, generator).to(device)
-    chosen = make_prior(prior, [subject], static, job.inputs.get("bank"), job.pictures, turn_deg)
+        start = initial_gaussians(subject, static.start, prior, turn_deg, generator, known).to(device)
+    chosen = make_prior(prior, [subject], static, job.inputs.get("bank"), job.pictures, turn_deg, known)
+    others = known_views(known) if known is not None else []
     curves = LossCurves(static.iterations, job.progress)
     with picture_of_divergence(job, rasterize):
-        gaussians = fit_gaussians(start, subject, chosen.prior, rasterize, static, generator, curves.add)
+        gaussians = fit_gaussians(start, subject, chosen.prior, rasterize, static, generator, curves.add, known=others)
     report = chosen.report(f"{backend} rasterizer")
     report = reconstruction.add_to(report) if reconstruction else report
     write_ply(job.outputs["gaussians"], gaussians)
@@ -64,10 +67,11 @@ def initial_gaussians(
     prior: PriorSettings,
     turn_deg: float,
     generator: torch.Generator,
+    known: Bank | None = None,
 ) -> Gaussians:
     """Initialize Gaussians as a random blob, or as points on the surface of the prior."""
     if isinstance(start, BlobStartSettings):
         return blob(start.points, BLOB_RADIUS, generator)
-    surface = subject_shapes(prior, [subject], turn_deg).surface(0)
+    surface = subject_shapes(prior, [subject], turn_deg, known).surface(0)
     points, _, colors, area = sample_surface(surface, start.points, generator)
     return on_surface(points, colors, area)

@@ -55,9 +55,7 @@ class KnownShapes:
         others = [i for i in range(len(views)) if i not in set(places)]
         if not places:
             return self._geometric.clean(views)
-        color, alpha = render_surface(
-            [self.surface(views[i].frame) for i in places], [views[i].camera for i in places]
-        )
+        color, alpha = render_surface([self.surface(views[i].frame) for i in places], [views[i].camera for i in places])
         both = torch.cat([over_background(color, alpha, 1.0), alpha], -1)
         if others:
             guessed = torch.cat(self._geometric.clean([views[i] for i in others]), -1)

@@ -11,6 +11,7 @@ from pydantic import Field, ValidationError
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.rasterizer.backends import backend_name, require_backend
 from flows.inputs import naming, sources
+from flows.inputs.given_views import ViewsRequest
 from flows.inputs.signing_key import certificate_digest
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen, digest_of
 from steps.profiles import PipelineSettings
@@ -31,6 +32,7 @@ class ConversionRequest(Frozen):
         text: prompt for a text-to-image model.
         video: driving video or folder of frames; then `picture` only names the asset.
         bank: folder of ground-truth views, for the oracle prior.
+        given_views: pictures of other sides.
         commercial_only: refuse weights whose license forbids commercial use.
     """
 
@@ -39,6 +41,7 @@ class ConversionRequest(Frozen):
     text: str = ""
     video: Path | None = None
     bank: Path | None = None
+    given_views: ViewsRequest = ViewsRequest()
     profile: str = "preview"
     settings: PipelineSettings
     seed: int = 0
@@ -63,6 +66,9 @@ class ConversionRequest(Frozen):
         if (self.settings.pack.lods or self.settings.pack.gltf.meshopt) and not find_spec("meshoptimizer"):
             raise BackendUnavailable("pack.lods and pack.gltf.meshopt need meshoptimizer: `deploy/install.sh meshopt`")
         self._check_source()
+        self.given_views.check()
+        if self.given_views and self.text:
+            raise BadInput("--view, --turntable and --cameras show the sides of a picture; --text has none to show")
         if self.bank is not None:
             sources.check_bank(self.bank)
         oracle = self.settings.prior.kind == "oracle"
@@ -113,6 +119,7 @@ class ConversionRequest(Frozen):
                 text=sources.single_spaced(self.text),
                 moving=self._suffix in sources.ALWAYS_MOVING or self.video is not None,
                 bank=sources.put_bank(self.bank, store) if self.bank is not None else None,
+                views=self.given_views.put(store, footage),
                 profile=self.profile,
                 settings=PipelineSettings.model_validate(without_paths(self.settings.model_dump(mode="json"))),
                 seed=self.seed,
@@ -165,6 +172,7 @@ class ConversionJob(Frozen):
     Attributes:
         source: picture, video, or frames; the prompt if `drawn`.
         text: that prompt.
+        views: pictures of other sides.
         moving: True if `source` is certainly a video.
     """
 
@@ -173,6 +181,7 @@ class ConversionJob(Frozen):
     text: str = ""
     moving: bool = False
     bank: ArtifactRef | None = None
+    views: ArtifactRef | None = None
     profile: str
     settings: PipelineSettings
     seed: int = Field(ge=0, le=LARGEST_SEED)
@@ -241,6 +250,11 @@ def job_from_record(
             raise BadInput(f"{path} is not the source of this package: its digest is {given}, recorded {ref.digest}")
         if not store.has(ref):
             raise BadInput(f"the source of this package ({ref.digest}) is not in the store: give it with {option}")
+    if job.views is not None and not store.has(job.views):
+        raise BadInput(
+            f"the views of this package ({job.views.digest}) are not in the store; make the asset again with its "
+            "--view, --turntable or --cameras"
+        )
     return job
 
 

@@ -109,7 +109,7 @@ class Roots(Frozen):
         if item.request is None:
             return
         files = (None if item.remote else item.request.picture, item.request.video, item.request.bank)
-        self.check_files(file for file in files if file is not None)
+        self.check_files(file for file in (*files, *item.request.given_views.files()) if file is not None)
         self.check_weights(item.request.settings.model_dump(mode="json"))
 
     def check_knobs(self, knobs: Mapping[str, Any]) -> None:

@@ -58,6 +58,7 @@ class Source:
         fps: frames per second after sampling, which keeps the duration.
         kind: picture or video.
         notes: sentences for the report about dropped frames and assumptions.
+        count: frames of the file; `frames` holds `evenly_spaced` ones.
     """
 
     frames: Float[Tensor, "t h w 4"]
@@ -65,6 +66,7 @@ class Source:
     fps: float
     kind: Literal["picture", "video"]
     notes: tuple[str, ...] = ()
+    count: int = 1
 
 
 def read_source(
@@ -118,7 +120,7 @@ def _video(
     kept = frames.shape[0]
     if kept < count:
         notes = (*notes, f"{kept} of the video's {count} frames are used, evenly spaced; it lasts as long as before.")
-    return Source(frames, has_alpha and _is_transparent(frames), thinned_rate(fps, count, kept), "video", notes)
+    return Source(frames, has_alpha and _is_transparent(frames), thinned_rate(fps, count, kept), "video", notes, count)
 
 
 def _is_transparent(frames: Float[Tensor, "t h w 4"]) -> bool:

@@ -1,0 +1,234 @@
+"""Step that turns pictures of other sides, a turntable or known cameras into a bank of views beside the input."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dg4d_lib.errors import BadInput
+from dg4d_lib.images import over_white
+from dg4d_lib.settings import SubjectSettings
+from dg4d_lib.video.subject import prepare_subject
+from dg4d_lib.visual_hull.adjusting import adjust_exposure, match_scale, same_scale
+from dg4d_lib.visual_hull.agreement import Agreement, agreement, hull_alpha, smaller, turntable_score
+from dg4d_lib.visual_hull.known import KnownView, known_view
+from steps.artifacts.archives import unpack
+from steps.artifacts.media import read_frames, read_png, write_png
+from steps.runtime.job import Job, StepReport
+from steps.sources.bank_writer import write_bank
+from steps.sources.clips import evenly_spaced
+from steps.sources.placing import place_pictures
+from steps.sources.reader import Source, read_source
+from steps.sources.views import GivenView, GivenViews, check_apart, read_views
+
+TURNTABLE_FRAMES = 24  # of a turntable are used
+FEWEST_FRAMES = 8  # of a turntable
+STILL = 0.004  # largest mean difference of a turntable's frames from its first, in [0, 1]: below, nothing turns
+OPEN_SHARE = 3.0  # difference of last and first frame, in largest steps between frames: above, the turn is not whole
+LEAST_FILLED = 0.78  # share of a silhouette that the hull of all fills: below, a view is not of this subject
+LEAST_TURN = 0.7  # mean share for a turntable
+INPUT = "the input"
+Moments = list[list[KnownView]]  # views by frame
+
+
+def run(job: Job) -> StepReport:
+    """Write the bank of known views, and a picture of them beside the hull that they share.
+
+    Raises:
+        BadInput: a view is not of the subject, or a file cannot be used.
+    """
+    settings: SubjectSettings = job.settings.subject
+    with TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        inputs = _input_frames(job, folder / "footage")
+        unpack(job.inputs["views"], folder / "views", "the zip of views")
+        given = read_views(folder / "views")
+        job.progress(1, 3, {})
+        known = _Reader(folder / "views", settings, inputs, job.inputs["source"])
+        moments, notes = known.turntable(given) if given.turntable else known.views(given)
+    job.progress(2, 3, {})
+    first = [known_view(inputs[0], name=INPUT), *moments[0]]
+    write_png(job.outputs["picture"], picture_of(first))
+    write_png(job.pictures / "views.png", picture_of(first))
+    notes = (*notes, *judge(first, agreement(first), LEAST_TURN if given.turntable else LEAST_FILLED))
+    adjusted = adjust_exposure(first)
+    notes = (*notes, *exposure_notes(first, adjusted))
+    if len(moments) == 1:
+        moments = [adjusted[1:]]
+    write_bank(job.outputs["known_views"], moments, job.pictures)
+    job.progress(3, 3, {})
+    return StepReport(notes=notes)
+
+
+class _Reader:
+    """Reader of the pictures beside an input.
+
+    Args:
+        folder: with the files of `views.json`.
+        settings: of the input, which all pictures share.
+        inputs: frames of the input, cut out.
+        original: file of the input.
+    """
+
+    def __init__(
+        self, folder: Path, settings: SubjectSettings, inputs: Float[Tensor, "t s s 4"], original: Path
+    ) -> None:
+        self.folder, self.settings, self.inputs, self.original = folder, settings, inputs, original
+
+    def source(self) -> Source:
+        """Return the decoded input."""
+        most = max(2, len(self.inputs))
+        return read_source(self.original, self.folder, most, self.settings.max_decode_gb)
+
+    def views(self, given: GivenViews) -> tuple[Moments, tuple[str, ...]]:
+        """Return the views of pictures and of videos beside the input's."""
+        sources = [self._read(view.file, view.name) for view in given.views]
+        moving = [source.kind == "video" for source in sources]
+        if any(moving) and not given.input_camera:
+            name = given.views[moving.index(True)].name
+            raise BadInput(f"{name} is a video; --view takes pictures: give videos of other sides with --cameras")
+        if all(moving):
+            return self._moving(given, sources)
+        if any(moving):
+            raise BadInput("--cameras names pictures and videos; give either pictures of one moment, or videos of all")
+        if given.input_camera is not None:
+            views = place_pictures(given, sources, self.source(), self.inputs[:1])
+            return [[moment[0] for moment in views]], ()
+        cutouts, notes = zip(*(self._cut(source) for source in sources), strict=True)
+        views = [self._scaled(view, cutout[0]) for view, cutout in zip(given.views, cutouts, strict=True)]
+        return [views], tuple(dict.fromkeys(note for several in notes for note in several))
+
+    def turntable(self, given: GivenViews) -> tuple[Moments, tuple[str, ...]]:
+        """Return the views of a turntable in the direction that fits better, and those of pictures beside it."""
+        source = self._read(given.turntable, "the turntable", TURNTABLE_FRAMES)
+        check_turn(source)
+        places = evenly_spaced(source.count, TURNTABLE_FRAMES)
+        cutouts, notes = self._cut(source)
+        angles = [360 * place / source.count for place in places]
+        views = [
+            self._scaled(GivenView(file="", name=f"turntable at {angle:.0f} degrees", azimuth=angle), cutout)
+            for angle, cutout in zip(angles, cutouts, strict=True)
+        ]
+        views = turned(known_view(self.inputs[0], name=INPUT), views[1:])
+        if given.views:
+            (more,), other_notes = self.views(given)
+            check_apart([(v.camera.azimuth_deg, v.camera.elevation_deg, v.name) for v in (*more, *views)])
+            views, notes = [*views, *more], (*notes, *other_notes)
+        return [views], notes
+
+    def _moving(self, given: GivenViews, sources: Sequence[Source]) -> tuple[Moments, tuple[str, ...]]:
+        """Return the views of synchronized videos by frame."""
+        count = len(self.inputs)
+        for view, source in zip(given.views, sources, strict=True):
+            if len(source.frames) != count:
+                raise BadInput(
+                    f"{view.name} has {source.count} frames and the input {count}; synchronized videos must have "
+                    "equally many"
+                )
+        placed = place_pictures(given, sources, self.source(), self.inputs)
+        return [[view[frame] for view in placed] for frame in range(count)], ()
+
+    def _read(self, file: str, name: str, frames: int = 0) -> Source:
+        most = frames or max(2, len(self.inputs))
+        try:
+            return read_source(self.folder / file, self.folder, most, self.settings.max_decode_gb)
+        except BadInput as error:
+            raise BadInput(f"{name}: {error}") from error
+
+    def _cut(self, source: Source) -> tuple[Float[Tensor, "t s s 4"], tuple[str, ...]]:
+        return prepare_subject(source.frames, source.has_alpha, self.settings)
+
+    def _scaled(self, view: GivenView, cutout: Float[Tensor, "s s 4"]) -> KnownView:
+        """Return a view in the scale of the input."""
+        reference = self.inputs[0]
+        if not same_scale(cutout, reference):
+            cutout = match_scale(cutout, reference, view.azimuth)
+        return known_view(cutout, view.azimuth, view.elevation, view.name)
+
+
+def check_turn(source: Source) -> None:
+    """Refuse a turntable that is a picture, too short, still, or not closed.
+
+    Raises:
+        BadInput: says what it is.
+    """
+    if source.kind != "video" or source.count < FEWEST_FRAMES:
+        raise BadInput(
+            f"the turntable has {source.count} frame{'s' * (source.count != 1)}; give a video of one whole turn with "
+            f"{FEWEST_FRAMES} or more"
+        )
+    color = over_white(source.frames)
+    from_first = (color - color[:1]).abs().mean((1, 2, 3))
+    steps = color.diff(dim=0).abs().mean((1, 2, 3))
+    if float(from_first.max()) < STILL:
+        raise BadInput("the turntable shows no turn: its frames are alike; film the still subject turned once")
+    gap = source.count - 1 - evenly_spaced(source.count, TURNTABLE_FRAMES)[-2]
+    if float(from_first[-1]) > OPEN_SHARE * max(float(steps.max()), float(steps[-1]) / gap):
+        raise BadInput(
+            "the turntable is no whole turn: its last frame is unlike its first; film one turn, cut right before the "
+            "first picture comes back"
+        )
+
+
+def turned(front: KnownView, views: Sequence[KnownView]) -> list[KnownView]:
+    """Return the views of a turntable, with the sign of their azimuths that fits the input better."""
+    reverse = [view.at(view.camera.elevation_deg, -view.camera.azimuth_deg % 360) for view in views]
+    return max(([*views], reverse), key=lambda ring: turntable_score([front, *ring]))
+
+
+def judge(views: Sequence[KnownView], found: Agreement, least: float) -> tuple[str, ...]:
+    """Return notes about a view that contradicts the others.
+
+    Raises:
+        BadInput: a view shows something else.
+    """
+    lowest = min(found.filled)
+    if lowest < least:
+        named = f"{_place(views[found.odd])} contradicts the others" if found.odd else "they contradict each other"
+        raise BadInput(
+            f"the views do not show one subject from their azimuths: {named}; only {lowest:.0%} of a silhouette, at "
+            f"least {least:.0%}, agrees with the rest. Check the pictures and the azimuths: 90 is the side that the "
+            "input shows on the right, 180 the back"
+        )
+    if found.odd is None:
+        return ()
+    return (
+        f"{_place(views[found.odd])} contradicts the other views: they fill {lowest:.0%} of a silhouette; check it in "
+        "the picture of prepare_views",
+    )
+
+
+def exposure_notes(before: Sequence[KnownView], after: Sequence[KnownView]) -> tuple[str, ...]:
+    """Return a note for every view that was made brighter or darker."""
+    changed = [old for old, new in zip(before, after, strict=True) if new is not old]
+    return (f"exposure adjusted to the input: {', '.join(_place(view) for view in changed)}",) if changed else ()
+
+
+def picture_of(views: Sequence[KnownView]) -> Float[Tensor, "h w 3"]:
+    """Compose the pictures in a row, and under each the outline of the hull that all share."""
+    small = [smaller(view) for view in views]
+    shown = torch.cat([over_white(view.cutout) for view in small], 1)
+    try:
+        alpha = torch.cat([*hull_alpha(small)], 1)
+    except BadInput:
+        alpha = torch.zeros_like(shown[..., :1])
+    mask = torch.cat([view.cutout[..., 3:] for view in small], 1)
+    missing = ((mask > 0.5) & (alpha < 0.5)).float()  # red: in the picture, and excluded by the others
+    under = (1 - 0.6 * alpha).expand_as(shown) * (1 - missing) + missing * torch.tensor([0.9, 0.1, 0.1])
+    return torch.cat([shown, under])
+
+
+def _place(view: KnownView) -> str:
+    camera = view.camera
+    return f"{view.name or 'a view'} (azimuth {camera.azimuth_deg:g}, elevation {camera.elevation_deg:g})"
+
+
+def _input_frames(job: Job, scratch: Path) -> Float[Tensor, "t s s 4"]:
+    """Return the frames of the input; a picture is one."""
+    if "footage" in job.inputs:
+        video = read_frames(job.inputs["footage"], scratch)
+        return torch.cat([video.frames, video.alpha], -1)
+    return read_png(job.inputs["subject"])[None]
