@@ -95,8 +95,8 @@ class _Reader:
         if any(moving):
             raise BadInput("--cameras names pictures and videos; give either pictures of one moment, or videos of all")
         if given.input_camera is not None:
-            views = place_pictures(given, sources, self.source(), self.inputs[:1])
-            return [[moment[0] for moment in views]], ()
+            placed = place_pictures(given, sources, self.source(), self.inputs[:1])
+            return [[frames[0] for frames in placed]], ()
         cutouts, notes = zip(*(self._cut(source) for source in sources), strict=True)
         views = [self._scaled(view, cutout[0]) for view, cutout in zip(given.views, cutouts, strict=True)]
         return [views], tuple(dict.fromkeys(note for several in notes for note in several))

@@ -84,7 +84,7 @@ def make_prior(
     bank: Path | None,
     scratch: Path,
     turn_deg: float = 0.0,
-    known: Bank | None = None,
+    sides: Bank | None = None,
 ) -> LoadedPrior:
     """Make the guidance prior of a stage.
 
@@ -95,7 +95,7 @@ def make_prior(
         bank: zip of ground-truth views, for the oracle.
         scratch: folder for unpacking.
         turn_deg: azimuth by which the subject is turned; see `subject_turn`.
-        known: views of other sides that the user gave; priors with shapes take them as their own.
+        sides: views of other sides that the user gave; priors with shapes take them as their own.
 
     Raises:
         BadInput: the oracle has no bank, or the weights are damaged or of another model.
@@ -104,11 +104,11 @@ def make_prior(
     noise = TimestepSchedule(stage.t_max_start, stage.t_max_end, uniform=stage.noise_draw == "uniform")
     match settings:
         case GeometricPriorSettings() | LearnedPriorSettings():
-            shapes = subject_shapes(settings, cutouts, turn_deg, known)
+            shapes = subject_shapes(settings, cutouts, turn_deg, sides)
             note, weight = GEOMETRIC_NOTE, 1.0
             if isinstance(shapes, KnownShapes):
                 prior = AnalyticPrior(shapes.clean, noise, frames=shapes.frames)
-                return LoadedPrior(prior, known_note(known), shapes=shapes)
+                return LoadedPrior(prior, known_note(sides), shapes=shapes)
             if isinstance(settings, LearnedPriorSettings):
                 note, weight = LEARNED_NOTE, settings.weight
             return LoadedPrior(AnalyticPrior(shapes.clean, noise, weight=weight), note, shapes=shapes)
@@ -129,7 +129,7 @@ def make_prior(
 
 
 def subject_shapes(
-    settings: PriorSettings, cutouts: Sequence[Float[Tensor, "h w 4"]], turn_deg: float, known: Bank | None = None
+    settings: PriorSettings, cutouts: Sequence[Float[Tensor, "h w 4"]], turn_deg: float, sides: Bank | None = None
 ) -> SubjectShapes:
     """Return the shapes behind a prior, by default inflated ones.
 
@@ -137,17 +137,17 @@ def subject_shapes(
         settings: of the prior; one that has no shapes of its own gets the inflation with its defaults.
         cutouts: the subject at every frame.
         turn_deg: turn of the subject about the vertical; see `subject_turn`.
-        known: views of other sides; their hull replaces the shapes of their frames.
+        sides: views of other sides; their hull replaces the shapes of their frames.
     """
     if isinstance(settings, LearnedPriorSettings):
         shapes: SubjectShapes = LearnedShapes(packaged.packaged_network(), cutouts, settings, turn_deg)
     else:
         own = settings if isinstance(settings, GeometricPriorSettings) else GeometricPriorSettings()
         shapes = InflatedSurfaces(cutouts, own, turn_deg)
-    if known is None:
+    if sides is None:
         return shapes
-    frames = [frame for frame in known.frames if frame < len(cutouts)]
-    return KnownShapes(shapes, {frame: [known_view(cutouts[frame]), *known_views(known, frame)] for frame in frames})
+    frames = [frame for frame in sides.frames if frame < len(cutouts)]
+    return KnownShapes(shapes, {frame: [known_view(cutouts[frame]), *known_views(sides, frame)] for frame in frames})
 
 
 def known_views(bank: Bank, frame: int = 0) -> list[KnownView]:
