@@ -12,7 +12,7 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.images import over_white
 from dg4d_lib.settings import SubjectSettings
 from dg4d_lib.video.subject import prepare_subject
-from dg4d_lib.visual_hull.adjusting import adjust_exposure, match_scale, same_scale
+from dg4d_lib.visual_hull.adjusting import adjust_exposure, match_scale, scaling_between
 from dg4d_lib.visual_hull.agreement import Agreement, agreement, hull_alpha, smaller, turntable_score
 from dg4d_lib.visual_hull.known import KnownView, known_view
 from steps.artifacts.archives import unpack
@@ -30,6 +30,7 @@ STILL = 0.004  # largest mean difference of a turntable's frames from its first,
 OPEN_SHARE = 3.0  # difference of last and first frame, in largest steps between frames: above, the turn is not whole
 LEAST_FILLED = 0.78  # share of a silhouette that the hull of all fills: below, a view is not of this subject
 LEAST_TURN = 0.7  # mean share for a turntable
+GOOD = 0.95  # mean share from which pictures are taken to have the scale of the input
 INPUT = "the input"
 Moments = list[list[KnownView]]  # views by frame
 
@@ -98,8 +99,9 @@ class _Reader:
             placed = place_pictures(given, sources, self.source(), self.inputs[:1])
             return [[frames[0] for frames in placed]], ()
         cutouts, notes = zip(*(self._cut(source) for source in sources), strict=True)
-        views = [self._scaled(view, cutout[0]) for view, cutout in zip(given.views, cutouts, strict=True)]
-        return [views], tuple(dict.fromkeys(note for several in notes for note in several))
+        return [self._scaled(given.views, [cutout[0] for cutout in cutouts])], tuple(
+            dict.fromkeys(note for several in notes for note in several)
+        )
 
     def turntable(self, given: GivenViews) -> tuple[Moments, tuple[str, ...]]:
         """Return the views of a turntable in the direction that fits better, and those of pictures beside it."""
@@ -108,11 +110,7 @@ class _Reader:
         places = evenly_spaced(source.count, TURNTABLE_FRAMES)
         cutouts, notes = self._cut(source)
         angles = [360 * place / source.count for place in places]
-        views = [
-            self._scaled(GivenView(file="", name=f"turntable at {angle:.0f} degrees", azimuth=angle), cutout)
-            for angle, cutout in zip(angles, cutouts, strict=True)
-        ]
-        views = turned(known_view(self.inputs[0], name=INPUT), views[1:])
+        views = self._turned(cutouts, angles)
         if given.views:
             (more,), other_notes = self.views(given)
             check_apart([(v.camera.azimuth_deg, v.camera.elevation_deg, v.name) for v in (*more, *views)])
@@ -141,12 +139,27 @@ class _Reader:
     def _cut(self, source: Source) -> tuple[Float[Tensor, "t s s 4"], tuple[str, ...]]:
         return prepare_subject(source.frames, source.has_alpha, self.settings)
 
-    def _scaled(self, view: GivenView, cutout: Float[Tensor, "s s 4"]) -> KnownView:
-        """Return a view in the scale of the input."""
-        reference = self.inputs[0]
-        if not same_scale(cutout, reference):
-            cutout = match_scale(cutout, reference, view.azimuth)
-        return known_view(cutout, view.azimuth, view.elevation, view.name)
+    def _scaled(self, given: Sequence[GivenView], cutouts: Sequence[Float[Tensor, "s s 4"]]) -> list[KnownView]:
+        """Return views in the scale of the input: as they are, or with its height, whichever agrees better."""
+        heights = [match_scale(cut, self.inputs[0], view.azimuth) for view, cut in zip(given, cutouts, strict=True)]
+        front = known_view(self.inputs[0], name=INPUT)
+        as_given, matched = (
+            [known_view(cut, v.azimuth, v.elevation, v.name) for v, cut in zip(given, chosen, strict=True)]
+            for chosen in (cutouts, heights)
+        )
+        unchanged = agreement([front, *as_given]).mean
+        if unchanged > GOOD or unchanged >= agreement([front, *matched]).mean:
+            return as_given
+        return matched
+
+    def _turned(self, cutouts: Float[Tensor, "t s s 4"], angles: Sequence[float]) -> list[KnownView]:
+        """Return the views of a turntable without its front, in the direction that fits better."""
+        scaling = scaling_between(cutouts[0], self.inputs[0])
+        views = []
+        for angle, cutout in list(zip(angles, cutouts, strict=True))[1:]:
+            picture = cutout if scaling.is_small else scaling.apply(cutout, angle, self.inputs.shape[1])
+            views.append(known_view(picture, angle, name=f"turntable at {angle:.0f} degrees"))
+        return turned(known_view(self.inputs[0], name=INPUT), views)
 
 
 def check_turn(source: Source) -> None:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -14,7 +14,7 @@ from dg4d_lib.visual_hull.carve import hull
 from dg4d_lib.visual_hull.known import KnownView
 from dg4d_lib.visual_hull.surface import extract, observations
 
-SAME_SCALE = 0.12  # relative difference of heights that perspective explains: larger ones are a difference of scale
+SAME = 0.01  # relative difference of scale that is left as it is
 CELLS = 64
 FEWEST = 30  # vertices that two views must share for a comparison of their exposure
 STIFFNESS = 0.05  # of the gains at 1, relative to a pair that overlaps fully
@@ -22,31 +22,54 @@ LARGEST_GAIN = 2.0
 UNSURE = 0.22  # mean logarithm of a gain that the hull's wrong places alone can cause: on equal exposures up to 0.21
 
 
-def same_scale(cutout: Float[Tensor, "s s 4"], reference: Float[Tensor, "s s 4"]) -> bool:
-    """Return True if a picture shows the subject at the height and size at which the input view shows it."""
-    _, top, _, bottom = bounding_box(cutout[None, ..., 3])
-    _, upper, _, lower = bounding_box(reference[None, ..., 3])
-    height = lower - upper
-    return max(abs(top - upper), abs(bottom - lower), abs(bottom - top - height)) <= SAME_SCALE * height
+@dataclass(frozen=True)
+class Scaling:
+    """Map from the square of the input to that of another picture.
+
+    Attributes:
+        factor: pixels of the picture per pixel of the input.
+        right: shift of the picture's middle in the input's square, pixels, as the input's direction shows it.
+        down: likewise, downwards.
+    """
+
+    factor: float
+    right: float
+    down: float
+
+    @property
+    def is_small(self) -> bool:
+        """True if the pictures already have one scale and place."""
+        return abs(self.factor - 1) < SAME and max(abs(self.right), abs(self.down)) < 1
+
+    def apply(self, cutout: Float[Tensor, "s s 4"], azimuth_deg: float, size: int) -> Float[Tensor, "t t 4"]:
+        """Return a picture from an azimuth in the square of the input; to the sides, the shift across vanishes."""
+        across = self.right * math.cos(math.radians(azimuth_deg))
+        zoom = self.factor * size / cutout.shape[0]
+        x, y = (-2 * zoom * shift / size for shift in (across, self.down))
+        return warped(cutout, torch.tensor([[[zoom, 0, x], [0, zoom, y]]]), size)
+
+
+def scaling_between(cutout: Float[Tensor, "s s 4"], reference: Float[Tensor, "t t 4"]) -> Scaling:
+    """Return the scaling that gives the subject the height and the place that the input shows."""
+    left, top, right, bottom = (edge - cutout.shape[0] / 2 for edge in bounding_box(cutout[None, ..., 3]))
+    first, upper, last, lower = (edge - reference.shape[0] / 2 for edge in bounding_box(reference[None, ..., 3]))
+    factor = (bottom - top) / (lower - upper)
+    return Scaling(factor, (first + last - (left + right) / factor) / 2, (upper + lower - (top + bottom) / factor) / 2)
 
 
 def match_scale(
-    cutout: Float[Tensor, "s s 4"], reference: Float[Tensor, "s s 4"], azimuth_deg: float
-) -> Float[Tensor, "s s 4"]:
-    """Scale and shift a picture so that the subject has the height and vertical place that the input view shows.
+    cutout: Float[Tensor, "s s 4"], reference: Float[Tensor, "t t 4"], azimuth_deg: float
+) -> Float[Tensor, "t t 4"]:
+    """Return a picture of another side with the subject's height and vertical place as in the input.
 
-    Across, the subject's middle is put where the input view has it, as far as the direction shows that axis.
+    Across, the subject's middle is put where the input has it, as far as the direction shows that axis.
     """
-    size = reference.shape[0]
-    left, top, right, bottom = bounding_box(cutout[None, ..., 3])
-    first, upper, last, lower = bounding_box(reference[None, ..., 3])
-    scale = (bottom - top) / (lower - upper)  # picture pixels per pixel of the result
-    middle = ((first + last) / 2 - size / 2) * math.cos(math.radians(azimuth_deg)) + size / 2
-    x = (left + right) / 2 - (middle - size / 2) * scale
-    y = (top + bottom) / 2 - ((upper + lower) / 2 - size / 2) * scale
-    side = cutout.shape[0]
-    matrix = torch.tensor([[[scale * size / side, 0, 2 * x / side - 1], [0, scale * size / side, 2 * y / side - 1]]])
-    return warped(cutout, matrix, size)
+    scaling = scaling_between(cutout, reference)
+    first, _, last, _ = (edge - reference.shape[0] / 2 for edge in bounding_box(reference[None, ..., 3]))
+    left, _, right, _ = (edge - cutout.shape[0] / 2 for edge in bounding_box(cutout[None, ..., 3]))
+    middle = (first + last) / 2 * math.cos(math.radians(azimuth_deg))
+    shift = middle - (left + right) / 2 / scaling.factor
+    return Scaling(scaling.factor, shift, scaling.down).apply(cutout, 0, reference.shape[0])
 
 
 def warped(cutout: Float[Tensor, "h w 4"], matrix: Float[Tensor, "1 2 3"], size: int) -> Float[Tensor, "s s 4"]:

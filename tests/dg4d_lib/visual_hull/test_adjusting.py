@@ -5,7 +5,8 @@ import torch
 from creatures import creature, ring, seen
 
 from dg4d_lib.images import resize
-from dg4d_lib.visual_hull.adjusting import adjust_exposure, match_scale, same_scale
+from dg4d_lib.video.framing import bounding_box
+from dg4d_lib.visual_hull.adjusting import Scaling, adjust_exposure, match_scale, scaling_between
 
 
 def test_darker_pictures_get_the_exposure_of_the_input():
@@ -26,8 +27,17 @@ def test_a_picture_of_another_scale_is_brought_to_that_of_the_input():
     front, side = seen(creature(), 0).cutout, seen(creature(), 90).cutout
     small = torch.zeros_like(side)
     small[30:78, 10:58] = resize(side[None], (48, 48))[0]
-    assert same_scale(side, front) and not same_scale(small, front)
     mended = match_scale(small, front, 90)
-    assert same_scale(mended, front)
+    assert bounding_box(mended[None, ..., 3])[1::2] == pytest.approx(bounding_box(front[None, ..., 3])[1::2], abs=1)
     both, either = (mended[..., 3] > 0.5) & (side[..., 3] > 0.5), (mended[..., 3] > 0.5) | (side[..., 3] > 0.5)
     assert float(both.sum() / either.sum()) > 0.75  # across, the middle is all that is known
+
+
+def test_the_scaling_of_a_picture_is_found_and_undone():
+    front = seen(creature(), 0).cutout
+    changed = Scaling(1.25, 6, -4).apply(front, 0, 96)
+    found = scaling_between(changed, front)
+    assert found.factor == pytest.approx(1 / 1.25, rel=0.03) and not found.is_small
+    back = found.apply(changed, 0, 96)
+    assert float((back[..., 3] - front[..., 3]).abs().mean()) < 0.01
+    assert scaling_between(front, front).is_small
