@@ -55,10 +55,9 @@ class ViewsRequest(Frozen):
         return bool(self.views or self.turntable or self.cameras)
 
     def files(self) -> tuple[Path, ...]:
-        """Return all files that are read, also those that `cameras` names if it can be read."""
-        named = tuple(path for path in (self.turntable, self.cameras) if path is not None)
-        shown = tuple(path for path, _ in _frames(self.cameras)) if self.cameras and self.cameras.is_file() else ()
-        return (*(view.path for view in self.views), *named, *shown)
+        """Return the files that are read; those that `cameras` names lie in or below its folder."""
+        named = (*(view.path for view in self.views), self.turntable, self.cameras)
+        return tuple(path for path in named if path is not None)
 
     def check(self) -> None:
         """Validate files and directions.
@@ -70,7 +69,7 @@ class ViewsRequest(Frozen):
             raise BadInput("--cameras says where every picture was taken; give it without --view and --turntable")
         if len(self.views) > MOST_VIEWS:
             raise BadInput(f"{len(self.views)} views are given; at most {MOST_VIEWS} are used")
-        for path in filter(None, (*(view.path for view in self.views), self.turntable, self.cameras)):
+        for path in self.files():
             naming.check_path(path)
         for view in self.views:
             sources.check_file(view.path)

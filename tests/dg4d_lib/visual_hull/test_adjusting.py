@@ -39,5 +39,5 @@ def test_the_scaling_of_a_picture_is_found_and_undone():
     found = scaling_between(changed, front)
     assert found.factor == pytest.approx(1 / 1.25, rel=0.03) and not found.is_small
     back = found.apply(changed, 0, 96)
-    assert float((back[..., 3] - front[..., 3]).abs().mean()) < 0.01
+    assert float((back[..., 3] - front[..., 3]).abs().mean()) < 0.02  # half a pixel of the outline
     assert scaling_between(front, front).is_small
