@@ -13,18 +13,20 @@ from steps.store.artifact_store import ArtifactMissing, StoreUnreachable
 from steps.store.files import DiskFull
 
 REMARKED = "prepare_subject"  # the matte may be a guess
+COMPARED = "prepare_views"  # a view may contradict the others
+CAPTIONS = {REMARKED: "Source, matte and cut-out", COMPARED: "Views, and the hull that they share"}
 NAME_LENGTH = 80  # characters of an item in the name of a picture
 DIGITS = 12  # of a digest in it
 MOST_PICTURES = 200  # kept files, the newest; they show private input
 
 
 def remark(item: str, label: str, result: StepResult) -> None:
-    """Emit the notes of a cut-out with the path of a picture of source, matte and cut-out."""
+    """Emit the notes of a cut-out, or of views, with the path of a picture that shows them."""
     notes = result.provenance.notes
-    if result.provenance.step != REMARKED or not notes:
+    if result.provenance.step not in CAPTIONS or not notes:
         return
     picture = _saved(item, result.outputs["picture"]) if "picture" in result.outputs else None
-    look = [f"Source, matte and cut-out: {picture}"] if picture else []
+    look = [f"{CAPTIONS[result.provenance.step]}: {picture}"] if picture else []
     emit(StepEvent(item, label, "remark", text=" ".join([*notes, *look])))
 
 
