@@ -134,7 +134,7 @@ COMMANDS: dict[str, Refused] = {
     "make: pick 17": Refused("--pick", USAGE),
     "make: pick with a video": Refused("--pick"),
     "make: a bank without the oracle": Refused("prior.kind=oracle"),
-    "make: a view without an azimuth": Refused("AZIMUTH[,ELEVATION]=FILE"),
+    "make: a view without an azimuth": Refused("is no view"),
     "make: a view from above": Refused("elevations from"),
     "make: a view that is gone": Refused("gone.png does not exist"),
     "make: two views of one direction": Refused("views of one direction"),
