@@ -83,7 +83,8 @@ def test_pictures_become_a_bank_that_replaces_the_guess(tmp_path):
         )
         for b in (None, bank)
     ]
-    assert overlaps[1] > 0.75 > 0.4 > overlaps[0]
+    assert overlaps[0] < 0.4
+    assert overlaps[1] > 0.75
 
 
 def test_the_views_and_their_hull_are_shown(tmp_path):
