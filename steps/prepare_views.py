@@ -14,7 +14,7 @@ from dg4d_lib.settings import SubjectSettings
 from dg4d_lib.video.subject import prepare_subject
 from dg4d_lib.visual_hull.adjusting import adjust_exposure, match_scale, scaling_between
 from dg4d_lib.visual_hull.agreement import Agreement, agreement, hull_alpha, smaller, turntable_score
-from dg4d_lib.visual_hull.known import KnownView, known_view
+from dg4d_lib.visual_hull.known import KnownView, angle_deg, known_view
 from steps.artifacts.archives import unpack
 from steps.artifacts.media import read_frames, read_png, write_png
 from steps.runtime.job import Job, StepReport
@@ -22,7 +22,7 @@ from steps.sources.bank_writer import write_bank
 from steps.sources.clips import evenly_spaced
 from steps.sources.placing import place_pictures
 from steps.sources.reader import Source, read_source
-from steps.sources.views import GivenView, GivenViews, check_apart, read_views
+from steps.sources.views import CLOSE_DEG, GivenView, GivenViews, read_views
 
 TURNTABLE_FRAMES = 24  # of a turntable are used
 FEWEST_FRAMES = 8  # of a turntable
@@ -113,8 +113,8 @@ class _Reader:
         views = self._turned(cutouts, angles)
         if given.views:
             (more,), other_notes = self.views(given)
-            check_apart([(v.camera.azimuth_deg, v.camera.elevation_deg, v.name) for v in (*more, *views)])
-            views, notes = [*views, *more], (*notes, *other_notes)
+            alone = [v for v in views if all(angle_deg(v.camera, own.camera) > CLOSE_DEG for own in more)]
+            views, notes = [*alone, *more], (*notes, *other_notes)
         return [views], notes
 
     def _moving(self, given: GivenViews, sources: Sequence[Source]) -> tuple[Moments, tuple[str, ...]]:

@@ -13,6 +13,8 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 
+SMALLEST = 1e-12
+LEAST_RIGHT = 0.9  # volume spanned by the unit axes of a camera: 1 if they are perpendicular and right-handed
 LEAST_SPREAD = 0.02  # smallest singular value of the normal equations per camera: parallel axes meet nowhere
 FARTHEST_MISS = 0.35  # distance of an axis from the meeting point, relative to the camera's distance
 
@@ -42,8 +44,14 @@ def meeting_point(poses: Float[Tensor, "k 3 4"]) -> Float[Tensor, " 3"]:
     Raises:
         BadInput: the axes are parallel, or the point lies behind cameras or far from their axes.
     """
-    places, forward = poses[:, :, 3], -poses[:, :, 2]
-    forward = forward / forward.norm(dim=-1, keepdim=True)
+    lengths = poses[:, :, :3].norm(dim=1)
+    volumes = torch.linalg.det(poses[:, :, :3]) / lengths.prod(-1).clamp(min=SMALLEST)
+    if bad := [i for i, volume in enumerate(volumes.tolist()) if volume < LEAST_RIGHT]:
+        raise BadInput(
+            f"transform_matrix of frame {bad[0]} (counted from 0) is no rotation and place: its first three columns "
+            "must be perpendicular axes, right, up and backward"
+        )
+    places, forward = poses[:, :, 3], -poses[:, :, 2] / lengths[:, 2:]
     projectors = torch.eye(3, dtype=poses.dtype) - forward[:, :, None] * forward[:, None]
     normal = projectors.sum(0)
     if float(torch.linalg.svdvals(normal)[-1]) < LEAST_SPREAD * len(poses):
@@ -73,6 +81,8 @@ def orbit_places(poses: Float[Tensor, "k 3 4"], reference: int, point: Float[Ten
     """
     back = poses[reference, :, 3] - point
     unit = float(back.norm())
+    if unit < SMALLEST:
+        raise BadInput("the input's camera is inside of the subject; check its transform_matrix")
     z = back / unit
     x = torch.linalg.cross(poses[reference, :, 1], z)
     x = x / x.norm()

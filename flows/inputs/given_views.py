@@ -70,6 +70,7 @@ class ViewsRequest(Frozen):
         if len(self.views) > MOST_VIEWS:
             raise BadInput(f"{len(self.views)} views are given; at most {MOST_VIEWS} are used")
         for path in self.files():
+            naming.check_text(path.name, "the file name")
             naming.check_path(path)
         for view in self.views:
             sources.check_file(view.path)
@@ -78,6 +79,7 @@ class ViewsRequest(Frozen):
             sources.check_video(self.turntable)
         if self.cameras is not None:
             for path, _ in _frames(self.cameras):
+                naming.check_text(path.name, "the file name")
                 sources.check_file(path)
 
     def put(self, store: ArtifactStore, source: Path | None) -> ArtifactRef | None:

@@ -133,7 +133,8 @@ class _Loose(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
 
 
-Row = tuple[float, float, float, float]
+Bounded = Annotated[float, Field(ge=-1e6, le=1e6)]  # larger ones are no places, and overflow when squared
+Row = tuple[Bounded, Bounded, Bounded, Bounded]
 
 
 class TransformsFrame(_Loose):

@@ -43,7 +43,7 @@ def test_cameras_come_back_as_they_were_placed_in_any_coordinates(change):
 
 def test_cameras_that_look_away_are_named():
     away = pose(90, 0, 2)
-    away[:, [0, 2]] *= -1
+    away[:, [0, 2]] *= -1  # turned about its up axis
     poses = torch.stack([pose(0, 0, 2), pose(40, 10, 2), pose(-40, 0, 2), away])
     with pytest.raises(BadInput, match="look away from the subject: frames 3 of 4"):
         meeting_point(poses)
@@ -54,3 +54,11 @@ def test_parallel_cameras_are_refused():
     shifted[0, 3] += 1
     with pytest.raises(BadInput, match="look in one direction"):
         meeting_point(torch.stack([pose(0, 0, 2), shifted]))
+
+
+@pytest.mark.parametrize("column", [0, 1])
+def test_matrices_that_are_no_rotation_are_refused(column):
+    flat = pose(90, 0, 2)
+    flat[:, column] = flat[:, 2]
+    with pytest.raises(BadInput, match=r"frame 1 .* is no rotation"):
+        meeting_point(torch.stack([pose(0, 0, 2), flat]))
