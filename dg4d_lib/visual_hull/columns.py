@@ -29,6 +29,7 @@ FARTHEST = 0.9  # world units: largest distance of a depth from the plane z = 0
 TURNS_DEG = tuple(range(-45, 46, 5))
 PREFERENCE = 0.0005  # IoU per degree by which a smaller turn is preferred
 ROUNDS = 6  # of smoothing and moving
+FARTHEST_STEP = 0.1  # world units by which a single column may leave the smooth middle: more makes spikes
 SMOOTH = 4.0  # pixels of `SIZE`
 DEEP_ENOUGH = 0.5  # of the margin in the input view: so far inside of the other silhouettes lies the middle of a column
 
@@ -93,7 +94,8 @@ def _moved(
         rows, columns = ndimage.distance_transform_edt(weight < 1e-3, return_distances=False, return_indices=True)
         middle = smooth[rows, columns]
     cost = np.abs(depths - middle[..., None]) + np.where(allowed > step, 0, 1e3)
-    return np.where(mask & (allowed > step).any(-1), depths[cost.argmin(-1)], middle)
+    nearest = depths[cost.argmin(-1)]
+    return np.where(mask & (np.abs(nearest - middle) < FARTHEST_STEP), nearest, middle)
 
 
 def _inside(
