@@ -29,7 +29,8 @@ FEWEST_FRAMES = 8  # of a turntable
 STILL = 0.004  # largest mean difference of a turntable's frames from its first, in [0, 1]: below, nothing turns
 OPEN_SHARE = 3.0  # difference of last and first frame, in largest steps between frames: above, the turn is not whole
 LEAST_FILLED = 0.78  # share of a silhouette that the hull of all fills: below, a view is not of this subject
-LEAST_TURN = 0.7  # mean share for a turntable
+FEW = 4  # views; among more, thin parts seen edge-on fill little of single silhouettes
+LEAST_MEAN = 0.6  # mean share of many silhouettes, likewise
 GOOD = 0.95  # mean share from which pictures are taken to have the scale of the input
 INPUT = "the input"
 Moments = list[list[KnownView]]  # views by frame
@@ -54,7 +55,7 @@ def run(job: Job) -> StepReport:
     first = [known_view(inputs[0], name=INPUT), *moments[0]]
     write_png(job.outputs["picture"], picture_of(first))
     write_png(job.pictures / "views.png", picture_of(first))
-    notes = (*notes, *judge(first, agreement(first), LEAST_TURN if given.turntable else LEAST_FILLED))
+    notes = (*notes, *judge(first, agreement(first)))
     adjusted = adjust_exposure(first)
     notes = (*notes, *exposure_notes(first, adjusted))
     if len(moments) == 1:
@@ -192,17 +193,18 @@ def turned(front: KnownView, views: Sequence[KnownView]) -> list[KnownView]:
     return max(([*views], reverse), key=lambda ring: turntable_score([front, *ring]))
 
 
-def judge(views: Sequence[KnownView], found: Agreement, least: float) -> tuple[str, ...]:
+def judge(views: Sequence[KnownView], found: Agreement) -> tuple[str, ...]:
     """Return notes about a view that contradicts the others.
 
     Raises:
         BadInput: a view shows something else.
     """
     lowest = min(found.filled)
-    if lowest < least:
+    share, least = (found.mean, LEAST_MEAN) if len(views) > FEW and found.odd is None else (lowest, LEAST_FILLED)
+    if share < least:
         named = f"{_place(views[found.odd])} contradicts the others" if found.odd else "they contradict each other"
         raise BadInput(
-            f"the views do not show one subject from their azimuths: {named}; only {lowest:.0%} of a silhouette, at "
+            f"the views do not show one subject from their azimuths: {named}; only {share:.0%} of a silhouette, at "
             f"least {least:.0%}, agrees with the rest. Check the pictures and the azimuths: 90 is the side that the "
             "input shows on the right, 180 the back"
         )
