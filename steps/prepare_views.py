@@ -29,6 +29,7 @@ FEWEST_FRAMES = 8  # of a turntable
 STILL = 0.004  # largest mean difference of a turntable's frames from its first, in [0, 1]: below, nothing turns
 OPEN_SHARE = 3.0  # difference of last and first frame, in largest steps between frames: above, the turn is not whole
 LEAST_FILLED = 0.78  # share of a silhouette that the hull of all fills: below, a view is not of this subject
+RELIABLE = 0.9  # mean share from which colors of the hull's surface are compared
 FEW = 4  # views; among more, thin parts seen edge-on fill little of single silhouettes
 LEAST_MEAN = 0.6  # mean share of many silhouettes, likewise
 GOOD = 0.95  # mean share from which pictures are taken to have the scale of the input
@@ -55,8 +56,9 @@ def run(job: Job) -> StepReport:
     first = [known_view(inputs[0], name=INPUT), *moments[0]]
     write_png(job.outputs["picture"], picture_of(first))
     write_png(job.pictures / "views.png", picture_of(first))
-    notes = (*notes, *judge(first, agreement(first)))
-    adjusted = adjust_exposure(first)
+    found = agreement(first)
+    notes = (*notes, *judge(first, found))
+    adjusted = adjust_exposure(first) if found.mean > RELIABLE else first
     notes = (*notes, *exposure_notes(first, adjusted))
     if len(moments) == 1:
         moments = [adjusted[1:]]
