@@ -26,6 +26,8 @@ OUTSIDE = -1.0  # world units: margin of points that no picture shows
 TRUNCATION = 2.0  # cells: margins are clipped there
 CHUNK = 1 << 18  # points at a time
 ROUND_EXPONENT = 2.5  # of the superellipse of two orthogonal views; 2 is an ellipse
+MANY = 6  # views; from more, each may err by `SLACK` before it removes a thin part
+SLACK = 0.5  # pixels
 SMALLEST_RADIUS = 1.5  # pixels: thinner parts are not rounded
 
 
@@ -100,7 +102,12 @@ def _apart(views: Sequence[KnownView]) -> str:
 def _silhouettes(views: Sequence[KnownView]) -> list[_Silhouette]:
     share = 2 / max(2, len(views))
     return [
-        _Silhouette(view, _planes(view), view.camera.viewmat().float(), share * (1 if len(views) > 1 else 0))
+        _Silhouette(
+            view,
+            _planes(view, SLACK if len(views) > MANY else 0.0),
+            view.camera.viewmat().float(),
+            share * (1 if len(views) > 1 else 0),
+        )
         for view in views
     ]
 
@@ -115,7 +122,7 @@ def _directions(views: Sequence[KnownView]) -> int:
     return len(kept)
 
 
-def _planes(view: KnownView) -> Float[Tensor, "1 2 h w"]:
+def _planes(view: KnownView, slack: float) -> Float[Tensor, "1 2 h w"]:
     """Return the signed distance to the outline, exact to parts of a pixel, and the place in the silhouette."""
     mask, alpha = subject_mask(view.cutout[..., 3].double().cpu().numpy())
     outside = ndimage.distance_transform_edt(~mask)
@@ -125,7 +132,7 @@ def _planes(view: KnownView) -> Float[Tensor, "1 2 h w"]:
     signed = np.where(edge, alpha.clip(0, 1) - 0.5, signed)
     radius = np.maximum(local_radius(mask, within), SMALLEST_RADIUS)
     place = np.where(mask & (radius > SMALLEST_RADIUS), 1 - (within / radius).clip(0, 1), 0.0)
-    return torch.from_numpy(np.stack([signed, place])[None]).float()
+    return torch.from_numpy(np.stack([signed + slack, place])[None]).float()
 
 
 def _bounds(silhouettes: Sequence[_Silhouette]) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
