@@ -26,8 +26,9 @@ OUTSIDE = -1.0  # world units: margin of points that no picture shows
 TRUNCATION = 2.0  # cells: margins are clipped there
 CHUNK = 1 << 18  # points at a time
 ROUND_EXPONENT = 2.5  # of the superellipse of two orthogonal views; 2 is an ellipse
-MANY = 6  # views; from more, each may err by `SLACK` before it removes a thin part
-SLACK = 0.5  # pixels
+MANY = 6  # views; with more, the errors of all add up, and thin parts get lost without `SLACK`
+SLACK = 0.5  # pixels by which thin parts of a silhouette are wider
+THIN = 3.0  # pixels: radius of thin parts
 SMALLEST_RADIUS = 1.5  # pixels: thinner parts are not rounded
 
 
@@ -131,8 +132,10 @@ def _planes(view: KnownView, slack: float) -> Float[Tensor, "1 2 h w"]:
     edge = np.abs(signed) < 1
     signed = np.where(edge, alpha.clip(0, 1) - 0.5, signed)
     radius = np.maximum(local_radius(mask, within), SMALLEST_RADIUS)
+    widest = ndimage.maximum_filter(radius * mask, 3)  # also right beside the outline
+    thin = (widest > 0) & (widest < THIN)
     place = np.where(mask & (radius > SMALLEST_RADIUS), 1 - (within / radius).clip(0, 1), 0.0)
-    return torch.from_numpy(np.stack([signed + slack, place])[None]).float()
+    return torch.from_numpy(np.stack([signed + slack * thin, place])[None]).float()
 
 
 def _bounds(silhouettes: Sequence[_Silhouette]) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
