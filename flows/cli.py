@@ -20,6 +20,7 @@ from flows.commands.doctor import doctor
 from flows.commands.endings import exit_on_error
 from flows.commands.options import (
     Box,
+    Cameras,
     Changes,
     Commercial,
     Compress,
@@ -31,6 +32,8 @@ from flows.commands.options import (
     Seed,
     Texture,
     Triangles,
+    Turntable,
+    Views,
     finite,
     shortcut_settings,
 )
@@ -83,6 +86,9 @@ def make(
         Path | None,
         typer.Option(metavar="PATH", help="driving video or folder of frames; PICTURE then only names the asset"),
     ] = None,
+    view: Views = None,
+    turntable: Turntable = None,
+    cameras: Cameras = None,
     profile: Profile = "preview",
     changes: Changes = None,
     triangles: Triangles = None,
@@ -116,6 +122,7 @@ def make(
         from flows.commands import terminal
         from flows.convert import convert_job
         from flows.inputs.conversion_job import name_from_text
+        from flows.inputs.given_views import ViewsRequest, parse_views
         from flows.inputs.naming import clean_name
         from flows.inputs.package_record import record_of
         from flows.packages.acceptance import failing_gates
@@ -128,7 +135,8 @@ def make(
             triangles, texture, fps, box=box, height_m=height_m, ground=ground, compress=compress
         ) | ({"driving.pick": pick} if pick else {})
         item = (clean_name(picture.stem) or "asset") if picture else name_from_text(text)
-        files = {"picture": picture, "text": text, "video": video, "bank": bank, "mask": mask}
+        sides = ViewsRequest(views=parse_views(view or []), turntable=turntable, cameras=cameras)
+        files = {"picture": picture, "text": text, "video": video, "bank": bank, "mask": mask, "given_views": sides}
         request = _request(profile, changes, short, item=item, seed=seed, commercial_only=commercial_only, **files)
         folder = out or Path("out") / item
         check_folder(folder, item, force)
@@ -250,8 +258,8 @@ def batch(
     """Make many assets.
 
     Finished items are skipped; a failed item does not stop the others. A manifest has one row per item with these
-    columns: path or text, and optionally video, name, profile, seed, bank, mask, priority (higher first), set ("a.b=c;
-    d.e=f"), or any setting by its name.
+    columns: path or text, and optionally video, name, profile, seed, views ("90=right.png; 180=back.png"), turntable,
+    cameras, bank, mask, priority (higher first), set ("a.b=c; d.e=f"), or any setting by its name.
     """
     with exit_on_error():
         os.environ.update({name: str(n) for name, n in {"DG4D_GPUS": gpus, "DG4D_CPUS": cpus}.items() if n is not None})

@@ -29,6 +29,7 @@ from flows.engine.orphans import claim_run
 from flows.engine.shared_results import sharing_results
 from flows.inputs.conversion_job import ConversionRequest
 from flows.inputs.fetching import local_copy, without_secrets
+from flows.inputs.given_views import ViewsRequest, parse_views
 from flows.inputs.manifest import parse_changes
 from flows.inputs.naming import clean_name
 from flows.packages.delivery import Outcome, pack_package, write_outcome
@@ -72,6 +73,7 @@ def _options_field(options: "Options") -> dict[str, Any]:
 Text = Annotated[str, Field(min_length=1)]
 Folder = Annotated[Text, Field(json_schema_extra=_title("Output folder"))]
 Workers = Annotated[int, Field(ge=1, le=64, json_schema_extra=_title("Items at a time"))]
+ViewText = Annotated[str, Field(pattern=r"^[-+.,\d\s]+=", title="View")]
 Setting = Annotated[str, Field(pattern=r"^\s*[a-z_]+(\.[a-z_0-9]+)*\s*=", title="Setting")]
 
 
@@ -129,6 +131,26 @@ class PictureOptions(Options):
         return super().knobs() | ({"driving.motion": self.motion} if self.motion else {})
 
 
+class Sides(Frozen):
+    """Pictures of other sides; files on the worker's machine."""
+
+    views: tuple[ViewText, ...] = Field(
+        (), title="Views", description="one per item, AZIMUTH[,ELEVATION]=FILE in degrees, as `90=/data/in/right.png`"
+    )
+    turntable: str = Field("", title="Turntable", description="video of the still subject turned once, from its front")
+    cameras: str = Field("", title="Cameras", description="transforms.json of nerfstudio with pictures of one moment")
+
+    def request(self) -> ViewsRequest:
+        """Return the views by paths.
+
+        Raises:
+            BadInput: a view is not of its form.
+        """
+        turntable, cameras = (Path(text) if text else None for text in (self.turntable, self.cameras))
+        return ViewsRequest(views=parse_views(self.views), turntable=turntable, cameras=cameras)
+
+
+FormSides = Annotated[Sides, Field(json_schema_extra=_title("Other sides") | {"default": Sides().model_dump()})]
 FormOptions = Annotated[Options, Field(json_schema_extra=_options_field(Options()))]
 FormPictureOptions = Annotated[PictureOptions, Field(json_schema_extra=_options_field(PictureOptions()))]
 
@@ -138,6 +160,7 @@ def picture_to_4d(
     picture: Annotated[Text, Field(json_schema_extra=_title("Picture"))],
     out: Folder,
     options: FormPictureOptions = PictureOptions(),  # noqa: B008 - frozen
+    sides: FormSides = Sides(),  # noqa: B008 - frozen
 ) -> None:
     """Convert a picture to an animated 3D asset.
 
@@ -146,8 +169,9 @@ def picture_to_4d(
             object, as `s3://bucket/fox.png`. Cut-outs with a transparent background are best
         out: on the worker's machine, as `/data/out/fox`; open `report.html` there when it is done
         options: the defaults work on any machine
+        sides: pictures of other sides, which the subject is shaped and colored by
     """
-    _convert(picture, out, options)
+    _convert(picture, out, options, sides)
 
 
 @flow(name="video-to-4d", flow_run_name=lambda: _run_name("video"), persist_result=False)
@@ -155,6 +179,7 @@ def video_to_4d(
     video: Annotated[Text, Field(json_schema_extra=_title("Video"))],
     out: Folder,
     options: FormOptions = Options(),  # noqa: B008 - frozen
+    sides: FormSides = Sides(),  # noqa: B008 - frozen
 ) -> None:
     """Convert a video to an animated 3D asset that moves as the video does.
 
@@ -163,8 +188,9 @@ def video_to_4d(
             `https://host/walk.mp4`; or an object, as `s3://bucket/walk.mp4`
         out: on the worker's machine, as `/data/out/walk`; open `report.html` there when it is done
         options: the defaults work on any machine
+        sides: pictures of other sides at the first frame, which the subject is shaped and colored by
     """
-    _convert(video, out, options, is_video=True)
+    _convert(video, out, options, sides, is_video=True)
 
 
 @flow(name="catalog-to-4d", flow_run_name=lambda: _run_name("inputs"), persist_result=False)
@@ -299,16 +325,18 @@ def _knobs(options: Options, roots: Roots) -> dict[str, Any]:
     return knobs
 
 
-def _convert(address: str, out: str, options: Options, is_video: bool = False) -> None:
+def _convert(address: str, out: str, options: Options, sides: Sides, is_video: bool = False) -> None:
     """Convert a source as `dg4d make` does; do nothing if the folder holds its package already."""
     _start()
     roots = Roots.of_this_process()
-    folder = roots.output(out)
+    folder, given = roots.output(out), sides.request()
+    roots.check_files(given.files())
     with local_copy(roots.source(address)) as path:
         request = ConversionRequest(
             item=clean_name(PurePosixPath(urlsplit(address).path).stem) or "asset",
             picture=path,
             video=path if is_video else None,
+            given_views=given,
             profile=options.profile,
             settings=revise(profile(options.profile), _knobs(options, roots)),
             seed=options.seed,

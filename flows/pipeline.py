@@ -30,6 +30,7 @@ from flows.tasks import (
     pack_asset,
     plan_mesh,
     prepare_subject,
+    prepare_views,
     refine_texture,
 )
 from flows.ui.asset_page import show_asset
@@ -52,7 +53,7 @@ def image_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int 
     with steps_of_flow():
         conversion = conversion_of(job, mesh_parts)
         subject = prepare_subject(job.source, conversion, job.mask)
-        return animate(subject, job, conversion, folder)
+        return animate(subject, job.source, job, conversion, folder)
 
 
 @flow(name="video_to_4d", flow_run_name="{job.item}", persist_result=False)
@@ -69,7 +70,7 @@ def video_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int 
             raise StepBadInput(
                 "prepare_subject", "this is a single picture, not a video: a video has two frames or more"
             )
-        return animate(subject, job, conversion, folder)
+        return animate(subject, job.source, job, conversion, folder)
 
 
 @flow(name="text_to_4d", flow_run_name="{job.item}", persist_result=False)
@@ -83,7 +84,7 @@ def text_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int =
         conversion = conversion_of(job, mesh_parts)
         picture = draw_picture(job.source, conversion)
         subject = prepare_subject(picture.picture, conversion)
-        return animate(subject, job, conversion, folder)
+        return animate(subject, picture.picture, job, conversion, folder)
 
 
 @flow(name="motions", flow_run_name="{job.item}", persist_result=False)
@@ -106,12 +107,15 @@ def conversion_of(job: ConversionJob, mesh_parts: int = 0) -> Conversion:
     return Conversion(item=job.item, settings=job.settings, seed=job.seed, mesh_parts=mesh_parts)
 
 
-def animate(subject: Subject, job: ConversionJob, conversion: Conversion, folder: Path | None) -> FlowResult:
+def animate(
+    subject: Subject, source: ArtifactRef, job: ConversionJob, conversion: Conversion, folder: Path | None
+) -> FlowResult:
     """Turn a subject into a package: driving video, static Gaussians, motion, mesh, texture, files, verdict."""
     filming = drive_video.submit(subject, conversion)
-    gaussians = fit_gaussians(subject, conversion, job.bank)  # in this thread, parallel to the driving video
+    known = prepare_views(job.views, source, subject, conversion) if job.views is not None else None
+    gaussians = fit_gaussians(subject, conversion, job.bank, known)  # in this thread, parallel to the driving video
     driving_video = filming.result()
-    motion = fit_motion(subject, gaussians, driving_video, conversion, job.bank)
+    motion = fit_motion(subject, gaussians, driving_video, conversion, job.bank, known)
     mesh = mesh_over_time(gaussians, motion, driving_video, conversion)
     if job.settings.refiner.kind != "identity":
         mesh = refine_texture(mesh, driving_video, conversion)

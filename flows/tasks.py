@@ -28,6 +28,10 @@ class Subject(StepResult):
         return self.outputs.get("footage")
 
 
+class KnownViews(StepResult):
+    """Pictures of other sides, with their cameras."""
+
+
 class DrivingVideo(StepResult):
     """Driving video; with contact sheet, ranking and films if it was selected among candidates."""
 
@@ -87,6 +91,12 @@ def prepare_subject(source: ArtifactRef, conversion: Conversion, mask: ArtifactR
     return run_step("prepare_subject", Subject, **locals())
 
 
+@task(**CACHED, tags=[CPU])
+def prepare_views(views: ArtifactRef, source: ArtifactRef, subject: Subject, conversion: Conversion) -> KnownViews:
+    """Cut out pictures of other sides, bring them to the scale of the input and compare them with it."""
+    return run_step("prepare_views", KnownViews, **locals())
+
+
 @task(**CACHED, tags=[GPU])
 def drive_video(subject: Subject, conversion: Conversion) -> DrivingVideo:
     """Take the footage of the subject, or generate a video of it in motion."""
@@ -94,7 +104,9 @@ def drive_video(subject: Subject, conversion: Conversion) -> DrivingVideo:
 
 
 @task(**CACHED, tags=[GPU])
-def fit_gaussians(subject: Subject, conversion: Conversion, bank: ArtifactRef | None = None) -> Gaussians:
+def fit_gaussians(
+    subject: Subject, conversion: Conversion, bank: ArtifactRef | None = None, known_views: KnownViews | None = None
+) -> Gaussians:
     """Fit static 3D Gaussians to the picture (DreamGaussianHD)."""
     return run_step("fit_gaussians", Gaussians, **locals())
 
@@ -106,6 +118,7 @@ def fit_motion(
     driving_video: DrivingVideo,
     conversion: Conversion,
     bank: ArtifactRef | None = None,
+    known_views: KnownViews | None = None,
 ) -> Motion:
     """Fit a HexPlane deformation to the driving video (paper, "Gaussian Deformation for Dynamic Generation")."""
     return run_step("fit_motion", Motion, **locals())

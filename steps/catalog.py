@@ -2,6 +2,8 @@
 
 Artifacts:
   frames      uncompressed zip of NNN.png (RGBA, straight alpha, square) and video.json {"fps": ...}
+  views       uncompressed zip of views.json (steps/sources/views.py) and the files that it names
+  bank        zip of bank.json (steps/sources/banks.py) and a sheet per view
   pose        JSON {"turn_deg": ...}: turn of the subject's plane that its footage shows, 0 where it shows none
   gaussians   standard 3DGS PLY (float32)
   motion      safetensors; metadata: kind of deformation, its settings and the number of frames
@@ -52,6 +54,7 @@ GATES = _port("gates", "json")
 SCORES = _port("scores", "json")
 PACKAGE = _port("package", "zip")
 BANK = _port("bank", "zip")
+VIEWS = _port("views", "zip")
 EITHER_MESH = {"tracked": _optional(TRACKED), "meshes": _optional(MESHES)}
 
 STEPS: dict[str, StepSpec] = {
@@ -72,6 +75,13 @@ STEPS: dict[str, StepSpec] = {
             timeout_s=2400,  # bounds decoders that hang in native code
         ),
         _step(
+            "prepare_views",
+            inputs={"views": VIEWS, "source": SOURCE, "subject": PNG, "footage": _optional(FRAMES)},
+            outputs={"known_views": BANK, "picture": PNG},
+            sections=("subject",),
+            timeout_s=2400,  # as prepare_subject
+        ),
+        _step(
             "drive_video",
             inputs={"subject": PNG, "footage": _optional(FRAMES)},
             outputs={
@@ -87,7 +97,7 @@ STEPS: dict[str, StepSpec] = {
         ),
         _step(
             "fit_gaussians",
-            inputs={"subject": PNG, "pose": _optional(POSE), "bank": _optional(BANK)},
+            inputs={"subject": PNG, "pose": _optional(POSE), "bank": _optional(BANK), "known_views": _optional(BANK)},
             outputs={"gaussians": PLY, "curves": CURVES, "picture": PNG},
             sections=("rasterizer", "subject.turn_deg", "prior", "static"),
             resource="gpu",
@@ -95,7 +105,13 @@ STEPS: dict[str, StepSpec] = {
         ),
         _step(
             "fit_motion",
-            inputs={"gaussians": PLY, "driving_video": FRAMES, "pose": _optional(POSE), "bank": _optional(BANK)},
+            inputs={
+                "gaussians": PLY,
+                "driving_video": FRAMES,
+                "pose": _optional(POSE),
+                "bank": _optional(BANK),
+                "known_views": _optional(BANK),
+            },
             outputs={"motion": MOTION, "gaussians": _optional(PLY), "curves": CURVES, "picture": PNG},
             sections=("rasterizer", "subject.turn_deg", "prior", "deformation", "motion"),
             resource="gpu",

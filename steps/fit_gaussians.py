@@ -18,7 +18,7 @@ from dg4d_lib.settings import (
     SurfaceStartSettings,
 )
 from steps.artifacts.media import read_png, write_png
-from steps.fitting.priors import make_prior, subject_shapes, subject_turn
+from steps.fitting.priors import known_views, make_prior, read_known_views, subject_shapes, subject_turn
 from steps.fitting.reconstruction import reconstruct_subject
 from steps.fitting.reporting import LossCurves, picture_of_divergence, render_turnaround
 from steps.runtime.job import Job, StepReport
@@ -35,19 +35,21 @@ def run(job: Job) -> StepReport:
     generator = torch.Generator().manual_seed(job.seed)
     rasterize = get_rasterizer(backend)
     device = preferred_device(backend)
+    known = read_known_views(job)
     reconstruction = None
     if isinstance(static.start, LgmStartSettings):  # before the prior, so that two networks are not in memory at once
         reconstruction = reconstruct_subject(subject.to(device), static.start, rasterize, generator)
         static = fine_tuning_settings(static)
-    chosen = make_prior(prior, [subject], static, job.inputs.get("bank"), job.pictures, turn_deg)
+    chosen = make_prior(prior, [subject], static, job.inputs.get("bank"), job.pictures, turn_deg, known)
+    others = known_views(known) if known is not None else []
     if reconstruction:
         start = reconstruction.gaussians
     else:
-        shapes = chosen.shapes or subject_shapes(prior, [subject], turn_deg)
+        shapes = chosen.shapes or subject_shapes(prior, [subject], turn_deg, known)
         start = initial_gaussians(job.settings.static.start, shapes, generator).to(device)
     curves = LossCurves(static.iterations, job.progress)
     with picture_of_divergence(job, rasterize):
-        gaussians = fit_gaussians(start, subject, chosen.prior, rasterize, static, generator, curves.add)
+        gaussians = fit_gaussians(start, subject, chosen.prior, rasterize, static, generator, curves.add, known=others)
     report = chosen.report(f"{backend} rasterizer")
     report = reconstruction.add_to(report) if reconstruction else report
     write_ply(job.outputs["gaussians"], gaussians)

@@ -10,7 +10,7 @@ from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
 from dg4d_lib.settings import DeformationSettings, MotionSettings
 from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.motions import new_deformation, write_motion
-from steps.fitting.priors import make_prior, subject_turn
+from steps.fitting.priors import make_prior, read_known_views, subject_turn
 from steps.fitting.reporting import LossCurves, picture_of_divergence, render_row
 from steps.runtime.job import Job, StepReport
 
@@ -30,7 +30,8 @@ def run(job: Job) -> StepReport:
     generator = torch.Generator().manual_seed(job.seed)
     rasterize = get_rasterizer(backend)
     cutouts = list(torch.cat([video.frames, video.alpha], -1))
-    chosen = make_prior(prior, cutouts, settings, job.inputs.get("bank"), job.pictures, turn_deg)
+    known = read_known_views(job)
+    chosen = make_prior(prior, cutouts, settings, job.inputs.get("bank"), job.pictures, turn_deg, known)
     deformation = new_deformation(kind, gaussians, len(video), generator)
     device = preferred_device(backend)
     deformation.to(device)

@@ -1,6 +1,6 @@
 """Static stage: optimization of canonical Gaussians, DreamGaussianHD (paper section 3.1)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,6 +17,7 @@ from dg4d_lib.gaussians.density_control import DensifyResult, Grad2dStats, densi
 from dg4d_lib.guidance.interface import GuidancePrior, GuidanceView, ring_size
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import FitSettings, StaticSettings
+from dg4d_lib.visual_hull.known import KnownView
 
 Report = Callable[[int, dict[str, float]], None]
 ADVICE = "lower the learning rates (static.*_lr) or the weights"
@@ -78,6 +79,7 @@ def fit_gaussians(
     generator: torch.Generator,
     report: Report = lambda iteration, values: None,
     input_camera: OrbitCamera | None = None,
+    known: Sequence[KnownView] = (),
 ) -> Gaussians:
     """Fit a cloud to one image, with a guidance prior for unseen views.
 
@@ -90,6 +92,7 @@ def fit_gaussians(
         generator: source of all randomness.
         report: called after every iteration with (iterations done, named losses).
         input_camera: camera of the image; the default is azimuth and elevation 0.
+        known: further images and their cameras; an iteration compares one of them, with the weight of the image.
 
     Raises:
         FitDiverged: the loss became non-finite, or (almost) no Gaussian is left.
@@ -98,6 +101,7 @@ def fit_gaussians(
     device = start.means.device
     color, alpha = resize_cutouts(subject[None].to(device), settings.reference_size)
     white = torch.tensor(WHITE, device=device)
+    others = [resize_cutouts(view.cutout[None].to(device), settings.reference_size) for view in known]
     cloud = _Cloud.of(start, learning_rates(settings))
     grad2d = Grad2dStats.zeros(len(start), device)
     for step in range(1, settings.iterations + 1):
@@ -105,11 +109,17 @@ def fit_gaussians(
         cloud.adam.param_groups[0]["lr"] = log_linear(settings.means_lr, settings.means_lr_end, progress)
         gaussians = cloud.gaussians
 
-        offsets = [torch.zeros(1, len(gaussians), 2, device=device, requires_grad=True)]
-        rendering = rasterize(gaussians, [camera], white, offsets[0])
+        cameras, colors, alphas = [camera], color, alpha
+        if known:
+            chosen = int(torch.randint(len(known), (), generator=generator))
+            side = settings.reference_size
+            cameras = [camera, replace(known[chosen].camera, width=side, height=side)]
+            colors, alphas = torch.cat([color, others[chosen][0]]), torch.cat([alpha, others[chosen][1]])
+        offsets = [torch.zeros(len(cameras), len(gaussians), 2, device=device, requires_grad=True)]
+        rendering = rasterize(gaussians, cameras, white, offsets[0])
         rendered = [(rendering.visible, settings.reference_size)]
-        reference = reference_loss(
-            rendering, color, alpha, settings.color_weight, settings.alpha_weight, settings.ssim_weight
+        reference = len(cameras) * reference_loss(
+            rendering, colors, alphas, settings.color_weight, settings.alpha_weight, settings.ssim_weight
         )
         loss = progress * reference
         guidance = torch.zeros((), device=device)
@@ -132,17 +142,26 @@ def fit_gaussians(
             if offset.grad is not None:
                 grad2d.add(offset.grad, visible, size)
         cloud.adam.step()
-        if step == settings.iterations >= settings.densify_every:  # new Gaussians would stay as they were copied
-            cloud.replace(prune(cloud.gaussians, settings.prune_opacity, LAST_PRUNE * settings.prune_scale))
-            require_enough(cloud, step, settings, gaussians)
-        elif step < settings.iterations and step % settings.densify_every == 0:
-            control_density(cloud, grad2d, settings, generator)
+        if adapt_density(cloud, grad2d, step, settings, generator):
             grad2d = Grad2dStats.zeros(len(cloud.gaussians), device)
             require_enough(cloud, step, settings, gaussians)
         if step % RESET_OPACITY_EVERY == 0 and step < settings.iterations:
             cloud.reset_opacity()
         report(step, {**numbers, "Gaussians": len(cloud.gaussians)})
     return cloud.gaussians.detach()
+
+
+def adapt_density(
+    cloud: _Cloud, grad2d: Grad2dStats, step: int, settings: StaticSettings, generator: torch.Generator
+) -> bool:
+    """Densify and prune if it is time to, and only prune after the last iteration; return whether it was."""
+    if step == settings.iterations >= settings.densify_every:  # new Gaussians would stay as they were copied
+        cloud.replace(prune(cloud.gaussians, settings.prune_opacity, LAST_PRUNE * settings.prune_scale))
+        return True
+    if step < settings.iterations and step % settings.densify_every == 0:
+        control_density(cloud, grad2d, settings, generator)
+        return True
+    return False
 
 
 def background(settings: StaticSettings, generator: torch.Generator) -> Float[Tensor, " 3"]:

@@ -62,6 +62,32 @@ Seed = Annotated[
     int,
     typer.Option(min=0, max=SEED_MAX, metavar="N", help="seed of all random numbers; equal seeds give equal bytes"),
 ]
+Views = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--view",
+        metavar="AZIMUTH[,ELEVATION]=FILE",
+        help="picture of another side at the first moment, degrees: 90 is the side that PICTURE shows on the right, "
+        "180 the back; may be repeated",
+    ),
+]
+Turntable = Annotated[
+    Path | None,
+    typer.Option(
+        "--turntable",
+        metavar="PATH",
+        help="video, or folder of frames, of the still subject turned once; starts with the side of PICTURE",
+    ),
+]
+Cameras = Annotated[
+    Path | None,
+    typer.Option(
+        "--cameras",
+        metavar="FILE",
+        help="transforms.json of nerfstudio with pictures of one moment, or synchronized videos; the camera of PICTURE "
+        "has its file name, or is the first",
+    ),
+]
 Triangles = Annotated[
     int | None, typer.Option(metavar="N", help="maximum number of triangles; short for --set mesh.max_faces=N")
 ]

@@ -88,7 +88,9 @@ class ItemDeployment(NamedTuple):
         ref = store.put_bytes(job.model_dump_json().encode(), JOB_MEDIA_TYPE)
         with running(store, job.item):
             hold(
-                store, job.item, [ref.digest, *(needed.digest for needed in (job.source, job.bank, job.mask) if needed)]
+                store,
+                job.item,
+                [ref.digest, *(needed.digest for needed in (job.source, job.bank, job.mask, job.views) if needed)],
             )
             outcome = self._outcome(job, ref, store)
             if outcome.package is None:

@@ -15,19 +15,22 @@ from steps.store.artifact_store import ArtifactMissing, StoreUnreachable
 from steps.store.files import DiskFull
 
 REMARKED = "prepare_subject"  # the cut-out may be wrong
-GATES = "cutout_gates"  # its output with the gates of an estimated cut-out
+COMPARED = "prepare_views"  # a view may contradict the others
+CAPTIONS = {REMARKED: "Source, matte and cut-out", COMPARED: "Views, and the hull that they share"}
+GATES = "cutout_gates"  # output of `prepare_subject` with the gates of an estimated cut-out
 NAME_LENGTH = 80  # characters of an item in the name of a picture
 DIGITS = 12  # of a digest in it
 MOST_PICTURES = 200  # kept files, the newest; they show private input
 
 
 def remark(item: str, label: str, result: StepResult) -> None:
-    """Emit the notes of a cut-out and its failed gates with the path of a picture of source, matte and cut-out."""
-    if result.provenance.step != REMARKED:
+    """Emit the notes and failed gates of a cut-out, or the notes of views, with the path of their picture."""
+    step, notes = result.provenance.step, result.provenance.notes
+    if step not in CAPTIONS or (step == COMPARED and not notes):
         return
     picture = _saved(item, result.outputs["picture"]) if "picture" in result.outputs else None
-    look = [f"Source, matte and cut-out: {picture}"] if picture else []
-    if text := " ".join([*result.provenance.notes, *_failed_gates(result), *look]):
+    look = [f"{CAPTIONS[step]}: {picture}"] if picture else []
+    if text := " ".join([*notes, *_failed_gates(result), *look]):
         emit(StepEvent(item, label, "remark", text=text))
 
 

@@ -36,6 +36,7 @@ class Version(Frozen):
         source: picture, video or text.
         bank: ground-truth views, if given.
         mask: of the subject, if given.
+        views: pictures of other sides, if given.
         steps: in pipeline order.
     """
 
@@ -48,6 +49,7 @@ class Version(Frozen):
     source: ArtifactRef
     bank: ArtifactRef | None = None
     mask: ArtifactRef | None = None
+    views: ArtifactRef | None = None
     steps: tuple[VersionStep, ...]
 
     @property
@@ -62,6 +64,8 @@ class Version(Frozen):
             found.setdefault(self.bank.digest, "bank")
         if self.mask is not None:
             found.setdefault(self.mask.digest, "mask")
+        if self.views is not None:
+            found.setdefault(self.views.digest, "views")
         for step in self.steps:
             for port, digest in step.outputs.items():
                 found.setdefault(digest, f"{step.label}: {port}")
@@ -89,6 +93,7 @@ def keep_version(store: ArtifactStore, job: ConversionJob, result: FlowResult) -
         source=job.source,
         bank=job.bank,
         mask=job.mask,
+        views=job.views,
         steps=tuple(
             VersionStep(
                 label=done.label,

@@ -11,6 +11,7 @@ from pydantic import Field, ValidationError
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.rasterizer.backends import backend_name, require_backend
 from flows.inputs import naming, sources
+from flows.inputs.given_views import ViewsRequest
 from flows.inputs.signing_key import certificate_digest
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen, digest_of
 from steps.profiles import PipelineSettings
@@ -32,6 +33,7 @@ class ConversionRequest(Frozen):
         video: driving video or folder of frames; then `picture` only names the asset.
         bank: folder of ground-truth views, for the oracle prior.
         mask: picture, or folder of frames for a video, that is white where the subject is.
+        given_views: pictures of other sides.
         commercial_only: refuse weights whose license forbids commercial use.
     """
 
@@ -41,6 +43,7 @@ class ConversionRequest(Frozen):
     video: Path | None = None
     bank: Path | None = None
     mask: Path | None = None
+    given_views: ViewsRequest = ViewsRequest()
     profile: str = "preview"
     settings: PipelineSettings
     seed: int = 0
@@ -67,6 +70,9 @@ class ConversionRequest(Frozen):
         self._check_source()
         if self.mask is not None:
             sources.check_mask(self.mask)
+        self.given_views.check()
+        if self.given_views and self.text:
+            raise BadInput("--view, --turntable and --cameras show the sides of a picture; --text has none to show")
         if self.bank is not None:
             sources.check_bank(self.bank)
         oracle = self.settings.prior.kind == "oracle"
@@ -118,6 +124,7 @@ class ConversionRequest(Frozen):
                 moving=self._suffix in sources.ALWAYS_MOVING or self.video is not None,
                 bank=sources.put_bank(self.bank, store) if self.bank is not None else None,
                 mask=sources.put_source(self.mask, store) if self.mask is not None else None,
+                views=self.given_views.put(store, footage),
                 profile=self.profile,
                 settings=PipelineSettings.model_validate(without_paths(self.settings.model_dump(mode="json"))),
                 seed=self.seed,
@@ -172,6 +179,7 @@ class ConversionJob(Frozen):
     Attributes:
         source: picture, video, or frames; the prompt if `drawn`.
         text: that prompt.
+        views: pictures of other sides.
         moving: True if `source` is certainly a video.
         mask: picture or frames that mark the subject, if given.
     """
@@ -182,6 +190,7 @@ class ConversionJob(Frozen):
     moving: bool = False
     bank: ArtifactRef | None = None
     mask: ArtifactRef | None = None
+    views: ArtifactRef | None = None
     profile: str
     settings: PipelineSettings
     seed: int = Field(ge=0, le=LARGEST_SEED)
@@ -256,6 +265,11 @@ def job_from_record(
             raise BadInput(f"{path} is not the source of this package: its digest is {given}, recorded {ref.digest}")
         if not store.has(ref):
             raise BadInput(f"the source of this package ({ref.digest}) is not in the store: give it with {option}")
+    if job.views is not None and not store.has(job.views):
+        raise BadInput(
+            f"the views of this package ({job.views.digest}) are not in the store; make the asset again with its "
+            "--view, --turntable or --cameras"
+        )
     return job
 
 

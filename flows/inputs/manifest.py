@@ -12,6 +12,7 @@ from dg4d_lib.errors import BadInput, DG4DError
 from flows.formatting.escaping import quoted, visible
 from flows.inputs import listing, sources
 from flows.inputs.conversion_job import ConversionRequest, name_from_text
+from flows.inputs.given_views import ViewsRequest, views_in_cell
 from flows.inputs.json_text import UnfitJSON, loads
 from flows.inputs.naming import check_path, clean_name, unique_names
 from flows.inputs.rows import MANIFESTS, ManifestRow, read_rows
@@ -24,7 +25,7 @@ INPUTS = (
     f"manifest ({', '.join(MANIFESTS)})"
 )
 HIGHEST_PRIORITY = 10**9
-TEXTS = ("path", "text", "video", "name", "profile", "bank", "mask")  # columns
+TEXTS = ("path", "text", "video", "name", "profile", "bank", "mask", "views", "turntable", "cameras")  # columns
 INTEGER = re.compile(r"[+-]?[0-9]{1,100}(\.0*)?")
 
 
@@ -224,6 +225,11 @@ class _Reader:
             video=self._file(cells, "video"),
             bank=self._file(cells, "bank"),
             mask=self._file(cells, "mask"),
+            given_views=ViewsRequest(
+                views=views_in_cell(cells.get("views", ""), self.root),
+                turntable=self._file(cells, "turntable"),
+                cameras=self._file(cells, "cameras"),
+            ),
         )
 
     def _settings(self, chosen: str, changes: dict[str, Any]) -> PipelineSettings:

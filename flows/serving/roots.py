@@ -110,7 +110,7 @@ class Roots(Frozen):
             return
         asked = item.request
         files = (None if item.remote else asked.picture, asked.video, asked.bank, asked.mask)
-        self.check_files(file for file in files if file is not None)
+        self.check_files(file for file in (*files, *asked.given_views.files()) if file is not None)
         self.check_weights(item.request.settings.model_dump(mode="json"))
 
     def check_knobs(self, knobs: Mapping[str, Any]) -> None:

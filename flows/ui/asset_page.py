@@ -18,6 +18,7 @@ PICTURES = {
     ("pack_asset", "sheet"): "Contact sheet",
     ("draw_picture", "picture"): "Drawn from the text",
     ("prepare_subject", "picture"): "Input, matte, cut-out",
+    ("prepare_views", "picture"): "Views, and the hull that they share",
     ("drive_video", "picture"): "Driving video",
     ("fit_gaussians", "picture"): "At rest, from all around",
     ("fit_motion", "picture"): "In motion, from the front and from the side",

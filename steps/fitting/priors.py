@@ -17,6 +17,7 @@ from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.geometric import InflatedSurfaces
 from dg4d_lib.guidance.imagedream import ImageDream, ImageDreamPrior
 from dg4d_lib.guidance.interface import GuidancePrior, SubjectShapes
+from dg4d_lib.guidance.known import KnownShapes
 from dg4d_lib.guidance.learned import LearnedShapes
 from dg4d_lib.guidance.oracle import Bank, perturb
 from dg4d_lib.guidance.zero123 import Zero123
@@ -31,11 +32,12 @@ from dg4d_lib.settings import (
     Zero123PriorSettings,
 )
 from dg4d_lib.shape_prior import packaged
+from dg4d_lib.visual_hull.known import KnownView, known_view
 from dg4d_lib.weights.registry import lookup_weights
 from steps.artifacts.archives import unpack
 from steps.artifacts.media import read_png
 from steps.artifacts.pose import read_turn
-from steps.runtime.job import StepReport
+from steps.runtime.job import Job, StepReport
 from steps.runtime.weights import LocatedWeights, open_weights
 from steps.sources.banks import BANK_JSON, BankIndex, check_sheet, read_index
 
@@ -82,6 +84,7 @@ def make_prior(
     bank: Path | None,
     scratch: Path,
     turn_deg: float = 0.0,
+    sides: Bank | None = None,
 ) -> LoadedPrior:
     """Make the guidance prior of a stage.
 
@@ -92,6 +95,7 @@ def make_prior(
         bank: zip of ground-truth views, for the oracle.
         scratch: folder for unpacking.
         turn_deg: azimuth by which the subject is turned; see `subject_turn`.
+        sides: views of other sides that the user gave; priors with shapes take them as their own.
 
     Raises:
         BadInput: the oracle has no bank, or the weights are damaged or of another model.
@@ -102,8 +106,11 @@ def make_prior(
     )
     match settings:
         case GeometricPriorSettings() | LearnedPriorSettings():
-            shapes = subject_shapes(settings, cutouts, turn_deg)
+            shapes = subject_shapes(settings, cutouts, turn_deg, sides)
             note, weight = GEOMETRIC_NOTE, 1.0
+            if isinstance(shapes, KnownShapes):
+                prior = AnalyticPrior(shapes.clean, noise, frames=shapes.frames)
+                return LoadedPrior(prior, known_note(sides), shapes=shapes)
             if isinstance(settings, LearnedPriorSettings):
                 note, weight = LEARNED_NOTE, settings.weight
             return LoadedPrior(AnalyticPrior(shapes.clean, noise, weight=weight), note, shapes=shapes)
@@ -124,7 +131,7 @@ def make_prior(
 
 
 def subject_shapes(
-    settings: PriorSettings, cutouts: Sequence[Float[Tensor, "h w 4"]], turn_deg: float
+    settings: PriorSettings, cutouts: Sequence[Float[Tensor, "h w 4"]], turn_deg: float, sides: Bank | None = None
 ) -> SubjectShapes:
     """Return the shapes behind a prior, by default inflated ones.
 
@@ -132,11 +139,30 @@ def subject_shapes(
         settings: of the prior; one that has no shapes of its own gets the inflation with its defaults.
         cutouts: the subject at every frame.
         turn_deg: turn of the subject about the vertical; see `subject_turn`.
+        sides: views of other sides; their hull replaces the shapes of their frames.
     """
     if isinstance(settings, LearnedPriorSettings):
-        return LearnedShapes(packaged.packaged_network(), cutouts, settings, turn_deg)
-    known = settings if isinstance(settings, GeometricPriorSettings) else GeometricPriorSettings()
-    return InflatedSurfaces(cutouts, known, turn_deg)
+        shapes: SubjectShapes = LearnedShapes(packaged.packaged_network(), cutouts, settings, turn_deg)
+    else:
+        own = settings if isinstance(settings, GeometricPriorSettings) else GeometricPriorSettings()
+        shapes = InflatedSurfaces(cutouts, own, turn_deg)
+    if sides is None:
+        return shapes
+    frames = [frame for frame in sides.frames if frame < len(cutouts)]
+    return KnownShapes(shapes, {frame: [known_view(cutouts[frame]), *known_views(sides, frame)] for frame in frames})
+
+
+def known_views(bank: Bank, frame: int = 0) -> list[KnownView]:
+    """Return the views of a frame in a bank."""
+    column = bank.frames.index(frame)
+    pictures = bank.pictures[:, column].float() / 255
+    return [KnownView(camera, picture) for camera, picture in zip(bank.cameras, pictures, strict=True)]
+
+
+def known_note(bank: Bank | None) -> str:
+    """Return the sentence about known views."""
+    count = len(bank.cameras) if bank is not None else 0
+    return f"prior: visual hull of {count + 1} views; what none of them shows is a guess"
 
 
 def subject_turn(settings: PriorSettings, pose: Path | None, hint_deg: float) -> float:
@@ -174,6 +200,15 @@ def check_variant(settings: Zero123PriorSettings) -> None:
         raise BadInput(
             f"prior.variant = {settings.variant} does not fit the weights {name}; set prior.variant={known[name]}"
         )
+
+
+def read_known_views(job: Job) -> Bank | None:
+    """Read the views of other sides that the user gave; None without."""
+    if "known_views" not in job.inputs:
+        return None
+    folder = job.pictures / "known_views"
+    folder.mkdir()
+    return read_bank(job.inputs["known_views"], folder)
 
 
 def read_bank(path: Path, scratch: Path) -> Bank:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conversions import Run, job, ran, tree
+from conversions import Run, job, ran, store_is_sound, tree
 from fake_steps import picture
 from prefect.client.orchestration import get_client
 from waiting import wait_until
@@ -18,6 +18,7 @@ from flows.convert import convert_job
 from flows.engine import executors
 from flows.engine.events import StepEvent, listening
 from flows.inputs.conversion_job import ConversionRequest
+from flows.inputs.given_views import ViewsRequest, parse_views
 from flows.packages import publish
 from steps.profiles import PREVIEW, revise
 from steps.store.artifact_store import StoreUnreachable
@@ -33,6 +34,18 @@ def test_a_mesh_per_frame_is_made_in_as_many_parts_as_the_machine_has_slots(
         report = json.loads((tmp_path / str(parts) / "report.json").read_text())
         assert sum(stage["step"].startswith("extract_mesh") for stage in report["steps"]) == parts
     assert len({(tmp_path / name / "asset.glb").read_bytes() for name in "135"}) == 1
+
+
+def test_views_of_other_sides_reach_both_fits_and_belong_to_the_package(log: Path, tmp_path: Path) -> None:
+    for name in ("front.png", "back.png"):
+        (tmp_path / name).write_text(picture(name))
+    sides = ViewsRequest(views=parse_views([f"180={tmp_path / 'back.png'}"]))
+    request = ConversionRequest(item="two", picture=tmp_path / "front.png", settings=PREVIEW, given_views=sides)
+    convert_job(request.to_job(home.store()), tmp_path / "out")
+    assert "prepare_views" in ran(log) and store_is_sound()
+    steps = json.loads((tmp_path / "out" / "provenance.json").read_text())["steps"]
+    inputs = {step["step"]: step["inputs"] for step in steps}
+    assert inputs["fit_gaussians"]["known_views"] == inputs["fit_motion"]["known_views"]
 
 
 def test_the_run_graph_has_every_edge(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

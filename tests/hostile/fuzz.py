@@ -36,7 +36,20 @@ MOST_S = 20.0  # of processor time for one input
 HANGS_S = 60.0
 LARGEST_SEED_FILE = 30_000  # bytes; mutations of larger files hit pixels, not headers
 AT_ONCE = 100  # inputs between two looks at the clock
-COLUMNS = ("path", "text", "video", "name", "profile", "seed", "bank", "priority", "set")
+COLUMNS = (
+    "path",
+    "text",
+    "video",
+    "name",
+    "profile",
+    "seed",
+    "bank",
+    "views",
+    "turntable",
+    "cameras",
+    "priority",
+    "set",
+)
 KNOBS = ("mesh.grid", "prior.kind", "motion.iterations", "text.weights")
 EDGES = (0, 1, 2, 31, 32, 127, 128, 255, 256, 4095, 32_767, 32_768, 65_535, 2**24, 2**31 - 1, 2**31, 2**32 - 1)
 

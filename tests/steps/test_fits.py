@@ -13,12 +13,14 @@ from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.video.driving import DrivingVideo
+from dg4d_lib.visual_hull.known import known_view
 from steps import fit_gaussians, fit_motion
 from steps.artifacts.media import read_png, write_frames, write_png
 from steps.artifacts.motions import read_motion
 from steps.fitting.priors import read_bank
 from steps.profiles import PREVIEW, revise, step_settings
 from steps.runtime.job import Job
+from steps.sources.bank_writer import write_bank
 
 SMALL = revise(
     PREVIEW,
@@ -103,6 +105,33 @@ def test_a_motion_comes_out_of_gaussians_and_a_video(tmp_path: Path, subject: Pa
     before, after = read_ply(gaussians), read_ply(work.outputs["gaussians"])
     assert len(before) == len(after) and not torch.equal(before.harmonics, after.harmonics)
     assert "together with their motion" in facts.notes[-1]
+
+
+def test_views_of_other_sides_shape_the_start_of_the_fit(tmp_path: Path, subject: Path):
+    thin = disc()
+    thin[:, :20] = thin[:, 28:] = 0
+    write_bank(tmp_path / "known.zip", [[known_view(thin, 90.0)]], tmp_path)
+    depths = {}
+    for name, more in (("alone", {}), ("known", {"known_views": tmp_path / "known.zip"})):
+        (tmp_path / name).mkdir()
+        inputs = {"subject": subject, **more}
+        work = job(tmp_path / name, fit_settings(), inputs, ["gaussians", "curves", "picture"])
+        facts = fit_gaussians.run(work)
+        depths[name] = float(read_ply(work.outputs["gaussians"]).means[:, 2].std())
+    assert depths["known"] < depths["alone"] / 2
+    assert "visual hull of 2 views" in facts.notes[0]
+
+    frames = torch.stack([disc(), disc(2)])
+    write_frames(tmp_path / "video.zip", DrivingVideo(frames[..., :3], frames[..., 3:], 5.0))
+    inputs = {"gaussians": work.outputs["gaussians"], "driving_video": tmp_path / "video.zip"}
+    (tmp_path / "moving").mkdir()
+    moving = job(
+        tmp_path / "moving",
+        step_settings("fit_motion", SMALL),
+        {**inputs, "known_views": tmp_path / "known.zip"},
+        ["motion", "gaussians", "curves", "picture"],
+    )
+    assert "visual hull of 2 views" in fit_motion.run(moving).notes[0]
 
 
 def test_both_fits_run_with_a_trained_prior_and_say_so(tmp_path: Path, subject: Path):

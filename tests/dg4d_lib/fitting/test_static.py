@@ -3,12 +3,14 @@ import math
 import pytest
 import torch
 
+from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import random_orbit
 from dg4d_lib.errors import FitDiverged
 from dg4d_lib.fitting.losses import Diverged
 from dg4d_lib.fitting.static import _Cloud, background, fit_gaussians, learning_rates
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.guidance.interface import GuidanceView
+from dg4d_lib.visual_hull.known import KnownView
 
 
 def seed(number: int = 0) -> torch.Generator:
@@ -37,6 +39,21 @@ def test_score_distillation_with_the_true_views_recovers_the_object(known, stati
     assert psnr_from_unseen_sides(known, fitted) > psnr_from_unseen_sides(known, start) + 8
     assert [i for i, _ in seen] == list(range(1, static_settings.iterations + 1))
     assert not fitted.means.requires_grad
+
+
+def test_known_pictures_of_other_sides_are_fitted_without_a_prior(known, static_settings):
+    alone = static_settings.model_copy(update={"guidance_weight": 0.0})
+    start = blob(static_settings.start.points, 0.5, seed())
+    camera = OrbitCamera(0, 90, width=32, height=32)
+    color, alpha = known.clean([GuidanceView(camera)])
+    cutout = torch.cat([(color - 1 + alpha) / alpha.clamp(min=1e-3), alpha], -1)[0]
+    errors = []
+    for sides in ([], [KnownView(camera, cutout)]):
+        fitted = fit_gaussians(start, known.subject(), known.prior(0.98), known.rasterize, alone, seed(), known=sides)
+        with torch.no_grad():
+            drawn = known.rasterize(fitted, [camera], torch.ones(3)).color
+        errors.append(float((drawn - color).square().mean()))
+    assert errors[1] < errors[0] / 4
 
 
 def test_the_same_seed_gives_the_same_bytes(known, static_settings):

@@ -8,7 +8,7 @@ import pytest
 
 from flows import home
 from flows.engine.events import StepEvent, listening
-from flows.engine.remarks import MOST_PICTURES, REMARKED, remark
+from flows.engine.remarks import CAPTIONS, MOST_PICTURES, REMARKED, remark
 from steps.contract import ProvenanceRecord, StepResult, digest_of
 
 NOTE = "The background was guessed."
@@ -90,3 +90,8 @@ def test_a_picture_that_is_gone_leaves_the_note_and_no_empty_file() -> None:
     shutil.rmtree(home.home() / "store")
     assert told("fox", done) == [NOTE]
     assert list(home.cutouts().iterdir()) == []
+
+
+def test_views_that_contradict_each_other_are_told_with_their_picture() -> None:
+    (text,) = told("fox", result(b"views", NOTE, step="prepare_views"))
+    assert text.startswith(f"{NOTE} {CAPTIONS['prepare_views']}: ")

@@ -1,0 +1,148 @@
+"""Quality of assets by what a user gives: a video alone, pictures of other sides, a turntable.
+
+    python -m benchmarks.inputs --views FOLDER --sheet sheet.png
+    python -m benchmarks.inputs --views FOLDER --azimuths 180
+    python -m benchmarks.inputs --turntable FOLDER
+    python -m benchmarks.inputs --none FOLDER
+
+FOLDER is a data set of `steps.artifacts.ground_truth` whose objects also have `static/az_AZIMUTH.png`, frame 0 from
+other sides, and `bank/`. A fit takes a minute or more per object; `--first` scores the shape of frame 0 alone, in
+seconds.
+"""
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from benchmarks.measure import parser_of
+from benchmarks.true_views import SIZE, Figures, Subject, figures, line, mean, prepared, read_subjects, score_fit
+
+import torch  # isort: skip
+from torch import Tensor
+
+from benchmarks.true_views import write_sheet
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.guidance.interface import GuidanceView
+from dg4d_lib.guidance.oracle import Bank
+from dg4d_lib.images import over_white
+from steps.artifacts.media import write_png, write_zip
+from steps.fitting.priors import read_bank, read_bank_folder, subject_shapes
+from steps.prepare_views import run as prepare_views
+from steps.profiles import PREVIEW, PipelineSettings, revise, step_settings
+from steps.runtime.job import Job
+from steps.sources.views import VIEWS_JSON, GivenView, GivenViews
+
+AZIMUTHS_DEG = (90.0, 180.0, 270.0)
+
+Given = tuple[GivenViews, list[tuple[str, bytes]]]  # what a user gives: views.json and the files that it names
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way of giving more than a video.
+
+    Attributes:
+        help: description of its option.
+        given: views of an object and their files, from a folder for scratch; None for none.
+    """
+
+    help: str
+    given: Callable[[Subject, Sequence[float], Path], Given] | None
+
+
+def pictures_of(subject: Subject, azimuths: Sequence[float], scratch: Path) -> Given:
+    """Return pictures of frame 0 from other sides."""
+    assert subject.truth is not None, "made-up subjects have no files"
+    folder = subject.truth.inputs[0].parents[1] / "static"
+    names = [f"az_{azimuth:03.0f}.png" for azimuth in azimuths]
+    views = [GivenView(file=name, name=name, azimuth=azimuth) for name, azimuth in zip(names, azimuths, strict=True)]
+    return GivenViews(views=tuple(views)), [(name, (folder / name).read_bytes()) for name in names]
+
+
+def turntable_of(subject: Subject, azimuths: Sequence[float], scratch: Path) -> Given:
+    """Return frame 0 of the bank at elevation 0 as a folder of frames."""
+    assert subject.truth is not None and subject.truth.bank is not None, f"{subject.name} has no bank"
+    bank = read_bank_folder(subject.truth.bank)
+    level = sorted((c.azimuth_deg % 360, row) for row, c in enumerate(bank.cameras) if c.elevation_deg == 0)
+    frames = []
+    for number, (_, row) in enumerate(level):
+        write_png(scratch / "frame.png", bank.pictures[row, bank.frames.index(0)].float() / 255)
+        frames.append((f"{number:03d}.png", (scratch / "frame.png").read_bytes()))
+    write_zip(scratch / "frames.zip", frames)
+    return GivenViews(turntable="turntable"), [("turntable", (scratch / "frames.zip").read_bytes())]
+
+
+WAYS = {  # further ways, such as a mesh of the user's own or a matte, get a line here or a module of their own
+    "none": Way("the video alone", None),
+    "views": Way("the video, and frame 0 from other azimuths", pictures_of),
+    "turntable": Way("the video, and a turntable of frame 0", turntable_of),
+}
+
+
+def sides_of(subject: Subject, way: Way, azimuths: Sequence[float], settings: PipelineSettings) -> Bank | None:
+    """Return the known views of an object as `prepare_views` makes them."""
+    if way.given is None:
+        return None
+    with TemporaryDirectory() as folder:
+        scratch = Path(folder)
+        given, files = way.given(subject, azimuths, scratch)
+        write_zip(scratch / "views.zip", [(VIEWS_JSON, given.model_dump_json().encode()), *files])
+        write_png(scratch / "subject.png", prepared(subject, settings)[0])
+        (scratch / "pictures").mkdir()
+        (scratch / "bank").mkdir()
+        inputs = {"views": scratch / "views.zip", "subject": scratch / "subject.png", "source": scratch / "subject.png"}
+        outputs = {"known_views": scratch / "known.zip", "picture": scratch / "picture.png"}
+        made = step_settings("prepare_views", settings)
+        report = prepare_views(Job(inputs, outputs, made, 0, lambda *_: None, scratch / "pictures"))
+        for note in report.notes:
+            sys.stderr.write(f"{subject.name}: {note}\n")
+        return read_bank(scratch / "known.zip", scratch / "bank")
+
+
+def score_first(subject: Subject, settings: PipelineSettings, sides: Bank | None) -> tuple[Figures, Tensor]:
+    """Compare the shape of frame 0, without any fit, with the true views."""
+    shapes = subject_shapes(settings.prior, [prepared(subject, settings)[0]], settings.subject.turn_deg, sides)
+    rows, strips = [], []
+    for azimuth, truth in subject.views.items():
+        color, alpha = shapes.clean([GuidanceView(OrbitCamera(0, azimuth, width=SIZE, height=SIZE))])
+        rows.append(figures(color, alpha, truth[:1]))
+        strips.append(torch.cat([color[0], over_white(truth[:1])[0]]))
+    return mean(rows), torch.cat(strips, 1)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Score one way of input on the objects of a data set."""
+    parser = parser_of(__doc__)
+    ways = parser.add_mutually_exclusive_group(required=True)
+    for name, way in WAYS.items():
+        ways.add_argument(f"--{name}", type=Path, metavar="FOLDER", help=way.help)
+    parser.add_argument("--only", nargs="+", default=(), help="names of objects")
+    parser.add_argument("--azimuths", type=float, nargs="+", default=AZIMUTHS_DEG, help="of the pictures of --views")
+    parser.add_argument("--first", action="store_true", help="score the shape of frame 0 alone, without a fit")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting")
+    parser.add_argument("--sheet", type=Path, help="picture: unseen views over time, above the true ones")
+    given = parser.parse_args(arguments)
+    name = next(name for name in WAYS if getattr(given, name))
+    changes = {key: json.loads(value) for key, value in (pair.split("=", 1) for pair in given.set)}
+    settings = revise(PREVIEW, changes)
+    found: dict[str, Figures] = {}
+    strips = []
+    for subject in read_subjects(getattr(given, name), given.only):
+        sides = sides_of(subject, WAYS[name], given.azimuths, settings)
+        score = score_first(subject, settings, sides) if given.first else score_fit(subject, settings, sides=sides)
+        found[subject.name] = score[0]
+        strips.append(score[1])
+        sys.stdout.write(line(subject.name, {name: score[0]}))
+        sys.stdout.flush()
+    sys.stdout.write(line("mean", {name: mean(list(found.values()))}))
+    if given.json:
+        given.json.write_text(json.dumps(found, indent=1))
+    if given.sheet:
+        write_sheet(given.sheet, strips)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Shape and colors of a subject from pictures of several sides."""

@@ -1,0 +1,56 @@
+"""Known view: a cut-out picture of a subject and the camera that took it."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from jaxtyping import Float
+from torch import Tensor
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.errors import BadInput
+
+
+@dataclass(frozen=True)
+class KnownView:
+    """Picture from a known camera.
+
+    Attributes:
+        camera: pose and size of the picture.
+        cutout: straight alpha, color and alpha in [0, 1].
+        name: for messages.
+    """
+
+    camera: OrbitCamera
+    cutout: Float[Tensor, "h w 4"]
+    name: str = ""
+
+    def at(self, elevation_deg: float, azimuth_deg: float) -> "KnownView":
+        """Return the picture as taken from another direction."""
+        return replace(self, camera=replace(self.camera, elevation_deg=elevation_deg, azimuth_deg=azimuth_deg))
+
+
+def known_view(
+    cutout: Float[Tensor, "h w 4"], azimuth_deg: float = 0.0, elevation_deg: float = 0.0, name: str = ""
+) -> KnownView:
+    """Return the view of a square picture from a direction; the default is that of the input camera.
+
+    Raises:
+        BadInput: the picture is not square.
+    """
+    height, width = cutout.shape[:2]
+    if height != width:
+        raise BadInput(f"a known view must be square; {name or 'the picture'} has {width} x {height} pixels")
+    return KnownView(OrbitCamera(elevation_deg, azimuth_deg, width=width, height=height), cutout, name)
+
+
+def angle_deg(one: OrbitCamera, other: OrbitCamera) -> float:
+    """Return the angle between the directions of two cameras."""
+    cosine = float(one.position() @ other.position()) / (one.radius * other.radius)
+    return math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+
+
+def shows_sides(views: Sequence[KnownView], least_deg: float) -> bool:
+    """Return True if two views differ by this angle or more, counting opposite directions as equal."""
+    pairs = [(a, b) for i, a in enumerate(views) for b in views[:i]]
+    return any(least_deg <= angle_deg(a.camera, b.camera) <= 180 - least_deg for a, b in pairs)

@@ -1,0 +1,275 @@
+"""Step that turns pictures of other sides, a turntable or known cameras into a bank of views beside the input."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dg4d_lib.errors import BadInput
+from dg4d_lib.images import over_white
+from dg4d_lib.settings import SubjectSettings
+from dg4d_lib.video.subject import Segmenter, prepare_subject
+from dg4d_lib.visual_hull.adjusting import adjust_exposure, match_scale, scaling_between
+from dg4d_lib.visual_hull.agreement import Agreement, agreement, hull_alpha, smaller, turntable_score
+from dg4d_lib.visual_hull.known import KnownView, angle_deg, known_view
+from steps.artifacts.archives import unpack
+from steps.artifacts.media import read_frames, read_png, write_png
+from steps.runtime.job import Job, StepReport
+from steps.sources.bank_writer import write_bank
+from steps.sources.clips import evenly_spaced
+from steps.sources.networks import LoadedNetwork, open_network
+from steps.sources.placing import place_pictures
+from steps.sources.reader import Source, read_source
+from steps.sources.views import CLOSE_DEG, GivenView, GivenViews, read_views
+
+TURNTABLE_FRAMES = 24  # of a turntable are used
+FEWEST_FRAMES = 8  # of a turntable
+LARGEST_WHOLE = 2048  # pixels of a side of an uncropped picture
+STILL = 0.004  # largest mean difference of a turntable's frames from its first, in [0, 1]: below, nothing turns
+OPEN_SHARE = 3.0  # difference of last and first frame, in largest steps between frames: above, the turn is not whole
+LEAST_FILLED = 0.78  # share of a silhouette that the hull of all fills: below, a view is not of this subject
+RELIABLE = 0.9  # mean share from which colors of the hull's surface are compared
+FEW = 4  # views; among more, thin parts seen edge-on fill little of single silhouettes
+LEAST_MEAN = 0.6  # mean share of many silhouettes, likewise
+GOOD = 0.95  # mean share from which pictures are taken to have the scale of the input
+INPUT = "the input"
+Moments = list[list[KnownView]]  # views by frame
+
+
+def run(job: Job) -> StepReport:
+    """Write the bank of known views, and a picture of them beside the hull that they share.
+
+    Raises:
+        BadInput: a view is not of the subject, or a file cannot be used.
+    """
+    settings: SubjectSettings = job.settings.subject
+    with TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        inputs = _input_frames(job, folder / "footage")
+        unpack(job.inputs["views"], folder / "views", "the zip of views")
+        given = read_views(folder / "views")
+        job.progress(1, 3, {})
+        network = open_network(settings.matting)
+        known = _Reader(folder / "views", settings, inputs, job.inputs["source"], network.segmenter)
+        moments, notes = known.turntable(given) if given.turntable else known.views(given)
+    job.progress(2, 3, {})
+    first = [known_view(inputs[0], name=INPUT), *moments[0]]
+    write_png(job.outputs["picture"], picture_of(first))
+    write_png(job.pictures / "views.png", picture_of(first))
+    found = agreement(first)
+    notes = (*notes, *judge(first, found))
+    adjusted = adjust_exposure(first) if found.mean > RELIABLE else first
+    notes = (*notes, *exposure_notes(first, adjusted))
+    if len(moments) == 1:
+        moments = [adjusted[1:]]
+    write_bank(job.outputs["known_views"], moments, job.pictures)
+    job.progress(3, 3, {})
+    used = network if known.used_network else LoadedNetwork()
+    return StepReport(weights=used.digests, licenses=used.licenses, notes=notes)
+
+
+class _Reader:
+    """Reader of the pictures beside an input.
+
+    Args:
+        folder: with the files of `views.json`.
+        settings: of the input, which all pictures share.
+        inputs: frames of the input, cut out.
+        original: file of the input.
+        segmenter: network for opaque pictures.
+
+    Attributes:
+        used_network: True if a picture was cut out by the network.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        settings: SubjectSettings,
+        inputs: Float[Tensor, "t s s 4"],
+        original: Path,
+        segmenter: Segmenter,
+    ) -> None:
+        self.folder, self.inputs, self.original, self.segmenter = folder, inputs, original, segmenter
+        self.settings = settings.model_copy(update={"box": None})  # the box is that of the input
+        self.used_network = False
+
+    def source(self) -> Source:
+        """Return the decoded input."""
+        most = max(2, len(self.inputs))
+        return read_source(self.original, self.folder, most, self.settings.max_decode_gb)
+
+    def views(self, given: GivenViews) -> tuple[Moments, tuple[str, ...]]:
+        """Return the views of pictures and of videos beside the input's."""
+        sources = [self._read(view.file, view.name) for view in given.views]
+        moving = [source.kind == "video" for source in sources]
+        if any(moving) and not given.input_camera:
+            name = given.views[moving.index(True)].name
+            raise BadInput(f"{name} is a video; --view takes pictures: give videos of other sides with --cameras")
+        if all(moving):
+            return self._moving(given, sources)
+        if any(moving):
+            raise BadInput("--cameras names pictures and videos; give either pictures of one moment, or videos of all")
+        if given.input_camera is not None:
+            placed = place_pictures(given, sources, self.source(), self.inputs[:1], self._cut_whole)
+            return [[frames[0] for frames in placed]], ()
+        cutouts, notes = zip(*(self._cut(source) for source in sources), strict=True)
+        return [self._scaled(given.views, [cutout[0] for cutout in cutouts])], tuple(
+            dict.fromkeys(note for several in notes for note in several)
+        )
+
+    def turntable(self, given: GivenViews) -> tuple[Moments, tuple[str, ...]]:
+        """Return the views of a turntable in the direction that fits better, and those of pictures beside it."""
+        source = self._read(given.turntable, "the turntable", TURNTABLE_FRAMES)
+        check_turn(source)
+        places = evenly_spaced(source.count, TURNTABLE_FRAMES)
+        cutouts, notes = self._cut(source)
+        angles = [360 * place / source.count for place in places]
+        views = self._turned(cutouts, angles)
+        if given.views:
+            (more,), other_notes = self.views(given)
+            alone = [v for v in views if all(angle_deg(v.camera, own.camera) > CLOSE_DEG for own in more)]
+            views, notes = [*alone, *more], (*notes, *other_notes)
+        return [views], notes
+
+    def _moving(self, given: GivenViews, sources: Sequence[Source]) -> tuple[Moments, tuple[str, ...]]:
+        """Return the views of synchronized videos by frame."""
+        count = len(self.inputs)
+        for view, source in zip(given.views, sources, strict=True):
+            if len(source.frames) != count:
+                raise BadInput(
+                    f"{view.name} has {source.count} frames and the input {count}; synchronized videos must have "
+                    "equally many"
+                )
+        placed = place_pictures(given, sources, self.source(), self.inputs, self._cut_whole)
+        return [[view[frame] for view in placed] for frame in range(count)], ()
+
+    def _read(self, file: str, name: str, frames: int = 0) -> Source:
+        most = frames or max(2, len(self.inputs))
+        try:
+            return read_source(self.folder / file, self.folder, most, self.settings.max_decode_gb)
+        except BadInput as error:
+            raise BadInput(f"{name}: {error}") from error
+
+    def _cut(self, source: Source) -> tuple[Float[Tensor, "t s s 4"], tuple[str, ...]]:
+        prepared = prepare_subject(source.frames, source.has_alpha, self.settings, segmenter=self.segmenter)
+        self.used_network |= prepared.estimate is not None and prepared.estimate.used_network
+        return prepared.frames, prepared.notes
+
+    def _cut_whole(self, source: Source, size: int) -> Float[Tensor, "t s s 4"]:
+        """Cut out the subject in the whole frame, without a crop."""
+        whole = SubjectSettings(size=min(LARGEST_WHOLE, size), framing="keep", matting=self.settings.matting)
+        prepared = prepare_subject(source.frames, source.has_alpha, whole, segmenter=self.segmenter)
+        self.used_network |= prepared.estimate is not None and prepared.estimate.used_network
+        return prepared.frames
+
+    def _scaled(self, given: Sequence[GivenView], cutouts: Sequence[Float[Tensor, "s s 4"]]) -> list[KnownView]:
+        """Return views in the scale of the input: as they are, or with its height, whichever agrees better."""
+        heights = [match_scale(cut, self.inputs[0], view.azimuth) for view, cut in zip(given, cutouts, strict=True)]
+        front = known_view(self.inputs[0], name=INPUT)
+        as_given, matched = (
+            [known_view(cut, v.azimuth, v.elevation, v.name) for v, cut in zip(given, chosen, strict=True)]
+            for chosen in (cutouts, heights)
+        )
+        unchanged = agreement([front, *as_given]).mean
+        if unchanged > GOOD or unchanged >= agreement([front, *matched]).mean:
+            return as_given
+        return matched
+
+    def _turned(self, cutouts: Float[Tensor, "t s s 4"], angles: Sequence[float]) -> list[KnownView]:
+        """Return the views of a turntable without its front, in the direction that fits better."""
+        scaling = scaling_between(cutouts[0], self.inputs[0])
+        views = []
+        for angle, cutout in list(zip(angles, cutouts, strict=True))[1:]:
+            picture = cutout if scaling.is_small else scaling.apply(cutout, angle, self.inputs.shape[1])
+            views.append(known_view(picture, angle, name=f"turntable at {angle:.0f} degrees"))
+        return turned(known_view(self.inputs[0], name=INPUT), views)
+
+
+def check_turn(source: Source) -> None:
+    """Refuse a turntable that is a picture, too short, still, or not closed.
+
+    Raises:
+        BadInput: says what it is.
+    """
+    if source.kind != "video" or source.count < FEWEST_FRAMES:
+        raise BadInput(
+            f"the turntable has {source.count} frame{'s' * (source.count != 1)}; give a video of one whole turn with "
+            f"{FEWEST_FRAMES} or more"
+        )
+    color = over_white(source.frames)
+    from_first = (color - color[:1]).abs().mean((1, 2, 3))
+    steps = color.diff(dim=0).abs().mean((1, 2, 3))
+    if float(from_first.max()) < STILL:
+        raise BadInput("the turntable shows no turn: its frames are alike; film the still subject turned once")
+    gap = source.count - 1 - evenly_spaced(source.count, TURNTABLE_FRAMES)[-2]
+    if float(from_first[-1]) > OPEN_SHARE * max(float(steps.max()), float(steps[-1]) / gap):
+        raise BadInput(
+            "the turntable is no whole turn: its last frame is unlike its first; film one turn, cut right before the "
+            "first picture comes back"
+        )
+
+
+def turned(front: KnownView, views: Sequence[KnownView]) -> list[KnownView]:
+    """Return the views of a turntable, with the sign of their azimuths that fits the input better."""
+    reverse = [view.at(view.camera.elevation_deg, -view.camera.azimuth_deg % 360) for view in views]
+    return max(([*views], reverse), key=lambda ring: turntable_score([front, *ring]))
+
+
+def judge(views: Sequence[KnownView], found: Agreement) -> tuple[str, ...]:
+    """Return notes about a view that contradicts the others.
+
+    Raises:
+        BadInput: a view shows something else.
+    """
+    lowest = min(found.filled)
+    share, least = (found.mean, LEAST_MEAN) if len(views) > FEW and found.odd is None else (lowest, LEAST_FILLED)
+    if share < least:
+        named = f"{_place(views[found.odd])} contradicts the others" if found.odd else "they contradict each other"
+        raise BadInput(
+            f"the views do not show one subject from their azimuths: {named}; only {share:.0%} of a silhouette, at "
+            f"least {least:.0%}, agrees with the rest. Check the pictures and the azimuths: 90 is the side that the "
+            "input shows on the right, 180 the back"
+        )
+    if found.odd is None:
+        return ()
+    return (
+        f"{_place(views[found.odd])} contradicts the other views: they fill {lowest:.0%} of a silhouette; check it in "
+        "the picture of prepare_views",
+    )
+
+
+def exposure_notes(before: Sequence[KnownView], after: Sequence[KnownView]) -> tuple[str, ...]:
+    """Return a note for every view that was made brighter or darker."""
+    changed = [old for old, new in zip(before, after, strict=True) if new is not old]
+    return (f"exposure adjusted to the input: {', '.join(_place(view) for view in changed)}",) if changed else ()
+
+
+def picture_of(views: Sequence[KnownView]) -> Float[Tensor, "h w 3"]:
+    """Compose the pictures in a row, and under each the outline of the hull that all share."""
+    small = [smaller(view) for view in views]
+    shown = torch.cat([over_white(view.cutout) for view in small], 1)
+    try:
+        alpha = torch.cat([*hull_alpha(small)], 1)
+    except BadInput:
+        alpha = torch.zeros_like(shown[..., :1])
+    mask = torch.cat([view.cutout[..., 3:] for view in small], 1)
+    missing = ((mask > 0.5) & (alpha < 0.5)).float()  # red: in the picture, and excluded by the others
+    under = (1 - 0.6 * alpha).expand_as(shown) * (1 - missing) + missing * torch.tensor([0.9, 0.1, 0.1])
+    return torch.cat([shown, under])
+
+
+def _place(view: KnownView) -> str:
+    camera = view.camera
+    return f"{view.name or 'a view'} (azimuth {camera.azimuth_deg:g}, elevation {camera.elevation_deg:g})"
+
+
+def _input_frames(job: Job, scratch: Path) -> Float[Tensor, "t s s 4"]:
+    """Return the frames of the input; a picture is one."""
+    if "footage" in job.inputs:
+        video = read_frames(job.inputs["footage"], scratch)
+        return torch.cat([video.frames, video.alpha], -1)
+    return read_png(job.inputs["subject"])[None]

@@ -1,0 +1,129 @@
+"""Pictures of known cameras, framed as the orbit cameras around the input would show them."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dg4d_lib.errors import BadInput
+from dg4d_lib.video.framing import bounding_box
+from dg4d_lib.visual_hull.adjusting import warped
+from dg4d_lib.visual_hull.known import KnownView, known_view
+from dg4d_lib.visual_hull.rig import OrbitPlace, meeting_point, orbit_places
+from steps.sources.reader import Source
+from steps.sources.views import HIGHEST_DEG, GivenViews, PlacedCamera, check_apart
+
+Box = tuple[float, float, float, float]  # left, top, right, bottom; tangents, or halves of the square
+
+
+def place_pictures(
+    given: GivenViews,
+    sources: Sequence[Source],
+    source: Source,
+    inputs: Float[Tensor, "t s s 4"],
+    cut_out: Callable[[Source, int], Float[Tensor, "n s s 4"]],
+) -> list[list[KnownView]]:
+    """Return the views of every camera by frame.
+
+    The input's own framing decides the scale: its outline in the source, in tangents, against that in its square.
+
+    Args:
+        given: views with their cameras, and the camera of the input.
+        sources: decoded files of the views.
+        source: decoded file of the input.
+        inputs: frames of the input, cut out and framed.
+        cut_out: cuts the subject out of a file, without a crop, in squares of at most so many pixels.
+
+    Raises:
+        BadInput: the cameras look away from the subject, from above, or two of them are one.
+    """
+    assert given.input_camera is not None, "placed views need the camera of the input"
+    cameras = [given.input_camera, *(view.camera for view in given.views if view.camera is not None)]
+    poses = torch.tensor([camera.matrix for camera in cameras], dtype=torch.float64)
+    size = inputs.shape[1]
+    whole = cut_out(replace(source, frames=source.frames[:1]), size)
+    scale, offset = _framing(_box(inputs[:1], 2 / size, 1), _tangent_box(whole, given.input_camera, source))
+    origin = _origin(poses, meeting_point(poses), scale, offset)
+    places = orbit_places(poses, 0, origin)
+    _check(places[1:], given)
+    views = []
+    for view, place, camera, file in zip(given.views, places[1:], cameras[1:], sources, strict=True):
+        theta = _affine(place, camera, file, scale)
+        cut = cut_out(file, 2 * size)
+        views.append(
+            [known_view(warped(frame, theta, size), place.azimuth_deg, place.elevation_deg, view.name) for frame in cut]
+        )
+    return views
+
+
+def _box(cutouts: Float[Tensor, "t s s 4"], unit: float, half: float) -> Box:
+    left, top, right, bottom = (edge * unit - half for edge in bounding_box(cutouts[..., 3]))
+    return left, top, right, bottom
+
+
+def _tangent_box(whole: Float[Tensor, "t s s 4"], camera: PlacedCamera, source: Source) -> Box:
+    """Return the outline's box in tangents of the angles from the optical axis."""
+    half = _half(camera, source)
+    x, y = _principal(camera, source)
+    left, top, right, bottom = _box(whole, 2 / whole.shape[1], 1)
+    return (left - x) * half, (top - y) * half, (right - x) * half, (bottom - y) * half
+
+
+def _half(camera: PlacedCamera, source: Source) -> float:
+    """Return the tangent of half the square frame around the picture."""
+    height, width = source.frames.shape[1:3]
+    return max(height, width) / width / camera.focal / 2
+
+
+def _principal(camera: PlacedCamera, source: Source) -> tuple[float, float]:
+    """Return the principal point in the square frame, in [-1, 1]."""
+    height, width = source.frames.shape[1:3]
+    side = max(height, width)
+    return (2 * camera.center[0] - 1) * width / side, (2 * camera.center[1] - 1) * height / side
+
+
+def _framing(framed: Box, tangents: Box) -> tuple[float, tuple[float, float]]:
+    """Return scale and offset from tangents to places in the framed input, in [-1, 1]."""
+    scale = (framed[3] - framed[1]) / max(1e-9, tangents[3] - tangents[1])
+    middle = (
+        [(box[0] + box[2]) / 2 for box in (framed, tangents)],
+        [(box[1] + box[3]) / 2 for box in (framed, tangents)],
+    )
+    return scale, (middle[0][0] - scale * middle[0][1], middle[1][0] - scale * middle[1][1])
+
+
+def _origin(
+    poses: Float[Tensor, "k 3 4"], meeting: Float[Tensor, " 3"], scale: float, offset: tuple[float, float]
+) -> Float[Tensor, " 3"]:
+    """Return the point in the middle of the framed input, as far away as the subject."""
+    pose = poses[0]
+    depth = -float((meeting - pose[:, 3]) @ pose[:, 2])
+    x, y = -offset[0] / scale, -offset[1] / scale  # tangents of the middle, y down
+    return pose[:, 3] + depth * (x * pose[:, 0] - y * pose[:, 1] - pose[:, 2])
+
+
+def _affine(place: OrbitPlace, camera: PlacedCamera, source: Source, scale: float) -> Float[Tensor, "1 2 3"]:
+    """Return the map from places in the framed view to places in the square around the picture."""
+    half, (x, y) = _half(camera, source), _principal(camera, source)
+    c, s = math.cos(math.radians(place.roll_deg)), math.sin(math.radians(place.roll_deg))
+    zoom = 1 / (scale * place.distance * half)
+    rows = [
+        [c * zoom, -s * zoom, place.center[0] / half + x],
+        [s * zoom, c * zoom, place.center[1] / half + y],
+    ]
+    return torch.tensor([rows])
+
+
+def _check(places: Sequence[OrbitPlace], given: GivenViews) -> None:
+    """Refuse cameras near a pole, and two cameras in one place."""
+    pairs = list(zip(places, given.views, strict=True))
+    for place, view in pairs:
+        if abs(place.elevation_deg) > HIGHEST_DEG:
+            raise BadInput(
+                f"{view.name} was taken from {place.elevation_deg:.0f} degrees above the input's horizon; cameras from "
+                f"-{HIGHEST_DEG:g} to {HIGHEST_DEG:g} are used: leave it out"
+            )
+    check_apart([(place.azimuth_deg, place.elevation_deg, view.name) for place, view in pairs])

@@ -1,0 +1,212 @@
+"""Format of the views that a user gives: `views.json` and the files that it names. Imports no torch.
+
+A zip of pictures with their azimuths, of a turntable video, or of pictures or videos with known cameras.
+"""
+
+import math
+from pathlib import Path
+from typing import Annotated, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from dg4d_lib.errors import BadInput
+from steps.artifacts.archives import stays_inside
+from steps.contract import Frozen, settings_errors, shown
+
+VIEWS_JSON = "views.json"
+LARGEST_JSON = 16 * 2**20  # bytes
+MOST_VIEWS = 64  # pictures or cameras
+CLOSE_DEG = 2.0  # two views nearer to each other count as one
+HIGHEST_DEG = 80.0  # elevation; near a pole the azimuth says nothing
+DISTORTED = 0.05  # largest lens distortion coefficient that is ignored
+
+
+class PlacedCamera(Frozen):
+    """Camera of a picture, as transforms.json gives it.
+
+    Attributes:
+        matrix: camera to world, OpenGL axes (x right, y up, z backward).
+        focal: focal length, in widths of the picture.
+        center: principal point, in widths and heights of the picture.
+    """
+
+    matrix: tuple[tuple[float, float, float, float], ...]
+    focal: float = Field(gt=0)
+    center: tuple[float, float] = (0.5, 0.5)
+
+
+class GivenView(Frozen):
+    """Picture, or video, from one direction.
+
+    Attributes:
+        file: name in the zip.
+        name: name for messages.
+        azimuth: degrees, 0 is the input view, 90 the side that it shows on the right.
+        elevation: degrees, positive above.
+        camera: known camera, which replaces the angles.
+    """
+
+    file: str
+    name: str
+    azimuth: float = Field(0.0, ge=-360, le=360)
+    elevation: float = Field(0.0, ge=-HIGHEST_DEG, le=HIGHEST_DEG)
+    camera: PlacedCamera | None = None
+
+
+class GivenViews(Frozen):
+    """Content of `views.json`.
+
+    Attributes:
+        views: pictures, in the order in which they were given.
+        turntable: name in the zip of a video of the still subject, turned once; empty without.
+        input_camera: camera of the input; None without known cameras.
+    """
+
+    views: tuple[GivenView, ...] = Field((), max_length=MOST_VIEWS)
+    turntable: str = ""
+    input_camera: PlacedCamera | None = None
+
+
+def read_views(folder: Path) -> GivenViews:
+    """Read the `views.json` of an unpacked zip.
+
+    Raises:
+        BadInput: it is of another form, or names a file outside of the zip.
+    """
+    try:
+        given = GivenViews.model_validate_json((folder / VIEWS_JSON).read_bytes())
+    except (OSError, ValidationError) as error:
+        raise BadInput(f"the views cannot be read: {error}; give them with --view, --turntable or --cameras") from error
+    for name in filter(None, (*(view.file for view in given.views), given.turntable)):
+        if not stays_inside(name) or not (folder / name).is_file():
+            raise BadInput(f"{VIEWS_JSON} names {shown(name)}, which is not among the views")
+    return given
+
+
+def parse_view(text: str) -> tuple[float, float, str]:
+    """Parse `AZIMUTH[,ELEVATION]=FILE`.
+
+    Raises:
+        BadInput: it is not of this form, or an angle is out of range.
+    """
+    angles, equals, file = text.partition("=")
+    try:
+        numbers = [float(part) for part in angles.split(",")]
+        if not equals or not file.strip() or len(numbers) > 2 or not all(map(math.isfinite, numbers)):
+            raise ValueError
+    except ValueError:
+        raise BadInput(
+            f"{shown(text)} is no view: write AZIMUTH[,ELEVATION]=FILE in degrees, for example 90=right.png"
+        ) from None
+    azimuth, elevation = (*numbers, 0.0)[:2]
+    if abs(azimuth) > 360 or abs(elevation) > HIGHEST_DEG:
+        raise BadInput(
+            f"{shown(text)}: azimuth {azimuth:g} and elevation {elevation:g}; azimuths from -360 to 360 and elevations "
+            f"from -{HIGHEST_DEG:g} to {HIGHEST_DEG:g} are allowed"
+        )
+    return azimuth, elevation, file.strip()
+
+
+def check_apart(places: list[tuple[float, float, str]]) -> None:
+    """Refuse two views of one direction; azimuth and elevation 0 is the input's.
+
+    Args:
+        places: azimuth, elevation and name.
+
+    Raises:
+        BadInput: names both.
+    """
+    known = [(0.0, 0.0, "the input")]
+    for azimuth, elevation, name in places:
+        for other_azimuth, other_elevation, other in known:
+            around = abs((azimuth - other_azimuth + 180) % 360 - 180)
+            if around < CLOSE_DEG and abs(elevation - other_elevation) < CLOSE_DEG:
+                raise BadInput(
+                    f"{name} and {other} are views of one direction (azimuth {azimuth:g}, elevation {elevation:g}); "
+                    "keep one of them, or correct the azimuth: 90 is the side that the input shows on the right, 180 "
+                    "the back"
+                )
+        known.append((azimuth, elevation, name))
+
+
+class _Loose(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+
+
+Bounded = Annotated[float, Field(ge=-1e6, le=1e6)]  # larger ones are no places, and overflow when squared
+Row = tuple[Bounded, Bounded, Bounded, Bounded]
+
+
+class TransformsFrame(_Loose):
+    """Frame of a transforms.json; intrinsics of its own win over the common ones."""
+
+    file_path: str = Field(min_length=1)
+    transform_matrix: Annotated[tuple[Row, ...], Field(min_length=3, max_length=4)]
+    fl_x: float | None = Field(None, gt=0)
+    cx: float | None = None
+    cy: float | None = None
+    w: int | None = Field(None, gt=0)
+    h: int | None = Field(None, gt=0)
+
+
+class Transforms(_Loose):
+    """Content of a transforms.json of nerfstudio: pinhole cameras in OpenGL axes."""
+
+    frames: tuple[TransformsFrame, ...] = Field(min_length=2, max_length=MOST_VIEWS + 1)
+    camera_angle_x: float | None = Field(None, gt=0, lt=math.pi)
+    fl_x: float | None = Field(None, gt=0)
+    cx: float | None = None
+    cy: float | None = None
+    w: int | None = Field(None, gt=0)
+    h: int | None = Field(None, gt=0)
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    camera_model: str = "OPENCV"
+
+    @model_validator(mode="after")
+    def _pinhole(self) -> Self:
+        bent = max(map(abs, (self.k1, self.k2, self.p1, self.p2)))
+        if bent > DISTORTED or "FISHEYE" in self.camera_model.upper():
+            raise ValueError(f"the lens is distorted (coefficient {bent:g}); give undistorted pictures")
+        return self
+
+    def camera(self, frame: TransformsFrame) -> PlacedCamera:
+        """Return the camera of a frame.
+
+        Raises:
+            BadInput: no focal length is given, or no size of the picture to go with it.
+        """
+        width, height = frame.w or self.w, frame.h or self.h
+        focal, x, y = frame.fl_x or self.fl_x, frame.cx or self.cx, frame.cy or self.cy
+        if focal and width:
+            share = focal / width
+        elif self.camera_angle_x:
+            share = 0.5 / math.tan(self.camera_angle_x / 2)
+        else:
+            raise BadInput(
+                f"{shown(frame.file_path)} has no focal length: give fl_x, w and h in pixels, or camera_angle_x in "
+                "radians"
+            )
+        center = (x / width if x and width else 0.5, y / height if y and height else 0.5)
+        return PlacedCamera(matrix=frame.transform_matrix[:3], focal=share, center=center)
+
+
+def read_transforms(path: Path) -> Transforms:
+    """Read a transforms.json.
+
+    Raises:
+        BadInput: it is too large or of another form.
+    """
+    try:
+        if (size := path.stat().st_size) > LARGEST_JSON:
+            raise BadInput(f"{path} has {size} bytes; at most {LARGEST_JSON} are read")
+        return Transforms.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise BadInput(f"{path} cannot be read: {error.strerror}") from error
+    except ValidationError as error:
+        raise BadInput(
+            f"{path} is no transforms.json of nerfstudio (frames with file_path and transform_matrix): "
+            f"{settings_errors(error)}"
+        ) from error

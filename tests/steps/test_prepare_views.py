@@ -1,0 +1,170 @@
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "dg4d_lib" / "visual_hull"))
+from creatures import creature, seen
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.errors import BadInput
+from dg4d_lib.inflation.surface import InflatedSurface
+from dg4d_lib.metrics.image import iou
+from dg4d_lib.settings import GeometricPriorSettings, SubjectSettings
+from dg4d_lib.visual_hull.known import KnownView
+from steps.artifacts.media import read_png, write_png, write_zip
+from steps.fitting.priors import known_views, read_bank, subject_shapes
+from steps.prepare_subject import run as prepare_subject
+from steps.prepare_views import run
+from steps.profiles import PREVIEW, step_settings
+from steps.runtime.job import Job, StepReport
+from steps.sources.views import VIEWS_JSON, GivenView, GivenViews, PlacedCamera
+
+SIZE = 96
+SETTINGS = PREVIEW.model_copy(update={"subject": SubjectSettings(size=SIZE)})
+
+
+class Workplace:
+    """A folder with a prepared input, to which views are added."""
+
+    def __init__(self, folder: Path, front: KnownView) -> None:
+        self.folder = folder
+        self.source = folder / "front.png"
+        write_png(self.source, front.cutout)
+        outputs = {port: folder / f"{port}.png" for port in ("subject", "footage", "pose", "picture")}
+        prepare_subject(Job({"source": self.source}, outputs, self.settings("prepare_subject"), 0, print, folder))
+
+    def settings(self, step: str) -> object:
+        return step_settings(step, SETTINGS)
+
+    def prepare(self, given: GivenViews, files: dict[str, bytes]) -> StepReport:
+        write_zip(self.folder / "views.zip", [(VIEWS_JSON, given.model_dump_json().encode()), *files.items()])
+        inputs = {"views": self.folder / "views.zip", "source": self.source, "subject": self.folder / "subject.png"}
+        outputs = {"known_views": self.folder / "known.zip", "picture": self.folder / "views_picture.png"}
+        for name in ("seen", "bank"):
+            (self.folder / name).mkdir(exist_ok=True)
+        quiet = lambda *_: None  # noqa: E731
+        return run(Job(inputs, outputs, self.settings("prepare_views"), 0, quiet, self.folder / "seen"))
+
+    def known(self) -> list[KnownView]:
+        return known_views(read_bank(self.folder / "known.zip", self.folder / "bank"))
+
+
+def png(view: KnownView, folder: Path) -> bytes:
+    write_png(folder / "view.png", view.cutout)
+    return (folder / "view.png").read_bytes()
+
+
+def sides(
+    folder: Path, *azimuths: float, subject: InflatedSurface | None = None
+) -> tuple[GivenViews, dict[str, bytes]]:
+    files = {f"{i:03d}": png(seen(subject or creature(), azimuth), folder) for i, azimuth in enumerate(azimuths)}
+    views = [GivenView(file=f, name=f"{a:g}.png", azimuth=a) for f, a in zip(files, azimuths, strict=True)]
+    return GivenViews(views=tuple(views)), files
+
+
+def test_pictures_become_a_bank_that_replaces_the_guess(tmp_path):
+    place = Workplace(tmp_path, seen(creature(), 0))
+    report = place.prepare(*sides(tmp_path, 90, 180, 270))
+    known = place.known()
+    assert [view.camera.azimuth_deg for view in known] == [90, 180, 270] and report.notes == ()
+    assert torch.allclose(known[0].cutout[..., 3], seen(creature(), 90).cutout[..., 3], atol=0.01)
+    bank = read_bank(tmp_path / "known.zip", tmp_path / "seen")
+    subject = read_png(tmp_path / "subject.png")
+    truth = seen(creature(), 45).cutout[None, ..., 3:]
+    overlaps = [
+        float(
+            iou(
+                seen(subject_shapes(GeometricPriorSettings(), [subject], 0, b).surface(0), 45).cutout[None, ..., 3:],
+                truth,
+            )
+        )
+        for b in (None, bank)
+    ]
+    assert overlaps[0] < 0.4
+    assert overlaps[1] > 0.75
+
+
+def test_the_views_and_their_hull_are_shown(tmp_path):
+    place = Workplace(tmp_path, seen(creature(), 0))
+    place.prepare(*sides(tmp_path, 90))
+    assert read_png(tmp_path / "views_picture.png").shape == (2 * 96, 2 * 96, 3)
+
+
+def test_a_view_of_something_else_is_refused_by_name_with_the_picture(tmp_path):
+    other = creature()
+    wide = InflatedSurface(other.vertices * torch.tensor([1.6, 0.3, 0.6]), *list(vars(other).values())[1:])
+    given, files = sides(tmp_path, 90, 180, 270)
+    files["001"] = png(seen(wide, 180), tmp_path)
+    place = Workplace(tmp_path, seen(creature(), 0))
+    with pytest.raises(BadInput, match=r"180\.png \(azimuth 180, elevation 0\) contradicts the others"):
+        place.prepare(given, files)
+    assert (tmp_path / "seen" / "views.png").is_file()
+
+
+def clip(folder: Path, azimuths: list[float]) -> bytes:
+    """Return a zip of frames from these azimuths."""
+    frames = [(f"{i:03d}.png", png(seen(creature(), a), folder)) for i, a in enumerate(azimuths)]
+    write_zip(folder / "frames.zip", frames)
+    return (folder / "frames.zip").read_bytes()
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_turntable_of_either_direction_is_placed_around_the_subject(sign, tmp_path):
+    place = Workplace(tmp_path, seen(creature(), 0))
+    place.prepare(GivenViews(turntable="turn"), {"turn": clip(tmp_path, [sign * 36.0 * i for i in range(10)])})
+    known = place.known()
+    assert [round(view.camera.azimuth_deg) % 360 for view in known] == [
+        round(sign * 36 * i) % 360 for i in range(1, 10)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("azimuths", "refusal"),
+    [
+        ([0.0] * 9, "shows no turn"),
+        ([0.0, 90, 180, 270], "has 4 frames"),
+        ([4.0 * i for i in range(12)], "no whole turn"),
+    ],
+)
+def test_a_turntable_that_is_no_turn_is_refused(azimuths, refusal, tmp_path):
+    place = Workplace(tmp_path, seen(creature(), 0))
+    with pytest.raises(BadInput, match=refusal):
+        place.prepare(GivenViews(turntable="turn"), {"turn": clip(tmp_path, azimuths)})
+
+
+def placed(azimuth: float, elevation: float = 0.0) -> PlacedCamera:
+    matrix = OrbitCamera(elevation, azimuth).viewmat().inverse()[:3] @ torch.diag(
+        torch.tensor([1.0, -1, -1, 1], dtype=torch.float64)
+    )
+    return PlacedCamera(matrix=[tuple(row) for row in matrix.tolist()], focal=OrbitCamera().focal / 256)
+
+
+def test_pictures_of_known_cameras_are_placed_by_them(tmp_path):
+    place = Workplace(tmp_path, seen(creature(), 0))
+    files = {"000": png(seen(creature(), 75, 20), tmp_path), "001": png(seen(creature(), 200), tmp_path)}
+    cameras = [placed(75, 20), placed(200)]
+    views = [GivenView(file=f, name=f, camera=c) for f, c in zip(files, cameras, strict=True)]
+    place.prepare(GivenViews(views=tuple(views), input_camera=placed(0)), files)
+    for view, (azimuth, elevation) in zip(place.known(), [(75, 20), (-160, 0)], strict=True):
+        assert (view.camera.azimuth_deg, view.camera.elevation_deg) == pytest.approx((azimuth, elevation), abs=1e-3)
+        truth = seen(creature(), azimuth, elevation).cutout
+        assert float(iou(view.cutout[None, ..., 3:], truth[None, ..., 3:])) > 0.95
+
+
+def test_a_video_among_pictures_is_refused(tmp_path):
+    place = Workplace(tmp_path, seen(creature(), 0))
+    given, files = sides(tmp_path, 90)
+    files["000"] = clip(tmp_path, [0.0, 90])
+    with pytest.raises(BadInput, match="is a video; --view takes pictures"):
+        place.prepare(given, files)
+
+
+def test_a_bundle_that_names_a_missing_file_is_refused(tmp_path):
+    place = Workplace(tmp_path, seen(creature(), 0))
+    given, _ = sides(tmp_path, 90)
+    with pytest.raises(BadInput, match="which is not among the views"):
+        place.prepare(given, {})
+    assert json.loads(given.model_dump_json())["views"][0]["file"] == "000"
