@@ -5,7 +5,7 @@ import json
 import os
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -59,11 +59,18 @@ def connect() -> None:
     settle_orphans()
 
 
-def convert_job(job: ConversionJob, folder: Path) -> tuple[Files, bool]:
+def convert_job(
+    job: ConversionJob, folder: Path, run: "Callable[[ConversionJob, Path], FlowResult] | None" = None
+) -> tuple[Files, bool]:
     """Run the flow of a job and publish the package in `folder`, signed if a key is configured.
 
     Cached artifacts that turn out to be missing or damaged are computed again. A run that finds another one writing the
     same folder waits for it, and reuses an equal package.
+
+    Args:
+        job: job to convert.
+        folder: output folder.
+        run: runs the steps and publishes the package; None: the flow, on the connected Prefect server.
 
     Returns:
         Files of the package, and true if every step was cached.
@@ -81,14 +88,15 @@ def convert_job(job: ConversionJob, folder: Path) -> tuple[Files, bool]:
     def waiting() -> None:
         emit(StepEvent(job.item, "output", "remark", text=f"waiting for another run that writes {folder}"))
 
+    run = run or run_flow
     cached = True
     with output_lock(folder, waiting) as waited:
         if not (waited and is_current(folder, job.digest())):
             with running(home.store(), job.item):
                 try:
-                    result = run_flow(job, folder)
+                    result = run(job, folder)
                 except (ArtifactMissing, StepLost):  # the cache entry of the missing artifact was dropped
-                    result = run_flow(job, folder)
+                    result = run(job, folder)
             cached = all(done.cached for done in result.steps)
     return (record_of(folder) or {"files": {}})["files"], cached
 

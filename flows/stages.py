@@ -12,10 +12,11 @@ from flows.packages.flow_result import StepRun, notes_of
 from flows.step_calls import DrivingVideo, Gaussians, Mesh, Motion, Package, Subject, Verdict
 from flows.step_errors import StepBadInput
 from steps.artifacts.mesh_plan import read_plan
+from steps.contract import StepResult
 
 P = ParamSpec("P")
-R = TypeVar("R")
-R_co = TypeVar("R_co", covariant=True)
+R = TypeVar("R", bound=StepResult)
+R_co = TypeVar("R_co", bound=StepResult, covariant=True)
 
 
 class StepFuture(Protocol[R_co]):

@@ -7,12 +7,13 @@ from flows import step_calls
 from flows.engine.step_tasks import finished_steps, step_task
 from flows.stages import StepTask, Tasks
 from flows.step_calls import DrivingVideo, Gaussians, Mesh, Motion, Package, Picture, Plan, Scores, Subject, Verdict
+from steps.contract import StepResult
 
 __all__ = ["DrivingVideo", "Gaussians", "Mesh", "Motion", "Package", "Picture", "Plan", "Scores", "Subject", "Verdict"]
 # records of earlier versions name the classes here
 
 P = ParamSpec("P")
-R = TypeVar("R")
+R = TypeVar("R", bound=StepResult)
 
 draw_picture = step_task(step_calls.draw_picture)
 prepare_subject = step_task(step_calls.prepare_subject)

@@ -42,7 +42,7 @@ PROGRESS_EVERY_S = 3.0  # between two updates of a progress artifact
 CPU, GPU = "resource:cpu", "resource:gpu"  # tags; Prefect keeps a thread and a client for every set of tags
 
 P = ParamSpec("P")
-R = TypeVar("R")
+R = TypeVar("R", bound=StepResult)
 
 
 def step_task(call: Callable[P, R]) -> Task[P, R]:
