@@ -24,6 +24,7 @@ from steps.store.files import home as store_home
 if TYPE_CHECKING:
     from flows.packages.flow_result import FlowResult
 
+STARTING = "starting the Prefect server"  # stage of `connect` when no server runs
 ANSWER_S = 10.0  # time limit of a health check of the user's own server
 
 
@@ -46,17 +47,33 @@ def connect() -> None:
     require_free_space(store_home())
     own = os.environ.get("PREFECT_API_URL")
     if own:
+        _announce(f"connecting to the Prefect server {own}")
         home.set_environment(own)
         _check(own)
     else:
         server = background.background_server()
+        if server.address() is None:
+            first = "" if server.has_database() else "; the first start creates its database, about 10 s"
+            _announce(f"{STARTING}{first}")
         server.start()
         background.set_own_server(server, server.wait_for_address())
+        _announce("importing the flows")
         importlib.import_module("flows.pipeline")  # takes seconds, as the start of the server does
+        _announce("waiting for the Prefect server")
         server.wait()
     from flows.engine.orphans import settle_orphans
 
     settle_orphans()
+
+
+@contextmanager
+def announcing(say: Callable[[str], None]) -> Iterator[None]:
+    """Call `say` with every stage of `connect` while the block runs."""
+    _listeners.append(say)
+    try:
+        yield
+    finally:
+        _listeners.remove(say)
 
 
 def convert_job(
@@ -169,6 +186,14 @@ def save_pictures(job: ConversionJob, error: Exception) -> list[Path]:
             continue
         saved.append(path)
     return saved
+
+
+_listeners: list[Callable[[str], None]] = []
+
+
+def _announce(stage: str) -> None:
+    for say in tuple(_listeners):
+        say(stage)
 
 
 def _check(api_url: str) -> None:

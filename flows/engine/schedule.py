@@ -75,6 +75,11 @@ class Schedule:
                 case _:
                     pass
 
+    @property
+    def finished(self) -> int:
+        """Number of planned steps that have ended."""
+        return len(self._ended)
+
     def number(self, label: str) -> int:
         """Return the position of a step from 1 on; 0 if it is not among the planned ones."""
         name = label.partition(" ")[0]
@@ -106,7 +111,7 @@ class Schedule:
             if not self._is_measured and planned < KNOWN_SHARE * sum(self._expected.values()):
                 return None
             pace = worked / planned if planned else 1.0
-            return sum(_left(expected * pace, fraction, elapsed) for expected, fraction, elapsed in rest)
+            return sum((_left(expected * pace, fraction, elapsed) for expected, fraction, elapsed in rest), 0.0)
 
     def durations(self) -> dict[str, float]:
         """Return the seconds of the steps that were computed."""
@@ -138,8 +143,8 @@ def durations_file() -> Path:
 
 
 def format_left(seconds: float | None) -> str:
-    """Return a text such as "about 40 s left" or "about 3 min left"; empty if the time is unknown."""
-    if seconds is None:
+    """Return a text such as "about 40 s left" or "about 3 min left"; empty if it is unknown or over."""
+    if not seconds:
         return ""
     if seconds < 60 * SHORT_MINUTES:
         return f"about {max(5 * math.ceil(seconds / 5), 5)} s left"

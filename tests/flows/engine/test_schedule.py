@@ -85,7 +85,7 @@ def test_durations_are_kept_by_profile_and_what_is_broken_is_ignored(
 
 @pytest.mark.parametrize(
     ("seconds", "text"),
-    [(None, ""), (0.0, "about 5 s left"), (41.0, "about 45 s left"), (121.0, "about 3 min left")],
+    [(None, ""), (0.0, ""), (0.1, "about 5 s left"), (41.0, "about 45 s left"), (121.0, "about 3 min left")],
 )
 def test_times_are_rounded_for_people(seconds: float | None, text: str) -> None:
     assert format_left(seconds) == text
