@@ -5,6 +5,8 @@ asset.render(dg4d.Camera(azimuth_deg=30), t=0.5)
 """
 
 from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -44,14 +46,35 @@ _PLACES = {
 }
 
 
+_PARTS = ("dg4d_lib", "steps", "flows")  # packages that are installed beside this one
+
+
 def __getattr__(name: str) -> Any:
     """Import a public name when it is used first; `import dg4d` alone imports nothing heavy."""
     if name not in _PLACES:
         raise AttributeError(f"module 'dg4d' has no attribute {name!r}; it has: {', '.join(__all__)}")
+    _check_parts()
     module, _, attribute = _PLACES[name].partition(":")
     value = getattr(import_module(module), attribute)
     globals()[name] = value
     return value
+
+
+def _check_parts() -> None:
+    """Refuse foreign modules that hide a part of dg4d, such as a `steps.py` beside a script.
+
+    Raises:
+        ImportError: names the file.
+    """
+    site = Path(__file__).resolve().parents[1]
+    for part in _PARTS:
+        spec = find_spec(part)
+        origin = spec.origin if spec is not None and spec.origin else None
+        if origin is None or Path(origin).resolve().parents[1] != site:
+            raise ImportError(
+                f"{origin or 'nothing'} hides the package {part!r} of dg4d in {site}: rename it, or remove its folder "
+                "from sys.path"
+            )
 
 
 def __dir__() -> list[str]:

@@ -78,10 +78,10 @@ def up(
         for worker in own:
             worker.start(api_url, {**variables, **limits[worker.pool]})
             typer.echo(f"{worker.pool} reads below {worker.sources}", err=True)
-        address, own = api_url.removesuffix("/api"), server.is_at(api_url)
-        typer.echo(OPEN_OWN if own else OPEN_OTHER, err=True)
-        typer.echo(server.login_address(address) if own else address)
-        if own:
+        address, is_own = api_url.removesuffix("/api"), server.is_at(api_url)
+        typer.echo(OPEN_OWN if is_own else OPEN_OTHER, err=True)
+        typer.echo(server.login_address(address) if is_own else address)
+        if is_own:
             typer.echo('other programs: eval "$(dg4d env)"; server and workers run until `dg4d down`', err=True)
 
 

@@ -132,10 +132,10 @@ class StepBars:
     def __call__(self, event: StepEvent) -> None:
         """Show an event."""
         if self._whole is not None and self._schedule is not None:
-            place, left = self._schedule.position(event.step), format_left(self._schedule.seconds_left())
-            done = self._schedule.finished
-            changes = {"description": place} if place and event.kind == "started" else {}
-            self.progress.update(self._whole, completed=done, numbers=left, **changes)
+            if event.kind == "started" and (place := self._schedule.position(event.step)):
+                self.progress.update(self._whole, description=place)
+            left = format_left(self._schedule.seconds_left())
+            self.progress.update(self._whole, completed=self._schedule.finished, numbers=left)
         if event.step not in self._bars:
             self._bars[event.step] = self.progress.add_task(plain(event.step), total=None, numbers="")
         bar = self._bars[event.step]

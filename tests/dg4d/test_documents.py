@@ -45,8 +45,10 @@ def test_the_page_has_every_public_name_and_argument() -> None:
     assert not [name for name in arguments if f"`{name}`" not in text]
 
 
-def test_the_notebook_runs(place: Path) -> None:
+def test_the_notebook_runs(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each code cell in order, as a kernel runs it: statements, then the value of a last expression."""
+    shutil.copyfile(place / "newt.png", tmp_path / "newt.png")
+    monkeypatch.chdir(tmp_path)
     cells = [cell for cell in json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"] if cell["cell_type"] == "code"]
     names: dict[str, Any] = {}
     shown = []
