@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
 
 from flows import home
-from flows.convert import convert_job
+from flows.convert import convert_job, prepare
 from flows.engine import resources
 from flows.engine.events import StepEvent, emit
 from flows.engine.executors import stop_all
@@ -51,6 +51,7 @@ def convert_inline(job: ConversionJob, folder: Path) -> tuple[Files, bool]:
     """
     require_free_space(store_home())
     with _stoppable():
+        prepare(job)
         return convert_job(job, folder, run_inline)
 
 
