@@ -90,7 +90,9 @@ def score(specimen: Specimen, states: Sequence[Gaussians]) -> Figures:
 def prior_of(bank: Bank, settings: PipelineSettings, stage: FitSettings) -> AnalyticPrior:
     """Return the oracle, perturbed or not, with the timestep schedule of a stage."""
     assert isinstance(settings.prior, OraclePriorSettings), "these fits are made with prior.kind = oracle"
-    noise = TimestepSchedule(stage.t_max_start, stage.t_max_end, uniform=stage.noise_draw == "uniform")
+    noise = TimestepSchedule(
+        stage.t_max_start, stage.t_max_end, stage.t_max_limit, uniform=stage.noise_draw == "uniform"
+    )
     return make_oracle_prior(bank, settings.prior, noise)
 
 

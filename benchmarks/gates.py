@@ -268,6 +268,7 @@ SPOILS: dict[str, tuple[str, Spoil]] = {
         lambda s: _refaced(s, s.surface.mesh.faces[torch.arange(len(s.surface.mesh.faces)) % 50 > 0]),
     ),
     "turned inside out": ("flaws", lambda s: _refaced(s, s.surface.mesh.faces.flip(1))),
+    "a crumpled mesh": ("folds", lambda s: _mesh_moved(s, lambda p: p + 0.02 * _noise(*p.shape).to(p))),
     "a mesh too thick": ("agreement", lambda s: _mesh_moved(s, lambda p: 1.15 * p)),
     "a blurred texture": ("sharpness", lambda s: _retextured(s, partial(_blurred, texels=16))),
     "noisy colors": ("sharpness", lambda s: _recolored(s, lambda c: c + 0.3 * _noise(*c.shape))),

@@ -90,7 +90,7 @@ def score_prior(subject: Subject, settings: PipelineSettings, frames: Sequence[i
     Returns:
         Figures, and the views of the first of these frames side by side, over white.
     """
-    cutouts, _ = prepare_subject(subject.footage, True, settings.subject)
+    cutouts = prepare_subject(subject.footage, True, settings.subject).frames
     shapes = subject_shapes(settings.prior, [cutouts[frame] for frame in frames], _turn(cutouts, settings))
     size = next(iter(subject.views.values())).shape[1]
     rows, strip = [], []
@@ -109,7 +109,7 @@ def score_fit(subject: Subject, settings: PipelineSettings, seed: int = 0) -> tu
         Figures, and the views of the first frame side by side, over white.
     """
     rasterize, generator = get_rasterizer("auto"), torch.Generator().manual_seed(seed)
-    cutouts, _ = prepare_subject(subject.footage, True, settings.subject)
+    cutouts = prepare_subject(subject.footage, True, settings.subject).frames
     turn_deg, start_settings = _turn(cutouts, settings), settings.static.start
     assert not isinstance(start_settings, LgmStartSettings), "these fits start without LGM"
     start = initial_gaussians(start_settings, subject_shapes(settings.prior, [cutouts[0]], turn_deg), generator)

@@ -55,6 +55,7 @@ def make(
     views: Any = None,
     asset: Any = None,
     bank: str | Path | None = None,
+    mask: str | Path | None = None,
     profile: str = "preview",
     seed: int = 0,
     name: str = "",
@@ -75,6 +76,7 @@ def make(
         views: reserved for several views of the subject.
         asset: reserved for an existing model.
         bank: folder of ground-truth views, for `prior.kind=oracle`.
+        mask: picture, or folder of frames for a video, that is white where the subject is.
         profile: set of settings.
         seed: seed of every step.
         name: name of the asset; default: from the file name or the text.
@@ -100,6 +102,7 @@ def make(
             text=text,
             video=Path(video) if video is not None else None,
             bank=Path(bank) if bank is not None else None,
+            mask=Path(mask) if mask is not None else None,
             profile=profile,
             settings=revise(named_profile(profile), flat_settings(settings)),
             seed=seed,

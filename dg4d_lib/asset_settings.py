@@ -34,8 +34,19 @@ class GltfSettings(Settings):
     metallic: Share = Field(0.0, description="metallic factor of the material")
 
 
+class CutoutGateSettings(Settings):
+    """Acceptance criteria of an estimated cut-out; ours, not calibrated: wide bounds that shreds fail."""
+
+    pieces_most: Share = Field(0.1, description="share of the cut-out outside of its largest piece")
+    holes_most: Share = Field(0.12, description="share of the filled cut-out that is holes")
+    border_most: Share = Field(0.5, description="share of the picture's border that the cut-out touches")
+    agreement_least: Share = Field(0.5, description="overlap of the cut-outs of two methods, IoU")
+
+
 class GateSettings(Settings):
     """Acceptance criteria of an asset; ours, calibrated by benchmarks/gates.py."""
+
+    cutout: CutoutGateSettings = CutoutGateSettings()
 
     fidelity_least: float = Field(16.5, ge=0, le=60, description="PSNR on the subject from the input camera, dB")
     silhouette_least: Share = Field(
@@ -51,6 +62,9 @@ class GateSettings(Settings):
         0.02, description="share of the alpha disconnected from the subject, minus the video's"
     )
     flaws_most: NotNegative = Field(0.002, le=10, description="defective edges and triangles of the mesh, per triangle")
+    folds_most: Share = Field(
+        0.002, description="share of the triangles that cross others, are flipped or folded, in the worst frame"
+    )
     agreement_least: Share = Field(0.85, description="overlap of the silhouettes of mesh and splats, IoU")
     sharpness_least: NotNegative = Field(0.75, le=10, description="color gradients, relative to the input image")
     sharpness_most: Positive = Field(1.25, le=10, description="color gradients, relative to the input image")
@@ -67,6 +81,12 @@ class ScoreSettings(Settings):
     clip_weights: str = Field("clip-vit-b-32", description="CLIP; a name, or a folder in the layout of transformers")
     i3d_weights: str = Field("i3d", description="FVD; a name or a folder")
     samples: int = Field(10_000, ge=100, le=1_000_000, description="points per surface, for the Chamfer distance")
+    actionbench_points: int = Field(
+        100_000, ge=100, le=1_000_000, description="ActionBench: points per surface (published: 100,000)"
+    )
+    icp_points: int = Field(
+        1000, ge=100, le=100_000, description="ActionBench: points for the alignment of a frame (published: 10,000)"
+    )
 
 
 class PackSettings(Settings):
@@ -103,7 +123,10 @@ class PackSettings(Settings):
     sheet_size: int = Field(192, ge=32, le=1024, description="pixels of a tile of the contact sheet")
     sheet_frames: int = Field(6, ge=1, le=32, description="columns: frames")
     sheet_azimuths_deg: tuple[Annotated[float, Field(ge=-360, le=360)], ...] = Field(
-        (0.0, -75.0, 15.0, 105.0, 195.0), min_length=1, description="rows: azimuths"
+        (0.0, -75.0, 15.0, 105.0, 195.0), min_length=1, description="rows: azimuths of the splats"
+    )
+    sheet_mesh_azimuths_deg: tuple[Annotated[float, Field(ge=-360, le=360)], ...] = Field(
+        (30.0, 195.0), description="further rows: azimuths of the lit mesh"
     )
 
     @field_validator("fps")

@@ -5,7 +5,7 @@ The defaults are the paper's; profiles change them (steps/profiles.py). "Ours" m
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -50,9 +50,26 @@ class TextSettings(Settings):
     low_memory: bool = Field(False, description="keep only the network in use on the GPU; slower")
 
 
+MATTING_METHODS = ("auto", "u2netp", "backdrop", "none")  # other names are weights
+BOX_FORM = "a box is X,Y,W,H in pixels: left and upper edge, width and height, both at least 1"
+
+
 class SubjectSettings(Settings):
     """Conversion of any picture or video to cut-outs in one square frame."""
 
+    matting: str = Field(
+        "auto",
+        min_length=1,
+        description="cut-out of the subject. auto: the picture's alpha channel, else `backdrop` where the backdrop is "
+        "plain, else `u2netp`; backdrop: by the color of a plain backdrop; u2netp: by U2-Netp; none: the alpha channel "
+        "alone; or another network by a name from `dg4d weights list`, or a folder with onnx/model.onnx",
+    )
+    box: tuple[Annotated[int, Field(ge=0, le=1_000_000)], ...] = Field(
+        (),
+        max_length=4,
+        description="[X, Y, width, height] of the subject in pixels of the upright picture; what is outside is "
+        "transparent; []: the whole picture",
+    )
     size: int = Field(512, ge=32, le=2048, description="pixels of the square frame")
     framing: Literal["auto", "center", "keep"] = Field(
         "auto",
@@ -72,6 +89,14 @@ class SubjectSettings(Settings):
     max_decode_gb: float = Field(
         1.0, ge=0.125, le=256, description="GiB of memory for decoding the source, including decoded frames; ours"
     )
+
+    @field_validator("box")
+    @classmethod
+    def _check_box(cls, box: tuple[int, ...]) -> tuple[int, ...]:
+        """Refuse boxes that are incomplete or empty."""
+        if box and (len(box) != 4 or min(box[2:]) < 1):
+            raise ValueError(BOX_FORM)
+        return box
 
 
 class VideoModelSettings(Settings):
@@ -303,6 +328,9 @@ class FitSettings(Settings):
     t_max_end: Share = Field(
         0.02, description="T_max at the end (paper; the public code anneals from 1 to 0, clamped at 0.02)"
     )
+    t_max_limit: float = Field(
+        0.98, gt=0.02, le=0.98, description="T_max is clipped to this (first release, dynamic stage: 0.5)"
+    )
     noise_draw: NoiseDraw = Field(
         "annealed", description="timestep of an iteration; annealed: T_max; uniform: drawn below T_max"
     )
@@ -362,9 +390,9 @@ class HexPlaneSettings(Settings):
     scales: tuple[Annotated[int, Field(ge=1, le=16)], ...] = Field(
         (1,), min_length=1, description="multi-resolution: factors on `spatial`; features are concatenated"
     )
-    variation_weight: NotNegative = Field(0.0, description="total variation of the spatial planes (typical: 1e-4)")
-    smoothness_weight: NotNegative = Field(0.0, description="second differences over time (typical: 0.01)")
-    sparsity_weight: NotNegative = Field(0.0, description="L1 distance of the time planes from one (typical: 1e-4)")
+    variation_weight: NotNegative = Field(0.0, description="second differences over space, per plane (typical: 1e-4)")
+    smoothness_weight: NotNegative = Field(0.0, description="second differences over time, per plane (typical: 0.01)")
+    sparsity_weight: NotNegative = Field(0.0, description="L1 distance of time planes from one, each (typical: 1e-4)")
 
 
 class MlpSettings(Settings):
@@ -407,6 +435,11 @@ class MotionSettings(FitSettings):
     means_lr: Positive = Field(0.001, description="learning rate of the canonical means at the start (public code)")
     means_lr_end: Positive = Field(
         2e-5, description="learning rate of the canonical means at the end, log-linear (public code)"
+    )
+    length_scale: Positive = Field(
+        1.0,
+        description="factor on learning rates of lengths: of the canonical means and of the layer that predicts their "
+        "displacement; 4/3 for Gaussians by LGM, whose rates belong to cameras at radius 1.5",
     )
 
 

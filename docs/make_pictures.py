@@ -18,11 +18,9 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from dg4d_lib.assets.formats.normals import SmoothNormals
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.mesh.render import render_mesh
-from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
+from dg4d_lib.images import over_white
+from dg4d_lib.mesh.render import render_lit
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from flows.convert import connect
 from flows.serving import background
@@ -33,8 +31,6 @@ IMAGES = Path(__file__).parent / "images"
 SIZE = 256  # pixels of a panel: input picture, lit mesh, splats
 FPS, SWAY_DEG, LOOPS = 12, 35.0, 2
 QUALITY = 72
-LIGHT = (-0.4, -0.6, -0.7)  # direction towards the light, in the camera axes (x right, y down, z forward)
-AMBIENT, DIFFUSE = 0.5, 0.7
 
 
 def main(arguments: list[str]) -> None:
@@ -58,25 +54,12 @@ def write_animation(package: Path, path: Path) -> None:
         position = torch.tensor([k * LOOPS * manifest.frames / count % manifest.frames], dtype=torch.float64)
         camera = OrbitCamera(8.0, SWAY_DEG * math.sin(2 * math.pi * k / count), width=SIZE, height=SIZE)
         splats = draw(states(position), [camera], torch.ones(3)).color[0]
-        mesh = lit(mesh_at(surface, position[0]), camera)
+        mesh = over_white(torch.cat(render_lit(mesh_at(surface, position[0]), camera), -1))
         panels = [np.asarray(subject), _bytes(mesh), _bytes(splats)]
         pictures.append(Image.fromarray(np.concatenate(panels, axis=1)))
     pictures[0].save(
         path, save_all=True, append_images=pictures[1:], duration=round(1000 / FPS), loop=0, quality=QUALITY, method=6
     )
-
-
-def lit(mesh: TexturedMesh, camera: OrbitCamera) -> Float[Tensor, "h w 3"]:
-    """Return a mesh over white, with smooth normals, one distant light and ambient light."""
-    color, alpha = render_mesh(mesh, [camera])
-    vertices, faces = mesh.vertices.numpy(), mesh.faces.numpy()
-    normals = torch.from_numpy(SmoothNormals(vertices, faces)(vertices))
-    fragments = rasterize_mesh(mesh.vertices, mesh.faces, [camera])
-    seen = torch.nn.functional.normalize(interpolate(fragments, mesh.faces, normals), dim=-1)
-    axes = camera.viewmat()[:3, :3].to(seen)
-    light = torch.nn.functional.normalize(torch.tensor(LIGHT), dim=0)
-    cosine = ((seen @ axes.T) * light).sum(-1, keepdim=True).clamp_min(0)
-    return (color * (AMBIENT + DIFFUSE * cosine) * alpha + 1 - alpha)[0].clamp(0, 1)
 
 
 def write_screenshot(package: Path, path: Path) -> None:

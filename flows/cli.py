@@ -17,10 +17,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flows.commands.checking import bench, rebuild, score, verify
+from flows.commands.doctor import doctor
 from flows.commands.endings import exit_on_error
 from flows.commands.options import (
+    Box,
     Changes,
     Commercial,
+    Mask,
     Profile,
     Rate,
     Seed,
@@ -96,6 +99,8 @@ def make(
     bank: Annotated[
         Path | None, typer.Option(metavar="DIR", help="ground-truth views, for --set prior.kind=oracle")
     ] = None,
+    mask: Mask = None,
+    box: Box = "",
     commercial_only: Commercial = False,
     force: Annotated[bool, typer.Option("--force", help="replace another asset in the output folder")] = False,
     pick: Annotated[int | None, typer.Option(min=1, max=16, metavar="K", help="use motion K of `dg4d motions`")] = None,
@@ -110,13 +115,13 @@ def make(
         from flows.commands import terminal
         from flows.commands.make import Wish, make_each
 
-        short = shortcut_settings(triangles, texture, fps) | ({"driving.pick": pick} if pick else {})
+        short = shortcut_settings(triangles, texture, fps, box) | ({"driving.pick": pick} if pick else {})
 
         def request(item: str, picture: Path | None) -> "ConversionRequest":
-            files = {"picture": picture, "text": text, "video": video, "bank": bank}
+            files = {"picture": picture, "text": text, "video": video, "bank": bank, "mask": mask}
             return _request(profile, changes, short, item=item, seed=seed, commercial_only=commercial_only, **files)
 
-        wish = Wish(tuple(pictures or ()), text, video, out, force, bool(pick), request)
+        wish = Wish(tuple(pictures or ()), text, video, mask, out, force, bool(pick), request)
         if status := make_each(wish, terminal.console()):
             raise typer.Exit(status)
 
@@ -127,6 +132,8 @@ def motions(
     profile: Profile = "preview",
     changes: Changes = None,
     seed: Seed = 0,
+    mask: Mask = None,
+    box: Box = "",
     commercial_only: Commercial = False,
     candidates: Annotated[int, typer.Option(min=2, max=16, metavar="N", help="number of motions")] = 6,
     out: Annotated[
@@ -145,9 +152,9 @@ def motions(
         from flows.packages.publish import check_writable
 
         console = terminal.console()
-        several = {"driving.candidates": candidates, "driving.pick": 0}
+        several = shortcut_settings(None, None, None, box) | {"driving.candidates": candidates, "driving.pick": 0}
         item = clean_name(picture.stem) or "asset"
-        files = {"item": item, "picture": picture}
+        files = {"item": item, "picture": picture, "mask": mask}
         request = _request(profile, changes, several, seed=seed, commercial_only=commercial_only, **files)
         folder = out or Path("out") / f"{item}-motions"
         check_writable(folder)
@@ -223,7 +230,7 @@ def batch(
     """Make many assets.
 
     Finished items are skipped; a failed item does not stop the others. A manifest has one row per item with these
-    columns: path or text, and optionally video, name, profile, seed, bank, priority (higher first), set ("a.b=c;
+    columns: path or text, and optionally video, name, profile, seed, bank, mask, priority (higher first), set ("a.b=c;
     d.e=f"), or any setting by its name.
     """
     with exit_on_error():
@@ -325,7 +332,7 @@ def compose(
         typer.echo(out)
 
 
-for command in (score, bench, verify, rebuild, up, down, env, watch):
+for command in (score, bench, verify, rebuild, doctor, up, down, env, watch):
     app.command()(command)
 app.command("settings")(list_settings)
 

@@ -99,7 +99,7 @@ def convert(job: ConversionJob, conversion: Conversion, tasks: Tasks, must_move:
         StepError: a step did not finish.
     """
     source = tasks.draw_picture(job.source, conversion).picture if job.drawn else job.source
-    subject = tasks.prepare_subject(source, conversion)
+    subject = tasks.prepare_subject(source, conversion, job.mask)
     if must_move and subject.footage is None:
         raise StepBadInput("prepare_subject", "this is a single picture, not a video: a video has two frames or more")
     return animate(subject, job, conversion, tasks)

@@ -60,9 +60,15 @@ STEPS: dict[str, StepSpec] = {
         _step("draw_picture", {"text": TEXT}, {"picture": PNG}, sections=("text",), resource="gpu"),
         _step(
             "prepare_subject",
-            inputs={"source": SOURCE},
-            outputs={"subject": PNG, "footage": _optional(FRAMES), "pose": _optional(POSE), "picture": PNG},
-            sections=("subject",),
+            inputs={"source": SOURCE, "mask": _optional(SOURCE)},
+            outputs={
+                "subject": PNG,
+                "footage": _optional(FRAMES),
+                "pose": _optional(POSE),
+                "cutout_gates": _optional(GATES),
+                "picture": PNG,
+            },
+            sections=("subject", "gates.cutout"),
             timeout_s=2400,  # bounds decoders that hang in native code
         ),
         _step(
@@ -119,7 +125,12 @@ STEPS: dict[str, StepSpec] = {
         ),
         _step(
             "check_asset",
-            inputs={"package": PACKAGE, "driving_video": FRAMES, "subject": PNG},
+            inputs={
+                "package": PACKAGE,
+                "driving_video": FRAMES,
+                "subject": PNG,
+                "cutout_gates": _optional(GATES),
+            },
             outputs={"gates": GATES, "picture": PNG},
             sections=("rasterizer", "gates"),
         ),

@@ -1,27 +1,28 @@
 """Step that checks a package against the quality gates."""
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.asset_settings import GateSettings
+from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.rendering.sheet import draw_tiles
 from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.fitting.losses import resize_cutouts
 from dg4d_lib.images import color_over_white
-from dg4d_lib.mesh.extraction.topology import check_topology, weld_vertices
-from dg4d_lib.metrics.gates import MESH, SPLATS, Gate, GateInputs, RgbaImages, Turntable, evaluate_gates, fidelity
+from dg4d_lib.mesh.extraction.topology import check_topology, join_seams, weld_vertices
+from dg4d_lib.mesh.folds import defective_faces
+from dg4d_lib.metrics.gates import MESH, SPLATS, GateInputs, RgbaImages, Turntable, evaluate_gates, fidelity
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.archives import unpack
+from steps.artifacts.gates import gates_as_json, read_rows, write_gates
 from steps.artifacts.media import read_frames, read_png, write_png
 from steps.artifacts.packages import ASSET, COMPACT, MANIFEST, MESHES, read_manifest
 from steps.artifacts.packages import SPLATS as SPLATS_FOLDER
@@ -34,8 +35,6 @@ TIMESTAMPS = 4  # number of frames that are rendered from other sides
 SIDES = ((0.0, 45.0), (10.0, 90.0), (0.0, 180.0), (10.0, 270.0))  # elevation and azimuth, degrees
 TURN = 24  # renders of one turn
 COLUMNS = 4  # frames in the picture
-DIGITS = 4  # decimals of every number
-GATE_FIELDS = ("name", "passed", "value", "unit", "least", "most", "form", "values", "meaning", "advice")
 
 
 @dataclass(frozen=True)
@@ -67,8 +66,9 @@ def run(job: Job) -> StepReport:
         video = read_frames(job.inputs["driving_video"], folder)
     rasterizer = get_rasterizer(job.settings.rasterizer)
     evidence = collect_evidence(asset, video, read_png(job.inputs["subject"]), rasterizer)
-    answer = gates_as_json(evaluate_gates(evidence, bounds))
-    job.outputs["gates"].write_text(json.dumps(answer, ensure_ascii=False, allow_nan=False), encoding="utf-8")
+    earlier = job.inputs.get("cutout_gates")
+    answer = gates_as_json(evaluate_gates(evidence, bounds), read_rows(earlier) if earlier else ())
+    write_gates(job.outputs["gates"], answer)
     write_png(job.outputs["picture"], picture(evidence, (_spread(len(video), MOST_FRAMES) / video.fps).tolist()))
     failing = answer["failing"]
     notes = (f"Not accepted: {', '.join(failing)}. The report says what to do.",) if failing else ()
@@ -129,18 +129,8 @@ def collect_evidence(
         side_views=around,
         turntable=Turntable(turn[..., 3:4], turn[..., 4:], viewmats(ring), front.focal),
         flaws=max(_flaws(asset.surface, timestamp) for timestamp in timestamps),
+        folds=max(_folds(asset.surface, timestamp) for timestamp in timestamps),
     )
-
-
-def gates_as_json(gates: Sequence[Gate]) -> dict[str, Any]:
-    """Return the gates as JSON, with rounded values."""
-    rows = []
-    for gate in gates:
-        values = {form: round(value, DIGITS) for form, value in gate.values.items()}
-        rows.append({name: getattr(gate, name) for name in GATE_FIELDS})
-        rows[-1] |= {"value": round(gate.value, DIGITS), "values": values}
-    failing = [gate.name for gate in gates if not gate.passed]
-    return {"accepted": not failing, "failing": failing, "gates": rows}
 
 
 def picture(evidence: GateInputs, seconds: Sequence[float]) -> Float[Tensor, "h w 3"]:
@@ -190,3 +180,11 @@ def _flaws(surface: Surface, position: Float[Tensor, ""]) -> float:
     check = check_topology(*weld_vertices(mesh.vertices.numpy(), mesh.faces.numpy()))
     broken = check.boundary_edges + check.nonmanifold_edges + check.inconsistent_edges + check.degenerate_faces
     return broken / max(1, check.triangles) + check.inverted_components / max(1, check.components)
+
+
+def _folds(surface: Surface, position: Float[Tensor, ""]) -> float:
+    """Return the share of triangles that cross others, are flipped or folded; a mesh per frame has none flipped."""
+    mesh = mesh_at(surface, position)
+    rest = surface.mesh.vertices if isinstance(surface, Asset4D) else mesh.vertices
+    joined, faces = join_seams(rest.numpy(), mesh.faces.numpy())
+    return float(defective_faces(mesh.vertices.numpy()[joined], faces, rest.numpy()[joined]).mean())

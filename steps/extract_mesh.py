@@ -12,11 +12,14 @@ from dg4d_lib.images import color_over_white
 from dg4d_lib.mesh.extraction.clean import clean
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface, usable_level
+from dg4d_lib.mesh.extraction.silhouettes import render_silhouettes, silhouette_iou
 from dg4d_lib.mesh.extraction.topology import MeshTopology, check_topology, weld_vertices
+from dg4d_lib.mesh.extraction.unfold import unfold
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
 from dg4d_lib.mesh.texturing.bake import bake_texture, vertex_normals
 from dg4d_lib.mesh.texturing.unwrap import unwrap
+from dg4d_lib.mesh.tracking.elastic import relax
 from dg4d_lib.mesh.tracking.isosurface_projection import project_to_isosurface
 from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU, register_nonrigid
 from dg4d_lib.mesh.tracking.reference_frame import relative_to_frame
@@ -91,7 +94,9 @@ def _tracked(
     mesh, sources = _colored(vertices, faces, rest, rasterize, settings)
     skinned = skin_vertices(vertices, rest, relative_to_frame(displacement, frame))
     projected = project_to_isosurface(vertices, skinned, faces, states, level, settings)
-    offsets, ious = register_nonrigid(vertices, projected, faces, states, level, rasterize, settings)
+    registered, _ = register_nonrigid(vertices, projected, faces, states, level, rasterize, settings)
+    offsets = relax(vertices, registered, faces)
+    ious = silhouette_iou(vertices + offsets, faces, render_silhouettes(states, range(len(offsets)), rasterize))
     return TrackedMesh(mesh, offsets[:, sources], reference_frame=frame), ious
 
 
@@ -100,7 +105,7 @@ def _cleaned_surface(
 ) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
     field = density_field(gaussians, settings)
     vertices, faces = clean(*extract_surface(field, usable_level(field, level)), settings, field.unit)
-    return torch.from_numpy(vertices), torch.from_numpy(faces)
+    return torch.from_numpy(unfold(vertices, faces)), torch.from_numpy(faces)
 
 
 def _colored(

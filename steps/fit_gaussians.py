@@ -9,6 +9,7 @@ from dg4d_lib.gaussians.ply import write_ply
 from dg4d_lib.guidance.interface import SubjectShapes
 from dg4d_lib.inflation.surface import sample_surface
 from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
+from dg4d_lib.reconstruction.lgm import WORLD_SCALE
 from dg4d_lib.settings import (
     BlobStartSettings,
     LgmStartSettings,
@@ -56,8 +57,14 @@ def run(job: Job) -> StepReport:
 
 
 def fine_tuning_settings(static: StaticSettings) -> StaticSettings:
-    """Return settings for reconstructed Gaussians: a tenth of the learning rate of the means, as DG4D's public code."""
-    return static.model_copy(update={"means_lr": static.means_lr / 10, "means_lr_end": static.means_lr_end / 10})
+    """Return settings for reconstructed Gaussians: a tenth of the learning rate of the means, as DG4D's public code.
+
+    Its rate belongs to LGM's own lengths, so it grows with these.
+    """
+    factor = WORLD_SCALE / 10
+    return static.model_copy(
+        update={"means_lr": factor * static.means_lr, "means_lr_end": factor * static.means_lr_end}
+    )
 
 
 def initial_gaussians(

@@ -37,7 +37,7 @@ from steps.artifacts.media import read_frames, write_png, write_zip
 from steps.artifacts.meshes import read_meshes, read_tracked
 from steps.artifacts.motions import read_motion
 from steps.artifacts.packages import MANIFEST, Manifest
-from steps.artifacts.rendering import Surface
+from steps.artifacts.rendering import Surface, mesh_at
 from steps.profiles import PackNotes
 from steps.runtime.job import Job, StepReport
 
@@ -157,8 +157,15 @@ class PackageWriter:
     def write_sheet(self) -> None:
         """Write the contact sheet."""
         fit = self.fit
-        sheet = draw_contact_sheet(fit.gaussians, fit.deformation, self.video, self.rasterizer, self.pack)
+        sheet = draw_contact_sheet(
+            fit.gaussians, fit.deformation, self.video, self.rasterizer, self.pack, self._mesh_at_frame
+        )
         write_png(self.path(packages.SHEET), sheet)
+
+    def _mesh_at_frame(self, frame: int) -> TexturedMesh:
+        """Return the mesh at a frame of the driving video, which may have another rate."""
+        frames = len(self.surface.offsets) if isinstance(self.surface, Asset4D) else len(self.surface)
+        return mesh_at(self.surface, torch.tensor(frame * frames / len(self.video), dtype=torch.float64))
 
 
 def run(job: Job) -> StepReport:

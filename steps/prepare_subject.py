@@ -1,5 +1,7 @@
 """Step that turns a picture or video into cut-outs of the subject in one square frame."""
 
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -9,13 +11,19 @@ from torch import Tensor
 
 from dg4d_lib.images import over_white
 from dg4d_lib.inflation.ground import ground_turn
-from dg4d_lib.settings import SubjectSettings
+from dg4d_lib.metrics.cutout import evaluate_cutout
+from dg4d_lib.settings import MATTING_METHODS, SubjectSettings
+from dg4d_lib.video import u2netp
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.framing import crop_whole_frame, reframe
-from dg4d_lib.video.subject import prepare_subject
+from dg4d_lib.video.segmentation_network import load_folder
+from dg4d_lib.video.subject import U2NETP, Segmenter, prepare_subject
+from steps.artifacts.gates import gates_as_json, write_gates
 from steps.artifacts.media import write_frames, write_png
 from steps.artifacts.pose import Pose, write_pose
 from steps.runtime.job import Job, StepReport
+from steps.runtime.weights import open_weights
+from steps.sources.masks import read_mask, scaled_box
 from steps.sources.reader import read_source
 
 TILE = 256  # pixels
@@ -29,9 +37,18 @@ def run(job: Job) -> StepReport:
     """
     settings: SubjectSettings = job.settings.subject
     with TemporaryDirectory() as scratch:
-        source = read_source(job.inputs["source"], Path(scratch), settings.max_frames, settings.max_decode_gb)
+        limits = Path(scratch), settings.max_frames, settings.max_decode_gb
+        source = read_source(job.inputs["source"], *limits)
+        mask = read_mask(job.inputs["mask"], source, *limits) if "mask" in job.inputs else None
     job.progress(1, 3, {})
-    cutouts, notes = prepare_subject(source.frames, source.has_alpha, settings)
+    network = open_network(settings.matting)
+    boxed = settings.model_copy(update={"box": scaled_box(settings.box, source)})
+    prepared = prepare_subject(source.frames, source.has_alpha, boxed, mask, network.segmenter)
+    cutouts, notes = prepared.frames, prepared.notes
+    if prepared.estimate is not None:
+        found = prepared.estimate
+        gates = gates_as_json(evaluate_cutout(found.frames[..., 3], found.agreement, job.settings.cutout))
+        write_gates(job.outputs["cutout_gates"], gates)
     job.progress(2, 3, {})
     write_png(job.outputs["subject"], cutouts[0])
     if source.kind == "video":
@@ -42,7 +59,30 @@ def run(job: Job) -> StepReport:
         notes = (*notes, turn_note(turn_deg)) if turn_deg and not settings.turn_deg else notes
     write_png(job.outputs["picture"], picture_of(source.frames[0], cutouts[0]))
     job.progress(3, 3, {})
-    return StepReport(notes=(*source.notes, *notes))
+    used = network if prepared.estimate is not None and prepared.estimate.used_network else LoadedNetwork()
+    return StepReport(weights=used.digests, licenses=used.licenses, notes=(*source.notes, *notes))
+
+
+@dataclass(frozen=True)
+class LoadedNetwork:
+    """Segmentation network with the digests and licenses of its weights."""
+
+    segmenter: Segmenter = U2NETP
+    digests: dict[str, str] = field(default_factory=dict)
+    licenses: dict[str, str] = field(default_factory=dict)
+
+
+def open_network(matting: str) -> LoadedNetwork:
+    """Return the network of `subject.matting`: U2-Netp, unless the setting names other weights; loads nothing yet.
+
+    Raises:
+        BadInput: the name is unknown.
+        BackendUnavailable: the weights are not installed.
+    """
+    if matting in MATTING_METHODS:
+        return LoadedNetwork(U2NETP, u2netp.digests(), {u2netp.NAME: u2netp.LICENSE})
+    opened = open_weights(matting)
+    return LoadedNetwork(Segmenter(matting, partial(load_folder, opened.folder)), opened.digests, opened.licenses)
 
 
 def turn_note(turn_deg: float) -> str:

@@ -127,6 +127,7 @@ class ScoreAssetSettings(Settings):
 
     rasterizer: Backend
     mesh: bool = Field(False, description="the textured mesh is judged instead of the splats")
+    actionbench: bool = Field(False, description="compare meshes by the metrics of ActionBench, too")
     score: ScoreSettings = ScoreSettings()
 
 
@@ -206,6 +207,9 @@ def _with_defaults(tree: dict[str, Any]) -> dict[str, Any]:
         return tree
 
 
+PUBLIC_BOX = 1.6  # half side of the planes' box in the public code, over which the paper chose a resolution of 32
+LGM_SCALE = 4 / 3  # our camera radius over LGM's, as WORLD_SCALE in dg4d_lib/reconstruction/lgm.py, which imports torch
+SMOOTHNESS = 0.01 / 3  # a third of the public code's weight: measured as a mean over the three time planes
 PREVIEW_SCHEDULE = [ResolutionStage(until=1.0, size=128).model_dump()]
 
 PREVIEW = revise(
@@ -219,7 +223,7 @@ PREVIEW = revise(
         "deformation.features": 16,
         "deformation.hidden": 32,
         "deformation.spatial": 64,
-        "deformation.smoothness_weight": 0.01,
+        "deformation.smoothness_weight": SMOOTHNESS,
         "motion.iterations": 250,
         "motion.views": 1,
         "motion.frames_per_iteration": 12,
@@ -238,12 +242,29 @@ PAPER = revise(
     {
         "driving.kind": "svd",
         "prior.kind": "zero123",
+        "deformation.half_side": PUBLIC_BOX,
         "mesh.mode": "per_frame",
         "refiner.kind": "video_to_video",
     },
 )
 VIDEO = revise(PAPER, {"subject.max_frames": 32, "motion.iterations": 500})
 VIDEO_FAST = revise(VIDEO, {"subject.max_frames": 16, "motion.views": 1})
+
+RELEASE = revise(
+    PAPER,
+    {
+        "static.t_max_start": 1.0,
+        "static.t_max_end": 0.0,
+        "deformation.spatial": 64,
+        "deformation.temporal": 25,
+        "deformation.scales": [1, 2, 4, 8],
+        "motion.t_max_start": 1.0,
+        "motion.t_max_end": 0.0,
+        "motion.t_max_limit": 0.5,
+        "motion.guidance_weight": 4.0,
+        "motion.alpha_weight": 0.0,
+    },
+)
 
 REFERENCE = revise(
     PAPER,
@@ -255,12 +276,13 @@ REFERENCE = revise(
         "static.t_max_start": 1.0,
         "static.t_max_end": 0.0,
         "deformation.temporal": 12,
-        "deformation.half_side": 1.6,
+        "deformation.half_side": LGM_SCALE * PUBLIC_BOX,
         "deformation.endpoint": False,
         "motion.iterations": 500,
         "motion.t_max_start": 1.0,
         "motion.t_max_end": 0.0,
         "motion.fine_tune": True,
+        "motion.length_scale": LGM_SCALE,
     },
 )
 
@@ -268,8 +290,9 @@ QUALITY = revise(
     PAPER,
     {
         "driving.candidates": 4,
+        "deformation.half_side": 0.0,
         "deformation.scales": [1, 4],
-        "deformation.smoothness_weight": 0.01,
+        "deformation.smoothness_weight": SMOOTHNESS,
         "motion.iterations": 500,
         "motion.fine_tune": True,
         "mesh.mode": "tracked",
@@ -282,6 +305,7 @@ PROFILES: dict[str, PipelineSettings] = {
     "paper": PAPER,
     "video": VIDEO,
     "video-fast": VIDEO_FAST,
+    "release": RELEASE,
     "reference": REFERENCE,
     "quality": QUALITY,
 }

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,6 @@ from statistics import fmean
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -26,13 +24,12 @@ from dg4d_lib.metrics.fvd import MIN_FRAMES, fvd_consistent4d, load_i3d, logits
 from dg4d_lib.metrics.image import iou, psnr, resize_square
 from dg4d_lib.metrics.lpips import Lpips, load_lpips
 from dg4d_lib.metrics.ssim import ssim
-from dg4d_lib.metrics.surface import align_bounding_boxes, chamfer_distance, sample_surface
 from dg4d_lib.metrics.video import flicker, motion_amount, temporal_error
 from steps.artifacts.archives import unpack
 from steps.artifacts.ground_truth import GroundTruth, find_ground_truth
 from steps.artifacts.media import read_png, write_zip
-from steps.artifacts.packages import read_manifest
-from steps.artifacts.rendering import frame_positions, mesh_at, read_surface, render_package
+from steps.artifacts.rendering import render_package
+from steps.artifacts.surface_scores import actionbench_scores, chamfer_scores, read_true_meshes
 from steps.profiles import ScoreAssetSettings
 from steps.runtime.job import Job, StepReport
 from steps.runtime.weights import open_weights
@@ -192,7 +189,7 @@ def _score_package(
         job.progress(done, total, {})
     scores: Scores = {"input": of_input, "views": views, "mean": _mean(views)}
     if truth.mesh is not None:
-        scores["geometry"] = _geometry(package, truth.mesh, settings.score.samples, job.seed)
+        scores["geometry"] = _geometry(package, truth.mesh, settings, job.seed, networks)
     job.progress(total, total, {})
     return _report(truth, size, {"asset": scores}, clips), films
 
@@ -236,25 +233,16 @@ def _mean(views: Mapping[str, Metrics]) -> Metrics:
     return {name: fmean(metrics[name] for metrics in views.values()) for name in names}
 
 
-def _geometry(package: Path, mesh: Path, samples: int, seed: int) -> Metrics:
-    """Return chamfer distances to the true mesh, means over frames: without and with one alignment."""
-    try:
-        with np.load(mesh) as archive:
-            vertices = torch.from_numpy(archive["vertices"].astype(np.float32))
-            faces = torch.from_numpy(archive["faces"].astype(np.int64))
-            weights = torch.from_numpy(archive["face_weight"].astype(np.float32)) if "face_weight" in archive else None
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise BadInput(f"{mesh.name} holds no meshes (vertices [t v 3], faces [f 3]): {error!r}") from error
-    generator = torch.Generator().manual_seed(seed)
-    theirs = torch.stack([sample_surface(frame, faces, samples, generator, weights) for frame in vertices])
-    manifest = read_manifest(package)
-    surface = read_surface(package, manifest)
-    meshes = [mesh_at(surface, position) for position in frame_positions(len(vertices), manifest)]
-    ours = torch.stack([sample_surface(mesh.vertices, mesh.faces, samples, generator) for mesh in meshes])
-    return {
-        name: fmean(chamfer_distance(a, b) for a, b in zip(points, theirs, strict=True))
-        for name, points in (("chamfer", ours), ("chamfer_aligned", align_bounding_boxes(ours, theirs)))
-    }
+def _geometry(package: Path, mesh: Path, settings: ScoreAssetSettings, seed: int, networks: MetricNetworks) -> Metrics:
+    """Return chamfer distances to the true mesh, and ActionBench's if they are wanted."""
+    meshes, score = read_true_meshes(mesh), settings.score
+    metrics = chamfer_scores(package, meshes, score.samples, seed)
+    if settings.actionbench:
+        found, reason = actionbench_scores(package, meshes, score.actionbench_points, score.icp_points, seed)
+        metrics |= found
+        if reason:
+            networks.missing["cd_m"] = reason
+    return metrics
 
 
 def _read(frames: Sequence[Path], size: int | None = None) -> ViewFrames:

@@ -48,6 +48,10 @@ class Framewise(nn.Module):
         """Return the parameters that use `plane_lr`: all."""
         return [self.table]
 
+    def length_parameters(self) -> list[nn.Parameter]:
+        """Return none: one table holds lengths and all else."""
+        return []
+
     def regularization_loss(self) -> Float[Tensor, ""]:
         """Return zero: the table has no regularizer."""
         return self.table.new_zeros(())

@@ -13,6 +13,7 @@ from dg4d_lib.deformation.hexplane_kernel import SPATIAL_AXES, hexplane_features
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.settings import HexPlaneSettings
 
+PLANES = 3  # of space and of time; the public code sums its regularizers over them
 ROWS = 1 << 13  # Gaussians times timestamps per pass of the MLP on the CPU: the activations fit into the cache
 
 
@@ -104,19 +105,28 @@ class HexPlane(nn.Module):
         """Return the parameters that use `plane_lr`: the six planes."""
         return [*self.space, *self.time]
 
+    def length_parameters(self) -> list[nn.Parameter]:
+        """Return the parameters that carry the unit of length: the last layer of the head of the means."""
+        return list(self.heads.means.outer.parameters())
+
     def regularization_loss(self) -> Float[Tensor, ""]:
-        """Return the weighted total variation, temporal smoothness and temporal sparsity; zero by default."""
+        """Return the weighted spatial variation, temporal smoothness and temporal sparsity; zero by default.
+
+        Each is a mean over a plane, summed over three planes: three times the mean over all, as they have one size.
+        Spatial planes have second differences along both axes; the public code has them along the rows only.
+        """
         s = self.settings
+        variation, smoothness, sparsity = (
+            PLANES * weight for weight in (s.variation_weight, s.smoothness_weight, s.sparsity_weight)
+        )
         total = self.bounds.new_zeros(())
         for space, time in zip(self.space, self.time, strict=True):
-            if s.variation_weight:
-                total = total + s.variation_weight * (
-                    space.diff(dim=-1).square().mean() + space.diff(dim=-2).square().mean()
-                )
-            if s.smoothness_weight:
-                total = total + s.smoothness_weight * time.diff(n=2, dim=-2).square().mean()
-            if s.sparsity_weight:
-                total = total + s.sparsity_weight * (time - 1).abs().mean()
+            if variation:
+                total = total + variation * sum(space.diff(n=2, dim=axis).square().mean() for axis in (-1, -2))
+            if smoothness:
+                total = total + smoothness * time.diff(n=2, dim=-2).square().mean()
+            if sparsity:
+                total = total + sparsity * (time - 1).abs().mean()
         return total
 
 

@@ -51,6 +51,10 @@ class Deformation(Protocol):
         """Return the parameters that use `plane_lr` (planes and tables); the others use `network_lr`."""
         ...
 
+    def length_parameters(self) -> list[nn.Parameter]:
+        """Return the parameters that carry the unit of length, whose learning rate `length_scale` multiplies."""
+        ...
+
     def regularization_loss(self) -> Float[Tensor, ""]:
         """Return the weighted sum of the model's regularizers; zero if none is enabled."""
         ...

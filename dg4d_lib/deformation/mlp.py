@@ -52,6 +52,10 @@ class Mlp(nn.Module):
         """Return the parameters that use `plane_lr`: none."""
         return []
 
+    def length_parameters(self) -> list[nn.Parameter]:
+        """Return the parameters that carry the unit of length: the last layer of the head of the means."""
+        return list(self.heads.means.outer.parameters())
+
     def regularization_loss(self) -> Float[Tensor, ""]:
         """Return zero: the network has no regularizer."""
         return self.bounds.new_zeros(())

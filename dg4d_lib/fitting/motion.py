@@ -61,7 +61,7 @@ def fit_motion(
     color, alpha = (images.permute(0, 3, 1, 2) for images in references)  # indexing keeps channels first in memory
     times = video.times.to(device)
     white = torch.tensor(WHITE, device=device)
-    gaussians, groups = gaussians.detach(), _groups(deformation, settings)
+    gaussians, groups = gaussians.detach(), parameter_groups(deformation, settings)
     if settings.fine_tune:
         gaussians = Gaussians(**{name: nn.Parameter(value.clone()) for name, value in vars(gaussians).items()})
         cloud_groups = [
@@ -73,7 +73,8 @@ def fit_motion(
     for step in range(1, settings.iterations + 1):
         progress = step / settings.iterations
         if settings.fine_tune:
-            adam.param_groups[0]["lr"] = log_linear(settings.means_lr, settings.means_lr_end, progress)
+            means_lr = log_linear(settings.means_lr, settings.means_lr_end, progress)
+            adam.param_groups[0]["lr"] = settings.length_scale * means_lr
         frames = sample_frames(len(video), settings.frames_per_iteration, generator)
         chosen = to_device_async(frames, device)
         moved = deformation.displace(gaussians.means, times[chosen]).apply(gaussians)
@@ -150,9 +151,16 @@ def bounds_of(gaussians: Gaussians, margin: float = 0.1) -> Float[Tensor, "2 3"]
     return torch.stack([low - slack, high + slack])
 
 
-def _groups(deformation: Deformation, settings: MotionSettings) -> list[dict[str, object]]:
+def parameter_groups(deformation: Deformation, settings: MotionSettings) -> list[dict[str, object]]:
+    """Return Adam's parameter groups of a deformation: planes, networks, and layers that predict lengths."""
     planes = deformation.grid_parameters()
     fast = {id(parameter) for parameter in planes}
-    network = [parameter for parameter in deformation.parameters() if id(parameter) not in fast]
-    groups = [{"params": planes, "lr": settings.plane_lr}, {"params": network, "lr": settings.network_lr}]
+    lengths = deformation.length_parameters() if settings.length_scale != 1 else []
+    apart = fast | {id(parameter) for parameter in lengths}
+    network = [parameter for parameter in deformation.parameters() if id(parameter) not in apart]
+    groups = [
+        {"params": planes, "lr": settings.plane_lr},
+        {"params": network, "lr": settings.network_lr},
+        {"params": lengths, "lr": settings.length_scale * settings.network_lr},
+    ]
     return [group for group in groups if group["params"]]

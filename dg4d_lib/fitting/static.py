@@ -23,6 +23,7 @@ ADVICE = "lower the learning rates (static.*_lr) or the weights"
 RADIUS_JITTER = 0.5  # world units; random views are at radius 2 +- 0.5 (paper)
 SPLIT_SCALE = 0.05  # world units; larger Gaussians are split, smaller ones cloned (DreamGaussian)
 RESET_OPACITY_EVERY = 700  # iterations (DreamGaussian); not reached with the default of 500
+LAST_PRUNE = 2.0  # factor on the largest scale in the prune after the last iteration (DreamGaussian: extent 1 for 0.5)
 MIN_GAUSSIANS = 8  # with fewer the fit counts as diverged (ours)
 
 
@@ -42,6 +43,15 @@ class _Cloud:
     @property
     def gaussians(self) -> Gaussians:
         return Gaussians(**self.parameters)
+
+    def reset_opacity(self) -> None:
+        """Clamp the opacities and clear their Adam moments, as 3DGS: old ones would carry on in the old direction."""
+        parameter = self.parameters["opacity_logits"]
+        parameter.data.copy_(reset_opacity(self.gaussians).opacity_logits)
+        state = self.adam.state.get(parameter, {})
+        for key in ("exp_avg", "exp_avg_sq"):
+            if key in state:
+                state[key].zero_()
 
     def replace(self, grown: DensifyResult) -> None:
         """Replace the cloud after density control; kept Gaussians keep their Adam state, new ones start at zero."""
@@ -122,18 +132,15 @@ def fit_gaussians(
             if offset.grad is not None:
                 grad2d.add(offset.grad, visible, size)
         cloud.adam.step()
-        if step % settings.densify_every == 0 and step < settings.iterations:
+        if step == settings.iterations >= settings.densify_every:  # new Gaussians would stay as they were copied
+            cloud.replace(prune(cloud.gaussians, settings.prune_opacity, LAST_PRUNE * settings.prune_scale))
+            require_enough(cloud, step, settings, gaussians)
+        elif step < settings.iterations and step % settings.densify_every == 0:
             control_density(cloud, grad2d, settings, generator)
             grad2d = Grad2dStats.zeros(len(cloud.gaussians), device)
-            if len(cloud.gaussians) < MIN_GAUSSIANS:
-                raise Diverged(
-                    f"fit_gaussians: {len(cloud.gaussians)} Gaussians are left at iteration {step} of "
-                    f"{settings.iterations}, at least {MIN_GAUSSIANS} are needed; lower static.prune_opacity or "
-                    "raise static.prune_scale",
-                    gaussians.detach(),
-                )
+            require_enough(cloud, step, settings, gaussians)
         if step % RESET_OPACITY_EVERY == 0 and step < settings.iterations:
-            cloud.parameters["opacity_logits"].data.copy_(reset_opacity(cloud.gaussians).opacity_logits)
+            cloud.reset_opacity()
         report(step, {**numbers, "Gaussians": len(cloud.gaussians)})
     return cloud.gaussians.detach()
 
@@ -179,3 +186,24 @@ def control_density(cloud: _Cloud, grad2d: Grad2dStats, settings: StaticSettings
         grown = densify(cloud.gaussians, grad2d.mean, settings.densify_gradient, SPLIT_SCALE, room, generator)
         cloud.replace(grown)
         cloud.replace(prune(cloud.gaussians, settings.prune_opacity, settings.prune_scale))
+
+
+def require_enough(cloud: _Cloud, step: int, settings: StaticSettings, before: Gaussians) -> None:
+    """Refuse a cloud of which pruning left (almost) nothing.
+
+    Args:
+        cloud: after pruning.
+        step: iterations done.
+        settings: of the stage.
+        before: the cloud before this iteration.
+
+    Raises:
+        Diverged: says how to keep more.
+    """
+    if len(cloud.gaussians) < MIN_GAUSSIANS:
+        raise Diverged(
+            f"fit_gaussians: {len(cloud.gaussians)} Gaussians are left at iteration {step} of "
+            f"{settings.iterations}, at least {MIN_GAUSSIANS} are needed; lower static.prune_opacity or "
+            "raise static.prune_scale",
+            before.detach(),
+        )

@@ -16,7 +16,8 @@ from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.diffusion.noise_schedule import NUM_TRAIN_TIMESTEPS, add_noise, alphas_cumprod
 
 T_MAX_END = 0.02  # fraction of the schedule at the end of the annealing (paper)
-MIN_TIMESTEP, MAX_TIMESTEP = 20, 980  # of 1000 (DreamFusion: 0.02 to 0.98)
+T_MAX_LIMIT = 0.98  # fraction of the schedule above which T_max is clipped (DreamFusion)
+MIN_TIMESTEP = 20  # of 1000 (DreamFusion: 0.02)
 
 PredictNoise = Callable[[Float[Tensor, "b c h w"], int], Float[Tensor, "b c h w"]]
 
@@ -28,31 +29,37 @@ class TimestepSchedule:
     Attributes:
         t_max_start: T_max at the start, fraction of the schedule; 0.98 in the paper, 0.5 in the dynamic stage.
         t_max_end: T_max at the end; 0.02 in the paper. The public code anneals from 1 to 0 in both stages.
+        t_max_limit: T_max is clipped to this; 0.5 in the dynamic stage of the public code's first release.
         uniform: draw the timestep uniformly from 0.02 to T_max instead of using T_max itself.
     """
 
     t_max_start: float
     t_max_end: float = T_MAX_END
+    t_max_limit: float = T_MAX_LIMIT
     uniform: bool = False
 
     def timestep(self, progress: float, generator: torch.Generator) -> int:
         """Return the timestep at a progress in [0, 1]; only uniform draws use the generator."""
-        highest = annealed_timestep(progress, self.t_max_start, self.t_max_end)
+        highest = annealed_timestep(progress, self.t_max_start, self.t_max_end, self.t_max_limit)
         if not self.uniform:
             return highest
         return int(torch.randint(MIN_TIMESTEP, highest + 1, (), generator=generator))
 
 
-def annealed_timestep(progress: float, t_max_start: float, t_max_end: float = T_MAX_END) -> int:
-    """Interpolate linearly from `t_max_start` to `t_max_end` of the schedule, clamped to 20 to 980.
+def annealed_timestep(
+    progress: float, t_max_start: float, t_max_end: float = T_MAX_END, t_max_limit: float = T_MAX_LIMIT
+) -> int:
+    """Interpolate linearly from `t_max_start` to `t_max_end` of the schedule, clipped to 20 and `t_max_limit`.
 
     Args:
         progress: of the optimization, in [0, 1].
         t_max_start: fraction of the schedule at progress 0.
         t_max_end: fraction of the schedule at progress 1.
+        t_max_limit: upper clip, fraction of the schedule.
     """
     fraction = t_max_start + (t_max_end - t_max_start) * progress
-    return min(max(round(NUM_TRAIN_TIMESTEPS * fraction), MIN_TIMESTEP), MAX_TIMESTEP)
+    highest = round(NUM_TRAIN_TIMESTEPS * t_max_limit)
+    return min(max(round(NUM_TRAIN_TIMESTEPS * fraction), MIN_TIMESTEP), highest)
 
 
 def sds_weight(timestep: int) -> float:

@@ -25,7 +25,7 @@ def configure_numba() -> None:
     """Install our cache locators and the compilation notice; call this before the first kernel is defined."""
     ours = [f"{__name__}.{locator.__name__}" for locator in (_EnvironmentCache, _SourceFolderCache, _UserCache)]
     locators = ",".join([*ours, "IPythonCacheLocator", "ZipCacheLocator"])  # Numba's own, for kernels of others
-    numba.config.CACHE_LOCATOR_CLASSES = locators  # type: ignore[attr-defined] - missing in its stub
+    numba.config.CACHE_LOCATOR_CLASSES = locators  # type: ignore[attr-defined]  # missing in its stub
     event.register("numba:compile", _CompileNotice())
 
 

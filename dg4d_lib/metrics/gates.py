@@ -1,6 +1,6 @@
 """Quality gates: acceptance criteria of an asset that need no ground truth.
 
-Nine measures compare the asset with its input image and driving video, and with itself from other sides. Their bounds,
+Ten measures compare the asset with its input image and driving video, and with itself from other sides. Their bounds,
 in `GateSettings`, are calibrated on good assets and on deliberately degraded ones (benchmarks/gates.py). Most measures
 are taken of both forms of an asset, splats and mesh, and the worse one counts.
 """
@@ -72,6 +72,7 @@ class GateInputs:
         side_views: the asset from other sides and at other frames, the same ones for every form.
         turntable: the splats from all around.
         flaws: broken edges and triangles of the mesh, per triangle.
+        folds: share of the triangles of the mesh that cross others, are flipped or folded, in the worst frame.
     """
 
     picture: RgbaImages
@@ -80,6 +81,7 @@ class GateInputs:
     side_views: Mapping[str, RgbaImages]
     turntable: Turntable
     flaws: float
+    folds: float
 
 
 @dataclass(frozen=True)
@@ -184,6 +186,15 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
             "",
             "boundary and non-manifold edges, degenerate and inverted triangles: per triangle",
             "extract again with another mesh.density_threshold or a larger mesh.grid",
+        ),
+        Gate(
+            "folds",
+            {MESH: inputs.folds},
+            None,
+            settings.folds_most,
+            "",
+            "share of the triangles that cross others, are flipped or folded, in the worst frame: light shows them",
+            "use mesh.mode=per_frame for complex motions, or a smaller mesh.grid",
         ),
         Gate(
             "agreement",

@@ -1,5 +1,7 @@
 """Chamfer distance of surfaces, by point samples."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -29,6 +31,27 @@ def align_bounding_boxes(points: Float[Tensor, "t n 3"], target: Float[Tensor, "
     return (points - center) * (target_size / size.clamp_min(torch.finfo(size.dtype).tiny)) + target_center
 
 
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points that keep their places on a surface while it moves.
+
+    Attributes:
+        corners: vertices of the triangle of each point.
+        u: share of the second corner.
+        v: share of the third corner.
+    """
+
+    corners: Int[Tensor, "n 3"]
+    u: Float[Tensor, " n"]
+    v: Float[Tensor, " n"]
+
+    def at(self, vertices: Float[Tensor, "v 3"]) -> Float[Tensor, "n 3"]:
+        """Return their positions, in double precision."""
+        places = vertices.detach().cpu().double()[self.corners]
+        first, second = places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]
+        return places[:, 0] + self.u[:, None] * first + self.v[:, None] * second
+
+
 def sample_surface(
     vertices: Float[Tensor, "v 3"],
     faces: Int[Tensor, "f 3"],
@@ -48,6 +71,17 @@ def sample_surface(
     Raises:
         BadInput: the triangles have no area.
     """
+    return place_points(vertices, faces, samples, generator, weights).at(vertices)
+
+
+def place_points(
+    vertices: Float[Tensor, "v 3"],
+    faces: Int[Tensor, "f 3"],
+    samples: int,
+    generator: torch.Generator,
+    weights: Float[Tensor, " f"] | None = None,
+) -> SurfacePoints:
+    """Choose the places that `sample_surface` samples, with its arguments."""
     corners = vertices.detach().cpu().double()[faces.cpu().long()]
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     areas = torch.linalg.cross(first, second).norm(dim=-1)
@@ -58,7 +92,7 @@ def sample_surface(
     chosen = torch.searchsorted(ends, position * ends[-1], right=True).clamp(max=len(faces) - 1)
     outside = u + v > 1  # the other half of the parallelogram, mirrored back
     u, v = torch.where(outside, 1 - u, u), torch.where(outside, 1 - v, v)
-    return corners[chosen, 0] + u[:, None] * first[chosen] + v[:, None] * second[chosen]
+    return SurfacePoints(faces.cpu().long()[chosen], u, v)
 
 
 def _box(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, " 3"], Float[Tensor, ""]]:

@@ -1,6 +1,7 @@
 """Choice and availability of rasterizer backends; imports no torch, so that flows can resolve `auto`."""
 
 import ctypes
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 
@@ -40,6 +41,45 @@ def gsplat_unavailable_reason() -> str:
     if not cuda_device_count():
         return "the CUDA driver shows no device (it needs an NVIDIA GPU, its driver, and no empty CUDA_VISIBLE_DEVICES)"
     return ""
+
+
+@dataclass(frozen=True)
+class CudaDevice:
+    """GPU that the CUDA driver shows.
+
+    Attributes:
+        name: of the model.
+        memory_bytes: in all.
+    """
+
+    name: str
+    memory_bytes: int
+
+
+def cuda_devices() -> list[CudaDevice]:
+    """Return the GPUs that the CUDA driver shows to this process; empty without a driver."""
+    count = cuda_device_count()
+    if not count:
+        return []
+    driver, found = ctypes.CDLL(CUDA_DRIVER), []
+    for index in range(count):
+        handle, name, size = ctypes.c_int(), ctypes.create_string_buffer(256), ctypes.c_size_t()
+        driver.cuDeviceGet(ctypes.byref(handle), index)
+        driver.cuDeviceGetName(name, len(name), handle)
+        driver.cuDeviceTotalMem_v2(ctypes.byref(size), handle)
+        found.append(CudaDevice(name.value.decode(errors="replace"), size.value))
+    return found
+
+
+def cuda_driver_version() -> str:
+    """Return the newest CUDA version that the driver supports, "13.0"; empty without a driver."""
+    try:
+        driver = ctypes.CDLL(CUDA_DRIVER)
+    except OSError:
+        return ""
+    version = ctypes.c_int()
+    driver.cuDriverGetVersion(ctypes.byref(version))
+    return f"{version.value // 1000}.{version.value % 1000 // 10}"
 
 
 def cuda_device_count() -> int:

@@ -217,7 +217,7 @@ def _neighbors(place: Int[Tensor, " n"]) -> list[tuple[Int[Tensor, " n"], Float[
 
 def channels_last(network: ShapePriorNetwork) -> ShapePriorNetwork:
     """Return the network with its convolutions in the order that processors run fastest."""
-    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload] - torch's stub knows dtypes and devices only
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stub knows dtypes and devices only
     return network
 
 

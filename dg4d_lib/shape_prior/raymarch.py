@@ -79,7 +79,7 @@ def _free(filled: Bool[np.ndarray, "r c d"]) -> UInt8[np.ndarray, "t u e"]:
     blocks = grown[:-1, :-1, :-1].reshape(rows, BLOCK, columns, BLOCK, bins, BLOCK).any((1, 3, 5))
     if not blocks.any():
         return np.full(blocks.shape, max(blocks.shape), np.uint8)
-    distances: Any = ndimage.distance_transform_cdt(~blocks, "chessboard")  # type: ignore[call-overload] - SciPy's stub
+    distances: Any = ndimage.distance_transform_cdt(~blocks, "chessboard")  # type: ignore[call-overload]  # SciPy's stub
     return np.ascontiguousarray(distances, np.uint8)
 
 

@@ -1,5 +1,6 @@
-"""Matting of opaque frames without learned weights: subject mask, alpha and foreground colors."""
+"""Matting of opaque frames: subject mask, alpha and foreground colors."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -8,26 +9,45 @@ import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy import ndimage
+from scipy.special import expit, logit
 from skimage.color import rgb2lab
 from torch import Tensor
-from torch.nn import functional
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.images import resize_planes
-from dg4d_lib.video.backdrop import border_ring, cut_out, fit_backdrop
-from dg4d_lib.video.saliency import segment
+from dg4d_lib.video import u2netp
+from dg4d_lib.video.backdrop import Backdrop, border_ring, cut_out, fit_backdrop
+from dg4d_lib.video.color_models import foreground_log_odds
+from dg4d_lib.video.guided_filter import guide_to_edges
+from dg4d_lib.video.segmentation_network import SegmentationNetwork
+from dg4d_lib.video.soft_edges import free_colors, unmix
+from dg4d_lib.video.still_pixels import average_still_pixels
 
-PLAIN_SIDE = 640  # longest side for the segmentation before plain backdrops, pixels
-PHOTO_SIDE = 192  # longest side for the segmentation of photographs, pixels
+Method = Literal["backdrop", "uneven backdrop", "network"]
+NetworkLoader = Callable[[], SegmentationNetwork]
+
+BACKDROP_SIDE = 640  # longest side for the segmentation before plain backdrops, pixels
+REFINED_SIDE = 512  # longest side for color models and for the coefficients of the guided filter, pixels
 MIN_AREA = 0.005  # minimum share of the first frame that the subject covers
 MAX_AREA = 0.95  # maximum share of the first frame that the subject covers
 MAX_BORDER = 0.85  # maximum share of the border that the subject touches
-MIN_SEPARATION = 0.75  # of the color models; see saliency.Segmentation
 PART = 0.02  # minimum area of a part relative to the largest one; smaller parts are dropped
-PHOTO_PART = 0.3  # the same in photographs, where small parts are more often mistakes
-STILL = 0.04  # change of color, in [0, 1], below which a pixel counts as static between two frames
+AGREED = 0.9  # overlap (IoU) from which backdrop and network are taken to have found the same subject
+BAND = 2  # half of the band along an outline before a plain backdrop, pixels of the segmentation
+BORDER_MARGIN = 0.02  # share of the border by which the network may touch more of it and still be preferred
+SURE = 0.02  # distance of probabilities from 0 and 1 that log odds are bounded by
+COLOR_SHARE = 0.5  # weight of the color models in the log odds; the rest is the segmentation's
+ROUNDS = 2  # alternations of color models and segmentation, as in GrabCut
+FILTER_RADIUS = 3 / 256  # of the guided filter, as a share of the longest side
+FILTER_EPS = 1e-3  # color variance below which the guided filter smooths
+STEEPNESS = 2.0  # slope that turns the filtered probability into alpha: edges are a pixel or two wide
+CHECKED_FRAMES = 4  # frames that a second method segments, evenly spaced
 KEPT = 0.8  # weight of the previous frame's alpha at static pixels
-ADVICE = "give a PNG with a transparent background, or a picture of one subject before a plain backdrop"
+STILL = 0.04  # change of color, in [0, 1], below which a pixel counts as static between two frames
+ADVICE = (
+    "give a PNG with a transparent background, a mask (--mask FILE), the part of the picture that shows the subject "
+    "(--box X,Y,W,H), or a picture of one subject before a plain backdrop"
+)
 
 
 @dataclass(frozen=True)
@@ -36,41 +56,50 @@ class Matte:
 
     Attributes:
         frames: cut-outs with straight alpha; colors are free of the background.
-        method: segmentation method; all but "backdrop" are guesses.
+        method: segmentation method; all but "backdrop" are estimates that may be wrong.
+        agreement: overlap (IoU) with a second method in the worst checked frame; the network's answer to the mirrored
+            picture if there is no other one; None if there is none at all.
+        used_network: True if the result depends on the network's weights.
     """
 
     frames: Float[Tensor, "t h w 4"]
-    method: Literal["backdrop", "uneven backdrop", "color models"]
+    method: Method
+    agreement: float | None = None
+    used_network: bool = False
 
 
-def matte(frames: Float[Tensor, "t h w 3"]) -> Matte:
+def matte(
+    frames: Float[Tensor, "t h w 3"],
+    method: Literal["auto", "backdrop", "network"] = "auto",
+    load: NetworkLoader = u2netp.packaged_network,
+) -> Matte:
     """Cut the subject out of opaque frames; all of them share one model of the background.
+
+    Args:
+        frames: sRGB in [0, 1].
+        method: "backdrop": by the color of a plain backdrop; "network": by a segmentation network; "auto": by both
+            before a plain backdrop, else by the network.
+        load: returns the network.
 
     Raises:
         BadInput: no subject is found.
+        BackendUnavailable: the network is not installed.
     """
-    height, width = frames.shape[1:3]
-    lab = _lab(frames, PLAIN_SIDE)
-    backdrop = fit_backdrop(lab)
-    if backdrop.is_plain:
-        masks, radius = np.stack([_parts(mask, PART) for mask in cut_out(lab, backdrop)]), 2
+    found = _segment(frames, method, load)
+    _check(found.probability[0].numpy() > 0.5)
+    cutouts = frames.new_empty(*frames.shape[:3], 4)  # filled one by one, since frames may take 0.5 GB
+    if found.is_exact:
+        scale = max(frames.shape[1:3]) / max(found.probability.shape[1:])
+        for cutout, frame, mask in zip(cutouts, frames, found.probability, strict=True):
+            large = resize_planes(mask[None, None], frames.shape[1:3], "bicubic")[0, 0] > 0.5
+            cutout[:] = unmix(frame, large.numpy(), max(2, round(BAND * max(1.0, scale))))
+        cutouts[..., 3] = average_still_pixels(cutouts[..., 3], frames)
     else:
-        lab = _lab(frames, PHOTO_SIDE)
-        found = segment(lab)
-        if found.separation < MIN_SEPARATION:
-            raise BadInput(f"no subject found: its colors are too similar to those of the background; {ADVICE}")
-        masks = np.stack([_compact(frame > 0.5) for frame in found.likelihood])
-        radius = 2
-    _check(masks[0])
-    scale = max(height, width) / max(masks.shape[1:])
-    band = max(2, round(radius * max(1.0, scale)))
-    cutouts = frames.new_empty(len(frames), height, width, 4)  # filled one by one, since frames may take 0.5 GB
-    for cutout, frame, mask in zip(cutouts, frames, masks, strict=True):
-        cutout[:] = _estimate_alpha(frame, _upscale(mask[None], height, width)[0], band)
-    _stabilize(cutouts, frames)
-    if not backdrop.is_plain:
-        return Matte(cutouts, "color models")
-    return Matte(cutouts, "backdrop" if backdrop.is_even else "uneven backdrop")
+        likelihood = _refine(frames, average_still_pixels(found.probability, _resized(frames, found.probability)))
+        for cutout, frame, alpha in zip(cutouts, frames, likelihood, strict=True):
+            cutout[:] = free_colors(frame, alpha)
+    _check(cutouts[0, ..., 3].cpu().numpy() > 0.5)
+    return Matte(cutouts, found.method, found.agreement, found.used_network)
 
 
 def matte_from_first_alpha(frames: Float[Tensor, "t h w 3"], first: Float[Tensor, "h w"]) -> Float[Tensor, "t h w 4"]:
@@ -98,25 +127,145 @@ def matte_from_first_alpha(frames: Float[Tensor, "t h w 3"], first: Float[Tensor
     return cutouts
 
 
-def _lab(frames: Float[Tensor, "t h w 3"], longest: int) -> Float[ndarray, "t h2 w2 3"]:
+@dataclass(frozen=True)
+class _Segmentation:
+    """Segmentation of all frames.
+
+    Attributes:
+        probability: of the subject, at reduced size.
+        is_exact: True for masks by a plain backdrop's color that no other method contradicts.
+        method, agreement, used_network: see `Matte`.
+    """
+
+    probability: Float[Tensor, "t h w"]
+    method: Method
+    agreement: float | None
+    used_network: bool
+    is_exact: bool = False
+
+
+def _segment(frames: Float[Tensor, "t h w 3"], method: str, load: NetworkLoader) -> _Segmentation:
+    if method == "network":
+        return _by_network(frames, load())
+    lab = _lab(frames, BACKDROP_SIDE)
+    backdrop = fit_backdrop(lab)
+    if method == "auto" and not backdrop.is_plain:
+        return _by_network(frames, load())
+    masks = _by_backdrop(lab, backdrop)
+    name: Method = "backdrop" if backdrop.is_even else "uneven backdrop"
+    if method == "backdrop":
+        return _Segmentation(masks, name, None, False, is_exact=True)
+    network = load()
+    checked = _spread(len(frames))
+    second = torch.stack([network.probability(frames[i]) for i in checked])
+    second = resize_planes(second[None], masks.shape[1:])[0]
+    agreement = min(overlap(masks[i] > 0.5, other > 0.5) for i, other in zip(checked, second, strict=True))
+    if agreement < AGREED and border_contact(second > 0.5) <= border_contact(masks[checked] > 0.5) + BORDER_MARGIN:
+        return _by_network(frames, network)
+    return _Segmentation(masks, name, agreement, True, is_exact=agreement >= AGREED)
+
+
+def overlap(one: Bool[Tensor, "*s"], other: Bool[Tensor, "*s"]) -> float:
+    """Return the intersection of two masks over their union; 1 if both are empty."""
+    union = int((one | other).sum())
+    return int((one & other).sum()) / union if union else 1.0
+
+
+def border_contact(masks: Bool[Tensor, "t h w"]) -> float:
+    """Return the share of the frames' border that masks cover."""
+    return float(masks[:, torch.from_numpy(border_ring(*masks.shape[1:]))].float().mean())
+
+
+def _by_backdrop(lab: Float[ndarray, "t h w 3"], backdrop: Backdrop) -> Float[Tensor, "t h w"]:
+    return torch.from_numpy(np.stack([_parts(mask, PART) for mask in cut_out(lab, backdrop)])).float()
+
+
+def _by_network(frames: Float[Tensor, "t h w 3"], network: SegmentationNetwork) -> _Segmentation:
+    """Segment every frame; compare some with the network's answer to the mirrored frame."""
+    size = _reduced(frames, REFINED_SIDE)
+    found = torch.stack([resize_planes(network.probability(frame)[None, None], size)[0, 0] for frame in frames])
+    agreement = 1.0
+    for i in _spread(len(frames)):
+        mirrored = resize_planes(network.probability(frames[i].flip(1)).flip(1)[None, None], size)[0, 0]
+        agreement = min(agreement, overlap(found[i] > 0.5, mirrored > 0.5))
+        if len(frames) == 1:
+            found = (found + mirrored) / 2
+    return _Segmentation(found, "network", agreement, True)
+
+
+def _refine(frames: Float[Tensor, "t h w 3"], probability: Float[Tensor, "t h2 w2"]) -> Float[Tensor, "t h w"]:
+    """Refine a segmentation by color models and by the edges of the frames, up to their full size."""
+    size = _reduced(frames, REFINED_SIDE)
+    prior = resize_planes(probability[None], size)[0].double().numpy()
+    lab, small = _lab(frames, REFINED_SIDE, blur=0), _resized(frames, torch.empty(0, *size)).cpu().numpy()
+    radius = max(2, round(FILTER_RADIUS * max(size)))
+    current = prior
+    for last in (False,) * (ROUNDS - 1) + (True,):
+        odds = foreground_log_odds(lab.reshape(-1, 3).astype(np.float64), current.ravel()).reshape(current.shape)
+        mixed = expit((1 - COLOR_SHARE) * logit(prior.clip(SURE, 1 - SURE)) + COLOR_SHARE * odds)
+        targets = frames.cpu() if last else torch.from_numpy(small)
+        filtered = torch.stack(
+            [
+                guide_to_edges(values, guide, target, radius, FILTER_EPS)
+                for values, guide, target in zip(mixed, small, targets, strict=True)
+            ]
+        ).clamp(0, 1)
+        current = filtered.double().numpy()
+    likelihood = average_still_pixels(filtered, frames.cpu())
+    alpha = (0.5 + STEEPNESS * (likelihood - 0.5)).clamp(0, 1)
+    large = resize_planes(probability[None], alpha.shape[1:])[0]
+    reach = 2 * max(2, round(FILTER_RADIUS * max(alpha.shape[1:])))
+    whole = [_without_false_holes(a.numpy(), p.cpu().numpy() > 0.5, reach) for a, p in zip(alpha, large, strict=True)]
+    return torch.from_numpy(np.stack(whole)).to(frames)
+
+
+def _without_false_holes(
+    alpha: Float[ndarray, "h w"], segmented: Bool[ndarray, "h w"], reach: int
+) -> Float[ndarray, "h w"]:
+    """Remove specks, and make solid what the segmentation has and the outline encloses, such as highlights.
+
+    Args:
+        alpha: refined by colors, which know no inside.
+        segmented: mask of the segmentation.
+        reach: distance from the outline from which alpha is solid, pixels.
+    """
+    mask = _parts(alpha > 0.5, PART)
+    filled = mask | (ndimage.binary_fill_holes(mask) & segmented)
+    deep = ndimage.binary_erosion(filled, iterations=reach, border_value=1) & segmented
+    solid = (filled & ~mask) | deep
+    return np.where(solid, np.ones_like(alpha), alpha * ndimage.binary_dilation(mask, iterations=2))
+
+
+def _lab(frames: Float[Tensor, "t h w 3"], longest: int, blur: float = 0.6) -> Float[ndarray, "t h2 w2 3"]:
     """Convert frames to CIE Lab, downscaled to a longest side and slightly blurred against pixel noise."""
-    scale = longest / max(frames.shape[1:3])
-    size = [max(8, round(side * scale)) for side in frames.shape[1:3]] if scale < 1 else list(frames.shape[1:3])
+    size = _reduced(frames, longest)
     lab = np.empty((len(frames), *size, 3), np.float32)
     for i, frame in enumerate(frames):
         small = frame.permute(2, 0, 1)[None]
-        if scale < 1:
+        if size != tuple(frames.shape[1:3]):
             small = resize_planes(small, size)
-        lab[i] = ndimage.gaussian_filter(rgb2lab(small[0].permute(1, 2, 0).cpu().numpy()), (0.6, 0.6, 0))
+        converted = rgb2lab(small[0].permute(1, 2, 0).cpu().numpy())
+        lab[i] = ndimage.gaussian_filter(converted, (blur, blur, 0)) if blur else converted
     return lab
 
 
-def _compact(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
-    """Close narrow gaps and holes of a photograph's mask, and remove wisps and small parts."""
-    disc = np.hypot(*np.mgrid[-3:4, -3:4]) < 3.5
-    closed = ndimage.binary_closing(np.pad(mask, 4, mode="edge"), disc)[4:-4, 4:-4]
-    opened = ndimage.binary_opening(ndimage.binary_fill_holes(closed), disc[1:-1, 1:-1])
-    return _parts(opened, PHOTO_PART)
+def _reduced(frames: Float[Tensor, "t h w 3"], longest: int) -> tuple[int, int]:
+    """Return height and width with a longest side of at most `longest` pixels."""
+    height, width = frames.shape[1:3]
+    scale = min(1.0, longest / max(height, width))
+    return (height, width) if scale == 1 else (max(8, round(height * scale)), max(8, round(width * scale)))
+
+
+def _resized(frames: Float[Tensor, "t h w 3"], like: Float[Tensor, "n h2 w2"]) -> Float[Tensor, "t h2 w2 3"]:
+    size = tuple(like.shape[1:])
+    if size == tuple(frames.shape[1:3]):
+        return frames
+    return torch.cat([resize_planes(frame.permute(2, 0, 1)[None], size).permute(0, 2, 3, 1) for frame in frames])
+
+
+def _spread(count: int) -> list[int]:
+    """Return the indices of the checked frames."""
+    return sorted({round(i) for i in np.linspace(0, count - 1, min(count, CHECKED_FRAMES))})
 
 
 def _parts(mask: Bool[ndarray, "h w"], min_share: float) -> Bool[ndarray, "h w"]:
@@ -131,7 +280,7 @@ def _parts(mask: Bool[ndarray, "h w"], min_share: float) -> Bool[ndarray, "h w"]
 def _check(mask: Bool[ndarray, "h w"]) -> None:
     share = float(mask.mean())
     if share < MIN_AREA:
-        found = "the picture is the same everywhere" if share == 0 else f"the foreground covers {share:.2%} of it"
+        found = "nothing stands out" if share == 0 else f"the foreground covers {share:.2%} of the picture"
         raise BadInput(f"no subject found: {found}, a subject must cover at least {MIN_AREA:.1%}; {ADVICE}")
     touched = float(mask[border_ring(*mask.shape)].mean())
     if share > MAX_AREA or touched > MAX_BORDER:
@@ -139,71 +288,3 @@ def _check(mask: Bool[ndarray, "h w"]) -> None:
             f"no subject found: the foreground covers {share:.0%} of the picture and {touched:.0%} of its border, at "
             f"most {MAX_AREA:.0%} and {MAX_BORDER:.0%} are allowed; {ADVICE}"
         )
-
-
-def _upscale(masks: Bool[ndarray, "t h w"], height: int, width: int) -> Bool[ndarray, "t h2 w2"]:
-    if masks.shape[1:] == (height, width):
-        return masks
-    soft = torch.from_numpy(masks).float()[:, None]
-    large = functional.interpolate(soft, (height, width), mode="bicubic", align_corners=False)
-    return (large[:, 0] > 0.5).numpy()
-
-
-def _estimate_alpha(picture: Float[Tensor, "h w 3"], mask: Bool[ndarray, "h w"], band: int) -> Float[Tensor, "h w 4"]:
-    """Estimate alpha and foreground color in a band along the outline.
-
-    A pixel there mixes the colors of the nearby subject and the nearby background: alpha is its position on the line
-    between these two colors, and the foreground color is the pixel without the background's part.
-    """
-    cutout = torch.cat([picture, torch.zeros_like(picture[..., :1])], -1)
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    if not len(rows):
-        return cutout
-    margin = 4 * band
-    window = (
-        slice(max(0, rows[0] - margin), rows[-1] + margin),
-        slice(max(0, columns[0] - margin), columns[-1] + margin),
-    )
-    cutout[window] = _unmix(picture[window], mask[window], band)
-    return cutout
-
-
-def _unmix(picture: Float[Tensor, "h w 3"], mask: Bool[ndarray, "h w"], band: int) -> Float[Tensor, "h w 4"]:
-    image = picture.cpu().numpy().astype(np.float64)
-    inside, outside = ndimage.distance_transform_edt(mask), ndimage.distance_transform_edt(~mask)
-    core = mask & (inside > np.minimum(band, 0.75 * ndimage.maximum_filter(inside, 2 * band + 1)))
-    away = outside > band
-    if not core.any() or not away.any():
-        return torch.cat([picture, torch.from_numpy(mask).to(picture)[..., None]], -1)
-    front, back = _extrapolate(image, core, band), _extrapolate(image, away, band)
-    line = front - back
-    length = (line**2).sum(-1)
-    mixed = ((image - back) * line).sum(-1) / np.maximum(length, 1e-6)
-    geometric = ndimage.gaussian_filter(mask.astype(np.float64), 0.5 * band)
-    trust = np.clip(length / 0.04, 0, 1)  # colors that differ by 0.2 in the unit cube determine alpha reliably
-    alpha = np.clip((trust * mixed + (1 - trust) * geometric - 0.04) / 0.92, 0, 1)
-    alpha = np.where(core, 1.0, np.where(away, 0.0, alpha))
-    pure = (image - (1 - alpha[..., None]) * back) / np.maximum(alpha[..., None], 1e-3)
-    color = np.where(core[..., None], image, front + alpha[..., None] * (np.clip(pure, 0, 1) - front))
-    return torch.from_numpy(np.dstack([color, alpha]).clip(0, 1)).to(picture)
-
-
-def _extrapolate(image: Float[ndarray, "h w 3"], source: Bool[ndarray, "h w"], band: int) -> Float[ndarray, "h w 3"]:
-    """Extrapolate the source pixels' colors: a local mean near them, the nearest color farther away."""
-    weight = ndimage.gaussian_filter(source.astype(np.float64), band)
-    mean = ndimage.gaussian_filter(image * source[..., None], (band, band, 0)) / np.maximum(weight, 1e-9)[..., None]
-    nearest = ndimage.distance_transform_edt(~source, return_distances=False, return_indices=True)
-    return np.where((weight > 1e-3)[..., None], mean, image[nearest[0], nearest[1]])
-
-
-def _stabilize(cutouts: Float[Tensor, "t h w 4"], frames: Float[Tensor, "t h w 3"]) -> None:
-    """Replace the alpha of static pixels by its median over three frames."""
-    count = len(cutouts)
-    if count < 3:
-        return
-    alpha = cutouts[..., 3].clone()
-    still = [(frames[i + 1] - frames[i]).abs().amax(-1) < STILL for i in range(count - 1)]
-    for i in range(count):
-        before, after = still[max(0, i - 1)], still[min(i, count - 2)]
-        near = torch.stack([alpha[max(0, i - 1)], alpha[i], alpha[min(i + 1, count - 1)]])
-        cutouts[i, ..., 3] = torch.where(before & after, near.median(0).values, alpha[i])

@@ -1,10 +1,17 @@
 """Subject preparation: matting, square cropping and resampling of input frames."""
 
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
+from dg4d_lib.images import over_white
 from dg4d_lib.settings import SubjectSettings
+from dg4d_lib.video import u2netp
 from dg4d_lib.video.framing import (
     VISIBLE,
     bounding_box,
@@ -13,44 +20,86 @@ from dg4d_lib.video.framing import (
     downscale,
     is_well_framed,
     reframe,
+    resample,
 )
-from dg4d_lib.video.matting import matte
+from dg4d_lib.video.matting import Matte, matte
+from dg4d_lib.video.segmentation_network import SegmentationNetwork
+from dg4d_lib.video.soft_edges import free_colors
 
 OVERSAMPLING = 2  # maximum size of opaque frames before matting, relative to the size of the square
 SMALLEST_SUBJECT = 16  # longest side, pixels; a smaller subject has too few pixels to reconstruct
+BOX_MARGIN = 0.1  # margin around the user's box that matting sees, as a share of its longest side
+UNCERTAIN = "so the outline is an estimate; if it is wrong, give a PNG with transparency, --mask FILE or --box X,Y,W,H."
 NOTES = {
     "backdrop": "The background was removed by its plain color; a PNG with transparency gives a more exact outline.",
-    "uneven backdrop": (
-        "The background was removed by its color although it is uneven, so the outline is a guess; "
-        "check subject.png, and give a PNG with transparency if it is wrong."
-    ),
-    "color models": (
-        "The background was removed by color models, so the outline is a guess on photographs; "
-        "check subject.png, and give a PNG with transparency if it is wrong."
-    ),
+    "uneven backdrop": f"The background was removed by its color although it is uneven, {UNCERTAIN}",
+    "network": f"The background was removed by the segmentation network {{name}}, {UNCERTAIN}",
 }
 
 
+@dataclass(frozen=True)
+class Segmenter:
+    """Network for opaque pictures.
+
+    Attributes:
+        name: in settings and notes.
+        load: returns the network.
+    """
+
+    name: str = u2netp.NAME
+    load: Callable[[], SegmentationNetwork] = u2netp.packaged_network
+
+
+U2NETP = Segmenter()
+
+
+@dataclass(frozen=True)
+class PreparedSubject:
+    """Cut-outs of a subject in one square frame.
+
+    Attributes:
+        frames: straight cut-outs with colors extended into transparent pixels.
+        notes: sentences for the report.
+        estimate: cut-outs in the frame of the source, if alpha was estimated; None if it was given.
+    """
+
+    frames: Float[Tensor, "t s s 4"]
+    notes: tuple[str, ...] = ()
+    estimate: Matte | None = None
+
+
 def prepare_subject(
-    frames: Float[Tensor, "t h w 4"], has_alpha: bool, settings: SubjectSettings
-) -> tuple[Float[Tensor, "t s s 4"], tuple[str, ...]]:
+    frames: Float[Tensor, "t h w 4"],
+    has_alpha: bool,
+    settings: SubjectSettings,
+    mask: Float[Tensor, "t h w"] | None = None,
+    segmenter: Segmenter = U2NETP,
+) -> PreparedSubject:
     """Cut out, crop and resample the subject, the same way in all frames.
 
     Args:
         frames: straight sRGB and alpha in [0, 1].
-        has_alpha: True if alpha marks the subject; else the subject is matted by its colors.
-        settings: size of the square in pixels, framing and border.
-
-    Returns:
-        Straight cut-outs with colors extended into transparent pixels, and notes for the report.
+        has_alpha: True if alpha marks the subject.
+        settings: matting, size of the square in pixels, framing and border; the box is in pixels of `frames`.
+        mask: alpha from the user, which replaces that of the frames.
+        segmenter: network for opaque frames.
 
     Raises:
-        BadInput: nothing is visible in the first frame, no subject is found, or it is too small.
+        BadInput: nothing is visible in the first frame, no subject is found, it is too small, or the box is outside.
+        BackendUnavailable: the network is not installed.
     """
+    check_box(settings.box, frames.shape[2], frames.shape[1])
     notes: tuple[str, ...] = ()
-    if not has_alpha:
-        found = matte(downscale(frames, OVERSAMPLING * settings.size)[..., :3])
-        frames, notes = found.frames, (NOTES[found.method],)
+    estimate = None
+    given = has_alpha or mask is not None
+    if mask is not None:
+        frames = apply_mask(frames, mask)
+    elif settings.matting != "none" and not (settings.matting == "auto" and has_alpha):
+        estimate = _estimate(frames, settings, segmenter)
+        frames, notes = estimate.frames, (NOTES[estimate.method].format(name=segmenter.name),)
+        given = False
+    if settings.box and estimate is None:
+        frames = _inside(frames, settings.box)
     alpha = frames[..., 3]
     bounding_box(alpha)  # raises if no frame shows anything
     if not (alpha[0] > VISIBLE).any():
@@ -61,8 +110,75 @@ def prepare_subject(
             f"the subject is {right - left} x {bottom - top} pixels; its longest side must have at least "
             f"{SMALLEST_SUBJECT} pixels: give a larger or closer picture"
         )
-    keep = settings.framing == "keep" or (settings.framing == "auto" and has_alpha and is_well_framed(alpha))
+    keep = settings.framing == "keep" or (settings.framing == "auto" and given and is_well_framed(alpha))
     crop = crop_whole_frame(*alpha.shape[1:]) if keep else crop_around_subject(alpha, settings.border)
     if not (alpha <= VISIBLE).any():
         notes = (*notes, "The subject fills the whole picture, so there is no outline to build a shape from.")
-    return reframe(frames, crop, settings.size), notes
+    return PreparedSubject(reframe(frames, crop, settings.size), notes, estimate)
+
+
+def check_box(box: tuple[int, ...], width: int, height: int) -> None:
+    """Refuse a box that is not inside a picture of this size.
+
+    Raises:
+        BadInput: says where the box ends and how large the picture is.
+    """
+    if box and (box[0] + box[2] > width or box[1] + box[3] > height):
+        raise BadInput(
+            f"the box {','.join(map(str, box))} reaches to x = {box[0] + box[2]} and y = {box[1] + box[3]}, outside of "
+            f"the picture of {width} x {height} pixels; give X,Y,W,H with X + W <= {width} and Y + H <= {height}"
+        )
+
+
+def apply_mask(frames: Float[Tensor, "t h w 4"], mask: Float[Tensor, "t h w"]) -> Float[Tensor, "t h w 4"]:
+    """Return cut-outs with the user's alpha, and colors freed from the background where it is soft.
+
+    Raises:
+        BadInput: the mask of the first frame is empty.
+    """
+    if not (mask[0] > VISIBLE).any():
+        raise BadInput(
+            "the mask is empty: no pixel of the first frame is brighter than "
+            f"{VISIBLE:.0%}; the subject must be white, the background black"
+        )
+    return torch.stack([free_colors(frame[..., :3], alpha) for frame, alpha in zip(frames, mask, strict=True)])
+
+
+def _estimate(frames: Float[Tensor, "t h w 4"], settings: SubjectSettings, segmenter: Segmenter) -> Matte:
+    """Cut the subject out of frames, over white where they are transparent, within the user's box."""
+    method: Literal["auto", "backdrop", "network"] = "network"
+    match settings.matting:
+        case "auto" | "backdrop" as chosen:
+            method = chosen
+    window = _window(settings.box, frames.shape[2], frames.shape[1])
+    seen = frames[:, window[0], window[1]]
+    opaque = torch.cat([over_white(seen), torch.ones_like(seen[..., 3:])], -1)
+    small = downscale(opaque, OVERSAMPLING * settings.size)
+    found = matte(small[..., :3], method, segmenter.load)
+    if not settings.box:
+        return found
+    cutouts = torch.zeros_like(frames)
+    cutouts[..., :3] = frames[..., :3]
+    for cutout, each in zip(cutouts, found.frames, strict=True):
+        cutout[window] = resample(each[None], *seen.shape[1:3])[0]
+    return replace(found, frames=_inside(cutouts, settings.box))
+
+
+def _window(box: tuple[int, ...], width: int, height: int) -> tuple[slice, slice]:
+    """Return rows and columns of the box with a margin; of the whole picture without a box."""
+    if not box:
+        return slice(0, height), slice(0, width)
+    x, y, w, h = box
+    margin = round(BOX_MARGIN * max(w, h))
+    return (
+        slice(max(0, y - margin), min(height, y + h + margin)),
+        slice(max(0, x - margin), min(width, x + w + margin)),
+    )
+
+
+def _inside(frames: Float[Tensor, "t h w 4"], box: tuple[int, ...]) -> Float[Tensor, "t h w 4"]:
+    """Make the pixels outside of a box transparent."""
+    x, y, w, h = box
+    kept = torch.zeros_like(frames[..., 3])
+    kept[:, y : y + h, x : x + w] = frames[:, y : y + h, x : x + w, 3]
+    return torch.cat([frames[..., :3], kept[..., None]], -1)

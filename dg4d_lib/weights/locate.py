@@ -5,13 +5,13 @@ import json
 import os
 from collections.abc import Iterator
 from importlib.util import find_spec
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.weights.lock import LockEntry, read_lock, write_json
 from dg4d_lib.weights.registry import KNOWN, Weights, lookup_weights
 
-TENSOR_SUFFIXES = frozenset([".safetensors", ".bin", ".pth", ".pt"])
+TENSOR_SUFFIXES = frozenset([".safetensors", ".bin", ".pth", ".pt", ".onnx"])
 READABLE_SUFFIXES = TENSOR_SUFFIXES | {".json", ".txt", ".model"}  # files that loading may read
 NO_TENSORS = f"has no tensors ({', '.join(sorted(TENSOR_SUFFIXES))})"
 DIGEST_CACHE = "digests.json"  # sha256 of large files, so that they are hashed once and not at every run
@@ -151,6 +151,11 @@ def digests(folder: Path, parts: tuple[str, ...] = (), cache: Path | None = None
     return {path.relative_to(root).as_posix(): have[path] for path in files}
 
 
+def is_part(path: PurePath, parts: tuple[str, ...]) -> bool:
+    """Return True for a file that is one of the parts, or in a folder that is."""
+    return path.parts[0] in parts or path.as_posix() in parts
+
+
 def identity(files: dict[str, str]) -> str:
     """Return one digest of the result of `digests`; it depends on names and content, not on the folder's path."""
     listing = json.dumps(files, sort_keys=True, separators=(",", ":"))
@@ -183,7 +188,7 @@ def _files(folder: Path, parts: tuple[str, ...]) -> Iterator[Path]:
         return
     for path in folder.rglob("*"):
         inside = path.relative_to(folder)
-        wanted = not parts or inside.parts[0] in parts or inside.name == "model_index.json"
+        wanted = not parts or is_part(inside, parts) or inside.name == "model_index.json"
         if (
             wanted
             and path.suffix in READABLE_SUFFIXES

@@ -2,8 +2,11 @@
 
 import errno
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.weights.locate import (
@@ -13,6 +16,7 @@ from dg4d_lib.weights.locate import (
     digests,
     find_problems,
     folder_name,
+    is_part,
 )
 from dg4d_lib.weights.lock import LockedFile, LockEntry, read_lock, write_lock
 from dg4d_lib.weights.registry import Weights
@@ -24,6 +28,48 @@ FORMATS = (
     (True, ".bin"),
     (False, ".bin"),
 )  # (half precision, suffix), preferred first
+
+
+PARTIAL = ".cache/huggingface/download"  # in the folder of a download: where the client keeps unfinished files
+
+
+@dataclass(frozen=True)
+class PullPlan:
+    """Files of a download.
+
+    Attributes:
+        weights: entry of the registry.
+        folder: destination.
+        revision: commit on the hub.
+        license: id on the model card; empty if the card has none.
+        sizes: bytes of every needed file, by its path in the folder; 0 if the hub does not tell.
+        published: sha256 of files whose digest is known before the download.
+    """
+
+    weights: Weights
+    folder: Path
+    revision: str
+    license: str
+    sizes: Mapping[str, int]
+    published: Mapping[str, str]
+
+    @property
+    def total_bytes(self) -> int:
+        """Size of all files."""
+        return sum(self.sizes.values())
+
+    @property
+    def present_bytes(self) -> int:
+        """Bytes that are here: whole files, and the beginnings of unfinished ones."""
+        whole = {name for name, size in self.sizes.items() if _size_of(self.folder / name) == size}
+        begun = sum(_size_of(path) for path in (self.folder / PARTIAL).rglob("*.incomplete"))
+        missing = sum(size for name, size in self.sizes.items() if name not in whole)
+        return self.total_bytes - missing + min(begun, missing)
+
+    @property
+    def missing_bytes(self) -> int:
+        """Bytes to download."""
+        return self.total_bytes - self.present_bytes
 
 
 def pull(weights: Weights, home: Path) -> LockEntry:
@@ -39,34 +85,45 @@ def pull(weights: Weights, home: Path) -> LockEntry:
             hub lists or the registry records.
         OSError: the disk is full.
     """
-    try:
-        import huggingface_hub as hub  # noqa: PLC0415 - an optional dependency
-    except ModuleNotFoundError as error:
-        raise BackendUnavailable(
-            "downloading weights needs the package huggingface_hub; run `make setup CUDA=1`"
-        ) from error
+    return download(plan_pull(weights, home), home)
+
+
+def plan_pull(weights: Weights, home: Path) -> PullPlan:
+    """Return the files that a download needs, and remove damaged ones.
+
+    Raises:
+        BackendUnavailable: the hub cannot be reached or refuses access.
+    """
+    hub = _client()
     before = read_lock(home).get(weights.name)
     folder = home / folder_name(weights)
     for name in find_problems(folder, weights, before, home / DIGEST_CACHE) if before else ():
         (folder / name).unlink(missing_ok=True)  # the downloader may consider a damaged file complete
-    try:
+    with _hub_errors(weights):
         info = hub.HfApi().model_info(
             weights.hub_id, revision=before.revision if before else weights.revision, files_metadata=True
         )
-        listed = info.siblings or []
-        published = {file.rfilename: file.lfs.sha256 for file in listed if file.lfs is not None}
-        if weights.revision in (None, info.sha):
-            published |= weights.published
-        chosen = needed([file.rfilename for file in listed], weights.parts)
-        folder.mkdir(parents=True, exist_ok=True)
-        hub.snapshot_download(weights.hub_id, revision=info.sha, local_dir=folder, allow_patterns=chosen)
-    except Exception as error:  # networks, proxies and servers fail in many ways
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise
-        raise BackendUnavailable(_refusal(weights, error)) from error
-    have = {name: digest for name, digest in digests(folder, cache=home / DIGEST_CACHE).items() if name in chosen}
-    wrong = {name: "was not downloaded" for name in chosen if name not in have} | find_problems(folder, weights)
-    for name in [name for name, digest in have.items() if published.get(name, digest) != digest]:
+    listed = info.siblings or []
+    published = {file.rfilename: file.lfs.sha256 for file in listed if file.lfs is not None}
+    if weights.revision in (None, info.sha):
+        published |= weights.published
+    chosen = set(needed([file.rfilename for file in listed], weights.parts))
+    sizes = {file.rfilename: int(file.size or 0) for file in listed if file.rfilename in chosen}
+    card = str(getattr(info.card_data, "license", None) or "")
+    return PullPlan(weights, folder, info.sha or "", card, dict(sorted(sizes.items())), published)
+
+
+def download(plan: PullPlan, home: Path) -> LockEntry:
+    """Download the files of a plan, verify them and record them in the lock; see `pull`."""
+    hub, weights, folder = _client(), plan.weights, plan.folder
+    folder.mkdir(parents=True, exist_ok=True)
+    with _hub_errors(weights):
+        hub.snapshot_download(
+            weights.hub_id, revision=plan.revision or None, local_dir=folder, allow_patterns=list(plan.sizes)
+        )
+    have = {name: digest for name, digest in digests(folder, cache=home / DIGEST_CACHE).items() if name in plan.sizes}
+    wrong = {name: "was not downloaded" for name in plan.sizes if name not in have} | find_problems(folder, weights)
+    for name in [name for name, digest in have.items() if plan.published.get(name, digest) != digest]:
         wrong[name] = "is damaged"
         (folder / name).unlink()
     if wrong:
@@ -74,11 +131,39 @@ def pull(weights: Weights, home: Path) -> LockEntry:
             f"the download of weights {weights.name} from {weights.hub_id} is incomplete: "
             f"{'; '.join(map(' '.join, wrong.items()))}; run `dg4d weights pull {weights.name}` again"
         )
-    files = {name: LockedFile(sha256=have[name], size=(folder / name).stat().st_size) for name in chosen}
-    card = str(getattr(info.card_data, "license", None) or "")
-    locked = LockEntry(hub_id=weights.hub_id, revision=info.sha or "", license=card, files=files)
+    files = {name: LockedFile(sha256=have[name], size=(folder / name).stat().st_size) for name in plan.sizes}
+    locked = LockEntry(hub_id=weights.hub_id, revision=plan.revision, license=plan.license, files=files)
     write_lock(home, weights.name, locked)
     return locked
+
+
+def _client() -> Any:
+    try:
+        import huggingface_hub  # noqa: PLC0415 - an optional dependency
+    except ModuleNotFoundError as error:
+        raise BackendUnavailable(
+            "downloading weights needs the package huggingface_hub; run `make setup CUDA=1`"
+        ) from error
+    return huggingface_hub
+
+
+@contextmanager
+def _hub_errors(weights: Weights) -> Iterator[None]:
+    """Turn errors of the client in the block into one message; a full disk stays one."""
+    try:
+        yield
+    except Exception as error:  # networks, proxies and servers fail in many ways
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        raise BackendUnavailable(_refusal(weights, error)) from error
+
+
+def _size_of(path: Path) -> int:
+    """Return the size of a file, -1 if there is none."""
+    try:
+        return path.stat().st_size
+    except OSError:
+        return -1
 
 
 def needed(names: Iterable[str], parts: tuple[str, ...] = ()) -> list[str]:
@@ -94,7 +179,7 @@ def needed(names: Iterable[str], parts: tuple[str, ...] = ()) -> list[str]:
         hidden = any(part.startswith(".") for part in path.parts)
         duplicate = "model_index.json" in everything and len(path.parts) == 1 and path.suffix in TENSOR_SUFFIXES
         other = ".non_ema." in name or path.name.startswith("openvino")
-        wanted = path.parts[0] in parts or path.name == "model_index.json" if parts else not duplicate
+        wanted = is_part(path, parts) or path.name == "model_index.json" if parts else not duplicate
         if wanted and path.suffix in READABLE_SUFFIXES and not hidden and not other:
             folders[path.parent].append(name)
     return sorted(name for files in folders.values() for name in _one_format(files))

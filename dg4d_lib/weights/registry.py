@@ -86,6 +86,7 @@ TERMS: dict[Commercial, str] = {
 
 ZERO123_PARTS = ("vae", "unet", "image_encoder", "clip_camera_projection", "scheduler")
 SVD_PARTS = ("vae", "unet", "image_encoder", "scheduler")
+SEGMENTATION_PARTS = ("onnx/model.onnx", "preprocessor_config.json")  # without the variants of lower precision
 SD_VAE = "3e4c08995484ee61270175e9e7a072b66a6e4eeb5f0c266667fe1f45b90daf9a"  # Stable Diffusion's VAE, half precision
 SVD_SHARED = {
     "vae/diffusion_pytorch_model.fp16.safetensors": "af602cd0eb4ad6086ec94fbf1438dfb1be5ec9ac03fd0215640854e90d6463a3",
@@ -184,6 +185,36 @@ KNOWN: dict[str, Weights] = {
                 "model_fp16_fixrot.safetensors": "744d6324656342c64f871308e73db97f0eb51858d94329b30090e986a6d050ab"
             },
             about_gb=0.83,
+        ),
+        Weights(
+            name="birefnet",
+            hub_id="onnx-community/BiRefNet-ONNX",
+            purpose="cut-outs: subject.matting=birefnet (BiRefNet)",
+            license=License("MIT", "yes", TERMS["yes"]),
+            parts=SEGMENTATION_PARTS,
+            about_gb=0.97,
+        ),
+        Weights(
+            name="birefnet-lite",
+            hub_id="onnx-community/BiRefNet_lite-ONNX",
+            purpose="cut-outs: subject.matting=birefnet-lite (BiRefNet, smaller)",
+            license=License("MIT", "yes", TERMS["yes"]),
+            parts=SEGMENTATION_PARTS,
+            about_gb=0.22,
+        ),
+        Weights(
+            name="isnet",
+            hub_id="onnx-community/ISNet-ONNX",
+            purpose="cut-outs: subject.matting=isnet (IS-Net)",
+            license=License(
+                "AGPL-3.0 on its card",
+                "unverified",
+                "the card of this export says AGPL-3.0, while the authors of IS-Net released their weights under "
+                "Apache-2.0; read both before any commercial use",
+            ),
+            parts=SEGMENTATION_PARTS,
+            revision="3fe6e3db3e32c69aadde61fe388ddb1a0574440c",
+            about_gb=0.18,
         ),
         Weights(
             name="vgg16",

@@ -20,7 +20,7 @@ from flows.packages.scores import Results
 from flows.packages.summary import BAD_INPUT, BatchProgress, Row
 from flows.step_errors import StepError, StepMissing
 from steps.artifacts.archives import unpack
-from steps.artifacts.ground_truth import GroundTruth, find_ground_truth, find_ground_truths
+from steps.artifacts.ground_truth import MESH, GroundTruth, find_ground_truth, find_ground_truths
 from steps.catalog import PACKAGE, TRUTH
 from steps.contract import ArtifactRef
 from steps.profiles import ScoreAssetSettings, profile, revise
@@ -47,6 +47,7 @@ def score(
     mesh: bool = False,
     changes: list[str] | None = None,
     out: Path | None = None,
+    actionbench: bool = False,
 ) -> Results:
     """Score one asset.
 
@@ -57,6 +58,7 @@ def score(
         mesh: score the textured mesh instead of the splats.
         changes: "score.NAME=VALUE", settings of `ScoreSettings`.
         out: file for the results, Markdown if it ends in .md, else JSON.
+        actionbench: compare the meshes by ActionBench's metrics, too.
 
     Raises:
         BadInput: the asset, the ground truth or a setting cannot be used, or `out` cannot be written.
@@ -65,6 +67,9 @@ def score(
     found, (pipeline, settings) = find_ground_truth(truth), _settings(changes, mesh)
     if pipeline:
         raise BadInput(f"only settings that begin with {SCORE!r} apply to a finished asset; given {min(pipeline)}")
+    if actionbench and found.mesh is None:
+        raise BadInput(f"{truth} has no {MESH}; --actionbench compares with true meshes (vertices, faces)")
+    settings = settings.model_copy(update={"actionbench": actionbench})
     record = load_verified(package)
     if out is not None:
         check_writable(out.parent)

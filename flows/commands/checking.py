@@ -20,6 +20,9 @@ def score(
     package: Package,
     truth: Annotated[Path, typer.Option(metavar="PATH", help="ground-truth views and meshes, or one picture")],
     mesh: Annotated[bool, typer.Option("--mesh", help="score the textured mesh instead of the splats")] = False,
+    actionbench: Annotated[
+        bool, typer.Option("--actionbench", help="also compare the meshes by ActionBench's CD-3D, CD-4D and CD-M")
+    ] = False,
     changes: Annotated[
         list[str] | None, typer.Option("--set", metavar="score.NAME=VALUE", help="change a setting; may be repeated")
     ] = None,
@@ -34,7 +37,7 @@ def score(
         from flows.commands.benchmark import score as score_asset
 
         console = terminal.console()
-        _print_scores(score_asset(package, truth, console, mesh, changes, out), console)
+        _print_scores(score_asset(package, truth, console, mesh, changes, out, actionbench), console)
 
 
 def bench(
@@ -91,6 +94,7 @@ def rebuild(
         Path | None, typer.Option(metavar="PATH", help="source file, if the store no longer has it")
     ] = None,
     bank: Annotated[Path | None, typer.Option(metavar="DIR", help="ground-truth views, likewise")] = None,
+    mask: Annotated[Path | None, typer.Option(metavar="PATH", help="mask of the subject, likewise")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", metavar="DIR", help="keep the new package in DIR")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -104,7 +108,7 @@ def rebuild(
         record = load_verified(package)
         if out is not None:
             check_folder(out)
-        job = job_from_record(record, home.store(), source, bank)
+        job = job_from_record(record, home.store(), source, bank, mask)
         console = terminal.console(stderr=as_json)
 
         def work() -> "RebuildReport":

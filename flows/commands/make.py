@@ -29,6 +29,7 @@ class Wish:
         pictures: pictures or videos.
         text: prompt instead of a picture.
         video: driving video.
+        mask: mask of the subject.
         out: output folder; of several pictures the folder above those of the assets.
         force: replace another asset in the output folder.
         picked: true if `--pick` chooses a motion.
@@ -38,6 +39,7 @@ class Wish:
     pictures: tuple[Path, ...]
     text: str
     video: Path | None
+    mask: Path | None
     out: Path | None
     force: bool
     picked: bool
@@ -60,8 +62,8 @@ def make_each(wish: Wish, console: "Console") -> int:
         item = (clean_name(picture.stem) or "asset") if picture else name_from_text(wish.text)
         _make(wish, item, picture, wish.out or Path("out") / item, console)
         return 0
-    if wish.text or wish.video:
-        option = "--text" if wish.text else "--video"
+    for_one = {"--text": wish.text, "--video": wish.video, "--mask": wish.mask}
+    if option := next((name for name, value in for_one.items() if value), ""):
         raise BadInput(f"{option} makes one asset, and {len(wish.pictures)} pictures are given; give one of them")
     items = unique_names([(clean_name(path.stem) or "asset", path.suffix.lstrip(".")) for path in wish.pictures])
     failed: dict[str, DG4DError | StepError] = {}

@@ -1,6 +1,7 @@
 """Options that several commands share."""
 
 import math
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,6 +20,7 @@ PROFILES = (
     "paper",
     "video",
     "video-fast",
+    "release",
     "reference",
     "quality",
 )  # as in steps/profiles.py
@@ -80,7 +82,39 @@ Rate = Annotated[
 ]
 
 
-def shortcut_settings(triangles: int | None, texture: int | None, fps: float | None) -> dict[str, Any]:
+Mask = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="PATH", help="picture, or folder of frames for a video, of the same size: white where the subject is"
+    ),
+]
+Box = Annotated[
+    str,
+    typer.Option(
+        metavar="X,Y,W,H",
+        help="part of the picture that shows the subject, in pixels; short for --set subject.box=[X,Y,W,H]",
+    ),
+]
+
+
+def parse_box(text: str) -> tuple[int, ...] | None:
+    """Return a box from "X,Y,W,H"; None if the text is empty.
+
+    Raises:
+        BadInput: it is not four whole numbers.
+    """
+    from dg4d_lib.errors import BadInput
+    from dg4d_lib.settings import BOX_FORM
+
+    if not text.strip():
+        return None
+    parts = [part.strip() for part in text.strip().strip("[]").split(",")]
+    if len(parts) != 4 or not all(re.fullmatch(r"[0-9]{1,7}", part) for part in parts):
+        raise BadInput(f"{BOX_FORM}, for example 120,40,300,420; given {text!r}")
+    return tuple(map(int, parts))
+
+
+def shortcut_settings(triangles: int | None, texture: int | None, fps: float | None, box: str = "") -> dict[str, Any]:
     """Return the settings that these options stand for."""
-    given = {"mesh.max_faces": triangles, "mesh.texture_size": texture, "pack.fps": fps}
+    given = {"mesh.max_faces": triangles, "mesh.texture_size": texture, "pack.fps": fps, "subject.box": parse_box(box)}
     return {name: value for name, value in given.items() if value is not None}

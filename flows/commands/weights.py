@@ -51,26 +51,38 @@ def show(
 
 
 @weights.command()
-def pull(names: Names) -> None:
+def pull(
+    names: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="NAME...",
+            help="a profile, whose weights are all downloaded; a name from `dg4d weights list`; or the id of a "
+            "Hugging Face repository",
+        ),
+    ],
+) -> None:
     """Download weights and record their revision and digests.
 
-    Weights that are present are skipped.
+    Sizes are shown first. Weights that are present are skipped, and a download that broke off goes on.
     """
     with exit_on_error():
-        from dg4d_lib.errors import BadInput
-        from dg4d_lib.weights.locate import given_folder
-        from dg4d_lib.weights.pull import pull as get
+        from dg4d_lib.weights.pull import download, plan_pull
         from dg4d_lib.weights.registry import lookup_weights
+        from flows.engine.free_space import require_room_for_weights
         from steps.runtime.weights import license_of, weights_home
 
-        for name in names:
-            if given_folder(name) is not None:
-                raise BadInput(
-                    f"{name} is a folder on this machine; give a name, or the id of a Hugging Face repository"
-                )
-            home = weights_home()
-            home.mkdir(parents=True, exist_ok=True)
-            locked = get(lookup_weights(name), home)
+        wanted = _expand(names)
+        home = weights_home()
+        plans = [plan_pull(lookup_weights(name), home) for name in wanted]
+        for name, plan in zip(wanted, plans, strict=True):
+            typer.echo(f"{name}: {_gb(plan.missing_bytes)} of {_gb(plan.total_bytes)} GB to download")
+        missing = sum(plan.missing_bytes for plan in plans)
+        require_room_for_weights(home, missing)
+        if len(plans) > 1:
+            typer.echo(f"all: {_gb(missing)} of {_gb(sum(plan.total_bytes for plan in plans))} GB to download")
+        home.mkdir(parents=True, exist_ok=True)
+        for name, plan in zip(wanted, plans, strict=True):
+            locked = download(plan, home)
             typer.echo(f"{name}: {_size(locked)} GB, revision {locked.revision}; {license_of(name)}")
 
 
@@ -112,6 +124,34 @@ def check(
                 typer.echo(f"{name}: intact, {count}, {_size(locked)} GB")
         if broken:
             raise BackendUnavailable(f"damaged or incomplete; download again: `dg4d weights pull {' '.join(broken)}`")
+
+
+def _expand(names: Sequence[str]) -> list[str]:
+    """Replace profiles by the weights that they name; every weights once.
+
+    Raises:
+        BadInput: a folder, or a profile without weights.
+    """
+    from dg4d_lib.errors import BadInput
+    from dg4d_lib.weights.locate import given_folder
+    from steps.profiles import PROFILES
+    from steps.runtime.weights import weights_in
+
+    found: list[str] = []
+    for name in names:
+        if name in PROFILES:
+            if not (of_profile := list(weights_in(PROFILES[name].model_dump(mode="json")))):
+                raise BadInput(f"profile {name} needs no weights; it runs as it is")
+            found += of_profile
+        elif given_folder(name) is not None:
+            raise BadInput(f"{name} is a folder on this machine; give a name, or the id of a Hugging Face repository")
+        else:
+            found.append(name)
+    return list(dict.fromkeys(found))
+
+
+def _gb(size_bytes: int) -> str:
+    return f"{size_bytes / 1e9:.2f}"
 
 
 def _all_of_them() -> list["Weights"]:

@@ -87,7 +87,9 @@ class ItemDeployment(NamedTuple):
         store = home.store()
         ref = store.put_bytes(job.model_dump_json().encode(), JOB_MEDIA_TYPE)
         with running(store, job.item):
-            hold(store, job.item, [ref.digest, *(needed.digest for needed in (job.source, job.bank) if needed)])
+            hold(
+                store, job.item, [ref.digest, *(needed.digest for needed in (job.source, job.bank, job.mask) if needed)]
+            )
             outcome = self._outcome(job, ref, store)
             if outcome.package is None:
                 raise ItemFailed(outcome)

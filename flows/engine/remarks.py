@@ -1,5 +1,6 @@
 """Remarks on a cut-out that the user should read before the conversion goes on, with a picture."""
 
+import json
 import os
 import re
 import tempfile
@@ -8,24 +9,41 @@ from pathlib import Path
 
 from flows import home
 from flows.engine.events import StepEvent, emit
+from flows.packages.acceptance import format_bounds, format_value
 from steps.contract import ArtifactRef, StepResult
 from steps.store.artifact_store import ArtifactMissing, StoreUnreachable
 from steps.store.files import DiskFull
 
-REMARKED = "prepare_subject"  # the matte may be a guess
+REMARKED = "prepare_subject"  # the cut-out may be wrong
+GATES = "cutout_gates"  # its output with the gates of an estimated cut-out
 NAME_LENGTH = 80  # characters of an item in the name of a picture
 DIGITS = 12  # of a digest in it
 MOST_PICTURES = 200  # kept files, the newest; they show private input
 
 
 def remark(item: str, label: str, result: StepResult) -> None:
-    """Emit the notes of a cut-out with the path of a picture of source, matte and cut-out."""
-    notes = result.provenance.notes
-    if result.provenance.step != REMARKED or not notes:
+    """Emit the notes of a cut-out and its failed gates with the path of a picture of source, matte and cut-out."""
+    if result.provenance.step != REMARKED:
         return
     picture = _saved(item, result.outputs["picture"]) if "picture" in result.outputs else None
     look = [f"Source, matte and cut-out: {picture}"] if picture else []
-    emit(StepEvent(item, label, "remark", text=" ".join([*notes, *look])))
+    if text := " ".join([*result.provenance.notes, *_failed_gates(result), *look]):
+        emit(StepEvent(item, label, "remark", text=text))
+
+
+def _failed_gates(result: StepResult) -> list[str]:
+    """Return a sentence for every failed gate of a cut-out."""
+    if GATES not in result.outputs:
+        return []
+    try:
+        verdict = json.loads(home.store().path(result.outputs[GATES]).read_text(encoding="utf-8"))
+    except (OSError, ArtifactMissing, StoreUnreachable):
+        return []
+    return [
+        f"Not accepted: {gate['name']} is {format_value(gate)}, allowed is {format_bounds(gate)}; {gate['advice']}."
+        for gate in verdict["gates"]
+        if not gate["passed"]
+    ]
 
 
 def _saved(item: str, ref: ArtifactRef) -> Path | None:

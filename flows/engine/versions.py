@@ -35,6 +35,7 @@ class Version(Frozen):
         finished: time of the last run that made or found it, ISO 8601 in UTC.
         source: picture, video or text.
         bank: ground-truth views, if given.
+        mask: of the subject, if given.
         steps: in pipeline order.
     """
 
@@ -46,6 +47,7 @@ class Version(Frozen):
     seed: int
     source: ArtifactRef
     bank: ArtifactRef | None = None
+    mask: ArtifactRef | None = None
     steps: tuple[VersionStep, ...]
 
     @property
@@ -58,6 +60,8 @@ class Version(Frozen):
         found = {self.package.digest: "package", self.source.digest: "source"}
         if self.bank is not None:
             found.setdefault(self.bank.digest, "bank")
+        if self.mask is not None:
+            found.setdefault(self.mask.digest, "mask")
         for step in self.steps:
             for port, digest in step.outputs.items():
                 found.setdefault(digest, f"{step.label}: {port}")
@@ -84,6 +88,7 @@ def keep_version(store: ArtifactStore, job: ConversionJob, result: FlowResult) -
         seed=job.seed,
         source=job.source,
         bank=job.bank,
+        mask=job.mask,
         steps=tuple(
             VersionStep(
                 label=done.label,

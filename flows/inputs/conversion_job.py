@@ -31,6 +31,7 @@ class ConversionRequest(Frozen):
         text: prompt for a text-to-image model.
         video: driving video or folder of frames; then `picture` only names the asset.
         bank: folder of ground-truth views, for the oracle prior.
+        mask: picture, or folder of frames for a video, that is white where the subject is.
         commercial_only: refuse weights whose license forbids commercial use.
     """
 
@@ -39,6 +40,7 @@ class ConversionRequest(Frozen):
     text: str = ""
     video: Path | None = None
     bank: Path | None = None
+    mask: Path | None = None
     profile: str = "preview"
     settings: PipelineSettings
     seed: int = 0
@@ -63,6 +65,8 @@ class ConversionRequest(Frozen):
         if (self.settings.pack.lods or self.settings.pack.gltf.meshopt) and not find_spec("meshoptimizer"):
             raise BackendUnavailable("pack.lods and pack.gltf.meshopt need meshoptimizer: `deploy/install.sh meshopt`")
         self._check_source()
+        if self.mask is not None:
+            sources.check_mask(self.mask)
         if self.bank is not None:
             sources.check_bank(self.bank)
         oracle = self.settings.prior.kind == "oracle"
@@ -82,7 +86,7 @@ class ConversionRequest(Frozen):
         """
         for path in filter(None, (self.picture, self.video)):
             naming.check_text(path.name, "the file name")
-        for path in filter(None, (self.picture, self.video, self.bank)):
+        for path in filter(None, (self.picture, self.video, self.bank, self.mask)):
             naming.check_path(path)
         naming.check_text(self.text, "the text")
         naming.check_name(self.item, "rename the file" if self.picture else "choose a shorter name")
@@ -113,6 +117,7 @@ class ConversionRequest(Frozen):
                 text=sources.single_spaced(self.text),
                 moving=self._suffix in sources.ALWAYS_MOVING or self.video is not None,
                 bank=sources.put_bank(self.bank, store) if self.bank is not None else None,
+                mask=sources.put_source(self.mask, store) if self.mask is not None else None,
                 profile=self.profile,
                 settings=PipelineSettings.model_validate(without_paths(self.settings.model_dump(mode="json"))),
                 seed=self.seed,
@@ -135,6 +140,8 @@ class ConversionRequest(Frozen):
     def _check_source(self) -> None:
         if self.text:
             sources.check_text(self.text)
+            if self.mask is not None:
+                raise BadInput("--mask marks the subject of a picture or video of yours, and --text has none")
             if self.picture is not None or self.video is not None:
                 raise BadInput("--text makes the picture; give a prompt, or a picture or video, not both")
             if not self.settings.text.weights:
@@ -166,6 +173,7 @@ class ConversionJob(Frozen):
         source: picture, video, or frames; the prompt if `drawn`.
         text: that prompt.
         moving: True if `source` is certainly a video.
+        mask: picture or frames that mark the subject, if given.
     """
 
     item: str
@@ -173,6 +181,7 @@ class ConversionJob(Frozen):
     text: str = ""
     moving: bool = False
     bank: ArtifactRef | None = None
+    mask: ArtifactRef | None = None
     profile: str
     settings: PipelineSettings
     seed: int = Field(ge=0, le=LARGEST_SEED)
@@ -204,7 +213,11 @@ class ConversionJob(Frozen):
 
 
 def job_from_record(
-    record: Mapping[str, Any], store: ArtifactStore, source: Path | None = None, bank: Path | None = None
+    record: Mapping[str, Any],
+    store: ArtifactStore,
+    source: Path | None = None,
+    bank: Path | None = None,
+    mask: Path | None = None,
 ) -> ConversionJob:
     """Return the job that made a package.
 
@@ -213,6 +226,7 @@ def job_from_record(
         store: has the source, or receives it.
         source: picture, video or folder of frames; needed if the store no longer has it.
         bank: folder of ground-truth views; likewise.
+        mask: picture or folder of frames that marks the subject; likewise.
 
     Raises:
         BadInput: the record has another format, a file is needed, or a given file differs from the recorded one.
@@ -234,6 +248,7 @@ def job_from_record(
     for option, path, ref, put in (
         ("--source", source, job.source, sources.put_source),
         ("--bank", bank, job.bank, sources.put_bank),
+        ("--mask", mask, job.mask, sources.put_source),
     ):
         if ref is None:
             continue

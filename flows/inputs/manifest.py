@@ -24,7 +24,7 @@ INPUTS = (
     f"manifest ({', '.join(MANIFESTS)})"
 )
 HIGHEST_PRIORITY = 10**9
-TEXTS = ("path", "text", "video", "name", "profile", "bank")  # columns
+TEXTS = ("path", "text", "video", "name", "profile", "bank", "mask")  # columns
 INTEGER = re.compile(r"[+-]?[0-9]{1,100}(\.0*)?")
 
 
@@ -223,6 +223,7 @@ class _Reader:
             picture=self._file(cells, "path"),
             video=self._file(cells, "video"),
             bank=self._file(cells, "bank"),
+            mask=self._file(cells, "mask"),
         )
 
     def _settings(self, chosen: str, changes: dict[str, Any]) -> PipelineSettings:

@@ -15,7 +15,7 @@ from flows.formatting.escaping import quoted
 from flows.inputs.json_text import loads
 
 COLUMNS = (
-    "path", "text", "video", "name", "profile", "seed", "bank", "priority", "set",
+    "path", "text", "video", "name", "profile", "seed", "bank", "mask", "priority", "set",
 )  # and any setting, such as mesh.grid  # fmt: skip
 MANIFESTS = (".csv", ".json", ".jsonl", ".parquet")
 LARGEST_MANIFEST_BYTES = 256 * 2**20

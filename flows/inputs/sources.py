@@ -91,6 +91,18 @@ def check_video(path: Path) -> None:
             check_still(frame)
 
 
+def check_mask(path: Path) -> None:
+    """Refuse masks as `check_video` refuses videos.
+
+    Raises:
+        BadInput: says what is wrong and what to give.
+    """
+    try:
+        check_video(path)
+    except BadInput as error:
+        raise BadInput(f"--mask: {error}") from error
+
+
 def check_text(text: str) -> None:
     """Refuse an empty or a long prompt.
 

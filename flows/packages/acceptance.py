@@ -9,6 +9,7 @@ from steps.contract import StepResult
 from steps.store.artifact_store import ArtifactStore
 
 GATES, PICTURE = "gates", "picture"  # outputs of check_asset
+CUTOUT = "subject"  # output of prepare_subject, which has a picture, too
 
 
 def load_verdict(results: Iterable[StepResult], store: ArtifactStore) -> dict[str, Any] | None:
@@ -20,6 +21,12 @@ def load_verdict(results: Iterable[StepResult], store: ArtifactStore) -> dict[st
 def load_picture(results: Iterable[StepResult], store: ArtifactStore) -> bytes | None:
     """Return the picture of the worst frames, PNG; None as for `load_verdict`."""
     return _output(results, PICTURE, store)
+
+
+def load_cutout(results: Iterable[StepResult], store: ArtifactStore) -> bytes | None:
+    """Return the picture of source, matte and cut-out, PNG; None if the step did not run, or the artifact is gone."""
+    refs = [result.outputs[PICTURE] for result in results if CUTOUT in result.outputs and PICTURE in result.outputs]
+    return store.path(refs[0]).read_bytes() if refs and store.has(refs[0]) else None
 
 
 def failing_gates(folder: Path) -> list[str] | None:

@@ -73,7 +73,9 @@ def render_records(
             json.loads(written), lambda name: (folder / name).read_bytes()
         ),  # as `dg4d view` will see it
         "report.json": json.dumps(report, indent=1, ensure_ascii=False) + "\n",
-        "report.html": report_page(report, load_picture(result.results, store)),
+        "report.html": report_page(
+            report, load_picture(result.results, store), acceptance.load_cutout(result.results, store)
+        ),
         RECORD: written,
     }
     facts = {name: bytes_digest(text.encode()) for name, text in beside.items()}
@@ -88,7 +90,7 @@ def provenance(
     Signatures differ in every run: in a signed package `files` and `signatures` are facts of a single run, too.
     """
     outputs = [ref for done in result.steps for ref in done.result.outputs.values()]
-    artifacts = [ref for ref in (job.source, job.bank, *outputs) if ref is not None]
+    artifacts = [ref for ref in (job.source, job.bank, job.mask, *outputs) if ref is not None]
     return {
         "format": FORMAT,
         "order": job.digest(),
@@ -166,12 +168,13 @@ def notes(job: ConversionJob, result: FlowResult) -> list[str]:
     return list(dict.fromkeys([*own, *theirs]))
 
 
-def report_page(report: dict[str, Any], shortcomings: bytes | None = None) -> str:
+def report_page(report: dict[str, Any], shortcomings: bytes | None = None, cutout: bytes | None = None) -> str:
     """Render the report as a page that shows the files of the package.
 
     Args:
         report: of `build_report`.
         shortcomings: picture of the worst frames, PNG; it is embedded.
+        cutout: picture of source, matte and cut-out, PNG; it is embedded.
     """
     folders: dict[str, list[int]] = {}
     for name, size in report["files"].items():
@@ -185,6 +188,7 @@ def report_page(report: dict[str, Any], shortcomings: bytes | None = None) -> st
         viewer=VIEWER,
         acceptance=acceptance,
         shortcomings=base64.b64encode(shortcomings or b"").decode(),
+        cutout=base64.b64encode(cutout or b"").decode(),
         format_flops=format_flops,
         svg_picture=svg_picture,
         format_size=format_size,

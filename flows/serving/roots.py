@@ -108,7 +108,8 @@ class Roots(Frozen):
         """
         if item.request is None:
             return
-        files = (None if item.remote else item.request.picture, item.request.video, item.request.bank)
+        asked = item.request
+        files = (None if item.remote else asked.picture, asked.video, asked.bank, asked.mask)
         self.check_files(file for file in files if file is not None)
         self.check_weights(item.request.settings.model_dump(mode="json"))
 

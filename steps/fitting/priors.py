@@ -97,7 +97,9 @@ def make_prior(
         BadInput: the oracle has no bank, or the weights are damaged or of another model.
         BackendUnavailable: weights or libraries are not installed.
     """
-    noise = TimestepSchedule(stage.t_max_start, stage.t_max_end, uniform=stage.noise_draw == "uniform")
+    noise = TimestepSchedule(
+        stage.t_max_start, stage.t_max_end, stage.t_max_limit, uniform=stage.noise_draw == "uniform"
+    )
     match settings:
         case GeometricPriorSettings() | LearnedPriorSettings():
             shapes = subject_shapes(settings, cutouts, turn_deg)

@@ -1,7 +1,8 @@
 """Weights that settings name: their files, digests and licenses. Imports no torch.
 
-Settings called `weights` or `*_weights` hold a name of the registry, a hub id or a folder; empty is none. Requests and
-records never hold the path of a folder, but its name and the beginning of its digest.
+Settings called `weights` or `*_weights` hold a name of the registry, a hub id or a folder; empty is none. So does
+`matting`, unless it names a method that needs no further weights. Requests and records never hold the path of a folder,
+but its name and the beginning of its digest.
 """
 
 import os
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
+from dg4d_lib.settings import MATTING_METHODS
 from dg4d_lib.weights.locate import DIGEST_CACHE, content_name, digests, find_weights, given_folder, identity
 from dg4d_lib.weights.lock import read_lock
 from dg4d_lib.weights.registry import License, lookup_weights
@@ -107,6 +109,12 @@ def _places(tree: Any) -> Iterator[tuple[dict[str, Any], str, str]]:
     if not isinstance(tree, dict):
         return
     for key, value in tree.items():
-        if isinstance(value, str) and value and (key == "weights" or key.endswith("_weights")):
+        if isinstance(value, str) and value and _names_weights(key, value):
             yield tree, key, value
         yield from _places(value)
+
+
+def _names_weights(key: str, value: str) -> bool:
+    if key == "matting":
+        return value not in MATTING_METHODS
+    return key == "weights" or key.endswith("_weights")

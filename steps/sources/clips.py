@@ -83,7 +83,10 @@ class Clip:
         count: frames that can be decoded.
         announced: number of frames in the header; 0 if absent.
         fps: frames per second.
+        size: width and height of the upright frames in pixels, before shrinking; known after `read`.
     """
+
+    size: tuple[int, int] = (0, 0)
 
     def __init__(self, path: Path, container: str, limit: DecodeLimit) -> None:
         self._path, self._container, self._limit = path, container, limit
@@ -102,6 +105,8 @@ class Clip:
             if i in kept:
                 has_alpha = has_alpha or any(part.is_alpha for part in frame.format.components)
                 kept.add(i, _picture(frame, kept.side, has_alpha))
+                turned = round(frame.rotation / 90) % 2
+                self.size = (frame.height, frame.width) if turned else (frame.width, frame.height)
         return kept.frames, has_alpha
 
     def _frames(self) -> Iterator[av.VideoFrame]:

@@ -57,6 +57,8 @@ class Source:
         has_alpha: True if some pixel is not opaque.
         fps: frames per second after sampling, which keeps the duration.
         kind: picture or video.
+        size: width and height of the upright file in pixels, before shrinking.
+        count: frames of the file, of which `frames` may be a part.
         notes: sentences for the report about dropped frames and assumptions.
     """
 
@@ -64,6 +66,8 @@ class Source:
     has_alpha: bool
     fps: float
     kind: Literal["picture", "video"]
+    size: tuple[int, int]
+    count: int
     notes: tuple[str, ...] = ()
 
 
@@ -105,20 +109,26 @@ def _decode(path: Path, head: bytes, scratch: Path, max_frames: int, limit: Deco
     link.unlink(missing_ok=True)
     link.symlink_to(path.resolve())
     picture = read_still(link, "the picture", limit)
-    return _picture(picture.pixels[None], picture.has_alpha)
+    return _picture(picture.pixels[None], picture.has_alpha, picture.size)
 
 
-def _picture(frames: Float[Tensor, "1 h w 4"], has_alpha: bool) -> Source:
-    return Source(frames, has_alpha and _is_transparent(frames), STILL_FPS, "picture")
+def _picture(frames: Float[Tensor, "1 h w 4"], has_alpha: bool, size: tuple[int, int]) -> Source:
+    return Source(frames, has_alpha and _is_transparent(frames), STILL_FPS, "picture", size, 1)
 
 
 def _video(
-    frames: Float[Tensor, "t h w 4"], has_alpha: bool, fps: float, count: int, notes: tuple[str, ...] = ()
+    frames: Float[Tensor, "t h w 4"],
+    has_alpha: bool,
+    fps: float,
+    count: int,
+    size: tuple[int, int],
+    notes: tuple[str, ...] = (),
 ) -> Source:
     kept = frames.shape[0]
     if kept < count:
         notes = (*notes, f"{kept} of the video's {count} frames are used, evenly spaced; it lasts as long as before.")
-    return Source(frames, has_alpha and _is_transparent(frames), thinned_rate(fps, count, kept), "video", notes)
+    rate = thinned_rate(fps, count, kept)
+    return Source(frames, has_alpha and _is_transparent(frames), rate, "video", size, count, notes)
 
 
 def _is_transparent(frames: Float[Tensor, "t h w 4"]) -> bool:
@@ -130,12 +140,12 @@ def _read_clip(path: Path, container: str, max_frames: int, limit: DecodeLimit) 
         check_first_frame(path)
     clip = Clip(path, container, limit)
     if clip.count == 1 and container in ("gif", "apng"):
-        return _picture(*clip.read([0]))
+        return _picture(*clip.read([0]), clip.size)
     _need_two(clip.count, "the video")
     frames, has_alpha = clip.read(evenly_spaced(clip.count, max_frames))
     lost = clip.announced - clip.count
     notes = (f"The video promises {clip.announced} frames; {clip.count} can be read.",) if lost > 1 else ()
-    return _video(frames, has_alpha, clip.fps, clip.count, notes)
+    return _video(frames, has_alpha, clip.fps, clip.count, clip.size, notes)
 
 
 def _read_webp(path: Path, max_frames: int, limit: DecodeLimit) -> Source:
@@ -146,7 +156,8 @@ def _read_webp(path: Path, max_frames: int, limit: DecodeLimit) -> Source:
         for i, frame in enumerate(clip):
             if i in kept:
                 kept.add(i, downscale_in_bands(frame, kept.side))
-    return _picture(kept.frames, True) if len(clip) == 1 else _video(kept.frames, True, clip.fps, len(clip))
+    size = clip.width, clip.height
+    return _picture(kept.frames, True, size) if len(clip) == 1 else _video(kept.frames, True, clip.fps, len(clip), size)
 
 
 def _need_two(count: int, what: str) -> None:
@@ -163,17 +174,17 @@ def _read_zip(path: Path, scratch: Path, max_frames: int, limit: DecodeLimit) ->
             check_no_scene(archive.namelist())
             frame_files = (info for info in archive.infolist() if not info.is_dir() and is_frame_name(info.filename))
             entries = _numbered(list(frame_files))
-            frames, any_alpha = _zipped_frames(archive, entries, scratch, max_frames, limit)
+            frames, any_alpha, size = _zipped_frames(archive, entries, scratch, max_frames, limit)
     except (zipfile.BadZipFile, RuntimeError, NotImplementedError, EOFError) as error:
         raise BadInput("the zip of frames is broken or encrypted; pack it again") from error
     note = f"A folder of frames has no frame rate; {FOLDER_FPS:g} per second are assumed."
-    return _video(frames, any_alpha, FOLDER_FPS, len(entries), (note,))
+    return _video(frames, any_alpha, FOLDER_FPS, len(entries), size, (note,))
 
 
 def _zipped_frames(
     archive: zipfile.ZipFile, entries: list[zipfile.ZipInfo], scratch: Path, max_frames: int, limit: DecodeLimit
-) -> tuple[Float[Tensor, "t h w 4"], bool]:
-    """Decode every frame, so that none is broken; return the selected ones, and True if one of them has alpha."""
+) -> tuple[Float[Tensor, "t h w 4"], bool, tuple[int, int]]:
+    """Decode every frame, so that none is broken; return the selected ones, True if one has alpha, and their size."""
     kept, any_alpha = KeptFrames(evenly_spaced(len(entries), max_frames), "the folder of frames"), False
     first, pixels, start = (0, 0), 0, time.monotonic()
     for i, info in enumerate(entries):
@@ -194,7 +205,7 @@ def _zipped_frames(
         if i in kept:
             kept.add(i, picture.pixels)
             any_alpha = any_alpha or picture.has_alpha
-    return kept.frames, any_alpha
+    return kept.frames, any_alpha, first
 
 
 def _numbered(entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo]:

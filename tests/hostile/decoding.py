@@ -123,6 +123,7 @@ def read_as_source(path: Path, scratch: Path) -> tuple[Kind, int]:
         "subject": scratch / "subject.png",
         "footage": scratch / "footage.zip",
         "pose": scratch / "pose.json",
+        "cutout_gates": scratch / "cutout_gates.json",
         "picture": scratch / "picture.png",
     }
     settings = step_settings("prepare_subject", revise(PREVIEW, {"subject.size": SIZE}))

@@ -58,7 +58,8 @@ def measure(path: Path, settings: Settings) -> Peak:
     Path("/proc/self/clear_refs").write_text("5")
     start, outcome = time.monotonic(), "done"
     with tempfile.TemporaryDirectory() as folder:
-        outputs = {name: Path(folder) / name for name in ("subject.png", "footage.zip", "pose.json", "picture.png")}
+        names = ("subject.png", "footage.zip", "pose.json", "cutout_gates.json", "picture.png")
+        outputs = {name: Path(folder) / name for name in names}
         try:
             run(
                 Job(

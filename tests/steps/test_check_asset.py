@@ -26,7 +26,8 @@ from steps.profiles import PREVIEW, step_settings
 from steps.runtime.job import Job, StepReport
 
 NAMES = [
-    "fidelity", "silhouette", "consistency", "flicker", "floaters", "flaws", "agreement", "sharpness", "motion",
+    "fidelity", "silhouette", "consistency", "flicker", "floaters", "flaws", "folds", "agreement", "sharpness",
+    "motion",
 ]  # fmt: skip
 
 
@@ -74,7 +75,7 @@ def test_the_picture_has_a_column_per_moment_and_five_rows(done: tuple[StepRepor
 
 
 def test_the_ports_are_those_of_the_catalog(done: tuple[StepReport, Job]) -> None:
-    assert set(done[1].inputs) == set(STEPS["check_asset"].inputs)
+    assert set(done[1].inputs) | {"cutout_gates"} == set(STEPS["check_asset"].inputs)  # of estimated cut-outs only
     assert set(done[1].outputs) == set(STEPS["check_asset"].outputs)
 
 
@@ -157,6 +158,16 @@ def test_flaws_are_counted_per_triangle(faces: Tensor, flaws: float) -> None:
     asset = tracked()
     spoiled = replace(asset, mesh=replace(asset.mesh, faces=faces))
     assert seen(parts_of(FRAMES, spoiled)).flaws == pytest.approx(flaws)
+
+
+def test_a_face_that_turns_over_in_one_frame_counts_as_a_fold() -> None:
+    asset = tracked()
+    assert seen(parts_of(FRAMES, asset)).folds == 0
+    center = asset.mesh.vertices.mean(0)
+    offsets = asset.offsets.clone()
+    corner = (asset.mesh.vertices == asset.mesh.vertices[0]).all(1)  # on both sides of a seam
+    offsets[-1, corner] += 1.5 * (center - asset.mesh.vertices[0])
+    assert seen(parts_of(FRAMES, replace(asset, offsets=offsets))).folds > 0.2
 
 
 def test_a_verdict_is_plain_json() -> None:

@@ -1,13 +1,17 @@
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from media_files import disc, opaque, save, save_clip, walk
+from tiny_onnx import write_network
 
-from dg4d_lib.errors import BadInput
+from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.settings import SubjectSettings
+from dg4d_lib.video import u2netp
 from dg4d_lib.video.framing import bounding_box
+from steps.artifacts.gates import read_rows
 from steps.artifacts.media import read_frames, read_png
 from steps.artifacts.pose import read_turn
 from steps.prepare_subject import run
@@ -15,13 +19,14 @@ from steps.profiles import PREVIEW, step_settings
 from steps.runtime.job import Job, StepReport
 
 
-def prepare(source: Path, out: Path, **settings: object) -> StepReport:
+def prepare(source: Path, out: Path, mask: Path | None = None, **settings: object) -> StepReport:
     out.mkdir()
-    names = {"subject": "subject.png", "footage": "footage.zip", "pose": "pose.json", "picture": "picture.png"}
-    outputs = {port: out / name for port, name in names.items()}
+    names = ("subject.png", "footage.zip", "pose.json", "cutout_gates.json", "picture.png")
+    outputs = {name.partition(".")[0]: out / name for name in names}
+    inputs = {"source": source} | ({"mask": mask} if mask else {})
     subject = PREVIEW.model_copy(update={"subject": SubjectSettings(size=64, **settings)})
     made = step_settings("prepare_subject", subject)
-    return run(Job({"source": source}, outputs, made, 0, lambda *_: None, out))
+    return run(Job(inputs, outputs, made, 0, lambda *_: None, out))
 
 
 def test_a_picture_becomes_a_square_cutout_and_no_footage(tmp_path):
@@ -108,3 +113,135 @@ def test_nothing_is_written_for_a_picture_that_is_refused(tmp_path):
 def test_a_fully_transparent_file_is_refused(tmp_path):
     with pytest.raises(BadInput, match="fully transparent"):
         prepare(save(tmp_path / "a.png", disc() * 0), tmp_path / "out")
+
+
+def half_mask(height: int, width: int, left: int = 0) -> np.ndarray:
+    """White in a band of 32 columns."""
+    mask = np.zeros((height, width, 3), np.uint8)
+    mask[8:-8, left : left + 32] = 255
+    return mask
+
+
+def zipped(path: Path, pictures: list[np.ndarray]) -> Path:
+    """Pictures as a zip of numbered frames."""
+    with zipfile.ZipFile(path, "w") as archive:
+        for number, picture in enumerate(pictures):
+            frame = save(path.with_name(f"{number:03d}.png"), picture)
+            archive.write(frame, frame.name)
+    return path
+
+
+def test_a_mask_replaces_matting_and_is_not_judged(tmp_path):
+    picture = opaque(disc())
+    mask = save(tmp_path / "mask.png", half_mask(*picture.shape[:2], left=picture.shape[1] // 2))
+    facts = prepare(save(tmp_path / "a.png", picture), tmp_path / "out", mask, framing="keep")
+    alpha = read_png(tmp_path / "out" / "subject.png")[..., 3]
+    assert alpha[:, :24].max() == 0 and alpha[24:40, 40:48].min() == 1
+    assert facts.weights == {} and not (tmp_path / "out" / "cutout_gates.json").exists()
+
+
+def test_the_alpha_channel_of_a_mask_is_the_mask(tmp_path):
+    picture = opaque(disc())
+    mask = np.dstack([np.zeros_like(picture[..., :3]), half_mask(*picture.shape[:2])[..., 0]])
+    prepare(save(tmp_path / "a.png", picture), tmp_path / "out", save(tmp_path / "m.png", mask), framing="keep")
+    assert read_png(tmp_path / "out" / "subject.png")[..., 3].max() == 1
+
+
+def test_a_video_takes_a_mask_for_every_frame(tmp_path):
+    film = [frame[..., :3] for frame in walk(4)]
+    masks = [half_mask(*film[0].shape[:2], left=4 * i) for i in range(len(film))]
+    source = zipped(tmp_path / "film.zip", film)
+    prepare(source, tmp_path / "out", zipped(tmp_path / "masks.zip", masks), framing="keep")
+    alpha = read_frames(tmp_path / "out" / "footage.zip", tmp_path).alpha[..., 0]
+    firsts = [int((frame.amax(0) > 0.5).nonzero()[0]) for frame in alpha]
+    assert firsts == sorted(set(firsts))
+
+
+@pytest.mark.parametrize(
+    ("mask", "says"),
+    [
+        (lambda height, width: half_mask(height, width + 8), r"the mask is \d+ x \d+ pixels, the picture \d+ x \d+"),
+        (lambda height, width: np.zeros((height, width, 3), np.uint8), "the mask is empty"),
+    ],
+    ids=["size", "empty"],
+)
+def test_a_mask_that_does_not_fit_is_refused(tmp_path, mask, says):
+    picture = opaque(disc())
+    with pytest.raises(BadInput, match=says):
+        prepare(save(tmp_path / "a.png", picture), tmp_path / "out", save(tmp_path / "m.png", mask(*picture.shape[:2])))
+
+
+def test_one_mask_for_a_video_is_refused(tmp_path):
+    film = [frame[..., :3] for frame in walk(4)]
+    mask = save(tmp_path / "m.png", half_mask(*film[0].shape[:2]))
+    with pytest.raises(BadInput, match="the mask has 1 frame, the video 4; give a picture for a picture"):
+        prepare(zipped(tmp_path / "film.zip", film), tmp_path / "out", mask)
+
+
+def two_squares() -> np.ndarray:
+    """Two dark squares on white; "h w 3"."""
+    picture = np.full((96, 96, 3), 255, np.uint8)
+    picture[10:40, 8:38] = (200, 30, 30)
+    picture[50:86, 52:88] = (30, 30, 200)
+    return picture
+
+
+def test_only_what_is_in_the_box_is_the_subject(tmp_path):
+    source = save(tmp_path / "a.png", two_squares())
+    prepare(source, tmp_path / "out", matting="backdrop", box=(46, 44, 48, 48))
+    subject = read_png(tmp_path / "out" / "subject.png")
+    visible = subject[subject[..., 3] > 0.5]
+    assert (visible[:, 2] > visible[:, 0]).all()
+
+
+def test_a_box_counts_pixels_of_the_file_and_not_of_the_shrunk_picture(tmp_path):
+    large = two_squares().repeat(32, 0).repeat(32, 1)  # 3072 pixels a side, shrunk on reading
+    source = save(tmp_path / "a.png", large)
+    prepare(source, tmp_path / "out", matting="none", box=(52 * 32, 50 * 32, 36 * 32, 36 * 32), framing="keep")
+    alpha = read_png(tmp_path / "out" / "subject.png")[..., 3]
+    rows = (alpha.amax(1) > 0.5).nonzero().flatten()
+    assert int(rows[0]) == pytest.approx(50 * 64 / 96, abs=1) and int(rows[-1]) + 1 == pytest.approx(
+        86 * 64 / 96, abs=1
+    )
+
+
+def test_a_box_outside_of_the_picture_is_refused(tmp_path):
+    with pytest.raises(BadInput, match=r"the box 60,0,50,20 reaches to x = 110 .* 96 x 96 pixels; give"):
+        prepare(save(tmp_path / "a.png", two_squares()), tmp_path / "out", box=(60, 0, 50, 20))
+
+
+@pytest.mark.parametrize("box", [(1, 2, 3), (0, 0, 0, 5), (-1, 0, 5, 5)])
+def test_a_box_that_is_none_is_refused(box):
+    with pytest.raises(ValueError, match="box"):
+        SubjectSettings(box=box)
+
+
+def test_a_network_of_the_weights_folder_cuts_out_and_is_recorded(tmp_path):
+    """A model that says how red a pixel is."""
+    folder = write_network(tmp_path / "red", mean=0.5, weights=(40.0, -40.0, 0.0), bias=-10.0)
+    source = save(tmp_path / "a.png", two_squares())
+    facts = prepare(source, tmp_path / "out", matting=str(folder), framing="keep")
+    alpha = read_png(tmp_path / "out" / "subject.png")[..., 3]
+    assert alpha[10:24, 8:22].mean() > 0.95 and alpha[34:, 34:].max() == 0
+    assert any(name.endswith("onnx/model.onnx") for name in facts.weights)
+    assert facts.licenses and any("segmentation network" in note for note in facts.notes)
+
+
+def test_a_network_that_is_not_installed_names_the_command(tmp_path, monkeypatch):
+    monkeypatch.setenv("DG4D_WEIGHTS", str(tmp_path / "weights"))
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
+    with pytest.raises(BackendUnavailable, match="dg4d weights pull birefnet"):
+        prepare(save(tmp_path / "a.png", two_squares()), tmp_path / "out", matting="birefnet")
+
+
+def test_an_estimated_cutout_is_judged_and_its_network_recorded(tmp_path):
+    facts = prepare(save(tmp_path / "a.png", opaque(disc())), tmp_path / "out")
+    rows = {row["name"]: row for row in read_rows(tmp_path / "out" / "cutout_gates.json")}
+    assert list(rows) == ["cut-out pieces", "cut-out holes", "cut-out border", "cut-out agreement"]
+    assert rows["cut-out pieces"]["value"] == 0
+    assert facts.weights == u2netp.digests() and "Apache-2.0" in facts.licenses["u2netp"]
+
+
+def test_none_keeps_the_picture_as_it_is(tmp_path):
+    prepare(save(tmp_path / "a.png", opaque(disc())), tmp_path / "out", matting="none", framing="keep")
+    assert read_png(tmp_path / "out" / "subject.png")[..., 3].min() == 1

@@ -7,6 +7,7 @@ from pydantic import ValidationError
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.rasterizer import backends
+from dg4d_lib.reconstruction.lgm import WORLD_SCALE
 from dg4d_lib.settings import Zero123PriorSettings
 from steps.profiles import CHANGED_KNOBS, PREVIEW, PROFILES, PipelineSettings, profile, revise, step_settings
 
@@ -22,6 +23,9 @@ def test_a_request_says_what_will_draw(lack: str, backend: str, monkeypatch: pyt
 
 PAPER = {"static.iterations": 500, "static.views": 16, "static.t_max_start": 0.98, "static.t_max_end": 0.02,
          "motion.iterations": 200, "motion.views": 4, "motion.t_max_start": 0.5, "motion.t_max_end": 0.02,
+         "static.t_max_limit": 0.98, "motion.t_max_limit": 0.98, "motion.guidance_weight": 1.0,
+         "motion.color_weight": 10000.0, "motion.alpha_weight": 1000.0, "static.alpha_weight": 1000.0,
+         "motion.length_scale": 1.0, "deformation.half_side": 1.6, "deformation.scales": (1,),
          "motion.frames_per_iteration": 0, "static.start.points": 5000,
          "deformation.temporal": 32, "deformation.spatial": 32, "deformation.features": 32,
          "deformation.endpoint": True, "motion.fine_tune": False,
@@ -33,10 +37,15 @@ DIFFERENCES = {
     "paper": {},
     "video": {"subject.max_frames": 32, "motion.iterations": 500},
     "video-fast": {"subject.max_frames": 16, "motion.iterations": 500, "motion.views": 1},
+    "release": {"static.t_max_start": 1.0, "static.t_max_end": 0.0,
+                "motion.t_max_start": 1.0, "motion.t_max_end": 0.0, "motion.t_max_limit": 0.5,
+                "motion.guidance_weight": 4.0, "motion.alpha_weight": 0.0,
+                "deformation.spatial": 64, "deformation.temporal": 25, "deformation.scales": (1, 2, 4, 8)},
     "reference": {"static.start.points": None, "motion.iterations": 500,
                   "static.t_max_start": 1.0, "static.t_max_end": 0.0,
                   "motion.t_max_start": 1.0, "motion.t_max_end": 0.0, "deformation.temporal": 12,
-                  "motion.fine_tune": True, "deformation.endpoint": False, "deformation.half_side": 1.6,
+                  "motion.fine_tune": True, "deformation.endpoint": False,
+                  "deformation.half_side": pytest.approx(1.6 * 4 / 3), "motion.length_scale": pytest.approx(4 / 3),
                   "prior.weights": "stable-zero123", "prior.variant": "stable",
                   "static.start.kind": "lgm", "static.iterations": 0},
 }  # fmt: skip
@@ -58,6 +67,20 @@ def test_profiles_have_the_numbers_that_they_are_named_after(name: str) -> None:
 def test_every_profile_but_the_preview_has_a_trained_prior() -> None:
     trained = {name for name in PROFILES if isinstance(profile(name).prior, Zero123PriorSettings)}
     assert trained == set(PROFILES) - {"preview"}
+
+
+def test_the_scale_of_lgm_is_that_of_the_library() -> None:
+    assert value_of("reference", "motion.length_scale") == pytest.approx(WORLD_SCALE)
+
+
+@pytest.mark.parametrize("name", ["preview", "quality"])
+def test_our_own_profiles_fit_the_planes_to_the_gaussians(name: str) -> None:
+    assert value_of(name, "deformation.half_side") == 0
+
+
+def test_the_preview_keeps_the_strength_of_its_smoothness() -> None:
+    weight = value_of("preview", "deformation.smoothness_weight")
+    assert isinstance(weight, float) and 3 * weight == 0.01  # a mean over three planes, as it was measured
 
 
 @pytest.mark.parametrize("turned", [False, True])

@@ -79,6 +79,8 @@ class Run:
         changes = dict(TINY)
         if self.profile == "preview":  # its stages have no models
             changes = {key: value for key, value in TINY.items() if not key.startswith(OF_MODELS)}
+        if self.profile == "release":
+            changes["deformation.spatial"] = 8  # its planes have up to 512 cells per side
         if profile(self.profile).static.start.kind == "lgm":
             changes["static.start.num_inference_steps"] = 2
             del changes["static.start.points"]
@@ -149,6 +151,7 @@ def source_of(folder: Path, store: ArtifactStore, moving: bool) -> ArtifactRef:
         ("paper", False, {"drive_video": {"svd"}}),
         ("video", True, {}),
         ("video-fast", True, {}),
+        ("release", False, {"drive_video": {"svd"}}),
         ("reference", False, {"drive_video": {"svd"}, "fit_gaussians": {"stable-zero123", "imagedream", "lgm"}}),
         ("quality", False, {"drive_video": {"svd"}}),
     ],

@@ -72,9 +72,9 @@ def test_what_the_prior_brought_stays_in_the_record(lgm: LgmStartSettings) -> No
     assert len(facts.licenses) == 3
 
 
-def test_means_of_a_reconstruction_move_a_tenth_as_fast() -> None:
+def test_means_of_a_reconstruction_move_a_tenth_as_fast_in_lgms_lengths() -> None:
     slow = fine_tuning_settings(StaticSettings())
-    assert (slow.means_lr, slow.means_lr_end) == pytest.approx((1e-3, 2e-5))
+    assert (slow.means_lr, slow.means_lr_end) == pytest.approx((1e-3 * 4 / 3, 2e-5 * 4 / 3))
     assert slow.color_lr == StaticSettings().color_lr
 
 

@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,12 @@ def zipped(folder: Path, out: Path) -> Path:
 
 
 def score(
-    out: Path, truth: Path, package: Path | None = None, mesh: bool = False, **knobs: object
+    out: Path,
+    truth: Path,
+    package: Path | None = None,
+    mesh: bool = False,
+    actionbench: bool = False,
+    **knobs: object,
 ) -> tuple[dict, StepReport]:
     out.mkdir(parents=True, exist_ok=True)
     inputs = {"truth": zipped(truth, out / "truth.zip")}
@@ -58,7 +64,7 @@ def score(
     job = Job(
         inputs=inputs,
         outputs={"scores": out / "scores.json", "films": out / "films.zip"},
-        settings=ScoreAssetSettings(rasterizer="reference", mesh=mesh, score=settings),
+        settings=ScoreAssetSettings(rasterizer="reference", mesh=mesh, actionbench=actionbench, score=settings),
         seed=0,
         progress=lambda done, total, values: None,
         pictures=out,
@@ -93,6 +99,41 @@ def test_a_mesh_elsewhere_is_far_until_it_is_aligned(package: Path, truth: Path,
     geometry = report["rows"]["asset"]["geometry"]
     assert geometry["chamfer"] > 0.5
     assert geometry["chamfer_aligned"] < 0.05
+
+
+def actionbench(truth: Path, package: Path, out: Path) -> dict[str, float]:
+    few = {"actionbench_points": 3000, "icp_points": 200}
+    report, _ = score(out, truth, package, actionbench=True, **few)
+    return report["rows"]["asset"]["geometry"]
+
+
+def small_truth(out: Path, truth: Path, change: Callable[[np.ndarray], np.ndarray], frames: int = 3) -> Path:
+    """The truth with fewer frames and other vertices."""
+    for folder in ("input", "view_15"):
+        (out / folder).mkdir(parents=True)
+        for i in range(frames):
+            (out / folder / f"{i:03d}.png").write_bytes((truth / folder / f"{i:03d}.png").read_bytes())
+    asset = tracked(frames)
+    vertices = (asset.mesh.vertices + asset.offsets).numpy()
+    np.savez(out / "mesh.npz", vertices=change(vertices), faces=asset.mesh.faces.numpy())
+    return out
+
+
+def test_the_metrics_of_actionbench_forgive_the_pose_and_not_the_motion(
+    package: Path, truth: Path, tmp_path: Path
+) -> None:
+    same = actionbench(small_truth(tmp_path / "a", truth, lambda v: v), package, tmp_path / "a/out")
+    spacing = 0.05  # of 3000 points on a gem of radius 0.6 in units of the box
+    assert all(0 < same[name] < 2 * spacing for name in ("cd_3d", "cd_4d", "cd_m")), same
+    larger = actionbench(small_truth(tmp_path / "b", truth, lambda v: 1.5 * v + 0.3), package, tmp_path / "b/out")
+    assert larger["chamfer"] > 0.3
+    assert larger["cd_3d"] < 0.12  # CD-4D: so even a gem also fits the first frame in other poses
+    still = actionbench(
+        small_truth(tmp_path / "c", truth, lambda v: np.repeat(v[:1], 3, 0)), package, tmp_path / "c/out"
+    )
+    assert still["cd_3d"] < 0.2 and 0.4 < still["cd_4d"] < still["cd_m"], still
+    reach = 0.4 / float(tracked().mesh.vertices.abs().max())  # of the motion, in halves of the gem, which fills the box
+    assert still["cd_m"] == pytest.approx(2 * reach * (0 + 0.5 + 1) / 3, rel=0.15)
 
 
 def test_the_mesh_is_judged_where_it_is_asked_for(package: Path, truth: Path, tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Contact sheets: tiles of an asset from several azimuths at several frames, and of driving videos."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +16,8 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.images import resize
+from dg4d_lib.mesh.render import render_lit
+from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 
@@ -31,11 +33,13 @@ def draw_contact_sheet(
     video: DrivingVideo,
     rasterizer: Rasterizer,
     settings: PackSettings,
+    mesh_at: Callable[[int], TexturedMesh] | None = None,
 ) -> Float[Tensor, "h w 3"]:
     """Draw the contact sheet of an asset as an image in [0, 1].
 
-    Columns are frames, evenly spaced from the first to the last. The first row shows the driving video, the others one
-    azimuth of `sheet_azimuths_deg` each, at elevation 0.
+    Columns are frames, evenly spaced from the first to the last. The first row shows the driving video, the next ones
+    the splats at one azimuth of `sheet_azimuths_deg` each, the last ones the lit mesh at one of
+    `sheet_mesh_azimuths_deg` each, all at elevation 0.
 
     Args:
         gaussians: the canonical cloud.
@@ -43,6 +47,7 @@ def draw_contact_sheet(
         video: driving video; determines the number of frames and the frame rate.
         rasterizer: the splatting backend.
         settings: size of a tile, columns and rows.
+        mesh_at: mesh at a frame; None: no rows of meshes.
     """
     columns = min(settings.sheet_frames, len(video))
     frames = torch.linspace(0, len(video) - 1, columns).round().long()
@@ -57,7 +62,19 @@ def draw_contact_sheet(
         ]
         rows.append(torch.cat(tiles))
     names = ["input", *(f"{azimuth_deg:g}°" for azimuth_deg in settings.sheet_azimuths_deg)]
+    if mesh_at is not None:
+        meshes = [mesh_at(int(frame)) for frame in frames]
+        rows += [_lit_tiles(meshes, azimuth_deg, panel) for azimuth_deg in settings.sheet_mesh_azimuths_deg]
+        names += [f"mesh {azimuth_deg:g}°" for azimuth_deg in settings.sheet_mesh_azimuths_deg]
     return draw_tiles(torch.stack(rows), names, _timestamps(frames, video.fps))
+
+
+def _lit_tiles(
+    meshes: Sequence[TexturedMesh], azimuth_deg: float, panel: Float[Tensor, "s s 3"]
+) -> Float[Tensor, "m s s 3"]:
+    camera = OrbitCamera(azimuth_deg=azimuth_deg, width=len(panel), height=len(panel))
+    lit = (render_lit(mesh, camera) for mesh in meshes)
+    return torch.stack([color * alpha + panel * (1 - alpha) for color, alpha in lit])
 
 
 def draw_video_sheet(

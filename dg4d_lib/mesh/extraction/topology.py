@@ -91,6 +91,14 @@ def weld_vertices(
     return positions, index.ravel()[faces]
 
 
+def join_seams(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Int[np.ndarray, " w"], Int[np.ndarray, "f 3"]]:
+    """Return one vertex of every position, and the faces between these; so a moved mesh is welded as at rest."""
+    _, first, index = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    return first, index.ravel()[faces]
+
+
 def orient_outward(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "f 3"]:
     """Flip the faces of inverted components; the triangles of a component must be consistently oriented."""
     components = face_components(len(vertices), faces)

@@ -151,7 +151,7 @@ def _move(bones, weights, points, rest, moved, turns, offsets):
         for a in range(3):
             for b in range(3):
                 covariance[a, b] += own * turn[a, b]
-        _nearest_rotation(covariance, rotation)
+        nearest_rotation(covariance, rotation)
         for a in range(3):
             offsets[v, a] = there[a] - points[v, a]
             for b in range(3):
@@ -160,7 +160,7 @@ def _move(bones, weights, points, rest, moved, turns, offsets):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _nearest_rotation(m, rotation):
+def nearest_rotation(m, rotation):
     """Write the proper rotation nearest to a matrix: an eigenvector (Horn 1987), found by Jacobi sweeps."""
     n = np.zeros((4, 4))
     n[0, 0], n[1, 1] = m[0, 0] + m[1, 1] + m[2, 2], m[0, 0] - m[1, 1] - m[2, 2]

@@ -42,6 +42,9 @@ class Turning:
     def grid_parameters(self) -> list[nn.Parameter]:
         return []
 
+    def length_parameters(self) -> list[nn.Parameter]:
+        return []
+
     def regularization_loss(self) -> Float[Tensor, ""]:
         return torch.zeros(())
 

@@ -2,11 +2,13 @@
 
 import pytest
 import torch
+import trimesh
 
 from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.rendering.sheet import PANEL, draw_contact_sheet, draw_video_sheet
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.reference import rasterize
 from dg4d_lib.video.driving import DrivingVideo
 
@@ -85,6 +87,18 @@ def test_a_short_video_has_a_column_per_frame(red_dot: Gaussians, slide: Framewi
 
 def test_equal_assets_give_equal_sheets(sheet: torch.Tensor, red_dot: Gaussians, slide: Framewise) -> None:
     assert torch.equal(draw_contact_sheet(red_dot, slide, footage(5), rasterize, SETTINGS), sheet)
+
+
+def test_rows_of_the_lit_mesh_come_last(red_dot: Gaussians, slide: Framewise) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.3)
+    vertices, faces = torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces)
+    mesh = TexturedMesh(vertices, faces, torch.full((len(vertices), 2), 0.5), torch.full((4, 4, 3), 0.5))
+    wanted = SETTINGS.model_copy(update={"sheet_mesh_azimuths_deg": (90.0,)})
+    sheet = draw_contact_sheet(red_dot, slide, footage(5), rasterize, wanted, lambda frame: mesh)
+    shown = tile(sheet, 3, 1, rows=4)[..., 0]
+    torch.testing.assert_close(shown[0, 0], torch.tensor(PANEL[0]), atol=1 / 255, rtol=0)
+    assert shown[19, 20] > 0.54  # the light comes from the upper left
+    assert 0.24 < shown[29, 29] < 0.45
 
 
 def test_several_videos_are_rows_in_the_given_order() -> None:

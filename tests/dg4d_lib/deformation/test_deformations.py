@@ -126,6 +126,47 @@ def test_regularizers_count_only_when_switched_on():
     assert rough.regularization_loss() == 0  # constant planes, time planes at one
 
 
+def public_smoothness(plane: torch.Tensor) -> torch.Tensor:
+    """Mean squared second difference along the rows, as a loop."""
+    rows = plane.shape[1]
+    terms = [(plane[:, i + 2] - plane[:, i + 1]) - (plane[:, i + 1] - plane[:, i]) for i in range(rows - 2)]
+    return torch.stack(terms).square().mean()
+
+
+def test_regularizers_are_the_public_codes_sums_over_planes():
+    weights = {"variation_weight": 2.0, "smoothness_weight": 3.0, "sparsity_weight": 5.0, "scales": (1, 2)}
+    field = HexPlane(SMALL.model_copy(update=weights), BOX, torch.Generator().manual_seed(0)).double()
+    for plane in field.time:
+        plane.data += 0.1 * torch.randn(plane.shape, generator=torch.Generator().manual_seed(1)).double()
+    expected = torch.zeros((), dtype=torch.float64)
+    for space, time in zip(field.space, field.time, strict=True):
+        expected += 2.0 * sum(public_smoothness(p) + public_smoothness(p.mT) for p in space)  # public: rows only
+        expected += 3.0 * sum(public_smoothness(p) for p in time)
+        expected += 5.0 * sum((1 - p).abs().mean() for p in time)
+    torch.testing.assert_close(field.regularization_loss(), expected)
+
+
+def test_planes_that_change_evenly_cost_nothing():
+    field = HexPlane(SMALL.model_copy(update={"variation_weight": 1.0}), BOX, torch.Generator().manual_seed(0))
+    ramp = torch.linspace(0, 1, 8)
+    for plane in field.space:
+        plane.data.copy_((ramp[:, None] - 2 * ramp).expand_as(plane))
+    assert field.regularization_loss() < 1e-12  # a first difference would see the slope
+
+
+@pytest.mark.parametrize("kind", ["hexplane", "mlp"])
+def test_the_last_layer_of_the_means_carries_the_unit_of_length(kind: str, cloud):
+    deformation = make(kind)
+    for parameter in deformation.heads.parameters():
+        torch.nn.init.normal_(parameter, generator=torch.Generator().manual_seed(2))
+    before = deformation.displace(cloud.means, torch.tensor([0.5]))
+    for parameter in deformation.length_parameters():
+        parameter.data *= 3
+    after = deformation.displace(cloud.means, torch.tensor([0.5]))
+    torch.testing.assert_close(after.means, 3 * before.means)
+    assert torch.equal(after.quats, before.quats) and torch.equal(after.log_scales, before.log_scales)
+
+
 def test_random_heads_move_the_cloud_before_the_first_step(cloud):
     random = HexPlane(SMALL.model_copy(update={"zero_start": False}), BOX, torch.Generator().manual_seed(0))
     moved = random.displace(cloud.means, torch.linspace(0, 1, FRAMES))

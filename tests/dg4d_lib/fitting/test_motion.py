@@ -3,11 +3,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from dg4d_lib.deformation.factory import new_deformation
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.deformation.hexplane import HexPlane
 from dg4d_lib.deformation.mlp import Mlp
 from dg4d_lib.errors import FitDiverged
-from dg4d_lib.fitting.motion import bounds_of, fit_motion, sample_frames, sample_views
+from dg4d_lib.fitting.motion import bounds_of, fit_motion, parameter_groups, sample_frames, sample_views
 from dg4d_lib.settings import HexPlaneSettings, MlpSettings
 
 FRAMES, SLIDE = 4, 0.3
@@ -70,6 +71,39 @@ def test_fine_tuning_learns_at_the_rates_of_the_public_code(known, motion_settin
         assert change.median().item() == pytest.approx(rate, rel=0.01), name
         assert change.max() < 1.02 * rate, name
     assert (settings.means_lr, settings.means_lr_end) == (1e-3, 2e-5)
+
+
+@pytest.mark.parametrize("kind", ["hexplane", "mlp"])
+def test_lengths_of_another_unit_are_fitted_alike(kind: str, known, motion_settings):
+    """A world that is 4/3 as large, with its learning rates of lengths, moves 4/3 as far in every iteration."""
+    moved = []
+    for scale in (1.0, 4 / 3):
+        box = scale * bounds_of(known.gaussians)
+        size = {"hidden": 16, **({"spatial": 4, "temporal": 4, "features": 8} if kind == "hexplane" else {})}
+        settings = HexPlaneSettings(**size) if kind == "hexplane" else MlpSettings(frequencies=2, **size)
+        deformation = new_deformation(settings, box, FRAMES, 40, seed())
+        rates = motion_settings.model_copy(update={"length_scale": scale})
+        adam = torch.optim.Adam(parameter_groups(deformation, rates), betas=(0.9, 0.999), eps=1e-15)
+        times = torch.linspace(0, 1, FRAMES)
+        slide = torch.stack([SLIDE * times, 0.1 * times.square(), torch.zeros(FRAMES)], -1)[:, None]
+        for _ in range(30):
+            adam.zero_grad()
+            means = deformation.displace(scale * known.gaussians.means, times).means / scale
+            (means - slide).square().mean().backward()
+            adam.step()
+        moved.append(deformation.displace(scale * known.gaussians.means, times).means.detach() / scale)
+    assert moved[0].abs().max() > 0.05
+    torch.testing.assert_close(moved[1], moved[0], atol=1e-4, rtol=0)
+
+
+def test_fine_tuned_means_learn_at_the_rate_of_their_unit(known, motion_settings):
+    settings = motion_settings.model_copy(update={"fine_tune": True, "iterations": 1, "length_scale": 4 / 3})
+    fitted = fit_motion(
+        known.gaussians, make("hexplane", known), known.video(), known.prior(0.5), known.rasterize, settings, seed()
+    )
+    for name, rate in {"means": 2e-5 * 4 / 3, "opacity_logits": 0.05}.items():
+        change = (getattr(fitted, name) - getattr(known.gaussians, name)).abs()
+        assert change.median().item() == pytest.approx(rate, rel=0.02), name
 
 
 def test_frames_of_an_iteration_are_spread_over_time():

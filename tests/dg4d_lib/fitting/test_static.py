@@ -1,10 +1,12 @@
+import math
+
 import pytest
 import torch
 
 from dg4d_lib.cameras.viewpoints import random_orbit
 from dg4d_lib.errors import FitDiverged
 from dg4d_lib.fitting.losses import Diverged
-from dg4d_lib.fitting.static import background, fit_gaussians
+from dg4d_lib.fitting.static import _Cloud, background, fit_gaussians, learning_rates
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.guidance.interface import GuidanceView
 
@@ -82,6 +84,42 @@ def test_a_cloud_that_vanishes_is_an_error_not_an_empty_asset(known, static_sett
         FitDiverged, match=r"0 Gaussians are left at iteration 2 of 150, .* lower static\.prune_opacity"
     ):
         fit_gaussians(blob(50, 0.5, seed()), known.subject(), known.prior(0.98), known.rasterize, greedy, seed())
+
+
+@pytest.mark.parametrize(("iterations", "left"), [(10, 60), (7, 100)])
+def test_the_last_iteration_prunes_and_adds_nothing(iterations: int, left: int, known, static_settings):
+    """As DreamGaussian after its last iteration, where the limit of the scale is twice that of densification.
+
+    A fit too short for any density control is left alone.
+    """
+    due = static_settings.model_copy(update={"iterations": iterations, "densify_every": 10, "densify_gradient": 1e-9})
+    start = blob(100, 0.3, seed())
+    start.opacity_logits[:30] = -20.0
+    start.log_scales[30:40] = 0.0  # standard deviations of 1, above the limit
+    start.log_scales[40:] = math.log(0.07)  # between both limits
+    fitted = fit_gaussians(start, known.subject(), known.prior(0.98), known.rasterize, due, seed())
+    assert len(fitted) == left
+    if left < len(start):
+        assert (fitted.opacities >= due.prune_opacity).all()
+        assert (fitted.scales <= 2 * due.prune_scale).all() and (fitted.scales > due.prune_scale).any()
+
+
+def test_a_reset_of_the_opacities_clears_their_moments_and_no_others(known, static_settings):
+    start = blob(60, 0.3, seed())
+    start.opacity_logits[:] = 2.0
+    cloud = _Cloud.of(start, learning_rates(static_settings))
+    sum((value - 1).square().sum() for value in vars(cloud.gaussians).values()).backward()
+    cloud.adam.step()
+    cloud.reset_opacity()
+    torch.testing.assert_close(cloud.gaussians.opacities, torch.full((60,), 0.01))
+    for name, parameter in cloud.parameters.items():
+        moments = [cloud.adam.state[parameter][key] for key in ("exp_avg", "exp_avg_sq")]
+        assert all(bool(moment.any()) == (name != "opacity_logits") for moment in moments), name
+    cloud.adam.zero_grad()
+    cloud.parameters["opacity_logits"].grad = torch.zeros(60)
+    before = cloud.parameters["opacity_logits"].detach().clone()
+    cloud.adam.step()
+    assert torch.equal(cloud.parameters["opacity_logits"], before)  # old moments would have lowered them on
 
 
 def test_a_random_background_is_black_every_other_time_and_only_behind_random_views(known, static_settings):

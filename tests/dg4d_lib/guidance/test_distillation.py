@@ -48,6 +48,16 @@ def test_the_timesteps_of_the_public_code():
     assert found[488] == 22 and set(found[489:]) == {20}
 
 
+def test_the_timesteps_of_the_first_release_stay_at_their_limit_for_half_of_the_fit():
+    generator = torch.Generator()
+    found = [TimestepSchedule(1.0, 0.0, 0.5).timestep(i / 200, generator) for i in range(1, 201)]
+    assert found == [min(max(round(1000 * (1 - i / 200)), 20), 500) for i in range(1, 201)]
+    assert set(found[:100]) == {500} and found[100] == 495 and found[-1] == 20
+    assert sum(found) / 200 == pytest.approx(374, abs=1)  # the paper's words give 259
+    literal = [TimestepSchedule(0.5).timestep(i / 200, generator) for i in range(1, 201)]
+    assert sum(literal) / 200 == pytest.approx(259, abs=1)
+
+
 def test_a_schedule_without_draws_leaves_the_generator_alone():
     generator = torch.Generator().manual_seed(1)
     TimestepSchedule(0.98).timestep(0.3, generator)

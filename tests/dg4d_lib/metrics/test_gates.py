@@ -63,7 +63,7 @@ def ball_turn(radius: float = 0.5, count: int = 24) -> Turntable:
 
 def evidence(pictures: RgbaImages, video: RgbaImages) -> GateInputs:
     forms = {SPLATS: pictures, MESH: pictures}
-    return GateInputs(RgbaImages(video.color[:1], video.alpha[:1]), video, forms, forms, ball_turn(), 0.0)
+    return GateInputs(RgbaImages(video.color[:1], video.alpha[:1]), video, forms, forms, ball_turn(), 0.0, 0.0)
 
 
 SWAYING = film([0.1 * math.sin(t) for t in range(8)])
@@ -79,6 +79,7 @@ def test_the_video_itself_passes_every_gate() -> None:
         "flicker": 0,
         "floaters": 0,
         "flaws": 0,
+        "folds": 0,
         "agreement": 1,
         "sharpness": 1,
         "motion": 1,

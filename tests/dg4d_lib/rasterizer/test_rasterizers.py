@@ -100,6 +100,21 @@ def test_nothing_is_drawn_below_the_least_alpha(rasterize, blobs):
     assert alpha[covered - 1] >= MIN_ALPHA
 
 
+def test_colors_are_clamped_per_gaussian_which_the_public_code_does_below_only(rasterize, blobs):
+    """Below one both formulas agree. Above, the public code mixes the whole color and clamps the picture."""
+    background = torch.tensor([0.2, 0.0, 1.0]).double()
+    for given, public, ours in (
+        ((0.7, 0.3, 0.9), (0.7, 0.3, 0.9), (0.7, 0.3, 0.9)),
+        ((1.5, -0.4, 1.1), (1.5, 0.0, 1.1), (1.0, 0.0, 1.0)),
+    ):
+        cloud = blobs([(0, 0, 0)], scale=0.2, opacity=0.6, colors=[given])
+        picture = rasterize(cloud, [OrbitCamera(width=33, height=33)], background)
+        alpha = picture.alpha[0, 16, 16]
+        mixed = [alpha * torch.tensor(color).double() + (1 - alpha) * background for color in (public, ours)]
+        torch.testing.assert_close(picture.color[0, 16, 16], mixed[1], rtol=1e-5, atol=1e-5)
+        assert (picture.color[0, 16, 16] <= mixed[0].clamp(0, 1) + 1e-5).all()
+
+
 def test_two_on_a_ray_cover_as_two_glasses_do(rasterize, blobs):
     red_before_blue = blobs([(0, 0, 0.2), (0, 0, -0.2)], opacity=0.6, colors=[(1, 0, 0), (0, 0, 1)])
     picture = rasterize(red_before_blue, [FRONT], BACKGROUND)

@@ -242,6 +242,45 @@ def test_equal_seeds_give_equal_bits() -> None:
     assert torch.equal(once, again) and not torch.equal(once, other)
 
 
+def front_of(texture: Tensor) -> TexturedMesh:
+    mesh = box(texture)
+    return TexturedMesh(mesh.vertices[:4], mesh.faces[:2], mesh.uvs[:4], texture)
+
+
+def test_the_reference_view_is_compared_at_full_size_without_supersampling() -> None:
+    """The public code renders 256 pixels, supersampled: averages of ours, whose error is never larger."""
+    start, truth = front_of(painted()), front_of(painted(1.0))
+    driving, losses = driving_of([truth]), []
+    settings = SETTINGS.model_copy(update={"iterations": 1})
+    refine_textures(
+        [MeshClip(start, torch.zeros(1, 4, 3))], driving, Satisfied(), settings, rng(),
+        lambda done, total, values: losses.append(values["loss"]),
+    )  # fmt: skip
+    camera = [OrbitCamera(width=SIZE, height=SIZE)]
+    covered = (shown([front_of(torch.zeros(32, 128, 3))], camera) == 0).all(-1, keepdim=True)
+    difference = (shown([start], camera) - driving.frames) * covered
+    assert losses[0] == pytest.approx(float(difference.square().mean()), rel=1e-4)
+    halves = torch.nn.functional.avg_pool2d(difference.movedim(-1, 1), 2)
+    assert 0.9 * losses[0] < float(halves.square().mean()) <= losses[0]  # equal but for the outline
+
+
+def test_black_texels_can_become_gray_within_the_papers_iterations() -> None:
+    """Adam moves a logit by 0.2 per iteration: from 1/512 31 iterations to gray, from the public code's 1e-6 69."""
+    assert -math.log(1 / 512 / (1 - 1 / 512)) / SETTINGS.lr == pytest.approx(31, abs=0.5)
+    assert -math.log(1e-6) / SETTINGS.lr == pytest.approx(69, abs=0.5) and SETTINGS.iterations == 50
+    black, gray = front_of(torch.zeros(32, 128, 3)), front_of(torch.full((32, 128, 3), 0.5))
+    (refined,) = refine_textures(
+        [MeshClip(black, torch.zeros(1, 4, 3))], driving_of([gray]), Satisfied(), SETTINGS, rng()
+    )
+    assert (refined.texture[4:28, 4:28] - 0.5).abs().max() < 0.1  # from 1e-6 it would be 0.48
+    settings = SETTINGS.model_copy(update={"iterations": 1})
+    (begun,) = refine_textures(
+        [MeshClip(black, torch.zeros(1, 4, 3))], driving_of([gray]), Satisfied(), settings, rng()
+    )
+    step = begun.texture[8:24, 8:24].logit() - torch.tensor(1 / 512).logit()
+    assert (step > 0.1).all() and (step < SETTINGS.lr + 1e-4).all()  # Adam's epsilon takes a part of small gradients
+
+
 def test_another_number_of_frames_is_refused() -> None:
     meshes = [box(painted())] * 2
     with pytest.raises(BadInput, match="3 frames and the driving video has 2"):

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.diffusion.clip_images import svd_clip_pixels
 from dg4d_lib.diffusion.latents import encode_images
 from dg4d_lib.diffusion.noise_schedule import ddim_timesteps
 from dg4d_lib.diffusion.video_model import VideoModel
@@ -81,6 +82,24 @@ def test_one_pass_is_what_the_formulas_say_with_the_same_noise() -> None:
     expected = by_the_formulas(parts, video(), picture, sigmas, rng(7))
     assert expected.std() > 0.05
     torch.testing.assert_close(refined, expected, rtol=1e-9, atol=1e-9)
+
+
+@torch.no_grad()
+def test_the_picture_is_conditioned_on_at_the_size_of_the_video() -> None:
+    """512 pixels with the paper's settings; the public code's 256 give CLIP nearly the same picture."""
+    parts = tiny_svd()
+    settings = VideoToVideoSettings(model=VideoModelSettings(decode_chunk_size=FRAMES))
+    model = VideoModel(parts.unet, parts.vae, parts.image_encoder, settings.model, CPU)
+    sizes, encode = [], model.encode_condition
+    model.encode_condition = lambda image, generators: sizes.append(image.shape) or encode(image, generators)
+    picture = torch.rand(2 * SIDE, 2 * SIDE, 3, generator=rng(2))
+    VideoToVideo(settings, model, picture).refine(video().float(), CAMERAS, 0.5, rng(7))
+    assert sizes == [(SIDE, SIDE, 3)] and VideoToVideoSettings().texture.size == 512
+    ramp = torch.linspace(0, 1, 512)
+    smooth = torch.stack([ramp[:, None] * ramp, (6 * ramp).sin()[:, None] * ramp, ramp.expand(512, 512)])[None]
+    half = interpolate(smooth, (256, 256), mode="bilinear", align_corners=False)
+    inner = (slice(None), slice(None), slice(8, -8), slice(8, -8))  # without the borders of the blur
+    assert (svd_clip_pixels(smooth) - svd_clip_pixels(half))[inner].abs().max() < 0.03
 
 
 def test_it_starts_at_the_level_of_the_paper_and_takes_eight_steps() -> None:

@@ -17,34 +17,35 @@ def cutout(size: int = 96, top: int = 20, left: int = 30, height: int = 50, widt
 
 def test_auto_keeps_a_square_cutout_bit_for_bit():
     frame = cutout()
-    result, notes = prepare_subject(frame, True, SubjectSettings(size=96))
-    assert notes == ()
+    prepared = prepare_subject(frame, True, SubjectSettings(size=96))
+    result = prepared.frames
+    assert prepared.notes == () and prepared.estimate is None
     visible = frame[..., 3] > 0
     assert torch.equal(result[..., 3], frame[..., 3]) and torch.equal(result[visible], frame[visible])
 
 
 def test_center_puts_the_same_cutout_into_the_middle():
-    result, _ = prepare_subject(cutout(), True, SubjectSettings(size=96, framing="center", border=0.2))
+    result = prepare_subject(cutout(), True, SubjectSettings(size=96, framing="center", border=0.2)).frames
     left, top, right, bottom = bounding_box(result[..., 3])
     assert bottom - top == pytest.approx(0.8 * 96, abs=2)
     assert abs(left - (96 - right)) <= 2 and abs(top - (96 - bottom)) <= 2
 
 
 def test_auto_centers_what_touches_the_edge():
-    result, _ = prepare_subject(cutout(top=0), True, SubjectSettings(size=96))
+    result = prepare_subject(cutout(top=0), True, SubjectSettings(size=96)).frames
     left, top, right, bottom = bounding_box(result[..., 3])
     assert min(left, top, 96 - right, 96 - bottom) >= 8
 
 
 def test_keep_pads_to_a_square_only():
     frame = cutout()[:, :80]
-    result, _ = prepare_subject(frame, True, SubjectSettings(size=96, framing="keep"))
+    result = prepare_subject(frame, True, SubjectSettings(size=96, framing="keep")).frames
     assert bounding_box(result[..., 3]) == (30, 28, 60, 78)
 
 
 def test_all_frames_share_one_crop():
     frames = torch.cat([cutout(left=2 + 8 * i) for i in range(5)])
-    result, _ = prepare_subject(frames, True, SubjectSettings(size=96, framing="center"))
+    result = prepare_subject(frames, True, SubjectSettings(size=96, framing="center")).frames
     lefts = [bounding_box(frame[None, ..., 3])[0] for frame in result]
     steps = torch.tensor(lefts).diff()
     assert (steps > 0).all() and steps.max() - steps.min() <= 2
@@ -54,7 +55,8 @@ def test_opaque_pictures_are_cut_out_and_centered():
     frame = cutout()
     opaque = torch.cat([frame[..., :3] * frame[..., 3:] + 1 - frame[..., 3:], torch.ones_like(frame[..., 3:])], -1)
     opaque[0, 20:70, 30:60, :3] *= 0.5
-    result, notes = prepare_subject(opaque, False, SubjectSettings(size=96))
+    prepared = prepare_subject(opaque, False, SubjectSettings(size=96))
+    result, notes = prepared.frames, prepared.notes
     assert any("background was removed" in note for note in notes)
     left, top, right, bottom = bounding_box(result[..., 3])
     assert bottom - top == pytest.approx(0.8 * 96, abs=3)
@@ -79,5 +81,5 @@ def test_a_subject_of_a_few_pixels_is_refused():
 def test_a_filled_frame_says_that_it_has_no_outline():
     full = torch.ones(1, 64, 64, 4)
     full[..., 3] = 0.9
-    _, notes = prepare_subject(full, True, SubjectSettings(size=64, framing="keep"))
+    notes = prepare_subject(full, True, SubjectSettings(size=64, framing="keep")).notes
     assert any("no outline" in note for note in notes)

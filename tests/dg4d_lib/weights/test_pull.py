@@ -11,7 +11,7 @@ from huggingface_hub.errors import OfflineModeIsEnabled
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.weights.locate import digests, find_weights
 from dg4d_lib.weights.lock import read_lock
-from dg4d_lib.weights.pull import needed, pull
+from dg4d_lib.weights.pull import needed, plan_pull, pull
 from dg4d_lib.weights.registry import KNOWN, lookup_weights
 
 SVD = replace(KNOWN["svd"], revision=None, published={})
@@ -95,6 +95,21 @@ def test_only_what_is_needed_is_downloaded_and_every_file_is_written_down(hub: H
         assert file.size == len(REPOSITORY[name])
     assert read_lock(tmp_path) == {"svd": locked}
     assert find_weights("svd", tmp_path) == tmp_path / "svd"
+
+
+def test_a_plan_knows_what_is_here_and_what_was_begun(hub: Hub, tmp_path: Path) -> None:
+    sizes = {name: len(REPOSITORY[name]) for name in WANTED}
+    plan = plan_pull(SVD, tmp_path)
+    assert (dict(plan.sizes), plan.present_bytes, plan.missing_bytes) == (sizes, 0, sum(sizes.values()))
+    assert hub.downloaded == [] and not plan.folder.exists()
+    (plan.folder / "vae").mkdir(parents=True)
+    (plan.folder / "vae/config.json").write_bytes(REPOSITORY["vae/config.json"])
+    begun = plan.folder / ".cache/huggingface/download/unet/x.incomplete"
+    begun.parent.mkdir(parents=True)
+    begun.write_bytes(b"1234567")
+    assert plan.present_bytes == sizes["vae/config.json"] + 7
+    pull(SVD, tmp_path)
+    assert plan_pull(SVD, tmp_path).missing_bytes == 0
 
 
 def test_a_second_pull_stays_with_the_first_revision_and_loads_nothing(hub: Hub, tmp_path: Path) -> None:

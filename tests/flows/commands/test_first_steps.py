@@ -41,7 +41,7 @@ def test_pictures_of_one_name_get_folders_of_their_own(dg4d: Run) -> None:
     assert sorted(path.name for path in Path("out").iterdir()) == ["a-png", "a-png-2"]
 
 
-@pytest.mark.parametrize("option", [("--text", "a fox"), ("--video", "a.png")])
+@pytest.mark.parametrize("option", [("--text", "a fox"), ("--video", "a.png"), ("--mask", "a.png")])
 def test_options_for_one_asset_are_refused_with_several_pictures(dg4d: Run, option: tuple[str, str]) -> None:
     done = dg4d("make", words("a.png", "1"), words("b.png", "2"), *option)
     assert done.exit_code == 65 and f"{option[0]} makes one asset, and 2 pictures are given" in done.stderr

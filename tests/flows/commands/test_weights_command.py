@@ -5,6 +5,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import huggingface_hub
 import pytest
@@ -12,9 +13,10 @@ from fake_steps import picture
 from typer.testing import CliRunner, Result
 
 from dg4d_lib.weights.locate import digests
-from dg4d_lib.weights.lock import LockedFile, LockEntry, write_lock
+from dg4d_lib.weights.lock import LockedFile, LockEntry, read_lock, write_lock
 from dg4d_lib.weights.registry import KNOWN
 from flows import cli
+from steps.profiles import PROFILES
 
 LGM = "model_fp16_fixrot.safetensors"
 
@@ -135,6 +137,59 @@ def test_pull_without_a_network_is_one_message(home: Path, monkeypatch: pytest.M
     assert len(result.stderr.strip().splitlines()) == 1
     assert "connect this machine to the network" in result.stderr
     assert not (home / "svd").exists()
+
+
+class Downloads:
+    """The hub with one large file per part of every repository; downloads are small, whatever it says."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, size_bytes: int) -> None:
+        self.got: list[str] = []
+        content = b"tensors"
+
+        def model_info(api: object, repository: str, **_: object) -> SimpleNamespace:
+            parts = next(one.parts for one in KNOWN.values() if one.hub_id == repository)
+            files = [SimpleNamespace(rfilename=f"{part}/m.safetensors", size=size_bytes, lfs=None) for part in parts]
+            return SimpleNamespace(sha="c" * 40, siblings=files, card_data=None)
+
+        def snapshot_download(repository: str, local_dir: Path, allow_patterns: list[str], **_: object) -> None:
+            self.got.append(repository)
+            for name in allow_patterns:
+                (local_dir / name).parent.mkdir(parents=True, exist_ok=True)
+                (local_dir / name).write_bytes(content)
+
+        monkeypatch.setattr(huggingface_hub.HfApi, "model_info", model_info)
+        monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+
+
+def test_a_profile_is_pulled_whole_and_its_sizes_are_told_first(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hub = Downloads(monkeypatch, 250_000_000)
+    result = dg4d("weights", "pull", "paper", "svd")
+    assert result.exit_code == 0, result.output
+    assert hub.got == [KNOWN["svd"].hub_id, KNOWN["zero123-xl"].hub_id]
+    assert result.stdout.splitlines()[:3] == [
+        "svd: 1.00 of 1.00 GB to download",
+        "zero123-xl: 1.25 of 1.25 GB to download",
+        "all: 2.25 of 2.25 GB to download",
+    ]
+    assert set(read_lock(home)) == {"svd", "zero123-xl"}
+
+
+def test_a_download_that_does_not_fit_is_refused_before_it_begins(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hub = Downloads(monkeypatch, 10**15)
+    result = dg4d("weights", "pull", "reference")
+    assert result.exit_code == 65
+    assert "GB does not fit on the disk" in result.stderr and "$DG4D_WEIGHTS" in result.stderr
+    assert hub.got == [] and not home.exists()
+
+
+def test_a_profile_without_weights_has_nothing_to_pull() -> None:
+    result = dg4d("weights", "pull", "preview")
+    assert result.exit_code == 65
+    assert "profile preview needs no weights" in result.stderr
+
+
+def test_no_profile_has_the_name_of_weights() -> None:
+    assert not set(PROFILES) & set(KNOWN)
 
 
 def test_pull_wants_names() -> None:

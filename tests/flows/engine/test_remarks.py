@@ -1,3 +1,4 @@
+import json
 import os
 import shutil
 import stat
@@ -63,10 +64,25 @@ def test_only_the_newest_pictures_are_kept_and_one_that_is_shown_again_is_new() 
     assert set(first.parent.iterdir()) == {first, *others[1:]}
 
 
-def test_a_step_without_notes_and_other_steps_say_nothing() -> None:
-    assert told("fox", result(b"picture")) == []
+def test_other_steps_say_nothing() -> None:
     assert told("fox", result(b"picture", NOTE, step="fit_motion")) == []
     assert not home.cutouts().exists()
+
+
+def test_the_picture_of_every_cutout_is_shown() -> None:
+    (text,) = told("fox", result(b"picture"))
+    path = Path(text.removeprefix("Source, matte and cut-out: "))
+    assert path.read_bytes() == b"picture"
+
+
+def test_failed_gates_of_a_cutout_are_told_with_their_advice() -> None:
+    gate = {"value": 0.4, "least": None, "most": 0.1, "unit": "", "advice": "give a mask"}
+    rows = [{"name": "cut-out pieces", "passed": False, **gate}, {"name": "cut-out holes", "passed": True, **gate}]
+    done = result(b"picture", NOTE)
+    ref = home.store().put_bytes(json.dumps({"gates": rows}).encode(), "application/vnd.dg4d.gates+json")
+    (text,) = told("fox", done.model_copy(update={"outputs": {**done.outputs, "cutout_gates": ref}}))
+    assert f"{NOTE} Not accepted: cut-out pieces is 0.4, allowed is at most 0.1; give a mask. Source" in text
+    assert "holes" not in text
 
 
 def test_a_picture_that_is_gone_leaves_the_note_and_no_empty_file() -> None:

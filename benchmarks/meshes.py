@@ -1,0 +1,110 @@
+"""Defects of packaged meshes, at rest and in every frame: crossings, flips, folds, creases and handles.
+
+Run with `python -m benchmarks.meshes PACKAGE ...` (`--json FILE` keeps the rows). A mesh per frame has no rest shape:
+its frames are counted one by one, and nothing is flipped.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.measure import new_console, parser_of, write_rows
+
+import torch  # isort: skip
+from rich.table import Table
+
+from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.mesh.extraction.topology import join_seams
+from dg4d_lib.mesh.folds import SurfaceDefects, genus, surface_defects
+from steps.artifacts.packages import read_manifest
+from steps.artifacts.rendering import Surface, mesh_at, read_surface
+
+PERCENT = 100
+
+
+@dataclass(frozen=True)
+class Row:
+    """Defects of the mesh of one package; shares in percent of the triangles or edges.
+
+    Attributes:
+        package: name of the folder.
+        moment: "rest", or "frames": the worst of all frames in each column.
+        triangles: number of triangles.
+        crossing: triangles that cross others.
+        flipped: triangles that turned over.
+        folds: edges above 120 degrees.
+        creases: edges above 60 degrees.
+        deviation_deg: root mean square angle between neighbors.
+        genus: handles.
+    """
+
+    package: str
+    moment: str
+    triangles: int
+    crossing: float
+    flipped: float
+    folds: float
+    creases: float
+    deviation_deg: float
+    genus: int
+
+
+def main() -> None:
+    parser = parser_of(__doc__)
+    parser.add_argument("packages", type=Path, nargs="+", help="folders of unpacked packages")
+    options = parser.parse_args()
+    rows = [row for folder in options.packages for row in measure(folder)]
+    new_console().print(table(rows))
+    if options.json:
+        write_rows(options.json, rows)
+
+
+def measure(folder: Path) -> Iterator[Row]:
+    """Measure the mesh of a package at rest, if it has a rest shape, and in all frames."""
+    manifest = read_manifest(folder)
+    surface = read_surface(folder, manifest)
+    if isinstance(surface, Asset4D):
+        joined, faces = join_seams(surface.mesh.vertices.numpy(), surface.mesh.faces.numpy())
+        rest = surface.mesh.vertices.numpy()[joined]
+        yield _row(folder.name, "rest", [surface_defects(rest, faces)], genus(faces))
+    frames = [_frame(surface, float(frame)) for frame in range(manifest.frames)]
+    yield _row(folder.name, "frames", [defects for defects, _ in frames], max(handles for _, handles in frames))
+
+
+def table(rows: list[Row]) -> Table:
+    """Return the rows as a table."""
+    shown = Table(title="Defects of meshes, percent of triangles or edges")
+    names = ("package", "moment", "triangles", "crossing", "flipped", "folds", "creases", "deviation", "genus")
+    for name in names:
+        shown.add_column(name, justify="left" if name in {"package", "moment"} else "right")
+    for row in rows:
+        shares = (f"{share:.3f}" for share in (row.crossing, row.flipped, row.folds, row.creases))
+        shown.add_row(row.package, row.moment, str(row.triangles), *shares, f"{row.deviation_deg:.1f}", str(row.genus))
+    return shown
+
+
+def _frame(surface: Surface, position: float) -> tuple[SurfaceDefects, int]:
+    mesh = mesh_at(surface, torch.tensor(position, dtype=torch.float64))
+    rest = surface.mesh.vertices if isinstance(surface, Asset4D) else mesh.vertices
+    joined, faces = join_seams(rest.numpy(), mesh.faces.numpy())
+    return surface_defects(mesh.vertices.numpy()[joined], faces, rest.numpy()[joined]), genus(faces)
+
+
+def _row(package: str, moment: str, found: list[SurfaceDefects], handles: int) -> Row:
+    triangles = min(defects.faces for defects in found)
+    edges = 1.5 * triangles / PERCENT
+    return Row(
+        package,
+        moment,
+        triangles,
+        crossing=max(defects.self_intersecting for defects in found) * PERCENT / triangles,
+        flipped=max(defects.flipped for defects in found) * PERCENT / triangles,
+        folds=max(defects.folds for defects in found) / edges,
+        creases=max(defects.creases for defects in found) / edges,
+        deviation_deg=max(defects.normal_deviation_deg for defects in found),
+        genus=handles,
+    )
+
+
+if __name__ == "__main__":
+    main()

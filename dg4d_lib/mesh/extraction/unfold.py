@@ -1,0 +1,33 @@
+"""Removal of folds and self-intersections from a surface by smoothing around them."""
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import diags_array
+
+from dg4d_lib.mesh.folds import defective_faces
+from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, grown
+
+ROUNDS = 24  # at most
+WIDER = 6  # rounds after which one more ring of neighbors is smoothed
+SWEEPS = 3  # averagings with the neighbors per round
+STEP = 0.5  # share of the way to the mean of the neighbors
+
+
+def unfold(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 3"]:
+    """Return vertices without folds and self-intersections, as far as smoothing around them removes them.
+
+    Args:
+        vertices: welded.
+        faces: counter-clockwise seen from outside; their order and number stay.
+    """
+    edges = edge_graph(faces, len(vertices))
+    mean_of_neighbors = diags_array(1 / np.maximum(edges.sum(axis=1), 1)) @ edges
+    smooth = vertices.astype(np.float64)
+    for number in range(ROUNDS):
+        defective = defective_faces(smooth, faces)
+        if not defective.any():
+            break
+        around = grown(faces_to_vertices(defective, faces, len(smooth)), edges, 1 + number // WIDER)
+        for _ in range(SWEEPS):
+            smooth[around] += STEP * ((mean_of_neighbors @ smooth)[around] - smooth[around])
+    return smooth.astype(vertices.dtype)

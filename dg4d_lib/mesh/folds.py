@@ -1,0 +1,246 @@
+"""Defects of a surface that light shows: self-intersections, folds, flipped faces and handles.
+
+Silhouettes and unlit comparisons are blind to them. All measures expect vertices that are welded along texture seams.
+"""
+
+from dataclasses import dataclass
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numba import njit
+
+from dg4d_lib.kernels.compiling import configure_numba
+from dg4d_lib.mesh.extraction.topology import face_components
+
+configure_numba()
+
+FOLD_DEG = 120.0  # between the normals of neighboring faces: the surface turns back on itself
+CREASE_DEG = 60.0  # between the normals of neighboring faces: a hard edge, seldom meant on creatures
+LONGEST_CELLS = 256  # cells of the search grid along the longest side of the mesh
+
+
+@dataclass(frozen=True)
+class SurfaceDefects:
+    """Counts of the defects of a surface at one moment.
+
+    Attributes:
+        faces: number of faces.
+        self_intersecting: faces that another face crosses.
+        flipped: faces that point against the local rotation of the surface; 0 at rest.
+        folds: edges whose faces differ by more than 120 degrees.
+        creases: edges whose faces differ by more than 60 degrees.
+        normal_deviation_deg: root mean square angle between neighboring faces.
+    """
+
+    faces: int
+    self_intersecting: int
+    flipped: int
+    folds: int
+    creases: int
+    normal_deviation_deg: float
+
+
+def surface_defects(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], rest: Float[np.ndarray, "v 3"] | None = None
+) -> SurfaceDefects:
+    """Count the defects of a surface.
+
+    Args:
+        vertices: of the surface, any units.
+        faces: counter-clockwise seen from outside.
+        rest: vertices of the rest shape, against which faces count as flipped; None: these are the rest shape.
+    """
+    angles = dihedral_angles_deg(vertices, faces)
+    return SurfaceDefects(
+        faces=len(faces),
+        self_intersecting=int(self_intersecting(vertices, faces).sum()),
+        flipped=0 if rest is None else int(flipped_faces(rest, vertices, faces).sum()),
+        folds=int((angles > FOLD_DEG).sum()),
+        creases=int((angles > CREASE_DEG).sum()),
+        normal_deviation_deg=float(np.sqrt(np.mean(np.square(angles)))) if len(angles) else 0.0,
+    )
+
+
+def genus(faces: Int[np.ndarray, "f 3"]) -> int:
+    """Return the number of handles of a closed surface, summed over its components (Euler characteristic)."""
+    used = np.unique(faces)
+    edges = np.unique(np.sort(_sides(faces), 1), axis=0)
+    components = int(face_components(int(faces.max()) + 1, faces).max()) + 1
+    return (2 * components - (len(used) - len(edges) + len(faces))) // 2
+
+
+def dihedral_angles_deg(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, " e"]:
+    """Return the angle between the normals of the two faces of every inner edge, 0 to 180 degrees."""
+    first, second, _ = neighboring_faces(faces)
+    normals = unit_normals(vertices, faces)
+    cosines = np.einsum("ei,ei->e", normals[first], normals[second])
+    return np.degrees(np.arccos(cosines.clip(-1, 1)))
+
+
+def neighboring_faces(
+    faces: Int[np.ndarray, "f 3"],
+) -> tuple[Int[np.ndarray, " e"], Int[np.ndarray, " e"], Int[np.ndarray, "e 2"]]:
+    """Return the two faces of every edge that has two, and its ends."""
+    sides = np.sort(_sides(faces), 1)
+    order = np.lexsort(sides.T)
+    edges, owners = sides[order], np.repeat(np.arange(len(faces)), 3)[order]
+    twin = np.flatnonzero((edges[1:] == edges[:-1]).all(1))
+    return owners[twin], owners[twin + 1], edges[twin]
+
+
+def unit_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
+    """Return the normals of the faces; 0 for faces without area."""
+    a, b, c = np.moveaxis(vertices.astype(np.float64)[faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-300)
+
+
+def flipped_faces(
+    rest: Float[np.ndarray, "v 3"], moved: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> Bool[np.ndarray, " f"]:
+    """Mark faces whose normal points against the rotation that fits the neighborhood best.
+
+    The neighborhood of a face are the edges at its three corners; the rotation is that of Kabsch.
+    """
+    sides = _sides(faces)
+    before, after = (np.asarray(shape, np.float64)[sides] for shape in (rest, moved))
+    arms, moved_arms = before[:, 1] - before[:, 0], after[:, 1] - after[:, 0]
+    products = moved_arms[:, :, None] * arms[:, None, :]
+    at_vertex = np.zeros((len(rest), 3, 3))
+    for end in (0, 1):
+        np.add.at(at_vertex, sides[:, end], products)
+    u, _, vt = np.linalg.svd(at_vertex[faces].sum(1))
+    u[..., -1] *= np.sign(np.linalg.det(u @ vt))[:, None]
+    expected = np.einsum("fij,fj->fi", u @ vt, unit_normals(rest, faces))
+    return np.einsum("fi,fi->f", expected, unit_normals(moved, faces)) < 0
+
+
+def defective_faces(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], rest: Float[np.ndarray, "v 3"] | None = None
+) -> Bool[np.ndarray, " f"]:
+    """Mark faces that intersect themselves, are flipped or lie at a fold; arguments as for `surface_defects`."""
+    defective = self_intersecting(vertices, faces)
+    if rest is not None:
+        defective |= flipped_faces(rest, vertices, faces)
+    first, second, _ = neighboring_faces(faces)
+    normals = unit_normals(vertices, faces)
+    folded = np.einsum("ei,ei->e", normals[first], normals[second]) < np.cos(np.radians(FOLD_DEG))
+    defective[first[folded]] = defective[second[folded]] = True
+    return defective
+
+
+def self_intersecting(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
+    """Mark faces that an edge of another face crosses, or that cross another face with an edge of their own.
+
+    Faces that only touch, at a corner or along an edge, do not count.
+    """
+    points = np.ascontiguousarray(vertices, np.float64)
+    corners = np.ascontiguousarray(faces, np.int64)
+    marked = np.zeros(len(corners), np.bool_)
+    if len(corners) == 0:
+        return marked
+    boxes = points[corners]
+    low, high = boxes.min(1), boxes.max(1)
+    extent = float((high.max(0) - low.min(0)).max())
+    cell = max(2 * float((high - low).mean()), extent / LONGEST_CELLS, 1e-300)
+    first = ((low - low.min(0)) / cell).astype(np.int64)
+    last = ((high - low.min(0)) / cell).astype(np.int64)
+    shape = last.max(0) + 1
+    starts, members = _fill_grid(first, last, shape)
+    _cross_faces(points, corners, low, high, low.min(0), cell, shape, starts, members, marked)
+    return marked
+
+
+def _sides(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
+    return np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2)
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _fill_grid(first, last, shape):
+    """List the faces of every cell that their bounding boxes touch, as offsets and members."""
+    counts = np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int64)
+    for fill in range(2):
+        if fill:
+            starts = np.cumsum(counts)
+            starts[1:] = starts[:-1].copy()
+            starts[0] = 0
+            members = np.empty(counts.sum(), np.int64)
+            places = starts.copy()
+        for face in range(len(first)):
+            for x in range(first[face, 0], last[face, 0] + 1):
+                for y in range(first[face, 1], last[face, 1] + 1):
+                    for z in range(first[face, 2], last[face, 2] + 1):
+                        cell = (x * shape[1] + y) * shape[2] + z
+                        if fill:
+                            members[places[cell]] = face
+                            places[cell] += 1
+                        else:
+                            counts[cell] += 1
+    return starts, members
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _cross_faces(points, faces, low, high, origin, size, shape, starts, members, marked):
+    """Mark the faces that cross another one; a pair is tested in the first cell that both boxes share."""
+    for cell in range(len(starts) - 1):
+        z, y, x = cell % shape[2], cell // shape[2] % shape[1], cell // (shape[1] * shape[2])
+        for m in range(starts[cell], starts[cell + 1]):
+            for n in range(starts[cell], m):
+                i, j = members[m], members[n]
+                if marked[i] and marked[j]:
+                    continue
+                apart = False
+                for axis in range(3):
+                    apart |= low[i, axis] > high[j, axis] or low[j, axis] > high[i, axis]
+                if apart:
+                    continue
+                here = (
+                    int((max(low[i, 0], low[j, 0]) - origin[0]) / size) == x
+                    and int((max(low[i, 1], low[j, 1]) - origin[1]) / size) == y
+                    and int((max(low[i, 2], low[j, 2]) - origin[2]) / size) == z
+                )
+                if here and _faces_cross(points, faces[i], faces[j]):
+                    marked[i] = marked[j] = True
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _faces_cross(points, a, b):
+    """Tell whether an edge of one face passes through the other; edges that end on it at a shared corner do not."""
+    return _edges_cross(points, a, b) or _edges_cross(points, b, a)
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _edges_cross(points, a, b):
+    for k in range(3):
+        p, q = a[k], a[(k + 1) % 3]
+        shared = False
+        for corner in b:
+            shared |= corner in (p, q)
+        if not shared and _segment_crosses(points[p], points[q], points[b[0]], points[b[1]], points[b[2]]):
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _segment_crosses(p, q, a, b, c):
+    """Tell whether the open segment pq passes through the inside of the triangle, by signs of volumes."""
+    if _volume(a, b, c, p) * _volume(a, b, c, q) >= 0:
+        return False
+    u, v, w = _volume(p, q, a, b), _volume(p, q, b, c), _volume(p, q, c, a)
+    return (u > 0 and v > 0 and w > 0) or (u < 0 and v < 0 and w < 0)
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _volume(a, b, c, d):
+    """Return six times the signed volume of a tetrahedron."""
+    ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    wx, wy, wz = d[0] - a[0], d[1] - a[1], d[2] - a[2]
+    return ux * (vy * wz - vz * wy) + uy * (vz * wx - vx * wz) + uz * (vx * wy - vy * wx)

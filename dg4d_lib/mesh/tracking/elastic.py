@@ -1,0 +1,129 @@
+"""Elastic relaxation of a tracked mesh: no frame folds, crosses itself or turns a face over.
+
+Skinning and projection move every vertex for itself, so neighbors overtake each other at joints. Here the vertices are
+pulled to where tracking put them and hold together by an as-rigid-as-possible energy towards the rest shape (Sorkine
+and Alexa 2007, with uniform weights, for the triangles are nearly equal). Where defects are left, the pull gives way.
+"""
+
+from functools import partial
+from typing import no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int
+from numba import njit
+from scipy.sparse import csc_array, csr_array, diags_array
+from scipy.sparse.linalg import SuperLU, splu
+from torch import Tensor
+
+from dg4d_lib.kernels.workers import run_parallel
+from dg4d_lib.mesh.folds import defective_faces
+from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, grown
+from dg4d_lib.mesh.tracking.skinning import nearest_rotation
+
+PULL = 1.0  # weight of the tracked position of a vertex, against 1 for each of its edges
+PASSES = 5  # alternations of rotations and positions
+ROUNDS = 5  # at most; after the first one only around defects
+YIELDING = 0.15  # factor of the pull around defects, from round to round
+RINGS = 3  # of neighbors around a defect that give way with it
+
+
+def relax(
+    vertices: Float[Tensor, "v 3"], offsets: Float[Tensor, "t v 3"], faces: Int[Tensor, "f 3"]
+) -> Float[Tensor, "t v 3"]:
+    """Return offsets near the given ones by which the surface moves without folds and crossings.
+
+    Args:
+        vertices: in the reference frame, not split along seams.
+        offsets: of the tracked vertices at every frame.
+        faces: counter-clockwise seen from outside, of nearly equal size. Defects that the rest shape has stay.
+    """
+    body = _ElasticBody(vertices.double().numpy(), faces.numpy())
+    relaxed = torch.empty_like(offsets)
+
+    def relax_frame(frame: int) -> None:
+        moved = body.relaxed((vertices + offsets[frame]).double().numpy())
+        relaxed[frame] = torch.from_numpy(moved - body.rest).to(offsets)
+
+    run_parallel([partial(relax_frame, frame) for frame in range(len(offsets))])
+    return relaxed
+
+
+class _ElasticBody:
+    """Rest shape with its edges, and the factors of the linear system that all frames share."""
+
+    def __init__(self, rest: Float64[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> None:
+        self.rest, self.faces = rest, faces
+        self.edges = edge_graph(faces, len(rest))
+        self.laplacian = csr_array(diags_array(self.edges.sum(axis=1)) - self.edges)
+        self._whole = _factors(self.laplacian, np.full(len(rest), PULL))
+        self._defective_at_rest = defective_faces(rest, faces)
+
+    def relaxed(self, tracked: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "v 3"]:
+        """Return the relaxed positions of one frame."""
+        pull = np.full(len(tracked), PULL)
+        moved = self._settle(tracked, tracked, pull, None)
+        for _ in range(ROUNDS - 1):
+            defective = defective_faces(moved, self.faces, self.rest) & ~self._defective_at_rest
+            if not defective.any():
+                break
+            yielding = grown(faces_to_vertices(defective, self.faces, len(moved)), self.edges, RINGS)
+            pull[yielding] *= YIELDING
+            moved = self._settle(moved, tracked, pull, yielding)
+        return moved
+
+    def _settle(
+        self,
+        start: Float64[np.ndarray, "v 3"],
+        tracked: Float64[np.ndarray, "v 3"],
+        pull: Float64[np.ndarray, " v"],
+        free: Bool[np.ndarray, " v"] | None,
+    ) -> Float64[np.ndarray, "v 3"]:
+        """Minimize the energy over the free vertices, all of them if None."""
+        moved, rotations, forces = start.copy(), np.empty((len(start), 3, 3)), np.empty_like(start)
+        rows: slice | Int[np.ndarray, " n"] = slice(None)
+        if free is None:
+            solve = self._whole.solve
+        else:
+            rows = np.flatnonzero(free)
+            solve = _factors(self.laplacian[rows][:, rows], pull[rows]).solve
+            outside = self.laplacian[rows][:, ~free]
+        for _ in range(PASSES):
+            _rotations(self.edges.indptr, self.edges.indices, self.rest, moved, rotations)
+            _forces(self.edges.indptr, self.edges.indices, self.rest, rotations, forces)
+            wanted = (forces + pull[:, None] * tracked)[rows]
+            moved[rows] = solve(wanted if free is None else wanted - outside @ moved[~free])
+        return moved
+
+
+def _factors(laplacian: csr_array, pull: Float64[np.ndarray, " v"]) -> SuperLU:
+    return splu(csc_array(laplacian + diags_array(pull)), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _rotations(starts, neighbors, rest, moved, rotations):
+    """Write the rotation of every vertex that turns its edges at rest into the present ones best."""
+    covariance = np.zeros((3, 3))
+    for v in range(rest.shape[0]):
+        covariance[:] = 0
+        for k in range(starts[v], starts[v + 1]):
+            j = neighbors[k]
+            for a in range(3):
+                for b in range(3):
+                    covariance[a, b] += (moved[j, a] - moved[v, a]) * (rest[j, b] - rest[v, b])
+        nearest_rotation(covariance, rotations[v])
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _forces(starts, neighbors, rest, rotations, forces):
+    """Write the right-hand side of the positions: edges at rest, turned by the mean rotation of both ends."""
+    forces[:] = 0
+    for v in range(rest.shape[0]):
+        for k in range(starts[v], starts[v + 1]):
+            j = neighbors[k]
+            for a in range(3):
+                for b in range(3):
+                    turn = 0.5 * (rotations[v, a, b] + rotations[j, a, b])
+                    forces[v, a] += turn * (rest[v, b] - rest[j, b])

@@ -1,0 +1,67 @@
+"""Masks of the user: pictures or frames that mark the subject of a source."""
+
+from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
+
+from dg4d_lib.errors import BadInput
+from dg4d_lib.images import resize_planes
+from dg4d_lib.video.subject import check_box
+from steps.sources.reader import Source, read_source
+
+
+def read_mask(
+    path: Path, source: Source, scratch: Path, max_frames: int, max_decode_gb: float
+) -> Float[Tensor, "t h w"]:
+    """Decode a mask and return it at the size of the decoded source, in [0, 1].
+
+    The alpha channel is the mask if there is one, else brightness: white is the subject.
+
+    Args:
+        path: picture for a picture, or as many frames as the video has.
+        source: decoded source.
+        scratch: existing folder for links and unpacked pictures.
+        max_frames: as for the source.
+        max_decode_gb: memory limit in GiB.
+
+    Raises:
+        BadInput: the mask cannot be read, or its size or number of frames differs from the source's.
+    """
+    try:
+        mask = read_source(path, scratch, max_frames, max_decode_gb)
+    except BadInput as error:
+        raise BadInput(f"the mask: {error}") from error
+    if mask.size != source.size:
+        raise BadInput(
+            f"the mask is {_by(mask.size)} pixels, the {source.kind} {_by(source.size)}; draw the mask at the size of "
+            f"the {source.kind}"
+        )
+    if mask.count != source.count:
+        raise BadInput(
+            f"the mask has {mask.count} frame{'s' * (mask.count != 1)}, the {source.kind} {source.count}; give a "
+            "picture for a picture, and a folder with a mask for every frame of a video"
+        )
+    values = mask.frames[..., 3] if mask.has_alpha else mask.frames[..., :3].mean(-1)
+    return resize_planes(values[None], source.frames.shape[1:3])[0].clamp(0, 1)
+
+
+def scaled_box(box: tuple[int, ...], source: Source) -> tuple[int, ...]:
+    """Return a box of the file in pixels of its decoded frames, rounded outwards.
+
+    Raises:
+        BadInput: the box reaches out of the file's picture.
+    """
+    if not box:
+        return ()
+    width, height = source.size
+    x, y, w, h = box
+    check_box(box, width, height)
+    rows, columns = source.frames.shape[1:3]
+    left, right = x * columns // width, -(-(x + w) * columns // width)
+    top, bottom = y * rows // height, -(-(y + h) * rows // height)
+    return left, top, right - left, bottom - top
+
+
+def _by(size: tuple[int, int]) -> str:
+    return f"{size[0]} x {size[1]}"

@@ -1,0 +1,17 @@
+"""The figures of meshes in packages."""
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.meshes import measure, table
+from tests.steps.small_package import packed
+
+
+@pytest.mark.parametrize(("mode", "moments"), [("tracked", ["rest", "frames"]), ("per_frame", ["frames"])])
+def test_a_clean_package_has_clean_figures(tmp_path: Path, mode: str, moments: list[str]) -> None:
+    rows = list(measure(packed(tmp_path, mode)))
+    assert [row.moment for row in rows] == moments
+    assert all((row.crossing, row.flipped, row.folds, row.genus) == (0, 0, 0, 0) for row in rows)
+    assert all(row.deviation_deg == pytest.approx(41.8, abs=0.1) for row in rows)  # an icosahedron
+    assert table(rows).row_count == len(rows)

@@ -1,0 +1,116 @@
+"""Folds, crossings, flips and handles on shapes for which they are known, and their removal."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from dg4d_lib.mesh.extraction.unfold import unfold
+from dg4d_lib.mesh.folds import genus, self_intersecting, surface_defects
+from dg4d_lib.mesh.tracking.elastic import relax
+
+
+def sphere(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    ball = trimesh.creation.icosphere(subdivisions)
+    return np.asarray(ball.vertices), np.asarray(ball.faces)
+
+
+def tube(rings: int = 41, around: int = 20) -> tuple[np.ndarray, np.ndarray]:
+    """An open tube of radius 0.1 along x, from 0 to 1, of nearly equal triangles."""
+    along, angle = np.meshgrid(np.linspace(0, 1, rings), 2 * np.pi * np.arange(around) / around, indexing="ij")
+    vertices = np.stack([along, 0.1 * np.cos(angle), 0.1 * np.sin(angle)], -1).reshape(-1, 3)
+    numbers = np.arange(rings * around).reshape(rings, around)
+    a, b = numbers[:-1], numbers[1:]
+    c, d = np.roll(a, -1, 1), np.roll(b, -1, 1)
+    return vertices, np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)]).reshape(-1, 3)
+
+
+def bent(vertices: np.ndarray, degrees: float) -> np.ndarray:
+    """The half beyond x = 0.5 turned about the z axis through (0.5, 0, 0), as stiffly as two bones without a joint."""
+    angle = np.radians(degrees)
+    joint = np.array([0.5, 0, 0])
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    return np.where(vertices[:, :1] > 0.5, (vertices - joint) @ turn.T + joint, vertices)
+
+
+def test_a_sphere_has_no_defects_and_no_handle() -> None:
+    defects = surface_defects(*sphere())
+    assert (defects.self_intersecting, defects.folds, defects.creases, defects.flipped) == (0, 0, 0, 0)
+    assert genus(sphere()[1]) == 0
+
+
+def test_a_torus_has_one_handle_and_two_of_them_have_two() -> None:
+    torus = trimesh.creation.torus(1, 0.3)
+    both = trimesh.util.concatenate([torus, torus.copy().apply_translation([5, 0, 0])])
+    assert genus(np.asarray(torus.faces)) == 1
+    assert genus(np.asarray(both.faces)) == 2
+
+
+@pytest.mark.parametrize(("distance", "crossing"), [(3.0, False), (1.0, True)])
+def test_two_spheres_cross_where_they_overlap(distance: float, crossing: bool) -> None:
+    vertices, faces = sphere(2)
+    both = np.concatenate([vertices, vertices + np.array([distance, 0, 0])])
+    marked = self_intersecting(both, np.concatenate([faces, faces + len(vertices)]))
+    assert marked.any() == crossing
+    middle = both[np.concatenate([faces, faces + len(vertices)])[marked]].mean(1)[:, 0]
+    assert (np.abs(middle - distance / 2) < 0.3).all()
+
+
+def test_crossings_are_those_of_a_search_over_all_pairs() -> None:
+    generator = np.random.default_rng(0)
+    corners = generator.normal(size=(60, 1, 3)) + 0.5 * generator.normal(size=(60, 3, 3))
+    faces = np.arange(180).reshape(60, 3)
+    expected = np.zeros(60, bool)
+    for i in range(60):
+        for j in range(60):
+            expected[[i, j]] |= i != j and any(passes(corners[i][[k, (k + 1) % 3]], corners[j]) for k in range(3))
+    assert expected.any() and not expected.all()
+    assert np.array_equal(self_intersecting(corners.reshape(-1, 3), faces), expected)
+
+
+def passes(segment: np.ndarray, triangle: np.ndarray) -> bool:
+    """Solve p + s (q - p) = a + u (b - a) + v (c - a)."""
+    (p, q), (a, b, c) = segment, triangle
+    s, u, v = np.linalg.solve(np.stack([p - q, b - a, c - a], 1), p - a)
+    return 0 < s < 1 and u > 0 and v > 0 and u + v < 1
+
+
+def test_a_rigid_motion_flips_nothing_and_a_vertex_that_overtakes_its_neighbor_flips_faces() -> None:
+    vertices, faces = sphere(2)
+    turn = trimesh.transformations.rotation_matrix(2.0, [1, 2, 3])[:3, :3]
+    assert surface_defects(vertices @ turn.T, faces, vertices).flipped == 0
+    corner, neighbor, _ = faces[0]
+    overtaken = vertices.copy()
+    overtaken[corner] += 2 * (vertices[neighbor] - vertices[corner])
+    assert 0 < surface_defects(overtaken, faces, vertices).flipped <= (faces == corner).any(1).sum()
+
+
+def test_a_spike_through_the_other_side_is_smoothed_away() -> None:
+    vertices, faces = sphere()
+    spiked = vertices.copy()
+    spiked[0] *= -1.3
+    assert surface_defects(spiked, faces).self_intersecting > 0
+    smooth = unfold(spiked, faces)
+    defects = surface_defects(smooth, faces)
+    assert (defects.self_intersecting, defects.folds) == (0, 0)
+    assert (smooth == spiked).all(1).mean() > 0.9
+    assert unfold(vertices, faces) is not vertices and np.array_equal(unfold(vertices, faces), vertices)
+
+
+def test_a_bone_that_bends_a_tube_at_once_makes_folds_and_relaxing_takes_them_away() -> None:
+    vertices, faces = tube()
+    moved = bent(vertices, 50.0)
+    assert surface_defects(moved, faces, vertices).self_intersecting > 10
+    rest, offsets = (torch.from_numpy(part).float() for part in (vertices, np.stack([moved - vertices])))
+    relaxed = relax(rest, offsets, torch.from_numpy(faces))
+    found = surface_defects((rest + relaxed[0]).numpy(), faces, vertices)
+    assert (found.self_intersecting, found.flipped) == (0, 0)
+    far = np.abs(vertices[:, 0] - 0.5) > 0.3
+    assert np.abs((relaxed - offsets)[0].numpy()[far]).max() < 0.02  # the ends stay where tracking put them
+
+
+def test_a_rigid_motion_is_left_as_it_is() -> None:
+    vertices, faces = sphere(2)
+    turn = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])[:3, :3]
+    offsets = torch.from_numpy(vertices @ turn.T + [0.1, 0.2, 0.3] - vertices)[None]
+    torch.testing.assert_close(relax(torch.from_numpy(vertices), offsets, torch.from_numpy(faces)), offsets)
