@@ -41,9 +41,9 @@ from flows.inputs.package_record import RECORD
 from flows.packages import summary
 from flows.packages.flow_result import StepRun
 from flows.packages.publish import Files, publish
-from flows.pipeline import conversion_of
 from flows.serving.auth import auth_string
 from flows.serving.server import HOST, SETTINGS, answers
+from flows.stages import conversion_of
 from flows.tasks import drive_video, prepare_subject
 
 DATABASES = ("sqlite", "postgresql")

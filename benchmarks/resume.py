@@ -107,7 +107,7 @@ def run_trials(place: Place, kills: int, seed: int) -> list[Row]:
         time.sleep(moment_s)
         command.send_signal(signal.SIGKILL)
         said, _ = command.communicate()
-        started = [line.split(":")[0] for line in said.splitlines() if line.endswith(": started")]
+        started = [line.split(":")[0] for line in said.splitlines() if ": started" in line]
         start = time.monotonic()
         said, _ = (again := place.start(trial)).communicate()
         rows.append(

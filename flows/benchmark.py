@@ -8,7 +8,7 @@ from prefect.artifacts import create_table_artifact
 
 from dg4d_lib.errors import BadInput
 from flows import home
-from flows.engine.step_tasks import Conversion
+from flows.engine.requests import Conversion
 from flows.formatting.escaping import markdown
 from flows.packages import scores
 from flows.packages.scores import ObjectScores, Results

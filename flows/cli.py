@@ -8,6 +8,7 @@ Commands import their modules when they run, so that `--help` and completion are
 import io
 import math
 import os
+import shlex
 import sys
 from importlib.metadata import version
 from pathlib import Path
@@ -73,8 +74,11 @@ def dg4d(
 
 @app.command()
 def make(
-    picture: Annotated[
-        Path | None, typer.Argument(metavar="PICTURE", help="a picture or a video", show_default=False)
+    pictures: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="PICTURE...", help="a picture or a video; several make an asset each", show_default=False
+        ),
     ] = None,
     text: Annotated[
         str,
@@ -99,7 +103,10 @@ def make(
     compress: Compress = False,
     seed: Seed = 0,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="DIR", help="output folder  [default: out/NAME]")
+        Path | None,
+        typer.Option(
+            "-o", "--out", metavar="DIR", help="output folder; of several pictures: DIR/NAME  [default: out/NAME]"
+        ),
     ] = None,
     bank: Annotated[
         Path | None, typer.Option(metavar="DIR", help="ground-truth views, for --set prior.kind=oracle")
@@ -110,50 +117,29 @@ def make(
     force: Annotated[bool, typer.Option("--force", help="replace another asset in the output folder")] = False,
     pick: Annotated[int | None, typer.Option(min=1, max=16, metavar="K", help="use motion K of `dg4d motions`")] = None,
 ) -> None:
-    """Make one animated asset.
+    """Make an animated asset of each picture.
 
     Motions without a driving video, for --set driving.motion=NAME: sway, bend, breathe, bounce, wave, turn.
     """
-    if picture is None and not text:
+    if not pictures and not text:
         raise typer.BadParameter("give a picture, a video, or --text WORDS")
     with exit_on_error():
-        from dg4d_lib.errors import BadInput
-        from flows import home
         from flows.commands import terminal
-        from flows.convert import convert_job
-        from flows.inputs.conversion_job import name_from_text
+        from flows.commands.make import Wish, make_each
         from flows.inputs.given_views import ViewsRequest, parse_views
-        from flows.inputs.naming import clean_name
-        from flows.inputs.package_record import record_of
-        from flows.packages.acceptance import failing_gates
-        from flows.packages.publish import check_folder, is_current
 
-        console = terminal.console()
-        if pick and video:
-            raise BadInput("--pick chooses a generated motion and cannot be combined with --video")
         short = shortcut_settings(
             triangles, texture, fps, box=box, height_m=height_m, ground=ground, compress=compress
         ) | ({"driving.pick": pick} if pick else {})
-        item = (clean_name(picture.stem) or "asset") if picture else name_from_text(text)
         sides = ViewsRequest(views=parse_views(view or []), turntable=turntable, cameras=cameras)
-        files = {"picture": picture, "text": text, "video": video, "bank": bank, "mask": mask, "given_views": sides}
-        request = _request(profile, changes, short, item=item, seed=seed, commercial_only=commercial_only, **files)
-        folder = out or Path("out") / item
-        check_folder(folder, item, force)
-        job = request.to_job(home.store())
-        cached = is_current(folder, job.digest())
-        if not cached:
-            _, cached = terminal.run_with_progress(job, console, lambda: convert_job(job, folder))
-        if cached:
-            console.print("nothing to do: every step was already done")
-        written = (record_of(folder) or {"files": {}})["files"]
-        terminal.print_package(console, folder, {name: fact["size_bytes"] for name, fact in written.items()})
-        if (folder / "report.html").is_file():
-            console.print(f"report: {folder / 'report.html'}", markup=False)
-        if failing := failing_gates(folder):
-            console.print(
-                f"not accepted: {', '.join(failing)}; the report says what to do", markup=False, style="yellow"
-            )
+
+        def request(item: str, picture: Path | None) -> "ConversionRequest":
+            files = {"picture": picture, "text": text, "video": video, "bank": bank, "mask": mask, "given_views": sides}
+            return _request(profile, changes, short, item=item, seed=seed, commercial_only=commercial_only, **files)
+
+        wish = Wish(tuple(pictures or ()), text, video, mask, bool(sides), out, force, bool(pick), request)
+        if status := make_each(wish, terminal.console()):
+            raise typer.Exit(status)
 
 
 @app.command()
@@ -189,11 +175,16 @@ def motions(
         folder = out or Path("out") / f"{item}-motions"
         check_writable(folder)
         job = request.to_job(home.store())
-        ranking = terminal.run_with_progress(job, console, lambda: rank_motions(job, folder))
-        for row in ranking["candidates"]:
-            remarks = "; ".join(row["remarks"])
-            console.print(f"{row['number']:>3}  {row['total']:.2f}  {row['name']}  {remarks}".rstrip(), markup=False)
+        steps = ("prepare_subject", "drive_video")
+        ranking = terminal.run_with_progress(job, console, lambda: rank_motions(job, folder), steps)
+        rows = [
+            (f"{row['number']:>4}", f"{row['total']:.2f}", f"{row['name']}  {'; '.join(row['remarks'])}".rstrip())
+            for row in ranking["candidates"]
+        ]
+        terminal.print_rows(console, [("pick", "score", "motion, best first"), *rows])
         console.print(f"sheet: {folder / 'motions.png'}", markup=False)
+        best = shlex.join(["dg4d", "make", str(picture), "--pick", str(ranking["candidates"][0]["number"])])
+        console.print(f"make the asset with one of them: {best}", markup=False)
 
 
 @app.command()

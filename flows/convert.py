@@ -5,7 +5,7 @@ import json
 import os
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +24,7 @@ from steps.store.files import home as store_home
 if TYPE_CHECKING:
     from flows.packages.flow_result import FlowResult
 
+STARTING = "starting the Prefect server"  # stage of `connect` when no server runs
 ANSWER_S = 10.0  # time limit of a health check of the user's own server
 
 
@@ -46,24 +47,47 @@ def connect() -> None:
     require_free_space(store_home())
     own = os.environ.get("PREFECT_API_URL")
     if own:
+        _announce(f"connecting to the Prefect server {own}")
         home.set_environment(own)
         _check(own)
     else:
         server = background.background_server()
+        if server.address() is None:
+            first = "" if server.has_database() else "; the first start creates its database, about 10 s"
+            _announce(f"{STARTING}{first}")
         server.start()
         background.set_own_server(server, server.wait_for_address())
+        _announce("importing the flows")
         importlib.import_module("flows.pipeline")  # takes seconds, as the start of the server does
+        _announce("waiting for the Prefect server")
         server.wait()
     from flows.engine.orphans import settle_orphans
 
     settle_orphans()
 
 
-def convert_job(job: ConversionJob, folder: Path) -> tuple[Files, bool]:
+@contextmanager
+def announcing(say: Callable[[str], None]) -> Iterator[None]:
+    """Call `say` with every stage of `connect` while the block runs."""
+    _listeners.append(say)
+    try:
+        yield
+    finally:
+        _listeners.remove(say)
+
+
+def convert_job(
+    job: ConversionJob, folder: Path, run: "Callable[[ConversionJob, Path], FlowResult] | None" = None
+) -> tuple[Files, bool]:
     """Run the flow of a job and publish the package in `folder`, signed if a key is configured.
 
     Cached artifacts that turn out to be missing or damaged are computed again. A run that finds another one writing the
     same folder waits for it, and reuses an equal package.
+
+    Args:
+        job: job to convert.
+        folder: output folder.
+        run: runs the steps and publishes the package; None: the flow, on the connected Prefect server.
 
     Returns:
         Files of the package, and true if every step was cached.
@@ -81,14 +105,15 @@ def convert_job(job: ConversionJob, folder: Path) -> tuple[Files, bool]:
     def waiting() -> None:
         emit(StepEvent(job.item, "output", "remark", text=f"waiting for another run that writes {folder}"))
 
+    run = run or run_flow
     cached = True
     with output_lock(folder, waiting) as waited:
         if not (waited and is_current(folder, job.digest())):
             with running(home.store(), job.item):
                 try:
-                    result = run_flow(job, folder)
+                    result = run(job, folder)
                 except (ArtifactMissing, StepLost):  # the cache entry of the missing artifact was dropped
-                    result = run_flow(job, folder)
+                    result = run(job, folder)
             cached = all(done.cached for done in result.steps)
     return (record_of(folder) or {"files": {}})["files"], cached
 
@@ -161,6 +186,14 @@ def save_pictures(job: ConversionJob, error: Exception) -> list[Path]:
             continue
         saved.append(path)
     return saved
+
+
+_listeners: list[Callable[[str], None]] = []
+
+
+def _announce(stage: str) -> None:
+    for say in tuple(_listeners):
+        say(stage)
 
 
 def _check(api_url: str) -> None:

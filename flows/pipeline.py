@@ -3,38 +3,18 @@
 import time
 from pathlib import Path
 
-from prefect import flow, runtime, unmapped
+from prefect import flow, runtime
 from prefect.transactions import transaction
 
 from flows import home
-from flows.engine import resources
-from flows.engine.frames import count_frames, divide_frames
 from flows.engine.publishing import keep_version, publish
-from flows.engine.step_tasks import Conversion, finished_steps, steps_of_flow
+from flows.engine.step_tasks import finished_steps, steps_of_flow
 from flows.inputs.conversion_job import ConversionJob
-from flows.packages.flow_result import FlowResult, notes_of
+from flows.packages.flow_result import FlowResult
+from flows.stages import conversion_of, convert
 from flows.step_errors import StepBadInput
-from flows.tasks import (
-    DrivingVideo,
-    Gaussians,
-    Mesh,
-    Motion,
-    Subject,
-    check_asset,
-    draw_picture,
-    drive_video,
-    extract_mesh,
-    fit_gaussians,
-    fit_motion,
-    join_meshes,
-    pack_asset,
-    plan_mesh,
-    prepare_subject,
-    prepare_views,
-    refine_texture,
-)
+from flows.tasks import TASKS, drive_video, prepare_subject
 from flows.ui.asset_page import show_asset
-from steps.artifacts.mesh_plan import read_plan
 from steps.contract import ArtifactRef
 
 
@@ -50,10 +30,7 @@ def image_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int 
     Raises:
         StepError: a step did not finish.
     """
-    with steps_of_flow():
-        conversion = conversion_of(job, mesh_parts)
-        subject = prepare_subject(job.source, conversion, job.mask)
-        return animate(subject, job.source, job, conversion, folder)
+    return _convert_in_flow(job, folder, mesh_parts)
 
 
 @flow(name="video_to_4d", flow_run_name="{job.item}", persist_result=False)
@@ -63,14 +40,7 @@ def video_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int 
     Raises:
         StepError: a step did not finish.
     """
-    with steps_of_flow():
-        conversion = conversion_of(job, mesh_parts)
-        subject = prepare_subject(job.source, conversion, job.mask)
-        if subject.footage is None:
-            raise StepBadInput(
-                "prepare_subject", "this is a single picture, not a video: a video has two frames or more"
-            )
-        return animate(subject, job.source, job, conversion, folder)
+    return _convert_in_flow(job, folder, mesh_parts, must_move=True)
 
 
 @flow(name="text_to_4d", flow_run_name="{job.item}", persist_result=False)
@@ -80,11 +50,7 @@ def text_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int =
     Raises:
         StepError: a step did not finish.
     """
-    with steps_of_flow():
-        conversion = conversion_of(job, mesh_parts)
-        picture = draw_picture(job.source, conversion)
-        subject = prepare_subject(picture.picture, conversion)
-        return animate(subject, picture.picture, job, conversion, folder)
+    return _convert_in_flow(job, folder, mesh_parts)
 
 
 @flow(name="motions", flow_run_name="{job.item}", persist_result=False)
@@ -102,47 +68,20 @@ def motions(job: ConversionJob) -> dict[str, ArtifactRef]:
         return drive_video(subject, conversion).outputs
 
 
-def conversion_of(job: ConversionJob, mesh_parts: int = 0) -> Conversion:
-    """Return the parameters that all steps of a job share."""
-    return Conversion(item=job.item, settings=job.settings, seed=job.seed, mesh_parts=mesh_parts)
-
-
-def animate(
-    subject: Subject, source: ArtifactRef, job: ConversionJob, conversion: Conversion, folder: Path | None
-) -> FlowResult:
-    """Turn a subject into a package: driving video, static Gaussians, motion, mesh, texture, files, verdict."""
-    filming = drive_video.submit(subject, conversion)
-    known = prepare_views(job.views, source, subject, conversion) if job.views is not None else None
-    gaussians = fit_gaussians(subject, conversion, job.bank, known)  # in this thread, parallel to the driving video
-    driving_video = filming.result()
-    motion = fit_motion(subject, gaussians, driving_video, conversion, job.bank, known)
-    mesh = mesh_over_time(gaussians, motion, driving_video, conversion)
-    if job.settings.refiner.kind != "identity":
-        mesh = refine_texture(mesh, driving_video, conversion)
-    notes = notes_of(done.result for done in finished_steps())
-    package = pack_asset(subject, driving_video, gaussians, motion, mesh, notes, conversion)
-    verdict = check_asset(package, driving_video, subject, conversion)
-    result = FlowResult(
-        package=package.package,
-        steps=finished_steps(),
-        flow_run=str(runtime.flow_run.id),
-        wall_s=round((time.time_ns() - conversion.begun_ns) / 1e9, 3),
-    )
-    show_asset(job.item, result.steps, result.package, home.store())
-    if folder is not None:
-        with transaction():  # a failed version restores the earlier content of the folder
-            publish(package, verdict, job, result, folder)
-            keep_version(job, result)
-    return result
-
-
-def mesh_over_time(gaussians: Gaussians, motion: Motion, driving_video: DrivingVideo, conversion: Conversion) -> Mesh:
-    """Extract one mesh that follows the motion, or a mesh per frame with the frames divided among the slots."""
-    plan = plan_mesh(gaussians, motion, conversion)
-    if read_plan(home.store().path(plan.plan)).mode == "tracked":
-        return extract_mesh(gaussians, motion, plan, conversion)
-    frames = count_frames(driving_video.frames, home.store())
-    parts = divide_frames(frames, conversion.mesh_parts or resources.cpus())
-    every = map(unmapped, (gaussians, motion, plan, conversion))
-    meshes = extract_mesh.map(*every, parts).result()
-    return meshes[0] if len(meshes) == 1 else join_meshes(meshes, conversion)
+def _convert_in_flow(job: ConversionJob, folder: Path | None, mesh_parts: int, must_move: bool = False) -> FlowResult:
+    """Convert a job in the current flow run, show the asset in the UI, and publish it if there is a folder."""
+    with steps_of_flow():
+        conversion = conversion_of(job, mesh_parts)
+        package, verdict = convert(job, conversion, TASKS, must_move)
+        result = FlowResult(
+            package=package.package,
+            steps=finished_steps(),
+            flow_run=str(runtime.flow_run.id),
+            wall_s=round((time.time_ns() - conversion.begun_ns) / 1e9, 3),
+        )
+        show_asset(job.item, result.steps, result.package, home.store())
+        if folder is not None:
+            with transaction():  # a failed version restores the earlier content of the folder
+                publish(package, verdict, job, result, folder)
+                keep_version(job, result)
+        return result

@@ -1,178 +1,37 @@
-"""Tasks of the pipeline, one per step: typed, cached by the digest of their request, retried where that may help.
+"""Tasks of the pipeline, one per step: typed, cached by the digest of their request, retried where that may help."""
 
-The arguments of a task are the arguments of its step: `**locals()` passes all of them on by name.
-"""
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar, cast
 
-from prefect import task
+from flows import step_calls
+from flows.engine.step_tasks import finished_steps, step_task
+from flows.stages import StepTask, Tasks
+from flows.step_calls import DrivingVideo, Gaussians, Mesh, Motion, Package, Picture, Plan, Scores, Subject, Verdict
+from steps.contract import StepResult
 
-from flows.engine.step_tasks import CACHED, CPU, GPU, Conversion, Part, run_step
-from steps.contract import ArtifactRef, StepResult
-from steps.profiles import ScoreAssetSettings
+__all__ = ["DrivingVideo", "Gaussians", "Mesh", "Motion", "Package", "Picture", "Plan", "Scores", "Subject", "Verdict"]
+# records of earlier versions name the classes here
 
+P = ParamSpec("P")
+R = TypeVar("R", bound=StepResult)
 
-class Picture(StepResult):
-    """Picture that a model drew from words."""
-
-    @property
-    def picture(self) -> ArtifactRef:
-        """PNG."""
-        return self.outputs["picture"]
-
-
-class Subject(StepResult):
-    """Cut-out of the subject, and its footage where the source is a video."""
-
-    @property
-    def footage(self) -> ArtifactRef | None:
-        """Frames of the video, cut out."""
-        return self.outputs.get("footage")
-
-
-class KnownViews(StepResult):
-    """Pictures of other sides, with their cameras."""
+draw_picture = step_task(step_calls.draw_picture)
+prepare_subject = step_task(step_calls.prepare_subject)
+prepare_views = step_task(step_calls.prepare_views)
+drive_video = step_task(step_calls.drive_video)
+fit_gaussians = step_task(step_calls.fit_gaussians)
+fit_motion = step_task(step_calls.fit_motion)
+plan_mesh = step_task(step_calls.plan_mesh)
+extract_mesh = step_task(step_calls.extract_mesh)
+join_meshes = step_task(step_calls.join_meshes)
+refine_texture = step_task(step_calls.refine_texture)
+pack_asset = step_task(step_calls.pack_asset)
+check_asset = step_task(step_calls.check_asset)
+score_asset = step_task(step_calls.score_asset)
 
 
-class DrivingVideo(StepResult):
-    """Driving video; with contact sheet, ranking and films if it was selected among candidates."""
-
-    @property
-    def frames(self) -> ArtifactRef:
-        """Frames with alpha, and their rate."""
-        return self.outputs["driving_video"]
+def _task_of(call: Callable[P, R]) -> StepTask[P, R]:
+    return cast("StepTask[P, R]", globals()[call.__name__])
 
 
-class Gaussians(StepResult):
-    """Static 3D Gaussians."""
-
-
-class Motion(StepResult):
-    """Deformation over time; with the Gaussians if they were fine-tuned together with it."""
-
-
-class Plan(StepResult):
-    """Mesh mode for the motion, and the density threshold of the surface."""
-
-    @property
-    def plan(self) -> ArtifactRef:
-        """JSON of `steps.artifacts.mesh_plan`."""
-        return self.outputs["plan"]
-
-
-class Mesh(StepResult):
-    """Either one tracked mesh or a mesh per frame."""
-
-
-class Package(StepResult):
-    """Packaged 4D asset."""
-
-    @property
-    def package(self) -> ArtifactRef:
-        """Zip of all files."""
-        return self.outputs["package"]
-
-
-class Verdict(StepResult):
-    """Verdict of the quality gates."""
-
-
-class Scores(StepResult):
-    """Metrics of an asset against the ground truth."""
-
-
-@task(**CACHED, tags=[GPU])
-def draw_picture(text: ArtifactRef, conversion: Conversion) -> Picture:
-    """Draw a picture from words."""
-    return run_step("draw_picture", Picture, **locals())
-
-
-@task(**CACHED, tags=[CPU])
-def prepare_subject(source: ArtifactRef, conversion: Conversion, mask: ArtifactRef | None = None) -> Subject:
-    """Read a picture or video, cut the subject out, by the user's mask if there is one, and center it."""
-    return run_step("prepare_subject", Subject, **locals())
-
-
-@task(**CACHED, tags=[CPU])
-def prepare_views(views: ArtifactRef, source: ArtifactRef, subject: Subject, conversion: Conversion) -> KnownViews:
-    """Cut out pictures of other sides, bring them to the scale of the input and compare them with it."""
-    return run_step("prepare_views", KnownViews, **locals())
-
-
-@task(**CACHED, tags=[GPU])
-def drive_video(subject: Subject, conversion: Conversion) -> DrivingVideo:
-    """Take the footage of the subject, or generate a video of it in motion."""
-    return run_step("drive_video", DrivingVideo, **locals())
-
-
-@task(**CACHED, tags=[GPU])
-def fit_gaussians(
-    subject: Subject, conversion: Conversion, bank: ArtifactRef | None = None, known_views: KnownViews | None = None
-) -> Gaussians:
-    """Fit static 3D Gaussians to the picture (DreamGaussianHD)."""
-    return run_step("fit_gaussians", Gaussians, **locals())
-
-
-@task(**CACHED, tags=[GPU])
-def fit_motion(
-    subject: Subject,
-    gaussians: Gaussians,
-    driving_video: DrivingVideo,
-    conversion: Conversion,
-    bank: ArtifactRef | None = None,
-    known_views: KnownViews | None = None,
-) -> Motion:
-    """Fit a HexPlane deformation to the driving video (paper, "Gaussian Deformation for Dynamic Generation")."""
-    return run_step("fit_motion", Motion, **locals())
-
-
-@task(**CACHED, tags=[CPU])
-def plan_mesh(gaussians: Gaussians, motion: Motion, conversion: Conversion) -> Plan:
-    """Decide whether one mesh can follow the motion or every frame needs its own."""
-    return run_step("plan_mesh", Plan, **locals())
-
-
-@task(**CACHED, tags=[CPU])
-def extract_mesh(
-    gaussians: Gaussians, motion: Motion, plan: Plan, conversion: Conversion, part: Part | None = None
-) -> Mesh:
-    """Extract one mesh that follows the motion, or a mesh per frame of a part of the frames."""
-    return run_step("extract_mesh", Mesh, **locals())
-
-
-@task(**CACHED, tags=[CPU])
-def join_meshes(parts: list[Mesh], conversion: Conversion) -> Mesh:
-    """Join the meshes of all parts."""
-    return run_step("join_meshes", Mesh, **locals())
-
-
-@task(**CACHED, tags=[GPU])
-def refine_texture(mesh: Mesh, driving_video: DrivingVideo, conversion: Conversion) -> Mesh:
-    """Refine the textures with a video-to-video diffusion model."""
-    return run_step("refine_texture", Mesh, **locals())
-
-
-@task(**CACHED, tags=[CPU])
-def pack_asset(
-    subject: Subject,
-    driving_video: DrivingVideo,
-    gaussians: Gaussians,
-    motion: Motion,
-    mesh: Mesh,
-    notes: tuple[str, ...],
-    conversion: Conversion,
-) -> Package:
-    """Write every delivery format into one package."""
-    return run_step("pack_asset", Package, **locals())
-
-
-@task(**CACHED, tags=[CPU])
-def check_asset(package: Package, driving_video: DrivingVideo, subject: Subject, conversion: Conversion) -> Verdict:
-    """Compare the package with the driving video and judge it by the quality gates."""
-    return run_step("check_asset", Verdict, **locals())
-
-
-@task(**CACHED, tags=[GPU])
-def score_asset(
-    truth: ArtifactRef, settings: ScoreAssetSettings, conversion: Conversion, package: ArtifactRef | None = None
-) -> Scores:
-    """Score an asset, or the naive baselines, against the ground truth."""
-    return run_step("score_asset", Scores, **locals())
+TASKS = Tasks(_task_of, finished_steps)

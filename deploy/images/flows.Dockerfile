@@ -3,7 +3,7 @@
 ARG STEPS=dg4d/cpu
 FROM ${STEPS}
 USER 0
-# the code of all three packages, in the place of that of two
+# the code of all four packages, in the place of that of two
 ENV PYTHONPATH="" DG4D_HOME=/home/dg4d/data PREFECT_HOME=/home/dg4d/data/prefect
 WORKDIR /src
 COPY deploy/install.sh deploy/
@@ -12,6 +12,7 @@ COPY pyproject.toml README.md LICENSE ./
 COPY dg4d_lib dg4d_lib
 COPY steps steps
 COPY flows flows
+COPY dg4d dg4d
 COPY deploy/pools.yaml deploy/prefect.yaml deploy/
 # these folders belong to whoever runs here; a new volume that takes the place of one belongs to them too
 RUN --mount=type=secret,id=pip,target=/etc/pip.conf \

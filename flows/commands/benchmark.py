@@ -57,7 +57,7 @@ def score(
         console: for progress.
         mesh: score the textured mesh instead of the splats.
         changes: "score.NAME=VALUE", settings of `ScoreSettings`.
-        out: JSON file for the results.
+        out: file for the results, Markdown if it ends in .md, else JSON.
         actionbench: compare the meshes by ActionBench's metrics, too.
 
     Raises:
@@ -95,7 +95,8 @@ def score(
         raise (StepMissing if one.kind in MISSING else StepError)("score_asset", one.error)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(out, _json(judged.results))
+        as_text = scores.markdown if out.suffix.lower() == ".md" else _json
+        write_atomically(out, as_text(judged.results))
     return judged.results
 
 

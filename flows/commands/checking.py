@@ -9,7 +9,10 @@ from flows.commands.endings import exit_on_error
 from flows.commands.options import AsJson, Changes, Package, Profile, Seed
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from flows.commands.rebuild import RebuildReport
+    from flows.packages.scores import Results
     from flows.packages.verify import Verification
 
 
@@ -24,18 +27,17 @@ def score(
         list[str] | None, typer.Option("--set", metavar="score.NAME=VALUE", help="change a setting; may be repeated")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="FILE", help="also write the results as JSON")
+        Path | None,
+        typer.Option("-o", "--out", metavar="FILE", help="also write the results, as Markdown (.md) or as JSON"),
     ] = None,
 ) -> None:
     """Score an asset and two trivial baselines against ground truth."""
     with exit_on_error():
         from flows.commands import terminal
         from flows.commands.benchmark import score as score_asset
-        from flows.packages.scores import markdown
 
         console = terminal.console()
-        results = score_asset(package, truth, console, mesh, changes, out, actionbench)
-        console.print(markdown(results), markup=False)
+        _print_scores(score_asset(package, truth, console, mesh, changes, out, actionbench), console)
 
 
 def bench(
@@ -56,12 +58,11 @@ def bench(
     with exit_on_error():
         from flows.commands import terminal
         from flows.commands.benchmark import bench as run_benchmark
-        from flows.packages.scores import markdown
 
         console = terminal.console()
         results = run_benchmark(dataset, out, console, profile, changes, seed, mesh, bank, limit, workers)
         if len(results.failed) < len(results.objects):
-            console.print(markdown(results), markup=False)
+            _print_scores(results, console)
         for one in results.failed:
             console.print(f"failed: {one.object}: {one.error}", markup=False, style="red")
         console.print(f"overview: {out / 'index.html'}", markup=False)
@@ -116,6 +117,16 @@ def rebuild(
             return rebuild_package(package, record, job, out)
 
         _print_result(terminal.run_with_progress(job, console, work), as_json)
+
+
+def _print_scores(results: "Results", console: "Console") -> None:
+    """Print scores as tables, and below them what is missing."""
+    from flows.commands import terminal
+    from flows.packages.scores import remarks, titled_tables
+
+    terminal.print_tables(console, titled_tables(results))
+    for line in remarks(results):
+        console.print(line, markup=False)
 
 
 def _print_result(found: "Verification | RebuildReport", as_json: bool) -> None:

@@ -12,6 +12,10 @@ from flows.commands.endings import exit_on_error
 from flows.commands.options import finite
 
 POLL_S = 1.0  # between two scans of a watched folder
+RESULTS_EVERY_S = 5.0  # between two looks for finished packages
+FORM = "then choose Deployments, Picture to 4D, Run"
+OPEN_OWN = f"open this address first: it signs the browser in to the Prefect UI; {FORM}"
+OPEN_OTHER = f"open this address, the Prefect UI of $PREFECT_API_URL; {FORM}"
 
 
 def up(
@@ -66,6 +70,7 @@ def up(
         connect()
         from flows.serving.registering import register
 
+        typer.echo("deployments, forms that run from the Prefect UI:", err=True)
         for name in register(known, chosen):
             typer.echo(name)
         api_url = os.environ["PREFECT_API_URL"]
@@ -73,8 +78,11 @@ def up(
         for worker in own:
             worker.start(api_url, {**variables, **limits[worker.pool]})
             typer.echo(f"{worker.pool} reads below {worker.sources}", err=True)
-        address = api_url.removesuffix("/api")
-        typer.echo(server.login_address(address) if server.is_at(api_url) else address)
+        address, is_own = api_url.removesuffix("/api"), server.is_at(api_url)
+        typer.echo(OPEN_OWN if is_own else OPEN_OTHER, err=True)
+        typer.echo(server.login_address(address) if is_own else address)
+        if is_own:
+            typer.echo('other programs: eval "$(dg4d env)"; server and workers run until `dg4d down`', err=True)
 
 
 def down() -> None:
@@ -134,16 +142,23 @@ def watch(
 
         check_writable(out)
         connect()
+        from flows.serving.results import Results
         from flows.serving.roots import granted
         from flows.serving.watching import Watcher, announce
 
         name = digest_of([str(folder.resolve()), str(out.resolve())]).removeprefix("sha256:")[:16]
         watcher = Watcher(folder, out, rest_s, background.background_server().folder / f"watched-{name}")
-        typer.echo(f"watching {watcher.folder}")
+        typer.echo(f"watching {watcher.folder}; packages go to {watcher.out}; stop with Ctrl-C")
+        results = Results(watcher.out)
         with granted(watcher.folder, watcher.out):
+            looked = 0.0
             while True:
+                if time.monotonic() - looked >= RESULTS_EVERY_S:
+                    for line in results.look():
+                        typer.echo(line)
+                    looked = time.monotonic()
                 if (digest := watcher.look(time.monotonic())) is not None:
                     announce(watcher.folder, watcher.out, digest)
                     watcher.told(digest)
-                    typer.echo(f"sent to the server: {digest}")
+                    typer.echo(f"files came to rest; sent to the server: {digest}")
                 time.sleep(POLL_S)

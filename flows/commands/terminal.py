@@ -1,13 +1,15 @@
 """Progress of runs: live on a terminal, as lines in a log file."""
 
+import shlex
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.live import Live
 from rich.markup import escape
@@ -15,10 +17,12 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 from rich.table import Table
 
 from flows.engine.events import StepEvent, listening
+from flows.engine.schedule import format_left
 from flows.formatting.escaping import visible
 from flows.formatting.numbers import format_number, format_size
 
 if TYPE_CHECKING:
+    from flows.engine.schedule import Schedule
     from flows.inputs.conversion_job import ConversionJob
     from flows.packages.summary import Row
 
@@ -44,17 +48,30 @@ class _Terminal(Console):
         super().print(*(visible(one) if isinstance(one, str) else one for one in objects), **options)
 
 
-def run_with_progress(job: "ConversionJob", out: Console, work: Callable[[], Result]) -> Result:
-    """Return the result of `work`, which runs the flow of a job, and show its steps."""
-    from flows.convert import connect, prepare, save_pictures
+def run_with_progress(
+    job: "ConversionJob", out: Console, work: Callable[[], Result], steps: Sequence[str] = ()
+) -> Result:
+    """Return the result of `work`, which runs the flow of a job, and show its steps.
+
+    Args:
+        job: job of the flow.
+        out: console.
+        work: runs the flow.
+        steps: names of the steps that it runs; default: those of a whole conversion, whose durations are remembered.
+    """
+    from flows.convert import save_pictures
+    from flows.engine.schedule import Schedule, keep_durations, load_durations
+    from flows.stages import planned_steps
     from flows.step_errors import StepBadInput
 
-    with out.status("starting") if out.is_terminal else nullcontext():
-        prepare(job)
-        connect()
+    _connect(job, out)
+    schedule = Schedule(steps or planned_steps(job), load_durations(job.profile))
     try:
-        with steps_shown(out):
-            return work()
+        with steps_shown(out, schedule):
+            result = work()
+        if not steps:
+            keep_durations(job.profile, schedule.durations())
+        return result
     except StepBadInput as error:  # a step knows no file names
         raise StepBadInput(error.step, f"{job.source_name}: {error.message}", error.pictures) from error
     except Exception as error:
@@ -63,22 +80,43 @@ def run_with_progress(job: "ConversionJob", out: Console, work: Callable[[], Res
         raise
 
 
+def _connect(job: "ConversionJob", out: Console) -> None:
+    """Connect to the server, and show the stages of its start."""
+    from flows.convert import STARTING, announcing, connect, prepare
+
+    def print_start(stage: str) -> None:
+        if stage.startswith(STARTING):
+            out.print(stage, markup=False)
+
+    status = out.status("starting the processes of the steps") if out.is_terminal else None
+    with status or nullcontext(), announcing(status.update if status else print_start):
+        prepare(job)
+        connect()
+
+
 @contextmanager
-def steps_shown(out: Console) -> Iterator[None]:
-    """Show the steps that run in the block: bars on a terminal, lines elsewhere."""
+def steps_shown(out: Console, schedule: "Schedule | None" = None) -> Iterator[None]:
+    """Show the steps that run in the block: bars on a terminal, lines elsewhere.
+
+    Args:
+        out: console.
+        schedule: of the conversion, for the number of the step and the time left; None: unknown.
+    """
+    noting = listening(schedule.note) if schedule is not None else nullcontext()
     if out.is_terminal:
-        bars = StepBars(out)
-        with bars.progress, listening(bars), listening(Remarks(out)):
+        bars = StepBars(out, schedule)
+        with bars.progress, noting, listening(bars), listening(Remarks(out)):
             yield
     else:
-        with listening(StepLines(out)):
+        with noting, listening(StepLines(out, schedule=schedule)):
             yield
 
 
 class StepBars:
     """Progress bar per step, with values and time."""
 
-    def __init__(self, out: Console) -> None:
+    def __init__(self, out: Console, schedule: "Schedule | None" = None) -> None:
+        self._schedule = schedule
         self.progress = Progress(
             SpinnerColumn(finished_text="[green]✓"),
             TextColumn("{task.description:<22}"),
@@ -89,9 +127,15 @@ class StepBars:
         )
         self._bars: dict[str, TaskID] = {}
         self._values = None if out.width >= WIDE else 1  # a narrow terminal has room for the loss only
+        self._whole = self.progress.add_task("starting", total=len(schedule.steps), numbers="") if schedule else None
 
     def __call__(self, event: StepEvent) -> None:
         """Show an event."""
+        if self._whole is not None and self._schedule is not None:
+            if event.kind == "started" and (place := self._schedule.position(event.step)):
+                self.progress.update(self._whole, description=place)
+            left = format_left(self._schedule.seconds_left())
+            self.progress.update(self._whole, completed=self._schedule.finished, numbers=left)
         if event.step not in self._bars:
             self._bars[event.step] = self.progress.add_task(plain(event.step), total=None, numbers="")
         bar = self._bars[event.step]
@@ -126,8 +170,8 @@ class Remarks:
 class StepLines:
     """Line when a step starts, every few seconds, and when it ends."""
 
-    def __init__(self, out: Console, with_item: bool = False) -> None:
-        self._out, self._with_item = out, with_item
+    def __init__(self, out: Console, with_item: bool = False, schedule: "Schedule | None" = None) -> None:
+        self._out, self._with_item, self._schedule = out, with_item, schedule
         self._last: dict[tuple[str, str], float] = {}
         self._lock = threading.Lock()
 
@@ -141,9 +185,9 @@ class StepLines:
             self._last[key] = now
             match event.kind:
                 case "started":
-                    what = "started"
+                    what = ", ".join(["started", *self._position(event, with_number=True)])
                 case "progress":
-                    what = numbers(event)
+                    what = ", ".join([numbers(event), *self._position(event)])
                 case "note" | "remark":
                     what = event.text
                 case "finished":
@@ -152,6 +196,13 @@ class StepLines:
                     what = f"failed after {event.seconds:.1f} s"
             name = f"{event.item}: {event.step}" if self._with_item else event.step
             self._out.print(f"{name}: {what}", markup=False)
+
+    def _position(self, event: StepEvent, with_number: bool = False) -> list[str]:
+        """Return the number of the step and the time left, as far as they are known."""
+        if self._schedule is None:
+            return []
+        number = self._schedule.position(event.step) if with_number else ""
+        return list(filter(None, [number, format_left(self._schedule.seconds_left())]))
 
 
 def _took(event: StepEvent) -> str:
@@ -249,6 +300,26 @@ def print_package(out: Console, folder: Path, sizes: dict[str, int]) -> None:
         files = f" ({count} file{'s' * (count != 1)})" if group.endswith("/") else ""
         table.add_row(plain(group) + files, format_size(total))
     out.print(table)
+
+
+def print_next(out: Console, folder: Path) -> None:
+    """Print the report of a package and the two ways to see the asset."""
+    if (folder / "report.html").is_file():
+        out.print(f"report: {folder / 'report.html'}", markup=False)
+    if (folder / "viewer.html").is_file():
+        command = shlex.join(["dg4d", "view", str(folder)])
+        out.print(f"viewer: {folder / 'viewer.html'}, opened in a browser by `{command}`", markup=False)
+
+
+def print_tables(out: Console, tables: Iterable[tuple[str, Sequence[Mapping[str, str]]]]) -> None:
+    """Print titled tables whose rows map headings to cells; the first column is text, the others are numbers."""
+    for title, rows in tables:
+        table = Table(title=plain(title), title_justify="left", title_style="bold", box=SIMPLE_HEAD)
+        for number, heading in enumerate(rows[0] if rows else ()):
+            table.add_column(plain(heading), justify="right" if number else "left", overflow="fold")
+        for row in rows:
+            table.add_row(*map(plain, row.values()))
+        out.print(table)
 
 
 def print_rows(out: Console, rows: Iterable[tuple[str, str, str]]) -> None:

@@ -3,7 +3,7 @@
 import math
 import zipfile
 
-from flows.engine.step_tasks import Part
+from flows.engine.requests import Part
 from steps.contract import ArtifactRef
 from steps.store.artifact_store import ArtifactStore
 

@@ -1,15 +1,16 @@
-"""Execution of a pipeline step inside a Prefect task: request, cache key, retries, progress and artifacts."""
+"""Prefect tasks of pipeline steps: cache key, retries, progress and artifacts in the UI."""
 
+import functools
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 from uuid import UUID
 
 import httpx
-from prefect import runtime
+from prefect import runtime, task
 from prefect.artifacts import create_progress_artifact, update_progress_artifact
 from prefect.client.schemas.objects import State, TaskRun
 from prefect.context import FlowRunContext
@@ -19,155 +20,40 @@ from prefect.logging import get_run_logger
 from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 from prefect.tasks import Task, exponential_backoff
 from prefect.transactions import IsolationLevel
-from pydantic import Field
 
-from dg4d_lib.settings import Settings
 from flows import home
-from flows.engine import resources
-from flows.engine.caching import FileLocks, RequestPolicy
+from flows.engine.caching import RequestPolicy
 from flows.engine.events import StepEvent, emit
-from flows.engine.executors import configured_executor, stop_all
-from flows.engine.leases import hold
+from flows.engine.executors import stop_all
+from flows.engine.file_locks import FileLocks
 from flows.engine.orphans import claim_run
-from flows.engine.remarks import remark
+from flows.engine.requests import in_order, label_of, request_for
+from flows.engine.running import RETRIES, RETRY_DELAY_S, finish_step, may_succeed, observed_by
 from flows.formatting.escaping import markdown
 from flows.formatting.numbers import format_number
 from flows.packages.flow_result import StepRun
-from flows.step_errors import StepCrashed, StepError, StepOutOfMemory, StepUnreachable
+from flows.step_errors import StepError
 from flows.ui import pages
 from flows.ui.showing import create_page, revive
-from steps.contract import LARGEST_SEED, ArtifactRef, Frozen, StepRequest, StepResult
-from steps.profiles import PipelineSettings, step_settings
-from steps.runtime.installed_code import catalog, request_version
-from steps.runtime.weights import identities, weights_in
-from steps.store.artifact_store import StoreUnreachable
+from steps.catalog import STEPS
+from steps.contract import StepResult
 
 PROGRESS_EVERY_S = 3.0  # between two updates of a progress artifact
-RETRIES = 2
-RETRY_DELAY_S = 2.0  # doubled with each retry
 CPU, GPU = "resource:cpu", "resource:gpu"  # tags; Prefect keeps a thread and a client for every set of tags
 
-Result = TypeVar("Result", bound=StepResult)
+P = ParamSpec("P")
+R = TypeVar("R", bound=StepResult)
 
 
-class Conversion(Frozen):
-    """Values that all steps of one conversion share.
+def step_task(call: Callable[P, R]) -> Task[P, R]:
+    """Return the task of a step: cached by its request, retried, tagged with its resource, shown in the UI."""
 
-    Attributes:
-        item: name of the asset.
-        settings: settings of the whole pipeline; a step reads its sections.
-        seed: seed of every step.
-        begun_ns: start of the conversion, nanoseconds since the epoch; earlier conversions go first on a machine.
-        mesh_parts: number of tasks that extract a mesh per frame; 0: one per slot of this machine.
-    """
+    @functools.wraps(call)
+    def run(*args: P.args, **kwargs: P.kwargs) -> R:
+        with observed_by(_Shown()):
+            return call(*args, **kwargs)
 
-    item: str
-    settings: PipelineSettings
-    seed: int = Field(0, ge=0, le=LARGEST_SEED)
-    begun_ns: int = Field(default_factory=time.time_ns)
-    mesh_parts: int = 0
-
-
-class Part(Frozen):
-    """Frames that one task of a divided step works on: from `first_frame` up to, not including, `end_frame`."""
-
-    number: int
-    of: int
-    first_frame: int
-    end_frame: int
-
-    def __str__(self) -> str:
-        return f"{self.number}/{self.of}"
-
-
-def request_for(step: str, arguments: Mapping[str, Any]) -> StepRequest:
-    """Return the request of a step, made from the arguments of its task.
-
-    Artifacts go to the input ports of their name: an `ArtifactRef` by the name of the argument, the outputs of an
-    earlier step by their own names; the results in a list go to a port that takes many, numbered. A `Part` and
-    every other value become settings of the step, unless its whole settings are among the arguments.
-    """
-    spec = catalog()[step]
-    inputs: dict[str, ArtifactRef] = {}
-    values: dict[str, Any] = {}
-    settings: Settings | None = None
-    conversion: Conversion = arguments["conversion"]
-    for name, value in arguments.items():
-        match value:
-            case Conversion() | None:
-                pass
-            case ArtifactRef():
-                inputs[name] = value
-            case StepResult():
-                inputs |= {port: ref for port, ref in value.outputs.items() if spec.input_port(port)}
-            case [StepResult(), *_]:
-                inputs |= {
-                    f"{port}_{number:03d}": ref
-                    for number, result in enumerate(value)
-                    for port, ref in result.outputs.items()
-                    if port in spec.inputs
-                }
-            case Settings():
-                settings = value
-            case Part():
-                values |= {"first_frame": value.first_frame, "end_frame": value.end_frame}
-            case _:
-                values[name] = value
-    settings = settings or step_settings(step, conversion.settings, **values)
-    tree = settings.model_dump(mode="json")
-    return StepRequest(
-        step=step,
-        version=request_version(spec),
-        inputs=inputs,
-        settings=tree,
-        seed=conversion.seed,
-        weights=identities(weights_in(tree)),
-    )
-
-
-def run_step(step: str, result_type: type[Result], **arguments: Any) -> Result:
-    """Run a step in the current task run, and show its progress and its outputs in the Prefect UI.
-
-    Args:
-        step: name in the catalog, and of the task.
-        result_type: class of the result.
-        arguments: arguments of the task by name; see `request_for`.
-
-    Raises:
-        StepError: the step did not finish.
-    """
-    request, conversion = request_for(step, arguments), arguments["conversion"]
-    item, label = conversion.item, label_of(step, arguments)
-    key = pages.key(label, item)
-    progress = _Progress(f"progress-{key}", f"{label} of {markdown(item)}")
-    emit(StepEvent(item, label, "started"))
-
-    def on_progress(done: int, total: int, values: dict[str, float]) -> None:
-        emit(StepEvent(item, label, "progress", done=done, total=total, values=values))
-        progress.update(done, total, values)
-
-    def say(text: str) -> None:
-        emit(StepEvent(item, label, "note", text=text))
-
-    try:
-        turn = resources.Turn(conversion.begun_ns, f"{label} of {item}")
-        with resources.slot(resources.resource_of(request), say, turn) as waited_s:
-            _waited[runtime.task_run.id] = waited_s
-            result = configured_executor()(catalog()[step], request, on_progress, say)
-    except StepError as error:
-        create_page(key, pages.failure_page(label, item, error, home.store()), markdown(f"{label} of {item} failed"))
-        raise
-    progress.update(1, 1, {})
-    for note in (*result.provenance.notes, *result.provenance.run_notes):
-        get_run_logger().info(note)
-    create_page(key, pages.step_page(label, item, result, home.store()), markdown(f"{label} of {item}"))
-    return result_type.model_validate(result.model_dump())
-
-
-def label_of(step: str, arguments: Mapping[str, Any]) -> str:
-    """Return the name of a step, with the part of its frames where they were divided: `extract_mesh 1/3`."""
-    part = arguments.get("part")
-    return f"{step} {part}" if part else step
+    return task(**CACHED, tags=[CPU if STEPS[call.__name__].resource == "cpu" else GPU])(run)
 
 
 def task_run_name() -> str:
@@ -177,16 +63,8 @@ def task_run_name() -> str:
 
 
 def should_retry(_task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
-    """Return true if a failed task run may succeed now: memory or the store may be available, a crash gets one retry.
-
-    A run that the user stopped is not retried.
-    """
-    error = state.result(raise_on_failure=False)
-    if resources.stopping.is_set():
-        return False
-    if isinstance(error, StepOutOfMemory | StepUnreachable | StoreUnreachable):
-        return True
-    return isinstance(error, StepCrashed | OSError) and run.run_count <= 1
+    """Return true if a failed task run may succeed now; see `may_succeed`."""
+    return may_succeed(state.result(raise_on_failure=False), run.run_count)
 
 
 def note_end(task: Task[..., Any], run: TaskRun, state: State[Any]) -> None:
@@ -199,25 +77,12 @@ def note_end(task: Task[..., Any], run: TaskRun, state: State[Any]) -> None:
         return
     result = state.result(raise_on_failure=False)
     assert isinstance(result, StepResult) and run.flow_run_id  # tasks of steps return one, and run in flows
-    cached = state.name == "Cached"
-    if cached:
-        hold(home.store(), item, (ref.digest for ref in result.outputs.values()))
-    _finished[run.flow_run_id].append(
-        StepRun(label=label, cached=cached, wall_s=round(seconds, 3), waited_s=round(waited_s, 3), result=result)
-    )
-    remark(item, label, result)
-    emit(StepEvent(item, label, "finished", seconds=seconds, waited_s=waited_s, cached=cached))
+    _finished[run.flow_run_id].append(finish_step(item, label, result, state.name == "Cached", seconds, waited_s))
 
 
 def finished_steps() -> list[StepRun]:
     """Return the step runs of the current flow run so far, in the order of the catalog, parts by their numbers."""
-    order = {name: position for position, name in enumerate(catalog())}
-
-    def position(done: StepRun) -> tuple[int, int]:
-        step, _, part = done.label.partition(" ")
-        return order[step], int(part.partition("/")[0] or 0)
-
-    return sorted(_finished[UUID(runtime.flow_run.id)], key=position)
+    return in_order(_finished[UUID(runtime.flow_run.id)])
 
 
 @contextmanager
@@ -271,6 +136,32 @@ CACHED: dict[str, Any] = {
     "on_completion": [note_end],
     "on_failure": [note_end],
 }  # options of every task that runs a step
+
+
+class _Shown:
+    """Pages and progress of a step in the Prefect UI."""
+
+    def __init__(self) -> None:
+        self._progress: _Progress | None = None
+
+    def on_slot(self, waited_s: float) -> None:
+        _waited[runtime.task_run.id] = waited_s
+
+    def on_progress(self, label: str, item: str, done: int, total: int, values: dict[str, float]) -> None:
+        if self._progress is None:
+            self._progress = _Progress(f"progress-{pages.key(label, item)}", f"{label} of {markdown(item)}")
+        self._progress.update(done, total, values)
+
+    def on_failure(self, label: str, item: str, error: StepError) -> None:
+        page = pages.failure_page(label, item, error, home.store())
+        create_page(pages.key(label, item), page, markdown(f"{label} of {item} failed"))
+
+    def on_result(self, label: str, item: str, result: StepResult) -> None:
+        self.on_progress(label, item, 1, 1, {})
+        for note in (*result.provenance.notes, *result.provenance.run_notes):
+            get_run_logger().info(note)
+        page = pages.step_page(label, item, result, home.store())
+        create_page(pages.key(label, item), page, markdown(f"{label} of {item}"))
 
 
 class _Progress:

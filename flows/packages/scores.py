@@ -204,6 +204,30 @@ def markdown(results: Results) -> str:
     return "\n\n".join("\n".join(part) for part in parts) + "\n"
 
 
+def titled_tables(results: Results) -> list[tuple[str, list[dict[str, str]]]]:
+    """Return the tables for a terminal with their titles: means, then every object if there are several."""
+    scored = len(results.objects) - len(results.failed)
+    several = "one object" if scored == 1 else f"means over {scored} objects"
+    paper, more = _present(results, PAPER_METRICS), _present(results, METRICS)
+    named = [(f"{results.title}: {several}, {results.drawn}", _rows(more, _means(results), results))]
+    if paper:
+        named.append(("Metrics of the paper", _rows(paper, _means(results), results)))
+    if scored > 1:
+        every = [
+            (f"{one.object}: {called(method)}", figures_of(judgment) | _time(one, method == results.ours))
+            for one in results.objects
+            for method, judgment in one.rows.items()
+        ]
+        named.append(("Every object", _rows({**paper, **more}, every, results)))
+    return named
+
+
+def remarks(results: Results) -> list[str]:
+    """Return missing metrics with their remedies, and notes on objects, a line each."""
+    missing = [f"{metric} is missing: {why}" for metric, why in results.missing.items()]
+    return [*missing, *(f"{one.object}: {note}" for one in results.objects for note in one.notes)]
+
+
 def scores_page(results: Results, films: Mapping[str, Mapping[str, Mapping[str, str]]]) -> str:
     """Render the tables and, for every object, the ground-truth videos above those of the asset.
 

@@ -84,6 +84,10 @@ class Server:
             arguments = (str(self.folder), str(self.prefect_home))
             spawn_guard("flows.serving.server", arguments, self.log, "ab", os.environ)
 
+    def has_database(self) -> bool:
+        """Return true if the server ran before, so that its next start creates no database."""
+        return (self.prefect_home / database_template.NAME).exists()
+
     def auth_string(self) -> str:
         """Return the secret that the server asks for, NAME:PASSWORD."""
         return auth.auth_string(self.folder)

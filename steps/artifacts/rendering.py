@@ -68,7 +68,7 @@ def render_package(
     if mesh:
         draw = mesh_renderer(read_surface(folder, manifest))
     else:
-        draw = _splat_renderer(read_states(folder, manifest), get_rasterizer(rasterizer))
+        draw = splat_renderer(read_states(folder, manifest), get_rasterizer(rasterizer))
     positions = frame_positions(manifest.frames if frames is None else frames, manifest)
     count = len(positions)
     views = [out / f"view_{azimuth_deg + 0.0:g}" for azimuth_deg in azimuths_deg]
@@ -173,7 +173,9 @@ def _check(azimuths_deg: Sequence[float], elevation_deg: float, size: int, frame
         raise BadInput(f"there must be at least one frame to render; given {frames}")
 
 
-def _splat_renderer(states: States, rasterizer: Rasterizer) -> Renderer:
+def splat_renderer(states: States, rasterizer: Rasterizer) -> Renderer:
+    """Return a function that renders Gaussians at positions in frames, with a camera for each, as RGBA."""
+
     def draw(positions: Float[Tensor, " b"], cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b h w 4"]:
         with torch.no_grad():
             drawn = rasterizer(states(positions), cameras, torch.zeros(3))

@@ -22,7 +22,7 @@ HEAVY = {
     "pymeshlab", "av", "OpenImageIO", "PIL", "safetensors", "jaxtyping", "rich", "pxr",
 }  # fmt: skip
 LIGHT_MODULES = (
-    "dg4d_lib", "dg4d_lib.settings", "dg4d_lib.weights.locate", "dg4d_lib.weights.pull",
+    "dg4d", "dg4d_lib", "dg4d_lib.settings", "dg4d_lib.weights.locate", "dg4d_lib.weights.pull",
     "dg4d_lib.assets.rendering.viewer_page", "steps.contract", "steps.catalog", "steps.profiles", "steps.runtime.job",
     "steps.runtime.weights",
 )  # fmt: skip

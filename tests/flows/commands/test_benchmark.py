@@ -214,4 +214,4 @@ def test_the_exit_status_says_whether_every_object_has_scores(
     assert result.exit_code == status, result.output
     for name, said in words.items():
         assert (f"failed: {name}: " in result.output) == ("=" in said)
-    assert ("| preview |" in result.output) == ("well" in words.values())
+    assert ("PSNR, dB" in result.output) == ("well" in words.values())

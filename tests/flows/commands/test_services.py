@@ -43,6 +43,10 @@ def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop
         "catalog-to-4d/Catalog to 4D", "item-to-4d/Item to 4D",
     ]  # fmt: skip
     assert address == os.environ["PREFECT_API_URL"].removesuffix("/api")
+    explained = said.stderr.splitlines()
+    assert explained[0].startswith("deployments, forms") and explained[-1].startswith(
+        "open this address, the Prefect UI"
+    )
     try:
         wait_until(lambda: [worker.pool for worker in running(folder)] == ["process-cpu"])
         log = folder / "worker-process-cpu.log"

@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 from records import result_with, write_record
 
-from flows.engine.caching import FileLocks, RequestPolicy, recorded
-from flows.engine.records import record_key
+from flows.engine.caching import RequestPolicy
+from flows.engine.file_locks import FileLocks
+from flows.engine.records import record_key, recorded
 from steps.contract import ArtifactRef, StepRequest, StepResult
 from steps.store.artifact_store import ArtifactStore
 
@@ -137,7 +138,7 @@ def test_threads_take_turns(tmp_path: Path) -> None:
 
 def test_a_killed_holder_leaves_no_lock(tmp_path: Path) -> None:
     program = (
-        "import sys, time; from pathlib import Path; from flows.engine.caching import FileLocks\n"
+        "import sys, time; from pathlib import Path; from flows.engine.file_locks import FileLocks\n"
         "locks = FileLocks(lambda: Path(sys.argv[1])); locks.acquire_lock('k', 'a')\n"
         "print('held', flush=True); time.sleep(60)"
     )

@@ -1,0 +1,105 @@
+"""Conversion of one picture or a few; behind `dg4d make`."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dg4d_lib.errors import BadInput, DG4DError
+from flows import home
+from flows.commands import terminal
+from flows.convert import convert_job
+from flows.exit_status import EXIT_BAD_INPUT, EXIT_FAILED
+from flows.inputs.conversion_job import ConversionRequest, name_from_text
+from flows.inputs.naming import clean_name, unique_names
+from flows.inputs.package_record import record_of
+from flows.packages.acceptance import failing_gates
+from flows.packages.publish import check_folder, is_current
+from flows.step_errors import StepBadInput, StepError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+@dataclass(frozen=True)
+class Wish:
+    """Arguments of `dg4d make` that concern the sources and the output.
+
+    Attributes:
+        pictures: pictures or videos.
+        text: prompt instead of a picture.
+        video: driving video.
+        mask: mask of the subject.
+        sides: true if there are pictures of other sides.
+        out: output folder; of several pictures the folder above those of the assets.
+        force: replace another asset in the output folder.
+        picked: true if `--pick` chooses a motion.
+        request: returns the checked request of an item with its picture.
+    """
+
+    pictures: tuple[Path, ...]
+    text: str
+    video: Path | None
+    mask: Path | None
+    sides: bool
+    out: Path | None
+    force: bool
+    picked: bool
+    request: Callable[[str, Path | None], ConversionRequest]
+
+
+def make_each(wish: Wish, console: "Console") -> int:
+    """Make an asset of every picture; return the exit status.
+
+    One picture that fails raises its error; of several, the others are made nevertheless.
+
+    Raises:
+        BadInput: arguments cannot be combined, or the only picture cannot be used.
+        StepError: a step of the only picture failed.
+    """
+    if wish.picked and wish.video:
+        raise BadInput("--pick chooses a generated motion and cannot be combined with --video")
+    if len(wish.pictures) < 2:
+        picture = wish.pictures[0] if wish.pictures else None
+        item = (clean_name(picture.stem) or "asset") if picture else name_from_text(wish.text)
+        _make(wish, item, picture, wish.out or Path("out") / item, console)
+        return 0
+    for_one = {"--text": wish.text, "--video": wish.video, "--mask": wish.mask, "--view": wish.sides}
+    if option := next((name for name, value in for_one.items() if value), ""):
+        raise BadInput(f"{option} makes one asset, and {len(wish.pictures)} pictures are given; give one of them")
+    items = unique_names([(clean_name(path.stem) or "asset", path.suffix.lstrip(".")) for path in wish.pictures])
+    failed: dict[str, DG4DError | StepError] = {}
+    for number, (item, picture) in enumerate(zip(items, wish.pictures, strict=True), 1):
+        console.print(f"{number} of {len(items)}: {picture}", markup=False)
+        try:
+            _make(wish, item, picture, (wish.out or Path("out")) / item, console)
+        except (DG4DError, StepError) as error:
+            failed[item] = error
+            console.print(f"failed: {item}: {_message(error)}", markup=False, style="red")
+    console.print(f"{len(items) - len(failed)} of {len(items)} assets are in {wish.out or Path('out')}", markup=False)
+    if not failed:
+        return 0
+    return (
+        EXIT_BAD_INPUT if all(isinstance(error, BadInput | StepBadInput) for error in failed.values()) else EXIT_FAILED
+    )
+
+
+def _make(wish: Wish, item: str, picture: Path | None, folder: Path, console: "Console") -> None:
+    """Make one asset, and print its files and how to see it."""
+    request = wish.request(item, picture)
+    check_folder(folder, item, wish.force)
+    job = request.to_job(home.store())
+    cached = is_current(folder, job.digest())
+    if not cached:
+        _, cached = terminal.run_with_progress(job, console, lambda: convert_job(job, folder))
+    if cached:
+        console.print("nothing to do: every step was already done")
+    written = (record_of(folder) or {"files": {}})["files"]
+    terminal.print_package(console, folder, {name: fact["size_bytes"] for name, fact in written.items()})
+    terminal.print_next(console, folder)
+    if failing := failing_gates(folder):
+        console.print(f"not accepted: {', '.join(failing)}; the report says what to do", markup=False, style="yellow")
+
+
+def _message(error: DG4DError | StepError) -> str:
+    return error.message if isinstance(error, StepError) else str(error)

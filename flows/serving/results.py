@@ -1,0 +1,66 @@
+"""Results in the output folder of a watched folder: lines for packages that appear, and for failures."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from flows.formatting.escaping import visible
+
+RECORD = "provenance.json"  # of a package
+REPORT = "report.json"
+SUMMARY = "summary.json"  # of a batch
+
+
+class Results:
+    """Packages and summaries below an output folder; those that exist at the start are not reported.
+
+    Args:
+        out: output folder; it need not exist yet.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self.out = out
+        self._packages = self._stamps()
+        self._failures = self._failed()
+
+    def look(self) -> list[str]:
+        """Return a line for every new or replaced package, and for every new failure, since the last look."""
+        packages, failures = self._stamps(), self._failed()
+        finished = [name for name, stamp in packages.items() if self._packages.get(name) != stamp]
+        failed = [name for name, message in failures.items() if self._failures.get(name) != message]
+        self._packages, self._failures = packages, failures
+        made = [f"done: {visible(str(self.out / name))}{self._verdict(name)}" for name in sorted(finished)]
+        return [*made, *(visible(f"failed: {name}: {failures[name]}") for name in sorted(failed))]
+
+    def _stamps(self) -> dict[str, int]:
+        """Return the times of the records of all packages by their folder."""
+        found: dict[str, int] = {}
+        for path in self.out.rglob(RECORD):
+            name = path.parent.relative_to(self.out)
+            if not any(part.startswith(".") for part in name.parts):  # scratch folders of a publication
+                try:
+                    found[name.as_posix()] = path.stat().st_mtime_ns
+                except OSError:  # it is being replaced
+                    continue
+        return found
+
+    def _failed(self) -> dict[str, str]:
+        """Return the messages of failed items in the summary."""
+        rows = _read(self.out / SUMMARY).get("items")
+        if not isinstance(rows, list):
+            return {}
+        failed = [row for row in rows if isinstance(row, dict) and row.get("status") == "failed"]
+        return {str(row.get("item")): str(row.get("message", "")) for row in failed}
+
+    def _verdict(self, name: str) -> str:
+        acceptance = _read(self.out / name / REPORT).get("acceptance")
+        failing = acceptance.get("failing") if isinstance(acceptance, dict) else None
+        return f" (not accepted: {', '.join(map(str, failing))})" if isinstance(failing, list) and failing else ""
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}

@@ -1,0 +1,138 @@
+"""Stages of a conversion: order of the steps and their data flow, for tasks of any engine."""
+
+from collections.abc import Callable
+from typing import NamedTuple, ParamSpec, Protocol, TypeVar
+
+from flows import home, step_calls
+from flows.engine import resources
+from flows.engine.frames import count_frames, divide_frames
+from flows.engine.requests import Conversion
+from flows.inputs.conversion_job import ConversionJob
+from flows.packages.flow_result import StepRun, notes_of
+from flows.step_calls import DrivingVideo, Gaussians, Mesh, Motion, Package, Subject, Verdict
+from flows.step_errors import StepBadInput
+from steps.artifacts.mesh_plan import read_plan
+from steps.contract import ArtifactRef, StepResult
+
+P = ParamSpec("P")
+R = TypeVar("R", bound=StepResult)
+R_co = TypeVar("R_co", bound=StepResult, covariant=True)
+
+
+class StepFuture(Protocol[R_co]):
+    """Result of a submitted task."""
+
+    def result(self) -> R_co:
+        """Wait for the task; return its result or raise its error."""
+
+
+class StepTask(Protocol[P, R_co]):
+    """Task of one step."""
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R_co:
+        """Run the task in this thread."""
+
+    def submit(self, *args: P.args, **kwargs: P.kwargs) -> StepFuture[R_co]:
+        """Run the task beside this thread."""
+
+
+class Bind(Protocol):
+    """Function that makes the call of a step a task of an engine."""
+
+    def __call__(self, call: Callable[P, R]) -> StepTask[P, R]:
+        """Return the task."""
+
+
+class Tasks:
+    """Tasks of one engine.
+
+    Args:
+        bind: makes the call of a step a task.
+        finished: returns the step runs of the current conversion so far, in the order of the catalog.
+    """
+
+    def __init__(self, bind: Bind, finished: Callable[[], list[StepRun]]) -> None:
+        self.finished = finished
+        self.draw_picture = bind(step_calls.draw_picture)
+        self.prepare_subject = bind(step_calls.prepare_subject)
+        self.prepare_views = bind(step_calls.prepare_views)
+        self.drive_video = bind(step_calls.drive_video)
+        self.fit_gaussians = bind(step_calls.fit_gaussians)
+        self.fit_motion = bind(step_calls.fit_motion)
+        self.plan_mesh = bind(step_calls.plan_mesh)
+        self.extract_mesh = bind(step_calls.extract_mesh)
+        self.join_meshes = bind(step_calls.join_meshes)
+        self.refine_texture = bind(step_calls.refine_texture)
+        self.pack_asset = bind(step_calls.pack_asset)
+        self.check_asset = bind(step_calls.check_asset)
+
+
+class Converted(NamedTuple):
+    """Package of a conversion and the verdict of the quality gates."""
+
+    package: Package
+    verdict: Verdict
+
+
+def conversion_of(job: ConversionJob, mesh_parts: int = 0) -> Conversion:
+    """Return the parameters that all steps of a job share."""
+    return Conversion(item=job.item, settings=job.settings, seed=job.seed, mesh_parts=mesh_parts)
+
+
+def planned_steps(job: ConversionJob) -> list[str]:
+    """Return the names of the steps that a job certainly runs, in the order in which they usually end."""
+    first = ["draw_picture"] if job.drawn else []
+    refined = ["refine_texture"] if job.settings.refiner.kind != "identity" else []
+    fits = ["drive_video", "fit_gaussians", "fit_motion", "plan_mesh", "extract_mesh"]
+    sides = ["prepare_views"] if job.views is not None else []
+    return [*first, "prepare_subject", *sides, *fits, *refined, "pack_asset", "check_asset"]
+
+
+def convert(job: ConversionJob, conversion: Conversion, tasks: Tasks, must_move: bool = False) -> Converted:
+    """Turn the source of a job into a package.
+
+    Args:
+        job: source and settings.
+        conversion: parameters that all steps share.
+        tasks: tasks of the engine.
+        must_move: refuse a source that is a single picture.
+
+    Raises:
+        StepError: a step did not finish.
+    """
+    source = tasks.draw_picture(job.source, conversion).picture if job.drawn else job.source
+    subject = tasks.prepare_subject(source, conversion, job.mask)
+    if must_move and subject.footage is None:
+        raise StepBadInput("prepare_subject", "this is a single picture, not a video: a video has two frames or more")
+    return animate(subject, source, job, conversion, tasks)
+
+
+def animate(
+    subject: Subject, source: ArtifactRef, job: ConversionJob, conversion: Conversion, tasks: Tasks
+) -> Converted:
+    """Turn a subject into a package: driving video, static Gaussians, motion, mesh, texture, files, verdict."""
+    filming = tasks.drive_video.submit(subject, conversion)
+    known = tasks.prepare_views(job.views, source, subject, conversion) if job.views is not None else None
+    gaussians = tasks.fit_gaussians(subject, conversion, job.bank, known)  # here, parallel to the driving video
+    driving_video = filming.result()
+    motion = tasks.fit_motion(subject, gaussians, driving_video, conversion, job.bank, known)
+    mesh = mesh_over_time(gaussians, motion, driving_video, conversion, tasks)
+    if job.settings.refiner.kind != "identity":
+        mesh = tasks.refine_texture(mesh, driving_video, conversion)
+    notes = notes_of(done.result for done in tasks.finished())
+    package = tasks.pack_asset(subject, driving_video, gaussians, motion, mesh, notes, conversion)
+    return Converted(package, tasks.check_asset(package, driving_video, subject, conversion))
+
+
+def mesh_over_time(
+    gaussians: Gaussians, motion: Motion, driving_video: DrivingVideo, conversion: Conversion, tasks: Tasks
+) -> Mesh:
+    """Extract one mesh that follows the motion, or a mesh per frame with the frames divided among the slots."""
+    plan = tasks.plan_mesh(gaussians, motion, conversion)
+    if read_plan(home.store().path(plan.plan)).mode == "tracked":
+        return tasks.extract_mesh(gaussians, motion, plan, conversion)
+    frames = count_frames(driving_video.frames, home.store())
+    parts = divide_frames(frames, conversion.mesh_parts or resources.cpus())
+    extracted = [tasks.extract_mesh.submit(gaussians, motion, plan, conversion, part) for part in parts]
+    meshes = [future.result() for future in extracted]
+    return meshes[0] if len(meshes) == 1 else tasks.join_meshes(meshes, conversion)

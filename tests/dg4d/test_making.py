@@ -1,0 +1,197 @@
+"""Conversions from Python, with fake steps and no server."""
+
+import inspect
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conversions import EVERY_STEP, ran
+from fake_steps import picture
+from PIL import Image
+
+import dg4d
+from dg4d import making, progress
+from dg4d.asset import Asset
+from dg4d_lib.errors import BadInput
+from flows.step_errors import StepBadInput
+
+
+@pytest.fixture(autouse=True)
+def loading(monkeypatch: pytest.MonkeyPatch, alone: Path) -> None:
+    """Fake packages have no manifest: load their record alone."""
+
+    def load(folder: Path) -> Asset:
+        asset = Asset.__new__(Asset)
+        asset.folder, asset._record = folder, json.loads((folder / "provenance.json").read_text())
+        return asset
+
+    monkeypatch.setattr(making, "load", load)
+
+
+def words(path: str, text: str) -> str:
+    Path(path).write_text(picture(text))
+    return path
+
+
+def test_a_picture_becomes_an_asset_and_the_second_call_does_nothing(alone: Path) -> None:
+    asset = dg4d.make(words("fox.png", "x"))
+    assert (asset.folder, asset.name) == (Path("out/fox"), "fox")
+    assert sorted(ran(alone)) == sorted(EVERY_STEP)
+    dg4d.make("fox.png", out="elsewhere", seed=0)
+    assert ran(alone) == []
+    dg4d.make("fox.png", seed=1)
+    assert "fit_motion" in ran(alone)
+
+
+@pytest.mark.parametrize(
+    "settings", [{"motion": {"iterations": 7}}, {"motion.iterations": 7}, {"motion": {"iterations": 7}, "mesh": {}}]
+)
+def test_settings_are_nested_or_dotted(settings: dict[str, Any]) -> None:
+    asset = dg4d.make(words("fox.png", "x"), **settings)
+    assert asset.provenance["recipe"]["settings"]["motion"]["iterations"] == 7
+    assert asset.provenance["recipe"]["settings"]["motion"]["views"] == 1  # of the profile, as before
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        ({"motion": {"iteration": 7}}, "motion.iteration"),
+        ({"motion": {"iterations": 0}}, "greater than or equal to 1"),
+        ({"engine": "steam"}, "inline, prefect"),
+        ({"profile": "perfect"}, "choose one of"),
+        ({"seed": -1}, "seed"),
+        ({"views": {90: "none.png"}}, "none.png"),
+        ({"views": {(90, 0): "fox.png", 90: "fox.png"}}, "90"),
+        ({"asset": "a.glb"}, "asset="),
+        ({"video": "none.mp4"}, "none.mp4 does not exist"),
+    ],
+)
+def test_wrong_arguments_are_refused_before_any_work(alone: Path, call: dict[str, Any], says: str) -> None:
+    with pytest.raises(BadInput, match=says):
+        dg4d.make(words("fox.png", "x"), **call)
+    assert ran(alone) == [] and not Path("out").exists()
+
+
+def test_nothing_to_make_and_another_asset_in_the_way_are_refused() -> None:
+    with pytest.raises(BadInput, match="nothing to make"):
+        dg4d.make()
+    dg4d.make(words("fox.png", "x"), out="here")
+    with pytest.raises(BadInput, match="holds the asset 'fox'"):
+        dg4d.make(words("cat.png", "y"), out="here")
+    assert dg4d.make("cat.png", out="here", force=True).name == "cat"
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        Image.new("RGBA", (40, 40), "red"),
+        np.full((40, 40, 3), 200, np.uint8),
+        np.full((40, 40, 4), 0.5, np.float32),
+    ],
+    ids=["PIL", "uint8", "float"],
+)
+def test_a_picture_in_memory_is_taken(given: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[Any] = []
+    monkeypatch.setattr(making, "_run", lambda job, folder, engine: taken.append(job))
+    monkeypatch.setattr(making, "load", taken.append)
+    dg4d.make(given, name="drawn")
+    job, folder = taken
+    assert (job.item, folder) == ("drawn", Path("out/drawn"))
+
+
+@pytest.mark.parametrize("given", [np.zeros((4, 4)), np.zeros((4, 4, 2)), np.full((4, 4, 3), "a"), object()])
+def test_other_things_in_memory_are_refused(given: Any) -> None:
+    with pytest.raises(BadInput, match="PIL image or an array"):
+        dg4d.make(given)
+
+
+def test_progress_counts_steps_and_knows_the_time_left_from_the_second_run_on() -> None:
+    first: list[dg4d.Progress] = []
+    dg4d.make(words("fox.png", "x fit_motion=sleep:0.3"), on_progress=first.append)
+    started = [one for one in first if one.kind == "started"]
+    assert {one.number for one in started} == set(range(1, 9)) and {one.of for one in first} == {8}
+    assert next(one for one in first if one.kind == "progress").values["loss"] > 0
+    assert first[-1].kind == "finished" and first[-1].seconds_left == 0.0
+    second: list[dg4d.Progress] = []
+    dg4d.make(words("cat.png", "y"), on_progress=second.append)
+    assert second[0].seconds_left is not None and second[0].seconds_left > 0.3
+    assert str(second[0]).startswith("step 1 of 8: prepare_subject started, about ")
+
+
+def test_an_exception_of_the_callback_cancels_the_conversion(alone: Path) -> None:
+    class Cancelled(Exception):
+        pass
+
+    calls = []
+
+    def cancel(one: dg4d.Progress) -> None:
+        calls.append(one)
+        if one.step == "fit_gaussians":
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        dg4d.make(words("fox.png", "x"), on_progress=cancel)
+    assert "fit_motion" not in ran(alone) and not Path("out/fox").exists()
+    assert [one.step for one in calls].count("fit_gaussians") == 1
+    assert dg4d.make("fox.png").name == "fox"
+
+
+def test_a_failed_step_is_an_error_with_its_message() -> None:
+    with pytest.raises(StepBadInput, match="the picture is empty"):
+        dg4d.make(words("fox.png", "x prepare_subject=bad:empty"))
+
+
+def test_a_batch_keeps_what_succeeded(alone: Path) -> None:
+    Path("a").mkdir()
+    pictures = [words("one.png", "1"), words("two.png", "2 fit_motion=bad:broken"), words("a/one.png", "3")]
+    done = dg4d.batch([*pictures, "none.png"], out="all", workers=2)
+    assert sorted(done.assets) == ["one-png", "one-png-2"]
+    assert set(done.errors) == {"two", "none"}
+    assert isinstance(done.errors["two"], StepBadInput) and "does not exist" in str(done.errors["none"])
+    assert all((Path("all") / name / "provenance.json").exists() for name in done.assets)
+
+
+def test_a_batch_of_a_folder_names_items_as_the_command_does() -> None:
+    Path("photos/deep").mkdir(parents=True)
+    words("photos/fox.png", "1")
+    words("photos/deep/cat.png", "2")
+    assert set(dg4d.batch("photos", out="all").assets) == {"fox", "deep/cat"}
+    with pytest.raises(BadInput, match="empty"):
+        dg4d.batch([])
+
+
+def test_conversions_in_threads_report_to_their_own_callbacks() -> None:
+    words("fox.png", "1")
+    words("cat.png", "2")
+    seen: dict[str, set[str]] = {"fox": set(), "cat": set()}
+
+    def convert(name: str) -> None:
+        dg4d.make(f"{name}.png", on_progress=lambda one: seen[name].add(one.item))
+
+    threads = [threading.Thread(target=convert, args=(name,)) for name in seen]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert seen == {"fox": {"fox"}, "cat": {"cat"}}
+
+
+def test_the_engine_of_prefect_connects_and_runs_the_flow(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[str] = []
+    monkeypatch.setattr("flows.convert.connect", lambda: calls.append("connect"))
+    monkeypatch.setattr("flows.convert.convert_job", lambda job, folder: calls.append(f"{job.item} in {folder}"))
+    monkeypatch.setattr(making, "load", lambda folder: folder)
+    dg4d.make(words("fox.png", "1"), engine="prefect")
+    assert calls == ["connect", "fox in out/fox"]
+
+
+def test_every_public_name_is_there_and_documented() -> None:
+    for name in dg4d.__all__:
+        assert inspect.getdoc(getattr(dg4d, name)), name
+    assert set(dg4d.__all__) <= set(dir(dg4d))
+    with pytest.raises(AttributeError, match="it has: Asset"):
+        _ = dg4d.nothing
+    assert dg4d.Progress is progress.Progress
