@@ -248,6 +248,30 @@ PriorSettings = Annotated[
 ]
 
 
+class AssetSettings(Settings):
+    """A model of the user's own (`--asset`): its placement, and the fit of its motion; ours."""
+
+    max_faces: int = Field(200000, ge=100, le=2000000, description="largest number of triangles of a model")
+    max_splats: int = Field(100000, ge=100, le=1000000, description="largest number of splats of a model")
+    min_agreement: Share = Field(
+        0.5, description="smallest IoU of the outlines of model and first frame; below, the model is refused"
+    )
+    points: int = Field(8000, ge=100, le=200000, description="number of Gaussians on the surface of a mesh")
+    nodes: int = Field(200, ge=4, le=2000, description="number of control nodes on the surface")
+    size: int = Field(128, ge=32, le=512, multiple_of=8, description="pixels of the compared pictures")
+    track_iterations: int = Field(40, ge=1, le=1000, description="iterations per frame while tracking")
+    joint_iterations: int = Field(150, ge=0, le=10000, description="iterations over all frames after tracking")
+    joint_frames: int = Field(8, ge=1, le=512, description="frames of a joint iteration")
+    lr: Positive = Field(0.006, description="learning rate of positions, world units; quaternions: twice that")
+    color_weight: NotNegative = Field(1.0, description="colors of the video, mean squared error over the subject")
+    alpha_weight: NotNegative = Field(1.0, description="alpha of the video, mean squared error over the subject")
+    rigidity: NotNegative = Field(0.3, description="as-rigid-as-possible energy of the surface")
+    bending: NotNegative = Field(0.1, description="differences of neighboring rotations, times `rigidity`")
+    inertia: NotNegative = Field(0.02, description="distance to the extrapolated motion while tracking")
+    smoothness: NotNegative = Field(0.02, description="accelerations in the joint fit")
+    depth: NotNegative = Field(0.005, description="displacements along the viewing direction")
+
+
 class BlobStartSettings(Settings):
     """Random ball of Gaussians (DreamGaussian)."""
 
