@@ -24,7 +24,7 @@ from torch import Tensor
 from benchmarks.objects.drawing import Painted
 from benchmarks.objects.specimens import OBJECTS
 from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
-from dg4d_lib.fitting.asset_motion import Binding, fit_asset_motion
+from dg4d_lib.fitting.asset_motion import fit_asset_motion
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.images import over_white
 from dg4d_lib.mesh.models.control_graph import build_control_graph

@@ -30,23 +30,6 @@ Report = Callable[[int, dict[str, float]], None]
 
 
 @dataclass(frozen=True)
-class Binding:
-    """Gaussians bound to points: each at a weighted mean of some of them.
-
-    Attributes:
-        indices: points of every Gaussian, corners of its triangle; the point itself for splats.
-        weights: of these points, sum 1.
-    """
-
-    indices: Int[Tensor, "n c"]
-    weights: Float[Tensor, "n c"]
-
-    def positions(self, points: Float[Tensor, "*t v 3"]) -> Float[Tensor, "*t n 3"]:
-        """Return the means of the bound Gaussians."""
-        return (points[..., self.indices, :] * self.weights[..., None]).sum(-2)
-
-
-@dataclass(frozen=True)
 class NodeMotion:
     """Rigid transforms of the nodes at every frame, and of the whole model.
 
@@ -106,8 +89,6 @@ def still(frames: int, graph: ControlGraph) -> NodeMotion:
 
 def fit_asset_motion(
     cloud: Gaussians,
-    binding: Binding,
-    points: Float[Tensor, "v 3"],
     graph: ControlGraph,
     video: DrivingVideo,
     rasterize: Rasterizer,
@@ -119,9 +100,7 @@ def fit_asset_motion(
 
     Args:
         cloud: Gaussians of the model at rest.
-        binding: of the cloud to the points.
-        points: surface of the model at rest, world units; the vertices of the graph.
-        graph: control graph of the points.
+        graph: control graph whose points are the Gaussians.
         video: its first frame shows the model about at rest.
         rasterize: rasterizer.
         settings: of the fit.
@@ -131,7 +110,7 @@ def fit_asset_motion(
     Raises:
         FitDiverged: the loss became non-finite.
     """
-    fit = _Fit(cloud, binding, points, graph, video, rasterize, settings)
+    fit = _Fit(cloud, graph, video, rasterize, settings)
     frames, done = len(video), 0
     tracked = [still(1, graph)]
     for frame in range(frames):
@@ -181,20 +160,18 @@ class _Fit:
     def __init__(
         self,
         cloud: Gaussians,
-        binding: Binding,
-        points: Float[Tensor, "v 3"],
         graph: ControlGraph,
         video: DrivingVideo,
         rasterize: Rasterizer,
         settings: AssetSettings,
     ) -> None:
-        self.cloud, self.binding, self.points, self.graph = cloud.detach(), binding, points, graph
+        self.cloud, self.graph = cloud.detach(), graph
         self.rasterize, self.settings = rasterize, settings
         self.camera = replace(OrbitCamera(), width=settings.size, height=settings.size)
         cutouts = torch.cat([video.frames, video.alpha], -1)
         self.colors, self.alphas = resize_cutouts(cutouts, settings.size)
         self.area = float(self.alphas.mean().clamp(min=1e-3))  # of the subject, share of the picture
-        self.unit = float((points.amax(0) - points.amin(0)).norm()) / 10
+        self.unit = float((graph.nodes.amax(0) - graph.nodes.amin(0)).norm()) / 10
         first, second = graph.edges.T
         self.spans = graph.nodes[second] - graph.nodes[first]
 
@@ -205,8 +182,7 @@ class _Fit:
     def losses(self, motion: NodeMotion, frames: list[int]) -> dict[str, Tensor]:
         """Return the weighted losses of some frames."""
         settings = self.settings
-        moved = motion.points(self.points, self.graph)
-        means = self.binding.positions(moved)
+        means = motion.points(self.cloud.means, self.graph)
         count = len(frames)
         states = replace(
             self.cloud,

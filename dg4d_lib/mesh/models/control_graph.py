@@ -4,7 +4,7 @@ Distances follow the surface, so that a leg does not move with the other one tha
 as eyes, are joined by bridges to their nearest neighbors and move with them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ NEIGHBORS = 4  # nodes that move a point
 BRIDGES = 6  # edges from a component to each component that it touches
 TOUCHING = 1.5  # factor on the smallest gap of a component: others within it are joined to it, too
 LINKS = 6  # nearest nodes of a node in the graph
+REACH = 6.0  # spacings of the nodes: farther points are not told apart
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,10 @@ class ControlGraph:
     weights: Float[Tensor, "v k"]
     edges: Int[Tensor, "e 2"]
     lengths: Float[Tensor, " e"]
+
+    def of(self, rows: Int[Tensor, " n"]) -> "ControlGraph":
+        """Return the same nodes with the weights of some of the points."""
+        return replace(self, indices=self.indices[rows], weights=self.weights[rows])
 
 
 def build_control_graph(
@@ -61,9 +66,10 @@ def graph_of_points(points: Float[np.ndarray, "v 3"], graph: csr_array, count: i
         graph: symmetric matrix of the distances between neighboring points, connected.
         count: number of nodes; at most one per point.
     """
-    chosen = spread_nodes(graph, points, min(count, len(points)))
+    chosen, spacing = spread_nodes(graph, points, min(count, len(points)))
     nearest = min(max(NEIGHBORS + 1, LINKS + 1), len(chosen))
-    distances = dijkstra(graph, directed=False, indices=chosen).astype(np.float32)  # m v
+    distances = dijkstra(graph, directed=False, indices=chosen, limit=REACH * spacing).astype(np.float32)  # m v
+    distances = np.minimum(distances, REACH * spacing)
     order = np.argpartition(distances, nearest - 1, axis=0)[:nearest].T
     near = np.take_along_axis(distances.T, order, 1)
     rank = near.argsort(1, kind="stable")
@@ -111,8 +117,10 @@ def bridge_components(points: Float[np.ndarray, "v 3"], pairs: Int[np.ndarray, "
         pairs = np.unique(np.sort(np.concatenate([pairs, _bridges(points, labels, parts)]), 1), axis=0)
 
 
-def spread_nodes(graph: csr_array, points: Float[np.ndarray, "v 3"], count: int) -> Int[np.ndarray, " m"]:
-    """Choose points that are far from each other along the graph, each the farthest from those before it."""
+def spread_nodes(
+    graph: csr_array, points: Float[np.ndarray, "v 3"], count: int
+) -> tuple[Int[np.ndarray, " m"], float]:
+    """Choose points along the graph, each the farthest from those before it; also return the largest gap left."""
     chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
     nearest = dijkstra(graph, directed=False, indices=chosen[0])
     while len(chosen) < count:
@@ -122,7 +130,7 @@ def spread_nodes(graph: csr_array, points: Float[np.ndarray, "v 3"], count: int)
             break
         found = dijkstra(graph, directed=False, indices=chosen[-1], limit=float(nearest[chosen[-1]]))
         nearest = np.minimum(nearest, found)
-    return np.array(chosen)
+    return np.array(chosen), max(float(nearest.max()), 1e-9)
 
 
 def _lengths(points: Float[np.ndarray, "v 3"], pairs: Int[np.ndarray, "e 2"]) -> csr_array:

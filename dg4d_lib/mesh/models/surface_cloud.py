@@ -16,7 +16,7 @@ from dg4d_lib.mesh.models.subdivision import FineMesh, subdivide
 
 WELD = 1e-5  # of the model's size: vertices closer than this are one
 EDGE = 0.03  # of the model's size: longest edge of the subdivided surface
-MAX_VERTICES = 40000  # of the subdivided surface
+MAX_VERTICES = 20000  # of the subdivided surface
 OPACITY = 0.95  # at the center of a Gaussian
 SPREAD = 0.75  # standard deviation, times the square root of the area per Gaussian
 FLATNESS = 0.15  # standard deviation along the normal, times that in the surface
@@ -30,15 +30,13 @@ class SurfaceCloud:
         fine: welded and subdivided surface.
         welded: vertex of `fine` for every vertex of the model.
         cloud: Gaussians at rest, flat on the surface.
-        corners: vertices of `fine` that every Gaussian lies between.
-        weights: barycentric coordinates of every Gaussian.
+        nearest: vertex of `fine` that every Gaussian is next to, in its triangle.
     """
 
     fine: FineMesh
     welded: Int[np.ndarray, " v"]
     cloud: Gaussians
-    corners: Int[Tensor, "n 3"]
-    weights: Float[Tensor, "n 3"]
+    nearest: Int[Tensor, " n"]
 
 
 def cover_surface(model: Model, count: int, generator: torch.Generator) -> SurfaceCloud:
@@ -82,9 +80,8 @@ def cover_surface(model: Model, count: int, generator: torch.Generator) -> Surfa
         torch.full((len(means),), math.log(OPACITY / (1 - OPACITY))),
         rgb_to_sh(torch.from_numpy(colors)),
     )
-    return SurfaceCloud(
-        fine, welded, cloud, torch.from_numpy(fine.faces[chosen]), torch.from_numpy(weights.astype(np.float32))
-    )
+    nearest = np.take_along_axis(fine.faces[chosen], weights.argmax(1)[:, None], 1)[:, 0]
+    return SurfaceCloud(fine, welded, cloud, torch.from_numpy(nearest))
 
 
 def weld(
