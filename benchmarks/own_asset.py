@@ -102,9 +102,7 @@ def made_up_subjects(frames: int, names: Sequence[str] = ()) -> Iterator[Subject
         linear = np.power(painted.colors.numpy(), 2.2)
         part = ModelPart(name, vertices[0].numpy(), painted.faces.numpy(), colors=linear)
         views = dict(zip(azimuths, pictures[1:], strict=True))
-        yield Subject(
-            name, Model((part,)), pictures[0], views, vertices, painted.faces, torch.ones(len(painted.faces))
-        )
+        yield Subject(name, Model((part,)), pictures[0], views, vertices, painted.faces, torch.ones(len(painted.faces)))
 
 
 def baked_model(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], bank_folder: Path) -> Model:

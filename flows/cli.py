@@ -89,6 +89,19 @@ def make(
     bank: Annotated[
         Path | None, typer.Option(metavar="DIR", help="ground-truth views, for --set prior.kind=oracle")
     ] = None,
+    asset: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="a model of your own that is set in motion: .glb, .gltf, .obj, .usdz, or splats as .ply, .spz",
+        ),
+    ] = None,
+    asset_azimuth: Annotated[
+        float | None,
+        typer.Option(
+            min=-360, max=360, callback=finite, metavar="DEG", help="azimuth of the model that the first frame shows"
+        ),
+    ] = None,
     commercial_only: Commercial = False,
     force: Annotated[bool, typer.Option("--force", help="replace another asset in the output folder")] = False,
     pick: Annotated[int | None, typer.Option(min=1, max=16, metavar="K", help="use motion K of `dg4d motions`")] = None,
@@ -97,8 +110,10 @@ def make(
 
     Motions without a driving video, for --set driving.motion=NAME: sway, bend, breathe, bounce, wave, turn.
     """
-    if picture is None and not text:
-        raise typer.BadParameter("give a picture, a video, or --text WORDS")
+    if picture is None and not text and asset is None:
+        raise typer.BadParameter("give a picture, a video, --text WORDS, or --asset FILE")
+    if asset_azimuth is not None and asset is None:
+        raise typer.BadParameter("--asset-azimuth needs --asset")
     with exit_on_error():
         from dg4d_lib.errors import BadInput
         from flows import home
@@ -114,8 +129,11 @@ def make(
         if pick and video:
             raise BadInput("--pick chooses a generated motion and cannot be combined with --video")
         short = shortcut_settings(triangles, texture, fps) | ({"driving.pick": pick} if pick else {})
-        item = (clean_name(picture.stem) or "asset") if picture else name_from_text(text)
-        files = {"picture": picture, "text": text, "video": video, "bank": bank}
+        if asset_azimuth is not None:
+            short |= {"asset.find_azimuth": False, "asset.azimuth_deg": asset_azimuth}
+        named = picture or asset
+        item = (clean_name(named.stem) or "asset") if named else name_from_text(text)
+        files = {"picture": picture, "text": text, "video": video, "bank": bank, "asset": asset}
         request = _request(profile, changes, short, item=item, seed=seed, commercial_only=commercial_only, **files)
         folder = out or Path("out") / item
         check_folder(folder, item, force)

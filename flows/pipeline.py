@@ -15,11 +15,13 @@ from flows.inputs.conversion_job import ConversionJob
 from flows.packages.flow_result import FlowResult, notes_of
 from flows.step_errors import StepBadInput
 from flows.tasks import (
+    Asset,
     DrivingVideo,
     Gaussians,
     Mesh,
     Motion,
     Subject,
+    animate_asset,
     check_asset,
     draw_picture,
     drive_video,
@@ -29,6 +31,7 @@ from flows.tasks import (
     join_meshes,
     pack_asset,
     plan_mesh,
+    prepare_asset,
     prepare_subject,
     refine_texture,
 )
@@ -51,6 +54,9 @@ def image_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int 
     """
     with steps_of_flow():
         conversion = conversion_of(job, mesh_parts)
+        if job.asset is not None and job.asset == job.source:  # no picture: the model's own render is set in motion
+            model = prepare_asset(job.asset, conversion)
+            return animate(model, job, conversion, folder, model)
         subject = prepare_subject(job.source, conversion)
         return animate(subject, job, conversion, folder)
 
@@ -106,13 +112,34 @@ def conversion_of(job: ConversionJob, mesh_parts: int = 0) -> Conversion:
     return Conversion(item=job.item, settings=job.settings, seed=job.seed, mesh_parts=mesh_parts)
 
 
-def animate(subject: Subject, job: ConversionJob, conversion: Conversion, folder: Path | None) -> FlowResult:
-    """Turn a subject into a package: driving video, static Gaussians, motion, mesh, texture, files, verdict."""
+def animate(
+    subject: Subject, job: ConversionJob, conversion: Conversion, folder: Path | None, asset: Asset | None = None
+) -> FlowResult:
+    """Turn a subject into a package: driving video, static Gaussians, motion, mesh, texture, files, verdict.
+
+    Args:
+        subject: cut-out.
+        job: what to make.
+        conversion: parameters of all steps.
+        folder: output folder of the package; None: the package stays in the store.
+        asset: the user's model, if it has been prepared already.
+    """
     filming = drive_video.submit(subject, conversion)
-    gaussians = fit_gaussians(subject, conversion, job.bank)  # in this thread, parallel to the driving video
-    driving_video = filming.result()
-    motion = fit_motion(subject, gaussians, driving_video, conversion, job.bank)
-    mesh = mesh_over_time(gaussians, motion, driving_video, conversion)
+    gaussians: Gaussians | Asset
+    if job.asset is not None:
+        gaussians = asset or prepare_asset(job.asset, conversion, subject)
+        driving_video = filming.result()
+        motion = animate_asset(gaussians, driving_video, conversion)
+    else:
+        gaussians = fit_gaussians(subject, conversion, job.bank)  # in this thread, parallel to the driving video
+        driving_video = filming.result()
+        motion = fit_motion(subject, gaussians, driving_video, conversion, job.bank)
+    own = motion.outputs.get("tracked")  # the mesh of the user's model
+    mesh = (
+        Mesh.model_validate(motion.model_dump())
+        if own
+        else mesh_over_time(gaussians, motion, driving_video, conversion)
+    )
     if job.settings.refiner.kind != "identity":
         mesh = refine_texture(mesh, driving_video, conversion)
     notes = notes_of(done.result for done in finished_steps())
@@ -132,7 +159,9 @@ def animate(subject: Subject, job: ConversionJob, conversion: Conversion, folder
     return result
 
 
-def mesh_over_time(gaussians: Gaussians, motion: Motion, driving_video: DrivingVideo, conversion: Conversion) -> Mesh:
+def mesh_over_time(
+    gaussians: Gaussians | Asset, motion: Motion, driving_video: DrivingVideo, conversion: Conversion
+) -> Mesh:
     """Extract one mesh that follows the motion, or a mesh per frame with the frames divided among the slots."""
     plan = plan_mesh(gaussians, motion, conversion)
     if read_plan(home.store().path(plan.plan)).mode == "tracked":

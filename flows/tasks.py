@@ -28,6 +28,10 @@ class Subject(StepResult):
         return self.outputs.get("footage")
 
 
+class Asset(Subject):
+    """Model of the user's own, placed; with its render as the subject where there is no picture."""
+
+
 class DrivingVideo(StepResult):
     """Driving video; with contact sheet, ranking and films if it was selected among candidates."""
 
@@ -87,6 +91,18 @@ def prepare_subject(source: ArtifactRef, conversion: Conversion) -> Subject:
     return run_step("prepare_subject", Subject, **locals())
 
 
+@task(**CACHED, tags=[CPU])
+def prepare_asset(model: ArtifactRef, conversion: Conversion, subject: Subject | None = None) -> Asset:
+    """Read a model of the user's own and find its azimuth, scale and position in the first frame."""
+    return run_step("prepare_asset", Asset, **locals())
+
+
+@task(**CACHED, tags=[GPU])
+def animate_asset(asset: Asset, driving_video: DrivingVideo, conversion: Conversion) -> Motion:
+    """Fit the motion of a model to the driving video, as rigid as its surface allows."""
+    return run_step("animate_asset", Motion, **locals())
+
+
 @task(**CACHED, tags=[GPU])
 def drive_video(subject: Subject, conversion: Conversion) -> DrivingVideo:
     """Take the footage of the subject, or generate a video of it in motion."""
@@ -112,14 +128,14 @@ def fit_motion(
 
 
 @task(**CACHED, tags=[CPU])
-def plan_mesh(gaussians: Gaussians, motion: Motion, conversion: Conversion) -> Plan:
+def plan_mesh(gaussians: Gaussians | Asset, motion: Motion, conversion: Conversion) -> Plan:
     """Decide whether one mesh can follow the motion or every frame needs its own."""
     return run_step("plan_mesh", Plan, **locals())
 
 
 @task(**CACHED, tags=[CPU])
 def extract_mesh(
-    gaussians: Gaussians, motion: Motion, plan: Plan, conversion: Conversion, part: Part | None = None
+    gaussians: Gaussians | Asset, motion: Motion, plan: Plan, conversion: Conversion, part: Part | None = None
 ) -> Mesh:
     """Extract one mesh that follows the motion, or a mesh per frame of a part of the frames."""
     return run_step("extract_mesh", Mesh, **locals())
@@ -141,7 +157,7 @@ def refine_texture(mesh: Mesh, driving_video: DrivingVideo, conversion: Conversi
 def pack_asset(
     subject: Subject,
     driving_video: DrivingVideo,
-    gaussians: Gaussians,
+    gaussians: Gaussians | Asset,
     motion: Motion,
     mesh: Mesh,
     notes: tuple[str, ...],

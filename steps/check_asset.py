@@ -23,7 +23,7 @@ from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.archives import unpack
 from steps.artifacts.media import read_frames, read_png, write_png
-from steps.artifacts.packages import ASSET, COMPACT, MANIFEST, MESHES, read_manifest
+from steps.artifacts.packages import ASSET, COMPACT, MANIFEST, MERGED, MESHES, read_manifest
 from steps.artifacts.packages import SPLATS as SPLATS_FOLDER
 from steps.artifacts.rendering import BATCH, States, Surface, mesh_at, mesh_renderer, read_states, read_surface
 from steps.runtime.job import Job, StepReport
@@ -81,7 +81,7 @@ def read_asset(package: Path, folder: Path) -> LoadedAsset:
     Raises:
         BadInput: files are missing or broken.
     """
-    wanted = (MANIFEST, ASSET, COMPACT, f"{MESHES}/", f"{SPLATS_FOLDER}/")
+    wanted = (MANIFEST, ASSET, MERGED, COMPACT, f"{MESHES}/", f"{SPLATS_FOLDER}/")
     unpack(package, folder, "the package", lambda name: name.startswith(wanted))
     manifest = read_manifest(folder)
     return LoadedAsset(read_states(folder, manifest), read_surface(folder, manifest), manifest.frames)

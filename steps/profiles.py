@@ -10,6 +10,7 @@ from dg4d_lib.asset_settings import GateSettings, PackSettings, ScoreSettings
 from dg4d_lib.errors import BadInput
 from dg4d_lib.rasterizer.backends import backend_name
 from dg4d_lib.settings import (
+    AssetSettings,
     DeformationSettings,
     DrivingSettings,
     GeometricPriorSettings,
@@ -87,6 +88,7 @@ class PipelineSettings(Settings):
     rasterizer: RasterizerName = Field("auto", description="auto: cuda_gsplat where that can run, else cpu")
     text: TextSettings = TextSettings()
     subject: SubjectSettings = SubjectSettings()
+    asset: AssetSettings = AssetSettings()
     driving: DrivingSettings = WarpSettings()
     prior: PriorSettings = GeometricPriorSettings()
     static: StaticSettings = StaticSettings()

@@ -5,7 +5,8 @@ surface (Sorkine and Alexa 2007), robust so that joints may bend, decides what t
 displacements in depth are penalized.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -25,7 +26,9 @@ from dg4d_lib.video.driving import DrivingVideo
 ADVICE = "lower asset.lr"
 LEVELS = (1, 2, 4, 8)  # pooling of the compared pictures; coarse ones see far motion
 ROBUST = 0.05  # relative stretch up to which the rigidity is quadratic
-ROTATION_LR = 2.0  # learning rate of quaternions, times that of positions
+WHOLE_DEPTH = 30.0  # weight of the mean displacement in depth, which a video hardly shows, times that of every node's
+BETA1, BETA2 = 0.9, 0.99  # of Adam
+FACTORS = {"turns": 6.0, "shifts": 3.0, "whole_turns": 2.0, "whole_shifts": 1.0}  # of the learning rate, per variable
 Report = Callable[[int, dict[str, float]], None]
 
 
@@ -75,18 +78,6 @@ class NodeMotion:
         return turned + center + self.whole_shifts[:, None]
 
 
-def still(frames: int, graph: ControlGraph) -> NodeMotion:
-    """Return the motion of a model at rest."""
-    identity = graph.nodes.new_tensor((1.0, 0.0, 0.0, 0.0))
-    count = len(graph.nodes)
-    return NodeMotion(
-        identity.expand(frames, count, 4).clone(),
-        graph.nodes.new_zeros(frames, count, 3),
-        identity.expand(frames, 4).clone(),
-        graph.nodes.new_zeros(frames, 3),
-    )
-
-
 def fit_asset_motion(
     cloud: Gaussians,
     graph: ControlGraph,
@@ -110,43 +101,38 @@ def fit_asset_motion(
     Raises:
         FitDiverged: the loss became non-finite.
     """
-    fit = _Fit(cloud, graph, video, rasterize, settings)
+    fit = _Fit(*_thinned(cloud, graph, settings.fit_points), video, rasterize, settings)
     frames, done = len(video), 0
-    tracked = [still(1, graph)]
+    tracked: list[_Unknowns] = [_Unknowns.still(1, graph)]
     for frame in range(frames):
-        start = tracked[-1]
-        if frame > 1:
-            start = _extrapolated(tracked[-2], tracked[-1])
-        steps = settings.track_iterations
-        current = _parameters(start)
-        adam = _adam(current, settings.lr)
-        expected = start.nodes(graph).detach()
+        start = tracked[-1] if frame < 2 else tracked[-2].continued(tracked[-1])
+        unknowns, steps = start.copy(), settings.track_iterations
+        descent = _Descent(unknowns)
+        expected = start.motion(fit.smoothing).nodes(graph).detach()
         for step in range(steps):
-            _set_lr(adam, settings.lr, 1 - 0.8 * step / steps)
-            moved = NodeMotion(**current)
+            moved = unknowns.motion(fit.smoothing)
             losses = fit.losses(moved, [frame])
-            losses["inertia"] = settings.inertia * fit.relative(moved.nodes(graph) - expected).square().mean()
-            fit.step(adam, losses, current, f"frame {frame}, iteration {step + 1}")
+            losses["inertia"] = settings.inertia * fit.relative(moved.nodes(graph) - expected).square().sum(-1).mean()
+            fit.step(losses, unknowns, f"frame {frame}, iteration {step + 1}")
+            descent.step(settings.lr * (1 - 0.8 * step / steps))
             done += 1
             report(done, {name: float(value.detach()) for name, value in losses.items()})
-        tracked.append(NodeMotion(**{name: value.detach() for name, value in current.items()}))
-    whole = {name: torch.cat([getattr(one, name) for one in tracked[1:]]) for name in vars(tracked[0])}
-    current = _parameters(NodeMotion(**whole))
-    adam = _adam(current, settings.lr)
+        tracked.append(unknowns.detach())
+    unknowns = _Unknowns.joined(tracked[1:])
+    descent = _Descent(unknowns)
     for step in range(settings.joint_iterations):
-        _set_lr(adam, 0.5 * settings.lr, 1 - 0.9 * step / settings.joint_iterations)
-        count = min(settings.joint_frames, frames)
-        chosen = torch.randperm(frames, generator=generator)[:count].sort().values
-        moved = NodeMotion(**current)
+        chosen = torch.randperm(frames, generator=generator)[: min(settings.joint_frames, frames)].sort().values
+        moved = unknowns.motion(fit.smoothing)
         losses = fit.losses(moved.at(chosen), chosen.tolist())
-        nodes = moved.nodes(graph)
         if frames > 2:
+            nodes = moved.nodes(graph)
             acceleration = fit.relative(nodes[2:] - 2 * nodes[1:-1] + nodes[:-2])
             losses["inertia"] = settings.smoothness * acceleration.square().sum(-1).mean()
-        fit.step(adam, losses, current, f"joint iteration {step + 1}")
+        fit.step(losses, unknowns, f"joint iteration {step + 1}")
+        descent.step(0.5 * settings.lr * (1 - 0.9 * step / settings.joint_iterations))
         done += 1
         report(done, {name: float(value.detach()) for name, value in losses.items()})
-    return NodeMotion(**{name: value.detach() for name, value in current.items()})
+    return unknowns.detach().motion(fit.smoothing)
 
 
 def iterations(settings: AssetSettings, frames: int) -> int:
@@ -173,6 +159,7 @@ class _Fit:
         self.area = float(self.alphas.mean().clamp(min=1e-3))  # of the subject, share of the picture
         self.unit = float((graph.nodes.amax(0) - graph.nodes.amin(0)).norm()) / 10
         first, second = graph.edges.T
+        self.smoothing = _smoothing(graph, settings.smoothing)
         self.spans = graph.nodes[second] - graph.nodes[first]
 
     def relative(self, values: Tensor) -> Tensor:
@@ -193,7 +180,8 @@ class _Fit:
         rendering = self.rasterize(states, [self.camera] * count, means.new_tensor(WHITE))
         color = _pyramid_error(rendering.color, self.colors[frames]) / self.area
         alpha = _pyramid_error(rendering.alpha, self.alphas[frames]) / self.area
-        depth = self.relative(motion.nodes(self.graph)[..., 2] - self.graph.nodes[:, 2]).square().mean()
+        depth = self.relative(motion.nodes(self.graph)[..., 2] - self.graph.nodes[:, 2])
+        depth = depth.square().mean() + WHOLE_DEPTH * depth.mean(-1).square().mean()
         return {
             "color": settings.color_weight * color,
             "alpha": settings.alpha_weight * alpha,
@@ -218,14 +206,103 @@ class _Fit:
         bend = (matrices[:, first] - matrices[:, second]).flatten(2)
         return _robust(stretch).mean() + self.settings.bending * _robust(bend).mean()
 
-    def step(self, adam: torch.optim.Adam, losses: dict[str, Tensor], current: dict[str, Tensor], place: str) -> None:
-        """Take a step down the sum of the losses."""
+    def step(self, losses: dict[str, Tensor], unknowns: "_Unknowns", place: str) -> None:
+        """Compute the gradients of the sum of the losses."""
         total = torch.stack(list(losses.values())).sum()
-        adam.zero_grad(set_to_none=True)
+        for value in vars(unknowns).values():
+            value.grad = None
         total.backward()
-        gradients = [value.grad for value in current.values()]
+        gradients = [value.grad for value in vars(unknowns).values()]
         check_finite("animate_asset", {"loss": total}, gradients, place, ADVICE, self.cloud)
-        adam.step()
+
+
+@dataclass(frozen=True)
+class _Unknowns:
+    """Variables of the fit: transforms of the nodes before smoothing over the graph, rotations as vectors.
+
+    Smoothing lets nodes that the video does not show move with those that it shows (Nicolet et al. 2021).
+    """
+
+    turns: Float[Tensor, "t m 3"]
+    shifts: Float[Tensor, "t m 3"]
+    whole_turns: Float[Tensor, "t 3"]
+    whole_shifts: Float[Tensor, "t 3"]
+
+    @classmethod
+    def still(cls, frames: int, graph: ControlGraph) -> "_Unknowns":
+        zeros, whole = graph.nodes.new_zeros(frames, len(graph.nodes), 3), graph.nodes.new_zeros(frames, 3)
+        return cls(zeros, zeros, whole, whole)
+
+    @classmethod
+    def joined(cls, frames: Sequence["_Unknowns"]) -> "_Unknowns":
+        return cls(**{name: torch.cat([getattr(one, name) for one in frames]) for name in vars(frames[0])}).copy()
+
+    def copy(self) -> "_Unknowns":
+        return _Unknowns(**{name: value.detach().clone().requires_grad_() for name, value in vars(self).items()})
+
+    def detach(self) -> "_Unknowns":
+        return _Unknowns(**{name: value.detach() for name, value in vars(self).items()})
+
+    def continued(self, last: "_Unknowns") -> "_Unknowns":
+        """Continue from this frame over the last one, at half the speed."""
+        return _Unknowns(
+            **{name: getattr(last, name) + 0.5 * (getattr(last, name) - value) for name, value in vars(self).items()}
+        )
+
+    def motion(self, smoothing: Float[Tensor, "m m"]) -> NodeMotion:
+        """Return the motion that they stand for."""
+        return NodeMotion(
+            _quats(smoothing @ self.turns), smoothing @ self.shifts, _quats(self.whole_turns), self.whole_shifts
+        )
+
+
+class _Descent:
+    """Adam with one step size for all coordinates of a variable and frame, so that weak gradients stay weak."""
+
+    def __init__(self, unknowns: _Unknowns) -> None:
+        self.values = vars(unknowns)
+        self.first = {name: torch.zeros_like(value) for name, value in self.values.items()}
+        self.second = {name: torch.zeros_like(value) for name, value in self.values.items()}
+        self.count = 0
+
+    @torch.no_grad()
+    def step(self, lr: float) -> None:
+        """Move all variables by their gradients."""
+        self.count += 1
+        for name, value in self.values.items():
+            if value.grad is None:
+                continue
+            first, second = self.first[name], self.second[name]
+            first.lerp_(value.grad, 1 - BETA1)
+            second.lerp_(value.grad.square(), 1 - BETA2)
+            largest = second.flatten(1).amax(1).view(-1, *[1] * (second.dim() - 1)) / (1 - BETA2**self.count)
+            moment = first / (1 - BETA1**self.count)
+            value -= lr * FACTORS[name] * moment / (largest.sqrt() + 1e-12)
+
+
+def _quats(turns: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
+    """Return rotations for vectors along the axis of twice the tangent of half the angle."""
+    return torch.cat([torch.ones_like(turns[..., :1]), 0.5 * turns], -1)
+
+
+def _smoothing(graph: ControlGraph, strength: float) -> Float[Tensor, "m m"]:
+    """Return (I + strength L)^-1 with the Laplacian L of the graph, scaled to keep a uniform motion."""
+    count = len(graph.nodes)
+    laplacian = torch.zeros(count, count, dtype=torch.float64)
+    first, second = graph.edges.T
+    laplacian[first, second] = -1.0
+    laplacian[second, first] = -1.0
+    laplacian.diagonal().copy_(-laplacian.sum(1))
+    inverse: Tensor = torch.linalg.inv(torch.eye(count, dtype=torch.float64) + strength * laplacian)
+    return inverse.to(graph.nodes)
+
+
+def _thinned(cloud: Gaussians, graph: ControlGraph, count: int) -> tuple[Gaussians, ControlGraph]:
+    """Return about `count` of the Gaussians, evenly chosen and larger to cover as much."""
+    step = max(1, round(len(cloud) / count))
+    rows = torch.arange(0, len(cloud), step)
+    thin = Gaussians(**{name: value[rows] for name, value in vars(cloud).items()})
+    return replace(thin, log_scales=thin.log_scales + 0.5 * math.log(step)), graph.of(rows)
 
 
 def _robust(values: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
@@ -238,24 +315,3 @@ def _pyramid_error(ours: Float[Tensor, "b h w c"], theirs: Float[Tensor, "b h w 
     difference = (ours - theirs).movedim(-1, 1)
     errors = [functional.avg_pool2d(difference, level).square().mean() for level in LEVELS]
     return torch.stack(errors).mean()
-
-
-def _parameters(motion: NodeMotion) -> dict[str, Tensor]:
-    return {name: value.detach().clone().requires_grad_() for name, value in vars(motion).items()}
-
-
-def _adam(parameters: dict[str, Tensor], lr: float) -> torch.optim.Adam:
-    factor = {"quats": ROTATION_LR, "shifts": 1.0, "whole_quats": ROTATION_LR, "whole_shifts": 1.0}
-    groups = [{"params": [value], "lr": lr * factor[name], "factor": factor[name]} for name, value in parameters.items()]
-    return torch.optim.Adam(groups, betas=(0.9, 0.98), eps=1e-12)
-
-
-def _set_lr(adam: torch.optim.Adam, lr: float, progress: float) -> None:
-    for group in adam.param_groups:
-        group["lr"] = lr * progress * group["factor"]
-
-
-def _extrapolated(before: NodeMotion, last: NodeMotion) -> NodeMotion:
-    """Continue a motion at half its speed."""
-    values = {name: getattr(last, name) + 0.5 * (getattr(last, name) - getattr(before, name)) for name in vars(last)}
-    return NodeMotion(**values)

@@ -133,9 +133,7 @@ def judge(
         ours, theirs = alpha > 0.5, mask[0] > 0.5
         both, either = (ours & theirs).sum(), (ours | theirs).sum()
         error = ((color - target[0]).square().mean(-1, keepdim=True) * (ours & theirs)).sum() / both.clamp(min=1)
-        judged.append(
-            replace(placement, agreement=float(both / either.clamp(min=1)), color_error=float(error.sqrt()))
-        )
+        judged.append(replace(placement, agreement=float(both / either.clamp(min=1)), color_error=float(error.sqrt())))
     return judged
 
 
@@ -157,7 +155,8 @@ def _renders(
     for start in range(0, len(placements), BATCH):
         placed = [one.apply(cloud) for one in placements[start : start + BATCH]]
         states = replace(
-            cloud, **{name: torch.stack([getattr(one, name) for one in placed]) for name in ("means", "log_scales", "quats")}
+            cloud,
+            **{name: torch.stack([getattr(one, name) for one in placed]) for name in ("means", "log_scales", "quats")},
         )
         with torch.no_grad():
             drawn = rasterize(states, [camera] * len(placed), torch.tensor(WHITE))
@@ -199,7 +198,9 @@ def _refined(
     camera = OrbitCamera(width=FINE_SIZE, height=FINE_SIZE)
     values = {name: torch.zeros(size, requires_grad=True) for name, size in (("turn", 1), ("grow", 1), ("move", 2))}
     rates = {"turn": 0.03 if turning else 0.0, "grow": 0.01, "move": 0.006}
-    adam = torch.optim.Adam([{"params": [value], "lr": rates[name]} for name, value in values.items()], betas=(0.9, 0.98))
+    adam = torch.optim.Adam(
+        [{"params": [value], "lr": rates[name]} for name, value in values.items()], betas=(0.9, 0.98)
+    )
     area = mask.mean().clamp(min=1e-3)
     for _ in range(ITERATIONS):
         quat, log_scale, shift = _moved(start, values)

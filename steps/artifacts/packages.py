@@ -11,6 +11,7 @@ from steps.contract import Frozen
 
 MANIFEST = "asset.json"
 ASSET = "asset.glb"
+MERGED = "asset_merged.glb"
 RIGGED = "asset_rigged.glb"
 USD = "asset.usdz"
 SPLATS = "splats"
@@ -28,6 +29,7 @@ SHEET = "contact_sheet.png"
 
 ABOUT = {
     ASSET: "animated textured mesh, glTF 2.0",
+    MERGED: "the user's model, animated, as one mesh with one texture, glTF 2.0",
     RIGGED: "the same mesh on a skeleton, glTF 2.0",
     USD: "animated mesh, and as a variant moving splats, USDZ",
     WEB_SPLATS: "moving splats for the viewer",
@@ -71,7 +73,7 @@ class Manifest(Frozen):
     format: Literal["dg4d-asset"] = "dg4d-asset"
     version: Literal[1] = 1
     generator: str
-    mode: Literal["tracked", "per_frame"]
+    mode: Literal["tracked", "per_frame", "own"]
     fps: float = Field(gt=0)
     frames: int = Field(ge=1)
     duration_s: float

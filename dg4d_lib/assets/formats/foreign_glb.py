@@ -406,9 +406,7 @@ def decode_picture(content: bytes, name: str) -> NDArray[np.uint8]:
                 )
             return np.array(picture.convert("RGBA"))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-        raise BadInput(
-            f"the texture {name!r} of the model cannot be read ({error}); save it as PNG or JPEG"
-        ) from error
+        raise BadInput(f"the texture {name!r} of the model cannot be read ({error}); save it as PNG or JPEG") from error
 
 
 def read_accessor(reader: GlbReader, index: int, raw: bool = False) -> NDArray[Any]:
@@ -419,21 +417,27 @@ def read_accessor(reader: GlbReader, index: int, raw: bool = False) -> NDArray[A
     """
     tree = reader.tree
     accessor = tree["accessors"][index]
-    kind = np.dtype({5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}[accessor["componentType"]])
+    kind = np.dtype(
+        {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}[accessor["componentType"]]
+    )
     width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}[accessor["type"]]
     count = int(accessor["count"])
     if not 0 <= count <= 50_000_000:
         raise ValueError(f"an accessor has {count} rows")
     if "bufferView" in accessor:
         view = tree["bufferViews"][accessor["bufferView"]]
-        rows = _rows(reader, accessor["bufferView"], accessor.get("byteOffset", 0), kind, width, count, view.get("byteStride"))
+        rows = _rows(
+            reader, accessor["bufferView"], accessor.get("byteOffset", 0), kind, width, count, view.get("byteStride")
+        )
     else:
         rows = np.zeros((count, width), kind)
     if "sparse" in accessor:
         sparse, rows = accessor["sparse"], rows.copy()
         where, what = sparse["indices"], sparse["values"]
         into = {5121: "u1", 5123: "<u2", 5125: "<u4"}[where["componentType"]]
-        places = _rows(reader, where["bufferView"], where.get("byteOffset", 0), np.dtype(into), 1, sparse["count"], None)
+        places = _rows(
+            reader, where["bufferView"], where.get("byteOffset", 0), np.dtype(into), 1, sparse["count"], None
+        )
         rows[places[:, 0]] = _rows(
             reader, what["bufferView"], what.get("byteOffset", 0), kind, width, sparse["count"], None
         )
@@ -499,5 +503,3 @@ def _transformed(matrices: NDArray[np.float64], points: NDArray[Any]) -> NDArray
     if len(matrices) == 1:
         return (homogeneous @ matrices[0].T)[:, :3]
     return np.einsum("vij,vj->vi", matrices, homogeneous)[:, :3]
-
-

@@ -71,9 +71,7 @@ def read_spz(content: bytes, max_splats: int) -> tuple[Gaussians, tuple[str, ...
     means = (words.view("<i4")[..., 0] >> 8) / 2**bits
     share = (alphas.astype(np.float64) / 255).clip(1e-4, 1 - 1e-4)
     quats = _smallest_three(turns) if version == 3 else _first_three(turns)
-    cloud = _cloud(
-        means, scales / 16 - 10.0, quats, np.log(share / (1 - share)), (colors / 255 - 0.5) / 0.15
-    )
+    cloud = _cloud(means, scales / 16 - 10.0, quats, np.log(share / (1 - share)), (colors / 255 - 0.5) / 0.15)
     return cloud, (HIGHER,) if degree else ()
 
 

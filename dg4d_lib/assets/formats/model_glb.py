@@ -43,5 +43,7 @@ def write_model_glb(model: Model) -> bytes:
 def _add_texture(document: GltfDocument, name: str, pixels: NDArray[np.uint8]) -> int:
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "PNG")
-    image = document.add("images", name=name, mimeType="image/png", bufferView=document.add_view(name, buffer.getvalue()))
+    image = document.add(
+        "images", name=name, mimeType="image/png", bufferView=document.add_view(name, buffer.getvalue())
+    )
     return document.add("textures", name=name, source=image)

@@ -94,7 +94,9 @@ def read_obj(text: str, read: Read, decode: Decode, max_faces: int) -> Model:
 def referred_files(text: str, limit: int = 64) -> list[str]:
     """Return the MTL files that an OBJ names, or the textures that an MTL names."""
     words = (line.split("#", 1)[0].split() for line in text.splitlines())
-    names = [row[-1] if row[0] == "map_Kd" else " ".join(row[1:]) for row in words if row[:1] in (["mtllib"], ["map_Kd"])]
+    names = [
+        row[-1] if row[0] == "map_Kd" else " ".join(row[1:]) for row in words if row[:1] in (["mtllib"], ["map_Kd"])
+    ]
     return list(dict.fromkeys(name.replace("\\", "/") for name in names if name))[:limit]
 
 
@@ -128,9 +130,7 @@ def _read_materials(content: bytes | None, materials: dict[str, _Material]) -> N
             current.texture = words[-1].replace("\\", "/")
 
 
-def _texture(
-    name: str, read: Read, decode: Decode, pictures: dict[str, NDArray[np.uint8]]
-) -> NDArray[np.uint8] | None:
+def _texture(name: str, read: Read, decode: Decode, pictures: dict[str, NDArray[np.uint8]]) -> NDArray[np.uint8] | None:
     if not name:
         return None
     if name not in pictures:

@@ -84,9 +84,7 @@ def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
     return Model(tuple(parts))
 
 
-def _part(
-    mesh: UsdGeom.Mesh, time: Any, cache: Any, upright: NDArray[np.float64], decode: Decode
-) -> ModelPart | None:
+def _part(mesh: UsdGeom.Mesh, time: Any, cache: Any, upright: NDArray[np.float64], decode: Decode) -> ModelPart | None:
     points = np.array(mesh.GetPointsAttr().Get(time) or [], float).reshape(-1, 3)
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get(time) or [], np.int64)
     indices = np.array(mesh.GetFaceVertexIndicesAttr().Get(time) or [], np.int64)
@@ -125,9 +123,7 @@ def _fans(counts: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.stack([starts, starts + number + 1, starts + number + 2], 1)
 
 
-def _per_corner(
-    prim: Any, names: tuple[str, ...], indices: NDArray[np.int64], time: Any
-) -> NDArray[np.float64] | None:
+def _per_corner(prim: Any, names: tuple[str, ...], indices: NDArray[np.int64], time: Any) -> NDArray[np.float64] | None:
     """Return the values of the first existing primvar at every corner; None if it cannot be used."""
     api = UsdGeom.PrimvarsAPI(prim)
     for name in names:
@@ -168,5 +164,3 @@ def _material(prim: Any, decode: Decode) -> tuple[NDArray[np.uint8] | None, tupl
     if asset is None:
         raise BadInput(f"the texture {picture.path[:80]!r} of the model is missing; pack it into the USDZ")
     return decode(bytes(asset.GetBuffer()), picture.path), gray
-
-

@@ -44,9 +44,7 @@ class ControlGraph:
         return replace(self, indices=self.indices[rows], weights=self.weights[rows])
 
 
-def build_control_graph(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], count: int
-) -> ControlGraph:
+def build_control_graph(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], count: int) -> ControlGraph:
     """Distribute nodes evenly over a surface and compute the weights of its vertices.
 
     Args:
@@ -117,9 +115,7 @@ def bridge_components(points: Float[np.ndarray, "v 3"], pairs: Int[np.ndarray, "
         pairs = np.unique(np.sort(np.concatenate([pairs, _bridges(points, labels, parts)]), 1), axis=0)
 
 
-def spread_nodes(
-    graph: csr_array, points: Float[np.ndarray, "v 3"], count: int
-) -> tuple[Int[np.ndarray, " m"], float]:
+def spread_nodes(graph: csr_array, points: Float[np.ndarray, "v 3"], count: int) -> tuple[Int[np.ndarray, " m"], float]:
     """Choose points along the graph, each the farthest from those before it; also return the largest gap left."""
     chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
     nearest = dijkstra(graph, directed=False, indices=chosen[0])
