@@ -277,7 +277,7 @@ class _Descent:
             second.lerp_(value.grad.square(), 1 - BETA2)
             largest = second.flatten(1).amax(1).view(-1, *[1] * (second.dim() - 1)) / (1 - BETA2**self.count)
             moment = first / (1 - BETA1**self.count)
-            value -= lr * FACTORS[name] * moment / (largest.sqrt() + 1e-12)
+            value.sub_(lr * FACTORS[name] * moment / (largest.sqrt() + 1e-12))
 
 
 def _quats(turns: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:

@@ -8,6 +8,7 @@ import binascii
 import json
 import struct
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -86,10 +87,9 @@ def _read(file: Path, settings: AssetSettings) -> OwnModel:
             model = read_obj(text, lambda name: _beside(file.parent, name), decode_picture, settings.max_faces)
             return _mesh(write_model_glb(model), settings, ("y", "z"))
         case _:
-            from dg4d_lib.assets.formats.usd_model import check_usdz, read_usd  # the USD library starts slowly
-
-            check_usdz(file)
-            return _mesh(write_model_glb(read_usd(file, decode_picture, settings.max_faces)), settings)
+            usd: Any = import_module("dg4d_lib.assets.formats.usd_model")  # the USD library starts slowly
+            usd.check_usdz(file)
+            return _mesh(write_model_glb(usd.read_usd(file, decode_picture, settings.max_faces)), settings)
 
 
 def _mesh(content: bytes, settings: AssetSettings, ups: tuple[str, ...] = ("y",)) -> OwnModel:

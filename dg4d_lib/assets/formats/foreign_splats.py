@@ -32,7 +32,8 @@ def read_foreign_ply(content: bytes, max_splats: int) -> tuple[Gaussians, tuple[
     names = dtype.names or ()
     if not set(COLORS) <= set(names):
         raise BadInput(
-            "the PLY has no splat colors (f_dc_0, f_dc_1, f_dc_2); give splats with color, or a mesh as GLB, OBJ or USDZ"
+            "the PLY has no splat colors (f_dc_0, f_dc_1, f_dc_2); give splats with color, or a mesh as GLB, OBJ or "
+            "USDZ"
         )
     if missing := [name for name in (*MEANS, *OPACITY, *SCALES, *QUATS) if name not in names]:
         raise BadInput(f"the PLY holds no splats: it lacks {', '.join(missing)}; give a mesh as GLB, OBJ or USDZ")
@@ -80,8 +81,8 @@ def _check_count(count: int, max_splats: int) -> None:
         raise BadInput(f"the file holds {count} splats; at least 4 are needed")
     if count > max_splats:
         raise BadInput(
-            f"the file holds {count} splats; asset.max_splats allows {max_splats}: reduce them, or raise the limit with "
-            f"--set asset.max_splats={count}"
+            f"the file holds {count} splats; asset.max_splats allows {max_splats}: reduce them, or raise the limit "
+            f"with --set asset.max_splats={count}"
         )
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,62 +43,75 @@ def read_obj(text: str, read: Read, decode: Decode, max_faces: int) -> Model:
     Raises:
         BadInput: numbers cannot be read or do not fit, there are no or too many triangles, or a texture is missing.
     """
-    positions: list[tuple[float, ...]] = []
-    uvs: list[tuple[float, float]] = []
-    materials: dict[str, _Material] = {}
-    groups: dict[tuple[str, str], _Group] = {}
-    name, material, faces = "model", "", 0
+    content = _Content(read, max_faces)
     for number, line in enumerate(text.splitlines(), 1):
         words = line.split("#", 1)[0].split()
         try:
-            match words[:1]:
-                case ["v"]:
-                    positions.append(tuple(map(float, words[1:7])))
-                case ["vt"]:
-                    uvs.append((float(words[1]), 1 - float(words[2])))
-                case ["o" | "g"]:
-                    name = " ".join(words[1:]) or "model"
-                case ["usemtl"]:
-                    material = " ".join(words[1:])
-                case ["mtllib"]:
-                    _read_materials(read(" ".join(words[1:])), materials)
-                case ["f"]:
-                    corners = [_corner(word, len(positions), len(uvs)) for word in words[1:]]
-                    group = groups.setdefault((name, material), _Group(name, material))
-                    for second, third in zip(corners[1:-1], corners[2:], strict=True):
-                        group.corners += [corners[0], second, third]
-                    faces += max(0, len(corners) - 2)
+            content.add(words)
         except (ValueError, IndexError) as error:
             raise BadInput(f"line {number} of the OBJ cannot be read ({error}); export the model again") from error
-        if faces > max_faces:
-            raise BadInput(
-                f"the model has more than {max_faces} triangles, the limit asset.max_faces: simplify it, or raise the "
-                "limit with --set asset.max_faces=N"
-            )
-    if not faces:
+    if not content.faces:
         raise BadInput("the model has no faces; give a mesh with triangles")
-    points = np.array([row[:3] for row in positions], float).reshape(-1, 3)
-    colored = np.array([row[3:6] for row in positions]) if all(len(row) == 6 for row in positions) else None
-    if not np.isfinite(points).all():
-        raise BadInput("the model has vertices that are not finite numbers (NaN or infinity); export it again")
-    coordinates = np.array(uvs, float).reshape(-1, 2)
-    pictures: dict[str, NDArray[np.uint8]] = {}
-    parts = []
-    for group in groups.values():
-        if group.corners:
-            known = materials.get(group.material, _Material())
-            texture = _texture(known.texture, read, decode, pictures)
-            parts.append(_part(group, points, coordinates, colored, known, texture))
-    return Model(tuple(parts))
+    return content.model(decode)
 
 
-def referred_files(text: str, limit: int = 64) -> list[str]:
-    """Return the MTL files that an OBJ names, or the textures that an MTL names."""
-    words = (line.split("#", 1)[0].split() for line in text.splitlines())
-    names = [
-        row[-1] if row[0] == "map_Kd" else " ".join(row[1:]) for row in words if row[:1] in (["mtllib"], ["map_Kd"])
-    ]
-    return list(dict.fromkeys(name.replace("\\", "/") for name in names if name))[:limit]
+class _Content:
+    """Statements of an OBJ read so far."""
+
+    def __init__(self, read: Read, max_faces: int) -> None:
+        self.read, self.max_faces = read, max_faces
+        self.positions: list[tuple[float, ...]] = []
+        self.uvs: list[tuple[float, float]] = []
+        self.materials: dict[str, _Material] = {}
+        self.groups: dict[tuple[str, str], _Group] = {}
+        self.name, self.material, self.faces = "model", "", 0
+
+    def add(self, words: list[str]) -> None:
+        """Read the words of a line."""
+        match words[:1]:
+            case ["v"]:
+                self.positions.append(tuple(map(float, words[1:7])))
+            case ["vt"]:
+                self.uvs.append((float(words[1]), 1 - float(words[2])))
+            case ["o" | "g"]:
+                self.name = " ".join(words[1:]) or "model"
+            case ["usemtl"]:
+                self.material = " ".join(words[1:])
+            case ["mtllib"]:
+                _read_materials(self.read(" ".join(words[1:])), self.materials)
+            case ["f"]:
+                self.add_face([_corner(word, len(self.positions), len(self.uvs)) for word in words[1:]])
+
+    def add_face(self, corners: list[tuple[int, int]]) -> None:
+        """Add a polygon as a fan of triangles."""
+        key = self.name, self.material
+        group = self.groups.setdefault(key, _Group(*key))
+        for second, third in pairwise(corners[1:]):
+            group.corners += [corners[0], second, third]
+        self.faces += max(0, len(corners) - 2)
+        if self.faces > self.max_faces:
+            raise BadInput(
+                f"the model has more than {self.max_faces} triangles, the limit asset.max_faces: simplify it, or raise "
+                "the limit with --set asset.max_faces=N"
+            )
+
+    def model(self, decode: Decode) -> Model:
+        """Return the parts."""
+        points = np.array([row[:3] for row in self.positions], float).reshape(-1, 3)
+        colored = None
+        if all(len(row) == 6 for row in self.positions):
+            colored = np.array([row[3:6] for row in self.positions])
+        if not np.isfinite(points).all():
+            raise BadInput("the model has vertices that are not finite numbers (NaN or infinity); export it again")
+        coordinates = np.array(self.uvs, float).reshape(-1, 2)
+        pictures: dict[str, NDArray[np.uint8]] = {}
+        parts = []
+        for group in self.groups.values():
+            if group.corners:
+                known = self.materials.get(group.material, _Material())
+                texture = _texture(known.texture, self.read, decode, pictures)
+                parts.append(_part(group, points, coordinates, colored, known, texture))
+        return Model(tuple(parts))
 
 
 def _corner(word: str, positions: int, uvs: int) -> tuple[int, int]:

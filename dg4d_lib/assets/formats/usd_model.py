@@ -33,11 +33,11 @@ def check_usdz(path: Path) -> None:
         raise BadInput(f"the USDZ is broken ({error}); export it again") from error
     if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
         raise BadInput("the USDZ has compressed entries, which the format forbids; export it again")
-    size = path.stat().st_size
-    if len(entries) > MAX_ENTRIES or sum(entry.file_size for entry in entries) > size:
+    size, inside = path.stat().st_size, sum(entry.file_size for entry in entries)
+    if len(entries) > MAX_ENTRIES or inside > size:
         raise BadInput(
-            f"the USDZ says that it holds {len(entries)} files of {sum(entry.file_size for entry in entries)} bytes, and "
-            f"has {size}; at most {MAX_ENTRIES} files are read, none twice: export it again"
+            f"the USDZ says that it holds {len(entries)} files of {inside} bytes, and has {size} bytes itself; at most "
+            f"{MAX_ENTRIES} files are read, none twice: export it again"
         )
 
 

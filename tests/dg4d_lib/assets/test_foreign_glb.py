@@ -141,5 +141,5 @@ def test_broken_files_get_a_sentence(case):
 
 
 def test_too_many_triangles_are_refused_with_the_setting():
-    with pytest.raises(BadInput, match="12 triangles; asset.max_faces allows 11.*asset.max_faces=12"):
+    with pytest.raises(BadInput, match=r"12 triangles; asset\.max_faces allows 11.*asset\.max_faces=12"):
         read_foreign_glb(box_glb(), 11)
