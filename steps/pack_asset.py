@@ -82,7 +82,7 @@ class PackageWriter:
     def write_meshes(self) -> None:
         """Write the animated mesh, and in the mode per_frame also the mesh of every frame."""
         gltf, surface = self.pack.gltf, self.surface
-        if "moving" in self.inputs:
+        if "moving" in self.inputs and isinstance(surface, Asset4D):
             shutil.copyfile(self.inputs["moving"], self.path(packages.ASSET))
             self.path(packages.MERGED).write_bytes(write_glb(surface, gltf))
             return

@@ -24,7 +24,8 @@ from dg4d_lib.settings import AssetSettings
 from dg4d_lib.video.driving import DrivingVideo
 
 ADVICE = "lower asset.lr"
-LEVELS = (1, 2, 4, 8)  # pooling of the compared pictures; coarse ones see far motion
+LEVELS = (1, 2, 4, 8)  # pooling of the compared pictures
+COARSE = (4, 8, 16)  # the same in the first half of tracking; coarse pictures see far motion
 ROBUST = 0.05  # relative stretch up to which the rigidity is quadratic
 WHOLE_DEPTH = 30.0  # weight of the mean displacement in depth, which a video hardly shows, times that of every node's
 BETA1, BETA2 = 0.9, 0.99  # of Adam
@@ -111,7 +112,7 @@ def fit_asset_motion(
         expected = start.motion(fit.smoothing).nodes(graph).detach()
         for step in range(steps):
             moved = unknowns.motion(fit.smoothing)
-            losses = fit.losses(moved, [frame])
+            losses = fit.losses(moved, [frame], COARSE if 2 * step < steps else LEVELS)
             losses["inertia"] = settings.inertia * fit.relative(moved.nodes(graph) - expected).square().sum(-1).mean()
             fit.step(losses, unknowns, f"frame {frame}, iteration {step + 1}")
             descent.step(settings.lr * (1 - 0.8 * step / steps))
@@ -166,7 +167,7 @@ class _Fit:
         """Return lengths in tenths of the model's size."""
         return values / self.unit
 
-    def losses(self, motion: NodeMotion, frames: list[int]) -> dict[str, Tensor]:
+    def losses(self, motion: NodeMotion, frames: list[int], levels: Sequence[int] = LEVELS) -> dict[str, Tensor]:
         """Return the weighted losses of some frames."""
         settings = self.settings
         means = motion.points(self.cloud.means, self.graph)
@@ -178,8 +179,8 @@ class _Fit:
             quats=self.cloud.quats.expand(count, -1, -1),
         )
         rendering = self.rasterize(states, [self.camera] * count, means.new_tensor(WHITE))
-        color = _pyramid_error(rendering.color, self.colors[frames]) / self.area
-        alpha = _pyramid_error(rendering.alpha, self.alphas[frames]) / self.area
+        color = _pyramid_error(rendering.color, self.colors[frames], levels) / self.area
+        alpha = _pyramid_error(rendering.alpha, self.alphas[frames], levels) / self.area
         depth = self.relative(motion.nodes(self.graph)[..., 2] - self.graph.nodes[:, 2])
         depth = depth.square().mean() + WHOLE_DEPTH * depth.mean(-1).square().mean()
         return {
@@ -310,8 +311,10 @@ def _robust(values: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
     return (values.square().sum(-1) + ROBUST**2).sqrt() - ROBUST
 
 
-def _pyramid_error(ours: Float[Tensor, "b h w c"], theirs: Float[Tensor, "b h w c"]) -> Float[Tensor, ""]:
+def _pyramid_error(
+    ours: Float[Tensor, "b h w c"], theirs: Float[Tensor, "b h w c"], levels: Sequence[int]
+) -> Float[Tensor, ""]:
     """Return the mean squared error, averaged over a pyramid."""
     difference = (ours - theirs).movedim(-1, 1)
-    errors = [functional.avg_pool2d(difference, level).square().mean() for level in LEVELS]
+    errors = [functional.avg_pool2d(difference, level).square().mean() for level in levels]
     return torch.stack(errors).mean()

@@ -218,7 +218,7 @@ def _refined(
         adam.step()
     with torch.no_grad():
         quat, log_scale, shift = _moved(start, values)
-    azimuth = (start.azimuth_deg - math.degrees(float(values["turn"]))) % 360
+    azimuth = (start.azimuth_deg - math.degrees(float(values["turn"].detach()))) % 360
     unit = functional.normalize(quat.detach(), dim=-1)
     return Placement(unit, float(log_scale.exp()), shift.detach(), azimuth)
 

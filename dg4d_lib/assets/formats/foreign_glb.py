@@ -133,7 +133,7 @@ def write_moving_glb(
     if "skins" in tree:
         notes.append("the skeleton of the model is kept at rest; its motion is in morph targets")
     span = Span(0, len(moved), len(moved))
-    back = np.linalg.inv(placement)
+    back: NDArray[np.float64] = np.linalg.inv(placement).astype(np.float64)
     animation = Animation(document, rate)
     start = 0
     for node, pieces in _by_node(glb.pieces).items():
@@ -252,7 +252,8 @@ def _read(reader: GlbReader, max_faces: int) -> ForeignGlb:
             f"the model has {faces} triangles; asset.max_faces allows {max_faces}: simplify it, or raise the limit "
             f"with --set asset.max_faces={faces}"
         )
-    pieces, pictures = [], {}
+    pieces: list[Piece] = []
+    pictures: dict[int, NDArray[np.uint8]] = {}
     for node in nodes:
         mesh = tree["meshes"][tree["nodes"][node]["mesh"]]
         for number, primitive in enumerate(mesh["primitives"]):

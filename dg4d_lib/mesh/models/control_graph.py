@@ -4,11 +4,13 @@ Distances follow the surface, so that a leg does not move with the other one tha
 as eyes, are joined by bridges to their nearest neighbors and move with them.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
@@ -66,7 +68,7 @@ def graph_of_points(points: Float[np.ndarray, "v 3"], graph: csr_array, count: i
     """
     chosen, spacing = spread_nodes(graph, points, min(count, len(points)))
     nearest = min(max(NEIGHBORS + 1, LINKS + 1), len(chosen))
-    distances = dijkstra(graph, directed=False, indices=chosen, limit=REACH * spacing).astype(np.float32)  # m v
+    distances = _distances(graph, chosen, REACH * spacing).astype(np.float32)  # m v
     distances = np.minimum(distances, REACH * spacing)
     order = np.argpartition(distances, nearest - 1, axis=0)[:nearest].T
     near = np.take_along_axis(distances.T, order, 1)
@@ -100,7 +102,7 @@ def surface_graph(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 
 def point_graph(points: Float[np.ndarray, "v 3"], neighbors: int = 8) -> csr_array:
     """Return the distances of points to their nearest neighbors as a symmetric connected matrix, for splats."""
     neighbors = min(neighbors, len(points) - 1)
-    index = cKDTree(points).query(points, k=neighbors + 1)[1][:, 1:]
+    index = np.asarray(cKDTree(points).query(points, k=neighbors + 1)[1])[:, 1:]
     pairs = np.stack([np.repeat(np.arange(len(points)), neighbors), index.ravel()], 1)
     return bridge_components(points, np.unique(np.sort(pairs, 1), axis=0))
 
@@ -109,7 +111,8 @@ def bridge_components(points: Float[np.ndarray, "v 3"], pairs: Int[np.ndarray, "
     """Join separate components of a graph by edges between their nearest points; return the matrix of lengths."""
     while True:
         graph = _lengths(points, pairs)
-        parts, labels = connected_components(graph, directed=False)
+        found: tuple[int, NDArray[np.int32]] = connected_components(graph, directed=False)  # type: ignore[assignment]
+        parts, labels = found
         if parts == 1:
             return graph
         pairs = np.unique(np.sort(np.concatenate([pairs, _bridges(points, labels, parts)]), 1), axis=0)
@@ -118,15 +121,24 @@ def bridge_components(points: Float[np.ndarray, "v 3"], pairs: Int[np.ndarray, "
 def spread_nodes(graph: csr_array, points: Float[np.ndarray, "v 3"], count: int) -> tuple[Int[np.ndarray, " m"], float]:
     """Choose points along the graph, each the farthest from those before it; also return the largest gap left."""
     chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
-    nearest = dijkstra(graph, directed=False, indices=chosen[0])
+    nearest = _distances(graph, chosen[:1])[0]
     while len(chosen) < count:
         chosen.append(int(nearest.argmax()))
         if nearest[chosen[-1]] == 0:
             chosen.pop()
             break
-        found = dijkstra(graph, directed=False, indices=chosen[-1], limit=float(nearest[chosen[-1]]))
-        nearest = np.minimum(nearest, found)
+        nearest = np.minimum(nearest, _distances(graph, chosen[-1:], float(nearest[chosen[-1]]))[0])
     return np.array(chosen), max(float(nearest.max()), 1e-9)
+
+
+def _distances(
+    graph: csr_array, sources: Sequence[int] | Int[np.ndarray, " m"], limit: float = np.inf
+) -> Float[np.ndarray, "m v"]:
+    """Return the distances from some points to all along the graph; infinity beyond the limit."""
+    found: Float[np.ndarray, "m v"] = dijkstra(  # type: ignore[call-overload]
+        graph, directed=False, indices=np.asarray(sources), limit=limit
+    )
+    return found
 
 
 def _lengths(points: Float[np.ndarray, "v 3"], pairs: Int[np.ndarray, "e 2"]) -> csr_array:
@@ -141,7 +153,7 @@ def _bridges(points: Float[np.ndarray, "v 3"], labels: Int[np.ndarray, " v"], pa
     found = []
     for part in np.argsort(sizes)[:-1]:
         inside, outside = np.flatnonzero(labels == part), np.flatnonzero(labels != part)
-        distances, index = cKDTree(points[outside]).query(points[inside])
+        distances, index = map(np.asarray, cKDTree(points[outside]).query(points[inside]))
         others = labels[outside[index]]
         for other in np.unique(others[distances <= TOUCHING * distances.min() + 1e-6]):
             rows = np.flatnonzero(others == other)

@@ -53,8 +53,8 @@ def test_colors_of_vertices_are_interpolated():
 def test_parts_keep_their_own_colors():
     uvs = np.array([(0, 1), (1, 1), (1, 0), (0, 0)], float)
     white = np.full((8, 8, 4), 255, np.uint8)
-    left = ModelPart("a", SQUARE - (0.55, 0, 0), FACES, uvs, white, (1.0, 0.0, 0.0))
-    right = ModelPart("b", SQUARE + (0.55, 0, 0), FACES, factor=(0.0, 0.0, 1.0))
+    left = ModelPart("a", SQUARE - np.float32([0.55, 0, 0]), FACES, uvs, white, (1.0, 0.0, 0.0))
+    right = ModelPart("b", SQUARE + np.float32([0.55, 0, 0]), FACES, factor=(0.0, 0.0, 1.0))
     model = Model((left, right))
     np.testing.assert_allclose(pixel(model, 0.3, 0.5), (1, 0, 0), atol=0.02)
     np.testing.assert_allclose(pixel(model, 0.7, 0.5), (0, 0, 1), atol=0.02)

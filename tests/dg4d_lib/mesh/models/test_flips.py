@@ -37,5 +37,5 @@ def test_a_folded_vertex_is_unfolded_and_the_rest_stays():
 
 def test_a_sound_motion_is_returned_unchanged():
     vertices, faces = sheet()
-    moved = vertices + (0.5, 0, 0)
+    moved = vertices + np.array([0.5, 0, 0])
     assert unflip(vertices, moved, faces, identity(len(vertices)))[0] is moved
