@@ -65,13 +65,13 @@ class ConversionRequest(Frozen):
         require_backend(self.settings.rasterizer)
         if (self.settings.pack.lods or self.settings.pack.gltf.meshopt) and not find_spec("meshoptimizer"):
             raise BackendUnavailable("pack.lods and pack.gltf.meshopt need meshoptimizer: `deploy/install.sh meshopt`")
-        self._check_source()
-        if self.bank is not None:
-            sources.check_bank(self.bank)
         if self.asset is not None:
             models.check_model(self.asset)
             if self.text:
-                raise BadInput("--asset takes a picture, a video, or nothing to be moved by; leave --text out")
+                raise BadInput("--asset is moved by a picture, a video, or a motion of its own; leave --text out")
+        self._check_source()
+        if self.bank is not None:
+            sources.check_bank(self.bank)
         oracle = self.settings.prior.kind == "oracle"
         if oracle and self.bank is None:
             raise BadInput("prior.kind=oracle needs ground-truth views: --bank DIR")
