@@ -271,6 +271,7 @@ class AssetSettings(Settings):
     smoothing: NotNegative = Field(4.0, description="smoothing of the steps over the control graph")
     color_weight: NotNegative = Field(1.0, description="colors of the video, mean squared error over the subject")
     alpha_weight: NotNegative = Field(1.0, description="alpha of the video, mean squared error over the subject")
+    flow: NotNegative = Field(0.1, description="optical flow between frames while tracking")
     rigidity: NotNegative = Field(0.3, description="as-rigid-as-possible energy of the surface")
     bending: NotNegative = Field(0.1, description="differences of neighboring rotations, times `rigidity`")
     inertia: NotNegative = Field(0.02, description="distance to the extrapolated motion while tracking")

@@ -9,8 +9,10 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
+from skimage.registration import optical_flow_tvl1
 from torch import Tensor
 from torch.nn import functional
 
@@ -24,8 +26,10 @@ from dg4d_lib.settings import AssetSettings
 from dg4d_lib.video.driving import DrivingVideo
 
 ADVICE = "lower asset.lr"
-LEVELS = (1, 2, 4, 8)  # pooling of the compared pictures
-COARSE = (4, 8, 16)  # the same in the first half of tracking; coarse pictures see far motion
+LEVELS = (1, 4, 8)  # widths of the filters over the compared pictures, pixels
+FLOW_SHARE = 0.6  # of the iterations of a frame that follow the optical flow; the rest follow the pictures alone
+FLOW_UNIT = 0.02  # of the picture's side: error of the flow up to which its loss is quadratic
+DEPTH_SLACK = 0.05  # world units by which a Gaussian may lie behind the visible surface
 ROBUST = 0.05  # relative stretch up to which the rigidity is quadratic
 WHOLE_DEPTH = 30.0  # weight of the mean displacement in depth, which a video hardly shows, times that of every node's
 BETA1, BETA2 = 0.9, 0.99  # of Adam
@@ -110,9 +114,12 @@ def fit_asset_motion(
         unknowns, steps = start.copy(), settings.track_iterations
         descent = _Descent(unknowns)
         expected = start.motion(fit.smoothing).nodes(graph).detach()
+        targets = fit.flow_targets(tracked[-1].motion(fit.smoothing), frame) if frame else None
         for step in range(steps):
             moved = unknowns.motion(fit.smoothing)
-            losses = fit.losses(moved, [frame], COARSE if 2 * step < steps else LEVELS)
+            losses = fit.losses(moved, [frame])
+            if targets is not None and step < FLOW_SHARE * steps:
+                losses["flow"] = settings.flow * fit.flow_loss(moved, *targets)
             losses["inertia"] = settings.inertia * fit.relative(moved.nodes(graph) - expected).square().sum(-1).mean()
             fit.step(losses, unknowns, f"frame {frame}, iteration {step + 1}")
             descent.step(settings.lr * (1 - 0.8 * step / steps))
@@ -167,7 +174,7 @@ class _Fit:
         """Return lengths in tenths of the model's size."""
         return values / self.unit
 
-    def losses(self, motion: NodeMotion, frames: list[int], levels: Sequence[int] = LEVELS) -> dict[str, Tensor]:
+    def losses(self, motion: NodeMotion, frames: list[int]) -> dict[str, Tensor]:
         """Return the weighted losses of some frames."""
         settings = self.settings
         means = motion.points(self.cloud.means, self.graph)
@@ -179,8 +186,8 @@ class _Fit:
             quats=self.cloud.quats.expand(count, -1, -1),
         )
         rendering = self.rasterize(states, [self.camera] * count, means.new_tensor(WHITE))
-        color = _pyramid_error(rendering.color, self.colors[frames], levels) / self.area
-        alpha = _pyramid_error(rendering.alpha, self.alphas[frames], levels) / self.area
+        color = _pyramid_error(rendering.color, self.colors[frames]) / self.area
+        alpha = _pyramid_error(rendering.alpha, self.alphas[frames]) / self.area
         depth = self.relative(motion.nodes(self.graph)[..., 2] - self.graph.nodes[:, 2])
         depth = depth.square().mean() + WHOLE_DEPTH * depth.mean(-1).square().mean()
         return {
@@ -189,6 +196,39 @@ class _Fit:
             "rigidity": settings.rigidity * self.rigidity(motion),
             "depth": settings.depth * depth,
         }
+
+    @torch.no_grad()
+    def flow_targets(self, before: NodeMotion, frame: int) -> tuple[Int[Tensor, " k"], Float[Tensor, "k 2"]]:
+        """Return the Gaussians that were visible before a frame, and the pixels that the optical flow moves them to."""
+        means = before.points(self.cloud.means, self.graph)
+        state = replace(self.cloud, means=means[0])
+        drawn = self.rasterize(state, [self.camera], means.new_tensor(WHITE))
+        pixels, depth = self._projected(means[0])
+        size = self.settings.size
+        column, row = pixels.floor().long().clamp(0, size - 1).T
+        alpha = drawn.alpha[0, row, column, 0]
+        surface = drawn.depth[0, row, column, 0] / alpha.clamp(min=1e-3)
+        visible = torch.nonzero((depth < surface + DEPTH_SLACK) & (alpha > 0.5))[:, 0]
+        pair = [luminance(self.colors[number]) for number in (frame - 1, frame)]
+        flow = torch.from_numpy(np.stack(optical_flow_tvl1(*pair), -1)).to(means)  # rows, columns
+        moved = pixels[visible] + flow[row[visible], column[visible]].flip(-1)
+        return visible, moved
+
+    def flow_loss(
+        self, motion: NodeMotion, visible: Int[Tensor, " k"], targets: Float[Tensor, "k 2"]
+    ) -> Float[Tensor, ""]:
+        """Return the robust distance of projected Gaussians to their targets."""
+        if len(visible) == 0:
+            return targets.new_zeros(())
+        means = motion.points(self.cloud.means[visible], self.graph.of(visible))[0]
+        error = (self._projected(means)[0] - targets) / (FLOW_UNIT * self.settings.size)
+        return ((error.square().sum(-1) + 1).sqrt() - 1).mean()
+
+    def _projected(self, means: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"]]:
+        """Return pixels (column, row) and depths of points."""
+        matrix = self.camera.viewmat().to(means)
+        seen = means @ matrix[:3, :3].T + matrix[:3, 3]
+        return seen[:, :2] / seen[:, 2:].clamp(min=0.1) * self.camera.focal + self.settings.size / 2, seen[:, 2]
 
     def rigidity(self, motion: NodeMotion) -> Float[Tensor, ""]:
         """Return the robust as-rigid-as-possible energy of the graph."""
@@ -298,6 +338,11 @@ def _smoothing(graph: ControlGraph, strength: float) -> Float[Tensor, "m m"]:
     return inverse.to(graph.nodes)
 
 
+def luminance(color: Float[Tensor, "h w 3"]) -> Float[np.ndarray, "h w"]:
+    """Return the luma of a picture."""
+    return (color @ color.new_tensor((0.299, 0.587, 0.114))).cpu().numpy()
+
+
 def _thinned(cloud: Gaussians, graph: ControlGraph, count: int) -> tuple[Gaussians, ControlGraph]:
     """Return about `count` of the Gaussians, evenly chosen and larger to cover as much."""
     step = max(1, round(len(cloud) / count))
@@ -311,10 +356,16 @@ def _robust(values: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
     return (values.square().sum(-1) + ROBUST**2).sqrt() - ROBUST
 
 
-def _pyramid_error(
-    ours: Float[Tensor, "b h w c"], theirs: Float[Tensor, "b h w c"], levels: Sequence[int]
-) -> Float[Tensor, ""]:
-    """Return the mean squared error, averaged over a pyramid."""
+def _pyramid_error(ours: Float[Tensor, "b h w c"], theirs: Float[Tensor, "b h w c"]) -> Float[Tensor, ""]:
+    """Return the mean squared error, averaged over filters of several widths.
+
+    Each is a mean over squares of half the width and three of three by three of these, which is nearly a Gaussian.
+    """
     difference = (ours - theirs).movedim(-1, 1)
-    errors = [functional.avg_pool2d(difference, level).square().mean() for level in levels]
+    errors = []
+    for width in LEVELS:
+        filtered = functional.avg_pool2d(difference, max(1, width // 2))
+        for _ in range(3 if width > 1 else 0):
+            filtered = functional.avg_pool2d(filtered, 3, 1, 1)
+        errors.append(filtered.square().mean())
     return torch.stack(errors).mean()

@@ -111,7 +111,7 @@ def bridge_components(points: Float[np.ndarray, "v 3"], pairs: Int[np.ndarray, "
     """Join separate components of a graph by edges between their nearest points; return the matrix of lengths."""
     while True:
         graph = _lengths(points, pairs)
-        found: tuple[int, NDArray[np.int32]] = connected_components(graph, directed=False)  # type: ignore[assignment]
+        found: tuple[int, NDArray[np.int32]] = connected_components(graph, directed=False)
         parts, labels = found
         if parts == 1:
             return graph
@@ -135,9 +135,7 @@ def _distances(
     graph: csr_array, sources: Sequence[int] | Int[np.ndarray, " m"], limit: float = np.inf
 ) -> Float[np.ndarray, "m v"]:
     """Return the distances from some points to all along the graph; infinity beyond the limit."""
-    found: Float[np.ndarray, "m v"] = dijkstra(  # type: ignore[call-overload]
-        graph, directed=False, indices=np.asarray(sources), limit=limit
-    )
+    found: Float[np.ndarray, "m v"] = dijkstra(graph, directed=False, indices=np.asarray(sources), limit=limit)
     return found
 
 
