@@ -17,6 +17,7 @@ from torch.nn import functional
 
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.errors import BadInput
+from dg4d_lib.fitting.asset_motion import antialiased
 from dg4d_lib.fitting.losses import WHITE, resize_cutouts
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
@@ -155,7 +156,7 @@ def _renders(
     for start in range(0, len(placements), BATCH):
         placed = [one.apply(cloud) for one in placements[start : start + BATCH]]
         states = replace(
-            cloud,
+            antialiased(placed[0], camera),
             **{name: torch.stack([getattr(one, name) for one in placed]) for name in ("means", "log_scales", "quats")},
         )
         with torch.no_grad():
@@ -202,6 +203,7 @@ def _refined(
         [{"params": [value], "lr": rates[name]} for name, value in values.items()], betas=(0.9, 0.98)
     )
     area = mask.mean().clamp(min=1e-3)
+    cloud = replace(cloud, opacity_logits=antialiased(start.apply(cloud), camera).opacity_logits)
     for _ in range(ITERATIONS):
         quat, log_scale, shift = _moved(start, values)
         drawn = rasterize(_similar(cloud, quat, log_scale, shift), [camera], torch.tensor(WHITE))
