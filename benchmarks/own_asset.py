@@ -24,6 +24,7 @@ from torch import Tensor
 
 from benchmarks.objects.drawing import Painted
 from benchmarks.objects.specimens import OBJECTS
+from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.fitting.asset_motion import fit_asset_motion
 from dg4d_lib.fitting.asset_pose import find_placement
@@ -39,7 +40,6 @@ from dg4d_lib.metrics.image import iou, psnr
 from dg4d_lib.metrics.surface import chamfer_distance, sample_surface
 from dg4d_lib.metrics.video import temporal_error
 from dg4d_lib.rasterizer.interface import get_rasterizer
-from dg4d_lib.settings import AssetSettings
 from dg4d_lib.video.driving import DrivingVideo
 from steps.animate_asset import moved_states, moved_vertices
 from steps.artifacts.ground_truth import find_ground_truths

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.assets.formats.foreign_glb import ForeignGlb, read_foreign_glb, write_moving_glb
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.fitting.asset_motion import NodeMotion, fit_asset_motion, iterations
@@ -19,7 +20,7 @@ from dg4d_lib.mesh.models.flips import unflip
 from dg4d_lib.mesh.models.surface_cloud import SurfaceCloud, cover_surface
 from dg4d_lib.mesh.textured import TrackedMesh
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
-from dg4d_lib.settings import AssetSettings, FramewiseSettings
+from dg4d_lib.settings import FramewiseSettings
 from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.meshes import write_tracked
 from steps.artifacts.motions import write_motion

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.fitting.asset_pose import Placement, centered_placement, find_placement, picture_of_both
@@ -14,7 +15,6 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import write_ply
 from dg4d_lib.mesh.models.surface_cloud import cover_surface
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
-from dg4d_lib.settings import AssetSettings
 from steps.artifacts.media import read_png, write_png
 from steps.artifacts.placements import write_placement
 from steps.fitting.reporting import render_turnaround

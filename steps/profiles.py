@@ -6,11 +6,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError, create_model, model_validator
 
-from dg4d_lib.asset_settings import GateSettings, PackSettings, ScoreSettings
+from dg4d_lib.asset_settings import AssetSettings, GateSettings, PackSettings, ScoreSettings
 from dg4d_lib.errors import BadInput
 from dg4d_lib.rasterizer.backends import backend_name
 from dg4d_lib.settings import (
-    AssetSettings,
     DeformationSettings,
     DrivingSettings,
     GeometricPriorSettings,

@@ -16,13 +16,13 @@ from skimage.registration import optical_flow_tvl1
 from torch import Tensor
 from torch.nn import functional
 
+from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.losses import WHITE, check_finite, resize_cutouts
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
 from dg4d_lib.mesh.models.control_graph import ControlGraph
 from dg4d_lib.rasterizer.interface import BLUR, Rasterizer
-from dg4d_lib.settings import AssetSettings
 from dg4d_lib.video.driving import DrivingVideo
 
 ADVICE = "lower asset.lr"

@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-from dg4d_lib.assets.formats.foreign_glb import ForeignGlb, decode_picture, read_foreign_glb
+from dg4d_lib.asset_settings import AssetSettings
+from dg4d_lib.assets.formats.foreign_glb import ForeignGlb, read_foreign_glb
 from dg4d_lib.assets.formats.foreign_splats import read_foreign_ply, read_spz
 from dg4d_lib.assets.formats.model_glb import write_model_glb
+from dg4d_lib.assets.formats.model_pictures import decode_picture
 from dg4d_lib.assets.formats.obj import read_obj
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.settings import AssetSettings
 from steps.artifacts.archives import stays_inside, unpack
 from steps.sources.decode_limit import DecodeLimit
 

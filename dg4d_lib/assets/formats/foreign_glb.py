@@ -5,7 +5,6 @@ animations are dropped, since they would move the model twice; existing morph ta
 Files are not trusted: every index, size and number is checked before it is used.
 """
 
-import io
 import json
 import math
 import struct
@@ -15,17 +14,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from dg4d_lib.assets.formats import meshopt
 from dg4d_lib.assets.formats.gltf import VERTEX_DATA, GlbReader, GltfDocument
+from dg4d_lib.assets.formats.model_pictures import decode_picture
 from dg4d_lib.assets.formats.normals import SmoothNormals
 from dg4d_lib.assets.formats.tracks import Animation, Span
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.models.model import Model, ModelPart
 
 MAX_POSES = 128  # morph targets; players keep their weights in uniforms, of which every GPU has at least 256
-MAX_IMAGE_PIXELS = 8192 * 8192
 MAX_NODES = 100_000
 MAX_DEPTH = 200  # of nested nodes
 TRIANGLES, STRIP, FAN = 4, 5, 6
@@ -390,24 +388,6 @@ def _picture(reader: GlbReader, index: int) -> NDArray[np.uint8]:
             "export the model as GLB with its textures"
         )
     return decode_picture(reader.view(image["bufferView"]), str(image.get("name", index)))
-
-
-def decode_picture(content: bytes, name: str) -> NDArray[np.uint8]:
-    """Decode a PNG, JPEG or WebP of a model as RGBA.
-
-    Raises:
-        BadInput: it cannot be decoded, or is too large.
-    """
-    try:
-        with Image.open(io.BytesIO(content), formats=["PNG", "JPEG", "WEBP"]) as picture:
-            if picture.width * picture.height > MAX_IMAGE_PIXELS:
-                raise BadInput(
-                    f"the texture {name!r} of the model is {picture.width} x {picture.height} pixels; at most "
-                    f"{MAX_IMAGE_PIXELS} pixels are read: make it smaller"
-                )
-            return np.array(picture.convert("RGBA"))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-        raise BadInput(f"the texture {name!r} of the model cannot be read ({error}); save it as PNG or JPEG") from error
 
 
 def read_accessor(reader: GlbReader, index: int, raw: bool = False) -> NDArray[Any]:

@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array, csr_array
 
-ROUNDS = 60  # smoothing steps at most
-RINGS = 2  # rings of vertices around a flipped face that are smoothed with it
+ROUNDS = 40  # smoothing steps at most
+RINGS = 1  # rings of vertices by which the smoothed region grows in a step
 
 
 def flipped_faces(
@@ -48,14 +48,13 @@ def unflip(
     region = np.zeros(len(rest), bool)
     for _ in range(ROUNDS):
         region[faces[wrong]] = True
-        near = region.copy()
         for _ in range(RINGS):
-            near |= (mean @ near.astype(np.float64)) > 0
+            region |= (mean @ region.astype(np.float64)) > 0
         affine = np.concatenate([turns.reshape(-1, 9), shifts], 1)
-        affine[near] = 0.5 * (affine[near] + (mean @ affine)[near])
+        affine[region] = 0.5 * (affine[region] + (mean @ affine)[region])
         turns, shifts = affine[:, :9].reshape(-1, 3, 3), affine[:, 9:]
-        moved[near] = (np.einsum("vij,vj->vi", turns, rest) + shifts)[near]
-        wrong = flipped_faces(rest, moved, faces, rotations)
+        moved[region] = (np.einsum("vij,vj->vi", turns, rest) + shifts)[region]
+        wrong = flipped_faces(rest, moved, faces, turns)
         if not wrong.any():
             break
     return moved, int(wrong.sum())

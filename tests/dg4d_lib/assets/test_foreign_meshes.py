@@ -7,8 +7,9 @@ import pytest
 from foreign_models import BOX, CORNERS, RED_AND_BLUE, png
 from pxr import Gf, Usd, UsdGeom, UsdUtils
 
-from dg4d_lib.assets.formats.foreign_glb import decode_picture, read_foreign_glb
+from dg4d_lib.assets.formats.foreign_glb import read_foreign_glb
 from dg4d_lib.assets.formats.model_glb import write_model_glb
+from dg4d_lib.assets.formats.model_pictures import decode_picture
 from dg4d_lib.assets.formats.obj import read_obj
 from dg4d_lib.assets.formats.usd_model import check_usdz, read_usd
 from dg4d_lib.errors import BadInput

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.asset_motion import NodeMotion, antialiased, fit_asset_motion
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -11,7 +12,6 @@ from dg4d_lib.mesh.models.control_graph import ControlGraph, build_control_graph
 from dg4d_lib.mesh.models.model import Model, ModelPart
 from dg4d_lib.mesh.models.surface_cloud import SurfaceCloud, cover_surface
 from dg4d_lib.rasterizer.interface import get_rasterizer
-from dg4d_lib.settings import AssetSettings
 from dg4d_lib.video.driving import DrivingVideo
 
 FRAMES, ANGLE = 4, 0.35  # radians at the last frame
