@@ -27,7 +27,8 @@ from dg4d_lib.diffusion.video_model import DECODER_GB, ENCODER_GB, GIB, UNET_GB
 from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.zero123 import VIEW_GB
-from dg4d_lib.settings import SvdSettings, Zero123PriorSettings
+from dg4d_lib.input_settings import SvdSettings
+from dg4d_lib.settings import Zero123PriorSettings
 from steps.profiles import profile
 
 FRAMES, VIEWS = 14, 4

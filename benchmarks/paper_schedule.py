@@ -45,6 +45,7 @@ from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.interface import GuidancePrior
 from dg4d_lib.guidance.zero123 import POSE_DIM, Zero123
 from dg4d_lib.images import over_white
+from dg4d_lib.input_settings import SvdSettings
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
 from dg4d_lib.settings import (
@@ -52,7 +53,6 @@ from dg4d_lib.settings import (
     MotionSettings,
     Precision,
     StaticSettings,
-    SvdSettings,
     VideoToVideoSettings,
     Zero123PriorSettings,
 )

@@ -57,7 +57,7 @@ def make(
     views: Views | None = None,
     turntable: str | Path | None = None,
     cameras: str | Path | None = None,
-    asset: Any = None,
+    asset: str | Path | None = None,
     bank: str | Path | None = None,
     mask: str | Path | None = None,
     profile: str = "preview",
@@ -80,7 +80,7 @@ def make(
         views: pictures of other sides at the first moment, by azimuth or (azimuth, elevation) in degrees.
         turntable: video, or folder of frames, of the still subject turned once.
         cameras: transforms.json of nerfstudio, with pictures of one moment or synchronized videos.
-        asset: reserved for an existing model.
+        asset: model of your own, a mesh or splats, that is set in motion.
         bank: folder of ground-truth views, for `prior.kind=oracle`.
         mask: picture, or folder of frames for a video, that is white where the subject is.
         profile: set of settings.
@@ -100,14 +100,14 @@ def make(
         BackendUnavailable: a library, a device or weights are missing.
         StepError: a step failed; the output folder is as it was.
     """
-    _check_reserved(asset)
     with _as_file(picture) as path:
         request = ConversionRequest(
-            item=name or _name_of(path, picture, text),
+            item=name or _name_of(path, picture, text, asset),
             picture=path,
             text=text,
             video=Path(video) if video is not None else None,
             bank=Path(bank) if bank is not None else None,
+            asset=Path(asset) if asset is not None else None,
             mask=Path(mask) if mask is not None else None,
             given_views=ViewsRequest(
                 views=tuple(_view_file(place, path) for place, path in (views or {}).items()),
@@ -291,7 +291,9 @@ def _written(picture: Any, folder: Path, stem: str) -> Path:
     return folder / f"{stem}.png"
 
 
-def _name_of(path: Path | None, picture: Picture | None, text: str) -> str:
+def _name_of(path: Path | None, picture: Picture | None, text: str, asset: str | Path | None = None) -> str:
+    if path is None and asset is not None:
+        return clean_name(Path(asset).stem) or "asset"
     if path is None:
         return name_from_text(text)
     return (clean_name(path.stem) or "asset") if isinstance(picture, str | Path) else "asset"
@@ -300,8 +302,3 @@ def _name_of(path: Path | None, picture: Picture | None, text: str) -> str:
 def _view_file(place: float | tuple[float, float], path: str | Path) -> ViewFile:
     azimuth, elevation = place if isinstance(place, tuple) else (place, 0.0)
     return ViewFile(azimuth=azimuth, elevation=elevation, path=Path(path))
-
-
-def _check_reserved(asset: Any) -> None:
-    if asset is not None:
-        raise BadInput("asset= is not supported yet; give picture= or video=")

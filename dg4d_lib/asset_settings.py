@@ -1,4 +1,4 @@
-"""Settings of delivered files, quality gates and scores, in the form of settings.py."""
+"""Settings of users' models, delivered files, quality gates and scores, in the form of settings.py."""
 
 from typing import Annotated, Literal
 
@@ -158,3 +158,34 @@ class PackSettings(Settings):
         if 0 < fps < 1:
             raise ValueError("use 0 for the frame rate of the driving video, or 1 to 240")
         return fps
+
+
+class AssetSettings(Settings):
+    """A model of the user's own (`--asset`): its placement, and the fit of its motion; ours."""
+
+    find_azimuth: bool = Field(True, description="find the azimuth from the first frame; false: `azimuth_deg`")
+    azimuth_deg: float = Field(
+        0.0, ge=-360, le=360, description="azimuth of the model that the video shows, 0 on its +z; `--asset-azimuth`"
+    )
+    max_faces: int = Field(200000, ge=100, le=2000000, description="largest number of triangles of a model")
+    max_splats: int = Field(100000, ge=100, le=1000000, description="largest number of splats of a model")
+    min_agreement: Share = Field(
+        0.5, description="smallest IoU of the outlines of model and first frame; below, the model is refused"
+    )
+    points: int = Field(12000, ge=100, le=200000, description="number of Gaussians on the surface of a mesh")
+    fit_points: int = Field(6000, ge=100, le=200000, description="number of Gaussians that the fit renders")
+    nodes: int = Field(200, ge=4, le=2000, description="number of control nodes on the surface")
+    size: int = Field(96, ge=32, le=512, multiple_of=16, description="pixels of the compared pictures")
+    track_iterations: int = Field(40, ge=1, le=1000, description="iterations per frame while tracking")
+    joint_iterations: int = Field(100, ge=0, le=10000, description="iterations over all frames after tracking")
+    joint_frames: int = Field(8, ge=1, le=512, description="frames of a joint iteration")
+    lr: Positive = Field(0.006, description="learning rate of the position of the model, world units")
+    smoothing: NotNegative = Field(4.0, description="smoothing of the steps over the control graph")
+    color_weight: NotNegative = Field(1.0, description="colors of the video, mean squared error over the subject")
+    alpha_weight: NotNegative = Field(1.0, description="alpha of the video, mean squared error over the subject")
+    flow: NotNegative = Field(0.1, description="optical flow between frames while tracking")
+    rigidity: NotNegative = Field(0.3, description="as-rigid-as-possible energy of the surface")
+    bending: NotNegative = Field(0.1, description="differences of neighboring rotations, times `rigidity`")
+    inertia: NotNegative = Field(0.02, description="distance to the extrapolated motion while tracking")
+    smoothness: NotNegative = Field(0.02, description="accelerations in the joint fit")
+    depth: NotNegative = Field(0.005, description="displacements along the viewing direction")

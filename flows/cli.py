@@ -113,6 +113,19 @@ def make(
     ] = None,
     mask: Mask = None,
     box: Box = "",
+    asset: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="a model of your own that is set in motion: .glb, .gltf, .obj, .usdz, or splats as .ply, .spz",
+        ),
+    ] = None,
+    asset_azimuth: Annotated[
+        float | None,
+        typer.Option(
+            min=-360, max=360, callback=finite, metavar="DEG", help="azimuth of the model that the first frame shows"
+        ),
+    ] = None,
     commercial_only: Commercial = False,
     force: Annotated[bool, typer.Option("--force", help="replace another asset in the output folder")] = False,
     pick: Annotated[int | None, typer.Option(min=1, max=16, metavar="K", help="use motion K of `dg4d motions`")] = None,
@@ -121,8 +134,10 @@ def make(
 
     Motions without a driving video, for --set driving.motion=NAME: sway, bend, breathe, bounce, wave, turn.
     """
-    if not pictures and not text:
-        raise typer.BadParameter("give a picture, a video, or --text WORDS")
+    if not pictures and not text and asset is None:
+        raise typer.BadParameter("give a picture, a video, --text WORDS, or --asset FILE")
+    if asset_azimuth is not None and asset is None:
+        raise typer.BadParameter("--asset-azimuth needs --asset")
     with exit_on_error():
         from flows.commands import terminal
         from flows.commands.make import Wish, make_each
@@ -131,13 +146,23 @@ def make(
         short = shortcut_settings(
             triangles, texture, fps, box=box, height_m=height_m, ground=ground, compress=compress
         ) | ({"driving.pick": pick} if pick else {})
+        if asset_azimuth is not None:
+            short |= {"asset.find_azimuth": False, "asset.azimuth_deg": asset_azimuth}
         sides = ViewsRequest(views=parse_views(view or []), turntable=turntable, cameras=cameras)
 
         def request(item: str, picture: Path | None) -> "ConversionRequest":
-            files = {"picture": picture, "text": text, "video": video, "bank": bank, "mask": mask, "given_views": sides}
+            files: dict[str, Any] = {
+                "picture": picture,
+                "text": text,
+                "video": video,
+                "bank": bank,
+                "mask": mask,
+                "asset": asset,
+            }
+            files["given_views"] = sides
             return _request(profile, changes, short, item=item, seed=seed, commercial_only=commercial_only, **files)
 
-        wish = Wish(tuple(pictures or ()), text, video, mask, bool(sides), out, force, bool(pick), request)
+        wish = Wish(tuple(pictures or ()), text, video, mask, asset, bool(sides), out, force, bool(pick), request)
         if status := make_each(wish, terminal.console()):
             raise typer.Exit(status)
 

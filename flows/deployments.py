@@ -16,7 +16,7 @@ from prefect.states import Completed, Failed
 from pydantic import ConfigDict, Field
 
 from dg4d_lib.errors import BackendUnavailable
-from dg4d_lib.settings import Motion
+from dg4d_lib.input_settings import Motion
 from flows import home
 from flows.catalog_request import CatalogRequest
 from flows.commands.batch import batch, print_summary

@@ -9,7 +9,7 @@ from flows.engine.frames import count_frames, divide_frames
 from flows.engine.requests import Conversion
 from flows.inputs.conversion_job import ConversionJob
 from flows.packages.flow_result import StepRun, notes_of
-from flows.step_calls import DrivingVideo, Gaussians, Mesh, Motion, Package, Subject, Verdict
+from flows.step_calls import Asset, DrivingVideo, Gaussians, Mesh, Motion, Package, Subject, Verdict
 from flows.step_errors import StepBadInput
 from steps.artifacts.mesh_plan import read_plan
 from steps.contract import ArtifactRef, StepResult
@@ -56,6 +56,8 @@ class Tasks:
         self.draw_picture = bind(step_calls.draw_picture)
         self.prepare_subject = bind(step_calls.prepare_subject)
         self.prepare_views = bind(step_calls.prepare_views)
+        self.prepare_asset = bind(step_calls.prepare_asset)
+        self.animate_asset = bind(step_calls.animate_asset)
         self.drive_video = bind(step_calls.drive_video)
         self.fit_gaussians = bind(step_calls.fit_gaussians)
         self.fit_motion = bind(step_calls.fit_motion)
@@ -84,6 +86,9 @@ def planned_steps(job: ConversionJob) -> list[str]:
     first = ["draw_picture"] if job.drawn else []
     refined = ["refine_texture"] if job.settings.refiner.kind != "identity" else []
     fits = ["drive_video", "fit_gaussians", "fit_motion", "plan_mesh", "extract_mesh"]
+    if job.asset is not None:  # splats go on to `plan_mesh` and `extract_mesh`
+        own = ["prepare_asset"] if job.asset == job.source else ["prepare_subject", "prepare_asset"]
+        return [*own, "drive_video", "animate_asset", *refined, "pack_asset", "check_asset"]
     sides = ["prepare_views"] if job.views is not None else []
     return [*first, "prepare_subject", *sides, *fits, *refined, "pack_asset", "check_asset"]
 
@@ -100,6 +105,9 @@ def convert(job: ConversionJob, conversion: Conversion, tasks: Tasks, must_move:
     Raises:
         StepError: a step did not finish.
     """
+    if job.asset is not None and job.asset == job.source:  # no picture: the model's own render is set in motion
+        model = tasks.prepare_asset(job.asset, conversion)
+        return animate(model, job.source, job, conversion, tasks, model)
     source = tasks.draw_picture(job.source, conversion).picture if job.drawn else job.source
     subject = tasks.prepare_subject(source, conversion, job.mask)
     if must_move and subject.footage is None:
@@ -108,15 +116,38 @@ def convert(job: ConversionJob, conversion: Conversion, tasks: Tasks, must_move:
 
 
 def animate(
-    subject: Subject, source: ArtifactRef, job: ConversionJob, conversion: Conversion, tasks: Tasks
+    subject: Subject,
+    source: ArtifactRef,
+    job: ConversionJob,
+    conversion: Conversion,
+    tasks: Tasks,
+    model: Asset | None = None,
 ) -> Converted:
-    """Turn a subject into a package: driving video, static Gaussians, motion, mesh, texture, files, verdict."""
+    """Turn a subject into a package: driving video, static Gaussians, motion, mesh, texture, files, verdict.
+
+    Args:
+        subject: cut-out.
+        source: file that it was cut out of.
+        job: source and settings.
+        conversion: parameters that all steps share.
+        tasks: tasks of the engine.
+        model: the user's model, if it has been prepared already.
+    """
     filming = tasks.drive_video.submit(subject, conversion)
-    known = tasks.prepare_views(job.views, source, subject, conversion) if job.views is not None else None
-    gaussians = tasks.fit_gaussians(subject, conversion, job.bank, known)  # here, parallel to the driving video
-    driving_video = filming.result()
-    motion = tasks.fit_motion(subject, gaussians, driving_video, conversion, job.bank, known)
-    mesh = mesh_over_time(gaussians, motion, driving_video, conversion, tasks)
+    gaussians: Gaussians | Asset
+    if job.asset is not None:
+        gaussians = model or tasks.prepare_asset(job.asset, conversion, subject)
+        driving_video = filming.result()
+        motion = tasks.animate_asset(gaussians, driving_video, conversion)
+    else:
+        known = tasks.prepare_views(job.views, source, subject, conversion) if job.views is not None else None
+        gaussians = tasks.fit_gaussians(subject, conversion, job.bank, known)  # here, parallel to the driving video
+        driving_video = filming.result()
+        motion = tasks.fit_motion(subject, gaussians, driving_video, conversion, job.bank, known)
+    if "tracked" in motion.outputs:  # the mesh of the user's model
+        mesh = Mesh.model_validate(motion.model_dump())
+    else:
+        mesh = mesh_over_time(gaussians, motion, driving_video, conversion, tasks)
     if job.settings.refiner.kind != "identity":
         mesh = tasks.refine_texture(mesh, driving_video, conversion)
     notes = notes_of(done.result for done in tasks.finished())
@@ -125,7 +156,7 @@ def animate(
 
 
 def mesh_over_time(
-    gaussians: Gaussians, motion: Motion, driving_video: DrivingVideo, conversion: Conversion, tasks: Tasks
+    gaussians: Gaussians | Asset, motion: Motion, driving_video: DrivingVideo, conversion: Conversion, tasks: Tasks
 ) -> Mesh:
     """Extract one mesh that follows the motion, or a mesh per frame with the frames divided among the slots."""
     plan = tasks.plan_mesh(gaussians, motion, conversion)

@@ -27,6 +27,10 @@ class Subject(StepResult):
         return self.outputs.get("footage")
 
 
+class Asset(Subject):
+    """Model of the user's own, placed; with its render as the subject where there is no picture."""
+
+
 class KnownViews(StepResult):
     """Pictures of other sides, with their cameras."""
 
@@ -93,6 +97,16 @@ def prepare_views(views: ArtifactRef, source: ArtifactRef, subject: Subject, con
     return run_step("prepare_views", KnownViews, **locals())
 
 
+def prepare_asset(model: ArtifactRef, conversion: Conversion, subject: Subject | None = None) -> Asset:
+    """Read a model of the user's own and find its azimuth, scale and position in the first frame."""
+    return run_step("prepare_asset", Asset, **locals())
+
+
+def animate_asset(asset: Asset, driving_video: DrivingVideo, conversion: Conversion) -> Motion:
+    """Fit the motion of a model to the driving video, as rigid as its surface allows."""
+    return run_step("animate_asset", Motion, **locals())
+
+
 def drive_video(subject: Subject, conversion: Conversion) -> DrivingVideo:
     """Take the footage of the subject, or generate a video of it in motion."""
     return run_step("drive_video", DrivingVideo, **locals())
@@ -117,13 +131,13 @@ def fit_motion(
     return run_step("fit_motion", Motion, **locals())
 
 
-def plan_mesh(gaussians: Gaussians, motion: Motion, conversion: Conversion) -> Plan:
+def plan_mesh(gaussians: Gaussians | Asset, motion: Motion, conversion: Conversion) -> Plan:
     """Decide whether one mesh can follow the motion or every frame needs its own."""
     return run_step("plan_mesh", Plan, **locals())
 
 
 def extract_mesh(
-    gaussians: Gaussians, motion: Motion, plan: Plan, conversion: Conversion, part: Part | None = None
+    gaussians: Gaussians | Asset, motion: Motion, plan: Plan, conversion: Conversion, part: Part | None = None
 ) -> Mesh:
     """Extract one mesh that follows the motion, or a mesh per frame of a part of the frames."""
     return run_step("extract_mesh", Mesh, **locals())
@@ -142,7 +156,7 @@ def refine_texture(mesh: Mesh, driving_video: DrivingVideo, conversion: Conversi
 def pack_asset(
     subject: Subject,
     driving_video: DrivingVideo,
-    gaussians: Gaussians,
+    gaussians: Gaussians | Asset,
     motion: Motion,
     mesh: Mesh,
     notes: tuple[str, ...],

@@ -5,6 +5,9 @@ Artifacts:
   views       uncompressed zip of views.json (steps/sources/views.py) and the files that it names
   bank        zip of bank.json (steps/sources/banks.py) and a sheet per view
   pose        JSON {"turn_deg": ...}: turn of the subject's plane that its footage shows, 0 where it shows none
+  model       uncompressed zip of model.SUFFIX (.glb, .gltf, .obj, .usdz, .ply, .spz) and the files that it refers to
+  glb         GLB of the model; `moving` has a morph target per frame
+  placement   JSON of steps/artifacts/placements.py: similarity from the model to the world
   gaussians   standard 3DGS PLY (float32)
   motion      safetensors; metadata: kind of deformation, its settings and the number of frames
   plan        JSON of steps/artifacts/mesh_plan.py: {"mode": "tracked" or "per_frame", "level": ..., ...}
@@ -41,6 +44,9 @@ TEXT = Port(media_type="text/plain", suffix=".txt")
 SOURCE = Port(media_type="application/octet-stream", suffix="")
 FRAMES = _port("frames", "zip")
 POSE = _port("pose", "json")
+ASSET = _port("model", "zip")
+GLB = Port(media_type="model/gltf-binary", suffix=".glb")
+PLACEMENT = _port("placement", "json")
 PLY = _port("gaussians", "ply")
 MOTION = _port("motion", "safetensors")
 PLAN = _port("mesh-plan", "json")
@@ -116,6 +122,32 @@ STEPS: dict[str, StepSpec] = {
             sections=("rasterizer", "subject.turn_deg", "prior", "deformation", "motion"),
             resource="gpu",
         ),
+        _step(
+            "prepare_asset",
+            inputs={"model": ASSET, "subject": _optional(PNG)},
+            outputs={
+                "glb": _optional(GLB),
+                "gaussians": PLY,
+                "placement": PLACEMENT,
+                "subject": _optional(PNG),
+                "picture": PNG,
+            },
+            sections=("rasterizer", "asset", "subject.size", "subject.max_decode_gb"),
+            timeout_s=2400,  # bounds decoders that hang in native code
+        ),
+        _step(
+            "animate_asset",
+            inputs={"gaussians": PLY, "glb": _optional(GLB), "placement": PLACEMENT, "driving_video": FRAMES},
+            outputs={
+                "motion": MOTION,
+                "tracked": _optional(TRACKED),
+                "moving": _optional(GLB),
+                "curves": CURVES,
+                "picture": PNG,
+            },
+            sections=("rasterizer", "asset", "pack.gltf", "mesh.texture_size"),
+            resource="gpu",
+        ),
         _step("plan_mesh", {"gaussians": PLY, "motion": MOTION}, {"plan": PLAN}, sections=("rasterizer", "mesh")),
         _step(
             "extract_mesh",
@@ -134,7 +166,8 @@ STEPS: dict[str, StepSpec] = {
         ),
         _step(
             "pack_asset",
-            inputs={"subject": PNG, "driving_video": FRAMES, "gaussians": PLY, "motion": MOTION, **EITHER_MESH},
+            inputs={"subject": PNG, "driving_video": FRAMES, "gaussians": PLY, "motion": MOTION, **EITHER_MESH}
+            | {"moving": _optional(GLB)},
             outputs={"package": PACKAGE, "sheet": PNG},
             settings="steps.profiles:PackNotes",
             sections=("rasterizer", "pack"),

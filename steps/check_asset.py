@@ -25,7 +25,7 @@ from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.archives import unpack
 from steps.artifacts.gates import gates_as_json, read_rows, write_gates
 from steps.artifacts.media import read_frames, read_png, write_png
-from steps.artifacts.packages import ASSET, COMPACT, MANIFEST, MESHES, read_manifest
+from steps.artifacts.packages import ASSET, COMPACT, MANIFEST, MERGED, MESHES, read_manifest
 from steps.artifacts.packages import SPLATS as SPLATS_FOLDER
 from steps.artifacts.rendering import BATCH, States, mesh_at, mesh_renderer, read_states, read_surface
 from steps.runtime.job import Job, StepReport
@@ -82,7 +82,7 @@ def read_asset(package: Path, folder: Path) -> LoadedAsset:
     Raises:
         BadInput: files are missing or broken.
     """
-    wanted = (MANIFEST, ASSET, COMPACT, f"{MESHES}/", f"{SPLATS_FOLDER}/")
+    wanted = (MANIFEST, ASSET, MERGED, COMPACT, f"{MESHES}/", f"{SPLATS_FOLDER}/")
     unpack(package, folder, "the package", lambda name: name.startswith(wanted))
     manifest = read_manifest(folder)
     return LoadedAsset(read_states(folder, manifest), read_surface(folder, manifest), manifest.frames)

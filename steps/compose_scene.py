@@ -19,7 +19,7 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.transform import concatenate, transform
 from dg4d_lib.rasterizer.interface import get_rasterizer
-from steps.artifacts.packages import ASSET, COMPACT, USD, read_file, read_manifest
+from steps.artifacts.packages import ASSET, COMPACT, MERGED, USD, read_file, read_manifest
 
 FILM_SIZE = 384  # pixels of a side
 MOST_PICTURES = 300  # of a film; all are in memory until it is written
@@ -159,8 +159,9 @@ class _MovingGaussians:
 
 
 def _body(folder: Path) -> AnimatedGlb:
-    content = read_file(folder, ASSET)
+    name = MERGED if read_manifest(folder).mode == "own" else ASSET
+    content = read_file(folder, name)
     try:
         return AnimatedGlb(content)
     except BadInput as error:
-        raise BadInput(f"{folder / ASSET}: {error}") from error
+        raise BadInput(f"{folder / name}: {error}") from error

@@ -5,7 +5,7 @@ import torch
 from dg4d_lib.diffusion.components import default_device
 from dg4d_lib.diffusion.text_to_image import draw_picture
 from dg4d_lib.errors import BadInput
-from dg4d_lib.settings import TextSettings
+from dg4d_lib.input_settings import TextSettings
 from steps.artifacts.media import write_png
 from steps.runtime.job import Job, StepReport
 from steps.runtime.weights import open_weights

@@ -18,7 +18,7 @@ from dg4d_lib.diffusion.components import default_device
 from dg4d_lib.diffusion.video_model import VideoModel
 from dg4d_lib.errors import BadInput
 from dg4d_lib.images import resize
-from dg4d_lib.settings import DrivingSettings, SvdSettings, WarpSettings
+from dg4d_lib.input_settings import DrivingSettings, SvdSettings, WarpSettings
 from dg4d_lib.video.candidate_ranking import MIN_GOOD_TOTAL, WEIGHTS, Candidate, rank_candidates, score_video
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.svd import StableVideo

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -85,6 +85,10 @@ class PackageWriter:
     def write_meshes(self) -> None:
         """Write the animated mesh, and in the mode per_frame also the mesh of every frame."""
         gltf, surface = self.pack.gltf, self.surface
+        if "moving" in self.inputs and isinstance(surface, Asset4D):
+            shutil.copyfile(self.inputs["moving"], self.path(packages.ASSET))
+            self.path(packages.MERGED).write_bytes(write_glb(surface, gltf))
+            return
         if isinstance(surface, Asset4D):
             self.path(packages.ASSET).write_bytes(write_glb(surface, gltf))
             return
@@ -210,7 +214,7 @@ def run(job: Job) -> StepReport:
         frames = len(package.states.means)
         manifest = Manifest(
             generator=_generator(),
-            mode="tracked" if isinstance(package.surface, Asset4D) else "per_frame",
+            mode=_mode(job, package.surface),
             fps=package.fps,
             frames=frames,
             duration_s=frames / package.fps,
@@ -227,6 +231,12 @@ def run(job: Job) -> StepReport:
         files = [(name, (package.folder / name).read_bytes()) for name in names]
         write_zip(job.outputs["package"], [(MANIFEST, text.encode()), *files])
     return StepReport(backend=f"{job.settings.rasterizer} rasterizer", notes=tuple(notes))
+
+
+def _mode(job: Job, surface: Surface) -> Literal["own", "tracked", "per_frame"]:
+    if "moving" in job.inputs:
+        return "own"
+    return "tracked" if isinstance(surface, Asset4D) else "per_frame"
 
 
 def _read_inputs(job: Job, scratch: Path) -> PackageWriter:

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from dg4d_lib.images import over_white
 from dg4d_lib.inflation.ground import ground_turn
+from dg4d_lib.input_settings import SubjectSettings
 from dg4d_lib.metrics.cutout import evaluate_cutout
-from dg4d_lib.settings import SubjectSettings
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.framing import crop_whole_frame, reframe
 from dg4d_lib.video.subject import prepare_subject

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.images import over_white
-from dg4d_lib.settings import SubjectSettings
+from dg4d_lib.input_settings import SubjectSettings
 from dg4d_lib.video.subject import Segmenter, prepare_subject
 from dg4d_lib.visual_hull.adjusting import adjust_exposure, match_scale, scaling_between
 from dg4d_lib.visual_hull.agreement import Agreement, agreement, hull_alpha, smaller, turntable_score
@@ -94,7 +94,7 @@ class _Reader:
         segmenter: Segmenter,
     ) -> None:
         self.folder, self.inputs, self.original, self.segmenter = folder, inputs, original, segmenter
-        self.settings = settings.model_copy(update={"box": None})  # the box is that of the input
+        self.settings = settings.model_copy(update={"box": ()})  # the box is that of the input
         self.used_network = False
 
     def source(self) -> Source:

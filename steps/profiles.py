@@ -6,12 +6,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError, create_model, model_validator
 
-from dg4d_lib.asset_settings import GateSettings, PackSettings, ScoreSettings
+from dg4d_lib.asset_settings import AssetSettings, GateSettings, PackSettings, ScoreSettings
 from dg4d_lib.errors import BadInput
+from dg4d_lib.input_settings import DrivingSettings, SubjectSettings, TextSettings, WarpSettings
 from dg4d_lib.rasterizer.backends import backend_name
 from dg4d_lib.settings import (
     DeformationSettings,
-    DrivingSettings,
     GeometricPriorSettings,
     HexPlaneSettings,
     IdentitySettings,
@@ -22,9 +22,6 @@ from dg4d_lib.settings import (
     ResolutionStage,
     Settings,
     StaticSettings,
-    SubjectSettings,
-    TextSettings,
-    WarpSettings,
 )
 from steps.catalog import STEPS
 from steps.contract import StepSpec, load_object, settings_errors, shown
@@ -87,6 +84,7 @@ class PipelineSettings(Settings):
     rasterizer: RasterizerName = Field("auto", description="auto: cuda_gsplat where that can run, else cpu")
     text: TextSettings = TextSettings()
     subject: SubjectSettings = SubjectSettings()
+    asset: AssetSettings = AssetSettings()
     driving: DrivingSettings = WarpSettings()
     prior: PriorSettings = GeometricPriorSettings()
     static: StaticSettings = StaticSettings()

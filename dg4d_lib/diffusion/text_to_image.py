@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from dg4d_lib.diffusion.components import HALF, compute_dtype, missing_packages
 from dg4d_lib.diffusion.flop_counter import attach_flop_counter
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.settings import TextSettings
+from dg4d_lib.input_settings import TextSettings
 
 
 def draw_picture(

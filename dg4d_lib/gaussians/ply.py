@@ -73,7 +73,7 @@ def read_ply(path: Path, *, y_down: bool = False) -> Gaussians:
         content = path.read_bytes()
     except OSError as error:
         raise BadInput(f"{path.name} cannot be read: {error.strerror}") from error
-    count, dtype, start = _header(path.name, content[:MAX_HEADER])
+    count, dtype, start = parse_header(path.name, content[:MAX_HEADER])
     names = dtype.names or ()
     missing = [name for name in COLUMNS if name not in names and name not in NORMALS]
     if missing:
@@ -126,8 +126,16 @@ def check_storable(gaussians: Gaussians, form: str) -> None:
         )
 
 
-def _header(name: str, beginning: bytes) -> tuple[int, np.dtype[np.void], int]:
-    """Return the number of rows, their type, and the offset of the first."""
+def parse_header(name: str, beginning: bytes) -> tuple[int, np.dtype[np.void], int]:
+    """Return the number of rows, their type, and the offset of the first.
+
+    Args:
+        name: of the file, for messages.
+        beginning: first bytes of the file.
+
+    Raises:
+        BadInput: it is no binary PLY of one element `vertex`.
+    """
     end = beginning.find(b"end_header\n")
     if not beginning.startswith(b"ply\n") or end < 0:
         raise BadInput(f"{name} is no PLY: it must start with 'ply' and have an 'end_header' line")

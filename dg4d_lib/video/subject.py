@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.images import over_white
-from dg4d_lib.settings import SubjectSettings
+from dg4d_lib.input_settings import SubjectSettings
 from dg4d_lib.video import u2netp
 from dg4d_lib.video.framing import (
     VISIBLE,

@@ -10,7 +10,7 @@ from torch import Tensor
 from dg4d_lib.diffusion.video_model import SIGMA_MAX, VideoModel, karras_sigmas
 from dg4d_lib.errors import BadInput
 from dg4d_lib.images import over_white
-from dg4d_lib.settings import SvdSettings
+from dg4d_lib.input_settings import SvdSettings
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.framing import resample
 from dg4d_lib.video.matting import matte_from_first_alpha

@@ -11,7 +11,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import inflate
-from dg4d_lib.settings import Motion, WarpSettings
+from dg4d_lib.input_settings import Motion, WarpSettings
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.limbs import WAVE_DEG, LimbAnimator, waving_limbs
 from dg4d_lib.video.puppet import Puppet

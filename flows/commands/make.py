@@ -30,6 +30,7 @@ class Wish:
         text: prompt instead of a picture.
         video: driving video.
         mask: mask of the subject.
+        asset: the user's own model.
         sides: true if there are pictures of other sides.
         out: output folder; of several pictures the folder above those of the assets.
         force: replace another asset in the output folder.
@@ -41,6 +42,7 @@ class Wish:
     text: str
     video: Path | None
     mask: Path | None
+    asset: Path | None
     sides: bool
     out: Path | None
     force: bool
@@ -61,10 +63,17 @@ def make_each(wish: Wish, console: "Console") -> int:
         raise BadInput("--pick chooses a generated motion and cannot be combined with --video")
     if len(wish.pictures) < 2:
         picture = wish.pictures[0] if wish.pictures else None
-        item = (clean_name(picture.stem) or "asset") if picture else name_from_text(wish.text)
+        named = picture or wish.asset
+        item = (clean_name(named.stem) or "asset") if named else name_from_text(wish.text)
         _make(wish, item, picture, wish.out or Path("out") / item, console)
         return 0
-    for_one = {"--text": wish.text, "--video": wish.video, "--mask": wish.mask, "--view": wish.sides}
+    for_one = {
+        "--text": wish.text,
+        "--video": wish.video,
+        "--mask": wish.mask,
+        "--asset": wish.asset,
+        "--view": wish.sides,
+    }
     if option := next((name for name, value in for_one.items() if value), ""):
         raise BadInput(f"{option} makes one asset, and {len(wish.pictures)} pictures are given; give one of them")
     items = unique_names([(clean_name(path.stem) or "asset", path.suffix.lstrip(".")) for path in wish.pictures])

@@ -130,7 +130,7 @@ def parse_box(text: str) -> tuple[int, ...] | None:
         BadInput: it is not four whole numbers.
     """
     from dg4d_lib.errors import BadInput
-    from dg4d_lib.settings import BOX_FORM
+    from dg4d_lib.input_settings import BOX_FORM
 
     if not text.strip():
         return None

@@ -10,7 +10,7 @@ from pydantic import Field, ValidationError
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.rasterizer.backends import backend_name, require_backend
-from flows.inputs import naming, sources
+from flows.inputs import models, naming, sources
 from flows.inputs.given_views import ViewsRequest
 from flows.inputs.signing_key import certificate_digest
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen, digest_of
@@ -34,6 +34,7 @@ class ConversionRequest(Frozen):
         bank: folder of ground-truth views, for the oracle prior.
         mask: picture, or folder of frames for a video, that is white where the subject is.
         given_views: pictures of other sides.
+        asset: model of the user's own, a mesh or splats, that is set in motion.
         commercial_only: refuse weights whose license forbids commercial use.
     """
 
@@ -44,6 +45,7 @@ class ConversionRequest(Frozen):
     bank: Path | None = None
     mask: Path | None = None
     given_views: ViewsRequest = ViewsRequest()
+    asset: Path | None = None
     profile: str = "preview"
     settings: PipelineSettings
     seed: int = 0
@@ -52,7 +54,8 @@ class ConversionRequest(Frozen):
     @property
     def source_name(self) -> str:
         """Name of the source, for people."""
-        return self._footage.name if self._footage else f'"{self.text}"'
+        path = self._footage or self.asset
+        return path.name if path else f'"{self.text}"'
 
     def check(self) -> None:
         """Validate the request before any work.
@@ -67,6 +70,10 @@ class ConversionRequest(Frozen):
         require_backend(self.settings.rasterizer)
         if (self.settings.pack.lods or self.settings.pack.gltf.meshopt) and not find_spec("meshoptimizer"):
             raise BackendUnavailable("pack.lods and pack.gltf.meshopt need meshoptimizer: `deploy/install.sh meshopt`")
+        if self.asset is not None:
+            models.check_model(self.asset)
+            if self.text:
+                raise BadInput("--asset is moved by a picture, a video, or a motion of its own; leave --text out")
         self._check_source()
         if self.mask is not None:
             sources.check_mask(self.mask)
@@ -90,12 +97,12 @@ class ConversionRequest(Frozen):
         Raises:
             BadInput: says which and why.
         """
-        for path in filter(None, (self.picture, self.video)):
+        for path in filter(None, (self.picture, self.video, self.asset)):
             naming.check_text(path.name, "the file name")
-        for path in filter(None, (self.picture, self.video, self.bank, self.mask)):
+        for path in filter(None, (self.picture, self.video, self.bank, self.mask, self.asset)):
             naming.check_path(path)
         naming.check_text(self.text, "the text")
-        naming.check_name(self.item, "rename the file" if self.picture else "choose a shorter name")
+        naming.check_name(self.item, "rename the file" if self.picture or self.asset else "choose a shorter name")
 
     def check_licenses(self) -> None:
         """Refuse weights that forbid commercial use if `commercial_only` is set.
@@ -117,9 +124,11 @@ class ConversionRequest(Frozen):
         """
         footage = self._footage
         try:
+            asset = models.put_model(self.asset, store) if self.asset is not None else None
             return ConversionJob(
                 item=self.item,
-                source=sources.put_source(footage, store) if footage else sources.put_text(self.text, store),
+                source=self._put_source(asset, store),
+                asset=asset,
                 text=sources.single_spaced(self.text),
                 moving=self._suffix in sources.ALWAYS_MOVING or self.video is not None,
                 bank=sources.put_bank(self.bank, store) if self.bank is not None else None,
@@ -134,6 +143,12 @@ class ConversionRequest(Frozen):
             )
         except OSError as error:
             raise BadInput(f"{footage} cannot be read: {error.strerror or error}") from error
+
+    def _put_source(self, asset: ArtifactRef | None, store: ArtifactStore) -> ArtifactRef:
+        """Store picture, video or prompt; a model without any is its own source."""
+        if self._footage is not None:
+            return sources.put_source(self._footage, store)
+        return asset or sources.put_text(self.text, store)
 
     @property
     def _footage(self) -> Path | None:
@@ -157,11 +172,13 @@ class ConversionRequest(Frozen):
                     "the id of a Hugging Face repository"
                 )
             return
+        if self.video is not None:
+            sources.check_video(self.video)
+        if self.asset is not None and self.picture is None:
+            return
         if self.picture is None:
             raise BadInput("nothing to make: give a picture, a video or --text")
         sources.check_file(self.picture)
-        if self.video is not None:
-            sources.check_video(self.video)
 
     def _weights(self) -> list[str]:
         """Return the weights that some step will load: text and driving models only if a step uses them."""
@@ -182,6 +199,7 @@ class ConversionJob(Frozen):
         views: pictures of other sides.
         moving: True if `source` is certainly a video.
         mask: picture or frames that mark the subject, if given.
+        asset: model of the user's own; equal to `source` if nothing else was given.
     """
 
     item: str
@@ -191,6 +209,7 @@ class ConversionJob(Frozen):
     bank: ArtifactRef | None = None
     mask: ArtifactRef | None = None
     views: ArtifactRef | None = None
+    asset: ArtifactRef | None = None
     profile: str
     settings: PipelineSettings
     seed: int = Field(ge=0, le=LARGEST_SEED)
@@ -227,6 +246,7 @@ def job_from_record(
     source: Path | None = None,
     bank: Path | None = None,
     mask: Path | None = None,
+    asset: Path | None = None,
 ) -> ConversionJob:
     """Return the job that made a package.
 
@@ -236,6 +256,7 @@ def job_from_record(
         source: picture, video or folder of frames; needed if the store no longer has it.
         bank: folder of ground-truth views; likewise.
         mask: picture or folder of frames that marks the subject; likewise.
+        asset: model of the user's own; likewise.
 
     Raises:
         BadInput: the record has another format, a file is needed, or a given file differs from the recorded one.
@@ -255,6 +276,7 @@ def job_from_record(
     if job.text:
         sources.put_text(job.text, store)
     for option, path, ref, put in (
+        ("--asset", asset, job.asset, models.put_model),  # may be the source, too
         ("--source", source, job.source, sources.put_source),
         ("--bank", bank, job.bank, sources.put_bank),
         ("--mask", mask, job.mask, sources.put_source),

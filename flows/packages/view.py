@@ -19,7 +19,7 @@ from steps.store.files import room_for
 VIEWER = "viewer.html"
 # files of a package, as in steps/artifacts/packages.py, whose import would load torch
 MANIFEST = "asset.json"
-ASSET = "asset.glb"
+ASSET, MERGED = "asset.glb", "asset_merged.glb"
 WEB_SPLATS = "splats/moving.websplats"
 SUBJECT = "input/subject.png"
 DRIVING = "input/driving.mp4"
@@ -95,7 +95,8 @@ def viewer_facts(record: Mapping[str, Any]) -> dict[str, Any]:
 def _page(title: str, names: Container[str], read: Callable[[str], bytes], facts: dict[str, Any]) -> str:
     splats, picture, video = (read(name) if name in names else None for name in (WEB_SPLATS, SUBJECT, DRIVING))
     camera = json.loads(read(MANIFEST)).get("camera", {}) if MANIFEST in names else {}
-    return build_viewer_page(title, read(ASSET), splats, picture, video, facts, camera)
+    body = read(MERGED if MERGED in names else ASSET)
+    return build_viewer_page(title, body, splats, picture, video, facts, camera)
 
 
 def _write(page: Path, text: str) -> None:

@@ -12,6 +12,7 @@ from steps.contract import Frozen
 
 MANIFEST = "asset.json"
 ASSET = "asset.glb"
+MERGED = "asset_merged.glb"
 RIGGED = "asset_rigged.glb"
 USD = "asset.usdz"
 USD_SPLATS = "asset_splats.usdz"
@@ -30,6 +31,7 @@ SHEET = "contact_sheet.png"
 
 ABOUT = {
     ASSET: "animated textured mesh, glTF 2.0",
+    MERGED: "the user's model, animated, as one mesh with one texture, glTF 2.0",
     RIGGED: "the same mesh on a skeleton, glTF 2.0",
     USD: "animated mesh, on a skeleton if one follows the motion, USDZ",
     USD_SPLATS: "moving splats, and as a variant point samples of the mesh, USDZ",
@@ -92,7 +94,7 @@ class Manifest(Frozen):
     format: Literal["dg4d-asset"] = "dg4d-asset"
     version: Literal[1] = 1
     generator: str
-    mode: Literal["tracked", "per_frame"]
+    mode: Literal["tracked", "per_frame", "own"]
     fps: float = Field(gt=0)
     frames: int = Field(ge=1)
     duration_s: float

@@ -22,7 +22,7 @@ from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from steps.artifacts.media import write_png
-from steps.artifacts.packages import ASSET, COMPACT, MESHES, SPLATS, Manifest, read_file, read_manifest
+from steps.artifacts.packages import ASSET, COMPACT, MERGED, MESHES, SPLATS, Manifest, read_file, read_manifest
 
 BATCH = 8  # pictures per rasterizer call, bounds the memory
 SMALLEST, LARGEST = 16, 4096  # pixels of a side
@@ -127,7 +127,7 @@ def read_surface(folder: Path, manifest: Manifest) -> Surface:
     if manifest.mode == "per_frame":
         meshes = [read_mesh_glb(read_file(folder, f"{MESHES}/{i:03d}.glb")) for i in range(manifest.frames)]
         return to_fit.surface(meshes)
-    asset = read_glb(read_file(folder, ASSET))
+    asset = read_glb(read_file(folder, MERGED if manifest.mode == "own" else ASSET))
     _check_frames(ASSET, len(asset.offsets), manifest)
     return to_fit.surface(asset)
 

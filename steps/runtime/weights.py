@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.settings import MATTING_METHODS
+from dg4d_lib.input_settings import MATTING_METHODS
 from dg4d_lib.weights.locate import DIGEST_CACHE, content_name, digests, find_weights, given_folder, identity
 from dg4d_lib.weights.lock import read_lock
 from dg4d_lib.weights.registry import License, lookup_weights

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from functools import partial
 
-from dg4d_lib.settings import MATTING_METHODS
+from dg4d_lib.input_settings import MATTING_METHODS
 from dg4d_lib.video import u2netp
 from dg4d_lib.video.segmentation_network import load_folder
 from dg4d_lib.video.subject import U2NETP, Segmenter

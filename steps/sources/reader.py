@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.settings import SubjectSettings
+from dg4d_lib.input_settings import SubjectSettings
 from dg4d_lib.video.downscaling import downscale_in_bands
 from steps.sources.clips import (
     MOST_DECODED,

@@ -65,7 +65,7 @@ def test_settings_are_nested_or_dotted(settings: dict[str, Any]) -> None:
         ({"seed": -1}, "seed"),
         ({"views": {90: "none.png"}}, "none.png"),
         ({"views": {(90, 0): "fox.png", 90: "fox.png"}}, "90"),
-        ({"asset": "a.glb"}, "asset="),
+        ({"asset": "none.glb"}, "none.glb"),
         ({"video": "none.mp4"}, "none.mp4 does not exist"),
     ],
 )

@@ -100,6 +100,31 @@ def fit_gaussians(job: Job) -> StepReport:
     return StepReport()
 
 
+def prepare_asset(job: Job) -> StepReport:
+    with zipfile.ZipFile(job.inputs["model"]) as archive:
+        content = archive.read(archive.namelist()[0])
+    words = _begin("prepare_asset", job, content)
+    job.outputs["gaussians"].write_bytes(words)
+    job.outputs["placement"].write_text("{}")
+    job.outputs["picture"].write_bytes(PNG)
+    if b"splats" not in words:
+        job.outputs["glb"].write_bytes(content)
+    if "subject" not in job.inputs:
+        job.outputs["subject"].write_bytes(PNG + words)
+    return StepReport()
+
+
+def animate_asset(job: Job) -> StepReport:
+    words = _begin("animate_asset", job, job.inputs["gaussians"].read_bytes())
+    job.outputs["motion"].write_bytes(b"motion of " + words)
+    job.outputs["picture"].write_bytes(PNG)
+    if "glb" in job.inputs:
+        job.outputs["tracked"].write_bytes(b"mesh of " + words)
+        job.outputs["moving"].write_bytes(b"moving " + words)
+    _curves(job)
+    return StepReport()
+
+
 def fit_motion(job: Job) -> StepReport:
     words = _begin("fit_motion", job, job.inputs["gaussians"].read_bytes())
     job.outputs["motion"].write_bytes(b"motion of " + words)

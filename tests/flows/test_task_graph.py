@@ -82,6 +82,28 @@ def test_every_frame_gets_a_mesh_where_one_cannot_follow(
     assert ran(log).count("extract_mesh") == 1
 
 
+def test_a_model_of_the_users_own_takes_the_place_of_the_fit(log: Path, tmp_path: Path) -> None:
+    (tmp_path / "a.glb").write_bytes(b"glTF model")
+    (tmp_path / "a.png").write_text(picture("moved"))
+    request = ConversionRequest(item="own", asset=tmp_path / "a.glb", settings=PREVIEW)
+    convert_job(request.to_job(home.store()), tmp_path / "alone")
+    assert ran(log) == ["prepare_asset", "drive_video", "animate_asset", "pack_asset", "check_asset"]
+    with_picture = request.model_copy(update={"picture": tmp_path / "a.png"})
+    convert_job(with_picture.to_job(home.store()), tmp_path / "pictured")
+    steps = ran(log)
+    assert sorted(steps[:3]) == ["drive_video", "prepare_asset", "prepare_subject"]
+    assert steps[3:] == ["animate_asset", "pack_asset", "check_asset"]
+
+
+def test_splats_of_the_users_own_get_a_mesh_as_fitted_ones_do(log: Path, tmp_path: Path) -> None:
+    (tmp_path / "a.spz").write_bytes(b"\x1f\x8b splats")
+    request = ConversionRequest(
+        item="own", asset=tmp_path / "a.spz", settings=revise(PREVIEW, {"mesh.mode": "tracked"})
+    )
+    convert_job(request.to_job(home.store()), tmp_path / "out")
+    assert ran(log)[2:5] == ["animate_asset", "plan_mesh", "extract_mesh"]
+
+
 def test_parts_side_by_side_take_less_time_on_the_clock_than_to_compute(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

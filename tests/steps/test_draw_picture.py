@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 from tiny_text_to_image import save_pipeline
 
-from dg4d_lib.settings import SubjectSettings, TextSettings
+from dg4d_lib.input_settings import SubjectSettings, TextSettings
 from steps.artifacts.media import read_png
 from steps.catalog import STEPS
 from steps.contract import StepFailure, StepRequest, StepResult

@@ -8,7 +8,7 @@ from media_files import disc
 from tiny_svd import save_tiny_svd
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.settings import SvdSettings, WarpSettings
+from dg4d_lib.input_settings import SvdSettings, WarpSettings
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import read_frames, read_png, write_frames, write_png
 from steps.drive_video import run

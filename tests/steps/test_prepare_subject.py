@@ -8,7 +8,7 @@ from media_files import disc, opaque, save, save_clip, walk
 from tiny_onnx import write_network
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.settings import SubjectSettings
+from dg4d_lib.input_settings import SubjectSettings
 from dg4d_lib.video import u2netp
 from dg4d_lib.video.framing import bounding_box
 from steps.artifacts.gates import read_rows

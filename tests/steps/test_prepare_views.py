@@ -11,8 +11,9 @@ from creatures import creature, seen
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.inflation.surface import InflatedSurface
+from dg4d_lib.input_settings import SubjectSettings
 from dg4d_lib.metrics.image import iou
-from dg4d_lib.settings import GeometricPriorSettings, SubjectSettings
+from dg4d_lib.settings import GeometricPriorSettings
 from dg4d_lib.visual_hull.known import KnownView
 from steps.artifacts.media import read_png, write_png, write_zip
 from steps.fitting.priors import known_views, read_bank, subject_shapes

@@ -7,7 +7,7 @@ from tiny_text_to_image import save_pipeline
 
 from dg4d_lib.diffusion.text_to_image import draw_picture
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.settings import TextSettings
+from dg4d_lib.input_settings import TextSettings
 
 CPU = torch.device("cpu")
 QUICK = TextSettings(size=48, num_inference_steps=3)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dg4d_lib.settings import WarpSettings
+from dg4d_lib.input_settings import WarpSettings
 from dg4d_lib.video.candidate_ranking import WEIGHTS, Candidate, VideoScore, rank_candidates, score_video
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.warp import MOTIONS, Warp, candidate_settings

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.settings import SubjectSettings
+from dg4d_lib.input_settings import SubjectSettings
 from dg4d_lib.video.framing import bounding_box
 from dg4d_lib.video.subject import prepare_subject
 

@@ -4,7 +4,8 @@ from tiny_svd import save_tiny_svd
 from torch import Tensor
 
 from dg4d_lib.diffusion.video_model import VideoCondition, VideoModel
-from dg4d_lib.settings import SvdSettings, VideoModelSettings
+from dg4d_lib.input_settings import SvdSettings
+from dg4d_lib.settings import VideoModelSettings
 from dg4d_lib.video.svd import StableVideo
 
 SIZE, FRAMES = 48, 4

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.settings import WarpSettings
+from dg4d_lib.input_settings import WarpSettings
 from dg4d_lib.video.arap import ArapMesh
 from dg4d_lib.video.limbs import waving_limbs
 from dg4d_lib.video.puppet import Puppet

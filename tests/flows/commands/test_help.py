@@ -8,7 +8,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from dg4d_lib.settings import Motion
+from dg4d_lib.input_settings import Motion
 from flows.cli import app
 from flows.commands import options
 from steps.contract import LARGEST_SEED

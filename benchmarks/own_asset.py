@@ -1,0 +1,285 @@
+"""Quality of `--asset`: true meshes of the first frame, driven by their videos, beside the frozen truth.
+
+    python -m benchmarks.own_asset FOLDER [--names panda mage] [--sheets DIR]
+    python -m benchmarks.own_asset --made-up
+
+FOLDER has a folder per object with `input/`, `view_AZIMUTH/`, `bank/` and `mesh.npz`. The model of an object is its
+mesh of frame 0, with colors baked from frame 0 of the bank; its place is searched as for any model.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import benchmarks.measure  # noqa: F401 (before torch: how its threads wait)
+
+import numpy as np  # isort: skip
+import torch  # isort: skip
+from jaxtyping import Float, Int
+from PIL import Image
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from benchmarks.objects.drawing import Painted
+from benchmarks.objects.specimens import OBJECTS
+from dg4d_lib.asset_settings import AssetSettings
+from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
+from dg4d_lib.fitting.asset_motion import fit_asset_motion
+from dg4d_lib.fitting.asset_pose import find_placement
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.images import over_white, resize
+from dg4d_lib.mesh.models.control_graph import build_control_graph
+from dg4d_lib.mesh.models.model import Model, ModelPart
+from dg4d_lib.mesh.models.surface_cloud import cover_surface
+from dg4d_lib.mesh.texturing.bake import locate_texels, vertex_normals
+from dg4d_lib.mesh.texturing.unwrap import unwrap
+from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
+from dg4d_lib.metrics.image import iou, psnr
+from dg4d_lib.metrics.surface import chamfer_distance, sample_surface
+from dg4d_lib.metrics.video import temporal_error
+from dg4d_lib.rasterizer.interface import get_rasterizer
+from dg4d_lib.video.driving import DrivingVideo
+from steps.animate_asset import moved_states, moved_vertices
+from steps.artifacts.ground_truth import find_ground_truths
+from steps.artifacts.media import read_png
+from steps.fitting.priors import read_bank_folder
+from steps.profiles import profile
+
+SIZE = 256  # pixels of the compared pictures
+TEXTURE = 512  # texels per side of baked models
+SAMPLES = 20000  # points of a surface for the chamfer distance
+DEPTH_SLACK = 0.02  # world units by which a texel may lie behind the surface that a bank view shows
+COLUMNS = ("psnr", "psnr_obj", "iou", "terr", "chamfer", "flipped", "input")
+FPS = 12.0
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Model of an object at its first frame, its footage, and its truth.
+
+    Attributes:
+        name: of the object.
+        model: mesh of frame 0, in world units.
+        footage: cut-outs, straight alpha.
+        views: azimuth to cut-outs.
+        vertices: of the true meshes.
+        faces: of the true meshes.
+        weights: of the faces in samples of the surface.
+    """
+
+    name: str
+    model: Model
+    footage: Float[Tensor, "t h w 4"]
+    views: dict[float, Float[Tensor, "t h w 4"]]
+    vertices: Float[Tensor, "t v 3"]
+    faces: Int[Tensor, "f 3"]
+    weights: Float[Tensor, " f"]
+
+
+def read_subjects(folder: Path, names: Sequence[str] = ()) -> Iterator[Subject]:
+    """Read the objects of a data set, all of them if none is named."""
+    for truth in find_ground_truths(folder):
+        if (names and truth.name not in names) or truth.mesh is None or truth.bank is None:
+            continue
+        with np.load(truth.mesh) as archive:
+            vertices = torch.from_numpy(archive["vertices"].astype(np.float32))
+            faces = torch.from_numpy(archive["faces"].astype(np.int64))
+            weights = torch.from_numpy(archive["face_weight"].astype(np.float32))
+        footage = torch.stack([read_png(path) for path in truth.inputs])
+        views = {view.azimuth_deg: torch.stack([read_png(path) for path in view.frames]) for view in truth.views}
+        model = baked_model(vertices[0], faces, truth.bank)
+        yield Subject(truth.name, model, footage, views, vertices, faces, weights)
+
+
+def made_up_subjects(frames: int, names: Sequence[str] = ()) -> Iterator[Subject]:
+    """Draw our own objects, for tuning."""
+    azimuths = (-75.0, 15.0, 105.0, 195.0)
+    cameras = [OrbitCamera(0, azimuth, width=SIZE, height=SIZE) for azimuth in (0.0, *azimuths)]
+    for name, make in OBJECTS.items():
+        if names and name not in names:
+            continue
+        painted = Painted(make())
+        pictures = torch.stack([painted.draw(frame / frames, cameras) for frame in range(frames)], 1)
+        vertices = torch.stack([painted.vertices(frame / frames) for frame in range(frames)])
+        linear = np.power(painted.colors.numpy(), 2.2)
+        part = ModelPart(name, vertices[0].numpy(), painted.faces.numpy(), colors=linear)
+        views = dict(zip(azimuths, pictures[1:], strict=True))
+        yield Subject(name, Model((part,)), pictures[0], views, vertices, painted.faces, torch.ones(len(painted.faces)))
+
+
+def baked_model(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], bank_folder: Path) -> Model:
+    """Return a mesh with a texture: means over the views of a bank's first frame that see a texel, by their angle."""
+    bank = read_bank_folder(bank_folder)
+    sources, corners, uvs = map(torch.from_numpy, unwrap(vertices.numpy(), faces.numpy(), TEXTURE))
+    split, corners = vertices[sources.long()], corners.long()
+    normals = vertex_normals(vertices, faces)[sources.long()]
+    texels = locate_texels(split, normals, corners, uvs, TEXTURE)
+    pictures = bank.pictures[:, bank.frames.index(0)].float() / 255
+    depth = rasterize_mesh(vertices, faces, list(bank.cameras)).depth
+    total, weight = torch.zeros(len(texels.rows), 3), torch.full((len(texels.rows), 1), 1e-9)
+    for camera, matrix, picture, nearest in zip(bank.cameras, viewmats(bank.cameras), pictures, depth, strict=True):
+        seen = texels.positions @ matrix[:3, :3].T.float() + matrix[:3, 3].float()
+        pixel = seen[:, :2] / seen[:, 2:] * camera.focal + camera.width / 2
+        column, row = (pixel.floor().long().clamp(0, camera.width - 1)).T
+        towards = torch.nn.functional.normalize(camera.position().float() - texels.positions, dim=-1)
+        facing = (towards * texels.normals).sum(-1).abs()  # some meshes are one-sided
+        visible = (seen[:, 2] < nearest[row, column] + DEPTH_SLACK) & (picture[row, column, 3] > 0.9)
+        share = (facing.square().square() * visible + 1e-6 * (picture[row, column, 3] > 0.5))[:, None]
+        total += share * picture[row, column, :3]
+        weight += share
+    texture = np.full((TEXTURE, TEXTURE, 4), 255, np.uint8)
+    texture[texels.rows, texels.columns, :3] = (255 * total / weight).round().clamp(0, 255).numpy()
+    for _ in range(4):  # grow the charts, for bilinear sampling
+        texture = _grown(texture, texels.rows, texels.columns)
+    return Model((ModelPart("object", split.numpy(), corners.numpy(), uvs.numpy(), texture),))
+
+
+def _grown(texture: np.ndarray, rows: Tensor, columns: Tensor) -> np.ndarray:
+    empty = np.ones(texture.shape[:2], bool)
+    empty[rows, columns] = False
+    nearest = distance_transform_edt(empty, return_distances=False, return_indices=True)
+    return texture[tuple(nearest)]
+
+
+def score(
+    subject: Subject, states: Gaussians, moved: Float[Tensor, "t v 3"], faces: Int[Tensor, "f 3"]
+) -> dict[str, float]:
+    """Compare renders and meshes of a motion with the truth."""
+    rasterize = get_rasterizer("auto")
+    rows = []
+    for azimuth, truth in {0.0: subject.footage, **subject.views}.items():
+        camera = OrbitCamera(0, azimuth, width=SIZE, height=SIZE)
+        with torch.no_grad():
+            drawn = rasterize(states, [camera] * len(states.means), torch.ones(3))
+        rows.append(_figures(drawn.color.clamp(0, 1), drawn.alpha, truth))
+    mean = {name: float(np.mean([row[name] for row in rows[1:]])) for name in rows[0]}
+    generator = torch.Generator().manual_seed(0)
+    distances = [
+        chamfer_distance(
+            sample_surface(ours, faces, SAMPLES, generator),
+            sample_surface(theirs, subject.faces, SAMPLES, generator, subject.weights),
+        )
+        for ours, theirs in zip(moved, subject.vertices, strict=True)
+    ]
+    return {**mean, "chamfer": float(np.mean(distances)), "input": rows[0]["psnr"]}
+
+
+def _figures(
+    color: Float[Tensor, "t h w 3"], alpha: Float[Tensor, "t h w 1"], truth: Float[Tensor, "t h w 4"]
+) -> dict[str, float]:
+    theirs = over_white(truth)
+    region = ((alpha > 0.5) | (truth[..., 3:] > 0.5)).float()
+    return {
+        "psnr": float(psnr(color, theirs).mean()),
+        "psnr_obj": float(psnr(color, theirs, region).mean()),
+        "iou": float(iou(alpha, truth[..., 3:]).mean()),
+        "terr": float(temporal_error(color, theirs)),
+    }
+
+
+def frozen(subject: Subject) -> dict[str, float]:
+    """Return the figures of the true first frame of each view and of the true first mesh, frozen."""
+    rows = []
+    for truth in (subject.footage, *subject.views.values()):
+        still = truth[:1].expand_as(truth)
+        rows.append(_figures(over_white(still), still[..., 3:], truth))
+    mean = {name: float(np.mean([row[name] for row in rows[1:]])) for name in rows[0]}
+    generator = torch.Generator().manual_seed(0)
+    clouds = [sample_surface(v, subject.faces, SAMPLES, generator, subject.weights) for v in subject.vertices]
+    rest = sample_surface(subject.vertices[0], subject.faces, SAMPLES, generator, subject.weights)
+    distance = float(np.mean([chamfer_distance(rest, cloud) for cloud in clouds]))
+    return {**mean, "chamfer": distance, "flipped": 0.0, "input": rows[0]["psnr"]}
+
+
+def animate(subject: Subject, settings: AssetSettings, seed: int = 0) -> tuple[dict[str, float], Tensor]:
+    """Place a subject's model, fit its motion, and compare with the truth.
+
+    Returns:
+        Figures, and a sheet: frames by views, our renders under the true ones.
+    """
+    rasterize = get_rasterizer("auto")
+    generator = torch.Generator().manual_seed(seed)
+    whole = cover_surface(subject.model, settings.points, generator).cloud
+    placement = find_placement(whole, subject.footage[0], rasterize)
+    model = subject.model.placed(placement.matrix)
+    surface = cover_surface(model, settings.points, torch.Generator().manual_seed(seed))
+    graph = build_control_graph(surface.fine.vertices, surface.fine.faces, settings.nodes)
+    bound = graph.of(surface.nearest)
+    video = DrivingVideo(subject.footage[..., :3].contiguous(), subject.footage[..., 3:].contiguous(), FPS)
+    motion = fit_asset_motion(surface.cloud, bound, video, rasterize, settings, generator)
+    vertices, flipped = moved_vertices(surface, graph, motion)
+    states = moved_states(surface.cloud, bound, motion)
+    figures = score(subject, states, vertices, torch.from_numpy(model.faces))
+    return {**figures, "flipped": float(flipped)}, _sheet(subject, states)
+
+
+def measure(
+    subjects: Iterator[Subject],
+    settings: AssetSettings,
+    show: Callable[[str], None] = print,
+    sheets: Path | None = None,
+) -> dict[str, dict[str, float]]:
+    """Animate subjects and show the figures of each beside the frozen truth; return ours.
+
+    Args:
+        subjects: with their truth.
+        settings: of the fit.
+        show: prints a line.
+        sheets: folder for a contact sheet of each.
+    """
+    found: dict[str, dict[str, float]] = {}
+    still: dict[str, dict[str, float]] = {}
+    show(f"{'':24}" + "".join(f"{column:>10}" for column in COLUMNS))
+    for subject in subjects:
+        begun = time.perf_counter()
+        found[subject.name], sheet = animate(subject, settings)
+        still[subject.name] = frozen(subject)
+        show(_row(subject.name, found[subject.name]) + f"   {time.perf_counter() - begun:.0f} s")
+        show(_row("  truth, frozen", still[subject.name]))
+        if sheets is not None:
+            sheets.mkdir(parents=True, exist_ok=True)
+            pixels = (255 * sheet.clamp(0, 1)).round().to(torch.uint8).numpy()
+            Image.fromarray(pixels).save(sheets / f"{subject.name}.png")
+    for name, rows in (("mean", found), ("  truth, frozen", still)):
+        show(_row(name, {column: float(np.mean([row[column] for row in rows.values()])) for column in COLUMNS}))
+    return found
+
+
+def _row(name: str, figures: dict[str, float]) -> str:
+    return f"{name:24}" + "".join(f"{figures[column]:10.3f}" for column in COLUMNS)
+
+
+def _sheet(subject: Subject, states: Gaussians, columns: int = 6, size: int = 144) -> Float[Tensor, "h w 3"]:
+    """Draw some frames: for every view a row of the truth and one of ours."""
+    rasterize = get_rasterizer("auto")
+    frames = torch.linspace(0, len(states.means) - 1, columns).round().long()
+    rows = []
+    for azimuth, truth in {0.0: subject.footage, **subject.views}.items():
+        camera = OrbitCamera(0, azimuth, width=size, height=size)
+        with torch.no_grad():
+            ours = rasterize(states.states(frames), [camera] * columns, torch.ones(3)).color
+        theirs = resize(over_white(truth[frames]), (size, size))
+        rows += [torch.cat(list(theirs), 1), torch.cat(list(ours), 1)]
+    return torch.cat(rows)
+
+
+def main() -> None:
+    """Measure the objects of a folder, or our own."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, nargs="?")
+    parser.add_argument("--names", nargs="*", default=[])
+    parser.add_argument("--made-up", action="store_true", help="our own objects instead")
+    parser.add_argument("--frames", type=int, default=16, help="of our own objects")
+    parser.add_argument("--sheets", type=Path, metavar="DIR")
+    given = parser.parse_args()
+    if given.folder is None and not given.made_up:
+        parser.error("give a folder, or --made-up")
+    made_up = given.made_up
+    subjects = made_up_subjects(given.frames, given.names) if made_up else read_subjects(given.folder, given.names)
+    measure(subjects, profile("preview").asset, sheets=given.sheets)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,487 @@
+"""GLBs of other programs: triangles and base colors at rest, and the same file with morph targets over time.
+
+Everything in the file is kept: nodes, names, materials, textures, texture coordinates and skeletons. Existing
+animations are dropped, since they would move the model twice; existing morph targets keep their default weights.
+Files are not trusted: every index, size and number is checked before it is used.
+"""
+
+import json
+import math
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dg4d_lib.assets.formats import meshopt
+from dg4d_lib.assets.formats.gltf import VERTEX_DATA, GlbReader, GltfDocument
+from dg4d_lib.assets.formats.model_pictures import decode_picture
+from dg4d_lib.assets.formats.normals import SmoothNormals
+from dg4d_lib.assets.formats.tracks import Animation
+from dg4d_lib.errors import BadInput
+from dg4d_lib.mesh.models.model import Model, ModelPart
+
+MAX_POSES = 128  # morph targets; players keep their weights in uniforms, of which every GPU has at least 256
+MAX_NODES = 100_000
+MAX_DEPTH = 200  # of nested nodes
+TRIANGLES, STRIP, FAN = 4, 5, 6
+PLACEMENT = "dg4d placement"
+MOTION = "dg4d motion"
+UNREADABLE = {
+    "KHR_draco_mesh_compression": "its meshes are compressed with Draco; export it without compression",
+    "KHR_texture_basisu": "its textures are in KTX2; export them as PNG or JPEG",
+}
+_FOREIGN = (KeyError, IndexError, TypeError, ValueError, ArithmeticError, AttributeError, OSError, struct.error)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A primitive of a mesh where a node shows it.
+
+    Attributes:
+        node: index of the node.
+        primitive: index in the mesh of the node.
+        local: vertices in the coordinates of the mesh, with default morph weights.
+        matrices: from there to the model, the same for all vertices or one per vertex (skinned).
+        part: vertices at rest in the coordinates of the model, triangles and colors.
+    """
+
+    node: int
+    primitive: int
+    local: NDArray[np.float32]
+    matrices: NDArray[np.float64]
+    part: ModelPart
+
+
+@dataclass(frozen=True)
+class ForeignGlb:
+    """GLB of another program.
+
+    Attributes:
+        reader: its tree and buffer.
+        pieces: its visible triangles.
+        notes: sentences about what is not used.
+    """
+
+    reader: GlbReader
+    pieces: tuple[Piece, ...]
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def model(self) -> Model:
+        """Triangles and colors at rest, in the coordinates of the file."""
+        return Model(tuple(piece.part for piece in self.pieces))
+
+
+def read_foreign_glb(content: bytes, max_faces: int) -> ForeignGlb:
+    """Read the triangles that a GLB shows, at rest.
+
+    Args:
+        content: of the file.
+        max_faces: largest number of triangles.
+
+    Raises:
+        BadInput: the file is broken, has no or too many triangles, numbers that are not finite, missing textures, or
+            a compression that cannot be read.
+    """
+    reader = GlbReader(content)
+    try:
+        return _read(reader, max_faces)
+    except (*_FOREIGN, RecursionError) as error:
+        raise BadInput(f"the model is a broken glTF ({error!r}); export it again") from error
+
+
+def write_moving_glb(
+    glb: ForeignGlb,
+    placement: NDArray[np.float64],
+    moved: NDArray[np.float32],
+    fps: float,
+    extras: dict[str, Any],
+    interpolation: str = "LINEAR",
+    moving_normals: bool = True,
+) -> tuple[bytes, tuple[str, ...]]:
+    """Write the file with a morph target per frame, in the coordinates of the world.
+
+    Args:
+        glb: the file at rest.
+        placement: from the coordinates of the model to the world.
+        moved: vertices of all pieces in their order, at every frame, world units.
+        fps: frames per second.
+        extras: JSON that is added to the asset.
+        interpolation: between frames, LINEAR or STEP.
+        moving_normals: True to move the normals of primitives that have some.
+
+    Returns:
+        The GLB, and notes about it.
+
+    Raises:
+        BadInput: the file would be larger than a GLB may be.
+    """
+    notes = list(glb.notes)
+    document = _reopened(glb.reader, extras)
+    tree = document.tree
+    if tree.pop("animations", None):
+        notes.append("the animations of the model were dropped: the new motion takes their place")
+    step = -(-len(moved) // MAX_POSES)
+    if step > 1:
+        notes.append(f"the animated model has every {step}. frame as a key; {MAX_POSES} morph targets are allowed")
+    moved, rate = moved[::step], fps / step
+    if "skins" in tree:
+        notes.append("the skeleton of the model is kept at rest; its motion is in morph targets")
+    keys = list(range(len(moved) + 1))  # the last one shows frame 0 again
+    track = np.eye(len(moved), dtype=np.float32)[np.array(keys) % len(moved)]  # the base is the model as given
+    back: NDArray[np.float64] = np.linalg.inv(placement).astype(np.float64)
+    animation = Animation(document, rate)
+    start = 0
+    for node, pieces in _by_node(glb.pieces).items():
+        mesh = {**tree["meshes"][tree["nodes"][node]["mesh"]]}
+        mesh["primitives"] = [{**primitive} for primitive in mesh["primitives"]]
+        for primitive in mesh["primitives"]:
+            primitive.pop("targets", None)
+        for piece in pieces:
+            states = moved[:, start : start + len(piece.local)]
+            start += len(piece.local)
+            primitive = mesh["primitives"][piece.primitive]
+            primitive["targets"] = _targets(document, piece, states, back, primitive, moving_normals)
+        mesh["primitives"] = [one for one in mesh["primitives"] if "targets" in one]  # all need as many targets
+        mesh["weights"] = track[0].tolist()
+        mesh["extras"] = {**_object(mesh.get("extras")), "targetNames": [f"frame_{pose:03d}" for pose in keys[:-1]]}
+        tree["nodes"][node] = {key: value for key, value in tree["nodes"][node].items() if key != "weights"}
+        tree["nodes"][node]["mesh"] = document.add("meshes", **mesh)
+        animation.add_morph(node, str(tree["nodes"][node].get("name", f"node {node}")), keys, track, interpolation)
+    animation.finish()
+    tree["animations"][-1]["name"] = MOTION
+    _place(document, placement)
+    _drop_unused_meshes(tree)
+    return document.to_bytes(), tuple(notes)
+
+
+def _by_node(pieces: Sequence[Piece]) -> dict[int, list[Piece]]:
+    found: dict[int, list[Piece]] = {}
+    for piece in pieces:
+        found.setdefault(piece.node, []).append(piece)
+    return found
+
+
+def _targets(
+    document: GltfDocument,
+    piece: Piece,
+    states: NDArray[np.float32],
+    back: NDArray[np.float64],
+    primitive: dict[str, Any],
+    moving_normals: bool,
+) -> list[dict[str, int]]:
+    """Add displacements in the coordinates of the mesh; return the morph targets."""
+    inverse = np.linalg.inv(piece.matrices) @ back
+    turning = "NORMAL" in primitive["attributes"] and moving_normals
+    normals_of = SmoothNormals(piece.local, piece.part.faces) if turning else None
+    rest = normals_of(piece.local) if normals_of else None
+    targets = []
+    for frame, state in enumerate(states):
+        local = _transformed(inverse, state).astype(np.float32)
+        name = f"{piece.part.name} frame_{frame:03d}"
+        target = {"POSITION": document.add_accessor(name, local - piece.local, VERTEX_DATA)}
+        if normals_of is not None and rest is not None:
+            target["NORMAL"] = document.add_accessor(f"{name} normals", normals_of(local) - rest, VERTEX_DATA)
+        targets.append(target)
+    return targets
+
+
+def _place(document: GltfDocument, placement: NDArray[np.float64]) -> None:
+    """Put all root nodes of the scene under a node that moves them into the world."""
+    tree = document.tree
+    scene = tree["scenes"][tree.get("scene", 0)]
+    root = document.add("nodes", name=PLACEMENT, children=scene["nodes"], matrix=placement.T.ravel().tolist())
+    scene["nodes"] = [root]
+
+
+def _drop_unused_meshes(tree: dict[str, Any]) -> None:
+    """Remove meshes that no node shows any more; others keep their order."""
+    used = sorted({node["mesh"] for node in tree["nodes"] if "mesh" in node})
+    tree["meshes"] = [tree["meshes"][index] for index in used]
+    for node in tree["nodes"]:
+        if "mesh" in node:
+            node["mesh"] = used.index(node["mesh"])
+
+
+def _reopened(reader: GlbReader, extras: dict[str, Any]) -> GltfDocument:
+    """Return the file as a document that can be added to, without compression."""
+    document = GltfDocument({})
+    tree = json.loads(json.dumps(reader.tree))
+    views = []
+    for index, view in enumerate(tree.get("bufferViews", [])):
+        content = reader.view(index)
+        view.get("extensions", {}).pop(meshopt.EXTENSION, None)
+        view.update(buffer=0, byteOffset=len(document.binary), byteLength=len(content))
+        document.binary += content + bytes(-len(content) % 4)
+        views.append(view)
+    tree["bufferViews"] = views
+    for names in (tree.get("extensionsUsed", []), tree.get("extensionsRequired", [])):
+        if meshopt.EXTENSION in names:
+            names.remove(meshopt.EXTENSION)
+    for collection in [name for name, value in tree.items() if value == []]:
+        del tree[collection]  # glTF allows no empty arrays
+    tree["asset"] = {**tree["asset"], "extras": {**_object(tree["asset"].get("extras")), **extras}}
+    document.tree = tree
+    return document
+
+
+def _object(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _read(reader: GlbReader, max_faces: int) -> ForeignGlb:
+    tree = reader.tree
+    if not isinstance(tree, dict) or str(_object(tree.get("asset")).get("version", ""))[:1] != "2":
+        raise BadInput("the model is no glTF 2.0; export it as GLB")
+    for extension, remedy in UNREADABLE.items():
+        if extension in tree.get("extensionsRequired", ()):
+            raise BadInput(f"the model cannot be read: {remedy}")
+    globals_ = _global_matrices(tree)
+    nodes = [n for n in sorted(globals_) if "mesh" in tree["nodes"][n]]
+    faces, notes = 0, []
+    for node in nodes:
+        for primitive in tree["meshes"][tree["nodes"][node]["mesh"]]["primitives"]:
+            accessor = primitive.get("indices", primitive["attributes"]["POSITION"])
+            faces += tree["accessors"][accessor]["count"] // 3 if primitive.get("mode", 4) == TRIANGLES else 0
+    if faces > max_faces:
+        raise BadInput(
+            f"the model has {faces} triangles; asset.max_faces allows {max_faces}: simplify it, or raise the limit "
+            f"with --set asset.max_faces={faces}"
+        )
+    pieces: list[Piece] = []
+    pictures: dict[int, NDArray[np.uint8]] = {}
+    for node in nodes:
+        mesh = tree["meshes"][tree["nodes"][node]["mesh"]]
+        for number, primitive in enumerate(mesh["primitives"]):
+            if primitive.get("mode", TRIANGLES) not in (TRIANGLES, STRIP, FAN):
+                notes.append(f"points and lines of {mesh.get('name', 'a mesh')!r} are not animated and left out")
+                continue
+            pieces.append(_piece(reader, node, number, globals_, pictures))
+    pieces = [piece for piece in pieces if len(piece.part.faces)]
+    if not pieces:
+        raise BadInput("the model shows no triangles; give a mesh with faces")
+    if not all(np.isfinite(piece.part.vertices).all() for piece in pieces):
+        raise BadInput("the model has vertices that are not finite numbers (NaN or infinity); export it again")
+    return ForeignGlb(reader, tuple(pieces), tuple(dict.fromkeys(notes)))
+
+
+def _piece(
+    reader: GlbReader,
+    node: int,
+    number: int,
+    globals_: dict[int, NDArray[np.float64]],
+    pictures: dict[int, NDArray[np.uint8]],
+) -> Piece:
+    tree = reader.tree
+    item = tree["nodes"][node]
+    mesh = tree["meshes"][item["mesh"]]
+    primitive = mesh["primitives"][number]
+    attributes = primitive["attributes"]
+    local = read_accessor(reader, attributes["POSITION"]).astype(np.float64)
+    weights = item.get("weights", mesh.get("weights", ()))
+    for weight, target in zip(weights, primitive.get("targets", ()), strict=False):
+        if weight and "POSITION" in target:
+            local = local + float(weight) * read_accessor(reader, target["POSITION"])
+    count = len(local)
+    matrices = globals_[node][None]
+    if "skin" in item and "JOINTS_0" in attributes:
+        matrices = _skin_matrices(reader, tree["skins"][item["skin"]], attributes, globals_)
+    faces = _faces(reader, primitive, count)
+    material = tree["materials"][primitive["material"]] if "material" in primitive else {}
+    shading = _object(material.get("pbrMetallicRoughness"))
+    texture, uvs = _texture(reader, shading.get("baseColorTexture"), attributes, pictures)
+    colors = read_accessor(reader, attributes["COLOR_0"])[:, :3] if "COLOR_0" in attributes else None
+    factor = [float(value) for value in shading.get("baseColorFactor", (1, 1, 1, 1))]
+    if any(values is not None and len(values) != count for values in (uvs, colors)):
+        raise BadInput("the attributes of a mesh of the model have different lengths; export it again")
+    with np.errstate(all="ignore"):
+        vertices = _transformed(matrices, local).astype(np.float32)
+    part = ModelPart(
+        str(mesh.get("name", f"mesh {item['mesh']}")),
+        vertices,
+        faces,
+        uvs,
+        texture,
+        (factor[0], factor[1], factor[2]),
+        None if colors is None else colors.astype(np.float64),
+        masked=material.get("alphaMode", "OPAQUE") != "OPAQUE",
+    )
+    return Piece(node, number, local.astype(np.float32), matrices, part)
+
+
+def _skin_matrices(
+    reader: GlbReader, skin: dict[str, Any], attributes: dict[str, int], globals_: dict[int, NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    """Return the blended matrix of every vertex in the rest pose of the skeleton."""
+    joints = [globals_[joint] for joint in skin["joints"]]
+    inverse = np.tile(np.eye(4), (len(joints), 1, 1))
+    if "inverseBindMatrices" in skin:
+        inverse = read_accessor(reader, skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)[: len(joints)]
+    posed = np.stack(joints) @ inverse
+    total: NDArray[np.float64] | None = None
+    share: NDArray[np.float64] | float = 0.0
+    for group in range(4):
+        if f"JOINTS_{group}" not in attributes:
+            break
+        indices = read_accessor(reader, attributes[f"JOINTS_{group}"], raw=True).astype(np.int64)
+        weights = read_accessor(reader, attributes[f"WEIGHTS_{group}"]).astype(np.float64)
+        blended = np.einsum("vk,vkij->vij", weights, posed[indices])
+        total = blended if total is None else total + blended
+        share = share + weights.sum(1)
+    assert total is not None  # the caller has seen JOINTS_0
+    broken = np.abs(share) < 1e-6
+    total = total / np.where(broken, 1, share)[:, None, None]
+    total[broken] = np.eye(4)
+    if np.linalg.det(total[:, :3, :3]).__abs__().min() < 1e-12:
+        raise BadInput("the skeleton of the model flattens it at rest; apply it and export the mesh again")
+    return total
+
+
+def _faces(reader: GlbReader, primitive: dict[str, Any], count: int) -> NDArray[np.int64]:
+    if "indices" in primitive:
+        order = read_accessor(reader, primitive["indices"], raw=True)[:, 0].astype(np.int64)
+    else:
+        order = np.arange(count)
+    if len(order) and not 0 <= order.min() <= order.max() < count:
+        raise BadInput(f"triangles of the model refer to vertices beyond its {count}; export it again")
+    match primitive.get("mode", TRIANGLES):
+        case 4:
+            return order[: len(order) // 3 * 3].reshape(-1, 3)
+        case 5:
+            strip = np.stack([order[:-2], order[1:-1], order[2:]], 1)
+            strip[1::2] = strip[1::2, [1, 0, 2]]
+            return strip
+        case _:
+            return np.stack([np.full(len(order) - 2, order[0]), order[1:-1], order[2:]], 1)
+
+
+def _texture(
+    reader: GlbReader, info: Any, attributes: dict[str, int], pictures: dict[int, NDArray[np.uint8]]
+) -> tuple[NDArray[np.uint8] | None, NDArray[np.float64] | None]:
+    """Return the base color texture and its coordinates; both None without one."""
+    if not isinstance(info, dict):
+        return None, None
+    tree = reader.tree
+    texture = tree["textures"][info["index"]]
+    extensions = _object(texture.get("extensions"))
+    source = next((v["source"] for v in (_object(extensions.get("EXT_texture_webp")), texture) if "source" in v), None)
+    transform = _object(_object(info.get("extensions")).get("KHR_texture_transform"))
+    name = f"TEXCOORD_{transform.get('texCoord', info.get('texCoord', 0))}"
+    if source is None or name not in attributes:
+        return None, None
+    if source not in pictures:
+        pictures[source] = _picture(reader, source)
+    uvs = read_accessor(reader, attributes[name]).astype(np.float64)
+    turn = float(transform.get("rotation", 0))
+    c, s = math.cos(turn), math.sin(turn)
+    uvs = (uvs * transform.get("scale", (1, 1))) @ np.array([[c, -s], [s, c]]) + transform.get("offset", (0, 0))
+    return pictures[source], uvs
+
+
+def _picture(reader: GlbReader, index: int) -> NDArray[np.uint8]:
+    image = reader.tree["images"][index]
+    if "bufferView" not in image:
+        raise BadInput(
+            f"the texture {str(image.get('uri', index))[:80]!r} of the model is missing; put it beside the model, or "
+            "export the model as GLB with its textures"
+        )
+    return decode_picture(reader.view(image["bufferView"]), str(image.get("name", index)))
+
+
+def read_accessor(reader: GlbReader, index: int, raw: bool = False) -> NDArray[Any]:
+    """Return the rows of an accessor; floats, or with `raw` the stored integers.
+
+    Raises:
+        ValueError: it reaches beyond its view.
+    """
+    tree = reader.tree
+    accessor = tree["accessors"][index]
+    kind = np.dtype(
+        {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}[accessor["componentType"]]
+    )
+    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}[accessor["type"]]
+    count = int(accessor["count"])
+    if not 0 <= count <= 50_000_000:
+        raise ValueError(f"an accessor has {count} rows")
+    if "bufferView" in accessor:
+        view = tree["bufferViews"][accessor["bufferView"]]
+        rows = _rows(
+            reader, accessor["bufferView"], accessor.get("byteOffset", 0), kind, width, count, view.get("byteStride")
+        )
+    else:
+        rows = np.zeros((count, width), kind)
+    if "sparse" in accessor:
+        sparse, rows = accessor["sparse"], rows.copy()
+        where, what = sparse["indices"], sparse["values"]
+        into = {5121: "u1", 5123: "<u2", 5125: "<u4"}[where["componentType"]]
+        places = _rows(
+            reader, where["bufferView"], where.get("byteOffset", 0), np.dtype(into), 1, sparse["count"], None
+        )
+        rows[places[:, 0]] = _rows(
+            reader, what["bufferView"], what.get("byteOffset", 0), kind, width, sparse["count"], None
+        )
+    if raw or kind.kind == "f":
+        return rows
+    values = rows.astype(np.float32)
+    return np.maximum(values / np.iinfo(kind).max, -1) if accessor.get("normalized") else values
+
+
+def _rows(
+    reader: GlbReader, view: int, offset: int, kind: np.dtype[Any], width: int, count: int, stride: int | None
+) -> NDArray[Any]:
+    content = reader.view(view)
+    step = stride or width * kind.itemsize
+    if offset < 0 or step < width * kind.itemsize:
+        raise ValueError("an accessor has a negative offset or a stride that is too small")
+    if count and offset + (count - 1) * step + width * kind.itemsize > len(content):
+        raise ValueError("an accessor reaches beyond its view")
+    return np.ndarray((count, width), kind, content, offset, (step, kind.itemsize))
+
+
+def _global_matrices(tree: dict[str, Any]) -> dict[int, NDArray[np.float64]]:
+    """Return the global matrix of every node of the scene."""
+    nodes = tree.get("nodes", [])
+    if len(nodes) > MAX_NODES:
+        raise BadInput(f"the model has {len(nodes)} nodes; at most {MAX_NODES} are read")
+    if not tree.get("scenes"):
+        children = {child for node in nodes for child in node.get("children", ())}
+        tree["scenes"] = [{"nodes": [index for index in range(len(nodes)) if index not in children]}]
+        tree["scene"] = 0
+    found: dict[int, NDArray[np.float64]] = {}
+    waiting = [(index, np.eye(4), 1) for index in tree["scenes"][tree.get("scene", 0)].get("nodes", ())]
+    while waiting:
+        index, parent, depth = waiting.pop()
+        if index in found or depth > MAX_DEPTH:
+            raise BadInput("the nodes of the model form a circle or are nested too deeply; export it again")
+        found[index] = parent @ _local_matrix(nodes[index])
+        waiting += [(child, found[index], depth + 1) for child in nodes[index].get("children", ())]
+    return found
+
+
+def _local_matrix(node: dict[str, Any]) -> NDArray[np.float64]:
+    if "matrix" in node:
+        return np.array(node["matrix"], float).reshape(4, 4).T
+    x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), float)
+    scale = 2 / max(x * x + y * y + z * z + w * w, 1e-12)
+    turn = np.array(
+        [
+            [1 - scale * (y * y + z * z), scale * (x * y - z * w), scale * (x * z + y * w)],
+            [scale * (x * y + z * w), 1 - scale * (x * x + z * z), scale * (y * z - x * w)],
+            [scale * (x * z - y * w), scale * (y * z + x * w), 1 - scale * (x * x + y * y)],
+        ]
+    )
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn * np.array(node.get("scale", (1, 1, 1)), float)
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix
+
+
+def _transformed(matrices: NDArray[np.float64], points: NDArray[Any]) -> NDArray[np.float64]:
+    """Apply one affine matrix, or one per point."""
+    homogeneous = np.concatenate([points, np.ones((len(points), 1))], 1)
+    if len(matrices) == 1:
+        return (homogeneous @ matrices[0].T)[:, :3]
+    return np.einsum("vij,vj->vi", matrices, homogeneous)[:, :3]

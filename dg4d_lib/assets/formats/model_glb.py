@@ -1,0 +1,49 @@
+"""GLB of a user's model in another format: a mesh, node and material per part, with their names."""
+
+import io
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from dg4d_lib.assets.formats.gltf import INDEX_DATA, VERTEX_DATA, GltfDocument
+from dg4d_lib.mesh.models.model import Model
+
+
+def write_model_glb(model: Model) -> bytes:
+    """Encode a model at rest; textures as PNG, each stored once."""
+    document = GltfDocument({})
+    textures: dict[int, int] = {}
+    nodes = []
+    for part in model.parts:
+        attributes = {"POSITION": document.add_accessor(part.name, part.vertices.astype("<f4"), VERTEX_DATA)}
+        shading: dict[str, object] = {"baseColorFactor": [*part.factor, 1.0], "metallicFactor": 0.0}
+        if part.uvs is not None:
+            uvs = document.add_accessor(f"{part.name} uvs", part.uvs.astype("<f4"), VERTEX_DATA)
+            attributes["TEXCOORD_0"] = uvs
+        if part.texture is not None and part.uvs is not None:
+            if id(part.texture) not in textures:
+                textures[id(part.texture)] = _add_texture(document, part.name, part.texture)
+            shading["baseColorTexture"] = {"index": textures[id(part.texture)]}
+        if part.colors is not None:
+            colors = document.add_accessor(f"{part.name} colors", part.colors.astype("<f4"), VERTEX_DATA)
+            attributes["COLOR_0"] = colors
+        mode = "MASK" if part.masked else None
+        material = document.add(
+            "materials", name=part.name, pbrMetallicRoughness=shading, alphaMode=mode, doubleSided=True
+        )
+        indices = document.add_accessor(f"{part.name} triangles", part.faces.ravel().astype("<u4"), INDEX_DATA)
+        primitive = {"attributes": attributes, "indices": indices, "material": material}
+        mesh = document.add("meshes", name=part.name, primitives=[primitive])
+        nodes.append(document.add("nodes", name=part.name, mesh=mesh))
+    document.tree["scene"] = document.add("scenes", name="model", nodes=nodes)
+    return document.to_bytes()
+
+
+def _add_texture(document: GltfDocument, name: str, pixels: NDArray[np.uint8]) -> int:
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG")
+    image = document.add(
+        "images", name=name, mimeType="image/png", bufferView=document.add_view(name, buffer.getvalue())
+    )
+    return document.add("textures", name=name, source=image)

@@ -1,0 +1,381 @@
+"""Motion of a user's model: rigid transforms of control nodes on its surface, fitted to a driving video.
+
+The frames are tracked one after the other, then all are refined together. An as-rigid-as-possible energy along the
+surface (Sorkine and Alexa 2007), robust so that joints may bend, decides what the video leaves open; accelerations and
+displacements in depth are penalized.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from skimage.registration import optical_flow_tvl1
+from torch import Tensor
+from torch.nn import functional
+
+from dg4d_lib.asset_settings import AssetSettings
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.fitting.losses import WHITE, check_finite, resize_cutouts
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
+from dg4d_lib.mesh.models.control_graph import ControlGraph
+from dg4d_lib.rasterizer.interface import BLUR, Rasterizer
+from dg4d_lib.video.driving import DrivingVideo
+
+ADVICE = "lower asset.lr"
+LEVELS = (1, 4, 8)  # widths of the filters over the compared pictures, pixels
+FLOW_SHARE = 0.6  # of the iterations of a frame that follow the optical flow; the rest follow the pictures alone
+FLOW_UNIT = 0.02  # of the picture's side: error of the flow up to which its loss is quadratic
+DEPTH_SLACK = 0.05  # world units by which a Gaussian may lie behind the visible surface
+ROBUST = 0.05  # relative stretch up to which the rigidity is quadratic
+WHOLE_DEPTH = 30.0  # weight of the mean displacement in depth, which a video hardly shows, times that of every node's
+BETA1, BETA2 = 0.9, 0.99  # of Adam
+FACTORS = {"turns": 6.0, "shifts": 3.0, "whole_turns": 2.0, "whole_shifts": 1.0}  # of the learning rate, per variable
+Report = Callable[[int, dict[str, float]], None]
+
+
+@dataclass(frozen=True)
+class NodeMotion:
+    """Rigid transforms of the nodes at every frame, and of the whole model.
+
+    Attributes:
+        quats: rotations of the nodes, wxyz, any non-zero norm.
+        shifts: translations of the nodes.
+        whole_quats: rotation of everything about the centroid of the nodes.
+        whole_shifts: translation of everything.
+    """
+
+    quats: Float[Tensor, "t m 4"]
+    shifts: Float[Tensor, "t m 3"]
+    whole_quats: Float[Tensor, "t 4"]
+    whole_shifts: Float[Tensor, "t 3"]
+
+    def at(self, frames: slice | Int[Tensor, " k"]) -> "NodeMotion":
+        """Return the motion of some frames."""
+        return NodeMotion(**{name: value[frames] for name, value in vars(self).items()})
+
+    def points(self, rest: Float[Tensor, "v 3"], graph: ControlGraph) -> Float[Tensor, "t v 3"]:
+        """Return the points that the nodes of `graph` move, at every frame."""
+        matrices = quat_to_rotmat(self.quats)  # t m 3 3
+        origins = graph.nodes + self.shifts - (matrices @ graph.nodes[..., None])[..., 0]  # x -> R x + origin
+        affine = torch.cat([matrices, origins[..., None]], -1).flatten(2)  # t m 12
+        blended = (affine[:, graph.indices] * graph.weights[..., None]).sum(2).unflatten(-1, (3, 4))
+        moved = (blended[..., :3] @ rest[..., None])[..., 0] + blended[..., 3]
+        return self._placed(moved, graph)
+
+    def nodes(self, graph: ControlGraph) -> Float[Tensor, "t m 3"]:
+        """Return the nodes at every frame."""
+        return self._placed(graph.nodes + self.shifts, graph)
+
+    def rotations(self, graph: ControlGraph) -> Float[Tensor, "t v 4"]:
+        """Return the blended rotations of the points, unit quaternions."""
+        unit = functional.normalize(self.quats, dim=-1)
+        blended = functional.normalize((unit[:, graph.indices] * graph.weights[..., None]).sum(2), dim=-1)
+        whole = functional.normalize(self.whole_quats, dim=-1)
+        return quat_multiply(whole[:, None].expand_as(blended), blended)
+
+    def _placed(self, points: Float[Tensor, "t v 3"], graph: ControlGraph) -> Float[Tensor, "t v 3"]:
+        center = graph.nodes.mean(0)
+        turned = (points - center) @ quat_to_rotmat(self.whole_quats).mT
+        return turned + center + self.whole_shifts[:, None]
+
+
+def fit_asset_motion(
+    cloud: Gaussians,
+    graph: ControlGraph,
+    video: DrivingVideo,
+    rasterize: Rasterizer,
+    settings: AssetSettings,
+    generator: torch.Generator,
+    report: Report = lambda iteration, values: None,
+) -> NodeMotion:
+    """Fit the motion of a placed model to a video of the camera at azimuth and elevation 0.
+
+    Args:
+        cloud: Gaussians of the model at rest.
+        graph: control graph whose points are the Gaussians.
+        video: its first frame shows the model about at rest.
+        rasterize: rasterizer.
+        settings: of the fit.
+        generator: draws the frames of joint iterations.
+        report: called after every iteration with (iterations done, named losses).
+
+    Raises:
+        FitDiverged: the loss became non-finite.
+    """
+    fit = _Fit(*_thinned(cloud, graph, settings.fit_points), video, rasterize, settings)
+    frames, done = len(video), 0
+    tracked: list[_Unknowns] = [_Unknowns.still(1, graph)]
+    for frame in range(frames):
+        start = tracked[-1] if frame < 2 else tracked[-2].continued(tracked[-1])
+        unknowns, steps = start.copy(), settings.track_iterations
+        descent = _Descent(unknowns)
+        expected = start.motion(fit.smoothing).nodes(graph).detach()
+        targets = fit.flow_targets(tracked[-1].motion(fit.smoothing), frame) if frame else None
+        for step in range(steps):
+            moved = unknowns.motion(fit.smoothing)
+            losses = fit.losses(moved, [frame])
+            if targets is not None and step < FLOW_SHARE * steps:
+                losses["flow"] = settings.flow * fit.flow_loss(moved, *targets)
+            losses["inertia"] = settings.inertia * fit.relative(moved.nodes(graph) - expected).square().sum(-1).mean()
+            fit.step(losses, unknowns, f"frame {frame}, iteration {step + 1}")
+            descent.step(settings.lr * (1 - 0.8 * step / steps))
+            done += 1
+            report(done, {name: float(value.detach()) for name, value in losses.items()})
+        tracked.append(unknowns.detach())
+    unknowns = _Unknowns.joined(tracked[1:])
+    descent = _Descent(unknowns)
+    for step in range(settings.joint_iterations):
+        chosen = torch.randperm(frames, generator=generator)[: min(settings.joint_frames, frames)].sort().values
+        moved = unknowns.motion(fit.smoothing)
+        losses = fit.losses(moved.at(chosen), chosen.tolist())
+        if frames > 2:
+            nodes = moved.nodes(graph)
+            acceleration = fit.relative(nodes[2:] - 2 * nodes[1:-1] + nodes[:-2])
+            losses["inertia"] = settings.smoothness * acceleration.square().sum(-1).mean()
+        fit.step(losses, unknowns, f"joint iteration {step + 1}")
+        descent.step(0.5 * settings.lr * (1 - 0.9 * step / settings.joint_iterations))
+        done += 1
+        report(done, {name: float(value.detach()) for name, value in losses.items()})
+    return unknowns.detach().motion(fit.smoothing)
+
+
+def iterations(settings: AssetSettings, frames: int) -> int:
+    """Return the number of iterations that a fit reports."""
+    return settings.track_iterations * frames + settings.joint_iterations
+
+
+class _Fit:
+    """Losses of a fit, over its targets."""
+
+    def __init__(
+        self,
+        cloud: Gaussians,
+        graph: ControlGraph,
+        video: DrivingVideo,
+        rasterize: Rasterizer,
+        settings: AssetSettings,
+    ) -> None:
+        self.camera = replace(OrbitCamera(), width=settings.size, height=settings.size)
+        self.cloud, self.graph = antialiased(cloud.detach(), self.camera), graph
+        self.rasterize, self.settings = rasterize, settings
+        cutouts = torch.cat([video.frames, video.alpha], -1)
+        self.colors, self.alphas = resize_cutouts(cutouts, settings.size)
+        self.area = float(self.alphas.mean().clamp(min=1e-3))  # of the subject, share of the picture
+        self.unit = float((graph.nodes.amax(0) - graph.nodes.amin(0)).norm()) / 10
+        first, second = graph.edges.T
+        self.smoothing = _smoothing(graph, settings.smoothing)
+        self.spans = graph.nodes[second] - graph.nodes[first]
+
+    def relative(self, values: Tensor) -> Tensor:
+        """Return lengths in tenths of the model's size."""
+        return values / self.unit
+
+    def losses(self, motion: NodeMotion, frames: list[int]) -> dict[str, Tensor]:
+        """Return the weighted losses of some frames."""
+        settings = self.settings
+        means = motion.points(self.cloud.means, self.graph)
+        count = len(frames)
+        states = replace(
+            self.cloud,
+            means=means,
+            log_scales=self.cloud.log_scales.expand(count, -1, -1),
+            quats=self.cloud.quats.expand(count, -1, -1),
+        )
+        rendering = self.rasterize(states, [self.camera] * count, means.new_tensor(WHITE))
+        color = _pyramid_error(rendering.color, self.colors[frames]) / self.area
+        alpha = _pyramid_error(rendering.alpha, self.alphas[frames]) / self.area
+        depth = self.relative(motion.nodes(self.graph)[..., 2] - self.graph.nodes[:, 2])
+        depth = depth.square().mean() + WHOLE_DEPTH * depth.mean(-1).square().mean()
+        return {
+            "color": settings.color_weight * color,
+            "alpha": settings.alpha_weight * alpha,
+            "rigidity": settings.rigidity * self.rigidity(motion),
+            "depth": settings.depth * depth,
+        }
+
+    @torch.no_grad()
+    def flow_targets(self, before: NodeMotion, frame: int) -> tuple[Int[Tensor, " k"], Float[Tensor, "k 2"]]:
+        """Return the Gaussians that were visible before a frame, and the pixels that the optical flow moves them to."""
+        means = before.points(self.cloud.means, self.graph)
+        state = replace(self.cloud, means=means[0])
+        drawn = self.rasterize(state, [self.camera], means.new_tensor(WHITE))
+        pixels, depth = self._projected(means[0])
+        size = self.settings.size
+        column, row = pixels.floor().long().clamp(0, size - 1).T
+        alpha = drawn.alpha[0, row, column, 0]
+        surface = drawn.depth[0, row, column, 0] / alpha.clamp(min=1e-3)
+        visible = torch.nonzero((depth < surface + DEPTH_SLACK) & (alpha > 0.5))[:, 0]
+        pair = [luminance(self.colors[number]) for number in (frame - 1, frame)]
+        flow = torch.from_numpy(np.stack(optical_flow_tvl1(*pair), -1)).to(means)  # rows, columns
+        moved = pixels[visible] + flow[row[visible], column[visible]].flip(-1)
+        return visible, moved
+
+    def flow_loss(
+        self, motion: NodeMotion, visible: Int[Tensor, " k"], targets: Float[Tensor, "k 2"]
+    ) -> Float[Tensor, ""]:
+        """Return the robust distance of projected Gaussians to their targets."""
+        if len(visible) == 0:
+            return targets.new_zeros(())
+        means = motion.points(self.cloud.means[visible], self.graph.of(visible))[0]
+        error = (self._projected(means)[0] - targets) / (FLOW_UNIT * self.settings.size)
+        return ((error.square().sum(-1) + 1).sqrt() - 1).mean()
+
+    def _projected(self, means: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"]]:
+        """Return pixels (column, row) and depths of points."""
+        matrix = self.camera.viewmat().to(means)
+        seen = means @ matrix[:3, :3].T + matrix[:3, 3]
+        return seen[:, :2] / seen[:, 2:].clamp(min=0.1) * self.camera.focal + self.settings.size / 2, seen[:, 2]
+
+    def rigidity(self, motion: NodeMotion) -> Float[Tensor, ""]:
+        """Return the robust as-rigid-as-possible energy of the graph."""
+        first, second = self.graph.edges.T
+        matrices = quat_to_rotmat(motion.quats)
+        shifts = motion.shifts
+        moved = self.spans + shifts[:, second] - shifts[:, first]
+        lengths = self.graph.lengths[:, None]
+        stretch = torch.cat(
+            [
+                (moved - (matrices[:, first] @ self.spans[..., None])[..., 0]) / lengths,
+                (moved - (matrices[:, second] @ self.spans[..., None])[..., 0]) / lengths,
+            ],
+            1,
+        )
+        bend = (matrices[:, first] - matrices[:, second]).flatten(2)
+        return _robust(stretch).mean() + self.settings.bending * _robust(bend).mean()
+
+    def step(self, losses: dict[str, Tensor], unknowns: "_Unknowns", place: str) -> None:
+        """Compute the gradients of the sum of the losses."""
+        total = torch.stack(list(losses.values())).sum()
+        for value in vars(unknowns).values():
+            value.grad = None
+        total.backward()
+        gradients = [value.grad for value in vars(unknowns).values()]
+        check_finite("animate_asset", {"loss": total}, gradients, place, ADVICE, self.cloud)
+
+
+@dataclass(frozen=True)
+class _Unknowns:
+    """Variables of the fit: transforms of the nodes before smoothing over the graph, rotations as vectors.
+
+    Smoothing lets nodes that the video does not show move with those that it shows (Nicolet et al. 2021).
+    """
+
+    turns: Float[Tensor, "t m 3"]
+    shifts: Float[Tensor, "t m 3"]
+    whole_turns: Float[Tensor, "t 3"]
+    whole_shifts: Float[Tensor, "t 3"]
+
+    @classmethod
+    def still(cls, frames: int, graph: ControlGraph) -> "_Unknowns":
+        zeros, whole = graph.nodes.new_zeros(frames, len(graph.nodes), 3), graph.nodes.new_zeros(frames, 3)
+        return cls(zeros, zeros, whole, whole)
+
+    @classmethod
+    def joined(cls, frames: Sequence["_Unknowns"]) -> "_Unknowns":
+        return cls(**{name: torch.cat([getattr(one, name) for one in frames]) for name in vars(frames[0])}).copy()
+
+    def copy(self) -> "_Unknowns":
+        return _Unknowns(**{name: value.detach().clone().requires_grad_() for name, value in vars(self).items()})
+
+    def detach(self) -> "_Unknowns":
+        return _Unknowns(**{name: value.detach() for name, value in vars(self).items()})
+
+    def continued(self, last: "_Unknowns") -> "_Unknowns":
+        """Continue from this frame over the last one, at half the speed."""
+        return _Unknowns(
+            **{name: getattr(last, name) + 0.5 * (getattr(last, name) - value) for name, value in vars(self).items()}
+        )
+
+    def motion(self, smoothing: Float[Tensor, "m m"]) -> NodeMotion:
+        """Return the motion that they stand for."""
+        return NodeMotion(
+            _quats(smoothing @ self.turns), smoothing @ self.shifts, _quats(self.whole_turns), self.whole_shifts
+        )
+
+
+class _Descent:
+    """Adam with one step size for all coordinates of a variable and frame, so that weak gradients stay weak."""
+
+    def __init__(self, unknowns: _Unknowns) -> None:
+        self.values = vars(unknowns)
+        self.first = {name: torch.zeros_like(value) for name, value in self.values.items()}
+        self.second = {name: torch.zeros_like(value) for name, value in self.values.items()}
+        self.count = 0
+
+    @torch.no_grad()
+    def step(self, lr: float) -> None:
+        """Move all variables by their gradients."""
+        self.count += 1
+        for name, value in self.values.items():
+            if value.grad is None:
+                continue
+            first, second = self.first[name], self.second[name]
+            first.lerp_(value.grad, 1 - BETA1)
+            second.lerp_(value.grad.square(), 1 - BETA2)
+            largest = second.flatten(1).amax(1).view(-1, *[1] * (second.dim() - 1)) / (1 - BETA2**self.count)
+            moment = first / (1 - BETA1**self.count)
+            value.sub_(lr * FACTORS[name] * moment / (largest.sqrt() + 1e-12))
+
+
+def _quats(turns: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
+    """Return rotations for vectors along the axis of twice the tangent of half the angle."""
+    return torch.cat([torch.ones_like(turns[..., :1]), 0.5 * turns], -1)
+
+
+def _smoothing(graph: ControlGraph, strength: float) -> Float[Tensor, "m m"]:
+    """Return (I + strength L)^-1 with the Laplacian L of the graph, scaled to keep a uniform motion."""
+    count = len(graph.nodes)
+    laplacian = torch.zeros(count, count, dtype=torch.float64)
+    first, second = graph.edges.T
+    laplacian[first, second] = -1.0
+    laplacian[second, first] = -1.0
+    laplacian.diagonal().copy_(-laplacian.sum(1))
+    inverse: Tensor = torch.linalg.inv(torch.eye(count, dtype=torch.float64) + strength * laplacian)
+    return inverse.to(graph.nodes)
+
+
+def luminance(color: Float[Tensor, "h w 3"]) -> Float[np.ndarray, "h w"]:
+    """Return the luma of a picture."""
+    return (color @ color.new_tensor((0.299, 0.587, 0.114))).cpu().numpy()
+
+
+def antialiased(cloud: Gaussians, camera: OrbitCamera) -> Gaussians:
+    """Return a cloud that covers as much after the rasterizer's low-pass filter as before it (Yu et al. 2024).
+
+    Without this, small opaque Gaussians widen all outlines by a pixel, and the fit shrinks the model.
+    """
+    pixels2 = (cloud.log_scales.topk(2, -1).values.mean(-1) + math.log(camera.focal / camera.radius)).mul(2).exp()
+    opacities = (cloud.opacities * pixels2 / (pixels2 + BLUR)).clamp(1e-3, 1 - 1e-3)
+    return replace(cloud, opacity_logits=opacities.logit())
+
+
+def _thinned(cloud: Gaussians, graph: ControlGraph, count: int) -> tuple[Gaussians, ControlGraph]:
+    """Return about `count` of the Gaussians, evenly chosen and larger to cover as much."""
+    step = max(1, round(len(cloud) / count))
+    rows = torch.arange(0, len(cloud), step)
+    thin = Gaussians(**{name: value[rows] for name, value in vars(cloud).items()})
+    return replace(thin, log_scales=thin.log_scales + 0.5 * math.log(step)), graph.of(rows)
+
+
+def _robust(values: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
+    """Return a loss that is quadratic for small and linear for large vectors."""
+    return (values.square().sum(-1) + ROBUST**2).sqrt() - ROBUST
+
+
+def _pyramid_error(ours: Float[Tensor, "b h w c"], theirs: Float[Tensor, "b h w c"]) -> Float[Tensor, ""]:
+    """Return the mean squared error, averaged over filters of several widths.
+
+    Each is a mean over squares of half the width and three of three by three of these, which is nearly a Gaussian.
+    """
+    difference = (ours - theirs).movedim(-1, 1)
+    errors = []
+    for width in LEVELS:
+        filtered = functional.avg_pool2d(difference, max(1, width // 2))
+        for _ in range(3 if width > 1 else 0):
+            filtered = functional.avg_pool2d(filtered, 3, 1, 1)
+        errors.append(filtered.square().mean())
+    return torch.stack(errors).mean()

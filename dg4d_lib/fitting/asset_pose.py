@@ -1,0 +1,261 @@
+"""Placement of a user's model in the frame of a cut-out: azimuth, scale and position, from outlines and colors.
+
+The model is rendered from azimuths all around (and with other axes up, where its format leaves that open), each time
+scaled and moved to the outline of the subject. The best candidates are refined by gradients. A model that agrees with
+the picture as it stands keeps its place.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
+from dg4d_lib.errors import BadInput
+from dg4d_lib.fitting.asset_motion import antialiased
+from dg4d_lib.fitting.losses import WHITE, resize_cutouts
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
+from dg4d_lib.rasterizer.interface import Rasterizer
+
+SIZE = 64  # pixels of the search
+FINE_SIZE = 96  # pixels of the refinement
+SEARCHED = 2500  # Gaussians in the search
+STEPS = 24  # azimuths of the search
+KEPT = 3  # candidates that are refined
+ITERATIONS = 40
+REACH = 0.6  # world units: half diagonal of a model without a picture
+BATCH = 8  # renders at once
+STANDS = 0.08  # advantage of a model as it stands: its depth is right, too, which outlines hardly show
+UPRIGHT = {"y": (1.0, 0.0, 0.0, 0.0), "z": (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0), "-y": (0.0, 1.0, 0.0, 0.0)}
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Similarity from the coordinates of a model to the world.
+
+    Attributes:
+        quat: rotation, wxyz, unit.
+        scale: factor, above 0.
+        shift: translation, world units.
+        azimuth_deg: azimuth of the model from which the picture was taken.
+        agreement: IoU of the outlines of model and subject.
+        color_error: root mean square difference of the colors where both are.
+    """
+
+    quat: Float[Tensor, " 4"]
+    scale: float
+    shift: Float[Tensor, " 3"]
+    azimuth_deg: float = 0.0
+    agreement: float = 1.0
+    color_error: float = 0.0
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "4 4"]:
+        """Affine matrix, float64."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.scale * quat_to_rotmat(self.quat.double()).numpy()
+        matrix[:3, 3] = self.shift.double().numpy()
+        return matrix
+
+    @property
+    def score(self) -> float:
+        """Agreement less color error, higher is better."""
+        return self.agreement - self.color_error
+
+    def apply(self, cloud: Gaussians) -> Gaussians:
+        """Return the placed Gaussians; their colors must not depend on the view."""
+        return _similar(cloud, self.quat, torch.tensor(self.scale).log(), self.shift)
+
+
+def centered_placement(cloud: Gaussians, azimuth_deg: float, up: str = "y") -> Placement:
+    """Return the placement of a model in the middle of the frame, seen from an azimuth.
+
+    Args:
+        cloud: Gaussians in the coordinates of the model.
+        azimuth_deg: azimuth of the model, 0 on its +z.
+        up: axis that points up: y, z or -y.
+    """
+    quat = quat_multiply(_turn(-azimuth_deg), torch.tensor(UPRIGHT[up]))
+    turned = cloud.means @ quat_to_rotmat(quat).T
+    low, high = turned.amin(0), turned.amax(0)
+    extent = float((high - low).norm()) / 2
+    if not 0 < extent < math.inf:
+        raise BadInput("the model has no extent: all of its points are in one place; export it again")
+    scale = REACH / extent
+    return Placement(quat, scale, -scale * (low + high) / 2, azimuth_deg)
+
+
+def find_placement(
+    cloud: Gaussians,
+    subject: Float[Tensor, "h w 4"],
+    rasterize: Rasterizer,
+    azimuth_deg: float | None = None,
+    ups: Sequence[str] = ("y",),
+) -> Placement:
+    """Find the placement in which a model agrees best with a cut-out of the camera at azimuth and elevation 0.
+
+    Args:
+        cloud: Gaussians in the coordinates of the model.
+        subject: square picture, straight alpha.
+        rasterize: rasterizer.
+        azimuth_deg: azimuth of the model, if the user says it.
+        ups: axes that may point up.
+    """
+    sparse = _thinned(cloud)
+    azimuths = [azimuth_deg] if azimuth_deg is not None else [360 * step / STEPS for step in range(STEPS)]
+    candidates = [centered_placement(sparse, azimuth, up) for up in ups for azimuth in azimuths]
+    for _ in range(2):
+        candidates = _framed(sparse, candidates, subject, rasterize)
+    judged = judge(sparse, candidates, subject, rasterize, SIZE)
+    best = sorted(judged, key=lambda one: -one.score)[:KEPT]
+    refined = [_refined(sparse, one, subject, rasterize, azimuth_deg is None) for one in best]
+    as_it_stands = Placement(torch.tensor(UPRIGHT["y"]), 1.0, torch.zeros(3))
+    tried = [*refined, *([as_it_stands] if not azimuth_deg else [])]
+    results = judge(cloud, tried, subject, rasterize, FINE_SIZE)
+    found = max(results[: len(refined)], key=lambda one: one.score)
+    if not azimuth_deg and results[-1].score + STANDS >= found.score:
+        return results[-1]
+    return found
+
+
+def judge(
+    cloud: Gaussians, placements: Sequence[Placement], subject: Float[Tensor, "h w 4"], rasterize: Rasterizer, size: int
+) -> list[Placement]:
+    """Return the placements with their agreement and color error."""
+    target, mask = resize_cutouts(subject[None], size)
+    judged = []
+    for placement, (color, alpha) in zip(placements, _renders(cloud, placements, rasterize, size), strict=True):
+        ours, theirs = alpha > 0.5, mask[0] > 0.5
+        both, either = (ours & theirs).sum(), (ours | theirs).sum()
+        error = ((color - target[0]).square().mean(-1, keepdim=True) * (ours & theirs)).sum() / both.clamp(min=1)
+        judged.append(replace(placement, agreement=float(both / either.clamp(min=1)), color_error=float(error.sqrt())))
+    return judged
+
+
+def picture_of_both(
+    cloud: Gaussians, placement: Placement, subject: Float[Tensor, "h w 4"], rasterize: Rasterizer, size: int = 256
+) -> Float[Tensor, "s w 3"]:
+    """Draw subject, placed model and the outlines of both in a row, over white; red: subject alone, blue: model."""
+    target, mask = resize_cutouts(subject[None], size)
+    ((color, alpha),) = _renders(cloud, [placement], rasterize, size)
+    overlay = torch.cat([1 - alpha, 1 - torch.maximum(alpha, mask[0]), 1 - mask[0]], -1)
+    return torch.cat([target[0], color, overlay], 1).clamp(0, 1)
+
+
+def _renders(
+    cloud: Gaussians, placements: Sequence[Placement], rasterize: Rasterizer, size: int
+) -> list[tuple[Float[Tensor, "s s 3"], Float[Tensor, "s s 1"]]]:
+    camera = OrbitCamera(width=size, height=size)
+    found = []
+    for start in range(0, len(placements), BATCH):
+        placed = [one.apply(cloud) for one in placements[start : start + BATCH]]
+        states = replace(
+            antialiased(placed[0], camera),
+            **{name: torch.stack([getattr(one, name) for one in placed]) for name in ("means", "log_scales", "quats")},
+        )
+        with torch.no_grad():
+            drawn = rasterize(states, [camera] * len(placed), torch.tensor(WHITE))
+        found += list(zip(drawn.color, drawn.alpha, strict=True))
+    return found
+
+
+def _framed(
+    cloud: Gaussians, placements: Sequence[Placement], subject: Float[Tensor, "h w 4"], rasterize: Rasterizer
+) -> list[Placement]:
+    """Scale and move placements so that area and center of their outlines are those of the subject."""
+    mask = resize_cutouts(subject[None], SIZE)[1][0]
+    area, center = _moments(mask)
+    framed = []
+    for placement, (_, alpha) in zip(placements, _renders(cloud, placements, rasterize, SIZE), strict=True):
+        ours, middle = _moments(alpha)
+        ratio = float((area / ours.clamp(min=1e-3)).sqrt().clamp(0.2, 5))
+        pixel = RADIUS * 2 * math.tan(math.radians(OrbitCamera().fov_y_deg) / 2) / SIZE  # world units at the origin
+        step = (center - ratio * (middle - SIZE / 2) - SIZE / 2) * pixel
+        shift = ratio * placement.shift + torch.tensor([float(step[0]), -float(step[1]), 0.0])
+        framed.append(replace(placement, scale=placement.scale * ratio, shift=shift))
+    return framed
+
+
+def _moments(mask: Float[Tensor, "s s 1"]) -> tuple[Float[Tensor, ""], Float[Tensor, " 2"]]:
+    """Return area and center (column, row) of a mask, in pixels."""
+    weights = mask[..., 0]
+    area = weights.sum()
+    places = torch.arange(len(weights)) + 0.5
+    center = torch.stack([(weights.sum(0) * places).sum(), (weights.sum(1) * places).sum()]) / area.clamp(min=1e-3)
+    return area, center
+
+
+def _refined(
+    cloud: Gaussians, start: Placement, subject: Float[Tensor, "h w 4"], rasterize: Rasterizer, turning: bool
+) -> Placement:
+    """Refine azimuth, scale and position by gradients; the distance to the camera stays."""
+    target, mask = resize_cutouts(subject[None], FINE_SIZE)
+    camera = OrbitCamera(width=FINE_SIZE, height=FINE_SIZE)
+    values = {name: torch.zeros(size, requires_grad=True) for name, size in (("turn", 1), ("grow", 1), ("move", 2))}
+    rates = {"turn": 0.03 if turning else 0.0, "grow": 0.01, "move": 0.006}
+    adam = torch.optim.Adam(
+        [{"params": [value], "lr": rates[name]} for name, value in values.items()], betas=(0.9, 0.98)
+    )
+    area = mask.mean().clamp(min=1e-3)
+    cloud = replace(cloud, opacity_logits=antialiased(start.apply(cloud), camera).opacity_logits)
+    for _ in range(ITERATIONS):
+        quat, log_scale, shift = _moved(start, values)
+        drawn = rasterize(_similar(cloud, quat, log_scale, shift), [camera], torch.tensor(WHITE))
+        color, alpha = (drawn.color - target).movedim(-1, 1), (drawn.alpha - mask).movedim(-1, 1)
+        loss = torch.stack(
+            [
+                (functional.avg_pool2d(part, level).square().mean() * weight)
+                for level in (1, 4, 8)
+                for part, weight in ((color, 1.0), (alpha, 2.0))
+            ]
+        ).sum()
+        adam.zero_grad(set_to_none=True)
+        (loss / area).backward()
+        adam.step()
+    with torch.no_grad():
+        quat, log_scale, shift = _moved(start, values)
+    azimuth = (start.azimuth_deg - math.degrees(float(values["turn"].detach()))) % 360
+    unit = functional.normalize(quat.detach(), dim=-1)
+    return Placement(unit, float(log_scale.exp()), shift.detach(), azimuth)
+
+
+def _moved(
+    start: Placement, values: dict[str, Tensor]
+) -> tuple[Float[Tensor, " 4"], Float[Tensor, ""], Float[Tensor, " 3"]]:
+    half = values["turn"][0] / 2
+    zero = torch.zeros(())
+    turn = torch.stack([half.cos(), zero, half.sin(), zero])
+    log_scale = math.log(start.scale) + values["grow"][0]
+    center = quat_to_rotmat(turn) @ start.shift * values["grow"][0].exp()
+    return quat_multiply(turn, start.quat), log_scale, center + torch.cat([values["move"], zero[None]])
+
+
+def _similar(
+    cloud: Gaussians, quat: Float[Tensor, " 4"], log_scale: Float[Tensor, ""], shift: Float[Tensor, " 3"]
+) -> Gaussians:
+    """Return a cloud under a similarity, differentiable."""
+    return replace(
+        cloud,
+        means=log_scale.exp() * (cloud.means @ quat_to_rotmat(quat).T) + shift,
+        log_scales=cloud.log_scales + log_scale,
+        quats=quat_multiply(quat.expand_as(cloud.quats), cloud.quats),
+    )
+
+
+def _turn(azimuth_deg: float) -> Float[Tensor, " 4"]:
+    """Return the rotation about the vertical that moves azimuth 0 to an azimuth."""
+    half = math.radians(azimuth_deg) / 2
+    return torch.tensor([math.cos(half), 0.0, math.sin(half), 0.0])
+
+
+def _thinned(cloud: Gaussians) -> Gaussians:
+    """Return evenly many of the Gaussians, larger to cover as much."""
+    step = max(1, len(cloud) // SEARCHED)
+    thin = Gaussians(**{name: value[::step] for name, value in vars(cloud).items()})
+    return replace(thin, log_scales=thin.log_scales + 0.5 * math.log(step))

@@ -1,0 +1,109 @@
+"""Settings of the inputs: words, picture or video, and the driving video."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator
+
+from dg4d_lib.settings import Precision, Settings, VideoModelSettings
+
+
+class TextSettings(Settings):
+    """Input image by any text-to-image pipeline of diffusers; only for orders with a prompt."""
+
+    weights: str = Field("", description="Hugging Face hub id, or a folder in diffusers' layout; empty: none")
+    size: int = Field(512, ge=32, le=2048, multiple_of=8, description="pixels of the square image")
+    num_inference_steps: int = Field(30, ge=1, le=1000, description="denoising steps")
+    guidance_scale: float = Field(7.5, ge=0, le=100, description="classifier-free guidance")
+    suffix: str = Field(
+        ", the whole of it in the middle of the picture, plain white background",
+        max_length=1000,
+        description="appended to the prompt, so that the subject can be cut out",
+    )
+    precision: Precision = Field("fp16", description="of the networks; always fp32 on CPUs")
+    low_memory: bool = Field(False, description="keep only the network in use on the GPU; slower")
+
+
+MATTING_METHODS = ("auto", "u2netp", "backdrop", "none")  # other names are weights
+BOX_FORM = "a box is X,Y,W,H in pixels: left and upper edge, width and height, both at least 1"
+
+
+class SubjectSettings(Settings):
+    """Conversion of any picture or video to cut-outs in one square frame."""
+
+    matting: str = Field(
+        "auto",
+        min_length=1,
+        description="cut-out of the subject. auto: the picture's alpha channel, else `backdrop` where the backdrop is "
+        "plain, else `u2netp`; backdrop: by the color of a plain backdrop; u2netp: by U2-Netp; none: the alpha channel "
+        "alone; or another network by a name from `dg4d weights list`, or a folder with onnx/model.onnx",
+    )
+    box: tuple[Annotated[int, Field(ge=0, le=1_000_000)], ...] = Field(
+        (),
+        max_length=4,
+        description="[X, Y, width, height] of the subject in pixels of the upright picture; what is outside is "
+        "transparent; []: the whole picture",
+    )
+    size: int = Field(512, ge=32, le=2048, description="pixels of the square frame")
+    framing: Literal["auto", "center", "keep"] = Field(
+        "auto",
+        description="center: crop to the subject and center it; keep: use the frame unchanged; "
+        "auto: keep a square cut-out that contains the whole subject, else center",
+    )
+    border: float = Field(
+        0.2, ge=0, lt=0.9, description="margin around a centered subject, fraction of the frame (paper's code)"
+    )
+    turn_deg: float = Field(
+        0.0, ge=-60, le=60, description="rotation of the subject away from the camera; a user's hint"
+    )
+    ground_turn: float = Field(
+        0.6, ge=0, le=1, description="factor on the turn that the ground line of footage gives if `turn_deg` is 0"
+    )
+    max_frames: int = Field(32, ge=2, le=512, description="largest number of frames; longer videos are sampled evenly")
+    max_decode_gb: float = Field(
+        1.0, ge=0.125, le=256, description="GiB of memory for decoding the source, including decoded frames; ours"
+    )
+
+    @field_validator("box")
+    @classmethod
+    def _check_box(cls, box: tuple[int, ...]) -> tuple[int, ...]:
+        """Refuse boxes that are incomplete or empty."""
+        if box and (len(box) != 4 or min(box[2:]) < 1):
+            raise ValueError(BOX_FORM)
+        return box
+
+
+Candidates = Annotated[
+    int, Field(ge=1, le=16, description="generated motions, scored and shown; the best is used unless `pick` is set")
+]
+Pick = Annotated[int, Field(ge=0, le=16, description="number of the only candidate to generate; 0: the best of all")]
+
+
+Motion = Literal["sway", "bend", "breathe", "bounce", "wave", "turn"]
+
+
+class WarpSettings(Settings):
+    """Driving video by warping the picture in a loop; no weights."""
+
+    kind: Literal["warp"] = "warp"
+    candidates: Candidates = 1
+    pick: Pick = 0
+    motion: Motion = Field("sway", description="weights-free motion, ours; further candidates use the other motions")
+    strength: float = Field(1.0, gt=0, le=3, description="factor on the motion's amplitude")
+    frames: int = Field(14, ge=2, le=128, description="frames of a generated video (paper: 14)")
+    fps: float = Field(7.0, gt=0, le=120, description="frames per second of a generated video (paper: 7)")
+
+
+class SvdSettings(Settings):
+    """Driving video by Stable Video Diffusion; candidate k has the seed of the order plus k - 1."""
+
+    kind: Literal["svd"] = "svd"
+    candidates: Candidates = 1
+    pick: Pick = 0
+    model: VideoModelSettings = VideoModelSettings()
+    frames: int = Field(14, ge=2, le=64, description="frames of the video; svd was trained on 14, svd-xt on 25")
+    fps: float = Field(7.0, gt=0, le=120, description="frames per second of playback (paper: 7)")
+    height: int = Field(512, ge=64, le=2048, multiple_of=64, description="pixels (public code: 512; trained on 576)")
+    width: int = Field(512, ge=64, le=2048, multiple_of=64, description="pixels (public code: 512; trained on 1024)")
+
+
+DrivingSettings = Annotated[WarpSettings | SvdSettings, Field(discriminator="kind")]

@@ -1,0 +1,160 @@
+"""Control nodes on a surface, with skinning weights by distance along it (embedded deformation, Sumner et al. 2007).
+
+Distances follow the surface, so that a leg does not move with the other one that it touches. Separate components, such
+as eyes, are joined by bridges to their nearest neighbors and move with them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+NEIGHBORS = 4  # nodes that move a point
+BRIDGES = 6  # edges from a component to each component that it touches
+TOUCHING = 1.5  # factor on the smallest gap of a component: others within it are joined to it, too
+LINKS = 6  # nearest nodes of a node in the graph
+REACH = 6.0  # spacings of the nodes: farther points are not told apart
+
+
+@dataclass(frozen=True)
+class ControlGraph:
+    """Nodes, the points that they move, and the edges between them.
+
+    Attributes:
+        nodes: positions at rest, world units.
+        indices: nodes that move every point.
+        weights: of these nodes, sum 1.
+        edges: pairs of neighboring nodes.
+        lengths: of the edges at rest, along the straight line.
+    """
+
+    nodes: Float[Tensor, "m 3"]
+    indices: Int[Tensor, "v k"]
+    weights: Float[Tensor, "v k"]
+    edges: Int[Tensor, "e 2"]
+    lengths: Float[Tensor, " e"]
+
+    def of(self, rows: Int[Tensor, " n"]) -> "ControlGraph":
+        """Return the same nodes with the weights of some of the points."""
+        return replace(self, indices=self.indices[rows], weights=self.weights[rows])
+
+
+def build_control_graph(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], count: int) -> ControlGraph:
+    """Distribute nodes evenly over a surface and compute the weights of its vertices.
+
+    Args:
+        vertices: of a mesh with short edges, welded.
+        faces: indices into the vertices.
+        count: number of nodes; at most one per vertex.
+    """
+    graph = surface_graph(vertices, faces)
+    return graph_of_points(vertices, graph, count)
+
+
+def graph_of_points(points: Float[np.ndarray, "v 3"], graph: csr_array, count: int) -> ControlGraph:
+    """Return the control graph of connected points; see `build_control_graph`.
+
+    Args:
+        points: world units.
+        graph: symmetric matrix of the distances between neighboring points, connected.
+        count: number of nodes; at most one per point.
+    """
+    chosen, spacing = spread_nodes(graph, points, min(count, len(points)))
+    nearest = min(max(NEIGHBORS + 1, LINKS + 1), len(chosen))
+    distances = _distances(graph, chosen, REACH * spacing).astype(np.float32)  # m v
+    distances = np.minimum(distances, REACH * spacing)
+    order = np.argpartition(distances, nearest - 1, axis=0)[:nearest].T
+    near = np.take_along_axis(distances.T, order, 1)
+    rank = near.argsort(1, kind="stable")
+    order, near = np.take_along_axis(order, rank, 1), np.take_along_axis(near, rank, 1)
+    used = min(NEIGHBORS, len(chosen))
+    reach = near[:, min(used, nearest - 1), None] if nearest > used else near[:, -1:] * 1.001 + 1e-9
+    weights = np.square(1 - near[:, :used] / np.maximum(reach, 1e-9)).clip(1e-8)
+    weights /= weights.sum(1, keepdims=True)
+    links = order[chosen, 1 : LINKS + 1]
+    pairs = np.stack([np.repeat(np.arange(len(chosen)), links.shape[1]), links.ravel()], 1)
+    pairs = np.unique(np.sort(pairs, 1), axis=0)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    nodes = points[chosen]
+    lengths = np.linalg.norm(nodes[pairs[:, 0]] - nodes[pairs[:, 1]], axis=1)
+    return ControlGraph(
+        torch.from_numpy(nodes.astype(np.float32)),
+        torch.from_numpy(order[:, :used].astype(np.int64)),
+        torch.from_numpy(weights.astype(np.float32)),
+        torch.from_numpy(pairs.astype(np.int64)),
+        torch.from_numpy(lengths.astype(np.float32)),
+    )
+
+
+def surface_graph(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> csr_array:
+    """Return the lengths of a mesh's edges as a symmetric matrix, with bridges between its components."""
+    pairs = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1), axis=0)
+    return bridge_components(vertices, pairs)
+
+
+def point_graph(points: Float[np.ndarray, "v 3"], neighbors: int = 8) -> csr_array:
+    """Return the distances of points to their nearest neighbors as a symmetric connected matrix, for splats."""
+    neighbors = min(neighbors, len(points) - 1)
+    index = np.asarray(cKDTree(points).query(points, k=neighbors + 1)[1])[:, 1:]
+    pairs = np.stack([np.repeat(np.arange(len(points)), neighbors), index.ravel()], 1)
+    return bridge_components(points, np.unique(np.sort(pairs, 1), axis=0))
+
+
+def bridge_components(points: Float[np.ndarray, "v 3"], pairs: Int[np.ndarray, "e 2"]) -> csr_array:
+    """Join separate components of a graph by edges between their nearest points; return the matrix of lengths."""
+    while True:
+        graph = _lengths(points, pairs)
+        found: tuple[int, NDArray[np.int32]] = connected_components(graph, directed=False)
+        parts, labels = found
+        if parts == 1:
+            return graph
+        pairs = np.unique(np.sort(np.concatenate([pairs, _bridges(points, labels, parts)]), 1), axis=0)
+
+
+def spread_nodes(graph: csr_array, points: Float[np.ndarray, "v 3"], count: int) -> tuple[Int[np.ndarray, " m"], float]:
+    """Choose points along the graph, each the farthest from those before it; also return the largest gap left."""
+    chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
+    nearest = _distances(graph, chosen[:1])[0]
+    while len(chosen) < count:
+        chosen.append(int(nearest.argmax()))
+        if nearest[chosen[-1]] == 0:
+            chosen.pop()
+            break
+        nearest = np.minimum(nearest, _distances(graph, chosen[-1:], float(nearest[chosen[-1]]))[0])
+    return np.array(chosen), max(float(nearest.max()), 1e-9)
+
+
+def _distances(
+    graph: csr_array, sources: Sequence[int] | Int[np.ndarray, " m"], limit: float = np.inf
+) -> Float[np.ndarray, "m v"]:
+    """Return the distances from some points to all along the graph; infinity beyond the limit."""
+    found: Float[np.ndarray, "m v"] = dijkstra(graph, directed=False, indices=np.asarray(sources), limit=limit)
+    return found
+
+
+def _lengths(points: Float[np.ndarray, "v 3"], pairs: Int[np.ndarray, "e 2"]) -> csr_array:
+    lengths = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1).clip(1e-6)  # 0 would be no edge
+    ends = np.concatenate([pairs, pairs[:, ::-1]]).T
+    return csr_array(coo_array((np.concatenate([lengths, lengths]), tuple(ends)), shape=(len(points),) * 2))
+
+
+def _bridges(points: Float[np.ndarray, "v 3"], labels: Int[np.ndarray, " v"], parts: int) -> Int[np.ndarray, "e 2"]:
+    """Return edges from every component but the largest to the nearest points of others."""
+    sizes = np.bincount(labels, minlength=parts)
+    found = []
+    for part in np.argsort(sizes)[:-1]:
+        inside, outside = np.flatnonzero(labels == part), np.flatnonzero(labels != part)
+        distances, index = map(np.asarray, cKDTree(points[outside]).query(points[inside]))
+        others = labels[outside[index]]
+        for other in np.unique(others[distances <= TOUCHING * distances.min() + 1e-6]):
+            rows = np.flatnonzero(others == other)
+            rows = rows[distances[rows].argsort(kind="stable")[:BRIDGES]]
+            found.append(np.stack([inside[rows], outside[index[rows]]], 1))
+    return np.concatenate(found)

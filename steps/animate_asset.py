@@ -1,0 +1,140 @@
+"""Step that sets a model of the user's own in motion, as the driving video shows it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dg4d_lib.asset_settings import AssetSettings
+from dg4d_lib.assets.formats.foreign_glb import ForeignGlb, read_foreign_glb, write_moving_glb
+from dg4d_lib.deformation.framewise import Framewise
+from dg4d_lib.fitting.asset_motion import NodeMotion, fit_asset_motion, iterations
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.ply import read_ply
+from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
+from dg4d_lib.mesh.models.atlas import merge_parts
+from dg4d_lib.mesh.models.control_graph import ControlGraph, build_control_graph, graph_of_points, point_graph
+from dg4d_lib.mesh.models.flips import unflip
+from dg4d_lib.mesh.models.surface_cloud import SurfaceCloud, cover_surface
+from dg4d_lib.mesh.textured import TrackedMesh
+from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
+from dg4d_lib.settings import FramewiseSettings
+from steps.artifacts.media import read_frames, write_png
+from steps.artifacts.meshes import write_tracked
+from steps.artifacts.motions import write_motion
+from steps.artifacts.placements import read_placement
+from steps.fitting.reporting import LossCurves, picture_of_divergence, render_row
+from steps.runtime.job import Job, StepReport
+
+PICTURE_FRAMES = 6
+NOTE = "The motion of sides that the video does not show follows from the rigidity of the surface."
+
+
+@dataclass(frozen=True)
+class _Mesh:
+    """Placed mesh of a model, and its control graph."""
+
+    glb: ForeignGlb
+    surface: SurfaceCloud
+    graph: ControlGraph
+
+
+def run(job: Job) -> StepReport:
+    """Fit the motion; write it for the Gaussians, and for a mesh also as morph targets of the model."""
+    settings: AssetSettings = job.settings.asset
+    rasterize = get_rasterizer(job.settings.rasterizer)
+    cloud = read_ply(job.inputs["gaussians"])
+    video = read_frames(job.inputs["driving_video"], job.pictures)
+    mesh = None
+    if "glb" in job.inputs:
+        glb = read_foreign_glb(job.inputs["glb"].read_bytes(), settings.max_faces)
+        model = glb.model.placed(read_placement(job.inputs["placement"]).matrix)
+        surface = cover_surface(model, settings.points, torch.Generator().manual_seed(job.seed))
+        mesh = _Mesh(glb, surface, build_control_graph(surface.fine.vertices, surface.fine.faces, settings.nodes))
+        graph = mesh.graph.of(surface.nearest)
+    else:
+        points = cloud.means.double().numpy()
+        graph = graph_of_points(points, point_graph(points), settings.nodes)
+    curves = LossCurves(iterations(settings, len(video)), job.progress)
+    with picture_of_divergence(job, rasterize):
+        generator = torch.Generator().manual_seed(job.seed)
+        motion = fit_asset_motion(cloud, graph, video, rasterize, settings, generator, curves.add)
+    states = moved_states(cloud, graph, motion)
+    deformation = framewise(cloud, states)
+    write_motion(job.outputs["motion"], deformation, FramewiseSettings(), len(video), len(cloud))
+    notes = [NOTE, *(_write_mesh(job, mesh, motion, video.fps) if mesh else ())]
+    curves.write(job.outputs["curves"], "motion of the model", notes)
+    write_png(job.outputs["picture"], _picture(states, rasterize))
+    return StepReport(backend=f"{job.settings.rasterizer} rasterizer", notes=tuple(notes))
+
+
+def moved_states(cloud: Gaussians, graph: ControlGraph, motion: NodeMotion) -> Gaussians:
+    """Return Gaussians that the nodes move, at every frame."""
+    frames = len(motion.shifts)
+    rest = cloud.quats.expand(frames, -1, -1)
+    return Gaussians(
+        motion.points(cloud.means, graph),
+        cloud.log_scales.expand(frames, -1, -1).contiguous(),
+        quat_multiply(motion.rotations(graph), rest),
+        cloud.opacity_logits,
+        cloud.harmonics,
+    )
+
+
+def framewise(cloud: Gaussians, states: Gaussians) -> Framewise:
+    """Return the deformation that gives these states at the frames."""
+    deformation = Framewise(len(states.means), len(cloud))
+    turned = states.quats
+    near = (turned[:-1] * turned[1:]).sum(-1, keepdim=True) < 0  # a quaternion and its negative are one rotation
+    signs = torch.where(torch.cat([torch.zeros_like(near[:1]), near]).cumsum(0) % 2 == 1, -1.0, 1.0)
+    table = torch.cat(
+        [states.means - cloud.means, states.log_scales - cloud.log_scales, signs * turned - cloud.quats], -1
+    )
+    with torch.no_grad():
+        deformation.table.copy_(table)
+    return deformation.requires_grad_(False)
+
+
+def moved_vertices(
+    surface: SurfaceCloud, graph: ControlGraph, motion: NodeMotion
+) -> tuple[Float[Tensor, "t v 3"], int]:
+    """Return the vertices of the model at every frame, without flipped faces; and how many faces stay flipped."""
+    rest = surface.fine.vertices
+    points = torch.from_numpy(rest.astype(np.float32))
+    moved = motion.points(points, graph).numpy()
+    turns = quat_to_rotmat(motion.rotations(graph)).numpy()
+    left, frames = 0, []
+    for state, turn in zip(moved, turns, strict=True):
+        repaired, flipped = unflip(rest, state.astype(np.float64), surface.fine.faces, turn.astype(np.float64))
+        frames.append(repaired[surface.welded].astype(np.float32))
+        left += flipped
+    return torch.from_numpy(np.stack(frames)), left
+
+
+def _write_mesh(job: Job, mesh: _Mesh, motion: NodeMotion, fps: float) -> list[str]:
+    """Write the model with morph targets, and as a tracked mesh with one texture; return notes."""
+    placement = read_placement(job.inputs["placement"])
+    vertices, flipped = moved_vertices(mesh.surface, mesh.graph, motion)
+    gltf = job.settings.gltf
+    content, notes = write_moving_glb(
+        mesh.glb,
+        placement.matrix,
+        vertices.numpy(),
+        fps,
+        {"notes": [NOTE]},
+        gltf.interpolation.upper(),
+        gltf.moving_normals,
+    )
+    job.outputs["moving"].write_bytes(content)
+    merged, sources = merge_parts(mesh.glb.model.placed(placement.matrix), job.settings.texture_size)
+    write_tracked(job.outputs["tracked"], TrackedMesh(merged, vertices[:, sources] - merged.vertices))
+    return [*notes, *([f"{flipped} faces are turned inside out over all frames"] if flipped else [])]
+
+
+def _picture(states: Gaussians, rasterize: Rasterizer) -> Float[Tensor, "h w 3"]:
+    """Render some frames from the front and from the side."""
+    frames = torch.linspace(0, len(states.means) - 1, min(PICTURE_FRAMES, len(states.means))).round().long()
+    chosen = states.states(frames)
+    return torch.cat([render_row(chosen, [azimuth] * len(frames), rasterize) for azimuth in (0.0, 90.0)])

@@ -1,0 +1,119 @@
+"""Step that reads a model of the user's own and finds its place in the frame of the subject."""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dg4d_lib.asset_settings import AssetSettings
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.errors import BadInput
+from dg4d_lib.fitting.asset_pose import Placement, centered_placement, find_placement, picture_of_both
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.ply import write_ply
+from dg4d_lib.mesh.models.surface_cloud import cover_surface
+from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
+from steps.artifacts.media import read_png, write_png
+from steps.artifacts.placements import write_placement
+from steps.fitting.reporting import render_turnaround
+from steps.runtime.job import Job, StepReport
+from steps.sources.models import OwnModel, read_model
+
+
+def run(job: Job) -> StepReport:
+    """Read the model, place it, and write it as Gaussians; without a subject, write its own render as the subject.
+
+    Raises:
+        BadInput: the model cannot be used, or does not agree with the subject; says why.
+    """
+    settings: AssetSettings = job.settings.asset
+    rasterize = get_rasterizer(job.settings.rasterizer)
+    with TemporaryDirectory() as scratch:
+        own = read_model(job.inputs["model"], Path(scratch), settings, job.settings.max_decode_gb)
+    job.progress(1, 3, {})
+    cloud = _cloud(own, settings, job.seed)
+    azimuth = None if settings.find_azimuth else settings.azimuth_deg
+    if "subject" in job.inputs:
+        subject = read_png(job.inputs["subject"])
+        placement = find_placement(cloud, subject, rasterize, azimuth, own.ups)
+        _check_agreement(job, cloud, placement, subject, rasterize, settings)
+    else:
+        placement = centered_placement(cloud, settings.azimuth_deg, own.ups[0])
+        subject = render_subject(placement.apply(cloud), job.settings.size, rasterize)
+        write_png(job.outputs["subject"], subject)
+    job.progress(2, 3, {})
+    if own.glb is not None:
+        job.outputs["glb"].write_bytes(own.content)
+        placed = cover_surface(own.glb.model.placed(placement.matrix), settings.points, _generator(job.seed)).cloud
+    else:
+        placed = placement.apply(cloud)
+    write_ply(job.outputs["gaussians"], placed)
+    write_placement(job.outputs["placement"], placement)
+    both = picture_of_both(cloud, placement, subject, rasterize)
+    write_png(job.outputs["picture"], _stacked(both, render_turnaround(placed, rasterize)))
+    job.progress(3, 3, {})
+    return StepReport(backend=f"{job.settings.rasterizer} rasterizer", notes=(*_notes(own, placement, job), *own.notes))
+
+
+def render_subject(cloud: Gaussians, size: int, rasterize: Rasterizer) -> Float[Tensor, "s s 4"]:
+    """Render a placed model from azimuth 0 as a cut-out, straight alpha."""
+    with torch.no_grad():
+        drawn = rasterize(cloud, [OrbitCamera(width=size, height=size)], torch.zeros(3))
+    straight = drawn.color[0] / drawn.alpha[0].clamp_min(1e-4)
+    return torch.cat([straight, drawn.alpha[0]], -1).clamp(0, 1)
+
+
+def _generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def _cloud(own: OwnModel, settings: AssetSettings, seed: int) -> Gaussians:
+    """Return the model as Gaussians, in its own coordinates."""
+    if own.splats is not None:
+        return own.splats
+    assert own.glb is not None  # a model is a mesh or splats
+    return cover_surface(own.glb.model, settings.points, _generator(seed)).cloud
+
+
+def _check_agreement(
+    job: Job,
+    cloud: Gaussians,
+    placement: Placement,
+    subject: Float[Tensor, "s s 4"],
+    rasterize: Rasterizer,
+    settings: AssetSettings,
+) -> None:
+    if placement.agreement >= settings.min_agreement:
+        return
+    write_png(job.pictures / "model_and_subject.png", picture_of_both(cloud, placement, subject, rasterize))
+    raise BadInput(
+        f"the model does not agree with the first frame: their outlines overlap by {placement.agreement:.0%} (IoU) at "
+        f"best, from azimuth {placement.azimuth_deg:.0f}; asset.min_agreement = {settings.min_agreement:g} is needed. "
+        "Give the video of this very model, say the azimuth with --asset-azimuth, or lower the setting"
+    )
+
+
+def _notes(own: OwnModel, placement: Placement, job: Job) -> list[str]:
+    if own.glb is not None:
+        model = own.glb.model
+        kind = f"{len(model.parts)} mesh parts, {len(model.vertices)} vertices, {len(model.faces)} triangles"
+    else:
+        kind = "splats"
+    notes = [f"the shape is a model of the user's own ({kind})"]
+    if "subject" in job.inputs:
+        notes.append(
+            f"the first frame shows it from azimuth {placement.azimuth_deg:.0f} degrees; the outlines of both overlap "
+            f"by {placement.agreement:.1%} (IoU)"
+        )
+    else:
+        notes.append("the picture that is set in motion is a render of the model")
+    return notes
+
+
+def _stacked(first: Float[Tensor, "h w 3"], second: Float[Tensor, "i j 3"]) -> Float[Tensor, "k l 3"]:
+    """Put two pictures above each other, on white."""
+    width = max(first.shape[1], second.shape[1])
+    rows = [torch.nn.functional.pad(one, (0, 0, 0, width - one.shape[1]), value=1.0) for one in (first, second)]
+    return torch.cat(rows)

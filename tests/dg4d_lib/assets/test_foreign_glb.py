@@ -1,0 +1,145 @@
+"""GLBs of other programs: read at rest, and written with morph targets."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+from foreign_models import CORNERS, box_glb, skinned_glb
+
+from dg4d_lib.assets.formats.foreign_glb import read_accessor, read_foreign_glb, write_moving_glb
+from dg4d_lib.assets.formats.gltf import GlbReader
+from dg4d_lib.errors import BadInput
+
+MOST = 1000  # triangles
+
+
+def edited(content: bytes, edit) -> bytes:
+    reader = GlbReader(content)
+    edit(reader.tree)
+    text = json.dumps(reader.tree).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(reader.binary), b"BIN\0") + reader.binary
+    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
+
+
+def shifted(glb, frames: int = 3) -> np.ndarray:
+    """Return the vertices, moved by 0.1 more along z at every frame."""
+    rest = glb.model.vertices
+    return np.stack([rest + np.float32([0, 0, 0.1 * frame]) for frame in range(frames)]).astype(np.float32)
+
+
+def test_transforms_of_the_nodes_are_applied():
+    model = read_foreign_glb(box_glb(), MOST).model
+    turned = np.stack([CORNERS[:, 2], CORNERS[:, 1] + 2, -CORNERS[:, 0]], 1)
+    np.testing.assert_allclose(model.vertices, turned, atol=1e-6)
+
+
+def test_colors_come_from_the_texture():
+    model = read_foreign_glb(box_glb(), MOST).model
+    colors, _ = model.sample(np.arange(12), np.full((12, 3), 1 / 3))
+    left = model.parts[0].faces.max(1) < 4  # faces at x = -0.5
+    np.testing.assert_allclose(colors[left], [[1, 0, 0]] * 2, atol=1e-5)
+
+
+def test_agrees_with_trimesh():
+    ours, theirs = (
+        read_foreign_glb(box_glb(), MOST).model,
+        trimesh.load_scene(_file(box_glb()), file_type="glb").to_mesh(),
+    )
+    np.testing.assert_allclose(ours.vertices[ours.faces].mean((0, 1)), theirs.triangles.mean((0, 1)), atol=1e-6)
+    assert len(theirs.faces) == len(ours.faces)
+
+
+def _file(content: bytes):
+    import io
+
+    return io.BytesIO(content)
+
+
+def test_moving_file_keeps_everything_else():
+    glb = read_foreign_glb(box_glb(), MOST)
+    content, notes = write_moving_glb(glb, np.eye(4), shifted(glb), 10.0, {"by": "test"})
+    before, after = GlbReader(box_glb()).tree, GlbReader(content).tree
+    for name in ("materials", "textures", "samplers", "images"):
+        assert [{**one, "bufferView": 0} for one in after[name]] == [{**one, "bufferView": 0} for one in before[name]]
+    assert [node["name"] for node in after["nodes"]] == ["inner", "outer", "dg4d placement"]
+    assert after["asset"]["extras"] == {"author": "somebody", "by": "test"}
+    old, new = before["meshes"][0]["primitives"][0], after["meshes"][0]["primitives"][0]
+    assert (new["attributes"], new["indices"], new["material"]) == (old["attributes"], old["indices"], old["material"])
+    assert [one["name"] for one in after["animations"]] == ["dg4d motion"]
+    assert any("animations" in note for note in notes)
+
+
+def played(content: bytes, frame: int) -> np.ndarray:
+    """Return the vertices of the only mesh in the world, at a frame, as a player computes them."""
+    reader = GlbReader(content)
+    tree = reader.tree
+    node = next(n for n in tree["nodes"] if "mesh" in n)
+    primitive = tree["meshes"][node["mesh"]]["primitives"][0]
+    poses = [read_accessor(reader, target["POSITION"]) for target in primitive["targets"]]
+    sampler = tree["animations"][0]["samplers"][0]
+    weights = read_accessor(reader, sampler["output"])[:, 0].reshape(-1, len(poses))[frame]
+    moved = edited(content, lambda t: t["meshes"][node["mesh"]].update(weights=weights.tolist()))
+    return read_foreign_glb(moved, MOST).model.vertices
+
+
+@pytest.mark.parametrize("make", [box_glb, skinned_glb])
+def test_morph_targets_lead_to_the_given_vertices(make):
+    glb = read_foreign_glb(make(), MOST)
+    placement = np.diag([0.5, 0.5, 0.5, 1.0])
+    placement[:3, 3] = (0.1, -0.2, 0.3)
+    rest = glb.model.placed(placement).vertices
+    moved = np.stack([rest, rest + np.float32([0, 0.25, 0]), rest * np.float32([1, 1, 2])])
+    content, _ = write_moving_glb(glb, placement, moved, 10.0, {})
+    for frame in range(3):
+        np.testing.assert_allclose(played(content, frame), moved[frame], atol=1e-5)
+
+
+def test_vertices_of_a_skin_follow_the_joints_at_rest():
+    model = read_foreign_glb(skinned_glb(), MOST).model
+    tip, foot = model.vertices[8], model.vertices[0]
+    np.testing.assert_allclose([tip, foot], [(1, 1, 0), (0, 0, 0)], atol=1e-6)  # the node's own transform is ignored
+
+
+def test_skeleton_is_kept():
+    glb = read_foreign_glb(skinned_glb(), MOST)
+    content, notes = write_moving_glb(glb, np.eye(4), shifted(glb), 10.0, {})
+    tree = GlbReader(content).tree
+    assert tree["skins"] == GlbReader(skinned_glb()).tree["skins"]
+    assert any("skeleton" in note for note in notes)
+
+
+def test_long_motions_have_fewer_keys():
+    glb = read_foreign_glb(box_glb(), MOST)
+    content, notes = write_moving_glb(glb, np.eye(4), shifted(glb, 200), 10.0, {})
+    assert len(GlbReader(content).tree["meshes"][0]["primitives"][0]["targets"]) == 100
+    assert any("every 2. frame" in note for note in notes)
+
+
+BROKEN = {
+    "nan": (lambda t: t["nodes"][0].update(scale=[float("nan")] * 3), "not finite"),
+    "no mesh": (lambda t: t["nodes"][0].pop("mesh"), "no triangles"),
+    "missing texture": (lambda t: t["images"].__setitem__(0, {"uri": "paint.png"}), "texture .* missing"),
+    "circle": (lambda t: t["nodes"][0].update(children=[1]), "circle"),
+    "draco": (lambda t: t.update(extensionsRequired=["KHR_draco_mesh_compression"]), "Draco"),
+    "far index": (lambda t: t["accessors"][2].update(byteOffset=10**9), "broken"),
+    "huge count": (lambda t: t["accessors"][0].update(count=10**12), "broken"),
+    "negative offset": (lambda t: t["accessors"][0].update(byteOffset=-64), "broken"),
+    "wrong type": (lambda t: t.update(nodes={"a": 1}), "broken"),
+    "old version": (lambda t: t["asset"].update(version="1.0"), "glTF 2.0"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_broken_files_get_a_sentence(case):
+    edit, sentence = BROKEN[case]
+    with pytest.raises(BadInput, match=sentence):
+        read_foreign_glb(edited(box_glb(), edit), MOST)
+
+
+def test_too_many_triangles_are_refused_with_the_setting():
+    with pytest.raises(BadInput, match=r"12 triangles; asset\.max_faces allows 11.*asset\.max_faces=12"):
+        read_foreign_glb(box_glb(), 11)

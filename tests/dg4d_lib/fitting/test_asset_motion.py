@@ -1,0 +1,121 @@
+"""Motion of users' models: recovers bends that the video shows, keeps lengths, and leaves depth alone."""
+
+import numpy as np
+import pytest
+import torch
+
+from dg4d_lib.asset_settings import AssetSettings
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.fitting.asset_motion import NodeMotion, antialiased, fit_asset_motion
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.mesh.models.control_graph import ControlGraph, build_control_graph
+from dg4d_lib.mesh.models.model import Model, ModelPart
+from dg4d_lib.mesh.models.surface_cloud import SurfaceCloud, cover_surface
+from dg4d_lib.rasterizer.interface import get_rasterizer
+from dg4d_lib.video.driving import DrivingVideo
+
+FRAMES, ANGLE = 4, 0.35  # radians at the last frame
+SETTINGS = AssetSettings(points=700, fit_points=700, nodes=16, size=48, track_iterations=25, joint_iterations=10)
+
+
+def arm() -> Model:
+    """Return a long box along y in short pieces, striped, so that places along it can be told apart."""
+    y, angle = np.meshgrid(np.linspace(-0.5, 0.5, 21), np.arange(8) * np.pi / 4, indexing="ij")
+    vertices = np.stack([0.1 * np.cos(angle), y, 0.1 * np.sin(angle)], -1).reshape(-1, 3)
+    row, column = np.meshgrid(np.arange(20), np.arange(8), indexing="ij")
+    a, b = (row * 8 + column).ravel(), (row * 8 + (column + 1) % 8).ravel()
+    faces = np.concatenate([np.stack([a, a + 8, b], 1), np.stack([b, a + 8, b + 8], 1)])
+    colors = np.stack([vertices[:, 1] > 0, np.sin(20 * vertices[:, 1]) > 0, vertices[:, 0] > 0], 1).astype(float)
+    return Model((ModelPart("arm", vertices.astype(np.float32), faces, colors=colors),))
+
+
+def bent(points: np.ndarray, angle: float) -> np.ndarray:
+    """Turn what is above the middle about z, smoothly."""
+    turn = angle * np.clip(points[:, 1] / 0.2, 0, 1)
+    c, s, up = np.cos(turn), np.sin(turn), np.maximum(points[:, 1], 0)
+    x = c * points[:, 0] - s * up
+    y = np.where(points[:, 1] > 0, s * points[:, 0] + c * up, points[:, 1])
+    return np.stack([x, y, points[:, 2]], 1)
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[SurfaceCloud, ControlGraph, DrivingVideo]:
+    surface = cover_surface(arm(), SETTINGS.points, torch.Generator().manual_seed(0))
+    graph = build_control_graph(surface.fine.vertices, surface.fine.faces, SETTINGS.nodes)
+    pictures = []
+    for frame in range(FRAMES):
+        part = arm().parts[0]
+        moved = bent(part.vertices, ANGLE * frame / (FRAMES - 1)).astype(np.float32)
+        model = Model((ModelPart("arm", moved, part.faces, colors=part.colors),))
+        cloud = cover_surface(model, 3000, torch.Generator().manual_seed(1)).cloud
+        drawn = get_rasterizer("cpu")(cloud, [OrbitCamera(width=96, height=96)], torch.zeros(3))
+        color, alpha = drawn.color[0], drawn.alpha[0]
+        pictures.append(torch.cat([color / alpha.clamp_min(1e-4), alpha], -1).clamp(0, 1))
+    video = torch.stack(pictures)
+    return surface, graph, DrivingVideo(video[..., :3], video[..., 3:], 5.0)
+
+
+@pytest.fixture(scope="module")
+def motion(scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo]) -> NodeMotion:
+    surface, graph, video = scene
+    bound = graph.of(surface.nearest)
+    generator = torch.Generator().manual_seed(0)
+    return fit_asset_motion(surface.cloud, bound, video, get_rasterizer("cpu"), SETTINGS, generator)
+
+
+def moved(scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo], motion: NodeMotion) -> np.ndarray:
+    surface, graph, _ = scene
+    return motion.points(torch.from_numpy(surface.fine.vertices).float(), graph).numpy()
+
+
+def test_a_bend_is_recovered(scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo], motion: NodeMotion) -> None:
+    rest = scene[0].fine.vertices
+    truth = bent(rest, ANGLE)
+    ours = moved(scene, motion)[-1]
+    error, still = (np.sqrt(np.square(one - truth).sum(1).mean()) for one in (ours, rest))
+    assert error < 0.5 * still  # 48 pixels and few iterations; a frozen model has 1
+
+
+def test_edges_keep_their_lengths(scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo], motion: NodeMotion) -> None:
+    fine = scene[0].fine
+    ends = fine.faces[:, :2]
+
+    def lengths(points: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1)
+
+    ratio = lengths(moved(scene, motion)[-1]) / lengths(fine.vertices)
+    assert np.abs(np.median(ratio) - 1) < 0.05
+    assert np.percentile(np.abs(ratio - 1), 90) < 0.25
+
+
+def test_nothing_drifts_in_depth(scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo], motion: NodeMotion) -> None:
+    depth = moved(scene, motion)[..., 2] - scene[0].fine.vertices[:, 2]
+    assert np.abs(depth.mean(1)).max() < 0.02
+
+
+def test_a_fit_is_repeatable(scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo]) -> None:
+    surface, graph, video = scene
+    quick = SETTINGS.model_copy(update={"track_iterations": 2, "joint_iterations": 1})
+    bound, rasterize = graph.of(surface.nearest), get_rasterizer("cpu")
+    runs = [
+        fit_asset_motion(surface.cloud, bound, video, rasterize, quick, torch.Generator().manual_seed(0))
+        for _ in range(2)
+    ]
+    for name, value in vars(runs[0]).items():
+        assert torch.equal(value, getattr(runs[1], name))
+
+
+def test_small_gaussians_cover_as_much_as_without_the_filter() -> None:
+    size, sigma = 64, 0.001  # far smaller than a pixel
+    camera = OrbitCamera(width=size, height=size)
+    one = Gaussians(
+        torch.zeros(1, 3),
+        torch.full((1, 3), sigma).log(),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.tensor([4.0]),
+        torch.zeros(1, 1, 3),
+    )
+    pixels = sigma * camera.focal / camera.radius
+    clear = antialiased(one, camera)
+    expected = one.opacities * pixels**2 / (pixels**2 + 0.3)
+    torch.testing.assert_close(clear.opacities, expected.clamp(min=1e-3))

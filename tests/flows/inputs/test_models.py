@@ -1,0 +1,91 @@
+"""Admission of users' models."""
+
+import json
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from dg4d_lib.errors import BadInput
+from flows.inputs.conversion_job import ConversionRequest
+from flows.inputs.models import check_model, put_model
+from steps.profiles import PREVIEW
+from steps.store.artifact_store import ArtifactStore
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> ArtifactStore:
+    return ArtifactStore(tmp_path / "store")
+
+
+def entries(path: Path, store: ArtifactStore) -> list[str]:
+    with zipfile.ZipFile(store.path(put_model(path, store))) as archive:
+        return archive.namelist()
+
+
+def test_a_gltf_comes_with_its_files(tmp_path: Path, store: ArtifactStore) -> None:
+    tree = {
+        "buffers": [{"uri": "a%20b.bin"}],
+        "images": [{"uri": "tex/c.png"}, {"uri": "data:,x"}, {"uri": "gone.png"}],
+    }
+    (tmp_path / "x.gltf").write_text(json.dumps(tree))
+    (tmp_path / "a b.bin").write_bytes(b"1")
+    (tmp_path / "tex").mkdir()
+    (tmp_path / "tex/c.png").write_bytes(b"2")
+    assert entries(tmp_path / "x.gltf", store) == ["model.gltf", "a b.bin", "tex/c.png"]
+
+
+def test_an_obj_comes_with_materials_and_textures(tmp_path: Path, store: ArtifactStore) -> None:
+    (tmp_path / "x.OBJ").write_text("mtllib my materials.mtl\nv 0 0 0\n")
+    (tmp_path / "my materials.mtl").write_text("newmtl a\nmap_Kd -s 1 1 1 paint.png\n")
+    (tmp_path / "paint.png").write_bytes(b"1")
+    assert entries(tmp_path / "x.OBJ", store) == ["model.obj", "my materials.mtl", "paint.png"]
+
+
+def test_the_name_of_a_model_does_not_count(tmp_path: Path, store: ArtifactStore) -> None:
+    for name in ("a.glb", "b.glb"):
+        (tmp_path / name).write_bytes(b"glTF same")
+    assert put_model(tmp_path / "a.glb", store) == put_model(tmp_path / "b.glb", store)
+
+
+@pytest.mark.parametrize("name", ["../secret", "/etc/passwd", "a/../../secret"])
+def test_files_outside_of_the_folder_are_refused(name: str, tmp_path: Path, store: ArtifactStore) -> None:
+    (tmp_path / "secret").write_text("secret")
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in/x.gltf").write_text(json.dumps({"buffers": [{"uri": name}]}))
+    with pytest.raises(BadInput, match="leads out of the folder"):
+        put_model(tmp_path / "in/x.gltf", store)
+
+
+REFUSED = {
+    "a.glb": (None, "does not exist"),
+    "a.fbx": (b"x", "export the model as GLB"),
+    "b.glb": (b"", "0 bytes"),
+    "c.glb": (b"PK??", r"does not start as a \.glb"),
+    "d.gltf": (b"{", "no glTF"),
+    "e.gltf": (b"[" * 2000, "no glTF"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_other_files_are_refused(name: str, tmp_path: Path, store: ArtifactStore) -> None:
+    content, sentence = REFUSED[name]
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(BadInput, match=sentence):
+        put_model(tmp_path / name, store)
+
+
+def test_a_model_needs_no_picture_and_takes_no_words(tmp_path: Path, store: ArtifactStore) -> None:
+    (tmp_path / "a.glb").write_bytes(b"glTF same")
+    request = ConversionRequest(item="a", asset=tmp_path / "a.glb", settings=PREVIEW)
+    request.check()
+    job = request.to_job(store)
+    assert job.asset == job.source and not job.moving and job.source_name == "a.glb"
+    with pytest.raises(BadInput, match="leave --text out"):
+        request.model_copy(update={"text": "words"}).check()
+
+
+def test_folders_are_no_models(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="is a folder"):
+        check_model(tmp_path)

@@ -1,0 +1,234 @@
+"""A model of the user's own: read, placed, set in motion, and packed."""
+
+import json
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from dg4d_lib.assets.formats.foreign_glb import read_foreign_glb
+from dg4d_lib.assets.formats.model_glb import write_model_glb
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.errors import BadInput
+from dg4d_lib.gaussians.ply import read_ply, write_ply
+from dg4d_lib.mesh.models.model import Model, ModelPart
+from dg4d_lib.mesh.models.surface_cloud import cover_surface
+from dg4d_lib.rasterizer.interface import get_rasterizer
+from dg4d_lib.video.driving import DrivingVideo
+from steps import animate_asset, pack_asset, prepare_asset
+from steps.artifacts.media import read_png, write_frames, write_png
+from steps.artifacts.motions import read_motion
+from steps.artifacts.packages import read_manifest
+from steps.artifacts.placements import read_placement
+from steps.artifacts.rendering import read_surface
+from steps.catalog import STEPS
+from steps.profiles import PREVIEW, revise, step_settings
+from steps.runtime.job import Job
+
+SMALL = revise(
+    PREVIEW,
+    {
+        "subject.size": 64,
+        "asset.points": 600,
+        "asset.fit_points": 600,
+        "asset.nodes": 12,
+        "asset.size": 32,
+        "asset.track_iterations": 6,
+        "asset.joint_iterations": 2,
+        "mesh.texture_size": 64,
+        "pack.splats": False,
+        "pack.spz": False,
+        "pack.rig": False,
+    },
+)
+CAMERA = OrbitCamera(width=64, height=64)
+
+
+def fish() -> Model:
+    """Return a long body with a red front, a blue back and a green fin on one side."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    vertices = ball.vertices * (0.35, 0.35, 0.8)
+    fin = (vertices[:, 1] > 0.1) & (vertices[:, 2] < -0.2)
+    vertices[fin] *= (1, 1.8, 1)
+    colors = np.where(vertices[:, 2:] > 0.2, (1.0, 0, 0), (0, 0, 1.0)).astype(float)
+    colors[vertices[:, 0] > 0.2] = (0, 1, 0)
+    return Model((ModelPart("fish", vertices.astype(np.float32), np.asarray(ball.faces), colors=colors),))
+
+
+def zipped(folder: Path, **files: bytes) -> Path:
+    path = folder / "model.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name.replace("_", "."), content)
+    return path
+
+
+def job_of(step: str, folder: Path, inputs: dict[str, Path], settings=SMALL, **values: object) -> Job:
+    folder.mkdir(exist_ok=True, parents=True)
+    (folder / "pictures").mkdir(exist_ok=True)
+    spec = STEPS[step]
+    outputs = {name: folder / f"{name}{port.suffix}" for name, port in spec.outputs.items()}
+    known = {name: path for name, path in inputs.items() if spec.input_port(name)}
+    return Job(known, outputs, step_settings(step, settings, **values), 0, lambda *_: None, folder / "pictures")
+
+
+def render(model: Model, azimuth: float) -> torch.Tensor:
+    """Return a cut-out of a model from an azimuth."""
+    cloud = cover_surface(model, 3000, torch.Generator().manual_seed(5)).cloud
+    drawn = get_rasterizer("cpu")(cloud, [OrbitCamera(0, azimuth, width=64, height=64)], torch.zeros(3))
+    color, alpha = drawn.color[0], drawn.alpha[0]
+    return torch.cat([color / alpha.clamp_min(1e-4), alpha], -1).clamp(0, 1)
+
+
+@pytest.fixture(scope="module")
+def model_zip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return zipped(tmp_path_factory.mktemp("model"), model_glb=write_model_glb(fish()))
+
+
+@pytest.fixture(scope="module")
+def prepared(model_zip: Path, tmp_path_factory: pytest.TempPathFactory) -> Job:
+    """Return the job that placed the fish in a picture of it from azimuth 60, at half its size and to the left."""
+    folder = tmp_path_factory.mktemp("prepared")
+    matrix = np.diag([0.7, 0.7, 0.7, 1.0])
+    write_png(folder / "subject.png", render(fish().placed(matrix), 60.0))
+    job = job_of("prepare_asset", folder / "out", {"model": model_zip, "subject": folder / "subject.png"})
+    prepare_asset.run(job)
+    return job
+
+
+def test_azimuth_and_scale_are_found(prepared: Job) -> None:
+    placement = read_placement(prepared.outputs["placement"])
+    assert placement.azimuth_deg == pytest.approx(60, abs=8)
+    assert placement.scale == pytest.approx(0.7, rel=0.06)
+    assert placement.agreement > 0.85
+
+
+def test_the_glb_is_kept_to_the_byte(prepared: Job) -> None:
+    assert read_foreign_glb(prepared.outputs["glb"].read_bytes(), 10**6).model.parts[0].name == "fish"
+
+
+def test_a_picture_of_something_else_is_refused_with_a_picture_of_both(model_zip: Path, tmp_path: Path) -> None:
+    ring = torch.zeros(64, 64, 4)
+    ring[4:60, 4:60] = 1
+    ring[12:52, 12:52] = 0
+    write_png(tmp_path / "ring.png", ring)
+    job = job_of("prepare_asset", tmp_path, {"model": model_zip, "subject": tmp_path / "ring.png"})
+    with pytest.raises(BadInput, match=r"does not agree with the first frame.*--asset-azimuth"):
+        prepare_asset.run(job)
+    assert (job.pictures / "model_and_subject.png").is_file()
+
+
+def test_a_model_alone_becomes_its_own_subject(model_zip: Path, tmp_path: Path) -> None:
+    settings = revise(SMALL, {"asset.find_azimuth": False, "asset.azimuth_deg": 90.0})
+    job = job_of("prepare_asset", tmp_path, {"model": model_zip}, settings)
+    report = prepare_asset.run(job)
+    subject = read_png(job.outputs["subject"])
+    assert subject[..., 3].mean() > 0.05
+    middle = subject[24:40, 24:40, :3].mean((0, 1))
+    assert middle.argmax() == 1  # the green side is at azimuth 90
+    assert any("render of the model" in note for note in report.notes)
+
+
+@pytest.fixture(scope="module")
+def animated(prepared: Job, tmp_path_factory: pytest.TempPathFactory) -> tuple[Job, dict[str, Path]]:
+    """Return the job that moved the placed fish to the right in three frames, and the inputs for packing."""
+    folder = tmp_path_factory.mktemp("animated")
+    cloud = read_ply(prepared.outputs["gaussians"])
+    frames = []
+    for frame in range(3):
+        shifted = cloud.means + torch.tensor([0.08 * frame, 0, 0])
+        drawn = get_rasterizer("cpu")(type(cloud)(**{**vars(cloud), "means": shifted}), [CAMERA], torch.zeros(3))
+        color, alpha = drawn.color[0], drawn.alpha[0]
+        frames.append(torch.cat([color / alpha.clamp_min(1e-4), alpha], -1).clamp(0, 1))
+    video = torch.stack(frames)
+    write_frames(folder / "video.zip", DrivingVideo(video[..., :3], video[..., 3:], 5.0))
+    write_png(folder / "subject.png", video[0])
+    inputs = {**prepared.outputs, "driving_video": folder / "video.zip", "subject": folder / "subject.png"}
+    settings = revise(SMALL, {"asset.track_iterations": 20})
+    job = job_of("animate_asset", folder / "out", inputs, settings)
+    animate_asset.run(job)
+    return job, {**inputs, **job.outputs}
+
+
+def test_the_motion_of_the_video_is_found(animated: tuple[Job, dict[str, Path]], prepared: Job) -> None:
+    fitted = read_motion(animated[0].outputs["motion"])
+    cloud = read_ply(prepared.outputs["gaussians"])
+    moved = fitted.deformation.displace(cloud.means, torch.linspace(0, 1, 3)).means.mean(1)
+    torch.testing.assert_close(moved[2] - moved[0], torch.tensor([0.16, 0.0, 0.0]), atol=0.03, rtol=0)
+
+
+def test_the_package_has_the_users_own_mesh(animated: tuple[Job, dict[str, Path]], tmp_path: Path) -> None:
+    job = job_of("pack_asset", tmp_path / "pack", animated[1], notes=("a note",))
+    pack_asset.run(job)
+    with zipfile.ZipFile(job.outputs["package"]) as archive:
+        archive.extractall(tmp_path / "package")
+    manifest = read_manifest(tmp_path / "package")
+    assert manifest.mode == "own"
+    own = read_foreign_glb((tmp_path / "package/asset.glb").read_bytes(), 10**6)
+    assert own.model.parts[0].name == "fish"
+    assert len(own.model.vertices) == len(fish().vertices)
+    surface = read_surface(tmp_path / "package", manifest)
+    assert len(surface.offsets) == 3 and len(surface.mesh.faces) == len(fish().faces)
+
+
+def test_splats_stay_splats(tmp_path: Path) -> None:
+    cloud = cover_surface(fish(), 500, torch.Generator().manual_seed(0)).cloud
+    write_ply(tmp_path / "a.ply", cloud)
+    path = zipped(tmp_path, model_ply=(tmp_path / "a.ply").read_bytes())
+    job = job_of("prepare_asset", tmp_path / "prepare", {"model": path})
+    prepare_asset.run(job)
+    assert not job.outputs["glb"].exists()
+    placed = read_ply(job.outputs["gaussians"])
+    torch.testing.assert_close(placed.harmonics, cloud.harmonics)
+    scale = read_placement(job.outputs["placement"]).scale
+    torch.testing.assert_close(placed.scales, scale * cloud.scales)
+
+
+REFUSED = {
+    "no faces": ({"model_obj": b"v 0 0 0\nv 1 0 0\n"}, "no faces"),
+    "nan": ({"model_obj": b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"}, "not finite"),
+    "flat": ({"model_obj": b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n"}, "no area"),
+    "missing texture": (
+        {"model_obj": b"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n",
+         "a_mtl": b"newmtl m\nmap_Kd paint.png\n"},
+        r"texture 'paint\.png' of the model is missing",
+    ),
+    "missing buffer": ({"model_gltf": json.dumps(
+        {"asset": {"version": "2.0"}, "buffers": [{"uri": "a.bin", "byteLength": 4}]}).encode()}, "buffer .* missing"),
+    "splats without color": (
+        {"model_ply": b"ply\nformat binary_little_endian 1.0\nelement vertex 4\nproperty float x\nend_header\n"},
+        "no splat colors",
+    ),
+    "no gzip": ({"model_spz": b"\x1f\x8bnothing"}, "SPZ is broken"),
+    "no usdz": ({"model_usdz": b"PK nothing"}, "USDZ is broken"),
+    "two models": ({"model_obj": b"", "model_ply": b""}, "must be one of"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_unusable_models_get_a_sentence(case: str, tmp_path: Path) -> None:
+    files, sentence = REFUSED[case]
+    job = job_of("prepare_asset", tmp_path / "out", {"model": zipped(tmp_path, **files)})
+    with pytest.raises(BadInput, match=sentence):
+        prepare_asset.run(job)
+
+
+def test_a_zip_bomb_as_usdz_is_refused_before_it_grows(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "bomb", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.usdc", bytes(10**7))
+    path = zipped(tmp_path, model_usdz=(tmp_path / "bomb").read_bytes())
+    with pytest.raises(BadInput, match="compressed entries"):
+        prepare_asset.run(job_of("prepare_asset", tmp_path / "out", {"model": path}))
+    assert sys.getsizeof(path.read_bytes()) < 10**6
+
+
+def test_too_many_triangles_of_an_obj_are_refused(tmp_path: Path) -> None:
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "f 1 2 3\n" * 101
+    settings = revise(SMALL, {"asset.max_faces": 100})
+    path = zipped(tmp_path, model_obj=text.encode())
+    with pytest.raises(BadInput, match=r"more than 100 triangles.*asset\.max_faces"):
+        prepare_asset.run(job_of("prepare_asset", tmp_path / "out", {"model": path}, settings))
