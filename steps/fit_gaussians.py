@@ -35,7 +35,7 @@ def run(job: Job) -> StepReport:
     generator = torch.Generator().manual_seed(job.seed)
     rasterize = get_rasterizer(backend)
     device = preferred_device(backend)
-    known = read_known_views(job)
+    known = read_known_views(job.inputs.get("known_views"), job.pictures)
     reconstruction = None
     if isinstance(static.start, LgmStartSettings):  # before the prior, so that two networks are not in memory at once
         reconstruction = reconstruct_subject(subject.to(device), static.start, rasterize, generator)

@@ -30,7 +30,7 @@ def run(job: Job) -> StepReport:
     generator = torch.Generator().manual_seed(job.seed)
     rasterize = get_rasterizer(backend)
     cutouts = list(torch.cat([video.frames, video.alpha], -1))
-    known = read_known_views(job)
+    known = read_known_views(job.inputs.get("known_views"), job.pictures)
     chosen = make_prior(prior, cutouts, settings, job.inputs.get("bank"), job.pictures, turn_deg, known)
     deformation = new_deformation(kind, gaussians, len(video), generator)
     device = preferred_device(backend)

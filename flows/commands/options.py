@@ -24,7 +24,7 @@ PROFILES = (
     "reference",
     "quality",
 )  # as in steps/profiles.py
-MOTIONS = ("sway", "bend", "breathe", "bounce", "wave", "turn")  # as in dg4d_lib/settings.py
+MOTIONS = ("sway", "bend", "breathe", "bounce", "wave", "turn")  # as in dg4d_lib/input_settings.py
 
 
 def complete_profile(incomplete: str) -> list[str]:

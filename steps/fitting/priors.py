@@ -37,7 +37,7 @@ from dg4d_lib.weights.registry import lookup_weights
 from steps.artifacts.archives import unpack
 from steps.artifacts.media import read_png
 from steps.artifacts.pose import read_turn
-from steps.runtime.job import Job, StepReport
+from steps.runtime.job import StepReport
 from steps.runtime.weights import LocatedWeights, open_weights
 from steps.sources.banks import BANK_JSON, BankIndex, check_sheet, read_index
 
@@ -202,13 +202,13 @@ def check_variant(settings: Zero123PriorSettings) -> None:
         )
 
 
-def read_known_views(job: Job) -> Bank | None:
-    """Read the views of other sides that the user gave; None without."""
-    if "known_views" not in job.inputs:
+def read_known_views(path: Path | None, scratch: Path) -> Bank | None:
+    """Read the views of other sides that the user gave; None without; `scratch` is for unpacking."""
+    if path is None:
         return None
-    folder = job.pictures / "known_views"
+    folder = scratch / "known_views"
     folder.mkdir()
-    return read_bank(job.inputs["known_views"], folder)
+    return read_bank(path, folder)
 
 
 def read_bank(path: Path, scratch: Path) -> Bank:

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
 import dg4d_lib.asset_settings
+import dg4d_lib.input_settings
 import dg4d_lib.settings
 import steps.profiles
 from dg4d_lib.errors import BadInput
@@ -21,7 +22,7 @@ from dg4d_lib.settings import MotionSettings, Settings, StaticSettings
 from steps.catalog import STEPS
 from steps.profiles import PROFILES, PipelineSettings, profile, revise
 
-DEFINITIONS = {"dg4d_lib/settings.py", "dg4d_lib/asset_settings.py", "steps/profiles.py"}
+DEFINITIONS = {"dg4d_lib/settings.py", "dg4d_lib/asset_settings.py", "dg4d_lib/input_settings.py", "steps/profiles.py"}
 EVIDENT = {  # numbers whose names say everything
     "iterations", "features", "hidden", "frequencies", "max_faces", "prune_opacity",
     "guidance_weight", "color_lr", "opacity_lr", "scale_lr", "rotation_lr",
@@ -32,7 +33,7 @@ Classes = Mapping[str, tuple[type[BaseModel], ...]]
 
 
 def settings_classes() -> list[type[Settings]]:
-    modules = (dg4d_lib.settings, dg4d_lib.asset_settings, steps.profiles)
+    modules = (dg4d_lib.settings, dg4d_lib.input_settings, dg4d_lib.asset_settings, steps.profiles)
     found = [value for module in modules for _, value in inspect.getmembers(module, inspect.isclass)]
     own = {c for c in found if issubclass(c, Settings) and c is not Settings}
     return sorted(own - {base for c in own for base in c.__bases__}, key=lambda c: c.__name__)
@@ -41,7 +42,11 @@ def settings_classes() -> list[type[Settings]]:
 def classes_by_name() -> Classes:
     """What the names in annotations stand for: a class, or the members of a union."""
     names = {c.__name__: (c,) for c in settings_classes()}
-    unions = {name: classes_in(value) for name, value in vars(dg4d_lib.settings).items() if name.endswith("Settings")}
+    unions = {
+        name: classes_in(value)
+        for name, value in {**vars(dg4d_lib.settings), **vars(dg4d_lib.input_settings)}.items()
+        if name.endswith("Settings")
+    }
     bases = {"FitSettings": (StaticSettings, MotionSettings)}
     return {**{name: members for name, members in unions.items() if members}, **names, **bases}
 
