@@ -1,8 +1,10 @@
-"""Quality of assets by what a user gives: a video alone, pictures of other sides, a turntable.
+"""Quality of assets by what a user gives: a video alone, pictures of other sides, a turntable, a mesh.
 
     python -m benchmarks.inputs --views FOLDER --sheet sheet.png
     python -m benchmarks.inputs --views FOLDER --azimuths 180
     python -m benchmarks.inputs --turntable FOLDER
+    python -m benchmarks.inputs --asset FOLDER
+    python -m benchmarks.inputs --matting FOLDER
     python -m benchmarks.inputs --none FOLDER
 
 FOLDER is a data set of `steps.artifacts.ground_truth` whose objects also have `static/az_AZIMUTH.png`, frame 0 from
@@ -17,7 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from benchmarks.measure import parser_of
+from benchmarks import matting, own_asset
+from benchmarks.measure import new_console, parser_of
 from benchmarks.true_views import SIZE, Figures, Subject, figures, line, mean, prepared, read_subjects, score_fit
 
 import torch  # isort: skip
@@ -75,7 +78,7 @@ def turntable_of(subject: Subject, azimuths: Sequence[float], scratch: Path) -> 
     return GivenViews(turntable="turntable"), [("turntable", (scratch / "frames.zip").read_bytes())]
 
 
-WAYS = {  # further ways, such as a mesh of the user's own or a matte, get a line here or a module of their own
+WAYS = {  # of giving views
     "none": Way("the video alone", None),
     "views": Way("the video, and frame 0 from other azimuths", pictures_of),
     "turntable": Way("the video, and a turntable of frame 0", turntable_of),
@@ -119,12 +122,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ways = parser.add_mutually_exclusive_group(required=True)
     for name, way in WAYS.items():
         ways.add_argument(f"--{name}", type=Path, metavar="FOLDER", help=way.help)
+    ways.add_argument("--asset", type=Path, metavar="FOLDER", help="the video, and the true mesh of frame 0")
+    ways.add_argument("--matting", type=Path, metavar="FOLDER", help="the input over backdrops; scores its cut-out")
     parser.add_argument("--only", nargs="+", default=(), help="names of objects")
     parser.add_argument("--azimuths", type=float, nargs="+", default=AZIMUTHS_DEG, help="of the pictures of --views")
     parser.add_argument("--first", action="store_true", help="score the shape of frame 0 alone, without a fit")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting")
     parser.add_argument("--sheet", type=Path, help="picture: unseen views over time, above the true ones")
     given = parser.parse_args(arguments)
+    if given.asset:
+        own_asset.measure(own_asset.read_subjects(given.asset, given.only), PREVIEW.asset)
+        return
+    if given.matting:
+        new_console().print(matting.table(matting.measure_matting(given.matting, objects=given.only)))
+        return
     name = next(name for name in WAYS if getattr(given, name))
     changes = {key: json.loads(value) for key, value in (pair.split("=", 1) for pair in given.set)}
     settings = revise(PREVIEW, changes)

@@ -8,7 +8,7 @@ Photographs with a subject of their own, such as a portrait, are ambiguous: whic
 know. They are reported apart, and no bound holds for them.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -87,17 +87,22 @@ def main() -> None:
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="a folder per object, with input/NNN.png")
     options = parser.parse_args()
     rows = measure_matting(options.folder)
-    names = sorted({row.object for row in rows})
-    title = f"overlap of the mask with the truth; bounds: mean {LEAST_MEAN}, worst {LEAST_WORST}"
-    table = Table("backdrop", *(Column(name, justify="right") for name in (*names, "mean")), title=title)
-    for backdrop in dict.fromkeys(row.backdrop for row in rows):
-        values = [row.iou for row in rows if row.backdrop == backdrop]
-        table.add_row(backdrop, *(f"{value:.3f}" for value in values), f"{fmean(values):.3f}")
-    for kind, (mean, worst) in summarize(rows).items():
-        table.add_row(f"{kind}: mean {mean:.3f}, worst {worst:.3f}")
-    new_console().print(table)
+    new_console().print(table(rows))
     if options.json:
         write_rows(options.json, rows)
+
+
+def table(rows: Sequence[Row]) -> Table:
+    """Return overlaps by backdrop and object, and means and worst ones by kind of backdrop."""
+    names = sorted({row.object for row in rows})
+    title = f"overlap of the mask with the truth; bounds: mean {LEAST_MEAN}, worst {LEAST_WORST}"
+    shown = Table("backdrop", *(Column(name, justify="right") for name in (*names, "mean")), title=title)
+    for backdrop in dict.fromkeys(row.backdrop for row in rows):
+        values = [row.iou for row in rows if row.backdrop == backdrop]
+        shown.add_row(backdrop, *(f"{value:.3f}" for value in values), f"{fmean(values):.3f}")
+    for kind, (mean, worst) in summarize(rows).items():
+        shown.add_row(f"{kind}: mean {mean:.3f}, worst {worst:.3f}")
+    return shown
 
 
 def _rows(name: str, cutout: Tensor) -> list[Row]:
