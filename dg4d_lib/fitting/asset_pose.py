@@ -140,7 +140,7 @@ def judge(
 
 def picture_of_both(
     cloud: Gaussians, placement: Placement, subject: Float[Tensor, "h w 4"], rasterize: Rasterizer, size: int = 256
-) -> Float[Tensor, "s w 3"]:
+) -> Float[Tensor, "size width 3"]:
     """Draw subject, placed model and the outlines of both in a row, over white; red: subject alone, blue: model."""
     target, mask = resize_cutouts(subject[None], size)
     ((color, alpha),) = _renders(cloud, [placement], rasterize, size)

@@ -79,6 +79,7 @@ class GuidancePrior(Protocol):
         ...
 
 
+@runtime_checkable
 class SubjectShapes(Protocol):
     """Shapes of a subject, one per frame, from which a prior draws the views that it expects."""
 

@@ -71,7 +71,7 @@ def chamfer_4d(points: Float[Tensor, "t n 3"], truth: Float[Tensor, "t m 3"], al
     return chamfer_3d(points, truth, [alignment] * len(points))
 
 
-def chamfer_motion(tracked: Float[Tensor, "t n 3"], truth: Float[Tensor, "t m 3"], alignment: Alignment) -> float:
+def chamfer_motion(tracked: Float[Tensor, "t n 3"], truth: Float[Tensor, "u m 3"], alignment: Alignment) -> float:
     """Return the mean distance over time of points that are nearest neighbors in the first frame.
 
     Args:

@@ -19,12 +19,12 @@ from dg4d_lib.video import u2netp
 from dg4d_lib.video.backdrop import Backdrop, border_ring, cut_out, fit_backdrop
 from dg4d_lib.video.color_models import foreground_log_odds
 from dg4d_lib.video.guided_filter import guide_to_edges
-from dg4d_lib.video.segmentation_network import SegmentationNetwork
+from dg4d_lib.video.segmentation_network import Segmentation
 from dg4d_lib.video.soft_edges import free_colors, unmix
 from dg4d_lib.video.still_pixels import average_still_pixels
 
 Method = Literal["backdrop", "uneven backdrop", "network"]
-NetworkLoader = Callable[[], SegmentationNetwork]
+NetworkLoader = Callable[[], Segmentation]
 
 BACKDROP_SIDE = 640  # longest side for the segmentation before plain backdrops, pixels
 REFINED_SIDE = 512  # longest side for color models and for the coefficients of the guided filter, pixels
@@ -180,7 +180,7 @@ def _by_backdrop(lab: Float[ndarray, "t h w 3"], backdrop: Backdrop) -> Float[Te
     return torch.from_numpy(np.stack([_parts(mask, PART) for mask in cut_out(lab, backdrop)])).float()
 
 
-def _by_network(frames: Float[Tensor, "t h w 3"], network: SegmentationNetwork) -> _Segmentation:
+def _by_network(frames: Float[Tensor, "t h w 3"], network: Segmentation) -> _Segmentation:
     """Segment every frame; compare some with the network's answer to the mirrored frame."""
     size = _reduced(frames, REFINED_SIDE)
     found = torch.stack([resize_planes(network.probability(frame)[None, None], size)[0, 0] for frame in frames])

@@ -3,7 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -40,6 +40,15 @@ class Preprocessing:
     std: tuple[float, ...] = IMAGENET_STD
     scale: float = 1 / 255
     side: int = 0
+
+
+@runtime_checkable
+class Segmentation(Protocol):
+    """Anything that tells where the salient object of a picture is."""
+
+    def probability(self, picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
+        """Return the probability of every pixel of an sRGB picture in [0, 1]."""
+        ...
 
 
 @dataclass(frozen=True)

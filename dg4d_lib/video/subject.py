@@ -23,7 +23,7 @@ from dg4d_lib.video.framing import (
     resample,
 )
 from dg4d_lib.video.matting import Matte, matte
-from dg4d_lib.video.segmentation_network import SegmentationNetwork
+from dg4d_lib.video.segmentation_network import Segmentation
 from dg4d_lib.video.soft_edges import free_colors
 
 OVERSAMPLING = 2  # maximum size of opaque frames before matting, relative to the size of the square
@@ -47,7 +47,7 @@ class Segmenter:
     """
 
     name: str = u2netp.NAME
-    load: Callable[[], SegmentationNetwork] = u2netp.packaged_network
+    load: Callable[[], Segmentation] = u2netp.packaged_network
 
 
 U2NETP = Segmenter()

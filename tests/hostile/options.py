@@ -10,7 +10,7 @@ LONG = "9" * 5000
 OPTIONS: dict[str, list[str]] = {
     "make: nothing": ["make"],
     "make: unknown option": ["make", "cat.png", "--tint", "red"],
-    "make: two pictures": ["make", "cat.png", "cat.png"],
+    "make: two pictures and words": ["make", "cat.png", "cat.png", "--text", "a fox"],
     "make: a picture that is gone": ["make", "dog.png"],
     "make: a folder": ["make", "pets"],
     "make: a picture and words": ["make", "cat.png", "--text", "a fox"],

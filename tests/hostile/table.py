@@ -104,7 +104,7 @@ USAGE = 2
 COMMANDS: dict[str, Refused] = {
     "make: nothing": Refused("give a picture", USAGE),
     "make: unknown option": Refused("--tint", USAGE),
-    "make: two pictures": Refused("unexpected extra argument", USAGE),
+    "make: two pictures and words": Refused("--text makes one asset"),
     "make: a picture that is gone": Refused("dog.png does not exist"),
     "make: a folder": Refused("is a folder"),
     "make: a picture and words": Refused("not both"),

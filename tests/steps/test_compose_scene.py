@@ -119,6 +119,7 @@ def test_a_film_has_an_end(package: Path, tmp_path: Path) -> None:
 
 
 def test_a_broken_asset_is_named(tmp_path: Path) -> None:
-    (tmp_path / "asset.glb").write_bytes(b"no GLB")
+    folder = packed(tmp_path)
+    (folder / "asset.glb").write_bytes(b"no GLB")
     with pytest.raises(BadInput, match=r"asset\.glb: this is not a GLB"):
-        SceneWriter([tmp_path], [item("a")], ["a"])
+        SceneWriter([folder], [item("a")], ["a"])

@@ -3,6 +3,7 @@ from pathlib import Path
 import pytest
 from tiny_text_to_image import save_pipeline
 
+from dg4d_lib.asset_settings import CutoutGateSettings
 from dg4d_lib.input_settings import SubjectSettings, TextSettings
 from steps.artifacts.media import read_png
 from steps.catalog import STEPS
@@ -83,7 +84,10 @@ def test_what_was_drawn_is_cut_out(store: ArtifactStore, tmp_path: Path) -> None
         step="prepare_subject",
         version=request_version(STEPS["prepare_subject"]),
         inputs={"source": picture},
-        settings={"subject": SubjectSettings(size=64, framing="keep").model_dump(mode="json")},
+        settings={
+            "subject": SubjectSettings(size=64, framing="keep").model_dump(mode="json"),
+            "cutout": CutoutGateSettings().model_dump(mode="json"),
+        },
         seed=0,
     )
     outcome = perform(request, store)[0]

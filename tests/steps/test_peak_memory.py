@@ -18,7 +18,8 @@ MOST_MIB = 2048
 SIDE = 10_900  # pixels; its square is just below stills.MOST_PIXELS
 FRAMES = 10  # of the video, whose memory grows with their number; the most that are kept are too slow to cut out here
 LIBRARIES_MIB = 450  # of the process before it decodes a video; measured 330 to 480
-SAME = "same everywhere"  # message for a picture of one color: decoded, and nothing to cut out
+SEGMENTATION_MIB = 600
+SAME = "no subject found"
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="VmHWM is Linux's")
 
@@ -111,7 +112,8 @@ def test_large_files_of_every_kind_stay_below_two_gibibytes(tmp_path: Path) -> N
     assert refused.mib + 100 < peaks["interlaced PNG of 16 bits"].mib
     assert {kind: peak for kind, peak in peaks.items() if peak.mib > MOST_MIB} == {}
     share = FRAMES * 1024**2 / MOST_WORK
-    assert peaks["video"].mib < LIBRARIES_MIB + share * (MOST_MIB - LIBRARIES_MIB), peaks["video"]
+    # an opaque video is segmented: a network, and color models of a few frames
+    assert peaks["video"].mib < LIBRARIES_MIB + SEGMENTATION_MIB + share * (MOST_MIB - LIBRARIES_MIB), peaks["video"]
     blank = ("gray PNG", "progressive JPEG", "EXR of 200 channels", "zip")
     ends = dict.fromkeys(peaks, "done") | dict.fromkeys(blank, SAME) | {"interlaced PNG of 16 bits": "transparent"}
     assert {kind: peak for kind, peak in peaks.items() if ends[kind] not in peak.outcome} == {}

@@ -43,7 +43,7 @@ def test_the_fit_starts_from_the_reconstruction_that_the_seed_decides(
     stage = PREVIEW.static.model_copy(update=changes)
     given = []
     fit = static.fit_gaussians
-    monkeypatch.setattr(fit_gaussians, "fit_gaussians", lambda *a: given.append(a) or fit(*a))
+    monkeypatch.setattr(fit_gaussians, "fit_gaussians", lambda *a, **named: given.append(a) or fit(*a, **named))
     write_png(tmp_path / "subject.png", subject())
     outputs = {name: tmp_path / name for name in ("gaussians", "curves", "picture.png")}
     outputs["picture"] = outputs.pop("picture.png")
@@ -56,7 +56,7 @@ def test_the_fit_starts_from_the_reconstruction_that_the_seed_decides(
     expected = reconstruct_subject(exact, lgm, get_rasterizer("cpu"), torch.Generator().manual_seed(1))
     assert torch.equal(start.means, expected.gaussians.means)
     assert torch.equal(read_ply(outputs["gaussians"]).means, start.means)
-    assert used.means_lr == pytest.approx(0.1 * stage.means_lr)
+    assert used.means_lr == pytest.approx(0.1 * 4 / 3 * stage.means_lr)  # LGM's lengths are 3/4 of ours
     assert NOTE in facts.notes
     assert NOTE in json.loads(outputs["curves"].read_text())["notes"]
     assert {Path(name).parent.name for name in facts.weights} >= {"unet", "vae", "lgm"}

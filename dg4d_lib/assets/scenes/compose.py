@@ -117,7 +117,11 @@ class AnimatedGlb:
         rows = self.file.accessor(tracks[0]["output"]).reshape(-1, len(targets)).astype(np.float64)
         unique = dict.fromkeys(map(tuple, rows.tolist()))  # the first key first
         return [
-            np.sum([weight * target for weight, target in zip(row, targets, strict=True) if weight] or [np.zeros(3)], 0)
+            np.sum(
+                [weight * target.astype(np.float64) for weight, target in zip(row, targets, strict=True) if weight]
+                or [np.zeros(3)],
+                0,
+            )
             for row in unique
         ]
 

@@ -68,7 +68,7 @@ def merge_parts(model: Model, texture_size: int) -> tuple[TexturedMesh, Int[Tens
     return mesh, order
 
 
-Piece = tuple[Int[np.ndarray, " w"], Int[np.ndarray, "f 3"], Float[np.ndarray, "w 2"]]
+Piece = tuple[Int[np.ndarray, " vertices"], Int[np.ndarray, "triangles 3"], Float[np.ndarray, "vertices 2"]]
 
 
 def _textured(part: ModelPart, picture: UInt8[np.ndarray, "h w 3"], corner: Int[np.ndarray, " 2"], tile: int) -> Piece:

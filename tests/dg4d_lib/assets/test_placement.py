@@ -15,7 +15,7 @@ MOVED = Placement(0.25, (1.0, -2.0, 3.0))
 
 
 def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> TexturedMesh:
-    corners = torch.cartesian_prod(*torch.tensor([low, high]).T)
+    corners = torch.cartesian_prod(*torch.tensor([low, high], dtype=torch.float32).T)
     return TexturedMesh(corners, torch.tensor([[0, 1, 2]]), torch.zeros(8, 2), torch.zeros(1, 1, 3))
 
 

@@ -212,7 +212,7 @@ def test_a_plain_subject_is_as_sharp_as_can_be() -> None:
 
 def test_every_threshold_decides() -> None:
     found = {gate.name: gate for gate in evaluate_gates(evidence(SWAYING, SWAYING), GateSettings())}
-    for knob in GateSettings.model_fields:
+    for knob in set(GateSettings.model_fields) - {"cutout"}:  # gates of another step
         name, _, side = knob.rpartition("_")
         changed = evaluate_gates(
             evidence(SWAYING, SWAYING), GateSettings(**{knob: getattr(GateSettings(), knob) * 0.5})

@@ -22,7 +22,7 @@ def test_pins_are_commits_and_digests_of_files_that_are_needed() -> None:
 
 def test_what_is_not_verified_is_not_commercial() -> None:
     allowed = {name for name, weights in KNOWN.items() if weights.license.allows_commercial_use}
-    assert allowed == {"svd", "svd-xt", "imagedream", "lgm", "vgg16", "lpips-vgg"}
+    assert allowed == {"svd", "svd-xt", "imagedream", "lgm", "vgg16", "lpips-vgg", "birefnet", "birefnet-lite"}
     assert lookup_weights("stable-zero123").license.commercial == "no"
     assert not lookup_weights("somebody/something").license.allows_commercial_use
 

@@ -196,7 +196,8 @@ def test_a_version_that_is_recorded_while_things_are_removed_is_whole_or_not_the
     store.remove([template.name])
 
     class ConversionJob:  # as much of one as is asked
-        item, profile, seed, source, bank = "cat", "preview", 0, template.source, None
+        item, profile, seed, source = "cat", "preview", 0, template.source
+        bank = mask = views = asset = None
 
         def digest(self) -> str:
             return template.order
