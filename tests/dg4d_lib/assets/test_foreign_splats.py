@@ -65,7 +65,11 @@ def test_a_header_that_promises_too_much_is_refused() -> None:
         read_spz(gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 2**31, 0, 12, 0, 0)), 100)
 
 
-@pytest.mark.parametrize("content", [b"", b"\x1f\x8b", gzip.compress(b"NGSP"), gzip.compress(b"x" * 64)])
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"\x1f\x8b", gzip.compress(b"NGSP"), gzip.compress(b"x" * 64)],
+    ids=["nothing", "no content", "a cut header", "another content"],
+)
 def test_broken_spz_gets_a_sentence(content: bytes) -> None:
     with pytest.raises(BadInput, match="SPZ"):
         read_spz(content, 100)
