@@ -35,7 +35,7 @@ clients: setup
 # Audit findings are reported but do not fail the build: they appear without a change of ours.
 test: setup clients check
 	-$(MAKE) --no-print-directory audit
-	$(BIN)/python -m pytest -n 3 --dist loadscope --jaxtyping-packages=dg4d_lib,beartype.beartype\(conf=beartype.BeartypeConf\(is_pep484_tower=True\)\)
+	$(BIN)/python -m pytest -n 2 --dist loadscope --jaxtyping-packages=dg4d_lib,beartype.beartype\(conf=beartype.BeartypeConf\(is_pep484_tower=True\)\)
 
 check: setup
 	$(BIN)/ruff format --check .

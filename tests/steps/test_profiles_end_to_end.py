@@ -15,7 +15,7 @@ from tiny_svd import save_tiny_svd
 from tiny_weights import write_zero123
 
 from dg4d_lib.weights.registry import KNOWN
-from steps.artifacts.packages import ABOUT, ASSET, MANIFEST, MESHES, RIGGED, SPLATS
+from steps.artifacts.packages import ABOUT, ASSET, MANIFEST, MERGED, MESHES, RIGGED, SPLATS
 from steps.catalog import STEPS
 from steps.contract import ArtifactRef, ProvenanceRecord, StepRequest, StepResult
 from steps.profiles import PROFILES, PipelineSettings, profile, revise, step_settings
@@ -63,7 +63,7 @@ WRITERS = {
     "imagedream": write_imagedream,
     "lgm": write_lgm,
 }
-ALWAYS = {MANIFEST, *ABOUT} - {RIGGED}
+ALWAYS = {MANIFEST, *ABOUT} - {RIGGED, MERGED}
 
 
 @dataclass
