@@ -377,7 +377,7 @@ def main() -> None:
         metavar="DIR",
         help="data set with banks, instead of our own objects; all ablations need videos but those of the static "
         f"stage ({', '.join(name for name, one in ABLATIONS.items() if one.still)}), which take pictures, too; "
-        "those of the refinement: benchmarks.oracle_refinement, and with weights benchmarks.refinement",
+        "those of the refinement: experiments.oracle_refinement, and with weights benchmarks.refinement",
     )
     parser.add_argument("--seeds", type=int, default=2, help="fits of every variant and object")
     parser.add_argument("--frames", type=int, default=16, help="largest number of frames")

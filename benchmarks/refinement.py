@@ -5,7 +5,7 @@ preferably on a GPU; FRAMES is the folder of cut-outs of the asset's driving vid
 step with a texture per frame. Flicker is the mean change of a texel from frame to frame, in levels of 255, over refined
 texels; sharpness is their mean difference to neighboring texels, relative to the input. Claims of the paper: whole
 videos flicker less than single images; a strength of 0.4 gives too smooth textures, 0.2 too noisy ones, 0.3 is best.
-`benchmarks.oracle_refinement` measures the loop without trained models.
+`experiments.oracle_refinement` measures the loop without trained models.
 """
 
 from dataclasses import dataclass

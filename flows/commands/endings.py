@@ -27,6 +27,9 @@ from flows.exit_status import (
 __all__ = ["EXIT_BAD_INPUT", "EXIT_FAILED", "Terminated", "exit_on_error"]
 
 UNREACHABLE = {errno.EACCES, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR}  # errors of given paths
+REMINDER_S = (
+    3.0  # an exception raised within a finalizer or a callback of C code is lost; it is raised again after this
+)
 CODES = {signal.SIGHUP: EXIT_HANGUP, signal.SIGTERM: EXIT_TERMINATED}
 STOPPED = "stopped; run the same command again to continue after the last finished step"
 
@@ -65,16 +68,26 @@ def exit_on_error() -> Iterator[None]:
 
 @contextmanager
 def _signals() -> Iterator[list[signal.Signals]]:
-    """Raise `Terminated` for the first SIGTERM or SIGHUP; yield the received signals.
+    """Raise `Terminated` for the first SIGTERM or SIGHUP, again if it was lost; yield the received signals.
 
     A signal that the parent ignores, as `nohup` does with SIGHUP, stays ignored.
     """
     received: list[signal.Signals] = []
+    ended = threading.Event()
+    restoring = threading.Lock()  # no reminder after the default handlers are back: they would end the process
 
     def stop(number: int, frame: FrameType | None) -> None:
         received.append(signal.Signals(number))
-        if len(received) == 1:  # later ones must not interrupt the cleanup
+        if len(received) == 1:
+            threading.Thread(target=remind, args=(threading.get_ident(),), daemon=True).start()
+        if not ended.is_set() and not _is_unwinding():  # later signals must not interrupt the cleanup
             raise Terminated(received[0])
+
+    def remind(main: int) -> None:
+        while not ended.wait(REMINDER_S):
+            with restoring:
+                if not ended.is_set():
+                    signal.pthread_kill(main, received[0])
 
     before = {}
     if threading.current_thread() is threading.main_thread():
@@ -84,8 +97,18 @@ def _signals() -> Iterator[list[signal.Signals]]:
     try:
         yield received
     finally:
+        with restoring:
+            ended.set()
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _is_unwinding() -> bool:
+    """Return whether the interrupted code cleans up after `Terminated`."""
+    error = sys.exception()
+    while error is not None and not isinstance(error, Terminated):
+        error = error.__context__
+    return error is not None
 
 
 def _describe(error: Exception) -> tuple[str, int]:

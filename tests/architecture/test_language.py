@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("dg4d", "dg4d_lib", "steps", "flows", "training", "benchmarks", "examples", "deploy", "docs")
+PACKAGES = ("dg4d", "dg4d_lib", "steps", "flows", "training", "benchmarks", "experiments", "examples", "deploy", "docs")
 QUESTION_WORDS = {"What", "How", "Where", "Which", "Whether", "Who", "Whoever", "Whom", "Whose"}
 MOST = 0.005  # share of docstrings; 24 % of flows had such an opening once
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)

@@ -90,7 +90,7 @@ def test_a_path_of_one_machine_would_be_noticed(literal: str) -> None:
 
 
 def test_no_path_of_one_machine_is_in_the_product() -> None:
-    product = [*PACKAGES, *repository.modules("examples", "benchmarks")]
+    product = [*PACKAGES, *repository.modules("examples", "benchmarks", "experiments")]
     found = {path: literals for path in product if (literals := machine_paths(repository.tree(path)))}
     assert found == {"flows/engine/containers.py": ["/tmp"]}  # a folder in a container, not on a machine
 

@@ -1,4 +1,4 @@
-"""Benchmarks are run by hand; what they use of the product must still be there."""
+"""Benchmarks and experiments are run by hand; what they use of the product must still be there."""
 
 import importlib
 from pathlib import Path
@@ -7,16 +7,21 @@ import pytest
 import torch
 
 import benchmarks
+import experiments
 from benchmarks.paper_schedule import QUICK, Schedule, Sizes
 from dg4d_lib.rasterizer.interface import preferred_device
 from steps.profiles import profile, revise
 
-NAMES = sorted(path.stem for path in Path(benchmarks.__path__[0]).glob("[!_]*.py"))
+NAMES = sorted(
+    f"{package.__name__}.{path.stem}"
+    for package in (benchmarks, experiments)
+    for path in Path(package.__path__[0]).glob("[!_]*.py")
+)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_benchmark_finds_what_it_uses(name: str) -> None:
-    module = importlib.import_module(f"benchmarks.{name}")
+    module = importlib.import_module(name)
     source = Path(str(module.__file__)).read_text(encoding="utf-8")
     assert ('__name__ == "__main__"' in source) == hasattr(module, "main")
 

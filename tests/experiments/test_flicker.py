@@ -1,6 +1,6 @@
 import torch
 
-from benchmarks.flicker import ERRORS_DEG, FRONT, OWN, measure_object, table
+from experiments.flicker import ERRORS_DEG, FRONT, OWN, measure_object, table
 
 
 def test_a_true_film_seen_beside_the_truth_flickers_more_than_one_that_stands_still() -> None:

@@ -1,7 +1,7 @@
 """Validity of the metric `flicker`: true videos seen from a few degrees off, against still videos.
 
 Kept as evidence for reading `flicker` together with `temporal_error` (0 is the true motion, 1 is none).
-`python -m benchmarks.flicker` (`--json FILE` keeps the rows) renders our own objects from the four scored views.
+`python -m experiments.flicker` (`--json FILE` keeps the rows) renders our own objects from the four scored views.
 """
 
 from collections.abc import Sequence

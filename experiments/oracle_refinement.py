@@ -1,6 +1,6 @@
 """Texture refinement on objects with a known texture, with an oracle instead of diffusion models.
 
-Kept as evidence for the noise level of the refinement. Run with `python -m benchmarks.oracle_refinement`. Our own
+Kept as evidence for the noise level of the refinement. Run with `python -m experiments.oracle_refinement`. Our own
 objects are unwrapped, with their paint as the texture and a blurred copy as the texture to refine; shape and motion are
 exact. Loop (`dg4d_lib.texture.refine`) and noise levels are those of the pipeline. The oracle denoises an image x as a
 network would that models images as a normal distribution around an image b of the object: with noise n of strength s,

@@ -1,14 +1,14 @@
 import pytest
 import torch
 
-from benchmarks import oracle_refinement
 from benchmarks.ablations import Variant
-from benchmarks.oracle_refinement import FLICKER, NOISE, VARIANTS, Model, Oracle, refine_model, score_model
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.bake import locate_texels
 from dg4d_lib.settings import TextureSettings
 from dg4d_lib.texture.refine import RefinedTextures
+from experiments import oracle_refinement
+from experiments.oracle_refinement import FLICKER, NOISE, VARIANTS, Model, Oracle, refine_model, score_model
 
 FRAMES, SIZE = 3, 64
 FRONT = [OrbitCamera(width=SIZE, height=SIZE)] * FRAMES

@@ -1,6 +1,6 @@
 """Cost of cross-attention to one token, with and without the shortcut of `diffusion/single_token_attention.py`.
 
-Kept as evidence for the shortcut. Run with `python -m benchmarks.single_token_attention` (15 minutes, 8 GB; `--quick`:
+Kept as evidence for the shortcut. Run with `python -m experiments.single_token_attention` (15 minutes, 8 GB; `--quick`:
 tiny networks, seconds; `--json FILE` keeps the rows). U-Nets of the published sizes with random weights, float32, one
 thread, no GPU. Columns:
 
