@@ -27,7 +27,7 @@ from steps.artifacts.media import read_png
 
 LEAST_MEAN, LEAST_WORST = 0.96, 0.85  # bounds on the masks' overlap
 OWN_SUBJECT = frozenset(["coffee", "rocket", "astronaut", "chelsea", "camera", "coins"])
-KINDS = ("procedural", "photograph", "photograph with a subject")
+KINDS: tuple[Kind, Kind, Kind] = ("procedural", "photograph", "photograph with a subject")
 
 Kind = Literal["procedural", "photograph", "photograph with a subject"]
 
@@ -107,25 +107,25 @@ def table(rows: Sequence[Row]) -> Table:
 
 def _rows(name: str, cutout: Tensor) -> list[Row]:
     size = cutout.shape[0]
-    own = {backdrop: "procedural" for backdrop in procedural(size)}
+    own: dict[str, Kind] = {backdrop: "procedural" for backdrop in procedural(size)}
     found = []
     for backdrop, picture in {**procedural(size), **photographs(size)}.items():
-        kind = own.get(backdrop, KINDS[2] if backdrop in OWN_SUBJECT else KINDS[1])
+        kind: Kind = own.get(backdrop, KINDS[2] if backdrop in OWN_SUBJECT else KINDS[1])
         found.append(_measure(name, backdrop, kind, cutout, torch.from_numpy(picture).float()))
     return found
 
 
-def _measure(name: str, backdrop: str, kind: str, cutout: Tensor, picture: Tensor) -> Row:
+def _measure(name: str, backdrop: str, kind: Kind, cutout: Tensor, picture: Tensor) -> Row:
     color, alpha = cutout[..., :3], cutout[..., 3]
     composite = torch.round(255 * (color * cutout[..., 3:] + picture * (1 - cutout[..., 3:]))) / 255
     try:
         result = matte(composite[None])
     except BadInput:
-        return Row(name, backdrop, kind, "refused", 0.0, 0.0, 0.0)  # type: ignore[arg-type]
+        return Row(name, backdrop, kind, "refused", 0.0, 0.0, 0.0)
     found = result.frames[0, ..., 3]
     soft = float(torch.minimum(found, alpha).sum() / torch.maximum(found, alpha).sum())
     iou = overlap(found > 0.5, alpha > 0.5)
-    return Row(name, backdrop, kind, result.method, iou, soft, result.agreement or 0.0)  # type: ignore[arg-type]
+    return Row(name, backdrop, kind, result.method, iou, soft, result.agreement or 0.0)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@
 from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
 from datetime import UTC, datetime
+from typing import Any
 from uuid import UUID
 
 from fastapi import FastAPI, Request, Response
@@ -88,10 +89,10 @@ def create_app() -> FastAPI:
     return application
 
 
-def add_first(application: FastAPI, path: str, answer: Callable[..., object], **options: object) -> None:
+def add_first(application: FastAPI, path: str, answer: Callable[..., object], **options: Any) -> None:
     """Add a route before that of the user interface, which matches every path."""
     routes = application.router.routes
-    application.add_api_route(path, answer, response_class=Response, include_in_schema=False, **options)  # type: ignore[arg-type]
+    application.add_api_route(path, answer, response_class=Response, include_in_schema=False, **options)
     routes.insert(0, routes.pop())
 
 

@@ -243,7 +243,7 @@ def load_network(path: Path) -> ShapePriorNetwork:
             raise BadInput(f"{path}: format {header.get('format')!r} is not {FORMAT!r}; train again or update dg4d")
         widths = tuple(map(int, header["widths"].split()))
         blocks = tuple(map(int, header["blocks"].split()))
-        config = ShapePriorConfig(widths, blocks, int(header["layers"]), int(header["head"]))  # type: ignore[arg-type]
+        config = ShapePriorConfig(widths, blocks, int(header["layers"]), int(header["head"]))  # type: ignore[arg-type]  # length checked by the state
         network = ShapePriorNetwork(config)
         network.load_state_dict({name: file.get_tensor(name).float() for name in file.keys()})  # noqa: SIM118
     return channels_last(network.eval())
@@ -281,7 +281,7 @@ class _Layer(nn.Module):
             nn.LayerNorm(width), nn.Linear(width, 3 * width), nn.GELU(approximate="tanh"), nn.Linear(3 * width, width)
         )
         for layer in (self.merge, self.feed[-1]):
-            nn.init.zeros_(layer.weight)  # type: ignore[arg-type]
+            nn.init.zeros_(layer.weight)  # type: ignore[arg-type]  # both are linear
 
     def forward(self, x: Float[Tensor, "b n c"]) -> Float[Tensor, "b n c"]:
         batch, count, width = x.shape

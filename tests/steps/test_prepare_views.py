@@ -46,8 +46,7 @@ class Workplace:
         outputs = {"known_views": self.folder / "known.zip", "picture": self.folder / "views_picture.png"}
         for name in ("seen", "bank"):
             (self.folder / name).mkdir(exist_ok=True)
-        quiet = lambda *_: None  # noqa: E731
-        return run(Job(inputs, outputs, self.settings("prepare_views"), 0, quiet, self.folder / "seen"))
+        return run(Job(inputs, outputs, self.settings("prepare_views"), 0, lambda *_: None, self.folder / "seen"))
 
     def known(self) -> list[KnownView]:
         return known_views(read_bank(self.folder / "known.zip", self.folder / "bank"))

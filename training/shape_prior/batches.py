@@ -8,6 +8,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, fields
 from multiprocessing import get_context, parent_process
 from threading import Thread
+from typing import Any
 
 import numpy as np
 import torch
@@ -132,11 +133,11 @@ def _arrays(value: object) -> object:
     return tuple(_arrays(part) for part in value) if isinstance(value, tuple) else value
 
 
-def _unpacked(arrays: dict[str, object]) -> Batch:
-    return Batch(**{name: _tensors(value) for name, value in arrays.items()})  # type: ignore[arg-type]
+def _unpacked(arrays: dict[str, Any]) -> Batch:
+    return Batch(**{name: _tensors(value) for name, value in arrays.items()})
 
 
-def _tensors(value: object) -> object:
+def _tensors(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return torch.from_numpy(value)
     return tuple(_tensors(part) for part in value) if isinstance(value, tuple) else value

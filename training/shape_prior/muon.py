@@ -20,7 +20,7 @@ class Muon(torch.optim.Optimizer):
         super().__init__(parameters, {"lr": lr, "momentum": momentum, "weight_decay": weight_decay})
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]  # torch overloads it
         """Update all parameters that have a gradient."""
         loss = None if closure is None else closure()
         for group in self.param_groups:
@@ -34,7 +34,7 @@ class Muon(torch.optim.Optimizer):
         if not state:
             state["momentum"] = torch.zeros_like(parameter)
         momentum = state["momentum"].lerp_(parameter.grad, 1 - group["momentum"])
-        ahead = parameter.grad.lerp(momentum, group["momentum"])  # type: ignore[union-attr]
+        ahead = parameter.grad.lerp(momentum, group["momentum"])  # type: ignore[union-attr]  # `step` checked it
         direction = orthogonalized(ahead.flatten(1))
         scale = 0.2 * max(direction.shape) ** 0.5  # the size of an update of Adam's
         parameter.mul_(1 - group["lr"] * group["weight_decay"])

@@ -101,7 +101,10 @@ def test_equal_assets_give_equal_films(written: Path, tmp_path: Path, red_dot: G
 
 def test_progress_ends_at_the_number_of_pictures(tmp_path: Path, red_dot: Gaussians, slide: Framewise) -> None:
     heard: list[tuple[int, int]] = []
-    report = lambda done, total: heard.append((done, total))  # noqa: E731
+
+    def report(done: int, total: int) -> None:
+        heard.append((done, total))
+
     write_preview(tmp_path / "a.mp4", red_dot, slide, 2, 30.0, rasterize, SETTINGS, report)
     assert heard == [(4, 4)]
 

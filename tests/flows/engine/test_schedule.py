@@ -1,6 +1,7 @@
 """Positions of steps and the time left, with a clock of our own."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -10,8 +11,8 @@ from flows.engine.schedule import USUAL_S, Schedule, durations_file, format_left
 STEPS = ["prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "plan_mesh", "extract_mesh"]
 
 
-def event(step: str, kind: str, **facts: object) -> StepEvent:
-    return StepEvent("newt", step, kind, **facts)  # type: ignore[arg-type]
+def event(step: str, kind: str, **facts: Any) -> StepEvent:
+    return StepEvent("newt", step, kind, **facts)
 
 
 def run(schedule: Schedule, step: str, start: float, end: float, cached: bool = False) -> None:
