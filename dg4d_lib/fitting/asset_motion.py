@@ -62,7 +62,7 @@ class NodeMotion:
         matrices = quat_to_rotmat(self.quats)  # t m 3 3
         origins = graph.nodes + self.shifts - (matrices @ graph.nodes[..., None])[..., 0]  # x -> R x + origin
         affine = torch.cat([matrices, origins[..., None]], -1).flatten(2)  # t m 12
-        blended = (affine[:, graph.indices] * graph.weights[..., None]).sum(2).unflatten(-1, (3, 4))
+        blended = graph.blend(affine).unflatten(-1, (3, 4))
         moved = (blended[..., :3] @ rest[..., None])[..., 0] + blended[..., 3]
         return self._placed(moved, graph)
 
@@ -73,7 +73,7 @@ class NodeMotion:
     def rotations(self, graph: ControlGraph) -> Float[Tensor, "t v 4"]:
         """Return the blended rotations of the points, unit quaternions."""
         unit = functional.normalize(self.quats, dim=-1)
-        blended = functional.normalize((unit[:, graph.indices] * graph.weights[..., None]).sum(2), dim=-1)
+        blended = functional.normalize(graph.blend(unit), dim=-1)
         whole = functional.normalize(self.whole_quats, dim=-1)
         return quat_multiply(whole[:, None].expand_as(blended), blended)
 
@@ -232,19 +232,12 @@ class _Fit:
 
     def rigidity(self, motion: NodeMotion) -> Float[Tensor, ""]:
         """Return the robust as-rigid-as-possible energy of the graph."""
-        first, second = self.graph.edges.T
-        matrices = quat_to_rotmat(motion.quats)
-        shifts = motion.shifts
-        moved = self.spans + shifts[:, second] - shifts[:, first]
-        lengths = self.graph.lengths[:, None]
-        stretch = torch.cat(
-            [
-                (moved - (matrices[:, first] @ self.spans[..., None])[..., 0]) / lengths,
-                (moved - (matrices[:, second] @ self.spans[..., None])[..., 0]) / lengths,
-            ],
-            1,
-        )
-        bend = (matrices[:, first] - matrices[:, second]).flatten(2)
+        matrices = self.graph.at_ends(quat_to_rotmat(motion.quats).flatten(2))
+        first, second = self.graph.at_ends(motion.shifts)
+        moved = self.spans + second - first
+        turned = [(matrix.unflatten(-1, (3, 3)) @ self.spans[..., None])[..., 0] for matrix in matrices]
+        stretch = torch.cat([(moved - span) / self.graph.lengths[:, None] for span in turned], 1)
+        bend = matrices[0] - matrices[1]
         return _robust(stretch).mean() + self.settings.bending * _robust(bend).mean()
 
     def step(self, losses: dict[str, Tensor], unknowns: "_Unknowns", place: str) -> None:

@@ -45,6 +45,18 @@ class ControlGraph:
         """Return the same nodes with the weights of some of the points."""
         return replace(self, indices=self.indices[rows], weights=self.weights[rows])
 
+    def blend(self, values: Float[Tensor, "t m c"]) -> Float[Tensor, "t v c"]:
+        """Return the weighted mean of the nodes' values at every point; its gradient is the same in every run."""
+        if not values.requires_grad:
+            return (values[:, self.indices] * self.weights[..., None]).sum(2)
+        dense = self.weights.new_zeros(len(self.weights), len(self.nodes))  # the gradient of indexing adds in any order
+        return dense.scatter_(1, self.indices, self.weights) @ values
+
+    def at_ends(self, values: Float[Tensor, "t m c"]) -> tuple[Float[Tensor, "t e c"], Float[Tensor, "t e c"]]:
+        """Return the nodes' values at both ends of the edges; their gradient is the same in every run."""
+        eye = torch.eye(len(self.nodes), dtype=values.dtype, device=values.device)
+        return eye[self.edges[:, 0]] @ values, eye[self.edges[:, 1]] @ values
+
 
 def build_control_graph(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], count: int) -> ControlGraph:
     """Distribute nodes evenly over a surface and compute the weights of its vertices.
