@@ -8,6 +8,8 @@ READY := $(VENV)/.ready$(if $(filter 1,$(CUDA)),-cuda)
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 ARITHMETIC ?= fast
 EMULATION := $(BIN)/python -m tests.emulation.build --arithmetic $(ARITHMETIC)
+TESTS := $(BIN)/python -m pytest -n 2 --dist loadscope \
+	--jaxtyping-packages=dg4d_lib,beartype.beartype\(conf=beartype.BeartypeConf\(is_pep484_tower=True\)\)
 GPU_TESTS := $(BIN)/python -m pytest -p tests.emulation.plugin --arithmetic $(ARITHMETIC) -m gpu
 
 TOOLS := out/tools
@@ -16,7 +18,7 @@ DOCS := out/docs
 SHAPE_PRIOR ?=
 UPGRADE ?=
 
-.PHONY: setup clients demo test check audit lock docs emulation examples shape-prior clean
+.PHONY: setup clients demo test nightly check audit lock docs emulation examples shape-prior clean
 
 setup: $(READY)
 
@@ -35,7 +37,11 @@ clients: setup
 # Audit findings are reported but do not fail the build: they appear without a change of ours.
 test: setup clients check
 	-$(MAKE) --no-print-directory audit
-	$(BIN)/python -m pytest -n 2 --dist loadscope --jaxtyping-packages=dg4d_lib,beartype.beartype\(conf=beartype.BeartypeConf\(is_pep484_tower=True\)\)
+	$(TESTS) -m "not slow"
+
+# the tests marked slow (several machines, crashing databases, the fuzzer, full-size profiles), and the emulated GPU
+nightly: setup clients emulation
+	$(TESTS) -m slow
 
 check: setup
 	$(BIN)/ruff format --check .

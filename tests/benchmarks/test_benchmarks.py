@@ -27,6 +27,7 @@ def test_a_benchmark_finds_what_it_uses(name: str) -> None:
 
 
 @pytest.mark.gpu
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:There are modules in")
 def test_the_paper_schedule_is_measured_stage_by_stage() -> None:
     device = preferred_device("auto")

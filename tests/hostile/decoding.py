@@ -114,7 +114,7 @@ class Decoder:
 
 
 def read_as_source(path: Path, scratch: Path) -> tuple[Kind, int]:
-    """Run the step that decodes a source and cuts out its subject."""
+    """Run the step that decodes a source; frames of opaque videos are not segmented by a network, which takes long."""
     from steps.prepare_subject import run
     from steps.profiles import PREVIEW, revise, step_settings
     from steps.runtime.job import Job
@@ -126,7 +126,7 @@ def read_as_source(path: Path, scratch: Path) -> tuple[Kind, int]:
         "cutout_gates": scratch / "cutout_gates.json",
         "picture": scratch / "picture.png",
     }
-    settings = step_settings("prepare_subject", revise(PREVIEW, {"subject.size": SIZE}))
+    settings = step_settings("prepare_subject", revise(PREVIEW, {"subject.size": SIZE, "subject.matting": "backdrop"}))
     run(Job({"source": path}, outputs, settings, 0, lambda *_: None, scratch))
     if outputs["footage"].exists():
         with zipfile.ZipFile(outputs["footage"]) as footage:

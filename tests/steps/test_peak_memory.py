@@ -87,6 +87,7 @@ def frames_in_a_zip(path: Path, frame: Path, count: int) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_large_files_of_every_kind_stay_below_two_gibibytes(tmp_path: Path) -> None:
     interlaced = gray_png(tmp_path / "interlaced.png", 4500, interlaced=True, depth=16, color=6)
     files = {

@@ -152,8 +152,13 @@ def source_of(folder: Path, store: ArtifactStore, moving: bool) -> ArtifactRef:
         ("video", True, {}),
         ("video-fast", True, {}),
         ("release", False, {"drive_video": {"svd"}}),
-        ("reference", False, {"drive_video": {"svd"}, "fit_gaussians": {"stable-zero123", "imagedream", "lgm"}}),
-        ("quality", False, {"drive_video": {"svd"}}),
+        pytest.param(
+            "reference",
+            False,
+            {"drive_video": {"svd"}, "fit_gaussians": {"stable-zero123", "imagedream", "lgm"}},
+            marks=pytest.mark.slow,
+        ),
+        pytest.param("quality", False, {"drive_video": {"svd"}}, marks=pytest.mark.slow),
     ],
 )
 def test_a_file_becomes_a_package_by_the_models_that_its_profile_names_and_no_others(

@@ -57,6 +57,7 @@ def test_the_video_has_the_wanted_length_and_size_and_follows_the_generator(mode
     assert not torch.equal(video.frames, maker.generate(subject, rng(4)).frames)
 
 
+@pytest.mark.slow
 def test_several_candidates_are_those_of_their_seeds(model: VideoModel, subject: Tensor) -> None:
     maker = StableVideo(SETTINGS, model)
     both = maker.generate_all(subject, [rng(3), rng(4)])

@@ -166,6 +166,7 @@ def test_a_database_that_is_locked_for_a_while_delays_a_run_and_no_more(
     load_verified(tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_a_database_that_crashes_during_a_batch_and_comes_back_loses_and_doubles_nothing(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -36,7 +36,6 @@ def plan(samples: int, **others: float) -> training.Plan:
     )  # type: ignore[arg-type]
 
 
-@pytest.mark.slow
 def test_a_tiny_network_learns(tmp_path: Path) -> None:
     run = training.Run(plan(480, ema=0.9, lr=0.01), TINY)
     training.train(run, tmp_path, workers=0, every=240)
