@@ -93,10 +93,17 @@ def sides_of(subject: Subject, way: Way, azimuths: Sequence[float], settings: Pi
         scratch = Path(folder)
         given, files = way.given(subject, azimuths, scratch)
         write_zip(scratch / "views.zip", [(VIEWS_JSON, given.model_dump_json().encode()), *files])
+        return known_bank(subject, scratch / "views.zip", settings)
+
+
+def known_bank(subject: Subject, views: Path, settings: PipelineSettings) -> Bank:
+    """Return the bank that `prepare_views` makes of the zip of views of an object; print its notes."""
+    with TemporaryDirectory() as folder:
+        scratch = Path(folder)
         write_png(scratch / "subject.png", prepared(subject, settings)[0])
         (scratch / "pictures").mkdir()
         (scratch / "bank").mkdir()
-        inputs = {"views": scratch / "views.zip", "subject": scratch / "subject.png", "source": scratch / "subject.png"}
+        inputs = {"views": views, "subject": scratch / "subject.png", "source": scratch / "subject.png"}
         outputs = {"known_views": scratch / "known.zip", "picture": scratch / "picture.png"}
         made = step_settings("prepare_views", settings)
         report = prepare_views(Job(inputs, outputs, made, 0, lambda *_: None, scratch / "pictures"))

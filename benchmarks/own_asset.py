@@ -178,25 +178,22 @@ def _chamfer(
     return float(np.mean(distances))
 
 
-def animate(own: OwnModel, settings: AssetSettings, seed: int = 0) -> tuple[Figures, Tensor]:
-    """Place a subject's model, fit its motion, and compare with the truth.
+def animate(own: OwnModel, settings: AssetSettings, seed: int = 0) -> tuple[Gaussians, Float[Tensor, "t v 3"], int]:
+    """Place a subject's model and fit its motion.
 
     Returns:
-        Figures, and a sheet: frames by views, our renders under the true ones.
+        Gaussians and vertices at all frames, and the number of flipped faces.
     """
     rasterize = get_rasterizer("auto")
     generator = torch.Generator().manual_seed(seed)
-    subject, whole = own.subject, cover_surface(own.model, settings.points, generator)
-    placement = find_placement(whole.cloud, subject.footage[0], rasterize)
+    footage, whole = own.subject.footage, cover_surface(own.model, settings.points, generator)
+    placement = find_placement(whole.cloud, footage[0], rasterize)
     surface = whole.placed(placement.quat, placement.scale, placement.shift)
     graph = build_control_graph(surface.fine.vertices, surface.fine.faces, settings.nodes)
     bound = graph.of(surface.nearest)
-    video = DrivingVideo(subject.footage[..., :3].contiguous(), subject.footage[..., 3:].contiguous(), FPS)
+    video = DrivingVideo(footage[..., :3].contiguous(), footage[..., 3:].contiguous(), FPS)
     motion = fit_asset_motion(surface.cloud, bound, video, rasterize, settings, generator)
-    vertices, flipped = moved_vertices(surface, graph, motion)
-    states = moved_states(surface.cloud, bound, motion)
-    figures = score(own, states, vertices, torch.from_numpy(own.model.faces))
-    return {**figures, "flipped": float(flipped)}, _sheet(subject, states)
+    return moved_states(surface.cloud, bound, motion), *moved_vertices(surface, graph, motion)
 
 
 def measure(
@@ -218,13 +215,14 @@ def measure(
     show(f"{'':24}" + "".join(f"{column:>10}" for column in COLUMNS))
     for own in models:
         begun, name = time.perf_counter(), own.subject.name
-        found[name], sheet = animate(own, settings)
+        states, vertices, flipped = animate(own, settings)
+        found[name] = {**score(own, states, vertices, torch.from_numpy(own.model.faces)), "flipped": float(flipped)}
         still[name] = frozen(own)
         show(_row(name, found[name]) + f"   {time.perf_counter() - begun:.0f} s")
         show(_row("  truth, frozen", still[name]))
         if sheets is not None:
             sheets.mkdir(parents=True, exist_ok=True)
-            true_views.write_sheet(sheets / f"{name}.png", [sheet])
+            true_views.write_sheet(sheets / f"{name}.png", [_sheet(own.subject, states)])
     show(_row("mean", mean(list(found.values()))))
     show(_row("  truth, frozen", mean(list(still.values()))))
     return found
