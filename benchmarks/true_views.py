@@ -28,6 +28,7 @@ from steps.artifacts.media import read_png
 from steps.artifacts.motions import new_deformation
 from steps.fit_gaussians import initial_gaussians
 from steps.fitting.priors import known_views, make_prior, subject_shapes
+from steps.fitting.tracking import tracked_shapes, tracks_surface
 from steps.profiles import PipelineSettings
 from steps.score_asset import MetricNetworks, ViewFrames, compare
 
@@ -95,8 +96,11 @@ def fit(subject: Subject, settings: PipelineSettings, seed: int = 0, sides: Bank
     prior = make_prior(settings.prior, [cutouts[0]], settings.static, None, Path(), turn_deg, sides).prior
     known = known_views(sides) if sides is not None else []
     rest = fit_gaussians(start, cutouts[0], prior, rasterize, settings.static, generator, known=known)
-    prior = make_prior(settings.prior, list(cutouts), settings.motion, None, Path(), turn_deg, sides).prior
-    video = DrivingVideo(cutouts[..., :3].contiguous(), cutouts[..., 3:].contiguous(), 10)
+    video, kind = DrivingVideo(cutouts[..., :3].contiguous(), cutouts[..., 3:].contiguous(), 10), settings.prior
+    moved = None
+    if sides and tracks_surface(settings.motion, kind, sides, len(video)):
+        moved = tracked_shapes(rest, video, sides, kind, turn_deg, rasterize, settings.asset, generator)
+    prior = make_prior(kind, list(cutouts), settings.motion, None, Path(), turn_deg, sides, moved).prior
     deformation = new_deformation(settings.deformation, rest, len(video), generator)
     fitted = fit_motion(rest, deformation, video, prior, rasterize, settings.motion, generator)
     with torch.no_grad():
