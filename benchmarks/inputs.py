@@ -93,10 +93,17 @@ def sides_of(subject: Subject, way: Way, azimuths: Sequence[float], settings: Pi
         scratch = Path(folder)
         given, files = way.given(subject, azimuths, scratch)
         write_zip(scratch / "views.zip", [(VIEWS_JSON, given.model_dump_json().encode()), *files])
+        return known_bank(subject, scratch / "views.zip", settings)
+
+
+def known_bank(subject: Subject, views: Path, settings: PipelineSettings) -> Bank:
+    """Return the bank that `prepare_views` makes of the zip of views of an object; print its notes."""
+    with TemporaryDirectory() as folder:
+        scratch = Path(folder)
         write_png(scratch / "subject.png", prepared(subject, settings)[0])
         (scratch / "pictures").mkdir()
         (scratch / "bank").mkdir()
-        inputs = {"views": scratch / "views.zip", "subject": scratch / "subject.png", "source": scratch / "subject.png"}
+        inputs = {"views": views, "subject": scratch / "subject.png", "source": scratch / "subject.png"}
         outputs = {"known_views": scratch / "known.zip", "picture": scratch / "picture.png"}
         made = step_settings("prepare_views", settings)
         report = prepare_views(Job(inputs, outputs, made, 0, lambda *_: None, scratch / "pictures"))
@@ -129,15 +136,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--first", action="store_true", help="score the shape of frame 0 alone, without a fit")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting")
     parser.add_argument("--sheet", type=Path, help="picture: unseen views over time, above the true ones")
+    parser.add_argument("--sheets", type=Path, metavar="DIR", help="folder for a contact sheet of each --asset")
     given = parser.parse_args(arguments)
+    changes = {key: json.loads(value) for key, value in (pair.split("=", 1) for pair in given.set)}
     if given.asset:
-        own_asset.measure(own_asset.read_subjects(given.asset, given.only), PREVIEW.asset)
+        models = own_asset.read_models(given.asset, given.only)
+        measured = own_asset.measure(models, revise(PREVIEW, changes).asset, own_asset.write_line, given.sheets)
+        if given.json:
+            given.json.write_text(json.dumps(measured, indent=1))
         return
     if given.matting:
         new_console().print(matting.table(matting.measure_matting(given.matting, objects=given.only)))
         return
     name = next(name for name in WAYS if getattr(given, name))
-    changes = {key: json.loads(value) for key, value in (pair.split("=", 1) for pair in given.set)}
     settings = revise(PREVIEW, changes)
     found: dict[str, Figures] = {}
     strips = []

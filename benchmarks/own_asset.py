@@ -1,24 +1,26 @@
 """Quality of `--asset`: true meshes of the first frame, driven by their videos, beside the frozen truth.
 
-    python -m benchmarks.own_asset FOLDER [--names panda mage] [--sheets DIR]
+    python -m benchmarks.own_asset FOLDER [--only panda mage] [--sheets DIR]
     python -m benchmarks.own_asset --made-up
 
 FOLDER has a folder per object with `input/`, `view_AZIMUTH/`, `bank/` and `mesh.npz`. The model of an object is its
 mesh of frame 0, with colors baked from frame 0 of the bank; its place is searched as for any model.
 """
 
-import argparse
+import json
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import benchmarks.measure  # noqa: F401 (before torch: how its threads wait)
+from benchmarks import true_views
+from benchmarks.measure import parser_of
+from benchmarks.true_views import SIZE, Figures, Subject, mean
 
 import numpy as np  # isort: skip
 import torch  # isort: skip
 from jaxtyping import Float, Int
-from PIL import Image
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
@@ -36,18 +38,13 @@ from dg4d_lib.mesh.models.surface_cloud import cover_surface
 from dg4d_lib.mesh.texturing.bake import locate_texels, vertex_normals
 from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
-from dg4d_lib.metrics.image import iou, psnr
 from dg4d_lib.metrics.surface import chamfer_distance, sample_surface
-from dg4d_lib.metrics.video import temporal_error
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 from steps.animate_asset import moved_states, moved_vertices
-from steps.artifacts.ground_truth import find_ground_truths
-from steps.artifacts.media import read_png
 from steps.fitting.priors import read_bank_folder
-from steps.profiles import profile
+from steps.profiles import PREVIEW
 
-SIZE = 256  # pixels of the compared pictures
 TEXTURE = 512  # texels per side of baked models
 SAMPLES = 20000  # points of a surface for the chamfer distance
 DEPTH_SLACK = 0.02  # world units by which a texel may lie behind the surface that a bank view shows
@@ -56,44 +53,38 @@ FPS = 12.0
 
 
 @dataclass(frozen=True)
-class Subject:
-    """Model of an object at its first frame, its footage, and its truth.
+class OwnModel:
+    """Model of a subject at its first frame, and the true meshes.
 
     Attributes:
-        name: of the object.
+        subject: footage and true views.
         model: mesh of frame 0, in world units.
-        footage: cut-outs, straight alpha.
-        views: azimuth to cut-outs.
         vertices: of the true meshes.
         faces: of the true meshes.
         weights: of the faces in samples of the surface.
     """
 
-    name: str
+    subject: Subject
     model: Model
-    footage: Float[Tensor, "t h w 4"]
-    views: dict[float, Float[Tensor, "t h w 4"]]
     vertices: Float[Tensor, "t v 3"]
     faces: Int[Tensor, "f 3"]
     weights: Float[Tensor, " f"]
 
 
-def read_subjects(folder: Path, names: Sequence[str] = ()) -> Iterator[Subject]:
-    """Read the objects of a data set, all of them if none is named."""
-    for truth in find_ground_truths(folder):
-        if (names and truth.name not in names) or truth.mesh is None or truth.bank is None:
+def read_models(folder: Path, names: Sequence[str] = ()) -> Iterator[OwnModel]:
+    """Read the objects of a data set that have meshes and a bank, all of them if none is named."""
+    for subject in true_views.read_subjects(folder, names):
+        truth = subject.truth
+        if truth is None or truth.mesh is None or truth.bank is None:
             continue
         with np.load(truth.mesh) as archive:
             vertices = torch.from_numpy(archive["vertices"].astype(np.float32))
             faces = torch.from_numpy(archive["faces"].astype(np.int64))
             weights = torch.from_numpy(archive["face_weight"].astype(np.float32))
-        footage = torch.stack([read_png(path) for path in truth.inputs])
-        views = {view.azimuth_deg: torch.stack([read_png(path) for path in view.frames]) for view in truth.views}
-        model = baked_model(vertices[0], faces, truth.bank)
-        yield Subject(truth.name, model, footage, views, vertices, faces, weights)
+        yield OwnModel(subject, baked_model(vertices[0], faces, truth.bank), vertices, faces, weights)
 
 
-def made_up_subjects(frames: int, names: Sequence[str] = ()) -> Iterator[Subject]:
+def made_up_models(frames: int, names: Sequence[str] = ()) -> Iterator[OwnModel]:
     """Draw our own objects, for tuning."""
     azimuths = (-75.0, 15.0, 105.0, 195.0)
     cameras = [OrbitCamera(0, azimuth, width=SIZE, height=SIZE) for azimuth in (0.0, *azimuths)]
@@ -106,7 +97,8 @@ def made_up_subjects(frames: int, names: Sequence[str] = ()) -> Iterator[Subject
         linear = np.power(painted.colors.numpy(), 2.2)
         part = ModelPart(name, vertices[0].numpy(), painted.faces.numpy(), colors=linear)
         views = dict(zip(azimuths, pictures[1:], strict=True))
-        yield Subject(name, Model((part,)), pictures[0], views, vertices, painted.faces, torch.ones(len(painted.faces)))
+        subject = Subject(name, pictures[0], views)
+        yield OwnModel(subject, Model((part,)), vertices, painted.faces, torch.ones(len(painted.faces)))
 
 
 def baked_model(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], bank_folder: Path) -> Model:
@@ -143,120 +135,115 @@ def _grown(texture: np.ndarray, rows: Tensor, columns: Tensor) -> np.ndarray:
     return texture[tuple(nearest)]
 
 
-def score(
-    subject: Subject, states: Gaussians, moved: Float[Tensor, "t v 3"], faces: Int[Tensor, "f 3"]
-) -> dict[str, float]:
+def score(own: OwnModel, states: Gaussians, moved: Float[Tensor, "t v 3"], faces: Int[Tensor, "f 3"]) -> Figures:
     """Compare renders and meshes of a motion with the truth."""
     rasterize = get_rasterizer("auto")
     rows = []
-    for azimuth, truth in {0.0: subject.footage, **subject.views}.items():
+    for azimuth, truth in _views(own.subject):
         camera = OrbitCamera(0, azimuth, width=SIZE, height=SIZE)
         with torch.no_grad():
             drawn = rasterize(states, [camera] * len(states.means), torch.ones(3))
-        rows.append(_figures(drawn.color.clamp(0, 1), drawn.alpha, truth))
-    mean = {name: float(np.mean([row[name] for row in rows[1:]])) for name in rows[0]}
+        rows.append(true_views.figures(drawn.color.clamp(0, 1), drawn.alpha, truth))
+    return {**mean(rows[1:]), "chamfer": _chamfer(own, moved, faces, None), "input": rows[0]["psnr"]}
+
+
+def frozen(own: OwnModel) -> Figures:
+    """Return the figures of the true first frame of each view and of the true first mesh, frozen."""
+    rows = []
+    for _, truth in _views(own.subject):
+        still = truth[:1].expand_as(truth)
+        rows.append(true_views.figures(over_white(still), still[..., 3:], truth))
+    rest = own.vertices[:1].expand_as(own.vertices)
+    distance = _chamfer(own, rest, own.faces, own.weights)
+    return {**mean(rows[1:]), "chamfer": distance, "flipped": 0.0, "input": rows[0]["psnr"]}
+
+
+def _views(subject: Subject) -> list[tuple[float, Float[Tensor, "t s s 4"]]]:
+    """Return azimuths and true pictures, those of the input first."""
+    return [(0.0, resize(subject.footage, (SIZE, SIZE))), *subject.views.items()]
+
+
+def _chamfer(
+    own: OwnModel, moved: Float[Tensor, "t v 3"], faces: Int[Tensor, "f 3"], weights: Float[Tensor, " f"] | None
+) -> float:
+    """Return the mean distance of moved meshes from the true ones."""
     generator = torch.Generator().manual_seed(0)
     distances = [
         chamfer_distance(
-            sample_surface(ours, faces, SAMPLES, generator),
-            sample_surface(theirs, subject.faces, SAMPLES, generator, subject.weights),
+            sample_surface(ours, faces, SAMPLES, generator, weights),
+            sample_surface(theirs, own.faces, SAMPLES, generator, own.weights),
         )
-        for ours, theirs in zip(moved, subject.vertices, strict=True)
+        for ours, theirs in zip(moved, own.vertices, strict=True)
     ]
-    return {**mean, "chamfer": float(np.mean(distances)), "input": rows[0]["psnr"]}
+    return float(np.mean(distances))
 
 
-def _figures(
-    color: Float[Tensor, "t h w 3"], alpha: Float[Tensor, "t h w 1"], truth: Float[Tensor, "t h w 4"]
-) -> dict[str, float]:
-    theirs = over_white(truth)
-    region = ((alpha > 0.5) | (truth[..., 3:] > 0.5)).float()
-    return {
-        "psnr": float(psnr(color, theirs).mean()),
-        "psnr_obj": float(psnr(color, theirs, region).mean()),
-        "iou": float(iou(alpha, truth[..., 3:]).mean()),
-        "terr": float(temporal_error(color, theirs)),
-    }
-
-
-def frozen(subject: Subject) -> dict[str, float]:
-    """Return the figures of the true first frame of each view and of the true first mesh, frozen."""
-    rows = []
-    for truth in (subject.footage, *subject.views.values()):
-        still = truth[:1].expand_as(truth)
-        rows.append(_figures(over_white(still), still[..., 3:], truth))
-    mean = {name: float(np.mean([row[name] for row in rows[1:]])) for name in rows[0]}
-    generator = torch.Generator().manual_seed(0)
-    clouds = [sample_surface(v, subject.faces, SAMPLES, generator, subject.weights) for v in subject.vertices]
-    rest = sample_surface(subject.vertices[0], subject.faces, SAMPLES, generator, subject.weights)
-    distance = float(np.mean([chamfer_distance(rest, cloud) for cloud in clouds]))
-    return {**mean, "chamfer": distance, "flipped": 0.0, "input": rows[0]["psnr"]}
-
-
-def animate(subject: Subject, settings: AssetSettings, seed: int = 0) -> tuple[dict[str, float], Tensor]:
-    """Place a subject's model, fit its motion, and compare with the truth.
+def animate(own: OwnModel, settings: AssetSettings, seed: int = 0) -> tuple[Gaussians, Float[Tensor, "t v 3"], int]:
+    """Place a subject's model and fit its motion.
 
     Returns:
-        Figures, and a sheet: frames by views, our renders under the true ones.
+        Gaussians and vertices at all frames, and the number of flipped faces.
     """
     rasterize = get_rasterizer("auto")
     generator = torch.Generator().manual_seed(seed)
-    whole = cover_surface(subject.model, settings.points, generator).cloud
-    placement = find_placement(whole, subject.footage[0], rasterize)
-    model = subject.model.placed(placement.matrix)
-    surface = cover_surface(model, settings.points, torch.Generator().manual_seed(seed))
+    footage, whole = own.subject.footage, cover_surface(own.model, settings.points, generator)
+    placement = find_placement(whole.cloud, footage[0], rasterize)
+    surface = whole.placed(placement.quat, placement.scale, placement.shift)
     graph = build_control_graph(surface.fine.vertices, surface.fine.faces, settings.nodes)
     bound = graph.of(surface.nearest)
-    video = DrivingVideo(subject.footage[..., :3].contiguous(), subject.footage[..., 3:].contiguous(), FPS)
+    video = DrivingVideo(footage[..., :3].contiguous(), footage[..., 3:].contiguous(), FPS)
     motion = fit_asset_motion(surface.cloud, bound, video, rasterize, settings, generator)
-    vertices, flipped = moved_vertices(surface, graph, motion)
-    states = moved_states(surface.cloud, bound, motion)
-    figures = score(subject, states, vertices, torch.from_numpy(model.faces))
-    return {**figures, "flipped": float(flipped)}, _sheet(subject, states)
+    return moved_states(surface.cloud, bound, motion), *moved_vertices(surface, graph, motion)
 
 
 def measure(
-    subjects: Iterator[Subject],
+    models: Iterator[OwnModel],
     settings: AssetSettings,
-    show: Callable[[str], None] = print,
+    show: Callable[[str], None],
     sheets: Path | None = None,
-) -> dict[str, dict[str, float]]:
-    """Animate subjects and show the figures of each beside the frozen truth; return ours.
+) -> dict[str, Figures]:
+    """Animate models and show the figures of each beside the frozen truth; return ours.
 
     Args:
-        subjects: with their truth.
+        models: with their truth.
         settings: of the fit.
         show: prints a line.
         sheets: folder for a contact sheet of each.
     """
-    found: dict[str, dict[str, float]] = {}
-    still: dict[str, dict[str, float]] = {}
+    found: dict[str, Figures] = {}
+    still: dict[str, Figures] = {}
     show(f"{'':24}" + "".join(f"{column:>10}" for column in COLUMNS))
-    for subject in subjects:
-        begun = time.perf_counter()
-        found[subject.name], sheet = animate(subject, settings)
-        still[subject.name] = frozen(subject)
-        show(_row(subject.name, found[subject.name]) + f"   {time.perf_counter() - begun:.0f} s")
-        show(_row("  truth, frozen", still[subject.name]))
+    for own in models:
+        begun, name = time.perf_counter(), own.subject.name
+        states, vertices, flipped = animate(own, settings)
+        found[name] = {**score(own, states, vertices, torch.from_numpy(own.model.faces)), "flipped": float(flipped)}
+        still[name] = frozen(own)
+        show(_row(name, found[name]) + f"   {time.perf_counter() - begun:.0f} s")
+        show(_row("  truth, frozen", still[name]))
         if sheets is not None:
             sheets.mkdir(parents=True, exist_ok=True)
-            pixels = (255 * sheet.clamp(0, 1)).round().to(torch.uint8).numpy()
-            Image.fromarray(pixels).save(sheets / f"{subject.name}.png")
-    for name, rows in (("mean", found), ("  truth, frozen", still)):
-        show(_row(name, {column: float(np.mean([row[column] for row in rows.values()])) for column in COLUMNS}))
+            true_views.write_sheet(sheets / f"{name}.png", [_sheet(own.subject, states)])
+    show(_row("mean", mean(list(found.values()))))
+    show(_row("  truth, frozen", mean(list(still.values()))))
     return found
 
 
-def _row(name: str, figures: dict[str, float]) -> str:
+def write_line(text: str) -> None:
+    """Write a line to standard output, at once."""
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
+
+
+def _row(name: str, figures: Figures) -> str:
     return f"{name:24}" + "".join(f"{figures[column]:10.3f}" for column in COLUMNS)
 
 
-def _sheet(subject: Subject, states: Gaussians, columns: int = 6, size: int = 144) -> Float[Tensor, "h w 3"]:
+def _sheet(subject: Subject, states: Gaussians, columns: int = 6, size: int = 288) -> Float[Tensor, "h w 3"]:
     """Draw some frames: for every view a row of the truth and one of ours."""
     rasterize = get_rasterizer("auto")
     frames = torch.linspace(0, len(states.means) - 1, columns).round().long()
     rows = []
-    for azimuth, truth in {0.0: subject.footage, **subject.views}.items():
+    for azimuth, truth in _views(subject):
         camera = OrbitCamera(0, azimuth, width=size, height=size)
         with torch.no_grad():
             ours = rasterize(states.states(frames), [camera] * columns, torch.ones(3)).color
@@ -265,20 +252,21 @@ def _sheet(subject: Subject, states: Gaussians, columns: int = 6, size: int = 14
     return torch.cat(rows)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Measure the objects of a folder, or our own."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("folder", type=Path, nargs="?")
-    parser.add_argument("--names", nargs="*", default=[])
+    parser.add_argument("--only", nargs="+", default=(), help="names of objects")
     parser.add_argument("--made-up", action="store_true", help="our own objects instead")
     parser.add_argument("--frames", type=int, default=16, help="of our own objects")
-    parser.add_argument("--sheets", type=Path, metavar="DIR")
-    given = parser.parse_args()
+    parser.add_argument("--sheets", type=Path, metavar="DIR", help="folder for a contact sheet of each")
+    given = parser.parse_args(arguments)
     if given.folder is None and not given.made_up:
         parser.error("give a folder, or --made-up")
-    made_up = given.made_up
-    subjects = made_up_subjects(given.frames, given.names) if made_up else read_subjects(given.folder, given.names)
-    measure(subjects, profile("preview").asset, sheets=given.sheets)
+    models = made_up_models(given.frames, given.only) if given.made_up else read_models(given.folder, given.only)
+    found = measure(models, PREVIEW.asset, write_line, given.sheets)
+    if given.json:
+        given.json.write_text(json.dumps(found, indent=1))
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from dg4d_lib.asset_settings import ScoreSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.motion import fit_motion
 from dg4d_lib.fitting.static import fit_gaussians
+from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.images import over_white, resize
 from dg4d_lib.inflation.ground import ground_turn
@@ -27,6 +28,7 @@ from steps.artifacts.media import read_png
 from steps.artifacts.motions import new_deformation
 from steps.fit_gaussians import initial_gaussians
 from steps.fitting.priors import known_views, make_prior, subject_shapes
+from steps.fitting.tracking import tracked_shapes, tracks_surface
 from steps.profiles import PipelineSettings
 from steps.score_asset import MetricNetworks, ViewFrames, compare
 
@@ -76,19 +78,14 @@ def turn_of(cutouts: Float[Tensor, "t h w 4"], settings: PipelineSettings) -> fl
     return settings.subject.turn_deg or found
 
 
-def score_fit(
-    subject: Subject, settings: PipelineSettings, seed: int = 0, sides: Bank | None = None
-) -> tuple[Figures, Tensor]:
-    """Fit Gaussians and their motion to the footage; compare views of all frames with the true ones.
+def fit(subject: Subject, settings: PipelineSettings, seed: int = 0, sides: Bank | None = None) -> Gaussians:
+    """Fit Gaussians and their motion to the footage; return their states at all frames.
 
     Args:
         subject: footage and true views.
         settings: of the pipeline.
         seed: of all randomness.
         sides: known views beside the input.
-
-    Returns:
-        Figures, and unseen views side by side over white: the fit's above the true ones.
     """
     rasterize, generator = get_rasterizer("auto"), torch.Generator().manual_seed(seed)
     cutouts = prepared(subject, settings)
@@ -99,19 +96,34 @@ def score_fit(
     prior = make_prior(settings.prior, [cutouts[0]], settings.static, None, Path(), turn_deg, sides).prior
     known = known_views(sides) if sides is not None else []
     rest = fit_gaussians(start, cutouts[0], prior, rasterize, settings.static, generator, known=known)
-    prior = make_prior(settings.prior, list(cutouts), settings.motion, None, Path(), turn_deg, sides).prior
-    video = DrivingVideo(cutouts[..., :3].contiguous(), cutouts[..., 3:].contiguous(), 10)
+    video, kind = DrivingVideo(cutouts[..., :3].contiguous(), cutouts[..., 3:].contiguous(), 10), settings.prior
+    moved = None
+    if sides and tracks_surface(settings.motion, kind, sides, len(video)):
+        moved = tracked_shapes(rest, video, sides, kind, turn_deg, rasterize, settings.asset, generator)
+    prior = make_prior(kind, list(cutouts), settings.motion, None, Path(), turn_deg, sides, moved).prior
     deformation = new_deformation(settings.deformation, rest, len(video), generator)
     fitted = fit_motion(rest, deformation, video, prior, rasterize, settings.motion, generator)
-    rows, strips = [], []
-    picked = torch.linspace(0, len(video) - 1, SHOWN).round().long()
     with torch.no_grad():
-        moved = deformation.displace(fitted.means, torch.linspace(0, 1, len(video))).apply(fitted)
+        return deformation.displace(fitted.means, torch.linspace(0, 1, len(video))).apply(fitted)
+
+
+def score_fit(
+    subject: Subject, settings: PipelineSettings, seed: int = 0, sides: Bank | None = None
+) -> tuple[Figures, Tensor]:
+    """Fit as `fit` does; compare views of all frames with the true ones.
+
+    Returns:
+        Figures, and unseen views side by side over white: the fit's above the true ones.
+    """
+    rasterize, moved = get_rasterizer("auto"), fit(subject, settings, seed, sides)
+    cutouts, rows, strips = prepared(subject, settings), [], []
+    picked = torch.linspace(0, len(cutouts) - 1, SHOWN).round().long()
+    with torch.no_grad():
         for azimuth, truth in {0.0: resize(cutouts, (SIZE, SIZE)), **subject.views}.items():
             camera = OrbitCamera(0, azimuth, width=SIZE, height=SIZE)
-            drawn = [rasterize(moved.at(frame), [camera], torch.ones(3)) for frame in range(len(video))]
+            drawn = [rasterize(moved.at(frame), [camera], torch.ones(3)) for frame in range(len(cutouts))]
             color = torch.cat([picture.color for picture in drawn]).clamp(0, 1)
-            rows.append(figures(color, torch.cat([picture.alpha for picture in drawn]), truth[: len(video)]))
+            rows.append(figures(color, torch.cat([picture.alpha for picture in drawn]), truth[: len(cutouts)]))
             pair = [color[picked], over_white(truth[picked])]
             strips.append(torch.cat([torch.cat([*pictures], 1) for pictures in pair]))
     return {**mean(rows[1:]), "input": rows[0]["psnr"]}, torch.cat(strips[1:], 1)

@@ -274,8 +274,9 @@ def batch(
     """Make many assets.
 
     Finished items are skipped; a failed item does not stop the others. A manifest has one row per item with these
-    columns: path or text, and optionally video, name, profile, seed, views ("90=right.png; 180=back.png"), turntable,
-    cameras, bank, mask, priority (higher first), set ("a.b=c; d.e=f"), or any setting by its name.
+    columns: path, text or asset, and optionally video, name, profile, seed, views ("90=right.png; 180=back.png"),
+    turntable, cameras, bank, mask, box ("X,Y,W,H"), priority (higher first), set ("a.b=c; d.e=f"), or any setting by
+    its name.
     """
     with exit_on_error():
         os.environ.update({name: str(n) for name, n in {"DG4D_GPUS": gpus, "DG4D_CPUS": cpus}.items() if n is not None})

@@ -30,7 +30,7 @@ from flows.engine.shared_results import sharing_results
 from flows.inputs.conversion_job import ConversionRequest
 from flows.inputs.fetching import local_copy, without_secrets
 from flows.inputs.given_views import ViewsRequest, parse_views
-from flows.inputs.manifest import parse_changes
+from flows.inputs.manifest import box_settings, parse_changes
 from flows.inputs.naming import clean_name
 from flows.packages.delivery import Outcome, pack_package, write_outcome
 from flows.packages.publish import check_folder, is_current
@@ -132,13 +132,18 @@ class PictureOptions(Options):
 
 
 class Sides(Frozen):
-    """Pictures of other sides; files on the worker's machine."""
+    """Pictures or a model of all sides; files on the worker's machine."""
 
     views: tuple[ViewText, ...] = Field(
         (), title="Views", description="one per item, AZIMUTH[,ELEVATION]=FILE in degrees, as `90=/data/in/right.png`"
     )
     turntable: str = Field("", title="Turntable", description="video of the still subject turned once, from its front")
     cameras: str = Field("", title="Cameras", description="transforms.json of nerfstudio with pictures of one moment")
+    asset: str = Field(
+        "",
+        title="Own model",
+        description="instead of pictures: a mesh or splats that are set in motion, as `/data/in/fox.glb`",
+    )
 
     def request(self) -> ViewsRequest:
         """Return the views by paths.
@@ -150,7 +155,19 @@ class Sides(Frozen):
         return ViewsRequest(views=parse_views(self.views), turntable=turntable, cameras=cameras)
 
 
+class Cutout(Frozen):
+    """Hints for cutting the subject out; empty: it is found."""
+
+    mask: str = Field(
+        "",
+        title="Mask",
+        description="picture, or folder of frames for a video, on the worker's machine: white where the subject is",
+    )
+    box: str = Field("", title="Box", description="X,Y,W,H in pixels, as `120,40,300,420`: the part with the subject")
+
+
 FormSides = Annotated[Sides, Field(json_schema_extra=_title("Other sides") | {"default": Sides().model_dump()})]
+FormCutout = Annotated[Cutout, Field(json_schema_extra=_title("Cut-out") | {"default": Cutout().model_dump()})]
 FormOptions = Annotated[Options, Field(json_schema_extra=_options_field(Options()))]
 FormPictureOptions = Annotated[PictureOptions, Field(json_schema_extra=_options_field(PictureOptions()))]
 
@@ -161,6 +178,7 @@ def picture_to_4d(
     out: Folder,
     options: FormPictureOptions = PictureOptions(),  # noqa: B008 - frozen
     sides: FormSides = Sides(),  # noqa: B008 - frozen
+    cutout: FormCutout = Cutout(),  # noqa: B008 - frozen
 ) -> None:
     """Convert a picture to an animated 3D asset.
 
@@ -169,9 +187,10 @@ def picture_to_4d(
             object, as `s3://bucket/fox.png`. Cut-outs with a transparent background are best
         out: on the worker's machine, as `/data/out/fox`; open `report.html` there when it is done
         options: the defaults work on any machine
-        sides: pictures of other sides, which the subject is shaped and colored by
+        sides: pictures of other sides, which the subject is shaped and colored by; or a model of it
+        cutout: where the subject is, if it is not found
     """
-    _convert(picture, out, options, sides)
+    _convert(picture, out, options, sides, cutout)
 
 
 @flow(name="video-to-4d", flow_run_name=lambda: _run_name("video"), persist_result=False)
@@ -180,6 +199,7 @@ def video_to_4d(
     out: Folder,
     options: FormOptions = Options(),  # noqa: B008 - frozen
     sides: FormSides = Sides(),  # noqa: B008 - frozen
+    cutout: FormCutout = Cutout(),  # noqa: B008 - frozen
 ) -> None:
     """Convert a video to an animated 3D asset that moves as the video does.
 
@@ -188,9 +208,10 @@ def video_to_4d(
             `https://host/walk.mp4`; or an object, as `s3://bucket/walk.mp4`
         out: on the worker's machine, as `/data/out/walk`; open `report.html` there when it is done
         options: the defaults work on any machine
-        sides: pictures of other sides at the first frame, which the subject is shaped and colored by
+        sides: pictures of other sides at the first frame, which the subject is shaped and colored by; or a model of it
+        cutout: where the subject is, if it is not found
     """
-    _convert(video, out, options, sides, is_video=True)
+    _convert(video, out, options, sides, cutout, is_video=True)
 
 
 @flow(name="catalog-to-4d", flow_run_name=lambda: _run_name("inputs"), persist_result=False)
@@ -325,20 +346,23 @@ def _knobs(options: Options, roots: Roots) -> dict[str, Any]:
     return knobs
 
 
-def _convert(address: str, out: str, options: Options, sides: Sides, is_video: bool = False) -> None:
+def _convert(address: str, out: str, options: Options, sides: Sides, cutout: Cutout, is_video: bool = False) -> None:
     """Convert a source as `dg4d make` does; do nothing if the folder holds its package already."""
     _start()
     roots = Roots.of_this_process()
     folder, given = roots.output(out), sides.request()
-    roots.check_files(given.files())
+    mask, asset = (Path(text) if text else None for text in (cutout.mask, sides.asset))
+    roots.check_files([*given.files(), *filter(None, (mask, asset))])
     with local_copy(roots.source(address)) as path:
         request = ConversionRequest(
             item=clean_name(PurePosixPath(urlsplit(address).path).stem) or "asset",
             picture=path,
             video=path if is_video else None,
             given_views=given,
+            mask=mask,
+            asset=asset,
             profile=options.profile,
-            settings=revise(profile(options.profile), _knobs(options, roots)),
+            settings=revise(profile(options.profile), _knobs(options, roots) | box_settings(cutout.box)),
             seed=options.seed,
             commercial_only=options.commercial_only,
         )

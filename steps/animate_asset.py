@@ -11,6 +11,7 @@ from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.assets.formats.foreign_glb import ForeignGlb, read_foreign_glb, write_moving_glb
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.fitting.asset_motion import NodeMotion, fit_asset_motion, iterations
+from dg4d_lib.fitting.asset_pose import Placement
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
@@ -37,6 +38,7 @@ class _Mesh:
     """Placed mesh of a model, and its control graph."""
 
     glb: ForeignGlb
+    placement: Placement
     surface: SurfaceCloud
     graph: ControlGraph
 
@@ -50,9 +52,12 @@ def run(job: Job) -> StepReport:
     mesh = None
     if "glb" in job.inputs:
         glb = read_foreign_glb(job.inputs["glb"].read_bytes(), settings.max_faces)
-        model = glb.model.placed(read_placement(job.inputs["placement"]).matrix)
-        surface = cover_surface(model, settings.points, torch.Generator().manual_seed(job.seed))
-        mesh = _Mesh(glb, surface, build_control_graph(surface.fine.vertices, surface.fine.faces, settings.nodes))
+        placement = read_placement(job.inputs["placement"])
+        # covered in its own coordinates, as in prepare_asset: rows of `nearest` are rows of the Gaussians
+        covered = cover_surface(glb.model, settings.points, torch.Generator().manual_seed(job.seed))
+        surface = covered.placed(placement.quat, placement.scale, placement.shift)
+        control = build_control_graph(surface.fine.vertices, surface.fine.faces, settings.nodes)
+        mesh = _Mesh(glb, placement, surface, control)
         graph = mesh.graph.of(surface.nearest)
     else:
         points = cloud.means.double().numpy()
@@ -115,12 +120,11 @@ def moved_vertices(
 
 def _write_mesh(job: Job, mesh: _Mesh, motion: NodeMotion, fps: float) -> list[str]:
     """Write the model with morph targets, and as a tracked mesh with one texture; return notes."""
-    placement = read_placement(job.inputs["placement"])
     vertices, flipped = moved_vertices(mesh.surface, mesh.graph, motion)
     gltf = job.settings.gltf
     content, notes = write_moving_glb(
         mesh.glb,
-        placement.matrix,
+        mesh.placement.matrix,
         vertices.numpy(),
         fps,
         {"notes": [NOTE]},
@@ -128,7 +132,7 @@ def _write_mesh(job: Job, mesh: _Mesh, motion: NodeMotion, fps: float) -> list[s
         gltf.moving_normals,
     )
     job.outputs["moving"].write_bytes(content)
-    merged, sources = merge_parts(mesh.glb.model.placed(placement.matrix), job.settings.texture_size)
+    merged, sources = merge_parts(mesh.glb.model.placed(mesh.placement.matrix), job.settings.texture_size)
     write_tracked(job.outputs["tracked"], TrackedMesh(merged, vertices[:, sources] - merged.vertices))
     return [*notes, *([f"{flipped} faces are turned inside out over all frames"] if flipped else [])]
 

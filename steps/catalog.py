@@ -119,7 +119,7 @@ STEPS: dict[str, StepSpec] = {
                 "known_views": _optional(BANK),
             },
             outputs={"motion": MOTION, "gaussians": _optional(PLY), "curves": CURVES, "picture": PNG},
-            sections=("rasterizer", "subject.turn_deg", "prior", "deformation", "motion"),
+            sections=("rasterizer", "subject.turn_deg", "prior", "deformation", "motion", "asset"),
             resource="gpu",
         ),
         _step(

@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import torch
 
+from dg4d_lib.asset_settings import AssetSettings
+from dg4d_lib.fitting.asset_motion import iterations
 from dg4d_lib.fitting.motion import fit_motion
 from dg4d_lib.gaussians.ply import read_ply, write_ply
 from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
@@ -12,6 +14,7 @@ from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.motions import new_deformation, write_motion
 from steps.fitting.priors import make_prior, read_known_views, subject_turn
 from steps.fitting.reporting import LossCurves, picture_of_divergence, render_row
+from steps.fitting.tracking import TRACKED_NOTE, tracked_shapes, tracks_surface
 from steps.runtime.job import Job, StepReport
 
 FINE_TUNED = "The Gaussians at rest were fitted to the whole video together with their motion."
@@ -31,14 +34,23 @@ def run(job: Job) -> StepReport:
     rasterize = get_rasterizer(backend)
     cutouts = list(torch.cat([video.frames, video.alpha], -1))
     known = read_known_views(job.inputs.get("known_views"), job.pictures)
-    chosen = make_prior(prior, cutouts, settings, job.inputs.get("bank"), job.pictures, turn_deg, known)
+    tracks = tracks_surface(settings, prior, known, len(video))
+    asset: AssetSettings = job.settings.asset
+    before = iterations(asset, len(video)) if tracks else 0
+    curves = LossCurves(before + settings.iterations, job.progress)
+    with picture_of_divergence(job, rasterize):
+        moved = (
+            tracked_shapes(gaussians, video, known, prior, turn_deg, rasterize, asset, generator, curves.add)
+            if known and tracks
+            else None
+        )
+    chosen = make_prior(prior, cutouts, settings, job.inputs.get("bank"), job.pictures, turn_deg, known, moved)
     deformation = new_deformation(kind, gaussians, len(video), generator)
     device = preferred_device(backend)
     deformation.to(device)
-    curves = LossCurves(settings.iterations, job.progress)
     with picture_of_divergence(job, rasterize):
         fitted = fit_motion(
-            gaussians.to(device), deformation, video, chosen.prior, rasterize, settings, generator, curves.add
+            gaussians.to(device), deformation, video, chosen.prior, rasterize, settings, generator, curves.after(before)
         )
     deformation.cpu()
     gaussians = fitted.to(torch.device("cpu"))
@@ -48,8 +60,9 @@ def run(job: Job) -> StepReport:
     curves.write(job.outputs["curves"], "motion fit", [chosen.note])
     timestamps = torch.linspace(0, 1, min(PICTURE_FRAMES, len(video)))
     with torch.no_grad():
-        moved = deformation.displace(gaussians.means, timestamps).apply(gaussians)
-    rows = [render_row(moved, [azimuth] * len(timestamps), rasterize) for azimuth in (FRONT_DEG, SIDE_DEG)]
+        states = deformation.displace(gaussians.means, timestamps).apply(gaussians)
+    rows = [render_row(states, [azimuth] * len(timestamps), rasterize) for azimuth in (FRONT_DEG, SIDE_DEG)]
     write_png(job.outputs["picture"], torch.cat(rows))
     report = chosen.report(f"{backend} rasterizer")
+    report = replace(report, notes=(*report.notes, TRACKED_NOTE)) if tracks else report
     return replace(report, notes=(*report.notes, FINE_TUNED)) if settings.fine_tune else report

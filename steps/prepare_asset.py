@@ -38,20 +38,20 @@ def run(job: Job) -> StepReport:
     if "subject" in job.inputs:
         subject = read_png(job.inputs["subject"])
         placement = find_placement(cloud, subject, rasterize, azimuth, own.ups)
-        _check_agreement(job, cloud, placement, subject, rasterize, settings)
     else:
         placement = centered_placement(cloud, settings.azimuth_deg, own.ups[0])
         subject = render_subject(placement.apply(cloud), job.settings.size, rasterize)
         write_png(job.outputs["subject"], subject)
+    both = picture_of_both(cloud, placement, subject, rasterize)
+    if "subject" in job.inputs and placement.agreement < settings.min_agreement:
+        write_png(job.pictures / "model_and_subject.png", both)
+        raise BadInput(_disagreement(placement, settings))
     job.progress(2, 3, {})
     if own.glb is not None:
         job.outputs["glb"].write_bytes(own.content)
-        placed = cover_surface(own.glb.model.placed(placement.matrix), settings.points, _generator(job.seed)).cloud
-    else:
-        placed = placement.apply(cloud)
+    placed = placement.apply(cloud)
     write_ply(job.outputs["gaussians"], placed)
     write_placement(job.outputs["placement"], placement)
-    both = picture_of_both(cloud, placement, subject, rasterize)
     write_png(job.outputs["picture"], _stacked(both, render_turnaround(placed, rasterize)))
     job.progress(3, 3, {})
     return StepReport(backend=f"{job.settings.rasterizer} rasterizer", notes=(*_notes(own, placement, job), *own.notes))
@@ -65,30 +65,16 @@ def render_subject(cloud: Gaussians, size: int, rasterize: Rasterizer) -> Float[
     return torch.cat([straight, drawn.alpha[0]], -1).clamp(0, 1)
 
 
-def _generator(seed: int) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
 def _cloud(own: OwnModel, settings: AssetSettings, seed: int) -> Gaussians:
     """Return the model as Gaussians, in its own coordinates."""
     if own.splats is not None:
         return own.splats
     assert own.glb is not None  # a model is a mesh or splats
-    return cover_surface(own.glb.model, settings.points, _generator(seed)).cloud
+    return cover_surface(own.glb.model, settings.points, torch.Generator().manual_seed(seed)).cloud
 
 
-def _check_agreement(
-    job: Job,
-    cloud: Gaussians,
-    placement: Placement,
-    subject: Float[Tensor, "s s 4"],
-    rasterize: Rasterizer,
-    settings: AssetSettings,
-) -> None:
-    if placement.agreement >= settings.min_agreement:
-        return
-    write_png(job.pictures / "model_and_subject.png", picture_of_both(cloud, placement, subject, rasterize))
-    raise BadInput(
+def _disagreement(placement: Placement, settings: AssetSettings) -> str:
+    return (
         f"the model does not agree with the first frame: their outlines overlap by {placement.agreement:.0%} (IoU) at "
         f"best, from azimuth {placement.azimuth_deg:.0f}; asset.min_agreement = {settings.min_agreement:g} is needed. "
         "Give the video of this very model, say the azimuth with --asset-azimuth, or lower the setting"

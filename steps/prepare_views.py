@@ -57,10 +57,14 @@ def run(job: Job) -> StepReport:
         moments, notes = known.turntable(given) if given.turntable else known.views(given)
     job.progress(2, 3, {})
     first = [known_view(inputs[0], name=INPUT), *moments[0]]
-    write_png(job.outputs["picture"], picture_of(first))
-    write_png(job.pictures / "views.png", picture_of(first))
+    picture = picture_of(first)
     found = agreement(first)
-    notes = (*notes, *judge(first, found))
+    try:
+        notes = (*notes, *judge(first, found))
+    except BadInput:
+        write_png(job.pictures / "views.png", picture)
+        raise
+    write_png(job.outputs["picture"], picture)
     adjusted = adjust_exposure(first) if found.mean > RELIABLE else first
     notes = (*notes, *exposure_notes(first, adjusted))
     if len(moments) == 1:
@@ -154,17 +158,19 @@ class _Reader:
         except BadInput as error:
             raise BadInput(f"{name}: {error}") from error
 
-    def _cut(self, source: Source) -> tuple[Float[Tensor, "t s s 4"], tuple[str, ...]]:
-        prepared = prepare_subject(source.frames, source.has_alpha, self.settings, segmenter=self.segmenter)
+    def _cut(
+        self, source: Source, settings: SubjectSettings | None = None
+    ) -> tuple[Float[Tensor, "t s s 4"], tuple[str, ...]]:
+        """Cut out the subject, by default framed as the input; return notes, too."""
+        settings = settings or self.settings
+        prepared = prepare_subject(source.frames, source.has_alpha, settings, segmenter=self.segmenter)
         self.used_network |= prepared.estimate is not None and prepared.estimate.used_network
         return prepared.frames, prepared.notes
 
     def _cut_whole(self, source: Source, size: int) -> Float[Tensor, "t s s 4"]:
         """Cut out the subject in the whole frame, without a crop."""
         whole = SubjectSettings(size=min(LARGEST_WHOLE, size), framing="keep", matting=self.settings.matting)
-        prepared = prepare_subject(source.frames, source.has_alpha, whole, segmenter=self.segmenter)
-        self.used_network |= prepared.estimate is not None and prepared.estimate.used_network
-        return prepared.frames
+        return self._cut(source, whole)[0]
 
     def _scaled(self, given: Sequence[GivenView], cutouts: Sequence[Float[Tensor, "s s 4"]]) -> list[KnownView]:
         """Return views in the scale of the input: as they are, or with its height, whichever agrees better."""

@@ -1,7 +1,6 @@
 """Options that several commands share."""
 
 import math
-import re
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -123,23 +122,6 @@ Box = Annotated[
 ]
 
 
-def parse_box(text: str) -> tuple[int, ...] | None:
-    """Return a box from "X,Y,W,H"; None if the text is empty.
-
-    Raises:
-        BadInput: it is not four whole numbers.
-    """
-    from dg4d_lib.errors import BadInput
-    from dg4d_lib.input_settings import BOX_FORM
-
-    if not text.strip():
-        return None
-    parts = [part.strip() for part in text.strip().strip("[]").split(",")]
-    if len(parts) != 4 or not all(re.fullmatch(r"[0-9]{1,7}", part) for part in parts):
-        raise BadInput(f"{BOX_FORM}, for example 120,40,300,420; given {text!r}")
-    return tuple(map(int, parts))
-
-
 Height = Annotated[
     float | None,
     typer.Option(
@@ -176,13 +158,14 @@ def shortcut_settings(
     compress: bool = False,
 ) -> dict[str, Any]:
     """Return the settings that these options stand for."""
+    from flows.inputs.manifest import box_settings
+
     given = {
         "mesh.max_faces": triangles,
         "mesh.texture_size": texture,
         "pack.fps": fps,
-        "subject.box": parse_box(box),
         "pack.height_m": height_m,
         "pack.ground": ground,
         "pack.gltf.meshopt": compress or None,
     }
-    return {name: value for name, value in given.items() if value is not None}
+    return {name: value for name, value in given.items() if value is not None} | box_settings(box)

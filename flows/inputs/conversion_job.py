@@ -71,9 +71,7 @@ class ConversionRequest(Frozen):
         if (self.settings.pack.lods or self.settings.pack.gltf.meshopt) and not find_spec("meshoptimizer"):
             raise BackendUnavailable("pack.lods and pack.gltf.meshopt need meshoptimizer: `deploy/install.sh meshopt`")
         if self.asset is not None:
-            models.check_model(self.asset)
-            if self.text:
-                raise BadInput("--asset is moved by a picture, a video, or a motion of its own; leave --text out")
+            self._check_asset(self.asset)
         self._check_source()
         if self.mask is not None:
             sources.check_mask(self.mask)
@@ -158,6 +156,18 @@ class ConversionRequest(Frozen):
     @property
     def _suffix(self) -> str:
         return self._footage.suffix.lower() if self._footage else ""
+
+    def _check_asset(self, asset: Path) -> None:
+        models.check_model(asset)
+        if self.text:
+            raise BadInput("--asset is moved by a picture, a video, or a motion of its own; leave --text out")
+        if self.given_views:
+            raise BadInput(
+                f"--asset: {asset.name} has all sides of the subject, and --view, --turntable or --cameras show them, "
+                "too; give the model, or the pictures, not both"
+            )
+        if self.mask is not None and self._footage is None:
+            raise BadInput("--mask marks the subject of a picture or video, and --asset is given alone; leave it out")
 
     def _check_source(self) -> None:
         if self.text:

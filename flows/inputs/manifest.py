@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from dg4d_lib.errors import BadInput, DG4DError
+from dg4d_lib.input_settings import BOX_FORM
 from flows.formatting.escaping import quoted, visible
 from flows.inputs import listing, sources
 from flows.inputs.conversion_job import ConversionRequest, name_from_text
@@ -25,7 +26,10 @@ INPUTS = (
     f"manifest ({', '.join(MANIFESTS)})"
 )
 HIGHEST_PRIORITY = 10**9
-TEXTS = ("path", "text", "video", "name", "profile", "bank", "mask", "views", "turntable", "cameras")  # columns
+TEXTS = (  # columns
+    "path", "text", "video", "asset", "name", "profile", "bank", "mask", "box", "views", "turntable", "cameras",
+)  # fmt: skip
+BOX_NUMBER = re.compile(r"[0-9]{1,7}")
 INTEGER = re.compile(r"[+-]?[0-9]{1,100}(\.0*)?")
 
 
@@ -158,6 +162,20 @@ def parse_changes(pairs: list[str]) -> dict[str, Any]:
     return dict(sorted(changes.items(), key=lambda pair: not pair[0].endswith(".kind")))  # a kind resets the others
 
 
+def box_settings(text: str) -> dict[str, tuple[int, ...]]:
+    """Return the setting that a box "X,Y,W,H" stands for; none if the text is empty.
+
+    Raises:
+        BadInput: it is not four whole numbers.
+    """
+    if not text.strip():
+        return {}
+    parts = [part.strip() for part in text.strip().strip("[]").split(",")]
+    if len(parts) != 4 or not all(BOX_NUMBER.fullmatch(part) for part in parts):
+        raise BadInput(f"{BOX_FORM}, for example 120,40,300,420; given {quoted(text)}")
+    return {"subject.box": tuple(map(int, parts))}
+
+
 def _names(found: list[listing.Found]) -> list[str]:
     paths = [PurePosixPath(file.name) for file in found]
     return unique_names([(clean_name(path.with_suffix("").as_posix()) or "asset", _kind(path)) for path in paths])
@@ -218,13 +236,16 @@ class _Reader:
         return ConversionRequest(
             item=name,
             profile=chosen,
-            settings=self._settings(chosen, {**self.changes, **_settings_in(cells)}),
+            settings=self._settings(
+                chosen, {**self.changes, **_settings_in(cells), **box_settings(cells.get("box", ""))}
+            ),
             seed=_integer("seed", cells.get("seed", self.seed), 0, LARGEST_SEED),
             text=cells.get("text", ""),
             picture=self._file(cells, "path"),
             video=self._file(cells, "video"),
             bank=self._file(cells, "bank"),
             mask=self._file(cells, "mask"),
+            asset=self._file(cells, "asset"),
             given_views=ViewsRequest(
                 views=views_in_cell(cells.get("views", ""), self.root),
                 turntable=self._file(cells, "turntable"),
@@ -259,7 +280,8 @@ def _wanted_name(row: ManifestRow) -> tuple[str, str]:
     """Return the name of a row's item, and a suffix in case another row has it too."""
     if name := clean_name(row.cells.get("name", "")):
         return name, ""
-    path, text = PurePosixPath(row.cells.get("path", "")), row.cells.get("text")
+    path = PurePosixPath(row.cells.get("path", "") or row.cells.get("asset", ""))
+    text = row.cells.get("text")
     return clean_name(path.stem) or (name_from_text(text) if text else row.place.replace(" ", "-")), _kind(path)
 
 

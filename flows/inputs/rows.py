@@ -15,9 +15,10 @@ from flows.formatting.escaping import quoted
 from flows.inputs.json_text import loads
 
 COLUMNS = (
-    "path", "text", "video", "name", "profile", "seed", "bank", "mask", "views", "turntable", "cameras", "priority",
-    "set",
+    "path", "text", "video", "asset", "name", "profile", "seed", "bank", "mask", "box", "views", "turntable", "cameras",
+    "priority", "set",
 )  # and any setting, such as mesh.grid  # fmt: skip
+SUBJECTS = ("path", "text", "asset")  # columns; a row needs one of them
 MANIFESTS = (".csv", ".json", ".jsonl", ".parquet")
 LARGEST_MANIFEST_BYTES = 256 * 2**20
 LARGEST_TABLE_BYTES = 2**30  # of a Parquet table after decompression
@@ -176,7 +177,7 @@ def _parquet(file: Path) -> list[ManifestRow]:
 def _row(place: str, cells: dict[str, Any]) -> ManifestRow:
     # NaN: an empty cell of a number column in Parquet files that data frames wrote; JSON with NaN is refused before
     filled = {column: value for column, value in cells.items() if value not in (None, "") and value == value}  # noqa: PLR0124
-    error = "" if filled.get("path") or filled.get("text") else "neither a path nor a text"
+    error = "" if any(filled.get(column) for column in SUBJECTS) else "neither a path nor a text, nor an asset"
     return ManifestRow(place, filled, error)
 
 

@@ -85,6 +85,7 @@ def make_prior(
     scratch: Path,
     turn_deg: float = 0.0,
     sides: Bank | None = None,
+    moved: SubjectShapes | None = None,
 ) -> LoadedPrior:
     """Make the guidance prior of a stage.
 
@@ -96,6 +97,7 @@ def make_prior(
         scratch: folder for unpacking.
         turn_deg: azimuth by which the subject is turned; see `subject_turn`.
         sides: views of other sides that the user gave; priors with shapes take them as their own.
+        moved: shapes of frames without such views, which then guide these frames, too.
 
     Raises:
         BadInput: the oracle has no bank, or the weights are damaged or of another model.
@@ -106,10 +108,10 @@ def make_prior(
     )
     match settings:
         case GeometricPriorSettings() | LearnedPriorSettings():
-            shapes = subject_shapes(settings, cutouts, turn_deg, sides)
+            shapes = subject_shapes(settings, cutouts, turn_deg, sides, moved)
             note, weight = GEOMETRIC_NOTE, 1.0
             if isinstance(shapes, KnownShapes):
-                prior = AnalyticPrior(shapes.clean, noise, frames=shapes.frames)
+                prior = AnalyticPrior(shapes.clean, noise, frames=None if moved else shapes.frames)
                 return LoadedPrior(prior, known_note(sides), shapes=shapes)
             if isinstance(settings, LearnedPriorSettings):
                 note, weight = LEARNED_NOTE, settings.weight
@@ -131,7 +133,11 @@ def make_prior(
 
 
 def subject_shapes(
-    settings: PriorSettings, cutouts: Sequence[Float[Tensor, "h w 4"]], turn_deg: float, sides: Bank | None = None
+    settings: PriorSettings,
+    cutouts: Sequence[Float[Tensor, "h w 4"]],
+    turn_deg: float,
+    sides: Bank | None = None,
+    moved: SubjectShapes | None = None,
 ) -> SubjectShapes:
     """Return the shapes behind a prior, by default inflated ones.
 
@@ -140,9 +146,12 @@ def subject_shapes(
         cutouts: the subject at every frame.
         turn_deg: turn of the subject about the vertical; see `subject_turn`.
         sides: views of other sides; their hull replaces the shapes of their frames.
+        moved: shapes of all other frames, instead of those of the settings.
     """
-    if isinstance(settings, LearnedPriorSettings):
-        shapes: SubjectShapes = LearnedShapes(packaged.packaged_network(), cutouts, settings, turn_deg)
+    if moved is not None:
+        shapes = moved
+    elif isinstance(settings, LearnedPriorSettings):
+        shapes = LearnedShapes(packaged.packaged_network(), cutouts, settings, turn_deg)
     else:
         own = settings if isinstance(settings, GeometricPriorSettings) else GeometricPriorSettings()
         shapes = InflatedSurfaces(cutouts, own, turn_deg)

@@ -1,7 +1,7 @@
 """Loss curves and renders of fits."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -40,6 +40,10 @@ class LossCurves:
         for name, value in values.items():
             self.series.setdefault(name, []).append(value)
         self.progress(iteration, self.total, values)
+
+    def after(self, done: int) -> Callable[[int, dict[str, float]], None]:
+        """Return a callback that counts iterations after those of an earlier optimization."""
+        return lambda iteration, values: self.add(done + iteration, values)
 
     def write(self, path: Path, title: str, notes: Sequence[str]) -> None:
         """Write the `curves` artifact, subsampled to about `CURVE_POINTS` points."""

@@ -66,10 +66,13 @@ def test_settings_are_nested_or_dotted(settings: dict[str, Any]) -> None:
         ({"views": {90: "none.png"}}, "none.png"),
         ({"views": {(90, 0): "fox.png", 90: "fox.png"}}, "90"),
         ({"asset": "none.glb"}, "none.glb"),
+        ({"asset": "fox.glb", "views": {180: "fox.png"}}, "not both"),
+        ({"asset": "fox.glb", "turntable": "fox.png"}, "not both"),
         ({"video": "none.mp4"}, "none.mp4 does not exist"),
     ],
 )
 def test_wrong_arguments_are_refused_before_any_work(alone: Path, call: dict[str, Any], says: str) -> None:
+    Path("fox.glb").write_bytes(b"glTF same")
     with pytest.raises(BadInput, match=says):
         dg4d.make(words("fox.png", "x"), **call)
     assert ran(alone) == [] and not Path("out").exists()

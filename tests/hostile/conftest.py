@@ -61,5 +61,6 @@ def furnished(place: Place, samples: dict[str, bytes]) -> Place:
     (place.work / "thesis").mkdir()
     (place.work / "thesis" / "one.doc").write_text("mine")
     (place.work / "broken.json").write_text("{")
+    (place.work / "cube.glb").write_bytes(b"glTF")
     banks.bank()(place.work / "bank")
     return place

@@ -18,6 +18,7 @@ from steps import fit_gaussians, fit_motion
 from steps.artifacts.media import read_png, write_frames, write_png
 from steps.artifacts.motions import read_motion
 from steps.fitting.priors import read_bank
+from steps.fitting.tracking import TRACKED_NOTE
 from steps.profiles import PREVIEW, revise, step_settings
 from steps.runtime.job import Job
 from steps.sources.bank_writer import write_bank
@@ -131,7 +132,31 @@ def test_views_of_other_sides_shape_the_start_of_the_fit(tmp_path: Path, subject
         {**inputs, "known_views": tmp_path / "known.zip"},
         ["motion", "gaussians", "curves", "picture"],
     )
-    assert "visual hull of 2 views" in fit_motion.run(moving).notes[0]
+    report = fit_motion.run(moving)
+    assert "visual hull of 2 views" in report.notes[0] and TRACKED_NOTE not in report.notes
+
+
+def test_the_surface_of_known_views_guides_later_frames_where_that_is_asked_for(tmp_path: Path, subject: Path):
+    write_bank(tmp_path / "known.zip", [[known_view(disc(), 90.0)]], tmp_path)
+    small = {"track_iterations": 2, "joint_iterations": 1, "nodes": 8, "size": 32}
+    settings = revise(SMALL, {"motion.track_surface": True, **{f"asset.{name}": n for name, n in small.items()}})
+    statics = job(tmp_path, fit_settings(), {"subject": subject}, ["gaussians", "curves", "picture"])
+    fit_gaussians.run(statics)
+    frames = torch.stack([disc(), disc(2), disc(4)])
+    write_frames(tmp_path / "video.zip", DrivingVideo(frames[..., :3], frames[..., 3:], 5.0))
+    inputs = {"driving_video": tmp_path / "video.zip", "known_views": tmp_path / "known.zip"}
+    for name, count in (("tracked", 3), ("alone", 0)):
+        (tmp_path / name).mkdir()
+        given = inputs if count else {"driving_video": inputs["driving_video"]}
+        work = job(
+            tmp_path / name,
+            step_settings("fit_motion", settings),
+            {**given, "gaussians": statics.outputs["gaussians"]},
+            ["motion", "gaussians", "curves", "picture"],
+        )
+        assert (TRACKED_NOTE in fit_motion.run(work).notes) == bool(count)
+        fitted = settings.motion.iterations
+        assert json.loads(work.outputs["curves"].read_text())["x"][-1] == fitted + (2 * count + 1 if count else 0)
 
 
 def test_both_fits_run_with_a_trained_prior_and_say_so(tmp_path: Path, subject: Path):

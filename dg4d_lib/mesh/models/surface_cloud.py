@@ -1,7 +1,7 @@
 """Gaussians on the surface of a model, bound to its subdivided triangles."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,6 +10,8 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.transform import transform
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
 from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.mesh.models.model import OPAQUE, Model
 from dg4d_lib.mesh.models.subdivision import FineMesh, subdivide
@@ -37,6 +39,14 @@ class SurfaceCloud:
     welded: Int[np.ndarray, " v"]
     cloud: Gaussians
     nearest: Int[Tensor, " n"]
+
+    def placed(self, quat: Float[Tensor, " 4"], scale: float, shift: Float[Tensor, " 3"]) -> "SurfaceCloud":
+        """Return the surface after scaling, rotation by a unit quaternion (wxyz), and translation."""
+        matrix = scale * quat_to_rotmat(quat.double()).numpy()
+        vertices = self.fine.vertices @ matrix.T + shift.double().numpy()
+        return replace(
+            self, fine=replace(self.fine, vertices=vertices), cloud=transform(self.cloud, quat, scale, shift)
+        )
 
 
 def cover_surface(model: Model, count: int, generator: torch.Generator) -> SurfaceCloud:

@@ -5,12 +5,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from fake_steps import PNG
 from tiny_s3 import BUCKET, TinyS3
 
 from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
 from flows.inputs import sources
 from flows.inputs.manifest import Item, items_of, parse_changes
+from flows.inputs.models import put_model
 from flows.inputs.naming import unique_names
+from steps.store.artifact_store import ArtifactStore
 
 
 def touch(folder: Path, *names: str) -> None:
@@ -68,6 +71,46 @@ def test_a_json_manifest_says_the_same(tmp_path: Path) -> None:
     (cat,) = items(tmp_path / "m.json")
     assert cat.request is not None
     assert (cat.name, cat.request.picture, cat.request.settings.mesh.grid) == ("cat", tmp_path / "p/cat.png", 32)
+
+
+def test_columns_name_a_model_a_mask_and_a_box_of_the_subject(tmp_path: Path) -> None:
+    (tmp_path / "m.csv").write_text(
+        "path,asset,mask,box\n"
+        "run.mp4,models/fox.glb,mask.png,\n"
+        ",models/owl.spz,,\n"
+        'cat.png,,,"120, 40,300,420"\n'
+        "dog.png,,,120x40\n"
+    )
+    fox, owl, cat, dog = items(tmp_path / "m.csv")
+    assert fox.request is not None and owl.request is not None and cat.request is not None
+    assert (fox.name, owl.name) == ("run", "owl")
+    assert (fox.request.asset, fox.request.mask) == (tmp_path / "models/fox.glb", tmp_path / "mask.png")
+    assert (owl.request.picture, owl.request.asset) == (None, tmp_path / "models/owl.spz")
+    assert (cat.request.asset, cat.request.settings.subject.box) == (None, (120, 40, 300, 420))
+    assert dog.request is None and "row 4: a box is X,Y,W,H" in dog.error
+
+
+def test_a_row_of_a_manifest_becomes_a_job_with_its_model_and_mask(tmp_path: Path) -> None:
+    (tmp_path / "fox.png").write_bytes(PNG)
+    (tmp_path / "fox.glb").write_bytes(b"glTF same")
+    (tmp_path / "m.json").write_text(json.dumps([{"path": "fox.png", "asset": "fox.glb", "mask": "fox.png"}]))
+    (item,) = items(tmp_path / "m.json")
+    with item.fetch() as request:
+        request.check()
+        store = ArtifactStore(tmp_path / "store")
+        job = request.to_job(store)
+    assert job.asset == put_model(tmp_path / "fox.glb", store)
+    assert job.mask == job.source and store.path(job.source).read_bytes() == PNG
+
+
+def test_a_row_with_a_model_and_views_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "fox.png").write_bytes(PNG)
+    (tmp_path / "fox.glb").write_bytes(b"glTF same")
+    (tmp_path / "m.json").write_text(json.dumps([{"path": "fox.png", "asset": "fox.glb", "views": "180=fox.png"}]))
+    (item,) = items(tmp_path / "m.json")
+    assert item.request is not None
+    with pytest.raises(BadInput, match="give the model, or the pictures, not both"):
+        item.request.check()
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".json"])

@@ -5,9 +5,11 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from fake_steps import PNG
 
 from dg4d_lib.errors import BadInput
 from flows.inputs.conversion_job import ConversionRequest
+from flows.inputs.given_views import ViewsRequest
 from flows.inputs.models import check_model, put_model
 from steps.profiles import PREVIEW
 from steps.store.artifact_store import ArtifactStore
@@ -84,6 +86,27 @@ def test_a_model_needs_no_picture_and_takes_no_words(tmp_path: Path, store: Arti
     assert job.asset == job.source and not job.moving and job.source_name == "a.glb"
     with pytest.raises(BadInput, match="leave --text out"):
         request.model_copy(update={"text": "words"}).check()
+
+
+@pytest.mark.parametrize("sides", ["views", "turntable", "cameras"])
+def test_a_model_excludes_pictures_of_other_sides(sides: str, tmp_path: Path) -> None:
+    (tmp_path / "a.glb").write_bytes(b"glTF same")
+    (tmp_path / "a.png").write_bytes(PNG)
+    path = tmp_path / "a.png"
+    given = ViewsRequest.model_validate({sides: [{"azimuth": 180, "path": path}] if sides == "views" else path})
+    request = ConversionRequest(item="a", picture=path, asset=tmp_path / "a.glb", settings=PREVIEW, given_views=given)
+    with pytest.raises(BadInput, match=r"--asset: a\.glb has all sides .* give the model, or the pictures, not both"):
+        request.check()
+    request.model_copy(update={"given_views": ViewsRequest()}).check()
+
+
+def test_a_mask_needs_a_picture_beside_the_model(tmp_path: Path) -> None:
+    (tmp_path / "a.glb").write_bytes(b"glTF same")
+    (tmp_path / "a.png").write_bytes(PNG)
+    request = ConversionRequest(item="a", asset=tmp_path / "a.glb", mask=tmp_path / "a.png", settings=PREVIEW)
+    with pytest.raises(BadInput, match="--mask marks the subject of a picture"):
+        request.check()
+    request.model_copy(update={"picture": tmp_path / "a.png"}).check()
 
 
 def test_folders_are_no_models(tmp_path: Path) -> None:

@@ -42,8 +42,8 @@ def test_the_form_offers_every_profile() -> None:
 @pytest.mark.parametrize(
     ("name", "titles"),
     [
-        ("picture-to-4d", ["Picture", "Output folder", "How it is made", "Other sides"]),
-        ("video-to-4d", ["Video", "Output folder", "How it is made", "Other sides"]),
+        ("picture-to-4d", ["Picture", "Output folder", "How it is made", "Other sides", "Cut-out"]),
+        ("video-to-4d", ["Video", "Output folder", "How it is made", "Other sides", "Cut-out"]),
         ("catalog-to-4d", ["Pictures and videos", "Output folder", "Items at a time", "Items run on",
                            "Stop at a faulty asset", "How it is made"]),
         ("benchmark", ["Data set", "Output folder", "Objects at most", "Score the meshes",
@@ -63,7 +63,7 @@ def test_a_form_has_a_plain_field_for_everything_in_a_sensible_order(
         "Profile", *(["Motion"] if pictures else []), "Triangles", "Texture size", "Frames per second", "Seed",
         "Commercial use only", "Further settings",
     ]  # fmt: skip
-    plain = [field for field in in_order(form) if field["title"] not in {"How it is made", "Other sides"}]
+    plain = [field for field in in_order(form) if field["title"] not in {"How it is made", "Other sides", "Cut-out"}]
     for field in [*plain, *in_order(options)]:
         assert field["description"] and field["title"][0].isupper()
         assert field["type"] in {"string", "integer", "number", "boolean", "array"}  # a choice of types is a riddle

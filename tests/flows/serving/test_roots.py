@@ -17,9 +17,11 @@ from waiting import wait_until
 
 from dg4d_lib.errors import BadInput
 from flows import deployments, home
-from flows.deployments import Options, PictureOptions
+from flows.deployments import Cutout, Options, PictureOptions, Sides
+from flows.inputs.conversion_job import ConversionJob
 from flows.serving import roots
 from flows.serving.roots import OUTPUTS, SOURCES, Roots, granted
+from steps.contract import Frozen
 
 SECRET = "root:x:0:0:root:/root:/bin/bash\n"
 
@@ -99,6 +101,47 @@ def test_a_source_that_lies_elsewhere_is_refused(place: Path, given: str) -> Non
         refused(lambda flow=flow: flow.fn(given.format(place=place), out))  # type: ignore[misc]
 
 
+ELSEWHERE_FORMS = [
+    {"sides": Sides(views=("180={place}/away/fox.png",))},
+    {"sides": Sides(turntable="{place}/in/dir/fox.png")},
+    {"sides": Sides(cameras="{place}/away/bank.json")},
+    {"sides": Sides(asset="{place}/away/fox.glb")},
+    {"cutout": Cutout(mask="{place}/in/../away/fox.png")},
+]
+
+
+@pytest.mark.parametrize("form", ELSEWHERE_FORMS)
+def test_other_sides_models_and_masks_that_lie_elsewhere_are_refused(place: Path, form: dict[str, Frozen]) -> None:
+    (place / "in" / "dir").symlink_to(place / "away")
+    (place / "away" / "fox.glb").write_bytes(b"glTF")
+    filled = {
+        name: type(fields).model_validate_json(fields.model_dump_json().replace("{place}", str(place)))
+        for name, fields in form.items()
+    }
+    for flow in (deployments.picture_to_4d, deployments.video_to_4d):
+        refused(lambda flow=flow: flow.fn(str(place / "in/fox.png"), str(place / "in/out"), **filled))  # type: ignore[misc]
+
+
+def test_a_form_with_a_model_and_views_is_refused(place: Path) -> None:
+    inside = str(place / "in" / "fox.png")
+    (place / "in" / "fox.glb").write_bytes(b"glTF")
+    sides = Sides(asset=str(place / "in" / "fox.glb"), views=(f"180={inside}",))
+    refused(lambda: deployments.picture_to_4d.fn(inside, str(place / "in" / "out"), sides=sides), "not both")
+
+
+def test_model_mask_and_box_of_a_form_reach_the_job(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    inside = str(place / "in" / "fox.png")
+    (place / "in" / "fox.glb").write_bytes(b"glTF same")
+    jobs: list[ConversionJob] = []
+    monkeypatch.setattr(deployments, "connect", lambda: None)
+    monkeypatch.setattr(deployments, "convert_job", lambda job, folder: jobs.append(job))
+    sides, cutout = Sides(asset=str(place / "in" / "fox.glb")), Cutout(mask=inside, box="1,2,30,40")
+    deployments.picture_to_4d.fn(inside, str(place / "in" / "out"), sides=sides, cutout=cutout)
+    (job,) = jobs
+    assert job.asset is not None and job.mask == job.source
+    assert job.settings.subject.box == (1, 2, 30, 40)
+
+
 @pytest.mark.parametrize("given", ["in/fox.png", "{place}/in/fox.png", "{place}/in2/../in/fox.png", "in/inner.png"])
 def test_a_source_in_a_root_is_found(place: Path, given: str) -> None:
     (place / "in" / "inner.png").symlink_to("fox.png")
@@ -141,6 +184,9 @@ def test_what_a_pattern_or_a_folder_finds_by_links_is_a_failed_row(place: Path) 
         {"path": "fox.png", "views": "180=dir/fox.png"},
         {"path": "fox.png", "turntable": "../away/fox.png"},
         {"path": "fox.png", "cameras": "dir/bank.json"},
+        {"path": "fox.png", "mask": "dir/fox.png"},
+        {"path": "fox.png", "asset": "../away/fox.glb"},
+        {"asset": "dir/fox.glb"},
         {"path": "fox.png", "prior.kind": "zero123", "prior.weights": "{place}/away"},
         {"path": "fox.png", "set": "prior.kind=zero123; prior.weights={place}/away"},
         {"text": "a fox", "text.weights": "./away"},

@@ -1,0 +1,46 @@
+"""Shapes of later frames from the surface of known views, moved as the video shows it."""
+
+import torch
+
+from dg4d_lib.asset_settings import AssetSettings
+from dg4d_lib.fitting.asset_motion import Report
+from dg4d_lib.fitting.surface_tracking import track_surface
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.guidance.moved import MovedSurfaces
+from dg4d_lib.guidance.oracle import Bank
+from dg4d_lib.rasterizer.interface import Rasterizer
+from dg4d_lib.settings import GeometricPriorSettings, LearnedPriorSettings, MotionSettings, PriorSettings
+from dg4d_lib.video.driving import DrivingVideo
+from steps.fitting.priors import subject_shapes
+
+TRACKED_NOTE = "motion of unseen sides: the surface of the known views, moved as the video shows it"
+
+
+def tracks_surface(settings: MotionSettings, prior: PriorSettings, known: Bank | None, frames: int) -> bool:
+    """Return True if the surface of known views is tracked.
+
+    Args:
+        settings: of the motion fit, which ask for it.
+        prior: must have shapes.
+        known: must show the first frame alone.
+        frames: of the video, two or more.
+    """
+    has_shapes = isinstance(prior, GeometricPriorSettings | LearnedPriorSettings)
+    return settings.track_surface and has_shapes and known is not None and known.frames == (0,) and frames > 1
+
+
+def tracked_shapes(
+    gaussians: Gaussians,
+    video: DrivingVideo,
+    known: Bank,
+    prior: PriorSettings,
+    turn_deg: float,
+    rasterize: Rasterizer,
+    settings: AssetSettings,
+    generator: torch.Generator,
+    report: Report = lambda iteration, values: None,
+) -> MovedSurfaces:
+    """Return the shapes of all frames; arguments as of `track_surface` and `subject_shapes`."""
+    first = torch.cat([video.frames[0], video.alpha[0]], -1)
+    surface = subject_shapes(prior, [first], turn_deg, known).surface(0)
+    return MovedSurfaces(track_surface(surface, gaussians, video, rasterize, settings, generator, report))
