@@ -119,8 +119,9 @@ def _converse(
 
 
 def _collect(stream: IO[str], put: Callable[[str | None], Any]) -> None:
-    for line in stream:
-        put(line)
+    with stream:
+        for line in stream:
+            put(line)
     put(None)
 
 

@@ -42,6 +42,7 @@ pack.preview_turns=1
 pack.sheet_size=48
 pack.sheet_frames=2
 """
+WIDGETS = {"STRING", "INT", "FLOAT"}
 SPECIAL = {"DG4D_ASSET", "IMAGE", "MASK", "STRING", "INT", "FLOAT"}
 
 
@@ -362,10 +363,11 @@ def test_workflows_of_the_page_are_those_of_the_api(comfy: Comfy, name: str) -> 
         assert linked == {name: value for name, value in inputs.items() if isinstance(value, list)}
         if node["type"].startswith("DG4D_"):
             kinds = comfy.classes[node["type"]].INPUT_TYPES()["required"]  # type: ignore[attr-defined]  # by contract
-            widgets = [name for name in kinds if name in inputs and not isinstance(inputs[name], list)]
             values = []
-            for widget in widgets:
-                values += [inputs[widget]] + ["fixed"] * bool((*kinds[widget], {})[1].get("control_after_generate"))
+            for widget, (kind, *more) in kinds.items():
+                if isinstance(kind, list) or kind in WIDGETS:  # a linked widget keeps its default
+                    value = more[0]["default"] if widget in linked else inputs[widget]
+                    values += [value] + ["fixed"] * bool(more and more[0].get("control_after_generate"))
             assert node["widgets_values"] == values
 
 
