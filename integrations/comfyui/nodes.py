@@ -268,8 +268,8 @@ def _call(name: str, arguments: Mapping[str, Any]) -> Any:
     bar = comfy.utils.ProgressBar(STEPS)
 
     def show(event: client.Event) -> None:
-        if event.get("fraction") is not None:
-            bar.update_absolute(round(STEPS * event["fraction"]))
+        if event.get("fraction") is not None:  # steps that run at one time report in any order
+            bar.update_absolute(max(bar.current, round(STEPS * event["fraction"])))
 
     check: Callable[[], None] = comfy.model_management.throw_exception_if_processing_interrupted
     result = client.call({"call": name, "arguments": arguments}, show, check)
