@@ -20,7 +20,12 @@ README = repository.text("README.md")
 USAGE = repository.text("docs/usage.md")
 README_LINES = 150
 DOCUMENTS = [path for path in repository.files() if path.endswith(".md")]
-FOLDED = ("tests/", "dg4d_lib/assets/viewer/src/", "docs/gallery/", "integrations/comfyui/workflows/")  # folders whose one line stands for everything in them
+FOLDED = (
+    "tests/",
+    "dg4d_lib/assets/viewer/src/",
+    "docs/gallery/",
+    "integrations/comfyui/workflows/",
+)  # folders whose one line stands for everything in them
 LINE = re.compile(r"( *)(\S+)(?: {2,}(\S.*))?")
 
 
