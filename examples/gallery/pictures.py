@@ -71,7 +71,8 @@ def _arm(number: int) -> list[tuple[float, float, float]]:
     rank = number if number < 3 else 5 - number  # 0 is the outermost
     x, y = 256 + side * (92 - 40 * rank), 272.0
     angle = math.radians(38 + 24 * rank)
-    circles, count = [], 70
+    circles: list[tuple[float, float, float]] = []
+    count = 70
     for k in range(count):
         share = k / (count - 1)
         circles.append((x, y, 29 - 19 * share))

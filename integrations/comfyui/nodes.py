@@ -13,7 +13,7 @@ import torch
 
 from . import client, media
 
-ASSET = "DG4D_ASSET"  # type of the sockets: folder of a package
+ASSET = "ASSET_4D"  # type of the sockets: folder of a package
 CATEGORY = "3d/dg4d"
 PROFILES = ["preview", "paper", "video", "video-fast", "release", "reference", "quality"]
 AS_PROFILE = "as the profile"
@@ -294,14 +294,14 @@ def _relative(path: Path, folder: str) -> str:
 
 
 NODE_CLASS_MAPPINGS: dict[str, type] = {
-    "DG4D_PictureTo4D": PictureTo4D,
-    "DG4D_VideoTo4D": VideoTo4D,
-    "DG4D_Views": Views4D,
-    "DG4D_Save": Save4D,
+    "Dg4dPictureTo4D": PictureTo4D,
+    "Dg4dVideoTo4D": VideoTo4D,
+    "Dg4dViews": Views4D,
+    "Dg4dSave": Save4D,
 }
 NODE_DISPLAY_NAME_MAPPINGS: dict[str, str] = {
-    "DG4D_PictureTo4D": "Picture to 4D",
-    "DG4D_VideoTo4D": "Video to 4D",
-    "DG4D_Views": "4D Views",
-    "DG4D_Save": "Save GLB/USDZ/splats",
+    "Dg4dPictureTo4D": "Picture to 4D",
+    "Dg4dVideoTo4D": "Video to 4D",
+    "Dg4dViews": "4D Views",
+    "Dg4dSave": "Save GLB/USDZ/splats",
 }

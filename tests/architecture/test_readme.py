@@ -168,7 +168,7 @@ def test_every_file_of_a_package_is_explained() -> None:
 
 def test_every_environment_variable_is_explained() -> None:
     name = re.compile(r"\bDG4D_[A-Z0-9_]*[A-Z0-9](?![A-Z0-9_])")
-    code = "".join(repository.text(path) for path in repository.modules(*repository.PACKAGES, "tests"))
+    code = "".join(repository.text(path) for path in repository.modules(*repository.PACKAGES, "integrations", "tests"))
     documents = "".join(repository.text(path) for path in DOCUMENTS)
     assert set(name.findall(code)) == set(name.findall(documents))
 

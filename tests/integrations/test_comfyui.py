@@ -43,7 +43,7 @@ pack.sheet_size=48
 pack.sheet_frames=2
 """
 WIDGETS = {"STRING", "INT", "FLOAT"}
-SPECIAL = {"DG4D_ASSET", "IMAGE", "MASK", "STRING", "INT", "FLOAT"}
+SPECIAL = {"ASSET_4D", "IMAGE", "MASK", "STRING", "INT", "FLOAT"}
 
 
 @pytest.fixture(scope="module")
@@ -127,15 +127,15 @@ def prompt(**changes: Any) -> dict[str, dict[str, Any]]:
     view = {"azimuth": 0.0, "elevation": 10.0, "turn": 180.0, "loops": 1, "count": 3, "size": 64, "background": "gray"}
     return {
         "1": {"class_type": "LoadImage", "inputs": {"image": "newt.png"}},
-        "2": {"class_type": "DG4D_PictureTo4D", "inputs": {"image": ["1", 0], "mask": ["1", 1], **made}},
-        "3": {"class_type": "DG4D_Views", "inputs": {"asset": ["2", 0], "show": "splats", **view}},
+        "2": {"class_type": "Dg4dPictureTo4D", "inputs": {"image": ["1", 0], "mask": ["1", 1], **made}},
+        "3": {"class_type": "Dg4dViews", "inputs": {"asset": ["2", 0], "show": "splats", **view}},
         "4": {"class_type": "Keep", "inputs": {"name": "views", "image": ["3", 0], "mask": ["3", 1]}},
         "5": {"class_type": "Keep", "inputs": {"name": "front", "image": ["2", 1]}},
-        "6": {"class_type": "DG4D_Save", "inputs": {"asset": ["2", 0], "format": "GLB", "filename_prefix": "3d/newt"}},
+        "6": {"class_type": "Dg4dSave", "inputs": {"asset": ["2", 0], "format": "GLB", "filename_prefix": "3d/newt"}},
     }
 
 
-@pytest.mark.parametrize("name", ["DG4D_PictureTo4D", "DG4D_VideoTo4D", "DG4D_Views", "DG4D_Save"])
+@pytest.mark.parametrize("name", ["Dg4dPictureTo4D", "Dg4dVideoTo4D", "Dg4dViews", "Dg4dSave"])
 def test_every_node_keeps_the_contract(comfy: Comfy, name: str) -> None:
     node: Any = comfy.classes[name]
     inputs = node.INPUT_TYPES()
@@ -153,7 +153,7 @@ def test_every_node_keeps_the_contract(comfy: Comfy, name: str) -> None:
 
 
 def test_names_of_profiles_and_motions_are_those_of_dg4d(comfy: Comfy) -> None:
-    required = comfy.classes["DG4D_PictureTo4D"].INPUT_TYPES()["required"]  # type: ignore[attr-defined]  # by contract
+    required = comfy.classes["Dg4dPictureTo4D"].INPUT_TYPES()["required"]  # type: ignore[attr-defined]  # by contract
     assert required["profile"][0] == list(PROFILES)
     for motion in required["motion"][0][1:]:
         revise(named_profile("preview"), {"driving.motion": motion})
@@ -210,7 +210,7 @@ def test_every_format_is_saved(comfy: Comfy, done: dict[str, Any], format_: str,
 
 @pytest.mark.slow
 def test_the_makers_path_is_one_that_preview_3d_shows(comfy: Comfy, done: dict[str, Any]) -> None:
-    (made,) = [values for key, values in comfy.cache.items() if key[1] == "DG4D_PictureTo4D"]
+    (made,) = [values for key, values in comfy.cache.items() if key[1] == "Dg4dPictureTo4D"]
     model_file = made[2][0]
     assert not Path(model_file).is_absolute() and model_file.startswith("dg4d/my-newt-")
     assert (comfy.output / model_file).read_bytes()[:4] == b"glTF"
@@ -221,7 +221,7 @@ def test_a_video_becomes_an_asset_with_its_frame_rate(comfy: Comfy) -> None:
     made = {"name": "ball", "profile": "preview", "seed": 0, "settings": QUICK, "fps": 12.5}
     workflow: dict[str, dict[str, Any]] = {
         "1": {"class_type": "LoadFrames", "inputs": {}},
-        "2": {"class_type": "DG4D_VideoTo4D", "inputs": {"frames": ["1", 0], "mask": ["1", 1], **made}},
+        "2": {"class_type": "Dg4dVideoTo4D", "inputs": {"frames": ["1", 0], "mask": ["1", 1], **made}},
         "3": {"class_type": "Keep", "inputs": {"name": "ball", "image": ["2", 1]}},
     }
     comfy.execute(workflow)
@@ -234,14 +234,14 @@ def test_a_video_becomes_an_asset_with_its_frame_rate(comfy: Comfy) -> None:
 def test_an_interrupt_ends_every_process_and_the_next_run_works(
     comfy: Comfy, module: types.ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("DG4D_COMFY_TEST", "interrupt")
+    monkeypatch.setenv("COMFY_NODES_TEST", "interrupt")
     started = len(comfy.reported)
     comfy.interrupt_when = lambda: len(comfy.reported) > started
     with pytest.raises(InterruptProcessingException):
         comfy.execute(prompt(seed=7))
     comfy.interrupt_when = lambda: False
     until = time.monotonic() + 20
-    while (left := processes_with("DG4D_COMFY_TEST=interrupt")) and time.monotonic() < until:
+    while (left := processes_with("COMFY_NODES_TEST=interrupt")) and time.monotonic() < until:
         time.sleep(0.1)
     assert not left
     comfy.execute(prompt(seed=7))
@@ -316,12 +316,12 @@ def test_a_child_that_ignores_the_interrupt_is_killed(
 
 
 def test_masks_of_another_size_or_number_are_refused(comfy: Comfy) -> None:
-    picture = comfy.classes["DG4D_PictureTo4D"]()
+    picture = comfy.classes["Dg4dPictureTo4D"]()
     with pytest.raises(ValueError, match="32 x 32 pixels, the picture 64 x 64"):
         picture.make(  # type: ignore[attr-defined]  # by contract
             torch.zeros(1, 64, 64, 3), "sway", "x", "preview", 0, "", mask=torch.ones(1, 32, 32)
         )
-    video = comfy.classes["DG4D_VideoTo4D"]()
+    video = comfy.classes["Dg4dVideoTo4D"]()
     with pytest.raises(ValueError, match="one mask per frame"):
         video.make(  # type: ignore[attr-defined]  # by contract
             torch.zeros(3, 8, 8, 3), 12.0, "x", "preview", 0, "", mask=torch.ones(2, 8, 8)
@@ -332,13 +332,13 @@ def test_masks_of_another_size_or_number_are_refused(comfy: Comfy) -> None:
 
 def test_an_asset_that_was_removed_is_named(comfy: Comfy, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="make it again"):
-        comfy.classes["DG4D_Save"]().save(str(tmp_path), "GLB", "x")  # type: ignore[attr-defined]  # by contract
+        comfy.classes["Dg4dSave"]().save(str(tmp_path), "GLB", "x")  # type: ignore[attr-defined]  # by contract
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in (FOLDER / "workflows").glob("*_api.json")))
 def test_example_workflows_are_valid(comfy: Comfy, name: str) -> None:
     workflow = json.loads((FOLDER / "workflows" / name).read_text())
-    assert sum(node["class_type"].startswith("DG4D_") for node in workflow.values()) == 3
+    assert sum(node["class_type"].startswith("Dg4d") for node in workflow.values()) == 3
     assert [error for error in comfy.validate(workflow) if "does not exist" not in error] == []
 
 
@@ -361,7 +361,7 @@ def test_workflows_of_the_page_are_those_of_the_api(comfy: Comfy, name: str) -> 
                 linked[socket["name"]] = [str(source), output]
         inputs = api[str(key)]["inputs"]
         assert linked == {name: value for name, value in inputs.items() if isinstance(value, list)}
-        if node["type"].startswith("DG4D_"):
+        if node["type"].startswith("Dg4d"):
             kinds = comfy.classes[node["type"]].INPUT_TYPES()["required"]  # type: ignore[attr-defined]  # by contract
             values = []
             for widget, (kind, *more) in kinds.items():
