@@ -26,7 +26,7 @@ NOISE = 0.008  # standard deviation of the camera noise, of full scale
 def write_picture(name: str, path: Path) -> None:
     """Draw one picture of the gallery; its name chooses the subject, the suffix of the path the format."""
     drawn = DRAWN[name]() if name in DRAWN else cutout(FIGURES[name]())
-    drawn.save(path, quality=QUALITY, **({"method": 6} if path.suffix == ".webp" else {}))
+    drawn.save(path, quality=QUALITY, method=6)  # JPEG ignores the method of WebP
 
 
 def cutout(figure: Figure) -> Image.Image:
@@ -69,7 +69,7 @@ def _arm(number: int) -> list[tuple[float, float, float]]:
     """Return circles along an arm, from the body to its curled tip: x, y, radius in pixels."""
     side = -1 if number < 3 else 1
     rank = number if number < 3 else 5 - number  # 0 is the outermost
-    x, y = 256 + side * (92 - 40 * rank), 272.0
+    x, y = 256.0 + side * (92 - 40 * rank), 272.0
     angle = math.radians(38 + 24 * rank)
     circles: list[tuple[float, float, float]] = []
     count = 70
