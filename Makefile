@@ -17,8 +17,9 @@ AUDIT := timeout 300 $(TOOLS)/bin/pip-audit --no-deps --disable-pip -f json --pr
 DOCS := out/docs
 SHAPE_PRIOR ?=
 UPGRADE ?=
+NAMES ?=
 
-.PHONY: setup clients demo test nightly check audit lock docs emulation examples shape-prior clean
+.PHONY: setup clients demo test nightly check audit lock docs emulation examples gallery shape-prior clean
 
 setup: $(READY)
 
@@ -82,6 +83,10 @@ emulation: setup
 
 examples: setup
 	$(BIN)/python -m examples.make_examples
+
+# draw and convert the ten pictures of docs/gallery.md, about 20 minutes; NAMES="fish car" chooses
+gallery: setup
+	$(BIN)/python -m examples.gallery.make_gallery $(NAMES)
 
 # train the network of `prior.kind=learned`; run it again to resume, SHAPE_PRIOR="--samples 800000" trains longer
 shape-prior: setup

@@ -14,7 +14,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PAGES = (
     *("README.md", "ARCHITECTURE.md", "CHANGELOG.md", "CONTRIBUTING.md", "DECISIONS.md", "SECURITY.md"),
-    *("dg4d_lib/README.md", "benchmarks/RESULTS.md", "examples/README.md"),
+    *("dg4d_lib/README.md", "benchmarks/RESULTS.md", "examples/README.md", "integrations/comfyui/README.md"),
     *(f"docs/{path.name}" for path in sorted(Path(__file__).parent.glob("*.md"))),
 )
 LINK = re.compile(r"(\]\()([^)#\s]+)(#[^)\s]*)?\)")

@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("dg4d", "dg4d_lib", "steps", "flows")
-CODE = (*PACKAGES, "examples", "benchmarks", "experiments", "tests", "deploy", "training")
+CODE = (*PACKAGES, "examples", "benchmarks", "experiments", "tests", "deploy", "training", "integrations")
 GENERATED = {".git", ".venv", "out", "build", "dist", "__pycache__"}  # where git is not asked
 
 

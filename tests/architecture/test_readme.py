@@ -20,7 +20,12 @@ README = repository.text("README.md")
 USAGE = repository.text("docs/usage.md")
 README_LINES = 150
 DOCUMENTS = [path for path in repository.files() if path.endswith(".md")]
-FOLDED = ("tests/", "dg4d_lib/assets/viewer/src/")  # folders whose one line stands for everything in them
+FOLDED = (
+    "tests/",
+    "dg4d_lib/assets/viewer/src/",
+    "docs/gallery/",
+    "integrations/comfyui/workflows/",
+)  # folders whose one line stands for everything in them
 LINE = re.compile(r"( *)(\S+)(?: {2,}(\S.*))?")
 
 
@@ -163,7 +168,7 @@ def test_every_file_of_a_package_is_explained() -> None:
 
 def test_every_environment_variable_is_explained() -> None:
     name = re.compile(r"\bDG4D_[A-Z0-9_]*[A-Z0-9](?![A-Z0-9_])")
-    code = "".join(repository.text(path) for path in repository.modules(*repository.PACKAGES, "tests"))
+    code = "".join(repository.text(path) for path in repository.modules(*repository.PACKAGES, "integrations", "tests"))
     documents = "".join(repository.text(path) for path in DOCUMENTS)
     assert set(name.findall(code)) == set(name.findall(documents))
 

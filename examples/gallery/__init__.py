@@ -1,0 +1,1 @@
+"""Ten assets for the gallery: their pictures, the conversions and the page."""

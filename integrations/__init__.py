@@ -1,0 +1,1 @@
+"""Plug-ins for other programs; not part of the installed package."""
