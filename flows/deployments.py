@@ -150,6 +150,14 @@ class Sides(Frozen):
         return ViewsRequest(views=parse_views(self.views), turntable=turntable, cameras=cameras)
 
 
+Mask = Annotated[
+    str,
+    Field(
+        title="Mask",
+        description="picture on the worker's machine that is white where the subject is; of a video a folder of them; "
+        "empty: the subject is found",
+    ),
+]
 FormSides = Annotated[Sides, Field(json_schema_extra=_title("Other sides") | {"default": Sides().model_dump()})]
 FormOptions = Annotated[Options, Field(json_schema_extra=_options_field(Options()))]
 FormPictureOptions = Annotated[PictureOptions, Field(json_schema_extra=_options_field(PictureOptions()))]
@@ -161,6 +169,7 @@ def picture_to_4d(
     out: Folder,
     options: FormPictureOptions = PictureOptions(),  # noqa: B008 - frozen
     sides: FormSides = Sides(),  # noqa: B008 - frozen
+    mask: Mask = "",
 ) -> None:
     """Convert a picture to an animated 3D asset.
 
@@ -170,8 +179,9 @@ def picture_to_4d(
         out: on the worker's machine, as `/data/out/fox`; open `report.html` there when it is done
         options: the defaults work on any machine
         sides: pictures of other sides, which the subject is shaped and colored by
+        mask: picture on the worker's machine that is white where the subject is; empty: the subject is found
     """
-    _convert(picture, out, options, sides)
+    _convert(picture, out, options, sides, mask=mask)
 
 
 @flow(name="video-to-4d", flow_run_name=lambda: _run_name("video"), persist_result=False)
@@ -180,6 +190,7 @@ def video_to_4d(
     out: Folder,
     options: FormOptions = Options(),  # noqa: B008 - frozen
     sides: FormSides = Sides(),  # noqa: B008 - frozen
+    mask: Mask = "",
 ) -> None:
     """Convert a video to an animated 3D asset that moves as the video does.
 
@@ -189,8 +200,32 @@ def video_to_4d(
         out: on the worker's machine, as `/data/out/walk`; open `report.html` there when it is done
         options: the defaults work on any machine
         sides: pictures of other sides at the first frame, which the subject is shaped and colored by
+        mask: folder on the worker's machine with a mask for every frame; empty: the subject is found
     """
-    _convert(video, out, options, sides, is_video=True)
+    _convert(video, out, options, sides, is_video=True, mask=mask)
+
+
+@flow(name="model-to-4d", flow_run_name=lambda: _run_name("model"), persist_result=False)
+def model_to_4d(
+    model: Annotated[Text, Field(json_schema_extra=_title("Model"))],
+    out: Folder,
+    picture: Annotated[str, Field(json_schema_extra=_title("Picture"))] = "",
+    options: FormPictureOptions = PictureOptions(),  # noqa: B008 - frozen
+) -> None:
+    """Set a model of your own in motion: a mesh or splats.
+
+    Args:
+        model: a file on the worker's machine, as `/data/in/fox.glb`; also .gltf, .obj, .usdz, .ply and .spz
+        out: on the worker's machine, as `/data/out/fox`; open `report.html` there when it is done
+        picture: of the model or a video of its motion, on the worker's machine; empty: the model's own render moves
+        options: the defaults work on any machine
+    """
+    _start()
+    roots = Roots.of_this_process()
+    folder = roots.output(out)
+    path, shown = Path(roots.folder(model)), Path(roots.folder(picture)) if picture else None
+    item = clean_name(path.stem) or "asset"
+    _publish(_request(item, options, roots, picture=shown, asset=path), folder)
 
 
 @flow(name="catalog-to-4d", flow_run_name=lambda: _run_name("inputs"), persist_result=False)
@@ -325,26 +360,36 @@ def _knobs(options: Options, roots: Roots) -> dict[str, Any]:
     return knobs
 
 
-def _convert(address: str, out: str, options: Options, sides: Sides, is_video: bool = False) -> None:
+def _convert(address: str, out: str, options: Options, sides: Sides, is_video: bool = False, mask: str = "") -> None:
     """Convert a source as `dg4d make` does; do nothing if the folder holds its package already."""
     _start()
     roots = Roots.of_this_process()
     folder, given = roots.output(out), sides.request()
     roots.check_files(given.files())
+    marked = Path(roots.folder(mask)) if mask else None
+    item = clean_name(PurePosixPath(urlsplit(address).path).stem) or "asset"
     with local_copy(roots.source(address)) as path:
-        request = ConversionRequest(
-            item=clean_name(PurePosixPath(urlsplit(address).path).stem) or "asset",
-            picture=path,
-            video=path if is_video else None,
-            given_views=given,
-            profile=options.profile,
-            settings=revise(profile(options.profile), _knobs(options, roots)),
-            seed=options.seed,
-            commercial_only=options.commercial_only,
-        )
-        request.check()
-        check_folder(folder, request.item)
-        job = request.to_job(home.store())
-        if not is_current(folder, job.digest()):
-            connect()
-            convert_job(job, folder)
+        files = {"picture": path, "video": path if is_video else None, "mask": marked, "given_views": given}
+        _publish(_request(item, options, roots, **files), folder)
+
+
+def _request(item: str, options: Options, roots: Roots, **files: Any) -> ConversionRequest:
+    """Return the request of a form, with its files by their names."""
+    return ConversionRequest(
+        item=item,
+        profile=options.profile,
+        settings=revise(profile(options.profile), _knobs(options, roots)),
+        seed=options.seed,
+        commercial_only=options.commercial_only,
+        **files,
+    )
+
+
+def _publish(request: ConversionRequest, folder: Path) -> None:
+    """Convert a request into a folder, unless its package is there already."""
+    request.check()
+    check_folder(folder, request.item)
+    job = request.to_job(home.store())
+    if not is_current(folder, job.digest()):
+        connect()
+        convert_job(job, folder)
