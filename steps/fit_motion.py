@@ -11,7 +11,7 @@ from dg4d_lib.settings import DeformationSettings, MotionSettings
 from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.motions import new_deformation, write_motion
 from steps.fitting.priors import make_prior, read_known_views, subject_turn
-from steps.fitting.reporting import LossCurves, picture_of_divergence, render_row
+from steps.fitting.reporting import LossCurves, picture_of_divergence, render_row, show_fit
 from steps.runtime.job import Job, StepReport
 
 FINE_TUNED = "The Gaussians at rest were fitted to the whole video together with their motion."
@@ -36,10 +36,15 @@ def run(job: Job) -> StepReport:
     device = preferred_device(backend)
     deformation.to(device)
     curves = LossCurves(settings.iterations, job.progress)
+    start = gaussians.to(device)
+    middle = torch.tensor([0.5])
+
+    def watch(iteration: int, values: dict[str, float]) -> None:
+        curves.add(iteration, values)
+        show_fit(job, lambda: deformation.displace(start.means, middle.to(device)).apply(start), rasterize)
+
     with picture_of_divergence(job, rasterize):
-        fitted = fit_motion(
-            gaussians.to(device), deformation, video, chosen.prior, rasterize, settings, generator, curves.add
-        )
+        fitted = fit_motion(start, deformation, video, chosen.prior, rasterize, settings, generator, watch)
     deformation.cpu()
     gaussians = fitted.to(torch.device("cpu"))
     if settings.fine_tune:

@@ -25,6 +25,7 @@ from steps.profiles import profile, revise
 from steps.runtime.installed_code import catalog
 
 MOTIONS = 6  # weights-free motions
+CUTOUT_SIZE = 384  # pixels; mattes are estimated at up to twice as many
 FILM_SIZE = 256  # pixels of the subject in the films
 AT_ONCE = threading.Semaphore(2)
 
@@ -81,7 +82,8 @@ def cut_out(draft: Draft, upload: Upload, box: tuple[int, ...] = ()) -> CutOut:
     """
     if upload.kind == "model":
         raise BadInput("a model has no background to cut away")
-    settings = revise(profile("preview"), {"subject.box": list(box)} if box else {})
+    changes: dict[str, Any] = {"subject.size": CUTOUT_SIZE} | ({"subject.box": list(box)} if box else {})
+    settings = revise(profile("preview"), changes)
     conversion = Conversion(item=draft.identifier, settings=settings)
     outputs = _run("cut_out", source=_source(upload), conversion=conversion).outputs
     facts = json.loads(home.store().path(outputs["facts"]).read_text(encoding="utf-8"))

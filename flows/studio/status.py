@@ -16,12 +16,12 @@ from flows.inputs.package_record import record_of
 from flows.stages import planned_steps
 from flows.studio.server_api import ENDED, Row, ServerApi
 from flows.studio.submission import asset_tag
+from flows.ui.pages import LIVE
 from steps.contract import Frozen
 
 FIGURES = re.compile(r": (\d+)/(\d+)((?:, .+)?)$")  # at the end of the description of a progress artifact
 PICTURE = re.compile(r"\((/dg4d/artifacts/[0-9a-f]{64}/\d+/picture\.png)\)")
 WRAPPING = re.compile(r"^Flow run encountered an exception: (?:\w+: )?")
-LIVE = "live-"  # key of artifacts with the picture of a running fit
 WORDS = {
     "SCHEDULED": "waiting",
     "PENDING": "waiting",

@@ -31,14 +31,29 @@ async function answerOf(response) {
   return content;
 }
 
+const signature = () => ({ Authorization: `Basic ${localStorage.getItem(SECRET) ?? ""}` });
+let token = { until: 0, headers: {} };
+
+// Headers of a change: the secret, and Prefect's token against forged requests.
+async function permission() {
+  if (token.until < Date.now()) {
+    const client = [...crypto.getRandomValues(new Uint8Array(16))].map((byte) => byte.toString(16).padStart(2, "0")).join("");
+    const given = await answerOf(await fetch(`/api/csrf-token?client=${client}`, { headers: signature() }));
+    const headers = { "Prefect-Csrf-Token": given.token, "Prefect-Csrf-Client": client };
+    token = { until: Math.min(Date.parse(given.expiration) - 60_000, Date.now() + 1_800_000), headers };
+  }
+  return { ...signature(), ...token.headers };
+}
+
 async function post(path, body = {}) {
   const raw = body instanceof Blob;
-  const headers = { Authorization: `Basic ${localStorage.getItem(SECRET) ?? ""}` };
-  headers["Content-Type"] = raw ? "application/octet-stream" : "application/json";
-  const sent = await fetch(path, { method: "POST", headers, body: raw ? body : JSON.stringify(body) }).catch(() => {
+  try {
+    const headers = { ...(await permission()), "Content-Type": raw ? "application/octet-stream" : "application/json" };
+    return await answerOf(await fetch(path, { method: "POST", headers, body: raw ? body : JSON.stringify(body) }));
+  } catch (error) {
+    if (!(error instanceof TypeError)) throw error;
     throw new Error("The server does not answer. It may be starting again; nothing is lost.");
-  });
-  return answerOf(sent);
+  }
 }
 
 async function read(path, headers = {}) {
@@ -76,11 +91,12 @@ document.addEventListener("click", (event) => {
 // ---- front page
 
 // Sends one file with its progress; fetch does not report that of uploads.
-function send(path, file, onProgress) {
+async function send(path, file, onProgress) {
+  const headers = await permission();
   return new Promise((resolve, reject) => {
     const request = new XMLHttpRequest();
     request.open("POST", path);
-    request.setRequestHeader("Authorization", `Basic ${localStorage.getItem(SECRET) ?? ""}`);
+    for (const [name, value] of Object.entries(headers)) request.setRequestHeader(name, value);
     request.upload.onprogress = (event) => onProgress(event.loaded);
     request.onerror = () => reject(new Error("The upload was cut off; drop the files again."));
     request.onload = () => {
