@@ -11,7 +11,7 @@ from dg4d_lib.settings import DeformationSettings, MotionSettings
 from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.motions import new_deformation, write_motion
 from steps.fitting.priors import make_prior, read_known_views, subject_turn
-from steps.fitting.reporting import LossCurves, picture_of_divergence, render_row, show_fit
+from steps.fitting.reporting import SHOWN_AZIMUTHS_DEG, LossCurves, picture_of_divergence, render_row, show_fit
 from steps.runtime.job import Job, StepReport
 
 FINE_TUNED = "The Gaussians at rest were fitted to the whole video together with their motion."
@@ -37,11 +37,11 @@ def run(job: Job) -> StepReport:
     deformation.to(device)
     curves = LossCurves(settings.iterations, job.progress)
     start = gaussians.to(device)
-    middle = torch.tensor([0.5])
+    moments = torch.linspace(0, 1, len(SHOWN_AZIMUTHS_DEG) + 1)[:-1].to(device)  # one for each side
 
     def watch(iteration: int, values: dict[str, float]) -> None:
         curves.add(iteration, values)
-        show_fit(job, lambda: deformation.displace(start.means, middle.to(device)).apply(start), rasterize)
+        show_fit(job, lambda: deformation.displace(start.means, moments).apply(start), rasterize)
 
     with picture_of_divergence(job, rasterize):
         fitted = fit_motion(start, deformation, video, chosen.prior, rasterize, settings, generator, watch)
