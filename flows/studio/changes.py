@@ -1,6 +1,5 @@
 """Changes that the studio page asks for: uploads, cut-outs, conversions, cancel, retry, again."""
 
-from pathlib import Path
 from typing import Any, TypeVar
 
 from fastapi import HTTPException, Request, Response
@@ -127,17 +126,12 @@ class Changes:
         if shown is None:
             raise LookupError("there is no such version")
         made = await run_in_threadpool(lambda: gallery.settings_of(shown.version))
-        run = await self._run_of(made[1]) if made else None
+        run = await self._api.run_into(str(made[1]), key) if made else None
         if run is None:
             raise BadInput(
                 "this version was not made in the studio; repeat it with `dg4d make` and the settings in its report"
             )
         return await self._start(again(run, wanted.settings, wanted.seed))
-
-    async def _run_of(self, folder: Path) -> dict[str, Any] | None:
-        """Return the run that made the package in a folder."""
-        rows = await self._api.runs([folder.parent.name])
-        return next((row for row in rows if row["parameters"].get("out") == str(folder)), None)
 
     async def _start(self, wanted: Order) -> Response:
         identifier = await self._api.start(*wanted)

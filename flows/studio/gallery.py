@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import quote
 
 from pydantic import Field, ValidationError
 
@@ -88,7 +89,8 @@ class Shown:
     @property
     def viewer(self) -> str:
         """Address of the viewer."""
-        return pages.address(pages.key("asset", self.version.item), self.version.package, ".html", VIEWER_ADDRESS)
+        title = quote(self.version.item.rpartition("/")[2], safe="")
+        return pages.address(title, self.version.package, ".html", VIEWER_ADDRESS)
 
     @property
     def package(self) -> str:
@@ -99,11 +101,6 @@ class Shown:
     def gates(self) -> dict[str, Any] | None:
         """Verdict of the gates; None if it is gone."""
         return _output(self.version, "check_asset", "gates")
-
-    @property
-    def cutout_gates(self) -> dict[str, Any] | None:
-        """Verdict on an estimated cut-out; None if there is none."""
-        return _output(self.version, "prepare_subject", "cutout_gates")
 
     @property
     def verdict(self) -> str:

@@ -14,7 +14,7 @@ from flows import home
 from flows.serving.addresses import STUDIO_ADDRESS
 from flows.studio import gallery, html, quick, status
 from flows.studio.drafts import Draft, Upload
-from flows.studio.remedies import Remedy, remedies
+from flows.studio.remedies import remedies
 from flows.studio.server_api import ServerApi
 from flows.studio.submission import GPU, draft_tag
 from steps.profiles import PROFILES
@@ -106,14 +106,21 @@ class Pages:
         versions = {each.key: each for each in found.versions}
         left = versions.get(request.query_params.get("v", ""), found.newest)
         right = versions.get(request.query_params.get("with", ""))
-        gates, can_repeat = await run_in_threadpool(lambda: _gates(left))
+        made = await run_in_threadpool(lambda: gallery.settings_of(left.version))
+        run = await self._api.run_into(str(made[1]), found.key) if made else None
+        drafts = [tag.removeprefix("draft-") for tag in (run or {}).get("tags", ()) if tag.startswith("draft-")]
+        gates = [
+            (gate, remedies(gate, made[0]) if made and run else []) for gate in (left.gates or {}).get("gates", ())
+        ]
         return _page(
             "asset.html",
             asset=found,
             shown=left,
             other=right if right is not left else None,
-            gates=gates,
-            can_repeat=can_repeat,
+            failed=[row for row in gates if not row[0]["passed"]],
+            passed=[row for row in gates if row[0]["passed"]],
+            can_repeat=run is not None,
+            draft=drafts[0] if drafts else "",
             downloads=await run_in_threadpool(lambda: gallery.downloads(left, home.store())),
             entries=quick.entry_address(left.version.package),
         )
@@ -126,16 +133,6 @@ class Pages:
             latest.setdefault(str(row["parameters"].get("out", row["id"])), row)
         shown = [status.summary(dict(row)) for row in latest.values()]
         return [each for each in shown if each.state != "done" or each.is_batch][:RECENT]
-
-
-def _gates(shown: gallery.Shown) -> tuple[list[tuple[dict[str, Any], list[Remedy]]], bool]:
-    """Return the gates of a version with remedies, and true if the page can repeat the conversion."""
-    made = gallery.settings_of(shown.version)
-    rows = []
-    for verdict in (shown.gates, shown.cutout_gates):
-        for gate in (verdict or {}).get("gates", ()):
-            rows.append((gate, remedies(gate, made[0]) if made else []))
-    return sorted(rows, key=lambda row: bool(row[0]["passed"])), made is not None
 
 
 def _takes_mask(first: Upload) -> bool:

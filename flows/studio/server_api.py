@@ -76,6 +76,11 @@ class ServerApi:
             "flow_runs", {"flow_runs": wanted, "sort": "EXPECTED_START_TIME_DESC", "limit": limit}
         )
 
+    async def run_into(self, out: str, tag: str) -> Row | None:
+        """Return the run with a tag that made the package in an output folder; None if the page started none."""
+        rows = await self.runs([tag])
+        return next((row for row in rows if row["parameters"].get("out") == out), None)
+
     async def children(self, identifier: str) -> list[Row]:
         """Return the flow runs that a run started, the oldest first."""
         wanted = {"parent_flow_run_id": {"any_": [identifier]}}
@@ -101,7 +106,8 @@ class ServerApi:
         """
         state = {"type": "CANCELLING", "name": "Cancelling", "message": "cancelled in the studio"}
         answer = await self._client.post(f"/flow_runs/{identifier}/set_state", json={"state": state})
-        if answer.status_code >= httpx.codes.BAD_REQUEST or answer.json()["status"] != "ACCEPT":
+        reached = (answer.json().get("state") or {}).get("type") if answer.is_success else None
+        if reached not in {"CANCELLING", "CANCELLED"}:  # of a run that has no process yet it is the latter
             raise HTTPException(409, "this conversion has ended and cannot be cancelled")
 
     async def has_worker(self, pool: str) -> bool:

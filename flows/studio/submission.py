@@ -10,10 +10,12 @@ from pydantic import Field
 from dg4d_lib.errors import BadInput
 from dg4d_lib.input_settings import Motion
 from flows import home
+from flows.inputs.manifest import parse_changes
 from flows.inputs.naming import check_name, clean_name
 from flows.studio.drafts import Draft, Upload
 from flows.ui import pages
 from steps.contract import LARGEST_SEED, Frozen
+from steps.profiles import profile, revise
 
 MOST_VIEWS = 63
 GPU = " on a GPU"
@@ -79,6 +81,7 @@ def order(draft: Draft, wanted: Submission) -> Order:
         LookupError: a view is not among the files.
         DiskFull: there is no room.
     """
+    revise(profile(wanted.profile), parse_changes(_lines(wanted)))  # refuses settings before a run starts
     if wanted.batch:
         return _batch(draft, wanted)
     first, key = draft.first(), secrets.token_hex(6)
@@ -163,20 +166,25 @@ def _same_deployment(run: Mapping[str, Any], parameters: dict[str, Any]) -> Orde
     return Order(deployment, item, parameters, tags)
 
 
-def _deployment(flow: str, title: str, profile: str) -> str:
+def _deployment(flow: str, title: str, profile_name: str) -> str:
     """Return the deployment of a flow; profiles other than `preview` want a GPU."""
-    return f"{flow}/{title} to 4D{'' if profile == 'preview' else GPU}"
+    return f"{flow}/{title} to 4D{'' if profile_name == 'preview' else GPU}"
 
 
 def _options(wanted: Submission, with_motion: bool) -> dict[str, Any]:
-    box = [f"subject.box=[{','.join(map(str, wanted.box))}]"] if wanted.box and not wanted.masked else []
     options: dict[str, Any] = {
         "profile": wanted.profile,
         "seed": wanted.seed,
         "commercial_only": wanted.commercial_only,
-        "settings": [*box, *wanted.settings],
+        "settings": _lines(wanted),
     }
     return options | ({"motion": wanted.motion} if wanted.motion and with_motion else {})
+
+
+def _lines(wanted: Submission) -> list[str]:
+    """Return the settings as `--set` takes them; a matte has been drawn within the box already."""
+    box = [f"subject.box=[{','.join(map(str, wanted.box))}]"] if wanted.box and not wanted.masked else []
+    return [*box, *wanted.settings]
 
 
 def _mask(draft: Draft, wanted: Submission, first: Upload, key: str) -> str:
