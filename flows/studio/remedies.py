@@ -90,13 +90,13 @@ def remedies(gate: Mapping[str, Any], settings: PipelineSettings) -> list[Remedy
 
 
 def _allowed(candidate: Candidate, settings: PipelineSettings) -> Remedy | None:
-    """Return a remedy; None if a value leaves its bounds, or the profile has no such setting."""
+    """Return a remedy; None if it changes nothing, a value leaves its bounds, or the profile has no such setting."""
     try:
         remedy = candidate(settings)
-        revise(settings, remedy.changes)
+        changed = revise(settings, remedy.changes)
     except (BadInput, AttributeError):
         return None
-    return remedy
+    return remedy if changed != settings else None
 
 
 def _value(settings: PipelineSettings, name: str) -> Any:

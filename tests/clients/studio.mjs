@@ -96,7 +96,16 @@ const stories = {
     await page.click("#open");
     await page.waitForURL(/assets/);
     await check("asset");
-    seen.viewer = await page.frames().at(-1).evaluate(() => document.title || document.body.innerText.slice(0, 200));
+    const viewer = page.frames().at(-1);
+    await viewer.waitForFunction(() => globalThis.dg4d);
+    seen.viewer = await viewer.evaluate(() => dg4d.ready.then(() => dg4d.state(), String));
+    seen.reached = await viewer.evaluate(() => {
+      try {
+        return localStorage.length >= 0;
+      } catch {
+        return false;
+      }
+    });
     seen.again = await page.locator("[data-again]").allInnerTexts();
     const waiting = page.waitForEvent("download");
     await page.click("text=asset.glb");

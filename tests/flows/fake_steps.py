@@ -1,5 +1,6 @@
 """Steps that do next to nothing, under the names of the real ones; what happens is said in the source file.
 
+The package holds the model in the file $FAKE_GLB, if there is one, and else text that no program plays.
 The source is text after the signature of a picture (`picture`): words that name a step and what it should do there,
 for example "fit_motion=sleep:5".
 Every run of a step is noted in the file $FAKE_LOG.
@@ -183,7 +184,8 @@ def pack_asset(job: Job) -> StepReport:
     words = _begin("pack_asset", job, job.inputs["subject"].read_bytes()[len(PNG) :])
     name = "tracked" if "tracked" in job.inputs else "meshes"
     with zipfile.ZipFile(job.outputs["package"], "w") as archive:
-        archive.writestr(zipfile.ZipInfo("asset.glb"), job.inputs[name].read_bytes())
+        model = os.environ.get("FAKE_GLB")
+        archive.writestr(zipfile.ZipInfo("asset.glb"), Path(model or job.inputs[name]).read_bytes())
         archive.writestr(zipfile.ZipInfo("contact_sheet.png"), PNG + words)
         archive.writestr(zipfile.ZipInfo("splats/000.ply"), b"0")
         archive.writestr(zipfile.ZipInfo("splats/001.ply"), str(job.seed).encode())

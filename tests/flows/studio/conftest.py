@@ -9,9 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+import trimesh
 from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
 from waiting import wait_until
 
+from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.assets.formats.glb import write_glb
+from dg4d_lib.mesh.textured import TexturedMesh
 from flows import home
 from flows.serving import background, registering
 from flows.serving.auth import basic
@@ -89,10 +94,19 @@ class Client:
         return found
 
 
+def egg() -> bytes:
+    """Return the GLB of an egg that swells."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
+    vertices = torch.tensor(ball.vertices, dtype=torch.float32)
+    mesh = TexturedMesh(vertices, torch.tensor(ball.faces), vertices[:, :2] + 0.5, torch.full((8, 8, 3), 0.6))
+    return write_glb(Asset4D(mesh, torch.linspace(0, 0.3, 3)[:, None, None] * vertices, 7.0))
+
+
 @pytest.fixture(scope="session")
 def studio(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
     """The studio of a server of its own: its steps are fake, and run in the processes of server and worker."""
     place = tmp_path_factory.mktemp("studio")
+    (place / "egg.glb").write_bytes(egg())
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {
             "DG4D_HOME": str(place / "home"),
@@ -101,6 +115,7 @@ def studio(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
             "DG4D_EXECUTOR": "in_process",
             "DG4D_STUDIO_UPLOAD_MB": "1",
             "FAKE_LOG": str(place / "ran"),
+            "FAKE_GLB": str(place / "egg.glb"),
             "PYTHONPATH": str(Path(__file__).parents[1]),
         }.items():
             patch.setenv(name, value)

@@ -42,6 +42,7 @@ def test_a_dropped_picture_is_corrected_converted_played_and_downloaded(studio: 
     assert seen["violations"] == []
     assert seen["wide"] == []
     assert seen["undo"] and seen["states"] == ["done", "done"] and seen["steps"] == 8
+    assert seen["viewer"]["playing"] and seen["viewer"]["frames"] == 3 and not seen["reached"]
     assert "Again with twice the motion iterations" in seen["again"]
     assert seen["downloaded"][0] == "asset.glb" and seen["downloaded"][1] > 0
     record = json.loads(next(home.studio_assets().glob("asset-heron-*/*/provenance.json")).read_text())
@@ -95,6 +96,6 @@ def test_two_hundred_assets_are_painted_within_a_second(studio: Client) -> None:
             if "creature" in entry.name:
                 store.remove([entry.name])
     assert seen["paint"] < FIRST_PAINT_MS
-    assert seen["before"] == 60 and seen["after"] == 10
+    assert seen["before"] == 60 and seen["after"] == sum("01" in f"{number:03d}" for number in range(MANY))
     assert seen["failed"].startswith("2") and "verdict=failed" in seen["address"]
     assert seen["violations"] == []
