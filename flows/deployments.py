@@ -150,14 +150,7 @@ class Sides(Frozen):
         return ViewsRequest(views=parse_views(self.views), turntable=turntable, cameras=cameras)
 
 
-Mask = Annotated[
-    str,
-    Field(
-        title="Mask",
-        description="picture on the worker's machine that is white where the subject is; of a video a folder of them; "
-        "empty: the subject is found",
-    ),
-]
+Mask = Annotated[str, Field(json_schema_extra=_title("Mask"))]
 FormSides = Annotated[Sides, Field(json_schema_extra=_title("Other sides") | {"default": Sides().model_dump()})]
 FormOptions = Annotated[Options, Field(json_schema_extra=_options_field(Options()))]
 FormPictureOptions = Annotated[PictureOptions, Field(json_schema_extra=_options_field(PictureOptions()))]
