@@ -142,8 +142,9 @@ async def full(run: Row, api: ServerApi, now: float) -> RunStatus:
     planned = _planned(children, run["parameters"])
     schedule = Schedule(planned, load_durations(short.profile))
     steps = steps_of(planned, tasks, artifacts, schedule)
-    if short.state == "done":
+    if short.state == "done":  # Prefect records the ends of tasks a moment after that of their flow
         keep_durations(short.profile, schedule.durations())
+        steps = tuple(step.model_copy(update={"state": "done", "fraction": 1.0}) for step in steps)
     running = short.state == "running"
     return short.model_copy(
         update={

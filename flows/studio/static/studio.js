@@ -493,7 +493,7 @@ function showStep(list, step) {
   if (!item) return;
   item.className = step.state;
   const figures = Object.entries(step.figures).slice(0, 2).map(([name, value]) => `${name} ${value}`).join(", ");
-  const text = step.state === "done" ? `${step.seconds} s` : step.state === "running" ? figures || "running" : step.state;
+  const text = step.state === "done" ? (step.seconds === null ? "done" : `${step.seconds} s`) : step.state === "running" ? figures || "running" : step.state;
   find(".step-state", item).textContent = text;
   find("progress", item).value = step.fraction;
 }

@@ -19,6 +19,6 @@ def test_a_restart_of_the_server_loses_nothing(studio: Client) -> None:
     Worker("process-cpu", studio.server.folder).start(address)
     wait_until(lambda: running(studio.server.folder))
     status = studio.ended(run)
-    assert (status["state"], status["name"]) == ("done", "lynx")
+    assert (status["state"], status["message"]) == ("done", "")
     assert studio.read(f"/drafts/{draft}")[0] == 200
     assert studio.read(status["asset"].removeprefix("/dg4d/studio"))[0] == 200
