@@ -6,6 +6,7 @@ Paths are those of the worker's machine, below the roots that its user allows (f
 
 import json
 import tempfile
+import time
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
@@ -35,6 +36,8 @@ from flows.inputs.naming import clean_name
 from flows.packages.delivery import Outcome, pack_package, write_outcome
 from flows.packages.publish import check_folder, is_current
 from flows.serving.roots import Roots
+from flows.serving.server import ServerUnavailable
+from flows.ui.showing import PATIENCE_S
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen
 from steps.profiles import profile, revise
 
@@ -337,7 +340,7 @@ def _convert_item(job: ArtifactRef, code: str, address: str) -> Outcome:
         _start()
         wanted = read_job(job, code, store, address)
         Roots.of_this_process().check_weights(wanted.settings.model_dump(mode="json"))
-        connect()
+        _connect_patiently()
         with sharing_results(store), tempfile.TemporaryDirectory(prefix="dg4d-item-") as scratch:
             folder = Path(scratch) / "package"
             _, cached = convert_job(wanted, folder)
@@ -384,5 +387,23 @@ def _publish(request: ConversionRequest, folder: Path) -> None:
     check_folder(folder, request.item)
     job = request.to_job(home.store())
     if not is_current(folder, job.digest()):
-        connect()
+        _connect_patiently()
         convert_job(job, folder)
+
+
+def _connect_patiently() -> None:
+    """Connect to the server of this run; wait for one that restarts.
+
+    Raises:
+        ServerUnavailable: it did not answer for `PATIENCE_S` seconds.
+    """
+    deadline = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            connect()
+        except ServerUnavailable:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(1.0)
+        else:
+            return
