@@ -38,7 +38,7 @@ from flows.commands.options import (
     finite,
     shortcut_settings,
 )
-from flows.commands.services import down, env, up, watch
+from flows.commands.services import down, env, studio, up, watch
 from flows.commands.settings import settings as list_settings
 from flows.commands.store import store
 from flows.commands.weights import weights
@@ -378,7 +378,7 @@ def compose(
         typer.echo(out)
 
 
-for command in (score, bench, verify, rebuild, doctor, up, down, env, watch):
+for command in (score, bench, verify, rebuild, doctor, up, studio, down, env, watch):
     app.command()(command)
 app.command("settings")(list_settings)
 

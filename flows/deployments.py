@@ -6,7 +6,10 @@ Paths are those of the worker's machine, below the roots that its user allows (f
 
 import json
 import tempfile
+import time
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
@@ -35,6 +38,8 @@ from flows.inputs.naming import clean_name
 from flows.packages.delivery import Outcome, pack_package, write_outcome
 from flows.packages.publish import check_folder, is_current
 from flows.serving.roots import Roots
+from flows.serving.server import ServerUnavailable
+from flows.ui.showing import PATIENCE_S
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen
 from steps.profiles import profile, revise
 
@@ -214,6 +219,29 @@ def video_to_4d(
     _convert(video, out, options, sides, cutout, is_video=True)
 
 
+@flow(name="model-to-4d", flow_run_name=lambda: _run_name("model"), persist_result=False)
+def model_to_4d(
+    model: Annotated[Text, Field(json_schema_extra=_title("Model"))],
+    out: Folder,
+    picture: Annotated[str, Field(json_schema_extra=_title("Picture"))] = "",
+    options: FormPictureOptions = PictureOptions(),  # noqa: B008 - frozen
+) -> None:
+    """Set a model of your own in motion: a mesh or splats.
+
+    Args:
+        model: a file on the worker's machine, as `/data/in/fox.glb`; also .gltf, .obj, .usdz, .ply and .spz
+        out: on the worker's machine, as `/data/out/fox`; open `report.html` there when it is done
+        picture: of the model or a video of its motion, on the worker's machine; empty: the model's own render moves
+        options: the defaults work on any machine
+    """
+    _start()
+    roots = Roots.of_this_process()
+    folder = roots.output(out)
+    path, shown = Path(roots.folder(model)), Path(roots.folder(picture)) if picture else None
+    item = clean_name(path.stem) or "asset"
+    _publish(_request(item, options, roots, picture=shown, asset=path), folder)
+
+
 @flow(name="catalog-to-4d", flow_run_name=lambda: _run_name("inputs"), persist_result=False)
 def catalog_to_4d(
     inputs: Annotated[Text, Field(json_schema_extra=_title("Pictures and videos"))],
@@ -330,7 +358,7 @@ def _convert_item(job: ArtifactRef, code: str, address: str) -> Outcome:
         _start()
         wanted = read_job(job, code, store, address)
         Roots.of_this_process().check_weights(wanted.settings.model_dump(mode="json"))
-        connect()
+        _connect_patiently()
         with sharing_results(store), tempfile.TemporaryDirectory(prefix="dg4d-item-") as scratch:
             folder = Path(scratch) / "package"
             _, cached = convert_job(wanted, folder)
@@ -353,22 +381,50 @@ def _convert(address: str, out: str, options: Options, sides: Sides, cutout: Cut
     folder, given = roots.output(out), sides.request()
     mask, asset = (Path(text) if text else None for text in (cutout.mask, sides.asset))
     roots.check_files([*given.files(), *filter(None, (mask, asset))])
+    item = clean_name(PurePosixPath(urlsplit(address).path).stem) or "asset"
     with local_copy(roots.source(address)) as path:
-        request = ConversionRequest(
-            item=clean_name(PurePosixPath(urlsplit(address).path).stem) or "asset",
-            picture=path,
-            video=path if is_video else None,
-            given_views=given,
-            mask=mask,
-            asset=asset,
-            profile=options.profile,
-            settings=revise(profile(options.profile), _knobs(options, roots) | box_settings(cutout.box)),
-            seed=options.seed,
-            commercial_only=options.commercial_only,
-        )
-        request.check()
-        check_folder(folder, request.item)
-        job = request.to_job(home.store())
-        if not is_current(folder, job.digest()):
+        files = {"picture": path, "video": path if is_video else None, "mask": mask, "asset": asset}
+        request = _request(item, options, roots, box_settings(cutout.box), given_views=given, **files)
+        _publish(request, folder)
+
+
+def _request(
+    item: str, options: Options, roots: Roots, knobs: Mapping[str, object] = MappingProxyType({}), **files: Any
+) -> ConversionRequest:
+    """Return the request of a form, with its files by their names and further settings."""
+    return ConversionRequest(
+        item=item,
+        profile=options.profile,
+        settings=revise(profile(options.profile), _knobs(options, roots) | dict(knobs)),
+        seed=options.seed,
+        commercial_only=options.commercial_only,
+        **files,
+    )
+
+
+def _publish(request: ConversionRequest, folder: Path) -> None:
+    """Convert a request into a folder, unless its package is there already."""
+    request.check()
+    check_folder(folder, request.item)
+    job = request.to_job(home.store())
+    if not is_current(folder, job.digest()):
+        _connect_patiently()
+        convert_job(job, folder)
+
+
+def _connect_patiently() -> None:
+    """Connect to the server of this run; wait for one that restarts.
+
+    Raises:
+        ServerUnavailable: it did not answer for `PATIENCE_S` seconds.
+    """
+    deadline = time.monotonic() + PATIENCE_S
+    while True:
+        try:
             connect()
-            convert_job(job, folder)
+        except ServerUnavailable:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(1.0)
+        else:
+            return

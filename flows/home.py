@@ -52,6 +52,21 @@ def cutouts() -> Path:
     return home() / "cutouts"
 
 
+def studio() -> Path:
+    """Return the folder of the studio page: uploads, and the packages that it asked for."""
+    return home() / "studio"
+
+
+def uploads() -> Path:
+    """Return the folder of files that were handed in through the studio page."""
+    return studio() / "uploads"
+
+
+def studio_assets() -> Path:
+    """Return the output folder of conversions that the studio page started."""
+    return studio() / "assets"
+
+
 def make_private(folder: Path) -> None:
     """Create a folder with mode 0700, or remove the permissions of others from an existing one and its content.
 

@@ -4,6 +4,8 @@ Artifacts:
   frames      uncompressed zip of NNN.png (RGBA, straight alpha, square) and video.json {"fps": ...}
   views       uncompressed zip of views.json (steps/sources/views.py) and the files that it names
   bank        zip of bank.json (steps/sources/banks.py) and a sheet per view
+  matte       PNG with one channel: alpha in the pixels of a picture
+  facts       JSON {"width": ..., "height": ..., "kind": ..., "frames": ..., "notes": [...], "problem": ...} of a source
   pose        JSON {"turn_deg": ...}: turn of the subject's plane that its footage shows, 0 where it shows none
   model       uncompressed zip of model.SUFFIX (.glb, .gltf, .obj, .usdz, .ply, .spz) and the files that it refers to
   glb         GLB of the model; `moving` has a morph target per frame
@@ -61,12 +63,20 @@ SCORES = _port("scores", "json")
 PACKAGE = _port("package", "zip")
 BANK = _port("bank", "zip")
 VIEWS = _port("views", "zip")
+FACTS = _port("facts", "json")
 EITHER_MESH = {"tracked": _optional(TRACKED), "meshes": _optional(MESHES)}
 
 STEPS: dict[str, StepSpec] = {
     spec.name: spec
     for spec in (
         _step("draw_picture", {"text": TEXT}, {"picture": PNG}, sections=("text",), resource="gpu"),
+        _step(
+            "cut_out",
+            inputs={"source": SOURCE},
+            outputs={"picture": PNG, "matte": PNG, "facts": FACTS},
+            sections=("subject",),
+            timeout_s=60,  # somebody waits for it
+        ),
         _step(
             "prepare_subject",
             inputs={"source": SOURCE, "mask": _optional(SOURCE)},

@@ -20,7 +20,7 @@ from dg4d_lib.settings import (
 from steps.artifacts.media import read_png, write_png
 from steps.fitting.priors import known_views, make_prior, read_known_views, subject_shapes, subject_turn
 from steps.fitting.reconstruction import reconstruct_subject
-from steps.fitting.reporting import LossCurves, picture_of_divergence, render_turnaround
+from steps.fitting.reporting import LossCurves, picture_of_divergence, render_turnaround, show_fit
 from steps.runtime.job import Job, StepReport
 
 BLOB_RADIUS = 0.5  # world units
@@ -48,8 +48,14 @@ def run(job: Job) -> StepReport:
         shapes = chosen.shapes or subject_shapes(prior, [subject], turn_deg, known)
         start = initial_gaussians(job.settings.static.start, shapes, generator).to(device)
     curves = LossCurves(static.iterations, job.progress)
+
+    def watch(now: Gaussians) -> None:
+        show_fit(job, now.detach, rasterize)
+
     with picture_of_divergence(job, rasterize):
-        gaussians = fit_gaussians(start, subject, chosen.prior, rasterize, static, generator, curves.add, known=others)
+        gaussians = fit_gaussians(
+            start, subject, chosen.prior, rasterize, static, generator, curves.add, known=others, watch=watch
+        )
     report = chosen.report(f"{backend} rasterizer")
     report = reconstruction.add_to(report) if reconstruction else report
     write_ply(job.outputs["gaussians"], gaussians)

@@ -13,7 +13,7 @@ from dg4d_lib.settings import DeformationSettings, MotionSettings
 from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.motions import new_deformation, write_motion
 from steps.fitting.priors import make_prior, read_known_views, subject_turn
-from steps.fitting.reporting import LossCurves, picture_of_divergence, render_row
+from steps.fitting.reporting import SHOWN_AZIMUTHS_DEG, LossCurves, picture_of_divergence, render_row, show_fit
 from steps.fitting.tracking import TRACKED_NOTE, tracked_shapes, tracks_surface
 from steps.runtime.job import Job, StepReport
 
@@ -48,10 +48,15 @@ def run(job: Job) -> StepReport:
     deformation = new_deformation(kind, gaussians, len(video), generator)
     device = preferred_device(backend)
     deformation.to(device)
+    start = gaussians.to(device)
+    moments = torch.linspace(0, 1, len(SHOWN_AZIMUTHS_DEG) + 1)[:-1].to(device)  # one for each side
+
+    def watch(iteration: int, values: dict[str, float]) -> None:
+        curves.add(before + iteration, values)
+        show_fit(job, lambda: deformation.displace(start.means, moments).apply(start), rasterize)
+
     with picture_of_divergence(job, rasterize):
-        fitted = fit_motion(
-            gaussians.to(device), deformation, video, chosen.prior, rasterize, settings, generator, curves.after(before)
-        )
+        fitted = fit_motion(start, deformation, video, chosen.prior, rasterize, settings, generator, watch)
     deformation.cpu()
     gaussians = fitted.to(torch.device("cpu"))
     if settings.fine_tune:

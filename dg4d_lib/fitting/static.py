@@ -80,6 +80,7 @@ def fit_gaussians(
     report: Report = lambda iteration, values: None,
     input_camera: OrbitCamera | None = None,
     known: Sequence[KnownView] = (),
+    watch: Callable[[Gaussians], None] = lambda gaussians: None,
 ) -> Gaussians:
     """Fit a cloud to one image, with a guidance prior for unseen views.
 
@@ -93,6 +94,7 @@ def fit_gaussians(
         report: called after every iteration with (iterations done, named losses).
         input_camera: camera of the image; the default is azimuth and elevation 0.
         known: further images and their cameras; an iteration compares one of them, with the weight of the image.
+        watch: called after every iteration with the cloud as it is then.
 
     Raises:
         FitDiverged: the loss became non-finite, or (almost) no Gaussian is left.
@@ -148,6 +150,7 @@ def fit_gaussians(
         if step % RESET_OPACITY_EVERY == 0 and step < settings.iterations:
             cloud.reset_opacity()
         report(step, {**numbers, "Gaussians": len(cloud.gaussians)})
+        watch(cloud.gaussians)
     return cloud.gaussians.detach()
 
 

@@ -1,15 +1,18 @@
-"""Commands for background services: up, down, env, watch."""
+"""Commands for background services: up, studio, down, env, watch."""
 
 import os
 import shlex
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from flows.commands.endings import exit_on_error
 from flows.commands.options import finite
+
+if TYPE_CHECKING:
+    from flows.serving.server import Server
 
 POLL_S = 1.0  # between two scans of a watched folder
 RESULTS_EVERY_S = 5.0  # between two looks for finished packages
@@ -44,45 +47,103 @@ def up(
     pools and deployments are registered on that server.
     """
     with exit_on_error():
-        from dg4d_lib.errors import BadInput
-        from dg4d_lib.rasterizer.backends import cuda_device_count
-        from flows.convert import connect
-        from flows.serving import background, roots
-        from flows.serving.pools import read_pools
-        from flows.serving.workers import Worker, limit
-
-        known = read_pools()
-        chosen = pools or ["process-cpu", *(["process-gpu"] if cuda_device_count() else [])]
-        if unknown := [name for name in chosen if name not in known]:
-            raise BadInput(f"unknown pool {unknown[0]!r}; deploy/pools.yaml has: {', '.join(known)}")
-        server = background.background_server()
-        variables = roots.environment(sources or ())
-        limits = {name: limit(known[name].per_worker) for name in chosen}
-        own = [Worker(name, server.folder) for name in chosen] if workers else []
-        for worker in own:
-            if sources and worker.is_there() and worker.sources != variables[roots.SOURCES]:
-                raise BadInput(
-                    f"the worker of {worker.pool} runs with --sources {worker.sources}; stop it: `dg4d down`"
-                )
-        if "PREFECT_API_URL" not in os.environ:
-            server.start()
-            server.keep()
-        connect()
-        from flows.serving.registering import register
-
-        typer.echo("deployments, forms that run from the Prefect UI:", err=True)
-        for name in register(known, chosen):
-            typer.echo(name)
+        server = _serve(pools, workers, sources)
         api_url = os.environ["PREFECT_API_URL"]
-        server.folder.mkdir(parents=True, exist_ok=True)
-        for worker in own:
-            worker.start(api_url, {**variables, **limits[worker.pool]})
-            typer.echo(f"{worker.pool} reads below {worker.sources}", err=True)
         address, is_own = api_url.removesuffix("/api"), server.is_at(api_url)
         typer.echo(OPEN_OWN if is_own else OPEN_OTHER, err=True)
         typer.echo(server.login_address(address) if is_own else address)
         if is_own:
             typer.echo('other programs: eval "$(dg4d env)"; server and workers run until `dg4d down`', err=True)
+
+
+def studio(
+    sources: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--sources",
+            metavar="DIR",
+            help="further folder or s3://BUCKET/PREFIX that deployments may read, besides what is dropped; may be "
+            "repeated",
+        ),
+    ] = None,
+    show: Annotated[bool, typer.Option("--open/--no-open", help="open the page in a browser")] = True,
+) -> None:
+    """Open a page to drop pictures on: convert them, and look at all assets.
+
+    Starts the Prefect server with deployments and a worker as `dg4d up` does, and prints the page's address, which
+    signs the browser in. Server and worker run until `dg4d down`.
+    """
+    with exit_on_error():
+        from dg4d_lib.errors import BadInput
+        from flows import home
+        from flows.serving.addresses import STUDIO_ADDRESS
+
+        if "PREFECT_API_URL" in os.environ:
+            raise BadInput(
+                "PREFECT_API_URL is set, and the studio is a page of the background server: unset the variable, or "
+                f"open {STUDIO_ADDRESS} on that server if it is one of dg4d's"
+            )
+        home.uploads().mkdir(mode=0o700, parents=True, exist_ok=True)
+        home.make_private(home.studio().parent)
+        server = _serve(None, True, [str(home.uploads()), *(sources or ())], quiet=True)
+        api_url = os.environ["PREFECT_API_URL"]
+        address = server.login_address(api_url.removesuffix("/api"), STUDIO_ADDRESS)
+        typer.echo("open this address: it signs the browser in; server and worker run until `dg4d down`", err=True)
+        typer.echo(address)
+        if show:
+            from flows.packages.view import open_page
+
+            open_page(address)
+
+
+def _serve(pools: list[str] | None, workers: bool, sources: list[str] | None, quiet: bool = False) -> "Server":
+    """Start the server, register pools and deployments, and start workers; see `up`.
+
+    Args:
+        pools: names; None: process-cpu, and process-gpu with a GPU.
+        workers: start workers on this machine.
+        sources: folders that deployments may read; None or empty: the default.
+        quiet: print no list, and leave a worker that runs with other sources as it is.
+
+    Raises:
+        BadInput: a pool is unknown, a source is no folder, or a worker runs with other sources.
+    """
+    from dg4d_lib.errors import BadInput
+    from dg4d_lib.rasterizer.backends import cuda_device_count
+    from flows.convert import connect
+    from flows.serving import background, roots
+    from flows.serving.pools import read_pools
+    from flows.serving.workers import Worker, limit
+
+    known = read_pools()
+    chosen = pools or ["process-cpu", *(["process-gpu"] if cuda_device_count() else [])]
+    if unknown := [name for name in chosen if name not in known]:
+        raise BadInput(f"unknown pool {unknown[0]!r}; deploy/pools.yaml has: {', '.join(known)}")
+    server = background.background_server()
+    variables = roots.environment(sources or ())
+    limits = {name: limit(known[name].per_worker) for name in chosen}
+    own = [Worker(name, server.folder) for name in chosen] if workers else []
+    for worker in own:
+        if sources and not quiet and worker.is_there() and worker.sources != variables[roots.SOURCES]:
+            raise BadInput(f"the worker of {worker.pool} runs with --sources {worker.sources}; stop it: `dg4d down`")
+    if "PREFECT_API_URL" not in os.environ:
+        server.start()
+        server.keep()
+    connect()
+    from flows.serving.registering import register
+
+    names = register(known, chosen)
+    if not quiet:
+        typer.echo("deployments, forms that run from the Prefect UI:", err=True)
+        for name in names:
+            typer.echo(name)
+    api_url = os.environ["PREFECT_API_URL"]
+    server.folder.mkdir(parents=True, exist_ok=True)
+    for worker in own:
+        worker.start(api_url, {**variables, **limits[worker.pool]})
+        if not quiet:
+            typer.echo(f"{worker.pool} reads below {worker.sources}", err=True)
+    return server
 
 
 def down() -> None:

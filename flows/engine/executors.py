@@ -3,6 +3,7 @@
 An executor is a function `(spec, request, on_progress, say) -> StepResult` that raises a `StepError`.
 """
 
+import base64
 import fcntl
 import json
 import os
@@ -13,6 +14,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Protocol
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -46,7 +48,29 @@ from steps.runtime.perform import perform
 from steps.store.files import home, remove_tree
 
 Say = Callable[[str], None]
-Execute = Callable[[StepSpec, StepRequest, Progress, Say], StepResult]
+Show = Callable[[bytes], None]
+
+
+def no_picture(_: bytes) -> None:
+    """Discard a picture of the work so far."""
+
+
+class Execute(Protocol):
+    """Run a step; raise a `StepError` if it does not finish."""
+
+    def __call__(
+        self, spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say, on_picture: Show = no_picture
+    ) -> StepResult:
+        """Run it.
+
+        Args:
+            spec: of the step.
+            request: of the step.
+            on_progress: called with every progress message.
+            say: called with every note.
+            on_picture: called with pictures of the work so far, PNG.
+        """
+
 
 TAIL_BYTES = 4000  # of standard error, for the message of a crash
 IN_USE = "in-use"  # locked file of a scratch folder
@@ -68,7 +92,9 @@ KILLED = (  # SIGKILL without a failure report is nearly always the kernel's out
 )
 
 
-def in_process(spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say) -> StepResult:
+def in_process(
+    spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say, on_picture: Show = no_picture
+) -> StepResult:
     """Run a step in this process, without limits of time and memory; for tests and debuggers."""
     with notes_to(say):
         outcome, error = perform(request, store(), on_progress)
@@ -77,7 +103,9 @@ def in_process(spec: StepSpec, request: StepRequest, on_progress: Progress, say:
     return outcome
 
 
-def in_subprocess(spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say) -> StepResult:
+def in_subprocess(
+    spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say, on_picture: Show = no_picture
+) -> StepResult:
     """Run a step in a child process, which ends with this process and is killed after `spec.timeout_s`."""
     with _scratch(request) as folder:
         environment = {"TMPDIR": str(folder), **resources.environment()}
@@ -87,10 +115,12 @@ def in_subprocess(spec: StepSpec, request: StepRequest, on_progress: Progress, s
             raise StepCrashed(
                 spec.name, "the fork server exited twice; run `python -m steps.runtime.fork_server 0` to see why"
             )
-        return _result_of(process, lambda: None, folder, spec, on_progress, say)
+        return _result_of(process, lambda: None, folder, spec, on_progress, say, on_picture)
 
 
-def in_container(spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say) -> StepResult:
+def in_container(
+    spec: StepSpec, request: StepRequest, on_progress: Progress, say: Say, on_picture: Show = no_picture
+) -> StepResult:
     """Run a step in a container, which ends with this process and is removed after `spec.timeout_s`."""
     with _scratch(request) as folder:
         try:
@@ -108,14 +138,20 @@ def in_container(spec: StepSpec, request: StepRequest, on_progress: Progress, sa
                 start_new_session=True,
                 text=True,
             )
-        return _result_of(process, run.remove, folder, spec, on_progress, say)
+        return _result_of(process, run.remove, folder, spec, on_progress, say, on_picture)
 
 
 Process = forks.Fork | subprocess.Popen[str]
 
 
 def _result_of(
-    process: Process, remove: Callable[[], None], folder: Path, spec: StepSpec, on_progress: Progress, say: Say
+    process: Process,
+    remove: Callable[[], None],
+    folder: Path,
+    spec: StepSpec,
+    on_progress: Progress,
+    say: Say,
+    on_picture: Show,
 ) -> StepResult:
     """Follow a process to its end and return the result that it wrote into a folder, or raise its error.
 
@@ -126,8 +162,11 @@ def _result_of(
         spec: of the step.
         on_progress: called with every progress message.
         say: called with every note.
+        on_picture: called with every picture.
     """
-    status, timed_out = _watched(process, remove, spec.timeout_s, on_progress, say)
+    status, timed_out = _watched(
+        process, remove, spec.timeout_s, lambda line: _relay(line, on_progress, say, on_picture)
+    )
     if timed_out:
         raise StepTimedOut(spec.name, f"no result after {spec.timeout_s:g} s, so it was stopped")
     outcome = _outcome(folder / "result.json")
@@ -182,7 +221,7 @@ def _arguments(folder: Path) -> list[str]:
 
 
 def _watched(
-    process: Process, end: Callable[[], None], timeout_s: float, on_progress: Progress, say: Say
+    process: Process, end: Callable[[], None], timeout_s: float, relay: Callable[[str], None]
 ) -> tuple[int, bool]:
     """Return the exit status of a step, and true if it was killed after `timeout_s`."""
     timed_out = threading.Event()
@@ -198,7 +237,7 @@ def _watched(
     try:
         assert process.stdout is not None  # it is a pipe
         for line in process.stdout:
-            _relay(line, on_progress, say)
+            relay(line)
         status = process.wait()
         return status, timed_out.is_set()
     finally:
@@ -210,9 +249,12 @@ def _watched(
             pipe.close()
 
 
-def _relay(line: str, on_progress: Progress, say: Say) -> None:
+def _relay(line: str, on_progress: Progress, say: Say, on_picture: Show) -> None:
     try:
         report = json.loads(line)
+        if "picture" in report:
+            on_picture(base64.b64decode(report["picture"], validate=True))
+            return
         if "note" in report:
             say(str(report["note"]))
             return

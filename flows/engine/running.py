@@ -33,6 +33,9 @@ class StepObserver(Protocol):
     def on_progress(self, label: str, item: str, done: int, total: int, values: dict[str, float]) -> None:
         """Note the progress of the step."""
 
+    def on_picture(self, label: str, item: str, picture: bytes) -> None:
+        """Note a picture of the work so far, PNG."""
+
     def on_failure(self, label: str, item: str, error: StepError) -> None:
         """Note the failure of the step."""
 
@@ -51,6 +54,9 @@ class NullObserver:
         self.waited_s = waited_s
 
     def on_progress(self, label: str, item: str, done: int, total: int, values: dict[str, float]) -> None:
+        """Do nothing."""
+
+    def on_picture(self, label: str, item: str, picture: bytes) -> None:
         """Do nothing."""
 
     def on_failure(self, label: str, item: str, error: StepError) -> None:
@@ -93,11 +99,14 @@ def run_step(step: str, result_type: type[Result], **arguments: Any) -> Result:
     def say(text: str) -> None:
         emit(StepEvent(item, label, "note", text=text))
 
+    def show(picture: bytes) -> None:
+        observer.on_picture(label, item, picture)
+
     try:
         turn = resources.Turn(conversion.begun_ns, f"{label} of {item}")
         with resources.slot(resources.resource_of(request), say, turn) as waited_s:
             observer.on_slot(waited_s)
-            result = configured_executor()(catalog()[step], request, on_progress, say)
+            result = configured_executor()(catalog()[step], request, on_progress, say, show)
     except StepError as error:
         observer.on_failure(label, item, error)
         raise

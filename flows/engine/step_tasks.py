@@ -11,7 +11,7 @@ from uuid import UUID
 
 import httpx
 from prefect import runtime, task
-from prefect.artifacts import create_progress_artifact, update_progress_artifact
+from prefect.artifacts import create_image_artifact, create_progress_artifact, update_progress_artifact
 from prefect.client.schemas.objects import State, TaskRun
 from prefect.context import FlowRunContext
 from prefect.exceptions import TerminationSignal
@@ -21,6 +21,7 @@ from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, PREFECT_LOCAL_ST
 from prefect.tasks import Task, exponential_backoff
 from prefect.transactions import IsolationLevel
 
+from dg4d_lib.errors import DG4DError
 from flows import home
 from flows.engine.caching import RequestPolicy
 from flows.engine.events import StepEvent, emit
@@ -151,6 +152,16 @@ class _Shown:
         if self._progress is None:
             self._progress = _Progress(f"progress-{pages.key(label, item)}", f"{label} of {markdown(item)}")
         self._progress.update(done, total, values)
+
+    def on_picture(self, label: str, item: str, picture: bytes) -> None:
+        """Keep a picture of the fit so far in the store, and its address in an artifact; it is worth no failed step."""
+        with suppress(httpx.HTTPError, DG4DError, OSError):
+            ref = home.store().put_bytes(picture, "image/png")
+            create_image_artifact(
+                pages.address("picture", ref, ".png"),
+                key=f"{pages.LIVE}{pages.key(label, item)}",
+                description=f"{label} of {markdown(item)}, so far",
+            )
 
     def on_failure(self, label: str, item: str, error: StepError) -> None:
         page = pages.failure_page(label, item, error, home.store())

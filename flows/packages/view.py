@@ -46,9 +46,15 @@ def view(folder: Path, open_browser: bool) -> Path:
         raise BadInput(f"{folder} cannot be viewed: its {RECORD} has an unknown format ({error!r})") from error
     if not page.is_file() or page.read_bytes() != text.encode():
         _write(page, text)
-    if open_browser and _has_screen():
-        webbrowser.open(page.resolve().as_uri())
+    if open_browser:
+        open_page(page.resolve().as_uri())
     return page
+
+
+def open_page(address: str) -> None:
+    """Open an address in a browser if there is a display."""
+    if _has_screen():
+        webbrowser.open(address)
 
 
 def viewer_html(record: Mapping[str, Any], read: Callable[[str], bytes]) -> str:

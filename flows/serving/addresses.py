@@ -2,3 +2,4 @@
 
 ARTIFACT_ADDRESS = "/dg4d/artifacts/"  # files of the store
 VIEWER_ADDRESS = "/dg4d/viewer/"  # viewer pages of packages
+STUDIO_ADDRESS = "/dg4d/studio"  # page on which pictures are dropped

@@ -1,7 +1,8 @@
 """Allow-lists of the folders and object store prefixes that deployments may read and write.
 
 Every user of the server can fill in the forms. The user of the worker's machine decides which folders they may name:
-`$DG4D_SOURCES` and `$DG4D_OUTPUTS` of the worker, and the folders of a running `dg4d watch` of the same user.
+`$DG4D_SOURCES` and `$DG4D_OUTPUTS` of the worker, the folders of a running `dg4d watch` of the same user, and those of
+the studio page.
 """
 
 import json
@@ -16,6 +17,7 @@ from urllib.parse import unquote
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.weights.registry import KNOWN
+from flows.home import studio_assets, uploads
 from flows.inputs.listing import BUCKET, WILDCARDS
 from flows.inputs.manifest import Item
 from flows.processes import locked
@@ -43,7 +45,7 @@ class Roots(Frozen):
         """
         sources = _places(os.environ.get(SOURCES) or str(Path.cwd()))
         outputs = _places(os.environ.get(OUTPUTS, "")) or _folders(sources)
-        granted = list(_granted())
+        granted = [*_of_studio(), *_granted()]
         return cls(
             sources=(*sources, *(place for roots in granted for place in roots.sources)),
             outputs=(*outputs, *(place for roots in granted for place in roots.outputs)),
@@ -172,6 +174,12 @@ def granted(folder: Path, out: Path) -> Iterator[None]:
             yield
         finally:
             place.unlink(missing_ok=True)
+
+
+def _of_studio() -> Iterator[Roots]:
+    """Yield the folders of the studio page, once it was used: its uploads are read, its packages written."""
+    if uploads().is_dir():
+        yield Roots(sources=_resolved([str(uploads())]), outputs=_resolved([str(studio_assets())]))
 
 
 def _granted() -> Iterator[Roots]:

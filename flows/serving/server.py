@@ -92,9 +92,14 @@ class Server:
         """Return the secret that the server asks for, NAME:PASSWORD."""
         return auth.auth_string(self.folder)
 
-    def login_address(self, address: str) -> str:
-        """Return the address that signs a browser in; what follows "#" is not sent over the network."""
-        return f"{address}{LOGIN}#{quote(self.auth_string(), safe=':')}"
+    def login_address(self, address: str, then: str = "") -> str:
+        """Return the address that signs a browser in; what follows "#" is not sent over the network.
+
+        Args:
+            address: of the server.
+            then: path of the page that follows; empty: Prefect's.
+        """
+        return f"{address}{LOGIN}{f'?next={then}' if then else ''}#{quote(self.auth_string(), safe=':')}"
 
     def wait_for_address(self) -> str:
         """Return the address of the server, which is known before it answers.

@@ -1,4 +1,4 @@
-"""ASGI application of the background server: Prefect's own, with artifacts and viewer below `/dg4d/`.
+"""ASGI application of the background server: Prefect's own, with artifacts, viewer and studio below `/dg4d/`.
 
 `python -m flows.serving.server_app FD` serves it on a listening socket that it inherits.
 """
@@ -21,8 +21,9 @@ from flows.prefect_compat import add_first
 from flows.serving.access import SESSION, SignIn, protect
 from flows.serving.addresses import ARTIFACT_ADDRESS, VIEWER_ADDRESS
 from flows.serving.server import LOGIN
-from steps.contract import ArtifactRef
+from steps.contract import ArtifactRef, load_object
 
+STUDIO = "flows.studio.routes:add_routes"  # the page uses the engine, which uses this package
 SHOWN = {".png": "image/png", ".json": "application/json"}  # inline; other files are downloads
 
 
@@ -44,6 +45,7 @@ def create_app() -> ASGIApp:
     signed_in = [Depends(sign_in.required)]
     add_first(application, ARTIFACT_ADDRESS + file, artifact, dependencies=signed_in)
     add_first(application, VIEWER_ADDRESS + file, viewer, dependencies=signed_in)
+    load_object(STUDIO)(application, sign_in, secret)
     add_first(application, LOGIN, sign_in.page)
     add_first(application, SESSION, sign_in.session)
     return protect(application)
@@ -71,7 +73,8 @@ def viewer(digest: str, size: int, name: str) -> Response:
         page = viewer_of_package(_path(digest, size), PurePath(name).stem)
     except BadInput as error:
         raise HTTPException(404, str(error)) from error
-    return HTMLResponse(page, headers={"Content-Security-Policy": "sandbox allow-scripts allow-downloads"})
+    policy = "sandbox allow-scripts allow-downloads; frame-ancestors 'self'"
+    return HTMLResponse(page, headers={"Content-Security-Policy": policy, "X-Frame-Options": "SAMEORIGIN"})
 
 
 def _path(digest: str, size: int) -> Path:

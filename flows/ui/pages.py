@@ -25,6 +25,7 @@ QUALITIES = (80, 50, 20)  # of WebP
 THUMBNAIL_BYTES = 30_000  # the server keeps pages in its database
 THUMBNAILS_KEPT = 32  # the page of an asset repeats those of its steps
 ROWS_OF_A_CURVE = 8
+LIVE = "live-"  # begins the keys of artifacts with a picture of a running fit
 
 
 def key(label: str, item: str) -> str:

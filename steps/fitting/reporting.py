@@ -17,6 +17,7 @@ from steps.artifacts.media import write_png
 from steps.runtime.job import Job, Progress
 
 TURNAROUND_AZIMUTHS_DEG = (0.0, 45.0, 90.0, 180.0, -90.0, -45.0)
+SHOWN_AZIMUTHS_DEG = (0.0, 60.0, 180.0)  # of a fit that runs
 PICTURE_SIZE = 192  # pixels
 CURVE_POINTS = 200
 
@@ -41,10 +42,6 @@ class LossCurves:
             self.series.setdefault(name, []).append(value)
         self.progress(iteration, self.total, values)
 
-    def after(self, done: int) -> Callable[[int, dict[str, float]], None]:
-        """Return a callback that counts iterations after those of an earlier optimization."""
-        return lambda iteration, values: self.add(done + iteration, values)
-
     def write(self, path: Path, title: str, notes: Sequence[str]) -> None:
         """Write the `curves` artifact, subsampled to about `CURVE_POINTS` points."""
         step = max(1, len(self.iterations) // CURVE_POINTS)
@@ -61,6 +58,24 @@ def picture_of_divergence(job: Job, rasterize: Rasterizer) -> Iterator[None]:
     except Diverged as error:
         write_png(job.pictures / "last_good_state.png", render_turnaround(error.gaussians, rasterize))
         raise
+
+
+def show_fit(job: Job, state: Callable[[], Gaussians], rasterize: Rasterizer) -> None:
+    """Offer a picture of a fit that runs.
+
+    Args:
+        job: of the step.
+        state: returns the Gaussians as they are now; called only if a picture is due.
+        rasterize: rasterizer.
+    """
+
+    def draw() -> bytes:
+        path = job.outputs["picture"].with_name("live.png")
+        with torch.no_grad():
+            write_png(path, render_row(state(), SHOWN_AZIMUTHS_DEG, rasterize))
+        return path.read_bytes()
+
+    job.show(draw)
 
 
 def render_turnaround(gaussians: Gaussians, rasterize: Rasterizer) -> Float[Tensor, "h w 3"]:

@@ -6,6 +6,11 @@ from pathlib import Path
 from typing import Any
 
 Progress = Callable[[int, int, dict[str, float]], None]
+Draw = Callable[[], bytes]  # returns a PNG
+
+
+def ignore(_: Draw) -> None:
+    """Show no picture."""
 
 
 @dataclass(frozen=True)
@@ -19,6 +24,7 @@ class Job:
         seed: seed of all random generators of the step.
         progress: callback (done, total, values to show); calls are cheap.
         pictures: folder for pictures that explain a failure.
+        show: callback for a picture of the work so far, PNG; it draws one every few seconds, or none.
     """
 
     inputs: Mapping[str, Path]
@@ -27,6 +33,7 @@ class Job:
     seed: int
     progress: Progress
     pictures: Path
+    show: Callable[[Draw], None] = ignore
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
-"""Progress and notes of a running step as JSON lines on standard output."""
+"""Progress, notes and pictures of a running step as JSON lines on standard output."""
 
+import base64
 import json
 import logging
 import os
@@ -10,9 +11,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
 
-from steps.runtime.job import Progress
+from steps.runtime.job import Draw, Progress
 
 PROGRESS_EVERY_S = 0.2
+PICTURE_EVERY_S = 4.0
 
 
 def progress_file(path: Path | None) -> TextIO:
@@ -46,6 +48,19 @@ def progress_lines(file: TextIO) -> Progress:
 def note_lines(file: TextIO) -> Callable[[str], None]:
     """Return a function that writes notes as JSON lines."""
     return lambda text: _write_line(file, {"note": text})
+
+
+def picture_lines(file: TextIO) -> Callable[[Draw], None]:
+    """Return a callback that draws a picture every few seconds and writes it as a JSON line."""
+    last = time.monotonic()
+
+    def show(draw: Draw) -> None:
+        nonlocal last
+        if time.monotonic() - last >= PICTURE_EVERY_S:
+            _write_line(file, {"picture": base64.b64encode(draw()).decode()})
+            last = time.monotonic()
+
+    return show
 
 
 @contextmanager

@@ -26,14 +26,17 @@ from steps.profiles import settings_class
 from steps.runtime.environment_info import environment_info
 from steps.runtime.failures import failure_kind, failure_message
 from steps.runtime.installed_code import catalog, code_version
-from steps.runtime.job import Job, Progress, StepReport
+from steps.runtime.job import Draw, Job, Progress, StepReport, ignore
 from steps.runtime.process_setup import cpu_seconds, peak_memory_mb
 from steps.runtime.weights import check_unchanged
 from steps.store.artifact_store import ArtifactStore, StoreUnreachable
 
 
 def perform(
-    request: StepRequest, store: ArtifactStore, progress: Progress | None = None
+    request: StepRequest,
+    store: ArtifactStore,
+    progress: Progress | None = None,
+    show: Callable[[Draw], None] = ignore,
 ) -> tuple[StepResult | StepFailure, BaseException | None]:
     """Run one step in this process.
 
@@ -41,6 +44,7 @@ def perform(
         request: step, inputs, settings and seed.
         store: source of its inputs and destination of its outputs.
         progress: callback of the step's progress.
+        show: callback for pictures of the work so far.
 
     Returns:
         The result and None, or the failure and its exception.
@@ -50,7 +54,7 @@ def perform(
         pictures = scratch / "pictures"
         try:
             pictures.mkdir()
-            return _perform(request, store, progress or (lambda done, total, values: None), scratch), None
+            return _perform(request, store, progress or (lambda done, total, values: None), show, scratch), None
         except (Exception, SystemExit) as error:
             failure = StepFailure(
                 step=request.step,
@@ -61,7 +65,9 @@ def perform(
             return failure, error
 
 
-def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scratch: Path) -> StepResult:
+def _perform(
+    request: StepRequest, store: ArtifactStore, progress: Progress, show: Callable[[Draw], None], scratch: Path
+) -> StepResult:
     started, start = datetime.now(UTC).isoformat(timespec="milliseconds"), time.perf_counter()
     cpu_before = cpu_seconds()
     spec = _checked_spec(request)
@@ -79,6 +85,7 @@ def _perform(request: StepRequest, store: ArtifactStore, progress: Progress, scr
         seed=request.seed,
         progress=progress,
         pictures=scratch / "pictures",
+        show=show,
     )
     (scratch / "out").mkdir()
     run: Callable[[Job], StepReport] = load_object(spec.entry)

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from dg4d_lib.errors import BadInput
 from steps.contract import EXIT_DONE, EXIT_STATUS, StepFailure, StepRequest, StepResult
 from steps.runtime.failures import failure_kind
-from steps.runtime.messages import note_lines, notes_to, progress_file, progress_lines
+from steps.runtime.messages import note_lines, notes_to, picture_lines, progress_file, progress_lines
 from steps.runtime.perform import perform
 from steps.runtime.process_setup import die_with, prepare_process, set_process_name
 from steps.store.files import write_atomically
@@ -41,7 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
             return _finish(failure, None, given.result)
         set_process_name(f"dg4d {request.step}")
         with notes_to(note_lines(file)):
-            outcome, error = perform(request, open_store(given.store), progress_lines(file))
+            outcome, error = perform(request, open_store(given.store), progress_lines(file), picture_lines(file))
         return _finish(outcome, error, given.result)
 
 

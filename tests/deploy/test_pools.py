@@ -35,7 +35,7 @@ def changed(tmp_path: Path, old: str, new: str, file: Path = DEPLOYMENTS) -> Pat
 def test_every_flow_is_deployed_in_every_pool_and_only_items_go_to_the_fleet() -> None:
     deployments = read_deployments()
     flows = {deployment["entrypoint"].rpartition(".")[2] for deployment in deployments}
-    assert flows == {"picture_to_4d", "video_to_4d", "catalog_to_4d", "benchmark", "item_to_4d"}
+    assert flows == {"picture_to_4d", "video_to_4d", "model_to_4d", "catalog_to_4d", "benchmark", "item_to_4d"}
     where = {(one["entrypoint"].rpartition(".")[2], one["work_pool"]["name"]) for one in deployments}
     assert where == {(flow, pool) for flow in flows for pool in set(POOLS) - {"fleet"}} | {("item_to_4d", "fleet")}
 

@@ -1,5 +1,6 @@
 """Steps that do next to nothing, under the names of the real ones; what happens is said in the source file.
 
+The package holds the model in the file $FAKE_GLB, if there is one, and else text that no program plays.
 The source is text after the signature of a picture (`picture`): words that name a step and what it should do there,
 for example "fit_motion=sleep:5".
 Every run of a step is noted in the file $FAKE_LOG.
@@ -55,6 +56,15 @@ def draw_picture(job: Job) -> StepReport:
     job.outputs["picture"].write_bytes(PNG + words)
     weights = {"fake/unet.safetensors": "sha256:" + "e" * 64}
     return StepReport(weights=weights, licenses={"fake": "fake license: <free>"})
+
+
+def cut_out(job: Job) -> StepReport:
+    _begin("cut_out", job, job.inputs["source"].read_bytes())
+    job.outputs["picture"].write_bytes(PNG)
+    job.outputs["matte"].write_bytes(PNG)
+    facts = {"width": 8, "height": 6, "kind": "picture", "frames": 1, "has_alpha": False, "notes": [], "problem": ""}
+    job.outputs["facts"].write_text(json.dumps(facts))
+    return StepReport()
 
 
 def prepare_subject(job: Job) -> StepReport:
@@ -174,7 +184,8 @@ def pack_asset(job: Job) -> StepReport:
     words = _begin("pack_asset", job, job.inputs["subject"].read_bytes()[len(PNG) :])
     name = "tracked" if "tracked" in job.inputs else "meshes"
     with zipfile.ZipFile(job.outputs["package"], "w") as archive:
-        archive.writestr(zipfile.ZipInfo("asset.glb"), job.inputs[name].read_bytes())
+        model = os.environ.get("FAKE_GLB")
+        archive.writestr(zipfile.ZipInfo("asset.glb"), Path(model or job.inputs[name]).read_bytes())
         archive.writestr(zipfile.ZipInfo("contact_sheet.png"), PNG + words)
         archive.writestr(zipfile.ZipInfo("splats/000.ply"), b"0")
         archive.writestr(zipfile.ZipInfo("splats/001.ply"), str(job.seed).encode())

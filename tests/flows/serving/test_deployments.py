@@ -29,6 +29,7 @@ from steps.profiles import PREVIEW, PROFILES, revise
 NAMES = {
     "picture-to-4d": "Picture to 4D",
     "video-to-4d": "Video to 4D",
+    "model-to-4d": "Model to 4D",
     "benchmark": "Benchmark",
     "catalog-to-4d": "Catalog to 4D",
     "item-to-4d": "Item to 4D",
@@ -44,6 +45,7 @@ def test_the_form_offers_every_profile() -> None:
     [
         ("picture-to-4d", ["Picture", "Output folder", "How it is made", "Other sides", "Cut-out"]),
         ("video-to-4d", ["Video", "Output folder", "How it is made", "Other sides", "Cut-out"]),
+        ("model-to-4d", ["Model", "Output folder", "Picture", "How it is made"]),
         ("catalog-to-4d", ["Pictures and videos", "Output folder", "Items at a time", "Items run on",
                            "Stop at a faulty asset", "How it is made"]),
         ("benchmark", ["Data set", "Output folder", "Objects at most", "Score the meshes",
@@ -57,7 +59,7 @@ def test_a_form_has_a_plain_field_for_everything_in_a_sensible_order(
     assert form is not None
     assert [field["title"] for field in in_order(form)] == titles
     assert [field["title"] for field in in_order(form) if "default" not in field] == titles[:2]
-    pictures = name in {"picture-to-4d", "catalog-to-4d"}
+    pictures = name in {"picture-to-4d", "model-to-4d", "catalog-to-4d"}
     options = form["definitions"]["PictureOptions" if pictures else "Options"]
     assert [field["title"] for field in in_order(options)] == [
         "Profile", *(["Motion"] if pictures else []), "Triangles", "Texture size", "Frames per second", "Seed",

@@ -374,3 +374,24 @@ def test_the_command_grants_what_it_watches(place: Path, monkeypatch: pytest.Mon
     CliRunner().invoke(cli.app, ["watch", "away", "-o", "in2/out"])
     assert seen == [Roots(sources=(f"{place}/in", f"{place}/away"), outputs=(f"{place}/in", f"{place}/in2/out"))]
     wait_until(lambda: Roots.of_this_process().sources == (f"{place}/in",))
+
+
+def test_the_studio_has_roots_in_the_home_and_opens_nothing_else_of_it(place: Path) -> None:
+    uploads = place / "home" / "studio" / "uploads"
+    refused(lambda: Roots.of_this_process().folder(str(uploads / "x" / "fox.png")), SOURCES)
+    (uploads / "x").mkdir(parents=True)
+    (uploads / "x" / "link.png").symlink_to(place / "home" / "server" / "auth")
+    roots = Roots.of_this_process()
+    assert roots.folder(str(uploads / "x" / "fox.png")) == str(uploads / "x" / "fox.png")
+    assert roots.output(str(place / "home" / "studio" / "assets" / "fox")).name == "fox"
+    for path in (uploads / "x" / "link.png", place / "home" / "store", uploads.parent / "assets"):
+        refused(lambda path=path: roots.folder(str(path)), SOURCES)
+    refused(lambda: roots.output(str(uploads / "x")), OUTPUTS)
+
+
+def test_a_mask_and_a_model_lie_in_the_roots(place: Path) -> None:
+    picture, out = str(place / "in" / "fox.png"), str(place / "in" / "out")
+    for flow in (deployments.picture_to_4d, deployments.video_to_4d):
+        refused(lambda flow=flow: flow.fn(picture, out, mask="/etc/passwd"))
+    refused(lambda: deployments.model_to_4d.fn("/etc/passwd", out))
+    refused(lambda: deployments.model_to_4d.fn(picture, out, picture="/etc/passwd"))

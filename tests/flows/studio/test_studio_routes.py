@@ -1,0 +1,198 @@
+"""Routes of the studio: sign-in, forged and hostile requests, unknown ids, and conversions without a page."""
+
+import json
+import re
+from io import BytesIO
+from pathlib import Path
+
+import pytest
+from fake_steps import PNG, picture
+from PIL import Image
+from waiting import wait_until
+
+from flows import home
+from flows.serving.auth import Sessions, basic
+from tests.flows.studio.conftest import Client
+
+READING = ["", "/activity", "/static/studio.js", "/drafts/0123456789abcdef", "/assets/x", "/thumbnails/00/1"]
+CHANGES = ["/drafts", "/drafts/0123456789abcdef/runs", "/runs/x/cancel", "/runs/x/retry", "/assets/x/again"]
+UNKNOWN = "00000000-0000-0000-0000-000000000000"
+
+
+@pytest.mark.parametrize("path", READING)
+def test_a_page_is_read_by_those_who_are_signed_in(studio: Client, path: str) -> None:
+    assert studio.ask(path)[0] == 401
+    assert studio.ask(path, Authorization=basic("dg4d:guess"))[0] == 401
+    assert studio.ask(path, **studio.secret)[0] in {200, 404}
+    status, headers, _ = studio.ask(path, Sec_Fetch_Dest="document", Sec_Fetch_Site="same-origin")
+    assert (status, headers["location"]) == (303, f"/dg4d/login?next=/dg4d/studio{path}")
+
+
+@pytest.mark.parametrize("path", CHANGES)
+def test_a_change_needs_the_secret_itself(studio: Client, path: str) -> None:
+    sessions = Sessions(studio.server.auth_string())
+    cookie = {"Cookie": f"{sessions.cookie}={sessions.issue()}", "Sec_Fetch_Site": "same-origin"}
+    assert studio.ask("", **cookie)[0] == 200  # the session of a browser reads
+    assert studio.ask(path, "POST", {}, **studio.token)[0] == 401
+    assert studio.ask(path, "POST", {}, **studio.token, **cookie)[0] == 401
+    assert studio.ask(path, "POST", {}, **studio.secret)[0] == 403  # without the token against forged requests
+
+
+@pytest.mark.parametrize("headers", [{"Origin": "http://evil.example"}, {"Sec_Fetch_Site": "same-site"}])
+def test_a_change_by_a_page_of_another_origin_is_refused(studio: Client, headers: dict[str, str]) -> None:
+    before = sorted(home.uploads().iterdir())
+    assert studio.ask("/drafts", "POST", {}, **studio.secret, **studio.token, **headers)[0] == 403
+    assert sorted(home.uploads().iterdir()) == before
+
+
+def test_the_page_runs_its_own_script_alone_and_is_not_framed(studio: Client) -> None:
+    _, headers, content = studio.ask("", **studio.secret)
+    policy = headers["content-security-policy"]
+    assert "script-src 'self';" in policy and "frame-ancestors 'none'" in policy and "unsafe" not in policy
+    assert not re.search(rb"<script(?![^>]* src=)|<style|\son\w+=|\sstyle=", content)
+    assert b"http" not in content.replace(b"http-equiv", b"")  # nothing of other hosts
+
+
+@pytest.mark.parametrize("path", ["/drafts/../x", "/drafts/0123", "/drafts/0123456789abcdef", f"/runs/{UNKNOWN}",
+                                  f"/runs/{UNKNOWN}/status", "/runs/x", "/assets/asset-none-000000",
+                                  "/static/..%2froutes.py", "/static/routes.py",
+                                  f"/thumbnails/{'0' * 64}/7", "/entries/zz/7/x",
+                                  f"/entries/{'0' * 64}/7/x"])  # fmt: skip
+def test_an_address_of_nothing_is_not_found(studio: Client, path: str) -> None:
+    status, content = studio.read(path)
+    assert status == 404 and b"Traceback" not in content
+
+
+@pytest.mark.parametrize("path", ["/drafts/0123456789abcdef/files?name=x", f"/runs/{UNKNOWN}/cancel",
+                                  f"/runs/{UNKNOWN}/retry", "/assets/asset-none-000000/again",
+                                  "/drafts/0123456789abcdef/runs"])  # fmt: skip
+def test_a_change_of_nothing_is_not_found(studio: Client, path: str) -> None:
+    body = {"version": "x"} if path.endswith("again") else {}
+    assert studio.post(path, body)[0] == 404
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "status", "says"),
+    [
+        ("fox.png", b"", 422, "empty"),
+        ("fox.png", b"hello, I am text", 422, "text file"),
+        ("fox.png", b"MZ\x90\0" * 40, 422, "not known here"),
+        ("page.html", b"<script>alert(1)</script>", 422, "text file"),
+        ("fox.glb", b"\x89PNG\r\n\x1a\n", 422, "does not start as"),
+        ("fox.zip", b"PK\3\4 broken", 422, "broken"),
+        ("large.png", PNG + bytes(2**20), 413, "DG4D_STUDIO_UPLOAD_MB"),
+    ],
+)
+def test_a_hostile_upload_gets_a_sentence_and_leaves_nothing(
+    studio: Client, name: str, content: bytes, status: int, says: str
+) -> None:
+    draft = studio.draft()
+    answered, said = studio.post(f"/drafts/{draft}/files?name={name}", content)
+    assert (answered, says in said["detail"]) == (status, True), said
+    assert str(home.uploads()) not in said["detail"]
+    assert list((home.uploads() / draft / "files").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "kept"),
+    [
+        ("..%2F..%2Fetc%2Fpasswd.png", "passwd.png"),
+        ("C:%5Cpictures%5Cfox.PNG", "fox.png"),
+        ("a%00b%0A.png", "ab.png"),
+        ("", "asset"),
+        ("%2E%2E", "asset"),
+        ("x" * 400 + ".png", "x" * 190 + ".png"),
+    ],
+)
+def test_the_name_of_an_upload_leads_nowhere(studio: Client, name: str, kept: str) -> None:
+    draft = studio.draft((name, PNG))
+    assert [path.name for path in (home.uploads() / draft / "files").iterdir()] == [kept]
+    assert studio.post(f"/drafts/{draft}/files?name={name}", PNG)[1]["name"] != kept  # no file replaces another
+
+
+@pytest.mark.parametrize("wanted", [{"profile": "no such"}, {"seed": -1}, {"settings": ["rm -rf"]}, {"box": [1, 2]},
+                                    {"views": [{"file": "none.png", "azimuth": 90}]}, {"other": 1},
+                                    {"masked": True}, {"name": "\x00"}])  # fmt: skip
+def test_choices_that_cannot_be_are_refused_before_a_run_starts(studio: Client, wanted: dict[str, object]) -> None:
+    draft = studio.draft(("fox.png", PNG))
+    status, said = studio.post(f"/drafts/{draft}/runs", wanted)
+    assert status in {404, 422} and said["detail"]
+
+
+def test_a_matte_gets_the_size_of_its_source(studio: Client) -> None:
+    draft = studio.draft(("fox.png", PNG))
+    for content, status in ((b"no picture", 422), (gray(0), 422), (gray(255), 201)):
+        assert studio.post(f"/drafts/{draft}/mask", content)[0] == status
+    with Image.open(home.uploads() / draft / "mask.png") as mask:
+        assert (mask.size, mask.mode) == ((8, 6), "L")  # of the fake source
+    assert [path.name for path in (home.uploads() / draft).glob(".*")] == []
+
+
+def gray(value: int) -> bytes:
+    content = BytesIO()
+    Image.new("L", (16, 12), value).save(content, "PNG")
+    return content.getvalue()
+
+
+def test_a_draft_becomes_an_asset_that_is_found_downloaded_and_made_again(studio: Client) -> None:
+    draft = studio.draft(("wolf.png", picture("a wolf that is torn").encode()), ("side.png", PNG))
+    cut = studio.post(f"/drafts/{draft}/cutout", {"box": [1, 1, 4, 4]})[1]
+    assert (cut["width"], cut["height"]) == (8, 6)
+    assert studio.post(f"/drafts/{draft}/mask", gray(255))[0] == 201
+    wanted = {"name": "wolf", "motion": "wave", "masked": True, "views": [{"file": "side.png", "azimuth": 90}]}
+    status = studio.ended(studio.post(f"/drafts/{draft}/runs", wanted)[1]["id"])
+    assert status["state"] == "done", status
+    assert {step["state"] for step in status["steps"]} == {"done"}
+    assert status["picture"].startswith("/dg4d/artifacts/")
+    record = json.loads(next((home.studio_assets()).glob("asset-wolf-*/*/provenance.json")).read_text())
+    assert record["recipe"]["mask"] and record["recipe"]["views"]
+    assert record["recipe"]["settings"]["driving"]["motion"] == "wave"
+
+    page = studio.read(status["asset"].removeprefix("/dg4d/studio"))[1].decode()
+    assert "Not accepted" in page and "Again with twice the motion iterations" in page
+    assert studio.read(re.findall(r'"/dg4d/studio(/entries/[^"]+asset.glb)"', page)[0])[1]
+    assert studio.read(re.findall(r'"/dg4d/studio(/thumbnails/[^"]+)"', page)[0])[1][8:12] == b"WEBP"
+    key = re.findall(r'data-asset="([^"]+)"', page)[0]
+    version = status["asset"].partition("?v=")[2]
+    again = {"version": version, "settings": ["motion.iterations=500"], "seed": 7}
+    second = studio.ended(studio.post(f"/assets/{key}/again", again)[1]["id"])
+    assert second["state"] == "done" and second["asset"] != status["asset"]
+    page = studio.read(f"/assets/{key}?v={version}&with={second['asset'].partition('?v=')[2]}")[1].decode()
+    assert page.count("<iframe") == 2 and "2 versions" in studio.read("?search=wolf")[1].decode()
+    assert "wolf" not in studio.read("?search=wolf&verdict=accepted")[1].decode().partition('id="cards"')[2]
+
+
+def test_a_failed_conversion_says_why_and_can_be_tried_again(studio: Client) -> None:
+    draft = studio.draft(("owl.png", picture("an owl pack_asset=full").encode()))
+    run = studio.post(f"/drafts/{draft}/runs", {})[1]["id"]
+    assert studio.post(f"/runs/{run}/retry")[0] == 409
+    status = studio.ended(run)
+    assert status["state"] == "failed" and "disk" in status["message"].lower() and "Traceback" not in status["message"]
+    assert studio.post(f"/runs/{run}/cancel")[0] == 409
+    again = studio.post(f"/runs/{run}/retry")[1]["id"]
+    assert again != run and studio.ended(again)["state"] == "failed"
+    page = studio.read("/activity")[1].decode()
+    assert page.count("<strong>owl</strong>") == 1  # the last attempt stands for both
+
+
+def test_a_conversion_is_cancelled(studio: Client) -> None:
+    draft = studio.draft(("slow.png", picture("fit_gaussians=sleep:300").encode()))
+    begun, waiting = (studio.post(f"/drafts/{draft}/runs", {"seed": seed})[1]["id"] for seed in (0, 1))
+    assert studio.post(f"/runs/{waiting}/cancel")[0] == 200
+    wait_until(lambda: json.loads(studio.read(f"/runs/{begun}/status")[1])["steps"][0]["state"] == "done")
+    assert studio.post(f"/runs/{begun}/cancel")[0] == 200
+    for run in (begun, waiting):
+        assert studio.ended(run)["state"] == "cancelled"
+        assert studio.post(f"/runs/{run}/cancel")[0] == 200  # a second tab
+
+
+def test_a_folder_becomes_a_batch(studio: Client) -> None:
+    draft = studio.draft(*((f"item{i}.png", picture(f"item {i}").encode()) for i in range(3)))
+    status = studio.ended(studio.post(f"/drafts/{draft}/runs", {"batch": True})[1]["id"])
+    assert status["state"] == "done" and len(status["items"]) == 3
+    assert studio.read("?search=item")[1].decode().count('class="asset"') == 3
+
+
+def test_uploads_lie_in_files_that_others_cannot_read(studio: Client) -> None:
+    draft = studio.draft(("fox.png", PNG))
+    assert (home.studio().parent.stat().st_mode & 0o077, Path(home.uploads() / draft).is_dir()) == (0, True)
