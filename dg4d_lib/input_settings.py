@@ -183,8 +183,8 @@ class ImageEditViewsSettings(Settings):
     guidance_scale: float = Field(4.0, ge=0, le=30, description="classifier-free guidance (the model's: 4)")
     precision: Precision = Field("bf16", description="of the networks; always fp32 on CPUs")
     memory_gb: PipelineBudget = 24.0
-    min_agreement: Share = Field(
-        0.5, description="largest weight, from 0 to 1, at which a view that disagrees with the others is left out; ours"
+    min_weight: Share = Field(
+        0.2, description="views whose agreement with the others, from 0 to 1, is lower are left out; ours"
     )
 
 

@@ -121,12 +121,12 @@ OPEN_MODELS = (
         purpose="driving videos on small GPUs: driving.kind=diffusers (LTX-Video, 2B)",
         license=License(
             "LTXV Open Weights License",
-            "conditions",
-            "commercial use is said to be free up to ten million US dollars of yearly revenue, and above to take a "
-            "license of Lightricks; the terms differ between its versions: read the text in the repository",
+            "unverified",
+            "the terms differ between versions of this model and depend on yearly revenue; read the text in its "
+            "repository before any commercial use",
         ),
         parts=WAN_PARTS,
-        about_gb=29.0,
+        revision="8984fa25007f376c1a299016d0957a37a2f797bb",
         flow_matching=True,
     ),
     Weights(

@@ -156,7 +156,8 @@ def known_views(bank: Bank, frame: int = 0) -> list[KnownView]:
     """Return the views of a frame in a bank."""
     column = bank.frames.index(frame)
     pictures = bank.pictures[:, column].float() / 255
-    return [KnownView(camera, picture) for camera, picture in zip(bank.cameras, pictures, strict=True)]
+    weights = bank.weights or (1.0,) * len(bank.cameras)
+    return [KnownView(*each, weight=one) for one, *each in zip(weights, bank.cameras, pictures, strict=True)]
 
 
 def known_note(bank: Bank | None) -> str:
@@ -236,7 +237,7 @@ def read_bank_folder(folder: Path) -> Bank:
     tiles = torch.empty(len(cameras), count, size, size, 4, dtype=torch.uint8)
     for row, view in enumerate(index.views):
         tiles[row] = _tiles(folder / view.file, index)[:count]
-    return Bank(cameras, index.frames, tiles)
+    return Bank(cameras, index.frames, tiles, tuple(view.weight for view in index.views))
 
 
 def _tiles(path: Path, index: BankIndex) -> UInt8[Tensor, "n s s 4"]:
