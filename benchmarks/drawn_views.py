@@ -71,9 +71,7 @@ def weighted_bank(bank: Bank, front: KnownView, min_weight: float) -> Bank:
     return Bank(tuple(view.camera for view in kept), (0,), pictures, tuple(view.weight for view in kept))
 
 
-def score(
-    subject: Subject, settings: PipelineSettings, sides: Bank, first: bool = False
-) -> tuple[Figures, Tensor]:
+def score(subject: Subject, settings: PipelineSettings, sides: Bank, first: bool = False) -> tuple[Figures, Tensor]:
     """Fit the subject with imperfect views and compare unseen ones; or only the shape of frame 0."""
     return score_first(subject, settings, sides) if first else score_fit(subject, settings, sides=sides)
 

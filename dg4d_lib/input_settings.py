@@ -127,7 +127,8 @@ class DiffusersVideoSettings(Settings):
         "camera movement, zoom, cut, shadow, text, blurry, deformed", max_length=2000, description="likewise"
     )
     loop: bool = Field(
-        False, description="the input is also the last picture, so that the motion loops; only for first-last-frame models"
+        False,
+        description="the input is also the last picture, so that the motion loops; only for first-last-frame models",
     )
     frames: int = Field(14, ge=2, le=128, description="frames of the driving video")
     generated_frames: int = Field(
@@ -138,7 +139,9 @@ class DiffusersVideoSettings(Settings):
         "spaced, are kept; 0: as many as are kept",
     )
     fps: float = Field(7.0, gt=0, le=120, description="frames per second of playback")
-    height: int = Field(512, ge=32, le=2048, multiple_of=8, description="pixels, rounded to a size that the model takes")
+    height: int = Field(
+        512, ge=32, le=2048, multiple_of=8, description="pixels, rounded to a size that the model takes"
+    )
     width: int = Field(512, ge=32, le=2048, multiple_of=8, description="pixels, rounded to a size that the model takes")
     num_inference_steps: int = Field(30, ge=1, le=200, description="denoising steps")
     guidance_scale: float = Field(5.0, ge=0, le=30, description="classifier-free guidance (Wan: 5)")

@@ -132,7 +132,9 @@ def _pipeline_videos(
         [torch.Generator().manual_seed(each) for each in seeds],
         lambda done, total: job.progress(done, total, {}),
     )
-    motions = [_Motion(number, f"seed {each}", video) for number, each, video in zip(numbers, seeds, videos, strict=True)]
+    motions = [
+        _Motion(number, f"seed {each}", video) for number, each, video in zip(numbers, seeds, videos, strict=True)
+    ]
     notes = (*generator.notes, license_note(settings.weights))
     backend = f"{device.type} (diffusers, {type(generator.pipeline).__name__})"
     return motions, StepReport(backend, opened.digests, opened.licenses, notes, offload_notes(generator.offload))

@@ -1,4 +1,4 @@
-"""Step that draws views of other sides of the subject and weights them by their agreement, as a bank beside the input."""
+"""Step that draws views of other sides of the subject, and weights them by their agreement."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -42,9 +42,7 @@ def run(job: Job) -> StepReport:
     opened = [open_weights(name) for name in (settings.weights, settings.lora_weights) if name]
     lora = opened[1].folder if settings.lora_weights else None
     drawer = ViewDrawer.load(opened[0].folder, lora, settings, device)
-    pictures = drawer.draw(
-        over_white(subject), directions, job.seed, lambda done, total: job.progress(done, total, {})
-    )
+    pictures = drawer.draw(over_white(subject), directions, job.seed, lambda done, total: job.progress(done, total, {}))
     offload = drawer.offload
     del drawer  # frees memory for the cut-outs
     network = open_network(job.settings.matting)

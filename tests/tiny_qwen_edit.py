@@ -27,7 +27,13 @@ def save_tiny_qwen_edit(folder: Path) -> Path:
     number = {token: tokenizer.convert_tokens_to_ids(token) for token in SPECIAL}
     small = {"hidden_size": 16, "intermediate_size": 16}
     rope = {"rope_type": "default", "mrope_section": [1, 1, 2], "rope_theta": 1e4}
-    words = {**small, "num_hidden_layers": 1, "num_attention_heads": 2, "num_key_value_heads": 2, "rope_parameters": rope}
+    words = {
+        **small,
+        "num_hidden_layers": 1,
+        "num_attention_heads": 2,
+        "num_key_value_heads": 2,
+        "rope_parameters": rope,
+    }
     ends = {"bos_token_id": number["<|endoftext|>"], "eos_token_id": number["<|im_end|>"]}
     eyes = {**small, "depth": 1, "num_heads": 2, "out_hidden_size": 16, "fullatt_block_indexes": [0]}
     config = Qwen2_5_VLConfig(

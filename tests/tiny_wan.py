@@ -26,7 +26,12 @@ def save_tiny_wan(folder: Path, last_image: bool = False) -> Path:
     )
     from transformers import UMT5Config, UMT5EncoderModel
 
-    shared: dict[str, Any] = {"base_dim": 4, "z_dim": 4, "num_res_blocks": 1, "temperal_downsample": [False, True, True]}
+    shared: dict[str, Any] = {
+        "base_dim": 4,
+        "z_dim": 4,
+        "num_res_blocks": 1,
+        "temperal_downsample": [False, True, True],
+    }
     shared |= {"latents_mean": [0.0] * 4, "latents_std": [1.0] * 4}
     network: dict[str, Any] = {"num_attention_heads": 2, "attention_head_dim": 12, "text_dim": 16, "freq_dim": 16}
     network |= {"ffn_dim": 32, "num_layers": 1, "cross_attn_norm": True, "qk_norm": "rms_norm_across_heads"}
@@ -64,7 +69,9 @@ def save_tiny_wan(folder: Path, last_image: bool = False) -> Path:
 def _name_as_published(folder: Path) -> None:
     """Name the text-to-video class, which has no image encoder."""
     index = json.loads((folder / "model_index.json").read_text())
-    index = {key: value for key, value in index.items() if not key.startswith("image_")} | {"_class_name": "WanPipeline"}
+    index = {key: value for key, value in index.items() if not key.startswith("image_")} | {
+        "_class_name": "WanPipeline"
+    }
     (folder / "model_index.json").write_text(json.dumps(index))
 
 

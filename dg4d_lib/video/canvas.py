@@ -16,9 +16,7 @@ MATTING_FAILED = (
 Window = tuple[slice, slice]  # rows and columns
 
 
-def white_canvas(
-    subject: Float[Tensor, "h w 4"], height: int, width: int
-) -> tuple[Float[Tensor, "y x 3"], Window]:
+def white_canvas(subject: Float[Tensor, "h w 4"], height: int, width: int) -> tuple[Float[Tensor, "y x 3"], Window]:
     """Scale the subject to a white canvas, centered; return the canvas and the rows and columns of the subject."""
     scale = min(height / subject.shape[0], width / subject.shape[1])
     rows, columns = (round(side * scale) for side in subject.shape[:2])

@@ -44,9 +44,7 @@ class ImageToVideo:
         notes: sentences for the user about changed sizes and about failed matting.
     """
 
-    def __init__(
-        self, settings: DiffusersVideoSettings, model: Path, pipeline: Any, offload: Offload = "none"
-    ) -> None:
+    def __init__(self, settings: DiffusersVideoSettings, model: Path, pipeline: Any, offload: Offload = "none") -> None:
         """Store the settings and a loaded pipeline, and check that it takes a picture.
 
         Raises:

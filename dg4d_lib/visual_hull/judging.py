@@ -47,28 +47,18 @@ class Judgment:
 
 
 def place_views(front: KnownView, views: Sequence[KnownView]) -> list[KnownView]:
-    """Return views in the scale of the input, whose cutouts may have any.
+    """Return views in the scale of the input: as they are, or matched if that agrees better.
 
-    Views from elevation 0 show the height of the input; others get the bounding box of the hull of these.
+    Matched views from elevation 0 show the height of the input; others get the bounding box of the hull of these.
 
     Args:
         front: input view.
         views: of the same subject, each centered in its frame.
     """
-    placed = {
-        number: replace(view, cutout=match_scale(view.cutout, front.cutout, view.camera.azimuth_deg))
-        for number, view in enumerate(views)
-        if view.camera.elevation_deg == 0
-    }
-    level = [front, *placed.values()]
-    for number, view in enumerate(views):
-        if number not in placed:
-            placed[number] = replace(view, cutout=_scaled_to_hull(view, level))
-    size = front.camera.width
-    return [
-        replace(view, camera=replace(view.camera, width=size, height=size))
-        for view in (placed[number] for number in range(len(views)))
-    ]
+    matched = _matched(front, views)
+    if any(view.cutout.shape != front.cutout.shape for view in views):
+        return matched
+    return max(([*views], matched), key=lambda ring: _agreement([front, *ring]))
 
 
 def better_direction(front: KnownView, views: Sequence[KnownView]) -> tuple[list[KnownView], bool]:
@@ -97,6 +87,24 @@ def judge_views(front: KnownView, views: Sequence[KnownView]) -> list[Judgment]:
     return [Judgment(*pair) for pair in zip(outlines[1:], tints[1:], strict=True)]
 
 
+def _matched(front: KnownView, views: Sequence[KnownView]) -> list[KnownView]:
+    """Return views with the height of the input, or the bounding box of the hull of those that have it."""
+    placed = {
+        number: replace(view, cutout=match_scale(view.cutout, front.cutout, view.camera.azimuth_deg))
+        for number, view in enumerate(views)
+        if view.camera.elevation_deg == 0
+    }
+    level = [front, *placed.values()]
+    for number, view in enumerate(views):
+        if number not in placed:
+            placed[number] = replace(view, cutout=_scaled_to_hull(view, level))
+    size = front.camera.width
+    return [
+        replace(view, camera=replace(view.camera, width=size, height=size))
+        for view in (placed[number] for number in range(len(views)))
+    ]
+
+
 def _scaled_to_hull(view: KnownView, others: Sequence[KnownView]) -> Float[Tensor, "s s 4"]:
     """Return the picture of a view with the bounding box that the hull of others has from its camera."""
     size = others[0].camera.width
@@ -112,7 +120,7 @@ def _angles(view: KnownView) -> tuple[float, float]:
 
 
 def _outline_errors(views: Sequence[KnownView]) -> tuple[list[float], list[float]]:
-    """Return, per view, the share of its silhouette outside of the others' hull, and the share that it cuts of theirs."""
+    """Return per view the share of its silhouette outside of the others' hull, and that which it cuts of theirs."""
     masks = torch.stack([view.cutout[..., 3] for view in views]) > 0.5
     areas = masks.sum((1, 2)).clamp(min=1)
     whole = _filled(views, views, masks, areas)
@@ -136,6 +144,13 @@ def _filled(
     except BadInput:
         return torch.zeros(len(views))
     return ((alpha > 0.5) & masks).sum((1, 2)) / areas
+
+
+def _agreement(views: Sequence[KnownView]) -> float:
+    """Return the mean share of the silhouettes that the hull of all fills."""
+    small = [smaller(view) for view in views]
+    masks = torch.stack([view.cutout[..., 3] for view in small]) > 0.5
+    return float(_filled(small, small, masks, masks.sum((1, 2)).clamp(min=1)).mean())
 
 
 def _color_errors(views: Sequence[KnownView]) -> list[float]:

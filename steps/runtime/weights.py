@@ -76,7 +76,11 @@ def license_note(name: str) -> str:
 def offload_notes(offload: str) -> tuple[str, ...]:
     """Return a sentence for the run if networks were moved to the GPU in parts, else nothing."""
     parts = {"model": "one network at a time", "sequential": "layer by layer, which is slow"}
-    return (f"the networks did not fit on the GPU together and were moved there {parts[offload]}",) if offload in parts else ()
+    return (
+        (f"the networks did not fit on the GPU together and were moved there {parts[offload]}",)
+        if offload in parts
+        else ()
+    )
 
 
 def _card_of(name: str) -> str:

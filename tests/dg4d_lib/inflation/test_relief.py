@@ -1,9 +1,9 @@
 import numpy as np
 import torch
 
+from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.guidance.geometric import InflatedSurfaces
 from dg4d_lib.guidance.interface import GuidanceView
-from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.inflation.relief import relief
 from dg4d_lib.inflation.surface import inflate
 from dg4d_lib.settings import GeometricPriorSettings

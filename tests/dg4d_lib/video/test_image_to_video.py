@@ -82,12 +82,12 @@ def test_a_loop_gives_the_picture_as_the_last_one_too(folders: dict[str, Path], 
 
 @pytest.mark.parametrize(("name", "reason"), [("wan", "was not trained on last pictures"), ("svd", "no last picture")])
 def test_a_loop_without_a_first_last_frame_model_is_refused(name: str, reason: str, folders: dict[str, Path]) -> None:
-    with pytest.raises(BadInput, match=f"driving.loop=true .*{reason}.*driving.weights=wan2.1-flf2v"):
+    with pytest.raises(BadInput, match=rf"driving\.loop=true .*{reason}.*driving\.weights=wan2\.1-flf2v"):
         ImageToVideo.load(folders[name], small(loop=True), CPU)
 
 
 def test_a_pipeline_without_a_picture_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="StableDiffusionPipeline .* is no image-to-video pipeline"):
+    with pytest.raises(BadInput, match=r"StableDiffusionPipeline .* is no image-to-video pipeline"):
         ImageToVideo.load(save_pipeline(tmp_path / "words"), small(), CPU)
 
 
@@ -142,5 +142,5 @@ def test_what_the_pipeline_refuses_is_told_in_its_words(folders: dict[str, Path]
 
     monkeypatch.setattr(type(generator.pipeline), "__call__", lambda self, image=None, num_frames=1: refuse(image, 1))
     generator._names = {"image": None, "num_frames": None}  # type: ignore[assignment]  # as the call above
-    with pytest.raises(BadInput, match="StableVideoDiffusionPipeline .* refused its input: this many frames"):
+    with pytest.raises(BadInput, match=r"StableVideoDiffusionPipeline .* refused its input: this many frames"):
         generator.generate_all(disc(), [torch.Generator()])
