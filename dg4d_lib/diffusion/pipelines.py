@@ -93,7 +93,7 @@ def place_pipeline(pipeline: Any, device: torch.device, memory_gb: float) -> Off
         pipeline.enable_sequential_cpu_offload(device=device)
     else:
         pipeline.to(device)
-    if offload != "none" and hasattr(pipeline.vae, "enable_tiling"):
+    if offload != "none" and hasattr(getattr(pipeline, "vae", None), "enable_tiling"):
         pipeline.vae.enable_tiling()
     return offload
 
