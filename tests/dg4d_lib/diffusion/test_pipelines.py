@@ -1,4 +1,4 @@
-"""Offloading by memory budgets, with networks of the published sizes on the meta device; schedulers of flow matching."""
+"""Offloading by memory budgets, with networks of the published sizes on the meta device; detection of flow matching."""
 
 import json
 from collections.abc import Callable
