@@ -52,7 +52,7 @@ def test_views_of_other_sides_reach_both_fits_and_belong_to_the_package(log: Pat
 @pytest.mark.parametrize("given", [False, True])
 def test_drawn_views_reach_both_fits_and_give_way_to_the_users(given: bool, log: Path, tmp_path: Path) -> None:
     for name in ("front.png", "back.png"):
-        (tmp_path / name).write_text(picture(name))
+        (tmp_path / name).write_text(picture(f"{name} beside drawn views: {given}"))  # not cached
     sides = ViewsRequest(views=parse_views([f"180={tmp_path / 'back.png'}"])) if given else ViewsRequest()
     settings = revise(PREVIEW, {"views.kind": "image_edit"})
     request = ConversionRequest(item="drawn", picture=tmp_path / "front.png", settings=settings, given_views=sides)
