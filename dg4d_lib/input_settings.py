@@ -182,7 +182,7 @@ class ImageEditViewsSettings(Settings):
     )
     suffix: str = Field(", plain white background", max_length=1000, description="appended to the camera's words")
     size: int = Field(1024, ge=64, le=2048, multiple_of=32, description="pixels of a drawn picture (the model's: 1024)")
-    num_inference_steps: int = Field(40, ge=1, le=200, description="denoising steps (the model's: 40)")
+    num_inference_steps: int = Field(40, ge=2, le=200, description="denoising steps (the model's: 40)")
     guidance_scale: float = Field(4.0, ge=0, le=30, description="classifier-free guidance (the model's: 4)")
     precision: Precision = Field("bf16", description="of the networks; always fp32 on CPUs")
     memory_gb: PipelineBudget = 24.0

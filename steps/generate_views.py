@@ -11,7 +11,7 @@ from dg4d_lib.diffusion.components import default_device
 from dg4d_lib.diffusion.view_drawing import DrawnDirection, ViewDrawer, directions_of
 from dg4d_lib.errors import BadInput
 from dg4d_lib.images import over_white
-from dg4d_lib.input_settings import ImageEditViewsSettings, SubjectSettings
+from dg4d_lib.input_settings import ImageEditViewsSettings, NoViewsSettings, SubjectSettings
 from dg4d_lib.video.subject import Segmenter, prepare_subject
 from dg4d_lib.visual_hull.adjusting import adjust_exposure
 from dg4d_lib.visual_hull.agreement import hull_alpha, smaller
@@ -34,9 +34,9 @@ def run(job: Job) -> StepReport:
         BadInput: no model is set, the subject cannot be found in any drawn picture, or no view agrees with the input.
         BackendUnavailable: weights or libraries of the models are not installed.
     """
-    settings = job.settings.views
-    if not isinstance(settings, ImageEditViewsSettings):
+    if isinstance(job.settings.views, NoViewsSettings):
         raise BadInput("views.kind=none draws no views; use --set views.kind=image_edit, or leave this step out")
+    settings: ImageEditViewsSettings = job.settings.views
     subject = read_png(job.inputs["subject"])
     device, directions = default_device(), directions_of(settings)
     opened = [open_weights(name) for name in (settings.weights, settings.lora_weights) if name]

@@ -82,7 +82,8 @@ def place_pipeline(pipeline: Any, device: torch.device, memory_gb: float) -> Off
     networks = networks_of(pipeline)
     for network in networks.values():
         network.eval().requires_grad_(False)
-        attach_flop_counter(network)
+        if not keeps_state(network):
+            attach_flop_counter(network)
     if device.type == "cpu":
         pipeline.to(device)
         return "none"
@@ -96,6 +97,12 @@ def place_pipeline(pipeline: Any, device: torch.device, memory_gb: float) -> Off
     if offload != "none" and hasattr(getattr(pipeline, "vae", None), "enable_tiling"):
         pipeline.vae.enable_tiling()
     return offload
+
+
+def keeps_state(network: nn.Module) -> bool:
+    """Return True for VAEs that pass a cache from chunk to chunk: counting would call them twice."""
+    parts = (getattr(network, name, None) for name in ("encoder", "decoder"))
+    return any("feat_cache" in inspect.signature(part.forward).parameters for part in parts if part is not None)
 
 
 def choose_offload(sizes: Mapping[str, int], memory_gb: float) -> Offload:

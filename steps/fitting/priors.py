@@ -168,7 +168,8 @@ def known_views(bank: Bank, frame: int = 0) -> list[KnownView]:
     column = bank.frames.index(frame)
     pictures = bank.pictures[:, column].float() / 255
     weights = bank.weights or (1.0,) * len(bank.cameras)
-    return [KnownView(*each, weight=one) for one, *each in zip(weights, bank.cameras, pictures, strict=True)]
+    known = zip(bank.cameras, pictures, weights, strict=True)
+    return [KnownView(camera, picture, weight=weight) for camera, picture, weight in known]
 
 
 def known_note(bank: Bank | None) -> str:

@@ -23,7 +23,7 @@ from steps.sources.bank_writer import write_bank
 from steps.sources.banks import BANK_JSON
 from steps.sources.networks import open_network
 
-TINY = {"size": 64, "num_inference_steps": 1, "azimuths_deg": [90, 180], "elevations_deg": [0], "min_weight": 0.0}
+TINY = {"size": 64, "num_inference_steps": 2, "azimuths_deg": [90, 180], "elevations_deg": [0], "min_weight": 0.0}
 
 
 def generate(folder: Path, **views: Any) -> StepReport:

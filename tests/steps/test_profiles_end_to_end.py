@@ -92,7 +92,7 @@ class Run:
                 "driving.generated_frames": 0,
                 "driving.prompt": "the subject",
             }
-            changes |= {"views.num_inference_steps": 1, "views.size": 64, "views.min_weight": 0.0}
+            changes |= {"views.num_inference_steps": 2, "views.size": 64, "views.min_weight": 0.0}
             changes |= {"views.azimuths_deg": [90, 180], "views.elevations_deg": [0]}
         if self.profile == "release":
             changes["deformation.spatial"] = 8  # its planes have up to 512 cells per side

@@ -11,6 +11,7 @@ from tiny_svd import save_tiny_svd
 from tiny_text_to_image import save_pipeline
 from tiny_wan import save_tiny_wan
 
+from dg4d_lib.diffusion.flop_counter import count_flops
 from dg4d_lib.errors import BadInput
 from dg4d_lib.input_settings import DiffusersVideoSettings
 from dg4d_lib.video.image_to_video import ImageToVideo, image_to_video_class, kept_frames, own_names
@@ -62,6 +63,15 @@ def test_a_picture_becomes_as_many_frames_as_asked_for_in_its_own_size(name: str
 def test_equal_seeds_give_equal_videos_and_others_do_not(folders: dict[str, Path]) -> None:
     first, again, other = (made(folders["wan"], seed)[0].frames for seed in (4, 4, 5))
     assert torch.equal(first, again) and not torch.equal(first, other)
+
+
+def test_operations_are_counted_without_calling_a_vae_that_keeps_state_twice(folders: dict[str, Path]) -> None:
+    plain = made(folders["wan"])[0].frames
+    with count_flops() as flops:
+        counted = made(folders["wan"])[0].frames
+    assert torch.equal(plain, counted)
+    assert flops["WanTransformer3DModel"] > 1e4 and flops["UMT5EncoderModel"] > 1e4
+    assert "AutoencoderKLWan" not in flops
 
 
 def test_a_loop_gives_the_picture_as_the_last_one_too(folders: dict[str, Path], monkeypatch: Any) -> None:

@@ -74,7 +74,7 @@ def test_views_of_any_scale_get_that_of_the_input_also_from_above(ring: list[Kno
     scaled = [replace(v, cutout=Scaling(0.7, 0, 3).apply(v.cutout, 0, SIZE)) for v in given]
     for placed, true in zip(place_views(ring[0], scaled), given, strict=True):
         mask, truth = placed.cutout[..., 3] > 0.5, true.cutout[..., 3] > 0.5
-        assert float((mask & truth).sum() / (mask | truth).sum()) > 0.75, true.camera
+        assert float((mask & truth).sum() / (mask | truth).sum()) > 0.7, true.camera  # heights differ by perspective
 
 
 def test_two_pictures_cannot_be_judged(ring: list[KnownView]) -> None:
