@@ -44,7 +44,10 @@ def imperfect_bank(subject: Subject, errors: OraclePriorSettings, spoil: int = 0
     assert subject.truth is not None and subject.truth.bank is not None, f"{subject.name} has no bank"
     folder, bank = subject.truth.inputs[0].parents[1] / "static", read_bank_folder(subject.truth.bank)
     pairs = [
-        (OrbitCamera(0, azimuth, width=SIZE, height=SIZE), read_png(folder / f"az_{azimuth:03d}.png"))
+        (
+            OrbitCamera(0, azimuth, width=SIZE, height=SIZE),
+            resize(read_png(folder / f"az_{azimuth:03d}.png")[None], (SIZE, SIZE))[0],
+        )
         for azimuth in range(STEP_DEG, 360, STEP_DEG)
     ]
     first = bank.frames.index(0)
