@@ -26,6 +26,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.guidance.oracle import Bank, perturb
 from dg4d_lib.images import resize
 from dg4d_lib.settings import OraclePriorSettings
+from dg4d_lib.visual_hull.agreement import smaller
 from dg4d_lib.visual_hull.known import KnownView, known_view
 from steps.artifacts.media import read_png
 from steps.fitting.priors import known_views, read_bank_folder
@@ -64,12 +65,12 @@ def imperfect_bank(subject: Subject, errors: OraclePriorSettings, spoil: int = 0
 
 def weighted_bank(bank: Bank, front: KnownView, min_weight: float) -> Bank:
     """Return the bank as `generate_views` writes it: placed, judged, weighted."""
-    kept, judgments, notes = weighted_views(front, known_views(bank), min_weight)
+    views = [smaller(view, front.camera.width) for view in known_views(bank)]
+    kept, judgments, notes = weighted_views(front, views, min_weight)
     weights = [one.weight for one in judgments]
     sys.stderr.write(f"{len(kept)} of {len(weights)} views kept, weights {min(weights):.2f} to {max(weights):.2f}, ")
     sys.stderr.write(f"mean {average(weights):.2f} {' '.join(notes)}\n")
-    size = front.camera.width
-    cutouts = torch.stack([resize(view.cutout[None], (size, size))[0].clamp(0, 1) for view in kept])
+    cutouts = torch.stack([view.cutout for view in kept]).clamp(0, 1)
     pictures = (cutouts * 255).round().to(torch.uint8)[:, None]
     return Bank(tuple(view.camera for view in kept), (0,), pictures, tuple(view.weight for view in kept))
 
