@@ -27,9 +27,8 @@ from steps.artifacts.media import read_png
 
 LEAST_MEAN, LEAST_WORST = 0.96, 0.85  # bounds on the masks' overlap
 OWN_SUBJECT = frozenset(["coffee", "rocket", "astronaut", "chelsea", "camera", "coins"])
-KINDS: tuple[Kind, Kind, Kind] = ("procedural", "photograph", "photograph with a subject")
-
 Kind = Literal["procedural", "photograph", "photograph with a subject"]
+KINDS: tuple[Kind, Kind, Kind] = ("procedural", "photograph", "photograph with a subject")
 
 
 @dataclass(frozen=True)

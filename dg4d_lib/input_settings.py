@@ -1,10 +1,10 @@
-"""Settings of the inputs: words, picture or video, and the driving video."""
+"""Settings of the inputs: words, picture or video, the driving video, and drawn views of other sides."""
 
 from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
-from dg4d_lib.settings import Precision, Settings, VideoModelSettings
+from dg4d_lib.settings import PipelineBudget, Precision, Settings, Share, VideoModelSettings
 
 
 class TextSettings(Settings):
@@ -106,4 +106,89 @@ class SvdSettings(Settings):
     width: int = Field(512, ge=64, le=2048, multiple_of=64, description="pixels (public code: 512; trained on 1024)")
 
 
-DrivingSettings = Annotated[WarpSettings | SvdSettings, Field(discriminator="kind")]
+class DiffusersVideoSettings(Settings):
+    """Driving video by any image-to-video pipeline of diffusers; candidate k has the seed of the order plus k - 1."""
+
+    kind: Literal["diffusers"] = "diffusers"
+    candidates: Candidates = 1
+    pick: Pick = 0
+    weights: str = Field(
+        "wan2.2-ti2v-5b",
+        min_length=1,
+        description="a name from `dg4d weights list`, a Hugging Face hub id, or a folder in diffusers' layout",
+    )
+    prompt: str = Field(
+        "the subject moves naturally in place, the whole of it stays in the picture, static camera, plain white "
+        "background",
+        max_length=2000,
+        description="for pipelines that take a prompt",
+    )
+    negative_prompt: str = Field(
+        "camera movement, zoom, cut, shadow, text, blurry, deformed", max_length=2000, description="likewise"
+    )
+    loop: bool = Field(
+        False,
+        description="the input is also the last picture, so that the motion loops; only for first-last-frame models",
+    )
+    frames: int = Field(14, ge=2, le=128, description="frames of the driving video")
+    generated_frames: int = Field(
+        0,
+        ge=0,
+        le=512,
+        description="frames that the pipeline generates, rounded up to a number that it can; `frames` of them, evenly "
+        "spaced, are kept; 0: as many as are kept",
+    )
+    fps: float = Field(7.0, gt=0, le=120, description="frames per second of playback")
+    height: int = Field(
+        512, ge=32, le=2048, multiple_of=8, description="pixels, rounded to a size that the model takes"
+    )
+    width: int = Field(512, ge=32, le=2048, multiple_of=8, description="pixels, rounded to a size that the model takes")
+    num_inference_steps: int = Field(30, ge=1, le=200, description="denoising steps")
+    guidance_scale: float = Field(5.0, ge=0, le=30, description="classifier-free guidance (Wan: 5)")
+    precision: Precision = Field("bf16", description="of the networks; always fp32 on CPUs")
+    memory_gb: PipelineBudget = 24.0
+
+
+DrivingSettings = Annotated[WarpSettings | SvdSettings | DiffusersVideoSettings, Field(discriminator="kind")]
+
+
+class NoViewsSettings(Settings):
+    """Other sides are not drawn."""
+
+    kind: Literal["none"] = "none"
+
+
+class ImageEditViewsSettings(Settings):
+    """Other sides drawn by an image-editing pipeline with a LoRA for camera angles (Qwen-Image-Edit)."""
+
+    kind: Literal["image_edit"] = "image_edit"
+    weights: str = Field(
+        "qwen-image-edit-2511",
+        min_length=1,
+        description="a name from `dg4d weights list`, a Hugging Face hub id, or a folder in diffusers' layout",
+    )
+    lora_weights: str = Field(
+        "qwen-multiple-angles",
+        description="LoRA for camera angles: a name from `dg4d weights list`, or a folder; empty: none",
+    )
+    lora_scale: float = Field(0.9, ge=0, le=2, description="strength of the LoRA (its card: 0.8 to 1)")
+    azimuths_deg: tuple[Literal[0, 45, 90, 135, 180, 225, 270, 315], ...] = Field(
+        (0, 45, 90, 135, 180, 225, 270, 315),
+        min_length=1,
+        description="azimuths of the drawn views; that of the input is not drawn at elevation 0",
+    )
+    elevations_deg: tuple[Literal[-30, 0, 30, 60], ...] = Field(
+        (0, 30), min_length=1, description="elevations of the drawn views"
+    )
+    suffix: str = Field(", plain white background", max_length=1000, description="appended to the camera's words")
+    size: int = Field(1024, ge=64, le=2048, multiple_of=32, description="pixels of a drawn picture (the model's: 1024)")
+    num_inference_steps: int = Field(40, ge=2, le=200, description="denoising steps (the model's: 40)")
+    guidance_scale: float = Field(4.0, ge=0, le=30, description="classifier-free guidance (the model's: 4)")
+    precision: Precision = Field("bf16", description="of the networks; always fp32 on CPUs")
+    memory_gb: PipelineBudget = 24.0
+    min_weight: Share = Field(
+        0.2, description="views whose agreement with the others, from 0 to 1, is lower are left out; ours"
+    )
+
+
+ViewsSettings = Annotated[NoViewsSettings | ImageEditViewsSettings, Field(discriminator="kind")]

@@ -12,6 +12,15 @@ NotNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Precision = Literal["fp16", "bf16", "fp32"]
 NoiseDraw = Literal["annealed", "uniform"]  # timestep of an iteration: T_max, or uniform below it
+PipelineBudget = Annotated[
+    float,
+    Field(
+        ge=6,
+        le=1024,
+        description="GiB of GPU memory to plan for, for example 12, 24 or 80; networks that do not fit together are "
+        "moved to the GPU one at a time, and one that does not fit alone layer by layer",
+    ),
+]
 
 
 class Settings(BaseModel):
@@ -76,6 +85,12 @@ class GeometricPriorSettings(Settings):
         description="standard deviation of the guessed depth, world units: a view from the side is the average over it,"
         " soft along the direction in which depth shows",
     )
+    depth_weights: str = Field(
+        "",
+        description="monocular depth network (`depth-anything-v2-small`, or a folder in the layout of transformers), a "
+        "hint at the relief of the side that the picture shows; empty: none",
+    )
+    depth_weight: Share = Field(0.5, description="share of the estimated relief that the surface takes on; ours")
 
 
 class LearnedPriorSettings(Settings):

@@ -87,7 +87,7 @@ class Options(Frozen):
 
     model_config = ConfigDict(json_schema_extra=_sort_fields)
 
-    profile: Literal["preview", "paper", "video", "video-fast", "release", "reference", "quality"] = Field(
+    profile: Literal["preview", "paper", "video", "video-fast", "release", "reference", "quality", "open"] = Field(
         "preview",
         title="Profile",
         description="`preview` takes minutes on any machine, without a pretrained model; others need a GPU and weights",

@@ -9,7 +9,7 @@ from flows.engine.frames import count_frames, divide_frames
 from flows.engine.requests import Conversion
 from flows.inputs.conversion_job import ConversionJob
 from flows.packages.flow_result import StepRun, notes_of
-from flows.step_calls import Asset, DrivingVideo, Gaussians, Mesh, Motion, Package, Subject, Verdict
+from flows.step_calls import Asset, DrivingVideo, Gaussians, KnownViews, Mesh, Motion, Package, Subject, Verdict
 from flows.step_errors import StepBadInput
 from steps.artifacts.mesh_plan import read_plan
 from steps.contract import ArtifactRef, StepResult
@@ -56,6 +56,7 @@ class Tasks:
         self.draw_picture = bind(step_calls.draw_picture)
         self.prepare_subject = bind(step_calls.prepare_subject)
         self.prepare_views = bind(step_calls.prepare_views)
+        self.generate_views = bind(step_calls.generate_views)
         self.prepare_asset = bind(step_calls.prepare_asset)
         self.animate_asset = bind(step_calls.animate_asset)
         self.drive_video = bind(step_calls.drive_video)
@@ -89,7 +90,8 @@ def planned_steps(job: ConversionJob) -> list[str]:
     if job.asset is not None:  # splats go on to `plan_mesh` and `extract_mesh`
         own = ["prepare_asset"] if job.asset == job.source else ["prepare_subject", "prepare_asset"]
         return [*own, "drive_video", "animate_asset", *refined, "pack_asset", "check_asset"]
-    sides = ["prepare_views"] if job.views is not None else []
+    drawn = job.settings.views.kind != "none"
+    sides = ["prepare_views"] if job.views is not None else ["generate_views"] if drawn else []
     return [*first, "prepare_subject", *sides, *fits, *refined, "pack_asset", "check_asset"]
 
 
@@ -140,7 +142,7 @@ def animate(
         driving_video = filming.result()
         motion = tasks.animate_asset(gaussians, driving_video, conversion)
     else:
-        known = tasks.prepare_views(job.views, source, subject, conversion) if job.views is not None else None
+        known = known_views(subject, source, job, conversion, tasks)
         gaussians = tasks.fit_gaussians(subject, conversion, job.bank, known)  # here, parallel to the driving video
         driving_video = filming.result()
         motion = tasks.fit_motion(subject, gaussians, driving_video, conversion, job.bank, known)
@@ -153,6 +155,15 @@ def animate(
     notes = notes_of(done.result for done in tasks.finished())
     package = tasks.pack_asset(subject, driving_video, gaussians, motion, mesh, notes, conversion)
     return Converted(package, tasks.check_asset(package, driving_video, subject, conversion))
+
+
+def known_views(
+    subject: Subject, source: ArtifactRef, job: ConversionJob, conversion: Conversion, tasks: Tasks
+) -> KnownViews | None:
+    """Return views of other sides: the user's, else those that a model draws, else none."""
+    if job.views is not None:
+        return tasks.prepare_views(job.views, source, subject, conversion)
+    return tasks.generate_views(subject, conversion) if job.settings.views.kind != "none" else None
 
 
 def mesh_over_time(

@@ -97,6 +97,11 @@ def prepare_views(views: ArtifactRef, source: ArtifactRef, subject: Subject, con
     return run_step("prepare_views", KnownViews, **locals())
 
 
+def generate_views(subject: Subject, conversion: Conversion) -> KnownViews:
+    """Draw views of other sides with an image-editing model and weight them by their agreement."""
+    return run_step("generate_views", KnownViews, **locals())
+
+
 def prepare_asset(model: ArtifactRef, conversion: Conversion, subject: Subject | None = None) -> Asset:
     """Read a model of the user's own and find its azimuth, scale and position in the first frame."""
     return run_step("prepare_asset", Asset, **locals())

@@ -98,6 +98,14 @@ STEPS: dict[str, StepSpec] = {
             timeout_s=2400,  # as prepare_subject
         ),
         _step(
+            "generate_views",
+            inputs={"subject": PNG},
+            outputs={"known_views": BANK, "picture": PNG},
+            sections=("views", "subject.matting"),
+            resource="gpu",
+            timeout_s=14400,  # 15 views layer by layer
+        ),
+        _step(
             "drive_video",
             inputs={"subject": PNG, "footage": _optional(FRAMES)},
             outputs={

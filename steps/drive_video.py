@@ -18,14 +18,15 @@ from dg4d_lib.diffusion.components import default_device
 from dg4d_lib.diffusion.video_model import VideoModel
 from dg4d_lib.errors import BadInput
 from dg4d_lib.images import resize
-from dg4d_lib.input_settings import DrivingSettings, SvdSettings, WarpSettings
+from dg4d_lib.input_settings import DiffusersVideoSettings, DrivingSettings, SvdSettings, WarpSettings
 from dg4d_lib.video.candidate_ranking import MIN_GOOD_TOTAL, WEIGHTS, Candidate, rank_candidates, score_video
 from dg4d_lib.video.driving import DrivingVideo
+from dg4d_lib.video.image_to_video import ImageToVideo
 from dg4d_lib.video.svd import StableVideo
 from dg4d_lib.video.warp import Warp, candidate_settings
 from steps.artifacts.media import read_frames, read_png, write_frames, write_png, write_zip
 from steps.runtime.job import Job, StepReport
-from steps.runtime.weights import open_weights
+from steps.runtime.weights import license_note, offload_notes, open_weights
 
 TILE, COLUMNS = 160, 7  # pixels of a tile, and frames, in the contact sheets
 FILM = 256  # pixels of a side of the films
@@ -61,6 +62,9 @@ def run(job: Job) -> StepReport:
         case SvdSettings():
             motions, report = _stable_videos(driving, subject, numbers, job.seed)
             origin = "Stable Video Diffusion ({})"
+        case DiffusersVideoSettings():
+            motions, report = _pipeline_videos(job, driving, subject, numbers)
+            origin = f"the video model {driving.weights} ({{}})"
     best, ranking_notes = _rank_candidates(job, subject, motions) if len(motions) > 1 else (motions[0], ())
     write_frames(job.outputs["driving_video"], best.video)
     write_png(job.outputs["picture"], draw_video_sheet([best.video], [best.name], TILE, COLUMNS))
@@ -113,6 +117,27 @@ def _stable_videos(
     motions = [_Motion(*generated) for generated in zip(numbers, names, videos, strict=True)]
     backend, run_notes = f"{device.type} (diffusers)", generator.model.notes()
     return motions, StepReport(backend, opened.digests, opened.licenses, generator.notes, run_notes)
+
+
+def _pipeline_videos(
+    job: Job, settings: DiffusersVideoSettings, subject: Float[Tensor, "h w 4"], numbers: Sequence[int]
+) -> tuple[list[_Motion], StepReport]:
+    """Generate videos with a pipeline of diffusers; number k uses the seed plus k - 1."""
+    opened = open_weights(settings.weights)
+    device = default_device()
+    generator = ImageToVideo.load(opened.folder, settings, device)
+    seeds = [job.seed + number - 1 for number in numbers]
+    videos = generator.generate_all(
+        subject,
+        [torch.Generator().manual_seed(each) for each in seeds],
+        lambda done, total: job.progress(done, total, {}),
+    )
+    motions = [
+        _Motion(number, f"seed {each}", video) for number, each, video in zip(numbers, seeds, videos, strict=True)
+    ]
+    notes = (*generator.notes, license_note(settings.weights))
+    backend = f"{device.type} (diffusers, {type(generator.pipeline).__name__})"
+    return motions, StepReport(backend, opened.digests, opened.licenses, notes, offload_notes(generator.offload))
 
 
 def _rank_candidates(

@@ -2,19 +2,27 @@
 
 import functools
 from operator import attrgetter
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, ValidationError, create_model, model_validator
 
 from dg4d_lib.asset_settings import AssetSettings, GateSettings, PackSettings, ScoreSettings
 from dg4d_lib.errors import BadInput
-from dg4d_lib.input_settings import DrivingSettings, SubjectSettings, TextSettings, WarpSettings
+from dg4d_lib.input_settings import (
+    DrivingSettings,
+    NoViewsSettings,
+    SubjectSettings,
+    TextSettings,
+    ViewsSettings,
+    WarpSettings,
+)
 from dg4d_lib.rasterizer.backends import backend_name
 from dg4d_lib.settings import (
     DeformationSettings,
     GeometricPriorSettings,
     HexPlaneSettings,
     IdentitySettings,
+    ImageToImageSettings,
     MeshSettings,
     MotionSettings,
     PriorSettings,
@@ -22,7 +30,9 @@ from dg4d_lib.settings import (
     ResolutionStage,
     Settings,
     StaticSettings,
+    VideoToVideoSettings,
 )
+from dg4d_lib.weights.registry import lookup_weights
 from steps.catalog import STEPS
 from steps.contract import StepSpec, load_object, settings_errors, shown
 
@@ -86,6 +96,7 @@ class PipelineSettings(Settings):
     subject: SubjectSettings = SubjectSettings()
     asset: AssetSettings = AssetSettings()
     driving: DrivingSettings = WarpSettings()
+    views: ViewsSettings = NoViewsSettings()
     prior: PriorSettings = GeometricPriorSettings()
     static: StaticSettings = StaticSettings()
     deformation: DeformationSettings = HexPlaneSettings()
@@ -94,6 +105,14 @@ class PipelineSettings(Settings):
     refiner: RefinerSettings = IdentitySettings()
     pack: PackSettings = PackSettings()
     gates: GateSettings = GateSettings()
+
+    @model_validator(mode="after")
+    def _refuse_flow_matching_priors(self) -> Self:
+        """Refuse models of flow matching where noise has to be predicted."""
+        for owner, name in (("prior", getattr(self.prior, "weights", "")), *_refiner_weights(self.refiner)):
+            if name and lookup_weights(name).flow_matching:
+                raise ValueError(flow_matching_refusal(owner, name))
+        return self
 
     @model_validator(mode="before")
     @classmethod
@@ -105,6 +124,24 @@ class PipelineSettings(Settings):
             if branch is not None and not isinstance(branch, dict | Settings):
                 raise ValueError(_renamed(old, new))
         return given
+
+
+def flow_matching_refusal(owner: str, name: str) -> str:
+    """Return the sentence that refuses a model of flow matching as a critic."""
+    return (
+        f"{owner}.weights = {name} is a flow-matching model: it generates views (views.weights) and videos "
+        f"(driving.weights), but score distillation and refinement need one that predicts noise; use zero123-xl, "
+        "stable-zero123 or imagedream for the prior, svd for the refiner"
+    )
+
+
+def _refiner_weights(refiner: RefinerSettings) -> list[tuple[str, str]]:
+    match refiner:
+        case VideoToVideoSettings():
+            return [("refiner.model", refiner.model.weights)]
+        case ImageToImageSettings():
+            return [("refiner.prior", refiner.prior.weights)]
+    return []
 
 
 class FrameRange(Settings):
@@ -298,6 +335,21 @@ QUALITY = revise(
     },
 )
 
+OPEN = revise(
+    PREVIEW,
+    {
+        "subject.size": 512,
+        "driving.kind": "diffusers",
+        "driving.frames": 24,
+        "driving.generated_frames": 49,
+        "driving.fps": 12.0,
+        "views.kind": "image_edit",
+        "mesh.mode": "tracked",
+        "mesh.max_faces": 100000,
+        "mesh.texture_size": 2048,
+    },
+)
+
 PROFILES: dict[str, PipelineSettings] = {
     "preview": PREVIEW,
     "paper": PAPER,
@@ -306,6 +358,7 @@ PROFILES: dict[str, PipelineSettings] = {
     "release": RELEASE,
     "reference": REFERENCE,
     "quality": QUALITY,
+    "open": OPEN,
 }
 
 

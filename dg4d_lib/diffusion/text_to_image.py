@@ -1,17 +1,17 @@
 """Text-to-image generation with any pipeline of diffusers."""
 
-import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
-from dg4d_lib.diffusion.components import HALF, compute_dtype, missing_packages
+from dg4d_lib.diffusion.components import compute_dtype
 from dg4d_lib.diffusion.flop_counter import attach_flop_counter
-from dg4d_lib.errors import BackendUnavailable, BadInput
+from dg4d_lib.diffusion.pipelines import after_step, call_parameters, load_pipeline, networks_of
+from dg4d_lib.errors import BadInput
 from dg4d_lib.input_settings import TextSettings
 
 
@@ -41,14 +41,12 @@ def draw_picture(
         BackendUnavailable: diffusers or transformers is not installed.
     """
     pipeline = _load(model, compute_dtype(device, settings.precision))
-    for part in pipeline.components.values():
-        if isinstance(part, nn.Module):
-            attach_flop_counter(part)
+    for network in networks_of(pipeline).values():
+        attach_flop_counter(network)
     if settings.low_memory and device.type != "cpu":
         pipeline.enable_model_cpu_offload(device=device)
     else:
         pipeline.to(device)
-    pipeline.set_progress_bar_config(disable=True)
     options = {
         "num_inference_steps": settings.num_inference_steps,
         "guidance_scale": settings.guidance_scale,
@@ -56,9 +54,9 @@ def draw_picture(
         "width": settings.size,
         "generator": generator,
         "output_type": "np",
-        "callback_on_step_end": _after_step(settings.num_inference_steps, progress),
+        "callback_on_step_end": after_step(settings.num_inference_steps, progress),
     }
-    known = inspect.signature(pipeline.__call__).parameters
+    known = call_parameters(pipeline)
     result = pipeline(text + settings.suffix, **{name: value for name, value in options.items() if name in known})
     if any(getattr(result, "nsfw_content_detected", None) or ()):
         raise BadInput(f"the safety checker of {model} blanked the image; change the prompt or the seed")
@@ -76,35 +74,10 @@ def _load(model: Path, dtype: torch.dtype) -> Any:
     Raises:
         BadInput: there is none, it cannot be read, or it is no text-to-image pipeline.
     """
-    try:
-        from diffusers import DiffusionPipeline  # noqa: PLC0415 - takes seconds
-    except ImportError as error:
-        raise missing_packages(error) from error
-    if not (model / "model_index.json").is_file():
-        raise BadInput(f"{model} has no model_index.json; give a text-to-image pipeline in the layout of diffusers")
-    half = any(model.glob(f"*/*.{HALF}*"))
-    try:
-        pipeline = DiffusionPipeline.from_pretrained(
-            model, dtype=dtype, variant=HALF if half else None, local_files_only=True
-        )
-    except ImportError as error:
-        raise BackendUnavailable(f"the pipeline in {model} needs a package that is not installed: {error}") from error
-    except Exception as error:  # every class and file format raises its own types
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise BadInput(f"the pipeline in {model} cannot be read: {reason}") from error
-    parameters = inspect.signature(pipeline.__call__).parameters
+    pipeline = load_pipeline(model, dtype)
+    parameters = call_parameters(pipeline)
     required = [name for name, parameter in parameters.items() if parameter.default is parameter.empty]
     other = [name for name in required if name not in ("prompt", "kwargs")]
     if "prompt" not in parameters or "image" in parameters or other:
         raise BadInput(f"{type(pipeline).__name__} in {model} is no text-to-image pipeline; choose one that is")
     return pipeline
-
-
-def _after_step(total: int, progress: Callable[[int, int], None]) -> Callable[..., dict[str, Any]]:
-    """Return a `callback_on_step_end` of diffusers that reports progress."""
-
-    def report(_pipeline: Any, number: int, _time: Any, tensors: dict[str, Any]) -> dict[str, Any]:
-        progress(min(number + 1, total), total)
-        return tensors
-
-    return report

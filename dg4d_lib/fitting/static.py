@@ -93,7 +93,8 @@ def fit_gaussians(
         generator: source of all randomness.
         report: called after every iteration with (iterations done, named losses).
         input_camera: camera of the image; the default is azimuth and elevation 0.
-        known: further images and their cameras; an iteration compares one of them, with the weight of the image.
+        known: further images and their cameras; an iteration compares one of them, drawn by their weights, with the
+            weight of the image.
         watch: called after every iteration with the cloud as it is then.
 
     Raises:
@@ -113,7 +114,7 @@ def fit_gaussians(
 
         cameras, colors, alphas = [camera], color, alpha
         if known:
-            chosen = int(torch.randint(len(known), (), generator=generator))
+            chosen = draw_view(known, generator)
             side = settings.reference_size
             cameras = [camera, replace(known[chosen].camera, width=side, height=side)]
             colors, alphas = torch.cat([color, others[chosen][0]]), torch.cat([alpha, others[chosen][1]])
@@ -152,6 +153,14 @@ def fit_gaussians(
         report(step, {**numbers, "Gaussians": len(cloud.gaussians)})
         watch(cloud.gaussians)
     return cloud.gaussians.detach()
+
+
+def draw_view(known: Sequence[KnownView], generator: torch.Generator) -> int:
+    """Draw one of the views: uniformly, or in proportion to their weights where these differ."""
+    weights = torch.tensor([view.weight for view in known])
+    if bool((weights == weights[0]).all()):
+        return int(torch.randint(len(known), (), generator=generator))
+    return int(torch.multinomial(weights, 1, generator=generator))
 
 
 def adapt_density(

@@ -7,7 +7,7 @@ view is blurred along the direction in which depth shows: not at all from the in
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import no_type_check
+from typing import Protocol, no_type_check, runtime_checkable
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.guidance.interface import GuidanceView, check_frame, check_views
 from dg4d_lib.images import over_background
 from dg4d_lib.inflation.render import render_surface
-from dg4d_lib.inflation.surface import InflatedSurface, inflate
+from dg4d_lib.inflation.surface import InflatedSurface, inflate, resample
 from dg4d_lib.kernels.simd import INLINE, KERNEL
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.settings import GeometricPriorSettings
@@ -28,11 +28,24 @@ SHARPEST = 0.05  # pixels: narrower Gaussians are the identity in float32
 LARGE = 2  # times the surface's own resolution: larger pictures take one sample per pixel
 
 
+@runtime_checkable
+class Disparity(Protocol):
+    """Estimator of relative inverse depth."""
+
+    def disparity(self, cutout: Float[Tensor, "s s 4"]) -> Float[Tensor, "s s"]:
+        """Return the inverse depth of a cut-out, larger where nearer, up to scale and offset."""
+        ...
+
+
 class InflatedSurfaces:
     """Inflated surface per frame, each built when first asked for."""
 
     def __init__(
-        self, cutouts: Sequence[Float[Tensor, "h w 4"]], settings: GeometricPriorSettings, turn_deg: float = 0.0
+        self,
+        cutouts: Sequence[Float[Tensor, "h w 4"]],
+        settings: GeometricPriorSettings,
+        turn_deg: float = 0.0,
+        depth: Disparity | None = None,
     ) -> None:
         """Store the pictures.
 
@@ -40,7 +53,9 @@ class InflatedSurfaces:
             cutouts: one per frame: square, straight alpha, color and alpha in [0, 1].
             settings: size of the surface, and uncertainty of its depth.
             turn_deg: turn of the subject about the vertical.
+            depth: estimator of inverse depth, a hint at the relief of every picture; None: none.
         """
+        self._depth = depth
         self._cutouts = tuple(cutouts)
         self._settings, self._turn_deg = settings, turn_deg
         self._surfaces: dict[int, InflatedSurface] = {}
@@ -53,7 +68,12 @@ class InflatedSurfaces:
         """
         check_frame(frame, len(self._cutouts))
         if frame not in self._surfaces:
-            self._surfaces[frame] = inflate(self._cutouts[frame], self._settings.size, self._turn_deg)
+            size, disparity = self._settings.size, None
+            if self._depth is not None:
+                disparity = self._depth.disparity(resample(self._cutouts[frame], size))
+            self._surfaces[frame] = inflate(
+                self._cutouts[frame], size, self._turn_deg, disparity, self._settings.depth_weight
+            )
         return self._surfaces[frame]
 
     def clean(self, views: Sequence[GuidanceView]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:

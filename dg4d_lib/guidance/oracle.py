@@ -24,11 +24,13 @@ class Bank:
         cameras: of the rows.
         frames: of the columns, indices into the driving video.
         pictures: RGBA, straight alpha, one row per camera, one column per frame.
+        weights: reliability of every camera's pictures, in [0, 1]; empty: 1.
     """
 
     cameras: tuple[OrbitCamera, ...]
     frames: tuple[int, ...]
     pictures: UInt8[Tensor, "v t h w 4"]
+    weights: tuple[float, ...] = ()
 
     def clean(self, views: Sequence[GuidanceView]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
         """Return color over white and alpha of views in the bank, resized to the camera's size.
@@ -80,7 +82,7 @@ def perturb(bank: Bank, settings: OraclePriorSettings, generator: torch.Generato
             replace(camera, elevation_deg=camera.elevation_deg + up, azimuth_deg=camera.azimuth_deg + around)
             for camera, (up, around) in zip(cameras, errors, strict=True)
         )
-    return Bank(cameras, bank.frames, pictures)
+    return Bank(cameras, bank.frames, pictures, bank.weights)
 
 
 def _blur_and_shift(

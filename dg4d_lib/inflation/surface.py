@@ -21,6 +21,7 @@ from dg4d_lib.images import resize_planes
 from dg4d_lib.inflation.colors import back_colors, front_colors
 from dg4d_lib.inflation.heights import heights
 from dg4d_lib.inflation.mask import subject_mask
+from dg4d_lib.inflation.relief import relief
 from dg4d_lib.inflation.sheet import Sheet, triangulate
 
 FARTHEST = 1.0  # world units: a turned plane leaves z = 0 by no more
@@ -45,7 +46,13 @@ class InflatedSurface:
     seen: Bool[Tensor, " v"]
 
 
-def inflate(cutout: Float[Tensor, "h w 4"], size: int, turn_deg: float = 0.0) -> InflatedSurface:
+def inflate(
+    cutout: Float[Tensor, "h w 4"],
+    size: int,
+    turn_deg: float = 0.0,
+    disparity: Float[Tensor, "{size} {size}"] | None = None,
+    depth_weight: float = 0.0,
+) -> InflatedSurface:
     """Inflate the subject of a picture taken by the input camera (azimuth and elevation 0, radius 2).
 
     An opaque picture has no silhouette and becomes a slab.
@@ -55,6 +62,8 @@ def inflate(cutout: Float[Tensor, "h w 4"], size: int, turn_deg: float = 0.0) ->
         size: pixels of a side at which the surface is built.
         turn_deg: how far the subject's plane is turned about the vertical; positive brings the right side of the
             picture nearer to the camera. Between -60 and 60.
+        disparity: estimated inverse depth of the picture, up to scale and offset; None: none.
+        depth_weight: share of its relief that the surface takes on.
 
     Raises:
         BadInput: the picture is not square, or shows no subject.
@@ -66,12 +75,16 @@ def inflate(cutout: Float[Tensor, "h w 4"], size: int, turn_deg: float = 0.0) ->
     pixel = 2 * RADIUS * math.tan(math.radians(FOV_Y_DEG) / 2) / size
     across = (np.arange(size) + 0.5 - size / 2) * pixel
     plane = np.clip(math.tan(math.radians(turn_deg)) * across, -FARTHEST, FARTHEST)
+    bulge = heights(mask, pixel)
+    middle = np.broadcast_to(plane, mask.shape)
+    if disparity is not None:
+        middle = middle + relief(disparity.double().cpu().numpy(), middle + bulge, mask, depth_weight)
     front = front_colors(picture[..., :3], alpha, mask)
     sheet = triangulate(mask, alpha)
     return _two_sheets(
         sheet,
-        sheet.at(heights(mask, pixel)) * sheet.inside,
-        sheet.at(np.broadcast_to(plane, mask.shape)),
+        sheet.at(bulge) * sheet.inside,
+        sheet.at(middle),
         sheet.at(front),
         sheet.at(back_colors(front, mask)),
         pixel,

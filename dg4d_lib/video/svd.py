@@ -8,16 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.diffusion.video_model import SIGMA_MAX, VideoModel, karras_sigmas
-from dg4d_lib.errors import BadInput
-from dg4d_lib.images import over_white
 from dg4d_lib.input_settings import SvdSettings
+from dg4d_lib.video.canvas import cut_out, white_canvas
 from dg4d_lib.video.driving import DrivingVideo
-from dg4d_lib.video.framing import resample
-from dg4d_lib.video.matting import matte_from_first_alpha
-
-MATTING_FAILED = (
-    "The subject could not be separated from the background of a generated video; it keeps the outline of the input."
-)
 
 
 class StableVideo:
@@ -47,20 +40,8 @@ class StableVideo:
         self, subject: Float[Tensor, "h w 4"], generators: Sequence[torch.Generator]
     ) -> list[DrivingVideo]:
         """Generate a video per random generator in one batch; equal to `generate` up to rounding."""
-        canvas, (rows, columns) = self._canvas(subject)
+        canvas, (rows, columns) = white_canvas(subject, self.settings.height, self.settings.width)
         return [self._cut_out(frames[:, rows, columns], subject) for frames in self._sample(canvas, generators)]
-
-    def _canvas(self, subject: Float[Tensor, "h w 4"]) -> tuple[Float[Tensor, "y x 3"], tuple[slice, slice]]:
-        """Scale the subject to a white canvas, centered; return the canvas and the rows and columns of the subject."""
-        height, width = self.settings.height, self.settings.width
-        scale = min(height / subject.shape[0], width / subject.shape[1])
-        rows, columns = (round(side * scale) for side in subject.shape[:2])
-        small = resample(subject[None], rows, columns)[0]
-        top, left = (height - rows) // 2, (width - columns) // 2
-        window = slice(top, top + rows), slice(left, left + columns)
-        canvas = subject.new_ones((height, width, 3))
-        canvas[window] = over_white(small)
-        return canvas, window
 
     def _sample(
         self, canvas: Float[Tensor, "y x 3"], generators: Sequence[torch.Generator]
@@ -73,12 +54,7 @@ class StableVideo:
             yield model.decode(latents)
 
     def _cut_out(self, frames: Float[Tensor, "t y x 3"], subject: Float[Tensor, "h w 4"]) -> DrivingVideo:
-        """Resize frames to the subject's size and matte them; if that fails, use the alpha of the input."""
-        opaque = torch.cat([frames, torch.ones_like(frames[..., :1])], -1).to(subject)
-        colors = resample(opaque, *subject.shape[:2])[..., :3]
-        try:
-            cutouts = matte_from_first_alpha(colors, subject[..., 3])
-        except BadInput:
-            self.notes = (*dict.fromkeys((*self.notes, MATTING_FAILED)),)
-            cutouts = torch.cat([colors, subject[..., 3:].expand(len(colors), -1, -1, -1)], -1)
-        return DrivingVideo(cutouts[..., :3], cutouts[..., 3:], self.settings.fps)
+        """Cut the subject out of frames, and note it if that fails."""
+        video, notes = cut_out(frames, subject, self.settings.fps)
+        self.notes = (*dict.fromkeys((*self.notes, *notes)),)
+        return video

@@ -10,6 +10,8 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 
+CARVES = 0.5  # weight from which the outline of a view bounds the hull
+
 
 @dataclass(frozen=True)
 class KnownView:
@@ -19,11 +21,13 @@ class KnownView:
         camera: pose and size of the picture.
         cutout: straight alpha, color and alpha in [0, 1].
         name: for messages.
+        weight: reliability in [0, 1]; views below `CARVES` give colors, but no outline.
     """
 
     camera: OrbitCamera
     cutout: Float[Tensor, "h w 4"]
     name: str = ""
+    weight: float = 1.0
 
     def at(self, elevation_deg: float, azimuth_deg: float) -> "KnownView":
         """Return the picture as taken from another direction."""

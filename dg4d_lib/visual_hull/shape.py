@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.visual_hull.carve import hull
 from dg4d_lib.visual_hull.columns import bounded, fitting_turn
-from dg4d_lib.visual_hull.known import KnownView, shows_sides
+from dg4d_lib.visual_hull.known import CARVES, KnownView, shows_sides
 from dg4d_lib.visual_hull.surface import colored_surface
 
 CELLS = 128  # along the longest side of the subject
@@ -18,7 +18,8 @@ def known_surface(views: Sequence[KnownView]) -> InflatedSurface:
     Raises:
         BadInput: the views have no common shape.
     """
-    volume = hull(views, CELLS)
-    if not shows_sides(views, SIDE_DEG):
-        volume = bounded(volume, views, fitting_turn(views))
+    carving = [view for view in views if view.weight >= CARVES]
+    volume = hull(carving, CELLS)
+    if not shows_sides(carving, SIDE_DEG):
+        volume = bounded(volume, carving, fitting_turn(carving))
     return colored_surface(volume, views)

@@ -75,7 +75,7 @@ def _observe(
     color = grid_sample(colors, at, align_corners=False, padding_mode="border")[0, :, 0].T
     cosine = (normals * normalize(camera.position().float() - vertices, dim=-1)).sum(-1)
     visible = (seen[:, 2] < nearest + SLACK * cell) & (cosine > GRAZING)
-    return color, torch.where(visible, (cosine - GRAZING).clamp(min=0) ** SHARPNESS, 0.0)
+    return color, torch.where(visible, view.weight * (cosine - GRAZING).clamp(min=0) ** SHARPNESS, 0.0)
 
 
 def blend(

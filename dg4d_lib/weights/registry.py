@@ -48,6 +48,7 @@ class Weights:
         revision: commit on the hub; None: the newest at the first pull, which the lock then records.
         published: sha256 of tensor files at that commit, by path, where known.
         about_gb: approximate size of the download, units of 1e9 bytes; None: unknown.
+        flow_matching: True for models that predict velocities of flow matching; no prior can be made of them.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Weights:
     revision: str | None = None
     published: Mapping[str, str] = field(default_factory=dict)
     about_gb: float | None = None
+    flow_matching: bool = False
 
 
 STABILITY_RESEARCH = License(
@@ -92,10 +94,82 @@ SVD_SHARED = {
     "vae/diffusion_pytorch_model.fp16.safetensors": "af602cd0eb4ad6086ec94fbf1438dfb1be5ec9ac03fd0215640854e90d6463a3",
     "image_encoder/model.fp16.safetensors": "ae616c24393dd1854372b0639e5541666f7521cbe219669255e865cb7f89466a",
 }  # the same files in the variants for 14 and for 25 frames
+APACHE_CARD = License(
+    "Apache-2.0", "yes", "commercial use is allowed; so say those who quote its card, read it before you sell"
+)
+WAN_PARTS = ("vae", "text_encoder", "tokenizer", "transformer", "scheduler", "model_index.json")
+OPEN_MODELS = (
+    Weights(
+        name="wan2.2-ti2v-5b",
+        hub_id="Wan-AI/Wan2.2-TI2V-5B-Diffusers",
+        purpose="driving videos: driving.kind=diffusers (Wan 2.2, 5B)",
+        license=APACHE_CARD,
+        parts=WAN_PARTS,
+        revision="b8fff7315c768468a5333511427288870b2e9635",
+        about_gb=34.2,
+        flow_matching=True,
+    ),
+    Weights(
+        name="wan2.1-flf2v",
+        hub_id="Wan-AI/Wan2.1-FLF2V-14B-720P-diffusers",
+        purpose="looping driving videos: driving.kind=diffusers, driving.loop=true (Wan 2.1, 14B)",
+        license=APACHE_CARD,
+        parts=(*WAN_PARTS, "image_encoder", "image_processor"),
+        flow_matching=True,
+    ),
+    Weights(
+        name="ltx-video",
+        hub_id="Lightricks/LTX-Video",
+        purpose="driving videos on small GPUs: driving.kind=diffusers (LTX-Video, 2B)",
+        license=License(
+            "LTXV Open Weights License",
+            "unverified",
+            "the terms differ between versions of this model and depend on yearly revenue; read the text in its "
+            "repository before any commercial use",
+        ),
+        parts=WAN_PARTS,
+        revision="8984fa25007f376c1a299016d0957a37a2f797bb",
+        flow_matching=True,
+    ),
+    Weights(
+        name="qwen-image-edit-2511",
+        hub_id="Qwen/Qwen-Image-Edit-2511",
+        purpose="views of other sides: views.kind=image_edit (Qwen-Image-Edit, 20B)",
+        license=APACHE_CARD,
+        revision="6f3ccc0b56e431dc6a0c2b2039706d7d26f22cb9",
+        about_gb=57.7,
+        flow_matching=True,
+    ),
+    Weights(
+        name="qwen-image-edit-2509",
+        hub_id="Qwen/Qwen-Image-Edit-2509",
+        purpose="views of other sides, earlier version (Qwen-Image-Edit, 20B)",
+        license=APACHE_CARD,
+        revision="d3968ef930e841f4c73640fb8afa3b306a78167e",
+        about_gb=57.7,
+        flow_matching=True,
+    ),
+    Weights(
+        name="qwen-multiple-angles",
+        hub_id="fal/Qwen-Image-Edit-2511-Multiple-Angles-LoRA",
+        purpose="LoRA for camera angles: views.lora_weights",
+        license=License("Apache-2.0", "yes", "commercial use is allowed; so says its card"),
+        parts=("qwen-image-edit-2511-multiple-angles-lora.safetensors",),
+    ),
+    Weights(
+        name="depth-anything-v2-small",
+        hub_id="depth-anything/Depth-Anything-V2-Small-hf",
+        purpose="depth as a hint for the geometric prior: prior.depth_weights (25M)",
+        license=License("Apache-2.0", "yes", "commercial use is allowed; so says its card, for the small model alone"),
+        revision="5426e4f0f36572d16453bbda7a8389317b1bef99",
+        about_gb=0.1,
+    ),
+)  # sizes from parameter counts and stored precisions; unpinned entries take the newest commit at the first pull
 
 KNOWN: dict[str, Weights] = {
     weights.name: weights
     for weights in (
+        *OPEN_MODELS,
         Weights(
             name="zero123-xl",
             hub_id="ashawkey/zero123-xl-diffusers",

@@ -22,6 +22,7 @@ PROFILES = (
     "release",
     "reference",
     "quality",
+    "open",
 )  # as in steps/profiles.py
 MOTIONS = ("sway", "bend", "breathe", "bounce", "wave", "turn")  # as in dg4d_lib/input_settings.py
 

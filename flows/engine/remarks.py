@@ -16,7 +16,12 @@ from steps.store.files import DiskFull
 
 REMARKED = "prepare_subject"  # the cut-out may be wrong
 COMPARED = "prepare_views"  # a view may contradict the others
-CAPTIONS = {REMARKED: "Source, matte and cut-out", COMPARED: "Views, and the hull that they share"}
+DRAWN = "generate_views"  # likewise
+CAPTIONS = {
+    REMARKED: "Source, matte and cut-out",
+    COMPARED: "Views, and the hull that they share",
+    DRAWN: "Drawn views, and the hull that they share",
+}
 GATES = "cutout_gates"  # output of `prepare_subject` with the gates of an estimated cut-out
 NAME_LENGTH = 80  # characters of an item in the name of a picture
 DIGITS = 12  # of a digest in it

@@ -19,6 +19,7 @@ PICTURES = {
     ("draw_picture", "picture"): "Drawn from the text",
     ("prepare_subject", "picture"): "Input, matte, cut-out",
     ("prepare_views", "picture"): "Views, and the hull that they share",
+    ("generate_views", "picture"): "Drawn views, faded where they disagree, and the hull that they share",
     ("drive_video", "picture"): "Driving video",
     ("fit_gaussians", "picture"): "At rest, from all around",
     ("fit_motion", "picture"): "In motion, from the front and from the side",

@@ -11,6 +11,8 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.diffusion.components import default_device
+from dg4d_lib.diffusion.depth import DepthEstimator
+from dg4d_lib.diffusion.pipelines import is_flow_matching
 from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.analytic import AnalyticPrior
 from dg4d_lib.guidance.distillation import TimestepSchedule
@@ -37,12 +39,14 @@ from dg4d_lib.weights.registry import lookup_weights
 from steps.artifacts.archives import unpack
 from steps.artifacts.media import read_png
 from steps.artifacts.pose import read_turn
+from steps.profiles import flow_matching_refusal
 from steps.runtime.job import StepReport
 from steps.runtime.weights import LocatedWeights, open_weights
 from steps.sources.banks import BANK_JSON, BankIndex, check_sheet, read_index
 
 GEOMETRIC_NOTE = "prior: inflation of the silhouette (no model); sides the picture does not show are guesses"
 LEARNED_NOTE = "prior: shape network trained on made-up shapes; sides the picture does not show are guesses"
+DEPTH_NOTE = "prior: inflation of the silhouette, with the relief of an estimated depth: weights"
 SMALLEST_NOTED = 0.05  # share of the inflation from which the report mentions it
 ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
 
@@ -109,13 +113,15 @@ def make_prior(
     match settings:
         case GeometricPriorSettings() | LearnedPriorSettings():
             shapes = subject_shapes(settings, cutouts, turn_deg, sides, moved)
-            note, weight = GEOMETRIC_NOTE, 1.0
+            note, weight, opened = GEOMETRIC_NOTE, 1.0, None
             if isinstance(shapes, KnownShapes):
                 prior = AnalyticPrior(shapes.clean, noise, frames=None if moved else shapes.frames)
                 return LoadedPrior(prior, known_note(sides), shapes=shapes)
             if isinstance(settings, LearnedPriorSettings):
                 note, weight = LEARNED_NOTE, settings.weight
-            return LoadedPrior(AnalyticPrior(shapes.clean, noise, weight=weight), note, shapes=shapes)
+            elif settings.depth_weights:
+                note, opened = f"{DEPTH_NOTE} {settings.depth_weights}", open_weights(settings.depth_weights)
+            return LoadedPrior(AnalyticPrior(shapes.clean, noise, weight=weight), note, opened, shapes=shapes)
         case OraclePriorSettings():
             if bank is None:
                 raise BadInput("prior.kind = oracle needs true views: give --bank FOLDER (with a bank.json)")
@@ -123,10 +129,12 @@ def make_prior(
         case Zero123PriorSettings():
             check_variant(settings)
             opened = open_weights(settings.weights)
+            check_predicts_noise(opened.folder, settings.weights)
             known = Zero123.load(opened.folder, settings, default_device()).conditioned_on(_pictures(cutouts), noise)
             return LoadedPrior(known, f"prior: Zero-1-to-3, weights {settings.weights}", opened, known.batches)
         case ImageDreamPriorSettings():
             opened = open_weights(settings.weights)
+            check_predicts_noise(opened.folder, settings.weights)
             model = ImageDream.load(opened.folder, settings.precision, default_device())
             dream = ImageDreamPrior(model, model.conditioned_on(_pictures(cutouts)), noise, settings)
             return LoadedPrior(dream, f"prior: ImageDream, weights {settings.weights}", opened, dream.batches)
@@ -154,7 +162,10 @@ def subject_shapes(
         shapes = LearnedShapes(packaged.packaged_network(), cutouts, settings, turn_deg)
     else:
         own = settings if isinstance(settings, GeometricPriorSettings) else GeometricPriorSettings()
-        shapes = InflatedSurfaces(cutouts, own, turn_deg)
+        depth = None
+        if own.depth_weights and sides is None:
+            depth = DepthEstimator.load(open_weights(own.depth_weights).folder, default_device())
+        shapes = InflatedSurfaces(cutouts, own, turn_deg, depth)
     if sides is None:
         return shapes
     frames = [frame for frame in sides.frames if frame < len(cutouts)]
@@ -165,7 +176,9 @@ def known_views(bank: Bank, frame: int = 0) -> list[KnownView]:
     """Return the views of a frame in a bank."""
     column = bank.frames.index(frame)
     pictures = bank.pictures[:, column].float() / 255
-    return [KnownView(camera, picture) for camera, picture in zip(bank.cameras, pictures, strict=True)]
+    weights = bank.weights or (1.0,) * len(bank.cameras)
+    known = zip(bank.cameras, pictures, weights, strict=True)
+    return [KnownView(camera, picture, weight=weight) for camera, picture, weight in known]
 
 
 def known_note(bank: Bank | None) -> str:
@@ -195,6 +208,16 @@ def make_oracle_prior(bank: Bank, settings: OraclePriorSettings, noise: Timestep
 
 def _pictures(cutouts: Sequence[Float[Tensor, "h w 4"]]) -> Float[Tensor, "t h w 3"]:
     return over_white(torch.stack(list(cutouts)))
+
+
+def check_predicts_noise(folder: Path, name: str) -> None:
+    """Refuse a folder with a model of flow matching, which is no critic of score distillation.
+
+    Raises:
+        BadInput: says what it can be used for, and which weights can be a prior.
+    """
+    if is_flow_matching(folder):
+        raise BadInput(flow_matching_refusal("prior", name))
 
 
 def check_variant(settings: Zero123PriorSettings) -> None:
@@ -245,7 +268,7 @@ def read_bank_folder(folder: Path) -> Bank:
     tiles = torch.empty(len(cameras), count, size, size, 4, dtype=torch.uint8)
     for row, view in enumerate(index.views):
         tiles[row] = _tiles(folder / view.file, index)[:count]
-    return Bank(cameras, index.frames, tiles)
+    return Bank(cameras, index.frames, tiles, tuple(view.weight for view in index.views))
 
 
 def _tiles(path: Path, index: BankIndex) -> UInt8[Tensor, "n s s 4"]:

@@ -14,7 +14,16 @@ from typing import Any
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.input_settings import MATTING_METHODS
-from dg4d_lib.weights.locate import DIGEST_CACHE, content_name, digests, find_weights, given_folder, identity
+from dg4d_lib.weights.card import card_license
+from dg4d_lib.weights.locate import (
+    CONTENT_MARK,
+    DIGEST_CACHE,
+    content_name,
+    digests,
+    find_weights,
+    given_folder,
+    identity,
+)
 from dg4d_lib.weights.lock import read_lock
 from dg4d_lib.weights.registry import License, lookup_weights
 from steps.store.files import home
@@ -56,7 +65,30 @@ def open_weights(name: str) -> LocatedWeights:
 def license_of(name: str) -> License:
     """Return the license of weights from the registry, else from the model card that was downloaded with them."""
     locked = read_lock(weights_home()).get(name)
-    return lookup_weights(name, locked.license if locked else "").license
+    return lookup_weights(name, locked.license if locked else _card_of(name)).license
+
+
+def license_note(name: str) -> str:
+    """Return a sentence about the license that was found for weights."""
+    return f"License found for {name}: {license_of(name)}."
+
+
+def offload_notes(offload: str) -> tuple[str, ...]:
+    """Return a sentence for the run if networks were moved to the GPU in parts, else nothing."""
+    parts = {"model": "one network at a time", "sequential": "layer by layer, which is slow"}
+    return (
+        (f"the networks did not fit on the GPU together and were moved there {parts[offload]}",)
+        if offload in parts
+        else ()
+    )
+
+
+def _card_of(name: str) -> str:
+    """Return the license id on the model card in a user's folder; empty for names and without a card."""
+    with suppress(BadInput, BackendUnavailable):
+        if CONTENT_MARK in name or given_folder(name) is not None:
+            return card_license(find_weights(name, weights_home()))
+    return ""
 
 
 def weights_in(tree: Mapping[str, Any]) -> Iterator[str]:

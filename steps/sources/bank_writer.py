@@ -37,6 +37,7 @@ def write_bank(path: Path, moments: Sequence[Sequence[KnownView]], scratch: Path
                 "azimuth": camera.azimuth_deg,
                 "elevation": camera.elevation_deg,
                 "radius": camera.radius,
+                "weight": view.weight,
                 "name": view.name,
             }
         )

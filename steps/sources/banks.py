@@ -38,12 +38,14 @@ class BankView(_Strict):
         azimuth: degrees, 0 is the input view.
         elevation: degrees, positive above.
         radius: distance from the origin, world units.
+        weight: reliability of the pictures; below 1 for drawn ones that disagree with others.
     """
 
     file: str = Field(min_length=1)
     azimuth: float = Field(ge=-360, le=360)
     elevation: float = Field(ge=-90, le=90)
     radius: float = Field(gt=0, le=1000)
+    weight: float = Field(1.0, ge=0, le=1)
 
 
 class BankIndex(_Strict):

@@ -83,6 +83,13 @@ def prepare_views(job: Job) -> StepReport:
     return StepReport()
 
 
+def generate_views(job: Job) -> StepReport:
+    _begin("generate_views", job, b"")
+    job.outputs["known_views"].write_bytes(b"views drawn of " + job.inputs["subject"].read_bytes())
+    job.outputs["picture"].write_bytes(PNG)
+    return StepReport()
+
+
 def drive_video(job: Job) -> StepReport:
     words = _begin("drive_video", job, job.inputs["subject"].read_bytes()[len(PNG) :])
     with zipfile.ZipFile(job.outputs["driving_video"], "w") as archive:

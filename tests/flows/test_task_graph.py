@@ -20,6 +20,7 @@ from flows.engine.events import StepEvent, listening
 from flows.inputs.conversion_job import ConversionRequest
 from flows.inputs.given_views import ViewsRequest, parse_views
 from flows.packages import publish
+from flows.stages import planned_steps
 from steps.profiles import PREVIEW, revise
 from steps.store.artifact_store import StoreUnreachable
 
@@ -43,6 +44,22 @@ def test_views_of_other_sides_reach_both_fits_and_belong_to_the_package(log: Pat
     request = ConversionRequest(item="two", picture=tmp_path / "front.png", settings=PREVIEW, given_views=sides)
     convert_job(request.to_job(home.store()), tmp_path / "out")
     assert "prepare_views" in ran(log) and store_is_sound()
+    steps = json.loads((tmp_path / "out" / "provenance.json").read_text())["steps"]
+    inputs = {step["step"]: step["inputs"] for step in steps}
+    assert inputs["fit_gaussians"]["known_views"] == inputs["fit_motion"]["known_views"]
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_drawn_views_reach_both_fits_and_give_way_to_the_users(given: bool, log: Path, tmp_path: Path) -> None:
+    for name in ("front.png", "back.png"):
+        (tmp_path / name).write_text(picture(f"{name} beside drawn views: {given}"))
+    sides = ViewsRequest(views=parse_views([f"180={tmp_path / 'back.png'}"])) if given else ViewsRequest()
+    settings = revise(PREVIEW, {"views.kind": "image_edit"})
+    request = ConversionRequest(item="drawn", picture=tmp_path / "front.png", settings=settings, given_views=sides)
+    wanted = request.to_job(home.store())
+    assert ("generate_views" in planned_steps(wanted)) == (not given)
+    convert_job(wanted, tmp_path / "out")
+    assert [step for step in ran(log) if step.endswith("_views")] == ["prepare_views" if given else "generate_views"]
     steps = json.loads((tmp_path / "out" / "provenance.json").read_text())["steps"]
     inputs = {step["step"]: step["inputs"] for step in steps}
     assert inputs["fit_gaussians"]["known_views"] == inputs["fit_motion"]["known_views"]

@@ -10,6 +10,7 @@ from dg4d_lib.rasterizer import backends
 from dg4d_lib.reconstruction.lgm import WORLD_SCALE
 from dg4d_lib.settings import Zero123PriorSettings
 from steps.profiles import CHANGED_KNOBS, PREVIEW, PROFILES, PipelineSettings, profile, revise, step_settings
+from steps.runtime.weights import license_of, weights_in
 
 
 @pytest.mark.parametrize(("lack", "backend"), [("no GPU", "cpu"), ("", "cuda_gsplat")])
@@ -66,7 +67,28 @@ def test_profiles_have_the_numbers_that_they_are_named_after(name: str) -> None:
 
 def test_every_profile_but_the_preview_has_a_trained_prior() -> None:
     trained = {name for name in PROFILES if isinstance(profile(name).prior, Zero123PriorSettings)}
-    assert trained == set(PROFILES) - {"preview"}
+    assert trained == set(PROFILES) - {"preview", "open"}
+
+
+def test_open_names_weights_that_may_be_sold_and_no_others() -> None:
+    named = list(weights_in(profile("open").model_dump(mode="json")))
+    assert named == ["wan2.2-ti2v-5b", "qwen-image-edit-2511", "qwen-multiple-angles"]
+    assert {license_of(name).commercial for name in named} == {"yes"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "owner"),
+    [
+        ({"prior.kind": "zero123", "prior.weights": "wan2.2-ti2v-5b"}, "prior.weights"),
+        ({"prior.kind": "imagedream", "prior.weights": "Qwen/Qwen-Image-Edit-2511"}, "prior.weights"),
+        ({"refiner.kind": "video_to_video", "refiner.model.weights": "ltx-video"}, "refiner.model.weights"),
+    ],
+)
+def test_a_flow_matching_model_is_no_critic(changes: dict[str, str], owner: str) -> None:
+    with pytest.raises(
+        BadInput, match=rf"{re.escape(owner)} = .* is a flow-matching model: it generates views .*zero123-xl"
+    ):
+        revise(PREVIEW, changes)
 
 
 def test_the_scale_of_lgm_is_that_of_the_library() -> None:

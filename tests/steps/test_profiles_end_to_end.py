@@ -11,9 +11,12 @@ import pytest
 import torch
 from media_files import save, save_zip, walk
 from tiny_imagedream import write_imagedream, write_lgm
+from tiny_qwen_edit import save_tiny_lora, save_tiny_qwen_edit, shrink_inputs
 from tiny_svd import save_tiny_svd
+from tiny_wan import save_tiny_wan
 from tiny_weights import write_zero123
 
+from dg4d_lib.diffusion.view_drawing import ViewDrawer
 from dg4d_lib.weights.registry import KNOWN
 from steps.artifacts.packages import ABOUT, ASSET, MANIFEST, MERGED, MESHES, RIGGED, SPLATS
 from steps.catalog import STEPS
@@ -62,6 +65,9 @@ WRITERS = {
     "svd": save_tiny_svd,
     "imagedream": write_imagedream,
     "lgm": write_lgm,
+    "wan2.2-ti2v-5b": save_tiny_wan,
+    "qwen-image-edit-2511": save_tiny_qwen_edit,
+    "qwen-multiple-angles": save_tiny_lora,
 }
 ALWAYS = {MANIFEST, *ABOUT} - {RIGGED, MERGED}
 
@@ -79,6 +85,15 @@ class Run:
         changes = dict(TINY)
         if self.profile == "preview":  # its stages have no models
             changes = {key: value for key, value in TINY.items() if not key.startswith(OF_MODELS)}
+        if self.profile == "open":
+            changes = {key: value for key, value in TINY.items() if not key.startswith(("refiner", "driving.model"))}
+            changes |= {
+                "driving.num_inference_steps": 1,
+                "driving.generated_frames": 0,
+                "driving.prompt": "the subject",
+            }
+            changes |= {"views.num_inference_steps": 2, "views.size": 64, "views.min_weight": 0.0}
+            changes |= {"views.azimuths_deg": [90, 180], "views.elevations_deg": [0]}
         if self.profile == "release":
             changes["deformation.spatial"] = 8  # its planes have up to 512 cells per side
         if profile(self.profile).static.start.kind == "lgm":
@@ -109,8 +124,11 @@ class Run:
         prepared = self.step("prepare_subject", {"source": source})
         subject, footage = prepared["subject"], prepared.get("footage")
         video = self.step("drive_video", {"subject": subject, "footage": footage})["driving_video"]
-        gaussians = self.step("fit_gaussians", {"subject": subject})["gaussians"]
-        fitted = self.step("fit_motion", {"gaussians": gaussians, "driving_video": video})
+        known = None
+        if self.settings.views.kind != "none":
+            known = self.step("generate_views", {"subject": subject})["known_views"]
+        gaussians = self.step("fit_gaussians", {"subject": subject, "known_views": known})["gaussians"]
+        fitted = self.step("fit_motion", {"gaussians": gaussians, "driving_video": video, "known_views": known})
         assert ("gaussians" in fitted) == self.settings.motion.fine_tune
         cloud = {"gaussians": fitted.get("gaussians", gaussians), "motion": fitted["motion"]}
         surface = self.step("extract_mesh", {**cloud, "plan": self.step("plan_mesh", cloud)["plan"]})
@@ -192,6 +210,25 @@ def test_a_file_becomes_a_package_by_the_models_that_its_profile_names_and_no_ot
         *(f"{MESHES}/{frame:03d}.glb" for frame in range(FRAMES * per_frame)),
     }
     assert manifest["frames"] == FRAMES and set(said) <= set(manifest["notes"])
+
+
+@pytest.mark.slow
+@pytest.mark.gpu
+def test_open_becomes_a_package_by_models_that_may_be_sold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shrink_inputs(monkeypatch)
+    subject = torch.ones(64, 64, 3)
+    subject[16:48, 20:44] = torch.tensor([0.8, 0.2, 0.1])
+    draw = ViewDrawer.draw
+    monkeypatch.setattr(ViewDrawer, "draw", lambda self, *given: [subject for _ in draw(self, *given)])
+    run = Run("open", ArtifactStore(tmp_path / "store"))
+    with zipfile.ZipFile(run.make(source_of(tmp_path, run.store, moving=False))) as files:
+        assert files.read(ASSET).startswith(b"glTF")
+    licenses = {name: text for record in run.records for name, text in record.licenses.items()}
+    models = {"wan2.2-ti2v-5b", "qwen-image-edit-2511", "qwen-multiple-angles"}
+    assert models <= set(licenses) and all(KNOWN[name].license.commercial == "yes" for name in models)
+    said = run.notes()
+    assert any("visual hull of 3 views" in note for note in said)
+    assert any("video model wan2.2-ti2v-5b" in note for note in said)
 
 
 @pytest.mark.gpu

@@ -9,6 +9,7 @@ from steps.runtime.perform import perform
 from steps.runtime.weights import (
     check_unchanged,
     identities,
+    license_note,
     license_of,
     open_weights,
     weights_home,
@@ -106,3 +107,17 @@ def test_a_request_for_other_weights_is_another_and_is_not_performed(home: Path,
 def test_missing_weights_are_missing_and_not_bad_input() -> None:
     with pytest.raises(BackendUnavailable, match="`dg4d weights pull svd`"):
         open_weights("svd")
+
+
+def test_the_license_of_a_folder_is_that_of_its_card_under_its_path_and_its_stored_name(
+    tmp_path: Path, home: Path
+) -> None:
+    folder = fill(tmp_path / "mine")
+    assert license_of(str(folder)).commercial == "unverified"
+    (folder / "README.md").write_text("---\nlicense: apache-2.0\n---\n")
+    stored = without_paths({"weights": str(folder)})["weights"]
+    assert license_of(str(folder)).commercial == license_of(stored).commercial == "yes"
+    assert license_note(stored) == f"License found for {stored}: apache-2.0: commercial use is allowed."
+    copy = fill(tmp_path / "stable-zero123-copy")
+    (copy / "README.md").write_text("---\nlicense: mit\n---\n")
+    assert license_of(str(copy)).commercial == "no"  # a copy inherits the license of the original

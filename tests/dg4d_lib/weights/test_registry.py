@@ -22,7 +22,11 @@ def test_pins_are_commits_and_digests_of_files_that_are_needed() -> None:
 
 def test_what_is_not_verified_is_not_commercial() -> None:
     allowed = {name for name, weights in KNOWN.items() if weights.license.allows_commercial_use}
-    assert allowed == {"svd", "svd-xt", "imagedream", "lgm", "vgg16", "lpips-vgg", "birefnet", "birefnet-lite"}
+    assert allowed == {
+        *("svd", "svd-xt", "imagedream", "lgm", "vgg16", "lpips-vgg", "birefnet", "birefnet-lite"),
+        *("wan2.2-ti2v-5b", "wan2.1-flf2v", "qwen-image-edit-2511", "qwen-image-edit-2509", "qwen-multiple-angles"),
+        "depth-anything-v2-small",
+    }
     assert lookup_weights("stable-zero123").license.commercial == "no"
     assert not lookup_weights("somebody/something").license.allows_commercial_use
 

@@ -389,9 +389,7 @@ def test_the_studio_has_roots_in_the_home_and_opens_nothing_else_of_it(place: Pa
     refused(lambda: roots.output(str(uploads / "x")), OUTPUTS)
 
 
-def test_a_mask_and_a_model_lie_in_the_roots(place: Path) -> None:
+def test_a_model_and_its_picture_lie_in_the_roots(place: Path) -> None:
     picture, out = str(place / "in" / "fox.png"), str(place / "in" / "out")
-    for flow in (deployments.picture_to_4d, deployments.video_to_4d):
-        refused(lambda flow=flow: flow.fn(picture, out, mask="/etc/passwd"))
     refused(lambda: deployments.model_to_4d.fn("/etc/passwd", out))
     refused(lambda: deployments.model_to_4d.fn(picture, out, picture="/etc/passwd"))

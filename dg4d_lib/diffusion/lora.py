@@ -1,0 +1,94 @@
+"""LoRA adapters, merged into the weights of a network: W + scale * (alpha / rank) * up @ down (Hu et al. 2021)."""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from dg4d_lib.diffusion.components import read_tensors
+from dg4d_lib.errors import BadInput
+from dg4d_lib.weights.locate import TENSOR_SUFFIXES
+
+PREFIXES = ("transformer.", "diffusion_model.", "model.diffusion_model.", "base_model.model.")
+DOWN, UP = ("lora_A", "lora_down", "lora.down"), ("lora_B", "lora_up", "lora.up")
+FACTOR = re.compile(
+    rf"^(?P<layer>.+?)[._](?P<factor>{'|'.join(re.escape(name) for name in (*DOWN, *UP))})(?:\.default)?\.weight$"
+)
+
+
+class _Factors(NamedTuple):
+    """Low-rank factors of one layer, and the scale that its file gives."""
+
+    down: Tensor
+    up: Tensor
+    alpha: float | None
+
+
+def merge_lora(network: nn.Module, path: Path, scale: float) -> int:
+    """Add a LoRA to the weights of a network's linear layers, in place; return the number of layers.
+
+    Args:
+        network: with the layers that the file names.
+        path: of the file, or a folder with one; names of PEFT, diffusers or kohya's dotted form.
+        scale: strength.
+
+    Raises:
+        BadInput: the file is no LoRA, or belongs to another network.
+    """
+    file = lora_file(path)
+    factors = _read_factors(file)
+    layers = dict(network.named_modules())
+    for name, one in factors.items():
+        layer = layers.get(name)
+        if not isinstance(layer, nn.Linear):
+            raise BadInput(f"{file} belongs to another network: {type(network).__name__} has no linear layer {name}")
+        expected = layer.out_features, layer.in_features
+        if (one.up.shape[0], one.down.shape[1]) != expected or one.up.shape[1] != one.down.shape[0]:
+            raise BadInput(f"{file} belongs to another network: {name} has {expected[0]} x {expected[1]} weights")
+        rank = one.down.shape[0]
+        factor = scale * (one.alpha / rank if one.alpha is not None else 1.0)
+        with torch.no_grad():
+            added = factor * (one.up.float() @ one.down.float())
+            layer.weight.copy_((layer.weight.float() + added.to(layer.weight.device)).to(layer.weight.dtype))
+    return len(factors)
+
+
+def lora_file(path: Path) -> Path:
+    """Return the file of a LoRA.
+
+    Raises:
+        BadInput: a folder has no such file, or several.
+    """
+    if path.is_file():
+        return path
+    found = sorted(one for one in path.iterdir() if one.suffix in TENSOR_SUFFIXES) if path.is_dir() else []
+    if len(found) != 1:
+        raise BadInput(f"{path} has {len(found)} files of tensors; a LoRA is one file: give its path")
+    return found[0]
+
+
+def _read_factors(file: Path) -> dict[str, _Factors]:
+    tensors = read_tensors(file)
+    down: dict[str, Tensor] = {}
+    up: dict[str, Tensor] = {}
+    for key, tensor in tensors.items():
+        if (found := FACTOR.match(key)) is not None:
+            (down if found["factor"] in DOWN else up)[found["layer"]] = tensor
+    if not down or set(down) != set(up) or any(one.ndim != 2 for one in (*down.values(), *up.values())):
+        raise BadInput(f"{file} is no LoRA of linear layers; give one that was made for this network")
+    return {_layer_name(name): _Factors(down[name], up[name], _alpha(tensors, name)) for name in down}
+
+
+def _layer_name(name: str) -> str:
+    """Return the name of a layer in the network of diffusers."""
+    for prefix in PREFIXES:
+        name = name.removeprefix(prefix)
+    return name
+
+
+def _alpha(tensors: Mapping[str, Tensor], name: str) -> float | None:
+    alpha = tensors.get(f"{name}.alpha")
+    return float(alpha) if alpha is not None else None

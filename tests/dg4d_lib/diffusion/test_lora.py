@@ -1,0 +1,66 @@
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import nn
+
+from dg4d_lib.diffusion.lora import merge_lora
+from dg4d_lib.errors import BadInput
+
+DOWN = torch.tensor([[1.0, 0.0, 2.0]])
+UP = torch.tensor([[1.0], [3.0]])
+
+
+def network(dtype: torch.dtype = torch.float32) -> nn.Module:
+    made = nn.ModuleDict({"block": nn.ModuleDict({"to_q": nn.Linear(3, 2), "to_k": nn.Linear(3, 2)})}).to(dtype)
+    nn.init.zeros_(made["block"]["to_q"].weight)
+    return made
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("transformer.block.to_q.lora_A.weight", "transformer.block.to_q.lora_B.weight"),
+        ("diffusion_model.block.to_q.lora_down.weight", "diffusion_model.block.to_q.lora_up.weight"),
+        ("block.to_q.lora_A.default.weight", "block.to_q.lora_B.default.weight"),
+        ("transformer.block.to_q.lora.down.weight", "transformer.block.to_q.lora.up.weight"),
+    ],
+)
+def test_the_product_of_the_factors_is_added_under_every_naming(names: tuple[str, str], tmp_path: Path) -> None:
+    save_file(dict(zip(names, (DOWN, UP), strict=True)), tmp_path / "lora.safetensors")
+    made = network()
+    before = made["block"]["to_k"].weight.clone()
+    assert merge_lora(made, tmp_path, 0.5) == 1
+    assert torch.equal(made["block"]["to_q"].weight, 0.5 * UP @ DOWN)
+    assert torch.equal(made["block"]["to_k"].weight, before)
+
+
+def test_alpha_over_rank_scales_and_the_precision_of_the_network_stays(tmp_path: Path) -> None:
+    name = "transformer.block.to_q"
+    tensors = {f"{name}.lora_A.weight": DOWN, f"{name}.lora_B.weight": UP, f"{name}.alpha": torch.tensor(4.0)}
+    save_file(tensors, tmp_path / "lora.safetensors")
+    made = network(torch.bfloat16)
+    merge_lora(made, tmp_path / "lora.safetensors", 1.0)
+    assert made["block"]["to_q"].weight.dtype == torch.bfloat16
+    assert torch.equal(made["block"]["to_q"].weight.float(), 4 * UP @ DOWN)
+
+
+@pytest.mark.parametrize(
+    ("tensors", "message"),
+    [
+        ({"block.other.lora_A.weight": DOWN, "block.other.lora_B.weight": UP}, "no linear layer block.other"),
+        ({"block.to_q.lora_A.weight": DOWN[:, :2], "block.to_q.lora_B.weight": UP}, "block.to_q has 2 x 3 weights"),
+        ({"block.to_q.lora_A.weight": DOWN}, "is no LoRA of linear layers"),
+        ({"block.to_q.weight": DOWN}, "is no LoRA of linear layers"),
+    ],
+)
+def test_a_file_for_another_network_is_refused(tensors: dict[str, torch.Tensor], message: str, tmp_path: Path) -> None:
+    save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, tmp_path / "lora.safetensors")
+    with pytest.raises(BadInput, match=message):
+        merge_lora(network(), tmp_path, 1.0)
+
+
+def test_a_folder_without_one_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="has 0 files of tensors"):
+        merge_lora(network(), tmp_path, 1.0)
