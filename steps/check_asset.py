@@ -18,7 +18,7 @@ from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.fitting.losses import resize_cutouts
 from dg4d_lib.images import color_over_white
 from dg4d_lib.mesh.extraction.topology import check_topology, join_seams, weld_vertices
-from dg4d_lib.mesh.folds import defective_faces
+from dg4d_lib.mesh.folds import DefectFinder
 from dg4d_lib.metrics.gates import MESH, SPLATS, GateInputs, RgbaImages, Turntable, evaluate_gates, fidelity
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
@@ -188,4 +188,4 @@ def _folds(surface: Surface, position: Float[Tensor, ""]) -> float:
     mesh = mesh_at(surface, position)
     rest = surface.mesh.vertices if isinstance(surface, Asset4D) else mesh.vertices
     joined, faces = join_seams(rest.numpy(), mesh.faces.numpy())
-    return float(defective_faces(mesh.vertices.numpy()[joined], faces, rest.numpy()[joined]).mean())
+    return float(DefectFinder(faces, rest.numpy()[joined]).defective(mesh.vertices.numpy()[joined]).mean())

@@ -94,9 +94,10 @@ def _tracked(
     mesh, sources = _colored(vertices, faces, rest, rasterize, settings)
     skinned = skin_vertices(vertices, rest, relative_to_frame(displacement, frame))
     projected = project_to_isosurface(vertices, skinned, faces, states, level, settings)
-    registered, _ = register_nonrigid(vertices, projected, faces, states, level, rasterize, settings)
+    silhouettes = render_silhouettes(states, range(len(projected)), rasterize)
+    registered, _ = register_nonrigid(vertices, projected, faces, states, silhouettes, level, settings)
     offsets = relax(vertices, registered, faces)
-    ious = silhouette_iou(vertices + offsets, faces, render_silhouettes(states, range(len(offsets)), rasterize))
+    ious = silhouette_iou(vertices + offsets, faces, silhouettes)
     return TrackedMesh(mesh, offsets[:, sources], reference_frame=frame), ious
 
 

@@ -9,9 +9,11 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numba import njit
+from scipy.sparse import csr_array
 
 from dg4d_lib.kernels.compiling import configure_numba
 from dg4d_lib.mesh.extraction.topology import face_components
+from dg4d_lib.mesh.neighbors import half_edges, mesh_edges
 
 configure_numba()
 
@@ -41,48 +43,90 @@ class SurfaceDefects:
     normal_deviation_deg: float
 
 
+class DefectFinder:
+    """Defects of one triangulation in many poses; neighbors and the rest shape are prepared once."""
+
+    def __init__(self, faces: Int[np.ndarray, "f 3"], rest: Float[np.ndarray, "v 3"] | None = None) -> None:
+        """Prepare the search.
+
+        Args:
+            faces: counter-clockwise seen from outside, welded.
+            rest: vertices of the rest shape, against which faces count as flipped; None: none do.
+        """
+        self._faces, self._rest = faces, rest
+        self._first, self._second, _ = neighboring_faces(faces)
+        if rest is not None:
+            self._sides = half_edges(faces)
+            self._arms = _arms(rest, self._sides)
+            self._normals_at_rest = unit_normals(rest, faces)
+            self._at_vertices = _sums_at_vertices(self._sides, len(rest))
+
+    def defective(self, vertices: Float[np.ndarray, "v 3"]) -> Bool[np.ndarray, " f"]:
+        """Mark faces that intersect others, are flipped or lie at a fold."""
+        normals = unit_normals(vertices, self._faces)
+        marked = self_intersecting(vertices, self._faces) | self._flipped(vertices, normals)
+        folded = self._cosines(normals) < np.cos(np.radians(FOLD_DEG))
+        marked[self._first[folded]] = marked[self._second[folded]] = True
+        return marked
+
+    def count(self, vertices: Float[np.ndarray, "v 3"]) -> SurfaceDefects:
+        """Count the defects of a pose."""
+        normals = unit_normals(vertices, self._faces)
+        angles = np.degrees(np.arccos(self._cosines(normals).clip(-1, 1)))
+        return SurfaceDefects(
+            faces=len(self._faces),
+            self_intersecting=int(self_intersecting(vertices, self._faces).sum()),
+            flipped=int(self._flipped(vertices, normals).sum()),
+            folds=int((angles > FOLD_DEG).sum()),
+            creases=int((angles > CREASE_DEG).sum()),
+            normal_deviation_deg=float(np.sqrt(np.mean(np.square(angles)))) if len(angles) else 0.0,
+        )
+
+    def _cosines(self, normals: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, " e"]:
+        """Return the cosine between the normals of the two faces of every inner edge."""
+        return np.einsum("ei,ei->e", normals[self._first], normals[self._second])
+
+    def _flipped(self, vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
+        """Mark faces whose normal points against the rotation that fits the neighborhood best.
+
+        The neighborhood of a face are the edges at its three corners; the rotation is that of Kabsch.
+        """
+        if self._rest is None:
+            return np.zeros(len(self._faces), np.bool_)
+        products = _arms(vertices, self._sides)[:, :, None] * self._arms[:, None, :]
+        at_vertex = (self._at_vertices @ products.reshape(-1, 9)).reshape(-1, 3, 3)
+        u, _, vt = np.linalg.svd(at_vertex[self._faces].sum(1))
+        u[..., -1] *= np.sign(np.linalg.det(u @ vt))[:, None]
+        expected = np.einsum("fij,fj->fi", u @ vt, self._normals_at_rest)
+        return np.einsum("fi,fi->f", expected, normals) < 0
+
+
 def surface_defects(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], rest: Float[np.ndarray, "v 3"] | None = None
 ) -> SurfaceDefects:
-    """Count the defects of a surface.
+    """Count the defects of one pose; for many poses of a mesh, use `DefectFinder`.
 
     Args:
         vertices: of the surface, any units.
         faces: counter-clockwise seen from outside.
         rest: vertices of the rest shape, against which faces count as flipped; None: these are the rest shape.
     """
-    angles = dihedral_angles_deg(vertices, faces)
-    return SurfaceDefects(
-        faces=len(faces),
-        self_intersecting=int(self_intersecting(vertices, faces).sum()),
-        flipped=0 if rest is None else int(flipped_faces(rest, vertices, faces).sum()),
-        folds=int((angles > FOLD_DEG).sum()),
-        creases=int((angles > CREASE_DEG).sum()),
-        normal_deviation_deg=float(np.sqrt(np.mean(np.square(angles)))) if len(angles) else 0.0,
-    )
+    return DefectFinder(faces, rest).count(vertices)
 
 
 def genus(faces: Int[np.ndarray, "f 3"]) -> int:
     """Return the number of handles of a closed surface, summed over its components (Euler characteristic)."""
     used = np.unique(faces)
-    edges = np.unique(np.sort(_sides(faces), 1), axis=0)
+    edges = mesh_edges(faces)
     components = int(face_components(int(faces.max()) + 1, faces).max()) + 1
     return (2 * components - (len(used) - len(edges) + len(faces))) // 2
-
-
-def dihedral_angles_deg(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, " e"]:
-    """Return the angle between the normals of the two faces of every inner edge, 0 to 180 degrees."""
-    first, second, _ = neighboring_faces(faces)
-    normals = unit_normals(vertices, faces)
-    cosines = np.einsum("ei,ei->e", normals[first], normals[second])
-    return np.degrees(np.arccos(cosines.clip(-1, 1)))
 
 
 def neighboring_faces(
     faces: Int[np.ndarray, "f 3"],
 ) -> tuple[Int[np.ndarray, " e"], Int[np.ndarray, " e"], Int[np.ndarray, "e 2"]]:
     """Return the two faces of every edge that has two, and its ends."""
-    sides = np.sort(_sides(faces), 1)
+    sides = np.sort(half_edges(faces), 1)
     order = np.lexsort(sides.T)
     edges, owners = sides[order], np.repeat(np.arange(len(faces)), 3)[order]
     twin = np.flatnonzero((edges[1:] == edges[:-1]).all(1))
@@ -91,43 +135,14 @@ def neighboring_faces(
 
 def unit_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
     """Return the normals of the faces; 0 for faces without area."""
-    a, b, c = np.moveaxis(vertices.astype(np.float64)[faces], 1, 0)
-    normals = np.cross(b - a, c - a)
+    normals = area_normals(vertices, faces)
     return normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-300)
 
 
-def flipped_faces(
-    rest: Float[np.ndarray, "v 3"], moved: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
-) -> Bool[np.ndarray, " f"]:
-    """Mark faces whose normal points against the rotation that fits the neighborhood best.
-
-    The neighborhood of a face are the edges at its three corners; the rotation is that of Kabsch.
-    """
-    sides = _sides(faces)
-    before, after = (np.asarray(shape, np.float64)[sides] for shape in (rest, moved))
-    arms, moved_arms = before[:, 1] - before[:, 0], after[:, 1] - after[:, 0]
-    products = moved_arms[:, :, None] * arms[:, None, :]
-    at_vertex = np.zeros((len(rest), 3, 3))
-    for end in (0, 1):
-        np.add.at(at_vertex, sides[:, end], products)
-    u, _, vt = np.linalg.svd(at_vertex[faces].sum(1))
-    u[..., -1] *= np.sign(np.linalg.det(u @ vt))[:, None]
-    expected = np.einsum("fij,fj->fi", u @ vt, unit_normals(rest, faces))
-    return np.einsum("fi,fi->f", expected, unit_normals(moved, faces)) < 0
-
-
-def defective_faces(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], rest: Float[np.ndarray, "v 3"] | None = None
-) -> Bool[np.ndarray, " f"]:
-    """Mark faces that intersect themselves, are flipped or lie at a fold; arguments as for `surface_defects`."""
-    defective = self_intersecting(vertices, faces)
-    if rest is not None:
-        defective |= flipped_faces(rest, vertices, faces)
-    first, second, _ = neighboring_faces(faces)
-    normals = unit_normals(vertices, faces)
-    folded = np.einsum("ei,ei->e", normals[first], normals[second]) < np.cos(np.radians(FOLD_DEG))
-    defective[first[folded]] = defective[second[folded]] = True
-    return defective
+def area_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
+    """Return the normals of the faces, of twice their area as length."""
+    a, b, c = np.moveaxis(vertices.astype(np.float64)[faces], 1, 0)
+    return np.cross(b - a, c - a)
 
 
 def self_intersecting(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
@@ -152,8 +167,15 @@ def self_intersecting(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray,
     return marked
 
 
-def _sides(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
-    return np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2)
+def _arms(vertices: Float[np.ndarray, "v 3"], sides: Int[np.ndarray, "e 2"]) -> Float[np.ndarray, "e 3"]:
+    ends = np.asarray(vertices, np.float64)[sides]
+    return ends[:, 1] - ends[:, 0]
+
+
+def _sums_at_vertices(sides: Int[np.ndarray, "e 2"], count: int) -> csr_array:
+    """Return the matrix that sums the values of half edges at both of their ends."""
+    places = (sides.ravel(), np.repeat(np.arange(len(sides)), 2))
+    return csr_array((np.ones(sides.size), places), shape=(count, len(sides)))
 
 
 @njit(cache=True, nogil=True)

@@ -2,15 +2,34 @@
 
 import numpy as np
 from jaxtyping import Bool, Int
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array, csr_array, diags_array
+
+
+def half_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
+    """Return the three directed edges of every face, face by face."""
+    return np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2)
+
+
+def mesh_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
+    """Return every edge once, its smaller index first, in ascending order."""
+    return np.unique(np.sort(half_edges(faces), 1), axis=0)
 
 
 def edge_graph(faces: Int[np.ndarray, "f 3"], count: int) -> csr_array:
     """Return the adjacency of the vertices: 1 where two share an edge."""
-    sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    edges = np.unique(np.sort(sides, 1), axis=0)
+    edges = mesh_edges(faces)
     rows, columns = np.concatenate([edges, edges[:, ::-1]]).T
     return coo_array((np.ones(2 * len(edges)), (rows, columns)), shape=(count, count)).tocsr()
+
+
+def neighbor_means(edges: csr_array) -> csr_array:
+    """Return the matrix that averages the neighbors of every vertex; rows of isolated vertices are 0."""
+    return csr_array(diags_array(1 / np.maximum(edges.sum(axis=1), 1)) @ edges)
+
+
+def graph_laplacian(edges: csr_array) -> csr_array:
+    """Return the number of neighbors on the diagonal minus the adjacency."""
+    return csr_array(diags_array(edges.sum(axis=1)) - edges)
 
 
 def faces_to_vertices(

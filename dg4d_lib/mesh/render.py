@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.mesh.extraction.topology import join_seams
+from dg4d_lib.mesh.extraction.topology import group_vertices
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.bake import vertex_normals
 from dg4d_lib.mesh_rasterizer.texture import build_lookup, sample_texture
@@ -65,9 +65,8 @@ def render_lit(mesh: TexturedMesh, camera: OrbitCamera) -> tuple[Float[Tensor, "
 
 def smooth_normals(mesh: TexturedMesh) -> Float[Tensor, "v 3"]:
     """Return area-weighted unit normals, equal on both sides of texture seams."""
-    joined, faces = join_seams(mesh.vertices.numpy(), mesh.faces.numpy())
-    _, copies = torch.unique(mesh.vertices, dim=0, return_inverse=True)
-    return vertex_normals(mesh.vertices[torch.from_numpy(joined)], torch.from_numpy(faces))[copies]
+    first, position = map(torch.from_numpy, group_vertices(mesh.vertices.numpy()))
+    return vertex_normals(mesh.vertices[first], position[mesh.faces.long()])[position]
 
 
 def _pooled(values: Float[Tensor, "b h w c"]) -> Float[Tensor, "b i j c"]:

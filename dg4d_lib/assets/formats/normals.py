@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from dg4d_lib.mesh.extraction.topology import group_vertices
+
 
 class SmoothNormals:
     """Area-weighted unit normals of a mesh in any pose.
@@ -14,8 +16,8 @@ class SmoothNormals:
     """
 
     def __init__(self, rest: NDArray[np.float32], faces: NDArray[np.integer[Any]]) -> None:
-        points, point_of = np.unique(rest, axis=0, return_inverse=True)
-        self._faces, self._point_of = faces, point_of.ravel()
+        points, self._point_of = group_vertices(rest)
+        self._faces = faces
         corners = (self._point_of[faces].ravel(), np.repeat(np.arange(len(faces)), 3))
         self._faces_around = csr_array((np.ones(faces.size), corners), shape=(len(points), len(faces)))
 

@@ -87,16 +87,30 @@ def weld_vertices(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "f 3"]]:
     """Merge vertices at equal positions, which undoes the split along texture seams."""
-    positions, index = np.unique(vertices, axis=0, return_inverse=True)
-    return positions, index.ravel()[faces]
+    first, joined = join_seams(vertices, faces)
+    return vertices[first], joined
 
 
 def join_seams(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Int[np.ndarray, " w"], Int[np.ndarray, "f 3"]]:
     """Return one vertex of every position, and the faces between these; so a moved mesh is welded as at rest."""
-    _, first, index = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
-    return first, index.ravel()[faces]
+    first, index = group_vertices(vertices)
+    return first, index[faces]
+
+
+def group_vertices(
+    vertices: Float[np.ndarray, "v 3"], tolerance: float = 0.0
+) -> tuple[Int[np.ndarray, " w"], Int[np.ndarray, " v"]]:
+    """Return the first vertex of every position, positions in ascending order, and the position of every vertex.
+
+    Args:
+        vertices: any units.
+        tolerance: side of the cells that count as one position, same units; 0: equal positions.
+    """
+    keys = np.round(vertices / tolerance).astype(np.int64) if tolerance > 0 else vertices
+    _, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    return first, index.ravel()
 
 
 def orient_outward(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "f 3"]:

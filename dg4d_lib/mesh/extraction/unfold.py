@@ -2,10 +2,9 @@
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import diags_array
 
-from dg4d_lib.mesh.folds import defective_faces
-from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, grown
+from dg4d_lib.mesh.folds import DefectFinder
+from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, grown, neighbor_means
 
 ROUNDS = 24  # at most
 WIDER = 6  # rounds after which one more ring of neighbors is smoothed
@@ -21,10 +20,10 @@ def unfold(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) ->
         faces: counter-clockwise seen from outside; their order and number stay.
     """
     edges = edge_graph(faces, len(vertices))
-    mean_of_neighbors = diags_array(1 / np.maximum(edges.sum(axis=1), 1)) @ edges
+    mean_of_neighbors, finder = neighbor_means(edges), DefectFinder(faces)
     smooth = vertices.astype(np.float64)
     for number in range(ROUNDS):
-        defective = defective_faces(smooth, faces)
+        defective = finder.defective(smooth)
         if not defective.any():
             break
         around = grown(faces_to_vertices(defective, faces, len(smooth)), edges, 1 + number // WIDER)

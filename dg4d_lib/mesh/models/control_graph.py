@@ -16,6 +16,8 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from dg4d_lib.mesh.neighbors import mesh_edges
+
 NEIGHBORS = 4  # nodes that move a point
 BRIDGES = 6  # edges from a component to each component that it touches
 TOUCHING = 1.5  # factor on the smallest gap of a component: others within it are joined to it, too
@@ -107,8 +109,7 @@ def graph_of_points(points: Float[np.ndarray, "v 3"], graph: csr_array, count: i
 
 def surface_graph(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> csr_array:
     """Return the lengths of a mesh's edges as a symmetric matrix, with bridges between its components."""
-    pairs = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1), axis=0)
-    return bridge_components(vertices, pairs)
+    return bridge_components(vertices, mesh_edges(faces))
 
 
 def point_graph(points: Float[np.ndarray, "v 3"], neighbors: int = 8) -> csr_array:

@@ -2,20 +2,22 @@
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array, csr_array
+
+from dg4d_lib.mesh.folds import area_normals
+from dg4d_lib.mesh.neighbors import edge_graph, grown, neighbor_means
 
 ROUNDS = 40  # smoothing steps at most
 RINGS = 1  # rings of vertices by which the smoothed region grows in a step
 
 
-def flipped_faces(
+def faces_against_rotations(
     rest: Float[np.ndarray, "v 3"],
     moved: Float[np.ndarray, "v 3"],
     faces: Int[np.ndarray, "f 3"],
     rotations: Float[np.ndarray, "v 3 3"],
 ) -> Bool[np.ndarray, " f"]:
-    """Return true for faces whose normal points away from that of the rest pose, turned with their first corner."""
-    before, after = _normals(rest, faces), _normals(moved, faces)
+    """Mark faces whose normal points away from that of the rest pose, turned with their first corner."""
+    before, after = area_normals(rest, faces), area_normals(moved, faces)
     expected = np.einsum("fij,fj->fi", rotations[faces[:, 0]], before)
     solid = np.linalg.norm(before, axis=1) > 1e-7 * np.linalg.norm(before, axis=1).max(initial=1e-30)
     return solid & (np.einsum("fi,fi->f", expected, after) < 0)
@@ -38,37 +40,23 @@ def unflip(
         faces: indices into the vertices.
         rotations: blended rotations of the vertices at this frame.
     """
-    wrong = flipped_faces(rest, moved, faces, rotations)
+    wrong = faces_against_rotations(rest, moved, faces, rotations)
     if not wrong.any():
         return moved, 0
-    mean = _neighbor_means(faces, len(rest))
+    edges = edge_graph(faces, len(rest))
+    mean = neighbor_means(edges)
     turns = rotations.copy()
     shifts = moved - np.einsum("vij,vj->vi", turns, rest)
     moved = moved.copy()
     region = np.zeros(len(rest), bool)
     for _ in range(ROUNDS):
         region[faces[wrong]] = True
-        for _ in range(RINGS):
-            region |= (mean @ region.astype(np.float64)) > 0
+        region = grown(region, edges, RINGS)
         affine = np.concatenate([turns.reshape(-1, 9), shifts], 1)
         affine[region] = 0.5 * (affine[region] + (mean @ affine)[region])
         turns, shifts = affine[:, :9].reshape(-1, 3, 3), affine[:, 9:]
         moved[region] = (np.einsum("vij,vj->vi", turns, rest) + shifts)[region]
-        wrong = flipped_faces(rest, moved, faces, turns)
+        wrong = faces_against_rotations(rest, moved, faces, turns)
         if not wrong.any():
             break
     return moved, int(wrong.sum())
-
-
-def _normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
-    corners = vertices[faces]
-    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-
-
-def _neighbor_means(faces: Int[np.ndarray, "f 3"], count: int) -> csr_array:
-    """Return the matrix that averages the neighbors of every vertex."""
-    pairs = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1), axis=0)
-    ends = np.concatenate([pairs, pairs[:, ::-1]]).T
-    graph = csr_array(coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(count, count)))
-    degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1)
-    return csr_array(graph.multiply(1 / degree[:, None]))

@@ -13,6 +13,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.transform import transform
 from dg4d_lib.geometry.quaternion import quat_to_rotmat
 from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
+from dg4d_lib.mesh.extraction.topology import group_vertices
 from dg4d_lib.mesh.models.model import OPAQUE, Model
 from dg4d_lib.mesh.models.subdivision import FineMesh, subdivide
 
@@ -62,8 +63,8 @@ def cover_surface(model: Model, count: int, generator: torch.Generator) -> Surfa
     """
     vertices, faces = model.vertices.astype(np.float64), model.faces
     size = float(np.linalg.norm(vertices.max(0) - vertices.min(0)))
-    welded_vertices, welded = weld(vertices, WELD * size)
-    fine = subdivide(welded_vertices, welded[faces], EDGE * size, MAX_VERTICES)
+    first, welded = group_vertices(vertices, max(WELD * size, 1e-12))
+    fine = subdivide(vertices[first], welded[faces], EDGE * size, MAX_VERTICES)
     corners = fine.vertices[fine.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.linalg.norm(normals, axis=1)
@@ -92,15 +93,6 @@ def cover_surface(model: Model, count: int, generator: torch.Generator) -> Surfa
     )
     nearest = np.take_along_axis(fine.faces[chosen], weights.argmax(1)[:, None], 1)[:, 0]
     return SurfaceCloud(fine, welded, cloud, torch.from_numpy(nearest))
-
-
-def weld(
-    vertices: Float[np.ndarray, "v 3"], tolerance: float
-) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, " v"]]:
-    """Merge vertices at about equal positions; return the merged ones, and their index for every vertex."""
-    cells = np.round(vertices / max(tolerance, 1e-12)).astype(np.int64)
-    _, first, index = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    return vertices[first], index.ravel()
 
 
 def _facing(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:

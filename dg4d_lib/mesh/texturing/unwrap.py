@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array, diags_array
 
 from dg4d_lib.errors import BackendUnavailable, DG4DError
+from dg4d_lib.mesh.neighbors import edge_graph, neighbor_means
 from dg4d_lib.mesh.subprocess_runner import Arrays, run_in_subprocess, serve
 
 PADDING = 2  # minimum distance between charts, texels
@@ -52,13 +52,9 @@ def taubin_smooth(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], steps: int = SMOOTHING
 ) -> Float[np.ndarray, "v 3"]:
     """Smooth a mesh with alternating inward and outward steps, which keep its volume (Taubin 1995)."""
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    ends = np.concatenate([ends, ends[:, ::-1]]).T
-    graph = coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(len(vertices),) * 2).tocsr()
-    graph.data[:] = 1  # every edge counts once, regardless of the number of faces that share it
-    degree = graph.sum(axis=1)
-    mean = diags_array(1 / np.maximum(degree, 1)) @ graph
-    isolated = (degree == 0)[:, None]
+    edges = edge_graph(faces, len(vertices))
+    mean = neighbor_means(edges)
+    isolated = (edges.sum(axis=1) == 0)[:, None]
     points = vertices.astype(np.float64)
     for step in range(steps):
         factor = 0.5 if step % 2 == 0 else -0.53

@@ -17,8 +17,8 @@ from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
 from dg4d_lib.kernels.workers import run_parallel
-from dg4d_lib.mesh.folds import defective_faces
-from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, grown
+from dg4d_lib.mesh.folds import DefectFinder
+from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, graph_laplacian, grown
 from dg4d_lib.mesh.tracking.skinning import nearest_rotation
 
 PULL = 1.0  # weight of the tracked position of a vertex, against 1 for each of its edges
@@ -55,16 +55,17 @@ class _ElasticBody:
     def __init__(self, rest: Float64[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> None:
         self.rest, self.faces = rest, faces
         self.edges = edge_graph(faces, len(rest))
-        self.laplacian = csr_array(diags_array(self.edges.sum(axis=1)) - self.edges)
+        self.laplacian = graph_laplacian(self.edges)
         self._whole = _factors(self.laplacian, np.full(len(rest), PULL))
-        self._defective_at_rest = defective_faces(rest, faces)
+        self._finder = DefectFinder(faces, rest)
+        self._sound_at_rest = ~DefectFinder(faces).defective(rest)
 
     def relaxed(self, tracked: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "v 3"]:
         """Return the relaxed positions of one frame."""
         pull = np.full(len(tracked), PULL)
         moved = self._settle(tracked, tracked, pull, None)
         for _ in range(ROUNDS - 1):
-            defective = defective_faces(moved, self.faces, self.rest) & ~self._defective_at_rest
+            defective = self._finder.defective(moved) & self._sound_at_rest
             if not defective.any():
                 break
             yielding = grown(faces_to_vertices(defective, self.faces, len(moved)), self.edges, RINGS)

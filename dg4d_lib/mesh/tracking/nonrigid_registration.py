@@ -10,8 +10,8 @@ from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
-from scipy.sparse import coo_array, csc_array, diags_array, eye_array
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import csc_array, eye_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -21,9 +21,9 @@ from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.clean import drop_small_components
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface, usable_level
-from dg4d_lib.mesh.extraction.silhouettes import render_silhouettes, silhouette_iou
+from dg4d_lib.mesh.extraction.silhouettes import silhouette_iou
+from dg4d_lib.mesh.neighbors import edge_graph, graph_laplacian
 from dg4d_lib.mesh.texturing.bake import vertex_normals
-from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
 
 MIN_IOU = 0.85  # silhouette IoU from which a frame is left unchanged
@@ -36,8 +36,8 @@ def register_nonrigid(
     offsets: Float[Tensor, "t v 3"],
     faces: Int[Tensor, "f 3"],
     states: Gaussians,
+    silhouettes: Bool[Tensor, "t k h w"],
     level: float,
-    rasterize: Rasterizer,
     settings: MeshSettings,
 ) -> tuple[Float[Tensor, "t v 3"], Float[Tensor, " t"]]:
     """Register the mesh in frames where its silhouettes differ from those of the Gaussians.
@@ -47,19 +47,18 @@ def register_nonrigid(
         offsets: of the skinned vertices at every frame.
         faces: counter-clockwise seen from outside.
         states: the cloud at every frame (fields "t n 3").
+        silhouettes: of the Gaussians at every frame (`render_silhouettes`).
         level: density of the surface.
-        rasterize: the splatting backend.
         settings: mesh settings.
 
     Returns:
         The offsets, and the silhouette IoU at every frame with them, in [0, 1], never lower than before.
     """
-    silhouettes = render_silhouettes(states, range(len(offsets)), rasterize)
     ious = silhouette_iou(vertices + offsets, faces, silhouettes)
     failed = torch.nonzero(ious < MIN_IOU)[:, 0].tolist()
     if not failed:
         return offsets, ious
-    identity, laplacian = eye_array(len(vertices)), _laplacian(faces, len(vertices))
+    identity, laplacian = eye_array(len(vertices)), graph_laplacian(edge_graph(faces.numpy(), len(vertices)))
     smooth = {stiffness: splu(csc_array(identity + stiffness * laplacian)) for stiffness in set(STIFFNESS)}
     registered = offsets.clone()
 
@@ -97,11 +96,3 @@ def _steps(
 
 def _with_normals(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> Float[np.ndarray, "v 6"]:
     return torch.cat([vertices, FACING * vertex_normals(vertices, faces)], 1).double().numpy()
-
-
-def _laplacian(faces: Int[Tensor, "f 3"], count: int) -> csc_array:
-    """Return the graph Laplacian of a mesh."""
-    ends = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).long().numpy().T
-    edges = coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(count, count)).tocsr()
-    joined = ((edges + edges.T) > 0).astype(np.float64)
-    return csc_array(diags_array(joined.sum(axis=1)) - joined)

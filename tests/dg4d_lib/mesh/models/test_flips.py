@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dg4d_lib.mesh.models.flips import flipped_faces, unflip
+from dg4d_lib.mesh.models.flips import faces_against_rotations, unflip
 
 
 def sheet(side: int = 12) -> tuple[np.ndarray, np.ndarray]:
@@ -19,7 +19,7 @@ def identity(count: int) -> np.ndarray:
 def test_a_turned_sheet_has_no_flipped_faces():
     vertices, faces = sheet()
     turn = np.diag([-1.0, 1.0, -1.0])  # half a turn about y: all normals point back, as they should
-    assert not flipped_faces(vertices, vertices @ turn.T, faces, np.tile(turn, (len(vertices), 1, 1))).any()
+    assert not faces_against_rotations(vertices, vertices @ turn.T, faces, np.tile(turn, (len(vertices), 1, 1))).any()
 
 
 def test_a_folded_vertex_is_unfolded_and_the_rest_stays():
@@ -27,10 +27,10 @@ def test_a_folded_vertex_is_unfolded_and_the_rest_stays():
     moved = vertices.copy()
     middle = 5 * 12 + 5
     moved[middle] += (3.0, 0, 0)
-    assert flipped_faces(vertices, moved, faces, identity(len(vertices))).any()
+    assert faces_against_rotations(vertices, moved, faces, identity(len(vertices))).any()
     repaired, left = unflip(vertices, moved, faces, identity(len(vertices)))
     assert left == 0
-    assert not flipped_faces(vertices, repaired, faces, identity(len(vertices))).any()
+    assert not faces_against_rotations(vertices, repaired, faces, identity(len(vertices))).any()
     np.testing.assert_array_equal(repaired[0], vertices[0])
     assert repaired[middle, 0] > vertices[middle, 0]
 
