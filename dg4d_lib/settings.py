@@ -370,6 +370,10 @@ class MeshSettings(Settings):
         description="tracked: one deforming mesh (ours); per_frame: one mesh per frame (paper); auto: tracked if one "
         "mesh can follow the motion",
     )
+    min_followed: Share = Field(
+        0.93,
+        description="auto: smallest silhouette IoU of the best trial mesh over the motion, else a mesh per frame",
+    )
     grid: int = Field(128, ge=16, le=512, description="resolution of the density field on each axis of [-1, 1]")
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Gaussians below this opacity are ignored")
     density_threshold: Positive = Field(0.5, description="level of the isosurface (typical for static assets: 1.0)")

@@ -96,7 +96,7 @@ def _tracked(
     projected = project_to_isosurface(vertices, skinned, faces, states, level, settings)
     silhouettes = render_silhouettes(states, range(len(projected)), rasterize)
     registered, _ = register_nonrigid(vertices, projected, faces, states, silhouettes, level, settings)
-    offsets = relax(vertices, registered, faces)
+    offsets = relax(vertices, registered, faces, silhouettes)
     ious = silhouette_iou(vertices + offsets, faces, silhouettes)
     return TrackedMesh(mesh, offsets[:, sources], reference_frame=frame), ious
 

@@ -2,7 +2,6 @@
 
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import select_level
-from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU
 from dg4d_lib.mesh.tracking.reference_frame import select_reference_frame
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
@@ -26,11 +25,12 @@ def run(job: Job) -> StepReport:
     if mode != "per_frame":
         frame, followed = select_reference_frame(states, displacement, rasterize, settings)
     if mode == "auto":
-        mode = "tracked" if followed >= MIN_IOU else "per_frame"
+        mode = "tracked" if followed >= settings.min_followed else "per_frame"
         if mode == "per_frame":
             frame = 0
             notes.append(
-                f"one mesh does not follow this motion ({followed:.1%} IoU on trial): every frame gets its own"
+                f"one mesh does not follow this motion ({followed:.1%} IoU on trial, mesh.min_followed asks for "
+                f"{settings.min_followed:.0%}): every frame gets its own"
             )
     job.progress(1, 2, {})
     rest = states.at(frame)

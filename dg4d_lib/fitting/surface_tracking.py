@@ -10,8 +10,8 @@ from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.fitting.asset_motion import Report, fit_asset_motion
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.inflation.surface import InflatedSurface
+from dg4d_lib.mesh.extraction.topology import group_vertices
 from dg4d_lib.mesh.models.control_graph import build_control_graph
-from dg4d_lib.mesh.models.surface_cloud import weld
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 
@@ -44,7 +44,9 @@ def track_surface(
     Raises:
         FitDiverged: the loss became non-finite.
     """
-    points, index = weld(surface.vertices.double().numpy(), CELL)
+    vertices = surface.vertices.double().numpy()
+    first, index = group_vertices(vertices, CELL)
+    points = vertices[first]
     faces = index[surface.faces.numpy()]
     whole = (faces != np.roll(faces, 1, 1)).all(1)
     graph = build_control_graph(points, faces[whole], settings.nodes)

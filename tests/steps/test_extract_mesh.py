@@ -122,8 +122,8 @@ def test_the_same_job_gives_the_same_bytes(tracked: tuple[Path, StepReport], tmp
 @pytest.mark.parametrize(
     ("mode", "followed", "expected"),
     [
-        ("auto", 0.9, ("tracked", 1)),
-        ("auto", 0.8, ("per_frame", 0)),
+        ("auto", 0.94, ("tracked", 1)),
+        ("auto", 0.92, ("per_frame", 0)),
         ("tracked", 0.8, ("tracked", 1)),
         ("per_frame", 0.0, ("per_frame", 0)),
     ],
@@ -137,7 +137,7 @@ def test_the_plan_says_what_is_extracted_and_from_which_frame(
     assert (plan.mode, plan.reference_frame) == expected
     made = {"tracked": "tracked", "per_frame": "meshes"}[plan.mode]
     assert {name for name, path in job.outputs.items() if path.exists()} == {"plan", made, "picture"}
-    refused = any("does not follow this motion (80.0% IoU" in note for note in facts.notes)
+    refused = any("does not follow this motion (92.0% IoU" in note for note in facts.notes)
     assert refused == (mode == "auto" and plan.mode == "per_frame")
     picture = read_png(job.outputs["picture"])[..., :3]
     assert picture.shape == (256, 1024, 3)

@@ -28,7 +28,7 @@ def render_silhouettes(states: Gaussians, frames: Sequence[int], rasterize: Rast
     black = torch.zeros(3, device=states.means.device)
     with torch.no_grad():
         views = [
-            rasterize(selected, cameras, black).alpha[..., 0] > ALPHA_THRESHOLD for cameras in _cameras(len(frames))
+            rasterize(selected, cameras, black).alpha[..., 0] > ALPHA_THRESHOLD for cameras in cameras_of(len(frames))
         ]
     return torch.stack(views, 1)
 
@@ -44,7 +44,7 @@ def silhouette_iou(
         silhouettes: output of `render_silhouettes` for these frames.
     """
     total = torch.zeros(len(vertices))
-    for view, cameras in enumerate(_cameras(len(vertices))):
+    for view, cameras in enumerate(cameras_of(len(vertices))):
         rendered = rasterize_mesh(vertices, faces, cameras).faces >= 0
         expected = silhouettes[:, view]
         intersection, union = (mask.flatten(1).sum(1) for mask in (rendered & expected, rendered | expected))
@@ -52,5 +52,6 @@ def silhouette_iou(
     return total / sum(weight for _, weight in VIEWS)
 
 
-def _cameras(frames: int) -> list[list[OrbitCamera]]:
+def cameras_of(frames: int) -> list[list[OrbitCamera]]:
+    """Return the camera of every frame, for each view."""
     return [[OrbitCamera(0, azimuth, width=SIZE, height=SIZE)] * frames for azimuth, _ in VIEWS]

@@ -3,8 +3,10 @@
 Skinning and projection move every vertex for itself, so neighbors overtake each other at joints. Here the vertices are
 pulled to where tracking put them and hold together by an as-rigid-as-possible energy towards the rest shape (Sorkine
 and Alexa 2007, with uniform weights, for the triangles are nearly equal). Where defects are left, the pull gives way.
+Where limbs cross, it must give way far around them, which may move outlines; that is kept if the silhouettes stay.
 """
 
+from dataclasses import dataclass
 from functools import partial
 from typing import no_type_check
 
@@ -17,19 +19,39 @@ from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
 from dg4d_lib.kernels.workers import run_parallel
+from dg4d_lib.mesh.extraction.silhouettes import silhouette_iou
 from dg4d_lib.mesh.folds import DefectFinder
 from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, graph_laplacian, grown
 from dg4d_lib.mesh.tracking.skinning import nearest_rotation
 
 PULL = 1.0  # weight of the tracked position of a vertex, against 1 for each of its edges
 PASSES = 5  # alternations of rotations and positions
-ROUNDS = 5  # at most; after the first one only around defects
-YIELDING = 0.15  # factor of the pull around defects, from round to round
-RINGS = 3  # of neighbors around a defect that give way with it
+MAX_LOSS = 0.003  # of the silhouette IoU that the stronger relaxation of a frame may cost
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Strength of a relaxation.
+
+    Attributes:
+        rounds: at most; after the first one only around defects.
+        rings: of neighbors around a defect that give way with it.
+        yielding: factor of the pull around defects, from round to round.
+    """
+
+    rounds: int
+    rings: int
+    yielding: float
+
+
+GENTLE, STRONG = Effort(5, 3, 0.15), Effort(12, 10, 0.05)
 
 
 def relax(
-    vertices: Float[Tensor, "v 3"], offsets: Float[Tensor, "t v 3"], faces: Int[Tensor, "f 3"]
+    vertices: Float[Tensor, "v 3"],
+    offsets: Float[Tensor, "t v 3"],
+    faces: Int[Tensor, "f 3"],
+    silhouettes: Bool[Tensor, "t k h w"] | None = None,
 ) -> Float[Tensor, "t v 3"]:
     """Return offsets near the given ones by which the surface moves without folds and crossings.
 
@@ -37,16 +59,30 @@ def relax(
         vertices: in the reference frame, not split along seams.
         offsets: of the tracked vertices at every frame.
         faces: counter-clockwise seen from outside, of nearly equal size. Defects that the rest shape has stay.
+        silhouettes: of the frames (`render_silhouettes`); with them, frames that keep defects are relaxed more
+            strongly where that costs at most 0.003 of their IoU.
     """
     body = _ElasticBody(vertices.double().numpy(), faces.numpy())
     relaxed = torch.empty_like(offsets)
 
     def relax_frame(frame: int) -> None:
-        moved = body.relaxed((vertices + offsets[frame]).double().numpy())
+        tracked = (vertices + offsets[frame]).double().numpy()
+        moved = body.relaxed(tracked, GENTLE)
+        if silhouettes is not None and body.defective(moved).any():
+            outline = silhouettes[frame, None]
+            strong = body.relaxed(tracked, STRONG)
+            if body.defective(strong).sum() < body.defective(moved).sum() and (
+                _iou(strong, faces, outline) >= _iou(moved, faces, outline) - MAX_LOSS
+            ):
+                moved = strong
         relaxed[frame] = torch.from_numpy(moved - body.rest).to(offsets)
 
     run_parallel([partial(relax_frame, frame) for frame in range(len(offsets))])
     return relaxed
+
+
+def _iou(moved: Float64[np.ndarray, "v 3"], faces: Int[Tensor, "f 3"], silhouettes: Bool[Tensor, "1 k h w"]) -> float:
+    return float(silhouette_iou(torch.from_numpy(moved).float()[None], faces, silhouettes)[0])
 
 
 class _ElasticBody:
@@ -60,16 +96,20 @@ class _ElasticBody:
         self._finder = DefectFinder(faces, rest)
         self._sound_at_rest = ~DefectFinder(faces).defective(rest)
 
-    def relaxed(self, tracked: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "v 3"]:
+    def defective(self, moved: Float64[np.ndarray, "v 3"]) -> Bool[np.ndarray, " f"]:
+        """Mark the faces with defects that the rest shape does not have."""
+        return self._finder.defective(moved) & self._sound_at_rest
+
+    def relaxed(self, tracked: Float64[np.ndarray, "v 3"], effort: Effort) -> Float64[np.ndarray, "v 3"]:
         """Return the relaxed positions of one frame."""
         pull = np.full(len(tracked), PULL)
         moved = self._settle(tracked, tracked, pull, None)
-        for _ in range(ROUNDS - 1):
-            defective = self._finder.defective(moved) & self._sound_at_rest
+        for _ in range(effort.rounds - 1):
+            defective = self.defective(moved)
             if not defective.any():
                 break
-            yielding = grown(faces_to_vertices(defective, self.faces, len(moved)), self.edges, RINGS)
-            pull[yielding] *= YIELDING
+            yielding = grown(faces_to_vertices(defective, self.faces, len(moved)), self.edges, effort.rings)
+            pull[yielding] *= effort.yielding
             moved = self._settle(moved, tracked, pull, yielding)
         return moved
 

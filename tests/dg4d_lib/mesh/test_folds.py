@@ -5,9 +5,11 @@ import pytest
 import torch
 import trimesh
 
+from dg4d_lib.mesh.extraction.silhouettes import cameras_of, silhouette_iou
 from dg4d_lib.mesh.extraction.unfold import unfold
-from dg4d_lib.mesh.folds import genus, self_intersecting, surface_defects
+from dg4d_lib.mesh.folds import DefectFinder, genus, self_intersecting, surface_defects
 from dg4d_lib.mesh.tracking.elastic import relax
+from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
 
 def sphere(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
@@ -107,6 +109,23 @@ def test_a_bone_that_bends_a_tube_at_once_makes_folds_and_relaxing_takes_them_aw
     assert (found.self_intersecting, found.flipped) == (0, 0)
     far = np.abs(vertices[:, 0] - 0.5) > 0.3
     assert np.abs((relaxed - offsets)[0].numpy()[far]).max() < 0.02  # the ends stay where tracking put them
+
+
+def test_a_stronger_relaxation_is_kept_where_the_outlines_allow_it() -> None:
+    vertices, faces = tube()
+    rest, moved, triangles = (
+        torch.from_numpy(vertices),
+        torch.from_numpy(bent(vertices, 150.0)),
+        torch.from_numpy(faces),
+    )
+    rest, offsets = (rest - torch.tensor([0.5, 0, 0])).float(), (moved - rest)[None].float()
+    gentle = relax(rest, offsets, triangles)
+    outlines = torch.stack([rasterize_mesh(rest + gentle, triangles, views).faces >= 0 for views in cameras_of(1)], 1)
+    assert silhouette_iou(rest + gentle, triangles, outlines)[0] == 1
+    assert torch.equal(relax(rest, offsets, triangles, outlines), gentle)  # the stronger one would lose more
+    strong = relax(rest, offsets, triangles, torch.zeros_like(outlines))  # an IoU of 0 cannot fall
+    left = [DefectFinder(faces, vertices).defective((rest + found[0]).numpy()).sum() for found in (strong, gentle)]
+    assert 0 < left[0] < left[1]
 
 
 def test_a_rigid_motion_is_left_as_it_is() -> None:
