@@ -7,12 +7,13 @@ Paths are those of the worker's machine, below the roots that its user allows (f
 import json
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
+import httpx
 from prefect import flow, runtime
 from prefect.client.schemas.objects import State
 from prefect.states import Completed, Failed
@@ -30,7 +31,7 @@ from flows.convert import connect, convert_job
 from flows.engine.item_runs import FLOW, failure, read_job
 from flows.engine.orphans import claim_run
 from flows.engine.shared_results import sharing_results
-from flows.inputs.conversion_job import ConversionRequest
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.fetching import local_copy, without_secrets
 from flows.inputs.given_views import ViewsRequest, parse_views
 from flows.inputs.manifest import box_settings, parse_changes
@@ -343,7 +344,7 @@ def _run_name(source: str) -> str:
 
 def _start() -> None:
     """Claim the run for this process; fail a run that was started too often, since it may be what kills its process."""
-    claim_run()
+    _patiently(claim_run)
     if runtime.flow_run.run_count > MOST_STARTS:
         raise BackendUnavailable(
             f"this run was started {MOST_STARTS} times and did not end: find out what kills its process, for example "
@@ -358,7 +359,7 @@ def _convert_item(job: ArtifactRef, code: str, address: str) -> Outcome:
         _start()
         wanted = read_job(job, code, store, address)
         Roots.of_this_process().check_weights(wanted.settings.model_dump(mode="json"))
-        _connect_patiently()
+        _patiently(connect)
         with sharing_results(store), tempfile.TemporaryDirectory(prefix="dg4d-item-") as scratch:
             folder = Path(scratch) / "package"
             _, cached = convert_job(wanted, folder)
@@ -408,21 +409,33 @@ def _publish(request: ConversionRequest, folder: Path) -> None:
     check_folder(folder, request.item)
     job = request.to_job(home.store())
     if not is_current(folder, job.digest()):
-        _connect_patiently()
-        convert_job(job, folder)
+        _convert_patiently(job, folder)
 
 
-def _connect_patiently() -> None:
-    """Connect to the server of this run; wait for one that restarts.
+def _convert_patiently(job: ConversionJob, folder: Path) -> None:
+    """Convert a job; if the server restarts meanwhile, convert it again after the last finished step."""
+    for start in range(1, MOST_STARTS + 1):
+        _patiently(connect)
+        try:
+            convert_job(job, folder)
+        except httpx.TransportError:
+            if start == MOST_STARTS:
+                raise
+        else:
+            return
+
+
+def _patiently(work: Callable[[], None]) -> None:
+    """Ask the server of this run, which may restart, until it answers.
 
     Raises:
-        ServerUnavailable: it did not answer for `PATIENCE_S` seconds.
+        ServerUnavailable, TransportError: it did not answer for `PATIENCE_S` seconds.
     """
     deadline = time.monotonic() + PATIENCE_S
     while True:
         try:
-            connect()
-        except ServerUnavailable:
+            work()
+        except (ServerUnavailable, httpx.TransportError):
             if time.monotonic() > deadline:
                 raise
             time.sleep(1.0)

@@ -68,7 +68,7 @@ def studio(
     ] = None,
     show: Annotated[bool, typer.Option("--open/--no-open", help="open the page in a browser")] = True,
 ) -> None:
-    """Open a page to drop pictures on: convert them, and look at all assets.
+    """Open a page to drop pictures on and to look at assets.
 
     Starts the Prefect server with deployments and a worker as `dg4d up` does, and prints the page's address, which
     signs the browser in. Server and worker run until `dg4d down`.

@@ -102,7 +102,7 @@ def egg() -> bytes:
     return write_glb(Asset4D(mesh, torch.linspace(0, 0.3, 3)[:, None, None] * vertices, 7.0))
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def studio(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
     """The studio of a server of its own: its steps are fake, and run in the processes of server and worker."""
     place = tmp_path_factory.mktemp("studio")

@@ -2,6 +2,7 @@
 
 import json
 
+import pytest
 from fake_steps import picture
 from waiting import wait_until
 
@@ -9,6 +10,7 @@ from flows.serving.workers import Worker, running
 from tests.flows.studio.conftest import Client
 
 
+@pytest.mark.slow
 def test_a_restart_of_the_server_loses_nothing(studio: Client) -> None:
     draft = studio.draft(("lynx.png", picture("a lynx fit_motion=sleep:8").encode()))
     run = studio.post(f"/drafts/{draft}/runs", {})[1]["id"]
