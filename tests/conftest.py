@@ -6,6 +6,7 @@ import signal
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -32,6 +33,17 @@ def emulated_gpu() -> Iterator[gpu.Emulated]:
         pytest.skip("asks an emulated GPU, which `make emulation` has")
     yield gpu.present
     gpu.present.has_memory()
+
+
+@pytest.fixture
+def quick_segmentation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Segment by the distance to the color of the first pixel: the network takes seconds per film."""
+    from dg4d_lib.video.segmentation_network import SegmentationNetwork
+
+    def far_from_corner(_: SegmentationNetwork, picture: Any) -> Any:
+        return ((picture - picture[0, 0]).abs().amax(-1) * 4).clamp(0, 1)
+
+    monkeypatch.setattr(SegmentationNetwork, "probability", far_from_corner)
 
 
 def pytest_unconfigure() -> None:

@@ -1,6 +1,6 @@
 """Matting of opaque frames: subject mask, alpha and foreground colors."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -157,11 +157,11 @@ def _segment(frames: Float[Tensor, "t h w 3"], method: str, load: NetworkLoader)
         return _Segmentation(masks, name, None, False, is_exact=True)
     network = load()
     checked = _spread(len(frames))
-    second = torch.stack([network.probability(frames[i]) for i in checked])
-    second = resize_planes(second[None], masks.shape[1:])[0]
+    known = {i: network.probability(frames[i]) for i in checked}
+    second = resize_planes(torch.stack(list(known.values()))[None], masks.shape[1:])[0]
     agreement = min(overlap(masks[i] > 0.5, other > 0.5) for i, other in zip(checked, second, strict=True))
     if agreement < AGREED and border_contact(second > 0.5) <= border_contact(masks[checked] > 0.5) + BORDER_MARGIN:
-        return _by_network(frames, network)
+        return _by_network(frames, network, known)
     return _Segmentation(masks, name, agreement, True, is_exact=agreement >= AGREED)
 
 
@@ -180,10 +180,16 @@ def _by_backdrop(lab: Float[ndarray, "t h w 3"], backdrop: Backdrop) -> Float[Te
     return torch.from_numpy(np.stack([_parts(mask, PART) for mask in cut_out(lab, backdrop)])).float()
 
 
-def _by_network(frames: Float[Tensor, "t h w 3"], network: Segmentation) -> _Segmentation:
-    """Segment every frame; compare some with the network's answer to the mirrored frame."""
+def _by_network(
+    frames: Float[Tensor, "t h w 3"],
+    network: Segmentation,
+    known: Mapping[int, Float[Tensor, "h w"]] | None = None,
+) -> _Segmentation:
+    """Segment all frames, known ones excepted; compare some with the answer to the mirrored frame."""
     size = _reduced(frames, REFINED_SIDE)
-    found = torch.stack([resize_planes(network.probability(frame)[None, None], size)[0, 0] for frame in frames])
+    known = known or {}
+    answers = (known[i] if i in known else network.probability(frame) for i, frame in enumerate(frames))
+    found = torch.stack([resize_planes(answer[None, None], size)[0, 0] for answer in answers])
     agreement = 1.0
     for i in _spread(len(frames)):
         mirrored = resize_planes(network.probability(frames[i].flip(1)).flip(1)[None, None], size)[0, 0]

@@ -94,6 +94,7 @@ def test_a_pick_makes_that_motion_and_no_other(tmp_path, subject):
     assert not (tmp_path / "ranking.json").exists()
 
 
+@pytest.mark.usefixtures("quick_segmentation")
 def test_video_diffusion_runs_from_a_folder_and_its_weights_are_in_the_record(tmp_path, subject):
     folder = save_tiny_svd(tmp_path / "svd")
     knobs = {"frames": 3, "height": 64, "width": 64, "model": {"weights": str(folder), "num_inference_steps": 2}}

@@ -17,7 +17,10 @@ from dg4d_lib.input_settings import DiffusersVideoSettings
 from dg4d_lib.video.image_to_video import ImageToVideo, image_to_video_class, kept_frames, own_names
 
 CPU = torch.device("cpu")
-pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # SVD's scheduler
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning"),  # SVD's scheduler
+    pytest.mark.usefixtures("quick_segmentation"),
+]
 
 
 @pytest.fixture(scope="module")

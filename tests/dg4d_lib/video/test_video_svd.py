@@ -8,6 +8,8 @@ from dg4d_lib.input_settings import SvdSettings
 from dg4d_lib.settings import VideoModelSettings
 from dg4d_lib.video.svd import StableVideo
 
+pytestmark = pytest.mark.usefixtures("quick_segmentation")
+
 SIZE, FRAMES = 48, 4
 SETTINGS = SvdSettings(frames=FRAMES, height=64, width=64, model=VideoModelSettings(num_inference_steps=2))
 

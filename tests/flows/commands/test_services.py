@@ -34,6 +34,7 @@ def children(pid_file: Path) -> list[str]:
     return Path(f"/proc/{pid_file.read_text()}/task/{pid_file.read_text()}/children").read_text().split()
 
 
+@pytest.mark.slow
 def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop(server: Server, folder: Path) -> None:
     said = dg4d("up", "--pool", "process-cpu", "--sources", str(folder.parent))
     assert said.returncode == 0, said.stderr

@@ -76,6 +76,7 @@ def during(step: str, log: Path, do: Callable[[], None]) -> threading.Thread:
     return thread
 
 
+@pytest.mark.slow
 def test_a_command_killed_in_every_stage_ends_with_the_bytes_of_an_undisturbed_one(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -185,6 +185,7 @@ def test_what_is_dropped_into_a_folder_is_converted_by_a_worker(
     assert any("[dropped](/artifacts/key/asset-dropped-" in str(page["data"]) for page in pages)
 
 
+@pytest.mark.slow
 def test_a_run_whose_process_was_killed_goes_on_after_its_last_finished_step(
     worker: tuple[TinyS3, Path], client: SyncPrefectClient, tmp_path: Path
 ) -> None:
@@ -200,6 +201,7 @@ def test_a_run_whose_process_was_killed_goes_on_after_its_last_finished_step(
     load_verified(tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_a_worker_knows_how_many_runs_would_end_with_it(
     worker: tuple[TinyS3, Path], client: SyncPrefectClient, server: Server, tmp_path: Path
 ) -> None:

@@ -60,6 +60,7 @@ def test_a_page_on_another_port_gets_nothing_from_a_browser_that_is_signed_in(
     assert "hostile" not in {flow.name for flow in client.read_flows()}
 
 
+@pytest.mark.slow
 def test_a_person_signs_in_fills_in_a_form_cancels_the_run_and_opens_an_artifact(
     worker: tuple[TinyS3, Path], client: SyncPrefectClient, server: Server, artifact: str, tmp_path: Path
 ) -> None:

@@ -49,11 +49,13 @@ def test_a_dropped_picture_is_corrected_converted_played_and_downloaded(studio: 
     assert record["recipe"]["mask"] and record["recipe"]["settings"]["driving"]["motion"] == "wave"
 
 
+@pytest.mark.slow
 def test_a_killed_conversion_tells_so_and_goes_on(studio: Client, drawn: Any) -> None:
     seen = tell(studio, "killed", picture=drawn("killed.png", "fit_motion=die-once"))
     assert "killed" in seen["reason"] and seen["state"] == "done" and seen["hidden"]
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_told_and_the_conversion_can_be_tried_again(studio: Client, drawn: Any) -> None:
     seen = tell(studio, "full", picture=drawn("crowded.png", "pack_asset=full"))
     assert "disk" in seen["reason"].lower() and seen["retried"]

@@ -134,6 +134,7 @@ def gray(value: int) -> bytes:
     return content.getvalue()
 
 
+@pytest.mark.slow
 def test_a_draft_becomes_an_asset_that_is_found_downloaded_and_made_again(studio: Client) -> None:
     draft = studio.draft(("wolf.png", picture("a wolf that is torn").encode()), ("side.png", PNG))
     cut = studio.post(f"/drafts/{draft}/cutout", {"box": [1, 1, 4, 4]})[1]
@@ -162,6 +163,7 @@ def test_a_draft_becomes_an_asset_that_is_found_downloaded_and_made_again(studio
     assert "wolf" not in studio.read("?search=wolf&verdict=accepted")[1].decode().partition('id="cards"')[2]
 
 
+@pytest.mark.slow
 def test_a_failed_conversion_says_why_and_can_be_tried_again(studio: Client) -> None:
     draft = studio.draft(("owl.png", picture("an owl pack_asset=full").encode()))
     run = studio.post(f"/drafts/{draft}/runs", {})[1]["id"]
