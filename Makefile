@@ -8,9 +8,12 @@ READY := $(VENV)/.ready$(if $(filter 1,$(CUDA)),-cuda)
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 ARITHMETIC ?= fast
 EMULATION := $(BIN)/python -m tests.emulation.build --arithmetic $(ARITHMETIC)
-TESTS := $(BIN)/python -m pytest -n 2 --dist loadscope \
+# three workers for two cores: many tests wait for servers and browsers
+TESTS := $(BIN)/python -m pytest -n 3 --dist loadscope \
 	--jaxtyping-packages=dg4d_lib,beartype.beartype\(conf=beartype.BeartypeConf\(is_pep484_tower=True\)\)
 GPU_TESTS := $(BIN)/python -m pytest -p tests.emulation.plugin --arithmetic $(ARITHMETIC) -m gpu
+
+unexport PYTHONDONTWRITEBYTECODE  # the hundreds of processes of the tests would compile our modules again and again
 
 TOOLS := out/tools
 AUDIT := timeout 300 $(TOOLS)/bin/pip-audit --no-deps --disable-pip -f json --progress-spinner off
