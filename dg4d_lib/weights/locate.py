@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import threading
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path, PurePath
@@ -88,7 +89,7 @@ def content_name(folder: Path, home: Path) -> str:
     name = f"{folder.stem}{CONTENT_MARK}{digest[:12]}"
     link = home / name
     if not link.is_symlink() or link.readlink() != folder:
-        scratch = home / f".{name}.{os.getpid()}"
+        scratch = home / f".{name}.{os.getpid()}-{threading.get_ident()}"
         scratch.unlink(missing_ok=True)
         scratch.symlink_to(folder)
         scratch.replace(link)

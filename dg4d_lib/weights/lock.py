@@ -6,6 +6,7 @@ compared with them. Copy the file to other machines to pull the same files there
 
 import json
 import os
+import threading
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -64,6 +65,6 @@ def write_lock(home: Path, name: str, locked: LockEntry) -> None:
 
 def write_json(path: Path, content: object) -> None:
     """Write a JSON file atomically: a reader sees the old content or the new one."""
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
+    scratch = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
     scratch.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n", encoding="utf-8")
     scratch.replace(path)

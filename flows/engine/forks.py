@@ -59,8 +59,10 @@ def fork(
 ) -> Fork | None:
     """Fork a step from the server of this environment; None if the server exited repeatedly."""
     for _ in range(ATTEMPTS):
-        if (process := _server().fork(arguments, environment, stderr, handles)) is not None:
+        server = _server()
+        if (process := server.fork(arguments, environment, stderr, handles)) is not None:
             return process
+        server.end()  # waits for its end: a killed process closes its sockets before it counts as ended
     return None
 
 

@@ -6,6 +6,7 @@ uploads/ID/runs/KEY/NAME     links to the files of one conversion, named as the 
 """
 
 import asyncio
+import io
 import os
 import re
 import secrets
@@ -32,7 +33,7 @@ from steps.sources.media_types import (
     is_zip,
 )
 from steps.store.files import home as home_folder
-from steps.store.files import room_for
+from steps.store.files import room_for, write_atomically
 
 Kind = Literal["picture", "video", "model"]
 
@@ -179,22 +180,18 @@ class Draft:
             BadInput: it is no PNG, or empty.
             DiskFull: there is no room.
         """
-        scratch = self.folder / ".mask.png"
-        with room_for(self.folder):
-            scratch.write_bytes(content)
-            try:
-                with Image.open(scratch, formats=["PNG"]) as picture:
-                    if max(picture.size) > MASK_SIDES:
-                        raise BadInput(f"the mask has {picture.size} pixels; its sides have at most {MASK_SIDES}")
-                    drawn = picture.convert("L").resize(size, Image.Resampling.BICUBIC)
-            except (OSError, ValueError, SyntaxError) as error:
-                raise BadInput("the mask is no PNG that can be read; draw it again") from error
-            finally:
-                scratch.unlink()
-            if drawn.getextrema() == (0, 0):
-                raise BadInput("the mask is empty: paint over the subject with the brush `keep`")
-            drawn.save(scratch, "PNG")
-            scratch.replace(self.mask)
+        try:
+            with Image.open(io.BytesIO(content), formats=["PNG"]) as picture:
+                if max(picture.size) > MASK_SIDES:
+                    raise BadInput(f"the mask has {picture.size} pixels; its sides have at most {MASK_SIDES}")
+                drawn = picture.convert("L").resize(size, Image.Resampling.BICUBIC)
+        except (OSError, ValueError, SyntaxError) as error:
+            raise BadInput("the mask is no PNG that can be read; draw it again") from error
+        if drawn.getextrema() == (0, 0):
+            raise BadInput("the mask is empty: paint over the subject with the brush `keep`")
+        png = io.BytesIO()
+        drawn.save(png, "PNG")
+        write_atomically(self.mask, png.getvalue())
 
     def link(self, key: str, name: str, path: Path) -> Path:
         """Link a file under the name of the asset for one conversion, and return the link.

@@ -1,6 +1,7 @@
 """Assets of the studio page: finished versions in the store, their verdicts, small pictures and files."""
 
 import functools
+import io
 import json
 import zipfile
 from collections.abc import Iterable, Sequence
@@ -23,7 +24,7 @@ from flows.ui import pages
 from steps.contract import ArtifactRef, Frozen
 from steps.profiles import PipelineSettings
 from steps.store.artifact_store import ArtifactStore, object_name
-from steps.store.files import DiskFull
+from steps.store.files import DiskFull, write_atomically
 
 PAGE = 60  # assets on one page of the gallery
 THUMBNAIL_SIZES, THUMBNAIL_QUALITIES, THUMBNAIL_BYTES = (384, 256, 128), (80, 60, 40), 40_000
@@ -182,22 +183,16 @@ def thumbnail(ref: ArtifactRef, store: ArtifactStore) -> Path | None:
         return small
     package = store.path(ref)
     small.parent.mkdir(parents=True, exist_ok=True)
-    scratch = small.with_suffix(".part")
     try:
         with zipfile.ZipFile(package) as archive:
             name = next((name for name in PICTURES if name in archive.namelist()), None)
-            if name is None:
-                return None
-            scratch.write_bytes(archive.read(name))
-        content = pages.small_webp(scratch, THUMBNAIL_BYTES, THUMBNAIL_SIZES, THUMBNAIL_QUALITIES)
-        if content is None:
+            picture = io.BytesIO(archive.read(name)) if name else None
+        content = picture and pages.small_webp(picture, THUMBNAIL_BYTES, THUMBNAIL_SIZES, THUMBNAIL_QUALITIES)
+        if not content:
             return None
-        scratch.write_bytes(content)
-        scratch.replace(small)
+        write_atomically(small, content)
     except (zipfile.BadZipFile, DiskFull, OSError):
         return None
-    finally:
-        scratch.unlink(missing_ok=True)
     return small
 
 

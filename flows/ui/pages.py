@@ -99,12 +99,15 @@ def thumbnail(ref: ArtifactRef, store: ArtifactStore, most_bytes: int = THUMBNAI
 
 
 def small_webp(
-    path: Path, most_bytes: int, sizes: tuple[int, ...] = THUMBNAIL_SIZES, qualities: tuple[int, ...] = QUALITIES
+    file: Path | io.BytesIO,
+    most_bytes: int,
+    sizes: tuple[int, ...] = THUMBNAIL_SIZES,
+    qualities: tuple[int, ...] = QUALITIES,
 ) -> bytes | None:
     """Return the first frame of a picture as a WebP, as large and as good as `most_bytes` allows.
 
     Args:
-        path: of the picture.
+        file: of the picture.
         most_bytes: of the result.
         sizes: longer side in pixels, the first choice first.
         qualities: of WebP, tried for each size.
@@ -113,7 +116,7 @@ def small_webp(
         None if the picture cannot be read or no size fits: a page is not worth a failed step.
     """
     try:
-        with Image.open(path) as picture:
+        with Image.open(file) as picture:
             small = picture.convert("RGBA")
     except (OSError, ValueError):
         return None

@@ -16,7 +16,9 @@ async function open(context, complaints) {
   const page = await context.newPage();
   page.on("pageerror", (error) => complaints.push(String(error)));
   page.on("console", (message) => {
-    if (message.type() === "error" && !/status of 4|ERR_CONNECTION/.test(message.text())) complaints.push(message.text());
+    if (message.type() === "error" && !/status of 4|ERR_CONNECTION/.test(message.text())) {
+      complaints.push(`${message.location().url}: ${message.text()}`);
+    }
   });
   await page.route((url) => url.protocol.startsWith("http") && url.hostname !== "127.0.0.1", (route) => {
     complaints.push(`asked for ${route.request().url()}`);

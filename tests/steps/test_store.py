@@ -1,5 +1,6 @@
 import errno
 import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -106,3 +107,11 @@ def test_home_is_where_the_environment_says(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.delenv("DG4D_HOME")
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "x"))
     assert home() == tmp_path / "x" / "dg4d"
+
+
+def test_threads_that_write_one_file_at_once_leave_one_whole_content(tmp_path: Path) -> None:
+    contents = [letter * 100_000 for letter in "abcdefgh"]
+    with ThreadPoolExecutor(8) as threads:
+        list(threads.map(lambda content: write_atomically(tmp_path / "state", content), contents * 4))
+    assert (tmp_path / "state").read_text() in contents
+    assert [path.name for path in tmp_path.iterdir()] == ["state"]

@@ -161,6 +161,10 @@ def test_a_server_that_was_killed_is_followed_by_another(place: Path) -> None:
     run("fine")
     forks._server().process.kill()
     run("fine too")
+    dying = forks._server()
+    dying._control.close()  # as of a process that has closed its descriptors and is not a zombie yet
+    run("fine as well")
+    assert dying.process.poll() is not None
     killed = forks._server().process
     with pytest.raises(StepOutOfMemory):
         run(f"prepare_subject=kill:{killed.pid}")

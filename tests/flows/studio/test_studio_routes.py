@@ -2,6 +2,7 @@
 
 import json
 import re
+from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
 from pathlib import Path
 
@@ -125,6 +126,13 @@ def test_a_matte_gets_the_size_of_its_source(studio: Client) -> None:
         assert studio.post(f"/drafts/{draft}/mask", content)[0] == status
     with Image.open(home.uploads() / draft / "mask.png") as mask:
         assert (mask.size, mask.mode) == ((8, 6), "L")  # of the fake source
+    headers = {**studio.secret, **studio.token}
+
+    def save(_: int) -> int:
+        return studio.ask(f"/drafts/{draft}/mask", "POST", gray(255), **headers)[0]
+
+    with ThreadPoolExecutor(4) as side:  # the page saves it again with every order
+        assert set(side.map(save, range(12))) == {201}
     assert [path.name for path in (home.uploads() / draft).glob(".*")] == []
 
 
