@@ -22,7 +22,7 @@ SHAPE_PRIOR ?=
 UPGRADE ?=
 NAMES ?=
 
-.PHONY: setup clients demo test nightly check audit lock docs emulation examples gallery shape-prior clean
+.PHONY: setup clients demo test tests nightly check audit audit-report lock docs emulation examples gallery shape-prior clean
 
 setup: $(READY)
 
@@ -38,10 +38,16 @@ demo: setup
 clients: setup
 	bash deploy/clients.sh
 
-# Audit findings are reported but do not fail the build: they appear without a change of ours.
-test: setup clients check
-	-$(MAKE) --no-print-directory audit
+# The checks and the audit run beside the tests, which often wait for servers.
+test: setup clients
+	$(MAKE) --no-print-directory --jobs=3 check audit-report tests
+
+tests:
 	$(TESTS) -m "not slow"
+
+# Audit findings are reported but do not fail the build: they appear without a change of ours.
+audit-report:
+	-$(MAKE) --no-print-directory audit
 
 # the tests marked slow (several machines, crashing databases, the fuzzer, full-size profiles), and the emulated GPU
 nightly: setup clients emulation

@@ -144,7 +144,7 @@ def _processor(model: Path) -> dict[str, Any]:
     except ImportError as error:
         raise missing_packages(error) from error
 
-    class PictureProcessor(Qwen2VLProcessor):
+    class PictureProcessor(Qwen2VLProcessor):  # type: ignore[misc]  # transformers is not followed
         """Processor without videos."""
 
         def check_argument_for_proper_class(self, argument_name: str, argument: Any) -> Any:
