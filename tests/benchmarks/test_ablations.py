@@ -64,6 +64,7 @@ def test_a_fit_reaches_more_than_a_still_one(specimen):
     assert moved.psnr_obj > still.psnr_obj + 0.5 and moved.terr < 0.9 < still.terr
 
 
+@pytest.mark.slow
 def test_every_frame_can_be_fitted_for_itself(specimen):
     alone = fits_per_frame(specimen, settings_of(CHANGES, SIZE, FRAMES), 0)
     assert len(alone) == FRAMES
@@ -147,6 +148,7 @@ def called(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
     main()
 
 
+@pytest.mark.slow
 def test_a_data_set_is_fitted_and_scored_as_the_objects_are(dataset, specimen, monkeypatch, capsys):
     settings = ["static.start.points=60", "static.iterations=10", "motion.iterations=5"]
     words = [*(f"--set={setting}" for setting in settings), "--objects=balls", "--seeds=1", f"--size={SIZE}"]

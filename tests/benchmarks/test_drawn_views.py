@@ -52,6 +52,7 @@ def test_errors_are_the_knobs_and_spoiled_views_are_upside_down(objects: Path) -
     assert sum(changed) == 1
 
 
+@pytest.mark.slow
 def test_imperfect_views_give_a_shape_that_overlaps_the_true_one(objects: Path, tmp_path: Path) -> None:
     out = tmp_path / "found.json"
     drawn_views.main([str(objects), "--first", "--json", str(out), "--sheet", str(tmp_path / "sheet.png"), *SMALL])

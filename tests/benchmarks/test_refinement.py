@@ -25,6 +25,7 @@ def board() -> tuple[Asset4D, DrivingVideo]:
     return Asset4D(mesh, torch.zeros(FRAMES, 4, 3), 8.0), DrivingVideo(red, torch.ones(FRAMES, 64, 64, 1), 8.0)
 
 
+@pytest.mark.slow
 def test_every_variant_runs_and_gives_a_texture_per_frame(tmp_path: Path) -> None:
     asset, video = board()
     svd, zero123 = save_tiny_svd(tmp_path / "svd"), write_zero123(tmp_path / "zero123")

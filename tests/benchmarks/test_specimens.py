@@ -23,6 +23,7 @@ def painted(name: str) -> Painted:
 
 
 @EVERY_OBJECT
+@pytest.mark.slow
 def test_the_motion_is_a_loop_and_nothing_jumps(name):
     at = painted(name).creature.at
     np.testing.assert_allclose(at(0.0), at(1.0), atol=1e-9)
@@ -31,6 +32,7 @@ def test_the_motion_is_a_loop_and_nothing_jumps(name):
 
 
 @EVERY_OBJECT
+@pytest.mark.slow
 def test_it_stays_in_the_picture(name):
     cameras = [OrbitCamera(0, azimuth, width=48, height=48) for azimuth in (0, *SCORED_AZIMUTHS_DEG)]
     for moment in (0.0, 0.3, 0.6):
@@ -40,6 +42,7 @@ def test_it_stays_in_the_picture(name):
 
 
 @EVERY_OBJECT
+@pytest.mark.slow
 def test_it_has_many_colors_and_looks_different_from_every_side(name):
     cameras = [OrbitCamera(0, azimuth, width=48, height=48) for azimuth in (0, 90, 180)]
     cutouts = painted(name).draw(0.1, cameras)
@@ -50,6 +53,7 @@ def test_it_has_many_colors_and_looks_different_from_every_side(name):
 
 
 @EVERY_OBJECT
+@pytest.mark.slow
 def test_its_surface_is_closed_at_every_moment(name):
     edges = np.sort(painted(name).faces.numpy()[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()

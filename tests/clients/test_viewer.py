@@ -130,7 +130,10 @@ def psnr(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
     return float(-10 * np.log10(np.square(first - second).mean()))
 
 
-@pytest.mark.parametrize("placement", [Placement(0.02, (0.0, 0.01, 0.3)), Placement(40.0, (3.0, 20.0, 0.0))])
+@pytest.mark.parametrize(
+    "placement",
+    [pytest.param(Placement(0.02, (0.0, 0.01, 0.3)), marks=pytest.mark.slow), Placement(40.0, (3.0, 20.0, 0.0))],
+)
 def test_the_input_camera_follows_a_placed_asset(placement: Placement, tried: Try) -> None:
     """Show a tiny and a huge asset as the one in the coordinates of the fit."""
     view = {"radius": 2 * placement.scale, "target": placement.translation}

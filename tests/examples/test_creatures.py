@@ -19,6 +19,7 @@ def newt() -> Newt:
     return Newt()
 
 
+@pytest.mark.slow
 def test_the_walk_is_a_loop(newt):
     np.testing.assert_allclose(newt.at(0.0), newt.at(1.0), atol=1e-9)
 

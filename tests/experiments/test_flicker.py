@@ -1,8 +1,10 @@
+import pytest
 import torch
 
 from experiments.flicker import ERRORS_DEG, FRONT, OWN, measure_object, table
 
 
+@pytest.mark.slow
 def test_a_true_film_seen_beside_the_truth_flickers_more_than_one_that_stands_still() -> None:
     rows = {row.film: row for row in measure_object("jellyfish", frames=6, size=64)}
     off = [rows[f"ground truth, {degrees} degrees off"] for degrees in ERRORS_DEG]

@@ -138,6 +138,7 @@ def test_a_killed_command_goes_on_where_it_was_and_gives_the_same_bytes(log: Pat
     assert set(tree(tmp_path / "out")) == set(tree(tmp_path / "other"))
 
 
+@pytest.mark.slow
 def test_two_commands_at_once_do_the_work_once(log: Path, tmp_path: Path) -> None:
     (tmp_path / "x.png").write_text(picture("both fit_gaussians=sleep:1"))
     both = [start("make", str(tmp_path / "x.png"), "-o", str(tmp_path / out)) for out in ("a", "b")]

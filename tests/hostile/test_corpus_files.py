@@ -23,6 +23,10 @@ from tests.hostile.table_files import FILES
 from tests.hostile.videos import VIDEOS
 
 CASES = {**PICTURES, **VIDEOS, **ZIPS, **OTHERS}
+BOMBS = (  # two seconds each; those that unpack a little less are tested every time
+    "png: 10,900 a side, zeros", "png: 8,000 a side, zeros of 1 bit", "webp: canvas of 6,000 a side",
+    "tiff: deflate bomb", "jpeg: 60 scans of 16 million pixels",
+)  # fmt: skip
 MOST_MB = 2048  # resident, of the process that decodes, with everything that it has loaded
 MOST_S = 12.0  # of processor time for one file; the largest that is read takes the most
 
@@ -52,7 +56,7 @@ def test_every_file_is_in_the_table() -> None:
     assert len(refused) >= 91 + 60 and len(FILES) - len(refused) >= 21
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in BOMBS else []) for n in CASES])
 def test_a_file_gets_what_the_table_says(name: str, decoder: Decoder, tmp_path: Path) -> None:
     path = tmp_path / "source"
     path.write_bytes(CASES[name]())

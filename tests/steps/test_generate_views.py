@@ -82,6 +82,7 @@ def test_drawn_pictures_are_cut_out_and_empty_ones_left_out_with_a_note() -> Non
         cut_views([torch.ones(64, 64, 3)], directions[:1], 64, "backdrop", segmenter)
 
 
+@pytest.mark.slow
 def test_views_that_agree_are_kept_with_their_weights() -> None:
     cutout = torch.from_numpy(disc()).float() / 255
     front = known_view(cutout)

@@ -111,7 +111,7 @@ def clip(folder: Path, azimuths: list[float]) -> bytes:
     return (folder / "frames.zip").read_bytes()
 
 
-@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("sign", [1, pytest.param(-1, marks=pytest.mark.slow)])
 def test_a_turntable_of_either_direction_is_placed_around_the_subject(sign, tmp_path):
     place = Workplace(tmp_path, seen(creature(), 0))
     place.prepare(GivenViews(turntable="turn"), {"turn": clip(tmp_path, [sign * 36.0 * i for i in range(10)])})

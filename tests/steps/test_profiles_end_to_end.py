@@ -232,6 +232,7 @@ def test_open_becomes_a_package_by_models_that_may_be_sold(tmp_path: Path, monke
 
 
 @pytest.mark.gpu
+@pytest.mark.slow
 def test_the_preview_draws_wherever_there_is_a_device(tmp_path: Path) -> None:
     """Its prior is the processor's everywhere."""
     run = Run("preview", ArtifactStore(tmp_path / "store"))

@@ -36,6 +36,7 @@ def subject() -> torch.Tensor:
     return torch.stack([inside, columns / 64 * inside, 0 * inside, inside], -1)
 
 
+@pytest.mark.slow
 def test_the_fit_starts_from_the_reconstruction_that_the_seed_decides(
     lgm: LgmStartSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -256,6 +256,7 @@ def test_tiny_textures_come_back(side: int) -> None:
     torch.testing.assert_close(read_mesh_glb(write_mesh_glb(mesh)).texture, mesh.texture, atol=2 / 255, rtol=0)
 
 
+@pytest.mark.slow
 def test_a_texture_of_8192_pixels_is_written_whole() -> None:
     mesh = replace(ball(), texture=torch.full((1, 1, 3), 0.5).expand(8192, 8192, 3))
     tree, binary = unpack(write_mesh_glb(mesh))

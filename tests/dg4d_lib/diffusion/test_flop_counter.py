@@ -89,6 +89,7 @@ def test_an_error_in_a_network_leaves_nothing_counting() -> None:
         assert flops["UNet2DConditionModel"] > 1e6
 
 
+@pytest.mark.slow
 def test_a_compiled_network_is_counted_as_well() -> None:
     unet = attach_flop_counter(tiny_unet())
     expected = call(unet)

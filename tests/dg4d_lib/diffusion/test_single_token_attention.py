@@ -137,6 +137,7 @@ def test_only_attention_to_tokens_is_shortened_and_files_stay_as_they_are(name: 
 
 
 @pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.slow
 def test_a_compiled_network_says_the_same(name: str) -> None:
     unet = network(name)
     tokens = drawn(BATCH, 1, TOKEN, seed=2)

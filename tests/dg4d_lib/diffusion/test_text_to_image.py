@@ -72,6 +72,7 @@ def test_with_little_memory_networks_wait_beside_the_gpu_and_draw_the_same(
     assert torch.equal(picture, draw(model, low_memory=True)) and len(asked) == 1  # without a GPU there is no other way
 
 
+@pytest.mark.slow
 def test_files_in_half_precision_are_read_and_draw_the_same_up_to_their_rounding(model: Path, tmp_path: Path) -> None:
     from diffusers import StableDiffusionPipeline
 

@@ -29,7 +29,9 @@ def make(kind: str, known):
             return Framewise(FRAMES, len(known.gaussians))
 
 
-@pytest.mark.parametrize("kind", ["hexplane", "mlp", "framewise"])
+@pytest.mark.parametrize(
+    "kind", ["hexplane", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("mlp", "framewise"))]
+)
 def test_a_slide_along_x_is_recovered(kind: str, known, motion_settings):
     deformation = make(kind, known)
     video = known.video()
@@ -39,6 +41,7 @@ def test_a_slide_along_x_is_recovered(kind: str, known, motion_settings):
     assert (slid - expected).abs().max() < 0.03
 
 
+@pytest.mark.slow
 def test_fine_tuning_mends_colors_and_a_frozen_cloud_keeps_its_bits(known, motion_settings):
     truth, gray = known.gaussians, replace(known.gaussians, harmonics=torch.zeros(40, 1, 3))
     wrong = (gray.colors - truth.colors).abs().mean()

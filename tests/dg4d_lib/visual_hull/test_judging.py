@@ -47,6 +47,7 @@ def test_true_views_have_full_weight(ring: list[KnownView]) -> None:
     assert min(one.weight for one in judge_views(ring[0], ring[1:])) > 0.85
 
 
+@pytest.mark.slow
 def test_an_outline_that_contradicts_the_others_weighs_little_and_the_others_keep_theirs(ring: list[KnownView]) -> None:
     views = spoiled(ring[1:], 3, ring[4].cutout.flip(0))
     found = judge_views(ring[0], views)
@@ -54,6 +55,7 @@ def test_an_outline_that_contradicts_the_others_weighs_little_and_the_others_kee
     assert min(one.weight for i, one in enumerate(found) if i != 3) > CARVES
 
 
+@pytest.mark.slow
 def test_colors_that_contradict_the_others_weigh_little(ring: list[KnownView]) -> None:
     wrong = torch.cat([1 - ring[3].cutout[..., :3], ring[3].cutout[..., 3:]], -1)
     found = judge_views(ring[0], spoiled(ring[1:], 2, wrong))

@@ -35,6 +35,8 @@ from flows.ui.gallery import ROWS_SHOWN
 from steps.profiles import PREVIEW
 
 QUIET = Console(quiet=True)
+SIGTERM = (signal.SIGTERM, 143)
+SIGHUP = pytest.param(signal.SIGHUP, 129, marks=pytest.mark.slow)
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +155,7 @@ def test_the_server_shows_how_far_a_batch_is_and_a_page_that_can_be_read(place: 
     assert "all are in summary.csv" in by_type["markdown"]["data"]
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), SIGTERM, SIGHUP])
 def test_a_user_who_stops_a_batch_keeps_what_is_done(
     place: None, tmp_path: Path, number: signal.Signals, status: int
 ) -> None:
@@ -191,7 +193,7 @@ def test_a_batch_goes_on_after_items_that_nothing_can_be_made_of(place: None, tm
 
 
 @pytest.mark.parametrize("step", ["fit_motion", "extract_mesh"])  # one alone, and several parts side by side
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize(("number", "status"), [SIGTERM, SIGHUP])
 def test_a_signal_ends_a_command_and_its_step_and_leaves_nothing_behind(
     place: None, tmp_path: Path, number: signal.Signals, status: int, step: str
 ) -> None:
@@ -211,6 +213,7 @@ def test_a_signal_ends_a_command_and_its_step_and_leaves_nothing_behind(
     assert left_behind(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_a_command_that_is_to_survive_its_terminal_does(place: None, tmp_path: Path) -> None:
     (tmp_path / "a.png").write_text(picture("nohup fit_motion=sleep:3"))
     log = tmp_path / "ran"

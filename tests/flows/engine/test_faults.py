@@ -103,6 +103,7 @@ def test_a_command_killed_in_every_stage_ends_with_the_bytes_of_an_undisturbed_o
     assert tree(tmp_path / "out", *RUN_FACTS) == tree(tmp_path / "other", *RUN_FACTS)
 
 
+@pytest.mark.slow
 def test_two_batches_of_the_same_folder_at_once_do_the_work_once(log: Path, tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     for name in ("a", "b"):

@@ -68,6 +68,7 @@ def package(tmp_path: Path) -> ArtifactRef:
     return pack_package(tmp_path / "package", home.store())
 
 
+@pytest.mark.slow
 def test_an_item_is_begun_once_and_again_only_after_it_failed(
     client: SyncPrefectClient, job: ConversionJob, reference: ArtifactRef, package: ArtifactRef
 ) -> None:

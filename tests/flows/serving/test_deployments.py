@@ -108,6 +108,7 @@ def test_registering_again_changes_nothing(client: SyncPrefectClient) -> None:
     assert {automation.name for automation in registering.AUTOMATIONS} <= set(before[1])
 
 
+@pytest.mark.slow
 def test_a_server_goes_on_following_the_runs_that_it_followed_when_it_is_registered_again(
     client: SyncPrefectClient,
 ) -> None:

@@ -19,6 +19,8 @@ from flows.serving import registering
 from flows.serving.pools import DEPLOY, read_pools
 from flows.serving.server import Server
 
+pytestmark = pytest.mark.slow  # a cluster and a worker take half a minute to start
+
 MANIFESTS: list[dict[str, Any]] = [
     document
     for file in sorted((DEPLOY / "k8s").glob("*.yaml"))

@@ -75,6 +75,7 @@ def test_a_run_that_is_asked_to_stop_saves_where_it_stands(tmp_path: Path) -> No
     assert training.Run.load(tmp_path, plan(32)).shown == 4
 
 
+@pytest.mark.slow
 def test_workers_make_the_same_batches() -> None:
     here = list(batches(3, 5, 2, 2, 64, workers=0))
     there = list(batches(3, 5, 2, 2, 64, workers=1))
