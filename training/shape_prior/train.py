@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import nn
 
-from dg4d_lib.shape_prior.network import ShapePriorConfig, ShapePriorNetwork, channels_last, save_network
+from dg4d_lib.shape_prior.network import ShapePriorConfig, ShapePriorNetwork, channels_last, load_network, save_network
 from training.shape_prior.batches import Batch, batches, make_batch
 from training.shape_prior.curves import draw_curves
 from training.shape_prior.losses import training_losses, validation_figures
@@ -126,9 +126,16 @@ class Run:
         run.shown, run.curve = state["shown"], state["curve"]
         return run
 
-    def warm_start(self, checkpoint: Path) -> list[str]:
-        """Take the averaged weights of another run where names and shapes agree; return the names left out."""
-        other = torch.load(checkpoint, weights_only=True)["average"]
+    def warm_start(self, path: Path) -> list[str]:
+        """Take the averaged weights of another run where names and shapes agree; return the names left out.
+
+        Args:
+            path: checkpoint of a run, or weights in safetensors such as the shipped ones.
+        """
+        if path.suffix == ".safetensors":
+            other = load_network(path).state_dict()
+        else:
+            other = torch.load(path, weights_only=True)["average"]
         own = self.network.state_dict()
         fitting = {name: value for name, value in other.items() if name in own and own[name].shape == value.shape}
         for network in (self.network, self.average):
@@ -232,7 +239,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--workers", type=int, default=1, help="processes that make shapes")
     parser.add_argument("--every", type=int, default=16_000, help="samples between two validations")
-    parser.add_argument("--warm-start", type=Path, help="checkpoint of another run to begin with")
+    parser.add_argument("--warm-start", type=Path, help="checkpoint or weights of another run to begin with")
     given = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", stream=sys.stderr)
     keep_freed_memory()

@@ -118,6 +118,15 @@ def test_a_warm_start_takes_what_fits(tmp_path: Path) -> None:
     assert "stem.weight" not in left_out
 
 
+def test_a_warm_start_from_weights_has_all_of_them(tmp_path: Path) -> None:
+    first, second = training.Run(plan(32), TINY), training.Run(plan(32, seed=7), TINY)
+    first.save(tmp_path)
+    assert not torch.equal(second.network.stem.weight, first.average.stem.weight)
+    assert second.warm_start(tmp_path / training.WEIGHTS) == []
+    for network in (second.network, second.average):
+        torch.testing.assert_close(network.stem.weight, first.average.stem.weight, atol=1e-3, rtol=1e-3)
+
+
 def test_the_rate_rises_stays_and_falls() -> None:
     rates = [plan(1000, cooldown=0.3).lr_at(shown) for shown in (0, 60, 500, 850, 1000)]
     assert rates == pytest.approx([4e-3 * 4 / 64, 4e-3, 4e-3, 2e-3, 0])
