@@ -29,6 +29,7 @@ from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import get_rasterizer
+from flows.packages.html_pages import render
 from flows.packages.report import report_page
 from flows.packages.summary import Row, Writer
 
@@ -258,8 +259,18 @@ REPORT = {
     "files": {f"{'long_name_' * 6}.glb": 1, "splats/000.ply": 7}, "settings": {"name": "x" * 200},
 }  # fmt: skip
 
+SCORES: dict[str, Any] = {
+    "title": "Scores", "metrics": [{"heading": f"metric {n}"} for n in range(9)], "ours": 0, "quote": str,
+    "table": [{str(n): "0.123" for n in range(10)}], "missing": {"LPIPS": "no weights"},
+    "objects": [
+        {"name": "fox", "error": "", "facts": ["PSNR 30"], "views": ["input", "view_90"],
+         "films": {"truth": {}, "ours": {}}},
+        {"name": "owl", "error": "The package is damaged."},
+    ],
+}  # fmt: skip
 
-def test_report_overview_and_viewer_are_for_everybody_on_a_phone_and_on_a_desk(tmp_path: Path) -> None:
+
+def test_pages_are_for_everybody_on_a_phone_and_on_a_desk(tmp_path: Path) -> None:
     """Check axe's rules, WCAG AA contrast among them, at 390 and 1280 pixels in light and dark."""
     (tmp_path / "viewer.html").write_text(build_viewer_page("Egg", write_glb(egg()), None, None, None, {"Steps": {}}))
     picture = io.BytesIO()
@@ -267,9 +278,10 @@ def test_report_overview_and_viewer_are_for_everybody_on_a_phone_and_on_a_desk(t
     (tmp_path / "report.html").write_text(report_page(REPORT, picture.getvalue(), picture.getvalue()))
     failed, skipped = (Row(item=state, status=state, message="why " * 30) for state in ("failed", "skipped"))
     Writer(tmp_path).write([Row(item="egg", status="done", seconds=3), failed, skipped], 1.0)
-    pages = [str(tmp_path / name) for name in ("report.html", "index.html", "viewer.html")]
+    (tmp_path / "scores.html").write_text(render("scores.html", **SCORES))
+    pages = [str(tmp_path / name) for name in ("report.html", "index.html", "scores.html", "viewer.html")]
     seen = run_node("pages.mjs", json.dumps({"pages": pages}))
-    assert len(seen) == 12
+    assert len(seen) == 4 * len(pages)
     embedded = {name: name.startswith("report") or None for name in seen}
     expected = {"violations": [], "wide": False, "mains": 1}
     assert seen == {name: expected | {"embedded": embedded[name]} for name in seen}
