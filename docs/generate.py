@@ -1,8 +1,9 @@
-"""Generator of docs/cli.md and docs/settings.md from the program.
+"""Generator of docs/cli.md, docs/settings.md and docs/provenance.schema.json from the program.
 
 Run `make docs`, or `python docs/generate.py`; with `--check` it writes nothing and fails if a page is out of date.
 """
 
+import json
 import sys
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from typer.testing import CliRunner
 
 from flows import cli
 from flows.inputs.setting_reference import SECTIONS, Setting, all_settings, value_in
+from flows.packages.record_schema import record_schema
 from steps.profiles import PROFILES
 
 DOCS = Path(__file__).parent
@@ -29,7 +31,8 @@ def main(arguments: list[str]) -> None:
 
 def pages() -> dict[str, str]:
     """Return the generated pages by file name."""
-    return {"cli.md": commands_page(), "settings.md": settings_page()}
+    schema = json.dumps(record_schema(), indent=1) + "\n"
+    return {"cli.md": commands_page(), "settings.md": settings_page(), "provenance.schema.json": schema}
 
 
 def commands_page() -> str:

@@ -2,12 +2,15 @@
 
 The profile is Process Run Crate 0.5 (https://w3id.org/ro/wfrun/process/0.5) on top of RO-Crate 1.1: every step is an
 action with its tool, inputs, settings and outputs. The crate lists every other file of the package with its digest, and
-the digest of the rest of itself, so that any changed byte is detected.
+the digest of the rest of itself, so that any changed byte is detected. Author and agent are whom `$DG4D_AUTHOR` names.
 """
 
+import functools
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import datetime, timedelta
+from importlib.metadata import PackageNotFoundError, metadata
 from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import quote
@@ -17,6 +20,9 @@ from flows.packages.publish import Files
 from steps.contract import canonical, digest_of
 from steps.runtime.environment_info import installed_distributions
 
+AUTHOR = "DG4D_AUTHOR"  # environment variable: NAME <URL>
+ORCID = "https://orcid.org/"  # of persons; other addresses are of organizations
+PACKAGE_INDEX = "https://pypi.org/"
 CRATE = "ro-crate-metadata.json"
 PROFILE = "https://w3id.org/ro/wfrun/process/0.5"
 SPECIFICATION = "https://w3id.org/ro/crate/1.1"
@@ -40,15 +46,16 @@ MEDIA_TYPES = {
 Entity = dict[str, Any]
 
 
-def crate_text(record: Mapping[str, Any], beside: Files, about: str) -> str:
+def crate_text(record: Mapping[str, Any], beside: Files, about: str, author: str = "") -> str:
     """Return the crate of a package as JSON-LD; equal arguments give equal text.
 
     Args:
         record: provenance.
         beside: digests of the files beside the package, including the record.
         about: description of the asset.
+        author: person with an ORCID, or organization, that made it, as "NAME <URL>" or "NAME"; "" if unknown.
     """
-    entities = _entities(record, beside, about)
+    entities = _entities(record, beside, about, _author(author))
     graph = list({entity["@id"]: _without_empty(entity) for entity in entities}.values())
     document = {"@context": CONTEXT, "@graph": graph}
     graph[0]["sha256"] = crate_digest(document)
@@ -73,7 +80,7 @@ def files_in(document: Mapping[str, Any]) -> dict[str, tuple[str, int]]:
     return {entity["name"]: (f"sha256:{entity['sha256']}", int(entity["contentSize"])) for entity in files}
 
 
-def _entities(record: Mapping[str, Any], beside: Files, about: str) -> Iterator[Entity]:
+def _entities(record: Mapping[str, Any], beside: Files, about: str, authors: list[Entity]) -> Iterator[Entity]:
     """Yield the descriptor, the package, then the rest; an entity may come more than once."""
     files = {**record["files"], **beside}
     runs = list(zip(record["steps"], record["run"]["steps"], strict=True))
@@ -93,11 +100,14 @@ def _entities(record: Mapping[str, Any], beside: Files, about: str) -> Iterator[
         "identifier": record["order"],
         "name": record["item"],
         "description": about,
+        "author": _references(authors),
+        "publisher": _references([author for author in authors if author["@type"] == "Organization"]),
         "datePublished": max((_end(run) for _, run in runs if run["started"]), default=""),
         "license": [_reference(name) for name in ("#license", *map(_license_id, record["licenses"]))],
         "hasPart": [_reference(quote(name)) for name in files],
         "mentions": actions,
     }
+    yield from authors
     yield {"@id": PROFILE, "@type": "CreativeWork", "name": "Process Run Crate", "version": "0.5"}
     yield {
         "@id": "#license",
@@ -113,7 +123,7 @@ def _entities(record: Mapping[str, Any], beside: Files, about: str) -> Iterator[
     for digest in sorted(digests - set(names)):
         yield _artifact(digest, record)
     for number, (step, run) in enumerate(runs, 1):
-        yield from _action(number, step, run, names, record)
+        yield from _action(number, step, run, names, record, authors)
 
 
 def _without_empty(entity: Entity) -> Entity:
@@ -166,7 +176,12 @@ def _artifact(digest: str, record: Mapping[str, Any]) -> Entity:
 
 
 def _action(
-    number: int, step: Mapping[str, Any], run: Mapping[str, Any], names: Mapping[str, str], record: Mapping[str, Any]
+    number: int,
+    step: Mapping[str, Any],
+    run: Mapping[str, Any],
+    names: Mapping[str, str],
+    record: Mapping[str, Any],
+    agents: list[Entity],
 ) -> Iterator[Entity]:
     """Describe a step with its tool, parameters, weights and machine."""
 
@@ -200,9 +215,10 @@ def _action(
     requirements: list[Entity] = [_packages(machine)] if "packages" in machine else []
     images = [_image(machine["image"])] if "image" in machine else []
     tool = {
-        "@id": f"#{step['step']}-{step['code_version']}",
+        "@id": f"{project_url()}#{step['step']}-{step['code_version']}",
         "@type": "SoftwareApplication",
         "name": f"dg4d {step['step']}",
+        "url": project_url(),
         "softwareVersion": step["code_version"],
         "softwareRequirements": _references(requirements),
     }
@@ -214,6 +230,7 @@ def _action(
         "@type": "CreateAction",
         "name": run["step"],
         "description": " ".join([f"Request {step['request_digest']}.", *step["notes"], *run["run_notes"]]),
+        "agent": _references(agents),
         "instrument": _reference(tool["@id"]),
         "object": [*artifacts(step["inputs"].values()), *_references(parameters), *_references(weights)],
         "result": results,
@@ -226,6 +243,27 @@ def _action(
     yield from (*requirements, *images, action, tool, *parameters, *usage, *facts, *weights)
 
 
+def _author(text: str) -> list[Entity]:
+    """Describe an author, NAME <URL> or NAME; nothing for an empty text."""
+    found = re.fullmatch(r"(.*\S)\s*<(https?://[^\s<>]+)>", text.strip())
+    name, url = (found[1], found[2]) if found else (text.strip(), "")
+    if not name:
+        return []
+    kind = "Person" if url.startswith(ORCID) else "Organization"
+    return [{"@id": url or "#author", "@type": kind, "name": name, "url": url}]
+
+
+@functools.cache
+def project_url() -> str:
+    """Return the home page in the metadata of the installed package; "" if it names none."""
+    try:
+        entries = metadata("dg4d").get_all("Project-URL") or []
+    except PackageNotFoundError:
+        return ""
+    urls = dict(entry.split(", ", 1) for entry in entries)
+    return urls.get("Homepage") or next(iter(urls.values()), "")
+
+
 def _property(own: str, name: str, value: str, **more: str) -> Entity:
     return {"@id": own, "@type": "PropertyValue", "name": name, **more, "value": value}
 
@@ -233,9 +271,10 @@ def _property(own: str, name: str, value: str, **more: str) -> Entity:
 def _packages(machine: Mapping[str, str]) -> Entity:
     """Describe the installed distributions; list them if they equal those of this machine."""
     entity = {
-        "@id": f"#packages-{_short(machine['packages'])}",
+        "@id": f"{PACKAGE_INDEX}#packages-{_short(machine['packages'])}",
         "@type": "SoftwareApplication",
         "name": "installed Python distributions",
+        "url": PACKAGE_INDEX,
         "softwareVersion": machine["packages"],
     }
     if machine["packages"] == digest_of(installed_distributions()):

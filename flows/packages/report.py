@@ -3,6 +3,7 @@
 import base64
 import json
 import math
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -16,7 +17,7 @@ from flows.inputs.package_record import FORMAT, RECORD
 from flows.inputs.signing_key import certificate_digest
 from flows.packages import acceptance
 from flows.packages.acceptance import load_picture, load_verdict
-from flows.packages.crate import CRATE, crate_text
+from flows.packages.crate import AUTHOR, CRATE, crate_text
 from flows.packages.credentials import Claim, Signer, sidecar_name
 from flows.packages.flow_result import FlowResult, StepRun
 from flows.packages.html_pages import render
@@ -79,7 +80,7 @@ def render_records(
         RECORD: written,
     }
     facts = {name: bytes_digest(text.encode()) for name, text in beside.items()}
-    return {**beside, CRATE: crate_text(record, facts, banner(job, result))}
+    return {**beside, CRATE: crate_text(record, facts, banner(job, result), os.environ.get(AUTHOR, ""))}
 
 
 def provenance(

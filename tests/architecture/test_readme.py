@@ -129,7 +129,7 @@ def test_the_readme_is_short() -> None:
     assert len(README.splitlines()) <= README_LINES
 
 
-@pytest.mark.parametrize("page", ["cli.md", "settings.md"])
+@pytest.mark.parametrize("page", ["cli.md", "settings.md", "provenance.schema.json"])
 def test_generated_pages_are_up_to_date(page: str) -> None:
     generated = runpy.run_path(str(repository.ROOT / "docs" / "generate.py"))["pages"]()
     assert generated[page] == repository.text(f"docs/{page}"), "run `make docs`"

@@ -1,5 +1,6 @@
 """The viewer page in a real browser: it plays, shows what our own renderers show, and asks nobody for anything."""
 
+import io
 import json
 import shutil
 from collections.abc import Callable
@@ -28,6 +29,9 @@ from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import get_rasterizer
+from flows.packages.html_pages import render
+from flows.packages.report import report_page
+from flows.packages.summary import Row, Writer
 
 VIEWER = CLIENTS.parents[1] / "dg4d_lib" / "assets" / "viewer"
 FRAMES, FPS = 4, 4.0
@@ -208,12 +212,15 @@ def test_it_plays_at_once_answers_hands_and_keys_and_asks_no_network(tried: Try)
     deeds = [
         ["wait", 0.3], ["press", "Space"], ["wait", 0.2], ["press", "Home"], ["press", "ArrowRight"],
         ["press", "ArrowLeft"], ["press", "ArrowUp"], ["press", "2"], ["press", "3"], ["press", "1"], ["press", "b"],
-        ["drag", 120, 40], ["press", "r"], ["wheel", 300], ["press", "r"],
+        ["drag", 120, 40], ["press", "r"], ["wheel", 300], ["press", "r"], ["press", "Shift+ArrowLeft"],
+        ["press", "Shift+ArrowUp"], ["press", "+"], ["press", "-"], ["press", "-"], ["press", "r"],
     ]  # fmt: skip
     page = tried(write_glb(egg()), splats(), facts={"Steps": {"1. fit": {"seed": 7}}}, deeds=deeds)
-    ready, played, stopped, later, home, forward, back, faster, cloud, wires, mesh, dark, turned, reset, far, again = (
+    told = [
         {**state, "picture": picture} for state, picture in zip(page.said["states"], page.said["drawn"], strict=True)
-    )
+    ]
+    ready, played, stopped, later, home, forward, back, faster, cloud, wires, mesh, dark, *moved = told
+    turned, reset, far, again, aside, above, nearer, _, farther, last = moved
     assert ready["playing"]
     assert ready["modes"] == ["mesh", "splats", "wireframe"]
     assert played["time"] != ready["time"]
@@ -227,10 +234,60 @@ def test_it_plays_at_once_answers_hands_and_keys_and_asks_no_network(tried: Try)
     assert len({state["picture"] for state in (cloud, wires, mesh)}) == 3
     assert dark["dark"] != mesh["dark"]
     assert len({state["picture"] for state in (mesh, turned, far)}) == 3
-    assert mesh["picture"] == reset["picture"] == again["picture"]
+    assert mesh["picture"] == reset["picture"] == again["picture"] == last["picture"]
+    by_keys = (mesh, aside, above, nearer, farther)
+    assert len({state["picture"] for state in by_keys}) == len(by_keys)
+    assert {(state["time"], state["speed"]) for state in by_keys} == {(mesh["time"], mesh["speed"])}
     (address,) = page.said["requests"]
     assert address.startswith("file://")
     assert "1. fit" in page.said["facts"]
+
+
+GATE = {
+    "name": "fidelity", "form": "mesh", "value": 24.6, "unit": "dB", "least": 16.5, "most": None,
+    "passed": True, "meaning": "agreement with the video from the input camera: PSNR on the subject",
+}  # fmt: skip
+CURVES = {"title": "static fit", "x": [0, 10, 20], "series": {str(n): [100.0, 1.0, 1 / (n + 1)] for n in range(8)}}
+REPORT = {
+    "item": "Egg", "source": "egg.png", "profile": "preview", "seed": 0, "banner": "Preview.",
+    "notes": ["sha256:" + "a" * 64], "wall_s": 2.0, "compute_s": 3.0,
+    "acceptance": {
+        "accepted": False,
+        "failing": ["silhouette"],
+        "gates": [GATE, GATE | {"name": "silhouette", "passed": False, "advice": "Choose a plain backdrop."}],
+    },
+    "steps": [{"step": "fit_gaussians", "compute_s": 3.0, "peak_memory_mb": 600, "cached": True, "curves": [CURVES],
+               "backend": "cpu rasterizer, pymeshlab, xatlas", "flops": {"UNet2DConditionModel": 10**12}}],
+    "licenses": {"zero123-xl": "MIT License with terms of which there are many words " * 3},
+    "files": {f"{'long_name_' * 6}.glb": 1, "splats/000.ply": 7}, "settings": {"name": "x" * 200},
+}  # fmt: skip
+
+SCORES: dict[str, Any] = {
+    "title": "Scores", "metrics": [{"heading": f"metric {n}"} for n in range(9)], "ours": 0, "quote": str,
+    "table": [{str(n): "0.123" for n in range(10)}], "missing": {"LPIPS": "no weights"},
+    "objects": [
+        {"name": "fox", "error": "", "facts": ["PSNR 30"], "views": ["input", "view_90"],
+         "films": {"truth": {}, "ours": {}}},
+        {"name": "owl", "error": "The package is damaged."},
+    ],
+}  # fmt: skip
+
+
+def test_pages_are_for_everybody_on_a_phone_and_on_a_desk(tmp_path: Path) -> None:
+    """Check axe's rules, WCAG AA contrast among them, at 390 and 1280 pixels in light and dark."""
+    (tmp_path / "viewer.html").write_text(build_viewer_page("Egg", write_glb(egg()), None, None, None, {"Steps": {}}))
+    picture = io.BytesIO()
+    Image.new("RGB", (900, 300)).save(picture, "PNG")
+    (tmp_path / "report.html").write_text(report_page(REPORT, picture.getvalue(), picture.getvalue()))
+    failed, skipped = (Row(item=state, status=state, message="why " * 30) for state in ("failed", "skipped"))
+    Writer(tmp_path).write([Row(item="egg", status="done", seconds=3), failed, skipped], 1.0)
+    (tmp_path / "scores.html").write_text(render("scores.html", **SCORES))
+    pages = [str(tmp_path / name) for name in ("report.html", "index.html", "scores.html", "viewer.html")]
+    seen = run_node("pages.mjs", json.dumps({"pages": pages}))
+    assert len(seen) == 4 * len(pages)
+    embedded = {name: name.startswith("report") or None for name in seen}
+    expected = {"violations": [], "wide": False, "mains": 1}
+    assert seen == {name: expected | {"embedded": embedded[name]} for name in seen}
 
 
 def test_the_page_is_small() -> None:

@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+import re
 from collections.abc import Iterator
+from email.message import Message
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,11 @@ from made_package import MACHINE, STEPS, WEIGHTS, made_package, record_in
 from rocrate.rocrate import ROCrate
 from signing import identity
 
-from flows.packages.crate import CRATE, crate_digest, crate_text, files_in, render_crate
+from flows.packages.crate import CRATE, crate_digest, crate_text, files_in, project_url, render_crate
+
+ADA = "https://orcid.org/0000-0002-1825-0097"
+TIME = re.compile(r"\d{4}-\d{2}-\d{2}T\d{2}:\d{2}:\d{2}\.\d{3}\+\d{2}:\d{2}")
+FORMAT = re.compile(r"\w*/\w[\w.-]*(\+\w[\w.-]*)?")
 
 
 @pytest.fixture(scope="module")
@@ -120,6 +126,81 @@ def test_every_reference_leads_to_an_entity_and_every_entity_has_one_name(folder
         - {*names, "https://w3id.org/ro/crate/1.1"}
         - {"https://w3id.org/ro/terms/workflow-run#DockerImage"}
     )
+
+
+def unmet(graph: list[dict[str, Any]]) -> set[str]:
+    """Recommendations of RO-Crate 1.1 and Process Run Crate 0.5 that a graph leaves open, after rocrate-validator."""
+    known = {entity["@id"]: entity for entity in graph}
+    root = known["./"]
+
+    def kinds(value: Any) -> set[str]:
+        return {known.get(name, {}).get("@type", "") for name in references(value)} if value else {"none"}
+
+    rules: dict[str, list[bool]] = {
+        "license": [kinds(root.get("license")) == {"CreativeWork"}],
+        "author": [kinds(root.get("author")) <= {"Person", "Organization"}],
+        "publisher": [kinds(root.get("publisher")) == {"Organization"}],
+        "date": [bool(TIME.fullmatch(root.get("datePublished", "")))],
+        "organization": [{"name", "url"} <= its.keys() for its in graph if its["@type"] == "Organization"],
+        "format": [bool(FORMAT.fullmatch(its["encodingFormat"])) for its in graph if its["@type"] == "File"],
+        "image": [{"additionalType", "registry", "name"} <= its.keys() for its in graph if "registry" in its],
+    }
+    tools = [entity for entity in graph if entity["@type"] == "SoftwareApplication"]
+    rules |= {f"tool's {name}": [name in its for its in tools] for name in ("name", "url", "softwareVersion")}
+    rules["tool's address"] = [its["@id"].startswith("http") for its in tools]
+    actions = [entity for entity in graph if entity["@type"] == "CreateAction"]
+    rules |= {f"action's {name}": [name in its for its in actions] for name in ("name", "description", "result")}
+    rules["action's times"] = [bool(TIME.fullmatch(its[name])) for its in actions for name in ("startTime", "endTime")]
+    rules["action's agent"] = [kinds(its.get("agent")) <= {"Person", "Organization"} for its in actions]
+    rules["mentions"] = [its["@id"] in references(root["mentions"]) for its in actions]
+    rules["object and result"] = [
+        kinds([its["object"], its["result"]]) <= {"File", "Dataset", "CreativeWork", "PropertyValue"} for its in actions
+    ]
+    return {name for name, met in rules.items() if not all(met)}
+
+
+def test_all_recommendations_are_met_where_author_and_home_page_are_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("DG4D_AUTHOR", raising=False)
+    monkeypatch.setattr("flows.packages.crate.project_url", lambda: "")
+    assert unmet(document(made_package(tmp_path / "bare", weights=WEIGHTS))["@graph"]) == {
+        *("author", "publisher", "action's agent"),  # nobody said who runs dg4d
+        *("tool's url", "tool's address"),  # the installed package names no home page
+    }
+    monkeypatch.setenv("DG4D_AUTHOR", "Test studio <https://studio.example/about>")
+    monkeypatch.setattr("flows.packages.crate.project_url", lambda: "https://dg4d.example/")
+    graph = document(made_package(tmp_path / "told", weights=WEIGHTS))["@graph"]
+    assert unmet(graph) == set()
+    (studio,) = [entity for entity in graph if entity["@type"] == "Organization"]
+    assert (studio["@id"], studio["name"]) == ("https://studio.example/about", "Test studio")
+
+
+@pytest.mark.parametrize(
+    ("text", "author"),
+    [
+        ("", None),
+        (" ", None),
+        ("Test studio", {"@id": "#author", "@type": "Organization", "name": "Test studio"}),
+        ("Test <studio>", {"@id": "#author", "@type": "Organization", "name": "Test <studio>"}),
+        (f"Ada <{ADA}>", {"@id": ADA, "@type": "Person", "name": "Ada", "url": ADA}),
+    ],
+)
+def test_an_author_is_a_person_by_orcid_or_an_organization(
+    folder: Path, text: str, author: dict[str, str] | None
+) -> None:
+    graph = json.loads(crate_text(record_in(folder), {}, "about", text))["@graph"]
+    assert [entity for entity in graph if entity["@type"] in {"Person", "Organization"}] == ([author] if author else [])
+    assert graph[1].get("author") == (author and {"@id": author["@id"]})
+    assert ("publisher" in graph[1]) == (author is not None and author["@type"] == "Organization")
+
+
+def test_a_home_page_is_read_from_the_metadata(monkeypatch: pytest.MonkeyPatch) -> None:
+    message = Message()
+    message["Project-URL"] = "Issues, https://dg4d.example/issues"
+    message["Project-URL"] = "Homepage, https://dg4d.example/"
+    monkeypatch.setattr("flows.packages.crate.metadata", {"dg4d": message}.__getitem__)
+    assert project_url.__wrapped__() == "https://dg4d.example/"
 
 
 def test_names_of_files_are_quoted_where_they_are_addresses(tmp_path: Path) -> None:

@@ -106,6 +106,21 @@ def test_the_page_is_self_contained_and_escapes_what_it_is_given(store: Artifact
     assert "5.4 MB" in page
 
 
+def test_the_verdict_and_the_viewer_come_before_the_notes(store: ArtifactStore, unpacked: Path) -> None:
+    told = report.build_report(*made(store), FILES, store)
+    told["acceptance"] = {"accepted": False, "failing": ["motion"], "gates": []}
+    page = report.report_page(told)
+    assert Links(page).tags.count("main") == 1
+    places = [page.index(part) for part in ("Not accepted: motion", "<iframe", "contact_sheet.png", "Twice said.")]
+    assert places == sorted(places)
+    assert 'title="3D viewer of &lt;fox&gt;"' in page
+
+
+def test_plots_have_names_with_their_last_values(told: dict[str, Any]) -> None:
+    page = report.report_page(told)
+    assert re.search(r'<svg [^>]*role="img" aria-label="static &lt;fit&gt;: 100 to 0.01[^"]*; loss 0.01"', page)
+
+
 def test_time_on_the_clock_and_time_of_computing_are_two_numbers(store: ArtifactStore) -> None:
     job, what = made(store)  # two steps, of 2 and 3 seconds
     told = report.build_report(job, what.model_copy(update={"wall_s": 3.2}), FILES, store)

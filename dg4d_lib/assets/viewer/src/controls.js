@@ -2,6 +2,8 @@
 import { SPEEDS } from "./player.js";
 
 const VIDEO_DRIFT = 0.12; // seconds; larger offsets of the video are corrected by seeking
+const TURN = Math.PI / 24; // of the camera, per key press
+const ZOOM = 1.1; // of its distance, per key press
 const byId = (id) => document.getElementById(id);
 
 export class Controls {
@@ -21,6 +23,7 @@ export class Controls {
     byId("background").addEventListener("click", () => this.darken());
     byId("details").addEventListener("click", () => this.unfold());
     document.addEventListener("keydown", (event) => this.press(event));
+    if (window !== window.parent) this.unfold(false); // another page embeds the viewer
     this.darken(matchMedia("(prefers-color-scheme: dark)").matches);
   }
 
@@ -69,9 +72,10 @@ export class Controls {
     document.documentElement.dataset.theme = dark ? "dark" : "light";
   }
 
-  unfold() {
-    document.body.toggleAttribute("data-folded");
-    byId("panel").scrollIntoView({ behavior: "smooth", block: "nearest" });
+  unfold(open = document.body.hasAttribute("data-folded")) {
+    document.body.toggleAttribute("data-folded", !open);
+    byId("details").setAttribute("aria-expanded", open);
+    if (open) byId("panel").scrollIntoView({ behavior: "smooth", block: "nearest" });
   }
 
   press(event) {
@@ -84,6 +88,9 @@ export class Controls {
       ArrowUp: () => this.change(() => player.shift(1)),
       ArrowDown: () => this.change(() => player.shift(-1)),
       Home: () => this.change(() => this.scrub(0)),
+      "+": () => this.stage.zoom(1 / ZOOM),
+      "=": () => this.stage.zoom(1 / ZOOM), // the key of + without shift
+      "-": () => this.stage.zoom(ZOOM),
       r: () => this.stage.reset(),
       b: () => this.darken(),
       i: () => this.unfold(),
@@ -91,7 +98,13 @@ export class Controls {
     ["mesh", "splats", "wireframe"].forEach((mode, i) => {
       if (this.modes.includes(mode)) deeds[i + 1] = () => this.show(mode);
     });
-    const deed = deeds[event.key] ?? deeds[event.key.toLowerCase()];
+    const turns = {
+      ArrowLeft: () => this.stage.turn(-TURN, 0),
+      ArrowRight: () => this.stage.turn(TURN, 0),
+      ArrowUp: () => this.stage.turn(0, -TURN),
+      ArrowDown: () => this.stage.turn(0, TURN),
+    };
+    const deed = (event.shiftKey && turns[event.key]) || (deeds[event.key] ?? deeds[event.key.toLowerCase()]);
     if (!deed) return;
     event.preventDefault();
     deed();

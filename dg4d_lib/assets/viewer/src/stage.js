@@ -1,5 +1,5 @@
 // Canvas, camera and orbit controls. The canvas is transparent, so the page's background shows through.
-import { DirectionalLight, Group, HemisphereLight, PerspectiveCamera, Scene, WebGLRenderer } from "three";
+import { DirectionalLight, Group, HemisphereLight, PerspectiveCamera, Scene, Spherical, WebGLRenderer } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 
 // The camera of the input picture: on +z, looking at the origin; as in dg4d_lib/cameras/orbit.py.
@@ -42,6 +42,29 @@ export class Stage {
     this.controls.enableDamping = true;
     this.controls.target.set(0, 0, 0);
     this.camera.position.set(0, 0, RADIUS);
+    this.controls.update();
+    this.stale = true;
+  }
+
+  /** Turns the camera around its target by angles in radians: `across` around the vertical axis, `up` over the top. */
+  turn(across, up) {
+    this.orbit((at) => {
+      at.theta -= across;
+      at.phi -= up;
+    });
+  }
+
+  /** Multiplies the distance from the target by a factor. */
+  zoom(factor) {
+    this.orbit((at) => (at.radius = Math.min(FARTHEST, Math.max(NEAREST, at.radius * factor))));
+  }
+
+  /** Changes the position of the camera in spherical coordinates around its target. */
+  orbit(change) {
+    const { target } = this.controls;
+    const at = new Spherical().setFromVector3(this.camera.position.clone().sub(target));
+    change(at);
+    this.camera.position.setFromSpherical(at.makeSafe()).add(target);
     this.controls.update();
     this.stale = true;
   }
