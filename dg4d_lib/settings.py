@@ -253,6 +253,13 @@ class FitSettings(Settings):
     opacity_lr: Positive = Field(0.05, description="learning rate of the opacity logits")
     scale_lr: Positive = Field(0.005, description="learning rate of the log scales")
     rotation_lr: Positive = Field(0.005, description="learning rate of the quaternions")
+    lr_end: float = Field(
+        1.0,
+        gt=0,
+        le=1,
+        description="factor on the learning rates at the end, log-linear over the last half; not on those of canonical "
+        "means, which have their own (ours; paper: 1)",
+    )
 
 
 class StaticSettings(FitSettings):

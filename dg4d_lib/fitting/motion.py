@@ -13,7 +13,7 @@ from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.deformation.rigidity_loss import neighborhoods, rigidity_loss
 from dg4d_lib.devices import to_device_async
 from dg4d_lib.fitting.losses import WHITE, check_finite, reference_loss, resize_cutouts
-from dg4d_lib.fitting.schedules import log_linear, resolution_at
+from dg4d_lib.fitting.schedules import late_decay, log_linear, resolution_at
 from dg4d_lib.fitting.static import learning_rates
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.interface import GuidancePrior, GuidanceView, ring_size
@@ -69,9 +69,12 @@ def fit_motion(
         ]
         groups = [*cloud_groups, *groups]
     adam = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15, fused=True)
+    rates = [float(group["lr"]) for group in adam.param_groups]
     neighbors = neighborhoods(gaussians.means) if settings.rigidity_weight else None
     for step in range(1, settings.iterations + 1):
         progress = step / settings.iterations
+        for group, rate in zip(adam.param_groups, rates, strict=True):
+            group["lr"] = rate * late_decay(settings.lr_end, progress)
         if settings.fine_tune:
             means_lr = log_linear(settings.means_lr, settings.means_lr_end, progress)
             adam.param_groups[0]["lr"] = settings.length_scale * means_lr

@@ -11,6 +11,11 @@ def log_linear(start: float, end: float, progress: float) -> float:
     return math.exp(math.log(start) * (1 - progress) + math.log(end) * progress)
 
 
+def late_decay(end: float, progress: float) -> float:
+    """Return a factor on learning rates: 1 up to half of the progress, then log-linear to `end`."""
+    return log_linear(1, end, max(0, 2 * progress - 1))
+
+
 def resolution_at(schedule: Sequence[ResolutionStage], progress: float) -> int:
     """Return the render size in pixels: that of the first stage with `until` above progress, else of the last."""
     return next((stage.size for stage in schedule if progress < stage.until), schedule[-1].size)

@@ -11,7 +11,7 @@ from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.cameras.viewpoints import random_orbit
 from dg4d_lib.devices import to_device_async
 from dg4d_lib.fitting.losses import WHITE, Diverged, check_finite, reference_loss, resize_cutouts
-from dg4d_lib.fitting.schedules import log_linear, resolution_at
+from dg4d_lib.fitting.schedules import late_decay, log_linear, resolution_at
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.density_control import DensifyResult, Grad2dStats, densify, prune, reset_opacity
 from dg4d_lib.guidance.interface import GuidancePrior, GuidanceView, ring_size
@@ -105,10 +105,13 @@ def fit_gaussians(
     color, alpha = resize_cutouts(subject[None].to(device), settings.reference_size)
     white = torch.tensor(WHITE, device=device)
     others = [resize_cutouts(view.cutout[None].to(device), settings.reference_size) for view in known]
-    cloud = _Cloud.of(start, learning_rates(settings))
+    rates = learning_rates(settings)
+    cloud = _Cloud.of(start, rates)
     grad2d = Grad2dStats.zeros(len(start), device)
     for step in range(1, settings.iterations + 1):
         progress = step / settings.iterations
+        for group in cloud.adam.param_groups:
+            group["lr"] = rates[group["name"]] * late_decay(settings.lr_end, progress)
         cloud.adam.param_groups[0]["lr"] = log_linear(settings.means_lr, settings.means_lr_end, progress)
         gaussians = cloud.gaussians
 

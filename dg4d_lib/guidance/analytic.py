@@ -2,6 +2,9 @@
 
 If the clean picture z0 of a view is known, the noise in x_t is (x_t - sqrt(alphabar) z0) / sqrt(1 - alphabar); the same
 score distillation then converges to z0. In pixel space, over white, with the alpha as a fourth channel.
+
+The drawn noise cancels: with x_t = sqrt(alphabar) z + sqrt(1 - alphabar) e, the gradient of score distillation is
+(1 - alphabar) (noise_pred - e) = sqrt(alphabar (1 - alphabar)) (z - z0). So no noise is drawn here.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,7 +15,7 @@ from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.noise_schedule import alphas_cumprod
-from dg4d_lib.guidance.distillation import TimestepSchedule, score_distillation
+from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.interface import GuidanceView
 
 LATENT_NUMBERS = 4 * 32 * 32  # of Zero-1-to-3; a pixel picture is weighted as if it had as many
@@ -54,12 +57,9 @@ class AnalyticPrior:
         timestep = self.schedule.timestep(progress, generator)
         alphabar = float(alphas_cumprod()[timestep])
         clean = self._encode(*self.clean(views)).to(images.device)
-
-        def predict_noise(noisy: Float[Tensor, "b c h w"], _timestep: int) -> Float[Tensor, "b c h w"]:
-            return (noisy - alphabar**0.5 * clean) / (1 - alphabar) ** 0.5
-
         pixels = 3 * images.shape[1] * images.shape[2]
-        loss = score_distillation(self._encode(images, alpha), predict_noise, timestep, generator)
+        strength = 0.5 * (alphabar * (1 - alphabar)) ** 0.5
+        loss = strength * (self._encode(images, alpha) - clean).square().sum() / len(images)
         return loss * (self.weight * LATENT_NUMBERS / pixels)
 
     def _encode(self, images: Float[Tensor, "b h w 3"], alpha: Float[Tensor, "b h w 1"]) -> Float[Tensor, "b c h w"]:

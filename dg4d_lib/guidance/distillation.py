@@ -67,14 +67,6 @@ def sds_weight(timestep: int) -> float:
     return 1.0 - float(alphas_cumprod()[timestep])
 
 
-def score_distillation(
-    latents: Float[Tensor, "b c h w"], predict_noise: PredictNoise, timestep: int, generator: torch.Generator
-) -> Float[Tensor, ""]:
-    """Return `distillation_loss` with noise from a generator."""
-    noise = torch.randn(latents.shape, dtype=latents.dtype, generator=generator).to(latents.device)
-    return distillation_loss(latents, predict_noise, timestep, noise)
-
-
 def distillation_loss(
     latents: Float[Tensor, "b c h w"], predict_noise: PredictNoise, timestep: int, noise: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, ""]:

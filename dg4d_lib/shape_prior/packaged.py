@@ -10,7 +10,7 @@ from dg4d_lib.shape_prior.network import ShapePriorNetwork, load_network
 NAME = "shape-prior"
 LICENSE = "Apache-2.0"
 WEIGHTS = Path(__file__).with_name("weights.safetensors")
-SHA256 = "9431ca42d9788a903ddbd8bb5ca242bd33e3567909d5de10da3edd2c5aa6dba2"
+SHA256 = "51829ed9470652c05d0c0eb0263d34fc52a84ba88d6a85a1470519be7112dc0b"
 
 
 @functools.cache
