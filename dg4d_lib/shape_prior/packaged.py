@@ -10,7 +10,7 @@ from dg4d_lib.shape_prior.network import ShapePriorNetwork, load_network
 NAME = "shape-prior"
 LICENSE = "Apache-2.0"
 WEIGHTS = Path(__file__).with_name("weights.safetensors")
-SHA256 = "51829ed9470652c05d0c0eb0263d34fc52a84ba88d6a85a1470519be7112dc0b"
+SHA256 = "fa07f759220e937c2b878a3299fd0f492eb2ca9995a44975e5ba1cf2a5a6e66e"
 
 
 @functools.cache
