@@ -157,7 +157,7 @@ def test_a_step_that_failed_leaves_its_reason_and_its_last_good_state(place: Pat
 
 def test_a_browser_draws_every_picture_of_the_page(server: Server, place: Path) -> None:
     convert_job(job("drawn", place, item="drawn"), place / "out")
-    (version,) = artifacts("drawn", "/artifacts/filter")["asset"]
+    version, *_ = artifacts("drawn", "/artifacts/filter")["asset"]
     seen = drawn_in_browser(server, version, place / "page.png")
     assert [shown["name"] for shown in seen["pictures"]] == [*TITLES, *["Losses of the fake"] * LOSSES]
     screen = np.asarray(Image.open(place / "page.png").convert("RGB")).astype(int)
