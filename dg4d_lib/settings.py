@@ -101,10 +101,11 @@ class LearnedPriorSettings(Settings):
         0.5, ge=0, le=10, description="factor on the guidance loss; a smaller one leaves the input view sharper"
     )
     contrast: float = Field(
-        1.2, ge=0.25, le=16, description="factor on the log-odds of matter; a larger one gives sharper unseen sides"
-    )
-    level: float = Field(
-        0.35, ge=0.05, le=0.95, description="probability of matter on the surface that the static fit starts from"
+        3.0,
+        ge=0.25,
+        le=16,
+        description="factor on the log-odds of matter, with as much matter on every ray; a larger one gives sharper "
+        "unseen sides",
     )
 
 
@@ -197,7 +198,13 @@ class SurfaceStartSettings(Settings):
     """Points on the surface of the prior, predicted or inflated from the picture (ours)."""
 
     kind: Literal["surface"] = "surface"
-    points: int = Field(5000, ge=16, le=500000, description="initial number of Gaussians")
+    points: int = Field(
+        0,
+        ge=0,
+        le=500000,
+        description="initial number of Gaussians; 0: 8,000 on a surface that the shape network predicts, which is "
+        "larger, else 5,000",
+    )
 
 
 class LgmStartSettings(Settings):

@@ -54,6 +54,7 @@ CHANGED_KNOBS = {  # old name: new name, empty if the value is fixed now; remove
     },
     "prior.turn_deg": "subject.turn_deg",
     "prior.coverage_weight": "",
+    "prior.level": "",
     **{
         f"{stage}.{old}": f"{stage}.{new}"
         for stage in ("static", "motion")
@@ -251,6 +252,7 @@ PREVIEW = revise(
     PipelineSettings(),
     {
         "subject.size": 256,
+        "prior.kind": "learned",
         "static.iterations": 250,
         "static.views": 4,
         "static.resolution_schedule": PREVIEW_SCHEDULE,
@@ -262,6 +264,7 @@ PREVIEW = revise(
         "motion.iterations": 250,
         "motion.views": 1,
         "motion.frames_per_iteration": 12,
+        "motion.fine_tune": True,
         "motion.plane_lr": 0.0256,
         "motion.network_lr": 0.00256,
         "motion.rigidity_weight": 1000.0,

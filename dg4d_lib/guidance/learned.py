@@ -14,9 +14,9 @@ from dg4d_lib.settings import LearnedPriorSettings
 from dg4d_lib.shape_prior.expected import expected_volume
 from dg4d_lib.shape_prior.field import ShapeField, ShapeFields
 from dg4d_lib.shape_prior.frustum import SIZE
-from dg4d_lib.shape_prior.level_set import level_surface
 from dg4d_lib.shape_prior.network import ShapePriorNetwork
 from dg4d_lib.shape_prior.raymarch import ShapeVolume, render_volumes
+from dg4d_lib.shape_prior.surface import decided_surface
 
 COARSER = 2  # times fewer pixels of a side than the camera has: expected views are soft
 
@@ -36,7 +36,7 @@ class LearnedShapes:
         Args:
             network: of the shape prior.
             cutouts: one per frame: square, straight alpha, color and alpha in [0, 1].
-            settings: contrast of the views, level of the surface.
+            settings: contrast of the views.
             turn_deg: hint at the turn of the subject about the vertical; it decides where the network is unsure.
         """
         self._fields = ShapeFields(network, cutouts, turn_deg)
@@ -56,7 +56,7 @@ class LearnedShapes:
         Raises:
             BadInput: there is no such frame, or its picture shows no subject.
         """
-        return level_surface(self._field(frame), self._settings.level)
+        return decided_surface(self._field(frame))
 
     def clean(self, views: Sequence[GuidanceView]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
         """Return the expected color over white and the expected alpha, in [0, 1].
