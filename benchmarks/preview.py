@@ -2,9 +2,9 @@
 
 Run with `python -m benchmarks.preview examples/newt.png` (`--before CHECKOUT`, `--turns 1`, `--set KNOB=VALUE`, `--json
 FILE` keeps the rows). `after` is `dg4d make` of this code. `before` is that of another checkout of the project, or
-without `--before` this code with the settings of the fits that do not save time (`WITHOUT`). Each starts with a small
-conversion that compiles the kernels; then every turn converts the picture in a new home folder, from the command without
-a running server to the package. Wall time is reported, so run nothing else; on a busy machine the CPU seconds say more.
+without `--before` this code with the settings of the fits that do not save time (`WITHOUT`). Each first makes a small
+asset, which compiles the kernels; then every turn converts the picture in a new home folder, from the command without a
+running server to the package. Wall time is reported, so run nothing else; on a busy machine the CPU seconds say more.
 """
 
 import json

@@ -170,10 +170,11 @@ def test_splats_look_as_our_rasterizer_draws_them(tried: Try) -> None:
 def test_splats_without_a_mesh_stand_still_and_can_be_turned(tried: Try) -> None:
     cloud = splats()
     still = replace(cloud, means=cloud.means[:1], log_scales=cloud.log_scales[:1], quats=cloud.quats[:1])
-    page = tried(None, still, shots=(("splats", 0.0),), deeds=[["drag", 120, 40]])
-    ready, turned = page.said["states"][0], page.said["states"][-1]
+    page = tried(None, still, shots=(("splats", 0.0),), deeds=[["drag", 120, 40], ["press", "r"]])
+    ready = page.said["states"][0]
     assert (ready["modes"], ready["frames"], ready["playing"]) == (["splats"], 1, False)
-    assert page.said["drawn"][0] != page.said["drawn"][-1] and turned["shown"] == "splats"
+    first, turned, reset = page.said["drawn"]
+    assert turned != first == reset
     drawn = get_rasterizer("cpu")(still.at(0), [page.camera()], torch.ones(3))
     assert psnr(over_white(page.pictures["splats", 0.0]), drawn.color[0].numpy()) > 35
 
