@@ -26,7 +26,7 @@ class KeptViews:
         """
         new = list(dict.fromkeys(view for view in views if view not in self._kept))
         if new:
-            both = torch.cat(self._draw(new), -1).half()
-            self._kept.update(zip(new, both.clone().unbind(), strict=True))
-        both = torch.stack([self._kept[view] for view in views]).float()
+            both = torch.cat(self._draw(new), -1).movedim(-1, 1)  # channels first, as renderings are stored
+            self._kept.update((view, picture.half()) for view, picture in zip(new, both.contiguous(), strict=True))
+        both = torch.stack([self._kept[view] for view in views]).float().movedim(1, -1)
         return both[..., :3], both[..., 3:]
