@@ -231,7 +231,8 @@ class FitSettings(Settings):
     )
     reference_size: int = Field(256, ge=32, le=1024, description="pixels of the reference view")
     reference_schedule: tuple[ResolutionStage, ...] = Field(
-        (), description="pixels of the reference view by progress; later, and where it is empty, reference_size (ours)"
+        (),
+        description="pixels of the reference view by progress, at most reference_size, which follows (ours)",
     )
     viewpoints: int = Field(
         0,

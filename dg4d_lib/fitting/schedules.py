@@ -22,6 +22,6 @@ def resolution_at(schedule: Sequence[ResolutionStage], progress: float) -> int:
 
 
 def reference_size_at(settings: FitSettings, progress: float) -> int:
-    """Return the pixels of the reference view."""
-    stages = settings.reference_schedule
-    return next((stage.size for stage in stages if progress < stage.until), settings.reference_size)
+    """Return the pixels of the reference view: those of its schedule, but at most its full size."""
+    full = settings.reference_size
+    return min(full, next((stage.size for stage in settings.reference_schedule if progress < stage.until), full))

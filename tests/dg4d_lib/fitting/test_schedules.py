@@ -20,3 +20,5 @@ def test_the_reference_view_grows_to_its_full_size():
     assert reference_size_at(MotionSettings(), 0.1) == 256
     settings = MotionSettings(reference_schedule=(ResolutionStage(until=0.5, size=128),))
     assert [reference_size_at(settings, progress) for progress in (0.0, 0.49, 0.5, 1.0)] == [128, 128, 256, 256]
+    small = settings.model_copy(update={"reference_size": 48})
+    assert [reference_size_at(small, progress) for progress in (0.0, 1.0)] == [48, 48]
