@@ -1,7 +1,10 @@
 """Step that fits static 3D Gaussians to one cut-out picture."""
 
+from dataclasses import replace
+
 import torch
 
+from dg4d_lib.assets.formats.web_splats import write_web_splats
 from dg4d_lib.fitting.static import fit_gaussians
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import blob, on_surface
@@ -61,9 +64,17 @@ def run(job: Job) -> StepReport:
     report = chosen.report(f"{backend} rasterizer")
     report = reconstruction.add_to(report) if reconstruction else report
     write_ply(job.outputs["gaussians"], gaussians)
+    job.outputs["first_look"].write_bytes(write_web_splats(one_state(gaussians), fps=1))
     curves.write(job.outputs["curves"], "static fit", report.notes)
     write_png(job.outputs["picture"], render_turnaround(gaussians, rasterize))
     return report
+
+
+def one_state(gaussians: Gaussians) -> Gaussians:
+    """Return a batch of one state."""
+    return replace(
+        gaussians, means=gaussians.means[None], log_scales=gaussians.log_scales[None], quats=gaussians.quats[None]
+    )
 
 
 def fine_tuning_settings(static: StaticSettings) -> StaticSettings:

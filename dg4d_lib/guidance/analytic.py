@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import mse_loss
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.noise_schedule import alphas_cumprod
@@ -56,13 +57,9 @@ class AnalyticPrior:
         """Return the weighted distance of the renders from the known images."""
         timestep = self.schedule.timestep(progress, generator)
         alphabar = float(alphas_cumprod()[timestep])
-        clean = self._encode(*self.clean(views)).to(images.device)
+        color, clean_alpha = (picture.to(images.device) for picture in self.clean(views))
         pixels = 3 * images.shape[1] * images.shape[2]
         strength = 0.5 * (alphabar * (1 - alphabar)) ** 0.5
-        loss = strength * (self._encode(images, alpha) - clean).square().sum() / len(images)
-        return loss * (self.weight * LATENT_NUMBERS / pixels)
-
-    def _encode(self, images: Float[Tensor, "b h w 3"], alpha: Float[Tensor, "b h w 1"]) -> Float[Tensor, "b c h w"]:
-        """Return pixels as they are diffused: color and alpha in [-1, 1]."""
-        channels = [2 * images - 1, 2 * alpha - 1]
-        return torch.cat([channel.permute(0, 3, 1, 2) for channel in channels], 1)
+        error = mse_loss(images, color, reduction="sum") + mse_loss(alpha, clean_alpha, reduction="sum")
+        # pixels are diffused as 2 x - 1, so squares are four times those of color and alpha in [0, 1]
+        return error * (4 * strength * self.weight * LATENT_NUMBERS / pixels / len(images))

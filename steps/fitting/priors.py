@@ -8,17 +8,20 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
+from dg4d_lib.cameras.viewpoints import spread_orbit
 from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.diffusion.components import default_device
 from dg4d_lib.diffusion.depth import DepthEstimator
 from dg4d_lib.diffusion.pipelines import is_flow_matching
 from dg4d_lib.errors import BadInput
+from dg4d_lib.fitting.static import RADIUS_JITTER
 from dg4d_lib.guidance.analytic import AnalyticPrior
 from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.geometric import InflatedSurfaces
 from dg4d_lib.guidance.imagedream import ImageDream, ImageDreamPrior
 from dg4d_lib.guidance.interface import GuidancePrior, SubjectShapes
+from dg4d_lib.guidance.kept_views import KeptViews
 from dg4d_lib.guidance.known import KnownShapes
 from dg4d_lib.guidance.learned import LearnedShapes
 from dg4d_lib.guidance.oracle import Bank, perturb
@@ -31,6 +34,7 @@ from dg4d_lib.settings import (
     LearnedPriorSettings,
     OraclePriorSettings,
     PriorSettings,
+    StaticSettings,
     Zero123PriorSettings,
 )
 from dg4d_lib.shape_prior import packaged
@@ -114,14 +118,17 @@ def make_prior(
         case GeometricPriorSettings() | LearnedPriorSettings():
             shapes = subject_shapes(settings, cutouts, turn_deg, sides, moved)
             note, weight, opened = GEOMETRIC_NOTE, 1.0, None
+            clean, viewpoints = shapes.clean, None
+            if stage.viewpoints:
+                clean, viewpoints = KeptViews(shapes.clean).clean, kept_viewpoints(stage)
             if isinstance(shapes, KnownShapes):
-                prior = AnalyticPrior(shapes.clean, noise, frames=None if moved else shapes.frames)
+                prior = AnalyticPrior(clean, noise, viewpoints, None if moved else shapes.frames)
                 return LoadedPrior(prior, known_note(sides), shapes=shapes)
             if isinstance(settings, LearnedPriorSettings):
                 note, weight = LEARNED_NOTE, settings.weight
             elif settings.depth_weights:
                 note, opened = f"{DEPTH_NOTE} {settings.depth_weights}", open_weights(settings.depth_weights)
-            return LoadedPrior(AnalyticPrior(shapes.clean, noise, weight=weight), note, opened, shapes=shapes)
+            return LoadedPrior(AnalyticPrior(clean, noise, viewpoints, weight=weight), note, opened, shapes=shapes)
         case OraclePriorSettings():
             if bank is None:
                 raise BadInput("prior.kind = oracle needs true views: give --bank FOLDER (with a bank.json)")
@@ -170,6 +177,16 @@ def subject_shapes(
         return shapes
     frames = [frame for frame in sides.frames if frame < len(cutouts)]
     return KnownShapes(shapes, {frame: [known_view(cutouts[frame]), *known_views(sides, frame)] for frame in frames})
+
+
+def kept_viewpoints(stage: FitSettings) -> tuple[OrbitCamera, ...]:
+    """Return the cameras that random views of a stage are drawn from, over the ranges of all its random views."""
+    jitter = RADIUS_JITTER if isinstance(stage, StaticSettings) else 0.0
+    return spread_orbit(
+        stage.viewpoints,
+        elevation_deg=(-stage.elevation_deg, stage.elevation_deg),
+        radius=(RADIUS - jitter, RADIUS + jitter),
+    )
 
 
 def known_views(bank: Bank, frame: int = 0) -> list[KnownView]:
