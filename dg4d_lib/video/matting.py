@@ -170,7 +170,7 @@ def _by_both(
     known = {i: network.probability(frames[i]) for i in checked}
     second = resize_planes(torch.stack(list(known.values()))[None], masks.shape[1:])[0]
     agreement = min(overlap(masks[i] > 0.5, other > 0.5) for i, other in zip(checked, second, strict=True))
-    if agreement >= AGREED and backdrop.is_uniform:
+    if agreement >= AGREED and (backdrop.is_uniform or len(frames) > 1):  # the network on all frames would take long
         return _Segmentation(masks, _name_of(backdrop), agreement, True, is_exact=True)
     touched = border_contact(second > 0.5)
     if agreement < AGREED and touched > border_contact(masks[checked] > 0.5) + BORDER_MARGIN:

@@ -2,13 +2,14 @@ import numpy as np
 import pytest
 import torch
 from scipy import ndimage
+from scipy.stats import multivariate_normal
 from skimage import data
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.video.backdrop import fit_backdrop
-from dg4d_lib.video.color_models import fit_mixture
-from dg4d_lib.video.matting import Matte, matte, matte_from_first_alpha
+from dg4d_lib.video.color_models import MIN_VARIANCE, fit_mixture
+from dg4d_lib.video.matting import Matte, _closer, matte, matte_from_first_alpha
 from dg4d_lib.video.u2netp import packaged_network
 
 SIZE = 160
@@ -244,6 +245,55 @@ def test_a_network_that_takes_the_border_for_the_subject_loses_to_a_plain_backdr
     assert iou(result.frames[0, ..., 3], truth) > 0.95
 
 
+def test_what_the_network_misses_before_an_even_backdrop_is_kept():
+    """The network knows the upper half; the backdrop's color tells the rest."""
+    truth, picture = ragged(), over(ragged(), texture(), gradient())
+    half = coarse(truth)
+    half[SIZE // 2 :] = 0.02
+    result = matte(picture[None], "auto", lambda: Answering(half, picture))
+    assert result.agreement < 0.7
+    assert iou(result.frames[0, ..., 3], truth) > 0.95
+
+
+def test_spots_of_a_backdrop_that_is_even_along_the_border_are_not_kept():
+    truth, back = ragged(), gradient()
+    for row, column in ((14, 20), (14, 120), (136, 20), (136, 130)):
+        back[row : row + 12, column : column + 12] = torch.tensor([0.2, 0.3, 0.1])
+    picture = over(truth, texture(), back)
+    half = coarse(truth)
+    half[SIZE // 2 :] = 0.02
+    alpha = matte(picture[None], "auto", lambda: Answering(half, picture)).frames[0, ..., 3]
+    assert alpha[14:26, 20:32].max() < 0.1 and alpha[136:148, 130:142].max() < 0.1
+
+
+def test_a_second_look_from_close_finds_what_is_small():
+    """Answers have 32 cells on a side, whatever the picture shows."""
+    truth = torch.zeros(SIZE, SIZE)
+    small = ragged()[::3, ::3]
+    truth[60 : 60 + len(small), 20 : 20 + small.shape[1]] = small
+    picture = over(truth, orange(), busy()).clamp(0, 1)
+
+    class Blocks(Answering):
+        def probability(self, picture: Tensor) -> Tensor:
+            known = super().probability(picture)[None, None]
+            cells = torch.nn.functional.interpolate(known, (32, 32), mode="area")
+            return torch.nn.functional.interpolate(cells, known.shape[2:], mode="bilinear")[0, 0].clamp(0, 1)
+
+    network = Blocks(truth, picture)
+    far, closer = network.probability(picture), _closer(picture, network.probability(picture), network)
+    errors = [float((answer - truth).abs().mean()) for answer in (far, closer)]
+    assert errors[1] < 0.6 * errors[0]
+
+
+def test_a_thing_of_the_subject_s_colors_that_the_network_does_not_see_is_dropped():
+    truth, front = ragged(), orange()
+    picture = over(truth, front, busy()).clamp(0, 1)
+    picture[4:20, 140:156] = front[4:20, 140:156]
+    alpha = matte(picture[None], "network", lambda: Answering(coarse(truth), picture)).frames[0, ..., 3]
+    assert alpha[4:20, 140:156].max() < 0.1
+    assert iou(alpha, truth) > 0.95
+
+
 def test_no_network_is_loaded_if_the_backdrop_is_asked_for():
     def refuse() -> Answering:
         raise AssertionError("loaded")
@@ -307,6 +357,13 @@ def test_a_mixture_finds_its_clusters():
     means = fit_mixture(colors, np.ones(len(colors))).means
     gaps = np.linalg.norm(means[:, None] - centers, axis=2).min(0)
     assert gaps.max() < 1
+
+
+def test_the_density_of_a_mixture_of_one_cluster_is_that_of_a_gaussian():
+    colors = np.random.default_rng(1).multivariate_normal((40, 10, -5), [(30, 5, 0), (5, 20, 3), (0, 3, 9)], 4000)
+    found = fit_mixture(colors, np.ones(len(colors))).log_density(colors)
+    spread = np.cov(colors.T) + MIN_VARIANCE * np.eye(3)
+    assert abs(found - multivariate_normal(colors.mean(0), spread).logpdf(colors)).mean() < 0.15
 
 
 def test_what_is_known_of_the_first_frame_steadies_the_rest():
