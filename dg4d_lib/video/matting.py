@@ -41,7 +41,7 @@ ROUNDS_SIDES = (128, 128, 128, REFINED_SIDE)  # longest sides of alternations of
 CROP_MARGIN = 0.12  # of the second look around the subject, as a share of its longest side
 CROP_SURE = 0.3  # probability from which a pixel counts for the crop
 FUSED = 0.9  # probability of pixels that differ from an even backdrop
-CLEAN_SHARE = 0.98  # minimum share of the border that agrees with the model of an even backdrop
+CLEAN_SHARE = 0.98  # minimum share of the border that an even backdrop and the subject explain
 ISLANDS = 0.05  # maximum area of what differs from an even backdrop apart from the subject, relative to the subject
 FILTER_RADIUS = 3 / 256  # of the guided filter, as a share of the longest side
 FILTER_EPS = 1e-3  # color variance below which the guided filter smooths
@@ -176,9 +176,9 @@ def _by_both(
     if agreement < AGREED and touched > border_contact(masks[checked] > 0.5) + BORDER_MARGIN:
         return _Segmentation(masks, _name_of(backdrop), agreement, True)
     found = _by_network(frames, network, known)
-    clean = backdrop.is_uniform and backdrop.share >= CLEAN_SHARE
-    subject = _subject_before(masks, found.probability) if clean else None
-    if subject is None or border_contact(subject) > touched + BORDER_MARGIN:
+    subject = _subject_before(masks, found.probability) if backdrop.is_uniform else None
+    contact = 0.0 if subject is None else border_contact(subject)
+    if subject is None or backdrop.share + contact < CLEAN_SHARE or contact > touched + 2 * BORDER_MARGIN:
         return found
     fused = torch.maximum(found.probability, FUSED * subject.float())
     return _Segmentation(fused, "network", min(agreement, found.agreement or 0.0), True)

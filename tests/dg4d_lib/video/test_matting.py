@@ -255,6 +255,18 @@ def test_what_the_network_misses_before_an_even_backdrop_is_kept():
     assert iou(result.frames[0, ..., 3], truth) > 0.95
 
 
+def test_a_pale_drawing_keeps_the_body_that_the_network_does_not_see():
+    rows, columns = np.mgrid[:SIZE, :SIZE]
+    head, body = (np.hypot(rows - row, columns - 80) - radius for row, radius in ((45, 25), (105, 38)))
+    truth = torch.from_numpy((head < 0) | (body < 0)).float()
+    line = torch.from_numpy((abs(head + 2) < 2) | (abs(body + 2) < 2)).float()
+    pale = over(truth, torch.full((SIZE, SIZE, 3), 0.85), white())
+    picture = over(line, torch.full((SIZE, SIZE, 3), 0.2), pale)
+    found = coarse(torch.from_numpy(head < 0).float())
+    result = matte(picture[None], "auto", lambda: Answering(found, picture))
+    assert iou(result.frames[0, ..., 3], truth) > 0.95
+
+
 def test_spots_of_a_backdrop_that_is_even_along_the_border_are_not_kept():
     truth, back = ragged(), gradient()
     for row, column in ((14, 20), (14, 120), (136, 20), (136, 130)):
