@@ -35,9 +35,11 @@ PART = 0.02  # minimum area of a part relative to the largest one; smaller parts
 AGREED = 0.9  # overlap (IoU) from which backdrop and network are taken to have found the same subject
 BAND = 2  # half of the band along an outline before a plain backdrop, pixels of the segmentation
 BORDER_MARGIN = 0.02  # share of the border by which the network may touch more of it and still be preferred
-SURE = 0.07  # distance of probabilities from 0 and 1 that log odds are bounded by; networks are sure where they err
+TELLING = 0.92  # share of subject and background, on average, that their colors tell apart where colors are trusted
+SURE = {True: 0.07, False: 0.02}  # bound of the segmentation's log odds, as a probability, by trust in colors
 COLOR_SHARE = 0.5  # weight of the color models in the log odds; the rest is the segmentation's
-ROUNDS_SIDES = (128, 128, 128, REFINED_SIDE)  # longest sides of alternations of color models and segmentation, pixels
+COLORS_SIDE = 128  # longest side for color models in all rounds but the last, pixels
+ROUNDS = {True: 4, False: 2}  # alternations of color models and segmentation, as in GrabCut, by trust in colors
 CROP_MARGIN = 0.12  # of the second look around the subject, as a share of its longest side
 CROP_SURE = 0.3  # probability from which a pixel counts for the crop
 FUSED = 0.9  # probability of pixels that differ from an even backdrop
@@ -263,14 +265,16 @@ def _closer(
 
 def _refine(frames: Float[Tensor, "t h w 3"], probability: Float[Tensor, "t h2 w2"]) -> Float[Tensor, "t h w"]:
     """Refine a segmentation by color models and by the edges of the frames, up to their full size."""
-    current = probability
-    for round_, side in enumerate(ROUNDS_SIDES, 1):
+    current, trusted = probability, _colors_tell(frames, probability)
+    sure = SURE[trusted]
+    for left in reversed(range(ROUNDS[trusted])):
+        side = COLORS_SIDE if left else REFINED_SIDE
         size = _reduced(frames, side)
         lab, small = _lab(frames, side, blur=0), _resized(frames, torch.empty(0, *size)).cpu().numpy()
-        prior, estimate = (resize_planes(each[None], size)[0].double().numpy() for each in (probability, current))
-        odds = foreground_log_odds(lab.reshape(-1, 3).astype(np.float64), estimate.ravel().clip(0, 1))
-        mixed = expit((1 - COLOR_SHARE) * logit(prior.clip(SURE, 1 - SURE)) + COLOR_SHARE * odds.reshape(prior.shape))
-        targets = frames.cpu() if round_ == len(ROUNDS_SIDES) else torch.from_numpy(small)
+        prior = resize_planes(probability[None], size)[0].double().numpy()
+        odds = _color_odds(lab, resize_planes(current[None], size)[0])
+        mixed = expit((1 - COLOR_SHARE) * logit(prior.clip(sure, 1 - sure)) + COLOR_SHARE * odds)
+        targets = torch.from_numpy(small) if left else frames.cpu()
         radius = max(2, round(FILTER_RADIUS * max(size)))
         filtered = [
             guide_to_edges(values, guide, target, radius, FILTER_EPS)
@@ -283,6 +287,22 @@ def _refine(frames: Float[Tensor, "t h w 3"], probability: Float[Tensor, "t h2 w
     reach = 2 * max(2, round(FILTER_RADIUS * max(alpha.shape[1:])))
     whole = [_without_false_holes(a.numpy(), p.cpu().numpy() > 0.5, reach) for a, p in zip(alpha, large, strict=True)]
     return torch.from_numpy(np.stack(whole)).to(frames)
+
+
+def _colors_tell(frames: Float[Tensor, "t h w 3"], probability: Float[Tensor, "t h2 w2"]) -> bool:
+    """Return True if colors tell the segmented subject from its background.
+
+    Where they do not, alternating with them drifts away from the segmentation.
+    """
+    found = resize_planes(probability[None], _reduced(frames, COLORS_SIDE))[0].double().numpy().clip(0, 1)
+    by_color = expit(_color_odds(_lab(frames, COLORS_SIDE, blur=0), torch.from_numpy(found)))
+    shares = (float(np.average(one, weights=w + 1e-9)) for one, w in ((by_color, found), (1 - by_color, 1 - found)))
+    return sum(shares) / 2 >= TELLING
+
+
+def _color_odds(lab: Float[ndarray, "t h w 3"], estimate: Float[Tensor, "t h w"]) -> Float[ndarray, "t h w"]:
+    colors, likely = lab.reshape(-1, 3).astype(np.float64), estimate.double().numpy().ravel().clip(0, 1)
+    return foreground_log_odds(colors, likely).reshape(estimate.shape)
 
 
 def _without_false_holes(
