@@ -7,7 +7,7 @@ The drawn noise cancels: with x_t = sqrt(alphabar) z + sqrt(1 - alphabar) e, the
 (1 - alphabar) (noise_pred - e) = sqrt(alphabar (1 - alphabar)) (z - z0). So no noise is drawn here.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from jaxtyping import Float
@@ -32,6 +32,7 @@ class AnalyticPrior:
         viewpoints: the only cameras `clean` knows; None is all.
         frames: the only frames `clean` knows; None is all.
         weight: factor on the loss.
+        weights: factor in place of `weight`, by frame.
     """
 
     def __init__(
@@ -41,8 +42,9 @@ class AnalyticPrior:
         viewpoints: tuple[OrbitCamera, ...] | None = None,
         frames: tuple[int, ...] | None = None,
         weight: float = 1.0,
+        weights: Mapping[int, float] | None = None,
     ) -> None:
-        self.clean, self.schedule, self.weight = clean, schedule, weight
+        self.clean, self.schedule, self.weight, self.weights = clean, schedule, weight, weights or {}
         self.viewpoints, self.frames = viewpoints, frames
 
     def loss(
@@ -59,8 +61,9 @@ class AnalyticPrior:
         clean = self._encode(*self.clean(views)).to(images.device)
         pixels = 3 * images.shape[1] * images.shape[2]
         strength = 0.5 * (alphabar * (1 - alphabar)) ** 0.5
-        loss = strength * (self._encode(images, alpha) - clean).square().sum() / len(images)
-        return loss * (self.weight * LATENT_NUMBERS / pixels)
+        weights = torch.tensor([self.weights.get(view.frame, self.weight) for view in views], device=images.device)
+        squares = (self._encode(images, alpha) - clean).square().sum((1, 2, 3))
+        return (weights * squares).mean() * (strength * LATENT_NUMBERS / pixels)
 
     def _encode(self, images: Float[Tensor, "b h w 3"], alpha: Float[Tensor, "b h w 1"]) -> Float[Tensor, "b c h w"]:
         """Return pixels as they are diffused: color and alpha in [-1, 1]."""

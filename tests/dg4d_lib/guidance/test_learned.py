@@ -9,6 +9,7 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.interface import GuidanceView, SubjectShapes
 from dg4d_lib.guidance.learned import LearnedShapes
 from dg4d_lib.settings import LearnedPriorSettings
+from dg4d_lib.shape_prior.field import ShapeFields
 
 SIZE = 48
 SETTINGS = LearnedPriorSettings()
@@ -21,7 +22,7 @@ def disc(x: float) -> torch.Tensor:
 
 
 def shapes(*places: float) -> SubjectShapes:
-    return LearnedShapes(tiny_network(), [disc(x) for x in places], SETTINGS)
+    return LearnedShapes(ShapeFields(tiny_network(), [disc(x) for x in places]), SETTINGS)
 
 
 def test_the_input_view_of_a_frame_shows_that_frame_over_white():
