@@ -3,6 +3,7 @@
     python -m benchmarks.prior FOLDER --frames 0 16 --sheet sheet.png
     python -m benchmarks.prior FOLDER --video
     python -m benchmarks.prior --made-up 60
+    python -m benchmarks.prior --pictures examples/newt.png examples/beetle.png --sheet sheet.png
 
 FOLDER has a folder per object with cut-outs `input/NNN.png` and `view_AZIMUTH/NNN.png`, all taken at elevation 0.
 """
@@ -35,7 +36,10 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.images import over_white, resize
+from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.shape_prior import packaged
+from dg4d_lib.video.subject import prepare_subject
+from steps.artifacts.media import read_png
 from steps.fitting.priors import subject_shapes
 from steps.profiles import PREVIEW, PipelineSettings, revise
 from training.shape_prior.samples import make_views
@@ -43,6 +47,7 @@ from training.shape_prior.samples import make_views
 MADE_UP_SEED = 991  # no training run uses it
 AZIMUTHS_DEG = (-75.0, 15.0, 105.0, 195.0)
 KINDS = ("geometric", "learned")
+SHEET, SHEET_ELEVATION_DEG = 256, 10.0  # pixels of a panel and elevation of the cameras in a sheet of surfaces
 
 
 def made_up_subjects(count: int) -> Iterator[Subject]:
@@ -73,6 +78,25 @@ def score_prior(subject: Subject, settings: PipelineSettings, frames: Sequence[i
     return mean(rows), torch.cat(strip, 1)
 
 
+def surface_strip(cutout: Tensor, settings: PipelineSettings) -> Tensor:
+    """Return the picture and the surface of frame 0 from eight sides, over white."""
+    shapes = subject_shapes(settings.prior, [cutout], settings.subject.turn_deg)
+    cameras = [OrbitCamera(SHEET_ELEVATION_DEG, azimuth, width=SHEET, height=SHEET) for azimuth in range(0, 360, 45)]
+    color, alpha = render_surface(shapes.surface(0), cameras)
+    return torch.cat([over_white(resize(cutout[None], (SHEET, SHEET)))[0], *(color * alpha + 1 - alpha)], 1)
+
+
+def compare_surfaces(pictures: Sequence[Path], kinds: Sequence[str], values: dict[str, object], sheet: Path) -> None:
+    """Write the surfaces that priors guess for pictures: a row per picture and kind."""
+    strips = []
+    for path in pictures:
+        for kind in kinds:
+            settings = revise(PREVIEW, {"prior.kind": kind, **values})
+            cutout = prepare_subject(read_png(path)[None], False, settings.subject).frames[0]
+            strips.append(surface_strip(cutout, settings))
+    write_sheet(sheet, strips)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Compare priors on objects whose views are known."""
     parser = parser_of(__doc__)
@@ -84,15 +108,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--video", action="store_true", help="fit Gaussians and motion with the profile preview")
     parser.add_argument("--weights", type=Path, help="network instead of the shipped one")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting, for all kinds")
+    parser.add_argument("--pictures", type=Path, nargs="+", help="PNG cut-outs whose guessed surfaces are drawn")
     parser.add_argument("--sheet", type=Path, help="picture: input, truth, and the views of every kind")
     given = parser.parse_args(arguments)
-    if (given.objects is None) == (given.made_up == 0):
-        parser.error("give a folder of objects or --made-up N")
+    if sum((given.objects is not None, given.made_up > 0, given.pictures is not None)) != 1:
+        parser.error("give a folder of objects, --made-up N or --pictures FILE ...")
+    if given.pictures and not given.sheet:
+        parser.error("--pictures needs --sheet FILE")
     if given.weights:
         packaged.WEIGHTS = given.weights
         packaged.SHA256 = hashlib.sha256(given.weights.read_bytes()).hexdigest()
     changes = dict(pair.split("=", 1) for pair in given.set)
     values = {key: json.loads(value) for key, value in changes.items()}
+    if given.pictures:
+        compare_surfaces(given.pictures, given.kinds, values, given.sheet)
+        return
     subjects = made_up_subjects(given.made_up) if given.made_up else read_subjects(given.objects, given.only)
     found: dict[str, dict[str, Figures]] = {}
     strips = []

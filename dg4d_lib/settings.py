@@ -101,10 +101,11 @@ class LearnedPriorSettings(Settings):
         0.5, ge=0, le=10, description="factor on the guidance loss; a smaller one leaves the input view sharper"
     )
     contrast: float = Field(
-        1.2, ge=0.25, le=16, description="factor on the log-odds of matter; a larger one gives sharper unseen sides"
-    )
-    level: float = Field(
-        0.35, ge=0.05, le=0.95, description="probability of matter on the surface that the static fit starts from"
+        2.0,
+        ge=0.25,
+        le=16,
+        description="factor on the log-odds of matter, with as much matter on every ray; a larger one gives sharper "
+        "unseen sides",
     )
 
 
@@ -197,7 +198,13 @@ class SurfaceStartSettings(Settings):
     """Points on the surface of the prior, predicted or inflated from the picture (ours)."""
 
     kind: Literal["surface"] = "surface"
-    points: int = Field(5000, ge=16, le=500000, description="initial number of Gaussians")
+    points: int = Field(
+        0,
+        ge=0,
+        le=500000,
+        description="initial number of Gaussians; 0: 8,000 on a surface that the shape network predicts, which is "
+        "larger, else 5,000",
+    )
 
 
 class LgmStartSettings(Settings):
@@ -230,6 +237,17 @@ class FitSettings(Settings):
         RESOLUTION_SCHEDULE, min_length=1, description="pixels of guidance renders by progress of the optimization"
     )
     reference_size: int = Field(256, ge=32, le=1024, description="pixels of the reference view")
+    reference_schedule: tuple[ResolutionStage, ...] = Field(
+        (),
+        description="pixels of the reference view by progress, at most reference_size, which follows (ours)",
+    )
+    viewpoints: int = Field(
+        0,
+        ge=0,
+        le=1024,
+        description="cameras that random views are drawn from, so that a prior with shapes draws each of them once per "
+        "frame; 0: new ones in every iteration (paper), as always for diffusion models",
+    )
     elevation_deg: float = Field(
         30.0, ge=0, le=80, description="random views have elevations within plus and minus this"
     )
@@ -344,6 +362,9 @@ class MotionSettings(FitSettings):
     iterations: int = Field(200, ge=1, le=20000, description="iterations (paper: 200)")
     views: int = Field(4, ge=0, le=64, description="random views per frame and iteration (paper: 4, fast: 1)")
     frames_per_iteration: int = Field(0, ge=0, le=512, description="random frames per iteration; 0: all")
+    guided_frames: int = Field(
+        0, ge=0, le=512, description="those of an iteration's frames that get random views, drawn anew; 0: all (paper)"
+    )
     t_max_start: float = Field(0.5, gt=0.02, le=1, description="T_max at the start of the annealing (paper: 0.5)")
     network_lr: Positive = Field(6.4e-4, description="learning rate of MLPs")
     plane_lr: Positive = Field(6.4e-3, description="learning rate of planes and frame-wise displacements")

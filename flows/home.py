@@ -52,6 +52,11 @@ def cutouts() -> Path:
     return home() / "cutouts"
 
 
+def first_looks() -> Path:
+    """Return the folder of pages that show the static splats of assets whose motion is being fitted."""
+    return home() / "first-looks"
+
+
 def studio() -> Path:
     """Return the folder of the studio page: uploads, and the packages that it asked for."""
     return home() / "studio"

@@ -11,6 +11,7 @@ Artifacts:
   glb         GLB of the model; `moving` has a morph target per frame
   placement   JSON of steps/artifacts/placements.py: similarity from the model to the world
   gaussians   standard 3DGS PLY (float32)
+  splats      web splats of one frame, to be looked at while the motion is fitted
   motion      safetensors; metadata: kind of deformation, its settings and the number of frames
   plan        JSON of steps/artifacts/mesh_plan.py: {"mode": "tracked" or "per_frame", "level": ..., ...}
   tracked     safetensors of a tracked mesh: vertices, faces, uvs, texture (uint8), offsets
@@ -63,6 +64,7 @@ SCORES = _port("scores", "json")
 PACKAGE = _port("package", "zip")
 BANK = _port("bank", "zip")
 VIEWS = _port("views", "zip")
+WEB_SPLATS = _port("splats", "websplats")
 FACTS = _port("facts", "json")
 EITHER_MESH = {"tracked": _optional(TRACKED), "meshes": _optional(MESHES)}
 
@@ -122,7 +124,7 @@ STEPS: dict[str, StepSpec] = {
         _step(
             "fit_gaussians",
             inputs={"subject": PNG, "pose": _optional(POSE), "bank": _optional(BANK), "known_views": _optional(BANK)},
-            outputs={"gaussians": PLY, "curves": CURVES, "picture": PNG},
+            outputs={"gaussians": PLY, "first_look": WEB_SPLATS, "curves": CURVES, "picture": PNG},
             sections=("rasterizer", "subject.turn_deg", "prior", "static"),
             resource="gpu",
             late_imports=("dg4d_lib.rasterizer.cpu", "torch._dynamo"),  # torch's optimizers import the latter

@@ -1,5 +1,7 @@
 """Step that extracts textured meshes from moving Gaussians: one tracked mesh, or a mesh per frame."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -91,13 +93,15 @@ def _tracked(
     frame, level = plan.reference_frame, plan.level
     rest = states.at(frame)
     vertices, faces = _cleaned_surface(rest, level, settings)
-    mesh, sources = _colored(vertices, faces, rest, rasterize, settings)
-    skinned = skin_vertices(vertices, rest, relative_to_frame(displacement, frame))
-    projected = project_to_isosurface(vertices, skinned, faces, states, level, settings)
-    silhouettes = render_silhouettes(states, range(len(projected)), rasterize)
-    registered, _ = register_nonrigid(vertices, projected, faces, states, silhouettes, level, settings)
-    offsets = relax(vertices, registered, faces, silhouettes)
-    ious = silhouette_iou(vertices + offsets, faces, silhouettes)
+    with ThreadPoolExecutor(1) as beside:  # unwrapping keeps one core busy, and tracking needs no texture
+        coloring = beside.submit(_colored, vertices, faces, rest, rasterize, settings)
+        skinned = skin_vertices(vertices, rest, relative_to_frame(displacement, frame))
+        projected = project_to_isosurface(vertices, skinned, faces, states, level, settings)
+        silhouettes = render_silhouettes(states, range(len(projected)), rasterize)
+        registered, _ = register_nonrigid(vertices, projected, faces, states, silhouettes, level, settings)
+        offsets = relax(vertices, registered, faces, silhouettes)
+        ious = silhouette_iou(vertices + offsets, faces, silhouettes)
+        mesh, sources = coloring.result()
     return TrackedMesh(mesh, offsets[:, sources], reference_frame=frame), ious
 
 

@@ -8,6 +8,7 @@ import torch
 from dg4d_lib.cameras.orbit import OrbitCamera
 
 BAKING_ELEVATIONS_DEG = (0.0, -45.0, 45.0)
+PLASTIC = 1.324717957244746  # real root of x^3 = x + 1
 POLE_DEG = 89.9  # elevation of the polar views; at exactly 90 the up vector is undefined
 
 
@@ -37,6 +38,25 @@ def random_orbit(
         for e, a, r in u
     ]
     return [camera for first in firsts for camera in turntable(ring, first)][:count]
+
+
+def spread_orbit(
+    count: int, *, elevation_deg: tuple[float, float], radius: tuple[float, float]
+) -> tuple[OrbitCamera, ...]:
+    """Return cameras that cover the ranges of `random_orbit` evenly.
+
+    Azimuths are at equal steps; elevations and radii follow the additive recurrence of the plastic number, which is
+    even in both together (Roberts 2018).
+    """
+    (low_e, high_e), (low_r, high_r) = elevation_deg, radius
+    return tuple(
+        OrbitCamera(
+            low_e + (high_e - low_e) * ((0.5 + i / PLASTIC) % 1),
+            -180 + 360 * (i + 0.5) / count,
+            low_r + (high_r - low_r) * ((0.5 + i / PLASTIC**2) % 1),
+        )
+        for i in range(count)
+    )
 
 
 def turntable(count: int, camera: OrbitCamera) -> list[OrbitCamera]:

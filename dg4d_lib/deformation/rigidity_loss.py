@@ -34,19 +34,18 @@ def rigidity_loss(moved: Gaussians, indices: Int[Tensor, "n k"], weights: Float[
     steps = len(moved.means) - 1
     if steps < 1:
         return moved.means.new_zeros(())
-    rotations = quat_to_rotmat(moved.quats)
     on_cpu = moved.means.device.type == "cpu" and moved.means.dtype == torch.float32
-    total = (rigidity_sum if on_cpu else rigidity_sum_reference)(moved.means, rotations, indices, weights)
+    total = (rigidity_sum if on_cpu else rigidity_sum_reference)(moved.means, moved.quats, indices, weights)
     return total / (steps * indices.numel())
 
 
 def rigidity_sum_reference(
     means: Float[Tensor, "t n 3"],
-    rotations: Float[Tensor, "t n 3 3"],
+    quats: Float[Tensor, "t n 4"],
     indices: Int[Tensor, "n k"],
     weights: Float[Tensor, "n k"],
 ) -> Float[Tensor, ""]:
     """Return `rigidity_sum` in plain torch: the reference, also used on other devices and precisions."""
     edges = means[:, indices] - means[:, :, None]
-    local = torch.einsum("tnij,tnki->tnkj", rotations, edges)
+    local = torch.einsum("tnij,tnki->tnkj", quat_to_rotmat(quats), edges)
     return (weights * local.diff(dim=0).norm(dim=-1)).sum()

@@ -1,42 +1,48 @@
 """Compiled local rigidity loss and its gradient, in one pass over pairs of neighbors.
 
-Time is the last axis of all buffers, so that the timestamps of a pair are vectorized.
+The lanes of a vector are consecutive timestamps of one Gaussian. Vectors overlap by one timestamp, so that each has the
+transitions between its own lanes and depends on no other.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, no_type_check
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from dg4d_lib.kernels.simd import KERNEL
-from dg4d_lib.kernels.workers import run_parallel, split_range
+from dg4d_lib.kernels.simd import FLOAT, INT, KERNEL, LANES, LONG, SimdBuilder, Value, pointers
+from dg4d_lib.kernels.workers import Scratch, run_parallel, split_range
 
 BLOCKS = 4  # blocks of Gaussians with separate sums; fixed, so that the result does not depend on threads
-TINY = np.float32(1e-20)  # squared distance below which the gradient is zero
+TINY = 1e-20  # squared distance below which the gradient is zero
+_STEPS = LANES - 1  # transitions in a vector
+_FIELDS = 7  # mean and quaternion of a Gaussian
 
 
 def rigidity_sum(
     means: Float[Tensor, "t n 3"],
-    rotations: Float[Tensor, "t n 3 3"],
+    quats: Float[Tensor, "t n 4"],
     indices: Int[Tensor, "n k"],
     weights: Float[Tensor, "n k"],
 ) -> Float[Tensor, ""]:
     """Return the sum over pairs and frame transitions of weighted distances.
 
-    Differentiable once, in means and rotations.
+    Differentiable once, in means and quaternions.
 
     Args:
         means: at two or more timestamps.
-        rotations: rotation matrices.
+        quats: rotations wxyz, of any non-zero norm.
         indices: neighbors of every Gaussian.
         weights: of the pairs.
     """
-    total: Tensor = _RigiditySum.apply(means, rotations, indices, weights)
+    total: Tensor = _RigiditySum.apply(means, quats, indices, weights)
     return total
 
 
@@ -44,78 +50,193 @@ class _RigiditySum(torch.autograd.Function):
     """Autograd function; the forward pass computes the gradient too, and the backward pass scales it."""
 
     @staticmethod
-    def forward(ctx: Any, means: Tensor, rotations: Tensor, indices: Tensor, weights: Tensor) -> Tensor:
-        points = means.detach().permute(1, 2, 0).contiguous().numpy()
-        frames = rotations.detach().permute(1, 2, 3, 0).contiguous().numpy()
-        inputs = (points, frames, indices.numpy(), weights.numpy())
-        parts = split_range(len(points), BLOCKS)
-        sums = np.zeros(len(parts))
-        grad_points = np.zeros((len(parts), *points.shape), np.float32)
-        grad_frames = np.zeros_like(frames)
+    def forward(ctx: Any, means: Tensor, quats: Tensor, indices: Tensor, weights: Tensor) -> Tensor:
+        given = means.detach().contiguous().numpy(), quats.detach().contiguous().numpy()
+        pairs = indices.to(torch.int32).contiguous().numpy(), weights.contiguous().numpy()
+        times, count = means.shape[:2]
+        vectors = -(-(times - 1) // _STEPS)
+        masks = np.zeros((vectors, LANES), np.float32)  # 1 for lanes from which a transition starts
+        masks.reshape(-1)[[step + step // _STEPS for step in range(times - 1)]] = 1
+        scratch, shape = Scratch(), (count, _FIELDS, LANES)
+        state, grad_own = ([scratch.empty(shape) for _ in range(vectors)] for _ in range(2))
+        parts, threads = split_range(count, BLOCKS), torch.get_num_threads()
+        grad_others = [scratch.empty((len(parts), count, 3, LANES)) for _ in range(vectors)]
+        sums = np.zeros((vectors, len(parts)))
         run_parallel(
-            [partial(_pairs, *inputs, grad_points[i], grad_frames, sums[i : i + 1], *p) for i, p in enumerate(parts)]
+            [
+                partial(_gather, *given, state[v], v * _STEPS, *p)
+                for v in range(vectors)
+                for p in split_range(count, threads)
+            ]
         )
-        ctx.gradients = torch.from_numpy(grad_points.sum(0)), torch.from_numpy(grad_frames)
+        run_parallel(
+            [
+                partial(_pairs, state[v], *pairs, masks[v], grad_own[v], grad_others[v][i], sums[v, i : i + 1], *p)
+                for v in range(vectors)
+                for i, p in enumerate(parts)
+            ]
+        )
+        gradients = np.zeros_like(given[0]), np.zeros_like(given[1])
+
+        def scatter(start: int, stop: int) -> None:
+            for v in range(vectors):
+                _scatter(grad_own[v], grad_others[v], *gradients, v * _STEPS, start, stop)
+
+        run_parallel([partial(scatter, *p) for p in split_range(count, threads)])
+        ctx.gradients = tuple(map(torch.from_numpy, gradients))
         return means.new_tensor(sums.sum())
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, incoming: Tensor) -> tuple[Tensor, Tensor, None, None]:
-        points, frames = ctx.gradients
-        return incoming * points.permute(2, 0, 1), incoming * frames.permute(3, 0, 1, 2), None, None
+        grad_means, grad_quats = ctx.gradients
+        return incoming * grad_means, incoming * grad_quats, None, None
 
 
 @njit(**KERNEL)
 @no_type_check
-def _pairs(points, frames, indices, weights, grad_points, grad_frames, total, start, stop):
-    times = points.shape[2]
-    edge, local = np.empty((3, times), np.float32), np.empty((3, times), np.float32)
-    slopes = np.zeros((3, times + 1), np.float32)  # of the transition before a timestamp; zero at both ends
+def _gather(means, quats, state, first, start, stop):
+    """Fill the lanes of Gaussians start..stop from a timestamp on; those after the last timestamp repeat it."""
+    last = len(means) - 1
+    for g in range(start, stop):
+        for lane in range(LANES):
+            time = min(first + lane, last)
+            for axis in range(3):
+                state[g, axis, lane] = means[time, g, axis]
+            for axis in range(4):
+                state[g, 3 + axis, lane] = quats[time, g, axis]
+
+
+@njit(**KERNEL)
+@no_type_check
+def _scatter(grad_own, grad_others, grad_means, grad_quats, first, start, stop):
+    """Add the gradients of the lanes of Gaussians start..stop to those of their timestamps."""
+    lanes = min(LANES, len(grad_means) - first)
+    for g in range(start, stop):
+        for lane in range(lanes):
+            for axis in range(3):
+                total = grad_own[g, axis, lane]
+                for part in range(len(grad_others)):
+                    total += grad_others[part, g, axis, lane]
+                grad_means[first + lane, g, axis] += total
+            for axis in range(4):
+                grad_quats[first + lane, g, axis] += grad_own[g, 3 + axis, lane]
+
+
+@njit(**KERNEL)
+@no_type_check
+def _pairs(state, indices, weights, mask, grad_own, grad_others, total, start, stop):
+    grad_others[:] = 0
     for own in range(start, stop):
-        for k in range(indices.shape[1]):
-            other, weight = indices[own, k], weights[own, k]
-            _to_local(points[own], points[other], frames[own], edge, local)
-            total[0] += weight * _transitions(local, weight, slopes)
-            _backward(frames[own], edge, slopes, grad_points[own], grad_points[other], grad_frames[own])
+        total[0] += _neighborhood(state, indices, weights, mask, grad_own, grad_others, own, indices.shape[1])
 
 
-@njit(**KERNEL)
+@intrinsic
 @no_type_check
-def _to_local(own, other, rotation, edge, local):
-    """Compute the offset of a neighbor in world axes and in the Gaussian's own axes."""
-    for t in range(edge.shape[1]):
-        x, y, z = other[0, t] - own[0, t], other[1, t] - own[1, t], other[2, t] - own[2, t]
-        edge[0, t], edge[1, t], edge[2, t] = x, y, z
-        local[0, t] = rotation[0, 0, t] * x + rotation[1, 0, t] * y + rotation[2, 0, t] * z
-        local[1, t] = rotation[0, 1, t] * x + rotation[1, 1, t] * y + rotation[2, 1, t] * z
-        local[2, t] = rotation[0, 2, t] * x + rotation[1, 2, t] * y + rotation[2, 2, t] * z
+def _neighborhood(typing_context, state, indices, weights, mask, grad_own, grad_others, own, count):
+    """Return the weighted distances of a Gaussian's pairs; store its gradient, add those of its neighbors."""
+    arrays = (state, indices, weights, mask, grad_own, grad_others)
+    signature = types.float32(*arrays, types.int64, types.int64)
+
+    def generate(context, builder, signature, arguments):
+        e = SimdBuilder(builder)
+        data = pointers(context, builder, signature, arguments)
+        own, count = arguments[6:]
+        place = _row(builder, own, _FIELDS)
+        mean, quat = _load(e, data[0], place, 3), _load(e, data[0], _field(builder, place, 3), 4)
+        matrix, unit, inverse_norm = _rotation(e, quat)
+        starts = e.load(data[3], _long(0))
+
+        def pair(k, carried):
+            distance, *sums = carried
+            other = builder.sext(e.load(data[1], k, INT), LONG)
+            weight = e.multiply(starts, e.splat(e.load(data[2], k, FLOAT)))
+            there = _load(e, data[0], _row(builder, other, _FIELDS), 3)
+            edge = [e.subtract(*both) for both in zip(there, mean, strict=True)]
+            local = [_dot(e, column, edge) for column in zip(*matrix, strict=True)]
+            steps = [e.subtract(e.shift(value, 1), value) for value in local]
+            squared = _dot(e, steps, steps)
+            length = e.call("sqrt", squared)
+            moves = e.less(e.constant(TINY), squared)
+            factor = e.select(moves, e.multiply(weight, e.reciprocal(length)), e.constant(0))
+            slopes = [e.multiply(factor, step) for step in steps]
+            pull = [e.subtract(e.shift(slope, -1), slope) for slope in slopes]
+            forces = [_dot(e, row, pull) for row in matrix]
+            for axis, force in enumerate(forces):
+                index = _field(builder, _row(builder, other, 3), axis)
+                e.store(data[5], index, e.add(e.load(data[5], index), force))
+            turned = [e.fma(edge[i], pull[j], sums[3 + 3 * i + j]) for i in range(3) for j in range(3)]
+            own_forces = [e.subtract(total, force) for total, force in zip(sums[:3], forces, strict=True)]
+            return [e.fma(weight, length, distance), *own_forces, *turned]
+
+        first = builder.mul(own, count)
+        distance, *sums = e.loop(first, builder.add(first, count), [e.constant(0)] * 13, pair)
+        for axis, value in enumerate([*sums[:3], *_quat_gradient(e, unit, inverse_norm, sums[3:])]):
+            e.store(data[4], _field(builder, place, axis), value)
+        return e.sum(distance)
+
+    return signature, generate
 
 
-@njit(**KERNEL)
-@no_type_check
-def _transitions(local, weight, slopes):
-    """Return the summed lengths of the transitions; store their weighted directions."""
-    total = np.float32(0)
-    for t in range(local.shape[1] - 1):
-        x, y, z = local[0, t + 1] - local[0, t], local[1, t + 1] - local[1, t], local[2, t + 1] - local[2, t]
-        squared = x * x + y * y + z * z
-        inverse = np.float32(1) / np.sqrt(squared) if squared > TINY else np.float32(0)
-        total += squared * inverse
-        slope = weight * inverse
-        slopes[0, t + 1], slopes[1, t + 1], slopes[2, t + 1] = slope * x, slope * y, slope * z
+def _rotation(e: SimdBuilder, quat: Sequence[Value]) -> tuple[list[list[Value]], list[Value], Value]:
+    """Return the rotation matrix by rows, the unit quaternion, and the inverse norm of the given one."""
+    inverse = e.reciprocal(e.call("sqrt", _dot(e, quat, quat)))
+    w, x, y, z = unit = [e.multiply(value, inverse) for value in quat]
+    one, two = e.constant(1), e.constant(2)
+
+    def twice(a: Value, b: Value, c: Value, d: Value) -> Value:
+        return e.multiply(two, e.fma(a, b, e.multiply(c, d)))
+
+    minus_w = e.negate(w)
+    matrix = [
+        [e.subtract(one, twice(y, y, z, z)), twice(x, y, minus_w, z), twice(x, z, w, y)],
+        [twice(x, y, w, z), e.subtract(one, twice(x, x, z, z)), twice(y, z, minus_w, x)],
+        [twice(x, z, minus_w, y), twice(y, z, w, x), e.subtract(one, twice(x, x, y, y))],
+    ]
+    return matrix, unit, inverse
+
+
+def _quat_gradient(e: SimdBuilder, unit: Sequence[Value], inverse: Value, matrix: Sequence[Value]) -> list[Value]:
+    """Propagate the gradient of a rotation matrix, by rows, to the quaternion of any norm."""
+    w, x, y, z = unit
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrix
+    a, b, c = e.subtract(m21, m12), e.subtract(m02, m20), e.subtract(m10, m01)
+    d, f, g = e.add(m01, m10), e.add(m02, m20), e.add(m12, m21)
+    minus_two = e.constant(-2)
+    diagonals = [e.multiply(minus_two, e.add(*pair)) for pair in ((m11, m22), (m00, m22), (m00, m11))]
+    halves = [
+        _dot(e, (x, y, z), (a, b, c)),
+        _dot(e, (w, x, y, z), (a, diagonals[0], d, f)),
+        _dot(e, (w, x, y, z), (b, d, diagonals[1], g)),
+        _dot(e, (w, x, y, z), (c, f, g, diagonals[2])),
+    ]
+    along = _dot(e, unit, halves)
+    scale = e.multiply(e.constant(2), inverse)
+    return [
+        e.multiply(scale, e.subtract(half, e.multiply(value, along))) for half, value in zip(halves, unit, strict=True)
+    ]
+
+
+def _dot(e: SimdBuilder, first: Sequence[Value], second: Sequence[Value]) -> Value:
+    (a, b), *others = zip(first, second, strict=True)
+    total = e.multiply(a, b)
+    for a, b in others:
+        total = e.fma(a, b, total)
     return total
 
 
-@njit(**KERNEL)
-@no_type_check
-def _backward(rotation, edge, slopes, grad_own, grad_other, grad_rotation):
-    """Add the gradient of one pair."""
-    for t in range(edge.shape[1]):
-        x, y, z = slopes[0, t] - slopes[0, t + 1], slopes[1, t] - slopes[1, t + 1], slopes[2, t] - slopes[2, t + 1]
-        for row in range(3):
-            gradient = rotation[row, 0, t] * x + rotation[row, 1, t] * y + rotation[row, 2, t] * z
-            grad_other[row, t] += gradient
-            grad_own[row, t] -= gradient
-            grad_rotation[row, 0, t] += edge[row, t] * x
-            grad_rotation[row, 1, t] += edge[row, t] * y
-            grad_rotation[row, 2, t] += edge[row, t] * z
+def _load(e: SimdBuilder, array: Value, place: Value, fields: int) -> list[Value]:
+    return [e.load(array, _field(e.builder, place, field)) for field in range(fields)]
+
+
+def _row(builder: Value, gaussian: Value, fields: int) -> Value:
+    """Return the index of the first field of a Gaussian."""
+    return builder.mul(gaussian, _long(fields * LANES))
+
+
+def _field(builder: Value, row: Value, field: int) -> Value:
+    return builder.add(row, _long(field * LANES))
+
+
+def _long(value: int) -> Value:
+    return ir.Constant(LONG, value)

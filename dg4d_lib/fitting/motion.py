@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import torch
 from jaxtyping import Float, Int
@@ -13,7 +14,7 @@ from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.deformation.rigidity_loss import neighborhoods, rigidity_loss
 from dg4d_lib.devices import to_device_async
 from dg4d_lib.fitting.losses import WHITE, check_finite, reference_loss, resize_cutouts
-from dg4d_lib.fitting.schedules import late_decay, log_linear, resolution_at
+from dg4d_lib.fitting.schedules import late_decay, log_linear, reference_size_at, resolution_at
 from dg4d_lib.fitting.static import learning_rates
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.interface import GuidancePrior, GuidanceView, ring_size
@@ -55,10 +56,15 @@ def fit_motion(
     Raises:
         FitDiverged: the loss became non-finite.
     """
-    camera = replace(input_camera or OrbitCamera(), width=settings.reference_size, height=settings.reference_size)
     device = gaussians.means.device
-    references = resize_cutouts(torch.cat([video.frames, video.alpha], -1).to(device), settings.reference_size)
-    color, alpha = (images.permute(0, 3, 1, 2) for images in references)  # indexing keeps channels first in memory
+    cutouts = torch.cat([video.frames, video.alpha], -1).to(device)
+
+    @cache
+    def references(size: int) -> tuple[OrbitCamera, Tensor, Tensor]:
+        """Return camera, color and alpha of the reference view; indexing keeps channels first in memory."""
+        color, alpha = (images.permute(0, 3, 1, 2) for images in resize_cutouts(cutouts, size))
+        return replace(input_camera or OrbitCamera(), width=size, height=size), color, alpha
+
     times = video.times.to(device)
     white = torch.tensor(WHITE, device=device)
     gaussians, groups = gaussians.detach(), parameter_groups(deformation, settings)
@@ -82,6 +88,7 @@ def fit_motion(
         chosen = to_device_async(frames, device)
         moved = deformation.displace(gaussians.means, times[chosen]).apply(gaussians)
 
+        camera, color, alpha = references(reference_size_at(settings, progress))
         rendering = rasterize(moved, [camera] * len(frames), white)
         reference = reference_loss(
             rendering,
@@ -127,9 +134,10 @@ def sample_frames(total: int, count: int, generator: torch.Generator) -> Int[Ten
 def sample_views(
     prior: GuidancePrior, frames: Int[Tensor, " k"], settings: MotionSettings, size: int, generator: torch.Generator
 ) -> tuple[list[GuidanceView], Int[Tensor, " m"]]:
-    """Draw random views of every frame that the prior supports; return them and their rows in `frames`."""
+    """Draw random views of the guided frames that the prior supports; return them and their rows in `frames`."""
     rows = [row for row, f in enumerate(frames.tolist()) if prior.frames is None or f in prior.frames]
-    rows = [row for row in rows for _ in range(settings.views)]
+    guided = sample_frames(len(rows), settings.guided_frames, generator).tolist()
+    rows = [rows[place] for place in guided for _ in range(settings.views)]
     if prior.viewpoints is None:
         elevation = (-settings.elevation_deg, settings.elevation_deg)
         cameras = random_orbit(

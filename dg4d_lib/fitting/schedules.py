@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 
-from dg4d_lib.settings import ResolutionStage
+from dg4d_lib.settings import FitSettings, ResolutionStage
 
 
 def log_linear(start: float, end: float, progress: float) -> float:
@@ -19,3 +19,9 @@ def late_decay(end: float, progress: float) -> float:
 def resolution_at(schedule: Sequence[ResolutionStage], progress: float) -> int:
     """Return the render size in pixels: that of the first stage with `until` above progress, else of the last."""
     return next((stage.size for stage in schedule if progress < stage.until), schedule[-1].size)
+
+
+def reference_size_at(settings: FitSettings, progress: float) -> int:
+    """Return the pixels of the reference view: those of its schedule, but at most its full size."""
+    full = settings.reference_size
+    return min(full, next((stage.size for stage in settings.reference_schedule if progress < stage.until), full))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import torch
 from jaxtyping import Float
@@ -11,7 +12,7 @@ from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.cameras.viewpoints import random_orbit
 from dg4d_lib.devices import to_device_async
 from dg4d_lib.fitting.losses import WHITE, Diverged, check_finite, reference_loss, resize_cutouts
-from dg4d_lib.fitting.schedules import late_decay, log_linear, resolution_at
+from dg4d_lib.fitting.schedules import late_decay, log_linear, reference_size_at, resolution_at
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.density_control import DensifyResult, Grad2dStats, densify, prune, reset_opacity
 from dg4d_lib.guidance.interface import GuidancePrior, GuidanceView, ring_size
@@ -100,11 +101,18 @@ def fit_gaussians(
     Raises:
         FitDiverged: the loss became non-finite, or (almost) no Gaussian is left.
     """
-    camera = replace(input_camera or OrbitCamera(), width=settings.reference_size, height=settings.reference_size)
     device = start.means.device
-    color, alpha = resize_cutouts(subject[None].to(device), settings.reference_size)
     white = torch.tensor(WHITE, device=device)
-    others = [resize_cutouts(view.cutout[None].to(device), settings.reference_size) for view in known]
+
+    @cache
+    def references(size: int) -> list[tuple[OrbitCamera, Tensor, Tensor]]:
+        """Return camera, color and alpha of the image and of the known views."""
+        views = [(input_camera or OrbitCamera(), subject), *((view.camera, view.cutout) for view in known)]
+        return [
+            (replace(camera, width=size, height=size), *resize_cutouts(cutout[None].to(device), size))
+            for camera, cutout in views
+        ]
+
     rates = learning_rates(settings)
     cloud = _Cloud.of(start, rates)
     grad2d = Grad2dStats.zeros(len(start), device)
@@ -115,17 +123,19 @@ def fit_gaussians(
         cloud.adam.param_groups[0]["lr"] = log_linear(settings.means_lr, settings.means_lr_end, progress)
         gaussians = cloud.gaussians
 
-        cameras, colors, alphas = [camera], color, alpha
-        if known:
-            chosen = draw_view(known, generator)
-            side = settings.reference_size
-            cameras = [camera, replace(known[chosen].camera, width=side, height=side)]
-            colors, alphas = torch.cat([color, others[chosen][0]]), torch.cat([alpha, others[chosen][1]])
+        side = reference_size_at(settings, progress)
+        first, *others = references(side)
+        cameras, colors, alphas = zip(first, *([others[draw_view(known, generator)]] if known else []), strict=True)
         offsets = [torch.zeros(len(cameras), len(gaussians), 2, device=device, requires_grad=True)]
         rendering = rasterize(gaussians, cameras, white, offsets[0])
-        rendered = [(rendering.visible, settings.reference_size)]
+        rendered = [(rendering.visible, side)]
         reference = len(cameras) * reference_loss(
-            rendering, colors, alphas, settings.color_weight, settings.alpha_weight, settings.ssim_weight
+            rendering,
+            torch.cat(colors),
+            torch.cat(alphas),
+            settings.color_weight,
+            settings.alpha_weight,
+            settings.ssim_weight,
         )
         loss = progress * reference
         guidance = torch.zeros((), device=device)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import mse_loss
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.noise_schedule import alphas_cumprod
@@ -58,14 +59,16 @@ class AnalyticPrior:
         """Return the weighted distance of the renders from the known images."""
         timestep = self.schedule.timestep(progress, generator)
         alphabar = float(alphas_cumprod()[timestep])
-        clean = self._encode(*self.clean(views)).to(images.device)
+        color, clean_alpha = (picture.to(images.device) for picture in self.clean(views))
         pixels = 3 * images.shape[1] * images.shape[2]
         strength = 0.5 * (alphabar * (1 - alphabar)) ** 0.5
-        weights = torch.tensor([self.weights.get(view.frame, self.weight) for view in views], device=images.device)
-        squares = (self._encode(images, alpha) - clean).square().sum((1, 2, 3))
-        return (weights * squares).mean() * (strength * LATENT_NUMBERS / pixels)
-
-    def _encode(self, images: Float[Tensor, "b h w 3"], alpha: Float[Tensor, "b h w 1"]) -> Float[Tensor, "b c h w"]:
-        """Return pixels as they are diffused: color and alpha in [-1, 1]."""
-        channels = [2 * images - 1, 2 * alpha - 1]
-        return torch.cat([channel.permute(0, 3, 1, 2) for channel in channels], 1)
+        squares = (
+            mse_loss(image, known, reduction="sum") + mse_loss(cover, known_cover, reduction="sum")
+            for image, known, cover, known_cover in zip(
+                *map(torch.unbind, (images, color, alpha, clean_alpha)), strict=True
+            )
+        )
+        weights = [self.weights.get(view.frame, self.weight) for view in views]
+        error = torch.stack([weight * square for weight, square in zip(weights, squares, strict=True)]).mean()
+        # pixels are diffused as 2 x - 1, so squares are four times those of color and alpha in [0, 1]
+        return error * (4 * strength * LATENT_NUMBERS / pixels)

@@ -10,12 +10,11 @@ from torch import Tensor
 from dg4d_lib.guidance.interface import GuidanceView, check_frame, check_views
 from dg4d_lib.images import resize
 from dg4d_lib.inflation.surface import InflatedSurface
-from dg4d_lib.settings import LearnedPriorSettings
-from dg4d_lib.shape_prior.expected import expected_volume
+from dg4d_lib.shape_prior.expected import MATTER, expected_volume
 from dg4d_lib.shape_prior.field import Fields, ShapeField
 from dg4d_lib.shape_prior.frustum import SIZE
-from dg4d_lib.shape_prior.level_set import level_surface
 from dg4d_lib.shape_prior.raymarch import ShapeVolume, render_volumes
+from dg4d_lib.shape_prior.surface import decided_surface
 
 COARSER = 2  # times fewer pixels of a side than the camera has: expected views are soft
 
@@ -23,15 +22,16 @@ COARSER = 2  # times fewer pixels of a side than the camera has: expected views 
 class LearnedShapes:
     """Predicted shape per frame, each built when first asked for."""
 
-    def __init__(self, fields: Fields, settings: LearnedPriorSettings) -> None:
+    def __init__(self, fields: Fields, contrast: float, matter: float = MATTER) -> None:
         """Store the fields.
 
         Args:
             fields: of all frames.
-            settings: contrast of the views, level of the surface.
+            contrast: factor on the log-odds of matter; see `expected_volume`.
+            matter: factor on the expected matter.
         """
         self._fields = fields
-        self._settings = settings
+        self._contrast, self._matter = contrast, matter
         self._volumes: dict[int, ShapeVolume] = {}
         self._inflated: dict[int, float] = {}
         self._last: tuple[int, ShapeField] | None = None  # one: a field has 17 MB
@@ -47,7 +47,7 @@ class LearnedShapes:
         Raises:
             BadInput: there is no such frame, or its picture shows no subject.
         """
-        return level_surface(self._field(frame), self._settings.level)
+        return decided_surface(self._field(frame))
 
     def clean(self, views: Sequence[GuidanceView]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
         """Return the expected color over white and the expected alpha, in [0, 1].
@@ -69,7 +69,7 @@ class LearnedShapes:
 
     def _volume(self, frame: int) -> ShapeVolume:
         if frame not in self._volumes:
-            self._volumes[frame] = expected_volume(self._field(frame), self._settings.contrast)
+            self._volumes[frame] = expected_volume(self._field(frame), self._contrast, self._matter)
         return self._volumes[frame]
 
     def _field(self, frame: int) -> ShapeField:

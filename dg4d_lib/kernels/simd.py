@@ -140,6 +140,10 @@ class SimdBuilder:
             step *= 2
         return remaining[0]
 
+    def shift(self, a: Value, lanes: int) -> Value:
+        """Move lane i + `lanes` to lane i; lanes that come from outside are 0."""
+        return self._pick(a, self.constant(0), [i + lanes if 0 <= i + lanes < LANES else LANES for i in range(LANES)])
+
     def _pick(self, a: Value, b: Value, lanes: Sequence[int]) -> Value:
         """Shuffle the lanes of two vectors; lanes of the second are numbered from `LANES` on."""
         return self.builder.shuffle_vector(a, b, ir.Constant(INTS, list(lanes)))

@@ -15,7 +15,9 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.images import resize_planes
 from dg4d_lib.inflation.heights import heights
 from dg4d_lib.inflation.mask import subject_mask
+from dg4d_lib.shape_prior.absorption import optical_density, transmittance
 from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV
+from dg4d_lib.shape_prior.mirror import MirrorPlane, mirror_plane, mirrored_colors
 from dg4d_lib.shape_prior.network import VISIBLE, Features, ShapePriorNetwork
 
 INFLATED_SOFTNESS = 0.05  # world units: depth over which the occupancy of an inflated shape falls
@@ -113,7 +115,20 @@ class ShapeFields:
         if share > 0:
             inflated = inflated_probability(mask).clamp(torch.tensor(-LARGEST_LOGIT).sigmoid())
             logits = torch.logit((1 - share) * logits.sigmoid() + share * inflated, 1e-3)
-        return ShapeField(logits, straight_color(picture), hidden, mask, share)
+        front, plane = straight_color(picture), self._plane(features)
+        if plane.trust > 0:
+            probability = logits.sigmoid()
+            left = transmittance(optical_density(probability, mask))
+            hidden = mirrored_colors(hidden, front, probability, left, mask, plane)
+        return ShapeField(logits, front, hidden, mask, share)
+
+    def _plane(self, features: Features) -> MirrorPlane:
+        """Return the mirror plane of a frame, the mean over the picture and its mirror image."""
+        with torch.no_grad():
+            moment, point, logit = self._network.mirror(features.code)
+        flip = torch.tensor([-1.0, 1.0, 1.0])  # x of the mirror image
+        moment = (moment[0] + moment[1] * flip * flip[:, None]) / 2
+        return mirror_plane(moment, (point[0] + point[1] * flip) / 2, float(logit.sigmoid().mean()))
 
     def _rays(self, features: Features) -> tuple[Float[Tensor, "2 128 128 64"], Float[Tensor, "2 128 128 8 3"]]:
         decoded = self._network.decode(features, self._code)

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from dg4d_lib.cameras.orbit import RADIUS
+from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.shape_prior.field import (
-    LARGEST_LOGIT,
     ShapeField,
     bounded_logits,
     picture_mask,
@@ -19,6 +19,7 @@ from dg4d_lib.shape_prior.field import (
     straight_color,
 )
 from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV
+from dg4d_lib.shape_prior.raymarch import CELL
 from dg4d_lib.visual_hull.carve import Volume
 from dg4d_lib.visual_hull.known import KnownView
 from dg4d_lib.visual_hull.shape import known_volume
@@ -35,14 +36,8 @@ def known_field(views: Sequence[KnownView]) -> ShapeField:
     """
     volume, picture = known_volume(views), premultiplied(views[0].cutout)
     surface = colored_surface(volume, views)
-    points = cell_centers()
-    margins = _sampled(volume, points)
-    near = margins > -SOFTNESS * LARGEST_LOGIT  # elsewhere nothing can be seen
-    _, nearest = cKDTree(surface.vertices.numpy()).query(points[near].numpy())
-    hidden = torch.zeros(*points.shape)
-    hidden[near] = surface.colors[torch.from_numpy(np.asarray(nearest))]
-    mask = picture_mask(picture)
-    return ShapeField(bounded_logits(margins / SOFTNESS, mask), straight_color(picture), hidden, mask, 0.0)
+    logits, mask = _sampled(volume, cell_centers()) / SOFTNESS, picture_mask(picture)
+    return ShapeField(bounded_logits(logits, mask), straight_color(picture), _nearest_colors(surface), mask, 0.0)
 
 
 def cell_centers() -> Float[Tensor, "128 128 64 3"]:
@@ -51,6 +46,24 @@ def cell_centers() -> Float[Tensor, "128 128 64 3"]:
     distance = NEAR + (torch.arange(BINS) + 0.5) * (FAR - NEAR) / BINS
     x, y = across[None, :, None] * distance, -across[:, None, None] * distance
     return torch.stack(torch.broadcast_tensors(x, y, RADIUS - distance), -1)
+
+
+def _nearest_colors(surface: InflatedSurface) -> Float[Tensor, "128 128 64 3"]:
+    """Return for every cell the color of the nearest one that the surface passes."""
+    x, y, z = surface.vertices.unbind(-1)
+    distance = RADIUS - z
+    column, row = ((side / (distance * TAN_HALF_FOV) + 1) * SIZE / 2 for side in (x, -y))
+    depth = (distance - NEAR) / CELL
+    cells = torch.stack([row, column, depth], -1).long()
+    inside = ((cells >= 0) & (cells < torch.tensor([SIZE, SIZE, BINS]))).all(-1)
+    place = tuple(cells[inside].T)
+    colors = torch.zeros(SIZE, SIZE, BINS, 3)
+    colors[place] = surface.colors[inside]
+    empty = np.ones((SIZE, SIZE, BINS), bool)
+    empty[place] = False
+    sides = (2 * RADIUS * TAN_HALF_FOV / SIZE, 2 * RADIUS * TAN_HALF_FOV / SIZE, CELL)
+    nearest = distance_transform_edt(empty, sampling=sides, return_distances=False, return_indices=True)
+    return colors[tuple(torch.from_numpy(np.asarray(nearest)).long())]
 
 
 def _sampled(volume: Volume, points: Float[Tensor, "r c d 3"]) -> Float[Tensor, "r c d"]:

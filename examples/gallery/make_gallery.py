@@ -38,8 +38,8 @@ MOST_BYTES = 150_000
 HEAD = """# Gallery
 
 Ten assets of the default profile, `preview`: no GPU, no pretrained generator, one picture each. First the input, then
-the lit mesh and the splats while the camera sways by 35 degrees to both sides. Backs and hidden parts are guessed from
-the outline, and the motion is one of the six loops that need no model.
+the lit mesh and the splats while the camera sways by 35 degrees to both sides. Backs and hidden parts are guesses,
+and the motion is one of the six loops that need no model.
 
 `make gallery` draws the inputs (`examples/gallery`), converts them and writes this page. Times are those of the
 conversions shown, on two cores that did other work too; on an idle machine a conversion takes about 90 s. The pictures

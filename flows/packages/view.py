@@ -23,6 +23,7 @@ ASSET, MERGED = "asset.glb", "asset_merged.glb"
 WEB_SPLATS = "splats/moving.websplats"
 SUBJECT = "input/subject.png"
 DRIVING = "input/driving.mp4"
+WEB_SPLATS_MAGIC = b"D4WS"  # first bytes of web splats, as in dg4d_lib/assets/formats/web_splats.py
 PROVENANCE = ("profile", "seed", "commercial_only", "source", "order", "package")  # fields of the record
 
 
@@ -80,6 +81,28 @@ def viewer_of_package(package: Path, title: str) -> str:
             return _page(title, sizes, archive.read, facts)
     except (zipfile.BadZipFile, KeyError) as error:
         raise BadInput(f"{title} is not a package that can be viewed") from error
+
+
+def viewer_of_splats(splats: bytes, title: str) -> str:
+    """Render the page of web splats without a mesh: the first look at an asset whose motion is being fitted.
+
+    Args:
+        splats: output of `write_web_splats`.
+        title: name of the asset.
+    """
+    facts = {"First look": {"shown": "the splats of the first frame", "to come": "motion, mesh and files"}}
+    return build_viewer_page(f"{title}: first look", None, splats, None, None, facts)
+
+
+def viewer_of_artifact(path: Path, title: str) -> str:
+    """Render the page of an artifact: of a package, or of web splats.
+
+    Raises:
+        BadInput: it is neither.
+    """
+    with path.open("rb") as file:
+        is_splats = file.read(len(WEB_SPLATS_MAGIC)) == WEB_SPLATS_MAGIC
+    return viewer_of_splats(path.read_bytes(), title) if is_splats else viewer_of_package(path, title)
 
 
 def viewer_facts(record: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from starlette.types import ASGIApp
 
 from dg4d_lib.errors import BadInput
 from flows import home, prefect_compat
-from flows.packages.view import viewer_of_package
+from flows.packages.view import viewer_of_artifact
 from flows.prefect_compat import add_first
 from flows.serving.access import SESSION, SignIn, protect
 from flows.serving.addresses import ARTIFACT_ADDRESS, VIEWER_ADDRESS
@@ -68,9 +68,9 @@ def artifact(digest: str, size: int, name: str) -> Response:
 
 
 def viewer(digest: str, size: int, name: str) -> Response:
-    """Return the page that plays a package of the store, in an origin of its own: it cannot read the secret."""
+    """Return the page of a package or of web splats, in an origin of its own: it cannot read the secret."""
     try:
-        page = viewer_of_package(_path(digest, size), PurePath(name).stem)
+        page = viewer_of_artifact(_path(digest, size), PurePath(name).stem)
     except BadInput as error:
         raise HTTPException(404, str(error)) from error
     policy = "sandbox allow-scripts allow-downloads; frame-ancestors 'self'"

@@ -21,6 +21,7 @@ from steps.contract import Frozen
 
 FIGURES = re.compile(r": (\d+)/(\d+)((?:, .+)?)$")  # at the end of the description of a progress artifact
 PICTURE = re.compile(r"\((/dg4d/artifacts/[0-9a-f]{64}/\d+/picture\.png)\)")
+LOOK = re.compile(r"\((/dg4d/viewer/[0-9a-f]{64}/\d+/first_look\.html)\)")
 WRAPPING = re.compile(r"^Flow run encountered an exception: (?:\w+: )?")
 WORDS = {
     "SCHEDULED": "waiting",
@@ -75,6 +76,7 @@ class RunStatus(Frozen):
     Attributes:
         left: estimate of the time left, in words; empty while it is unknown.
         picture: address of the newest picture of the asset; empty if there is none.
+        first_look: address of the page with its static splats; empty before there are any.
         asset: address of the page of the asset, once it is made.
         items: name and state of the items of a batch.
     """
@@ -90,6 +92,7 @@ class RunStatus(Frozen):
     steps: tuple[StepStatus, ...] = ()
     left: str = ""
     picture: str = ""
+    first_look: str = ""
     asset: str = ""
     is_batch: bool = False
     items: tuple[tuple[str, str], ...] = ()
@@ -151,6 +154,7 @@ async def full(run: Row, api: ServerApi, now: float) -> RunStatus:
             "steps": steps,
             "left": format_left(schedule.seconds_left(now)) if running else "",
             "picture": newest_picture(artifacts),
+            "first_look": newest_look(artifacts),
         }
     )
 
@@ -198,6 +202,14 @@ def newest_picture(artifacts: Iterable[Row]) -> str:
         if str(artifact["key"]).startswith(LIVE):
             return data
         if match := PICTURE.search(data):
+            return match[1]
+    return ""
+
+
+def newest_look(artifacts: Iterable[Row]) -> str:
+    """Return the address of the newest page with static splats."""
+    for artifact in sorted(artifacts, key=lambda row: str(row["updated"]), reverse=True):
+        if match := LOOK.search(str(artifact["data"])):
             return match[1]
     return ""
 

@@ -14,7 +14,7 @@ from PIL import Image
 from flows.formatting.escaping import markdown
 from flows.formatting.numbers import format_size
 from flows.packages import acceptance
-from flows.serving.addresses import ARTIFACT_ADDRESS
+from flows.serving.addresses import ARTIFACT_ADDRESS, VIEWER_ADDRESS
 from flows.step_errors import StepError
 from steps.contract import ArtifactRef, StepResult
 from steps.runtime.installed_code import catalog
@@ -25,6 +25,7 @@ QUALITIES = (80, 50, 20)  # of WebP
 THUMBNAIL_BYTES = 30_000  # the server keeps pages in its database
 THUMBNAILS_KEPT = 32  # the page of an asset repeats those of its steps
 ROWS_OF_A_CURVE = 8
+FIRST_LOOK = "first_look"  # output of `fit_gaussians`
 LIVE = "live-"  # begins the keys of artifacts with a picture of a running fit
 
 
@@ -39,11 +40,18 @@ def address(name: str, ref: ArtifactRef, suffix: str, place: str = ARTIFACT_ADDR
     return f"{place}{ref.digest.removeprefix('sha256:')}/{ref.size_bytes}/{name}{suffix}"
 
 
+def first_look_address(ref: ArtifactRef) -> str:
+    """Return the path on the background server of the page that shows static splats."""
+    return address(FIRST_LOOK, ref, ".html", VIEWER_ADDRESS)
+
+
 def step_page(label: str, item: str, result: StepResult, store: ArtifactStore) -> str:
     """Return the page of a finished step: pictures, notes, curves, facts, and links to its files."""
     record = result.provenance
     lines = [f"# {label}: {markdown(item)}", ""]
     lines += [f"{image}\n" for image in pictures_of(result.outputs, store)]
+    if FIRST_LOOK in result.outputs:
+        lines += [f"[First look: the splats from all sides]({first_look_address(result.outputs[FIRST_LOOK])})", ""]
     lines += [f"> {markdown(note)}\n" for note in (*record.notes, *record.run_notes)]
     for ref in result.outputs.values():
         if ref.media_type.endswith("curves+json"):

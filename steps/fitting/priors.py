@@ -8,18 +8,21 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
+from dg4d_lib.cameras.viewpoints import spread_orbit
 from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.diffusion.components import default_device
 from dg4d_lib.diffusion.depth import DepthEstimator
 from dg4d_lib.diffusion.pipelines import is_flow_matching
 from dg4d_lib.errors import BadInput
+from dg4d_lib.fitting.static import RADIUS_JITTER
 from dg4d_lib.guidance.analytic import AnalyticPrior
 from dg4d_lib.guidance.carried import CarriedFields
 from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.geometric import InflatedSurfaces
 from dg4d_lib.guidance.imagedream import ImageDream, ImageDreamPrior
 from dg4d_lib.guidance.interface import GuidancePrior, SubjectShapes
+from dg4d_lib.guidance.kept_views import KeptViews
 from dg4d_lib.guidance.known import KnownShapes
 from dg4d_lib.guidance.learned import LearnedShapes
 from dg4d_lib.guidance.oracle import Bank, perturb
@@ -32,10 +35,11 @@ from dg4d_lib.settings import (
     LearnedPriorSettings,
     OraclePriorSettings,
     PriorSettings,
+    StaticSettings,
     Zero123PriorSettings,
 )
 from dg4d_lib.shape_prior import packaged
-from dg4d_lib.shape_prior.field import InflatedFields, ShapeField, ShapeFields
+from dg4d_lib.shape_prior.field import Fields, InflatedFields, ShapeField, ShapeFields
 from dg4d_lib.visual_hull.frustum_field import known_field
 from dg4d_lib.visual_hull.known import KnownView, known_view
 from dg4d_lib.weights.registry import lookup_weights
@@ -52,6 +56,7 @@ LEARNED_NOTE = "prior: shape network trained on made-up shapes; sides the pictur
 DEPTH_NOTE = "prior: inflation of the silhouette, with the relief of an estimated depth: weights"
 SMALLEST_NOTED = 0.05  # share of the inflation from which the report mentions it
 GUESS_WEIGHT = 0.5  # of frames whose other sides are a guess, beside frames with known views
+CARRIED_CONTRAST = 1.2  # of shapes that a known first frame has made sure already
 ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
 
 
@@ -120,18 +125,21 @@ def make_prior(
         case GeometricPriorSettings() | LearnedPriorSettings():
             shapes = subject_shapes(settings, cutouts, turn_deg, sides, moved)
             note, weight, opened = GEOMETRIC_NOTE, 1.0, None
+            clean, viewpoints = shapes.clean, None
+            if stage.viewpoints:
+                clean, viewpoints = KeptViews(shapes.clean).clean, kept_viewpoints(stage)
             guided = settings.weight if isinstance(settings, LearnedPriorSettings) else GUESS_WEIGHT
             if isinstance(shapes, KnownShapes):
                 frames = None if moved or 0 in shapes.frames else shapes.frames
                 weights = dict.fromkeys(shapes.frames, 1.0)
-                prior = AnalyticPrior(shapes.clean, noise, frames=frames, weight=guided, weights=weights)
+                prior = AnalyticPrior(clean, noise, viewpoints, frames, guided, weights)
                 network = _network(shapes.guess, settings)
                 return LoadedPrior(prior, known_note(sides), shapes=shapes, network=network)
             if isinstance(settings, LearnedPriorSettings):
                 note, weight = LEARNED_NOTE, guided
             elif settings.depth_weights:
                 note, opened = f"{DEPTH_NOTE} {settings.depth_weights}", open_weights(settings.depth_weights)
-            prior, network = AnalyticPrior(shapes.clean, noise, weight=weight), _network(shapes, settings)
+            prior, network = AnalyticPrior(clean, noise, viewpoints, weight=weight), _network(shapes, settings)
             return LoadedPrior(prior, note, opened, shapes=shapes, network=network)
         case OraclePriorSettings():
             if bank is None:
@@ -174,7 +182,7 @@ def subject_shapes(
     elif 0 in known and len(cutouts) > 1:
         shapes = _carried_shapes(settings, cutouts, turn_deg, known_field(known[0]))
     elif isinstance(settings, LearnedPriorSettings):
-        shapes = LearnedShapes(ShapeFields(packaged.packaged_network(), cutouts, turn_deg), settings)
+        shapes = LearnedShapes(ShapeFields(packaged.packaged_network(), cutouts, turn_deg), settings.contrast)
     else:
         own = settings if isinstance(settings, GeometricPriorSettings) else GeometricPriorSettings()
         depth = None
@@ -188,14 +196,25 @@ def _carried_shapes(
     settings: PriorSettings, cutouts: Sequence[Float[Tensor, "h w 4"]], turn_deg: float, first: ShapeField
 ) -> LearnedShapes:
     """Return the shapes of later frames from the known one of the first frame and a guess per frame."""
-    learned = settings if isinstance(settings, LearnedPriorSettings) else None
-    fields = ShapeFields(packaged.packaged_network(), cutouts, turn_deg) if learned else InflatedFields(cutouts)
-    return LearnedShapes(CarriedFields(fields, first, cutouts), learned or LearnedPriorSettings())
+    guess: Fields = InflatedFields(cutouts)
+    if isinstance(settings, LearnedPriorSettings):
+        guess = ShapeFields(packaged.packaged_network(), cutouts, turn_deg)
+    return LearnedShapes(CarriedFields(guess, first, cutouts), CARRIED_CONTRAST, matter=1.0)
 
 
 def _network(shapes: SubjectShapes, settings: PriorSettings) -> LearnedShapes | None:
     """Return the shapes if the shape network predicts them."""
     return shapes if isinstance(settings, LearnedPriorSettings) and isinstance(shapes, LearnedShapes) else None
+
+
+def kept_viewpoints(stage: FitSettings) -> tuple[OrbitCamera, ...]:
+    """Return the cameras that random views of a stage are drawn from, over the ranges of all its random views."""
+    jitter = RADIUS_JITTER if isinstance(stage, StaticSettings) else 0.0
+    return spread_orbit(
+        stage.viewpoints,
+        elevation_deg=(-stage.elevation_deg, stage.elevation_deg),
+        radius=(RADIUS - jitter, RADIUS + jitter),
+    )
 
 
 def known_views(bank: Bank, frame: int = 0) -> list[KnownView]:

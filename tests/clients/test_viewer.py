@@ -99,7 +99,7 @@ def tried(tmp_path: Path) -> Try:
     """Writes a page of these parts and tries it out in a browser."""
 
     def run(
-        glb: bytes,
+        glb: bytes | None,
         cloud: Gaussians | None = None,
         video: bytes | None = None,
         facts: dict[str, Any] | None = None,
@@ -165,6 +165,18 @@ def test_splats_look_as_our_rasterizer_draws_them(tried: Try) -> None:
         assert overlap(theirs[..., 3], drawn.alpha[0, ..., 0].numpy()) > 0.98
         assert psnr(over_white(theirs), drawn.color[0].numpy()) > 35  # 8-bit blending and the compact file
     assert psnr(*(over_white(page.pictures["splats", time]) for time in TIMES)) < 30
+
+
+def test_splats_without_a_mesh_stand_still_and_can_be_turned(tried: Try) -> None:
+    cloud = splats()
+    still = replace(cloud, means=cloud.means[:1], log_scales=cloud.log_scales[:1], quats=cloud.quats[:1])
+    page = tried(None, still, shots=(("splats", 0.0),), deeds=[["drag", 120, 40], ["press", "r"]])
+    ready = page.said["states"][0]
+    assert (ready["modes"], ready["frames"], ready["playing"]) == (["splats"], 1, False)
+    first, turned, reset = page.said["drawn"]
+    assert turned != first == reset
+    drawn = get_rasterizer("cpu")(still.at(0), [page.camera()], torch.ones(3))
+    assert psnr(over_white(page.pictures["splats", 0.0]), drawn.color[0].numpy()) > 35
 
 
 VARIANTS = {

@@ -8,6 +8,7 @@ import pytest
 import tiny_weights
 import torch
 
+from dg4d_lib.assets.formats.web_splats import write_web_splats
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.gaussians.ply import read_ply
@@ -17,6 +18,7 @@ from dg4d_lib.visual_hull.known import known_view
 from steps import fit_gaussians, fit_motion
 from steps.artifacts.media import read_png, write_frames, write_png
 from steps.artifacts.motions import read_motion
+from steps.fit_gaussians import one_state
 from steps.fitting.priors import read_bank
 from steps.fitting.tracking import TRACKED_NOTE
 from steps.profiles import PREVIEW, revise, step_settings
@@ -40,6 +42,9 @@ SMALL = revise(
         "prior.size": 32,
     },
 )
+
+
+STATIC = ["gaussians", "first_look", "curves", "picture"]  # outputs
 
 
 def disc(shift: int = 0) -> torch.Tensor:
@@ -71,7 +76,7 @@ def fit_settings(settings=SMALL):
 
 
 def fitted(tmp_path: Path, subject: Path) -> Job:
-    work = job(tmp_path, fit_settings(), {"subject": subject}, ["gaussians", "curves", "picture"])
+    work = job(tmp_path, fit_settings(), {"subject": subject}, STATIC)
     fit_gaussians.run(work)
     return work
 
@@ -83,6 +88,8 @@ def test_static_gaussians_come_out_with_curves_and_a_picture(tmp_path: Path, sub
     assert curves["x"] == [1, 2, 3]
     assert set(curves["series"]) == {"loss", "reference", "guidance", "Gaussians"}
     assert read_png(work.outputs["picture"]).shape == (192, 6 * 192, 3)
+    gaussians = read_ply(work.outputs["gaussians"])
+    assert work.outputs["first_look"].read_bytes() == write_web_splats(one_state(gaussians), fps=1)
     assert (tmp_path / "progress.txt").read_text().startswith("3/3")
 
 
@@ -116,7 +123,7 @@ def test_views_of_other_sides_shape_the_start_of_the_fit(tmp_path: Path, subject
     for name, more in (("alone", {}), ("known", {"known_views": tmp_path / "known.zip"})):
         (tmp_path / name).mkdir()
         inputs = {"subject": subject, **more}
-        work = job(tmp_path / name, fit_settings(), inputs, ["gaussians", "curves", "picture"])
+        work = job(tmp_path / name, fit_settings(), inputs, STATIC)
         facts = fit_gaussians.run(work)
         depths[name] = float(read_ply(work.outputs["gaussians"]).means[:, 2].std())
     assert depths["known"] < depths["alone"] / 2
@@ -140,7 +147,7 @@ def test_the_surface_of_known_views_guides_later_frames_where_that_is_asked_for(
     write_bank(tmp_path / "known.zip", [[known_view(disc(), 90.0)]], tmp_path)
     small = {"track_iterations": 2, "joint_iterations": 1, "nodes": 8, "size": 32}
     settings = revise(SMALL, {"motion.track_surface": True, **{f"asset.{name}": n for name, n in small.items()}})
-    statics = job(tmp_path, fit_settings(), {"subject": subject}, ["gaussians", "curves", "picture"])
+    statics = job(tmp_path, fit_settings(), {"subject": subject}, STATIC)
     fit_gaussians.run(statics)
     frames = torch.stack([disc(), disc(2), disc(4)])
     write_frames(tmp_path / "video.zip", DrivingVideo(frames[..., :3], frames[..., 3:], 5.0))
@@ -162,7 +169,7 @@ def test_the_surface_of_known_views_guides_later_frames_where_that_is_asked_for(
 def test_both_fits_run_with_a_trained_prior_and_say_so(tmp_path: Path, subject: Path):
     model = tiny_weights.write_zero123(tmp_path / "tiny")
     trained = revise(SMALL, {"prior.kind": "zero123", "prior.weights": str(model), "motion.views": 1})
-    statics = job(tmp_path, fit_settings(trained), {"subject": subject}, ["gaussians", "curves", "picture"])
+    statics = job(tmp_path, fit_settings(trained), {"subject": subject}, STATIC)
     of_the_cloud = fit_gaussians.run(statics)
     frames = torch.stack([disc(), disc(2)])
     write_frames(tmp_path / "video.zip", DrivingVideo(frames[..., :3], frames[..., 3:], 5.0))
@@ -180,7 +187,7 @@ def test_both_fits_run_with_a_trained_prior_and_say_so(tmp_path: Path, subject: 
 
 def test_a_loss_that_is_no_number_leaves_a_picture_of_the_last_good_state(tmp_path: Path, subject: Path):
     wild = revise(SMALL, {"static.color_weight": 1e45})
-    work = job(tmp_path, fit_settings(wild), {"subject": subject}, ["gaussians", "curves", "picture"])
+    work = job(tmp_path, fit_settings(wild), {"subject": subject}, STATIC)
     with pytest.raises(FitDiverged, match="the loss became inf at iteration 1 of 3"):
         fit_gaussians.run(work)
     assert read_png(work.pictures / "last_good_state.png").shape[2] == 3
@@ -190,7 +197,7 @@ def test_a_loss_that_is_no_number_leaves_a_picture_of_the_last_good_state(tmp_pa
 def test_the_oracle_without_a_bank_is_refused(tmp_path: Path, subject: Path):
     settings = fit_settings(revise(SMALL, {"prior.kind": "oracle"}))
     with pytest.raises(BadInput, match="--bank"):
-        fit_gaussians.run(job(tmp_path, settings, {"subject": subject}, ["gaussians", "curves", "picture"]))
+        fit_gaussians.run(job(tmp_path, settings, {"subject": subject}, STATIC))
 
 
 def test_a_bank_is_read_tile_by_tile(tmp_path: Path):

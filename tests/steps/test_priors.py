@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -217,3 +218,31 @@ def test_the_geometric_prior_starts_and_judges_as_the_inflation_does(tmp_path: P
     assert torch.equal(shapes.vertices, expected.vertices) and torch.equal(shapes.colors, expected.colors)
     prior = make_prior(settings, CUTOUTS, StaticSettings(), None, tmp_path).prior
     assert isinstance(prior, AnalyticPrior) and prior.weight == 1
+
+
+def test_random_views_of_shapes_come_from_a_few_cameras_where_that_is_asked_for(tmp_path: Path) -> None:
+    settings = GeometricPriorSettings(size=32)
+    assert make_prior(settings, CUTOUTS, MotionSettings(), None, tmp_path).prior.viewpoints is None
+    radii = {}
+    for stage in (StaticSettings(viewpoints=6), MotionSettings(viewpoints=6)):
+        cameras = make_prior(settings, CUTOUTS, stage, None, tmp_path).prior.viewpoints
+        assert cameras is not None and len(set(cameras)) == 6
+        assert all(abs(camera.elevation_deg) <= stage.elevation_deg for camera in cameras)
+        radii[type(stage)] = {camera.radius for camera in cameras}
+    assert radii[MotionSettings] == {2.0}
+    assert len(radii[StaticSettings]) == 6 and all(1.5 <= radius <= 2.5 for radius in radii[StaticSettings])
+
+
+def test_a_prior_that_keeps_its_views_says_the_same(tmp_path: Path) -> None:
+    settings = GeometricPriorSettings(size=32)
+    fresh, keeping = (
+        make_prior(settings, CUTOUTS, MotionSettings(viewpoints=count), None, tmp_path) for count in (0, 6)
+    )
+    assert keeping.prior.viewpoints is not None
+    view = GuidanceView(replace(keeping.prior.viewpoints[2], width=64, height=64), 1)
+    images = torch.rand(1, 64, 64, 3, generator=torch.Generator().manual_seed(2))
+    losses = [
+        prior.loss(images, images[..., :1], [view], 0.5, torch.Generator())
+        for prior in (fresh.prior, keeping.prior, keeping.prior)
+    ]
+    assert losses[1] == losses[2] == pytest.approx(float(losses[0]), rel=1e-4)

@@ -46,7 +46,7 @@ def test_the_fit_starts_from_the_reconstruction_that_the_seed_decides(
     fit = static.fit_gaussians
     monkeypatch.setattr(fit_gaussians, "fit_gaussians", lambda *a, **named: given.append(a) or fit(*a, **named))
     write_png(tmp_path / "subject.png", subject())
-    outputs = {name: tmp_path / name for name in ("gaussians", "curves", "picture.png")}
+    outputs = {name: tmp_path / name for name in ("gaussians", "first_look", "curves", "picture.png")}
     outputs["picture"] = outputs.pop("picture.png")
     settings = step_settings("fit_gaussians", PREVIEW.model_copy(update={"rasterizer": "cpu", "static": stage}))
     inputs = {"subject": tmp_path / "subject.png"}

@@ -24,7 +24,7 @@ _TITLE, _DATA = "@title@", "@data@"
 
 def build_viewer_page(
     title: str,
-    glb: bytes,
+    glb: bytes | None,
     splats: bytes | None,
     picture: bytes | None,
     video: bytes | None,
@@ -35,9 +35,9 @@ def build_viewer_page(
 
     Args:
         title: title of the page.
-        glb: the animated mesh; its first animation plays. Supported are morph targets, node animations, animated
-            texture transforms (KHR_animation_pointer), KHR_mesh_quantization, EXT_meshopt_compression, PNG, JPEG and
-            WebP.
+        glb: the animated mesh; its first animation plays; without it the page shows the splats only. Supported are
+            morph targets, node animations, animated texture transforms (KHR_animation_pointer), KHR_mesh_quantization,
+            EXT_meshopt_compression, PNG, JPEG and WebP.
         splats: output of `write_web_splats`; without it the page shows the mesh only.
         picture: the input picture as PNG, JPEG or WebP.
         video: the driving video as MP4, played in sync with the asset.
@@ -50,7 +50,12 @@ def build_viewer_page(
     """
     blocks = [
         _block(name, "application/octet-stream", base64.b64encode(zlib.compress(content)).decode())
-        for name, content in (("glb", _zero_unused(glb)), ("splats", splats), ("picture", picture), ("video", video))
+        for name, content in (
+            ("glb", glb and _zero_unused(glb)),
+            ("splats", splats),
+            ("picture", picture),
+            ("video", video),
+        )
         if content is not None
     ]
     view = {name: camera[name] for name in ("radius", "target") if name in camera}

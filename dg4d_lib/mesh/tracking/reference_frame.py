@@ -4,10 +4,13 @@ Parts that touch in the reference frame share a surface and tear when they separ
 surface yet. So several frames are tried on a coarse grid and compared by their silhouettes over the whole motion.
 """
 
+from functools import partial
+
 import torch
 
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface, select_level
 from dg4d_lib.mesh.extraction.silhouettes import render_silhouettes, silhouette_iou
@@ -46,8 +49,9 @@ def select_reference_frame(
     frames = len(states.means)
     compared = evenly_spaced(frames, COMPARED)
     silhouettes = render_silhouettes(states, compared, rasterize)
-    scores = {}
-    for frame in evenly_spaced(frames, CANDIDATES):
+    scores: dict[int, float] = {}
+
+    def try_frame(frame: int) -> None:
         rest = states.at(frame)
         field = density_field(rest, settings.model_copy(update={"grid": min(GRID, settings.grid)}))
         level, _ = select_level(field, rest, rasterize, settings.density_threshold)
@@ -56,7 +60,10 @@ def select_reference_frame(
         selected = Displacement(**{name: value[compared] for name, value in vars(motion).items()})
         moved = vertices + skin_vertices(vertices, rest, selected)
         scores[frame] = float(silhouette_iou(moved, faces, silhouettes).mean())
-    best = max(scores, key=lambda frame: scores[frame])
+
+    candidates = evenly_spaced(frames, CANDIDATES)
+    run_parallel([partial(try_frame, frame) for frame in candidates])
+    best = max(candidates, key=lambda frame: scores[frame])
     reference_frame = best if scores[best] > scores[0] + GAIN else 0
     return reference_frame, scores[reference_frame]
 

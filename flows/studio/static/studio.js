@@ -540,6 +540,7 @@ function showRun(run) {
     fit.src = run.picture;
     [fit.hidden, find("#no-fit").hidden] = [false, true];
   }
+  if (run.first_look) [find("#look a").href, find("#look").hidden] = [run.first_look, false];
   find("#cancel").hidden = run.has_ended || run.state === "cancelling";
   find("#retry").hidden = !["failed", "cancelled", "crashed"].includes(run.state);
   find("#open").hidden = run.state !== "done";

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.cameras.viewpoints import baking_views, random_orbit, turntable
+from dg4d_lib.cameras.viewpoints import baking_views, random_orbit, spread_orbit, turntable
 
 
 def test_random_views_stay_in_their_ranges_and_go_all_around():
@@ -18,6 +18,17 @@ def test_the_same_seed_gives_the_same_views():
         return random_orbit(3, 8, elevation_deg=(0, 1), radius=(1, 2), generator=torch.Generator().manual_seed(5))
 
     assert draw() == draw()
+
+
+def test_spread_views_cover_all_azimuths_elevations_and_radii_evenly():
+    cameras = spread_orbit(24, elevation_deg=(-30, 30), radius=(1.5, 2.5))
+    azimuths = torch.tensor([camera.azimuth_deg for camera in cameras])
+    torch.testing.assert_close(azimuths.diff(), torch.full((23,), 15.0))
+    assert azimuths[0] == -172.5
+    cells = [(int((c.elevation_deg + 30) // 20), int((c.radius - 1.5) // 0.5)) for c in cameras]
+    assert all(2 <= cells.count((row, column)) <= 6 for row in range(3) for column in range(2))
+    quarters = [(number // 6, camera.elevation_deg < 0) for number, camera in enumerate(cameras)]
+    assert all(quarters.count((quarter, below)) == 3 for quarter in range(4) for below in (True, False))
 
 
 def test_baking_sees_three_rings_and_both_poles():

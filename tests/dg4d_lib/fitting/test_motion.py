@@ -9,7 +9,7 @@ from dg4d_lib.deformation.hexplane import HexPlane
 from dg4d_lib.deformation.mlp import Mlp
 from dg4d_lib.errors import FitDiverged
 from dg4d_lib.fitting.motion import bounds_of, fit_motion, parameter_groups, sample_frames, sample_views
-from dg4d_lib.settings import HexPlaneSettings, MlpSettings
+from dg4d_lib.settings import HexPlaneSettings, MlpSettings, ResolutionStage
 
 FRAMES, SLIDE = 4, 0.3
 
@@ -125,6 +125,31 @@ def test_a_prior_is_only_asked_what_it_can_judge(known, motion_settings):
     )
     assert [view.frame for view in views] == [2, 2]
     assert rows.tolist() == [1, 1]
+
+
+def test_only_some_frames_of_an_iteration_get_random_views(known, motion_settings):
+    settings = motion_settings.model_copy(update={"guided_frames": 2, "views": 2})
+    prior = known.prior(0.5)
+    seen = set()
+    for number in range(20):
+        views, rows = sample_views(prior, torch.arange(FRAMES), settings, 16, seed(number))
+        assert [view.frame for view in views] == rows.tolist()
+        assert rows[0] == rows[1] < 2 <= rows[2] == rows[3]  # one from each half
+        seen.update(rows.tolist())
+    assert seen == set(range(FRAMES))
+
+
+def test_the_reference_view_is_drawn_small_first(known, motion_settings):
+    sizes = []
+
+    def rasterize(gaussians, cameras, background, offsets=None):
+        sizes.append(cameras[0].width)
+        return known.rasterize(gaussians, cameras, background, offsets)
+
+    early = {"reference_schedule": (ResolutionStage(until=0.5, size=16),), "iterations": 4, "views": 0}
+    settings = motion_settings.model_copy(update=early)
+    fit_motion(known.gaussians, make("framewise", known), known.video(), known.prior(0.5), rasterize, settings, seed())
+    assert sizes == [16, 32, 32, 32]
 
 
 def test_a_loss_that_is_no_number_stops_the_fit(known, motion_settings):

@@ -12,7 +12,6 @@ from dg4d_lib.settings import LearnedPriorSettings
 from dg4d_lib.shape_prior.field import ShapeFields
 
 SIZE = 48
-SETTINGS = LearnedPriorSettings()
 
 
 def disc(x: float) -> torch.Tensor:
@@ -22,7 +21,7 @@ def disc(x: float) -> torch.Tensor:
 
 
 def shapes(*places: float) -> SubjectShapes:
-    return LearnedShapes(ShapeFields(tiny_network(), [disc(x) for x in places]), SETTINGS)
+    return LearnedShapes(ShapeFields(tiny_network(), [disc(x) for x in places]), LearnedPriorSettings().contrast)
 
 
 def test_the_input_view_of_a_frame_shows_that_frame_over_white():

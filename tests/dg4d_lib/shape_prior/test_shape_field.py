@@ -1,6 +1,7 @@
-"""Fields, expected volumes and level surfaces of the shape prior."""
+"""Fields, expected volumes and surfaces of the shape prior."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from tiny_shape_prior import tiny_network
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.inflation.render import render_surface
+from dg4d_lib.shape_prior.decided import decide, smooth_logits
 from dg4d_lib.shape_prior.expected import expected_volume
 from dg4d_lib.shape_prior.field import (
     LARGEST_LOGIT,
@@ -21,8 +23,8 @@ from dg4d_lib.shape_prior.field import (
     plane_evidence,
 )
 from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV
-from dg4d_lib.shape_prior.level_set import level_surface
 from dg4d_lib.shape_prior.raymarch import render_volumes
+from dg4d_lib.shape_prior.surface import decided_surface
 
 RED, BLUE = torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.1, 0.1, 0.9])
 RADIUS = 0.4
@@ -76,8 +78,8 @@ def test_contrast_sharpens_unsure_depth():
 
 
 @pytest.mark.parametrize("center_z", [0.0, 0.3, -0.2])
-def test_the_level_surface_of_a_ball_is_the_ball(center_z):
-    surface = level_surface(ball(center_z), 0.5)
+def test_the_surface_of_a_ball_is_the_ball(center_z):
+    surface = decided_surface(ball(center_z))
     radii = (surface.vertices - torch.tensor([0, 0, center_z])).norm(dim=1)
     assert (radii - RADIUS).abs().mean() < 0.015  # half a cell
     corners = surface.vertices[surface.faces].double()
@@ -91,18 +93,39 @@ def test_the_level_surface_of_a_ball_is_the_ball(center_z):
     assert (surface.colors[back] - BLUE).abs().max() < 0.05 and not surface.seen[back].any()
 
 
-def test_a_lower_level_gives_a_larger_shape():
-    field = ball(unsure=0.9)
-    cameras = [OrbitCamera(0, 90, width=64, height=64)]
-    small, large = (render_surface(level_surface(field, level), cameras)[1].sum() for level in (0.6, 0.3))
-    assert large > 1.1 * small
+def test_matter_whose_depth_is_unsure_is_put_in_one_place():
+    field = ball()
+    spread = torch.where(field.mask[..., None], torch.full_like(field.logits, -1.4), field.logits)  # a fifth each
+    spread[..., 40:44] += 0.2
+    surface = decided_surface(replace(field, logits=spread))
+    depth = surface.vertices[:, 2].max() - surface.vertices[:, 2].min()
+    matter = float(spread[64, 64].sigmoid().sum()) * (FAR - NEAR) / BINS
+    assert depth == pytest.approx(matter, rel=0.3) and matter < 0.5
+    middle = 2 - (NEAR + 42 * (FAR - NEAR) / BINS)
+    assert surface.vertices[:, 2].mean() == pytest.approx(middle, abs=0.05)
 
 
-def test_every_pixel_of_the_subject_has_matter_at_any_level():
+def test_every_pixel_of_the_subject_has_matter():
     field = ball(unsure=0.99)
-    _, alpha = render_surface(level_surface(field, 0.9), [OrbitCamera(width=SIZE, height=SIZE)])
+    faint = replace(field, logits=field.logits - 4)
+    _, alpha = render_surface(decided_surface(faint), [OrbitCamera(width=SIZE, height=SIZE)])
     inside = (alpha[0, ..., 0] > 0.5) & field.mask
     assert inside.sum() > 0.97 * field.mask.sum()
+
+
+@pytest.mark.parametrize("contrast", [0.5, 1.0, 4.0, 16.0])
+def test_contrast_keeps_the_matter_of_every_ray(contrast):
+    field = ball(unsure=0.9)
+    before, after = (
+        each.sigmoid().sum(-1)[field.mask] for each in (field.logits, decide(field.logits, field.mask, contrast))
+    )
+    torch.testing.assert_close(after, before.clamp(min=1), atol=0.01, rtol=0.001)
+
+
+def test_smooth_logits_keep_the_outline_and_a_plane():
+    field = ball()
+    level = torch.where(field.mask[..., None], torch.tensor(2.0), torch.tensor(-LARGEST_LOGIT)).expand(SIZE, SIZE, BINS)
+    torch.testing.assert_close(smooth_logits(level, field.mask), level, atol=1e-4, rtol=0)
 
 
 def test_a_mirrored_picture_has_the_mirrored_field():

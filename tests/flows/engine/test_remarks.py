@@ -9,6 +9,7 @@ import pytest
 from flows import home
 from flows.engine.events import StepEvent, listening
 from flows.engine.remarks import CAPTIONS, MOST_PICTURES, REMARKED, remark
+from flows.packages.view import viewer_of_splats
 from steps.contract import ProvenanceRecord, StepResult, digest_of
 
 NOTE = "The background was guessed."
@@ -62,6 +63,17 @@ def test_only_the_newest_pictures_are_kept_and_one_that_is_shown_again_is_new() 
         os.utime(path, (1000 + i, 1000 + i))
     assert shown("first", b"first") == first
     assert set(first.parent.iterdir()) == {first, *others[1:]}
+
+
+def test_the_first_look_at_the_splats_is_a_page_for_its_owner() -> None:
+    done = result(b"picture", NOTE, step="fit_gaussians")
+    ref = home.store().put_bytes(b"D4WS of a fox", "application/vnd.dg4d.splats+websplats")
+    (text,) = told("a fox/red", done.model_copy(update={"outputs": {**done.outputs, "first_look": ref}}))
+    page = Path(text.removeprefix("First look, the splats from all sides: "))
+    assert page.parent == home.first_looks() and page.name.startswith("a-fox-red-") and page.suffix == ".html"
+    assert stat.S_IMODE(page.stat().st_mode) == 0o600
+    assert page.read_text() == viewer_of_splats(b"D4WS of a fox", "a fox/red")
+    assert not home.cutouts().exists()
 
 
 def test_other_steps_say_nothing() -> None:

@@ -16,7 +16,7 @@ from flows.inputs.package_record import RECORD
 from flows.packages import view as module
 from flows.packages.publish import Files, publish
 from flows.packages.verify import verify
-from flows.packages.view import VIEWER, view, viewer_facts, viewer_html
+from flows.packages.view import VIEWER, view, viewer_facts, viewer_html, viewer_of_artifact, viewer_of_package
 from steps.artifacts import packages
 
 CONTENT = {"asset.json": b"{}", "asset.glb": b"glTF", "splats/moving.websplats": b"D4WS", "input/subject.png": b"png"}
@@ -49,6 +49,18 @@ def package(tmp_path: Path) -> Path:
             archive.writestr(name, content)
     publish(tmp_path / "package.zip", tmp_path / "fox", finish)
     return tmp_path / "fox"
+
+
+def test_splats_of_the_store_have_a_page_without_a_mesh(tmp_path: Path, package: Path) -> None:
+    (tmp_path / "splats").write_bytes(b"D4WS and more")
+    page = viewer_of_artifact(tmp_path / "splats", "a <fox>")
+    assert "<h1>a &lt;fox&gt;: first look</h1>" in page
+    assert 'id="data-splats"' in page and 'id="data-glb"' not in page
+    packed = tmp_path / "package.zip"
+    assert viewer_of_artifact(packed, "a fox") == viewer_of_package(packed, "a fox")
+    (tmp_path / "text").write_text("D4")
+    with pytest.raises(BadInput, match="not a package"):
+        viewer_of_artifact(tmp_path / "text", "text")
 
 
 def test_a_page_that_is_missing_or_altered_is_made(package: Path) -> None:

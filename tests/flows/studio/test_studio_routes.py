@@ -153,6 +153,7 @@ def test_a_draft_becomes_an_asset_that_is_found_downloaded_and_made_again(studio
     assert status["state"] == "done", status
     assert {step["state"] for step in status["steps"]} == {"done"}
     assert status["picture"].startswith("/dg4d/artifacts/")
+    assert status["first_look"].startswith("/dg4d/viewer/")
     record = json.loads(next((home.studio_assets()).glob("asset-wolf-*/*/provenance.json")).read_text())
     assert record["recipe"]["mask"] and record["recipe"]["views"]
     assert record["recipe"]["settings"]["driving"]["motion"] == "wave"

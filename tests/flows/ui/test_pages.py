@@ -90,6 +90,8 @@ def test_an_item_leaves_a_page_per_step_and_one_with_everything(place: Path) -> 
     labels = {step.replace("_", "-") for step in EVERY_STEP}
     assert set(kept) == labels | {f"progress-{label}" for label in labels} | {"asset"}
     assert kept["progress-fit-gaussians"]["data"] == 100
+    (look,) = re.findall(r"\(/dg4d/viewer/([0-9a-f]{64})/\d+/first_look\.html\)", kept["fit-gaussians"]["data"])
+    assert f'"first_look": "sha256:{look}"' in (place / "out" / "provenance.json").read_text()
     motion = kept["fit-motion"]["data"]
     assert "data:image/webp;base64," in motion and "| 2 | 0.01 |" in motion
 

@@ -15,7 +15,8 @@ const stageElement = document.getElementById("stage");
 
 /** Loads the embedded representations, keyed by display mode. */
 async function read() {
-  const mesh = await readMesh(await bytesOf("glb"));
+  const glb = await bytesOf("glb");
+  const mesh = glb && (await readMesh(glb));
   const packed = await bytesOf("splats");
   const splats = packed && (await readSplats(packed));
   return { mesh, cloud: splats && new Cloud(splats) };
@@ -25,9 +26,10 @@ async function start() {
   const video = fillPanel(facts(), await bytesOf("picture"), await bytesOf("video"));
   if (!canDraw()) throw new Error(NO_WEBGL);
   const { mesh, cloud } = await read();
-  const player = new Player(Math.max(mesh.duration, cloud?.splats.duration ?? 0), cloud?.splats.fps || mesh.fps || 1);
+  const player = new Player(Math.max(mesh?.duration ?? 0, cloud?.splats.duration ?? 0), cloud?.splats.fps || mesh?.fps || 1);
+  player.playing = player.frames > 1;
   const stage = new Stage(stageElement, camera());
-  const modes = ["mesh", ...(cloud ? ["splats"] : []), "wireframe"];
+  const modes = [...(mesh ? ["mesh"] : []), ...(cloud ? ["splats"] : []), ...(mesh ? ["wireframe"] : [])];
   const shown = [mesh, cloud].filter(Boolean);
   stage.world.add(...shown.map(({ object }) => object));
   let mode;
@@ -56,6 +58,7 @@ async function start() {
     dark: document.documentElement.dataset.theme === "dark",
   });
   const controls = new Controls({ player, stage, video, modes, show, draw });
+  document.querySelector("footer").hidden = player.frames === 1;
   show(modes[0]);
   stageElement.removeAttribute("data-loading");
   Object.assign(window.dg4d, {

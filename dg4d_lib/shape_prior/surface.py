@@ -1,4 +1,4 @@
-"""Closed surface at a level of a predicted shape, colored by the picture and the hidden colors."""
+"""Closed surface of a predicted shape, colored by the picture and the hidden colors."""
 
 import numpy as np
 import torch
@@ -10,36 +10,28 @@ from torch.nn.functional import cosine_similarity, grid_sample
 
 from dg4d_lib.cameras.orbit import RADIUS
 from dg4d_lib.inflation.surface import InflatedSurface
+from dg4d_lib.shape_prior.decided import most_probable, smooth_logits
 from dg4d_lib.shape_prior.field import ShapeField
 from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV
 
-SMOOTHNESS = 1.0  # cells: standard deviation of the blur that takes ragged edges off
-MARGIN = 1.0  # logits above the level that every pixel of the subject reaches; beyond, the outline would move
 BEHIND = 2.5  # cells behind the first surface of a ray from which a point is hidden
 FACING = 12.0  # slope from hidden to seen over the cosine between normal and camera
 
 
-def level_surface(field: ShapeField, level: float) -> InflatedSurface:
-    """Extract the surface at which matter is as likely as `level`.
+def decided_surface(field: ShapeField) -> InflatedSurface:
+    """Extract the surface around the most probable cells of every ray, as many as matter is expected on it.
 
-    Args:
-        field: of one frame.
-        level: probability, between 0 and 1; every pixel of the subject has some matter at any level.
+    A surface at one probability would leave out what is sure to be there but not where, or be far too thick.
     """
-    logits = (field.logits - torch.tensor(level).logit()).numpy()
-    inside = field.mask.numpy()[..., None].astype(np.float32)
-    share = ndimage.gaussian_filter(inside, (SMOOTHNESS, SMOOTHNESS, 0))
-    smooth = ndimage.gaussian_filter(logits * inside, SMOOTHNESS) / np.maximum(share, 1e-3)  # of the subject alone
-    smooth += np.maximum(MARGIN - smooth.max(-1, keepdims=True), 0)
-    bounded = np.where(inside > 0, smooth.clip(-MARGIN, MARGIN), -MARGIN)
-    volume = np.pad(bounded, 1, constant_values=-MARGIN)
+    chosen = most_probable(smooth_logits(field.logits, field.mask), field.mask).numpy()
+    volume = np.pad(chosen, 1, constant_values=-1.0)
     places, faces, _, _ = marching_cubes(volume, 0.0)
     row, column, cell = (places - 0.5).astype(np.float64).T
     distance = NEAR + cell / BINS * (FAR - NEAR)
     x, y = (2 * column / SIZE - 1) * TAN_HALF_FOV, (1 - 2 * row / SIZE) * TAN_HALF_FOV
     vertices = torch.from_numpy(np.stack([x * distance, y * distance, RADIUS - distance], -1))
     triangles = _outward(vertices, torch.from_numpy(faces.astype(np.int64)))
-    first = torch.from_numpy(np.argmax(smooth > 0, -1)).float()
+    first = torch.from_numpy(np.argmax(chosen > 0, -1)).float()
     shown = _shown(vertices, triangles, torch.from_numpy(np.stack([row, column, cell], -1)), first)
     at = torch.from_numpy(np.stack([2 * column / SIZE - 1, 2 * row / SIZE - 1], -1)).float()
     place = torch.cat([torch.from_numpy(2 * cell / BINS - 1)[:, None].float(), at], 1)[None, None, None]

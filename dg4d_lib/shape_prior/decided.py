@@ -1,0 +1,70 @@
+"""Shapes decided from probabilities of matter: sharper than these, with as much matter on every ray."""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy import ndimage
+from torch import Tensor
+
+SMOOTHNESS = 2.0  # cells: standard deviation of the blur of the logits, so that neighboring rays decide alike
+STEPS = 20  # of the bisection
+RANGE = 30.0  # logits: largest shift of a ray
+LEAST = 1.0  # cells of matter on a ray of the subject
+TIE = 1e-3  # logits by which the ends of a ray are less probable than its middle
+
+
+def smooth_logits(logits: Float[Tensor, "128 128 64"], mask: Bool[Tensor, "128 128"]) -> Float[Tensor, "128 128 64"]:
+    """Return logits averaged with those of neighboring cells of the subject; the outline stays where it is."""
+    inside = mask.numpy()[..., None].astype(np.float32)
+    share = ndimage.gaussian_filter(inside, (SMOOTHNESS, SMOOTHNESS, 0))
+    smooth = ndimage.gaussian_filter(logits.numpy() * inside, SMOOTHNESS) / np.maximum(share, 1e-3)
+    return torch.where(mask[..., None], torch.from_numpy(smooth), logits)
+
+
+def most_probable(logits: Float[Tensor, "128 128 64"], mask: Bool[Tensor, "128 128"]) -> Float[Tensor, "128 128 64"]:
+    """Return a field that is positive in the most probable cells of every ray, as many as matter is expected on it.
+
+    Args:
+        logits: of every cell lying inside the subject.
+        mask: pixels of the subject.
+
+    Returns:
+        Values in [-1, 1]; 1 at the best cell of each of these rays, -1 on all others.
+    """
+    middle = torch.linspace(-1, 1, logits.shape[-1]).abs()
+    rays = logits[mask] - TIE * middle
+    expected = logits[mask].sigmoid().sum(-1, keepdim=True).clamp(LEAST, logits.shape[-1] - LEAST)
+    ranked = rays.sort(-1, descending=True).values
+    first = (
+        (expected - 0.5).floor().long()
+    )  # cell number k of the ranking ends after k + 1 cells, its middle is k + 1/2
+    share = expected - 0.5 - first
+    level = ranked.gather(-1, first) * (1 - share) + ranked.gather(-1, first + 1) * share
+    field = torch.full_like(logits, -1.0)
+    field[mask] = ((rays - level) / (ranked[:, :1] - level)).clamp(-1, 1)
+    return field
+
+
+def decide(
+    logits: Float[Tensor, "128 128 64"], mask: Bool[Tensor, "128 128"], contrast: float, matter: float = 1.0
+) -> Float[Tensor, "128 128 64"]:
+    """Return logits times a contrast, shifted on every ray so that its expected matter stays the same.
+
+    Without the shift, matter whose depth is unsure would vanish: each of its cells is improbable.
+
+    Args:
+        logits: of every cell lying inside the subject.
+        mask: pixels of the subject; other rays stay as they are.
+        contrast: 1 changes nothing; with a large one, matter lies in the most probable cells alone.
+        matter: factor on the expected matter.
+    """
+    rays = logits[mask]
+    expected = (matter * rays.sigmoid().sum(-1, keepdim=True)).clamp(LEAST, logits.shape[-1] - LEAST)
+    low, high = torch.full_like(expected, -RANGE), torch.full_like(expected, RANGE)
+    for _ in range(STEPS):
+        middle = (low + high) / 2
+        much = (contrast * (rays + middle)).sigmoid().sum(-1, keepdim=True) > expected
+        low, high = torch.where(much, low, middle), torch.where(much, middle, high)
+    decided = logits.clone()
+    decided[mask] = contrast * (rays + (low + high) / 2)
+    return decided
