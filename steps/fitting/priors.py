@@ -132,7 +132,7 @@ def make_prior(
             if isinstance(shapes, KnownShapes):
                 frames = None if moved or 0 in shapes.frames else shapes.frames
                 weights = dict.fromkeys(shapes.frames, 1.0)
-                prior = AnalyticPrior(clean, noise, viewpoints, frames, guided, weights)
+                prior = AnalyticPrior(clean, noise, viewpoints, frames, 1.0 if moved else guided, weights)
                 network = _network(shapes.guess, settings)
                 return LoadedPrior(prior, known_note(sides), shapes=shapes, network=network)
             if isinstance(settings, LearnedPriorSettings):

@@ -65,7 +65,9 @@ def test_the_opposite_view_shows_hidden_colors():
 
 def test_unsure_depth_is_soft_from_the_side():
     side = OrbitCamera(0, 90, width=64, height=64)
-    sharp, soft = (render_volumes([expected_volume(ball(0, u), 1.2)], [side])[1][0, ..., 0] for u in (0.0, 0.97))
+    sharp, soft = (
+        render_volumes([expected_volume(ball(0, u), 1.2, matter=1.0)], [side])[1][0, ..., 0] for u in (0.0, 0.97)
+    )
     between = [float(((alpha > 0.1) & (alpha < 0.9)).float().mean()) for alpha in (sharp, soft)]
     assert between[1] > 2 * between[0]
 
