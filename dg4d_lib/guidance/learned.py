@@ -11,6 +11,7 @@ from dg4d_lib.guidance.geometric import surface_views
 from dg4d_lib.guidance.interface import GuidanceView, check_frame, check_views
 from dg4d_lib.images import resize
 from dg4d_lib.inflation.surface import InflatedSurface
+from dg4d_lib.settings import LearnedPriorSettings
 from dg4d_lib.shape_prior.expected import expected_volume
 from dg4d_lib.shape_prior.field import Fields, ShapeField
 from dg4d_lib.shape_prior.frustum import SIZE
