@@ -56,7 +56,7 @@ LEARNED_NOTE = "prior: shape network trained on made-up shapes; sides the pictur
 DEPTH_NOTE = "prior: inflation of the silhouette, with the relief of an estimated depth: weights"
 SMALLEST_NOTED = 0.05  # share of the inflation from which the report mentions it
 GUESS_WEIGHT = 0.5  # of frames whose other sides are a guess, beside frames with known views
-CARRIED_CONTRAST = 1.2  # of shapes that a known first frame has made sure already
+CARRIED_CONTRAST = 2.0  # of shapes that a known first frame has made sure already
 ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
 
 

@@ -9,6 +9,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.guidance.carried import CarriedFields
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.learned import LearnedShapes
+from dg4d_lib.settings import LearnedPriorSettings
 from dg4d_lib.shape_prior.field import LARGEST_LOGIT, InflatedFields, ShapeField, bounded_logits
 from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE
 
@@ -65,7 +66,7 @@ def test_a_box_that_turns_in_the_image_plane_keeps_its_depth_and_its_back():
 def test_views_of_other_sides_show_the_turned_box():
     pictures = [picture(TURN_DEG * frame) for frame in range(FRAMES)]
     known = _Known(box(TURN_DEG * (FRAMES - 1)))
-    found, truth = (LearnedShapes(fields, 1.2, 1.0) for fields in (carried(pictures), known))
+    found, truth = (LearnedShapes(fields, LearnedPriorSettings(contrast=1.2)) for fields in (carried(pictures), known))
     for azimuth in (90, 180, 215):
         camera = OrbitCamera(0, azimuth, width=64, height=64)
         color, alpha = found.clean([GuidanceView(camera, FRAMES - 1)])
