@@ -56,7 +56,6 @@ LEARNED_NOTE = "prior: shape network trained on made-up shapes; sides the pictur
 DEPTH_NOTE = "prior: inflation of the silhouette, with the relief of an estimated depth: weights"
 SMALLEST_NOTED = 0.05  # share of the inflation from which the report mentions it
 GUESS_WEIGHT = 0.5  # of frames whose other sides are a guess, beside frames with known views
-CARRIED_CONTRAST = 1.2  # of shapes that a known first frame has made sure already
 ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
 
 
@@ -197,9 +196,10 @@ def _carried_shapes(
 ) -> LearnedShapes:
     """Return the shapes of later frames from the known one of the first frame and a guess per frame."""
     guess: Fields = InflatedFields(cutouts)
+    contrast = LearnedPriorSettings().contrast
     if isinstance(settings, LearnedPriorSettings):
-        guess = ShapeFields(packaged.packaged_network(), cutouts, turn_deg)
-    return LearnedShapes(CarriedFields(guess, first, cutouts), CARRIED_CONTRAST, matter=1.0)
+        guess, contrast = ShapeFields(packaged.packaged_network(), cutouts, turn_deg), settings.contrast
+    return LearnedShapes(CarriedFields(guess, first, cutouts), contrast, matter=1.0)
 
 
 def _network(shapes: SubjectShapes, settings: PriorSettings) -> LearnedShapes | None:
