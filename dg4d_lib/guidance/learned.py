@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dg4d_lib.guidance.interface import GuidanceView, check_frame, check_views
 from dg4d_lib.images import resize
+from dg4d_lib.inflation.hints import NO_HINT, DepthHint
 from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.settings import LearnedPriorSettings
 from dg4d_lib.shape_prior.expected import expected_volume
@@ -29,7 +30,7 @@ class LearnedShapes:
         network: ShapePriorNetwork,
         cutouts: Sequence[Float[Tensor, "h w 4"]],
         settings: LearnedPriorSettings,
-        turn_deg: float = 0.0,
+        hint: DepthHint = NO_HINT,
     ) -> None:
         """Encode the pictures.
 
@@ -37,9 +38,9 @@ class LearnedShapes:
             network: of the shape prior.
             cutouts: one per frame: square, straight alpha, color and alpha in [0, 1].
             settings: contrast of the views.
-            turn_deg: hint at the turn of the subject about the vertical; it decides where the network is unsure.
+            hint: at the depth of the subject; it decides where the network is unsure.
         """
-        self._fields = ShapeFields(network, cutouts, turn_deg)
+        self._fields = ShapeFields(network, cutouts, hint)
         self._settings = settings
         self._volumes: dict[int, ShapeVolume] = {}
         self._inflated: dict[int, float] = {}
