@@ -101,7 +101,7 @@ class LearnedPriorSettings(Settings):
         0.5, ge=0, le=10, description="factor on the guidance loss; a smaller one leaves the input view sharper"
     )
     contrast: float = Field(
-        3.0,
+        2.0,
         ge=0.25,
         le=16,
         description="factor on the log-odds of matter, with as much matter on every ray; a larger one gives sharper "

@@ -5,7 +5,7 @@ from dg4d_lib.shape_prior.decided import decide
 from dg4d_lib.shape_prior.field import ShapeField
 from dg4d_lib.shape_prior.raymarch import ShapeVolume, make_volume
 
-MATTER = 1.2  # factor on the expected matter: views of a shape that is not certain overlap most with more than that
+MATTER = 1.25  # factor on the expected matter: views of a shape that is not certain overlap most with more than that
 SEEN, UNSEEN = 0.3, 0.05  # transmittance from the input camera: above it the picture's color, below it the hidden one
 
 

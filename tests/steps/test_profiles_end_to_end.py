@@ -17,6 +17,7 @@ from tiny_wan import save_tiny_wan
 from tiny_weights import write_zero123
 
 from dg4d_lib.diffusion.view_drawing import ViewDrawer
+from dg4d_lib.shape_prior import packaged
 from dg4d_lib.weights.registry import KNOWN
 from steps.artifacts.packages import ABOUT, ASSET, MANIFEST, MERGED, MESHES, RIGGED, SPLATS
 from steps.catalog import STEPS
@@ -83,7 +84,7 @@ class Run:
 
     def __post_init__(self) -> None:
         changes = dict(TINY)
-        if self.profile == "preview":  # its stages have no models
+        if self.profile == "preview":  # its stages have no large models
             changes = {key: value for key, value in TINY.items() if not key.startswith(OF_MODELS)}
         if self.profile == "open":
             changes = {key: value for key, value in TINY.items() if not key.startswith(("refiner", "driving.model"))}
@@ -238,9 +239,10 @@ def test_the_preview_draws_wherever_there_is_a_device(tmp_path: Path) -> None:
     run = Run("preview", ArtifactStore(tmp_path / "store"))
     with zipfile.ZipFile(run.make(source_of(tmp_path, run.store, moving=False))) as files:
         assert files.read(ASSET).startswith(b"glTF")
-    assert not any(record.weights or record.flops for record in run.records)
+    used = {name for record in run.records for name in record.weights}
+    assert used == set(packaged.digests()) and not any(record.flops for record in run.records)
     assert all(("gpu" in record.machine) == torch.cuda.is_available() for record in run.records)
-    assert any("no model" in note for note in run.notes())
+    assert any("shape network" in note for note in run.notes())
 
 
 @pytest.mark.parametrize("name", PROFILES)
