@@ -20,12 +20,12 @@ from benchmarks.true_views import (
     Figures,
     Subject,
     figures,
+    hint_of,
     line,
     mean,
     prepared,
     read_subjects,
     score_fit,
-    turn_of,
     write_sheet,
 )
 
@@ -36,6 +36,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.images import over_white, resize
+from dg4d_lib.inflation.hints import DepthHint
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.shape_prior import packaged
 from dg4d_lib.video.subject import prepare_subject
@@ -67,7 +68,7 @@ def score_prior(subject: Subject, settings: PipelineSettings, frames: Sequence[i
         Figures, and the views of the first of these frames side by side, over white.
     """
     cutouts = prepared(subject, settings)
-    shapes = subject_shapes(settings.prior, [cutouts[frame] for frame in frames], turn_of(cutouts, settings))
+    shapes = subject_shapes(settings.prior, [cutouts[frame] for frame in frames], hint_of(cutouts, settings))
     size = next(iter(subject.views.values())).shape[1]
     rows, strip = [], []
     for azimuth, truth in subject.views.items():
@@ -80,7 +81,7 @@ def score_prior(subject: Subject, settings: PipelineSettings, frames: Sequence[i
 
 def surface_strip(cutout: Tensor, settings: PipelineSettings) -> Tensor:
     """Return the picture and the surface of frame 0 from eight sides, over white."""
-    shapes = subject_shapes(settings.prior, [cutout], settings.subject.turn_deg)
+    shapes = subject_shapes(settings.prior, [cutout], DepthHint(settings.subject.turn_deg))
     cameras = [OrbitCamera(SHEET_ELEVATION_DEG, azimuth, width=SHEET, height=SHEET) for azimuth in range(0, 360, 45)]
     color, alpha = render_surface(shapes.surface(0), cameras)
     return torch.cat([over_white(resize(cutout[None], (SHEET, SHEET)))[0], *(color * alpha + 1 - alpha)], 1)

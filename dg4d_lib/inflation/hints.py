@@ -154,9 +154,7 @@ def depth_field(
     return DepthField(torch.from_numpy(np.where(sure, body, 0)).float(), torch.from_numpy(sure), sigma)
 
 
-def layer_field(
-    levels: Float[Tensor, "s s"], known: Bool[Tensor, "s s"], alpha: Float[Tensor, "s s"]
-) -> DepthField:
+def layer_field(levels: Float[Tensor, "s s"], known: Bool[Tensor, "s s"], alpha: Float[Tensor, "s s"]) -> DepthField:
     """Return the field of a picture of layers: mid-gray lies in the subject's plane, lighter before, darker behind it.
 
     Args:

@@ -40,7 +40,9 @@ def hint_evidence(
     return torch.from_numpy(middle_evidence(middle, own_middle(logits, inside))).to(logits)
 
 
-def middle_evidence(middle: Float64[np.ndarray, "s s"], own: Float64[np.ndarray, "s s"]) -> Float64[np.ndarray, "s s d"]:
+def middle_evidence(
+    middle: Float64[np.ndarray, "s s"], own: Float64[np.ndarray, "s s"]
+) -> Float64[np.ndarray, "s s d"]:
     """Return the log ratio of Gaussians about the hinted middle and about that of the network."""
     offset = (middle - own)[..., None]
     return offset * (2 * DEPTHS - (middle + own)[..., None]) / (2 * PLANE_SIGMA**2)

@@ -1,6 +1,6 @@
 """Guidance priors of the fits, from settings and files."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from dg4d_lib.guidance.learned import LearnedShapes
 from dg4d_lib.guidance.oracle import Bank, perturb
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.images import over_white
+from dg4d_lib.inflation.hints import NO_HINT, DepthHint
 from dg4d_lib.settings import (
     FitSettings,
     GeometricPriorSettings,
@@ -41,6 +42,7 @@ from dg4d_lib.shape_prior import packaged
 from dg4d_lib.visual_hull.known import KnownView, known_view
 from dg4d_lib.weights.registry import lookup_weights
 from steps.artifacts.archives import unpack
+from steps.artifacts.depth_fields import read_depth_field
 from steps.artifacts.media import read_png
 from steps.artifacts.pose import read_turn
 from steps.profiles import flow_matching_refusal
@@ -91,7 +93,7 @@ def make_prior(
     stage: FitSettings,
     bank: Path | None,
     scratch: Path,
-    turn_deg: float = 0.0,
+    hint: DepthHint = NO_HINT,
     sides: Bank | None = None,
     moved: SubjectShapes | None = None,
 ) -> LoadedPrior:
@@ -103,7 +105,7 @@ def make_prior(
         stage: settings of the fit, which give the timesteps.
         bank: zip of ground-truth views, for the oracle.
         scratch: folder for unpacking.
-        turn_deg: azimuth by which the subject is turned; see `subject_turn`.
+        hint: at the depth of the subject; see `subject_hint`.
         sides: views of other sides that the user gave; priors with shapes take them as their own.
         moved: shapes of frames without such views, which then guide these frames, too.
 
@@ -116,7 +118,7 @@ def make_prior(
     )
     match settings:
         case GeometricPriorSettings() | LearnedPriorSettings():
-            shapes = subject_shapes(settings, cutouts, turn_deg, sides, moved)
+            shapes = subject_shapes(settings, cutouts, hint, sides, moved)
             note, weight, opened = GEOMETRIC_NOTE, 1.0, None
             clean, viewpoints = shapes.clean, None
             if stage.viewpoints:
@@ -126,7 +128,7 @@ def make_prior(
                 return LoadedPrior(prior, known_note(sides), shapes=shapes)
             if isinstance(settings, LearnedPriorSettings):
                 note, weight = LEARNED_NOTE, settings.weight
-            elif settings.depth_weights:
+            elif settings.depth_weights and not hint.sigma:
                 note, opened = f"{DEPTH_NOTE} {settings.depth_weights}", open_weights(settings.depth_weights)
             return LoadedPrior(AnalyticPrior(clean, noise, viewpoints, weight=weight), note, opened, shapes=shapes)
         case OraclePriorSettings():
@@ -150,7 +152,7 @@ def make_prior(
 def subject_shapes(
     settings: PriorSettings,
     cutouts: Sequence[Float[Tensor, "h w 4"]],
-    turn_deg: float,
+    hint: DepthHint = NO_HINT,
     sides: Bank | None = None,
     moved: SubjectShapes | None = None,
 ) -> SubjectShapes:
@@ -159,20 +161,20 @@ def subject_shapes(
     Args:
         settings: of the prior; one that has no shapes of its own gets the inflation with its defaults.
         cutouts: the subject at every frame.
-        turn_deg: turn of the subject about the vertical; see `subject_turn`.
+        hint: at its depth; see `subject_hint`. A depth picture goes before an estimate by `prior.depth_weights`.
         sides: views of other sides; their hull replaces the shapes of their frames.
         moved: shapes of all other frames, instead of those of the settings.
     """
     if moved is not None:
         shapes = moved
     elif isinstance(settings, LearnedPriorSettings):
-        shapes = LearnedShapes(packaged.packaged_network(), cutouts, settings, turn_deg)
+        shapes = LearnedShapes(packaged.packaged_network(), cutouts, settings, hint)
     else:
         own = settings if isinstance(settings, GeometricPriorSettings) else GeometricPriorSettings()
         depth = None
-        if own.depth_weights and sides is None:
+        if own.depth_weights and sides is None and not hint.sigma:
             depth = DepthEstimator.load(open_weights(own.depth_weights).folder, default_device())
-        shapes = InflatedSurfaces(cutouts, own, turn_deg, depth)
+        shapes = InflatedSurfaces(cutouts, own, hint, depth)
     if sides is None:
         return shapes
     frames = [frame for frame in sides.frames if frame < len(cutouts)]
@@ -204,12 +206,20 @@ def known_note(bank: Bank | None) -> str:
     return f"prior: visual hull of {count + 1} views; what none of them shows is a guess"
 
 
-def subject_turn(settings: PriorSettings, pose: Path | None, hint_deg: float) -> float:
-    """Return the turn of the subject for a prior, degrees: the user's hint, else that of its footage.
+def subject_hint(settings: PriorSettings, inputs: Mapping[str, Path], turn_deg: float) -> DepthHint:
+    """Return what is known about the depth of the subject, for a prior.
 
-    The shape network sees turns itself: even true ones from elsewhere do not improve it, so it gets hints alone.
+    The shape network sees turns itself: even true ones from elsewhere do not improve it, so it gets those of the user
+    alone.
+
+    Args:
+        settings: of the prior.
+        inputs: of a step, by port.
+        turn_deg: turn by the user, which goes before that of the footage.
     """
-    return read_turn(None if isinstance(settings, LearnedPriorSettings) else pose, hint_deg)
+    pose = None if isinstance(settings, LearnedPriorSettings) else inputs.get("pose")
+    field = inputs.get("depth_field")
+    return DepthHint(read_turn(pose, turn_deg), read_depth_field(field) if field else None)
 
 
 def inflated_note(share: float) -> str:

@@ -64,7 +64,8 @@ def test_distances_of_an_enlarged_crop_are_as_deep_as_the_subject_is_wide() -> N
 
 def test_inverse_depth_is_known_up_to_scale_and_offset() -> None:
     one, other = (
-        depth_field(scale / (2 - FRONT) + offset, KNOWN, ALPHA, "inverse") for scale, offset in ((1.0, 0.0), (90.0, 7.0))
+        depth_field(scale / (2 - FRONT) + offset, KNOWN, ALPHA, "inverse")
+        for scale, offset in ((1.0, 0.0), (90.0, 7.0))
     )
     assert (one.middle - other.middle).abs().max() < 1e-3
     right, left = one.middle[32, 48], one.middle[32, 15]
@@ -83,7 +84,9 @@ def test_unknown_pixels_take_the_nearest_depth_and_fade_to_the_plane() -> None:
     middle, weight = hint.middle(SIZE)
     assert middle[32, 20] == pytest.approx(0.4) and weight[32, 20] == 1
     gap = 10 * PIXEL / FADE
-    assert weight[32, 33] == pytest.approx(math.exp(-(gap**2))) and middle[32, 33] == pytest.approx(0.4 * weight[32, 33])
+    assert weight[32, 33] == pytest.approx(math.exp(-(gap**2))) and middle[32, 33] == pytest.approx(
+        0.4 * weight[32, 33]
+    )
     assert abs(middle[32, 60]) < 1e-3
 
 

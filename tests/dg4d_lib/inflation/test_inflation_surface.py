@@ -111,7 +111,9 @@ def test_a_symmetric_picture_gives_a_symmetric_surface():
 @pytest.mark.parametrize("turn_deg", [0.0, 25.0])
 def test_the_input_view_shows_the_picture(name, turn_deg):
     picture = cutout(SHAPES[name])
-    color, coverage = render_surface(inflate(picture, SIZE, DepthHint(turn_deg)), [OrbitCamera(width=SIZE, height=SIZE)])
+    color, coverage = render_surface(
+        inflate(picture, SIZE, DepthHint(turn_deg)), [OrbitCamera(width=SIZE, height=SIZE)]
+    )
     excess = coverage[0, ..., 0] - picture[..., 3]
     assert excess.min() > -0.51  # half of an edge pixel is cut
     assert (excess > 0.51).sum() <= 0.002 * SIZE**2
