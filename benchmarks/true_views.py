@@ -50,12 +50,14 @@ class Subject:
         footage: cut-outs, straight alpha.
         views: azimuth to cut-outs.
         truth: files of the object; None for made-up ones.
+        depth: distance of the first frame's surface from the camera's plane, 0 where there is none; None: unknown.
     """
 
     name: str
     footage: Float[Tensor, "t h w 4"]
     views: Mapping[float, Float[Tensor, "t s s 4"]] = field(default_factory=dict)
     truth: GroundTruth | None = None
+    depth: Float[Tensor, "s s"] | None = None
 
 
 def read_subjects(folder: Path, names: Sequence[str] = ()) -> Iterator[Subject]:

@@ -35,7 +35,9 @@ def run(job: Job) -> StepReport:
     """Fit the Gaussians and render them from six sides."""
     static: StaticSettings = job.settings.static
     prior: PriorSettings = job.settings.prior
-    backend, hint = job.settings.rasterizer, subject_hint(prior, job.inputs, job.settings.turn_deg)
+    backend = job.settings.rasterizer
+    depth = job.inputs.get("depth_field")
+    hint = subject_hint(prior, job.inputs.get("pose"), depth, job.settings.turn_deg)
     subject = read_png(job.inputs["subject"])
     generator = torch.Generator().manual_seed(job.seed)
     rasterize = get_rasterizer(backend)

@@ -46,6 +46,7 @@ def run(job: Job) -> StepReport:
     boxed = settings.model_copy(update={"box": scaled_box(settings.box, source)})
     prepared = prepare_subject(source.frames, source.has_alpha, boxed, mask, network.segmenter)
     cutouts, notes = prepared.frames, prepared.notes
+    hinted = read_hint(job, source, prepared)
     if prepared.estimate is not None:
         found = prepared.estimate
         gates = gates_as_json(evaluate_cutout(found.frames[..., 3], found.agreement, job.settings.cutout))
@@ -59,7 +60,7 @@ def run(job: Job) -> StepReport:
         write_pose(job.outputs["pose"], Pose(turn_deg=round(turn_deg, 3)))
         notes = (*notes, turn_note(turn_deg)) if turn_deg and not settings.turn_deg else notes
     tiles = picture_of(source.frames[0], cutouts[0])
-    if hinted := read_hint(job, source, prepared):
+    if hinted:
         field, note = hinted
         write_depth_field(job.outputs["depth_field"], field)
         notes, tiles = (*notes, note), torch.cat([tiles, picture_of_depth(field)], 1)

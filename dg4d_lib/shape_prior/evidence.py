@@ -13,7 +13,7 @@ from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV
 
 PLANE_SIGMA = 0.3  # world units: standard deviation of the body's middle about a plane, or layers, of a user
 OWN_BLUR = 10.0  # pixels: a plane is compared with the network's own middle without detail
-FRONT = 9.0  # logits right before and right behind a surface that is known
+FRONT = 4.0  # logits right before and right behind a surface that is known
 BEHIND = 2.0  # logits against matter from twice the expected thickness on
 THINNEST = 0.04  # world units: half thickness of parts that the outline shows thinner
 PIXEL = 4 * TAN_HALF_FOV / SIZE  # world units in the plane z = 0

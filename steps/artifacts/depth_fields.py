@@ -28,19 +28,12 @@ def read_depth_field(path: Path) -> DepthField:
     """
     try:
         about, tensors = read_tensors(path, KEY)
-        field = DepthField(tensors["middle"], tensors["known"], float(about["sigma"]))
+        middle, known, sigma = tensors["middle"], tensors["known"], float(about["sigma"])
     except (SafetensorError, KeyError, ValueError, TypeError) as error:
         raise BadInput(
             f"{path.name} is no depth field ({type(error).__name__}); give the output `depth_field` of prepare_subject"
         ) from error
-    square = field.middle.ndim == 2 and len(set(field.middle.shape)) == 1
-    if (
-        not square
-        or field.known.shape != field.middle.shape
-        or field.known.dtype != torch.bool
-        or not field.known.any()
-    ):
-        raise BadInput(
-            f"{path.name} is no depth field: {tuple(field.middle.shape)} values, {int(field.known.sum())} known"
-        )
-    return field
+    square = middle.ndim == 2 and len(set(middle.shape)) == 1 and middle.shape == known.shape
+    if not square or known.dtype != torch.bool or not known.any():
+        raise BadInput(f"{path.name} is no depth field: {tuple(middle.shape)} values, {int(known.sum())} known")
+    return DepthField(middle.float(), known, sigma)

@@ -1,6 +1,6 @@
 """Guidance priors of the fits, from settings and files."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -206,7 +206,7 @@ def known_note(bank: Bank | None) -> str:
     return f"prior: visual hull of {count + 1} views; what none of them shows is a guess"
 
 
-def subject_hint(settings: PriorSettings, inputs: Mapping[str, Path], turn_deg: float) -> DepthHint:
+def subject_hint(settings: PriorSettings, pose: Path | None, field: Path | None, turn_deg: float) -> DepthHint:
     """Return what is known about the depth of the subject, for a prior.
 
     The shape network sees turns itself: even true ones from elsewhere do not improve it, so it gets those of the user
@@ -214,12 +214,12 @@ def subject_hint(settings: PriorSettings, inputs: Mapping[str, Path], turn_deg: 
 
     Args:
         settings: of the prior.
-        inputs: of a step, by port.
+        pose: turn that the footage shows.
+        field: depth by the user.
         turn_deg: turn by the user, which goes before that of the footage.
     """
-    pose = None if isinstance(settings, LearnedPriorSettings) else inputs.get("pose")
-    field = inputs.get("depth_field")
-    return DepthHint(read_turn(pose, turn_deg), read_depth_field(field) if field else None)
+    shown = None if isinstance(settings, LearnedPriorSettings) else pose
+    return DepthHint(read_turn(shown, turn_deg), read_depth_field(field) if field else None)
 
 
 def inflated_note(share: float) -> str:
