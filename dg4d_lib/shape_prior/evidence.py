@@ -16,6 +16,8 @@ OWN_BLUR = 10.0  # pixels: a plane is compared with the network's own middle wit
 FRONT = 4.0  # logits right before and right behind a surface that is known
 BEHIND = 2.0  # logits against matter from twice the expected thickness on
 THINNEST = 0.04  # world units: half thickness of parts that the outline shows thinner
+JUMP = 0.2  # world units between neighboring pixels: a part before another one
+BESIDE = 4  # pixels: within it the farther part goes on behind the nearer one
 PIXEL = 4 * TAN_HALF_FOV / SIZE  # world units in the plane z = 0
 DEPTHS = RADIUS - (NEAR + (np.arange(BINS) + 0.5) * (FAR - NEAR) / BINS)  # middles of the cells, world units along +z
 
@@ -35,8 +37,10 @@ def hint_evidence(
     middle, weight = hint.middle(SIZE)
     inside = mask.numpy()
     if hint.sigma:
-        front = middle + heights(inside, PIXEL)
-        return torch.from_numpy(weight[..., None] * front_evidence(front, front - middle, hint.sigma)).to(logits)
+        bulge = heights(inside, PIXEL)
+        front = middle + bulge
+        thickness = np.maximum(2 * np.maximum(bulge, THINNEST), _behind_jumps(front, inside))
+        return torch.from_numpy(weight[..., None] * front_evidence(front, thickness, hint.sigma)).to(logits)
     return torch.from_numpy(middle_evidence(middle, own_middle(logits, inside))).to(logits)
 
 
@@ -49,7 +53,7 @@ def middle_evidence(
 
 
 def front_evidence(
-    front: Float64[np.ndarray, "s s"], bulge: Float64[np.ndarray, "s s"], sigma: float
+    front: Float64[np.ndarray, "s s"], thickness: Float64[np.ndarray, "s s"], sigma: float
 ) -> Float64[np.ndarray, "s s d"]:
     """Return log-odds of matter on rays whose first surface is known.
 
@@ -57,15 +61,22 @@ def front_evidence(
 
     Args:
         front: depth of the surface, world units along +z.
-        bulge: half the expected thickness.
+        thickness: expected behind it, world units.
         sigma: standard deviation of the surface's depth, world units.
     """
     deep = front[..., None] - DEPTHS
-    thickness = 2 * np.maximum(bulge, THINNEST)[..., None]
     behind = 1 / (1 + np.exp(-(2 * deep / sigma).clip(-50, 50)))
-    past = deep / thickness - 1
+    past = deep / thickness[..., None] - 1
     matter = np.where(past < 0, -FRONT * past, -BEHIND * past.clip(0, 1))
     return behind * matter - (1 - behind) * FRONT
+
+
+def _behind_jumps(front: Float64[np.ndarray, "s s"], mask: Bool[np.ndarray, "s s"]) -> Float64[np.ndarray, "s s"]:
+    """Return the thickness that reaches farther parts beside a jump of depth: they go on behind what covers them."""
+    deepest, nearest = np.where(mask, front, np.inf), np.where(mask, front, -np.inf)
+    jumps = mask & (ndimage.maximum_filter(nearest, 3) - ndimage.minimum_filter(deepest, 3) > JUMP)
+    beside = mask & ndimage.maximum_filter(jumps, 2 * BESIDE + 1)
+    return np.where(beside, 2 * (front - ndimage.minimum_filter(deepest, 2 * BESIDE + 1)), 0.0)
 
 
 def own_middle(logits: Float[Tensor, "s s d"], mask: Bool[np.ndarray, "s s"]) -> Float64[np.ndarray, "s s"]:

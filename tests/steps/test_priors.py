@@ -196,8 +196,9 @@ def test_a_depth_field_survives_its_file_and_bends_both_priors(tmp_path: Path, m
     ball = torch.from_numpy(disc()).float() / 255
     for settings in (GeometricPriorSettings(), LearnedPriorSettings()):
         hint = subject_hint(settings, None, tmp_path / "field.safetensors", 0.0)
-        plain, near = (subject_shapes(settings, [ball], each).surface(0) for each in (DepthHint(), hint))
-        assert float(near.vertices[:, 2].mean() - plain.vertices[:, 2].mean()) > 0.1
+        behind = DepthHint(0.0, replace(field, middle=-field.middle))
+        near, far = (subject_shapes(settings, [ball], each).surface(0) for each in (hint, behind))
+        assert float(near.vertices[:, 2].mean() - far.vertices[:, 2].mean()) > 0.2
 
 
 def test_a_depth_picture_goes_before_a_depth_network(tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ def test_the_middle_of_the_matter_is_found() -> None:
 
 
 def test_a_known_surface_has_nothing_before_it_and_matter_behind_it() -> None:
-    found = front_evidence(np.full((1, 1), 0.1), np.full((1, 1), 0.15), 0.03)[0, 0]
+    found = front_evidence(np.full((1, 1), 0.1), np.full((1, 1), 0.3), 0.03)[0, 0]
     deep = 0.1 - DEPTHS
     assert np.allclose(found[deep < -0.1], -FRONT, atol=0.1)
     assert found[np.argmin(np.abs(deep - 0.06))] == pytest.approx(0.8 * FRONT, rel=0.1)
