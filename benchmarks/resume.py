@@ -25,7 +25,6 @@ from flows.packages.publish import load_verified
 SMALL = {
     "subject.size": "64",
     "driving.frames": "4",
-    "prior.size": "48",
     "static.iterations": "40",
     "static.views": "1",
     "static.start.points": "400",

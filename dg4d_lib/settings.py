@@ -94,18 +94,25 @@ class GeometricPriorSettings(Settings):
 
 
 class LearnedPriorSettings(Settings):
-    """Shape prior of this package, trained on made-up shapes: expected views of the subject; no download."""
+    """Shape prior of this package, trained on made-up shapes; no download."""
 
     kind: Literal["learned"] = "learned"
     weight: float = Field(
         0.5, ge=0, le=10, description="factor on the guidance loss; a smaller one leaves the input view sharper"
     )
+    depth_sigma: float = Field(
+        0.06,
+        ge=0,
+        le=0.5,
+        description="standard deviation of the guessed depth, world units: a view from the side is the average over it,"
+        " soft along the direction in which depth shows",
+    )
     contrast: float = Field(
-        2.0,
-        ge=0.25,
+        0.0,
+        ge=0,
         le=16,
-        description="factor on the log-odds of matter, with as much matter on every ray; a larger one gives sharper "
-        "unseen sides",
+        description="0: views of the surface of the most probable cells; else views averaged over all shapes that are "
+        "possible, with this factor on the log-odds of matter: closer to the truth on average, but fog (typical: 2)",
     )
 
 

@@ -92,13 +92,27 @@ class InflatedSurfaces:
         check_views(views, len(self._cutouts))
         surfaces = [self.surface(view.frame) for view in views]
         cameras = [view.camera for view in views]
-        fine = max(camera.height for camera in cameras) > LARGE * self._settings.size
-        color, alpha = render_surface(surfaces, cameras, supersample=1 if fine else 2)
-        white = over_background(color, alpha, 1.0)
-        both = torch.cat([white.movedim(-1, 1), alpha.movedim(-1, 1)], 1).movedim(1, -1)  # plane by plane
-        if self._settings.depth_sigma:
-            both = averaged_over_depth(both, cameras, self._settings.depth_sigma)
-        return both[..., :3], both[..., 3:]
+        return surface_views(surfaces, cameras, self._settings.size, self._settings.depth_sigma)
+
+
+def surface_views(
+    surfaces: Sequence[InflatedSurface], cameras: Sequence[OrbitCamera], size: int, depth_sigma: float
+) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
+    """Return color over white and alpha of surfaces whose depth is unsure, in [0, 1].
+
+    Args:
+        surfaces: one per camera.
+        cameras: of one size.
+        size: pixels of a side at which the surfaces were built.
+        depth_sigma: see `averaged_over_depth`; 0: none.
+    """
+    fine = max(camera.height for camera in cameras) > LARGE * size
+    color, alpha = render_surface(surfaces, cameras, supersample=1 if fine else 2)
+    white = over_background(color, alpha, 1.0)
+    both = torch.cat([white.movedim(-1, 1), alpha.movedim(-1, 1)], 1).movedim(1, -1)  # plane by plane
+    if depth_sigma:
+        both = averaged_over_depth(both, cameras, depth_sigma)
+    return both[..., :3], both[..., 3:]
 
 
 def averaged_over_depth(

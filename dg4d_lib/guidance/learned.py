@@ -1,4 +1,4 @@
-"""Expected views of a subject by the shape prior: averages over the shapes that it holds possible."""
+"""Views of a subject by the shape prior: of its most probable surface, or averages over all shapes that are possible."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dg4d_lib.guidance.geometric import surface_views
 from dg4d_lib.guidance.interface import GuidanceView, check_frame, check_views
 from dg4d_lib.images import resize
 from dg4d_lib.inflation.hints import NO_HINT, DepthHint
@@ -37,11 +38,12 @@ class LearnedShapes:
         Args:
             network: of the shape prior.
             cutouts: one per frame: square, straight alpha, color and alpha in [0, 1].
-            settings: contrast of the views.
+            settings: uncertainty of the views.
             hint: at the depth of the subject; it decides where the network is unsure.
         """
         self._fields = ShapeFields(network, cutouts, hint)
         self._settings = settings
+        self._surfaces: dict[int, InflatedSurface] = {}
         self._volumes: dict[int, ShapeVolume] = {}
         self._inflated: dict[int, float] = {}
         self._last: tuple[int, ShapeField] | None = None  # one: a field has 17 MB
@@ -57,10 +59,12 @@ class LearnedShapes:
         Raises:
             BadInput: there is no such frame, or its picture shows no subject.
         """
-        return decided_surface(self._field(frame))
+        if frame not in self._surfaces:
+            self._surfaces[frame] = decided_surface(self._field(frame))
+        return self._surfaces[frame]
 
     def clean(self, views: Sequence[GuidanceView]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
-        """Return the expected color over white and the expected alpha, in [0, 1].
+        """Return color over white and alpha, in [0, 1].
 
         Args:
             views: b cameras of one size, each with its frame.
@@ -69,6 +73,9 @@ class LearnedShapes:
             BadInput: no views, views of different sizes, or a frame that is not there.
         """
         check_views(views, len(self._fields))
+        if not self._settings.contrast:
+            surfaces = [self.surface(view.frame) for view in views]
+            return surface_views(surfaces, [view.camera for view in views], SIZE, self._settings.depth_sigma)
         size = views[0].camera.height, views[0].camera.width
         coarse = _coarse(size)
         cameras = [replace(view.camera, height=coarse[0], width=coarse[1]) for view in views]

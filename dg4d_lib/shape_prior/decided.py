@@ -9,6 +9,7 @@ from torch import Tensor
 SMOOTHNESS = 2.0  # cells: standard deviation of the blur of the logits, so that neighboring rays decide alike
 STEPS = 20  # of the bisection
 RANGE = 30.0  # logits: largest shift of a ray
+MATTER = 1.25  # factor on the expected matter: shapes that are not certain overlap most with a bit more than that
 LEAST = 1.0  # cells of matter on a ray of the subject
 TIE = 1e-3  # logits by which the ends of a ray are less probable than its middle
 
@@ -33,7 +34,7 @@ def most_probable(logits: Float[Tensor, "128 128 64"], mask: Bool[Tensor, "128 1
     """
     middle = torch.linspace(-1, 1, logits.shape[-1]).abs()
     rays = logits[mask] - TIE * middle
-    expected = logits[mask].sigmoid().sum(-1, keepdim=True).clamp(LEAST, logits.shape[-1] - LEAST)
+    expected = (matter * logits[mask].sigmoid().sum(-1, keepdim=True)).clamp(LEAST, logits.shape[-1] - LEAST)
     ranked = rays.sort(-1, descending=True).values
     first = (
         (expected - 0.5).floor().long()

@@ -1,11 +1,10 @@
 """Volume whose renderings are the expected color and alpha of a predicted shape."""
 
 from dg4d_lib.shape_prior.absorption import optical_density, transmittance
-from dg4d_lib.shape_prior.decided import decide
+from dg4d_lib.shape_prior.decided import MATTER, decide
 from dg4d_lib.shape_prior.field import ShapeField
 from dg4d_lib.shape_prior.raymarch import ShapeVolume, make_volume
 
-MATTER = 1.25  # factor on the expected matter: views of a shape that is not certain overlap most with more than that
 SEEN, UNSEEN = 0.3, 0.05  # transmittance from the input camera: above it the picture's color, below it the hidden one
 
 

@@ -19,7 +19,6 @@ pytestmark = pytest.mark.slow
 TINY = {
     "subject.size": 64,
     "driving.frames": 3,
-    "prior.size": 48,
     "static.iterations": 4,
     "static.views": 1,
     "static.start.points": 400,

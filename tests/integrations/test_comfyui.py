@@ -24,7 +24,6 @@ FOLDER = ROOT / "integrations" / "comfyui"
 QUICK = """
 subject.size=64
 driving.frames=4  # of the paper's 14
-prior.size=48
 static.iterations=10
 static.views=1
 static.start.points=400

@@ -11,7 +11,8 @@ from dg4d_lib.guidance.learned import LearnedShapes
 from dg4d_lib.settings import LearnedPriorSettings
 
 SIZE = 48
-SETTINGS = LearnedPriorSettings()
+SETTINGS = LearnedPriorSettings(depth_sigma=0)
+AVERAGES = LearnedPriorSettings(contrast=2)
 
 
 def disc(x: float) -> torch.Tensor:
@@ -20,12 +21,15 @@ def disc(x: float) -> torch.Tensor:
     return torch.cat([torch.tensor([0.9, 0.3, 0.1]).expand(SIZE, SIZE, 3), alpha], -1)
 
 
-def shapes(*places: float) -> SubjectShapes:
-    return LearnedShapes(tiny_network(), [disc(x) for x in places], SETTINGS)
+def shapes(*places: float, settings: LearnedPriorSettings = SETTINGS) -> SubjectShapes:
+    return LearnedShapes(tiny_network(), [disc(x) for x in places], settings)
 
 
-def test_the_input_view_of_a_frame_shows_that_frame_over_white():
-    color, alpha = shapes(16, 32).clean([GuidanceView(OrbitCamera(width=SIZE, height=SIZE), frame) for frame in (1, 0)])
+@pytest.mark.parametrize("settings", [SETTINGS, AVERAGES])
+def test_the_input_view_of_a_frame_shows_that_frame_over_white(settings):
+    color, alpha = shapes(16, 32, settings=settings).clean(
+        [GuidanceView(OrbitCamera(width=SIZE, height=SIZE), frame) for frame in (1, 0)]
+    )
     for view, x in enumerate((32, 16)):
         picture = disc(x)
         assert (alpha[view] - picture[..., 3:]).abs().mean() < 0.06  # a tenth of the disc shines through, and edges
@@ -33,11 +37,12 @@ def test_the_input_view_of_a_frame_shows_that_frame_over_white():
         assert (color[view][outside] - 1).abs().max() < 0.01
 
 
-def test_views_do_not_depend_on_their_neighbors():
+@pytest.mark.parametrize("settings", [SETTINGS, AVERAGES])
+def test_views_do_not_depend_on_their_neighbors(settings):
     views = [GuidanceView(OrbitCamera(10 * i, 70 * i, width=32, height=32), i % 2) for i in range(4)]
-    color, alpha = shapes(16, 32).clean(views)
+    color, alpha = shapes(16, 32, settings=settings).clean(views)
     for i, view in enumerate(views):
-        alone, cover = shapes(16, 32).clean([view])
+        alone, cover = shapes(16, 32, settings=settings).clean([view])
         assert torch.equal(alone[0], color[i]) and torch.equal(cover[0], alpha[i])
 
 
@@ -46,6 +51,14 @@ def test_pictures_have_the_size_of_their_camera():
         color, alpha = shapes(24).clean([GuidanceView(OrbitCamera(0, 30, width=width, height=height))])
         assert color.shape == (1, height, width, 3) and alpha.shape == (1, height, width, 1)
         assert ((color >= 0) & (color <= 1)).all() and ((alpha >= 0) & (alpha <= 1)).all()
+
+
+def test_unsure_depth_blurs_the_side_and_not_the_front():
+    front, side = (GuidanceView(OrbitCamera(0, azimuth, width=SIZE, height=SIZE)) for azimuth in (0, 90))
+    soft = shapes(24, settings=LearnedPriorSettings(depth_sigma=0.1))
+    for view, changed in ((front, False), (side, True)):
+        difference = (soft.clean([view])[1] - shapes(24).clean([view])[1]).abs().max()
+        assert bool(difference > 0.05) == changed
 
 
 def test_the_surface_of_a_frame_lies_where_the_frame_shows_it():
