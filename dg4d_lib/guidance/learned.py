@@ -1,4 +1,4 @@
-"""Views of a subject by the shape prior: of its most probable surface, or averages over all shapes that are possible."""
+"""Views of a subject by the shape prior: of its most probable surface, or averages over all possible shapes."""
 
 from collections.abc import Sequence
 from dataclasses import replace

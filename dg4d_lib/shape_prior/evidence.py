@@ -17,7 +17,7 @@ FRONT = 4.0  # logits right before and right behind a surface that is known
 BEHIND = 2.0  # logits against matter from twice the expected thickness on
 THINNEST = 0.04  # world units: half thickness of parts that the outline shows thinner
 JUMP = 0.2  # world units between neighboring pixels: a part before another one
-BESIDE = 4  # pixels: within it the farther part goes on behind the nearer one
+BESIDE = 3  # pixels around a jump: at least two, as jumps are two wide
 PIXEL = 4 * TAN_HALF_FOV / SIZE  # world units in the plane z = 0
 DEPTHS = RADIUS - (NEAR + (np.arange(BINS) + 0.5) * (FAR - NEAR) / BINS)  # middles of the cells, world units along +z
 
@@ -39,7 +39,7 @@ def hint_evidence(
     if hint.sigma:
         bulge = heights(inside, PIXEL)
         front = middle + bulge
-        thickness = np.maximum(2 * np.maximum(bulge, THINNEST), _behind_jumps(front, inside))
+        thickness = np.maximum(2 * np.maximum(bulge, THINNEST), _bridges(front, inside))
         return torch.from_numpy(weight[..., None] * front_evidence(front, thickness, hint.sigma)).to(logits)
     return torch.from_numpy(middle_evidence(middle, own_middle(logits, inside))).to(logits)
 
@@ -71,12 +71,19 @@ def front_evidence(
     return behind * matter - (1 - behind) * FRONT
 
 
-def _behind_jumps(front: Float64[np.ndarray, "s s"], mask: Bool[np.ndarray, "s s"]) -> Float64[np.ndarray, "s s"]:
-    """Return the thickness that reaches farther parts beside a jump of depth: they go on behind what covers them."""
-    deepest, nearest = np.where(mask, front, np.inf), np.where(mask, front, -np.inf)
-    jumps = mask & (ndimage.maximum_filter(nearest, 3) - ndimage.minimum_filter(deepest, 3) > JUMP)
-    beside = mask & ndimage.maximum_filter(jumps, 2 * BESIDE + 1)
-    return np.where(beside, 2 * (front - ndimage.minimum_filter(deepest, 2 * BESIDE + 1)), 0.0)
+def _bridges(front: Float64[np.ndarray, "s s"], mask: Bool[np.ndarray, "s s"]) -> Float64[np.ndarray, "s s"]:
+    """Return the thickness that joins parts which jumps of depth would tear off, beside these jumps; else 0.
+
+    A far leg goes on behind the body that covers it, though no pixel shows it there.
+    """
+    deep, near = np.where(mask, front, np.inf), np.where(mask, front, -np.inf)
+    calm = mask & (ndimage.maximum_filter(near, 3) - ndimage.minimum_filter(deep, 3) <= JUMP)
+    parts, count = ndimage.label(calm)
+    if count < 2:
+        return np.zeros_like(front)
+    largest = 1 + int(np.argmax(np.bincount(parts.ravel())[1:]))
+    beside = [ndimage.maximum_filter(calm & each, 2 * BESIDE + 1) for each in (parts == largest, parts != largest)]
+    return np.where(mask & beside[0] & beside[1], 2 * (front - ndimage.minimum_filter(deep, 2 * BESIDE + 1)), 0.0)
 
 
 def own_middle(logits: Float[Tensor, "s s d"], mask: Bool[np.ndarray, "s s"]) -> Float64[np.ndarray, "s s"]:
