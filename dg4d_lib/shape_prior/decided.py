@@ -9,7 +9,7 @@ from torch import Tensor
 SMOOTHNESS = 2.0  # cells: standard deviation of the blur of the logits, so that neighboring rays decide alike
 STEPS = 20  # of the bisection
 RANGE = 30.0  # logits: largest shift of a ray
-MATTER = 1.25  # factor on the expected matter: shapes that are not certain overlap most with a bit more than that
+GENEROSITY = 0.5  # cells of matter per unit of variance on a ray: unsure shapes overlap most with more than is expected
 LEAST = 1.0  # cells of matter on a ray of the subject
 TIE = 1e-3  # logits by which the ends of a ray are less probable than its middle
 
@@ -22,23 +22,31 @@ def smooth_logits(logits: Float[Tensor, "128 128 64"], mask: Bool[Tensor, "128 1
     return torch.where(mask[..., None], torch.from_numpy(smooth), logits)
 
 
-def most_probable(logits: Float[Tensor, "128 128 64"], mask: Bool[Tensor, "128 128"]) -> Float[Tensor, "128 128 64"]:
+def matter_on(rays: Float[Tensor, "n 64"], generosity: float) -> Float[Tensor, "n 1"]:
+    """Return the cells of matter on rays: the expected number, and more where it is unsure."""
+    inside = rays.sigmoid()
+    expected = (inside + generosity * inside * (1 - inside)).sum(-1, keepdim=True)
+    return expected.clamp(LEAST, rays.shape[-1] - LEAST)
+
+
+def most_probable(
+    logits: Float[Tensor, "128 128 64"], mask: Bool[Tensor, "128 128"], generosity: float = 0.0
+) -> Float[Tensor, "128 128 64"]:
     """Return a field that is positive in the most probable cells of every ray, as many as matter is expected on it.
 
     Args:
         logits: of every cell lying inside the subject.
         mask: pixels of the subject.
+        generosity: matter to add per unit of its variance, where its place is unsure.
 
     Returns:
         Values in [-1, 1]; 1 at the best cell of each of these rays, -1 on all others.
     """
     middle = torch.linspace(-1, 1, logits.shape[-1]).abs()
     rays = logits[mask] - TIE * middle
-    expected = (matter * logits[mask].sigmoid().sum(-1, keepdim=True)).clamp(LEAST, logits.shape[-1] - LEAST)
+    expected = matter_on(logits[mask], generosity)
     ranked = rays.sort(-1, descending=True).values
-    first = (
-        (expected - 0.5).floor().long()
-    )  # cell number k of the ranking ends after k + 1 cells, its middle is k + 1/2
+    first = (expected - 0.5).floor().long()  # the middle of cell number k of the ranking lies at k + 1/2
     share = expected - 0.5 - first
     level = ranked.gather(-1, first) * (1 - share) + ranked.gather(-1, first + 1) * share
     field = torch.full_like(logits, -1.0)
@@ -47,7 +55,7 @@ def most_probable(logits: Float[Tensor, "128 128 64"], mask: Bool[Tensor, "128 1
 
 
 def decide(
-    logits: Float[Tensor, "128 128 64"], mask: Bool[Tensor, "128 128"], contrast: float, matter: float = 1.0
+    logits: Float[Tensor, "128 128 64"], mask: Bool[Tensor, "128 128"], contrast: float, generosity: float = 0.0
 ) -> Float[Tensor, "128 128 64"]:
     """Return logits times a contrast, shifted on every ray so that its expected matter stays the same.
 
@@ -57,10 +65,10 @@ def decide(
         logits: of every cell lying inside the subject.
         mask: pixels of the subject; other rays stay as they are.
         contrast: 1 changes nothing; with a large one, matter lies in the most probable cells alone.
-        matter: factor on the expected matter.
+        generosity: matter to add per unit of its variance, where its place is unsure.
     """
     rays = logits[mask]
-    expected = (matter * rays.sigmoid().sum(-1, keepdim=True)).clamp(LEAST, logits.shape[-1] - LEAST)
+    expected = matter_on(rays, generosity)
     low, high = torch.full_like(expected, -RANGE), torch.full_like(expected, RANGE)
     for _ in range(STEPS):
         middle = (low + high) / 2

@@ -55,6 +55,11 @@ class Backdrop:
         return self.is_plain and (self.spread <= EVEN_SPREAD or self.share >= EVEN_SHARE)
 
     @property
+    def is_uniform(self) -> bool:
+        """True if the border has no texture but noise."""
+        return self.is_plain and self.spread <= EVEN_SPREAD
+
+    @property
     def tolerance(self) -> float:
         """Color difference in Lab units below which a pixel is backdrop."""
         return float(np.clip(SPREADS * self.spread, *TOLERANCE))

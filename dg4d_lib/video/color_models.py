@@ -12,6 +12,7 @@ EM_STEPS = 12
 MIN_VARIANCE = 2.0  # of a Gaussian, squared Lab units
 MIN_SPREAD = 1e-6  # weighted variance below which a cluster is one color, squared Lab units
 MAX_LOG_ODDS = 4.0  # bound of the log odds of a color
+PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of Lab channels
 
 
 @dataclass(frozen=True)
@@ -19,25 +20,16 @@ class Mixture:
     """Gaussian mixture in Lab.
 
     Attributes:
-        shares: mixture weights, sum 1.
         means: centers.
-        roots: R with R R^T the inverse of the covariance.
-        log_norms: log density at the center.
+        logs: log of share times density of every Gaussian, as coefficients of the monomials of `_monomials`.
     """
 
-    shares: Float[ndarray, " k"]
     means: Float[ndarray, "k 3"]
-    roots: Float[ndarray, "k 3 3"]
-    log_norms: Float[ndarray, " k"]
+    logs: Float[ndarray, "k m"]
 
     def log_density(self, colors: Float[ndarray, "p 3"]) -> Float[ndarray, " p"]:
         """Return the log density at colors."""
-        return np.logaddexp.reduce(self.log_joint(colors), axis=1)
-
-    def log_joint(self, colors: Float[ndarray, "p 3"]) -> Float[ndarray, "p k"]:
-        """Return the log of share times density for every Gaussian."""
-        distances = [(((colors - mean) @ root) ** 2).sum(1) for mean, root in zip(self.means, self.roots, strict=True)]
-        return np.log(self.shares) + self.log_norms - 0.5 * np.stack(distances, 1)
+        return _log_sum(self.logs @ _monomials(colors))
 
 
 def foreground_log_odds(colors: Float[ndarray, "p 3"], probability: Float[ndarray, " p"]) -> Float[ndarray, " p"]:
@@ -72,22 +64,41 @@ def fit_mixture(colors: Float[ndarray, "p 3"], weights: Float[ndarray, " p"]) ->
         axis = np.linalg.eigh((centered * weights[widest, None]).T @ centered)[1][:, -1]
         axis = axis * np.sign(axis[np.abs(axis).argmax()])
         owners[np.flatnonzero(widest)[centered @ axis > 0]] = k
-    memberships = np.eye(MIXTURE)[owners]
-    mixture = _estimate(colors, weights, memberships)
+    monomials = _monomials(colors)
+    mixture = _estimate(monomials, weights * (owners == np.arange(MIXTURE)[:, None]))
     for _ in range(EM_STEPS):
-        joint = mixture.log_joint(colors)
-        memberships = np.exp(joint - np.logaddexp.reduce(joint, axis=1)[:, None])
-        mixture = _estimate(colors, weights, memberships)
+        joint = mixture.logs @ monomials
+        mixture = _estimate(monomials, weights * np.exp(joint - _log_sum(joint)))
     return mixture
 
 
-def _estimate(colors: Float[ndarray, "p 3"], weights: Float[ndarray, " p"], members: Float[ndarray, "p k"]) -> Mixture:
-    share = members * weights[:, None]
-    total = share.sum(0) + 1e-9
-    means = share.T @ colors / total[:, None]
-    spreads = np.empty((len(total), 3, 3))
-    for k, mean in enumerate(means):
-        offset = colors - mean
-        spreads[k] = (offset * share[:, k : k + 1]).T @ offset / total[k] + MIN_VARIANCE * np.eye(3)
-    log_norms = -0.5 * np.linalg.slogdet(spreads)[1] - 1.5 * np.log(2 * np.pi)
-    return Mixture(total / total.sum(), means, np.linalg.cholesky(np.linalg.inv(spreads)), log_norms)
+def _monomials(colors: Float[ndarray, "p 3"]) -> Float[ndarray, "m p"]:
+    """Return 1, the color, and the products of two of its channels: Gaussians are the exponentials of their sums."""
+    ones = np.ones((1, len(colors)))
+    products = [colors[:, i] * colors[:, j] for i, j in PAIRS]
+    return np.concatenate([ones, colors.T, np.stack(products)])
+
+
+def _log_sum(logs: Float[ndarray, "k p"]) -> Float[ndarray, " p"]:
+    """Return the log of the sum of exponentials; a plain loop over `logaddexp` takes ten times as long."""
+    greatest = logs.max(0)
+    return np.asarray(greatest + np.log(np.exp(logs - greatest).sum(0)))
+
+
+def _estimate(monomials: Float[ndarray, "m p"], weights: Float[ndarray, "k p"]) -> Mixture:
+    """Return the mixture with the weighted moments of the colors."""
+    moments = weights @ monomials.T
+    total = moments[:, 0] + 1e-9
+    means = moments[:, 1:4] / total[:, None]
+    logs = np.empty((len(total), 4 + len(PAIRS)))
+    for k, (mean, products) in enumerate(zip(means, moments[:, 4:] / total[:, None], strict=True)):
+        spread = MIN_VARIANCE * np.eye(3)
+        for (i, j), product in zip(PAIRS, products, strict=True):
+            spread[i, j] += product - mean[i] * mean[j]
+            spread[j, i] = spread[i, j]
+        precision = np.linalg.inv(spread)
+        norm = -0.5 * np.linalg.slogdet(spread)[1] - 1.5 * np.log(2 * np.pi)
+        logs[k, 0] = np.log(total[k] / total.sum()) + norm - 0.5 * mean @ precision @ mean
+        logs[k, 1:4] = precision @ mean
+        logs[k, 4:] = [-(0.5 if i == j else 1.0) * precision[i, j] for i, j in PAIRS]
+    return Mixture(means, logs)

@@ -35,9 +35,16 @@ PART = 0.02  # minimum area of a part relative to the largest one; smaller parts
 AGREED = 0.9  # overlap (IoU) from which backdrop and network are taken to have found the same subject
 BAND = 2  # half of the band along an outline before a plain backdrop, pixels of the segmentation
 BORDER_MARGIN = 0.02  # share of the border by which the network may touch more of it and still be preferred
-SURE = 0.02  # distance of probabilities from 0 and 1 that log odds are bounded by
+TELLING = 0.92  # share of subject and background, on average, that their colors tell apart where colors are trusted
+SURE = {True: 0.07, False: 0.02}  # bound of the segmentation's log odds, as a probability, by trust in colors
 COLOR_SHARE = 0.5  # weight of the color models in the log odds; the rest is the segmentation's
-ROUNDS = 2  # alternations of color models and segmentation, as in GrabCut
+COLORS_SIDE = 128  # longest side for color models in all rounds but the last, pixels
+ROUNDS = {True: 4, False: 2}  # alternations of color models and segmentation, as in GrabCut, by trust in colors
+CROP_MARGIN = 0.12  # of the second look around the subject, as a share of its longest side
+CROP_SURE = 0.3  # probability from which a pixel counts for the crop
+FUSED = 0.9  # probability of pixels that differ from an even backdrop
+CLEAN_SHARE = 0.98  # minimum share of the border that an even backdrop and the subject explain
+ISLANDS = 0.05  # maximum area of what differs from an even backdrop apart from the subject, relative to the subject
 FILTER_RADIUS = 3 / 256  # of the guided filter, as a share of the longest side
 FILTER_EPS = 1e-3  # color variance below which the guided filter smooths
 STEEPNESS = 2.0  # slope that turns the filtered probability into alpha: edges are a pixel or two wide
@@ -152,17 +159,51 @@ def _segment(frames: Float[Tensor, "t h w 3"], method: str, load: NetworkLoader)
     if method == "auto" and not backdrop.is_plain:
         return _by_network(frames, load())
     masks = _by_backdrop(lab, backdrop)
-    name: Method = "backdrop" if backdrop.is_even else "uneven backdrop"
     if method == "backdrop":
-        return _Segmentation(masks, name, None, False, is_exact=True)
-    network = load()
+        return _Segmentation(masks, _name_of(backdrop), None, False, is_exact=True)
+    return _by_both(frames, masks, backdrop, load())
+
+
+def _by_both(
+    frames: Float[Tensor, "t h w 3"], masks: Float[Tensor, "t h2 w2"], backdrop: Backdrop, network: Segmentation
+) -> _Segmentation:
+    """Choose between masks by a plain backdrop and the network's, or fuse them before an even one."""
     checked = _spread(len(frames))
     known = {i: network.probability(frames[i]) for i in checked}
     second = resize_planes(torch.stack(list(known.values()))[None], masks.shape[1:])[0]
     agreement = min(overlap(masks[i] > 0.5, other > 0.5) for i, other in zip(checked, second, strict=True))
-    if agreement < AGREED and border_contact(second > 0.5) <= border_contact(masks[checked] > 0.5) + BORDER_MARGIN:
-        return _by_network(frames, network, known)
-    return _Segmentation(masks, name, agreement, True, is_exact=agreement >= AGREED)
+    if agreement >= AGREED and (backdrop.is_uniform or len(frames) > 1):  # the network on all frames would take long
+        return _Segmentation(masks, _name_of(backdrop), agreement, True, is_exact=True)
+    touched = border_contact(second > 0.5)
+    if agreement < AGREED and touched > border_contact(masks[checked] > 0.5) + BORDER_MARGIN:
+        return _Segmentation(masks, _name_of(backdrop), agreement, True)
+    found = _by_network(frames, network, known)
+    subject = _subject_before(masks, found.probability) if backdrop.is_uniform else None
+    contact = 0.0 if subject is None else border_contact(subject)
+    if subject is None or backdrop.share + contact < CLEAN_SHARE or contact > touched + 2 * BORDER_MARGIN:
+        return found
+    fused = torch.maximum(found.probability, FUSED * subject.float())
+    return _Segmentation(fused, "network", min(agreement, found.agreement or 0.0), True)
+
+
+def _name_of(backdrop: Backdrop) -> Method:
+    return "backdrop" if backdrop.is_even else "uneven backdrop"
+
+
+def _subject_before(
+    masks: Float[Tensor, "t h w"], probability: Float[Tensor, "t h2 w2"]
+) -> Bool[Tensor, "t h2 w2"] | None:
+    """Return the parts of masks by an even backdrop that the network's subject touches; None if there are many others.
+
+    Others are a sign that the backdrop is even along the border alone: stars, lights, stains.
+    """
+    kept = []
+    for mask, found in zip(resize_planes(masks[None], probability.shape[1:])[0] > 0.5, probability > 0.5, strict=True):
+        labels, _ = ndimage.label(mask.numpy(), np.ones((3, 3)))
+        kept.append(np.isin(labels, np.unique(labels[found.numpy() & (labels > 0)])) & (labels > 0))
+        if (labels > 0).sum() > (1 + ISLANDS) * kept[-1].sum():
+            return None
+    return torch.from_numpy(np.stack(kept))
 
 
 def overlap(one: Bool[Tensor, "*s"], other: Bool[Tensor, "*s"]) -> float:
@@ -196,28 +237,51 @@ def _by_network(
         agreement = min(agreement, overlap(found[i] > 0.5, mirrored > 0.5))
         if len(frames) == 1:
             found = (found + mirrored) / 2
+            found = (2 * found + _closer(frames[0], found[0], network)) / 3
     return _Segmentation(found, "network", agreement, True)
+
+
+def _closer(
+    frame: Float[Tensor, "h w 3"], found: Float[Tensor, "h2 w2"], network: Segmentation
+) -> Float[Tensor, "h2 w2"]:
+    """Return a segmentation whose square around the subject comes from a picture of that square alone."""
+    rows, columns = (np.flatnonzero((found > CROP_SURE).any(axis).numpy()) for axis in (1, 0))
+    if not len(rows):
+        return found
+    side = max(np.ptp(rows), np.ptp(columns)) + 1
+    spans = []
+    for places, length in ((rows, found.shape[0]), (columns, found.shape[1])):
+        size = min(length, round(side * (1 + 2 * CROP_MARGIN)))
+        first = min(max(0, (places[0] + places[-1] + 1 - size) // 2), length - size)
+        spans.append(slice(first, first + size))
+    window = (spans[0], spans[1])
+    scale = frame.shape[0] / found.shape[0], frame.shape[1] / found.shape[1]
+    large = tuple(slice(round(s.start * k), round(s.stop * k)) for s, k in zip(spans, scale, strict=True))
+    answer = network.probability(frame[large])
+    closer = found.clone()
+    closer[window] = resize_planes(answer[None, None], tuple(closer[window].shape))[0, 0]
+    return closer
 
 
 def _refine(frames: Float[Tensor, "t h w 3"], probability: Float[Tensor, "t h2 w2"]) -> Float[Tensor, "t h w"]:
     """Refine a segmentation by color models and by the edges of the frames, up to their full size."""
-    size = _reduced(frames, REFINED_SIDE)
-    prior = resize_planes(probability[None], size)[0].double().numpy()
-    lab, small = _lab(frames, REFINED_SIDE, blur=0), _resized(frames, torch.empty(0, *size)).cpu().numpy()
-    radius = max(2, round(FILTER_RADIUS * max(size)))
-    current = prior
-    for last in (False,) * (ROUNDS - 1) + (True,):
-        odds = foreground_log_odds(lab.reshape(-1, 3).astype(np.float64), current.ravel()).reshape(current.shape)
-        mixed = expit((1 - COLOR_SHARE) * logit(prior.clip(SURE, 1 - SURE)) + COLOR_SHARE * odds)
-        targets = frames.cpu() if last else torch.from_numpy(small)
-        filtered = torch.stack(
-            [
-                guide_to_edges(values, guide, target, radius, FILTER_EPS)
-                for values, guide, target in zip(mixed, small, targets, strict=True)
-            ]
-        ).clamp(0, 1)
-        current = filtered.double().numpy()
-    likelihood = average_still_pixels(filtered, frames.cpu())
+    current, trusted = probability, _colors_tell(frames, probability)
+    sure = SURE[trusted]
+    for left in reversed(range(ROUNDS[trusted])):
+        side = COLORS_SIDE if left else REFINED_SIDE
+        size = _reduced(frames, side)
+        lab, small = _lab(frames, side, blur=0), _resized(frames, torch.empty(0, *size)).cpu().numpy()
+        prior = resize_planes(probability[None], size)[0].double().numpy()
+        odds = _color_odds(lab, resize_planes(current[None], size)[0])
+        mixed = expit((1 - COLOR_SHARE) * logit(prior.clip(sure, 1 - sure)) + COLOR_SHARE * odds)
+        targets = torch.from_numpy(small) if left else frames.cpu()
+        radius = max(2, round(FILTER_RADIUS * max(size)))
+        filtered = [
+            guide_to_edges(values, guide, target, radius, FILTER_EPS)
+            for values, guide, target in zip(mixed, small, targets, strict=True)
+        ]
+        current = torch.stack(filtered).clamp(0, 1)
+    likelihood = average_still_pixels(current, frames.cpu())
     alpha = (0.5 + STEEPNESS * (likelihood - 0.5)).clamp(0, 1)
     large = resize_planes(probability[None], alpha.shape[1:])[0]
     reach = 2 * max(2, round(FILTER_RADIUS * max(alpha.shape[1:])))
@@ -225,17 +289,35 @@ def _refine(frames: Float[Tensor, "t h w 3"], probability: Float[Tensor, "t h2 w
     return torch.from_numpy(np.stack(whole)).to(frames)
 
 
+def _colors_tell(frames: Float[Tensor, "t h w 3"], probability: Float[Tensor, "t h2 w2"]) -> bool:
+    """Return True if colors tell the segmented subject from its background.
+
+    Where they do not, alternating with them drifts away from the segmentation.
+    """
+    found = resize_planes(probability[None], _reduced(frames, COLORS_SIDE))[0].double().numpy().clip(0, 1)
+    by_color = expit(_color_odds(_lab(frames, COLORS_SIDE, blur=0), torch.from_numpy(found)))
+    shares = (float(np.average(one, weights=w + 1e-9)) for one, w in ((by_color, found), (1 - by_color, 1 - found)))
+    return sum(shares) / 2 >= TELLING
+
+
+def _color_odds(lab: Float[ndarray, "t h w 3"], estimate: Float[Tensor, "t h w"]) -> Float[ndarray, "t h w"]:
+    colors, likely = lab.reshape(-1, 3).astype(np.float64), estimate.double().numpy().ravel().clip(0, 1)
+    return foreground_log_odds(colors, likely).reshape(estimate.shape)
+
+
 def _without_false_holes(
     alpha: Float[ndarray, "h w"], segmented: Bool[ndarray, "h w"], reach: int
 ) -> Float[ndarray, "h w"]:
-    """Remove specks, and make solid what the segmentation has and the outline encloses, such as highlights.
+    """Remove specks and parts unknown to the segmentation; make solid what it has and the outline encloses.
+
+    Highlights are such holes; things of the subject's colors elsewhere in a picture are such parts.
 
     Args:
         alpha: refined by colors, which know no inside.
         segmented: mask of the segmentation.
         reach: distance from the outline from which alpha is solid, pixels.
     """
-    mask = _parts(alpha > 0.5, PART)
+    mask = _parts(alpha > 0.5, PART, segmented)
     filled = mask | (ndimage.binary_fill_holes(mask) & segmented)
     deep = ndimage.binary_erosion(filled, iterations=reach, border_value=1) & segmented
     solid = (filled & ~mask) | deep
@@ -274,13 +356,22 @@ def _spread(count: int) -> list[int]:
     return sorted({round(i) for i in np.linspace(0, count - 1, min(count, CHECKED_FRAMES))})
 
 
-def _parts(mask: Bool[ndarray, "h w"], min_share: float) -> Bool[ndarray, "h w"]:
-    """Keep the connected parts of at least this area relative to the largest one."""
+def _parts(
+    mask: Bool[ndarray, "h w"], min_share: float, touched: Bool[ndarray, "h w"] | None = None
+) -> Bool[ndarray, "h w"]:
+    """Keep the connected parts of at least this area relative to the largest one, and of them those that are touched.
+
+    Args:
+        mask: of all parts.
+        min_share: minimum area relative to the largest part.
+        touched: pixels of which a part has one or more.
+    """
     labels, count = ndimage.label(mask, np.ones((3, 3)))
     if count == 0:
         return mask
     areas = ndimage.sum_labels(mask, labels, np.arange(1, count + 1))
-    return np.isin(labels, 1 + np.flatnonzero(areas >= max(4, min_share * areas.max())))
+    large = 1 + np.flatnonzero(areas >= max(4, min_share * areas.max()))
+    return np.isin(labels, large if touched is None else np.intersect1d(large, labels[touched]))
 
 
 def _check(mask: Bool[ndarray, "h w"]) -> None:

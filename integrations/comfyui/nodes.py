@@ -52,22 +52,27 @@ class _Maker:
         return str(client.interpreter())
 
     @classmethod
-    def VALIDATE_INPUTS(cls, settings: str | None = None, name: str | None = None) -> bool | str:
-        """Return True, or why the widgets cannot be used; a widget with a link is None."""
+    def VALIDATE_INPUTS(cls, settings: str | None = None) -> bool | str:
+        """Return True, or why the settings cannot be used; None where they come by a link.
+
+        ComfyUI shows the answer at every argument of this method, so there is one.
+        """
         try:
             client.interpreter()
             setting_lines(settings or "")
         except (client.Dg4dError, ValueError) as error:
             return str(error)
-        return True if name is None or media.clean_name(name) else f"name {name!r} has no letter or digit"
+        return True
 
     def _make(self, place: Path, name: str, arguments: dict[str, Any]) -> tuple[str, torch.Tensor, str]:
         """Convert, and render the frames from the front."""
-        digest = media.digest(arguments, place)
-        folder = Path(folder_paths.get_output_directory()) / "dg4d" / f"{media.clean_name(name)}-{digest}"
+        safe = media.clean_name(name)
+        if not safe:
+            raise ValueError(f"name {name!r} has no letter or digit")
+        folder = Path(folder_paths.get_output_directory()) / "dg4d" / f"{safe}-{media.digest(arguments, place)}"
         paths = {key: _under(place, arguments[key]) for key in ("picture", "frames", "mask") if arguments.get(key)}
         views = {azimuth: _under(place, path) for azimuth, path in arguments.get("views", {}).items()}
-        made = _call("make", {**arguments, **paths, "views": views, "out": str(folder), "name": media.clean_name(name)})
+        made = _call("make", {**arguments, **paths, "views": views, "out": str(folder), "name": safe})
         front = [{"azimuth": 0.0, "elevation": 0.0, "phase": k / made["frames"]} for k in range(made["frames"])]
         pictures = _render(place, str(folder), front, INPUT_FRAMES, mesh=False)
         model_file = (folder / "asset.glb").relative_to(folder_paths.get_output_directory()).as_posix()

@@ -124,7 +124,7 @@ class Comfy:
             given = {name: None if isinstance(value, list) else value for name, value in node["inputs"].items()}
             answer = check(**{name: value for name, value in given.items() if name in checked})
             if answer is not True:
-                yield f"Custom validation failed for node: {answer}"
+                yield from (f"Custom validation failed for node: {name} - {answer}" for name in sorted(checked))
 
     def execute(self, prompt: Prompt) -> dict[str, Any]:
         """Run the output nodes of a prompt; return what they send to the page, by node."""

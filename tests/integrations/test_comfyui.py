@@ -273,6 +273,11 @@ def test_wrong_widgets_are_refused_before_any_work(comfy: Comfy, changes: dict[s
         comfy.execute(prompt(**changes))
 
 
+def test_a_wrong_setting_is_shown_at_the_settings_alone(comfy: Comfy) -> None:
+    (error,) = comfy.validate(prompt(settings="oops"))
+    assert "settings - a setting is NAME=VALUE" in error
+
+
 def test_errors_of_dg4d_arrive_with_their_sentence(comfy: Comfy, module: types.ModuleType) -> None:
     with pytest.raises(module.Dg4dError, match=r"motion.iterations"):
         comfy.execute(prompt(settings="motion.iteration=3"))

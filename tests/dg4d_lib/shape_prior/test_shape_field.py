@@ -11,7 +11,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.inflation.hints import DepthHint
 from dg4d_lib.inflation.render import render_surface
-from dg4d_lib.shape_prior.decided import decide, smooth_logits
+from dg4d_lib.shape_prior.decided import GENEROSITY, decide, matter_on, smooth_logits
 from dg4d_lib.shape_prior.expected import expected_volume
 from dg4d_lib.shape_prior.field import (
     LARGEST_LOGIT,
@@ -65,7 +65,7 @@ def test_the_opposite_view_shows_hidden_colors():
 
 def test_unsure_depth_is_soft_from_the_side():
     side = OrbitCamera(0, 90, width=64, height=64)
-    sharp, soft = (render_volumes([expected_volume(ball(0, u), 1.2)], [side])[1][0, ..., 0] for u in (0.0, 0.97))
+    sharp, soft = (render_volumes([expected_volume(ball(0, u), 1.0)], [side])[1][0, ..., 0] for u in (0.0, 0.97))
     between = [float(((alpha > 0.1) & (alpha < 0.9)).float().mean()) for alpha in (sharp, soft)]
     assert between[1] > 2 * between[0]
 
@@ -99,8 +99,8 @@ def test_matter_whose_depth_is_unsure_is_put_in_one_place():
     spread[..., 40:44] += 0.2
     surface = decided_surface(replace(field, logits=spread))
     depth = surface.vertices[:, 2].max() - surface.vertices[:, 2].min()
-    matter = float(spread[64, 64].sigmoid().sum()) * (FAR - NEAR) / BINS
-    assert depth == pytest.approx(matter, rel=0.3) and matter < 0.5
+    matter = float(matter_on(spread[64, 64][None], GENEROSITY)) * (FAR - NEAR) / BINS
+    assert depth == pytest.approx(matter, rel=0.15) and matter < 0.5
     middle = 2 - (NEAR + 42 * (FAR - NEAR) / BINS)
     assert surface.vertices[:, 2].mean() == pytest.approx(middle, abs=0.05)
 
@@ -120,6 +120,15 @@ def test_contrast_keeps_the_matter_of_every_ray(contrast):
         each.sigmoid().sum(-1)[field.mask] for each in (field.logits, decide(field.logits, field.mask, contrast))
     )
     torch.testing.assert_close(after, before.clamp(min=1), atol=0.01, rtol=0.001)
+
+
+def test_unsure_matter_counts_for_more():
+    rays = torch.stack([torch.full((BINS,), -1.4), torch.full((BINS,), -LARGEST_LOGIT)])
+    rays[1, 20:30] = LARGEST_LOGIT
+    p = float(torch.sigmoid(torch.tensor(-1.4)))
+    unsure, sure = matter_on(rays, 0.5)[:, 0].tolist()
+    assert unsure == pytest.approx(BINS * (p + 0.5 * p * (1 - p)), rel=1e-4)
+    assert sure == pytest.approx(10, abs=0.5)
 
 
 def test_smooth_logits_keep_the_outline_and_a_plane():

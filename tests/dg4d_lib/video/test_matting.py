@@ -2,13 +2,14 @@ import numpy as np
 import pytest
 import torch
 from scipy import ndimage
+from scipy.stats import multivariate_normal
 from skimage import data
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.video.backdrop import fit_backdrop
-from dg4d_lib.video.color_models import fit_mixture
-from dg4d_lib.video.matting import Matte, matte, matte_from_first_alpha
+from dg4d_lib.video.color_models import MIN_VARIANCE, fit_mixture
+from dg4d_lib.video.matting import Matte, _closer, matte, matte_from_first_alpha
 from dg4d_lib.video.u2netp import packaged_network
 
 SIZE = 160
@@ -52,14 +53,21 @@ def over(alpha: Tensor, front: Tensor, back: Tensor) -> Tensor:
 
 
 class Answering:
-    """Network that answers every picture with the same map, mirrored pictures with the mirrored one."""
+    """Network that knows one picture, its mirrored one, and every part of both."""
 
     def __init__(self, truth: Tensor, picture: Tensor) -> None:
         self.truth, self.picture, self.calls = truth, picture, 0
 
     def probability(self, picture: Tensor) -> Tensor:
         self.calls += 1
-        return self.truth if (picture - self.picture).abs().mean() < 0.05 else self.truth.flip(1)
+        height, width = picture.shape[:2]
+        fits = [
+            ((picture - known[top : top + height, left : left + width]).abs().mean(), truth[top:, left:])
+            for known, truth in ((self.picture, self.truth), (self.picture.flip(1), self.truth.flip(1)))
+            for top in range(known.shape[0] - height + 1)
+            for left in range(known.shape[1] - width + 1)
+        ]
+        return min(fits, key=lambda fit: fit[0])[1][:height, :width]
 
 
 def by_backdrop(frames: Tensor) -> Matte:
@@ -237,6 +245,67 @@ def test_a_network_that_takes_the_border_for_the_subject_loses_to_a_plain_backdr
     assert iou(result.frames[0, ..., 3], truth) > 0.95
 
 
+def test_what_the_network_misses_before_an_even_backdrop_is_kept():
+    """The network knows the upper half; the backdrop's color tells the rest."""
+    truth, picture = ragged(), over(ragged(), texture(), gradient())
+    half = coarse(truth)
+    half[SIZE // 2 :] = 0.02
+    result = matte(picture[None], "auto", lambda: Answering(half, picture))
+    assert result.agreement < 0.7
+    assert iou(result.frames[0, ..., 3], truth) > 0.95
+
+
+def test_a_pale_drawing_keeps_the_body_that_the_network_does_not_see():
+    rows, columns = np.mgrid[:SIZE, :SIZE]
+    head, body = (np.hypot(rows - row, columns - 80) - radius for row, radius in ((45, 25), (105, 38)))
+    truth = torch.from_numpy((head < 0) | (body < 0)).float()
+    line = torch.from_numpy((abs(head + 2) < 2) | (abs(body + 2) < 2)).float()
+    pale = over(truth, torch.full((SIZE, SIZE, 3), 0.85), white())
+    picture = over(line, torch.full((SIZE, SIZE, 3), 0.2), pale)
+    found = coarse(torch.from_numpy(head < 0).float())
+    result = matte(picture[None], "auto", lambda: Answering(found, picture))
+    assert iou(result.frames[0, ..., 3], truth) > 0.95
+
+
+def test_spots_of_a_backdrop_that_is_even_along_the_border_are_not_kept():
+    truth, back = ragged(), gradient()
+    for row, column in ((14, 20), (14, 120), (136, 20), (136, 130)):
+        back[row : row + 12, column : column + 12] = torch.tensor([0.2, 0.3, 0.1])
+    picture = over(truth, texture(), back)
+    half = coarse(truth)
+    half[SIZE // 2 :] = 0.02
+    alpha = matte(picture[None], "auto", lambda: Answering(half, picture)).frames[0, ..., 3]
+    assert alpha[14:26, 20:32].max() < 0.1 and alpha[136:148, 130:142].max() < 0.1
+
+
+def test_a_second_look_from_close_finds_what_is_small():
+    """Answers have 32 cells on a side, whatever the picture shows."""
+    truth = torch.zeros(SIZE, SIZE)
+    small = ragged()[::3, ::3]
+    truth[60 : 60 + len(small), 20 : 20 + small.shape[1]] = small
+    picture = over(truth, orange(), busy()).clamp(0, 1)
+
+    class Blocks(Answering):
+        def probability(self, picture: Tensor) -> Tensor:
+            known = super().probability(picture)[None, None]
+            cells = torch.nn.functional.interpolate(known, (32, 32), mode="area")
+            return torch.nn.functional.interpolate(cells, known.shape[2:], mode="bilinear")[0, 0].clamp(0, 1)
+
+    network = Blocks(truth, picture)
+    far, closer = network.probability(picture), _closer(picture, network.probability(picture), network)
+    errors = [float((answer - truth).abs().mean()) for answer in (far, closer)]
+    assert errors[1] < 0.6 * errors[0]
+
+
+def test_a_thing_of_the_subject_s_colors_that_the_network_does_not_see_is_dropped():
+    truth, front = ragged(), orange()
+    picture = over(truth, front, busy()).clamp(0, 1)
+    picture[4:20, 140:156] = front[4:20, 140:156]
+    alpha = matte(picture[None], "network", lambda: Answering(coarse(truth), picture)).frames[0, ..., 3]
+    assert alpha[4:20, 140:156].max() < 0.1
+    assert iou(alpha, truth) > 0.95
+
+
 def test_no_network_is_loaded_if_the_backdrop_is_asked_for():
     def refuse() -> Answering:
         raise AssertionError("loaded")
@@ -251,7 +320,7 @@ def test_the_cat_of_a_photograph_is_cut_out_whole():
     alpha = result.frames[0, ..., 3]
     assert result.method == "network" and result.used_network
     assert alpha[40:120, 60:150].mean() > 0.97  # face
-    assert alpha[:30, -40:].mean() < 0.1  # upper right corner
+    assert alpha[:30, -30:].mean() < 0.02  # upper right corner, beside the ear
 
 
 def test_noise_has_no_subject_for_the_network():
@@ -300,6 +369,13 @@ def test_a_mixture_finds_its_clusters():
     means = fit_mixture(colors, np.ones(len(colors))).means
     gaps = np.linalg.norm(means[:, None] - centers, axis=2).min(0)
     assert gaps.max() < 1
+
+
+def test_the_density_of_a_mixture_of_one_cluster_is_that_of_a_gaussian():
+    colors = np.random.default_rng(1).multivariate_normal((40, 10, -5), [(30, 5, 0), (5, 20, 3), (0, 3, 9)], 4000)
+    found = fit_mixture(colors, np.ones(len(colors))).log_density(colors)
+    spread = np.cov(colors.T) + MIN_VARIANCE * np.eye(3)
+    assert abs(found - multivariate_normal(colors.mean(0), spread).logpdf(colors)).mean() < 0.15
 
 
 def test_what_is_known_of_the_first_frame_steadies_the_rest():
