@@ -15,6 +15,7 @@ from dg4d_lib.guidance.analytic import AnalyticPrior
 from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.images import over_white
+from dg4d_lib.inflation.hints import DepthHint
 from dg4d_lib.metrics.image import iou, psnr
 from dg4d_lib.metrics.video import temporal_error
 from dg4d_lib.rasterizer.interface import get_rasterizer
@@ -43,7 +44,9 @@ def static_fit(specimen: Specimen, settings: PipelineSettings, seed: int) -> Gau
     subject = specimen.cutouts[0]
     kind = settings.static.start
     assert not isinstance(kind, LgmStartSettings), "these fits start without LGM"
-    start = initial_gaussians(kind, subject_shapes(settings.prior, [subject], settings.subject.turn_deg), generator)
+    start = initial_gaussians(
+        kind, subject_shapes(settings.prior, [subject], DepthHint(settings.subject.turn_deg)), generator
+    )
     prior = prior_of(specimen.bank, settings, settings.static)
     return fit_gaussians(start, subject, prior, RASTERIZE, settings.static, generator)
 

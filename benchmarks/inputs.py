@@ -31,6 +31,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.images import over_white
+from dg4d_lib.inflation.hints import DepthHint
 from steps.artifacts.media import write_png, write_zip
 from steps.fitting.priors import read_bank, read_bank_folder, subject_shapes
 from steps.prepare_views import run as prepare_views
@@ -114,7 +115,9 @@ def known_bank(subject: Subject, views: Path, settings: PipelineSettings) -> Ban
 
 def score_first(subject: Subject, settings: PipelineSettings, sides: Bank | None) -> tuple[Figures, Tensor]:
     """Compare the shape of frame 0, without any fit, with the true views."""
-    shapes = subject_shapes(settings.prior, [prepared(subject, settings)[0]], settings.subject.turn_deg, sides)
+    shapes = subject_shapes(
+        settings.prior, [prepared(subject, settings)[0]], DepthHint(settings.subject.turn_deg), sides
+    )
     rows, strips = [], []
     for azimuth, truth in subject.views.items():
         color, alpha = shapes.clean([GuidanceView(OrbitCamera(0, azimuth, width=SIZE, height=SIZE))])

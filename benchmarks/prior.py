@@ -3,6 +3,7 @@
     python -m benchmarks.prior FOLDER --frames 0 16 --sheet sheet.png
     python -m benchmarks.prior FOLDER --video
     python -m benchmarks.prior --made-up 60
+    python -m benchmarks.prior --made-up 40 --hints
     python -m benchmarks.prior --pictures examples/newt.png examples/beetle.png --sheet sheet.png
 
 FOLDER has a folder per object with cut-outs `input/NNN.png` and `view_AZIMUTH/NNN.png`, all taken at elevation 0.
@@ -11,21 +12,22 @@ FOLDER has a folder per object with cut-outs `input/NNN.png` and `view_AZIMUTH/N
 import hashlib
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
+from benchmarks.depth_hints import hints_of, mesh_depth, sample_depth
 from benchmarks.measure import parser_of
 from benchmarks.true_views import (
     SIZE,
     Figures,
     Subject,
     figures,
+    hint_of,
     line,
     mean,
     prepared,
     read_subjects,
     score_fit,
-    turn_of,
     write_sheet,
 )
 
@@ -36,6 +38,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.images import over_white, resize
+from dg4d_lib.inflation.hints import DepthHint
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.shape_prior import packaged
 from dg4d_lib.video.subject import prepare_subject
@@ -57,17 +60,39 @@ def made_up_subjects(count: int) -> Iterator[Subject]:
         pictures = torch.from_numpy(np.concatenate([sample.picture[None].astype(np.float32) / 255, views]))
         straight = torch.cat([pictures[..., :3] / pictures[..., 3:].clamp(min=1e-3), pictures[..., 3:]], -1).clamp(0, 1)
         known = zip(AZIMUTHS_DEG, straight[1:, None], strict=True)
-        yield Subject(f"{sample.family} {index}", straight[:1], dict(known))
+        yield Subject(f"{sample.family} {index}", straight[:1], dict(known), depth=sample_depth(sample))
 
 
-def score_prior(subject: Subject, settings: PipelineSettings, frames: Sequence[int]) -> tuple[Figures, Tensor]:
+def true_hints(subject: Subject) -> dict[str, DepthHint]:
+    """Return hints at the depth of a subject that are true, or nearly so, by name.
+
+    The depth belongs to the whole frame, so the framing must be kept.
+    """
+    depth = subject.depth
+    if depth is None:
+        assert subject.truth is not None and subject.truth.mesh is not None, "hints need a true depth"
+        depth = mesh_depth(subject.truth.mesh, SIZE)
+    alpha = resize(subject.footage[:1, ..., 3:], (len(depth), len(depth)))[0, ..., 0].clamp(0, 1)
+    return hints_of(depth, alpha)
+
+
+def score_prior(
+    subject: Subject, settings: PipelineSettings, frames: Sequence[int], hint: DepthHint | None = None
+) -> tuple[Figures, Tensor]:
     """Compare the prior's own views of some frames with the true ones.
+
+    Args:
+        subject: footage and true views.
+        settings: of the pipeline.
+        frames: that are compared.
+        hint: at the depth of the subject, instead of the turn that the pipeline finds.
 
     Returns:
         Figures, and the views of the first of these frames side by side, over white.
     """
     cutouts = prepared(subject, settings)
-    shapes = subject_shapes(settings.prior, [cutouts[frame] for frame in frames], turn_of(cutouts, settings))
+    hint = hint or hint_of(cutouts, settings)
+    shapes = subject_shapes(settings.prior, [cutouts[frame] for frame in frames], hint)
     size = next(iter(subject.views.values())).shape[1]
     rows, strip = [], []
     for azimuth, truth in subject.views.items():
@@ -80,7 +105,7 @@ def score_prior(subject: Subject, settings: PipelineSettings, frames: Sequence[i
 
 def surface_strip(cutout: Tensor, settings: PipelineSettings) -> Tensor:
     """Return the picture and the surface of frame 0 from eight sides, over white."""
-    shapes = subject_shapes(settings.prior, [cutout], settings.subject.turn_deg)
+    shapes = subject_shapes(settings.prior, [cutout], DepthHint(settings.subject.turn_deg))
     cameras = [OrbitCamera(SHEET_ELEVATION_DEG, azimuth, width=SHEET, height=SHEET) for azimuth in range(0, 360, 45)]
     color, alpha = render_surface(shapes.surface(0), cameras)
     return torch.cat([over_white(resize(cutout[None], (SHEET, SHEET)))[0], *(color * alpha + 1 - alpha)], 1)
@@ -97,6 +122,34 @@ def compare_surfaces(pictures: Sequence[Path], kinds: Sequence[str], values: dic
     write_sheet(sheet, strips)
 
 
+def compare_hints(
+    subjects: Iterable[Subject], kinds: Sequence[str], values: dict[str, object], frames: Sequence[int]
+) -> tuple[dict[str, dict[str, dict[str, Figures]]], list[Tensor]]:
+    """Score priors with true hints at the depth.
+
+    Returns:
+        Figures by subject, hint and kind, and strips: per subject and hint the picture, and the views of every kind.
+    """
+    found: dict[str, dict[str, dict[str, Figures]]] = {}
+    strips = []
+    for subject in subjects:
+        rows: dict[str, dict[str, Figures]] = {}
+        picture = over_white(resize(subject.footage[:1], (SIZE, SIZE)))[0]
+        for name, hint in true_hints(subject).items():
+            shown, rows[name] = [picture], {}
+            for kind in kinds:
+                settings = revise(PREVIEW, {"prior.kind": kind, "subject.framing": "keep", **values})
+                rows[name][kind], strip = score_prior(subject, settings, frames, hint)
+                shown.append(_fitted(strip))
+            strips.append(torch.cat(shown, 1))
+        found[subject.name] = rows
+        sys.stderr.write(f"{subject.name}\n")
+    for name in next(iter(found.values())):
+        means = {kind: mean([rows[name][kind] for rows in found.values()]) for kind in kinds}
+        sys.stdout.write(line(name, means))
+    return found, strips
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Compare priors on objects whose views are known."""
     parser = parser_of(__doc__)
@@ -105,6 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--made-up", type=int, default=0, metavar="N", help="made-up shapes instead of a folder")
     parser.add_argument("--kinds", nargs="+", default=KINDS, help="values of prior.kind")
     parser.add_argument("--frames", type=int, nargs="+", default=(0,), help="frames of which priors are compared")
+    parser.add_argument("--hints", action="store_true", help="what true turns, layers and depths bring, means")
     parser.add_argument("--video", action="store_true", help="fit Gaussians and motion with the profile preview")
     parser.add_argument("--weights", type=Path, help="network instead of the shipped one")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting, for all kinds")
@@ -124,6 +178,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         compare_surfaces(given.pictures, given.kinds, values, given.sheet)
         return
     subjects = made_up_subjects(given.made_up) if given.made_up else read_subjects(given.objects, given.only)
+    if given.hints:
+        scored, strips = compare_hints(subjects, given.kinds, values, given.frames)
+        if given.json:
+            given.json.write_text(json.dumps(scored, indent=1))
+        if given.sheet:
+            write_sheet(given.sheet, strips)
+        return
     found: dict[str, dict[str, Figures]] = {}
     strips = []
     for subject in subjects:

@@ -19,6 +19,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.images import over_white, resize
 from dg4d_lib.inflation.ground import ground_turn
+from dg4d_lib.inflation.hints import DepthHint
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import LearnedPriorSettings, LgmStartSettings
 from dg4d_lib.video.driving import DrivingVideo
@@ -49,12 +50,14 @@ class Subject:
         footage: cut-outs, straight alpha.
         views: azimuth to cut-outs.
         truth: files of the object; None for made-up ones.
+        depth: distance of the first frame's surface from the camera's plane, 0 where there is none; None: unknown.
     """
 
     name: str
     footage: Float[Tensor, "t h w 4"]
     views: Mapping[float, Float[Tensor, "t s s 4"]] = field(default_factory=dict)
     truth: GroundTruth | None = None
+    depth: Float[Tensor, "s s"] | None = None
 
 
 def read_subjects(folder: Path, names: Sequence[str] = ()) -> Iterator[Subject]:
@@ -71,11 +74,11 @@ def prepared(subject: Subject, settings: PipelineSettings) -> Float[Tensor, "t s
     return prepare_subject(subject.footage, True, settings.subject).frames
 
 
-def turn_of(cutouts: Float[Tensor, "t h w 4"], settings: PipelineSettings) -> float:
+def hint_of(cutouts: Float[Tensor, "t h w 4"], settings: PipelineSettings) -> DepthHint:
     """Return the turn that the pipeline uses for this footage."""
     learned = isinstance(settings.prior, LearnedPriorSettings)
     found = 0.0 if learned else ground_turn(cutouts[..., 3:], settings.subject.ground_turn)
-    return settings.subject.turn_deg or found
+    return DepthHint(settings.subject.turn_deg or found)
 
 
 def fit(subject: Subject, settings: PipelineSettings, seed: int = 0, sides: Bank | None = None) -> Gaussians:
@@ -89,18 +92,18 @@ def fit(subject: Subject, settings: PipelineSettings, seed: int = 0, sides: Bank
     """
     rasterize, generator = get_rasterizer("auto"), torch.Generator().manual_seed(seed)
     cutouts = prepared(subject, settings)
-    turn_deg, start_settings = turn_of(cutouts, settings), settings.static.start
+    hint, start_settings = hint_of(cutouts, settings), settings.static.start
     assert not isinstance(start_settings, LgmStartSettings), "these fits start without LGM"
-    shapes = subject_shapes(settings.prior, [cutouts[0]], turn_deg, sides)
+    shapes = subject_shapes(settings.prior, [cutouts[0]], hint, sides)
     start = initial_gaussians(start_settings, shapes, generator)
-    prior = make_prior(settings.prior, [cutouts[0]], settings.static, None, Path(), turn_deg, sides).prior
+    prior = make_prior(settings.prior, [cutouts[0]], settings.static, None, Path(), hint, sides).prior
     known = known_views(sides) if sides is not None else []
     rest = fit_gaussians(start, cutouts[0], prior, rasterize, settings.static, generator, known=known)
     video, kind = DrivingVideo(cutouts[..., :3].contiguous(), cutouts[..., 3:].contiguous(), 10), settings.prior
     moved = None
     if sides and tracks_surface(settings.motion, kind, sides, len(video)):
-        moved = tracked_shapes(rest, video, sides, kind, turn_deg, rasterize, settings.asset, generator)
-    prior = make_prior(kind, list(cutouts), settings.motion, None, Path(), turn_deg, sides, moved).prior
+        moved = tracked_shapes(rest, video, sides, kind, hint, rasterize, settings.asset, generator)
+    prior = make_prior(kind, list(cutouts), settings.motion, None, Path(), hint, sides, moved).prior
     deformation = new_deformation(settings.deformation, rest, len(video), generator)
     fitted = fit_motion(rest, deformation, video, prior, rasterize, settings.motion, generator)
     with torch.no_grad():

@@ -60,6 +60,8 @@ def make(
     asset: str | Path | None = None,
     bank: str | Path | None = None,
     mask: str | Path | None = None,
+    depth: str | Path | None = None,
+    layers: str | Path | None = None,
     profile: str = "preview",
     seed: int = 0,
     name: str = "",
@@ -83,6 +85,8 @@ def make(
         asset: model of your own, a mesh or splats, that is set in motion.
         bank: folder of ground-truth views, for `prior.kind=oracle`.
         mask: picture, or folder of frames for a video, that is white where the subject is.
+        depth: picture of the depth of the first frame: integers are inverse depth, floating-point numbers distances.
+        layers: gray picture of the first frame: parts lighter than mid-gray lie before the rest, darker ones behind it.
         profile: set of settings.
         seed: seed of every step.
         name: name of the asset; default: from the file name or the text.
@@ -109,6 +113,8 @@ def make(
             bank=Path(bank) if bank is not None else None,
             asset=Path(asset) if asset is not None else None,
             mask=Path(mask) if mask is not None else None,
+            depth=Path(depth) if depth is not None else None,
+            layers=Path(layers) if layers is not None else None,
             given_views=ViewsRequest(
                 views=tuple(_view_file(place, path) for place, path in (views or {}).items()),
                 turntable=Path(turntable) if turntable is not None else None,

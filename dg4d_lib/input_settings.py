@@ -58,6 +58,11 @@ class SubjectSettings(Settings):
     ground_turn: float = Field(
         0.6, ge=0, le=1, description="factor on the turn that the ground line of footage gives if `turn_deg` is 0"
     )
+    depth_kind: Literal["auto", "inverse", "distance"] = Field(
+        "auto",
+        description="values of a depth picture (--depth). inverse: relative inverse depth, bright is near; distance: "
+        "from the camera, in any unit; auto: distances if they are floating-point numbers, else inverse",
+    )
     max_frames: int = Field(32, ge=2, le=512, description="largest number of frames; longer videos are sampled evenly")
     max_decode_gb: float = Field(
         1.0, ge=0.125, le=256, description="GiB of memory for decoding the source, including decoded frames; ours"

@@ -26,13 +26,19 @@ from dg4d_lib.assets.formats.model_glb import write_model_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.images import over_white, resize
+from dg4d_lib.inflation.hints import DepthHint
+from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.mesh.models.model import Model, ModelPart
+from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.subject import prepare_subject
 from examples.newt import Newt
 from flows.inputs.given_views import ViewFile, ViewsRequest
 from steps.artifacts.media import write_png
+from steps.fitting.priors import subject_shapes
 from steps.profiles import PREVIEW, revise
+from steps.sources.depth import read_depth, read_layers
+from steps.sources.reader import read_source
 from steps.store.artifact_store import ArtifactStore
 
 ROOT = Path(__file__).parents[1]
@@ -43,6 +49,7 @@ VIEWS_DEG = (90, 180, 270)
 CAMERAS_DEG = ((60, 20), (170, -10), (280, 30))  # azimuth, elevation
 SHOWN_DEG = (45.0, 135.0, 225.0)  # azimuths of the sheets, which no way is given
 SHOWN_FRAMES = (0, 4, 8, 12)
+TURN_DEG = 20.0  # of the newt, whose head is nearer
 TILE = 96  # pixels
 QUALITY = 80  # of WebP
 Tile = Float[Tensor, "s s 3"]
@@ -51,12 +58,14 @@ Tile = Float[Tensor, "s s 3"]
 def main() -> None:
     """Write the files and the pictures of all ways, or of some."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--only", nargs="+", choices=(*WAYS, "cutout"), default=(*WAYS, "cutout"))
+    parser.add_argument("--only", nargs="+", choices=(*WAYS, *ROWS), default=(*WAYS, *ROWS))
     chosen = parser.parse_args().only
     painted = Painted(Newt())
     FILES.mkdir(parents=True, exist_ok=True)
     if "cutout" in chosen:
         save("cutout", cutout_row(painted))
+    if "depth" in chosen:
+        save("depth", depth_rows(painted))
     for name, way in WAYS.items():
         if name in chosen:
             given, sheet = way(painted)
@@ -139,6 +148,9 @@ WAYS: dict[str, Callable[[Painted], tuple[list[Tile], Tensor]]] = {
 }
 
 
+ROWS = ("cutout", "depth")  # pictures without a fit
+
+
 def with_sides(painted: Painted, request: ViewsRequest) -> Tensor:
     """Fit the video and views beside it; return the sheet."""
     subject = subject_of(painted)
@@ -165,6 +177,45 @@ def cutout_row(painted: Painted) -> Tensor:
     return row([tile(picture) for picture in shown])
 
 
+def depth_rows(painted: Painted) -> Tensor:
+    """Show the guessed surface without a hint, with a turn, layers and a depth picture, and the animal itself."""
+    animal = photograph(painted, 0)
+    write_png(FILES / "newt.png", animal)
+    cameras = [OrbitCamera(0, azimuth, width=SIZE, height=SIZE) for azimuth in (0.0, *SHOWN_DEG)]
+    shown = rasterize_mesh(painted.vertices(0.0), painted.faces, cameras[:1])
+    inside, distance = shown.faces[0] >= 0, shown.depth[0]
+    near, far = float(distance[inside].min()), float(distance[inside].max())
+    share = torch.where(inside, (1 / distance.clamp(min=near) - 1 / far) / (1 / near - 1 / far), 0.0).clamp(0, 1)
+    Image.fromarray((65535 * share).round().to(torch.int32).numpy().astype(np.uint16)).save(FILES / "newt_depth.png")
+    low, high = share[inside].quantile(torch.tensor([1 / 3, 2 / 3])).tolist()
+    levels = torch.where(inside, 0.5 * ((share > low).float() + (share > high)), 0.5)[..., None].expand(-1, -1, 3)
+    write_png(FILES / "newt_layers.png", torch.cat([levels, inside[..., None].float()], -1))
+    given = {name: read_picture(FILES / f"newt_{name}.png", animal) for name in ("layers", "depth")}
+    blank = torch.ones(SIZE, SIZE, 3)
+    drawn = [(animal, DepthHint()), (blank, DepthHint(TURN_DEG)), *given.values()]
+    rows = []
+    for picture, hint in drawn:
+        color, alpha = render_surface(subject_shapes(PREVIEW.prior, [animal], hint).surface(0), cameras[1:])
+        rows.append([picture, *(color * alpha + 1 - alpha)])
+    rows.append([blank, *painted.draw(0.0, cameras[1:])])
+    return torch.cat([row([tile(picture) for picture in pictures]) for pictures in rows])
+
+
+def read_picture(path: Path, animal: Float[Tensor, "s s 4"]) -> tuple[Tensor, DepthHint]:
+    """Return a picture of the animal's depth, and what it says, read as the pipeline reads it."""
+    with TemporaryDirectory() as folder:
+        source = read_source(FILES / "newt.png", Path(folder), 2)
+        settings = revise(PREVIEW, {"subject.framing": "keep"}).subject
+        prepared = prepare_subject(animal[None], True, settings)
+        read = read_layers if "layers" in path.name else read_depth
+        field, _ = read(path, source, prepared, settings, Path(folder))
+    with Image.open(path) as picture:
+        pixels = np.asarray(picture).astype(np.float32)
+    gray = torch.from_numpy(pixels / 65535 if pixels.ndim == 2 else pixels[..., 0] / 255)
+    over = torch.where(animal[..., 3] > 0.5, gray, 1.0)[..., None].expand(-1, -1, 3)
+    return over, DepthHint(0.0, field)
+
+
 def sheet_of(states: Gaussians) -> Tensor:
     """Render some frames from azimuths that nobody gave, a row each."""
     rasterize, frames = get_rasterizer("auto"), torch.tensor(SHOWN_FRAMES)
@@ -177,8 +228,10 @@ def sheet_of(states: Gaussians) -> Tensor:
     return torch.cat(rows)
 
 
-def tile(cutout: Float[Tensor, "s s 4"]) -> Tile:
-    """Return a small picture over white."""
+def tile(cutout: Float[Tensor, "s s c"]) -> Tile:
+    """Return a small picture, over white if it has alpha."""
+    if cutout.shape[-1] == 3:
+        return resize(cutout[None], (TILE, TILE))[0]
     return resize(over_white(cutout[None]), (TILE, TILE))[0]
 
 

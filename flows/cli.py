@@ -25,8 +25,10 @@ from flows.commands.options import (
     Changes,
     Commercial,
     Compress,
+    Depth,
     Ground,
     Height,
+    Layers,
     Mask,
     Profile,
     Rate,
@@ -113,6 +115,8 @@ def make(
     ] = None,
     mask: Mask = None,
     box: Box = "",
+    depth: Depth = None,
+    layers: Layers = None,
     asset: Annotated[
         Path | None,
         typer.Option(
@@ -157,12 +161,24 @@ def make(
                 "video": video,
                 "bank": bank,
                 "mask": mask,
+                "depth": depth,
+                "layers": layers,
                 "asset": asset,
             }
             files["given_views"] = sides
             return _request(profile, changes, short, item=item, seed=seed, commercial_only=commercial_only, **files)
 
-        wish = Wish(tuple(pictures or ()), text, video, mask, asset, bool(sides), out, force, bool(pick), request)
+        for_one = {
+            "--text": text,
+            "--video": video,
+            "--mask": mask,
+            "--depth": depth,
+            "--layers": layers,
+            "--asset": asset,
+            "--view": bool(sides),
+        }
+        alone = next((option for option, value in for_one.items() if value), "")
+        wish = Wish(tuple(pictures or ()), text, video, asset, alone, out, force, bool(pick), request)
         if status := make_each(wish, terminal.console()):
             raise typer.Exit(status)
 
@@ -175,6 +191,8 @@ def motions(
     seed: Seed = 0,
     mask: Mask = None,
     box: Box = "",
+    depth: Depth = None,
+    layers: Layers = None,
     commercial_only: Commercial = False,
     candidates: Annotated[int, typer.Option(min=2, max=16, metavar="N", help="number of motions")] = 6,
     out: Annotated[
@@ -195,7 +213,7 @@ def motions(
         console = terminal.console()
         several = shortcut_settings(None, None, None, box=box) | {"driving.candidates": candidates, "driving.pick": 0}
         item = clean_name(picture.stem) or "asset"
-        files = {"item": item, "picture": picture, "mask": mask}
+        files = {"item": item, "picture": picture, "mask": mask, "depth": depth, "layers": layers}
         request = _request(profile, changes, several, seed=seed, commercial_only=commercial_only, **files)
         folder = out or Path("out") / f"{item}-motions"
         check_writable(folder)
@@ -275,8 +293,8 @@ def batch(
 
     Finished items are skipped; a failed item does not stop the others. A manifest has one row per item with these
     columns: path, text or asset, and optionally video, name, profile, seed, views ("90=right.png; 180=back.png"),
-    turntable, cameras, bank, mask, box ("X,Y,W,H"), priority (higher first), set ("a.b=c; d.e=f"), or any setting by
-    its name.
+    turntable, cameras, bank, mask, box ("X,Y,W,H"), depth, layers, priority (higher first), set ("a.b=c; d.e=f"), or
+    any setting by its name.
     """
     with exit_on_error():
         os.environ.update({name: str(n) for name, n in {"DG4D_GPUS": gpus, "DG4D_CPUS": cpus}.items() if n is not None})

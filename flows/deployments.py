@@ -162,7 +162,7 @@ class Sides(Frozen):
 
 
 class Cutout(Frozen):
-    """Hints for cutting the subject out; empty: it is found."""
+    """Hints for cutting the subject out and for its depth; empty: both are found."""
 
     mask: str = Field(
         "",
@@ -170,10 +170,24 @@ class Cutout(Frozen):
         description="picture, or folder of frames for a video, on the worker's machine: white where the subject is",
     )
     box: str = Field("", title="Box", description="X,Y,W,H in pixels, as `120,40,300,420`: the part with the subject")
+    depth: str = Field(
+        "",
+        title="Depth",
+        description="depth picture of the first frame, on the worker's machine: inverse depth (bright is near), or "
+        "distances as EXR or TIFF with floating-point numbers",
+    )
+    layers: str = Field(
+        "",
+        title="Layers",
+        description="gray picture of the first frame, on the worker's machine: parts lighter than mid-gray lie before "
+        "the rest, darker ones behind it",
+    )
 
 
 FormSides = Annotated[Sides, Field(json_schema_extra=_title("Other sides") | {"default": Sides().model_dump()})]
-FormCutout = Annotated[Cutout, Field(json_schema_extra=_title("Cut-out") | {"default": Cutout().model_dump()})]
+FormCutout = Annotated[
+    Cutout, Field(json_schema_extra=_title("Cut-out and depth") | {"default": Cutout().model_dump()})
+]
 FormOptions = Annotated[Options, Field(json_schema_extra=_options_field(Options()))]
 FormPictureOptions = Annotated[PictureOptions, Field(json_schema_extra=_options_field(PictureOptions()))]
 
@@ -194,7 +208,7 @@ def picture_to_4d(
         out: on the worker's machine, as `/data/out/fox`; open `report.html` there when it is done
         options: the defaults work on any machine
         sides: pictures of other sides, which the subject is shaped and colored by; or a model of it
-        cutout: where the subject is, if it is not found
+        cutout: where the subject is, if it is not found, and what lies nearer
     """
     _convert(picture, out, options, sides, cutout)
 
@@ -215,7 +229,7 @@ def video_to_4d(
         out: on the worker's machine, as `/data/out/walk`; open `report.html` there when it is done
         options: the defaults work on any machine
         sides: pictures of other sides at the first frame, which the subject is shaped and colored by; or a model of it
-        cutout: where the subject is, if it is not found
+        cutout: where the subject is, if it is not found, and what lies nearer
     """
     _convert(video, out, options, sides, cutout, is_video=True)
 
@@ -380,11 +394,12 @@ def _convert(address: str, out: str, options: Options, sides: Sides, cutout: Cut
     _start()
     roots = Roots.of_this_process()
     folder, given = roots.output(out), sides.request()
-    mask, asset = (Path(text) if text else None for text in (cutout.mask, sides.asset))
-    roots.check_files([*given.files(), *filter(None, (mask, asset))])
+    named = {"mask": cutout.mask, "depth": cutout.depth, "layers": cutout.layers, "asset": sides.asset}
+    own = {name: Path(text) if text else None for name, text in named.items()}
+    roots.check_files([*given.files(), *filter(None, own.values())])
     item = clean_name(PurePosixPath(urlsplit(address).path).stem) or "asset"
     with local_copy(roots.source(address)) as path:
-        files = {"picture": path, "video": path if is_video else None, "mask": mask, "asset": asset}
+        files = {"picture": path, "video": path if is_video else None, **own}
         request = _request(item, options, roots, box_settings(cutout.box), given_views=given, **files)
         _publish(request, folder)
 

@@ -62,7 +62,7 @@ def motions(job: ConversionJob) -> dict[str, ArtifactRef]:
     """
     with steps_of_flow():
         conversion = conversion_of(job)
-        subject = prepare_subject(job.source, conversion, job.mask)
+        subject = prepare_subject(job.source, conversion, job.mask, job.depth, job.layers)
         if subject.footage is not None:
             raise StepBadInput("prepare_subject", "this is a video and has its motion already; give a picture")
         return drive_video(subject, conversion).outputs

@@ -111,7 +111,7 @@ def convert(job: ConversionJob, conversion: Conversion, tasks: Tasks, must_move:
         model = tasks.prepare_asset(job.asset, conversion)
         return animate(model, job.source, job, conversion, tasks, model)
     source = tasks.draw_picture(job.source, conversion).picture if job.drawn else job.source
-    subject = tasks.prepare_subject(source, conversion, job.mask)
+    subject = tasks.prepare_subject(source, conversion, job.mask, job.depth, job.layers)
     if must_move and subject.footage is None:
         raise StepBadInput("prepare_subject", "this is a single picture, not a video: a video has two frames or more")
     return animate(subject, source, job, conversion, tasks)

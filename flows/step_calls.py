@@ -87,7 +87,13 @@ def draw_picture(text: ArtifactRef, conversion: Conversion) -> Picture:
     return run_step("draw_picture", Picture, **locals())
 
 
-def prepare_subject(source: ArtifactRef, conversion: Conversion, mask: ArtifactRef | None = None) -> Subject:
+def prepare_subject(
+    source: ArtifactRef,
+    conversion: Conversion,
+    mask: ArtifactRef | None = None,
+    depth: ArtifactRef | None = None,
+    layers: ArtifactRef | None = None,
+) -> Subject:
     """Read a picture or video, cut the subject out, by the user's mask if there is one, and center it."""
     return run_step("prepare_subject", Subject, **locals())
 

@@ -7,6 +7,7 @@ Artifacts:
   matte       PNG with one channel: alpha in the pixels of a picture
   facts       JSON {"width": ..., "height": ..., "kind": ..., "frames": ..., "notes": [...], "problem": ...} of a source
   pose        JSON {"turn_deg": ...}: turn of the subject's plane that its footage shows, 0 where it shows none
+  depth-field safetensors of steps/artifacts/depth_fields.py: depth of the middle of the subject behind every pixel
   model       uncompressed zip of model.SUFFIX (.glb, .gltf, .obj, .usdz, .ply, .spz) and the files that it refers to
   glb         GLB of the model; `moving` has a morph target per frame
   placement   JSON of steps/artifacts/placements.py: similarity from the model to the world
@@ -47,6 +48,7 @@ TEXT = Port(media_type="text/plain", suffix=".txt")
 SOURCE = Port(media_type="application/octet-stream", suffix="")
 FRAMES = _port("frames", "zip")
 POSE = _port("pose", "json")
+DEPTH_FIELD = _port("depth-field", "safetensors")
 ASSET = _port("model", "zip")
 GLB = Port(media_type="model/gltf-binary", suffix=".glb")
 PLACEMENT = _port("placement", "json")
@@ -81,11 +83,17 @@ STEPS: dict[str, StepSpec] = {
         ),
         _step(
             "prepare_subject",
-            inputs={"source": SOURCE, "mask": _optional(SOURCE)},
+            inputs={
+                "source": SOURCE,
+                "mask": _optional(SOURCE),
+                "depth": _optional(SOURCE),
+                "layers": _optional(SOURCE),
+            },
             outputs={
                 "subject": PNG,
                 "footage": _optional(FRAMES),
                 "pose": _optional(POSE),
+                "depth_field": _optional(DEPTH_FIELD),
                 "cutout_gates": _optional(GATES),
                 "picture": PNG,
             },
@@ -109,7 +117,7 @@ STEPS: dict[str, StepSpec] = {
         ),
         _step(
             "drive_video",
-            inputs={"subject": PNG, "footage": _optional(FRAMES)},
+            inputs={"subject": PNG, "depth_field": _optional(DEPTH_FIELD), "footage": _optional(FRAMES)},
             outputs={
                 "driving_video": FRAMES,
                 "picture": PNG,
@@ -123,7 +131,13 @@ STEPS: dict[str, StepSpec] = {
         ),
         _step(
             "fit_gaussians",
-            inputs={"subject": PNG, "pose": _optional(POSE), "bank": _optional(BANK), "known_views": _optional(BANK)},
+            inputs={
+                "subject": PNG,
+                "pose": _optional(POSE),
+                "depth_field": _optional(DEPTH_FIELD),
+                "bank": _optional(BANK),
+                "known_views": _optional(BANK),
+            },
             outputs={"gaussians": PLY, "first_look": WEB_SPLATS, "curves": CURVES, "picture": PNG},
             sections=("rasterizer", "subject.turn_deg", "prior", "static"),
             resource="gpu",
@@ -135,6 +149,7 @@ STEPS: dict[str, StepSpec] = {
                 "gaussians": PLY,
                 "driving_video": FRAMES,
                 "pose": _optional(POSE),
+                "depth_field": _optional(DEPTH_FIELD),
                 "bank": _optional(BANK),
                 "known_views": _optional(BANK),
             },

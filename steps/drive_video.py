@@ -18,12 +18,14 @@ from dg4d_lib.diffusion.components import default_device
 from dg4d_lib.diffusion.video_model import VideoModel
 from dg4d_lib.errors import BadInput
 from dg4d_lib.images import resize
+from dg4d_lib.inflation.hints import DepthHint
 from dg4d_lib.input_settings import DiffusersVideoSettings, DrivingSettings, SvdSettings, WarpSettings
 from dg4d_lib.video.candidate_ranking import MIN_GOOD_TOTAL, WEIGHTS, Candidate, rank_candidates, score_video
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.image_to_video import ImageToVideo
 from dg4d_lib.video.svd import StableVideo
 from dg4d_lib.video.warp import Warp, candidate_settings
+from steps.artifacts.depth_fields import read_depth_field
 from steps.artifacts.media import read_frames, read_png, write_frames, write_png, write_zip
 from steps.runtime.job import Job, StepReport
 from steps.runtime.weights import license_note, offload_notes, open_weights
@@ -57,7 +59,7 @@ def run(job: Job) -> StepReport:
     numbers = [driving.pick] if driving.pick else list(range(1, driving.candidates + 1))
     match driving:
         case WarpSettings():
-            motions, report = _warps(driving, job.settings.turn_deg, subject, numbers), StepReport()
+            motions, report = _warps(driving, _hint(job), subject, numbers), StepReport()
             origin = "a warp of the picture ({}), without a learned model"
         case SvdSettings():
             motions, report = _stable_videos(driving, subject, numbers, job.seed)
@@ -91,14 +93,20 @@ def _use_footage(job: Job, subject: Float[Tensor, "h w 4"]) -> StepReport:
     )
 
 
+def _hint(job: Job) -> DepthHint:
+    """Return what the user knows about the depth of the subject."""
+    field = job.inputs.get("depth_field")
+    return DepthHint(job.settings.turn_deg, read_depth_field(field) if field else None)
+
+
 def _warps(
-    settings: WarpSettings, turn_deg: float, subject: Float[Tensor, "h w 4"], numbers: Sequence[int]
+    settings: WarpSettings, hint: DepthHint, subject: Float[Tensor, "h w 4"], numbers: Sequence[int]
 ) -> list[_Motion]:
     """Generate warps of the picture."""
     motions = []
     for number in numbers:
         variant = candidate_settings(settings, number)
-        warp = Warp(variant, turn_deg)
+        warp = Warp(variant, hint)
         video = warp.generate(subject, torch.Generator())
         motions.append(_Motion(number, variant.motion, video, warp.notes))
     return motions

@@ -22,7 +22,7 @@ from dg4d_lib.settings import (
     SurfaceStartSettings,
 )
 from steps.artifacts.media import read_png, write_png
-from steps.fitting.priors import known_views, make_prior, read_known_views, subject_shapes, subject_turn
+from steps.fitting.priors import known_views, make_prior, read_known_views, subject_hint, subject_shapes
 from steps.fitting.reconstruction import reconstruct_subject
 from steps.fitting.reporting import LossCurves, picture_of_divergence, render_turnaround, show_fit
 from steps.runtime.job import Job, StepReport
@@ -35,7 +35,9 @@ def run(job: Job) -> StepReport:
     """Fit the Gaussians and render them from six sides."""
     static: StaticSettings = job.settings.static
     prior: PriorSettings = job.settings.prior
-    backend, turn_deg = job.settings.rasterizer, subject_turn(prior, job.inputs.get("pose"), job.settings.turn_deg)
+    backend = job.settings.rasterizer
+    depth = job.inputs.get("depth_field")
+    hint = subject_hint(prior, job.inputs.get("pose"), depth, job.settings.turn_deg)
     subject = read_png(job.inputs["subject"])
     generator = torch.Generator().manual_seed(job.seed)
     rasterize = get_rasterizer(backend)
@@ -45,12 +47,12 @@ def run(job: Job) -> StepReport:
     if isinstance(static.start, LgmStartSettings):  # before the prior, so that two networks are not in memory at once
         reconstruction = reconstruct_subject(subject.to(device), static.start, rasterize, generator)
         static = fine_tuning_settings(static)
-    chosen = make_prior(prior, [subject], static, job.inputs.get("bank"), job.pictures, turn_deg, known)
+    chosen = make_prior(prior, [subject], static, job.inputs.get("bank"), job.pictures, hint, known)
     others = known_views(known) if known is not None else []
     if reconstruction:
         start = reconstruction.gaussians
     else:
-        shapes = chosen.shapes or subject_shapes(prior, [subject], turn_deg, known)
+        shapes = chosen.shapes or subject_shapes(prior, [subject], hint, known)
         start = initial_gaussians(job.settings.static.start, shapes, generator).to(device)
     curves = LossCurves(static.iterations, job.progress)
 

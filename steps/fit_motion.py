@@ -12,7 +12,7 @@ from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
 from dg4d_lib.settings import DeformationSettings, MotionSettings
 from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.motions import new_deformation, write_motion
-from steps.fitting.priors import make_prior, read_known_views, subject_turn
+from steps.fitting.priors import make_prior, read_known_views, subject_hint
 from steps.fitting.reporting import SHOWN_AZIMUTHS_DEG, LossCurves, picture_of_divergence, render_row, show_fit
 from steps.fitting.tracking import TRACKED_NOTE, tracked_shapes, tracks_surface
 from steps.runtime.job import Job, StepReport
@@ -25,7 +25,8 @@ FRONT_DEG, SIDE_DEG = 0.0, 90.0
 def run(job: Job) -> StepReport:
     """Fit the deformation, with `fine_tune` also the Gaussians; render six timestamps from front and side."""
     backend, prior = job.settings.rasterizer, job.settings.prior
-    turn_deg = subject_turn(prior, job.inputs.get("pose"), job.settings.turn_deg)
+    depth = job.inputs.get("depth_field")
+    hint = subject_hint(prior, job.inputs.get("pose"), depth, job.settings.turn_deg)
     kind: DeformationSettings = job.settings.deformation
     settings: MotionSettings = job.settings.motion
     gaussians = read_ply(job.inputs["gaussians"])
@@ -40,11 +41,11 @@ def run(job: Job) -> StepReport:
     curves = LossCurves(before + settings.iterations, job.progress)
     with picture_of_divergence(job, rasterize):
         moved = (
-            tracked_shapes(gaussians, video, known, prior, turn_deg, rasterize, asset, generator, curves.add)
+            tracked_shapes(gaussians, video, known, prior, hint, rasterize, asset, generator, curves.add)
             if known and tracks
             else None
         )
-    chosen = make_prior(prior, cutouts, settings, job.inputs.get("bank"), job.pictures, turn_deg, known, moved)
+    chosen = make_prior(prior, cutouts, settings, job.inputs.get("bank"), job.pictures, hint, known, moved)
     deformation = new_deformation(kind, gaussians, len(video), generator)
     device = preferred_device(backend)
     deformation.to(device)

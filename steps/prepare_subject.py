@@ -7,26 +7,31 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dg4d_lib.images import over_white
+from dg4d_lib.images import over_white, resize
 from dg4d_lib.inflation.ground import ground_turn
+from dg4d_lib.inflation.hints import DepthField
 from dg4d_lib.input_settings import SubjectSettings
 from dg4d_lib.metrics.cutout import evaluate_cutout
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.framing import crop_whole_frame, reframe
-from dg4d_lib.video.subject import prepare_subject
+from dg4d_lib.video.subject import PreparedSubject, prepare_subject
+from steps.artifacts.depth_fields import write_depth_field
 from steps.artifacts.gates import gates_as_json, write_gates
 from steps.artifacts.media import write_frames, write_png
 from steps.artifacts.pose import Pose, write_pose
 from steps.runtime.job import Job, StepReport
+from steps.sources.depth import read_depth, read_layers
 from steps.sources.masks import read_mask, scaled_box
 from steps.sources.networks import LoadedNetwork, open_network
-from steps.sources.reader import read_source
+from steps.sources.reader import Source, read_source
 
 TILE = 256  # pixels
 
 
 def run(job: Job) -> StepReport:
     """Decode `source`, cut out and frame the subject; write `footage` and `pose` if the source is a video.
+
+    A depth picture or layers of the first frame become a `depth_field` in the same frame.
 
     Raises:
         BadInput: the file cannot be used; says why and what to do.
@@ -41,6 +46,7 @@ def run(job: Job) -> StepReport:
     boxed = settings.model_copy(update={"box": scaled_box(settings.box, source)})
     prepared = prepare_subject(source.frames, source.has_alpha, boxed, mask, network.segmenter)
     cutouts, notes = prepared.frames, prepared.notes
+    hinted = read_hint(job, source, prepared)
     if prepared.estimate is not None:
         found = prepared.estimate
         gates = gates_as_json(evaluate_cutout(found.frames[..., 3], found.agreement, job.settings.cutout))
@@ -53,10 +59,25 @@ def run(job: Job) -> StepReport:
         turn_deg = ground_turn(footage.alpha, settings.ground_turn)
         write_pose(job.outputs["pose"], Pose(turn_deg=round(turn_deg, 3)))
         notes = (*notes, turn_note(turn_deg)) if turn_deg and not settings.turn_deg else notes
-    write_png(job.outputs["picture"], picture_of(source.frames[0], cutouts[0]))
+    tiles = picture_of(source.frames[0], cutouts[0])
+    if hinted:
+        field, note = hinted
+        write_depth_field(job.outputs["depth_field"], field)
+        notes, tiles = (*notes, note), torch.cat([tiles, picture_of_depth(field)], 1)
+    write_png(job.outputs["picture"], tiles)
     job.progress(3, 3, {})
     used = network if prepared.estimate is not None and prepared.estimate.used_network else LoadedNetwork()
     return StepReport(weights=used.digests, licenses=used.licenses, notes=(*source.notes, *notes))
+
+
+def read_hint(job: Job, source: Source, prepared: PreparedSubject) -> tuple[DepthField, str] | None:
+    """Return what the user says about the depth, and a sentence about it; None if nothing is given."""
+    settings: SubjectSettings = job.settings.subject
+    for port, read in (("depth", read_depth), ("layers", read_layers)):
+        if port in job.inputs:
+            with TemporaryDirectory() as scratch:
+                return read(job.inputs[port], source, prepared, settings, Path(scratch))
+    return None
 
 
 def turn_note(turn_deg: float) -> str:
@@ -66,6 +87,14 @@ def turn_note(turn_deg: float) -> str:
         f"ground line of the footage: the {nearer} side is taken to be nearer, by a turn of {abs(turn_deg):.0f} "
         "degrees, by the geometric prior; `subject.turn_deg` overrides it, `subject.ground_turn=0` ignores it"
     )
+
+
+def picture_of_depth(field: DepthField) -> Float[Tensor, "t t 3"]:
+    """Draw a field in gray, near parts bright; white where nothing is known."""
+    middle = field.middle[field.known]
+    gray = 0.1 + 0.7 * (field.middle - middle.min()) / (middle.max() - middle.min()).clamp(min=1e-6)
+    drawn = torch.where(field.known, gray, 1.0)[..., None].expand(-1, -1, 3)
+    return resize(drawn[None], (TILE, TILE))[0].clamp(0, 1)
 
 
 def picture_of(source: Float[Tensor, "h w 4"], cutout: Float[Tensor, "s s 4"]) -> Float[Tensor, "t w3 3"]:

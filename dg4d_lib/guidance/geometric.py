@@ -18,6 +18,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.guidance.interface import GuidanceView, check_frame, check_views
 from dg4d_lib.images import over_background
+from dg4d_lib.inflation.hints import NO_HINT, DepthHint
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import InflatedSurface, inflate, resample
 from dg4d_lib.kernels.simd import INLINE, KERNEL
@@ -44,7 +45,7 @@ class InflatedSurfaces:
         self,
         cutouts: Sequence[Float[Tensor, "h w 4"]],
         settings: GeometricPriorSettings,
-        turn_deg: float = 0.0,
+        hint: DepthHint = NO_HINT,
         depth: Disparity | None = None,
     ) -> None:
         """Store the pictures.
@@ -52,12 +53,12 @@ class InflatedSurfaces:
         Args:
             cutouts: one per frame: square, straight alpha, color and alpha in [0, 1].
             settings: size of the surface, and uncertainty of its depth.
-            turn_deg: turn of the subject about the vertical.
-            depth: estimator of inverse depth, a hint at the relief of every picture; None: none.
+            hint: at the depth of the subject, by a user.
+            depth: estimator of inverse depth, for the relief of every picture; None: none.
         """
         self._depth = depth
         self._cutouts = tuple(cutouts)
-        self._settings, self._turn_deg = settings, turn_deg
+        self._settings, self._hint = settings, hint
         self._surfaces: dict[int, InflatedSurface] = {}
 
     def surface(self, frame: int) -> InflatedSurface:
@@ -72,7 +73,7 @@ class InflatedSurfaces:
             if self._depth is not None:
                 disparity = self._depth.disparity(resample(self._cutouts[frame], size))
             self._surfaces[frame] = inflate(
-                self._cutouts[frame], size, self._turn_deg, disparity, self._settings.depth_weight
+                self._cutouts[frame], size, self._hint, disparity, self._settings.depth_weight
             )
         return self._surfaces[frame]
 

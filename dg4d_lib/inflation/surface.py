@@ -6,7 +6,6 @@ covers the picture exactly in the input view, and the back sheet its mirror imag
 then show through a hole or a notch in the input view, where it slides inwards less.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,16 +14,16 @@ from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from dg4d_lib.cameras.orbit import FOV_Y_DEG, RADIUS
+from dg4d_lib.cameras.orbit import RADIUS
 from dg4d_lib.errors import BadInput
 from dg4d_lib.images import resize_planes
 from dg4d_lib.inflation.colors import back_colors, front_colors
 from dg4d_lib.inflation.heights import heights
+from dg4d_lib.inflation.hints import NO_HINT, DepthHint, pixel_size
 from dg4d_lib.inflation.mask import subject_mask
 from dg4d_lib.inflation.relief import relief
 from dg4d_lib.inflation.sheet import Sheet, triangulate
 
-FARTHEST = 1.0  # world units: a turned plane leaves z = 0 by no more
 SLIDES = (0.75, 0.5, 0.25, 0.0)  # places tried for the back sheet, outmost first
 CELLS = 1 << 10  # of a space-filling curve, per axis
 
@@ -49,7 +48,7 @@ class InflatedSurface:
 def inflate(
     cutout: Float[Tensor, "h w 4"],
     size: int,
-    turn_deg: float = 0.0,
+    hint: DepthHint = NO_HINT,
     disparity: Float[Tensor, "{size} {size}"] | None = None,
     depth_weight: float = 0.0,
 ) -> InflatedSurface:
@@ -60,8 +59,7 @@ def inflate(
     Args:
         cutout: square; straight alpha, color and alpha in [0, 1].
         size: pixels of a side at which the surface is built.
-        turn_deg: how far the subject's plane is turned about the vertical; positive brings the right side of the
-            picture nearer to the camera. Between -60 and 60.
+        hint: at the depth of the subject.
         disparity: estimated inverse depth of the picture, up to scale and offset; None: none.
         depth_weight: share of its relief that the surface takes on.
 
@@ -72,11 +70,9 @@ def inflate(
         raise BadInput(f"a picture to inflate must be square; given {cutout.shape[1]} x {cutout.shape[0]} pixels")
     picture = resample(cutout, size).double().cpu().numpy()
     mask, alpha = subject_mask(picture[..., 3])
-    pixel = 2 * RADIUS * math.tan(math.radians(FOV_Y_DEG) / 2) / size
-    across = (np.arange(size) + 0.5 - size / 2) * pixel
-    plane = np.clip(math.tan(math.radians(turn_deg)) * across, -FARTHEST, FARTHEST)
+    pixel = pixel_size(size)
     bulge = heights(mask, pixel)
-    middle = np.broadcast_to(plane, mask.shape)
+    middle, _ = hint.middle(size)
     if disparity is not None:
         middle = middle + relief(disparity.double().cpu().numpy(), middle + bulge, mask, depth_weight)
     front = front_colors(picture[..., :3], alpha, mask)

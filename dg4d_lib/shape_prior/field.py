@@ -1,6 +1,5 @@
 """Predicted matter and colors on the rays of the input camera, for one picture or for the frames of a video."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -10,20 +9,19 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from dg4d_lib.cameras.orbit import RADIUS
 from dg4d_lib.errors import BadInput
 from dg4d_lib.images import resize_planes
 from dg4d_lib.inflation.heights import heights
+from dg4d_lib.inflation.hints import NO_HINT, DepthHint
 from dg4d_lib.inflation.mask import subject_mask
 from dg4d_lib.shape_prior.absorption import optical_density, transmittance
+from dg4d_lib.shape_prior.evidence import hint_evidence
 from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV
 from dg4d_lib.shape_prior.mirror import MirrorPlane, mirror_plane, mirrored_colors
 from dg4d_lib.shape_prior.network import VISIBLE, Features, ShapePriorNetwork
 
 INFLATED_SOFTNESS = 0.05  # world units: depth over which the occupancy of an inflated shape falls
 SURE, UNSURE = 0.8, 0.95  # expected 1 - p of matter: below it the network alone, above it the inflation alone
-HINT_SIGMA = 0.3  # world units: standard deviation of the subject's middle about a plane that the user hints at
-FARTHEST = 1.0  # world units: a turned plane leaves z = 0 by no more
 LARGEST_LOGIT = 5.3  # probabilities are kept from 0.005 to 0.995
 
 
@@ -70,14 +68,14 @@ class ShapeFields:
     """
 
     def __init__(
-        self, network: ShapePriorNetwork, cutouts: Sequence[Float[Tensor, "h w 4"]], turn_deg: float = 0.0
+        self, network: ShapePriorNetwork, cutouts: Sequence[Float[Tensor, "h w 4"]], hint: DepthHint = NO_HINT
     ) -> None:
         """Encode the pictures.
 
         Args:
             network: in evaluation mode.
             cutouts: one per frame: square, straight alpha, color and alpha in [0, 1].
-            turn_deg: hint at the turn of the subject's plane; see `inflate`.
+            hint: at the depth of the subject.
 
         Raises:
             BadInput: a picture is not square.
@@ -86,7 +84,7 @@ class ShapeFields:
             raise BadInput(
                 f"pictures of the shape prior must be square; given {crooked[0][1]} x {crooked[0][0]} pixels"
             )
-        self._network, self._turn_deg = network, turn_deg
+        self._network, self._hint = network, hint
         self._pictures = [premultiplied(cutout) for cutout in cutouts]
         with torch.no_grad():
             pairs = [network.encode(torch.stack([picture, picture.flip(2)])).code for picture in self._pictures]
@@ -109,8 +107,7 @@ class ShapeFields:
         logits, colors = ((part[0] + part[1].flip(1)) / 2 for part in both)
         knots = colors.permute(3, 2, 0, 1)[None]
         hidden = interpolate(knots, (BINS, SIZE, SIZE), mode="trilinear", align_corners=True)[0].permute(2, 3, 1, 0)
-        logits = logits + plane_evidence(self._turn_deg) if self._turn_deg else logits
-        logits = bounded_logits(logits, mask)
+        logits = bounded_logits(logits + hint_evidence(self._hint, logits, mask), mask)
         share = inflated_share(logits.sigmoid(), mask)
         if share > 0:
             inflated = inflated_probability(mask).clamp(torch.tensor(-LARGEST_LOGIT).sigmoid())
@@ -183,14 +180,6 @@ def picture_mask(picture: Float[Tensor, "4 128 128"]) -> Bool[Tensor, "128 128"]
 def straight_color(picture: Float[Tensor, "4 128 128"]) -> Float[Tensor, "128 128 3"]:
     """Return the color of a premultiplied picture."""
     return (picture[:3] / picture[3:].clamp(min=VISIBLE)).clamp(0, 1).permute(1, 2, 0)
-
-
-def plane_evidence(turn_deg: float) -> Float[Tensor, "1 128 64"]:
-    """Return what a turned plane adds to the logits: the log ratio of Gaussians about it and about z = 0."""
-    z = RADIUS - (NEAR + (torch.arange(BINS) + 0.5) * (FAR - NEAR) / BINS)
-    across = (2 * (torch.arange(SIZE) + 0.5) / SIZE - 1) * TAN_HALF_FOV * RADIUS
-    plane = (math.tan(math.radians(turn_deg)) * across).clamp(-FARTHEST, FARTHEST)[:, None]
-    return ((2 * z - plane) * plane / (2 * HINT_SIGMA**2))[None]
 
 
 def inflated_share(probability: Float[Tensor, "128 128 64"], mask: Bool[Tensor, "128 128"]) -> float:

@@ -14,6 +14,7 @@ from dg4d_lib.input_settings import SubjectSettings
 from dg4d_lib.video import u2netp
 from dg4d_lib.video.framing import (
     VISIBLE,
+    Crop,
     bounding_box,
     crop_around_subject,
     crop_whole_frame,
@@ -61,9 +62,13 @@ class PreparedSubject:
         frames: straight cut-outs with colors extended into transparent pixels.
         notes: sentences for the report.
         estimate: cut-outs in the frame of the source, if alpha was estimated; None if it was given.
+        frame: height and width of the frames that were cropped, pixels; estimates are made on smaller ones.
+        crop: of these frames.
     """
 
     frames: Float[Tensor, "t s s 4"]
+    frame: tuple[int, int]
+    crop: Crop
     notes: tuple[str, ...] = ()
     estimate: Matte | None = None
 
@@ -114,7 +119,8 @@ def prepare_subject(
     crop = crop_whole_frame(*alpha.shape[1:]) if keep else crop_around_subject(alpha, settings.border)
     if not (alpha <= VISIBLE).any():
         notes = (*notes, "The subject fills the whole picture, so there is no outline to build a shape from.")
-    return PreparedSubject(reframe(frames, crop, settings.size), notes, estimate)
+    height, width = alpha.shape[1:]
+    return PreparedSubject(reframe(frames, crop, settings.size), (height, width), crop, notes, estimate)
 
 
 def check_box(box: tuple[int, ...], width: int, height: int) -> None:

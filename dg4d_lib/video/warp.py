@@ -9,6 +9,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.inflation.hints import NO_HINT, DepthHint
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import inflate
 from dg4d_lib.input_settings import Motion, WarpSettings
@@ -47,9 +48,9 @@ class Warp:
         notes: sentences for the user about deviations of the last video from the configured motion.
     """
 
-    def __init__(self, settings: WarpSettings, turn_deg: float = 0.0) -> None:
-        """Store the settings; `turn_deg` is the azimuth of the subject in the picture, for `turn`."""
-        self.settings, self.turn_deg = settings, turn_deg
+    def __init__(self, settings: WarpSettings, hint: DepthHint = NO_HINT) -> None:
+        """Store the settings, and what is known about the depth of the subject, for `turn`."""
+        self.settings, self.hint = settings, hint
         self.notes: tuple[str, ...] = ()
 
     def generate(self, subject: Float[Tensor, "h w 4"], generator: torch.Generator) -> DrivingVideo:
@@ -98,7 +99,7 @@ class Warp:
 
     def _turn(self, subject: Float[Tensor, "h w 4"]) -> DrivingVideo:
         height, width = subject.shape[:2]
-        surface = inflate(subject, min(height, TURN_SIZE), self.turn_deg)
+        surface = inflate(subject, min(height, TURN_SIZE), self.hint)
         angles = [TURN_DEG * self.settings.strength * math.sin(2 * math.pi * phase) for phase in self._phases()]
         cameras = [OrbitCamera(azimuth_deg=angle, width=width, height=height) for angle in angles]
         color, alpha = render_surface(surface, cameras)

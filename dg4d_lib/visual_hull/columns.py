@@ -16,6 +16,7 @@ from torch.nn.functional import grid_sample
 
 from dg4d_lib.cameras.orbit import FOV_Y_DEG, RADIUS
 from dg4d_lib.inflation.heights import heights, outline_distance
+from dg4d_lib.inflation.hints import DepthHint
 from dg4d_lib.inflation.mask import subject_mask
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import inflate, resample
@@ -40,7 +41,7 @@ def fitting_turn(views: Sequence[KnownView]) -> float:
     truth = torch.stack([view.cutout[..., 3:] for view in small[1:]])
 
     def agreement(turn_deg: float) -> float:
-        surface = inflate(small[0].cutout, 64, turn_deg)
+        surface = inflate(small[0].cutout, 64, DepthHint(turn_deg))
         _, alpha = render_surface(surface, [view.camera for view in small[1:]])
         return float(iou(alpha, truth).mean()) - PREFERENCE * abs(turn_deg)
 

@@ -95,6 +95,8 @@ def rebuild(
     ] = None,
     bank: Annotated[Path | None, typer.Option(metavar="DIR", help="ground-truth views, likewise")] = None,
     mask: Annotated[Path | None, typer.Option(metavar="PATH", help="mask of the subject, likewise")] = None,
+    depth: Annotated[Path | None, typer.Option(metavar="FILE", help="depth picture, likewise")] = None,
+    layers: Annotated[Path | None, typer.Option(metavar="FILE", help="picture of layers, likewise")] = None,
     asset: Annotated[Path | None, typer.Option(metavar="FILE", help="the user's own model, likewise")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", metavar="DIR", help="keep the new package in DIR")] = None,
     as_json: AsJson = False,
@@ -109,7 +111,7 @@ def rebuild(
         record = load_verified(package)
         if out is not None:
             check_folder(out)
-        job = job_from_record(record, home.store(), source, bank, mask, asset)
+        job = job_from_record(record, home.store(), source, bank, mask, depth, layers, asset)
         console = terminal.console(stderr=as_json)
 
         def work() -> "RebuildReport":

@@ -29,9 +29,8 @@ class Wish:
         pictures: pictures or videos.
         text: prompt instead of a picture.
         video: driving video.
-        mask: mask of the subject.
         asset: the user's own model.
-        sides: true if there are pictures of other sides.
+        alone: an option of the command line that makes one asset; empty if none is given.
         out: output folder; of several pictures the folder above those of the assets.
         force: replace another asset in the output folder.
         picked: true if `--pick` chooses a motion.
@@ -41,9 +40,8 @@ class Wish:
     pictures: tuple[Path, ...]
     text: str
     video: Path | None
-    mask: Path | None
     asset: Path | None
-    sides: bool
+    alone: str
     out: Path | None
     force: bool
     picked: bool
@@ -67,15 +65,8 @@ def make_each(wish: Wish, console: "Console") -> int:
         item = (clean_name(named.stem) or "asset") if named else name_from_text(wish.text)
         _make(wish, item, picture, wish.out or Path("out") / item, console)
         return 0
-    for_one = {
-        "--text": wish.text,
-        "--video": wish.video,
-        "--mask": wish.mask,
-        "--asset": wish.asset,
-        "--view": wish.sides,
-    }
-    if option := next((name for name, value in for_one.items() if value), ""):
-        raise BadInput(f"{option} makes one asset, and {len(wish.pictures)} pictures are given; give one of them")
+    if wish.alone:
+        raise BadInput(f"{wish.alone} makes one asset, and {len(wish.pictures)} pictures are given; give one of them")
     items = unique_names([(clean_name(path.stem) or "asset", path.suffix.lstrip(".")) for path in wish.pictures])
     failed: dict[str, DG4DError | StepError] = {}
     for number, (item, picture) in enumerate(zip(items, wish.pictures, strict=True), 1):

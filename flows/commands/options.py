@@ -114,6 +114,22 @@ Mask = Annotated[
         metavar="PATH", help="picture, or folder of frames for a video, of the same size: white where the subject is"
     ),
 ]
+Depth = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="depth picture of the first frame, of its size: inverse depth (bright is near), or distances as EXR or "
+        "TIFF with floating-point numbers",
+    ),
+]
+Layers = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="gray picture of the first frame, of its size: parts lighter than mid-gray lie before the rest, darker "
+        "ones behind it",
+    ),
+]
 Box = Annotated[
     str,
     typer.Option(

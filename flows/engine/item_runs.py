@@ -90,7 +90,7 @@ class ItemDeployment(NamedTuple):
             hold(
                 store,
                 job.item,
-                [ref.digest, *(needed.digest for needed in (job.source, job.bank, job.mask, job.views) if needed)],
+                [ref.digest, *(needed.digest for needed in job.given().values())],
             )
             outcome = self._outcome(job, ref, store)
             if outcome.package is None:

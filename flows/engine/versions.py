@@ -36,6 +36,8 @@ class Version(Frozen):
         source: picture, video or text.
         bank: ground-truth views, if given.
         mask: of the subject, if given.
+        depth: picture of the subject's depth, if given.
+        layers: picture of the order of its parts in depth, if given.
         views: pictures of other sides, if given.
         steps: in pipeline order.
     """
@@ -49,6 +51,8 @@ class Version(Frozen):
     source: ArtifactRef
     bank: ArtifactRef | None = None
     mask: ArtifactRef | None = None
+    depth: ArtifactRef | None = None
+    layers: ArtifactRef | None = None
     views: ArtifactRef | None = None
     steps: tuple[VersionStep, ...]
 
@@ -60,12 +64,10 @@ class Version(Frozen):
     def artifacts(self) -> dict[str, str]:
         """Return the digests of all artifacts of the version with their role."""
         found = {self.package.digest: "package", self.source.digest: "source"}
-        if self.bank is not None:
-            found.setdefault(self.bank.digest, "bank")
-        if self.mask is not None:
-            found.setdefault(self.mask.digest, "mask")
-        if self.views is not None:
-            found.setdefault(self.views.digest, "views")
+        for role in ("bank", "mask", "depth", "layers", "views"):
+            given: ArtifactRef | None = getattr(self, role)
+            if given is not None:
+                found.setdefault(given.digest, role)
         for step in self.steps:
             for port, digest in step.outputs.items():
                 found.setdefault(digest, f"{step.label}: {port}")
@@ -93,6 +95,8 @@ def keep_version(store: ArtifactStore, job: ConversionJob, result: FlowResult) -
         source=job.source,
         bank=job.bank,
         mask=job.mask,
+        depth=job.depth,
+        layers=job.layers,
         views=job.views,
         steps=tuple(
             VersionStep(

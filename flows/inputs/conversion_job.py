@@ -33,6 +33,8 @@ class ConversionRequest(Frozen):
         video: driving video or folder of frames; then `picture` only names the asset.
         bank: folder of ground-truth views, for the oracle prior.
         mask: picture, or folder of frames for a video, that is white where the subject is.
+        depth: picture of the depth of the first frame.
+        layers: picture of the order of parts in depth in the first frame.
         given_views: pictures of other sides.
         asset: model of the user's own, a mesh or splats, that is set in motion.
         commercial_only: refuse weights whose license forbids commercial use.
@@ -44,6 +46,8 @@ class ConversionRequest(Frozen):
     video: Path | None = None
     bank: Path | None = None
     mask: Path | None = None
+    depth: Path | None = None
+    layers: Path | None = None
     given_views: ViewsRequest = ViewsRequest()
     asset: Path | None = None
     profile: str = "preview"
@@ -75,6 +79,7 @@ class ConversionRequest(Frozen):
         self._check_source()
         if self.mask is not None:
             sources.check_mask(self.mask)
+        self._check_depth()
         self.given_views.check()
         if self.given_views and self.text:
             raise BadInput("--view, --turntable and --cameras show the sides of a picture; --text has none to show")
@@ -97,7 +102,7 @@ class ConversionRequest(Frozen):
         """
         for path in filter(None, (self.picture, self.video, self.asset)):
             naming.check_text(path.name, "the file name")
-        for path in filter(None, (self.picture, self.video, self.bank, self.mask, self.asset)):
+        for path in filter(None, (self.picture, self.video, self.bank, self.mask, self.depth, self.layers, self.asset)):
             naming.check_path(path)
         naming.check_text(self.text, "the text")
         naming.check_name(self.item, "rename the file" if self.picture or self.asset else "choose a shorter name")
@@ -131,6 +136,8 @@ class ConversionRequest(Frozen):
                 moving=self._suffix in sources.ALWAYS_MOVING or self.video is not None,
                 bank=sources.put_bank(self.bank, store) if self.bank is not None else None,
                 mask=sources.put_source(self.mask, store) if self.mask is not None else None,
+                depth=sources.put_still(self.depth, store) if self.depth is not None else None,
+                layers=sources.put_still(self.layers, store) if self.layers is not None else None,
                 views=self.given_views.put(store, footage),
                 profile=self.profile,
                 settings=PipelineSettings.model_validate(without_paths(self.settings.model_dump(mode="json"))),
@@ -168,6 +175,19 @@ class ConversionRequest(Frozen):
             )
         if self.mask is not None and self._footage is None:
             raise BadInput("--mask marks the subject of a picture or video, and --asset is given alone; leave it out")
+
+    def _check_depth(self) -> None:
+        """Check a depth picture or layers: one of them, for a picture whose depth is a guess."""
+        given = {option: path for option, path in (("--depth", self.depth), ("--layers", self.layers)) if path}
+        for option, path in given.items():
+            sources.check_still_file(path, option)
+            if self.text:
+                raise BadInput(f"{option} shows the depth of a picture or video of yours, and --text has none")
+            if self.asset is not None or self.given_views:
+                other = "--asset has" if self.asset is not None else "--view, --turntable and --cameras show"
+                raise BadInput(f"{option} helps to guess the sides of one picture, and {other} them; leave one out")
+        if len(given) > 1:
+            raise BadInput("--depth says more than --layers; give one of them")
 
     def _check_source(self) -> None:
         if self.text:
@@ -209,6 +229,8 @@ class ConversionJob(Frozen):
         views: pictures of other sides.
         moving: True if `source` is certainly a video.
         mask: picture or frames that mark the subject, if given.
+        depth: picture of the depth of the first frame, if given.
+        layers: picture of the order of its parts in depth, if given.
         asset: model of the user's own; equal to `source` if nothing else was given.
     """
 
@@ -218,6 +240,8 @@ class ConversionJob(Frozen):
     moving: bool = False
     bank: ArtifactRef | None = None
     mask: ArtifactRef | None = None
+    depth: ArtifactRef | None = None
+    layers: ArtifactRef | None = None
     views: ArtifactRef | None = None
     asset: ArtifactRef | None = None
     profile: str
@@ -231,6 +255,12 @@ class ConversionJob(Frozen):
     def drawn(self) -> bool:
         """True if a text-to-image model draws the picture."""
         return bool(self.text)
+
+    def given(self) -> dict[str, ArtifactRef]:
+        """Return the artifacts that the user gave, by role."""
+        roles = ("source", "bank", "mask", "depth", "layers", "views", "asset")
+        found = {role: getattr(self, role) for role in roles}
+        return {role: ref for role, ref in found.items() if ref is not None}
 
     def recipe(self) -> dict[str, Any]:
         """Return all inputs that determine the package with given code, as JSON, without names for people."""
@@ -256,6 +286,8 @@ def job_from_record(
     source: Path | None = None,
     bank: Path | None = None,
     mask: Path | None = None,
+    depth: Path | None = None,
+    layers: Path | None = None,
     asset: Path | None = None,
 ) -> ConversionJob:
     """Return the job that made a package.
@@ -266,6 +298,8 @@ def job_from_record(
         source: picture, video or folder of frames; needed if the store no longer has it.
         bank: folder of ground-truth views; likewise.
         mask: picture or folder of frames that marks the subject; likewise.
+        depth: picture of its depth; likewise.
+        layers: picture of the order of its parts in depth; likewise.
         asset: model of the user's own; likewise.
 
     Raises:
@@ -290,6 +324,8 @@ def job_from_record(
         ("--source", source, job.source, sources.put_source),
         ("--bank", bank, job.bank, sources.put_bank),
         ("--mask", mask, job.mask, sources.put_source),
+        ("--depth", depth, job.depth, sources.put_still),
+        ("--layers", layers, job.layers, sources.put_still),
     ):
         if ref is None:
             continue

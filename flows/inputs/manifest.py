@@ -27,7 +27,8 @@ INPUTS = (
 )
 HIGHEST_PRIORITY = 10**9
 TEXTS = (  # columns
-    "path", "text", "video", "asset", "name", "profile", "bank", "mask", "box", "views", "turntable", "cameras",
+    "path", "text", "video", "asset", "name", "profile", "bank", "mask", "box", "depth", "layers", "views", "turntable",
+    "cameras",
 )  # fmt: skip
 BOX_NUMBER = re.compile(r"[0-9]{1,7}")
 INTEGER = re.compile(r"[+-]?[0-9]{1,100}(\.0*)?")
@@ -245,6 +246,8 @@ class _Reader:
             video=self._file(cells, "video"),
             bank=self._file(cells, "bank"),
             mask=self._file(cells, "mask"),
+            depth=self._file(cells, "depth"),
+            layers=self._file(cells, "layers"),
             asset=self._file(cells, "asset"),
             given_views=ViewsRequest(
                 views=views_in_cell(cells.get("views", ""), self.root),

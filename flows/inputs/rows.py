@@ -15,8 +15,8 @@ from flows.formatting.escaping import quoted
 from flows.inputs.json_text import loads
 
 COLUMNS = (
-    "path", "text", "video", "asset", "name", "profile", "seed", "bank", "mask", "box", "views", "turntable", "cameras",
-    "priority", "set",
+    "path", "text", "video", "asset", "name", "profile", "seed", "bank", "mask", "box", "depth", "layers", "views",
+    "turntable", "cameras", "priority", "set",
 )  # and any setting, such as mesh.grid  # fmt: skip
 SUBJECTS = ("path", "text", "asset")  # columns; a row needs one of them
 MANIFESTS = (".csv", ".json", ".jsonl", ".parquet")

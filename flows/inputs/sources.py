@@ -103,6 +103,29 @@ def check_mask(path: Path) -> None:
         raise BadInput(f"--mask: {error}") from error
 
 
+def check_still_file(path: Path, option: str) -> None:
+    """Refuse anything but one picture.
+
+    Args:
+        path: file that is read.
+        option: that it was given with.
+
+    Raises:
+        BadInput: says what the file is and what to give.
+    """
+    wanted = "give one gray picture of the first frame (PNG, TIFF, EXR)"
+    if path.is_dir():
+        raise BadInput(f"{option}: {path} is a folder; {wanted}")
+    try:
+        check_file(path)
+    except BadInput as error:
+        raise BadInput(f"{option}: {error}") from error
+    try:
+        check_still(path)
+    except BadInput as error:
+        raise BadInput(f"{option}: {path.name} is no picture; {wanted}") from error
+
+
 def check_text(text: str) -> None:
     """Refuse an empty or a long prompt.
 
@@ -130,6 +153,17 @@ def put_source(path: Path, store: ArtifactStore) -> ArtifactRef:
     check_video(path)
     if path.is_dir():
         return put_zip({frame.name: frame for frame in list_frames(path)}, SOURCE.media_type, store)
+    return store.put(path, SOURCE.media_type)
+
+
+def put_still(path: Path, store: ArtifactStore) -> ArtifactRef:
+    """Store a picture.
+
+    Raises:
+        BadInput: it is none.
+        DiskFull: the disk is full.
+    """
+    check_still_file(path, "the picture")
     return store.put(path, SOURCE.media_type)
 
 

@@ -91,7 +91,7 @@ def provenance(
     Signatures differ in every run: in a signed package `files` and `signatures` are facts of a single run, too.
     """
     outputs = [ref for done in result.steps for ref in done.result.outputs.values()]
-    artifacts = [ref for ref in (job.source, job.bank, job.mask, job.views, job.asset, *outputs) if ref is not None]
+    artifacts = [*job.given().values(), *outputs]
     return {
         "format": FORMAT,
         "order": job.digest(),

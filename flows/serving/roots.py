@@ -111,7 +111,8 @@ class Roots(Frozen):
         if item.request is None:
             return
         asked = item.request
-        files = (None if item.remote else asked.picture, asked.video, asked.bank, asked.mask, asked.asset)
+        own = (asked.video, asked.bank, asked.mask, asked.depth, asked.layers, asked.asset)
+        files = (None if item.remote else asked.picture, *own)
         self.check_files(file for file in (*files, *asked.given_views.files()) if file is not None)
         self.check_weights(item.request.settings.model_dump(mode="json"))
 

@@ -28,6 +28,7 @@ from dg4d_lib.guidance.learned import LearnedShapes
 from dg4d_lib.guidance.oracle import Bank, perturb
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.images import over_white
+from dg4d_lib.inflation.hints import NO_HINT, DepthHint
 from dg4d_lib.settings import (
     FitSettings,
     GeometricPriorSettings,
@@ -44,6 +45,7 @@ from dg4d_lib.visual_hull.frustum_field import known_field
 from dg4d_lib.visual_hull.known import KnownView, known_view
 from dg4d_lib.weights.registry import lookup_weights
 from steps.artifacts.archives import unpack
+from steps.artifacts.depth_fields import read_depth_field
 from steps.artifacts.media import read_png
 from steps.artifacts.pose import read_turn
 from steps.profiles import flow_matching_refusal
@@ -98,7 +100,7 @@ def make_prior(
     stage: FitSettings,
     bank: Path | None,
     scratch: Path,
-    turn_deg: float = 0.0,
+    hint: DepthHint = NO_HINT,
     sides: Bank | None = None,
     moved: SubjectShapes | None = None,
 ) -> LoadedPrior:
@@ -110,7 +112,7 @@ def make_prior(
         stage: settings of the fit, which give the timesteps.
         bank: zip of ground-truth views, for the oracle.
         scratch: folder for unpacking.
-        turn_deg: azimuth by which the subject is turned; see `subject_turn`.
+        hint: at the depth of the subject; see `subject_hint`.
         sides: views of other sides that the user gave; priors with shapes take them as their own.
         moved: shapes of frames without such views, which then guide these frames, too.
 
@@ -123,7 +125,7 @@ def make_prior(
     )
     match settings:
         case GeometricPriorSettings() | LearnedPriorSettings():
-            shapes = subject_shapes(settings, cutouts, turn_deg, sides, moved)
+            shapes = subject_shapes(settings, cutouts, hint, sides, moved)
             note, weight, opened = GEOMETRIC_NOTE, 1.0, None
             clean, viewpoints = shapes.clean, None
             if stage.viewpoints:
@@ -137,7 +139,7 @@ def make_prior(
                 return LoadedPrior(prior, known_note(sides), shapes=shapes, network=network)
             if isinstance(settings, LearnedPriorSettings):
                 note, weight = LEARNED_NOTE, guided
-            elif settings.depth_weights:
+            elif settings.depth_weights and not hint.sigma:
                 note, opened = f"{DEPTH_NOTE} {settings.depth_weights}", open_weights(settings.depth_weights)
             prior, network = AnalyticPrior(clean, noise, viewpoints, weight=weight), _network(shapes, settings)
             return LoadedPrior(prior, note, opened, shapes=shapes, network=network)
@@ -162,7 +164,7 @@ def make_prior(
 def subject_shapes(
     settings: PriorSettings,
     cutouts: Sequence[Float[Tensor, "h w 4"]],
-    turn_deg: float,
+    hint: DepthHint = NO_HINT,
     sides: Bank | None = None,
     moved: SubjectShapes | None = None,
 ) -> SubjectShapes:
@@ -171,7 +173,7 @@ def subject_shapes(
     Args:
         settings: of the prior; one that has no shapes of its own gets the inflation with its defaults.
         cutouts: the subject at every frame.
-        turn_deg: turn of the subject about the vertical; see `subject_turn`.
+        hint: at its depth; see `subject_hint`. A depth picture goes before an estimate by `prior.depth_weights`.
         sides: views of other sides; their hull replaces the shapes of their frames.
         moved: shapes of all other frames, instead of those of the settings.
     """
@@ -180,31 +182,31 @@ def subject_shapes(
     if moved is not None:
         shapes = moved
     elif 0 in known and len(cutouts) > 1:
-        shapes = _carried_shapes(settings, cutouts, turn_deg, known_field(known[0]))
+        shapes = _carried_shapes(settings, cutouts, hint, known_field(known[0]))
     elif isinstance(settings, LearnedPriorSettings):
-        shapes = LearnedShapes(learned_fields(cutouts, turn_deg), settings)
+        shapes = LearnedShapes(learned_fields(cutouts, hint), settings)
     else:
         own = settings if isinstance(settings, GeometricPriorSettings) else GeometricPriorSettings()
         depth = None
-        if own.depth_weights and sides is None:
+        if own.depth_weights and sides is None and not hint.sigma:
             depth = DepthEstimator.load(open_weights(own.depth_weights).folder, default_device())
-        shapes = InflatedSurfaces(cutouts, own, turn_deg, depth)
+        shapes = InflatedSurfaces(cutouts, own, hint, depth)
     return KnownShapes(shapes, known) if sides else shapes
 
 
 def _carried_shapes(
-    settings: PriorSettings, cutouts: Sequence[Float[Tensor, "h w 4"]], turn_deg: float, first: ShapeField
+    settings: PriorSettings, cutouts: Sequence[Float[Tensor, "h w 4"]], hint: DepthHint, first: ShapeField
 ) -> LearnedShapes:
     """Return the shapes of later frames from the known one of the first frame and a guess per frame."""
     guess: Fields = InflatedFields(cutouts)
     if isinstance(settings, LearnedPriorSettings):
-        guess = ShapeFields(packaged.packaged_network(), cutouts, turn_deg)
+        guess = ShapeFields(packaged.packaged_network(), cutouts, hint)
     return LearnedShapes(CarriedFields(guess, first, cutouts), LearnedPriorSettings(contrast=CARRIED_CONTRAST))
 
 
-def learned_fields(cutouts: Sequence[Float[Tensor, "h w 4"]], turn_deg: float) -> Fields:
+def learned_fields(cutouts: Sequence[Float[Tensor, "h w 4"]], hint: DepthHint) -> Fields:
     """Return what the shape network says of every frame; the video carries what it says of the first one along."""
-    fields = ShapeFields(packaged.packaged_network(), cutouts, turn_deg)
+    fields = ShapeFields(packaged.packaged_network(), cutouts, hint)
     return CarriedFields(fields, fields.predict(0), cutouts) if len(cutouts) > 1 else fields
 
 
@@ -238,12 +240,20 @@ def known_note(bank: Bank | None) -> str:
     return f"prior: visual hull of {count + 1} views; what none of them shows is a guess"
 
 
-def subject_turn(settings: PriorSettings, pose: Path | None, hint_deg: float) -> float:
-    """Return the turn of the subject for a prior, degrees: the user's hint, else that of its footage.
+def subject_hint(settings: PriorSettings, pose: Path | None, field: Path | None, turn_deg: float) -> DepthHint:
+    """Return what is known about the depth of the subject, for a prior.
 
-    The shape network sees turns itself: even true ones from elsewhere do not improve it, so it gets hints alone.
+    The shape network sees turns itself: even true ones from elsewhere do not improve it, so it gets those of the user
+    alone.
+
+    Args:
+        settings: of the prior.
+        pose: turn that the footage shows.
+        field: depth by the user.
+        turn_deg: turn by the user, which goes before that of the footage.
     """
-    return read_turn(None if isinstance(settings, LearnedPriorSettings) else pose, hint_deg)
+    shown = None if isinstance(settings, LearnedPriorSettings) else pose
+    return DepthHint(read_turn(shown, turn_deg), read_depth_field(field) if field else None)
 
 
 def inflated_note(share: float) -> str:

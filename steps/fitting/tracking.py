@@ -8,6 +8,7 @@ from dg4d_lib.fitting.surface_tracking import track_surface
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.moved import MovedSurfaces
 from dg4d_lib.guidance.oracle import Bank
+from dg4d_lib.inflation.hints import DepthHint
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import GeometricPriorSettings, LearnedPriorSettings, MotionSettings, PriorSettings
 from dg4d_lib.video.driving import DrivingVideo
@@ -34,7 +35,7 @@ def tracked_shapes(
     video: DrivingVideo,
     known: Bank,
     prior: PriorSettings,
-    turn_deg: float,
+    hint: DepthHint,
     rasterize: Rasterizer,
     settings: AssetSettings,
     generator: torch.Generator,
@@ -42,5 +43,5 @@ def tracked_shapes(
 ) -> MovedSurfaces:
     """Return the shapes of all frames; arguments as of `track_surface` and `subject_shapes`."""
     first = torch.cat([video.frames[0], video.alpha[0]], -1)
-    surface = subject_shapes(prior, [first], turn_deg, known).surface(0)
+    surface = subject_shapes(prior, [first], hint, known).surface(0)
     return MovedSurfaces(track_surface(surface, gaussians, video, rasterize, settings, generator, report))

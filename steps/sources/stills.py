@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import OpenImageIO as oiio
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
@@ -29,6 +29,9 @@ READ_WHOLE = (".ppm", ".pgm", ".webp", ".jxl", ".jp2")  # formats whose files Op
 HELD_BYTES = {"webp": 6.0}  # bytes per pixel that a decoder holds, measured
 TIFF_CONVERTED = (6, 8, 9, 10)  # photometric interpretations: YCbCr, CIE Lab, ICC Lab, ITU Lab
 
+FLOATS = ("half", "float", "double")
+HALF = 0.5  # alpha from which a pixel has a value
+DEPTH_NAMES = ("z", "depth", "depth.z", "depth.v")  # of channels, or their ends after a dot; before red, green and blue
 LINEAR_FORMATS = ("openexr", "hdr")
 FAINT_ALPHA = 1e-3  # premultiplied colors are divided by no smaller alpha
 
@@ -95,10 +98,7 @@ def read_still(path: Path, what: str, limit: DecodeLimit, longest: int = LARGEST
     file, held = _open(path, what, limit)
     try:
         spec = file.spec()
-        check_size(spec.width, spec.height, what)
-        if spec.deep or spec.depth > 1:
-            kind = "has several samples per pixel (deep data)" if spec.deep else "is a volume of several slices"
-            raise BadInput(f"{what} {kind}, which cannot be read here; export it flattened, as PNG or EXR")
+        _check_flat(spec, what)
         still = _Still(file, what)
         limit.require(still.needed_bytes(held), what, spec.width, spec.height)
         shrinker = BandDownscaler(still.height, still.width, longest)
@@ -108,6 +108,82 @@ def read_still(path: Path, what: str, limit: DecodeLimit, longest: int = LARGEST
         file.close()
     orientation = int(spec.get_int_attribute("Orientation", 1))
     return _upright(shrinker.picture(), still.has_alpha, orientation, (still.width, still.height))
+
+
+class StillValues(NamedTuple):
+    """Values of one channel of a picture, not as colors.
+
+    Attributes:
+        values: as stored; integers in [0, 1] of their range.
+        known: pixels that are finite, and not transparent.
+        is_float: True if the file holds floating-point numbers.
+        tint: mean difference of the color channels, where known.
+        size: width and height of the upright file.
+    """
+
+    values: Float32[ndarray, "h w"]
+    known: Bool[ndarray, "h w"]
+    is_float: bool
+    tint: float
+    size: tuple[int, int]
+
+
+def read_values(path: Path, what: str, limit: DecodeLimit, height: int, width: int) -> StillValues:
+    """Decode a gray picture as numbers: the nearest pixels of a grid, as edges of depth must not be mixed.
+
+    Args:
+        path: file with the suffix of its format.
+        what: name of the picture in messages.
+        limit: memory limit.
+        height: of the grid over the upright picture.
+        width: likewise.
+
+    Raises:
+        BadInput: the file cannot be read, or its size is out of range.
+    """
+    if path.suffix == ".avif":
+        raise BadInput(f"{what} is an AVIF, which is read as colors alone; give PNG, TIFF or EXR")
+    file, held = _open(path, what, limit)
+    try:
+        spec = file.spec()
+        _check_flat(spec, what)
+        still = _Still(file, what, depth=True)
+        limit.require(still.needed_bytes(held), what, spec.width, spec.height)
+        orientation = int(spec.get_int_attribute("Orientation", 1))
+        if orientation in TRANSPOSED:
+            height, width = width, height
+        rows, columns = _nearest(height, still.height), _nearest(width, still.width)
+        picked = np.concatenate([band[:, columns][_within(rows, top, len(band))] for top, band in still.value_bands()])
+    finally:
+        file.close()
+    size = (still.width, still.height)
+    if orientation in TRANSPOSED:
+        picked, size = picked.transpose(1, 0, 2), (size[1], size[0])
+    flipped = [axis for axis, values in enumerate((FLIPPED_ROWS, FLIPPED_COLUMNS)) if orientation in values]
+    picked = np.flip(picked, tuple(flipped))
+    colors, alpha = picked[..., :3], picked[..., 3]
+    known = np.isfinite(colors).all(-1) & (alpha > HALF)
+    tint = float(np.ptp(colors[known], -1).mean()) if known.any() else 0.0
+    values = np.where(known, colors[..., 0], 0).astype(np.float32)
+    return StillValues(values, known, str(spec.format) in FLOATS, tint, size)
+
+
+def _check_flat(spec: oiio.ImageSpec, what: str) -> None:
+    """Refuse sizes out of range, deep pictures and volumes."""
+    check_size(spec.width, spec.height, what)
+    if spec.deep or spec.depth > 1:
+        kind = "has several samples per pixel (deep data)" if spec.deep else "is a volume of several slices"
+        raise BadInput(f"{what} {kind}, which cannot be read here; export it flattened, as PNG or EXR")
+
+
+def _nearest(count: int, length: int) -> ndarray:
+    """Return the pixels of a side that lie nearest to the centers of `count` even parts."""
+    return ((np.arange(count) + 0.5) * length / count).astype(np.int64)
+
+
+def _within(rows: ndarray, top: int, count: int) -> ndarray:
+    """Return those of ascending rows that lie in a band, counted from its first row."""
+    return rows[(rows >= top) & (rows < top + count)] - top
 
 
 def _read_avif(path: Path, what: str, limit: DecodeLimit, longest: int) -> StillPicture:
@@ -164,10 +240,11 @@ class _Still:
         has_alpha: True if the file has an alpha channel.
     """
 
-    def __init__(self, file: oiio.ImageInput, what: str) -> None:
+    def __init__(self, file: oiio.ImageInput, what: str, depth: bool = False) -> None:
+        """Find the channels; with `depth` one that is named so goes before colors."""
         self._file, self._what, self._spec = file, what, file.spec()
         self.width, self.height = self._spec.width, self._spec.height
-        self._channels, self.has_alpha = _rgba_channels(self._spec)
+        self._channels, self.has_alpha = _rgba_channels(self._spec, depth)
         self._first, self._last = min(self._channels), max(self._channels) + 1
         self._rows = self._rows_at_once()
 
@@ -177,7 +254,7 @@ class _Still:
         Raises:
             BadInput: the file is cut off or broken.
         """
-        is_linear = self._file.format_name() in LINEAR_FORMATS or str(self._spec.format) in ("half", "float", "double")
+        is_linear = self._file.format_name() in LINEAR_FORMATS or str(self._spec.format) in FLOATS
         for top in range(0, self.height, self._rows):
             pixels = self._pixels(top, min(self._rows, self.height - top))
             picture = _as_rgba(pixels, [channel - self._first for channel in self._channels])
@@ -186,6 +263,17 @@ class _Still:
                     picture[..., :3] /= np.maximum(picture[..., 3:], FAINT_ALPHA)
                 picture[..., :3] = _srgb(picture[..., :3])
             yield top, picture.clip(0, 1)
+
+    def value_bands(self) -> Iterator[tuple[int, Float[ndarray, "rows w 4"]]]:
+        """Yield the first row of every band, and three channels and alpha as they are stored.
+
+        Raises:
+            BadInput: the file is cut off or broken.
+        """
+        for top in range(0, self.height, self._rows):
+            pixels = self._pixels(top, min(self._rows, self.height - top))
+            picked = [channel - self._first for channel in self._channels]
+            yield top, np.concatenate([pixels[..., picked], np.ones((*pixels.shape[:2], 4 - len(picked)))], -1)
 
     def _rows_at_once(self) -> int:
         """Return the height of a band: whole tiles, or whole compressed blocks if they are small enough."""
@@ -228,12 +316,15 @@ class _Still:
         return np.asarray(pixels, np.float32).reshape(rows, self.width, -1)
 
 
-def _rgba_channels(spec: oiio.ImageSpec) -> tuple[list[int], bool]:
-    """Find red, green, blue and alpha, if present; gray is repeated, depth and the like are ignored."""
+def _rgba_channels(spec: oiio.ImageSpec, depth: bool = False) -> tuple[list[int], bool]:
+    """Find red, green, blue and alpha, if present; gray is repeated, depth and the like are ignored unless wanted."""
     names = [name.lower() for name in spec.channelnames]
     alpha = spec.alpha_channel if spec.alpha_channel >= 0 else names.index("a") if "a" in names else -1
     rest = [i for i in range(len(names)) if i != alpha] or [0]
-    if all(name in names for name in "rgb"):
+    deep = [i for i, name in enumerate(names) if name.endswith(tuple(f".{end}" for end in DEPTH_NAMES))]
+    if depth and (deep := [i for i, name in enumerate(names) if name in DEPTH_NAMES] or deep):
+        colors = deep[:1] * 3
+    elif all(name in names for name in "rgb"):
         colors = [names.index(name) for name in "rgb"]
     else:
         colors = rest[:3] if len(rest) >= 3 else rest[:1] * 3

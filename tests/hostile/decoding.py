@@ -134,6 +134,21 @@ def read_as_source(path: Path, scratch: Path) -> tuple[Kind, int]:
     return "picture", 1
 
 
+def read_as_depth(path: Path, scratch: Path) -> tuple[Kind, int]:
+    """Run the step that decodes a depth picture, beside a sound cut-out of 64 x 64 pixels."""
+    from steps.prepare_subject import run
+    from steps.profiles import PREVIEW, revise, step_settings
+    from steps.runtime.job import Job
+    from tests.hostile.samples import sound_png
+
+    names = ("subject.png", "footage.zip", "pose.json", "depth_field.safetensors", "cutout_gates.json", "picture.png")
+    outputs = {name.partition(".")[0]: scratch / name for name in names}
+    (scratch / "cat.png").write_bytes(sound_png())
+    settings = step_settings("prepare_subject", revise(PREVIEW, {"subject.size": SIZE}))
+    run(Job({"source": scratch / "cat.png", "depth": path}, outputs, settings, 0, lambda *_: None, scratch))
+    return "done", 1
+
+
 def read_as_zip(path: Path, scratch: Path) -> tuple[Kind, int]:
     """Unpack a zip that somebody else wrote."""
     from steps.artifacts.archives import unpack
@@ -223,6 +238,7 @@ def crash(path: Path, scratch: Path) -> tuple[Kind, int]:
 
 READERS: dict[str, Callable[[Path, Path], tuple[Kind, int]]] = {
     "source": read_as_source,
+    "depth": read_as_depth,
     "zip": read_as_zip,
     "bank": read_as_bank,
     "csv": _read_as_manifest(".csv"),

@@ -47,6 +47,8 @@ COLUMNS = (
     "bank",
     "mask",
     "box",
+    "depth",
+    "layers",
     "views",
     "turntable",
     "cameras",

@@ -8,9 +8,11 @@ from media_files import disc, opaque, save, save_clip, walk
 from tiny_onnx import write_network
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
+from dg4d_lib.inflation.hints import LAYER
 from dg4d_lib.input_settings import SubjectSettings
 from dg4d_lib.video import u2netp
 from dg4d_lib.video.framing import bounding_box
+from steps.artifacts.depth_fields import read_depth_field
 from steps.artifacts.gates import read_rows
 from steps.artifacts.media import read_frames, read_png
 from steps.artifacts.pose import read_turn
@@ -19,11 +21,19 @@ from steps.profiles import PREVIEW, step_settings
 from steps.runtime.job import Job, StepReport
 
 
-def prepare(source: Path, out: Path, mask: Path | None = None, **settings: object) -> StepReport:
+def prepare(
+    source: Path,
+    out: Path,
+    mask: Path | None = None,
+    depth: Path | None = None,
+    layers: Path | None = None,
+    **settings: object,
+) -> StepReport:
     out.mkdir()
-    names = ("subject.png", "footage.zip", "pose.json", "cutout_gates.json", "picture.png")
+    names = ("depth_field.safetensors", "subject.png", "footage.zip", "pose.json", "cutout_gates.json", "picture.png")
     outputs = {name.partition(".")[0]: out / name for name in names}
-    inputs = {"source": source} | ({"mask": mask} if mask else {})
+    given = {"source": source, "mask": mask, "depth": depth, "layers": layers}
+    inputs = {port: path for port, path in given.items() if path}
     subject = PREVIEW.model_copy(update={"subject": SubjectSettings(size=64, **settings)})
     made = step_settings("prepare_subject", subject)
     return run(Job(inputs, outputs, made, 0, lambda *_: None, out))
@@ -113,6 +123,99 @@ def test_nothing_is_written_for_a_picture_that_is_refused(tmp_path):
 def test_a_fully_transparent_file_is_refused(tmp_path):
     with pytest.raises(BadInput, match="fully transparent"):
         prepare(save(tmp_path / "a.png", disc() * 0), tmp_path / "out")
+
+
+def slanted(size: int = 64) -> np.ndarray:
+    """Distances of a wall whose right side is nearer, in meters."""
+    return np.repeat(np.linspace(3.0, 2.0, size, dtype=np.float32)[None], size, 0)[..., None]
+
+
+def rise(path: Path) -> float:
+    """How much nearer the right side of a field is, world units."""
+    field = read_depth_field(path)
+    left, right = (field.middle[:, part][field.known[:, part]].mean() for part in (slice(0, 32), slice(32, 64)))
+    return float(right - left)
+
+
+def test_distances_and_inverse_depths_become_a_field_in_the_frame_of_the_subject(tmp_path):
+    source = save(tmp_path / "a.png", disc(left=20))
+    far = slanted()
+    far[:8] = np.inf  # a sky
+    near = (65535 * (1 / slanted() - 1 / 3) / (1 / 2 - 1 / 3)).astype(np.uint16)
+    files = {
+        "exr": save(tmp_path / "d.exr", far, "float"),
+        "tif": save(tmp_path / "d.tif", 1000 * slanted(), "float"),
+        "png": save(tmp_path / "d.png", near, "uint16"),
+    }
+    rises = {}
+    for name, depth in files.items():
+        facts = prepare(source, tmp_path / name, depth=depth)
+        rises[name] = rise(tmp_path / name / "depth_field.safetensors")
+        said = "relative inverse depth" if name == "png" else "distances"
+        assert any(said in note for note in facts.notes)
+        assert read_png(tmp_path / name / "picture.png").shape == (256, 4 * 256, 3)
+    assert rises["exr"] == pytest.approx(rises["tif"], abs=0.02)
+    assert min(rises.values()) > 0.1
+    flipped = prepare(source, tmp_path / "read", depth=files["tif"], depth_kind="inverse")
+    assert rise(tmp_path / "read" / "depth_field.safetensors") < -0.1 and flipped.notes
+
+
+def test_the_depth_of_an_opaque_picture_is_cropped_as_the_picture_is(tmp_path):
+    picture = np.full((96, 160, 4), 255, np.uint8)
+    picture[16:80, 90:154] = disc()
+    source = save(tmp_path / "a.png", opaque(picture))
+    depth = np.full((96, 160, 1), 9.0, np.float32)
+    depth[16:80, 90:154] = slanted()
+    prepare(source, tmp_path / "out", depth=save(tmp_path / "d.exr", depth, "float"), matting="backdrop")
+    field = read_depth_field(tmp_path / "out" / "depth_field.safetensors")
+    alpha = read_png(tmp_path / "out" / "subject.png")[..., 3]
+    assert float((field.known & (alpha > 0.5)).sum() / (alpha > 0.5).sum()) > 0.8
+    assert rise(tmp_path / "out" / "depth_field.safetensors") > 0.1
+
+
+def test_layers_become_offsets_and_serve_the_first_frame_of_a_video(tmp_path):
+    source = save_clip(tmp_path / "a.mkv", walk(3), "ffv1", "bgra")
+    levels = np.full((64, 64, 1), 128, np.uint8)
+    levels[:, 30:] = 255
+    facts = prepare(source, tmp_path / "out", layers=save(tmp_path / "l.png", levels), framing="keep")
+    field = read_depth_field(tmp_path / "out" / "depth_field.safetensors")
+    assert field.sigma == 0 and any("layers" in note for note in facts.notes)
+    assert float(field.middle.max()) == pytest.approx(LAYER, abs=0.01)
+    assert abs(float(field.middle[32, 20])) < 0.01
+
+
+NAN = np.full((64, 64, 1), np.nan, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("name", "pixels", "form", "reason"),
+    [
+        (
+            "d.png",
+            np.repeat(np.arange(50, dtype=np.uint8)[None], 50, 0)[..., None],
+            "uint8",
+            "50 x 50 .*picture 64 x 64",
+        ),
+        ("d.png", np.full((64, 64, 1), 90, np.uint8), "uint8", "one value"),
+        ("d.exr", NAN, "float", "values for 0%"),
+        ("d.png", disc()[..., :3], "uint8", "colored"),
+        ("d.tif", -slanted(), "float", "values for 0%"),
+    ],
+)
+def test_pictures_that_are_no_depth_are_refused(tmp_path, name, pixels, form, reason):
+    source = save(tmp_path / "a.png", disc())
+    with pytest.raises(BadInput, match=reason):
+        prepare(source, tmp_path / "out", depth=save(tmp_path / name, pixels, form))
+
+
+def test_videos_and_zips_are_no_depth(tmp_path):
+    source = save(tmp_path / "a.png", disc())
+    frames = zipped(tmp_path / "d.zip", [disc(), disc()])
+    clip = save_clip(tmp_path / "d.mkv", walk(3), "ffv1", "bgra")
+    for number, (given, reason) in enumerate(((frames, "is a zip"), (clip, "is a video"))):
+        for port in ("depth", "layers"):
+            with pytest.raises(BadInput, match=reason):
+                prepare(source, tmp_path / f"{port}{number}", **{port: given})
 
 
 def half_mask(height: int, width: int, left: int = 0) -> np.ndarray:

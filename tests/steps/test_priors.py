@@ -6,6 +6,8 @@ import pytest
 import tiny_shape_prior
 import tiny_weights
 import torch
+from media_files import disc
+from safetensors.torch import save_file
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BackendUnavailable, BadInput
@@ -14,6 +16,7 @@ from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.known import KnownShapes
 from dg4d_lib.guidance.oracle import Bank
+from dg4d_lib.inflation.hints import DepthField, DepthHint
 from dg4d_lib.inflation.surface import inflate
 from dg4d_lib.settings import (
     GeometricPriorSettings,
@@ -24,6 +27,7 @@ from dg4d_lib.settings import (
     Zero123PriorSettings,
 )
 from dg4d_lib.shape_prior import packaged
+from steps.artifacts.depth_fields import read_depth_field, write_depth_field
 from steps.artifacts.media import write_png, write_zip
 from steps.artifacts.pose import Pose, write_pose
 from steps.fitting.priors import (
@@ -32,8 +36,8 @@ from steps.fitting.priors import (
     make_prior,
     read_bank,
     read_bank_folder,
+    subject_hint,
     subject_shapes,
-    subject_turn,
 )
 
 CUTOUTS = [torch.rand(64, 64, 4, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1)]
@@ -207,14 +211,59 @@ def test_the_report_tells_how_much_of_an_unsure_shape_is_inflated(
 def test_footage_turns_the_inflation_and_hints_turn_every_prior(tmp_path: Path) -> None:
     write_pose(tmp_path / "pose.json", Pose(turn_deg=12.0))
     for settings, found in ((GeometricPriorSettings(), 12.0), (LearnedPriorSettings(), 0.0)):
-        assert subject_turn(settings, tmp_path / "pose.json", 0.0) == found
-        assert subject_turn(settings, tmp_path / "pose.json", -5.0) == -5
-        assert subject_turn(settings, None, 0.0) == 0
+        assert subject_hint(settings, tmp_path / "pose.json", None, 0.0) == DepthHint(found)
+        assert subject_hint(settings, tmp_path / "pose.json", None, -5.0) == DepthHint(-5)
+        assert subject_hint(settings, None, None, 0.0).says_nothing
+
+
+def test_a_depth_field_survives_its_file_and_bends_both_priors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(packaged, "packaged_network", tiny_shape_prior.tiny_network)
+    known = torch.ones(32, 32, dtype=torch.bool)
+    write_depth_field(tmp_path / "field.safetensors", DepthField(torch.full((32, 32), 0.3), known, 0.1))
+    field = read_depth_field(tmp_path / "field.safetensors")
+    assert field.sigma == 0.1 and torch.equal(field.known, known) and (field.middle == 0.3).all()
+    ball = torch.from_numpy(disc()).float() / 255
+    for settings in (GeometricPriorSettings(), LearnedPriorSettings()):
+        hint = subject_hint(settings, None, tmp_path / "field.safetensors", 0.0)
+        behind = DepthHint(0.0, replace(field, middle=-field.middle))
+        near, far = (subject_shapes(settings, [ball], each).surface(0) for each in (hint, behind))
+        assert float(near.vertices[:, 2].mean() - far.vertices[:, 2].mean()) > 0.2
+
+
+def test_a_depth_picture_goes_before_a_depth_network(tmp_path: Path) -> None:
+    known = torch.ones(32, 32, dtype=torch.bool)
+    settings = GeometricPriorSettings(depth_weights=str(tmp_path / "gone"))
+    for sigma, runs in ((0.1, False), (0.0, True)):
+        hint = DepthHint(0.0, DepthField(torch.zeros(32, 32), known, sigma))
+        if runs:  # layers say too little to spare it
+            with pytest.raises((BadInput, BackendUnavailable)):
+                make_prior(settings, CUTOUTS, StaticSettings(), None, tmp_path, hint)
+        else:
+            assert "depth" not in make_prior(settings, CUTOUTS, StaticSettings(), None, tmp_path, hint).note
+
+
+def test_broken_depth_fields_are_refused(tmp_path: Path) -> None:
+    known = torch.ones(32, 32, dtype=torch.bool)
+    for middle, there in (
+        (torch.zeros(32, 16), known),
+        (torch.zeros(32, 32), ~known),
+        (torch.zeros(32, 32), known + 1.0),
+    ):
+        tensors = {"middle": middle, "known": there}
+        save_file(tensors, tmp_path / "field.safetensors", {"depth_field": '{"sigma": 0.1}'})
+        with pytest.raises(BadInput, match="no depth field"):
+            read_depth_field(tmp_path / "field.safetensors")
+    (tmp_path / "field.safetensors").write_bytes(b"none")
+    with pytest.raises(BadInput, match="no depth field"):
+        read_depth_field(tmp_path / "field.safetensors")
 
 
 def test_the_geometric_prior_starts_and_judges_as_the_inflation_does(tmp_path: Path) -> None:
     settings = GeometricPriorSettings(size=32)
-    shapes, expected = subject_shapes(settings, CUTOUTS, 10.0).surface(1), inflate(CUTOUTS[1], 32, 10.0)
+    shapes, expected = (
+        subject_shapes(settings, CUTOUTS, DepthHint(10.0)).surface(1),
+        inflate(CUTOUTS[1], 32, DepthHint(10.0)),
+    )
     assert torch.equal(shapes.vertices, expected.vertices) and torch.equal(shapes.colors, expected.colors)
     prior = make_prior(settings, CUTOUTS, StaticSettings(), None, tmp_path).prior
     assert isinstance(prior, AnalyticPrior) and prior.weight == 1

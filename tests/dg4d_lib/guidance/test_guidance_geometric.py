@@ -5,6 +5,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.geometric import InflatedSurfaces, averaged_over_depth
 from dg4d_lib.guidance.interface import GuidanceView
+from dg4d_lib.inflation.hints import DepthHint
 from dg4d_lib.settings import GeometricPriorSettings
 
 SIZE = 48
@@ -53,7 +54,7 @@ def test_only_the_frames_that_are_asked_for_are_built_and_only_once():
 
 def test_the_turn_of_the_subject_is_used():
     color, _ = InflatedSurfaces([disc(24)], SETTINGS).clean([GuidanceView(OrbitCamera(0, 50, width=SIZE, height=SIZE))])
-    turned, _ = InflatedSurfaces([disc(24)], SETTINGS, turn_deg=40).clean(
+    turned, _ = InflatedSurfaces([disc(24)], SETTINGS, hint=DepthHint(40)).clean(
         [GuidanceView(OrbitCamera(0, 50, width=SIZE, height=SIZE))]
     )
     assert (color - turned).abs().mean() > 0.01

@@ -6,6 +6,7 @@ import torch
 from dg4d_lib.cameras.orbit import FOV_Y_DEG, RADIUS, OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.inflation.heights import SWELL
+from dg4d_lib.inflation.hints import DepthHint
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import inflate, resample, sample_surface
 
@@ -110,7 +111,9 @@ def test_a_symmetric_picture_gives_a_symmetric_surface():
 @pytest.mark.parametrize("turn_deg", [0.0, 25.0])
 def test_the_input_view_shows_the_picture(name, turn_deg):
     picture = cutout(SHAPES[name])
-    color, coverage = render_surface(inflate(picture, SIZE, turn_deg), [OrbitCamera(width=SIZE, height=SIZE)])
+    color, coverage = render_surface(
+        inflate(picture, SIZE, DepthHint(turn_deg)), [OrbitCamera(width=SIZE, height=SIZE)]
+    )
     excess = coverage[0, ..., 0] - picture[..., 3]
     assert excess.min() > -0.51  # half of an edge pixel is cut
     assert (excess > 0.51).sum() <= 0.002 * SIZE**2
@@ -162,7 +165,7 @@ def test_the_fringe_of_the_old_background_does_not_color_the_sides():
 
 
 def test_turning_brings_the_right_side_nearer():
-    flat, turned = (inflate(cutout(SHAPES["disc"]), SIZE, turn) for turn in (0.0, 30.0))
+    flat, turned = (inflate(cutout(SHAPES["disc"]), SIZE, DepthHint(turn)) for turn in (0.0, 30.0))
     right = flat.vertices[:, 0] > 0.3
     assert (turned.vertices[right, 2] > flat.vertices[right, 2] + 0.1).all()
 

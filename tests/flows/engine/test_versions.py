@@ -197,7 +197,7 @@ def test_a_version_that_is_recorded_while_things_are_removed_is_whole_or_not_the
 
     class ConversionJob:  # as much of one as is asked
         item, profile, seed, source = "cat", "preview", 0, template.source
-        bank = mask = views = asset = None
+        bank = mask = depth = layers = views = asset = None
 
         def digest(self) -> str:
             return template.order

@@ -103,6 +103,22 @@ def test_a_row_of_a_manifest_becomes_a_job_with_its_model_and_mask(tmp_path: Pat
     assert job.mask == job.source and store.path(job.source).read_bytes() == PNG
 
 
+def test_columns_name_a_depth_picture_or_layers(tmp_path: Path) -> None:
+    (tmp_path / "fox.png").write_bytes(PNG)
+    (tmp_path / "m.csv").write_text("path,depth,layers\nfox.png,fox.png,\nfox.png,,fox.png\nfox.png,fox.png,fox.png\n")
+    jobs = []
+    for item in items(tmp_path / "m.csv"):
+        with item.fetch() as request:
+            if request.depth and request.layers:
+                with pytest.raises(BadInput, match="give one of them"):
+                    request.check()
+                continue
+            request.check()
+            jobs.append(request.to_job(ArtifactStore(tmp_path / "store")))
+    assert [(job.depth == job.source, job.layers == job.source) for job in jobs] == [(True, False), (False, True)]
+    assert {"source", "depth"} == set(jobs[0].given())
+
+
 def test_a_row_with_a_model_and_views_is_refused(tmp_path: Path) -> None:
     (tmp_path / "fox.png").write_bytes(PNG)
     (tmp_path / "fox.glb").write_bytes(b"glTF same")

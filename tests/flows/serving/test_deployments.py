@@ -43,8 +43,8 @@ def test_the_form_offers_every_profile() -> None:
 @pytest.mark.parametrize(
     ("name", "titles"),
     [
-        ("picture-to-4d", ["Picture", "Output folder", "How it is made", "Other sides", "Cut-out"]),
-        ("video-to-4d", ["Video", "Output folder", "How it is made", "Other sides", "Cut-out"]),
+        ("picture-to-4d", ["Picture", "Output folder", "How it is made", "Other sides", "Cut-out and depth"]),
+        ("video-to-4d", ["Video", "Output folder", "How it is made", "Other sides", "Cut-out and depth"]),
         ("model-to-4d", ["Model", "Output folder", "Picture", "How it is made"]),
         ("catalog-to-4d", ["Pictures and videos", "Output folder", "Items at a time", "Items run on",
                            "Stop at a faulty asset", "How it is made"]),
@@ -65,7 +65,11 @@ def test_a_form_has_a_plain_field_for_everything_in_a_sensible_order(
         "Profile", *(["Motion"] if pictures else []), "Triangles", "Texture size", "Frames per second", "Seed",
         "Commercial use only", "Further settings",
     ]  # fmt: skip
-    plain = [field for field in in_order(form) if field["title"] not in {"How it is made", "Other sides", "Cut-out"}]
+    plain = [
+        field
+        for field in in_order(form)
+        if field["title"] not in {"How it is made", "Other sides", "Cut-out and depth"}
+    ]
     for field in [*plain, *in_order(options)]:
         assert field["description"] and field["title"][0].isupper()
         assert field["type"] in {"string", "integer", "number", "boolean", "array"}  # a choice of types is a riddle

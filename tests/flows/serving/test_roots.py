@@ -107,6 +107,8 @@ ELSEWHERE_FORMS = [
     {"sides": Sides(cameras="{place}/away/bank.json")},
     {"sides": Sides(asset="{place}/away/fox.glb")},
     {"cutout": Cutout(mask="{place}/in/../away/fox.png")},
+    {"cutout": Cutout(depth="{place}/in/../away/fox.png")},
+    {"cutout": Cutout(layers="{place}/away/fox.png")},
 ]
 
 
@@ -140,6 +142,16 @@ def test_model_mask_and_box_of_a_form_reach_the_job(place: Path, monkeypatch: py
     (job,) = jobs
     assert job.asset is not None and job.mask == job.source
     assert job.settings.subject.box == (1, 2, 30, 40)
+
+
+def test_depth_of_a_form_reaches_the_job(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    inside = str(place / "in" / "fox.png")
+    jobs: list[ConversionJob] = []
+    monkeypatch.setattr(deployments, "connect", lambda: None)
+    monkeypatch.setattr(deployments, "convert_job", lambda job, folder: jobs.append(job))
+    for form in (Cutout(depth=inside), Cutout(layers=inside)):
+        deployments.picture_to_4d.fn(inside, str(place / "in" / "out"), cutout=form)
+    assert [(job.depth == job.source, job.layers == job.source) for job in jobs] == [(True, False), (False, True)]
 
 
 @pytest.mark.parametrize("given", ["in/fox.png", "{place}/in/fox.png", "{place}/in2/../in/fox.png", "in/inner.png"])
@@ -185,6 +197,8 @@ def test_what_a_pattern_or_a_folder_finds_by_links_is_a_failed_row(place: Path) 
         {"path": "fox.png", "turntable": "../away/fox.png"},
         {"path": "fox.png", "cameras": "dir/bank.json"},
         {"path": "fox.png", "mask": "dir/fox.png"},
+        {"path": "fox.png", "depth": "dir/fox.png"},
+        {"path": "fox.png", "layers": "dir/fox.png"},
         {"path": "fox.png", "asset": "../away/fox.glb"},
         {"asset": "dir/fox.glb"},
         {"path": "fox.png", "prior.kind": "zero123", "prior.weights": "{place}/away"},
