@@ -39,6 +39,7 @@ from steps.runtime.job import Job, StepReport
 
 COLORED = 16  # frames of the driving video that are baked into the texture of a mesh that follows it
 FOLLOWED = {"gaussians": "motion", "video": "driving video"}
+OUTLINES = {"gaussians": "the Gaussians'", "video": "those of video and Gaussians"}
 PICTURE_CAMERAS = [OrbitCamera(0, azimuth, width=256, height=256) for azimuth in (0.0, 75.0, 180.0, 285.0)]
 
 
@@ -70,7 +71,7 @@ def run(job: Job) -> StepReport:
             f"at rest it is {_check(mesh)}",
             f"it is the surface of frame {plan.reference_frame}, which follows the {FOLLOWED[plan.guide]} best "
             f"({plan.followed:.1%} IoU on trial)",
-            f"its outlines agree with the Gaussians' to {ious.mean():.1%} (IoU), to {ious.min():.1%} at worst",
+            f"its outlines agree with {OUTLINES[plan.guide]} to {ious.mean():.1%} (IoU), to {ious.min():.1%} at worst",
         ]
         if ious.mean() < MIN_IOU:
             notes.append("one mesh follows this motion poorly: --set mesh.mode=per_frame gives a mesh per frame")

@@ -16,13 +16,16 @@ from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface, select_level
 from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD, render_silhouettes, silhouette_iou
 from dg4d_lib.mesh.tracking.outline_registration import register_to_outlines
-from dg4d_lib.mesh.tracking.reference_frame import COMPARED, GRID, evenly_spaced
+from dg4d_lib.mesh.tracking.reference_frame import evenly_spaced
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
 from dg4d_lib.video.driving import DrivingVideo
 
 TRACKING = AssetSettings(size=128)
-TRIAL = AssetSettings(size=64, nodes=100, fit_points=2500, track_iterations=12, joint_iterations=10)
+TRIAL = AssetSettings(size=64, nodes=100, fit_points=2500, track_iterations=12, joint_iterations=0)
+TRIAL_ROUNDS = (6,)  # passes of the registration to outlines in a trial
+TRIAL_FRAMES = 6  # at which silhouettes are compared
+TRIAL_GRID = 48  # cells per axis of the density field
 CANDIDATES = 3  # candidate frames with long outlines, besides the given ones
 APART = 1 / 10  # smallest distance of two candidates, share of the frames
 
@@ -85,10 +88,10 @@ def select_guided_reference(
     Raises:
         FitDiverged: the cloud is empty, or the loss became non-finite.
     """
-    compared = evenly_spaced(len(video), COMPARED)
+    compared = evenly_spaced(len(video), TRIAL_FRAMES)
     alpha = video.alpha[compared][..., 0]
     silhouettes = render_silhouettes(states, compared, rasterize, alpha)
-    coarse = settings.model_copy(update={"grid": min(GRID, settings.grid)})
+    coarse = settings.model_copy(update={"grid": min(TRIAL_GRID, settings.grid)})
     scores = {}
     for frame in dict.fromkeys([0, given, *frames_with_long_outlines(video, CANDIDATES)]):
         rest = states.at(frame)
@@ -97,7 +100,9 @@ def select_guided_reference(
         vertices, faces = (torch.from_numpy(array) for array in extract_surface(field, level))
         moved = track_vertices(vertices, faces, rest, video, rasterize, TRIAL, generator, frame)[compared]
         chosen = states.states(compared)
-        offsets = register_to_outlines(vertices, moved - vertices, faces, chosen, alpha, level, rasterize, coarse)
+        offsets = register_to_outlines(
+            vertices, moved - vertices, faces, chosen, alpha, level, rasterize, coarse, TRIAL_ROUNDS
+        )
         scores[frame] = float(silhouette_iou(vertices + offsets, faces, silhouettes).mean())
     best = max(scores, key=lambda frame: scores[frame])
     return best, scores[best]

@@ -6,6 +6,7 @@ an as-rigid-as-possible energy; every step starts from the last positions, so a 
 and crossings are smoothed away in between.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -76,6 +77,7 @@ def register_to_outlines(
     level: float,
     rasterize: Rasterizer,
     settings: MeshSettings,
+    rounds: Sequence[int] = ROUNDS,
 ) -> Float[Tensor, "t v 3"]:
     """Return offsets by which the outlines of the mesh agree with those of the subject.
 
@@ -88,6 +90,7 @@ def register_to_outlines(
         level: density of the surface.
         rasterize: the splatting backend.
         settings: mesh settings.
+        rounds: passes, after each of which folds and crossings are smoothed away.
     """
     cameras = [OrbitCamera(0, azimuth, width=SIZE, height=SIZE) for azimuth in AZIMUTHS_DEG]
     masks = [functional.interpolate(alpha[:, None], (SIZE, SIZE), mode="bicubic")[:, 0] > ALPHA_THRESHOLD]
@@ -102,7 +105,7 @@ def register_to_outlines(
     def register_frame(frame: int) -> None:
         targets = [outline_of(mask[frame].numpy(force=True)).points for mask in masks]
         field = density_field(states.at(frame), settings)
-        moved = _registered(body, vertices + offsets[frame], faces, targets, cameras, field, level)
+        moved = _registered(body, vertices + offsets[frame], faces, targets, cameras, field, level, rounds)
         registered[frame] = moved.to(offsets) - vertices
 
     run_parallel([partial(register_frame, frame) for frame in range(len(offsets))])
@@ -155,11 +158,12 @@ def _registered(
     cameras: list[OrbitCamera],
     field: DensityField,
     level: float,
+    rounds: Sequence[int],
 ) -> Float[Tensor, "v 3"]:
     """Return the registered vertices of one frame."""
     mean_of_neighbors = neighbor_means(body.edges)
     moved, done = start.double().numpy(), 0
-    for passes in ROUNDS:
+    for passes in rounds:
         for _ in range(passes):
             shown = torch.from_numpy(moved).float()
             normals = vertex_normals(shown, faces).numpy()
