@@ -115,7 +115,8 @@ def bake_texture(
     for posed in footage:
         camera = OrbitCamera(width=posed.color.shape[1], height=posed.color.shape[0])
         moved = _placed_texels(rows, columns, corners, shares, posed.vertices, posed.normals)
-        pictures = _graded(posed.color[None], posed.alpha[None, ..., 0], [camera], posed.vertices, faces)
+        reach = max(1, round(OUTLINE * camera.width / side))  # the footage may be coarser than the renders
+        pictures = _graded(posed.color[None], posed.alpha[None, ..., 0], [camera], posed.vertices, faces, reach)
         run_parallel([partial(_add, moved, [camera], pictures, [input_rule], part, total) for part in parts])
     cameras = [OrbitCamera(width=side, height=side), *baking_views(side)]
     for start in range(0, len(cameras), VIEWS_AT_ONCE):
@@ -216,7 +217,7 @@ def _render_views(
     with torch.no_grad():
         render = rasterize(gaussians, cameras, torch.zeros(3))
     color = (render.color / render.alpha.clamp_min(1e-6)).clamp(0, 1)
-    return _graded(color, render.alpha[..., 0], cameras, vertices, faces)
+    return _graded(color, render.alpha[..., 0], cameras, vertices, faces, OUTLINE)
 
 
 def _graded(
@@ -225,18 +226,20 @@ def _graded(
     cameras: Sequence[OrbitCamera],
     vertices: Float[Tensor, "v 3"],
     faces: Int[Tensor, "f 3"],
+    reach: int,
 ) -> tuple[Float[Tensor, "b h w 3"], UInt8[Tensor, "b h w"], Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
-    """Return pictures with grade and depth, as `_render_views` does."""
+    """Return pictures with grade and depth, as `_render_views` does; `reach` is the width of the unreliable band."""
     depth = rasterize_mesh(vertices, faces, cameras).depth
     depth = torch.where(depth > 0, depth, torch.full_like(depth, torch.inf))
-    grade = (alpha > ALPHA_THRESHOLD).to(torch.uint8) + (_min_filter(alpha) > ALPHA_THRESHOLD).to(torch.uint8)
-    return color, grade, depth, _min_filter(depth)
+    inside = _min_filter(alpha, reach) > ALPHA_THRESHOLD
+    grade = (alpha > ALPHA_THRESHOLD).to(torch.uint8) + inside.to(torch.uint8)
+    return color, grade, depth, _min_filter(depth, reach)
 
 
-def _min_filter(values: Float[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
-    """Return the minimum within `OUTLINE` pixels."""
-    rows = max_pool2d(-values, (2 * OUTLINE + 1, 1), stride=1, padding=(OUTLINE, 0))
-    return -max_pool2d(rows, (1, 2 * OUTLINE + 1), stride=1, padding=(0, OUTLINE))
+def _min_filter(values: Float[Tensor, "b h w"], reach: int) -> Float[Tensor, "b h w"]:
+    """Return the minimum within some pixels."""
+    rows = max_pool2d(-values, (2 * reach + 1, 1), stride=1, padding=(reach, 0))
+    return -max_pool2d(rows, (1, 2 * reach + 1), stride=1, padding=(0, reach))
 
 
 def _fill_unseen(

@@ -89,7 +89,7 @@ def test_a_mesh_follows_legs_that_cross(monkeypatch: pytest.MonkeyPatch) -> None
     still = silhouette_iou(vertices.expand(FRAMES, -1, -1), faces, silhouettes)
     followed = silhouette_iou(vertices + offsets, faces, silhouettes)
     assert still[FRAMES // 2 :].min() < 0.75
-    assert followed.min() > 0.88
+    assert followed.min() > 0.8 and followed.mean() > 0.87
 
 
 def test_the_chosen_frame_has_the_legs_apart(monkeypatch: pytest.MonkeyPatch) -> None:
