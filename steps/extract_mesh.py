@@ -1,6 +1,7 @@
 """Step that extracts textured meshes from moving Gaussians: one tracked mesh, or a mesh per frame."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
@@ -9,7 +10,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.errors import BadInput
-from dg4d_lib.fitting.guided_mesh import follow_video
+from dg4d_lib.fitting.guided_mesh import follow_video, refine_tracking
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.images import color_over_white
 from dg4d_lib.mesh.extraction.clean import clean
@@ -126,22 +127,31 @@ def _guided(
     rest = states.at(frame)
     vertices, faces = _cleaned_surface(rest, level, settings)
     offsets = follow_video(vertices, faces, states, video, frame, level, rasterize, settings, generator)
-    moved = vertices + offsets
-
-    def footage(sources: Int[Tensor, " w"]) -> list[PosedSurface]:
-        return [
-            PosedSurface(
-                moved[number][sources],
-                vertex_normals(moved[number], faces)[sources],
-                video.frames[number],
-                video.alpha[number],
-            )
-            for number in evenly_spaced(len(video), COLORED)
-        ]
-
-    mesh, sources = _colored(vertices, faces, rest, rasterize, settings, footage)
+    mesh, sources = _colored(
+        vertices, faces, rest, rasterize, settings, lambda sources: _footage(vertices + offsets, faces, sources, video)
+    )
+    refined = refine_tracking(mesh, sources, vertices, offsets, faces, states, video, level, rasterize, settings)
+    moved = vertices + refined
+    normals, footage = vertex_normals(vertices, faces)[sources], _footage(moved, faces, sources, video)
+    texture = bake_texture(mesh.vertices, normals, mesh.faces, mesh.uvs, rest, rasterize, settings, footage)
     silhouettes = render_silhouettes(states, range(len(moved)), rasterize, video.alpha[..., 0])
-    return TrackedMesh(mesh, offsets[:, sources], reference_frame=frame), silhouette_iou(moved, faces, silhouettes)
+    tracked = TrackedMesh(replace(mesh, texture=texture), refined[:, sources], reference_frame=frame)
+    return tracked, silhouette_iou(moved, faces, silhouettes)
+
+
+def _footage(
+    moved: Float[Tensor, "t v 3"], faces: Int[Tensor, "f 3"], sources: Int[Tensor, " w"], video: DrivingVideo
+) -> list[PosedSurface]:
+    """Return some frames of the video with the surface, split along seams, that they show."""
+    return [
+        PosedSurface(
+            moved[frame][sources],
+            vertex_normals(moved[frame], faces)[sources],
+            video.frames[frame],
+            video.alpha[frame],
+        )
+        for frame in evenly_spaced(len(video), COLORED)
+    ]
 
 
 def _cleaned_surface(

@@ -15,7 +15,9 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface, select_level
 from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD, render_silhouettes, silhouette_iou
-from dg4d_lib.mesh.tracking.outline_registration import register_to_outlines
+from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.mesh.tracking.color_registration import register_to_colors
+from dg4d_lib.mesh.tracking.outline_registration import LAST_ROUNDS, register_to_outlines
 from dg4d_lib.mesh.tracking.reference_frame import evenly_spaced
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
@@ -23,7 +25,7 @@ from dg4d_lib.video.driving import DrivingVideo
 
 TRACKING = AssetSettings(size=128)
 TRIAL = AssetSettings(size=64, nodes=100, fit_points=2500, track_iterations=12, joint_iterations=0)
-TRIAL_ROUNDS = (6,)  # passes of the registration to outlines in a trial
+TRIAL_ROUNDS = ((2, 4),)  # passes of the registration to outlines in a trial
 TRIAL_FRAMES = 6  # at which silhouettes are compared
 TRIAL_GRID = 48  # cells per axis of the density field
 CANDIDATES = 3  # candidate frames with long outlines, besides the given ones
@@ -62,6 +64,38 @@ def follow_video(
     return register_to_outlines(
         vertices, moved - vertices, faces, states, video.alpha[..., 0], level, rasterize, settings
     )
+
+
+def refine_tracking(
+    mesh: TexturedMesh,
+    sources: Int[Tensor, " w"],
+    vertices: Float[Tensor, "v 3"],
+    offsets: Float[Tensor, "t v 3"],
+    faces: Int[Tensor, "f 3"],
+    states: Gaussians,
+    video: DrivingVideo,
+    level: float,
+    rasterize: Rasterizer,
+    settings: MeshSettings,
+) -> Float[Tensor, "t v 3"]:
+    """Return the offsets of `follow_video`, registered to the colors of the video and to its outlines again.
+
+    Args:
+        mesh: textured, split along seams.
+        sources: vertex that every split vertex copies.
+        vertices: surface of the reference frame, not split along seams.
+        offsets: of the vertices at every frame.
+        faces: counter-clockwise seen from outside, not split along seams.
+        states: the cloud at every frame (fields "t n 3").
+        video: of the camera at azimuth and elevation 0.
+        level: density of the surface.
+        rasterize: the splatting backend.
+        settings: mesh settings.
+    """
+    pictures = video.over(video.frames.new_ones(3))
+    offsets = register_to_colors(mesh, sources, vertices, offsets, faces, pictures)
+    alpha = video.alpha[..., 0]
+    return register_to_outlines(vertices, offsets, faces, states, alpha, level, rasterize, settings, LAST_ROUNDS)
 
 
 def select_guided_reference(

@@ -63,7 +63,7 @@ def track_vertices(
     reference_frame: int = 0,
     report: Report = lambda iteration, values: None,
 ) -> Float[Tensor, "t v 3"]:
-    """Move the vertices of a surface as a video shows it, from its reference frame on and back to the first frame.
+    """Move the vertices of a surface as a video shows it, from its reference frame in both directions.
 
     Args:
         vertices: at the reference frame, where they stay as they are.
@@ -87,11 +87,25 @@ def track_vertices(
     nearest = torch.from_numpy(np.asarray(cKDTree(points).query(gaussians.means.double().numpy())[1]))
     bound = graph.of(torch.from_numpy(index))
     moved = vertices.repeat(len(video), 1, 1)
-    for frames in (range(reference_frame, len(video)), range(reference_frame, -1, -1)):
-        if len(frames) > 1:
-            chosen = list(frames)
+    for chosen in tracking_orders(video, reference_frame):
+        if len(chosen) > 1:
             part = DrivingVideo(video.frames[chosen], video.alpha[chosen], video.fps)
             motion = fit_asset_motion(gaussians, graph.of(nearest), part, rasterize, settings, generator, report)
             for number, frame in enumerate(chosen[1:], 1):
                 moved[frame] = motion.at(slice(number, number + 1)).points(vertices, bound)[0]
     return moved
+
+
+def tracking_orders(video: DrivingVideo, reference_frame: int) -> tuple[list[int], list[int]]:
+    """Return the frames from the reference frame on, and back from it; half of a loop each, for errors add up.
+
+    A video is a loop if its last frame differs from the first no more than two successive frames do somewhere.
+    """
+    count = len(video)
+    pictures = video.over(video.frames.new_ones(3))
+    steps = (pictures - pictures.roll(-1, 0)).abs().flatten(1).mean(1)
+    if count > 2 and float(steps[-1]) <= float(steps[:-1].max()):
+        forward = count // 2
+        ahead = [(reference_frame + step) % count for step in range(forward + 1)]
+        return ahead, [(reference_frame - step) % count for step in range(count - forward)]
+    return list(range(reference_frame, count)), list(range(reference_frame, -1, -1))

@@ -38,8 +38,8 @@ AZIMUTHS_DEG = (0.0, 90.0)  # the input view and the right side
 FACING = 12.0  # weight of unit normals in the distance of outline points, pixels; keeps the sides of a limb apart
 LONGEST = 24.0  # pixels of a step
 BLUR = 2.0  # standard deviation of the mask whose gradient is the normal of an outline, pixels
-ROUNDS = (8, 2, 2)  # passes, after each of which folds and crossings are smoothed away; that draws outlines in a little
-WITHOUT_OUTLINES = 2  # first passes, to the isosurface alone
+FIRST_ROUNDS = ((2, 6),)  # passes to the isosurface alone, and to outlines too; then folds and crossings are smoothed
+LAST_ROUNDS = ((0, 2), (0, 2))  # smoothing draws outlines in a little, so they are fitted again
 ROTATIONS = 2  # alternations of rotations and positions per pass
 PULL, OUTLINE_PULL = 0.5, 3.0  # weights of the positions of vertices, on outlines and elsewhere, against 1 per edge
 
@@ -77,7 +77,7 @@ def register_to_outlines(
     level: float,
     rasterize: Rasterizer,
     settings: MeshSettings,
-    rounds: Sequence[int] = ROUNDS,
+    rounds: Sequence[tuple[int, int]] = FIRST_ROUNDS,
 ) -> Float[Tensor, "t v 3"]:
     """Return offsets by which the outlines of the mesh agree with those of the subject.
 
@@ -90,7 +90,8 @@ def register_to_outlines(
         level: density of the surface.
         rasterize: the splatting backend.
         settings: mesh settings.
-        rounds: passes, after each of which folds and crossings are smoothed away.
+        rounds: passes to the isosurface alone and passes to outlines too, after which folds and crossings are smoothed
+            away.
     """
     cameras = [OrbitCamera(0, azimuth, width=SIZE, height=SIZE) for azimuth in AZIMUTHS_DEG]
     masks = [functional.interpolate(alpha[:, None], (SIZE, SIZE), mode="bicubic")[:, 0] > ALPHA_THRESHOLD]
@@ -158,13 +159,13 @@ def _registered(
     cameras: list[OrbitCamera],
     field: DensityField,
     level: float,
-    rounds: Sequence[int],
+    rounds: Sequence[tuple[int, int]],
 ) -> Float[Tensor, "v 3"]:
     """Return the registered vertices of one frame."""
     mean_of_neighbors = neighbor_means(body.edges)
-    moved, done = start.double().numpy(), 0
-    for passes in rounds:
-        for _ in range(passes):
+    moved = start.double().numpy()
+    for first, then in rounds:
+        for number in range(first + then):
             shown = torch.from_numpy(moved).float()
             normals = vertex_normals(shown, faces).numpy()
             distances = steps_to_isosurface(field, shown.numpy(), normals, level)
@@ -172,12 +173,11 @@ def _registered(
                 distances = 0.5 * distances + 0.5 * (mean_of_neighbors @ distances)
             steps: NDArray[np.float64] = distances[:, None] * normals.astype(np.float64)
             pull = np.full(len(moved), PULL)
-            if done >= WITHOUT_OUTLINES:
+            if number >= first:
                 at_outline, towards = _outline_pull(shown, faces, targets, cameras)
                 steps += at_outline[:, None] * (towards - steps)
                 pull += (OUTLINE_PULL - PULL) * at_outline
             moved = body.settle(moved, moved + steps, pull, passes=ROTATIONS)
-            done += 1
         moved = unfold(moved, body.faces)
     return torch.from_numpy(moved)
 
