@@ -171,10 +171,11 @@ def mesh_over_time(
 ) -> Mesh:
     """Extract one mesh that follows the motion, or a mesh per frame with the frames divided among the slots."""
     plan = tasks.plan_mesh(gaussians, motion, conversion)
+    pictures = None if isinstance(gaussians, Asset) else driving_video  # a user's splats keep their own colors
     if read_plan(home.store().path(plan.plan)).mode == "tracked":
-        return tasks.extract_mesh(gaussians, motion, plan, conversion)
+        return tasks.extract_mesh(gaussians, motion, plan, conversion, pictures)
     frames = count_frames(driving_video.frames, home.store())
     parts = divide_frames(frames, conversion.mesh_parts or resources.cpus())
-    extracted = [tasks.extract_mesh.submit(gaussians, motion, plan, conversion, part) for part in parts]
+    extracted = [tasks.extract_mesh.submit(gaussians, motion, plan, conversion, pictures, part) for part in parts]
     meshes = [future.result() for future in extracted]
     return meshes[0] if len(meshes) == 1 else tasks.join_meshes(meshes, conversion)

@@ -142,9 +142,17 @@ def plan_mesh(gaussians: Gaussians | Asset, motion: Motion, conversion: Conversi
 
 
 def extract_mesh(
-    gaussians: Gaussians | Asset, motion: Motion, plan: Plan, conversion: Conversion, part: Part | None = None
+    gaussians: Gaussians | Asset,
+    motion: Motion,
+    plan: Plan,
+    conversion: Conversion,
+    driving_video: DrivingVideo | None = None,
+    part: Part | None = None,
 ) -> Mesh:
-    """Extract one mesh that follows the motion, or a mesh per frame of a part of the frames."""
+    """Extract one mesh that follows the motion, or a mesh per frame of a part of the frames.
+
+    Textures take their colors from the driving video, if it is given, where it shows the surface.
+    """
     return run_step("extract_mesh", Mesh, **locals())
 
 

@@ -169,7 +169,7 @@ STEPS: dict[str, StepSpec] = {
         _step("plan_mesh", {"gaussians": PLY, "motion": MOTION}, {"plan": PLAN}, sections=("rasterizer", "mesh")),
         _step(
             "extract_mesh",
-            inputs={"gaussians": PLY, "motion": MOTION, "plan": PLAN},
+            inputs={"gaussians": PLY, "motion": MOTION, "plan": PLAN, "driving_video": _optional(FRAMES)},
             outputs={**EITHER_MESH, "picture": PNG},
             settings="steps.profiles:FrameRange",
             sections=("rasterizer", "mesh"),

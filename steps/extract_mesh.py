@@ -1,5 +1,8 @@
 """Step that extracts textured meshes from moving Gaussians: one tracked mesh, or a mesh per frame."""
 
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -26,7 +29,7 @@ from dg4d_lib.mesh.tracking.reference_frame import relative_to_frame
 from dg4d_lib.mesh.tracking.skinning import skin_vertices
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.settings import MeshSettings
-from steps.artifacts.media import write_png
+from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.mesh_plan import MeshPlan, read_plan
 from steps.artifacts.meshes import write_meshes, write_tracked
 from steps.artifacts.motions import read_states
@@ -48,9 +51,10 @@ def run(job: Job) -> StepReport:
     rasterize = get_rasterizer(job.settings.rasterizer)
     states, displacement = read_states(job.inputs["gaussians"], job.inputs["motion"])
     frames = len(states.means)
+    pictures = _pictures(job, frames)
     if plan.mode == "tracked":
         job.progress(1, 3, {})
-        tracked, ious = _tracked(states, displacement, plan, rasterize, settings)
+        tracked, ious = _tracked(states, displacement, plan, rasterize, settings, pictures)
         job.progress(2, 3, {})
         write_tracked(job.outputs["tracked"], tracked)
         mesh = tracked.mesh
@@ -69,29 +73,54 @@ def run(job: Job) -> StepReport:
             raise BadInput(f"frames {first} to {end} were asked for; the motion has {frames}")
         meshes = {}
         for frame in range(first, end):
-            meshes[frame] = textured_mesh(states.at(frame), plan.level, rasterize, settings)
+            meshes[frame] = textured_mesh(
+                states.at(frame), plan.level, rasterize, settings, None if pictures is None else pictures[frame]
+            )
             job.progress(frame - first + 1, end - first, {})
         write_meshes(job.outputs["meshes"], meshes)
         notes = _soundness(meshes)
         mesh = meshes[first]
     write_png(job.outputs["picture"], _picture(mesh))
-    return StepReport(backend=f"{job.settings.rasterizer} rasterizer, pymeshlab, xatlas", notes=tuple(notes))
+    return StepReport(backend=f"{job.settings.rasterizer} rasterizer, pymeshlab", notes=tuple(notes))
 
 
-def textured_mesh(gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings) -> TexturedMesh:
+def textured_mesh(
+    gaussians: Gaussians,
+    level: float,
+    rasterize: Rasterizer,
+    settings: MeshSettings,
+    picture: Float[Tensor, "h w 4"] | None = None,
+) -> TexturedMesh:
     """Return the isosurface of one state of the Gaussians at a density, with a baked texture."""
     vertices, faces = _cleaned_surface(gaussians, level, settings)
-    return _colored(vertices, faces, gaussians, rasterize, settings)[0]
+    return _colored(vertices, faces, gaussians, rasterize, settings, picture)[0]
+
+
+def _pictures(job: Job, frames: int) -> Float[Tensor, "t h w 4"] | None:
+    """Return the frames of the driving video, if the job has one."""
+    if "driving_video" not in job.inputs:
+        return None
+    with TemporaryDirectory() as scratch:
+        video = read_frames(job.inputs["driving_video"], Path(scratch))
+    if len(video) != frames:
+        raise BadInput(f"the driving video has {len(video)} frames and the motion {frames}; fit the motion again")
+    return torch.cat([video.frames, video.alpha], -1)
 
 
 def _tracked(
-    states: Gaussians, displacement: Displacement, plan: MeshPlan, rasterize: Rasterizer, settings: MeshSettings
+    states: Gaussians,
+    displacement: Displacement,
+    plan: MeshPlan,
+    rasterize: Rasterizer,
+    settings: MeshSettings,
+    pictures: Float[Tensor, "t h w 4"] | None,
 ) -> tuple[TrackedMesh, Float[Tensor, " t"]]:
     """Return the mesh of the reference frame with its offsets at every frame, and the IoU of its outlines."""
     frame, level = plan.reference_frame, plan.level
     rest = states.at(frame)
     vertices, faces = _cleaned_surface(rest, level, settings)
-    mesh, sources = _colored(vertices, faces, rest, rasterize, settings)
+    picture = None if pictures is None else pictures[frame]
+    mesh, sources = _colored(vertices, faces, rest, rasterize, settings, picture)
     skinned = skin_vertices(vertices, rest, relative_to_frame(displacement, frame))
     projected = project_to_isosurface(vertices, skinned, faces, states, level, settings)
     silhouettes = render_silhouettes(states, range(len(projected)), rasterize)
@@ -115,12 +144,13 @@ def _colored(
     gaussians: Gaussians,
     rasterize: Rasterizer,
     settings: MeshSettings,
+    picture: Float[Tensor, "h w 4"] | None,
 ) -> tuple[TexturedMesh, Int[Tensor, " w"]]:
     """Return the unwrapped mesh with a baked texture, and the source vertex of each of its vertices."""
     unwrapped = unwrap(vertices.numpy(), faces.numpy(), settings.texture_size)
     sources, corners, uvs = map(torch.from_numpy, unwrapped)
     normals = vertex_normals(vertices, faces)[sources]
-    texture = bake_texture(vertices[sources], normals, corners, uvs, gaussians, rasterize, settings)
+    texture = bake_texture(vertices[sources], normals, corners, uvs, gaussians, rasterize, settings, picture)
     return TexturedMesh(vertices[sources], corners, uvs, texture), sources
 
 

@@ -1,8 +1,8 @@
-"""Texture baking: colors of Gaussians projected onto a mesh (Tang et al. 2024, section 3.2).
+"""Texture baking: colors of pictures and Gaussians projected onto a mesh (Tang et al. 2024, section 3.2).
 
 The Gaussians are rendered from 26 views and from the input view, and every texel takes a weighted mean of the colors
-it projects to; views that face it head-on weigh most. Colors are un-premultiplied and pixels along soft silhouettes
-skipped, so no background bleeds into the texture.
+it projects to; views that face it head-on weigh most. In the input view a picture replaces the render, where there is
+one. Colors are un-premultiplied and pixels along soft silhouettes skipped, so no background bleeds into the texture.
 """
 
 from collections.abc import Sequence
@@ -25,8 +25,10 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import baking_views
 from dg4d_lib.errors import DG4DError
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.images import resize
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
+from dg4d_lib.mesh.texturing.seams import level_seams, seam_points
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
@@ -70,8 +72,9 @@ def bake_texture(
     gaussians: Gaussians,
     rasterize: Rasterizer,
     settings: MeshSettings,
+    picture: Float[Tensor, "i j 4"] | None = None,
 ) -> Float[Tensor, "h w 3"]:
-    """Bake the texture of a mesh from the Gaussians it was extracted from.
+    """Bake the texture of a mesh from a picture of it and from the Gaussians it was extracted from.
 
     Args:
         vertices: world units, split along the seams.
@@ -81,9 +84,11 @@ def bake_texture(
         gaussians: one state.
         rasterize: the splatting backend.
         settings: mesh settings.
+        picture: square cut-out from the input camera, straight colors and alpha; None: renders of the Gaussians alone.
 
     Returns:
-        Colors in [0, 1] of every texel; texels outside all charts are filled from their surroundings.
+        Colors in [0, 1] of every texel; texels outside all charts are filled from their surroundings, and both sides of
+        a seam have the same colors.
     """
     texels = locate_texels(vertices, normals, faces, uvs, settings.texture_size)
     size = settings.texture_size
@@ -94,7 +99,7 @@ def bake_texture(
     cameras = [OrbitCamera(width=side, height=side), *baking_views(side)]
     for start in range(0, len(cameras), VIEWS_AT_ONCE):
         batch = cameras[start : start + VIEWS_AT_ONCE]
-        renders = _render_views(batch, vertices, faces, gaussians, rasterize)
+        renders = _render_views(batch, vertices, faces, gaussians, rasterize, picture if start == 0 else None)
         rules = [(MIN_COSINE, 1.0)] * len(batch)
         if start == 0:
             rules[0] = (INPUT_FLATTER * MIN_COSINE, INPUT_WEIGHT)
@@ -103,7 +108,7 @@ def bake_texture(
     seen = weight[:, 0] > 0
     colors = torch.where(seen[:, None], torch.from_numpy(total[:, :3]) / weight.clamp_min(1e-30), 0.5)
     colors = _fill_unseen(colors, seen, texels.positions)
-    return _fill_texture(colors, texels, size)
+    return level_seams(_fill_texture(colors, texels, size), seam_points(vertices, faces, uvs, size))
 
 
 def vertex_normals(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "v 3"]:
@@ -162,8 +167,9 @@ def _render_views(
     faces: Int[Tensor, "f 3"],
     gaussians: Gaussians,
     rasterize: Rasterizer,
+    picture: Float[Tensor, "i j 4"] | None,
 ) -> tuple[Float[Tensor, "b h w 3"], UInt8[Tensor, "b h w"], Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
-    """Render the Gaussians and the mesh.
+    """Render the Gaussians and the mesh; a picture replaces the colors of the first view.
 
     Returns:
         Straight color; grade (0: background, 1: along the silhouette, 2: inside); camera z of the mesh; and the minimum
@@ -173,6 +179,11 @@ def _render_views(
         render = rasterize(gaussians, cameras, torch.zeros(3))
     color = (render.color / render.alpha.clamp_min(1e-6)).clamp(0, 1)
     alpha = render.alpha[..., 0]
+    if picture is not None:
+        premultiplied = torch.cat([picture[..., :3] * picture[..., 3:], picture[..., 3:]], -1)
+        shown = resize(premultiplied[None].to(color), color.shape[1:3])[0]
+        color[0] = (shown[..., :3] / shown[..., 3:].clamp_min(1e-6)).clamp(0, 1)
+        alpha[0] = torch.minimum(alpha[0], shown[..., 3])
     depth = rasterize_mesh(vertices, faces, cameras).depth
     depth = torch.where(depth > 0, depth, torch.full_like(depth, torch.inf))
     grade = (alpha > ALPHA_THRESHOLD).to(torch.uint8) + (_min_filter(alpha) > ALPHA_THRESHOLD).to(torch.uint8)
