@@ -1,7 +1,7 @@
-"""Defects of packaged meshes, at rest and in every frame: crossings, flips, folds, creases and handles.
+"""Defects of packaged meshes, at rest and in every frame: crossings, flips, folds, creases, handles; and their atlas.
 
-Run with `python -m benchmarks.meshes PACKAGE ...` (`--json FILE` keeps the rows). A mesh per frame has no rest shape:
-its frames are counted one by one, and nothing is flipped.
+Run with `python -m benchmarks.meshes PACKAGE ...` (`--json FILE` keeps the rows of the first table). A mesh per frame
+has no rest shape: its frames are counted one by one, and nothing is flipped.
 """
 
 from collections.abc import Iterator
@@ -17,6 +17,7 @@ from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.placement import Surface
 from dg4d_lib.mesh.extraction.topology import join_seams
 from dg4d_lib.mesh.folds import SurfaceDefects, genus, surface_defects
+from dg4d_lib.mesh.texturing.atlas_quality import AtlasQuality, atlas_quality
 from steps.artifacts.packages import read_manifest
 from steps.artifacts.rendering import mesh_at, read_surface
 
@@ -55,7 +56,9 @@ def main() -> None:
     parser.add_argument("packages", type=Path, nargs="+", help="folders of unpacked packages")
     options = parser.parse_args()
     rows = [row for folder in options.packages for row in measure(folder)]
-    new_console().print(table(rows))
+    console = new_console()
+    console.print(table(rows))
+    console.print(atlas_table({folder.name: measure_atlas(folder) for folder in options.packages}))
     if options.json:
         write_rows(options.json, rows)
 
@@ -81,6 +84,34 @@ def table(rows: list[Row]) -> Table:
     for row in rows:
         shares = (f"{share:.3f}" for share in (row.crossing, row.flipped, row.folds, row.creases))
         shown.add_row(row.package, row.moment, str(row.triangles), *shares, f"{row.deviation_deg:.1f}", str(row.genus))
+    return shown
+
+
+def measure_atlas(folder: Path) -> AtlasQuality:
+    """Measure texture coordinates and texture of a package, of the first frame if it has a mesh per frame."""
+    surface = read_surface(folder, read_manifest(folder))
+    return atlas_quality(surface.mesh if isinstance(surface, Asset4D) else surface[0])
+
+
+def atlas_table(qualities: dict[str, AtlasQuality]) -> Table:
+    """Return the qualities of atlases by package as a table."""
+    shown = Table(title="Texture atlases")
+    shown.add_column("package")
+    for name in (
+        "islands",
+        "of < 10 triangles",
+        "mirrored",
+        "coverage",
+        "density p99 / p1",
+        "seams, mean",
+        "seams, p95",
+    ):
+        shown.add_column(name, justify="right")
+    for package, quality in qualities.items():
+        shares = (f"{share:.1%}" for share in (quality.mirrored, quality.coverage))
+        seams = (f"{difference:.2f} / 255" for difference in (quality.seam_mean, quality.seam_p95))
+        counts = (str(quality.islands), str(quality.small_islands))
+        shown.add_row(package, *counts, *shares, f"{quality.density_ratio:.2f}", *seams)
     return shown
 
 

@@ -118,6 +118,11 @@ class PackSettings(Settings):
         "is where the camera looks",
     )
     gltf: GltfSettings = GltfSettings()
+    delight: bool = Field(
+        False,
+        description="divide the picture's light out of the mesh's texture, as spherical harmonics of degree 2, for "
+        "viewers with lights; splats keep it, and a bright belly is taken for light",
+    )
     lods: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = Field(
         (),
         max_length=8,

@@ -182,14 +182,15 @@ def mesh_over_time(
         driving_video: frames that the motion was fitted to.
         conversion: parameters that all steps share.
         tasks: tasks of the engine.
-        fitted: the cloud was fitted to the video too, so that a mesh may follow the video; not splats of the user's.
+        fitted: the cloud was fitted to the video too, so that a mesh may follow the video and has its colors; not
+            splats of the user's.
     """
     guide = driving_video if fitted else None
     plan = tasks.plan_mesh(gaussians, motion, conversion, guide)
     if read_plan(home.store().path(plan.plan)).mode == "tracked":
-        return tasks.extract_mesh(gaussians, motion, plan, conversion, None, guide)
+        return tasks.extract_mesh(gaussians, motion, plan, conversion, guide)
     frames = count_frames(driving_video.frames, home.store())
     parts = divide_frames(frames, conversion.mesh_parts or resources.cpus())
-    extracted = [tasks.extract_mesh.submit(gaussians, motion, plan, conversion, part) for part in parts]
+    extracted = [tasks.extract_mesh.submit(gaussians, motion, plan, conversion, guide, part) for part in parts]
     meshes = [future.result() for future in extracted]
     return meshes[0] if len(meshes) == 1 else tasks.join_meshes(meshes, conversion)

@@ -154,10 +154,13 @@ def extract_mesh(
     motion: Motion,
     plan: Plan,
     conversion: Conversion,
-    part: Part | None = None,
     driving_video: DrivingVideo | None = None,
+    part: Part | None = None,
 ) -> Mesh:
-    """Extract one mesh that follows the motion, or a mesh per frame of a part of the frames."""
+    """Extract one mesh that follows the motion, or a mesh per frame of a part of the frames.
+
+    Textures take their colors from the driving video, if it is given, where it shows the surface.
+    """
     return run_step("extract_mesh", Mesh, **locals())
 
 

@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import torch
 from jaxtyping import Float, Int
@@ -39,6 +41,9 @@ from steps.artifacts.motions import read_states
 from steps.profiles import FrameRange
 from steps.runtime.job import Job, StepReport
 
+Frame = tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]  # color and alpha
+Footage = Callable[[Int[Tensor, " w"]], list[PosedSurface]]
+
 COLORED = 16  # frames of the driving video that are baked into the texture of a mesh that follows it
 FOLLOWED = {"gaussians": "motion", "video": "driving video"}
 OUTLINES = {"gaussians": "the Gaussians'", "video": "those of video and Gaussians"}
@@ -57,14 +62,14 @@ def run(job: Job) -> StepReport:
     rasterize = get_rasterizer(job.settings.rasterizer)
     states, displacement = read_states(job.inputs["gaussians"], job.inputs["motion"])
     frames = len(states.means)
+    video = _driving_video(job, frames)
     if plan.mode == "tracked":
         job.progress(1, 3, {})
-        if plan.guide == "video":
-            video = read_frames(job.inputs["driving_video"], job.pictures)
+        if video and plan.guide == "video":
             generator = torch.Generator().manual_seed(job.seed)
             tracked, ious = _guided(states, video, plan, rasterize, settings, generator)
         else:
-            tracked, ious = _tracked(states, displacement, plan, rasterize, settings)
+            tracked, ious = _tracked(states, displacement, plan, rasterize, settings, video)
         job.progress(2, 3, {})
         write_tracked(job.outputs["tracked"], tracked)
         mesh = tracked.mesh
@@ -83,30 +88,49 @@ def run(job: Job) -> StepReport:
             raise BadInput(f"frames {first} to {end} were asked for; the motion has {frames}")
         meshes = {}
         for frame in range(first, end):
-            meshes[frame] = textured_mesh(states.at(frame), plan.level, rasterize, settings)
+            meshes[frame] = textured_mesh(states.at(frame), plan.level, rasterize, settings, _at(video, frame))
             job.progress(frame - first + 1, end - first, {})
         write_meshes(job.outputs["meshes"], meshes)
         notes = _soundness(meshes)
         mesh = meshes[first]
     write_png(job.outputs["picture"], _picture(mesh))
-    return StepReport(backend=f"{job.settings.rasterizer} rasterizer, pymeshlab, xatlas", notes=tuple(notes))
+    return StepReport(backend=f"{job.settings.rasterizer} rasterizer, pymeshlab", notes=tuple(notes))
 
 
-def textured_mesh(gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings) -> TexturedMesh:
-    """Return the isosurface of one state of the Gaussians at a density, with a baked texture."""
+def textured_mesh(
+    gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings, frame: Frame | None = None
+) -> TexturedMesh:
+    """Return the isosurface of one state of the Gaussians at a density, with a texture baked from it and the frame."""
     vertices, faces = _cleaned_surface(gaussians, level, settings)
-    return _colored(vertices, faces, gaussians, rasterize, settings)[0]
+    return _colored(vertices, faces, gaussians, rasterize, settings, _shown(vertices, faces, frame))[0]
+
+
+def _driving_video(job: Job, frames: int) -> DrivingVideo | None:
+    """Return the driving video, if the job has one."""
+    if "driving_video" not in job.inputs:
+        return None
+    with TemporaryDirectory() as scratch:
+        video = read_frames(job.inputs["driving_video"], Path(scratch))
+    if len(video) != frames:
+        raise BadInput(f"the driving video has {len(video)} frames and the motion {frames}; fit the motion again")
+    return video
 
 
 def _tracked(
-    states: Gaussians, displacement: Displacement, plan: MeshPlan, rasterize: Rasterizer, settings: MeshSettings
+    states: Gaussians,
+    displacement: Displacement,
+    plan: MeshPlan,
+    rasterize: Rasterizer,
+    settings: MeshSettings,
+    video: DrivingVideo | None,
 ) -> tuple[TrackedMesh, Float[Tensor, " t"]]:
     """Return the mesh of the reference frame with its offsets at every frame, and the IoU of its outlines."""
     frame, level = plan.reference_frame, plan.level
     rest = states.at(frame)
     vertices, faces = _cleaned_surface(rest, level, settings)
     with ThreadPoolExecutor(1) as beside:  # unwrapping keeps one core busy, and tracking needs no texture
-        coloring = beside.submit(_colored, vertices, faces, rest, rasterize, settings)
+        shown = _shown(vertices, faces, _at(video, frame))
+        coloring = beside.submit(_colored, vertices, faces, rest, rasterize, settings, shown)
         skinned = skin_vertices(vertices, rest, relative_to_frame(displacement, frame))
         projected = project_to_isosurface(vertices, skinned, faces, states, level, settings)
         silhouettes = render_silhouettes(states, range(len(projected)), rasterize)
@@ -146,15 +170,23 @@ def _footage(
     moved: Float[Tensor, "t v 3"], faces: Int[Tensor, "f 3"], sources: Int[Tensor, " w"], video: DrivingVideo
 ) -> list[PosedSurface]:
     """Return some frames of the video with the surface, split along seams, that they show."""
-    return [
-        PosedSurface(
-            moved[frame][sources],
-            vertex_normals(moved[frame], faces)[sources],
-            video.frames[frame],
-            video.alpha[frame],
-        )
-        for frame in evenly_spaced(len(video), COLORED)
-    ]
+    frames = evenly_spaced(len(video), COLORED)
+    return [surface for frame in frames for surface in _shown(moved[frame], faces, _at(video, frame))(sources)]
+
+
+def _at(video: DrivingVideo | None, frame: int) -> Frame | None:
+    return None if video is None else (video.frames[frame], video.alpha[frame])
+
+
+def _shown(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], frame: Frame | None) -> Footage:
+    """Return a function that splits a surface along seams, as a frame of the video shows it."""
+
+    def split(sources: Int[Tensor, " w"]) -> list[PosedSurface]:
+        if frame is None:
+            return []
+        return [PosedSurface(vertices[sources], vertex_normals(vertices, faces)[sources], *frame)]
+
+    return split
 
 
 def _cleaned_surface(
@@ -171,7 +203,7 @@ def _colored(
     gaussians: Gaussians,
     rasterize: Rasterizer,
     settings: MeshSettings,
-    footage: Callable[[Int[Tensor, " w"]], list[PosedSurface]] = lambda sources: [],
+    footage: Footage,
 ) -> tuple[TexturedMesh, Int[Tensor, " w"]]:
     """Return the unwrapped mesh with a baked texture, and the source vertex of each of its vertices."""
     unwrapped = unwrap(vertices.numpy(), faces.numpy(), settings.texture_size)

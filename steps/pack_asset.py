@@ -31,6 +31,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.mesh.extraction.simplify import simplify_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.mesh.texturing.delight import delight, remove_shading
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts import packages
@@ -257,6 +258,8 @@ def _read_inputs(job: Job, scratch: Path) -> PackageWriter:
             f"a mesh per frame has the frames of the driving video, {video.fps:g} a second; {fps:g} are asked for: "
             "leave pack.fps at 0, or choose mesh.mode=tracked"
         )
+    if pack.delight and "moving" not in job.inputs:  # a user's model keeps its textures
+        surface = _delit(surface)
     placement = place(surface, pack.height_m, pack.ground)
     states = pose_gaussians_in_chunks(gaussians, deformation, frames, resampled_positions(frames, video.fps, fps))
     return PackageWriter(
@@ -287,6 +290,16 @@ def _surface(job: Job, fps: float, notes: Sequence[str]) -> Surface:
         case ["meshes"]:
             return read_meshes(job.inputs["meshes"])
     raise BadInput(f"a package needs one kind of mesh, `tracked` or `meshes`; given {given or 'neither'}")
+
+
+def _delit(surface: Surface) -> Surface:
+    """Return the meshes without the shading in their textures."""
+    if not isinstance(surface, Asset4D):
+        return [delight(mesh) for mesh in surface]
+    textures = surface.textures
+    if textures is not None:
+        textures = torch.stack([remove_shading(texture, surface.mesh) for texture in textures])
+    return replace(surface, mesh=delight(surface.mesh), textures=textures)
 
 
 def _check_frames(expected: int, given: dict[str, int]) -> None:

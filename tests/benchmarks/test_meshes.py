@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.meshes import measure, table
+from benchmarks.meshes import atlas_table, measure, measure_atlas, table
 from tests.steps.small_package import packed
 
 
@@ -15,3 +15,11 @@ def test_a_clean_package_has_clean_figures(tmp_path: Path, mode: str, moments: l
     assert all((row.crossing, row.flipped, row.folds, row.genus) == (0, 0, 0, 0) for row in rows)
     assert all(row.deviation_deg == pytest.approx(41.8, abs=0.1) for row in rows)  # an icosahedron
     assert table(rows).row_count == len(rows)
+
+
+@pytest.mark.parametrize("mode", ["tracked", "per_frame"])
+def test_the_atlas_of_a_package_is_measured(tmp_path: Path, mode: str) -> None:
+    """All its texture coordinates are equal."""
+    quality = measure_atlas(packed(tmp_path, mode))
+    assert (quality.islands, quality.mirrored, quality.coverage, quality.seam_mean) == (1, 0, 0, 0)
+    assert atlas_table({"a": quality, "b": quality}).row_count == 2

@@ -269,7 +269,7 @@ REPORT = {
         "gates": [GATE, GATE | {"name": "silhouette", "passed": False, "advice": "Choose a plain backdrop."}],
     },
     "steps": [{"step": "fit_gaussians", "compute_s": 3.0, "peak_memory_mb": 600, "cached": True, "curves": [CURVES],
-               "backend": "cpu rasterizer, pymeshlab, xatlas", "flops": {"UNet2DConditionModel": 10**12}}],
+               "backend": "cpu rasterizer, pymeshlab", "flops": {"UNet2DConditionModel": 10**12}}],
     "licenses": {"zero123-xl": "MIT License with terms of which there are many words " * 3},
     "files": {f"{'long_name_' * 6}.glb": 1, "splats/000.ply": 7}, "settings": {"name": "x" * 200},
 }  # fmt: skip

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import small_package
 import torch
+import trimesh
 from pxr import Usd, UsdGeom
 from small_package import FPS, FRAMES, NOTE, REACH, cloud, extracted, gem, inputs, job, packed, tracked
 
@@ -17,6 +18,9 @@ from dg4d_lib.assets.formats.glb import read_glb
 from dg4d_lib.assets.formats.splats import read_splats
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
+from dg4d_lib.mesh.texturing.bake import locate_texels
+from dg4d_lib.mesh.texturing.unwrap import unwrap
 from steps.artifacts.archives import EPOCH
 from steps.artifacts.media import read_png
 from steps.artifacts.meshes import write_tracked
@@ -88,6 +92,29 @@ def test_the_glb_moves_as_the_tracked_mesh_and_says_how_it_was_made(package: Pat
     assert asset.fps == FPS
     assert asset.extras["notes"] == [NOTE]
     assert asset.extras["generator"].startswith("dg4d ")
+
+
+def test_delight_evens_the_texture_out(tmp_path: Path) -> None:
+    """A gray ball that is lit from above."""
+    shape = trimesh.creation.icosphere(2, radius=0.3)
+    unwrapped = unwrap(shape.vertices.astype(np.float32), shape.faces.astype(np.int32), 64)
+    sources, faces, uvs = map(torch.from_numpy, unwrapped)
+    vertices = torch.from_numpy(shape.vertices.astype(np.float32))[sources]
+    texels = locate_texels(vertices, vertices, faces, uvs, 64)
+    texture = torch.full((64, 64, 3), 0.5)
+    texture[texels.rows, texels.columns] += 0.5 * texels.positions[:, 1:2]
+    offsets = tracked().offsets[:, :1].expand(FRAMES, len(vertices), 3)
+    spreads = []
+    for lit in (False, True):
+        given = inputs(tmp_path / f"inputs_{lit}")
+        write_tracked(given["tracked"], TrackedMesh(TexturedMesh(vertices, faces, uvs, texture), offsets))
+        out = job(given, tmp_path / f"out_{lit}", delight=lit, rig=False, usd=False, splats=False, spz=False)
+        run(out)
+        with zipfile.ZipFile(out.outputs["package"]) as archive:
+            archive.extractall(tmp_path / f"asset_{lit}")
+        shown = surface(tmp_path / f"asset_{lit}").mesh.texture[texels.rows, texels.columns]
+        spreads.append(float(shown.mean(1).std()))
+    assert spreads[1] < 0.3 * spreads[0]
 
 
 def test_another_frame_rate_keeps_the_length_and_the_frames(tmp_path: Path) -> None:

@@ -20,6 +20,8 @@ from dg4d_lib.mesh.tracking.rig import Rig, fit_rig
 
 NAME = "subject"
 TARGET_ERROR = 0.05  # share of the motion; no bones are added below it, as the rest is hardly visible
+RIGID = 0.02  # change of a bone's length below which it counts as constant
+STILL = 1e-5  # change of a translation below which it gets no channel, relative to the largest coordinate
 MAX_BONES = 255  # joint indices are bytes
 FLOAT = 5126  # glTF component type
 WEIGHT_ONE, QUANTIZED_ONE = 65535, 255  # integer that stands for the weight 1
@@ -38,10 +40,11 @@ def fit_asset_rig(asset: Asset4D, max_bones: int, max_error: float) -> tuple[Rig
     """
     rig = fit_rig(asset.mesh.vertices, asset.offsets, TARGET_ERROR, max_bones)
     bones = "1 bone misses" if len(rig.rest_positions) == 1 else f"{len(rig.rest_positions)} bones miss"
+    lengths = "bones keep their lengths" if rig.stretch < RIGID else f"bones stretch by up to {rig.stretch:.0%}"
     figures = f"{bones} {rig.error:.1%} of the motion: {rig.rms:.2g} world units (rms), at most {rig.max_distance:.2g}"
     if rig.error > max_error:
         return None, f"no rig: {figures}; {max_error:.1%} is allowed"
-    return rig, f"rig: {figures}"
+    return rig, f"rig: {figures}; {lengths}"
 
 
 def write_rigged_glb(asset: Asset4D, rig: Rig, settings: GltfSettings) -> bytes:
@@ -131,17 +134,17 @@ def _add_bind_matrices(document: GltfDocument, rest: Float[np.ndarray, "b 3"], c
 
 
 def _add_motion(document: GltfDocument, rig: Rig, joints: list[int], fps: float, interpolation: str) -> None:
-    """Add an animation with the rotations and translations of all joints relative to their parents."""
+    """Add an animation of all joints relative to their parents; a bone of constant length only turns."""
     rotations, translations = relative_motion(rig)
     samplers: list[dict[str, Any]] = []
     channels = []
     times = document.add_accessor("times", (np.arange(len(rotations) + 1) / fps).astype("<f4"))
     for number, joint in enumerate(joints):
         name = document.tree["nodes"][joint]["name"]
-        for path, values in (
-            ("rotation", rotations[:, number][:, [1, 2, 3, 0]]),
-            ("translation", translations[:, number]),
-        ):
+        tracks = [("rotation", rotations[:, number][:, [1, 2, 3, 0]])]
+        if np.ptp(translations[:, number], axis=0).max() > STILL * np.abs(translations).max() or number == 0:
+            tracks.append(("translation", translations[:, number]))
+        for path, values in tracks:
             output = document.add_accessor(f"{name} {path}", close_loop(values))
             channels.append({"sampler": len(samplers), "target": {"node": joint, "path": path}})
             samplers.append({"input": times, "output": output, "interpolation": interpolation})

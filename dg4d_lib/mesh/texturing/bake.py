@@ -1,8 +1,9 @@
-"""Texture baking: colors of Gaussians projected onto a mesh (Tang et al. 2024, section 3.2).
+"""Texture baking: colors of pictures and Gaussians projected onto a mesh (Tang et al. 2024, section 3.2).
 
 The Gaussians are rendered from 26 views and from the input view, and every texel takes a weighted mean of the colors
-it projects to; views that face it head-on weigh most. Colors are un-premultiplied and pixels along soft silhouettes
-skipped, so no background bleeds into the texture.
+it projects to; views that face it head-on weigh most. Frames of the driving video replace the input view
+where there are some. Colors are un-premultiplied and pixels along soft silhouettes skipped, so no background bleeds
+into the texture.
 """
 
 from collections.abc import Sequence
@@ -27,6 +28,7 @@ from dg4d_lib.errors import DG4DError
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
+from dg4d_lib.mesh.texturing.seams import level_seams, seam_points
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
@@ -103,7 +105,8 @@ def bake_texture(
             the input view.
 
     Returns:
-        Colors in [0, 1] of every texel; texels outside all charts are filled from their surroundings.
+        Colors in [0, 1] of every texel; texels outside all charts are filled from their surroundings, and both sides of
+        a seam have the same colors.
     """
     size, side = settings.texture_size, settings.render_size
     rows, columns, corners, shares = _covered_texels(faces, uvs, size)
@@ -130,7 +133,7 @@ def bake_texture(
     seen = weight[:, 0] > 0
     colors = torch.where(seen[:, None], torch.from_numpy(total[:, :3]) / weight.clamp_min(1e-30), 0.5)
     colors = _fill_unseen(colors, seen, texels.positions)
-    return _fill_texture(colors, texels, size)
+    return level_seams(_fill_texture(colors, texels, size), seam_points(vertices, faces, uvs, size))
 
 
 def vertex_normals(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "v 3"]:

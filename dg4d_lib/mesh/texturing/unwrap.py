@@ -1,26 +1,14 @@
-"""UV unwrapping into one square texture with xatlas.
-
-xatlas runs in a child process, `python -m dg4d_lib.mesh.texturing.unwrap`, which exits without running destructors:
-that of xatlas can deadlock while it stops its threads (seen about once in a hundred calls on a busy machine).
-"""
-
-from importlib import import_module
-from typing import Any
+"""UV unwrapping into one square texture: charts of low distortion, packed at a common scale."""
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from dg4d_lib.errors import BackendUnavailable, DG4DError
+from dg4d_lib.errors import DG4DError
 from dg4d_lib.mesh.neighbors import edge_graph, neighbor_means
-from dg4d_lib.mesh.subprocess_runner import Arrays, run_in_subprocess, serve
+from dg4d_lib.mesh.texturing.chart_packing import pack_charts
+from dg4d_lib.mesh.texturing.charts import find_charts
 
-PADDING = 2  # minimum distance between charts, texels
-SMOOTHING = 20  # Taubin steps; xatlas is slow on rough surfaces, so charts are cut on a smoothed copy
-MOST_PADDING = (
-    1 / 8
-)  # of the side of the atlas: its padding grows, up to this, until it survives the fit into the square
-
-_KEPT: list[Any] = []  # keeps the child's atlases alive, so that their destructors never run
+SMOOTHING = 20  # Taubin steps; charts follow the normals of a smoothed copy, so that noise does not divide them
 
 
 def unwrap(
@@ -35,17 +23,20 @@ def unwrap(
 
     Returns:
         For every new vertex the index of the old one it copies (vertices are split along seams); the faces in their
-        order, with new indices; and texture coordinates in [0, 1] of every new vertex, u right and v down. Charts are
-        at least two texels apart.
+        order, with new indices; and texture coordinates in [0, 1] of every new vertex, u right and v down. Charts show
+        the surface as it is seen from outside, not mirrored, and are at least two texels apart.
 
     Raises:
-        BackendUnavailable: xatlas is missing.
-        DG4DError: the charts do not fit into the texture, or xatlas crashed.
+        DG4DError: the charts do not fit into the texture.
     """
-    smooth = taubin_smooth(vertices, faces).astype(np.float32)
-    arrays = {"vertices": smooth, "faces": faces.astype(np.uint32), "size": np.array(size)}
-    flat = run_in_subprocess("dg4d_lib.mesh.texturing.unwrap", "unwrap the mesh", arrays)
-    return flat["copied"], flat["corners"], flat["uvs"]
+    charts = find_charts(vertices, faces, taubin_smooth(vertices, faces))
+    uvs = pack_charts(charts.flat, charts.faces, charts.labels, size)
+    if uvs is None:
+        raise DG4DError(
+            f"the charts of {len(faces)} faces do not fit into a texture of {size} x {size} texels; "
+            "raise mesh.texture_size or lower mesh.max_faces"
+        )
+    return charts.sources.astype(np.int32), charts.faces.astype(np.int32), np.clip(uvs, 0, 1).astype(np.float32)
 
 
 def taubin_smooth(
@@ -60,33 +51,3 @@ def taubin_smooth(
         factor = 0.5 if step % 2 == 0 else -0.53
         points = np.where(isolated, points, points + factor * (mean @ points - points))
     return points
-
-
-def _unwrap_in_child(arrays: Arrays) -> Arrays:
-    """Unwrap the mesh in the child process."""
-    try:
-        xatlas: Any = import_module("xatlas")
-    except ImportError as error:
-        raise BackendUnavailable(f"xatlas cannot be imported ({error}); run `make setup`") from error
-    vertices, faces, size = arrays["vertices"], arrays["faces"], int(arrays["size"])
-    chart, pack = xatlas.ChartOptions(), xatlas.PackOptions()
-    pack.resolution, pack.padding, pack.bilinear = size, 2 * PADDING, True
-    while pack.padding <= size * MOST_PADDING:
-        atlas = xatlas.Atlas()
-        _KEPT.append(atlas)
-        atlas.add_mesh(vertices, faces)
-        atlas.generate(chart, pack)
-        # The atlas is a rectangle of about the requested size; stretching it to the square may shrink its padding.
-        if pack.padding * size >= PADDING * max(atlas.width, atlas.height):
-            copied, corners, uvs = atlas.get_mesh(0)
-            uvs = np.clip(uvs, 0, 1).astype(np.float32)
-            return {"copied": copied.astype(np.int32), "corners": corners.astype(np.int32), "uvs": uvs}
-        pack.padding = max(pack.padding + 1, int(np.ceil(1.2 * PADDING * max(atlas.width, atlas.height) / size)))
-    raise DG4DError(
-        f"the charts of {len(faces)} faces do not fit into a texture of {size} x {size} texels; "
-        "raise mesh.texture_size or lower mesh.max_faces"
-    )
-
-
-if __name__ == "__main__":
-    serve(_unwrap_in_child)

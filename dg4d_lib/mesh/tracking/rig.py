@@ -2,7 +2,8 @@
 
 Smooth skinning decomposition with rigid bones (SSDR, Le and Deng 2012); their p, v, B and w are `rest`, `moved`, `maps`
 and `weights` here. Weights are convex with at most four bones per vertex. Vertices are first clustered by common rigid
-motions; then weights and bone motions are optimized in alternation, each exactly with the other fixed. The algorithm is
+motions; then weights and bone motions are optimized in alternation, each exactly with the other fixed. At last the
+bones are joined to a skeleton whose bones keep their lengths, unless the motion tears it. The algorithm is
 deterministic.
 """
 
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.geometry.quaternion import quat_to_rotmat
+from dg4d_lib.mesh.tracking.articulation import Articulation, fit_joints, fit_rotations
 
 INFLUENCES = 4  # bones per vertex, the number that every glTF player supports
 GROWTH = 1.4  # ratio of successive trial numbers of bones
@@ -29,6 +31,9 @@ SAMPLE = 2000  # vertices on which numbers of bones are tried
 SPLIT = 0.2  # share of a cluster's vertices, those around the worst one, that start a new cluster
 STIFF = 1e-9  # Tikhonov weight towards zero rotation, relative to the spread of the vertices
 APART = 1e-6  # added to distances and shared weights, so that bones without shared vertices are joined last
+WORTH = 1.0  # of the target residual: by as much, in the root mean square over time, a further bone must help a vertex
+ARTICULATIONS = 6  # alternations of joints, rotations and weights of a skeleton whose bones keep their lengths
+LOOSEST = 2.0  # residual of such a skeleton relative to that of free bones, above which bones may stretch
 EXACT = 1e-7  # residual relative to the mesh size below which a fit is exact in float32
 CHUNK = 2048  # vertices per batch of the weight solver; bounds memory
 
@@ -65,6 +70,14 @@ class Rig:
     max_distance: float = 0.0
 
     @property
+    def stretch(self) -> float:
+        """Largest change of the length of a bone, from the joint of its parent to its own, relative to rest."""
+        parents = self.parents[1:]
+        rest = (self.rest_positions[1:] - self.rest_positions[parents]).norm(dim=-1)
+        moved = (self.positions[:, 1:] - self.positions[:, parents]).norm(dim=-1)
+        return float((moved / rest.clamp_min(1e-9) - 1).abs().max()) if len(parents) else 0.0
+
+    @property
     def error(self) -> float:
         """Residual relative to the motion: 0 is exact, 1 is as bad as no motion."""
         return self.rms / self.motion_rms if self.motion_rms > 0 else 0.0
@@ -95,9 +108,12 @@ def fit_rig(vertices: Float[Tensor, "v 3"], offsets: Float[Tensor, "t v 3"], err
     goal = max(error * motion_rms, EXACT * float(np.ptp(rest, axis=0).max()))
     maps, weights = _fit_fewest_bones(rest, moved, goal, max_bones)
     order, parents, joints = _skeleton(rest, weights)
-    rotations = maps[order, :, :, :3] + np.eye(3)
-    positions = (rotations @ joints[:, None, :, None])[..., 0] + maps[order, :, :, 3]
-    bones, bone_weights = _largest_weights(weights[:, order][copies.ravel()])
+    maps = maps[order]
+    weights = _fit_weights(rest, moved, maps, _worth(goal, moved))
+    maps, weights, joints = _articulated(rest, moved, goal, maps, weights, parents, joints)
+    rotations = maps[..., :3] + np.eye(3)
+    positions = (rotations @ joints[:, None, :, None])[..., 0] + maps[..., 3]
+    bones, bone_weights = _largest_weights(weights[copies.ravel()])
     rig = Rig(
         torch.from_numpy(joints + origin).to(vertices),
         torch.from_numpy(parents),
@@ -142,6 +158,34 @@ def _fit_fewest_bones(rest: Array, moved: Array, goal: float, max_bones: int) ->
                 return maps, weights
         count = min(max_bones, max(count + 1, round(GROWTH * count)))
         clusters = _split(sample_rest, sample_moved, sample_maps, sample_weights, clusters, count)
+
+
+def _articulated(
+    rest: Array, moved: Array, goal: float, maps: Array, weights: Array, parents: NDArray[np.int64], joints: Array
+) -> tuple[Array, Array, Array]:
+    """Let the bones keep their lengths, if the motion is then followed almost as well.
+
+    Returns:
+        Motions of the bones, weights, and joints at rest; those given if the motion tears the skeleton.
+    """
+    step = -(-len(rest) // SAMPLE)
+    sample_rest, sample_moved, sample_weights = rest[::step], moved[::step], weights[::step]
+    rotations = maps[..., :3] + np.eye(3)
+    skeleton = Articulation(parents, joints, rotations, rotations[0] @ joints[0] + maps[0, :, :, 3])
+    for _ in range(ARTICULATIONS):
+        skeleton = fit_joints(skeleton, sample_rest, sample_moved, sample_weights, joints)
+        skeleton = fit_rotations(skeleton, sample_rest, sample_moved, sample_weights)
+        sample_weights = _fit_weights(sample_rest, sample_moved, skeleton.maps(), _worth(goal, moved))
+    new_maps = skeleton.maps()
+    new_weights = _fit_weights(rest, moved, new_maps, _worth(goal, moved))
+    if _rms(rest, moved, new_maps, new_weights) > LOOSEST * max(goal, _rms(rest, moved, maps, weights)):
+        return maps, weights, joints
+    return new_maps, new_weights, skeleton.joints
+
+
+def _worth(goal: float, moved: Array) -> float:
+    """Return the decrease of the squared residual, summed over time, for which a vertex gets a further bone."""
+    return float(moved.shape[1] * (WORTH * goal) ** 2)
 
 
 def _cluster(rest: Array, moved: Array, clusters: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
@@ -239,19 +283,26 @@ def _outer_products(rest: Array) -> Array:
     return (points[:, :, None] * points[:, None]).reshape(len(rest), 16)
 
 
-def _fit_weights(rest: Array, moved: Array, maps: Array) -> Array:
-    """Fit convex weights "n k" with at most four bones per vertex, added greedily."""
+def _fit_weights(rest: Array, moved: Array, maps: Array, worth: float = 0.0) -> Array:
+    """Fit convex weights "n k" with at most four bones per vertex, added greedily.
+
+    Args:
+        rest: vertices "n 3".
+        moved: their displacements "n t 3".
+        maps: displacement matrices of the bones "k t 3 4".
+        worth: least decrease of the squared residual, summed over time, for which a vertex gets a further bone.
+    """
     bones = len(maps)
     pairs = np.einsum("ktac,ltad->cdkl", maps, maps, optimize=True).reshape(16, bones * bones)
     parts = []
     for start in range(0, len(rest), CHUNK):
         part = slice(start, start + CHUNK)
         gram = (_outer_products(rest[part]) @ pairs).reshape(-1, bones, bones)
-        parts.append(_greedy_weights(gram, _inner_products(rest[part], moved[part], maps)))
+        parts.append(_greedy_weights(gram, _inner_products(rest[part], moved[part], maps), worth))
     return np.concatenate(parts)
 
 
-def _greedy_weights(gram: Array, given: Array) -> Array:
+def _greedy_weights(gram: Array, given: Array, worth: float) -> Array:
     """Select up to four bones per vertex greedily and solve for their weights.
 
     Starts with the best bone; each further bone is the one that decreases the residual most on the line towards it, and
@@ -260,6 +311,7 @@ def _greedy_weights(gram: Array, given: Array) -> Array:
     Args:
         gram: inner products "n k k" of the bones' displacements.
         given: their inner products "n k" with the given displacements.
+        worth: decrease of the residual below which a vertex gets no further bone.
     """
     rows = np.arange(len(gram))[:, None]
     own = np.einsum("nkk->nk", gram)
@@ -273,10 +325,18 @@ def _greedy_weights(gram: Array, given: Array) -> Array:
         gain = np.square(slope.clip(0)) / length.clip(np.finfo(float).tiny)
         gain[rows, selected] = -1
         selected = np.concatenate((selected, gain.argmax(1)[:, None]), 1)
-        shares = _convex_weights(gram[rows[..., None], selected[:, :, None], selected[:, None]], given[rows, selected])
+        inner, outer = gram[rows[..., None], selected[:, :, None], selected[:, None]], given[rows, selected]
+        before, after = np.pad(shares, ((0, 0), (0, 1))), _convex_weights(inner, outer)
+        helps = _cost(inner, outer, before) - _cost(inner, outer, after) > worth
+        shares = np.where(helps[:, None], after, before)
     weights = np.zeros(given.shape)
     weights[rows, selected] = shares
     return weights
+
+
+def _cost(gram: Array, given: Array, weights: Array) -> Array:
+    """Return the squared residuals of weights, up to a constant per vertex."""
+    return np.einsum("na,nab,nb->n", weights, gram, weights) - 2 * np.asarray((weights * given).sum(1))
 
 
 def _convex_weights(gram: Array, given: Array) -> Array:
@@ -294,7 +354,7 @@ def _convex_weights(gram: Array, given: Array) -> Array:
         for subset in map(list, combinations(range(count), number)):
             inner, outer = gram[:, np.array(subset)[:, None], subset], given[:, subset]
             candidate = _affine_weights(inner, outer)
-            cost = np.einsum("na,nab,nb->n", candidate, inner, candidate) - 2 * (candidate * outer).sum(1)
+            cost = _cost(inner, outer, candidate)
             better = (candidate >= 0).all(1) & (cost < best_cost)
             best_cost[better] = cost[better]
             best[better] = 0

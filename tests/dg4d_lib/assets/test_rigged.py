@@ -74,6 +74,7 @@ def skin(file: pygltflib.GLTF2) -> tuple[np.ndarray, np.ndarray]:
         matrix[:3, 3] = file.nodes[node].translation or (0, 0, 0)
         if (node, "rotation") in tracks:
             matrix[:3, :3] = Rotation.from_quat(tracks[node, "rotation"][key]).as_matrix()
+        if (node, "translation") in tracks:
             matrix[:3, 3] = tracks[node, "translation"][key]
         return world(parents[node], key) @ matrix if node in parents else matrix
 

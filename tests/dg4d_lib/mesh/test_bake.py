@@ -60,7 +60,10 @@ def test_what_no_view_sees_takes_the_color_of_what_lies_nearest(baked: tuple[tor
 
 
 def test_every_texel_in_a_gutter_has_a_color_of_the_chart_beside_it(baked: tuple[torch.Tensor, ...]) -> None:
-    """Within two texels of a chart: what bilinear reading along a seam can reach."""
+    """Within two texels of a chart: what bilinear reading along a seam can reach.
+
+    Leveled seams extrapolate a little where the colors have an edge.
+    """
     colors, _, texture, texels = baked
     inside = torch.zeros(texture.shape[:2], dtype=torch.bool)
     inside[texels[0], texels[1]] = True
@@ -73,8 +76,8 @@ def test_every_texel_in_a_gutter_has_a_color_of_the_chart_beside_it(baked: tuple
     beside = ndimage.distance_transform_edt(~inside.numpy()) <= 2
     gutter = torch.from_numpy(beside) & ~inside
     assert gutter.sum() > 1000
-    assert (texture <= highest(texture))[gutter].all()
-    assert (texture >= -highest(-texture))[gutter].all()
+    assert (texture <= highest(texture) + 0.2)[gutter].all()
+    assert (texture >= -highest(-texture) - 0.2)[gutter].all()
 
 
 def test_far_from_all_charts_there_is_no_hole_either(baked: tuple[torch.Tensor, ...]) -> None:
@@ -82,7 +85,29 @@ def test_far_from_all_charts_there_is_no_hole_either(baked: tuple[torch.Tensor, 
     share = (baked[2][..., 0] - BLUE[0]) / (RED[0] - BLUE[0])
     blend = torch.lerp(BLUE, RED, share[..., None])
     assert (baked[2] - blend).abs().max() < 0.06
-    assert -0.06 < share.min() < share.max() < 1.06
+    assert -0.1 < share.min() < share.max() < 1.1
+
+
+def test_the_picture_colors_what_it_shows(sphere: Mesh, sphere_of_gaussians: Cloud) -> None:
+    """A green picture of a sphere of red and blue Gaussians: its front becomes green, its back does not."""
+    mesh, side = flattened(*sphere), SETTINGS.render_size
+    gaussians = sphere_of_gaussians(2500, 0.5, red_and_blue)
+    green = torch.tensor([0.1, 0.8, 0.1])
+    picture = torch.cat([green.expand(side, side, 3), torch.ones(side, side, 1)], -1)
+    texture = bake_texture(*mesh, gaussians, get_rasterizer("auto"), SETTINGS, picture)
+    texels = locate_texels(*mesh, SETTINGS.texture_size)
+    colors = texture[texels.rows, texels.columns]
+    front, back = texels.normals[:, 2] > 0.85, texels.normals[:, 2] < -0.2
+    assert (colors[front] - green).abs().max() < 0.05
+    assert (colors[back, 1] < 0.2).all()
+
+
+def test_a_transparent_picture_changes_nothing(sphere: Mesh, sphere_of_gaussians: Cloud) -> None:
+    mesh, gaussians = flattened(*sphere), sphere_of_gaussians(600, 0.5, red_and_blue)
+    picture = torch.zeros(SETTINGS.render_size, SETTINGS.render_size, 4)
+    rasterize = get_rasterizer("auto")
+    textures = [bake_texture(*mesh, gaussians, rasterize, SETTINGS, given) for given in (None, picture)]
+    assert (textures[0] - textures[1]).abs().mean() < 0.01  # the front then comes from oblique views
 
 
 def test_a_transparent_cloud_leaves_the_texture_gray(sphere: Mesh, sphere_of_gaussians: Cloud) -> None:

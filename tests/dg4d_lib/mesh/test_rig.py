@@ -68,6 +68,37 @@ def test_a_bent_cylinder_is_two_bones_that_meet_at_the_bend() -> None:
     assert rig.parents.tolist() == [-1, 0]
 
 
+def test_bones_keep_their_lengths() -> None:
+    """An arm of three parts, each turning against the last, with noise that free bones would follow."""
+    rest, _ = bent_cylinder()
+    y, noise = rest[:, 1], torch.randn((FRAMES, len(rest), 3), generator=torch.Generator().manual_seed(3))
+    lower, upper = (((y - bend) / 0.4).clamp(0, 1)[None, :, None] for bend in (-0.6, 0.3))
+    elbow, wrist = torch.tensor([0.0, -0.4, 0.0]), torch.tensor([0.0, 0.5, 0.0])
+    first, second = turning((0.0, 0.0, 1.0), 50), turning((1.0, 0.0, 0.0), 40)
+    forearm = (rest - elbow) @ first.mT + elbow
+    carried = (first @ (wrist - elbow))[:, None] + elbow
+    hand = (rest - wrist) @ second.mT @ first.mT + carried
+    moved = rest + lower * (forearm - rest) + upper * (hand - forearm)
+    rig = fit_rig(rest, moved - rest + 0.003 * noise, 0.05, 16)
+    assert len(rig.rest_positions) >= 3
+    assert rig.stretch < 1e-4
+    assert rig.error < 0.1
+
+
+def test_bones_stretch_where_parts_fly_apart() -> None:
+    rest, offsets = two_boxes()
+    rig = fit_rig(rest, offsets, 1e-3, 16)
+    assert rig.stretch > 0.1
+    assert rig.max_distance < 2e-6
+
+
+def test_a_vertex_has_no_bone_that_does_not_help_it() -> None:
+    rest, offsets = waving()
+    exact, rough = fit_rig(rest, offsets, 0.0, 8), fit_rig(rest, offsets, 0.3, 8)
+    counts = [float((rig.weights > 0).sum(1).float().mean()) for rig in (exact, rough)]
+    assert counts[1] < min(counts[0], 2.5)
+
+
 def test_a_mesh_that_stands_still_is_one_bone_that_stands_still() -> None:
     rest = torch.rand(100, 3, generator=torch.Generator().manual_seed(0))
     rig = fit_rig(rest, torch.zeros(5, 100, 3), 0.1, 16)

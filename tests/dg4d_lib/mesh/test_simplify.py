@@ -22,7 +22,7 @@ pytest.importorskip("meshoptimizer", reason="meshoptimizer is not installed: mak
 
 @pytest.fixture(scope="module")
 def ball() -> TexturedMesh:
-    """A sphere, unwrapped by xatlas and so cut by seams; its texture is a smooth picture over the atlas."""
+    """A sphere, unwrapped and so cut by seams; its texture is a smooth picture over the atlas."""
     sphere = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
     vertices = sphere.vertices.astype(np.float32)
     copied, corners, uvs = unwrap(vertices, sphere.faces.astype(np.int32), 128)

@@ -1,6 +1,3 @@
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 import torch
@@ -60,13 +57,13 @@ def test_places_lie_in_the_texture_and_fill_it(flat: tuple[np.ndarray, ...]) -> 
     uvs = flat[2]
     assert uvs.min() >= 0
     assert uvs.max() <= 1
-    assert (uvs.max(0) > 0.95).all(), "the rectangle of the atlas is stretched to the square"
+    assert (uvs.max(0) > 0.95).all(), "the charts reach from side to side"
 
 
 def test_no_two_triangles_share_a_texel(flat: tuple[np.ndarray, ...]) -> None:
     count, _ = drawn(*flat[1:])
     assert count.max() == 1
-    assert (count > 0).mean() > 0.35
+    assert (count > 0).mean() > 0.5
 
 
 def test_charts_keep_two_texels_apart(flat: tuple[np.ndarray, ...]) -> None:
@@ -88,16 +85,33 @@ def test_a_texture_without_room_is_refused(torus: Mesh) -> None:
         unwrap(*torus, 16)
 
 
-def test_xatlas_stays_out_of_the_calling_process() -> None:
-    code = """if True:
-        import sys
-        import numpy as np
-        from dg4d_lib.mesh.texturing.unwrap import unwrap
-        corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
-        unwrap(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32), 64)
-        sys.exit("xatlas" in sys.modules)
-    """
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+def test_charts_are_shown_as_seen_from_outside(flat: tuple[np.ndarray, ...]) -> None:
+    """Counter-clockwise on the picture, whose v runs down: no chart is mirrored."""
+    _, faces, uvs = flat
+    sides = uvs[faces[:, 1:]] - uvs[faces[:, :1]]
+    assert (np.linalg.det(sides.astype(np.float64)) < 0).all()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_the_texel_density_is_even(noise: float) -> None:
+    mesh = trimesh.creation.icosphere(4)
+    shift = noise * np.random.default_rng(0).normal(size=(len(mesh.vertices), 1))
+    vertices = mesh.vertices * (1 + shift)
+    sources, faces, uvs = unwrap(vertices.astype(np.float32), mesh.faces.astype(np.int32), SIZE)
+    sides = vertices[sources][faces[:, 1:]] - vertices[sources][faces[:, :1]]
+    areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2
+    flat = np.abs(np.linalg.det((uvs[faces[:, 1:]] - uvs[faces[:, :1]]).astype(np.float64))) / 2
+    lowest, highest = np.quantile(np.sqrt(flat / areas), (0.01, 0.99))
+    assert highest < 2 * lowest
+
+
+def test_loose_and_degenerate_triangles_get_charts_too() -> None:
+    corners = np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32)
+    corners[3:6] = corners[3]  # a triangle without area
+    faces = np.concatenate([np.arange(30).reshape(-1, 3), [[0, 1, 6], [0, 1, 9]]]).astype(np.int32)  # an edge of three
+    sources, new, uvs = unwrap(corners, faces, SIZE)
+    np.testing.assert_array_equal(sources[new], faces)
+    assert np.isfinite(uvs).all()
 
 
 def test_smoothing_takes_noise_away_and_keeps_the_size(sphere: Mesh) -> None:

@@ -1,0 +1,202 @@
+"""Packing of flat charts into a square texture: the largest common scale at which all find a place.
+
+Charts are placed one after the other, large ones first, each at the first free place of a grid from below, in the turn
+in which its center then lies lowest. Several orders are tried. Charts are turned, never mirrored.
+"""
+
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float, Int
+from numba import njit
+from numpy.typing import NDArray
+from scipy import ndimage
+
+FINEST = 512  # cells per side of the grid of places, at most
+GAP = 2  # texels between charts, at least
+TURNS = 16  # rotations of a chart that are tried
+MOST_SHAPES = 640  # charts times turns; more charts are turned less
+ORDERS = 12  # orders of the charts that are tried: the first by area, the others disturbed
+DISTURBANCE = 0.25  # standard deviation of the logarithm of the area in a disturbed order
+FIRST_COVERAGE, STEP = 0.62, 0.01  # share of the texture that is tried first, and its increments
+LEAST_COVERAGE = 0.03  # share of the texture below which charts count as too many
+
+Array = NDArray[np.float64]
+Placed = list[tuple[NDArray[np.int64], Array]]  # vertices of every chart and their places, cells
+
+
+def pack_charts(
+    flat: Float[np.ndarray, "w 2"], faces: Int[np.ndarray, "f 3"], labels: Int[np.ndarray, " f"], size: int
+) -> Float[np.ndarray, "w 2"] | None:
+    """Place charts side by side, all at one scale and at least two texels apart.
+
+    Args:
+        flat: position of every vertex in the plane of its chart, counter-clockwise with v up.
+        faces: triangles of all charts.
+        labels: chart of every face, numbered from 0.
+        size: side of the texture, texels.
+
+    Returns:
+        Texture coordinates in [0, 1], v down; None if there is no room for so many charts.
+    """
+    grid = min(FINEST, size)
+    gap = -(-GAP * grid // size)  # cells
+    order = np.argsort(labels, kind="stable")
+    members = np.split(faces[order], np.flatnonzero(np.diff(labels[order])) + 1)
+    turns = int(np.clip(MOST_SHAPES // len(members), 1, TURNS))
+    best = _place_all([_Chart(flat, part, turns, gap) for part in members], grid, gap)
+    if best is None:
+        return None
+    uvs = np.zeros(flat.shape)
+    for vertices, places in best:
+        uvs[vertices] = places / grid
+    uvs[:, 1] = 1 - uvs[:, 1]
+    return uvs
+
+
+class _Chart:
+    """A chart's area, and its vertices in every turn with the lower left corner at the origin."""
+
+    def __init__(self, flat: Array, faces: Int[np.ndarray, "f 3"], turns: int, gap: int) -> None:
+        self.gap = gap
+        self.vertices, local = np.unique(faces, return_inverse=True)
+        self.faces = local.reshape(-1, 3)
+        points = flat[self.vertices]
+        sides = points[self.faces[:, 1:]] - points[self.faces[:, :1]]
+        self.area = float((sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]).sum() / 2)
+        upright = _tightest_turn(points)
+        self.turned = [_turn(points, upright + angle) for angle in 2 * np.pi * np.arange(turns) / turns]
+        self.known: dict[float, list[_Shape]] = {}
+
+    def shapes(self, scale: float) -> list["_Shape"]:
+        """Return the cells that the chart occupies in every turn at a scale, cells per unit."""
+        if scale not in self.known:
+            self.known[scale] = [_Shape(points * scale, self.faces, self.gap) for points in self.turned]
+        return self.known[scale]
+
+
+class _Shape:
+    """Cells of a chart in one turn: those that it touches, and with the gap around it, in random order."""
+
+    def __init__(self, points: Array, faces: Int[np.ndarray, "f 3"], gap: int) -> None:
+        self.points = points
+        self.height, self.width = (int(side) + 1 for side in points.max(0)[::-1])
+        self.marked = np.zeros((self.height, self.width), np.bool_)
+        _mark_cells(points, faces, self.marked)
+        self.center = float(self.marked.sum(1) @ np.arange(self.height) / self.marked.sum())
+        around = ndimage.binary_dilation(np.pad(self.marked, gap), np.ones((3, 3), bool), gap)
+        # a collision shows after few cells
+        self.cells = np.random.default_rng(0).permutation(np.argwhere(around).astype(np.int32))
+
+
+def _tightest_turn(points: Array) -> float:
+    """Return the rotation, out of steps of 3 degrees, whose bounding box is smallest."""
+    angles = np.pi / 2 * np.arange(30) / 30
+    boxes = [np.prod(np.ptp(_turn(points, angle), axis=0)) for angle in angles]
+    return float(angles[int(np.argmin(boxes))])
+
+
+def _turn(points: Array, angle: float) -> Array:
+    cosine, sine = np.cos(angle), np.sin(angle)
+    turned = points @ np.array([[cosine, sine], [-sine, cosine]])
+    return np.asarray(turned - turned.min(0))
+
+
+def _place_all(charts: list[_Chart], grid: int, gap: int) -> Placed | None:
+    """Place all charts at the largest scale that is found, or return None if there is none."""
+    total, areas = sum(chart.area for chart in charts), np.array([chart.area for chart in charts])
+    generator = np.random.default_rng(0)
+    best, covered = None, FIRST_COVERAGE
+    for _ in range(ORDERS if len(charts) <= MOST_SHAPES else 1):
+        noise = generator.normal(size=len(charts)) * (DISTURBANCE if best is not None else 0)
+        order = [charts[index] for index in np.argsort(noise - np.log(areas), kind="stable")]
+        while best is None and covered > LEAST_COVERAGE:
+            best = _place(order, grid, gap, grid * np.sqrt(covered / total))
+            covered = covered if best is not None else 0.95 * covered
+        if best is None:
+            return None
+        while (better := _place(order, grid, gap, grid * np.sqrt((covered + STEP) / total))) is not None:
+            best, covered = better, covered + STEP
+    return best
+
+
+def _place(charts: list[_Chart], grid: int, gap: int, scale: float) -> Placed | None:
+    """Place charts one after the other at a scale; None if one finds no place."""
+    taken = np.zeros((grid + 2 * gap, grid + 2 * gap), np.bool_)  # charts may touch the border of the texture
+    next_free = np.tile(np.arange(grid + 2 * gap), (grid + 2 * gap, 1))
+    placed: Placed = []
+    for chart in charts:
+        lowest: tuple[float, int, int, _Shape] | None = None
+        for shape in chart.shapes(scale):
+            last = grid - shape.height
+            if lowest is not None:
+                last = min(last, int(lowest[0] - shape.center))
+            row, column = _first_place(taken, next_free, shape.cells, last, grid - shape.width)
+            if row >= 0 and (lowest is None or row + shape.center < lowest[0]):
+                lowest = row + shape.center, row, column, shape
+        if lowest is None:
+            return None
+        _, row, column, shape = lowest
+        rows = slice(row + gap, row + gap + shape.height)
+        taken[rows, column + gap : column + gap + shape.width] |= shape.marked
+        _find_next_free(taken[rows], next_free[rows])
+        placed.append((chart.vertices, shape.points + np.array([column, row])))
+    return placed
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _mark_cells(points, faces, marked):
+    """Mark every cell that a triangle touches: no edge and no side of the cell separates the two."""
+    height, width = marked.shape
+    for f in range(len(faces)):
+        xa, ya = points[faces[f, 0], 0], points[faces[f, 0], 1]
+        xb, yb = points[faces[f, 1], 0], points[faces[f, 1], 1]
+        xc, yc = points[faces[f, 2], 0], points[faces[f, 2], 1]
+        for row in range(max(0, int(min(ya, yb, yc))), min(height - 1, int(max(ya, yb, yc))) + 1):
+            for column in range(max(0, int(min(xa, xb, xc))), min(width - 1, int(max(xa, xb, xc))) + 1):
+                outside = marked[row, column]
+                for side in range(3):
+                    if side == 0:
+                        px, py, dx, dy = xa, ya, xb - xa, yb - ya
+                    elif side == 1:
+                        px, py, dx, dy = xb, yb, xc - xb, yc - yb
+                    else:
+                        px, py, dx, dy = xc, yc, xa - xc, ya - yc
+                    x = column + (1 if dy < 0 else 0)  # corner of the cell that lies farthest to the left of the edge
+                    y = row + (1 if dx > 0 else 0)
+                    if dx * (y - py) - dy * (x - px) < 0:
+                        outside = True
+                        break
+                if not outside:
+                    marked[row, column] = True
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _find_next_free(taken, next_free):
+    """Write the column of the next free cell to the right of every cell, or the cell's own column."""
+    for row in range(taken.shape[0]):
+        beyond = taken.shape[1]
+        for column in range(taken.shape[1] - 1, -1, -1):
+            if not taken[row, column]:
+                beyond = column
+            next_free[row, column] = beyond
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _first_place(taken, next_free, cells, last_row, last_column):
+    """Return the lowest, then leftmost place at which no cell is taken, or -1."""
+    for row in range(last_row + 1):
+        column = 0
+        while column <= last_column:
+            blocked = 0
+            for i in range(len(cells)):
+                if taken[row + cells[i, 0], column + cells[i, 1]]:
+                    blocked = next_free[row + cells[i, 0], column + cells[i, 1]] - cells[i, 1] - column
+                    break
+            if blocked == 0:
+                return row, column
+            column += blocked
+    return -1, -1
