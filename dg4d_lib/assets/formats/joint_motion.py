@@ -1,4 +1,4 @@
-"""Motion of a rig's joints relative to their parents, as glTF and UsdSkel store it."""
+"""Names of a rig's bones, and their motion relative to their parents, as glTF and UsdSkel store it."""
 
 import numpy as np
 from jaxtyping import Float
@@ -6,6 +6,11 @@ from numpy.typing import NDArray
 
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
 from dg4d_lib.mesh.tracking.rig import Rig
+
+
+def bone_names(rig: Rig) -> list[str]:
+    """Return the names of all bones, numbered from the root; what a bone moves follows from the motion alone."""
+    return [f"bone_{number:02d}" for number in range(1, len(rig.parents) + 1)]
 
 
 def rest_arms(rig: Rig) -> Float[np.ndarray, "b 3"]:

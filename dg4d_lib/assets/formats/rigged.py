@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.gltf import VERTEX_DATA, GltfDocument
-from dg4d_lib.assets.formats.joint_motion import close_loop, relative_motion, rest_arms
+from dg4d_lib.assets.formats.joint_motion import bone_names, close_loop, relative_motion, rest_arms
 from dg4d_lib.assets.formats.materials import add_material, add_texture, to_uint8
 from dg4d_lib.assets.formats.primitives import MeshPrimitive, QuantizationCube, quantization_cube, reorder_mesh
 from dg4d_lib.errors import BadInput
@@ -106,8 +106,8 @@ def _add_joints(document: GltfDocument, rig: Rig) -> tuple[int, list[int]]:
     """Add the joint nodes in the rest pose; return the index of the skeleton's root node and those of the joints."""
     parents = rig.parents.tolist()
     joints = [
-        document.add("nodes", name=f"joint_{bone:03d}", translation=arm)
-        for bone, arm in enumerate(rest_arms(rig).tolist())
+        document.add("nodes", name=name, translation=arm)
+        for name, arm in zip(bone_names(rig), rest_arms(rig).tolist(), strict=True)
     ]
     nodes = document.tree["nodes"]
     for bone, parent in enumerate(parents):

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from dg4d_lib.assets.formats.joint_motion import close_loop, relative_motion, rest_arms
+from dg4d_lib.assets.formats.joint_motion import bone_names, close_loop, relative_motion, rest_arms
 from dg4d_lib.assets.formats.usd_stage import bounds, integers, matrices, quaternions, time_code, vectors
 from dg4d_lib.mesh.tracking.rig import Rig, rig_offsets
 
@@ -34,7 +34,7 @@ def add_skeleton(
         rig: skeleton, weights and motion.
         fps: frames per second.
     """
-    joints = _joint_paths(rig.parents.tolist())
+    joints = _joint_paths(rig)
     skeleton = UsdSkel.Skeleton.Define(stage, RIG)
     skeleton.CreateJointsAttr(joints)
     skeleton.CreateBindTransformsAttr(matrices(rig.rest_positions.double().cpu().numpy()))
@@ -58,11 +58,10 @@ def add_skeleton(
         extent.Set(box, time_code(frame, fps))
 
 
-def _joint_paths(parents: list[int]) -> list[str]:
+def _joint_paths(rig: Rig) -> list[str]:
     """Return the joints as UsdSkel names them: a path from the root, whose last element is the joint's own name."""
     paths: list[str] = []
-    for joint, parent in enumerate(parents):
-        name = f"joint_{joint:03d}"
+    for name, parent in zip(bone_names(rig), rig.parents.tolist(), strict=True):
         paths.append(f"{paths[parent]}/{name}" if parent >= 0 else name)
     return paths
 

@@ -106,6 +106,16 @@ def test_the_skin_in_the_file_misses_the_morphed_file_by_what_the_rig_says(
     assert rig.error <= 0.02
 
 
+def test_only_the_root_moves_and_the_bones_are_numbered(rigged: tuple[Asset4D, Rig, bytes]) -> None:
+    _, rig, content = rigged
+    file = pygltflib.GLTF2.load_from_bytes(content)
+    joints = file.skins[0].joints
+    assert [file.nodes[joint].name for joint in joints] == [f"bone_{n:02d}" for n in range(1, len(joints) + 1)]
+    assert rig.stretch < 1e-4
+    moving = [each.target.node for each in file.animations[0].channels if each.target.path == "translation"]
+    assert moving == [joints[0]]
+
+
 def test_the_animation_is_closed_and_lasts_as_long_as_the_video(rigged: tuple[Asset4D, Rig, bytes]) -> None:
     asset, _, content = rigged
     times, poses = skin(pygltflib.GLTF2.load_from_bytes(content))
