@@ -379,7 +379,13 @@ class MeshSettings(Settings):
     )
     min_followed: Share = Field(
         0.93,
-        description="auto: smallest silhouette IoU of the best trial mesh over the motion, else a mesh per frame",
+        description="smallest silhouette IoU of the best trial mesh that moves with the Gaussians; below, the mesh follows "
+        "the driving video",
+    )
+    min_guided: Share = Field(
+        0.85,
+        description="auto: smallest silhouette IoU of the best trial mesh that follows the driving video, else a mesh "
+        "per frame",
     )
     grid: int = Field(128, ge=16, le=512, description="resolution of the density field on each axis of [-1, 1]")
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Gaussians below this opacity are ignored")
