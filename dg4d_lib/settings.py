@@ -379,8 +379,8 @@ class MeshSettings(Settings):
     )
     min_followed: Share = Field(
         0.93,
-        description="smallest silhouette IoU of the best trial mesh that moves with the Gaussians; below, the mesh follows "
-        "the driving video",
+        description="smallest silhouette IoU of the best trial mesh that moves with the Gaussians; below, the mesh "
+        "follows the driving video, or in mode auto without one, every frame gets its own",
     )
     min_guided: Share = Field(
         0.85,
