@@ -407,7 +407,13 @@ class MeshSettings(Settings):
     )
     min_followed: Share = Field(
         0.93,
-        description="auto: smallest silhouette IoU of the best trial mesh over the motion, else a mesh per frame",
+        description="smallest silhouette IoU of the best trial mesh that moves with the Gaussians; below, the mesh "
+        "follows the driving video, or in mode auto without one, every frame gets its own",
+    )
+    min_guided: Share = Field(
+        0.85,
+        description="auto: smallest silhouette IoU of the best trial mesh that follows the driving video, else a mesh "
+        "per frame",
     )
     grid: int = Field(128, ge=16, le=512, description="resolution of the density field on each axis of [-1, 1]")
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Gaussians below this opacity are ignored")

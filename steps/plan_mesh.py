@@ -15,6 +15,8 @@ from steps.artifacts.mesh_plan import MeshPlan, write_plan
 from steps.artifacts.motions import read_states
 from steps.runtime.job import Job, StepReport
 
+LIMITS = {"gaussians": "min_followed", "video": "min_guided"}
+
 
 def run(job: Job) -> StepReport:
     """Choose one tracked mesh or a mesh per frame, the reference frame, and the level of the isosurface.
@@ -32,21 +34,19 @@ def run(job: Job) -> StepReport:
     if mode != "per_frame":
         frame, followed = select_reference_frame(states, displacement, rasterize, settings)
         if followed < settings.min_followed and "driving_video" in job.inputs:
-            video, generator = (
-                read_frames(job.inputs["driving_video"], job.pictures),
-                torch.Generator().manual_seed(job.seed),
-            )
-            guided = select_guided_reference(states, video, rasterize, settings, frame, generator)
-            if guided[1] > followed:
-                (frame, followed), guide = guided, "video"
+            video = read_frames(job.inputs["driving_video"], job.pictures)
+            generator = torch.Generator().manual_seed(job.seed)
+            frame, followed = select_guided_reference(states, video, rasterize, settings, frame, generator)
+            guide = "video"
     if mode == "auto":
-        mode = "tracked" if followed >= settings.min_followed else "per_frame"
+        least = settings.min_followed if guide == "gaussians" else settings.min_guided
+        mode = "tracked" if followed >= least else "per_frame"
         if mode == "per_frame":
-            frame, guide = 0, "gaussians"
             notes.append(
-                f"one mesh does not follow this motion ({followed:.1%} IoU on trial, mesh.min_followed asks for "
-                f"{settings.min_followed:.0%}): every frame gets its own"
+                f"one mesh does not follow this motion ({followed:.1%} IoU on trial, mesh.{LIMITS[guide]} asks for "
+                f"{least:.0%}): every frame gets its own"
             )
+            frame, guide = 0, "gaussians"
     job.progress(1, 2, {})
     rest = states.at(frame)
     level, agreement = select_level(density_field(rest, settings), rest, rasterize, settings.density_threshold)

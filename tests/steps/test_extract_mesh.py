@@ -3,6 +3,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
@@ -27,6 +29,7 @@ from steps.profiles import PREVIEW, step_settings
 from steps.runtime.job import Job, StepReport
 
 FRAMES = 3
+CAMERA = OrbitCamera(width=64, height=64)
 SHIFT = torch.tensor([0.1, -0.05, 0.2])
 MESH = MeshSettings(grid=32, edge_length=0.12, texture_size=64, render_size=64)
 
@@ -155,27 +158,46 @@ def test_the_plan_says_what_is_extracted_and_from_which_frame(
     assert 0.05 < blue < 0.5
 
 
-@pytest.mark.parametrize(("followed", "guide"), [(0.97, "video"), (0.7, "gaussians")])
-def test_a_mesh_follows_the_video_if_that_goes_better_than_its_gaussians(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, followed: float, guide: str
+def green_video(path: Path) -> Float[Tensor, "t h w 1"]:
+    """Write a video of the moving ball in another color than its Gaussians have, and return its alpha."""
+    cameras = [CAMERA]
+    clouds = [replace(ball(), means=ball().means + (frame + 1) * SHIFT) for frame in range(FRAMES)]
+    alpha = torch.cat([get_rasterizer("cpu")(cloud, cameras, torch.zeros(3)).alpha for cloud in clouds])
+    green = torch.tensor([0.1, 0.9, 0.2]).expand(*alpha.shape[:-1], 3).contiguous()
+    write_frames(path, DrivingVideo(green, alpha, 8.0))
+    return alpha
+
+
+def test_a_mesh_follows_the_video_where_its_gaussians_do_not_guide_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plan_mesh, "select_reference_frame", lambda *given: (1, 0.8))
-    monkeypatch.setattr(plan_mesh, "select_guided_reference", lambda *given: (2, followed))
+    monkeypatch.setattr(plan_mesh, "select_guided_reference", lambda *given: (2, 0.9))
     monkeypatch.setattr(guided_mesh, "TRACKING", AssetSettings(size=32, nodes=8, track_iterations=10, fit_points=100))
-    camera = OrbitCamera(width=64, height=64)
-    clouds = [replace(ball(), means=ball().means + (frame + 1) * SHIFT) for frame in range(FRAMES)]
-    drawn = [get_rasterizer("cpu")(cloud, [camera], torch.zeros(3)) for cloud in clouds]
-    color, alpha = (torch.cat([getattr(each, name) for each in drawn]) for name in ("color", "alpha"))
-    green = torch.tensor([0.1, 0.9, 0.2]).expand_as(color)  # other than the Gaussians: says whose colors are baked
-    write_frames(tmp_path / "video", DrivingVideo(green.contiguous(), alpha, 8.0))
-    _, facts = extract(tmp_path, ball(), video=tmp_path / "video")
+    alpha = green_video(tmp_path / "video")
+    _, facts = extract(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}), video=tmp_path / "video")
     plan = read_plan(tmp_path / "plan")
-    assert (plan.guide, plan.reference_frame) == (guide, 2 if guide == "video" else 1)
+    assert (plan.mode, plan.guide, plan.reference_frame) == ("tracked", "video", 2)
     asset = read_tracked(tmp_path / "tracked")
-    shown, covered = render_mesh(asset.mesh, [camera] * FRAMES, asset.offsets)
+    shown, covered = render_mesh(asset.mesh, [CAMERA] * FRAMES, asset.offsets)
     assert iou(covered, alpha).min() > 0.8  # held still, 0.4: the ball also grows, for it comes nearer
-    assert (shown[covered[..., 0] == 1].mean(0).argmax() == 1) == (guide == "video")
-    assert any("follows the driving video best" in note for note in facts.notes) == (guide == "video")
+    assert shown[covered[..., 0] == 1].mean(0).argmax() == 1  # green, from the video
+    assert any("follows the driving video best (90.0% IoU" in note for note in facts.notes)
+
+
+@pytest.mark.parametrize("with_video", [True, False])
+def test_what_no_trial_follows_gets_a_mesh_per_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, with_video: bool
+) -> None:
+    monkeypatch.setattr(plan_mesh, "select_reference_frame", lambda *given: (1, 0.8))
+    monkeypatch.setattr(plan_mesh, "select_guided_reference", lambda *given: (2, 0.84))
+    green_video(tmp_path / "video")
+    video = tmp_path / "video" if with_video else None
+    _, facts = extract(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}), video=video)
+    plan = read_plan(tmp_path / "plan")
+    assert (plan.mode, plan.guide, plan.reference_frame) == ("per_frame", "gaussians", 0)
+    limit = "84.0% IoU on trial, mesh.min_guided" if with_video else "80.0% IoU on trial, mesh.min_followed"
+    assert any(limit in note for note in facts.notes)
 
 
 def test_a_plan_comes_back_with_every_bit_and_other_files_are_refused(tmp_path: Path) -> None:
