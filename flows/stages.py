@@ -149,7 +149,7 @@ def animate(
     if "tracked" in motion.outputs:  # the mesh of the user's model
         mesh = Mesh.model_validate(motion.model_dump())
     else:
-        mesh = mesh_over_time(gaussians, motion, driving_video, conversion, tasks)
+        mesh = mesh_over_time(gaussians, motion, driving_video, conversion, tasks, fitted=job.asset is None)
     if job.settings.refiner.kind != "identity":
         mesh = tasks.refine_texture(mesh, driving_video, conversion)
     notes = notes_of(done.result for done in tasks.finished())
@@ -167,12 +167,27 @@ def known_views(
 
 
 def mesh_over_time(
-    gaussians: Gaussians | Asset, motion: Motion, driving_video: DrivingVideo, conversion: Conversion, tasks: Tasks
+    gaussians: Gaussians | Asset,
+    motion: Motion,
+    driving_video: DrivingVideo,
+    conversion: Conversion,
+    tasks: Tasks,
+    fitted: bool,
 ) -> Mesh:
-    """Extract one mesh that follows the motion, or a mesh per frame with the frames divided among the slots."""
-    plan = tasks.plan_mesh(gaussians, motion, conversion)
+    """Extract one mesh that follows the motion, or a mesh per frame with the frames divided among the slots.
+
+    Args:
+        gaussians: static cloud.
+        motion: its motion.
+        driving_video: frames that the motion was fitted to.
+        conversion: parameters that all steps share.
+        tasks: tasks of the engine.
+        fitted: the cloud was fitted to the video too, so that a mesh may follow the video; not splats of the user's.
+    """
+    guide = driving_video if fitted else None
+    plan = tasks.plan_mesh(gaussians, motion, conversion, guide)
     if read_plan(home.store().path(plan.plan)).mode == "tracked":
-        return tasks.extract_mesh(gaussians, motion, plan, conversion)
+        return tasks.extract_mesh(gaussians, motion, plan, conversion, None, guide)
     frames = count_frames(driving_video.frames, home.store())
     parts = divide_frames(frames, conversion.mesh_parts or resources.cpus())
     extracted = [tasks.extract_mesh.submit(gaussians, motion, plan, conversion, part) for part in parts]

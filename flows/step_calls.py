@@ -142,13 +142,20 @@ def fit_motion(
     return run_step("fit_motion", Motion, **locals())
 
 
-def plan_mesh(gaussians: Gaussians | Asset, motion: Motion, conversion: Conversion) -> Plan:
+def plan_mesh(
+    gaussians: Gaussians | Asset, motion: Motion, conversion: Conversion, driving_video: DrivingVideo | None = None
+) -> Plan:
     """Decide whether one mesh can follow the motion or every frame needs its own."""
     return run_step("plan_mesh", Plan, **locals())
 
 
 def extract_mesh(
-    gaussians: Gaussians | Asset, motion: Motion, plan: Plan, conversion: Conversion, part: Part | None = None
+    gaussians: Gaussians | Asset,
+    motion: Motion,
+    plan: Plan,
+    conversion: Conversion,
+    part: Part | None = None,
+    driving_video: DrivingVideo | None = None,
 ) -> Mesh:
     """Extract one mesh that follows the motion, or a mesh per frame of a part of the frames."""
     return run_step("extract_mesh", Mesh, **locals())

@@ -183,10 +183,15 @@ STEPS: dict[str, StepSpec] = {
             sections=("rasterizer", "asset", "pack.gltf", "mesh.texture_size"),
             resource="gpu",
         ),
-        _step("plan_mesh", {"gaussians": PLY, "motion": MOTION}, {"plan": PLAN}, sections=("rasterizer", "mesh")),
+        _step(
+            "plan_mesh",
+            inputs={"gaussians": PLY, "motion": MOTION, "driving_video": _optional(FRAMES)},
+            outputs={"plan": PLAN},
+            sections=("rasterizer", "mesh"),
+        ),
         _step(
             "extract_mesh",
-            inputs={"gaussians": PLY, "motion": MOTION, "plan": PLAN},
+            inputs={"gaussians": PLY, "motion": MOTION, "plan": PLAN, "driving_video": _optional(FRAMES)},
             outputs={**EITHER_MESH, "picture": PNG},
             settings="steps.profiles:FrameRange",
             sections=("rasterizer", "mesh"),

@@ -1,6 +1,8 @@
 """Step that extracts textured meshes from moving Gaussians: one tracked mesh, or a mesh per frame."""
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
@@ -9,6 +11,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.errors import BadInput
+from dg4d_lib.fitting.guided_mesh import follow_video, refine_tracking
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.images import color_over_white
 from dg4d_lib.mesh.extraction.clean import clean
@@ -19,22 +22,26 @@ from dg4d_lib.mesh.extraction.topology import MeshTopology, check_topology, weld
 from dg4d_lib.mesh.extraction.unfold import unfold
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
-from dg4d_lib.mesh.texturing.bake import bake_texture, vertex_normals
+from dg4d_lib.mesh.texturing.bake import PosedSurface, bake_texture, vertex_normals
 from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.mesh.tracking.elastic import relax
 from dg4d_lib.mesh.tracking.isosurface_projection import project_to_isosurface
 from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU, register_nonrigid
-from dg4d_lib.mesh.tracking.reference_frame import relative_to_frame
+from dg4d_lib.mesh.tracking.reference_frame import evenly_spaced, relative_to_frame
 from dg4d_lib.mesh.tracking.skinning import skin_vertices
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.settings import MeshSettings
-from steps.artifacts.media import write_png
+from dg4d_lib.video.driving import DrivingVideo
+from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.mesh_plan import MeshPlan, read_plan
 from steps.artifacts.meshes import write_meshes, write_tracked
 from steps.artifacts.motions import read_states
 from steps.profiles import FrameRange
 from steps.runtime.job import Job, StepReport
 
+COLORED = 16  # frames of the driving video that are baked into the texture of a mesh that follows it
+FOLLOWED = {"gaussians": "motion", "video": "driving video"}
+OUTLINES = {"gaussians": "the Gaussians'", "video": "those of video and Gaussians"}
 PICTURE_CAMERAS = [OrbitCamera(0, azimuth, width=256, height=256) for azimuth in (0.0, 75.0, 180.0, 285.0)]
 
 
@@ -52,16 +59,21 @@ def run(job: Job) -> StepReport:
     frames = len(states.means)
     if plan.mode == "tracked":
         job.progress(1, 3, {})
-        tracked, ious = _tracked(states, displacement, plan, rasterize, settings)
+        if plan.guide == "video":
+            video = read_frames(job.inputs["driving_video"], job.pictures)
+            generator = torch.Generator().manual_seed(job.seed)
+            tracked, ious = _guided(states, video, plan, rasterize, settings, generator)
+        else:
+            tracked, ious = _tracked(states, displacement, plan, rasterize, settings)
         job.progress(2, 3, {})
         write_tracked(job.outputs["tracked"], tracked)
         mesh = tracked.mesh
         notes = [
             f"one mesh for {frames} frames: {len(mesh.vertices)} vertices, {len(mesh.faces)} triangles",
             f"at rest it is {_check(mesh)}",
-            f"it is the surface of frame {plan.reference_frame}, which follows the motion best "
+            f"it is the surface of frame {plan.reference_frame}, which follows the {FOLLOWED[plan.guide]} best "
             f"({plan.followed:.1%} IoU on trial)",
-            f"its outlines agree with the Gaussians' to {ious.mean():.1%} (IoU), to {ious.min():.1%} at worst",
+            f"its outlines agree with {OUTLINES[plan.guide]} to {ious.mean():.1%} (IoU), to {ious.min():.1%} at worst",
         ]
         if ious.mean() < MIN_IOU:
             notes.append("one mesh follows this motion poorly: --set mesh.mode=per_frame gives a mesh per frame")
@@ -105,6 +117,46 @@ def _tracked(
     return TrackedMesh(mesh, offsets[:, sources], reference_frame=frame), ious
 
 
+def _guided(
+    states: Gaussians,
+    video: DrivingVideo,
+    plan: MeshPlan,
+    rasterize: Rasterizer,
+    settings: MeshSettings,
+    generator: torch.Generator,
+) -> tuple[TrackedMesh, Float[Tensor, " t"]]:
+    """Return the mesh that follows the driving video, with colors from it, and the IoU of its outlines."""
+    frame, level = plan.reference_frame, plan.level
+    rest = states.at(frame)
+    vertices, faces = _cleaned_surface(rest, level, settings)
+    offsets = follow_video(vertices, faces, states, video, frame, level, rasterize, settings, generator)
+    mesh, sources = _colored(
+        vertices, faces, rest, rasterize, settings, lambda sources: _footage(vertices + offsets, faces, sources, video)
+    )
+    refined = refine_tracking(mesh, sources, vertices, offsets, faces, states, video, level, rasterize, settings)
+    moved = vertices + refined
+    normals, footage = vertex_normals(vertices, faces)[sources], _footage(moved, faces, sources, video)
+    texture = bake_texture(mesh.vertices, normals, mesh.faces, mesh.uvs, rest, rasterize, settings, footage)
+    silhouettes = render_silhouettes(states, range(len(moved)), rasterize, video.alpha[..., 0])
+    tracked = TrackedMesh(replace(mesh, texture=texture), refined[:, sources], reference_frame=frame)
+    return tracked, silhouette_iou(moved, faces, silhouettes)
+
+
+def _footage(
+    moved: Float[Tensor, "t v 3"], faces: Int[Tensor, "f 3"], sources: Int[Tensor, " w"], video: DrivingVideo
+) -> list[PosedSurface]:
+    """Return some frames of the video with the surface, split along seams, that they show."""
+    return [
+        PosedSurface(
+            moved[frame][sources],
+            vertex_normals(moved[frame], faces)[sources],
+            video.frames[frame],
+            video.alpha[frame],
+        )
+        for frame in evenly_spaced(len(video), COLORED)
+    ]
+
+
 def _cleaned_surface(
     gaussians: Gaussians, level: float, settings: MeshSettings
 ) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
@@ -119,12 +171,14 @@ def _colored(
     gaussians: Gaussians,
     rasterize: Rasterizer,
     settings: MeshSettings,
+    footage: Callable[[Int[Tensor, " w"]], list[PosedSurface]] = lambda sources: [],
 ) -> tuple[TexturedMesh, Int[Tensor, " w"]]:
     """Return the unwrapped mesh with a baked texture, and the source vertex of each of its vertices."""
     unwrapped = unwrap(vertices.numpy(), faces.numpy(), settings.texture_size)
     sources, corners, uvs = map(torch.from_numpy, unwrapped)
     normals = vertex_normals(vertices, faces)[sources]
-    texture = bake_texture(vertices[sources], normals, corners, uvs, gaussians, rasterize, settings)
+    moments = footage(sources)
+    texture = bake_texture(vertices[sources], normals, corners, uvs, gaussians, rasterize, settings, moments)
     return TexturedMesh(vertices[sources], corners, uvs, texture), sources
 
 

@@ -1,10 +1,12 @@
-"""Tracking of a subject's surface through its video, from its surface at the first frame."""
+"""Tracking of a subject's surface through its video, from its surface at one frame."""
 
 from dataclasses import replace
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.fitting.asset_motion import Report, fit_asset_motion
@@ -44,14 +46,66 @@ def track_surface(
     Raises:
         FitDiverged: the loss became non-finite.
     """
-    vertices = surface.vertices.double().numpy()
-    first, index = group_vertices(vertices, CELL)
-    points = vertices[first]
-    faces = index[surface.faces.numpy()]
-    whole = (faces != np.roll(faces, 1, 1)).all(1)
-    graph = build_control_graph(points, faces[whole], settings.nodes)
+    moved = track_vertices(
+        surface.vertices, surface.faces, gaussians, video, rasterize, settings, generator, report=report
+    )
+    return [surface, *(replace(surface, vertices=vertices) for vertices in moved[1:])]
+
+
+def track_vertices(
+    vertices: Float[Tensor, "v 3"],
+    faces: Int[Tensor, "f 3"],
+    gaussians: Gaussians,
+    video: DrivingVideo,
+    rasterize: Rasterizer,
+    settings: AssetSettings,
+    generator: torch.Generator,
+    reference_frame: int = 0,
+    report: Report = lambda iteration, values: None,
+) -> Float[Tensor, "t v 3"]:
+    """Move the vertices of a surface as a video shows it, from its reference frame in both directions.
+
+    Args:
+        vertices: at the reference frame, where they stay as they are.
+        faces: counter-clockwise seen from outside.
+        gaussians: one state, fitted to the reference frame, near the surface: what the fit renders.
+        video: of the camera at azimuth and elevation 0.
+        rasterize: rasterizer.
+        settings: of the fit.
+        generator: draws the frames of joint iterations.
+        reference_frame: frame of the video.
+        report: called after every iteration with (iterations done, named losses).
+
+    Raises:
+        FitDiverged: the loss became non-finite.
+    """
+    points = vertices.double().numpy()
+    first, index = group_vertices(points, CELL)
+    points, joined = points[first], index[faces.numpy()]
+    whole = (joined != np.roll(joined, 1, 1)).all(1)
+    graph = build_control_graph(points, joined[whole], settings.nodes)
     nearest = torch.from_numpy(np.asarray(cKDTree(points).query(gaussians.means.double().numpy())[1]))
-    motion = fit_asset_motion(gaussians, graph.of(nearest), video, rasterize, settings, generator, report)
     bound = graph.of(torch.from_numpy(index))
-    moved = [motion.at(slice(frame, frame + 1)).points(surface.vertices, bound)[0] for frame in range(1, len(video))]
-    return [surface, *(replace(surface, vertices=vertices) for vertices in moved)]
+    moved = vertices.repeat(len(video), 1, 1)
+    for chosen in tracking_orders(video, reference_frame):
+        if len(chosen) > 1:
+            part = DrivingVideo(video.frames[chosen], video.alpha[chosen], video.fps)
+            motion = fit_asset_motion(gaussians, graph.of(nearest), part, rasterize, settings, generator, report)
+            for number, frame in enumerate(chosen[1:], 1):
+                moved[frame] = motion.at(slice(number, number + 1)).points(vertices, bound)[0]
+    return moved
+
+
+def tracking_orders(video: DrivingVideo, reference_frame: int) -> tuple[list[int], list[int]]:
+    """Return the frames from the reference frame on, and back from it; half of a loop each, for errors add up.
+
+    A video is a loop if its last frame differs from the first no more than two successive frames do somewhere.
+    """
+    count = len(video)
+    pictures = video.over(video.frames.new_ones(3))
+    steps = (pictures - pictures.roll(-1, 0)).abs().flatten(1).mean(1)
+    if count > 2 and float(steps[-1]) <= float(steps[:-1].max()):
+        forward = count // 2
+        ahead = [(reference_frame + step) % count for step in range(forward + 1)]
+        return ahead, [(reference_frame - step) % count for step in range(count - forward)]
+    return list(range(reference_frame, count)), list(range(reference_frame, -1, -1))

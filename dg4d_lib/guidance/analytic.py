@@ -7,7 +7,7 @@ The drawn noise cancels: with x_t = sqrt(alphabar) z + sqrt(1 - alphabar) e, the
 (1 - alphabar) (noise_pred - e) = sqrt(alphabar (1 - alphabar)) (z - z0). So no noise is drawn here.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from jaxtyping import Float
@@ -33,6 +33,7 @@ class AnalyticPrior:
         viewpoints: the only cameras `clean` knows; None is all.
         frames: the only frames `clean` knows; None is all.
         weight: factor on the loss.
+        weights: factor in place of `weight`, by frame.
     """
 
     def __init__(
@@ -42,8 +43,9 @@ class AnalyticPrior:
         viewpoints: tuple[OrbitCamera, ...] | None = None,
         frames: tuple[int, ...] | None = None,
         weight: float = 1.0,
+        weights: Mapping[int, float] | None = None,
     ) -> None:
-        self.clean, self.schedule, self.weight = clean, schedule, weight
+        self.clean, self.schedule, self.weight, self.weights = clean, schedule, weight, weights or {}
         self.viewpoints, self.frames = viewpoints, frames
 
     def loss(
@@ -60,6 +62,13 @@ class AnalyticPrior:
         color, clean_alpha = (picture.to(images.device) for picture in self.clean(views))
         pixels = 3 * images.shape[1] * images.shape[2]
         strength = 0.5 * (alphabar * (1 - alphabar)) ** 0.5
-        error = mse_loss(images, color, reduction="sum") + mse_loss(alpha, clean_alpha, reduction="sum")
+        squares = (
+            mse_loss(image, known, reduction="sum") + mse_loss(cover, known_cover, reduction="sum")
+            for image, known, cover, known_cover in zip(
+                *map(torch.unbind, (images, color, alpha, clean_alpha)), strict=True
+            )
+        )
+        weights = [self.weights.get(view.frame, self.weight) for view in views]
+        error = torch.stack([weight * square for weight, square in zip(weights, squares, strict=True)]).mean()
         # pixels are diffused as 2 x - 1, so squares are four times those of color and alpha in [0, 1]
-        return error * (4 * strength * self.weight * LATENT_NUMBERS / pixels / len(images))
+        return error * (4 * strength * LATENT_NUMBERS / pixels)

@@ -15,18 +15,23 @@ from dg4d_lib.visual_hull.shape import known_surface
 
 
 class KnownShapes:
-    """Shapes per frame: from known views where a frame has some, else from the geometric prior."""
+    """Shapes per frame: from known views where a frame has some, else a guess."""
 
-    def __init__(self, geometric: SubjectShapes, known: Mapping[int, Sequence[KnownView]]) -> None:
+    def __init__(self, guess: SubjectShapes, known: Mapping[int, Sequence[KnownView]]) -> None:
         """Store the views.
 
         Args:
-            geometric: shapes of frames without known views.
+            guess: shapes of frames without known views.
             known: views by frame, the input view first.
         """
-        self._geometric = geometric
+        self._guess = guess
         self._known = {frame: tuple(views) for frame, views in known.items()}
         self._surfaces: dict[int, InflatedSurface] = {}
+
+    @property
+    def guess(self) -> SubjectShapes:
+        """Shapes of the other frames."""
+        return self._guess
 
     @property
     def frames(self) -> tuple[int, ...]:
@@ -40,7 +45,7 @@ class KnownShapes:
             BadInput: there is no such frame, or its views contradict each other.
         """
         if frame not in self._known:
-            return self._geometric.surface(frame)
+            return self._guess.surface(frame)
         if frame not in self._surfaces:
             self._surfaces[frame] = known_surface(self._known[frame])
         return self._surfaces[frame]
@@ -54,10 +59,10 @@ class KnownShapes:
         places = [i for i, view in enumerate(views) if view.frame in self._known]
         others = [i for i in range(len(views)) if i not in set(places)]
         if not places:
-            return self._geometric.clean(views)
+            return self._guess.clean(views)
         color, alpha = render_surface([self.surface(views[i].frame) for i in places], [views[i].camera for i in places])
         both = torch.cat([over_background(color, alpha, 1.0), alpha], -1)
         if others:
-            guessed = torch.cat(self._geometric.clean([views[i] for i in others]), -1)
+            guessed = torch.cat(self._guess.clean([views[i] for i in others]), -1)
             both = torch.cat([both, guessed])[torch.argsort(torch.tensor([*places, *others]))]
         return both[..., :3], both[..., 3:]

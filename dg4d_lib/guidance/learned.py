@@ -10,13 +10,11 @@ from torch import Tensor
 from dg4d_lib.guidance.geometric import surface_views
 from dg4d_lib.guidance.interface import GuidanceView, check_frame, check_views
 from dg4d_lib.images import resize
-from dg4d_lib.inflation.hints import NO_HINT, DepthHint
 from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.settings import LearnedPriorSettings
 from dg4d_lib.shape_prior.expected import expected_volume
-from dg4d_lib.shape_prior.field import ShapeField, ShapeFields
+from dg4d_lib.shape_prior.field import Fields, ShapeField
 from dg4d_lib.shape_prior.frustum import SIZE
-from dg4d_lib.shape_prior.network import ShapePriorNetwork
 from dg4d_lib.shape_prior.raymarch import ShapeVolume, render_volumes
 from dg4d_lib.shape_prior.surface import decided_surface
 
@@ -26,23 +24,14 @@ COARSER = 2  # times fewer pixels of a side than the camera has: expected views 
 class LearnedShapes:
     """Predicted shape per frame, each built when first asked for."""
 
-    def __init__(
-        self,
-        network: ShapePriorNetwork,
-        cutouts: Sequence[Float[Tensor, "h w 4"]],
-        settings: LearnedPriorSettings,
-        hint: DepthHint = NO_HINT,
-    ) -> None:
-        """Encode the pictures.
+    def __init__(self, fields: Fields, settings: LearnedPriorSettings) -> None:
+        """Store the fields.
 
         Args:
-            network: of the shape prior.
-            cutouts: one per frame: square, straight alpha, color and alpha in [0, 1].
+            fields: of all frames.
             settings: uncertainty of the views.
-            hint: at the depth of the subject; it decides where the network is unsure.
         """
-        self._fields = ShapeFields(network, cutouts, hint)
-        self._settings = settings
+        self._fields, self._settings = fields, settings
         self._surfaces: dict[int, InflatedSurface] = {}
         self._volumes: dict[int, ShapeVolume] = {}
         self._inflated: dict[int, float] = {}

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -46,6 +47,23 @@ class ShapeField:
     smoothness: float = SMOOTHNESS
 
 
+@runtime_checkable
+class Fields(Protocol):
+    """Field of a subject per frame."""
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        ...
+
+    def predict(self, frame: int) -> ShapeField:
+        """Return the field of a frame.
+
+        Raises:
+            BadInput: the frame shows no subject.
+        """
+        ...
+
+
 class ShapeFields:
     """Fields of the frames of a subject, each predicted when first asked for.
 
@@ -85,22 +103,19 @@ class ShapeFields:
             BadInput: the picture shows no subject.
         """
         picture = self._pictures[frame]
-        inside, _ = subject_mask(picture[3].double().numpy())
-        mask = torch.from_numpy(inside)
+        mask = picture_mask(picture)
         with torch.no_grad():
             features = self._network.encode(torch.stack([picture, picture.flip(2)]))
             both = self._rays(features)
         logits, colors = ((part[0] + part[1].flip(1)) / 2 for part in both)
         knots = colors.permute(3, 2, 0, 1)[None]
         hidden = interpolate(knots, (BINS, SIZE, SIZE), mode="trilinear", align_corners=True)[0].permute(2, 3, 1, 0)
-        logits = logits + hint_evidence(self._hint, logits, mask)
-        logits = torch.where(mask[..., None], logits.clamp(-LARGEST_LOGIT, LARGEST_LOGIT), -LARGEST_LOGIT)
+        logits = bounded_logits(logits + hint_evidence(self._hint, logits, mask), mask)
         share = inflated_share(logits.sigmoid(), mask)
         if share > 0:
             inflated = inflated_probability(mask).clamp(torch.tensor(-LARGEST_LOGIT).sigmoid())
             logits = torch.logit((1 - share) * logits.sigmoid() + share * inflated, 1e-3)
-        front = (picture[:3] / picture[3:].clamp(min=VISIBLE)).clamp(0, 1).permute(1, 2, 0)
-        plane = self._plane(features)
+        front, plane = straight_color(picture), self._plane(features)
         if plane.trust > 0:
             probability = logits.sigmoid()
             left = transmittance(optical_density(probability, mask))
@@ -123,11 +138,52 @@ class ShapeFields:
         return logits.unflatten(0, (2, SIZE, SIZE)), colors.unflatten(0, (2, SIZE, SIZE))
 
 
+class InflatedFields:
+    """Field of the inflated silhouette per frame: hidden surfaces have the colors before them."""
+
+    def __init__(self, cutouts: Sequence[Float[Tensor, "h w 4"]]) -> None:
+        """Store the pictures, one per frame: square, straight alpha, color and alpha in [0, 1]."""
+        self._pictures = [premultiplied(cutout) for cutout in cutouts]
+
+    def __len__(self) -> int:
+        return len(self._pictures)
+
+    def predict(self, frame: int) -> ShapeField:
+        """Return the field of a frame.
+
+        Raises:
+            BadInput: the picture shows no subject.
+        """
+        picture = self._pictures[frame]
+        mask, front = picture_mask(picture), straight_color(picture)
+        logits = bounded_logits(torch.logit(inflated_probability(mask)), mask)
+        return ShapeField(logits, front, front[:, :, None].expand(-1, -1, BINS, -1), mask, 1.0)
+
+
 def premultiplied(cutout: Float[Tensor, "h w 4"]) -> Float[Tensor, "4 128 128"]:
     """Return premultiplied color and alpha at the network's size."""
     alpha = cutout[..., 3:]
     planes = torch.cat([cutout[..., :3] * alpha, alpha], -1).permute(2, 0, 1)[None].float().cpu()
     return resize_planes(planes, (SIZE, SIZE))[0].clamp(0, 1)
+
+
+def bounded_logits(logits: Float[Tensor, "128 128 64"], mask: Bool[Tensor, "128 128"]) -> Float[Tensor, "128 128 64"]:
+    """Return log-odds within the bounds of a field, lowest outside of the subject."""
+    return torch.where(mask[..., None], logits.clamp(-LARGEST_LOGIT, LARGEST_LOGIT), -LARGEST_LOGIT)
+
+
+def picture_mask(picture: Float[Tensor, "4 128 128"]) -> Bool[Tensor, "128 128"]:
+    """Return the pixels of the subject in a premultiplied picture.
+
+    Raises:
+        BadInput: the picture shows no subject.
+    """
+    return torch.from_numpy(subject_mask(picture[3].double().numpy())[0])
+
+
+def straight_color(picture: Float[Tensor, "4 128 128"]) -> Float[Tensor, "128 128 3"]:
+    """Return the color of a premultiplied picture."""
+    return (picture[:3] / picture[3:].clamp(min=VISIBLE)).clamp(0, 1).permute(1, 2, 0)
 
 
 def inflated_share(probability: Float[Tensor, "128 128 64"], mask: Bool[Tensor, "128 128"]) -> float:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from dg4d_lib.inflation.surface import InflatedSurface
-from dg4d_lib.visual_hull.carve import hull
+from dg4d_lib.visual_hull.carve import Volume, hull
 from dg4d_lib.visual_hull.columns import bounded, fitting_turn
 from dg4d_lib.visual_hull.known import CARVES, KnownView, shows_sides
 from dg4d_lib.visual_hull.surface import colored_surface
@@ -18,8 +18,17 @@ def known_surface(views: Sequence[KnownView]) -> InflatedSurface:
     Raises:
         BadInput: the views have no common shape.
     """
+    return colored_surface(known_volume(views), views)
+
+
+def known_volume(views: Sequence[KnownView]) -> Volume:
+    """Return the hull of a subject from views of one moment, the input view first.
+
+    Raises:
+        BadInput: the views have no common shape.
+    """
     carving = [view for view in views if view.weight >= CARVES]
     volume = hull(carving, CELLS)
     if not shows_sides(carving, SIDE_DEG):
         volume = bounded(volume, carving, fitting_turn(carving))
-    return colored_surface(volume, views)
+    return volume

@@ -17,6 +17,7 @@ from dg4d_lib.diffusion.pipelines import is_flow_matching
 from dg4d_lib.errors import BadInput
 from dg4d_lib.fitting.static import RADIUS_JITTER
 from dg4d_lib.guidance.analytic import AnalyticPrior
+from dg4d_lib.guidance.carried import CarriedFields
 from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.geometric import InflatedSurfaces
 from dg4d_lib.guidance.imagedream import ImageDream, ImageDreamPrior
@@ -39,6 +40,8 @@ from dg4d_lib.settings import (
     Zero123PriorSettings,
 )
 from dg4d_lib.shape_prior import packaged
+from dg4d_lib.shape_prior.field import Fields, InflatedFields, ShapeField, ShapeFields
+from dg4d_lib.visual_hull.frustum_field import known_field
 from dg4d_lib.visual_hull.known import KnownView, known_view
 from dg4d_lib.weights.registry import lookup_weights
 from steps.artifacts.archives import unpack
@@ -54,6 +57,8 @@ GEOMETRIC_NOTE = "prior: inflation of the silhouette (no model); sides the pictu
 LEARNED_NOTE = "prior: shape network trained on made-up shapes; sides the picture does not show are guesses"
 DEPTH_NOTE = "prior: inflation of the silhouette, with the relief of an estimated depth: weights"
 SMALLEST_NOTED = 0.05  # share of the inflation from which the report mentions it
+GUESS_WEIGHT = 0.5  # of frames whose other sides are a guess, beside frames with known views
+CARRIED_CONTRAST = 2.0  # of shapes that a known first frame has made sure already
 ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
 
 
@@ -67,6 +72,7 @@ class LoadedPrior:
         opened: weights; None for priors without a model.
         batches: micro-batches, which shrink when memory runs out.
         shapes: shapes behind the prior; None for models of pictures and for the oracle.
+        network: shapes by the shape network, for all frames or those without known views; None: it is not used.
     """
 
     prior: GuidancePrior
@@ -74,15 +80,16 @@ class LoadedPrior:
     opened: LocatedWeights | None = None
     batches: MicroBatches | None = None
     shapes: SubjectShapes | None = None
+    network: LearnedShapes | None = None
 
     def report(self, backend: str) -> StepReport:
         """Return the report of a step that has used this prior."""
         run_notes = self.batches.notes() if self.batches else ()
         weights, licenses = (self.opened.digests, self.opened.licenses) if self.opened else ({}, {})
         notes: tuple[str, ...] = (self.note,)
-        if isinstance(self.shapes, LearnedShapes):
+        if self.network is not None:
             weights = packaged.digests()
-            share = self.shapes.inflated_share
+            share = self.network.inflated_share
             notes = (self.note, inflated_note(share)) if share >= SMALLEST_NOTED else notes
         return StepReport(backend, weights, licenses, notes=notes, run_notes=run_notes)
 
@@ -123,14 +130,19 @@ def make_prior(
             clean, viewpoints = shapes.clean, None
             if stage.viewpoints:
                 clean, viewpoints = KeptViews(shapes.clean).clean, kept_viewpoints(stage)
+            guided = settings.weight if isinstance(settings, LearnedPriorSettings) else GUESS_WEIGHT
             if isinstance(shapes, KnownShapes):
-                prior = AnalyticPrior(clean, noise, viewpoints, None if moved else shapes.frames)
-                return LoadedPrior(prior, known_note(sides), shapes=shapes)
+                frames = None if moved or 0 in shapes.frames else shapes.frames
+                weights = dict.fromkeys(shapes.frames, 1.0)
+                prior = AnalyticPrior(clean, noise, viewpoints, frames, 1.0 if moved else guided, weights)
+                network = _network(shapes.guess, settings)
+                return LoadedPrior(prior, known_note(sides), shapes=shapes, network=network)
             if isinstance(settings, LearnedPriorSettings):
-                note, weight = LEARNED_NOTE, settings.weight
+                note, weight = LEARNED_NOTE, guided
             elif settings.depth_weights and not hint.sigma:
                 note, opened = f"{DEPTH_NOTE} {settings.depth_weights}", open_weights(settings.depth_weights)
-            return LoadedPrior(AnalyticPrior(clean, noise, viewpoints, weight=weight), note, opened, shapes=shapes)
+            prior, network = AnalyticPrior(clean, noise, viewpoints, weight=weight), _network(shapes, settings)
+            return LoadedPrior(prior, note, opened, shapes=shapes, network=network)
         case OraclePriorSettings():
             if bank is None:
                 raise BadInput("prior.kind = oracle needs true views: give --bank FOLDER (with a bank.json)")
@@ -165,20 +177,42 @@ def subject_shapes(
         sides: views of other sides; their hull replaces the shapes of their frames.
         moved: shapes of all other frames, instead of those of the settings.
     """
+    frames = [frame for frame in sides.frames if frame < len(cutouts)] if sides else []
+    known = {frame: [known_view(cutouts[frame]), *known_views(sides, frame)] for frame in frames if sides}
     if moved is not None:
         shapes = moved
+    elif 0 in known and len(cutouts) > 1:
+        shapes = _carried_shapes(settings, cutouts, hint, known_field(known[0]))
     elif isinstance(settings, LearnedPriorSettings):
-        shapes = LearnedShapes(packaged.packaged_network(), cutouts, settings, hint)
+        shapes = LearnedShapes(learned_fields(cutouts, hint), settings)
     else:
         own = settings if isinstance(settings, GeometricPriorSettings) else GeometricPriorSettings()
         depth = None
         if own.depth_weights and sides is None and not hint.sigma:
             depth = DepthEstimator.load(open_weights(own.depth_weights).folder, default_device())
         shapes = InflatedSurfaces(cutouts, own, hint, depth)
-    if sides is None:
-        return shapes
-    frames = [frame for frame in sides.frames if frame < len(cutouts)]
-    return KnownShapes(shapes, {frame: [known_view(cutouts[frame]), *known_views(sides, frame)] for frame in frames})
+    return KnownShapes(shapes, known) if sides else shapes
+
+
+def _carried_shapes(
+    settings: PriorSettings, cutouts: Sequence[Float[Tensor, "h w 4"]], hint: DepthHint, first: ShapeField
+) -> LearnedShapes:
+    """Return the shapes of later frames from the known one of the first frame and a guess per frame."""
+    guess: Fields = InflatedFields(cutouts)
+    if isinstance(settings, LearnedPriorSettings):
+        guess = ShapeFields(packaged.packaged_network(), cutouts, hint)
+    return LearnedShapes(CarriedFields(guess, first, cutouts), LearnedPriorSettings(contrast=CARRIED_CONTRAST))
+
+
+def learned_fields(cutouts: Sequence[Float[Tensor, "h w 4"]], hint: DepthHint) -> Fields:
+    """Return what the shape network says of every frame; the video carries what it says of the first one along."""
+    fields = ShapeFields(packaged.packaged_network(), cutouts, hint)
+    return CarriedFields(fields, fields.predict(0), cutouts) if len(cutouts) > 1 else fields
+
+
+def _network(shapes: SubjectShapes, settings: PriorSettings) -> LearnedShapes | None:
+    """Return the shapes if the shape network predicts them."""
+    return shapes if isinstance(settings, LearnedPriorSettings) and isinstance(shapes, LearnedShapes) else None
 
 
 def kept_viewpoints(stage: FitSettings) -> tuple[OrbitCamera, ...]:

@@ -4,14 +4,21 @@ from pathlib import Path
 import pytest
 import torch
 
+from dg4d_lib.asset_settings import AssetSettings
+from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.errors import BadInput, FitDiverged
+from dg4d_lib.fitting import guided_mesh
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import write_ply
 from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
+from dg4d_lib.mesh.render import render_mesh
+from dg4d_lib.metrics.image import iou
+from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import FramewiseSettings, MeshSettings
+from dg4d_lib.video.driving import DrivingVideo
 from steps import plan_mesh
-from steps.artifacts.media import read_png
+from steps.artifacts.media import read_png, write_frames
 from steps.artifacts.mesh_plan import MeshPlan, read_plan, write_plan
 from steps.artifacts.meshes import read_meshes, read_tracked
 from steps.artifacts.motions import write_motion
@@ -33,7 +40,9 @@ def ball() -> Gaussians:
     return Gaussians(points, torch.full((300, 3), -2.8), quats, torch.full((300,), 3.0), rgb_to_sh(color))
 
 
-def extract(folder: Path, gaussians: Gaussians, mesh: MeshSettings = MESH, **frames: int) -> tuple[Job, StepReport]:
+def extract(
+    folder: Path, gaussians: Gaussians, mesh: MeshSettings = MESH, video: Path | None = None, **frames: int
+) -> tuple[Job, StepReport]:
     """Plan and extract the mesh of a cloud that begins one SHIFT beside its canonical place and goes on by one a frame.
 
     Facts are those of `extract_mesh`, with the notes of `plan_mesh` before its own.
@@ -47,7 +56,8 @@ def extract(folder: Path, gaussians: Gaussians, mesh: MeshSettings = MESH, **fra
     write_motion(folder / "motion", motion, FramewiseSettings(), FRAMES, len(gaussians))
     settings = PREVIEW.model_copy(update={"mesh": mesh})
     job = Job(
-        inputs={"gaussians": folder / "gaussians.ply", "motion": folder / "motion"},
+        inputs={"gaussians": folder / "gaussians.ply", "motion": folder / "motion"}
+        | ({"driving_video": video} if video else {}),
         outputs={
             "plan": folder / "plan",
             "tracked": folder / "tracked",
@@ -143,6 +153,29 @@ def test_the_plan_says_what_is_extracted_and_from_which_frame(
     assert picture.shape == (256, 1024, 3)
     blue = (picture[..., 2] - picture[..., 0] > 0.3).float().mean()
     assert 0.05 < blue < 0.5
+
+
+@pytest.mark.parametrize(("followed", "guide"), [(0.97, "video"), (0.7, "gaussians")])
+def test_a_mesh_follows_the_video_if_that_goes_better_than_its_gaussians(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, followed: float, guide: str
+) -> None:
+    monkeypatch.setattr(plan_mesh, "select_reference_frame", lambda *given: (1, 0.8))
+    monkeypatch.setattr(plan_mesh, "select_guided_reference", lambda *given: (2, followed))
+    monkeypatch.setattr(guided_mesh, "TRACKING", AssetSettings(size=32, nodes=8, track_iterations=10, fit_points=100))
+    camera = OrbitCamera(width=64, height=64)
+    clouds = [replace(ball(), means=ball().means + (frame + 1) * SHIFT) for frame in range(FRAMES)]
+    drawn = [get_rasterizer("cpu")(cloud, [camera], torch.zeros(3)) for cloud in clouds]
+    color, alpha = (torch.cat([getattr(each, name) for each in drawn]) for name in ("color", "alpha"))
+    green = torch.tensor([0.1, 0.9, 0.2]).expand_as(color)  # other than the Gaussians: says whose colors are baked
+    write_frames(tmp_path / "video", DrivingVideo(green.contiguous(), alpha, 8.0))
+    _, facts = extract(tmp_path, ball(), video=tmp_path / "video")
+    plan = read_plan(tmp_path / "plan")
+    assert (plan.guide, plan.reference_frame) == (guide, 2 if guide == "video" else 1)
+    asset = read_tracked(tmp_path / "tracked")
+    shown, covered = render_mesh(asset.mesh, [camera] * FRAMES, asset.offsets)
+    assert iou(covered, alpha).min() > 0.8  # held still, 0.4: the ball also grows, for it comes nearer
+    assert (shown[covered[..., 0] == 1].mean(0).argmax() == 1) == (guide == "video")
+    assert any("follows the driving video best" in note for note in facts.notes) == (guide == "video")
 
 
 def test_a_plan_comes_back_with_every_bit_and_other_files_are_refused(tmp_path: Path) -> None:

@@ -14,6 +14,8 @@ from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.guidance.analytic import AnalyticPrior
 from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.interface import GuidanceView
+from dg4d_lib.guidance.known import KnownShapes
+from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.inflation.hints import DepthField, DepthHint
 from dg4d_lib.inflation.surface import inflate
 from dg4d_lib.settings import (
@@ -120,6 +122,33 @@ def test_the_prior_without_weights_has_none_in_its_facts(tmp_path: Path) -> None
     settings = GeometricPriorSettings(size=32)
     facts = make_prior(settings, CUTOUTS[:1], StaticSettings(), None, tmp_path).report("cpu")
     assert facts.weights == {} and facts.licenses == {} and len(facts.notes) == 1
+
+
+@pytest.mark.parametrize("settings", [GeometricPriorSettings(size=32), LearnedPriorSettings(weight=0.25)])
+def test_known_views_of_the_first_frame_guide_all_frames(
+    settings: GeometricPriorSettings | LearnedPriorSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(packaged, "packaged_network", tiny_shape_prior.tiny_network)
+    alpha = torch.zeros(64, 64, 1)
+    alpha[20:44, 20:44] = 1
+    cutouts = [torch.cat([torch.full((64, 64, 3), 0.4), alpha.roll(shift, 1)], -1) for shift in (0, 3)]
+    sides = Bank((OrbitCamera(0, 90, width=64, height=64),), (0,), (cutouts[0] * 255).to(torch.uint8)[None, None])
+    choice = make_prior(settings, cutouts, MotionSettings(), None, tmp_path, sides=sides)
+    assert isinstance(choice.prior, AnalyticPrior) and isinstance(choice.shapes, KnownShapes)
+    assert choice.prior.frames is None and choice.prior.weights == {0: 1.0} and choice.prior.weight < 1
+    for azimuth, sign in ((0, 1), (180, -1)):
+        camera = OrbitCamera(0, azimuth, width=64, height=64)
+        _, cover = choice.prior.clean([GuidanceView(camera, frame) for frame in (0, 1)])
+        middles = (cover[..., 0].sum(1) * torch.arange(64)).sum(1) / cover.sum((1, 2, 3))
+        assert sign * float(middles[1] - middles[0]) > 2  # pixels; from behind it moves left
+    learned = isinstance(settings, LearnedPriorSettings)
+    assert bool(choice.report("cpu").weights) == learned  # the network has guessed frame 1
+
+
+def test_known_views_of_a_later_frame_guide_that_frame_alone(tmp_path: Path) -> None:
+    sides = Bank((OrbitCamera(0, 90, width=64, height=64),), (1,), torch.full((1, 1, 64, 64, 4), 255).byte())
+    choice = make_prior(GeometricPriorSettings(), CUTOUTS, MotionSettings(), None, tmp_path, sides=sides)
+    assert choice.prior.frames == (1,)
 
 
 def bank_folder(folder: Path) -> Path:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -16,13 +17,19 @@ VIEWS = ((0.0, 2.0), (75.0, 1.0))  # azimuth in degrees and weight; people compa
 ALPHA_THRESHOLD = 0.5  # alpha above which a pixel belongs to the subject
 
 
-def render_silhouettes(states: Gaussians, frames: Sequence[int], rasterize: Rasterizer) -> Bool[Tensor, "m k h w"]:
+def render_silhouettes(
+    states: Gaussians,
+    frames: Sequence[int],
+    rasterize: Rasterizer,
+    alpha: Float[Tensor, "m i j"] | None = None,
+) -> Bool[Tensor, "m k h w"]:
     """Render silhouettes of the Gaussians at m frames from k views.
 
     Args:
         states: the cloud at every frame (fields "t n 3").
         frames: indices of the frames to render.
         rasterize: the splatting backend.
+        alpha: of the driving video at these frames, which takes the place of the Gaussians at the input view.
     """
     selected = states.states(frames)
     black = torch.zeros(3, device=states.means.device)
@@ -30,6 +37,8 @@ def render_silhouettes(states: Gaussians, frames: Sequence[int], rasterize: Rast
         views = [
             rasterize(selected, cameras, black).alpha[..., 0] > ALPHA_THRESHOLD for cameras in cameras_of(len(frames))
         ]
+    if alpha is not None:
+        views[0] = interpolate(alpha[:, None], (SIZE, SIZE), mode="area")[:, 0].to(black) > ALPHA_THRESHOLD
     return torch.stack(views, 1)
 
 

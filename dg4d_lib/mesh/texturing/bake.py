@@ -46,6 +46,23 @@ TEXELS_AT_ONCE = 1 << 16  # texels per job of the thread pool
 
 
 @dataclass(frozen=True)
+class PosedSurface:
+    """Surface at one frame of the driving video, and what the input view shows of it.
+
+    Attributes:
+        vertices: world units, split along the seams.
+        normals: of the unsplit surface, one per split vertex.
+        color: straight color of the frame, in [0, 1].
+        alpha: of the frame, in [0, 1].
+    """
+
+    vertices: Float[Tensor, "v 3"]
+    normals: Float[Tensor, "v 3"]
+    color: Float[Tensor, "h w 3"]
+    alpha: Float[Tensor, "h w 1"]
+
+
+@dataclass(frozen=True)
 class Texels:
     """Texels whose centers lie on the surface.
 
@@ -70,8 +87,9 @@ def bake_texture(
     gaussians: Gaussians,
     rasterize: Rasterizer,
     settings: MeshSettings,
+    footage: Sequence[PosedSurface] = (),
 ) -> Float[Tensor, "h w 3"]:
-    """Bake the texture of a mesh from the Gaussians it was extracted from.
+    """Bake the texture of a mesh from the Gaussians it was extracted from, and from footage that it follows.
 
     Args:
         vertices: world units, split along the seams.
@@ -81,24 +99,33 @@ def bake_texture(
         gaussians: one state.
         rasterize: the splatting backend.
         settings: mesh settings.
+        footage: the surface at frames of the driving video. They are averaged, and take the place of the Gaussians in
+            the input view.
 
     Returns:
         Colors in [0, 1] of every texel; texels outside all charts are filled from their surroundings.
     """
-    texels = locate_texels(vertices, normals, faces, uvs, settings.texture_size)
-    size = settings.texture_size
+    size, side = settings.texture_size, settings.render_size
+    rows, columns, corners, shares = _covered_texels(faces, uvs, size)
+    texels = _placed_texels(rows, columns, corners, shares, vertices, normals)
     if len(texels.rows) == 0:  # all triangles are smaller than a texel
         return torch.full((size, size, 3), 0.5)
     total = np.zeros((len(texels.rows), 4), np.float32)  # sums of weight * color and of weight
-    side = settings.render_size
+    parts, input_rule = _parts(len(total)), (INPUT_FLATTER * MIN_COSINE, INPUT_WEIGHT)
+    for posed in footage:
+        camera = OrbitCamera(width=posed.color.shape[1], height=posed.color.shape[0])
+        moved = _placed_texels(rows, columns, corners, shares, posed.vertices, posed.normals)
+        reach = max(1, round(OUTLINE * camera.width / side))  # the footage may be coarser than the renders
+        pictures = _graded(posed.color[None], posed.alpha[None, ..., 0], [camera], posed.vertices, faces, reach)
+        run_parallel([partial(_add, moved, [camera], pictures, [input_rule], part, total) for part in parts])
     cameras = [OrbitCamera(width=side, height=side), *baking_views(side)]
     for start in range(0, len(cameras), VIEWS_AT_ONCE):
         batch = cameras[start : start + VIEWS_AT_ONCE]
         renders = _render_views(batch, vertices, faces, gaussians, rasterize)
         rules = [(MIN_COSINE, 1.0)] * len(batch)
-        if start == 0:
-            rules[0] = (INPUT_FLATTER * MIN_COSINE, INPUT_WEIGHT)
-        run_parallel([partial(_add, texels, batch, renders, rules, part, total) for part in _parts(len(total))])
+        if start == 0 and not footage:
+            rules[0] = input_rule
+        run_parallel([partial(_add, texels, batch, renders, rules, part, total) for part in parts])
     weight = torch.from_numpy(total[:, 3:])
     seen = weight[:, 0] > 0
     colors = torch.where(seen[:, None], torch.from_numpy(total[:, :3]) / weight.clamp_min(1e-30), 0.5)
@@ -122,12 +149,30 @@ def locate_texels(
     size: int,
 ) -> Texels:
     """Locate the texels of a square texture on the surface; texel centers are at (index + 0.5) / size."""
+    return _placed_texels(*_covered_texels(faces, uvs, size), vertices, normals)
+
+
+def _covered_texels(
+    faces: Int[Tensor, "f 3"], uvs: Float[Tensor, "v 2"], size: int
+) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"], Int[Tensor, "p 3"], Float[Tensor, "p 3"]]:
+    """Return row and column of the texels in charts, and the corners of their triangle with barycentric weights."""
     ids, weights = np.full((size, size), -1, np.int32), np.zeros((size, size, 3), np.float32)
     _rasterize_uvs(uvs.double().numpy() * size, faces.to(torch.int32).numpy(), ids, weights)
     found = torch.from_numpy(ids)
     rows, columns = torch.nonzero(found >= 0, as_tuple=True)
-    corners = faces.long()[found[rows, columns].long()]
-    share = torch.from_numpy(weights)[rows, columns][..., None]
+    return rows, columns, faces.long()[found[rows, columns].long()], torch.from_numpy(weights)[rows, columns]
+
+
+def _placed_texels(
+    rows: Int[Tensor, " p"],
+    columns: Int[Tensor, " p"],
+    corners: Int[Tensor, "p 3"],
+    shares: Float[Tensor, "p 3"],
+    vertices: Float[Tensor, "v 3"],
+    normals: Float[Tensor, "v 3"],
+) -> Texels:
+    """Return the texels where the vertices are."""
+    share = shares[..., None]
     return Texels(
         rows,
         columns,
@@ -172,17 +217,29 @@ def _render_views(
     with torch.no_grad():
         render = rasterize(gaussians, cameras, torch.zeros(3))
     color = (render.color / render.alpha.clamp_min(1e-6)).clamp(0, 1)
-    alpha = render.alpha[..., 0]
+    return _graded(color, render.alpha[..., 0], cameras, vertices, faces, OUTLINE)
+
+
+def _graded(
+    color: Float[Tensor, "b h w 3"],
+    alpha: Float[Tensor, "b h w"],
+    cameras: Sequence[OrbitCamera],
+    vertices: Float[Tensor, "v 3"],
+    faces: Int[Tensor, "f 3"],
+    reach: int,
+) -> tuple[Float[Tensor, "b h w 3"], UInt8[Tensor, "b h w"], Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
+    """Return pictures with grade and depth, as `_render_views` does; `reach` is the width of the unreliable band."""
     depth = rasterize_mesh(vertices, faces, cameras).depth
     depth = torch.where(depth > 0, depth, torch.full_like(depth, torch.inf))
-    grade = (alpha > ALPHA_THRESHOLD).to(torch.uint8) + (_min_filter(alpha) > ALPHA_THRESHOLD).to(torch.uint8)
-    return color, grade, depth, _min_filter(depth)
+    inside = _min_filter(alpha, reach) > ALPHA_THRESHOLD
+    grade = (alpha > ALPHA_THRESHOLD).to(torch.uint8) + inside.to(torch.uint8)
+    return color, grade, depth, _min_filter(depth, reach)
 
 
-def _min_filter(values: Float[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
-    """Return the minimum within `OUTLINE` pixels."""
-    rows = max_pool2d(-values, (2 * OUTLINE + 1, 1), stride=1, padding=(OUTLINE, 0))
-    return -max_pool2d(rows, (1, 2 * OUTLINE + 1), stride=1, padding=(0, OUTLINE))
+def _min_filter(values: Float[Tensor, "b h w"], reach: int) -> Float[Tensor, "b h w"]:
+    """Return the minimum within some pixels."""
+    rows = max_pool2d(-values, (2 * reach + 1, 1), stride=1, padding=(reach, 0))
+    return -max_pool2d(rows, (1, 2 * reach + 1), stride=1, padding=(0, reach))
 
 
 def _fill_unseen(

@@ -52,6 +52,7 @@ def relax(
     offsets: Float[Tensor, "t v 3"],
     faces: Int[Tensor, "f 3"],
     silhouettes: Bool[Tensor, "t k h w"] | None = None,
+    everywhere: bool = True,
 ) -> Float[Tensor, "t v 3"]:
     """Return offsets near the given ones by which the surface moves without folds and crossings.
 
@@ -61,16 +62,17 @@ def relax(
         faces: counter-clockwise seen from outside, of nearly equal size. Defects that the rest shape has stay.
         silhouettes: of the frames (`render_silhouettes`); with them, frames that keep defects are relaxed more
             strongly where that costs at most 0.003 of their IoU.
+        everywhere: relax all of the surface once; false: only around defects, for offsets that were fitted to outlines.
     """
-    body = _ElasticBody(vertices.double().numpy(), faces.numpy())
+    body = ElasticBody(vertices.double().numpy(), faces.numpy())
     relaxed = torch.empty_like(offsets)
 
     def relax_frame(frame: int) -> None:
         tracked = (vertices + offsets[frame]).double().numpy()
-        moved = body.relaxed(tracked, GENTLE)
+        moved = body.relaxed(tracked, GENTLE, everywhere)
         if silhouettes is not None and body.defective(moved).any():
             outline = silhouettes[frame, None]
-            strong = body.relaxed(tracked, STRONG)
+            strong = body.relaxed(tracked, STRONG, everywhere)
             if body.defective(strong).sum() < body.defective(moved).sum() and (
                 _iou(strong, faces, outline) >= _iou(moved, faces, outline) - MAX_LOSS
             ):
@@ -85,7 +87,7 @@ def _iou(moved: Float64[np.ndarray, "v 3"], faces: Int[Tensor, "f 3"], silhouett
     return float(silhouette_iou(torch.from_numpy(moved).float()[None], faces, silhouettes)[0])
 
 
-class _ElasticBody:
+class ElasticBody:
     """Rest shape with its edges, and the factors of the linear system that all frames share."""
 
     def __init__(self, rest: Float64[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> None:
@@ -100,36 +102,47 @@ class _ElasticBody:
         """Mark the faces with defects that the rest shape does not have."""
         return self._finder.defective(moved) & self._sound_at_rest
 
-    def relaxed(self, tracked: Float64[np.ndarray, "v 3"], effort: Effort) -> Float64[np.ndarray, "v 3"]:
-        """Return the relaxed positions of one frame."""
+    def relaxed(
+        self, tracked: Float64[np.ndarray, "v 3"], effort: Effort, everywhere: bool
+    ) -> Float64[np.ndarray, "v 3"]:
+        """Return the relaxed positions of one frame; unless `everywhere`, vertices far from defects stay."""
         pull = np.full(len(tracked), PULL)
-        moved = self._settle(tracked, tracked, pull, None)
+        moved = self.settle(tracked, tracked, pull) if everywhere else tracked.copy()
         for _ in range(effort.rounds - 1):
             defective = self.defective(moved)
             if not defective.any():
                 break
             yielding = grown(faces_to_vertices(defective, self.faces, len(moved)), self.edges, effort.rings)
             pull[yielding] *= effort.yielding
-            moved = self._settle(moved, tracked, pull, yielding)
+            moved = self.settle(moved, tracked, pull, yielding)
         return moved
 
-    def _settle(
+    def settle(
         self,
         start: Float64[np.ndarray, "v 3"],
         tracked: Float64[np.ndarray, "v 3"],
         pull: Float64[np.ndarray, " v"],
-        free: Bool[np.ndarray, " v"] | None,
+        free: Bool[np.ndarray, " v"] | None = None,
+        passes: int = PASSES,
     ) -> Float64[np.ndarray, "v 3"]:
-        """Minimize the energy over the free vertices, all of them if None."""
+        """Minimize the energy over the free vertices, all of them if None.
+
+        Args:
+            start: positions from which the first rotations are estimated.
+            tracked: positions that the vertices are pulled to.
+            pull: weight of the pull of every vertex, against 1 for each of its edges.
+            free: vertices that may move.
+            passes: alternations of rotations and positions.
+        """
         moved, rotations, forces = start.copy(), np.empty((len(start), 3, 3)), np.empty_like(start)
         rows: slice | Int[np.ndarray, " n"] = slice(None)
         if free is None:
-            solve = self._whole.solve
+            solve = (self._whole if (pull == PULL).all() else _factors(self.laplacian, pull)).solve
         else:
             rows = np.flatnonzero(free)
             solve = _factors(self.laplacian[rows][:, rows], pull[rows]).solve
             outside = self.laplacian[rows][:, ~free]
-        for _ in range(PASSES):
+        for _ in range(passes):
             _rotations(self.edges.indptr, self.edges.indices, self.rest, moved, rotations)
             _forces(self.edges.indptr, self.edges.indices, self.rest, rotations, forces)
             wanted = (forces + pull[:, None] * tracked)[rows]

@@ -49,14 +49,14 @@ def project_to_isosurface(
         for _ in range(PASSES):
             moved = vertices + corrected[frame]
             normals = vertex_normals(moved, faces)
-            distances = _steps_to_isosurface(field, moved.numpy(), normals.numpy(), LEVEL_FACTOR * level)
+            distances = steps_to_isosurface(field, moved.numpy(), normals.numpy(), LEVEL_FACTOR * level)
             for _ in range(SMOOTHING):
                 distances = 0.5 * distances + 0.5 * (mean_of_neighbors @ distances)
             corrected[frame] += torch.from_numpy(distances.astype(np.float32))[:, None] * normals
     return corrected
 
 
-def _steps_to_isosurface(
+def steps_to_isosurface(
     field: DensityField, positions: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"], level: float
 ) -> Float[np.ndarray, " v"]:
     """Return the signed distance of every vertex along its normal to the isosurface; 0 where none is within reach."""

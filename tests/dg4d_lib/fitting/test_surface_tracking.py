@@ -13,7 +13,7 @@ from creatures import creature, seen
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
-from dg4d_lib.fitting.surface_tracking import track_surface
+from dg4d_lib.fitting.surface_tracking import track_surface, tracking_orders
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.known import KnownShapes
 from dg4d_lib.guidance.moved import MovedSurfaces
@@ -64,3 +64,13 @@ def test_views_of_a_moved_surface_show_it_at_their_frame(tracked: list[InflatedS
     assert columns[0] < columns[1] - 3  # to the left, seen from behind
     with pytest.raises(BadInput, match="frame 2"):
         KnownShapes(shapes, {}).surface(2)
+
+
+def test_loops_are_tracked_by_halves_and_other_videos_to_their_ends() -> None:
+    turning = torch.zeros(6, 8, 8, 3)
+    for frame in range(6):
+        turning[frame, frame] = 1  # as far from the last frame to the first as between others
+    alpha = torch.ones(6, 8, 8, 1)
+    assert tracking_orders(DrivingVideo(turning, alpha, 5.0), 4) == ([4, 5, 0, 1], [4, 3, 2])
+    growing = turning.cumsum(0)
+    assert tracking_orders(DrivingVideo(growing, alpha, 5.0), 4) == ([4, 5], [4, 3, 2, 1, 0])

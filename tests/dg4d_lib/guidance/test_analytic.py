@@ -56,3 +56,15 @@ def test_free_pixels_converge_to_the_known_picture():
     color, alpha = known_pictures()
     assert (images - color).abs().max() < 0.01
     assert (coverage - alpha).abs().max() < 0.01
+
+
+def test_frames_have_their_own_weights():
+    def loss(frame: int, **weights) -> float:
+        known = AnalyticPrior(lambda views: known_pictures(), TimestepSchedule(0.98), **weights)
+        views = [GuidanceView(VIEWS[0].camera, frame)] * 3
+        images = torch.zeros(3, SIZE, SIZE, 3)
+        return float(known.loss(images, images[..., :1], views, 0.5, torch.Generator()))
+
+    weights = {"weight": 0.25, "weights": {0: 1.0}}
+    assert loss(0, **weights) == pytest.approx(loss(0))
+    assert loss(5, **weights) == pytest.approx(loss(0) / 4)

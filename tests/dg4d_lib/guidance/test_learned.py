@@ -9,6 +9,7 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.interface import GuidanceView, SubjectShapes
 from dg4d_lib.guidance.learned import LearnedShapes
 from dg4d_lib.settings import LearnedPriorSettings
+from dg4d_lib.shape_prior.field import ShapeFields
 
 SIZE = 48
 SETTINGS = LearnedPriorSettings(depth_sigma=0)
@@ -22,7 +23,7 @@ def disc(x: float) -> torch.Tensor:
 
 
 def shapes(*places: float, settings: LearnedPriorSettings = SETTINGS) -> SubjectShapes:
-    return LearnedShapes(tiny_network(), [disc(x) for x in places], settings)
+    return LearnedShapes(ShapeFields(tiny_network(), [disc(x) for x in places]), settings)
 
 
 @pytest.mark.parametrize("settings", [SETTINGS, AVERAGES])

@@ -1,0 +1,103 @@
+"""Meshes that follow the video: legs that cross and touch on the way keep their surfaces."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from dg4d_lib.asset_settings import AssetSettings
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.fitting import guided_mesh
+from dg4d_lib.fitting.guided_mesh import follow_video, frames_with_long_outlines, select_guided_reference
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
+from dg4d_lib.mesh.extraction.density import density_field
+from dg4d_lib.mesh.extraction.extract import extract_surface, select_level
+from dg4d_lib.mesh.extraction.silhouettes import render_silhouettes, silhouette_iou
+from dg4d_lib.rasterizer.interface import get_rasterizer
+from dg4d_lib.settings import MeshSettings
+from dg4d_lib.video.driving import DrivingVideo
+
+FRAMES = 5
+SWING_DEG = 20.0  # per frame; the legs cross in the middle
+SETTINGS = MeshSettings(grid=32, max_faces=4000, edge_length=0.04)
+FAST = AssetSettings(fit_points=400, nodes=24, size=48, track_iterations=20, joint_iterations=0)
+IN_FRONT = np.array([0, 0, 0.06])
+RASTERIZE = get_rasterizer("cpu")
+
+
+def leg(angle_deg: float) -> np.ndarray:
+    """Points on a capsule that hangs from a hip and is turned in the plane of the picture."""
+    capsule = trimesh.creation.capsule(0.45, 0.07, count=[10, 10])
+    points = trimesh.transform_points(capsule.vertices, trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
+    turn = trimesh.transformations.rotation_matrix(np.radians(angle_deg), [0, 0, 1])
+    return trimesh.transform_points(points - np.array([0, 0.1, 0]), turn)
+
+
+def scissors() -> Gaussians:
+    """Two legs that swing past each other in parallel planes and exchange their Gaussians when they touch."""
+    states = []
+    for frame in range(FRAMES):
+        angle = SWING_DEG * (frame - FRAMES // 2)
+        states.append(np.concatenate([leg(angle) + IN_FRONT, leg(-angle) - IN_FRONT]))
+    means = torch.from_numpy(np.stack(states).astype(np.float32))
+    count = means.shape[1]
+    half = count // 2
+    means[FRAMES // 2 + 1 :] = torch.cat([means[FRAMES // 2 + 1 :, half:], means[FRAMES // 2 + 1 :, :half]], 1)
+    along = torch.linspace(0, 1, half)[:, None].repeat(2, 1)
+    colors = torch.cat([0.2 + 0.6 * along, 0.5 - 0.3 * along, 0.8 - 0.6 * along], 1)
+    return Gaussians(
+        means,
+        torch.full((FRAMES, count, 3), -3.5),
+        torch.tensor([[1.0, 0, 0, 0]]).expand(FRAMES, count, 4),
+        torch.full((count,), 3.0),
+        rgb_to_sh(colors),
+    )
+
+
+def video_of(states: Gaussians) -> DrivingVideo:
+    camera = OrbitCamera(width=128, height=128)
+    drawn = RASTERIZE(states, [camera] * FRAMES, torch.zeros(3))
+    return DrivingVideo((drawn.color / drawn.alpha.clamp_min(1e-6)).clamp(0, 1), drawn.alpha, 8.0)
+
+
+def test_frames_with_long_outlines_have_the_legs_apart() -> None:
+    video = video_of(scissors())
+    assert FRAMES // 2 not in frames_with_long_outlines(video, 2)
+    assert frames_with_long_outlines(video, 99)[-1] == FRAMES // 2
+
+
+def test_candidates_are_apart_in_time() -> None:
+    alpha = torch.zeros(20, 32, 32, 1)
+    alpha[:, 8:24, 8:24] = 1
+    still = DrivingVideo(torch.zeros(20, 32, 32, 3), alpha, 8.0)
+    chosen = frames_with_long_outlines(still, 3)
+    assert min(abs(a - b) for a in chosen for b in chosen if a != b) > 2
+
+
+def test_a_mesh_follows_legs_that_cross(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guided_mesh, "TRACKING", FAST)
+    states = scissors()
+    video = video_of(states)
+    rest = states.at(0)
+    field = density_field(rest, SETTINGS)
+    level, _ = select_level(field, rest, RASTERIZE, 0.5)
+    vertices, faces = map(torch.from_numpy, extract_surface(field, level))
+    generator = torch.Generator().manual_seed(0)
+    offsets = follow_video(vertices, faces, states, video, 0, level, RASTERIZE, SETTINGS, generator)
+    silhouettes = render_silhouettes(states, range(FRAMES), RASTERIZE, video.alpha[..., 0])
+    still = silhouette_iou(vertices.expand(FRAMES, -1, -1), faces, silhouettes)
+    followed = silhouette_iou(vertices + offsets, faces, silhouettes)
+    assert still[FRAMES // 2 :].min() < 0.75
+    assert followed.min() > 0.8 and followed.mean() > 0.87
+
+
+def test_the_chosen_frame_has_the_legs_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guided_mesh, "TRIAL", FAST.model_copy(update={"track_iterations": 5}))
+    states = scissors()
+    middle = FRAMES // 2
+    frame, followed = select_guided_reference(
+        states, video_of(states), RASTERIZE, SETTINGS, middle, torch.Generator().manual_seed(0)
+    )
+    assert frame != middle
+    assert 0.85 < followed < 1
