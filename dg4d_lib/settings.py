@@ -101,7 +101,7 @@ class LearnedPriorSettings(Settings):
         0.5, ge=0, le=10, description="factor on the guidance loss; a smaller one leaves the input view sharper"
     )
     depth_sigma: float = Field(
-        0.09,
+        0.03,
         ge=0,
         le=0.5,
         description="standard deviation of the guessed depth, world units: a view from the side is the average over it,"

@@ -13,7 +13,7 @@ from torch import Tensor
 from dg4d_lib.shape_prior.field import Fields, ShapeField, bounded_logits, premultiplied
 from dg4d_lib.video.first_frame import Correspondence, match_first_frame
 
-MOST = 0.75  # share of the first frame where the video is followed perfectly
+MOST = 1.0  # share of the first frame where the video is followed perfectly
 
 
 class CarriedFields:

@@ -6,19 +6,27 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 
-SMOOTHNESS = 2.0  # cells: standard deviation of the blur of the logits, so that neighboring rays decide alike
 STEPS = 20  # of the bisection
 RANGE = 30.0  # logits: largest shift of a ray
 GENEROSITY = 0.5  # cells of matter per unit of variance on a ray: unsure shapes overlap most with more than is expected
 LEAST = 1.0  # cells of matter on a ray of the subject
 TIE = 1e-3  # logits by which the ends of a ray are less probable than its middle
+OFF_MIDDLE = 0.01  # shift of that middle, in halves of a ray, so that no two cells are equal
 
 
-def smooth_logits(logits: Float[Tensor, "128 128 64"], mask: Bool[Tensor, "128 128"]) -> Float[Tensor, "128 128 64"]:
-    """Return logits averaged with those of neighboring cells of the subject; the outline stays where it is."""
+def smooth_logits(
+    logits: Float[Tensor, "128 128 64"], mask: Bool[Tensor, "128 128"], smoothness: float
+) -> Float[Tensor, "128 128 64"]:
+    """Return logits averaged with those of neighboring cells of the subject; the outline stays where it is.
+
+    Args:
+        logits: of every cell lying inside the subject.
+        mask: pixels of the subject.
+        smoothness: standard deviation of the blur, cells.
+    """
     inside = mask.numpy()[..., None].astype(np.float32)
-    share = ndimage.gaussian_filter(inside, (SMOOTHNESS, SMOOTHNESS, 0))
-    smooth = ndimage.gaussian_filter(logits.numpy() * inside, SMOOTHNESS) / np.maximum(share, 1e-3)
+    share = ndimage.gaussian_filter(inside, (smoothness, smoothness, 0))
+    smooth = ndimage.gaussian_filter(logits.numpy() * inside, smoothness) / np.maximum(share, 1e-3)
     return torch.where(mask[..., None], torch.from_numpy(smooth), logits)
 
 
@@ -42,7 +50,7 @@ def most_probable(
     Returns:
         Values in [-1, 1]; 1 at the best cell of each of these rays, -1 on all others.
     """
-    middle = torch.linspace(-1, 1, logits.shape[-1]).abs()
+    middle = torch.linspace(-1, 1 + OFF_MIDDLE, logits.shape[-1]).abs()
     rays = logits[mask] - TIE * middle
     expected = matter_on(logits[mask], generosity)
     ranked = rays.sort(-1, descending=True).values

@@ -38,7 +38,7 @@ def hint_evidence(
     inside = mask.numpy()
     if hint.sigma:
         bulge = heights(inside, PIXEL)
-        front = middle + bulge
+        front = (middle + bulge).clip(DEPTHS[-1] + THINNEST, DEPTHS[0])  # deeper or nearer, rays would be empty
         thickness = np.maximum(2 * np.maximum(bulge, THINNEST), _bridges(front, inside))
         return torch.from_numpy(weight[..., None] * front_evidence(front, thickness, hint.sigma)).to(logits)
     return torch.from_numpy(middle_evidence(middle, own_middle(logits, inside))).to(logits)

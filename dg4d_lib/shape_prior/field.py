@@ -22,6 +22,7 @@ from dg4d_lib.shape_prior.network import VISIBLE, Features, ShapePriorNetwork
 
 INFLATED_SOFTNESS = 0.05  # world units: depth over which the occupancy of an inflated shape falls
 SURE, UNSURE = 0.8, 0.95  # expected 1 - p of matter: below it the network alone, above it the inflation alone
+SMOOTHNESS, KNOWN_SMOOTHNESS = 2.0, 1.0  # cells: of surfaces that the network guesses, and of those that are known
 LARGEST_LOGIT = 5.3  # probabilities are kept from 0.005 to 0.995
 
 
@@ -35,6 +36,7 @@ class ShapeField:
         hidden: color of surfaces that the picture does not show, in [0, 1].
         mask: pixels of the subject.
         inflated_share: share of the inflation in the probabilities, in [0, 1].
+        smoothness: cells over which neighboring rays decide alike where the surface lies.
     """
 
     logits: Float[Tensor, "128 128 64"]
@@ -42,6 +44,7 @@ class ShapeField:
     hidden: Float[Tensor, "128 128 64 3"]
     mask: Bool[Tensor, "128 128"]
     inflated_share: float
+    smoothness: float = SMOOTHNESS
 
 
 @runtime_checkable
@@ -117,7 +120,8 @@ class ShapeFields:
             probability = logits.sigmoid()
             left = transmittance(optical_density(probability, mask))
             hidden = mirrored_colors(hidden, front, probability, left, mask, plane)
-        return ShapeField(logits, front, hidden, mask, share)
+        smoothness = KNOWN_SMOOTHNESS if self._hint.sigma else SMOOTHNESS
+        return ShapeField(logits, front, hidden, mask, share, smoothness)
 
     def _plane(self, features: Features) -> MirrorPlane:
         """Return the mirror plane of a frame, the mean over the picture and its mirror image."""

@@ -23,7 +23,7 @@ def decided_surface(field: ShapeField) -> InflatedSurface:
 
     A surface at one probability would leave out what is sure to be there but not where, or be far too thick.
     """
-    chosen = most_probable(smooth_logits(field.logits, field.mask), field.mask, GENEROSITY).numpy()
+    chosen = most_probable(smooth_logits(field.logits, field.mask, field.smoothness), field.mask, GENEROSITY).numpy()
     volume = np.pad(chosen, 1, constant_values=-1.0)
     places, faces, _, _ = marching_cubes(volume, 0.0)
     row, column, cell = (places - 0.5).astype(np.float64).T

@@ -5,6 +5,7 @@ import pytest
 import torch
 from tiny_shape_prior import tiny_network
 
+from dg4d_lib.inflation.heights import heights
 from dg4d_lib.inflation.hints import DepthField, DepthHint
 from dg4d_lib.shape_prior.evidence import (
     BEHIND,
@@ -17,7 +18,8 @@ from dg4d_lib.shape_prior.evidence import (
     own_middle,
 )
 from dg4d_lib.shape_prior.field import ShapeFields
-from dg4d_lib.shape_prior.frustum import BINS, SIZE
+from dg4d_lib.shape_prior.frustum import BINS, SIZE, TAN_HALF_FOV
+from dg4d_lib.shape_prior.surface import decided_surface
 
 MASK = torch.zeros(SIZE, SIZE, dtype=torch.bool)
 MASK[30:100, 20:110] = True
@@ -56,11 +58,33 @@ def test_a_known_surface_has_nothing_before_it_and_matter_behind_it() -> None:
 
 def test_the_first_surface_moves_to_the_hinted_depth() -> None:
     picture = torch.zeros(SIZE, SIZE, 4)
-    picture[MASK] = torch.tensor([0.5, 0.2, 0.1, 1.0])
+    picture[50:80, 55:75] = torch.tensor([0.5, 0.2, 0.1, 1.0])
+    known = picture[..., 3] > 0
     for place in (-0.3, 0.3):
+        hint = DepthHint(0.0, DepthField(torch.full((SIZE, SIZE), place), known, 0.03))
+        logits = ShapeFields(tiny_network(), [picture], hint).predict(0).logits[65, 65]
+        half = heights(known.numpy(), 4 * TAN_HALF_FOV / SIZE)[65, 65]
+        first = float(DEPTHS[int((logits > 0).int().argmax())])
+        assert first == pytest.approx(place + half, abs=0.05)
+
+
+def test_a_leg_behind_a_body_goes_on_behind_it() -> None:
+    middle = torch.full((SIZE, SIZE), 0.3)
+    middle[75:, 60:66] = -0.3  # the leg, and a body whose back lies before it
+    mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    mask[60:76, 20:110] = mask[75:100, 60:66] = True
+    found = hint_evidence(DepthHint(0.0, DepthField(middle, mask, 0.03)), bump(0.0), mask)
+    between = int(np.argmin(np.abs(DEPTHS + 0.05)))
+    assert found[74, 63, between] > 0 > found[74, 25, between]
+
+
+def test_surfaces_out_of_the_frustum_leave_no_ray_empty() -> None:
+    picture = torch.zeros(SIZE, SIZE, 4)
+    picture[MASK] = torch.tensor([0.5, 0.2, 0.1, 1.0])
+    for place in (-1.0, 1.0):
         hint = DepthHint(0.0, DepthField(torch.full((SIZE, SIZE), place), MASK, 0.03))
-        matter = ShapeFields(tiny_network(), [picture], hint).predict(0).logits[65, 65].sigmoid()
-        assert float((matter * torch.from_numpy(DEPTHS).float()).sum() / matter.sum()) == pytest.approx(place, abs=0.12)
+        field = ShapeFields(tiny_network(), [picture], hint).predict(0)
+        assert decided_surface(field).vertices.isfinite().all()
 
 
 def test_turns_to_both_sides_are_mirror_images() -> None:

@@ -11,10 +11,11 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.inflation.hints import DepthHint
 from dg4d_lib.inflation.render import render_surface
-from dg4d_lib.shape_prior.decided import GENEROSITY, decide, matter_on, smooth_logits
+from dg4d_lib.shape_prior.decided import GENEROSITY, decide, matter_on, most_probable, smooth_logits
 from dg4d_lib.shape_prior.expected import expected_volume
 from dg4d_lib.shape_prior.field import (
     LARGEST_LOGIT,
+    SMOOTHNESS,
     SURE,
     UNSURE,
     ShapeField,
@@ -134,7 +135,7 @@ def test_unsure_matter_counts_for_more():
 def test_smooth_logits_keep_the_outline_and_a_plane():
     field = ball()
     level = torch.where(field.mask[..., None], torch.tensor(2.0), torch.tensor(-LARGEST_LOGIT)).expand(SIZE, SIZE, BINS)
-    torch.testing.assert_close(smooth_logits(level, field.mask), level, atol=1e-4, rtol=0)
+    torch.testing.assert_close(smooth_logits(level, field.mask, SMOOTHNESS), level, atol=1e-4, rtol=0)
 
 
 def test_a_mirrored_picture_has_the_mirrored_field():
@@ -186,6 +187,13 @@ def test_a_hint_brings_the_right_side_nearer_and_mirrors():
         depth = (matter * near).sum(1) / matter.sum(1)
         sides.append(float(depth[95:105].mean() - depth[25:35].mean()))
     assert sides[1] - sides[0] > 0.05 and sides[2] - sides[0] < -0.05
+
+
+def test_a_ray_whose_cells_are_all_equal_has_matter_in_its_middle():
+    mask = torch.ones(SIZE, SIZE, dtype=torch.bool)
+    chosen = most_probable(torch.full((SIZE, SIZE, BINS), -LARGEST_LOGIT), mask)
+    assert chosen.isfinite().all()
+    assert (chosen.argmax(-1) - BINS / 2).abs().max() <= 1 and (chosen.amax(-1) == 1).all()
 
 
 def test_oblong_pictures_are_refused():
