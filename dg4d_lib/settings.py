@@ -11,6 +11,7 @@ Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Precision = Literal["fp16", "bf16", "fp32"]
+UnwrapMethod = Literal["charts", "xatlas"]
 NoiseDraw = Literal["annealed", "uniform"]  # timestep of an iteration: T_max, or uniform below it
 PipelineBudget = Annotated[
     float,
@@ -424,6 +425,10 @@ class MeshSettings(Settings):
     max_faces: int = Field(100000, ge=100, description="largest number of triangles of a mesh")
     min_component: Share = Field(
         0.02, description="connected components with a smaller fraction of the faces are removed"
+    )
+    unwrap: UnwrapMethod = Field(
+        "charts",
+        description="charts: even, none mirrored (ours); xatlas: by that library, in half the time, with more islands",
     )
     texture_size: int = Field(1024, ge=64, le=8192, description="texels per side")
     render_size: int = Field(512, ge=64, le=2048, description="pixels of the renders that are baked into the texture")

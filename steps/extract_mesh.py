@@ -206,7 +206,7 @@ def _colored(
     footage: Footage,
 ) -> tuple[TexturedMesh, Int[Tensor, " w"]]:
     """Return the unwrapped mesh with a baked texture, and the source vertex of each of its vertices."""
-    unwrapped = unwrap(vertices.numpy(), faces.numpy(), settings.texture_size)
+    unwrapped = unwrap(vertices.numpy(), faces.numpy(), settings.texture_size, settings.unwrap)
     sources, corners, uvs = map(torch.from_numpy, unwrapped)
     normals = vertex_normals(vertices, faces)[sources]
     moments = footage(sources)

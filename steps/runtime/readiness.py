@@ -24,7 +24,7 @@ from steps.runtime.weights import weights_home, weights_in
 NVIDIA_DRIVER = Path("/proc/driver/nvidia/version")
 MEMORY = Path("/proc/meminfo")
 TORCH_TIMEOUT_S = 120  # for the import of torch in a process of its own
-CORE = ("torch", "numpy", "scipy", "numba", "av", "OpenImageIO", "PIL", "skimage", "trimesh", "pymeshlab")
+CORE = ("torch", "numpy", "scipy", "numba", "av", "OpenImageIO", "PIL", "skimage", "trimesh", "xatlas", "pymeshlab")
 NETWORKS = ("diffusers", "transformers", "accelerate", "safetensors")  # of profiles with weights
 SHOWN = ("torch", "gsplat", "diffusers", "transformers", "av")  # packages whose versions are shown
 SETUP, SETUP_CUDA = "make setup", "make setup CUDA=1"

@@ -18,7 +18,7 @@ from packaging.utils import canonicalize_name
 
 HEAVY = {
     "torch", "diffusers", "transformers", "huggingface_hub",
-    "gsplat", "prefect", "numpy", "scipy", "numba", "llvmlite", "skimage", "trimesh",
+    "gsplat", "prefect", "numpy", "scipy", "numba", "llvmlite", "skimage", "trimesh", "xatlas",
     "pymeshlab", "av", "OpenImageIO", "PIL", "safetensors", "jaxtyping", "rich", "pxr",
 }  # fmt: skip
 LIGHT_MODULES = (

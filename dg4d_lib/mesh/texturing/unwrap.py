@@ -7,12 +7,17 @@ from dg4d_lib.errors import DG4DError
 from dg4d_lib.mesh.neighbors import edge_graph, neighbor_means
 from dg4d_lib.mesh.texturing.chart_packing import pack_charts
 from dg4d_lib.mesh.texturing.charts import find_charts
+from dg4d_lib.mesh.texturing.xatlas_charts import unwrap_with_xatlas
+from dg4d_lib.settings import UnwrapMethod
 
 SMOOTHING = 20  # Taubin steps; charts follow the normals of a smoothed copy, so that noise does not divide them
 
 
 def unwrap(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], size: int
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    size: int,
+    method: UnwrapMethod = "charts",
 ) -> tuple[Int[np.ndarray, " w"], Int[np.ndarray, "f 3"], Float[np.ndarray, "w 2"]]:
     """Unwrap a mesh: compute texture coordinates without overlaps.
 
@@ -20,6 +25,7 @@ def unwrap(
         vertices: any units.
         faces: counter-clockwise seen from outside.
         size: side of the square texture, texels.
+        method: charts of this project, or those of xatlas, which may be mirrored.
 
     Returns:
         For every new vertex the index of the old one it copies (vertices are split along seams); the faces in their
@@ -27,9 +33,13 @@ def unwrap(
         the surface as it is seen from outside, not mirrored, and are at least two texels apart.
 
     Raises:
-        DG4DError: the charts do not fit into the texture.
+        BackendUnavailable: xatlas is missing.
+        DG4DError: the charts do not fit into the texture, or xatlas crashed.
     """
-    charts = find_charts(vertices, faces, taubin_smooth(vertices, faces))
+    smooth = taubin_smooth(vertices, faces)
+    if method == "xatlas":
+        return unwrap_with_xatlas(smooth, faces, size)
+    charts = find_charts(vertices, faces, smooth)
     uvs = pack_charts(charts.flat, charts.faces, charts.labels, size)
     if uvs is None:
         raise DG4DError(

@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -120,3 +123,17 @@ def test_smoothing_takes_noise_away_and_keeps_the_size(sphere: Mesh) -> None:
     radii = np.linalg.norm(taubin_smooth(vertices + noise, faces), axis=1)
     assert radii.std() < 0.4 * np.linalg.norm(vertices + noise, axis=1).std()
     assert radii.mean() == pytest.approx(0.5, rel=0.01)
+
+
+def test_xatlas_unwraps_in_a_process_of_its_own() -> None:
+    code = """if True:
+        import sys
+        import numpy as np
+        from dg4d_lib.mesh.texturing.unwrap import unwrap
+        corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+        faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+        sources, new, uvs = unwrap(corners, faces, 64, "xatlas")
+        assert (sources[new] == faces).all() and uvs.min() >= 0 and uvs.max() <= 1
+        sys.exit("xatlas" in sys.modules)
+    """
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
