@@ -34,6 +34,7 @@ SMALL = revise(
         "static.reference_size": 32,
         "static.prune_scale": 1.0,
         "motion.iterations": 2,
+        "motion.fine_tune": False,
         "motion.reference_size": 32,
         "motion.frames_per_iteration": 0,
         "static.resolution_schedule": [{"until": 1.0, "size": 32}],

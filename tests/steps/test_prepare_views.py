@@ -77,7 +77,7 @@ def test_pictures_become_a_bank_that_replaces_the_guess(tmp_path):
     overlaps = [
         float(
             iou(
-                seen(subject_shapes(GeometricPriorSettings(), [subject], 0, b).surface(0), 45).cutout[None, ..., 3:],
+                seen(subject_shapes(GeometricPriorSettings(), [subject], sides=b).surface(0), 45).cutout[None, ..., 3:],
                 truth,
             )
         )

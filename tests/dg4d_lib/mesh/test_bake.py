@@ -7,13 +7,13 @@ from scipy import ndimage
 from torch.nn.functional import max_pool2d
 
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.mesh.texturing.bake import bake_texture, locate_texels, vertex_normals
+from dg4d_lib.mesh.texturing.bake import PosedSurface, bake_texture, locate_texels, vertex_normals
 from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
 
 SETTINGS = MeshSettings(texture_size=128, render_size=128)
-RED, BLUE = torch.tensor([0.8, 0.1, 0.1]), torch.tensor([0.1, 0.1, 0.8])
+RED, GREEN, BLUE = torch.tensor([0.8, 0.1, 0.1]), torch.tensor([0.1, 0.8, 0.1]), torch.tensor([0.1, 0.1, 0.8])
 Cloud = Callable[..., Gaussians]
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -23,6 +23,12 @@ def flattened(vertices: np.ndarray, faces: np.ndarray) -> tuple[torch.Tensor, ..
     normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces))
     copied, corners, uvs = (torch.from_numpy(a) for a in unwrap(vertices, faces, SETTINGS.texture_size))
     return torch.from_numpy(vertices)[copied], normals[copied], corners, uvs
+
+
+def green_frame(alpha: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Color and alpha of a frame."""
+    side = SETTINGS.render_size
+    return GREEN.expand(side, side, 3), torch.full((side, side, 1), alpha)
 
 
 def red_and_blue(points: torch.Tensor) -> torch.Tensor:
@@ -88,25 +94,29 @@ def test_far_from_all_charts_there_is_no_hole_either(baked: tuple[torch.Tensor, 
     assert -0.1 < share.min() < share.max() < 1.1
 
 
-def test_the_picture_colors_what_it_shows(sphere: Mesh, sphere_of_gaussians: Cloud) -> None:
-    """A green picture of a sphere of red and blue Gaussians: its front becomes green, its back does not."""
-    mesh, side = flattened(*sphere), SETTINGS.render_size
+def test_footage_colors_what_it_shows_where_the_surface_was(sphere: Mesh, sphere_of_gaussians: Cloud) -> None:
+    """Green frames of a sphere of red and blue Gaussians that turned by a right angle about y.
+
+    What faced the camera in the frame becomes green; what faced it at rest is oblique there and keeps its color.
+    """
+    vertices, normals, faces, uvs = flattened(*sphere)
+    turned = torch.tensor([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # takes x to z
+    footage = PosedSurface(vertices @ turned, normals @ turned, *green_frame(1.0))
     gaussians = sphere_of_gaussians(2500, 0.5, red_and_blue)
-    green = torch.tensor([0.1, 0.8, 0.1])
-    picture = torch.cat([green.expand(side, side, 3), torch.ones(side, side, 1)], -1)
-    texture = bake_texture(*mesh, gaussians, get_rasterizer("auto"), SETTINGS, picture)
-    texels = locate_texels(*mesh, SETTINGS.texture_size)
+    texture = bake_texture(vertices, normals, faces, uvs, gaussians, get_rasterizer("auto"), SETTINGS, [footage])
+    texels = locate_texels(vertices, normals, faces, uvs, SETTINGS.texture_size)
     colors = texture[texels.rows, texels.columns]
-    front, back = texels.normals[:, 2] > 0.85, texels.normals[:, 2] < -0.2
-    assert (colors[front] - green).abs().max() < 0.05
-    assert (colors[back, 1] < 0.2).all()
+    shown, hidden = texels.normals @ turned[:, 2] > 0.85, texels.normals @ turned[:, 2] < -0.2
+    assert shown.sum() > 300 and hidden.sum() > 1000
+    assert (colors[shown] - GREEN).abs().max() < 0.05
+    assert (colors[hidden, 1] < 0.2).all()
 
 
-def test_a_transparent_picture_changes_nothing(sphere: Mesh, sphere_of_gaussians: Cloud) -> None:
+def test_transparent_footage_changes_nothing(sphere: Mesh, sphere_of_gaussians: Cloud) -> None:
     mesh, gaussians = flattened(*sphere), sphere_of_gaussians(600, 0.5, red_and_blue)
-    picture = torch.zeros(SETTINGS.render_size, SETTINGS.render_size, 4)
+    nothing = PosedSurface(*mesh[:2], *green_frame(0.0))
     rasterize = get_rasterizer("auto")
-    textures = [bake_texture(*mesh, gaussians, rasterize, SETTINGS, given) for given in (None, picture)]
+    textures = [bake_texture(*mesh, gaussians, rasterize, SETTINGS, given) for given in ((), [nothing])]
     assert (textures[0] - textures[1]).abs().mean() < 0.01  # the front then comes from oblique views
 
 
