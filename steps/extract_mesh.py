@@ -21,6 +21,7 @@ from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface, usable_level
 from dg4d_lib.mesh.extraction.silhouettes import render_silhouettes, silhouette_iou
 from dg4d_lib.mesh.extraction.topology import MeshTopology, check_topology, weld_vertices
+from dg4d_lib.mesh.extraction.tunnels import fill_tunnels
 from dg4d_lib.mesh.extraction.unfold import unfold
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
@@ -101,7 +102,7 @@ def textured_mesh(
     gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings, frame: Frame | None = None
 ) -> TexturedMesh:
     """Return the isosurface of one state of the Gaussians at a density, with a texture baked from it and the frame."""
-    vertices, faces = _cleaned_surface(gaussians, level, settings)
+    vertices, faces = _cleaned_surface(gaussians, level, rasterize, settings)
     return _colored(vertices, faces, gaussians, rasterize, settings, _shown(vertices, faces, frame))[0]
 
 
@@ -127,7 +128,7 @@ def _tracked(
     """Return the mesh of the reference frame with its offsets at every frame, and the IoU of its outlines."""
     frame, level = plan.reference_frame, plan.level
     rest = states.at(frame)
-    vertices, faces = _cleaned_surface(rest, level, settings)
+    vertices, faces = _cleaned_surface(rest, level, rasterize, settings)
     with ThreadPoolExecutor(1) as beside:  # unwrapping keeps one core busy, and tracking needs no texture
         shown = _shown(vertices, faces, _at(video, frame))
         coloring = beside.submit(_colored, vertices, faces, rest, rasterize, settings, shown)
@@ -152,7 +153,7 @@ def _guided(
     """Return the mesh that follows the driving video, with colors from it, and the IoU of its outlines."""
     frame, level = plan.reference_frame, plan.level
     rest = states.at(frame)
-    vertices, faces = _cleaned_surface(rest, level, settings)
+    vertices, faces = _cleaned_surface(rest, level, rasterize, settings)
     offsets = follow_video(vertices, faces, states, video, frame, level, rasterize, settings, generator)
     mesh, sources = _colored(
         vertices, faces, rest, rasterize, settings, lambda sources: _footage(vertices + offsets, faces, sources, video)
@@ -190,10 +191,12 @@ def _shown(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], frame: Fra
 
 
 def _cleaned_surface(
-    gaussians: Gaussians, level: float, settings: MeshSettings
+    gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings
 ) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
     field = density_field(gaussians, settings)
-    vertices, faces = clean(*extract_surface(field, usable_level(field, level)), settings, field.unit)
+    level = usable_level(field, level)
+    field = fill_tunnels(field, level, gaussians, rasterize)
+    vertices, faces = clean(*extract_surface(field, level), settings, field.unit)
     return torch.from_numpy(unfold(vertices, faces)), torch.from_numpy(faces)
 
 

@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from dg4d_lib.mesh.folds import DefectFinder
 from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, grown, neighbor_means
 
-ROUNDS = 24  # at most
+ROUNDS = 24  # at most; smoothing also shrinks, which makes new defects in the end, so the best round counts
 WIDER = 6  # rounds after which one more ring of neighbors is smoothed
 SWEEPS = 3  # averagings with the neighbors per round
 STEP = 0.5  # share of the way to the mean of the neighbors
@@ -22,11 +22,14 @@ def unfold(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) ->
     edges = edge_graph(faces, len(vertices))
     mean_of_neighbors, finder = neighbor_means(edges), DefectFinder(faces)
     smooth = vertices.astype(np.float64)
+    fewest, best = len(faces) + 1, smooth
     for number in range(ROUNDS):
         defective = finder.defective(smooth)
-        if not defective.any():
+        if defective.sum() < fewest:
+            fewest, best = defective.sum(), smooth.copy()
+        if fewest == 0:
             break
         around = grown(faces_to_vertices(defective, faces, len(smooth)), edges, 1 + number // WIDER)
         for _ in range(SWEEPS):
             smooth[around] += STEP * ((mean_of_neighbors @ smooth)[around] - smooth[around])
-    return smooth.astype(vertices.dtype)
+    return best.astype(vertices.dtype)

@@ -99,6 +99,18 @@ def test_a_spike_through_the_other_side_is_smoothed_away() -> None:
     assert unfold(vertices, faces) is not vertices and np.array_equal(unfold(vertices, faces), vertices)
 
 
+def test_more_rounds_of_smoothing_never_leave_more_defects(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thin and crumpled tube, which smoothing collapses in the end."""
+    vertices, faces = tube(rings=41, around=4)
+    noise = 0.05 * np.random.default_rng(0).normal(size=vertices.shape) * [0.3, 1, 1]
+    left = []
+    for rounds in range(1, 25):
+        monkeypatch.setattr("dg4d_lib.mesh.extraction.unfold.ROUNDS", rounds)
+        left.append(DefectFinder(faces).defective(unfold(vertices + noise, faces)).sum())
+    assert left[0] > 100 and left[-1] < 10
+    assert left == sorted(left, reverse=True)
+
+
 def test_a_bone_that_bends_a_tube_at_once_makes_folds_and_relaxing_takes_them_away() -> None:
     vertices, faces = tube()
     moved = bent(vertices, 50.0)

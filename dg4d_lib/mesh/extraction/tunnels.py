@@ -1,0 +1,89 @@
+"""Removal of handles that no view shows: tunnels through the body of a density field are filled.
+
+The Gaussians of a fit leave gaps where parts of a body meet, such as a leg and the belly, and the surface gets a handle
+around every gap. Silhouettes hide these tunnels, light shows them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy import ndimage
+from skimage.measure import euler_number
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.mesh.extraction.density import DensityField
+from dg4d_lib.mesh.extraction.extract import SILHOUETTE_SIZE, SILHOUETTE_VIEWS_DEG
+from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
+from dg4d_lib.rasterizer.interface import Rasterizer
+
+RADII = (1, 2, 3, 4)  # cells; tunnels narrower than twice the last are filled, the narrowest first
+INSIDE = 1.3  # density of filled samples, of the level: the surface over them lies between the samples
+COVERED = 0.75  # smallest share of a filled tunnel that every view sees covered
+CONNECTIVITY = 3  # samples that share a corner are connected
+
+
+def fill_tunnels(field: DensityField, level: float, gaussians: Gaussians, rasterize: Rasterizer) -> DensityField:
+    """Return the field with narrow tunnels filled, except those that some view looks through.
+
+    A morphological closing (dilation by a ball, then erosion) gives the candidates; those that lower the genus are
+    filled.
+
+    Args:
+        field: the density of these Gaussians.
+        level: density of the surface.
+        gaussians: one state; their silhouettes tell which tunnels are seen.
+        rasterize: the splatting backend.
+    """
+    inside = field.values.numpy() >= level
+    if not inside.any():
+        return field
+    (body,), margin = ndimage.find_objects(inside.astype(np.int8)), RADII[-1] + 2
+    origin = field.origin.double().numpy() + (np.array([side.start for side in body]) - margin) * field.cell
+    solid = np.pad(inside[body], margin)
+    filled, views = solid.copy(), _silhouettes(gaussians, rasterize)
+    for radius in RADII:
+        candidates, _ = ndimage.label(_closed(filled, radius) & ~filled)
+        for number, place in enumerate(ndimage.find_objects(candidates), 1):
+            box = tuple(slice(side.start - 1, side.stop + 1) for side in place)
+            here, part = filled[box], candidates[box] == number
+            if euler_number(here | part, CONNECTIVITY) <= euler_number(here, CONNECTIVITY):
+                continue
+            corner = np.array([side.start for side in box])
+            positions = origin + (np.argwhere(part) + corner) * field.cell
+            if _least_covered(positions, views) >= COVERED:
+                here |= part
+    values = field.values.clone()
+    values[body][torch.from_numpy((filled & ~solid)[(slice(margin, -margin),) * 3])] = INSIDE * level
+    return replace(field, values=values)
+
+
+def _closed(solid: Bool[np.ndarray, "i j k"], radius: int) -> Bool[np.ndarray, "i j k"]:
+    grown = ndimage.distance_transform_edt(~solid) <= radius
+    return ndimage.distance_transform_edt(grown) > radius
+
+
+def _silhouettes(gaussians: Gaussians, rasterize: Rasterizer) -> list[tuple[OrbitCamera, Bool[np.ndarray, "h w"]]]:
+    """Return the silhouettes of the Gaussians with their cameras."""
+    views = dict.fromkeys(SILHOUETTE_VIEWS_DEG)
+    cameras = [OrbitCamera(e, a, width=SILHOUETTE_SIZE, height=SILHOUETTE_SIZE) for e, a in views]
+    with torch.no_grad():
+        alpha = rasterize(gaussians, cameras, torch.zeros(3)).alpha[..., 0]
+    return list(zip(cameras, (alpha > ALPHA_THRESHOLD).numpy(), strict=True))
+
+
+def _least_covered(
+    positions: Float[np.ndarray, "p 3"], views: Sequence[tuple[OrbitCamera, Bool[np.ndarray, "h w"]]]
+) -> float:
+    """Return the share of the positions that lie within a silhouette, in the view where fewest do."""
+    shares = []
+    for camera, mask in views:
+        matrix = camera.viewmat().numpy()
+        seen = positions @ matrix[:3, :3].T + matrix[:3, 3]
+        pixels = np.floor(seen[:, :2] / seen[:, 2:] * camera.focal + 0.5 * np.array([camera.width, camera.height]))
+        columns, rows = pixels.astype(int).clip(0, np.array(mask.shape)[::-1] - 1).T
+        shares.append(float(mask[rows, columns].mean()))
+    return min(shares)
