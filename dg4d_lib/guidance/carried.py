@@ -4,31 +4,42 @@ Every pixel of a later frame takes along what lies behind it at the first frame,
 in the image plane. Where the video is followed badly, the frame's own guess is left.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.shape_prior.field import Fields, ShapeField, bounded_logits, premultiplied
-from dg4d_lib.video.first_frame import Correspondence, match_first_frame
+from dg4d_lib.video.first_frame import Correspondence, match_first_frame, strain
 
-MOST = 1.0  # share of the first frame where the video is followed perfectly
+MOST_STRAIN = 0.2  # of the picture, at which the share of a guessed first frame falls to 1/e
 
 
 class CarriedFields:
-    """Guess per frame, mixed with the known field of the first frame as the video carries it."""
+    """Guess per frame, mixed with the field of the first frame as the video carries it."""
 
-    def __init__(self, guess: Fields, known: ShapeField, cutouts: Sequence[Float[Tensor, "h w 4"]]) -> None:
+    def __init__(
+        self,
+        guess: Fields,
+        first: ShapeField,
+        cutouts: Sequence[Float[Tensor, "h w 4"]],
+        most_strain: float = math.inf,
+    ) -> None:
         """Follow the video.
 
         Args:
             guess: fields of all frames.
-            known: field of the first frame.
+            first: field of the first frame.
             cutouts: one per frame: square, straight alpha, color and alpha in [0, 1].
+            most_strain: of the picture, at which the share of the first frame falls to 1/e. Parts that turn in depth
+                are foreshortened; a first frame that is a guess too says no more of them than the own guess.
         """
-        self._guess, self._known = guess, known
-        self._matches = match_first_frame([premultiplied(cutout) for cutout in cutouts])
+        self._guess, self._first, self._most_strain = guess, first, most_strain
+        self._pictures = [premultiplied(cutout) for cutout in cutouts]
+        self._matches = match_first_frame(self._pictures)
 
     def __len__(self) -> int:
         return len(self._guess)
@@ -40,10 +51,11 @@ class CarriedFields:
             BadInput: the frame shows no subject.
         """
         own, match = self._guess.predict(frame), self._matches[frame]
-        carried = carry(self._known, match)
-        trust = match.trust[..., None]
-        logits = own.logits + MOST * trust * (carried.logits - own.logits)
-        hidden = own.hidden + trust[..., None] * (carried.hidden - own.hidden)
+        carried, share = carry(self._first, match), match.trust
+        if math.isfinite(self._most_strain):
+            share = share * torch.exp(-(strain(match, own.mask) / self._most_strain).square())
+        logits = own.logits + share[..., None] * (carried.logits - own.logits)
+        hidden = own.hidden + share[..., None, None] * (carried.hidden - own.hidden)
         return replace(own, logits=bounded_logits(logits, own.mask), hidden=hidden)
 
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy import ndimage
 from skimage.registration import optical_flow_tvl1
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
@@ -19,6 +20,7 @@ BACKDROP = 1.5  # luminance outside of the subject: brighter than any, so that o
 WARPS, STEPS = 5, 10  # of the flow at every level; a third of scikit-image's own and as good here
 DIFFERENCE = 0.2  # of color (mean) and alpha together, at which the trust falls to 1/e
 WINDOW = 5  # pixels of a side over which differences are averaged
+SMOOTH = 3.0  # pixels: standard deviation of the blur of the flow before its strain is taken
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,28 @@ class Correspondence:
         size = torch.tensor([height, width])
         at = (2 * self.places + 1) / size - 1
         return grid_sample(planes[None], at.flip(-1)[None], align_corners=False, padding_mode="border")[0]
+
+
+def strain(match: Correspondence, mask: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Return how much the picture is stretched or compressed around each pixel since the first frame.
+
+    It is 0 where parts shift and turn in the picture plane. Parts that turn in depth are foreshortened.
+
+    Args:
+        match: of the frame.
+        mask: pixels of the subject; the flow of others does not count.
+
+    Returns:
+        Largest absolute logarithm of the singular values of the flow's Jacobian.
+    """
+    inside = mask.numpy().astype(np.float64)
+    share = ndimage.gaussian_filter(inside, SMOOTH) + 1e-3
+    grid = np.stack(np.meshgrid(*map(np.arange, inside.shape), indexing="ij"), -1)
+    flow = (match.places.double().numpy() - grid) * inside[..., None]
+    flow = ndimage.gaussian_filter(flow, (SMOOTH, SMOOTH, 0)) / share[..., None]
+    jacobian = np.stack(np.gradient(flow, axis=(0, 1)), -1) + np.eye(2)
+    stretch = np.linalg.svd(jacobian, compute_uv=False).clip(1e-3)
+    return torch.from_numpy(np.abs(np.log(stretch)).max(-1)).float()
 
 
 def match_first_frame(pictures: Sequence[Float[Tensor, "4 h w"]]) -> list[Correspondence]:

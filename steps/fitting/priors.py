@@ -17,7 +17,7 @@ from dg4d_lib.diffusion.pipelines import is_flow_matching
 from dg4d_lib.errors import BadInput
 from dg4d_lib.fitting.static import RADIUS_JITTER
 from dg4d_lib.guidance.analytic import AnalyticPrior
-from dg4d_lib.guidance.carried import CarriedFields
+from dg4d_lib.guidance.carried import MOST_STRAIN, CarriedFields
 from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.geometric import InflatedSurfaces
 from dg4d_lib.guidance.imagedream import ImageDream, ImageDreamPrior
@@ -207,7 +207,7 @@ def _carried_shapes(
 def learned_fields(cutouts: Sequence[Float[Tensor, "h w 4"]], hint: DepthHint) -> Fields:
     """Return what the shape network says of every frame; the video carries what it says of the first one along."""
     fields = ShapeFields(packaged.packaged_network(), cutouts, hint)
-    return CarriedFields(fields, fields.predict(0), cutouts) if len(cutouts) > 1 else fields
+    return CarriedFields(fields, fields.predict(0), cutouts, MOST_STRAIN) if len(cutouts) > 1 else fields
 
 
 def _network(shapes: SubjectShapes, settings: PriorSettings) -> LearnedShapes | None:
