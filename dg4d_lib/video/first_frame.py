@@ -20,7 +20,8 @@ BACKDROP = 1.5  # luminance outside of the subject: brighter than any, so that o
 WARPS, STEPS = 5, 10  # of the flow at every level; a third of scikit-image's own and as good here
 DIFFERENCE = 0.2  # of color (mean) and alpha together, at which the trust falls to 1/e
 WINDOW = 5  # pixels of a side over which differences are averaged
-SMOOTH = 3.0  # pixels: standard deviation of the blur of the flow before its strain is taken
+SMOOTH = 3.0  # pixels: standard deviation of the window in which the strain of the flow is taken
+THINNEST = 0.1  # square pixels, added to the variances in that window: thin parts have no strain across
 
 
 @dataclass(frozen=True)
@@ -56,11 +57,22 @@ def strain(match: Correspondence, mask: Bool[Tensor, "h w"]) -> Float[Tensor, "h
         Largest absolute logarithm of the singular values of the flow's Jacobian.
     """
     inside = mask.numpy().astype(np.float64)
-    share = ndimage.gaussian_filter(inside, SMOOTH) + 1e-3
-    grid = np.stack(np.meshgrid(*map(np.arange, inside.shape), indexing="ij"), -1)
-    flow = (match.places.double().numpy() - grid) * inside[..., None]
-    flow = ndimage.gaussian_filter(flow, (SMOOTH, SMOOTH, 0)) / share[..., None]
-    jacobian = np.stack(np.gradient(flow, axis=(0, 1)), -1) + np.eye(2)
+    grid = np.stack(np.meshgrid(*map(np.arange, inside.shape), indexing="ij"), -1) - np.array(inside.shape) / 2
+    flow = match.places.double().numpy() - np.array(inside.shape) / 2 - grid
+
+    def mean(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+        return ndimage.gaussian_filter(values * inside, SMOOTH) / share
+
+    def covariances(one: Float[np.ndarray, "h w 2"], other: Float[np.ndarray, "h w 2"]) -> Float[np.ndarray, "h w 2 2"]:
+        rows = [
+            [mean(one[..., i] * other[..., j]) - mean(one[..., i]) * mean(other[..., j]) for j in (0, 1)]
+            for i in (0, 1)
+        ]
+        return np.moveaxis(np.array(rows), (0, 1), (2, 3))
+
+    share = ndimage.gaussian_filter(inside, SMOOTH) + 1e-9
+    extent = covariances(grid, grid) + THINNEST * np.eye(2)
+    jacobian = np.eye(2) + covariances(flow, grid) @ np.linalg.inv(extent)  # of the affine map that fits best
     stretch = np.linalg.svd(jacobian, compute_uv=False).clip(1e-3)
     return torch.from_numpy(np.abs(np.log(stretch)).max(-1)).float()
 

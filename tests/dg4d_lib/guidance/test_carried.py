@@ -87,6 +87,21 @@ def test_a_frame_that_shows_something_else_keeps_its_own_guess():
     assert torch.equal(found.front, guess.front) and torch.equal(found.mask, guess.mask)
 
 
+def test_a_guessed_first_frame_is_carried_along_with_turns_in_the_picture_and_not_with_foreshortened_parts():
+    turned, narrow = picture(TURN_DEG), torch.zeros(SIZE, SIZE, 4)
+    columns = ((torch.arange(SIZE) - MIDDLE) / 0.6 + MIDDLE).round().long()
+    kept = (columns >= 0) & (columns < SIZE)
+    narrow[:, kept] = picture(0)[:, columns[kept]]  # the box turned about a vertical axis, from afar
+    first = box(0)
+    for later, least, most in ((turned, 0.9, 1.0), (narrow, 0.0, 0.3)):
+        guess = InflatedFields([picture(0), later])
+        free, bound = (CarriedFields(guess, first, [picture(0), later], limit) for limit in (math.inf, 0.2))
+        own, all_of_it, some = (fields.predict(1).logits for fields in (guess, free, bound))
+        differs = (all_of_it - own).abs() > 1
+        assert differs.float().mean() > 0.01
+        assert least <= ((some - own) / (all_of_it - own))[differs].median() <= most
+
+
 class _Known:
     """One field, known."""
 

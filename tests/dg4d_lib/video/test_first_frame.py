@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from dg4d_lib.video.first_frame import Correspondence, match_first_frame
+from dg4d_lib.video.first_frame import Correspondence, match_first_frame, strain
 
 SIZE = 64
 MIDDLE = (SIZE - 1) / 2
@@ -40,6 +40,17 @@ def test_a_turn_of_several_frames_is_recovered():
 def test_warping_shows_the_first_frame_as_the_later_one_does():
     match = Correspondence(turned_places(20), torch.ones(SIZE, SIZE))
     assert (match.warp(turned(0)) - turned(20)).abs().mean() < 0.01
+
+
+@pytest.mark.parametrize(("factor", "expected"), [(1.0, 0.0), (0.5, math.log(2)), (1.25, math.log(1.25))])
+def test_strain_is_the_logarithm_of_the_largest_stretch_and_blind_to_turns(factor, expected):
+    inside = turned(30)[3] > 0.5
+    places = turned_places(30)
+    places[..., 1] = (places[..., 1] - MIDDLE) * factor + MIDDLE  # along the bar at rest
+    away = torch.where(inside[..., None], places, 0.0)  # what the flow says elsewhere does not count
+    found = strain(Correspondence(away, torch.ones(SIZE, SIZE)), inside)
+    middle = inside & (turned_places(30) - MIDDLE).norm(dim=-1).lt(6)
+    assert (found[middle] - expected).abs().max() < 0.05
 
 
 @pytest.mark.parametrize("count", [1, 3])
