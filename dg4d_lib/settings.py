@@ -407,7 +407,7 @@ class MeshSettings(Settings):
         "mesh can follow the motion",
     )
     min_followed: Share = Field(
-        0.9,
+        0.87,
         description="smallest silhouette IoU of the best trial mesh that moves with the Gaussians; below, the mesh "
         "follows the driving video, or in mode auto without one, every frame gets its own",
     )

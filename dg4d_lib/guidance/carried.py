@@ -15,7 +15,7 @@ from torch import Tensor
 from dg4d_lib.shape_prior.field import Fields, ShapeField, bounded_logits, premultiplied
 from dg4d_lib.video.first_frame import Correspondence, match_first_frame, strain
 
-MOST_STRAIN = 0.2  # of the picture, at which the share of a guessed first frame falls to 1/e
+MOST_STRAIN = 0.15  # of the picture, at which the share of a guessed first frame falls to 1/e
 
 
 class CarriedFields:

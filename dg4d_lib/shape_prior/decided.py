@@ -8,7 +8,7 @@ from torch import Tensor
 
 STEPS = 20  # of the bisection
 RANGE = 30.0  # logits: largest shift of a ray
-GENEROSITY = 0.5  # cells of matter per unit of variance on a ray: unsure shapes overlap most with more than is expected
+GENEROSITY = 1.0  # cells of matter per unit of variance on a ray: unsure shapes overlap most with more than is expected
 LEAST = 1.0  # cells of matter on a ray of the subject
 TIE = 1e-3  # logits by which the ends of a ray are less probable than its middle
 OFF_MIDDLE = 0.01  # shift of that middle, in halves of a ray, so that no two cells are equal
