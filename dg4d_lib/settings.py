@@ -411,6 +411,11 @@ class MeshSettings(Settings):
         description="smallest silhouette IoU of the best trial mesh that moves with the Gaussians; below, the mesh "
         "follows the driving video, or in mode auto without one, every frame gets its own",
     )
+    max_stretch: NotNegative = Field(
+        0.25,
+        description="largest stretch of that trial mesh (root mean square logarithm of its edges over those at rest); "
+        "above, the mesh follows the driving video if there is one",
+    )
     min_guided: Share = Field(
         0.85,
         description="auto: smallest silhouette IoU of the best trial mesh that follows the driving video, else a mesh "

@@ -32,12 +32,15 @@ def run(job: Job) -> StepReport:
     mode, frame, followed, notes = settings.mode, 0, 1.0, []
     guide: Literal["gaussians", "video"] = "gaussians"
     if mode != "per_frame":
-        frame, followed = select_reference_frame(states, displacement, rasterize, settings)
-        if followed < settings.min_followed and "driving_video" in job.inputs:
+        trial = select_reference_frame(states, displacement, rasterize, settings)
+        frame, followed = trial.frame, trial.iou
+        torn = followed < settings.min_followed or trial.stretch > settings.max_stretch
+        if torn and "driving_video" in job.inputs:
             video = read_frames(job.inputs["driving_video"], job.pictures)
             generator = torch.Generator().manual_seed(job.seed)
-            frame, followed = select_guided_reference(states, video, rasterize, settings, frame, generator)
-            guide = "video"
+            guided = select_guided_reference(states, video, rasterize, settings, frame, generator)
+            if mode == "tracked" or guided[1] >= settings.min_guided or followed < settings.min_followed:
+                (frame, followed), guide = guided, "video"
     if mode == "auto":
         least = settings.min_followed if guide == "gaussians" else settings.min_guided
         mode = "tracked" if followed >= least else "per_frame"
