@@ -232,7 +232,22 @@ def _cross_faces(points, faces, low, high, origin, size, shape, starts, members,
 @no_type_check
 def _faces_cross(points, a, b):
     """Tell whether an edge of one face passes through the other; edges that end on it at a shared corner do not."""
+    if _on_one_side(points, a, b) or _on_one_side(points, b, a):  # most pairs
+        return False
     return _edges_cross(points, a, b) or _edges_cross(points, b, a)
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _on_one_side(points, a, b):
+    """Tell whether the plane of the first face leaves the second one on one side, shared corners aside."""
+    below, above = False, False
+    for corner in b:
+        if corner not in (a[0], a[1], a[2]):
+            volume = _volume(points[a[0]], points[a[1]], points[a[2]], points[corner])
+            below |= volume < 0
+            above |= volume > 0
+    return not (below and above)
 
 
 @njit(cache=True, nogil=True)
