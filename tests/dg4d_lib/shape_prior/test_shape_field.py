@@ -85,7 +85,7 @@ def test_the_surface_of_a_ball_is_the_ball(center_z):
     assert (radii - RADIUS).abs().mean() < 0.015  # half a cell
     corners = surface.vertices[surface.faces].double()
     volume = (corners[:, 0] * torch.linalg.cross(corners[:, 1], corners[:, 2])).sum() / 6
-    assert volume == pytest.approx(4 / 3 * math.pi * RADIUS**3, rel=0.08)
+    assert volume == pytest.approx(4 / 3 * math.pi * RADIUS**3, rel=0.12)  # the rim is unsure, so it gets more matter
     edges = torch.cat([surface.faces[:, [i, (i + 1) % 3]] for i in range(3)])
     assert (torch.unique(edges.sort(1)[0], dim=0, return_counts=True)[1] == 2).all()
     front = surface.vertices[:, 2] - center_z > 0.8 * RADIUS
@@ -101,7 +101,7 @@ def test_matter_whose_depth_is_unsure_is_put_in_one_place():
     surface = decided_surface(replace(field, logits=spread))
     depth = surface.vertices[:, 2].max() - surface.vertices[:, 2].min()
     matter = float(matter_on(spread[64, 64][None], GENEROSITY)) * (FAR - NEAR) / BINS
-    assert depth == pytest.approx(matter, rel=0.15) and matter < 0.5
+    assert depth == pytest.approx(matter, rel=0.15) and matter < 0.65
     middle = 2 - (NEAR + 42 * (FAR - NEAR) / BINS)
     assert surface.vertices[:, 2].mean() == pytest.approx(middle, abs=0.05)
 
