@@ -103,7 +103,7 @@ def test_matter_whose_depth_is_unsure_is_put_in_one_place():
     matter = float(matter_on(spread[64, 64][None], GENEROSITY)) * (FAR - NEAR) / BINS
     assert depth == pytest.approx(matter, rel=0.15) and matter < 0.65
     middle = 2 - (NEAR + 42 * (FAR - NEAR) / BINS)
-    assert surface.vertices[:, 2].mean() == pytest.approx(middle, abs=0.05)
+    assert surface.vertices[:, 2].mean() == pytest.approx(middle, abs=0.1)  # equal cells: those near the middle first
 
 
 def test_every_pixel_of_the_subject_has_matter():
