@@ -8,8 +8,8 @@ READY := $(VENV)/.ready$(if $(filter 1,$(CUDA)),-cuda)
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 ARITHMETIC ?= fast
 EMULATION := $(BIN)/python -m tests.emulation.build --arithmetic $(ARITHMETIC)
-# four workers for two cores: many tests wait for servers and browsers, which tests/conftest.py spreads over the run
-TESTS := $(BIN)/python -m pytest -n 4 --dist loadscope --no-loadscope-reorder \
+# three workers for two cores: many tests wait for servers and browsers
+TESTS := $(BIN)/python -m pytest -n 3 --dist loadscope \
 	--jaxtyping-packages=dg4d_lib,beartype.beartype\(conf=beartype.BeartypeConf\(is_pep484_tower=True\)\)
 GPU_TESTS := $(BIN)/python -m pytest -p tests.emulation.plugin --arithmetic $(ARITHMETIC) -m gpu
 

@@ -12,7 +12,6 @@ import pytest
 
 from tests.emulation import gpu
 
-WAITING = ("clients", "dg4d", "flows", "integrations")  # folders of tests that often wait for servers and browsers
 _HOME = Path(tempfile.mkdtemp(prefix="dg4d-tests-"))
 for _name in tuple(os.environ):
     if _name.startswith(("PREFECT_", "DG4D_")) and not _name.startswith("DG4D_TEST_"):
@@ -45,15 +44,6 @@ def quick_segmentation(monkeypatch: pytest.MonkeyPatch) -> None:
         return ((picture - picture[0, 0]).abs().amax(-1) * 4).clamp(0, 1)
 
     monkeypatch.setattr(SegmentationNetwork, "probability", far_from_corner)
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Spread modules that wait for servers evenly among those that keep the processor busy, so that neither is idle."""
-    modules: dict[bool, list[Path]] = {True: [], False: []}
-    for path in dict.fromkeys(item.path for item in items):
-        modules[path.relative_to(Path(__file__).parent).parts[0] in WAITING].append(path)
-    place = {path: (k + 0.5) / len(group) for group in modules.values() for k, path in enumerate(group)}
-    items.sort(key=lambda item: place[item.path])
 
 
 def pytest_unconfigure() -> None:
