@@ -38,8 +38,7 @@ class CarriedFields:
                 are foreshortened; a first frame that is a guess too says no more of them than the own guess.
         """
         self._guess, self._first, self._most_strain = guess, first, most_strain
-        self._pictures = [premultiplied(cutout) for cutout in cutouts]
-        self._matches = match_first_frame(self._pictures)
+        self._matches = match_first_frame([premultiplied(cutout) for cutout in cutouts])
 
     def __len__(self) -> int:
         return len(self._guess)

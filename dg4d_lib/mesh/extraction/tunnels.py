@@ -72,7 +72,7 @@ def _silhouettes(gaussians: Gaussians, rasterize: Rasterizer) -> list[tuple[Orbi
     cameras = [OrbitCamera(e, a, width=SILHOUETTE_SIZE, height=SILHOUETTE_SIZE) for e, a in views]
     with torch.no_grad():
         alpha = rasterize(gaussians, cameras, torch.zeros(3)).alpha[..., 0]
-    return list(zip(cameras, (alpha > ALPHA_THRESHOLD).numpy(), strict=True))
+    return list(zip(cameras, (alpha > ALPHA_THRESHOLD).numpy(force=True), strict=True))
 
 
 def _least_covered(
