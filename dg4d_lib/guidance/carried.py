@@ -55,7 +55,8 @@ class CarriedFields:
             share = share * torch.exp(-(strain(match, own.mask) / self._most_strain).square())
         logits = own.logits + share[..., None] * (carried.logits - own.logits)
         hidden = own.hidden + share[..., None, None] * (carried.hidden - own.hidden)
-        return replace(own, logits=bounded_logits(logits, own.mask), hidden=hidden)
+        logits = bounded_logits(logits, own.mask)
+        return replace(own, logits=logits, hidden=hidden, generosity=self._first.generosity)
 
 
 def carry(field: ShapeField, match: Correspondence) -> ShapeField:

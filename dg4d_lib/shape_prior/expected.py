@@ -1,7 +1,7 @@
 """Volume whose renderings are the expected color and alpha of a predicted shape."""
 
 from dg4d_lib.shape_prior.absorption import optical_density, transmittance
-from dg4d_lib.shape_prior.decided import GENEROSITY, decide
+from dg4d_lib.shape_prior.decided import decide
 from dg4d_lib.shape_prior.field import ShapeField
 from dg4d_lib.shape_prior.raymarch import ShapeVolume, make_volume
 
@@ -15,6 +15,6 @@ def expected_volume(field: ShapeField, contrast: float) -> ShapeVolume:
         field: of one frame.
         contrast: of the probabilities, see `decide`; more than 1 is sharper than what is known.
     """
-    density = optical_density(decide(field.logits, field.mask, contrast, GENEROSITY).sigmoid(), field.mask)
+    density = optical_density(decide(field.logits, field.mask, contrast, field.generosity).sigmoid(), field.mask)
     seen = ((transmittance(density) - UNSEEN) / (SEEN - UNSEEN)).clamp(0, 1)[..., None]
     return make_volume(density, seen * field.front[:, :, None] + (1 - seen) * field.hidden)

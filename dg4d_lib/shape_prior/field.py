@@ -15,6 +15,7 @@ from dg4d_lib.inflation.heights import heights
 from dg4d_lib.inflation.hints import NO_HINT, DepthHint
 from dg4d_lib.inflation.mask import subject_mask
 from dg4d_lib.shape_prior.absorption import optical_density, transmittance
+from dg4d_lib.shape_prior.decided import GENEROSITY
 from dg4d_lib.shape_prior.evidence import hint_evidence
 from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV
 from dg4d_lib.shape_prior.mirror import MirrorPlane, mirror_plane, mirrored_colors
@@ -37,6 +38,7 @@ class ShapeField:
         mask: pixels of the subject.
         inflated_share: share of the inflation in the probabilities, in [0, 1].
         smoothness: cells over which neighboring rays decide alike where the surface lies.
+        generosity: cells of matter to add per unit of variance on a ray; 0 for shapes that are known.
     """
 
     logits: Float[Tensor, "128 128 64"]
@@ -45,6 +47,7 @@ class ShapeField:
     mask: Bool[Tensor, "128 128"]
     inflated_share: float
     smoothness: float = SMOOTHNESS
+    generosity: float = GENEROSITY
 
 
 @runtime_checkable

@@ -10,7 +10,7 @@ from torch.nn.functional import cosine_similarity, grid_sample
 
 from dg4d_lib.cameras.orbit import RADIUS
 from dg4d_lib.inflation.surface import InflatedSurface
-from dg4d_lib.shape_prior.decided import GENEROSITY, most_probable, smooth_logits
+from dg4d_lib.shape_prior.decided import most_probable, smooth_logits
 from dg4d_lib.shape_prior.field import ShapeField
 from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV
 
@@ -23,7 +23,9 @@ def decided_surface(field: ShapeField) -> InflatedSurface:
 
     A surface at one probability would leave out what is sure to be there but not where, or be far too thick.
     """
-    chosen = most_probable(smooth_logits(field.logits, field.mask, field.smoothness), field.mask, GENEROSITY).numpy()
+    chosen = most_probable(
+        smooth_logits(field.logits, field.mask, field.smoothness), field.mask, field.generosity
+    ).numpy()
     volume = np.pad(chosen, 1, constant_values=-1.0)
     places, faces, _, _ = marching_cubes(volume, 0.0)
     row, column, cell = (places - 0.5).astype(np.float64).T

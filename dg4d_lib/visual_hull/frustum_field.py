@@ -37,7 +37,8 @@ def known_field(views: Sequence[KnownView]) -> ShapeField:
     volume, picture = known_volume(views), premultiplied(views[0].cutout)
     surface = colored_surface(volume, views)
     logits, mask = _sampled(volume, cell_centers()) / SOFTNESS, picture_mask(picture)
-    return ShapeField(bounded_logits(logits, mask), straight_color(picture), _nearest_colors(surface), mask, 0.0)
+    color, hidden = straight_color(picture), _nearest_colors(surface)
+    return ShapeField(bounded_logits(logits, mask), color, hidden, mask, 0.0, generosity=0.0)
 
 
 def cell_centers() -> Float[Tensor, "128 128 64 3"]:
