@@ -1,4 +1,4 @@
-"""Fields of a subject whose first frame is known, carried to the later frames by the motion of the video.
+"""Shapes of later frames: that of the first frame, carried along by the motion of the video, and the own guess.
 
 Every pixel of a later frame takes along what lies behind it at the first frame, at the same depths: exact for motions
 in the image plane. Where the video is followed badly, the frame's own guess is left.

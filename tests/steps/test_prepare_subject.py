@@ -131,7 +131,7 @@ def slanted(size: int = 64) -> np.ndarray:
 
 
 def rise(path: Path) -> float:
-    """How much nearer the right side of a field is, world units."""
+    """Return by how much the right side of a field is nearer than the left one, world units."""
     field = read_depth_field(path)
     left, right = (field.middle[:, part][field.known[:, part]].mean() for part in (slice(0, 32), slice(32, 64)))
     return float(right - left)

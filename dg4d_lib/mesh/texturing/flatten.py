@@ -247,7 +247,10 @@ def _longest_step(
 ) -> Array:
     """Return for every disk the factor of the step at which its first triangle loses its area."""
     sides, moves = (values[faces[:, 1:]] - values[faces[:, :1]] for values in (flat, step))
-    cross = lambda a, b: a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]  # noqa: E731
+
+    def cross(a: Array, b: Array) -> Array:
+        return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
     square = cross(moves[:, 0], moves[:, 1])
     linear = cross(sides[:, 0], moves[:, 1]) + cross(moves[:, 0], sides[:, 1])
     constant = cross(sides[:, 0], sides[:, 1])
