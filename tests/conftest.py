@@ -1,5 +1,6 @@
 """Every test run has a home of its own, and nothing of the user's environment."""
 
+import gc
 import os
 import shutil
 import signal
@@ -12,6 +13,7 @@ import pytest
 
 from tests.emulation import gpu
 
+gc.disable()  # until all is imported: it would look through the same modules again and again
 _HOME = Path(tempfile.mkdtemp(prefix="dg4d-tests-"))
 for _name in tuple(os.environ):
     if _name.startswith(("PREFECT_", "DG4D_")) and not _name.startswith("DG4D_TEST_"):
@@ -24,6 +26,11 @@ os.environ["DO_NOT_TRACK"] = "1"
 os.environ["PREFECT_SERVER_ANALYTICS_ENABLED"] = "false"
 os.environ["PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL"] = "CRITICAL"
 signal.signal(signal.SIGINT, signal.default_int_handler)  # shells have background jobs ignore it, with all they begin
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture
@@ -47,4 +54,5 @@ def quick_segmentation(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def pytest_unconfigure() -> None:
+    gc.unfreeze()
     shutil.rmtree(_HOME, ignore_errors=True)

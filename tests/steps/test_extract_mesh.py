@@ -44,13 +44,10 @@ def ball() -> Gaussians:
     return Gaussians(points, torch.full((300, 3), -2.8), quats, torch.full((300,), 3.0), rgb_to_sh(color))
 
 
-def extract(
-    folder: Path, gaussians: Gaussians, mesh: MeshSettings = MESH, video: Path | None = None, **frames: int
+def make_plan(
+    folder: Path, gaussians: Gaussians, mesh: MeshSettings = MESH, video: Path | None = None
 ) -> tuple[Job, StepReport]:
-    """Plan and extract the mesh of a cloud that begins one SHIFT beside its canonical place and goes on by one a frame.
-
-    Facts are those of `extract_mesh`, with the notes of `plan_mesh` before its own.
-    """
+    """Plan the mesh of a cloud that begins one SHIFT beside its canonical place and goes on by one a frame."""
     motion = Framewise(FRAMES, len(gaussians))
     with torch.no_grad():
         for parameter in motion.parameters():
@@ -73,13 +70,19 @@ def extract(
         progress=lambda done, total, values: None,
         pictures=folder,
     )
-    planned = plan_mesh.run(job)
-    job = replace(
-        job,
-        inputs={**job.inputs, "plan": folder / "plan"},
-        settings=step_settings("extract_mesh", settings, **frames),
-    )
-    facts = run(job)
+    return job, plan_mesh.run(job)
+
+
+def extract(
+    folder: Path, gaussians: Gaussians, mesh: MeshSettings = MESH, video: Path | None = None, **frames: int
+) -> tuple[Job, StepReport]:
+    """Plan and extract a mesh.
+
+    Facts are those of `extract_mesh`, with the notes of `plan_mesh` before its own.
+    """
+    job, planned = make_plan(folder, gaussians, mesh, video)
+    settings = step_settings("extract_mesh", PREVIEW.model_copy(update={"mesh": mesh}), **frames)
+    facts = run(replace(job, inputs={**job.inputs, "plan": folder / "plan"}, settings=settings))
     return job, replace(facts, notes=(*planned.notes, *facts.notes))
 
 
@@ -170,16 +173,25 @@ def green_video(path: Path) -> Float[Tensor, "t h w 1"]:
 
 
 @pytest.mark.parametrize("trial", [Trial(1, 0.8, 0.0), Trial(1, 0.95, 0.4)], ids=["silhouettes", "stretch"])
-def test_a_mesh_follows_the_video_where_its_gaussians_do_not_guide_it(
+def test_the_video_guides_where_the_gaussians_do_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trial: Trial
 ) -> None:
     monkeypatch.setattr(plan_mesh, "select_reference_frame", lambda *given: trial)
     monkeypatch.setattr(plan_mesh, "select_guided_reference", lambda *given: (2, 0.9))
+    green_video(tmp_path / "video")
+    make_plan(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}), video=tmp_path / "video")
+    plan = read_plan(tmp_path / "plan")
+    assert (plan.mode, plan.guide, plan.reference_frame, plan.followed) == ("tracked", "video", 2, 0.9)
+
+
+def test_a_mesh_that_the_video_guides_follows_it_and_has_its_colors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plan_mesh, "select_reference_frame", lambda *given: Trial(1, 0.8, 0.0))
+    monkeypatch.setattr(plan_mesh, "select_guided_reference", lambda *given: (2, 0.9))
     monkeypatch.setattr(guided_mesh, "TRACKING", AssetSettings(size=32, nodes=8, track_iterations=10, fit_points=100))
     alpha = green_video(tmp_path / "video")
     _, facts = extract(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}), video=tmp_path / "video")
-    plan = read_plan(tmp_path / "plan")
-    assert (plan.mode, plan.guide, plan.reference_frame) == ("tracked", "video", 2)
     asset = read_tracked(tmp_path / "tracked")
     shown, covered = render_mesh(asset.mesh, [CAMERA] * FRAMES, asset.offsets)
     assert iou(covered, alpha).min() > 0.8  # held still, 0.4: the ball also grows, for it comes nearer
@@ -195,7 +207,7 @@ def test_what_no_trial_follows_gets_a_mesh_per_frame(
     monkeypatch.setattr(plan_mesh, "select_guided_reference", lambda *given: (2, 0.84))
     green_video(tmp_path / "video")
     video = tmp_path / "video" if with_video else None
-    _, facts = extract(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}), video=video)
+    _, facts = make_plan(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}), video=video)
     plan = read_plan(tmp_path / "plan")
     assert (plan.mode, plan.guide, plan.reference_frame) == ("per_frame", "gaussians", 0)
     limit = "84.0% IoU on trial, mesh.min_guided" if with_video else "80.0% IoU on trial, mesh.min_followed"
@@ -208,7 +220,7 @@ def test_a_stretched_mesh_that_the_video_guides_no_better_stays_with_its_gaussia
     monkeypatch.setattr(plan_mesh, "select_reference_frame", lambda *given: Trial(1, 0.95, 0.4))
     monkeypatch.setattr(plan_mesh, "select_guided_reference", lambda *given: (2, 0.84))
     green_video(tmp_path / "video")
-    extract(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}), video=tmp_path / "video")
+    make_plan(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}), video=tmp_path / "video")
     plan = read_plan(tmp_path / "plan")
     assert (plan.mode, plan.guide, plan.reference_frame, plan.followed) == ("tracked", "gaussians", 1, 0.95)
 

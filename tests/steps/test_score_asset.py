@@ -119,6 +119,7 @@ def small_truth(out: Path, truth: Path, change: Callable[[np.ndarray], np.ndarra
     return out
 
 
+@pytest.mark.slow
 def test_the_metrics_of_actionbench_forgive_the_pose_and_not_the_motion(
     package: Path, truth: Path, tmp_path: Path
 ) -> None:

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 from numpy.typing import NDArray
-from scipy import ndimage
 
 FINEST = 512  # cells per side of the grid of places, at most
 GAP = 2  # texels between charts, at least
@@ -83,10 +82,7 @@ class _Shape:
         self.height, self.width = (int(side) + 1 for side in points.max(0)[::-1])
         self.marked = np.zeros((self.height, self.width), np.bool_)
         _mark_cells(points, faces, self.marked)
-        self.center = float(self.marked.sum(1) @ np.arange(self.height) / self.marked.sum())
-        around = ndimage.binary_dilation(np.pad(self.marked, gap), np.ones((3, 3), bool), gap)
-        # a collision shows after few cells
-        self.cells = np.random.default_rng(0).permutation(np.argwhere(around).astype(np.int32))
+        self.center, self.cells = _center_and_cells(self.marked, gap)
 
 
 def _tightest_turn(points: Array) -> float:
@@ -155,7 +151,9 @@ def _mark_cells(points, faces, marked):
         xc, yc = points[faces[f, 2], 0], points[faces[f, 2], 1]
         for row in range(max(0, int(min(ya, yb, yc))), min(height - 1, int(max(ya, yb, yc))) + 1):
             for column in range(max(0, int(min(xa, xb, xc))), min(width - 1, int(max(xa, xb, xc))) + 1):
-                outside = marked[row, column]
+                if marked[row, column]:
+                    continue
+                outside = False
                 for side in range(3):
                     if side == 0:
                         px, py, dx, dy = xa, ya, xb - xa, yb - ya
@@ -170,6 +168,27 @@ def _mark_cells(points, faces, marked):
                         break
                 if not outside:
                     marked[row, column] = True
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _center_and_cells(marked, gap):
+    """Return the mean row of the marked cells, and in random order the cells at most a gap away from one."""
+    height, width = marked.shape
+    around = np.zeros((height + 2 * gap, width + 2 * gap), np.bool_)
+    rows, count = 0, 0
+    for row in range(height):
+        for column in range(width):
+            if marked[row, column]:
+                rows, count = rows + row, count + 1
+                around[row : row + 2 * gap + 1, column : column + 2 * gap + 1] = True
+    cells = np.argwhere(around).astype(np.int32)
+    np.random.seed(0)
+    for i in range(len(cells) - 1, 0, -1):  # shuffled, so that a collision shows after few cells
+        j = np.random.randint(0, i + 1)
+        for axis in range(2):
+            cells[i, axis], cells[j, axis] = cells[j, axis], cells[i, axis]
+    return rows / count, cells
 
 
 @njit(cache=True, nogil=True)

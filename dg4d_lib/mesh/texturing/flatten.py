@@ -141,14 +141,14 @@ def _as_rigid_as_possible(flat: Array, faces: Int[np.ndarray, "f 3"], corners: F
     laplacian = (weighted @ difference).tocsc()
     anchor = PROXIMAL * laplacian.diagonal().mean()
     solver = splu((laplacian + anchor * diags_array(np.ones(count))).tocsc(), **SYMMETRIC)
+    complex_sides = np.ascontiguousarray(sides).view(np.complex128)[..., 0]  # x + iy
     for _ in range(ROTATIONS):
         now = (difference @ flat).reshape(sides.shape)
         cosine = (weights * (now * sides).sum(-1)).sum(1)
         sine = (weights * _cross(sides, now)).sum(1)
-        length = np.maximum(np.hypot(cosine, sine), np.finfo(float).tiny)
-        rotations = np.array([[cosine, -sine], [sine, cosine]]) / length
-        turned = np.einsum("ijf,fkj->fki", rotations, sides)
-        flat = solver.solve(weighted @ turned.reshape(-1, 2) + anchor * flat)
+        rotation = cosine + 1j * sine
+        turned = complex_sides * (rotation / np.maximum(abs(rotation), np.finfo(float).tiny))[:, None]
+        flat = solver.solve(weighted @ turned.view(np.float64).reshape(-1, 2) + anchor * flat)
     return flat
 
 

@@ -92,6 +92,7 @@ def test_a_mesh_follows_legs_that_cross(monkeypatch: pytest.MonkeyPatch) -> None
     assert followed.min() > 0.8 and followed.mean() > 0.87
 
 
+@pytest.mark.slow
 def test_the_chosen_frame_has_the_legs_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guided_mesh, "TRIAL", FAST.model_copy(update={"track_iterations": 5}))
     states = scissors()

@@ -155,7 +155,9 @@ def test_the_server_shows_how_far_a_batch_is_and_a_page_that_can_be_read(place: 
     assert "all are in summary.csv" in by_type["markdown"]["data"]
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), SIGTERM, SIGHUP])
+@pytest.mark.parametrize(
+    ("number", "status"), [(signal.SIGINT, 130), pytest.param(*SIGTERM, marks=pytest.mark.slow), SIGHUP]
+)
 def test_a_user_who_stops_a_batch_keeps_what_is_done(
     place: None, tmp_path: Path, number: signal.Signals, status: int
 ) -> None:

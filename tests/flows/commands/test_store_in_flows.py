@@ -78,7 +78,7 @@ def test_a_finished_order_is_a_version_and_the_same_order_again_is_the_same(log:
     assert list(home.store().entries("running")) == []
 
 
-@pytest.mark.parametrize("how", ["gone", "flipped", "short"])
+@pytest.mark.parametrize("how", ["gone", "flipped", pytest.param("short", marks=pytest.mark.slow)])
 def test_whatever_is_damaged_between_two_runs_is_made_again(log: Path, tmp_path: Path, how: str) -> None:
     convert_job(job("damage", tmp_path), tmp_path / "one")
     every = ran(log)

@@ -245,7 +245,7 @@ def test_a_step_that_hangs_is_killed_and_the_next_run_begins_with_it(
     assert "prepare_subject" not in (again := ran(log)) and "drive_video" in again
 
 
-@pytest.mark.parametrize("skew_s", [-400 * DAY_S, 400 * DAY_S])
+@pytest.mark.parametrize("skew_s", [-400 * DAY_S, pytest.param(400 * DAY_S, marks=pytest.mark.slow)])
 def test_results_are_used_whatever_the_clock_said_when_they_were_made(log: Path, tmp_path: Path, skew_s: float) -> None:
     convert_job(job("skew", tmp_path), tmp_path / "one")
     assert sorted(ran(log)) == sorted(EVERY_STEP)

@@ -37,10 +37,10 @@ def plan(samples: int, **others: float) -> training.Plan:
 
 
 def test_a_tiny_network_learns(tmp_path: Path) -> None:
-    run = training.Run(plan(480, ema=0.9, lr=0.01), TINY)
-    training.train(run, tmp_path, workers=0, every=240)
+    run = training.Run(plan(360, ema=0.9, lr=0.01), TINY)
+    training.train(run, tmp_path, workers=0, every=180)
     curve = json.loads((tmp_path / "curves.json").read_text())
-    assert [row["shown"] for row in curve] == [240, 480]
+    assert [row["shown"] for row in curve] == [180, 360]
     held_out = [make_batch(training.VALIDATION_SEED, number, 4, 1024) for number in range(2)]
     matter = torch.cat([batch.occupancy for batch in held_out]).float() / 255
     same_for_every_ray = binary_cross_entropy(matter.mean(0).expand_as(matter), matter).item()
