@@ -90,7 +90,7 @@ def make(
     ] = "",
     video: Annotated[
         Path | None,
-        typer.Option(metavar="PATH", help="driving video or folder of frames; PICTURE then only names the asset"),
+        typer.Option(metavar="PATH", help="driving video or folder of frames; PICTURE may be left out and only names the asset"),
     ] = None,
     view: Views = None,
     turntable: Turntable = None,
@@ -138,7 +138,7 @@ def make(
 
     Motions without a driving video, for --set driving.motion=NAME: sway, bend, breathe, bounce, wave, turn.
     """
-    if not pictures and not text and asset is None:
+    if not (pictures or text or video or asset):
         raise typer.BadParameter("give a picture, a video, --text WORDS, or --asset FILE")
     if asset_azimuth is not None and asset is None:
         raise typer.BadParameter("--asset-azimuth needs --asset")

@@ -61,13 +61,12 @@ def make_each(wish: Wish, console: "Console") -> int:
         raise BadInput("--pick chooses a generated motion and cannot be combined with --video")
     if len(wish.pictures) < 2:
         picture = wish.pictures[0] if wish.pictures else None
-        named = picture or wish.asset
-        item = (clean_name(named.stem) or "asset") if named else name_from_text(wish.text)
+        item = _name_of(picture or wish.asset or wish.video) or name_from_text(wish.text)
         _make(wish, item, picture, wish.out or Path("out") / item, console)
         return 0
     if wish.alone:
         raise BadInput(f"{wish.alone} makes one asset, and {len(wish.pictures)} pictures are given; give one of them")
-    items = unique_names([(clean_name(path.stem) or "asset", path.suffix.lstrip(".")) for path in wish.pictures])
+    items = unique_names([(_name_of(path), path.suffix.lstrip(".")) for path in wish.pictures])
     failed: dict[str, DG4DError | StepError] = {}
     for number, (item, picture) in enumerate(zip(items, wish.pictures, strict=True), 1):
         console.print(f"{number} of {len(items)}: {picture}", markup=False)
@@ -82,6 +81,13 @@ def make_each(wish: Wish, console: "Console") -> int:
     return (
         EXIT_BAD_INPUT if all(isinstance(error, BadInput | StepBadInput) for error in failed.values()) else EXIT_FAILED
     )
+
+
+def _name_of(path: Path | None) -> str:
+    """Return the name that a file or a folder gives its asset; nothing for None."""
+    if path is None:
+        return ""
+    return clean_name(path.name if path.is_dir() else path.stem) or "asset"
 
 
 def _make(wish: Wish, item: str, picture: Path | None, folder: Path, console: "Console") -> None:

@@ -105,7 +105,7 @@ class ConversionRequest(Frozen):
         for path in filter(None, (self.picture, self.video, self.bank, self.mask, self.depth, self.layers, self.asset)):
             naming.check_path(path)
         naming.check_text(self.text, "the text")
-        naming.check_name(self.item, "rename the file" if self.picture or self.asset else "choose a shorter name")
+        naming.check_name(self.item, "rename the file" if self._footage or self.asset else "choose a shorter name")
 
     def check_licenses(self) -> None:
         """Refuse weights that forbid commercial use if `commercial_only` is set.
@@ -204,11 +204,10 @@ class ConversionRequest(Frozen):
             return
         if self.video is not None:
             sources.check_video(self.video)
-        if self.asset is not None and self.picture is None:
-            return
-        if self.picture is None:
+        if self.picture is not None:
+            sources.check_file(self.picture)
+        elif self.video is None and self.asset is None:
             raise BadInput("nothing to make: give a picture, a video or --text")
-        sources.check_file(self.picture)
 
     def _weights(self) -> list[str]:
         """Return the weights that some step will load: text and driving models only if a step uses them."""

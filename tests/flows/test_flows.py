@@ -211,6 +211,14 @@ def test_a_video_has_its_motion_already(dg4d: Run, tmp_path: Path) -> None:
     assert done.exit_code == 65 and "x.png" in done.stderr and "motion already" in done.stderr
 
 
+def test_a_video_needs_no_picture_and_names_its_asset(dg4d: Run, log: Path, tmp_path: Path) -> None:
+    (tmp_path / "run.v2").mkdir()
+    for number in range(2):
+        (tmp_path / "run.v2" / f"{number}.png").write_text(picture(f"moving alone {number}"))
+    assert dg4d("make", "--video", "run.v2").exit_code == 0
+    assert (tmp_path / "out" / "run.v2" / "asset.glb").is_file()
+
+
 def test_a_pick_is_a_knob_of_the_driving_video(dg4d: Run, log: Path, tmp_path: Path) -> None:
     (tmp_path / "x.png").write_text(picture("pick"))
     assert dg4d("make", "x.png", "--pick", "3", "-o", "picked").exit_code == 0

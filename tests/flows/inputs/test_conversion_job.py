@@ -20,7 +20,7 @@ def code(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DG4D_CODE_VERSION", "test")
 
 
-def request(path: Path, video: Path | None = None, bank: Path | None = None, **changes: object) -> ConversionRequest:
+def request(path: Path | None, video: Path | None = None, bank: Path | None = None, **changes: object) -> ConversionRequest:
     return ConversionRequest(item="x", picture=path, video=video, bank=bank, settings=revise(PREVIEW, dict(changes)))
 
 
@@ -93,6 +93,8 @@ def test_a_folder_of_frames_is_a_video_and_equal_frames_are_equal_sources(tmp_pa
     assert one.moving
     assert (one.source_name, one.picture_name) == ("one", "a.png")
     assert job(request(tmp_path / "a.png", frames(tmp_path / "one", 4)), store).source != one.source
+    alone = job(request(None, tmp_path / "two"), store)
+    assert (alone.source, alone.source_name, alone.picture_name) == (two.source, "two", "")
 
 
 @pytest.mark.parametrize(("name", "moving"), [("a.mp4", True), ("a.WEBM", True), ("a.gif", False), ("a.png", False)])
