@@ -90,7 +90,7 @@ def make(
     ] = "",
     video: Annotated[
         Path | None,
-        typer.Option(metavar="PATH", help="driving video or folder of frames; PICTURE may be left out and only names the asset"),
+        typer.Option(metavar="PATH", help="driving video or folder of frames; a PICTURE only names the asset"),
     ] = None,
     view: Views = None,
     turntable: Turntable = None,

@@ -4,6 +4,7 @@ Charts are placed one after the other, large ones first, each at the first free 
 in which its center then lies lowest. Several orders are tried. Charts are turned, never mirrored.
 """
 
+import math
 from typing import no_type_check
 
 import numpy as np
@@ -19,6 +20,7 @@ ORDERS = 12  # orders of the charts that are tried: the first by area, the other
 DISTURBANCE = 0.25  # standard deviation of the logarithm of the area in a disturbed order
 FIRST_COVERAGE, STEP = 0.62, 0.01  # share of the texture that is tried first, and its increments
 LEAST_COVERAGE = 0.03  # share of the texture below which charts count as too many
+GOLDEN = 0.618  # multiples of this share of a length are spread evenly
 
 Array = NDArray[np.float64]
 Placed = list[tuple[NDArray[np.int64], Array]]  # vertices of every chart and their places, cells
@@ -75,7 +77,7 @@ class _Chart:
 
 
 class _Shape:
-    """Cells of a chart in one turn: those that it touches, and with the gap around it, in random order."""
+    """Cells of a chart in one turn: those that it touches, and with the gap around it, in scattered order."""
 
     def __init__(self, points: Array, faces: Int[np.ndarray, "f 3"], gap: int) -> None:
         self.points = points
@@ -173,7 +175,7 @@ def _mark_cells(points, faces, marked):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _center_and_cells(marked, gap):
-    """Return the mean row of the marked cells, and in random order the cells at most a gap away from one."""
+    """Return the mean row of the marked cells, and in scattered order the cells at most a gap away from one."""
     height, width = marked.shape
     around = np.zeros((height + 2 * gap, width + 2 * gap), np.bool_)
     rows, count = 0, 0
@@ -183,12 +185,13 @@ def _center_and_cells(marked, gap):
                 rows, count = rows + row, count + 1
                 around[row : row + 2 * gap + 1, column : column + 2 * gap + 1] = True
     cells = np.argwhere(around).astype(np.int32)
-    np.random.seed(0)
-    for i in range(len(cells) - 1, 0, -1):  # shuffled, so that a collision shows after few cells
-        j = np.random.randint(0, i + 1)
-        for axis in range(2):
-            cells[i, axis], cells[j, axis] = cells[j, axis], cells[i, axis]
-    return rows / count, cells
+    scattered = np.empty_like(cells)  # a collision shows after few cells
+    stride = max(1, int(GOLDEN * len(cells)))
+    while math.gcd(stride, len(cells)) > 1:
+        stride += 1
+    for i in range(len(cells)):
+        scattered[i] = cells[i * stride % len(cells)]
+    return rows / count, scattered
 
 
 @njit(cache=True, nogil=True)

@@ -20,7 +20,9 @@ def code(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DG4D_CODE_VERSION", "test")
 
 
-def request(path: Path | None, video: Path | None = None, bank: Path | None = None, **changes: object) -> ConversionRequest:
+def request(
+    path: Path | None, video: Path | None = None, bank: Path | None = None, **changes: object
+) -> ConversionRequest:
     return ConversionRequest(item="x", picture=path, video=video, bank=bank, settings=revise(PREVIEW, dict(changes)))
 
 
