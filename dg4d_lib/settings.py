@@ -378,10 +378,10 @@ class MotionSettings(FitSettings):
     plane_lr: Positive = Field(6.4e-3, description="learning rate of planes and frame-wise displacements")
     rigidity_weight: NotNegative = Field(0.0, description="local rigidity over time (Luiten et al. 2024)")
     track_surface: bool = Field(
-        False,
-        description="with pictures of other sides at the first frame: move their surface as the video shows it, by the "
-        "settings `asset.*`, and let its renders guide all later frames (ours); better for figures that run, worse "
-        "where limbs touch at first",
+        True,
+        description="with pictures of other sides at the first frame and a prior without weights: move their surface as "
+        "the video shows it, by the settings `asset.*`; later frames are guided by the mean of its renders and of the "
+        "other guess (ours)",
     )
     fine_tune: bool = Field(
         False,

@@ -25,6 +25,7 @@ from dg4d_lib.guidance.interface import GuidancePrior, SubjectShapes
 from dg4d_lib.guidance.kept_views import KeptViews
 from dg4d_lib.guidance.known import KnownShapes
 from dg4d_lib.guidance.learned import LearnedShapes
+from dg4d_lib.guidance.mixed import MixedShapes
 from dg4d_lib.guidance.oracle import Bank, perturb
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.images import over_white
@@ -59,6 +60,7 @@ DEPTH_NOTE = "prior: inflation of the silhouette, with the relief of an estimate
 SMALLEST_NOTED = 0.05  # share of the inflation from which the report mentions it
 GUESS_WEIGHT = 0.5  # of frames whose other sides are a guess, beside frames with known views
 CARRIED_CONTRAST = 2.0  # of shapes that a known first frame has made sure already
+CARRIED_SHARE = 0.6  # of the carried shapes in their mean with tracked ones
 ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
 
 
@@ -114,7 +116,7 @@ def make_prior(
         scratch: folder for unpacking.
         hint: at the depth of the subject; see `subject_hint`.
         sides: views of other sides that the user gave; priors with shapes take them as their own.
-        moved: shapes of frames without such views, which then guide these frames, too.
+        moved: their surface, tracked through the video; see `subject_shapes`.
 
     Raises:
         BadInput: the oracle has no bank, or the weights are damaged or of another model.
@@ -132,7 +134,7 @@ def make_prior(
                 clean, viewpoints = KeptViews(shapes.clean).clean, kept_viewpoints(stage)
             guided = settings.weight if isinstance(settings, LearnedPriorSettings) else GUESS_WEIGHT
             if isinstance(shapes, KnownShapes):
-                frames = None if moved or 0 in shapes.frames else shapes.frames
+                frames = None if 0 in shapes.frames else shapes.frames
                 weights = dict.fromkeys(shapes.frames, 1.0)
                 prior = AnalyticPrior(clean, noise, viewpoints, frames, 1.0 if moved else guided, weights)
                 network = _network(shapes.guess, settings)
@@ -175,14 +177,14 @@ def subject_shapes(
         cutouts: the subject at every frame.
         hint: at its depth; see `subject_hint`. A depth picture goes before an estimate by `prior.depth_weights`.
         sides: views of other sides; their hull replaces the shapes of their frames.
-        moved: shapes of all other frames, instead of those of the settings.
+        moved: the surface of known views of the first frame, tracked; averaged with the other guess at later frames.
     """
     frames = [frame for frame in sides.frames if frame < len(cutouts)] if sides else []
     known = {frame: [known_view(cutouts[frame]), *known_views(sides, frame)] for frame in frames if sides}
-    if moved is not None:
-        shapes = moved
-    elif 0 in known and len(cutouts) > 1:
+    shapes: SubjectShapes
+    if 0 in known and len(cutouts) > 1:
         shapes = _carried_shapes(settings, cutouts, hint, known_field(known[0]))
+        shapes = shapes if moved is None else MixedShapes(moved, shapes, CARRIED_SHARE)
     elif isinstance(settings, LearnedPriorSettings):
         shapes = LearnedShapes(learned_fields(cutouts, hint), settings)
     else:
@@ -212,6 +214,7 @@ def learned_fields(cutouts: Sequence[Float[Tensor, "h w 4"]], hint: DepthHint) -
 
 def _network(shapes: SubjectShapes, settings: PriorSettings) -> LearnedShapes | None:
     """Return the shapes if the shape network predicts them."""
+    shapes = shapes.second if isinstance(shapes, MixedShapes) else shapes
     return shapes if isinstance(settings, LearnedPriorSettings) and isinstance(shapes, LearnedShapes) else None
 
 

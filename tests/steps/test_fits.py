@@ -35,6 +35,7 @@ SMALL = revise(
         "static.prune_scale": 1.0,
         "motion.iterations": 2,
         "motion.fine_tune": False,
+        "motion.track_surface": False,
         "motion.reference_size": 32,
         "motion.frames_per_iteration": 0,
         "static.resolution_schedule": [{"until": 1.0, "size": 32}],
@@ -145,7 +146,7 @@ def test_views_of_other_sides_shape_the_start_of_the_fit(tmp_path: Path, subject
 
 
 @pytest.mark.slow
-def test_the_surface_of_known_views_guides_later_frames_where_that_is_asked_for(tmp_path: Path, subject: Path):
+def test_the_tracked_surface_of_known_views_guides_later_frames(tmp_path: Path, subject: Path):
     write_bank(tmp_path / "known.zip", [[known_view(disc(), 90.0)]], tmp_path)
     small = {"track_iterations": 2, "joint_iterations": 1, "nodes": 8, "size": 32}
     settings = revise(SMALL, {"motion.track_surface": True, **{f"asset.{name}": n for name, n in small.items()}})
