@@ -379,9 +379,9 @@ class MotionSettings(FitSettings):
     rigidity_weight: NotNegative = Field(0.0, description="local rigidity over time (Luiten et al. 2024)")
     track_surface: bool = Field(
         True,
-        description="with pictures of other sides at the first frame and a prior without weights: move their surface as "
-        "the video shows it, by the settings `asset.*`; later frames are guided by the mean of its renders and of the "
-        "other guess (ours)",
+        description="with pictures of other sides at the first frame, and a prior without weights: move their surface "
+        "as the video shows it, by the settings `asset.*`; later frames are guided by the mean of its renders and of "
+        "the other guess (ours)",
     )
     fine_tune: bool = Field(
         False,
