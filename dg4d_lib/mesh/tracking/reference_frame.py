@@ -21,7 +21,7 @@ from dg4d_lib.mesh.tracking.skinning import skin_vertices
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
 
-CANDIDATES = 8  # candidate frames
+CANDIDATES = 10  # candidate frames
 COMPARED = 8  # frames at which silhouettes are compared
 GRID = 64  # cells per axis of the candidates' density field
 SHORTEST = 1e-3  # of an edge, relative to its length at rest; shorter ones count as this

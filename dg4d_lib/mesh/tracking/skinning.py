@@ -95,22 +95,31 @@ def _drop_parting_bones(bones, weights, points, rest, moved):
 
     The dominant one has the largest total weight of Gaussians that move with it. The rows are normalized to sum 1.
     """
-    count = bones.shape[1]
+    count, times = bones.shape[1], moved.shape[0]
     agree = np.empty((count, count))
+    paths = np.empty((count, times + 1, 3))  # at rest, then at every timestamp: close together in memory
     for v in range(bones.shape[0]):
         reach2 = 1e-18
-        for i in bones[v]:
-            reach2 = max(reach2, np.square(rest[i] - points[v]).sum())
+        for k in range(count):
+            i, distance2 = bones[v, k], 0.0
+            for a in range(3):
+                paths[k, 0, a] = rest[i, a]
+                distance2 += (rest[i, a] - points[v, a]) ** 2
+                for t in range(times):
+                    paths[k, t + 1, a] = moved[t, i, a]
+            reach2 = max(reach2, distance2)
         agree[:] = 1.0
         for k in range(count):
             for m in range(k):
-                i, j, change = bones[v, k], bones[v, m], 0.0
-                before = np.sqrt(np.square(rest[i] - rest[j]).sum())
-                for t in range(moved.shape[0]):
-                    after = 0.0
+                before, change = 0.0, 0.0
+                for t in range(times + 1):
+                    distance2 = 0.0
                     for a in range(3):
-                        after += (moved[t, i, a] - moved[t, j, a]) ** 2
-                    change = max(change, abs(np.sqrt(after) - before))
+                        distance2 += (paths[k, t, a] - paths[m, t, a]) ** 2
+                    distance = np.sqrt(distance2)
+                    if t == 0:
+                        before = distance
+                    change = max(change, abs(distance - before))
                 agree[k, m] = agree[m, k] = np.exp(-0.5 * change * change / (PARTING * PARTING * reach2))
         most, dominant = -1.0, 0
         for m in range(count):
