@@ -60,7 +60,7 @@ DEPTH_NOTE = "prior: inflation of the silhouette, with the relief of an estimate
 SMALLEST_NOTED = 0.05  # share of the inflation from which the report mentions it
 GUESS_WEIGHT = 0.5  # of frames whose other sides are a guess, beside frames with known views
 CARRIED_CONTRAST = 2.0  # of shapes that a known first frame has made sure already
-CARRIED_SHARE = 0.6  # of the carried shapes in their mean with tracked ones
+CARRIED_SHARE = 0.3  # of the carried shapes in their mean with tracked ones: more is foggy where limbs move
 ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
 
 
