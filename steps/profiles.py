@@ -265,7 +265,7 @@ PREVIEW = revise(
         "deformation.hidden": 32,
         "deformation.spatial": 64,
         "deformation.smoothness_weight": SMOOTHNESS,
-        "motion.iterations": 225,
+        "motion.iterations": 250,
         "motion.views": 1,
         "motion.frames_per_iteration": 12,
         "motion.fine_tune": True,
