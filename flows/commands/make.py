@@ -1,5 +1,6 @@
 """Conversion of one picture or a few; behind `dg4d make`."""
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,7 +88,8 @@ def _name_of(path: Path | None) -> str:
     """Return the name that a file or a folder gives its asset; nothing for None."""
     if path is None:
         return ""
-    return clean_name(path.name if path.is_dir() else path.stem) or "asset"
+    folder = os.path.isdir(path)  # false for a name that is too long, where Path.is_dir raises
+    return clean_name(path.name if folder else path.stem) or "asset"
 
 
 def _make(wish: Wish, item: str, picture: Path | None, folder: Path, console: "Console") -> None:
