@@ -1,6 +1,5 @@
 """Conversion of one picture or a few; behind `dg4d make`."""
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,7 +87,10 @@ def _name_of(path: Path | None) -> str:
     """Return the name that a file or a folder gives its asset; nothing for None."""
     if path is None:
         return ""
-    folder = os.path.isdir(path)  # false for a name that is too long, where Path.is_dir raises
+    try:
+        folder = path.is_dir()
+    except OSError:  # the name is too long; it is refused later
+        folder = False
     return clean_name(path.name if folder else path.stem) or "asset"
 
 
