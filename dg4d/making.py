@@ -15,7 +15,7 @@ from flows import home
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest, name_from_text
 from flows.inputs.given_views import ViewFile, ViewsRequest
 from flows.inputs.manifest import Item, items_of
-from flows.inputs.naming import clean_name, unique_names
+from flows.inputs.naming import name_from_path, unique_names
 from flows.inputs.setting_reference import check_names
 from flows.packages.publish import check_folder, is_current
 from flows.step_errors import StepError
@@ -78,7 +78,7 @@ def make(
         picture: picture or video: a path, a PIL image, or an array of shape (height, width, 3 or 4), uint8 or float in
             [0, 1].
         text: prompt for a text-to-image model, instead of a picture.
-        video: driving video or folder of frames; `picture` then only names the asset.
+        video: driving video or folder of frames; a `picture` only names the asset.
         views: pictures of other sides at the first moment, by azimuth or (azimuth, elevation) in degrees.
         turntable: video, or folder of frames, of the still subject turned once.
         cameras: transforms.json of nerfstudio, with pictures of one moment or synchronized videos.
@@ -89,7 +89,7 @@ def make(
         layers: gray picture of the first frame: parts lighter than mid-gray lie before the rest, darker ones behind it.
         profile: set of settings.
         seed: seed of every step.
-        name: name of the asset; default: from the file name or the text.
+        name: name of the asset; default: from the name of picture, model or video, or from the text.
         out: folder of the package; default: out/NAME.
         on_progress: called with every event, from the threads of the steps; an exception of it ends the conversion.
         engine: `inline` runs the steps from this process; `prefect` runs a flow on the Prefect server of `dg4d up`,
@@ -106,7 +106,7 @@ def make(
     """
     with _as_file(picture) as path:
         request = ConversionRequest(
-            item=name or _name_of(path, picture, text, asset),
+            item=name or _name_of(picture, asset, video, text),
             picture=path,
             text=text,
             video=Path(video) if video is not None else None,
@@ -254,7 +254,7 @@ def _items(
             paths.append(Path(one) if isinstance(one, str | Path) else _written(one, folder, f"picture-{number}"))
         if not paths:
             raise BadInput("the batch is empty; give one picture or more")
-        names = unique_names([(clean_name(path.stem) or "asset", path.suffix.lstrip(".")) for path in paths])
+        names = unique_names([(name_from_path(path), path.suffix.lstrip(".")) for path in paths])
         yield [
             Item(
                 name=name, request=ConversionRequest(item=name, picture=path, profile=profile, settings=base, seed=seed)
@@ -297,12 +297,11 @@ def _written(picture: Any, folder: Path, stem: str) -> Path:
     return folder / f"{stem}.png"
 
 
-def _name_of(path: Path | None, picture: Picture | None, text: str, asset: str | Path | None = None) -> str:
-    if path is None and asset is not None:
-        return clean_name(Path(asset).stem) or "asset"
-    if path is None:
-        return name_from_text(text)
-    return (clean_name(path.stem) or "asset") if isinstance(picture, str | Path) else "asset"
+def _name_of(picture: Picture | None, asset: str | Path | None, video: str | Path | None, text: str) -> str:
+    if picture is not None and not isinstance(picture, str | Path):
+        return "asset"
+    named = picture or asset or video
+    return name_from_path(Path(named)) if named else name_from_text(text)
 
 
 def _view_file(place: float | tuple[float, float], path: str | Path) -> ViewFile:

@@ -207,12 +207,12 @@ def motions(
         from flows import home
         from flows.commands import terminal
         from flows.convert import rank_motions
-        from flows.inputs.naming import clean_name
+        from flows.inputs.naming import name_from_path
         from flows.packages.publish import check_writable
 
         console = terminal.console()
         several = shortcut_settings(None, None, None, box=box) | {"driving.candidates": candidates, "driving.pick": 0}
-        item = clean_name(picture.stem) or "asset"
+        item = name_from_path(picture)
         files = {"item": item, "picture": picture, "mask": mask, "depth": depth, "layers": layers}
         request = _request(profile, changes, several, seed=seed, commercial_only=commercial_only, **files)
         folder = out or Path("out") / f"{item}-motions"

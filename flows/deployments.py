@@ -35,7 +35,7 @@ from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.fetching import local_copy, without_secrets
 from flows.inputs.given_views import ViewsRequest, parse_views
 from flows.inputs.manifest import box_settings, parse_changes
-from flows.inputs.naming import clean_name
+from flows.inputs.naming import name_from_path
 from flows.packages.delivery import Outcome, pack_package, write_outcome
 from flows.packages.publish import check_folder, is_current
 from flows.serving.roots import Roots
@@ -253,7 +253,7 @@ def model_to_4d(
     roots = Roots.of_this_process()
     folder = roots.output(out)
     path, shown = Path(roots.folder(model)), Path(roots.folder(picture)) if picture else None
-    item = clean_name(path.stem) or "asset"
+    item = name_from_path(path)
     _publish(_request(item, options, roots, picture=shown, asset=path), folder)
 
 
@@ -397,7 +397,7 @@ def _convert(address: str, out: str, options: Options, sides: Sides, cutout: Cut
     named = {"mask": cutout.mask, "depth": cutout.depth, "layers": cutout.layers, "asset": sides.asset}
     own = {name: Path(text) if text else None for name, text in named.items()}
     roots.check_files([*given.files(), *filter(None, own.values())])
-    item = clean_name(PurePosixPath(urlsplit(address).path).stem) or "asset"
+    item = name_from_path(PurePosixPath(urlsplit(address).path))
     with local_copy(roots.source(address)) as path:
         files = {"picture": path, "video": path if is_video else None, **own}
         request = _request(item, options, roots, box_settings(cutout.box), given_views=given, **files)

@@ -11,7 +11,7 @@ from flows.commands import terminal
 from flows.convert import convert_job
 from flows.exit_status import EXIT_BAD_INPUT, EXIT_FAILED
 from flows.inputs.conversion_job import ConversionRequest, name_from_text
-from flows.inputs.naming import clean_name, unique_names
+from flows.inputs.naming import name_from_path, unique_names
 from flows.inputs.package_record import record_of
 from flows.packages.acceptance import failing_gates
 from flows.packages.publish import check_folder, is_current
@@ -61,12 +61,13 @@ def make_each(wish: Wish, console: "Console") -> int:
         raise BadInput("--pick chooses a generated motion and cannot be combined with --video")
     if len(wish.pictures) < 2:
         picture = wish.pictures[0] if wish.pictures else None
-        item = _name_of(picture or wish.asset or wish.video) or name_from_text(wish.text)
+        named = picture or wish.asset or wish.video
+        item = name_from_path(named) if named else name_from_text(wish.text)
         _make(wish, item, picture, wish.out or Path("out") / item, console)
         return 0
     if wish.alone:
         raise BadInput(f"{wish.alone} makes one asset, and {len(wish.pictures)} pictures are given; give one of them")
-    items = unique_names([(_name_of(path), path.suffix.lstrip(".")) for path in wish.pictures])
+    items = unique_names([(name_from_path(path), path.suffix.lstrip(".")) for path in wish.pictures])
     failed: dict[str, DG4DError | StepError] = {}
     for number, (item, picture) in enumerate(zip(items, wish.pictures, strict=True), 1):
         console.print(f"{number} of {len(items)}: {picture}", markup=False)
@@ -81,17 +82,6 @@ def make_each(wish: Wish, console: "Console") -> int:
     return (
         EXIT_BAD_INPUT if all(isinstance(error, BadInput | StepBadInput) for error in failed.values()) else EXIT_FAILED
     )
-
-
-def _name_of(path: Path | None) -> str:
-    """Return the name that a file or a folder gives its asset; nothing for None."""
-    if path is None:
-        return ""
-    try:
-        folder = path.is_dir()
-    except OSError:  # the name is too long; it is refused later
-        folder = False
-    return clean_name(path.name if folder else path.stem) or "asset"
 
 
 def _make(wish: Wish, item: str, picture: Path | None, folder: Path, console: "Console") -> None:

@@ -3,7 +3,7 @@
 import os
 import unicodedata
 from collections import Counter
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 
 from dg4d_lib.errors import BadInput
 from flows.formatting.escaping import quoted, visible
@@ -18,6 +18,15 @@ def clean_name(name: str) -> str:
     """Remove unprintable characters, and parts that lead out of a folder; the result may be empty."""
     printable = "".join(letter for letter in name if letter.isprintable())
     return "/".join(part for part in PurePosixPath(printable).parts if part.strip("/ ") not in {"", ".", ".."})
+
+
+def name_from_path(path: PurePath) -> str:
+    """Return the name that a file, or a folder of frames, gives its asset: `fox` for fox.png and for the folder fox."""
+    try:
+        folder = isinstance(path, Path) and path.is_dir()
+    except OSError:  # the name is too long, which `check_path` refuses
+        folder = False
+    return clean_name(path.name if folder else path.stem) or "asset"
 
 
 def check_name(name: str, advice: str = "choose a shorter name") -> None:

@@ -46,6 +46,13 @@ def test_a_picture_becomes_an_asset_and_the_second_call_does_nothing(alone: Path
     assert "fit_motion" in ran(alone)
 
 
+def test_a_video_needs_no_picture_and_names_its_asset(alone: Path) -> None:
+    Path("run.v2").mkdir()
+    for number in range(2):
+        words(f"run.v2/{number}.png", f"moving {number}")
+    assert dg4d.make(video="run.v2").name == "run.v2"
+
+
 @pytest.mark.parametrize(
     "settings", [{"motion": {"iterations": 7}}, {"motion.iterations": 7}, {"motion": {"iterations": 7}, "mesh": {}}]
 )

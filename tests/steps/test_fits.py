@@ -145,7 +145,6 @@ def test_views_of_other_sides_shape_the_start_of_the_fit(tmp_path: Path, subject
     assert "visual hull of 2 views" in report.notes[0] and TRACKED_NOTE not in report.notes
 
 
-@pytest.mark.slow
 def test_the_tracked_surface_of_known_views_guides_later_frames(tmp_path: Path, subject: Path):
     write_bank(tmp_path / "known.zip", [[known_view(disc(), 90.0)]], tmp_path)
     small = {"track_iterations": 2, "joint_iterations": 1, "nodes": 8, "size": 32}

@@ -15,6 +15,7 @@ from dg4d_lib.guidance.analytic import AnalyticPrior
 from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.known import KnownShapes
+from dg4d_lib.guidance.moved import MovedSurfaces
 from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.inflation.hints import DepthField, DepthHint
 from dg4d_lib.inflation.surface import inflate
@@ -143,6 +144,12 @@ def test_known_views_of_the_first_frame_guide_all_frames(
         assert sign * float(middles[1] - middles[0]) > 2  # pixels; from behind it moves left
     learned = isinstance(settings, LearnedPriorSettings)
     assert bool(choice.report("cpu").weights) == learned  # the network has guessed frame 1
+    tracked = MovedSurfaces([choice.shapes.surface(0)] * 2)
+    mixed = make_prior(settings, cutouts, MotionSettings(), None, tmp_path, sides=sides, moved=tracked)
+    assert isinstance(mixed.prior, AnalyticPrior) and mixed.prior.weight == 1
+    _, between = mixed.prior.clean([GuidanceView(camera, 1)])
+    assert float((between[0] - cover[1]).abs().max()) > 0.1  # pulled towards the tracked shape, which stands still
+    assert bool(mixed.report("cpu").weights) == learned
 
 
 def test_known_views_of_a_later_frame_guide_that_frame_alone(tmp_path: Path) -> None:

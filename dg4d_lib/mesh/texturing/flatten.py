@@ -247,13 +247,9 @@ def _longest_step(
 ) -> Array:
     """Return for every disk the factor of the step at which its first triangle loses its area."""
     sides, moves = (values[faces[:, 1:]] - values[faces[:, :1]] for values in (flat, step))
-
-    def cross(a: Array, b: Array) -> Array:
-        return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-
-    square = cross(moves[:, 0], moves[:, 1])
-    linear = cross(sides[:, 0], moves[:, 1]) + cross(moves[:, 0], sides[:, 1])
-    constant = cross(sides[:, 0], sides[:, 1])
+    square = _cross(moves[:, 0], moves[:, 1])
+    linear = _cross(sides[:, 0], moves[:, 1]) + _cross(moves[:, 0], sides[:, 1])
+    constant = _cross(sides[:, 0], sides[:, 1])
     # the smallest positive root of square t^2 + linear t + constant, in a form without cancellation
     discriminant = np.square(linear) - 4 * square * constant
     root = np.sqrt(np.maximum(discriminant, 0))

@@ -11,6 +11,7 @@ from flows.inputs.naming import (
     check_name,
     check_not_reserved,
     check_path,
+    name_from_path,
     unique_names,
 )
 
@@ -27,6 +28,16 @@ def test_every_name_that_is_allowed_leaves_room_for_the_names_of_scratch_folders
     longest = "n" * LONGEST_PART_BYTES
     for name in (f".{longest}.incoming-4194304", f".{longest}.outgoing-4194304", f"{longest}-motions"):
         (tmp_path / name).mkdir()
+
+
+def test_a_file_gives_its_stem_and_a_folder_its_whole_name(tmp_path: Path) -> None:
+    (tmp_path / "run.v2").mkdir()
+    (tmp_path / "fox.v2.png").touch()
+    assert name_from_path(tmp_path / "run.v2") == "run.v2"
+    assert name_from_path(tmp_path / "fox.v2.png") == "fox.v2"
+    assert name_from_path(Path("no file.mp4")) == "no file"
+    assert name_from_path(Path(f"{'x' * 5000}.png")) == "x" * 5000  # longer than a file system looks up
+    assert name_from_path(Path()) == "asset"
 
 
 @pytest.mark.parametrize("name", ["", "..", "/", "a\nb", "a\x1b[31mb", "a\u202eb", "a\0b"])
