@@ -1,7 +1,7 @@
 """Motion of a user's model: rigid transforms of control nodes on its surface, fitted to a driving video.
 
-The frames are tracked one after the other, then all are refined together. An as-rigid-as-possible energy along the
-surface (Sorkine and Alexa 2007), robust so that joints may bend, decides what the video leaves open; accelerations and
+The frames are tracked one after the other (`flow_tracking`), then all are refined together. An as-rigid-as-possible
+energy (Sorkine and Alexa 2007), robust so that joints may bend, decides what the video leaves open; accelerations and
 displacements in depth are penalized.
 """
 
@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from skimage.registration import optical_flow_tvl1
 from torch import Tensor
 from torch.nn import functional
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.fitting.flow_tracking import FlowTracker, Pose
 from dg4d_lib.fitting.losses import WHITE, check_finite, resize_cutouts
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
@@ -27,11 +27,11 @@ from dg4d_lib.video.driving import DrivingVideo
 
 ADVICE = "lower asset.lr"
 LEVELS = (1, 4, 8)  # widths of the filters over the compared pictures, pixels
-FLOW_SHARE = 0.6  # of the iterations of a frame that follow the optical flow; the rest follow the pictures alone
-FLOW_UNIT = 0.02  # of the picture's side: error of the flow up to which its loss is quadratic
-DEPTH_SLACK = 0.05  # world units by which a Gaussian may lie behind the visible surface
+MATCH_ITERATIONS = 80  # of the colors at the first frame
+MATCH_LR = (0.05, 0.1, 0.01)  # of harmonics, opacities and sizes
 ROBUST = 0.05  # relative stretch up to which the rigidity is quadratic
 WHOLE_DEPTH = 30.0  # weight of the mean displacement in depth, which a video hardly shows, times that of every node's
+SMALLEST_REAL = 0.05  # part of a quaternion: turns by half a circle have no vector
 BETA1, BETA2 = 0.9, 0.99  # of Adam
 FACTORS = {"turns": 6.0, "shifts": 3.0, "whole_turns": 2.0, "whole_shifts": 1.0}  # of the learning rate, per variable
 Report = Callable[[int, dict[str, float]], None]
@@ -107,27 +107,18 @@ def fit_asset_motion(
         FitDiverged: the loss became non-finite.
     """
     fit = _Fit(*_thinned(cloud, graph, settings.fit_points), video, rasterize, settings)
-    frames, done = len(video), 0
-    tracked: list[_Unknowns] = [_Unknowns.still(1, graph)]
-    for frame in range(frames):
-        start = tracked[-1] if frame < 2 else tracked[-2].continued(tracked[-1])
-        unknowns, steps = start.copy(), settings.track_iterations
-        descent = _Descent(unknowns)
-        expected = start.motion(fit.smoothing).nodes(graph).detach()
-        targets = fit.flow_targets(tracked[-1].motion(fit.smoothing), frame) if frame else None
-        for step in range(steps):
-            moved = unknowns.motion(fit.smoothing)
-            losses = fit.losses(moved, [frame])
-            if targets is not None and step < FLOW_SHARE * steps:
-                losses["flow"] = settings.flow * fit.flow_loss(moved, *targets)
-            losses["inertia"] = settings.inertia * fit.relative(moved.nodes(graph) - expected).square().sum(-1).mean()
-            fit.step(losses, unknowns, f"frame {frame}, iteration {step + 1}")
-            descent.step(settings.lr * (1 - 0.8 * step / steps))
-            done += 1
-            report(done, {name: float(value.detach()) for name, value in losses.items()})
-        tracked.append(unknowns.detach())
-    unknowns = _Unknowns.joined(tracked[1:])
+    poses, done = [Pose.rest(len(graph.nodes))], 0
+    for frame in range(len(video)):
+        if frame:
+            poses.append(fit.tracker.tracked(poses[max(frame - 2, 0)], poses[-1], frame))
+        else:
+            poses[0] = fit.tracker.placed(poses[0])
+            fit.match_first_frame(poses[0])
+        done += settings.track_iterations
+        report(done, {"color": fit.tracker.error(poses[-1], frame)})
+    unknowns = _Unknowns.of(poses, fit.smoothing).copy()
     descent = _Descent(unknowns)
+    frames = len(video)
     for step in range(settings.joint_iterations):
         chosen = torch.randperm(frames, generator=generator)[: min(settings.joint_frames, frames)].sort().values
         moved = unknowns.motion(fit.smoothing)
@@ -160,15 +151,48 @@ class _Fit:
         settings: AssetSettings,
     ) -> None:
         self.camera = replace(OrbitCamera(), width=settings.size, height=settings.size)
-        self.cloud, self.graph = antialiased(cloud.detach(), self.camera), graph
+        self.plain, self.graph = cloud.detach(), graph
         self.rasterize, self.settings = rasterize, settings
         cutouts = torch.cat([video.frames, video.alpha], -1)
         self.colors, self.alphas = resize_cutouts(cutouts, settings.size)
+        self.tracker = self.tracker_of(self.plain)
         self.area = float(self.alphas.mean().clamp(min=1e-3))  # of the subject, share of the picture
         self.unit = float((graph.nodes.amax(0) - graph.nodes.amin(0)).norm()) / 10
         first, second = graph.edges.T
         self.smoothing = _smoothing(graph, settings.smoothing)
         self.spans = graph.nodes[second] - graph.nodes[first]
+
+    @property
+    def cloud(self) -> Gaussians:
+        """Return the Gaussians that are rendered."""
+        return self.tracker.cloud
+
+    def tracker_of(self, plain: Gaussians) -> FlowTracker:
+        """Return the tracker of Gaussians as they would be without the rasterizer's low-pass filter."""
+        drawn = antialiased(plain, self.camera)
+        return FlowTracker(drawn, self.graph, self.colors, self.alphas, self.rasterize, self.settings)
+
+    def match_first_frame(self, pose: Pose) -> None:
+        """Fit colors, opacities and sizes to the first frame: light, texture and gaps differ from the video's."""
+        motion = _Unknowns.of([pose], self.smoothing).motion(self.smoothing)
+        means, quats = motion.points(self.plain.means, self.graph)[0], motion.rotations(self.graph)[0]
+        names = ("harmonics", "opacity_logits", "log_scales")
+        values = {name: getattr(self.plain, name).clone().requires_grad_() for name in names}
+        optimizer = torch.optim.Adam(
+            [{"params": [values[name]], "lr": lr} for name, lr in zip(names, MATCH_LR, strict=True)]
+        )
+        for step in range(MATCH_ITERATIONS):
+            state = replace(self.plain, means=means, quats=quat_multiply(quats, self.plain.quats), **values)
+            drawn = self.rasterize(antialiased(state, self.camera), [self.camera], means.new_tensor(WHITE))
+            loss = (drawn.color - self.colors[:1]).square().mean() + (drawn.alpha - self.alphas[:1]).square().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            gradients = [value.grad for value in values.values()]
+            check_finite(
+                "animate_asset", {"loss": loss}, gradients, f"colors, iteration {step + 1}", ADVICE, self.plain
+            )
+            optimizer.step()
+        self.tracker = self.tracker_of(replace(self.plain, **{name: value.detach() for name, value in values.items()}))
 
     def relative(self, values: Tensor) -> Tensor:
         """Return lengths in tenths of the model's size."""
@@ -196,39 +220,6 @@ class _Fit:
             "rigidity": settings.rigidity * self.rigidity(motion),
             "depth": settings.depth * depth,
         }
-
-    @torch.no_grad()
-    def flow_targets(self, before: NodeMotion, frame: int) -> tuple[Int[Tensor, " k"], Float[Tensor, "k 2"]]:
-        """Return the Gaussians that were visible before a frame, and the pixels that the optical flow moves them to."""
-        means = before.points(self.cloud.means, self.graph)
-        state = replace(self.cloud, means=means[0])
-        drawn = self.rasterize(state, [self.camera], means.new_tensor(WHITE))
-        pixels, depth = self._projected(means[0])
-        size = self.settings.size
-        column, row = pixels.floor().long().clamp(0, size - 1).T
-        alpha = drawn.alpha[0, row, column, 0]
-        surface = drawn.depth[0, row, column, 0] / alpha.clamp(min=1e-3)
-        visible = torch.nonzero((depth < surface + DEPTH_SLACK) & (alpha > 0.5))[:, 0]
-        pair = [luminance(self.colors[number]) for number in (frame - 1, frame)]
-        flow = torch.from_numpy(np.stack(optical_flow_tvl1(*pair), -1)).to(means)  # rows, columns
-        moved = pixels[visible] + flow[row[visible], column[visible]].flip(-1)
-        return visible, moved
-
-    def flow_loss(
-        self, motion: NodeMotion, visible: Int[Tensor, " k"], targets: Float[Tensor, "k 2"]
-    ) -> Float[Tensor, ""]:
-        """Return the robust distance of projected Gaussians to their targets."""
-        if len(visible) == 0:
-            return targets.new_zeros(())
-        means = motion.points(self.cloud.means[visible], self.graph.of(visible))[0]
-        error = (self._projected(means)[0] - targets) / (FLOW_UNIT * self.settings.size)
-        return ((error.square().sum(-1) + 1).sqrt() - 1).mean()
-
-    def _projected(self, means: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"]]:
-        """Return pixels (column, row) and depths of points."""
-        matrix = self.camera.viewmat().to(means)
-        seen = means @ matrix[:3, :3].T + matrix[:3, 3]
-        return seen[:, :2] / seen[:, 2:].clamp(min=0.1) * self.camera.focal + self.settings.size / 2, seen[:, 2]
 
     def rigidity(self, motion: NodeMotion) -> Float[Tensor, ""]:
         """Return the robust as-rigid-as-possible energy of the graph."""
@@ -263,25 +254,19 @@ class _Unknowns:
     whole_shifts: Float[Tensor, "t 3"]
 
     @classmethod
-    def still(cls, frames: int, graph: ControlGraph) -> "_Unknowns":
-        zeros, whole = graph.nodes.new_zeros(frames, len(graph.nodes), 3), graph.nodes.new_zeros(frames, 3)
-        return cls(zeros, zeros, whole, whole)
-
-    @classmethod
-    def joined(cls, frames: Sequence["_Unknowns"]) -> "_Unknowns":
-        return cls(**{name: torch.cat([getattr(one, name) for one in frames]) for name in vars(frames[0])}).copy()
+    def of(cls, poses: Sequence[Pose], smoothing: Float[Tensor, "m m"]) -> "_Unknowns":
+        """Return the variables of tracked poses."""
+        quats = torch.stack([pose.quats() for pose in poses])
+        turns = 2 * quats[..., 1:] / quats[..., :1].clamp(min=SMALLEST_REAL)
+        shifts = torch.from_numpy(np.stack([pose.shifts for pose in poses])).to(turns)
+        whole = turns.new_zeros(len(poses), 3)
+        return cls(torch.linalg.solve(smoothing, turns), torch.linalg.solve(smoothing, shifts), whole, whole)
 
     def copy(self) -> "_Unknowns":
         return _Unknowns(**{name: value.detach().clone().requires_grad_() for name, value in vars(self).items()})
 
     def detach(self) -> "_Unknowns":
         return _Unknowns(**{name: value.detach() for name, value in vars(self).items()})
-
-    def continued(self, last: "_Unknowns") -> "_Unknowns":
-        """Continue from this frame over the last one, at half the speed."""
-        return _Unknowns(
-            **{name: getattr(last, name) + 0.5 * (getattr(last, name) - value) for name, value in vars(self).items()}
-        )
 
     def motion(self, smoothing: Float[Tensor, "m m"]) -> NodeMotion:
         """Return the motion that they stand for."""
@@ -329,11 +314,6 @@ def _smoothing(graph: ControlGraph, strength: float) -> Float[Tensor, "m m"]:
     laplacian.diagonal().copy_(-laplacian.sum(1))
     inverse: Tensor = torch.linalg.inv(torch.eye(count, dtype=torch.float64) + strength * laplacian)
     return inverse.to(graph.nodes)
-
-
-def luminance(color: Float[Tensor, "h w 3"]) -> Float[np.ndarray, "h w"]:
-    """Return the luma of a picture."""
-    return (color @ color.new_tensor((0.299, 0.587, 0.114))).cpu().numpy()
 
 
 def antialiased(cloud: Gaussians, camera: OrbitCamera) -> Gaussians:

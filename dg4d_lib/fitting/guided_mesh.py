@@ -23,8 +23,8 @@ from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
 from dg4d_lib.video.driving import DrivingVideo
 
-TRACKING = AssetSettings(size=128)
-TRIAL = AssetSettings(size=64, nodes=100, fit_points=2500, track_iterations=12, joint_iterations=0)
+TRACKING = AssetSettings()
+TRIAL = AssetSettings(size=64, nodes=100, fit_points=2500, track_iterations=2, joint_iterations=0)
 TRIAL_ROUNDS = ((2, 4),)  # passes of the registration to outlines in a trial
 TRIAL_FRAMES = 6  # at which silhouettes are compared
 TRIAL_GRID = 48  # cells per axis of the density field

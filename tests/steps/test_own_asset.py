@@ -37,7 +37,7 @@ SMALL = revise(
         "asset.fit_points": 600,
         "asset.nodes": 12,
         "asset.size": 32,
-        "asset.track_iterations": 6,
+        "asset.track_iterations": 1,
         "asset.joint_iterations": 2,
         "mesh.texture_size": 64,
         "pack.splats": False,
@@ -148,7 +148,7 @@ def animated(prepared: Job, tmp_path_factory: pytest.TempPathFactory) -> tuple[J
     write_frames(folder / "video.zip", DrivingVideo(video[..., :3], video[..., 3:], 5.0))
     write_png(folder / "subject.png", video[0])
     inputs = {**prepared.outputs, "driving_video": folder / "video.zip", "subject": folder / "subject.png"}
-    settings = revise(SMALL, {"asset.track_iterations": 20})
+    settings = revise(SMALL, {"asset.track_iterations": 2})
     job = job_of("animate_asset", folder / "out", inputs, settings)
     animate_asset.run(job)
     return job, {**inputs, **job.outputs}

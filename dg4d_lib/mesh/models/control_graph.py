@@ -22,6 +22,9 @@ NEIGHBORS = 4  # nodes that move a point
 BRIDGES = 6  # edges from a component to each component that it touches
 TOUCHING = 1.5  # factor on the smallest gap of a component: others within it are joined to it, too
 LINKS = 6  # nearest nodes of a node in the graph
+BRACES = 4  # edges of a node through the inside
+BRACE_REACH = 0.35  # of the diagonal: the longest of them
+INWARD = 0.5  # cosine between such an edge and the normals at its ends
 REACH = 6.0  # spacings of the nodes: farther points are not told apart
 
 
@@ -68,8 +71,8 @@ def build_control_graph(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarra
         faces: indices into the vertices.
         count: number of nodes; at most one per vertex.
     """
-    graph = surface_graph(vertices, faces)
-    return graph_of_points(vertices, graph, count)
+    control = graph_of_points(vertices, surface_graph(vertices, faces), count)
+    return _braced(control, _node_normals(control, vertices, faces))
 
 
 def graph_of_points(points: Float[np.ndarray, "v 3"], graph: csr_array, count: int) -> ControlGraph:
@@ -105,6 +108,45 @@ def graph_of_points(points: Float[np.ndarray, "v 3"], graph: csr_array, count: i
         torch.from_numpy(pairs.astype(np.int64)),
         torch.from_numpy(lengths.astype(np.float32)),
     )
+
+
+def _node_normals(
+    control: ControlGraph, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> Float[np.ndarray, "m 3"]:
+    """Return unit normals at the nodes; of pieces that are inside out, turned."""
+    a, b, c = vertices[faces].swapaxes(0, 1)
+    normals = np.cross(b - a, c - a)
+    volumes = (a * np.cross(b, c)).sum(1)
+    edges = mesh_edges(faces)
+    piece = connected_components(_lengths(vertices, edges), directed=False)[1][faces[:, 0]]
+    normals[np.bincount(piece, volumes)[piece] < 0] *= -1
+    smooth = np.stack([np.bincount(faces.ravel(), np.repeat(normals[:, k], 3), len(vertices)) for k in range(3)], 1)
+    found = smooth[cKDTree(vertices).query(control.nodes.double().numpy())[1]]
+    unit: Float[np.ndarray, "m 3"] = found / np.linalg.norm(found, axis=1, keepdims=True).clip(1e-12)
+    return unit
+
+
+def _braced(control: ControlGraph, normals: Float[np.ndarray, "m 3"]) -> ControlGraph:
+    """Add edges through the inside, so that the surface is as stiff as a solid.
+
+    A straight line between two nodes runs inside if it leaves both against their normals; between two legs it does not.
+    """
+    nodes = control.nodes.double().numpy()
+    near = cKDTree(nodes).query_pairs(BRACE_REACH * float(np.linalg.norm(np.ptp(nodes, axis=0))), output_type="ndarray")
+    spans = nodes[near[:, 1]] - nodes[near[:, 0]]
+    lengths = np.linalg.norm(spans, axis=1)
+    leaves = -(spans * normals[near[:, 0]]).sum(1), (spans * normals[near[:, 1]]).sum(1)
+    inside = np.minimum(*leaves) > INWARD * lengths
+    near, lengths = near[inside], lengths[inside]
+    kept = np.zeros(len(near), bool)
+    for end in (0, 1):  # the shortest ones of every node
+        order = np.lexsort((lengths, near[:, end]))
+        first = np.searchsorted(near[order, end], near[order, end])
+        kept[order[np.arange(len(order)) - first < BRACES]] = True
+    pairs = torch.from_numpy(np.sort(near[kept], 1).astype(np.int64))
+    edges = torch.unique(torch.cat([control.edges, pairs]), dim=0)
+    ends = control.nodes[edges]
+    return replace(control, edges=edges, lengths=(ends[:, 1] - ends[:, 0]).norm(dim=-1))
 
 
 def surface_graph(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> csr_array:

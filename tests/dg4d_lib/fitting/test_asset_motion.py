@@ -15,7 +15,7 @@ from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 
 FRAMES, ANGLE = 4, 0.35  # radians at the last frame
-SETTINGS = AssetSettings(points=700, fit_points=700, nodes=16, size=48, track_iterations=25, joint_iterations=10)
+SETTINGS = AssetSettings(points=700, fit_points=700, nodes=16, size=48, track_iterations=3, joint_iterations=10)
 
 
 def arm() -> Model:
@@ -95,7 +95,7 @@ def test_nothing_drifts_in_depth(scene: tuple[SurfaceCloud, ControlGraph, Drivin
 
 def test_a_fit_is_repeatable(scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo]) -> None:
     surface, graph, video = scene
-    quick = SETTINGS.model_copy(update={"track_iterations": 2, "joint_iterations": 1})
+    quick = SETTINGS.model_copy(update={"track_iterations": 1, "joint_iterations": 1})
     bound, rasterize = graph.of(surface.nearest), get_rasterizer("cpu")
     threads = torch.get_num_threads()
     torch.set_num_threads(2)  # which may add gradients in any order

@@ -23,7 +23,7 @@ from dg4d_lib.mesh.models.surface_cloud import cover_surface
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 
-SETTINGS = AssetSettings(fit_points=600, nodes=16, size=48, track_iterations=25, joint_iterations=10)
+SETTINGS = AssetSettings(fit_points=600, nodes=16, size=48, track_iterations=3, joint_iterations=10)
 SHIFT = 0.06
 
 

@@ -1,0 +1,354 @@
+"""Motion of control nodes from frame to frame of a video, by optical flow from renders of the model to the frames.
+
+Every frame is found by rounds: render the model, follow the optical flow from the render to the frame, and solve for
+rigid transforms of the nodes by Gauss-Newton steps, with an as-rigid-as-possible energy (Sorkine and Alexa 2007) that
+is robust so that joints may bend. Where parts move farther than their size, flow fails; so each frame is also tried
+from a start that matches patches of the surface anywhere near, and the better of the two stays.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import coo_array, csr_array, vstack
+from scipy.spatial.transform import Rotation
+from skimage.registration import optical_flow_tvl1
+from torch import Tensor
+from torch.nn import functional
+
+from dg4d_lib.asset_settings import AssetSettings
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.geometry.quaternion import quat_multiply
+from dg4d_lib.mesh.models.control_graph import ControlGraph
+from dg4d_lib.rasterizer.interface import Rasterizer, Rendering
+
+STEPS = 2  # Gauss-Newton steps per round
+MATCH_STEPS = 4  # towards matched patches
+FOLLOWED = 1500  # largest number of Gaussians that follow the flow
+FLOW_UNIT = 0.01  # of the picture's side: error of the flow up to which its loss is quadratic
+ROBUST = 0.02  # relative stretch, or radians, up to which the rigidity is quadratic
+DEPTH_SLACK = 0.05  # world units by which a Gaussian may lie behind the visible surface
+STILL = 0.15  # weight of the last frame's place beside that of the extrapolated one
+DEPTH = 0.1  # of `asset.depth`, which suits the refinement
+WHOLE_DEPTH = 30.0  # weight of the mean displacement in depth, which a video hardly shows, times that of every node's
+CONTINUED = 0.5  # of the last motion, in the extrapolation
+GAIN = 0.02  # by which matched patches must lower the error
+AGREEMENT = 0.9  # IoU of outlines at the first frame from which the model is at rest there
+WINDOW = 8  # search of patches, in pixels of a picture of half the size, at 64 pixels of `asset.size`
+ALPHA_WEIGHT = 0.5  # of alpha beside a color, in patches
+LARGEST_COST = 0.3  # of a pixel, so that occluded ones do not decide
+NEIGHBORS, SPREAD = 2, 0.3  # rounds and weight of the neighbors' costs
+PULL = 0.003  # cost of the farthest places of a patch
+SHARP = 0.01  # cost above the best place from which another one is told apart
+
+Turns = Float[np.ndarray, "m 3 3"]
+Shifts = Float[np.ndarray, "m 3"]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Rigid transforms of the nodes at one frame.
+
+    Attributes:
+        turns: rotation matrices about the nodes at rest.
+        shifts: translations of the nodes, world units.
+    """
+
+    turns: Turns
+    shifts: Shifts
+
+    @classmethod
+    def rest(cls, count: int) -> "Pose":
+        """Return the pose of so many nodes at rest."""
+        return cls(np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)))
+
+    def quats(self) -> Float[Tensor, "m 4"]:
+        """Return the rotations as unit quaternions, wxyz, w not negative."""
+        found = Rotation.from_matrix(self.turns).as_quat(canonical=True)
+        return torch.from_numpy(np.roll(found, 1, -1)).float()
+
+    def continued(self, last: "Pose") -> "Pose":
+        """Continue from this pose over the last one, at part of the speed."""
+        return Pose(
+            _rotation(CONTINUED * _vector(last.turns @ self.turns.swapaxes(1, 2))) @ last.turns,
+            last.shifts + CONTINUED * (last.shifts - self.shifts),
+        )
+
+
+@dataclass(frozen=True)
+class _Targets:
+    """Pixels (column, row) that Gaussians should come to, with weights."""
+
+    rows: Int[np.ndarray, " k"]
+    pixels: Float[np.ndarray, "k 2"]
+    weights: Float[np.ndarray, " k"]
+
+
+class FlowTracker:
+    """Tracks a model from frame to frame.
+
+    Attributes:
+        cloud: the Gaussians that are rendered.
+    """
+
+    def __init__(
+        self,
+        cloud: Gaussians,
+        graph: ControlGraph,
+        colors: Float[Tensor, "t s s 3"],
+        alphas: Float[Tensor, "t s s 1"],
+        rasterize: Rasterizer,
+        settings: AssetSettings,
+    ) -> None:
+        """Store the model and the frames.
+
+        Args:
+            cloud: Gaussians of the model at rest, as `rasterize` should draw them.
+            graph: control graph whose points are the Gaussians.
+            colors: frames over white.
+            alphas: of the frames.
+            rasterize: rasterizer.
+            settings: of the fit.
+        """
+        self.cloud = cloud
+        self._graph, self._rasterize, self._settings = graph, rasterize, settings
+        self._colors, self._alphas = colors, alphas
+        self._camera = replace(OrbitCamera(), width=settings.size, height=settings.size)
+        self._viewmat = self._camera.viewmat().double().numpy()
+        self._rest = cloud.means.double().numpy()
+        self._nodes = graph.nodes.double().numpy()
+        self._indices, self._weights = graph.indices.numpy(), graph.weights.double().numpy()
+        self._edges = graph.edges.numpy()
+        self._spans = self._nodes[self._edges[:, 1]] - self._nodes[self._edges[:, 0]]
+        self._lengths = np.linalg.norm(self._spans, axis=1)
+        self._unit = float(np.linalg.norm(np.ptp(self._nodes, axis=0))) / 10
+        dark = _luma(colors - (1 - alphas)).sum() < 0.5 * float(alphas.sum())
+        self._backdrop = 1.0 if dark else 0.0  # the one that contrasts with the subject
+        self._pictures = self._over(colors, alphas)
+        self._features = _features(self._pictures, alphas)
+        self._lumas = _luma(self._pictures)
+
+    def placed(self, rest: Pose) -> Pose:
+        """Return the pose at the first frame: at rest, or by optical flow where outlines differ."""
+        inside, wanted = self._draw(rest)[0].alpha[0] > 0.5, self._alphas[0] > 0.5
+        agreement = float((inside & wanted).sum() / (inside | wanted).sum().clamp(min=1))
+        return rest if agreement >= AGREEMENT else self._followed(rest, rest, rest, 0)
+
+    def tracked(self, before: Pose, last: Pose, frame: int) -> Pose:
+        """Return the pose at a frame from the poses at the two frames before it."""
+        start = before.continued(last)
+        found = self._followed(start, start, last, frame)
+        matched = start
+        targets = self._patches(start, frame)
+        for _ in range(MATCH_STEPS):
+            matched = self._solved(matched, targets, start, last)
+        matched = self._followed(matched, matched, last, frame)
+        return matched if self.error(matched, frame) < (1 - GAIN) * self.error(found, frame) else found
+
+    def error(self, pose: Pose, frame: int) -> float:
+        """Return the root mean square difference of the render and a frame, over the subject."""
+        drawn = self._draw(pose)[0]
+        difference = torch.cat([drawn.color[0] - self._colors[frame], drawn.alpha[0] - self._alphas[frame]], -1)
+        smooth = functional.avg_pool2d(difference.movedim(-1, 0)[None], 3, 1, 1)
+        return float(smooth.square().mean().sqrt() / self._alphas[frame].mean().clamp(min=1e-3).sqrt())
+
+    def _followed(self, pose: Pose, expected: Pose, last: Pose, frame: int) -> Pose:
+        """Return the pose after rounds of optical flow."""
+        for _ in range(self._settings.track_iterations):
+            targets = self._flow(pose, frame)
+            for _ in range(STEPS):
+                pose = self._solved(pose, targets, expected, last)
+        return pose
+
+    def _flow(self, pose: Pose, frame: int) -> _Targets:
+        """Return where the optical flow from the render moves the visible Gaussians."""
+        drawn, pixels, visible = self._seen(pose)
+        picture = _luma(self._over(drawn.color, drawn.alpha))[0]
+        flow = np.stack(optical_flow_tvl1(picture, self._lumas[frame]), -1)[..., ::-1]  # columns, rows
+        column, row = self._cells(pixels[visible]).T
+        return _Targets(visible, pixels[visible] + flow[row, column], np.ones(len(visible)))
+
+    @torch.no_grad()
+    def _patches(self, pose: Pose, frame: int) -> _Targets:
+        """Return where the patches around the nodes are found in a frame, by color and alpha."""
+        drawn, pixels, visible = self._seen(pose)
+        reach = max(2, WINDOW * self._settings.size // 64)
+        ours = _features(self._over(drawn.color, drawn.alpha), drawn.alpha)[0]
+        theirs = functional.pad(self._features[frame], (reach,) * 4, mode="replicate")
+        column, row = torch.from_numpy(self._cells(pixels[visible]) // 2).T
+        down, right = torch.meshgrid(*[torch.arange(2 * reach + 1)] * 2, indexing="ij")
+        places = theirs[:, row[:, None] + down.reshape(-1), column[:, None] + right.reshape(-1)]
+        cost = (places - ours[:, row, column][..., None]).square().sum(0).clamp(max=LARGEST_COST).double().numpy()
+        nodes, count = self._indices[visible, 0], len(self._nodes)
+        owned = csr_array((np.ones(len(visible)), (nodes, np.arange(len(visible)))), shape=(count, len(visible)))
+        ends = np.concatenate([self._edges, self._edges[:, ::-1]]).T
+        beside = csr_array((np.ones(ends.shape[1]), tuple(ends)), shape=(count, count))
+        total, pieces = owned @ cost, owned @ np.ones(len(visible))
+        for _ in range(NEIGHBORS):
+            total, pieces = total + SPREAD * (beside @ total), pieces + SPREAD * (beside @ pieces)
+        offsets = np.stack([right.reshape(-1).numpy(), down.reshape(-1).numpy()], 1) - reach
+        mean = total / np.maximum(pieces, 1e-9)[:, None] + PULL * np.square(offsets / reach).sum(1)
+        best = mean.argmin(1)
+        above = mean - mean[np.arange(count), best][:, None]
+        sure = np.square(1 - np.exp(-above / SHARP).mean(1))  # of patches that are alike everywhere: 0
+        return _Targets(visible, pixels[visible] + 2.0 * offsets[best][nodes], sure[nodes])
+
+    def _seen(self, pose: Pose) -> tuple[Rendering, Float[np.ndarray, "n 2"], Int[np.ndarray, " k"]]:
+        """Return the render, the pixels of all Gaussians, and some that are visible, evenly chosen."""
+        drawn, points = self._draw(pose)
+        pixels, depth, _ = self._projected(points)
+        column, row = self._cells(pixels).T
+        alpha = drawn.alpha[0, ..., 0].numpy()[row, column]
+        surface = drawn.depth[0, ..., 0].numpy()[row, column] / alpha.clip(1e-3)
+        visible = np.flatnonzero((depth < surface + DEPTH_SLACK) & (alpha > 0.5))
+        return drawn, pixels, visible[:: max(1, -(-len(visible) // FOLLOWED))]
+
+    @torch.no_grad()
+    def _draw(self, pose: Pose) -> tuple[Rendering, Float[np.ndarray, "n 3"]]:
+        points = self._points(pose, np.arange(len(self._rest)))[0]
+        turned = functional.normalize(self._graph.blend(pose.quats()[None])[0], dim=-1)
+        state = replace(
+            self.cloud,
+            means=torch.from_numpy(points).to(self.cloud.means),
+            quats=quat_multiply(turned, self.cloud.quats),
+        )
+        return self._rasterize(state, [self._camera], torch.ones(3)), points
+
+    def _points(
+        self, pose: Pose, rows: Int[np.ndarray, " k"]
+    ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k n 3"]]:
+        """Return some of the Gaussians' means, and their turned offsets from the nodes that move them."""
+        index, weights = self._indices[rows], self._weights[rows]
+        arms = np.einsum("nkij,nkj->nki", pose.turns[index], self._rest[rows, None] - self._nodes[index])
+        return (weights[..., None] * (arms + self._nodes[index] + pose.shifts[index])).sum(1), arms
+
+    def _projected(
+        self, points: Float[np.ndarray, "k 3"]
+    ) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, " k"], Float[np.ndarray, "k 2 3"]]:
+        """Return pixels (column, row), depths, and derivatives of the pixels by the points."""
+        turn, focal = self._viewmat[:3, :3], self._camera.focal
+        seen = points @ turn.T + self._viewmat[:3, 3]
+        depth = seen[:, 2].clip(0.1)
+        slope = np.zeros((len(points), 2, 3))
+        slope[:, 0, 0] = slope[:, 1, 1] = focal / depth
+        slope[:, :, 2] = -focal * seen[:, :2] / np.square(depth)[:, None]
+        return seen[:, :2] / depth[:, None] * focal + self._settings.size / 2, seen[:, 2], slope @ turn
+
+    def _cells(self, pixels: Float[np.ndarray, "k 2"]) -> Int[np.ndarray, "k 2"]:
+        cells: Int[np.ndarray, "k 2"] = np.floor(pixels).astype(np.int64).clip(0, self._settings.size - 1)
+        return cells
+
+    def _over(self, colors: Float[Tensor, "t s s 3"], alphas: Float[Tensor, "t s s 1"]) -> Float[Tensor, "t s s 3"]:
+        """Return pictures over the backdrop that contrasts, from those over white."""
+        return colors - (1 - alphas) * (1 - self._backdrop)
+
+    def _solved(self, pose: Pose, targets: _Targets, expected: Pose, last: Pose) -> Pose:
+        """Return the pose after a Gauss-Newton step on all losses."""
+        settings, count = self._settings, len(self._nodes)
+        terms = [*self._flow_terms(pose, targets), *self._rigidity_terms(pose)]
+        place = np.concatenate([expected.shifts[:, :2], last.shifts[:, 2:]], 1)  # depth is not extrapolated
+        for target, weight in ((place, settings.inertia), (last.shifts, STILL * settings.inertia)):
+            scale = np.sqrt(weight / count) / self._unit
+            blocks = np.zeros((count, 1, 3, 6))
+            blocks[..., 3:] = scale * np.eye(3)
+            terms.append((_rows(blocks, np.arange(count)[:, None], count), ((pose.shifts - target) * scale).ravel()))
+        depth = np.zeros((count, 1, 1, 6))
+        depth[..., 5] = scale = np.sqrt(DEPTH * settings.depth / count) / self._unit
+        terms.append((_rows(depth, np.arange(count)[:, None], count), pose.shifts[:, 2] * scale))
+        depth[..., 5] = scale = np.sqrt(WHOLE_DEPTH * DEPTH * settings.depth) / count / self._unit
+        terms.append((_rows(depth[None, :, 0], np.arange(count)[None], count), pose.shifts[:, 2:].sum(0) * scale))
+        matrix = vstack([rows for rows, _ in terms], format="csr")
+        normal = (matrix.T @ matrix).toarray()
+        normal[np.diag_indices(6 * count)] += 1e-9
+        step = cho_solve(cho_factor(normal), -(matrix.T @ np.concatenate([values for _, values in terms])))
+        step = step.reshape(count, 6)
+        return Pose(_rotation(step[:, :3]) @ pose.turns, pose.shifts + step[:, 3:])
+
+    def _flow_terms(self, pose: Pose, targets: _Targets) -> list[tuple[csr_array, Float[np.ndarray, " r"]]]:
+        if not len(targets.rows):
+            return []
+        points, arms = self._points(pose, targets.rows)
+        pixels, _, slope = self._projected(points)
+        unit = FLOW_UNIT * self._settings.size
+        error = (pixels - targets.pixels) / unit
+        robust = targets.weights * self._settings.flow / len(points) / np.sqrt(1 + np.square(error).sum(1))
+        scale = np.sqrt(robust)
+        slope *= scale[:, None, None] / unit
+        moved = np.broadcast_to(slope[:, None], (*arms.shape[:2], 2, 3))
+        blocks = np.concatenate([-moved @ _cross(arms), moved], -1) * self._weights[targets.rows][..., None, None]
+        index = self._indices[targets.rows]
+        return [(_rows(blocks, index, len(self._nodes)), (error * scale[:, None]).ravel())]
+
+    def _rigidity_terms(self, pose: Pose) -> list[tuple[csr_array, Float[np.ndarray, " r"]]]:
+        weight, count, edges = self._settings.rigidity, len(self._nodes), len(self._edges)
+        places, eye, none = self._nodes + pose.shifts, np.eye(3), np.zeros((edges, 3, 3))
+        terms = []
+        for start, end, sign in ((0, 1, 1.0), (1, 0, -1.0)):
+            first, second = self._edges[:, start], self._edges[:, end]
+            turned = np.einsum("eij,ej->ei", pose.turns[first], sign * self._spans)
+            stretch = (places[second] - places[first] - turned) / self._lengths[:, None]
+            scale = np.sqrt(weight / (2 * edges) / _softened(stretch))
+            unit = (scale / self._lengths)[:, None, None]
+            blocks = np.stack(
+                [
+                    np.concatenate([_cross(turned) * unit, -eye * unit], -1),
+                    np.concatenate([none, eye * unit], -1),
+                ],
+                1,
+            )
+            terms.append((_rows(blocks, np.stack([first, second], 1), count), (stretch * scale[:, None]).ravel()))
+        first, second = self._edges.T
+        bend = _vector(pose.turns[second] @ pose.turns[first].swapaxes(1, 2))
+        scale = np.sqrt(weight * self._settings.bending / edges / _softened(bend))
+        unit = scale[:, None, None] * eye
+        blocks = np.stack([np.concatenate([-unit, none], -1), np.concatenate([unit, none], -1)], 1)
+        terms.append((_rows(blocks, self._edges, count), (bend * scale[:, None]).ravel()))
+        return terms
+
+
+def _features(pictures: Float[Tensor, "t s s 3"], alphas: Float[Tensor, "t s s 1"]) -> Float[Tensor, "t 4 h w"]:
+    """Return blurred pictures of half the size."""
+    both = torch.cat([pictures, ALPHA_WEIGHT * alphas], -1).movedim(-1, 1)
+    return functional.avg_pool2d(functional.avg_pool2d(functional.avg_pool2d(both, 3, 1, 1), 3, 1, 1), 2)
+
+
+def _luma(pictures: Float[Tensor, "t s s 3"]) -> Float[np.ndarray, "t s s"]:
+    return (pictures @ pictures.new_tensor((0.299, 0.587, 0.114))).cpu().numpy()
+
+
+def _rows(blocks: Float[np.ndarray, "n k d 6"], nodes: Int[np.ndarray, "n k"], count: int) -> csr_array:
+    """Return derivatives by the six unknowns of `k` nodes per item as a sparse matrix of `n d` rows."""
+    items, _, height, _ = blocks.shape
+    row = np.arange(items * height).reshape(items, 1, height, 1)
+    column = 6 * nodes[:, :, None, None] + np.arange(6)
+    places = tuple(np.broadcast_to(one, blocks.shape).ravel() for one in (row, column))
+    return csr_array(coo_array((blocks.ravel(), places), shape=(items * height, 6 * count)))
+
+
+def _softened(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Return the divisor that makes a quadratic loss linear for large values."""
+    divisor: Float[np.ndarray, " n"] = np.sqrt(np.square(values).sum(1) + ROBUST**2)
+    return divisor
+
+
+def _cross(vectors: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
+    """Return the matrices of the cross products with vectors."""
+    matrix = np.zeros((*vectors.shape, 3))
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -z, y, -x
+    return matrix - matrix.swapaxes(-1, -2)
+
+
+def _rotation(vectors: Shifts) -> Turns:
+    """Return rotations by vectors along the axis, of the length of the angle."""
+    found: Turns = Rotation.from_rotvec(vectors).as_matrix()
+    return found
+
+
+def _vector(turns: Turns) -> Shifts:
+    """Return the vectors of rotations; see `_rotation`."""
+    found: Shifts = Rotation.from_matrix(turns).as_rotvec()
+    return found
