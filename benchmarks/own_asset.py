@@ -11,7 +11,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from benchmarks import true_views
@@ -23,6 +23,7 @@ import torch  # isort: skip
 from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from benchmarks.objects.drawing import Painted
 from benchmarks.objects.specimens import OBJECTS
@@ -30,7 +31,6 @@ from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.fitting.asset_motion import fit_asset_motion
 from dg4d_lib.fitting.asset_pose import find_placement
-from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.images import over_white, resize
 from dg4d_lib.mesh.models.control_graph import build_control_graph
 from dg4d_lib.mesh.models.model import Model, ModelPart
@@ -41,7 +41,7 @@ from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.metrics.surface import chamfer_distance, sample_surface
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
-from steps.animate_asset import moved_states, moved_vertices
+from steps.animate_asset import moved_vertices
 from steps.fitting.priors import read_bank_folder
 from steps.profiles import PREVIEW
 
@@ -135,15 +135,29 @@ def _grown(texture: np.ndarray, rows: Tensor, columns: Tensor) -> np.ndarray:
     return texture[tuple(nearest)]
 
 
-def score(own: OwnModel, states: Gaussians, moved: Float[Tensor, "t v 3"], faces: Int[Tensor, "f 3"]) -> Figures:
+def draw_model(model: Model, moved: Float[Tensor, "t v 3"], camera: OrbitCamera) -> Float[Tensor, "t s s 4"]:
+    """Draw a model unlit at all frames, straight alpha."""
+    fine = replace(camera, width=2 * camera.width, height=2 * camera.height)
+    frames = []
+    for vertices in moved:
+        fragments = rasterize_mesh(vertices.float(), torch.from_numpy(model.faces).long(), [fine])
+        covered = fragments.faces[0] >= 0
+        picture = torch.zeros(fine.height, fine.width, 4)
+        colors, _ = model.sample(
+            fragments.faces[0][covered].long().numpy(), fragments.barycentrics[0][covered].double().numpy()
+        )
+        picture[covered] = torch.cat([torch.from_numpy(colors), torch.ones(len(colors), 1)], 1)
+        frames.append(avg_pool2d(picture.movedim(-1, 0)[None], 2)[0].movedim(0, -1))
+    drawn = torch.stack(frames)
+    return torch.cat([drawn[..., :3] / drawn[..., 3:].clamp(min=1e-6), drawn[..., 3:]], -1)
+
+
+def score(own: OwnModel, moved: Float[Tensor, "t v 3"], faces: Int[Tensor, "f 3"]) -> Figures:
     """Compare renders and meshes of a motion with the truth."""
-    rasterize = get_rasterizer("auto")
     rows = []
     for azimuth, truth in _views(own.subject):
-        camera = OrbitCamera(0, azimuth, width=SIZE, height=SIZE)
-        with torch.no_grad():
-            drawn = rasterize(states, [camera] * len(states.means), torch.ones(3))
-        rows.append(true_views.figures(drawn.color.clamp(0, 1), drawn.alpha, truth))
+        drawn = draw_model(own.model, moved, OrbitCamera(0, azimuth, width=SIZE, height=SIZE))
+        rows.append(true_views.figures(over_white(drawn), drawn[..., 3:], truth))
     return {**mean(rows[1:]), "chamfer": _chamfer(own, moved, faces, None), "input": rows[0]["psnr"]}
 
 
@@ -178,12 +192,8 @@ def _chamfer(
     return float(np.mean(distances))
 
 
-def animate(own: OwnModel, settings: AssetSettings, seed: int = 0) -> tuple[Gaussians, Float[Tensor, "t v 3"], int]:
-    """Place a subject's model and fit its motion.
-
-    Returns:
-        Gaussians and vertices at all frames, and the number of flipped faces.
-    """
+def animate(own: OwnModel, settings: AssetSettings, seed: int = 0) -> tuple[Float[Tensor, "t v 3"], int]:
+    """Place a subject's model and fit its motion; return its vertices at all frames and the number of flipped faces."""
     rasterize = get_rasterizer("auto")
     generator = torch.Generator().manual_seed(seed)
     footage, whole = own.subject.footage, cover_surface(own.model, settings.points, generator)
@@ -193,7 +203,7 @@ def animate(own: OwnModel, settings: AssetSettings, seed: int = 0) -> tuple[Gaus
     bound = graph.of(surface.nearest)
     video = DrivingVideo(footage[..., :3].contiguous(), footage[..., 3:].contiguous(), FPS)
     motion = fit_asset_motion(surface.cloud, bound, video, rasterize, settings, generator)
-    return moved_states(surface.cloud, bound, motion), *moved_vertices(surface, graph, motion)
+    return moved_vertices(surface, graph, motion)
 
 
 def measure(
@@ -215,14 +225,14 @@ def measure(
     show(f"{'':24}" + "".join(f"{column:>10}" for column in COLUMNS))
     for own in models:
         begun, name = time.perf_counter(), own.subject.name
-        states, vertices, flipped = animate(own, settings)
-        found[name] = {**score(own, states, vertices, torch.from_numpy(own.model.faces)), "flipped": float(flipped)}
+        vertices, flipped = animate(own, settings)
+        found[name] = {**score(own, vertices, torch.from_numpy(own.model.faces)), "flipped": float(flipped)}
         still[name] = frozen(own)
         show(_row(name, found[name]) + f"   {time.perf_counter() - begun:.0f} s")
         show(_row("  truth, frozen", still[name]))
         if sheets is not None:
             sheets.mkdir(parents=True, exist_ok=True)
-            true_views.write_sheet(sheets / f"{name}.png", [_sheet(own.subject, states)])
+            true_views.write_sheet(sheets / f"{name}.png", [_sheet(own, vertices)])
     show(_row("mean", mean(list(found.values()))))
     show(_row("  truth, frozen", mean(list(still.values()))))
     return found
@@ -238,15 +248,12 @@ def _row(name: str, figures: Figures) -> str:
     return f"{name:24}" + "".join(f"{figures[column]:10.3f}" for column in COLUMNS)
 
 
-def _sheet(subject: Subject, states: Gaussians, columns: int = 6, size: int = 288) -> Float[Tensor, "h w 3"]:
+def _sheet(own: OwnModel, moved: Float[Tensor, "t v 3"], columns: int = 6, size: int = 288) -> Float[Tensor, "h w 3"]:
     """Draw some frames: for every view a row of the truth and one of ours."""
-    rasterize = get_rasterizer("auto")
-    frames = torch.linspace(0, len(states.means) - 1, columns).round().long()
+    frames = torch.linspace(0, len(moved) - 1, columns).round().long()
     rows = []
-    for azimuth, truth in _views(subject):
-        camera = OrbitCamera(0, azimuth, width=size, height=size)
-        with torch.no_grad():
-            ours = rasterize(states.states(frames), [camera] * columns, torch.ones(3)).color
+    for azimuth, truth in _views(own.subject):
+        ours = over_white(draw_model(own.model, moved[frames], OrbitCamera(0, azimuth, width=size, height=size)))
         theirs = resize(over_white(truth[frames]), (size, size))
         rows += [torch.cat(list(theirs), 1), torch.cat(list(ours), 1)]
     return torch.cat(rows)

@@ -20,7 +20,7 @@ from torch import Tensor
 from benchmarks.backdrops import procedural
 from benchmarks.inputs import known_bank
 from benchmarks.objects.drawing import Painted
-from benchmarks.own_asset import OwnModel, animate
+from benchmarks.own_asset import OwnModel, animate, draw_model
 from benchmarks.true_views import Subject, fit
 from dg4d_lib.assets.formats.model_glb import write_model_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
@@ -129,7 +129,9 @@ def asset(painted: Painted) -> tuple[list[Tile], Tensor]:
     (FILES / "newt.glb").write_bytes(write_model_glb(model))
     own = OwnModel(subject_of(painted), model, vertices[None], painted.faces, torch.ones(len(painted.faces)))
     shown = [tile(photograph(painted, 0, azimuth, 20)) for azimuth in (30, 120, 210, 300)]
-    return shown, sheet_of(animate(own, PREVIEW.asset)[0])
+    moved = animate(own, PREVIEW.asset)[0][torch.tensor(SHOWN_FRAMES)]
+    cameras = [OrbitCamera(0, azimuth, width=SIZE, height=SIZE) for azimuth in SHOWN_DEG]
+    return shown, torch.cat([row([tile(one) for one in draw_model(model, moved, camera)]) for camera in cameras])
 
 
 def truth(painted: Painted) -> tuple[list[Tile], Tensor]:

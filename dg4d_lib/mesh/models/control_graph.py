@@ -24,6 +24,7 @@ TOUCHING = 1.5  # factor on the smallest gap of a component: others within it ar
 LINKS = 6  # nearest nodes of a node in the graph
 BRACES = 4  # edges of a node through the inside
 BRACE_REACH = 0.35  # of the diagonal: the longest of them
+PLACES = 7  # on such an edge, evenly, that must lie inside
 INWARD = 0.5  # cosine between such an edge and the normals at its ends
 REACH = 6.0  # spacings of the nodes: farther points are not told apart
 
@@ -72,7 +73,7 @@ def build_control_graph(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarra
         count: number of nodes; at most one per vertex.
     """
     control = graph_of_points(vertices, surface_graph(vertices, faces), count)
-    return _braced(control, _node_normals(control, vertices, faces))
+    return _braced(control, vertices, _outward(vertices, faces))
 
 
 def graph_of_points(points: Float[np.ndarray, "v 3"], graph: csr_array, count: int) -> ControlGraph:
@@ -110,10 +111,8 @@ def graph_of_points(points: Float[np.ndarray, "v 3"], graph: csr_array, count: i
     )
 
 
-def _node_normals(
-    control: ControlGraph, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
-) -> Float[np.ndarray, "m 3"]:
-    """Return unit normals at the nodes; of pieces that are inside out, turned."""
+def _outward(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 3"]:
+    """Return unit normals of the vertices; of pieces that are inside out, turned."""
     a, b, c = vertices[faces].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
     volumes = (a * np.cross(b, c)).sum(1)
@@ -121,22 +120,30 @@ def _node_normals(
     piece = connected_components(_lengths(vertices, edges), directed=False)[1][faces[:, 0]]
     normals[np.bincount(piece, volumes)[piece] < 0] *= -1
     smooth = np.stack([np.bincount(faces.ravel(), np.repeat(normals[:, k], 3), len(vertices)) for k in range(3)], 1)
-    found = smooth[cKDTree(vertices).query(control.nodes.double().numpy())[1]]
-    unit: Float[np.ndarray, "m 3"] = found / np.linalg.norm(found, axis=1, keepdims=True).clip(1e-12)
+    unit: Float[np.ndarray, "v 3"] = smooth / np.linalg.norm(smooth, axis=1, keepdims=True).clip(1e-12)
     return unit
 
 
-def _braced(control: ControlGraph, normals: Float[np.ndarray, "m 3"]) -> ControlGraph:
+def _braced(
+    control: ControlGraph, vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"]
+) -> ControlGraph:
     """Add edges through the inside, so that the surface is as stiff as a solid.
 
-    A straight line between two nodes runs inside if it leaves both against their normals; between two legs it does not.
+    A straight line between two nodes runs inside if it leaves both against their normals, and if places on it lie
+    behind the vertices next to them; through two legs it does not.
     """
     nodes = control.nodes.double().numpy()
+    surface = cKDTree(vertices)
+    own = normals[np.asarray(surface.query(nodes)[1], np.int64)]
     near = cKDTree(nodes).query_pairs(BRACE_REACH * float(np.linalg.norm(np.ptp(nodes, axis=0))), output_type="ndarray")
     spans = nodes[near[:, 1]] - nodes[near[:, 0]]
     lengths = np.linalg.norm(spans, axis=1)
-    leaves = -(spans * normals[near[:, 0]]).sum(1), (spans * normals[near[:, 1]]).sum(1)
+    leaves = -(spans * own[near[:, 0]]).sum(1), (spans * own[near[:, 1]]).sum(1)
     inside = np.minimum(*leaves) > INWARD * lengths
+    near, lengths, spans = near[inside], lengths[inside], spans[inside]
+    places = nodes[near[:, :1]] + np.linspace(0, 1, PLACES + 2)[1:-1, None] * spans[:, None]  # pairs, places, 3
+    nearest = np.asarray(surface.query(places)[1], np.int64)
+    inside = (((places - vertices[nearest]) * normals[nearest]).sum(-1) < -1e-6 * lengths[:, None]).all(1)
     near, lengths = near[inside], lengths[inside]
     kept = np.zeros(len(near), bool)
     for end in (0, 1):  # the shortest ones of every node

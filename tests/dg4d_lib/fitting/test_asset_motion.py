@@ -1,5 +1,7 @@
 """Motion of users' models: recovers bends that the video shows, keeps lengths, and leaves depth alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -124,3 +126,16 @@ def test_small_gaussians_cover_as_much_as_without_the_filter() -> None:
     clear = antialiased(one, camera)
     expected = one.opacities * pixels**2 / (pixels**2 + 0.3)
     torch.testing.assert_close(clear.opacities, expected.clamp(min=1e-3))
+
+
+def test_colors_of_the_video_are_taken_over(
+    scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo], motion: NodeMotion
+) -> None:
+    """A model in other light than the video moves alike."""
+    surface, graph, video = scene
+    dim = replace(surface.cloud, harmonics=0.5 * surface.cloud.harmonics)
+    bound, generator = graph.of(surface.nearest), torch.Generator().manual_seed(0)
+    other = fit_asset_motion(dim, bound, video, get_rasterizer("cpu"), SETTINGS, generator)
+    rest = scene[0].fine.vertices
+    still = np.linalg.norm(moved(scene, motion)[-1] - rest, axis=1).mean()
+    assert np.linalg.norm(moved(scene, other)[-1] - moved(scene, motion)[-1], axis=1).mean() < 0.1 * still

@@ -1,9 +1,10 @@
 """Control graphs: weights follow the surface, and separate components hang together."""
 
 import numpy as np
+import pytest
 import torch
 
-from dg4d_lib.mesh.models.control_graph import build_control_graph, graph_of_points, point_graph
+from dg4d_lib.mesh.models.control_graph import build_control_graph, graph_of_points, point_graph, surface_graph
 
 
 def strip(length: int, x: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -62,3 +63,29 @@ def test_scattered_points_get_a_graph():
 
 def test_more_nodes_than_points_are_no_error():
     assert len(build_control_graph(*strip(3), 100).nodes) == 6
+
+
+def tube(x: float, inside_out: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Return an open tube along y, 0.2 wide."""
+    y, angle = np.meshgrid(np.linspace(0, 1, 21), np.arange(12) * np.pi / 6, indexing="ij")
+    vertices = np.stack([x + 0.1 * np.cos(angle), y, 0.1 * np.sin(angle)], -1).reshape(-1, 3)
+    row, column = np.meshgrid(np.arange(20), np.arange(12), indexing="ij")
+    a, b = (row * 12 + column).ravel(), (row * 12 + (column + 1) % 12).ravel()
+    faces = np.concatenate([np.stack([a, a + 12, b], 1), np.stack([b, a + 12, b + 12], 1)])
+    return vertices, faces[:, ::-1] if inside_out else faces
+
+
+@pytest.mark.parametrize("inside_out", [False, True])
+def test_edges_run_through_the_inside_but_not_between_legs(inside_out):
+    left, right = tube(0.0, inside_out), tube(0.25)  # 0.05 apart
+    vertices = np.concatenate([left[0], right[0]])
+    faces = np.concatenate([left[1], right[1] + len(left[0])])
+    graph = build_control_graph(vertices, faces, 120)
+    surface = graph_of_points(vertices, surface_graph(vertices, faces), 120)
+    known = {tuple(pair) for pair in surface.edges.tolist()}
+    added = graph.nodes[[pair for pair in graph.edges.tolist() if tuple(pair) not in known]]
+    assert known <= {tuple(pair) for pair in graph.edges.tolist()} and len(added) > 60
+    middle = added.mean(1)
+    center = torch.where(middle[:, 0] < 0.125, 0.0, 0.25)
+    assert (torch.stack([middle[:, 0] - center, middle[:, 2]], 1).norm(dim=1) < 0.1).all()  # inside
+    assert ((added[:, 0, 0] < 0.125) == (added[:, 1, 0] < 0.125)).all()

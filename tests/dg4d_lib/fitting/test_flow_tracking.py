@@ -1,0 +1,124 @@
+"""Tracking by optical flow: known motions are recovered, far jumps are found, and what nobody shows stays."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from dg4d_lib.asset_settings import AssetSettings
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.fitting.flow_tracking import FlowTracker, Pose, _Targets
+from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.mesh.models.control_graph import graph_of_points, point_graph
+from dg4d_lib.rasterizer.interface import get_rasterizer
+
+SIZE = 64
+SETTINGS = AssetSettings(size=SIZE, nodes=40, inertia=0.0, depth=0.0)
+
+
+def cloud_of(points: np.ndarray, colors: np.ndarray) -> Gaussians:
+    count = len(points)
+    return Gaussians(
+        torch.from_numpy(points).float(),
+        torch.full((count, 3), 0.03).log(),
+        torch.tensor([1.0, 0, 0, 0]).expand(count, 4).contiguous(),
+        torch.full((count,), 4.0),
+        torch.from_numpy((colors - 0.5) / 0.28209479)[:, None].float(),
+    )
+
+
+def scene() -> tuple[np.ndarray, np.ndarray]:
+    """Return a gray block and a small red ball beside it."""
+    random = np.random.default_rng(0)
+    block = random.uniform((-0.1, -0.5, -0.1), (0.3, 0.5, 0.1), (800, 3))
+    ball = random.normal(size=(300, 3))
+    ball *= 0.09 / np.linalg.norm(ball, axis=1, keepdims=True)
+    gray = 0.4 + 0.2 * np.sin(12 * block[:, 1:2]) * np.ones(3)
+    return np.concatenate([block, np.add(ball, (-0.35, -0.4, 0))]), np.concatenate(
+        [gray, np.tile([0.9, 0.1, 0.1], (300, 1))]
+    )
+
+
+def tracker_of(moved: np.ndarray, settings: AssetSettings = SETTINGS) -> FlowTracker:
+    """Return a tracker of the scene whose second frame shows moved points."""
+    points, colors = scene()
+    drawn = [
+        get_rasterizer("cpu")(cloud_of(one, colors), [OrbitCamera(width=SIZE, height=SIZE)], torch.ones(3))
+        for one in (points, moved)
+    ]
+    graph = graph_of_points(points, point_graph(points), settings.nodes)
+    frames, alphas = (torch.cat([getattr(one, name) for one in drawn]) for name in ("color", "alpha"))
+    return FlowTracker(cloud_of(points, colors), graph, frames, alphas, get_rasterizer("cpu"), settings)
+
+
+def test_gauss_newton_recovers_a_rigid_motion_from_exact_pixels() -> None:
+    points, _ = scene()
+    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.2, 0.1], [0.2, 0.0, -0.15], [-0.1, 0.15, 0.0]])).numpy()
+    truth = points @ turn.T + (0.05, -0.1, 0.02)
+    tracker = tracker_of(points)
+    targets = _Targets(np.arange(len(points)), tracker._projected(truth)[0], np.ones(len(points)))
+    pose = rest = Pose.rest(len(tracker._nodes))
+    for _ in range(15):
+        pose = tracker._solved(pose, targets, rest, rest)
+    found = tracker._points(pose, np.arange(len(points)))[0]
+    assert np.abs(found - truth).max() < 1e-3  # in depth, too: perspective shows it
+    np.testing.assert_allclose(pose.turns, np.tile(turn, (len(pose.turns), 1, 1)), atol=1e-3)
+
+
+def test_a_part_that_jumps_farther_than_its_size_is_found() -> None:
+    points, _ = scene()
+    moved = points.copy()
+    moved[800:, 1] += 0.4  # the ball is 0.18 wide
+    tracker = tracker_of(moved)
+    rest = Pose.rest(len(tracker._nodes))
+    targets = tracker._patches(rest, 1)
+    steps = targets.pixels - tracker._projected(points[targets.rows])[0]
+    expected = tracker._projected(moved[targets.rows])[0] - tracker._projected(points[targets.rows])[0]
+    ball = (targets.rows >= 800) & (np.abs(points[targets.rows, 0] + 0.35) < 0.05)
+    assert (
+        np.abs(np.median(steps[ball], 0) - np.median(expected[ball], 0)).max() <= 2
+    )  # pixels: half the size is searched
+    assert targets.weights[ball].min() > 0.25
+    after = tracker._points(tracker.tracked(rest, rest, 1), np.arange(len(points)))[0]
+    error = np.linalg.norm(after - moved, axis=1)
+    assert np.median(error[800:]) < 0.2 and np.median(error[:800]) < 0.1  # of 0.4; the block hangs on it
+
+
+def test_a_still_video_moves_nothing() -> None:
+    points, _ = scene()
+    tracker = tracker_of(points)
+    rest = Pose.rest(len(tracker._nodes))
+    after = tracker._points(tracker.tracked(rest, rest, 1), np.arange(len(points)))[0]
+    assert np.abs(after - points).max() < 0.01
+
+
+def test_depth_is_not_extrapolated() -> None:
+    points, _ = scene()
+    tracker = tracker_of(points, SETTINGS.model_copy(update={"inertia": 1.0}))
+    rest = Pose.rest(len(tracker._nodes))
+    expected = replace(rest, shifts=np.add(rest.shifts, (0.1, 0, 0.1)))
+    nothing = _Targets(np.arange(0), np.zeros((0, 2)), np.zeros(0))
+    pose = rest
+    for _ in range(5):
+        pose = tracker._solved(pose, nothing, expected, rest)
+    np.testing.assert_allclose(pose.shifts.mean(0), (0.1 / 1.15, 0, 0), atol=1e-4)
+
+
+@pytest.mark.parametrize("agrees", [True, False])
+def test_the_first_frame_is_tracked_only_where_outlines_differ(agrees: bool) -> None:
+    points, _ = scene()
+    tracker = tracker_of(points)
+    if not agrees:
+        tracker._alphas[0] = tracker._alphas[0].roll(9, 1)
+    rest = Pose.rest(len(tracker._nodes))
+    assert (tracker.placed(rest) is rest) == agrees
+
+
+def test_poses_continue_at_half_their_speed() -> None:
+    angle = torch.tensor([[0.0, -0.4, 0], [0.4, 0, 0], [0, 0, 0]])
+    pair = [torch.linalg.matrix_exp(scale * angle).double().numpy()[None] for scale in (1.0, 1.5)]
+    rest = Pose.rest(1)
+    found = rest.continued(Pose(pair[0], np.array([[0.2, 0, 0]])))
+    np.testing.assert_allclose(found.turns, pair[1], atol=1e-4)
+    np.testing.assert_allclose(found.shifts, [[0.3, 0, 0]])
