@@ -181,7 +181,14 @@ class AssetSettings(Settings):
     fit_points: int = Field(6000, ge=100, le=200000, description="number of Gaussians that the fit renders")
     nodes: int = Field(200, ge=4, le=2000, description="number of control nodes on the surface")
     size: int = Field(128, ge=32, le=512, multiple_of=16, description="pixels of the compared pictures")
-    track_iterations: int = Field(3, ge=1, le=100, description="rounds of optical flow per frame while tracking")
+    tracking: Literal["flow", "descent"] = Field(
+        "flow",
+        description="frame by frame: `flow`: optical flow from renders, and far jumps are searched; "
+        "`descent`: along gradients, softer",
+    )
+    track_iterations: int = Field(
+        3, ge=1, le=1000, description="rounds of optical flow, or steps of the descent, per frame while tracking"
+    )
     joint_iterations: int = Field(100, ge=0, le=10000, description="iterations over all frames after tracking")
     joint_frames: int = Field(8, ge=1, le=512, description="frames of a joint iteration")
     lr: Positive = Field(0.006, description="learning rate of the position of the model, world units")

@@ -154,7 +154,7 @@ STEPS: dict[str, StepSpec] = {
                 "known_views": _optional(BANK),
             },
             outputs={"motion": MOTION, "gaussians": _optional(PLY), "curves": CURVES, "picture": PNG},
-            sections=("rasterizer", "subject.turn_deg", "prior", "deformation", "motion", "asset"),
+            sections=("rasterizer", "subject.turn_deg", "prior", "deformation", "motion"),
             resource="gpu",
         ),
         _step(

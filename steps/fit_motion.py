@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import torch
 
-from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.fitting.asset_motion import iterations
 from dg4d_lib.fitting.motion import fit_motion
+from dg4d_lib.fitting.surface_tracking import DESCENT
 from dg4d_lib.gaussians.ply import read_ply, write_ply
 from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
 from dg4d_lib.settings import DeformationSettings, MotionSettings
@@ -36,12 +36,11 @@ def run(job: Job) -> StepReport:
     cutouts = list(torch.cat([video.frames, video.alpha], -1))
     known = read_known_views(job.inputs.get("known_views"), job.pictures)
     tracks = tracks_surface(settings, prior, known, len(video))
-    asset: AssetSettings = job.settings.asset
-    before = iterations(asset, len(video)) if tracks else 0
+    before = iterations(DESCENT, len(video)) if tracks else 0
     curves = LossCurves(before + settings.iterations, job.progress)
     with picture_of_divergence(job, rasterize):
         moved = (
-            tracked_shapes(gaussians, video, known, prior, hint, rasterize, asset, generator, curves.add)
+            tracked_shapes(gaussians, video, known, prior, hint, rasterize, DESCENT, generator, curves.add)
             if known and tracks
             else None
         )

@@ -1,8 +1,8 @@
 """Motion of a user's model: rigid transforms of control nodes on its surface, fitted to a driving video.
 
-The frames are tracked one after the other (`flow_tracking`), then all are refined together. An as-rigid-as-possible
-energy (Sorkine and Alexa 2007), robust so that joints may bend, decides what the video leaves open; accelerations and
-displacements in depth are penalized.
+The frames are tracked one after the other, by optical flow (`flow_tracking`) or by descent, then all are refined
+together. An as-rigid-as-possible energy (Sorkine and Alexa 2007), robust so that joints may bend, decides what the
+video leaves open; accelerations and displacements in depth are penalized.
 """
 
 import math
@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from skimage.registration import optical_flow_tvl1
 from torch import Tensor
 from torch.nn import functional
 
@@ -27,6 +28,9 @@ from dg4d_lib.video.driving import DrivingVideo
 
 ADVICE = "lower asset.lr"
 LEVELS = (1, 4, 8)  # widths of the filters over the compared pictures, pixels
+FLOW_SHARE = 0.6  # of the iterations of a descent that follow the optical flow; the rest follow the pictures alone
+FLOW_UNIT = 0.02  # of the picture's side: error of the flow up to which its loss is quadratic
+DEPTH_SLACK = 0.05  # world units by which a Gaussian may lie behind the visible surface
 MATCH_ITERATIONS = 80  # of the colors at the first frame
 MATCH_LR = (0.05, 0.1, 0.01)  # of harmonics, opacities and sizes
 ROBUST = 0.05  # relative stretch up to which the rigidity is quadratic
@@ -107,18 +111,10 @@ def fit_asset_motion(
         FitDiverged: the loss became non-finite.
     """
     fit = _Fit(*_thinned(cloud, graph, settings.fit_points), video, rasterize, settings)
-    poses, done = [Pose.rest(len(graph.nodes))], 0
-    for frame in range(len(video)):
-        if frame:
-            poses.append(fit.tracker.tracked(poses[max(frame - 2, 0)], poses[-1], frame))
-        else:
-            poses[0] = fit.tracker.placed(poses[0])
-            fit.match_first_frame(poses[0])
-        done += settings.track_iterations
-        report(done, {"color": fit.tracker.error(poses[-1], frame)})
-    unknowns = _Unknowns.of(poses, fit.smoothing).copy()
+    frames, done = len(video), iterations(settings, len(video)) - settings.joint_iterations
+    track = _followed if settings.tracking == "flow" else _descended
+    unknowns = _Unknowns.joined(track(fit, frames, settings, report))
     descent = _Descent(unknowns)
-    frames = len(video)
     for step in range(settings.joint_iterations):
         chosen = torch.randperm(frames, generator=generator)[: min(settings.joint_frames, frames)].sort().values
         moved = unknowns.motion(fit.smoothing)
@@ -137,6 +133,43 @@ def fit_asset_motion(
 def iterations(settings: AssetSettings, frames: int) -> int:
     """Return the number of iterations that a fit reports."""
     return settings.track_iterations * frames + settings.joint_iterations
+
+
+def _followed(fit: "_Fit", frames: int, settings: AssetSettings, report: Report) -> list["_Unknowns"]:
+    """Track the frames one after the other by optical flow; return their variables."""
+    poses = [fit.tracker.placed(Pose.rest(len(fit.graph.nodes)))]
+    fit.match_first_frame(poses[0])
+    for frame in range(frames):
+        if frame:
+            poses.append(fit.tracker.tracked(poses[max(frame - 2, 0)], poses[-1], frame))
+        report((frame + 1) * settings.track_iterations, {"color": fit.tracker.error(poses[-1], frame)})
+    return [_Unknowns.of(pose, fit.smoothing) for pose in poses]
+
+
+def _descended(fit: "_Fit", frames: int, settings: AssetSettings, report: Report) -> list["_Unknowns"]:
+    """Track the frames one after the other along gradients; return their variables."""
+    done = 0
+    tracked: list[_Unknowns] = [_Unknowns.still(1, fit.graph)]
+    for frame in range(frames):
+        start = tracked[-1] if frame < 2 else tracked[-2].continued(tracked[-1])
+        unknowns, steps = start.copy(), settings.track_iterations
+        descent = _Descent(unknowns)
+        expected = start.motion(fit.smoothing).nodes(fit.graph).detach()
+        targets = fit.flow_targets(tracked[-1].motion(fit.smoothing), frame) if frame else None
+        for step in range(steps):
+            moved = unknowns.motion(fit.smoothing)
+            losses = fit.losses(moved, [frame])
+            if targets is not None and step < FLOW_SHARE * steps:
+                losses["flow"] = settings.flow * fit.flow_loss(moved, *targets)
+            losses["inertia"] = (
+                settings.inertia * fit.relative(moved.nodes(fit.graph) - expected).square().sum(-1).mean()
+            )
+            fit.step(losses, unknowns, f"frame {frame}, iteration {step + 1}")
+            descent.step(settings.lr * (1 - 0.8 * step / steps))
+            done += 1
+            report(done, {name: float(value.detach()) for name, value in losses.items()})
+        tracked.append(unknowns.detach())
+    return tracked[1:]
 
 
 class _Fit:
@@ -174,7 +207,7 @@ class _Fit:
 
     def match_first_frame(self, pose: Pose) -> None:
         """Fit colors, opacities and sizes to the first frame: light, texture and gaps differ from the video's."""
-        motion = _Unknowns.of([pose], self.smoothing).motion(self.smoothing)
+        motion = _Unknowns.of(pose, self.smoothing).motion(self.smoothing)
         means, quats = motion.points(self.plain.means, self.graph)[0], motion.rotations(self.graph)[0]
         names = ("harmonics", "opacity_logits", "log_scales")
         values = {name: getattr(self.plain, name).clone().requires_grad_() for name in names}
@@ -221,6 +254,39 @@ class _Fit:
             "depth": settings.depth * depth,
         }
 
+    @torch.no_grad()
+    def flow_targets(self, before: NodeMotion, frame: int) -> tuple[Int[Tensor, " k"], Float[Tensor, "k 2"]]:
+        """Return the Gaussians that were visible before a frame, and the pixels that the optical flow moves them to."""
+        means = before.points(self.cloud.means, self.graph)
+        state = replace(self.cloud, means=means[0])
+        drawn = self.rasterize(state, [self.camera], means.new_tensor(WHITE))
+        pixels, depth = self._projected(means[0])
+        size = self.settings.size
+        column, row = pixels.floor().long().clamp(0, size - 1).T
+        alpha = drawn.alpha[0, row, column, 0]
+        surface = drawn.depth[0, row, column, 0] / alpha.clamp(min=1e-3)
+        visible = torch.nonzero((depth < surface + DEPTH_SLACK) & (alpha > 0.5))[:, 0]
+        pair = [luminance(self.colors[number]) for number in (frame - 1, frame)]
+        flow = torch.from_numpy(np.stack(optical_flow_tvl1(*pair), -1)).to(means)  # rows, columns
+        moved = pixels[visible] + flow[row[visible], column[visible]].flip(-1)
+        return visible, moved
+
+    def flow_loss(
+        self, motion: NodeMotion, visible: Int[Tensor, " k"], targets: Float[Tensor, "k 2"]
+    ) -> Float[Tensor, ""]:
+        """Return the robust distance of projected Gaussians to their targets."""
+        if len(visible) == 0:
+            return targets.new_zeros(())
+        means = motion.points(self.cloud.means[visible], self.graph.of(visible))[0]
+        error = (self._projected(means)[0] - targets) / (FLOW_UNIT * self.settings.size)
+        return ((error.square().sum(-1) + 1).sqrt() - 1).mean()
+
+    def _projected(self, means: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"]]:
+        """Return pixels (column, row) and depths of points."""
+        matrix = self.camera.viewmat().to(means)
+        seen = means @ matrix[:3, :3].T + matrix[:3, 3]
+        return seen[:, :2] / seen[:, 2:].clamp(min=0.1) * self.camera.focal + self.settings.size / 2, seen[:, 2]
+
     def rigidity(self, motion: NodeMotion) -> Float[Tensor, ""]:
         """Return the robust as-rigid-as-possible energy of the graph."""
         matrices = self.graph.at_ends(quat_to_rotmat(motion.quats).flatten(2))
@@ -254,19 +320,34 @@ class _Unknowns:
     whole_shifts: Float[Tensor, "t 3"]
 
     @classmethod
-    def of(cls, poses: Sequence[Pose], smoothing: Float[Tensor, "m m"]) -> "_Unknowns":
-        """Return the variables of tracked poses."""
-        quats = torch.stack([pose.quats() for pose in poses])
-        turns = 2 * quats[..., 1:] / quats[..., :1].clamp(min=SMALLEST_REAL)
-        shifts = torch.from_numpy(np.stack([pose.shifts for pose in poses])).to(turns)
-        whole = turns.new_zeros(len(poses), 3)
-        return cls(torch.linalg.solve(smoothing, turns), torch.linalg.solve(smoothing, shifts), whole, whole)
+    def still(cls, frames: int, graph: ControlGraph) -> "_Unknowns":
+        zeros, whole = graph.nodes.new_zeros(frames, len(graph.nodes), 3), graph.nodes.new_zeros(frames, 3)
+        return cls(zeros, zeros, whole, whole)
+
+    @classmethod
+    def of(cls, pose: Pose, smoothing: Float[Tensor, "m m"]) -> "_Unknowns":
+        """Return the variables of a tracked pose."""
+        quats = pose.quats()
+        turns = 2 * quats[:, 1:] / quats[:, :1].clamp(min=SMALLEST_REAL)
+        shifts, whole = torch.from_numpy(pose.shifts).to(turns), turns.new_zeros(1, 3)
+        rough = [torch.linalg.solve(smoothing, one)[None] for one in (turns, shifts)]
+        return cls(rough[0], rough[1], whole, whole)
+
+    @classmethod
+    def joined(cls, frames: Sequence["_Unknowns"]) -> "_Unknowns":
+        return cls(**{name: torch.cat([getattr(one, name) for one in frames]) for name in vars(frames[0])}).copy()
 
     def copy(self) -> "_Unknowns":
         return _Unknowns(**{name: value.detach().clone().requires_grad_() for name, value in vars(self).items()})
 
     def detach(self) -> "_Unknowns":
         return _Unknowns(**{name: value.detach() for name, value in vars(self).items()})
+
+    def continued(self, last: "_Unknowns") -> "_Unknowns":
+        """Continue from this frame over the last one, at half the speed."""
+        return _Unknowns(
+            **{name: getattr(last, name) + 0.5 * (getattr(last, name) - value) for name, value in vars(self).items()}
+        )
 
     def motion(self, smoothing: Float[Tensor, "m m"]) -> NodeMotion:
         """Return the motion that they stand for."""
@@ -314,6 +395,11 @@ def _smoothing(graph: ControlGraph, strength: float) -> Float[Tensor, "m m"]:
     laplacian.diagonal().copy_(-laplacian.sum(1))
     inverse: Tensor = torch.linalg.inv(torch.eye(count, dtype=torch.float64) + strength * laplacian)
     return inverse.to(graph.nodes)
+
+
+def luminance(color: Float[Tensor, "h w 3"]) -> Float[np.ndarray, "h w"]:
+    """Return the luma of a picture."""
+    return (color @ color.new_tensor((0.299, 0.587, 0.114))).cpu().numpy()
 
 
 def antialiased(cloud: Gaussians, camera: OrbitCamera) -> Gaussians:

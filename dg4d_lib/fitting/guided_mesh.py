@@ -9,8 +9,7 @@ from jaxtyping import Float, Int
 from skimage.measure import perimeter
 from torch import Tensor
 
-from dg4d_lib.asset_settings import AssetSettings
-from dg4d_lib.fitting.surface_tracking import track_vertices
+from dg4d_lib.fitting.surface_tracking import DESCENT, track_vertices
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface, select_level
@@ -23,8 +22,10 @@ from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
 from dg4d_lib.video.driving import DrivingVideo
 
-TRACKING = AssetSettings()
-TRIAL = AssetSettings(size=64, nodes=100, fit_points=2500, track_iterations=2, joint_iterations=0)
+TRACKING = DESCENT.model_copy(update={"size": 128})
+TRIAL = DESCENT.model_copy(
+    update={"size": 64, "nodes": 100, "fit_points": 2500, "track_iterations": 12, "joint_iterations": 0}
+)
 TRIAL_ROUNDS = ((2, 4),)  # passes of the registration to outlines in a trial
 TRIAL_FRAMES = 6  # at which silhouettes are compared
 TRIAL_GRID = 48  # cells per axis of the density field

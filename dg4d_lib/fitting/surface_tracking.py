@@ -17,6 +17,15 @@ from dg4d_lib.mesh.models.control_graph import build_control_graph
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 
+DESCENT = AssetSettings(  # for surfaces that are guesses: what flow takes for certain tears them
+    tracking="descent",
+    track_iterations=40,
+    size=96,
+    smoothing=4.0,
+    rigidity=0.3,
+    inertia=0.02,
+    smoothness=0.02,
+)
 CELL = 0.02  # world units: vertices in one cell move alike; distances along a finer surface take a minute
 
 
@@ -83,7 +92,7 @@ def track_vertices(
     first, index = group_vertices(points, CELL)
     points, joined = points[first], index[faces.numpy()]
     whole = (joined != np.roll(joined, 1, 1)).all(1)
-    graph = build_control_graph(points, joined[whole], settings.nodes)
+    graph = build_control_graph(points, joined[whole], settings.nodes, settings.tracking == "flow")
     nearest = torch.from_numpy(np.asarray(cKDTree(points).query(gaussians.means.double().numpy())[1]))
     bound = graph.of(torch.from_numpy(index))
     moved = vertices.repeat(len(video), 1, 1)

@@ -189,7 +189,11 @@ def test_a_mesh_that_the_video_guides_follows_it_and_has_its_colors(
 ) -> None:
     monkeypatch.setattr(plan_mesh, "select_reference_frame", lambda *given: Trial(1, 0.8, 0.0))
     monkeypatch.setattr(plan_mesh, "select_guided_reference", lambda *given: (2, 0.9))
-    monkeypatch.setattr(guided_mesh, "TRACKING", AssetSettings(size=32, nodes=8, track_iterations=1, fit_points=100))
+    monkeypatch.setattr(
+        guided_mesh,
+        "TRACKING",
+        AssetSettings(tracking="descent", size=32, nodes=8, track_iterations=10, fit_points=100),
+    )
     alpha = green_video(tmp_path / "video")
     _, facts = extract(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}), video=tmp_path / "video")
     asset = read_tracked(tmp_path / "tracked")

@@ -145,10 +145,13 @@ def test_views_of_other_sides_shape_the_start_of_the_fit(tmp_path: Path, subject
     assert "visual hull of 2 views" in report.notes[0] and TRACKED_NOTE not in report.notes
 
 
-def test_the_tracked_surface_of_known_views_guides_later_frames(tmp_path: Path, subject: Path):
+def test_the_tracked_surface_of_known_views_guides_later_frames(
+    tmp_path: Path, subject: Path, monkeypatch: pytest.MonkeyPatch
+):
     write_bank(tmp_path / "known.zip", [[known_view(disc(), 90.0)]], tmp_path)
     small = {"track_iterations": 2, "joint_iterations": 1, "nodes": 8, "size": 32}
-    settings = revise(SMALL, {"motion.track_surface": True, **{f"asset.{name}": n for name, n in small.items()}})
+    monkeypatch.setattr(fit_motion, "DESCENT", fit_motion.DESCENT.model_copy(update=small))
+    settings = revise(SMALL, {"motion.track_surface": True})
     statics = job(tmp_path, fit_settings(), {"subject": subject}, STATIC)
     fit_gaussians.run(statics)
     frames = torch.stack([disc(), disc(2), disc(4)])

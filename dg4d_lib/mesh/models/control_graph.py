@@ -64,16 +64,19 @@ class ControlGraph:
         return eye[self.edges[:, 0]] @ values, eye[self.edges[:, 1]] @ values
 
 
-def build_control_graph(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], count: int) -> ControlGraph:
+def build_control_graph(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], count: int, braced: bool = True
+) -> ControlGraph:
     """Distribute nodes evenly over a surface and compute the weights of its vertices.
 
     Args:
         vertices: of a mesh with short edges, welded.
         faces: indices into the vertices.
         count: number of nodes; at most one per vertex.
+        braced: edges run through the inside, too.
     """
     control = graph_of_points(vertices, surface_graph(vertices, faces), count)
-    return _braced(control, vertices, _outward(vertices, faces))
+    return _braced(control, vertices, _outward(vertices, faces)) if braced else control
 
 
 def graph_of_points(points: Float[np.ndarray, "v 3"], graph: csr_array, count: int) -> ControlGraph:

@@ -5,10 +5,10 @@ import pytest
 import torch
 import trimesh
 
-from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting import guided_mesh
 from dg4d_lib.fitting.guided_mesh import follow_video, frames_with_long_outlines, select_guided_reference
+from dg4d_lib.fitting.surface_tracking import DESCENT
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.mesh.extraction.density import density_field
@@ -21,7 +21,9 @@ from dg4d_lib.video.driving import DrivingVideo
 FRAMES = 5
 SWING_DEG = 20.0  # per frame; the legs cross in the middle
 SETTINGS = MeshSettings(grid=32, max_faces=4000, edge_length=0.04)
-FAST = AssetSettings(fit_points=400, nodes=24, size=48, track_iterations=3, joint_iterations=0)
+FAST = DESCENT.model_copy(
+    update={"fit_points": 400, "nodes": 24, "size": 48, "track_iterations": 20, "joint_iterations": 0}
+)
 IN_FRONT = np.array([0, 0, 0.06])
 RASTERIZE = get_rasterizer("cpu")
 
@@ -94,7 +96,7 @@ def test_a_mesh_follows_legs_that_cross(monkeypatch: pytest.MonkeyPatch) -> None
 
 @pytest.mark.slow
 def test_the_chosen_frame_has_the_legs_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(guided_mesh, "TRIAL", FAST.model_copy(update={"track_iterations": 1}))
+    monkeypatch.setattr(guided_mesh, "TRIAL", FAST.model_copy(update={"track_iterations": 5}))
     states = scissors()
     middle = FRAMES // 2
     frame, followed = select_guided_reference(

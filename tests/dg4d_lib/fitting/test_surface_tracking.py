@@ -10,10 +10,9 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1] / "visual_hull"))
 from creatures import creature, seen
 
-from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
-from dg4d_lib.fitting.surface_tracking import track_surface, tracking_orders
+from dg4d_lib.fitting.surface_tracking import DESCENT, track_surface, tracking_orders
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.known import KnownShapes
 from dg4d_lib.guidance.moved import MovedSurfaces
@@ -23,7 +22,9 @@ from dg4d_lib.mesh.models.surface_cloud import cover_surface
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 
-SETTINGS = AssetSettings(fit_points=600, nodes=16, size=48, track_iterations=3, joint_iterations=10)
+SETTINGS = DESCENT.model_copy(
+    update={"fit_points": 600, "nodes": 16, "size": 48, "track_iterations": 25, "joint_iterations": 10}
+)
 SHIFT = 0.06
 
 
