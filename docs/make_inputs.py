@@ -1,6 +1,6 @@
 """Pictures of docs/inputs.md: one animal by every way of input, and the files that its commands name.
 
-    python docs/make_inputs.py [--only views asset]
+    python -m docs.make_inputs [--only views asset]
 
 The files go to out/inputs, the pictures to docs/images.
 """
