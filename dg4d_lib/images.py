@@ -39,3 +39,8 @@ def color_over_white(color: Float[Tensor, "*b h w 3"], alpha: Float[Tensor, "*b 
 def over_white(cutouts: Float[Tensor, "*b h w 4"]) -> Float[Tensor, "*b h w 3"]:
     """Composite straight cut-outs over white."""
     return color_over_white(cutouts[..., :3], cutouts[..., 3:])
+
+
+def luminance(pictures: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+    """Return the luma of pictures (ITU-R BT.601)."""
+    return pictures @ pictures.new_tensor((0.299, 0.587, 0.114))

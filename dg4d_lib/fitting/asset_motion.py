@@ -18,10 +18,11 @@ from torch.nn import functional
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.fitting.flow_tracking import FlowTracker, Pose
+from dg4d_lib.fitting.flow_tracking import DEPTH_SLACK, FlowTracker, Pose
 from dg4d_lib.fitting.losses import WHITE, check_finite, resize_cutouts
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
+from dg4d_lib.images import luminance
 from dg4d_lib.mesh.models.control_graph import ControlGraph
 from dg4d_lib.rasterizer.interface import BLUR, Rasterizer
 from dg4d_lib.video.driving import DrivingVideo
@@ -30,7 +31,6 @@ ADVICE = "lower asset.lr"
 LEVELS = (1, 4, 8)  # widths of the filters over the compared pictures, pixels
 FLOW_SHARE = 0.6  # of the iterations of a descent that follow the optical flow; the rest follow the pictures alone
 FLOW_UNIT = 0.02  # of the picture's side: error of the flow up to which its loss is quadratic
-DEPTH_SLACK = 0.05  # world units by which a Gaussian may lie behind the visible surface
 MATCH_ITERATIONS = 80  # of the colors at the first frame
 MATCH_LR = (0.05, 0.1, 0.01)  # of harmonics, opacities and sizes
 ROBUST = 0.05  # relative stretch up to which the rigidity is quadratic
@@ -111,7 +111,7 @@ def fit_asset_motion(
         FitDiverged: the loss became non-finite.
     """
     fit = _Fit(*_thinned(cloud, graph, settings.fit_points), video, rasterize, settings)
-    frames, done = len(video), iterations(settings, len(video)) - settings.joint_iterations
+    frames, done = len(video), settings.track_iterations * len(video)
     track = _followed if settings.tracking == "flow" else _descended
     unknowns = _Unknowns.joined(track(fit, frames, settings, report))
     descent = _Descent(unknowns)
@@ -137,12 +137,14 @@ def iterations(settings: AssetSettings, frames: int) -> int:
 
 def _followed(fit: "_Fit", frames: int, settings: AssetSettings, report: Report) -> list["_Unknowns"]:
     """Track the frames one after the other by optical flow; return their variables."""
-    poses = [fit.tracker.placed(Pose.rest(len(fit.graph.nodes)))]
+    tracker = FlowTracker(fit.cloud, fit.graph, fit.colors, fit.alphas, fit.rasterize, settings)
+    poses = [tracker.placed(Pose.rest(len(fit.graph.nodes)))]
     fit.match_first_frame(poses[0])
+    tracker.cloud = fit.cloud
     for frame in range(frames):
         if frame:
-            poses.append(fit.tracker.tracked(poses[max(frame - 2, 0)], poses[-1], frame))
-        report((frame + 1) * settings.track_iterations, {"color": fit.tracker.error(poses[-1], frame)})
+            poses.append(tracker.tracked(poses[max(frame - 2, 0)], poses[-1], frame))
+        report((frame + 1) * settings.track_iterations, {"color": tracker.error(poses[-1], frame)})
     return [_Unknowns.of(pose, fit.smoothing) for pose in poses]
 
 
@@ -185,25 +187,15 @@ class _Fit:
     ) -> None:
         self.camera = replace(OrbitCamera(), width=settings.size, height=settings.size)
         self.plain, self.graph = cloud.detach(), graph
+        self.cloud = antialiased(self.plain, self.camera)
         self.rasterize, self.settings = rasterize, settings
         cutouts = torch.cat([video.frames, video.alpha], -1)
         self.colors, self.alphas = resize_cutouts(cutouts, settings.size)
-        self.tracker = self.tracker_of(self.plain)
         self.area = float(self.alphas.mean().clamp(min=1e-3))  # of the subject, share of the picture
         self.unit = float((graph.nodes.amax(0) - graph.nodes.amin(0)).norm()) / 10
         first, second = graph.edges.T
         self.smoothing = _smoothing(graph, settings.smoothing)
         self.spans = graph.nodes[second] - graph.nodes[first]
-
-    @property
-    def cloud(self) -> Gaussians:
-        """Return the Gaussians that are rendered."""
-        return self.tracker.cloud
-
-    def tracker_of(self, plain: Gaussians) -> FlowTracker:
-        """Return the tracker of Gaussians as they would be without the rasterizer's low-pass filter."""
-        drawn = antialiased(plain, self.camera)
-        return FlowTracker(drawn, self.graph, self.colors, self.alphas, self.rasterize, self.settings)
 
     def match_first_frame(self, pose: Pose) -> None:
         """Fit colors, opacities and sizes to the first frame: light, texture and gaps differ from the video's."""
@@ -225,7 +217,8 @@ class _Fit:
                 "animate_asset", {"loss": loss}, gradients, f"colors, iteration {step + 1}", ADVICE, self.plain
             )
             optimizer.step()
-        self.tracker = self.tracker_of(replace(self.plain, **{name: value.detach() for name, value in values.items()}))
+        found = replace(self.plain, **{name: value.detach() for name, value in values.items()})
+        self.cloud = antialiased(found, self.camera)
 
     def relative(self, values: Tensor) -> Tensor:
         """Return lengths in tenths of the model's size."""
@@ -266,7 +259,7 @@ class _Fit:
         alpha = drawn.alpha[0, row, column, 0]
         surface = drawn.depth[0, row, column, 0] / alpha.clamp(min=1e-3)
         visible = torch.nonzero((depth < surface + DEPTH_SLACK) & (alpha > 0.5))[:, 0]
-        pair = [luminance(self.colors[number]) for number in (frame - 1, frame)]
+        pair = [luminance(self.colors[number]).cpu().numpy() for number in (frame - 1, frame)]
         flow = torch.from_numpy(np.stack(optical_flow_tvl1(*pair), -1)).to(means)  # rows, columns
         moved = pixels[visible] + flow[row[visible], column[visible]].flip(-1)
         return visible, moved
@@ -395,11 +388,6 @@ def _smoothing(graph: ControlGraph, strength: float) -> Float[Tensor, "m m"]:
     laplacian.diagonal().copy_(-laplacian.sum(1))
     inverse: Tensor = torch.linalg.inv(torch.eye(count, dtype=torch.float64) + strength * laplacian)
     return inverse.to(graph.nodes)
-
-
-def luminance(color: Float[Tensor, "h w 3"]) -> Float[np.ndarray, "h w"]:
-    """Return the luma of a picture."""
-    return (color @ color.new_tensor((0.299, 0.587, 0.114))).cpu().numpy()
 
 
 def antialiased(cloud: Gaussians, camera: OrbitCamera) -> Gaussians:

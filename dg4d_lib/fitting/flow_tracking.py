@@ -22,6 +22,7 @@ from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import quat_multiply
+from dg4d_lib.images import luminance
 from dg4d_lib.mesh.models.control_graph import ControlGraph
 from dg4d_lib.rasterizer.interface import Rasterizer, Rendering
 
@@ -91,7 +92,7 @@ class FlowTracker:
     """Tracks a model from frame to frame.
 
     Attributes:
-        cloud: the Gaussians that are rendered.
+        cloud: the Gaussians that are rendered; others with the same means may take their place.
     """
 
     def __init__(
@@ -125,11 +126,11 @@ class FlowTracker:
         self._spans = self._nodes[self._edges[:, 1]] - self._nodes[self._edges[:, 0]]
         self._lengths = np.linalg.norm(self._spans, axis=1)
         self._unit = float(np.linalg.norm(np.ptp(self._nodes, axis=0))) / 10
-        dark = _luma(colors - (1 - alphas)).sum() < 0.5 * float(alphas.sum())
+        dark = luminance(colors - (1 - alphas)).sum() < 0.5 * alphas.sum()
         self._backdrop = 1.0 if dark else 0.0  # the one that contrasts with the subject
         self._pictures = self._over(colors, alphas)
         self._features = _features(self._pictures, alphas)
-        self._lumas = _luma(self._pictures)
+        self._lumas = luminance(self._pictures).cpu().numpy()
 
     def placed(self, rest: Pose) -> Pose:
         """Return the pose at the first frame: at rest, or by optical flow where outlines differ."""
@@ -166,7 +167,7 @@ class FlowTracker:
     def _flow(self, pose: Pose, frame: int) -> _Targets:
         """Return where the optical flow from the render moves the visible Gaussians."""
         drawn, pixels, visible = self._seen(pose)
-        picture = _luma(self._over(drawn.color, drawn.alpha))[0]
+        picture = luminance(self._over(drawn.color, drawn.alpha))[0].cpu().numpy()
         flow = np.stack(optical_flow_tvl1(picture, self._lumas[frame]), -1)[..., ::-1]  # columns, rows
         column, row = self._cells(pixels[visible]).T
         return _Targets(visible, pixels[visible] + flow[row, column], np.ones(len(visible)))
@@ -313,10 +314,6 @@ def _features(pictures: Float[Tensor, "t s s 3"], alphas: Float[Tensor, "t s s 1
     """Return blurred pictures of half the size."""
     both = torch.cat([pictures, ALPHA_WEIGHT * alphas], -1).movedim(-1, 1)
     return functional.avg_pool2d(functional.avg_pool2d(functional.avg_pool2d(both, 3, 1, 1), 3, 1, 1), 2)
-
-
-def _luma(pictures: Float[Tensor, "t s s 3"]) -> Float[np.ndarray, "t s s"]:
-    return (pictures @ pictures.new_tensor((0.299, 0.587, 0.114))).cpu().numpy()
 
 
 def _rows(blocks: Float[np.ndarray, "n k d 6"], nodes: Int[np.ndarray, "n k"], count: int) -> csr_array:

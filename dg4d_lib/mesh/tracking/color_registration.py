@@ -14,14 +14,13 @@ from skimage.registration import optical_flow_tvl1
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.images import color_over_white
+from dg4d_lib.images import color_over_white, luminance
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.tracking.elastic import ElasticBody
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
-LUMA = (0.299, 0.587, 0.114)
 ROTATIONS = 2  # alternations of rotations and positions
 HIDDEN_PULL, SHOWN_PULL = 0.1, 1.5  # weights of the positions of hidden and of shown vertices, against 1 per edge
 
@@ -92,5 +91,5 @@ def steps_of_flow(
 
 
 def _luma(color: Float[Tensor, "h w 3"]) -> Float[np.ndarray, "h w"]:
-    luma: Float[np.ndarray, "h w"] = (color @ color.new_tensor(LUMA)).numpy(force=True)
+    luma: Float[np.ndarray, "h w"] = luminance(color).numpy(force=True)
     return luma
