@@ -18,6 +18,7 @@ from flows.packages.publish import Files, is_current
 from flows.serving import background
 from flows.serving.server import ServerUnavailable
 from steps.artifacts.archives import unpack
+from steps.runtime.process_setup import collector_resting
 from steps.store.artifact_store import ArtifactMissing
 from steps.store.files import home as store_home
 
@@ -58,7 +59,8 @@ def connect() -> None:
         server.start()
         background.set_own_server(server, server.wait_for_address())
         _announce("importing the flows")
-        importlib.import_module("flows.pipeline")  # takes seconds, as the start of the server does
+        with collector_resting():
+            importlib.import_module("flows.pipeline")  # takes seconds, as the start of the server does
         _announce("waiting for the Prefect server")
         server.wait()
     from flows.engine.orphans import settle_orphans

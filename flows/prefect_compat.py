@@ -11,14 +11,17 @@ from uuid import UUID
 
 from fastapi import FastAPI, Request, Response
 from fastapi.responses import PlainTextResponse
+from prefect.plugins import load_prefect_collections
 from prefect.server.api import server
 from prefect.server.database import configurations, dependencies, provide_database_interface
 from prefect.server.events.ordering import memory
 from prefect.server.events.schemas.events import ReceivedEvent
+from prefect.server.models.block_registration import run_block_auto_registration
 from prefect.settings import PREFECT_API_DATABASE_CONNECTION_URL
 from sqlalchemy.ext.asyncio import AsyncSession, AsyncSessionTransaction
 
 PARTS = (  # module:attribute
+    "prefect.plugins:load_prefect_collections",
     "prefect.server.api.server:create_app",
     "prefect.server.api.server:custom_internal_exception_handler",
     "prefect.server.database:provide_database_interface",
@@ -26,10 +29,12 @@ PARTS = (  # module:attribute
     "prefect.server.database.dependencies:MODELS_DEPENDENCIES",
     "prefect.server.database.interface:PrefectDBInterface.FlowRunState",
     "prefect.server.database.interface:PrefectDBInterface.session_context",
+    "prefect.server.database.interface:PrefectDBInterface.create_db",
     "prefect.server.events.ordering.memory:CausalOrdering.event_has_been_seen",
     "prefect.server.events.ordering.memory:CausalOrdering.wait_for_leader",
     "prefect.server.events.schemas.events:ReceivedEvent",
     "prefect.server.concurrency.lease_storage.filesystem:ConcurrencyLeaseStorage",
+    "prefect.server.models.block_registration:run_block_auto_registration",
 )
 BEGAN = datetime.now(UTC)
 
@@ -74,6 +79,15 @@ async def _is_from_before(event: UUID) -> bool:
     async with database.session_context() as session:
         state = await session.get(database.FlowRunState, event)
     return state is not None and state.timestamp < BEGAN
+
+
+async def fill_database() -> None:
+    """Create the database of PREFECT_HOME with the block types that a server registers when it starts."""
+    database = provide_database_interface()
+    await database.create_db()
+    load_prefect_collections()
+    async with database.session_context() as session:
+        await run_block_auto_registration(session)
 
 
 def create_app() -> FastAPI:

@@ -259,10 +259,11 @@ def _serve(listener: socket.socket, folder: Path, prefect_home: Path) -> subproc
         **SETTINGS,
         "PREFECT_HOME": str(prefect_home),
         "PREFECT_SERVER_API_AUTH_STRING": auth.auth_string(folder),
+        "PREFECT_SERVER_REGISTER_BLOCKS_ON_START": str(not database_template.has_block_types(prefect_home)).lower(),
         "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": f"http://{HOST}:{port}",
     }
     return subprocess.Popen(
-        python("-m", "flows.serving.server_app", str(listener.fileno())),
+        python("-m", "flows.serving.server_program", str(listener.fileno())),
         env=environment,
         cwd=prefect_home,
         pass_fds=[listener.fileno()],

@@ -1,13 +1,8 @@
 """ASGI application of the background server: Prefect's own, with artifacts, viewer and studio below `/dg4d/`.
-
-`python -m flows.serving.server_app FD` serves it on a listening socket that it inherits.
 """
 
-import socket
-import sys
 from pathlib import Path, PurePath
 
-import uvicorn
 from fastapi import Depends, HTTPException, Response
 from fastapi.responses import FileResponse, HTMLResponse
 from prefect.settings import PREFECT_SERVER_API_AUTH_STRING
@@ -51,11 +46,6 @@ def create_app() -> ASGIApp:
     return protect(application)
 
 
-def serve(listener: socket.socket) -> None:
-    """Serve the application on a bound socket until the process is stopped."""
-    uvicorn.Server(uvicorn.Config(create_app(), log_level="warning")).run(sockets=[listener])
-
-
 def artifact(digest: str, size: int, name: str) -> Response:
     """Return a file of the store, by the address that `pages.address` gives."""
     kind = SHOWN.get(PurePath(name).suffix)
@@ -91,7 +81,3 @@ def _path(digest: str, size: int) -> Path:
     if not store.has(ref):
         raise HTTPException(404, "this artifact is not in the store; run the same command again to renew it")
     return store.path(ref)
-
-
-if __name__ == "__main__":
-    serve(socket.socket(fileno=int(sys.argv[1])))

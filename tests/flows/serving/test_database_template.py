@@ -45,3 +45,16 @@ def test_where_none_was_made_the_server_makes_its_own(tmp_path: Path, monkeypatc
     monkeypatch.setattr(database_template, "template", lambda: tmp_path / "missing.db")
     database_template.copy_to(tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_copy_has_all_block_types_and_a_database_of_earlier_days_may_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert not database_template.has_block_types(tmp_path)
+    database_template.copy_to(tmp_path)
+    assert database_template.has_block_types(tmp_path)
+    with closing(sqlite3.connect(tmp_path / database_template.NAME)) as database, database:
+        assert database.execute("DELETE FROM block_schema WHERE checksum IN (SELECT min(checksum) FROM block_schema)")
+    assert not database_template.has_block_types(tmp_path)
+    monkeypatch.setattr(database_template, "template", lambda: tmp_path / "missing.db")
+    assert not database_template.has_block_types(tmp_path)
