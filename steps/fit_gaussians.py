@@ -59,7 +59,7 @@ def run(job: Job) -> StepReport:
     def watch(now: Gaussians) -> None:
         show_fit(job, now.detach, rasterize)
 
-    with picture_of_divergence(job, rasterize):
+    with picture_of_divergence(job, rasterize), chosen.threads():
         gaussians = fit_gaussians(
             start, subject, chosen.prior, rasterize, static, generator, curves.add, known=others, watch=watch
         )

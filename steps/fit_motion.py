@@ -55,7 +55,7 @@ def run(job: Job) -> StepReport:
         curves.add(before + iteration, values)
         show_fit(job, lambda: deformation.displace(start.means, moments).apply(start), rasterize)
 
-    with picture_of_divergence(job, rasterize):
+    with picture_of_divergence(job, rasterize), chosen.threads():
         fitted = fit_motion(start, deformation, video, chosen.prior, rasterize, settings, generator, watch)
     deformation.cpu()
     gaussians = fitted.to(torch.device("cpu"))

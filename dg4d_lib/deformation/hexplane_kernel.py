@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from dg4d_lib.kernels.simd import FLOAT, INT, KERNEL, LANES, LONG, SimdBuilder, Value, pointers
-from dg4d_lib.kernels.workers import run_parallel, split_range
+from dg4d_lib.kernels.workers import run_parallel, split_range, thread_count
 
 SPATIAL_AXES = ((0, 1), (0, 2), (1, 2))  # xy, xz, yz: (column axis, row axis)
 BLOCKS = 4  # blocks of points with separate gradient sums
@@ -55,7 +55,7 @@ class _Features(torch.autograd.Function):
         cells, weights = _cells(coordinates, planes.shape[-1])
         features = torch.empty(lines.shape[1], len(coordinates), plane_buffer.shape[-1])
         arrays = [tensor.numpy() for tensor in (cells, weights, plane_buffer, line_buffer)]
-        parts = split_range(len(coordinates), torch.get_num_threads())
+        parts = split_range(len(coordinates), thread_count())
         run_parallel([partial(_read, *arrays, features.numpy(), *part) for part in parts])
         ctx.arrays, ctx.channels = arrays, channels
         ctx.slope = (coordinates.abs() < 1) * (planes.shape[-1] - 1) / 2  # d weights / d coordinates

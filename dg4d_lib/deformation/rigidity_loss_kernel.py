@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from dg4d_lib.kernels.simd import FLOAT, INT, KERNEL, LANES, LONG, SimdBuilder, Value, pointers
-from dg4d_lib.kernels.workers import Scratch, run_parallel, split_range
+from dg4d_lib.kernels.workers import Scratch, run_parallel, split_range, thread_count
 
 BLOCKS = 4  # blocks of Gaussians with separate sums; fixed, so that the result does not depend on threads
 TINY = 1e-20  # squared distance below which the gradient is zero
@@ -59,7 +59,7 @@ class _RigiditySum(torch.autograd.Function):
         masks.reshape(-1)[[step + step // _STEPS for step in range(times - 1)]] = 1
         scratch, shape = Scratch(), (count, _FIELDS, LANES)
         state, grad_own = ([scratch.empty(shape) for _ in range(vectors)] for _ in range(2))
-        parts, threads = split_range(count, BLOCKS), torch.get_num_threads()
+        parts, threads = split_range(count, BLOCKS), thread_count()
         grad_others = [scratch.empty((len(parts), count, 3, LANES)) for _ in range(vectors)]
         sums = np.zeros((vectors, len(parts)))
         run_parallel(

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -11,6 +12,7 @@ from dg4d_lib.guidance.geometric import surface_views
 from dg4d_lib.guidance.interface import GuidanceView, check_frame, check_views
 from dg4d_lib.images import resize
 from dg4d_lib.inflation.surface import InflatedSurface
+from dg4d_lib.kernels.workers import run_parallel, torch_on_one_thread
 from dg4d_lib.settings import LearnedPriorSettings
 from dg4d_lib.shape_prior.expected import expected_volume
 from dg4d_lib.shape_prior.field import Fields, ShapeField
@@ -63,6 +65,9 @@ class LearnedShapes:
         """
         check_views(views, len(self._fields))
         if not self._settings.contrast:
+            frames = dict.fromkeys(view.frame for view in views)
+            with torch_on_one_thread():
+                run_parallel([partial(self.surface, frame) for frame in frames if frame not in self._surfaces])
             surfaces = [self.surface(view.frame) for view in views]
             return surface_views(surfaces, [view.camera for view in views], SIZE, self._settings.depth_sigma)
         size = views[0].camera.height, views[0].camera.width
@@ -80,9 +85,10 @@ class LearnedShapes:
 
     def _field(self, frame: int) -> ShapeField:
         check_frame(frame, len(self._fields))
-        if self._last is None or self._last[0] != frame:
-            self._last = frame, self._fields.predict(frame)
-        field = self._last[1]
+        last = self._last
+        if last is None or last[0] != frame:
+            self._last = last = frame, self._fields.predict(frame)
+        field = last[1]
         self._inflated[frame] = field.inflated_share
         return field
 

@@ -1,14 +1,15 @@
 """Thread pool and buffer pool of the Numba kernels.
 
-Kernels release the GIL, so ordinary threads are enough; there are `torch.get_num_threads()` of them, idle between
-calls. Buffers are reused because the page faults of freshly allocated megabytes cost more than the blending itself.
+Kernels release the GIL, so ordinary threads are enough; there are `thread_count()` of them, idle between calls. Buffers
+are reused because the page faults of freshly allocated megabytes cost more than the blending itself.
 """
 
 import os
 import weakref
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 from math import prod
 from typing import Any
@@ -19,9 +20,32 @@ from numpy.typing import DTypeLike, NDArray
 
 _IDLE: defaultdict[int, list[NDArray[np.uint8]]] = defaultdict(list)  # free buffers by size in bytes
 _MAX_IDLE_BYTES = 1 << 29
+_kept_count = 0  # threads of the kernels while torch has one; 0: as torch
 
 
-def run_parallel(jobs: Sequence[Callable[[], None]]) -> None:
+def thread_count() -> int:
+    """Return the number of threads of the kernels: that of torch, or in `torch_on_one_thread` what it was before."""
+    return _kept_count or torch.get_num_threads()
+
+
+@contextmanager
+def torch_on_one_thread() -> Iterator[None]:
+    """Keep the kernels on all threads and torch's own operators on one: for small ones, waking its threads costs more.
+
+    Their sums then also have one order, whatever the number of threads.
+    """
+    global _kept_count  # noqa: PLW0603 - of the process, as the number of torch
+    outside, threads = _kept_count, torch.get_num_threads()
+    _kept_count = thread_count()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        _kept_count = outside
+
+
+def run_parallel(jobs: Sequence[Callable[[], object]]) -> None:
     """Run independent jobs on this thread and the pool, wait for all, and re-raise the exception of a failed one."""
     queue = iter(jobs)  # shared by the threads without a lock: advancing a list iterator is atomic under the GIL
 
@@ -29,8 +53,13 @@ def run_parallel(jobs: Sequence[Callable[[], None]]) -> None:
         for job in queue:
             job()
 
-    helpers = min(torch.get_num_threads(), len(jobs)) - 1
-    futures = [_pool(os.getpid(), helpers).submit(work) for _ in range(helpers)]
+    def help_out() -> None:
+        if _kept_count:
+            torch.set_num_threads(1)  # every thread has its own number
+        work()
+
+    helpers = min(thread_count(), len(jobs)) - 1
+    futures = [_pool(os.getpid(), helpers).submit(help_out) for _ in range(helpers)]
     try:
         work()
     finally:

@@ -21,7 +21,7 @@ from torch.nn.functional import logsigmoid
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.kernels.workers import Scratch, empty_recycled, run_parallel, split_range
+from dg4d_lib.kernels.workers import Scratch, empty_recycled, run_parallel, split_range, thread_count
 from dg4d_lib.rasterizer.cpu_bins import TILE, bin_by_tile
 from dg4d_lib.rasterizer.cpu_blend import PLANE
 from dg4d_lib.rasterizer.cpu_project import CAMERA, RECORD, project, unproject
@@ -132,7 +132,7 @@ class _ForwardState:
     @property
     def by_view(self) -> bool:
         """True if threads take whole views, false if they share the tiles of each view."""
-        return len(self.cameras) >= torch.get_num_threads()
+        return len(self.cameras) >= thread_count()
 
     def draw(self, clouds: _Clouds) -> list[Tensor]:
         """Render color, alpha and depth, channels first.
@@ -144,7 +144,7 @@ class _ForwardState:
         if self.by_view:
             run_parallel([partial(self._draw_view, clouds, planes, view) for view in self.views])
         else:
-            threads = torch.get_num_threads()
+            threads = thread_count()
             parts = split_range(len(clouds), threads)
             run_parallel([partial(self._project, clouds, view, *part) for view in self.views for part in parts])
             run_parallel([partial(self._bin, view) for view in self.views])
@@ -192,7 +192,7 @@ class _Gradients:
 
     def collect(self) -> None:
         """Compute the gradients in groups of views, which bounds the memory; views are summed in order."""
-        state, threads = self.state, torch.get_num_threads()
+        state, threads = self.state, thread_count()
         for first in state.views[:: 2 * threads]:
             group, scratch = state.views[first : first + 2 * threads], Scratch()
             records = self._blend_group(group, scratch)
@@ -211,7 +211,7 @@ class _Gradients:
             _, entries = state.bins[view]
             slots = scratch.empty(entries.shape, np.uint32)
             rows = scratch.empty((assign_rows(entries, count, slots), RECORD))
-            parts = split_range(state.tiles, 1 if state.by_view else 4 * torch.get_num_threads())
+            parts = split_range(state.tiles, 1 if state.by_view else 4 * thread_count())
             blends += [partial(self._blend, view, slots, rows, *part) for part in parts]
             sums.append(partial(add_duplicates, entries, slots, count, rows))
             grad_records.append(rows)

@@ -1,5 +1,4 @@
-"""ASGI application of the background server: Prefect's own, with artifacts, viewer and studio below `/dg4d/`.
-"""
+"""ASGI application of the background server: Prefect's own, with artifacts, viewer and studio below `/dg4d/`."""
 
 from pathlib import Path, PurePath
 

@@ -14,7 +14,7 @@ from steps.runtime.process_setup import collector_resting
 def serve(listener: socket.socket) -> None:
     """Serve the application on a bound socket until the process is stopped."""
     with collector_resting():
-        from flows.serving.server_app import create_app
+        from flows.serving.server_app import create_app  # noqa: PLC0415 - this is what takes time
 
         config = uvicorn.Config(create_app(), log_level="warning")
     uvicorn.Server(config).run(sockets=[listener])

@@ -1,6 +1,7 @@
 """Guidance priors of the fits, from settings and files."""
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from dg4d_lib.guidance.oracle import Bank, perturb
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.images import over_white
 from dg4d_lib.inflation.hints import NO_HINT, DepthHint
+from dg4d_lib.kernels.workers import torch_on_one_thread
 from dg4d_lib.settings import (
     FitSettings,
     GeometricPriorSettings,
@@ -83,6 +85,10 @@ class LoadedPrior:
     batches: MicroBatches | None = None
     shapes: SubjectShapes | None = None
     network: LearnedShapes | None = None
+
+    def threads(self) -> AbstractContextManager[None]:
+        """Return the context of a fit: without a model, all operators of torch are small."""
+        return nullcontext() if self.opened else torch_on_one_thread()
 
     def report(self, backend: str) -> StepReport:
         """Return the report of a step that has used this prior."""

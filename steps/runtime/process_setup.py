@@ -37,7 +37,7 @@ def prepare_process() -> None:
 
 @contextmanager
 def collector_resting() -> Iterator[None]:
-    """Collect no garbage in the block, and never look at what it leaves: for imports, a quarter of whose time that is."""
+    """Collect no garbage in the block and never look at what it leaves: that is a quarter of the time of imports."""
     enabled = gc.isenabled()
     gc.disable()
     try:

@@ -1,10 +1,19 @@
 """Thread pool and buffer pool of the kernels."""
 
+import threading
+
 import numpy as np
 import pytest
 import torch
 
-from dg4d_lib.kernels.workers import Scratch, empty_recycled, run_parallel, split_range
+from dg4d_lib.kernels.workers import (
+    Scratch,
+    empty_recycled,
+    run_parallel,
+    split_range,
+    thread_count,
+    torch_on_one_thread,
+)
 
 
 def test_ranges_cover_the_whole_at_multiples():
@@ -47,3 +56,17 @@ def test_memory_of_a_recycled_array_waits_for_the_tensor_made_of_it():
     assert part.eq(1).all()
     del part
     assert empty_recycled((1000, 3)).ctypes.data == address
+
+
+def test_the_kernels_keep_their_threads_while_torch_has_one():
+    before, seen = torch.get_num_threads(), []
+    torch.set_num_threads(3)
+    try:
+        with torch_on_one_thread(), torch_on_one_thread():
+            started = threading.Barrier(3)
+            run_parallel([lambda: seen.append((started.wait(10), torch.get_num_threads())[1])] * 3)
+            assert thread_count() == 3
+        assert seen == [1, 1, 1]  # at once, by the barrier
+        assert torch.get_num_threads() == thread_count() == 3
+    finally:
+        torch.set_num_threads(before)
