@@ -15,7 +15,8 @@ from skimage.registration import optical_flow_tvl1
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
-LUMINANCE = (0.299, 0.587, 0.114)
+from dg4d_lib.images import luminance
+
 BACKDROP = 1.5  # luminance outside of the subject: brighter than any, so that outlines guide the flow
 WARPS, STEPS = 5, 10  # of the flow at every level; a third of scikit-image's own and as good here
 DIFFERENCE = 0.2  # of color (mean) and alpha together, at which the trust falls to 1/e
@@ -99,8 +100,7 @@ def match_first_frame(pictures: Sequence[Float[Tensor, "4 h w"]]) -> list[Corres
 
 def _gray(picture: Float[Tensor, "4 h w"]) -> Float[np.ndarray, "h w"]:
     """Return the luminance before the bright backdrop."""
-    weights = torch.tensor(LUMINANCE)[:, None, None]
-    return ((weights * picture[:3]).sum(0) + (1 - picture[3]) * BACKDROP).double().numpy()
+    return (luminance(picture[:3].movedim(0, -1)) + (1 - picture[3]) * BACKDROP).double().numpy()
 
 
 def _agreement(one: Float[Tensor, "4 h w"], other: Float[Tensor, "4 h w"]) -> Float[Tensor, "h w"]:
