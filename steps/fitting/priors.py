@@ -26,7 +26,7 @@ from dg4d_lib.guidance.interface import GuidancePrior, SubjectShapes
 from dg4d_lib.guidance.kept_views import KeptViews
 from dg4d_lib.guidance.known import KnownShapes
 from dg4d_lib.guidance.learned import LearnedShapes
-from dg4d_lib.guidance.mixed import MixedShapes, outline_overlaps
+from dg4d_lib.guidance.mixed import MixedShapes
 from dg4d_lib.guidance.oracle import Bank, perturb
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.images import over_white
@@ -63,7 +63,6 @@ SMALLEST_NOTED = 0.05  # share of the inflation from which the report mentions i
 GUESS_WEIGHT = 0.5  # of frames whose other sides are a guess, beside frames with known views
 CARRIED_CONTRAST = 2.0  # of shapes that a known first frame has made sure already
 CARRIED_SHARE = 0.3  # of the carried shapes in their mean with tracked ones: more is foggy where limbs move
-LOST, FOLLOWED = 0.7, 0.85  # IoU of the tracked outline with the video's: below, carried shapes alone; above, the share
 ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
 
 
@@ -184,15 +183,14 @@ def subject_shapes(
         cutouts: the subject at every frame.
         hint: at its depth; see `subject_hint`. A depth picture goes before an estimate by `prior.depth_weights`.
         sides: views of other sides; their hull replaces the shapes of their frames.
-        moved: the surface of known views of the first frame, tracked; averaged with the other guess at later frames,
-            where it has followed the video.
+        moved: the surface of known views of the first frame, tracked; averaged with the other guess at later frames.
     """
     frames = [frame for frame in sides.frames if frame < len(cutouts)] if sides else []
     known = {frame: [known_view(cutouts[frame]), *known_views(sides, frame)] for frame in frames if sides}
     shapes: SubjectShapes
     if 0 in known and len(cutouts) > 1:
         shapes = _carried_shapes(settings, cutouts, hint, known_field(known[0]))
-        shapes = shapes if moved is None else MixedShapes(moved, shapes, _carried_shares(moved, cutouts))
+        shapes = shapes if moved is None else MixedShapes(moved, shapes, CARRIED_SHARE)
     elif isinstance(settings, LearnedPriorSettings):
         shapes = LearnedShapes(learned_fields(cutouts, hint), settings)
     else:
@@ -212,12 +210,6 @@ def _carried_shapes(
     if isinstance(settings, LearnedPriorSettings):
         guess = ShapeFields(packaged.packaged_network(), cutouts, hint)
     return LearnedShapes(CarriedFields(guess, first, cutouts), LearnedPriorSettings(contrast=CARRIED_CONTRAST))
-
-
-def _carried_shares(moved: SubjectShapes, cutouts: Sequence[Float[Tensor, "h w 4"]]) -> list[float]:
-    """Return the share of the carried shapes at every frame: 1 where the tracked surface has lost the video."""
-    trusts = (min(max((iou - LOST) / (FOLLOWED - LOST), 0.0), 1.0) for iou in outline_overlaps(moved, cutouts))
-    return [1 - (1 - CARRIED_SHARE) * trust for trust in trusts]
 
 
 def learned_fields(cutouts: Sequence[Float[Tensor, "h w 4"]], hint: DepthHint) -> Fields:
