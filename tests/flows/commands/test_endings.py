@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from collections.abc import Iterator
 
 import pytest
 import typer
@@ -12,8 +13,11 @@ from flows.exit_status import EXIT_HANGUP, EXIT_TERMINATED
 
 
 @pytest.fixture(autouse=True)
-def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+def soon(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(endings, "REMINDER_S", 0.05)
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # `nohup` ignores it
+    yield
+    signal.signal(signal.SIGHUP, before)
 
 
 def ends_with(status: int) -> pytest.RaisesExc[typer.Exit]:
