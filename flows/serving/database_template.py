@@ -61,7 +61,7 @@ def has_block_types(prefect_home: Path) -> bool:
 
 def _block_schemas(path: Path) -> set[str]:
     """Return the checksums of the block schemas of a database."""
-    with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as database:
+    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database:
         return {checksum for (checksum,) in database.execute("SELECT checksum FROM block_schema")}
 
 

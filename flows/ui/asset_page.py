@@ -44,7 +44,7 @@ def show_asset(item: str, finished: Sequence[StepRun], package: ArtifactRef, sto
 def asset_page(item: str, finished: Sequence[StepRun], package: ArtifactRef, store: ArtifactStore) -> str:
     """Return the page: pictures, loss curves, gates, notes and a table of steps."""
     links = [f"[{label}]({address})" for label, address in addresses(item, package).items()]
-    lines = [f"# {markdown(item)}", "", " · ".join([*links, f"`{package.digest[:19]}`"]), ""]
+    lines = [f"# {markdown(item)}", "", " · ".join([*links, f"`{package.digest}`"]), ""]
     first = {done.result.provenance.step: done.result.outputs for done in reversed(finished)}
     for (step, output), title in PICTURES.items():
         if output in first.get(step, {}) and (small := pages.thumbnail(first[step][output], store)):
