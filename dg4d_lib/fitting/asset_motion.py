@@ -18,8 +18,10 @@ from torch.nn import functional
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.fitting.flow_tracking import DEPTH_SLACK, FlowTracker, Pose
+from dg4d_lib.fitting.flow_tracking import DEPTH_SLACK, FlowTracker
 from dg4d_lib.fitting.losses import WHITE, check_finite, resize_cutouts
+from dg4d_lib.fitting.node_pose import Pose
+from dg4d_lib.fitting.tracking_order import tracking_orders
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
 from dg4d_lib.images import luminance
@@ -113,7 +115,7 @@ def fit_asset_motion(
     fit = _Fit(*_thinned(cloud, graph, settings.fit_points), video, rasterize, settings)
     frames, done = len(video), settings.track_iterations * len(video)
     track = _followed if settings.tracking == "flow" else _descended
-    unknowns = _Unknowns.joined(track(fit, frames, settings, report))
+    unknowns = _Unknowns.joined(track(fit, video, settings, report))
     descent = _Descent(unknowns)
     for step in range(settings.joint_iterations):
         chosen = torch.randperm(frames, generator=generator)[: min(settings.joint_frames, frames)].sort().values
@@ -135,24 +137,25 @@ def iterations(settings: AssetSettings, frames: int) -> int:
     return settings.track_iterations * frames + settings.joint_iterations
 
 
-def _followed(fit: "_Fit", frames: int, settings: AssetSettings, report: Report) -> list["_Unknowns"]:
-    """Track the frames one after the other by optical flow; return their variables."""
+def _followed(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list["_Unknowns"]:
+    """Track the frames by optical flow, loops from both ends; return their variables."""
     tracker = FlowTracker(fit.cloud, fit.graph, fit.colors, fit.alphas, fit.rasterize, settings)
-    poses = [tracker.placed(Pose.rest(len(fit.graph.nodes)))]
+    poses = {0: tracker.placed(Pose.rest(len(fit.graph.nodes)))}
     fit.match_first_frame(poses[0])
     tracker.cloud = fit.cloud
-    for frame in range(frames):
-        if frame:
-            poses.append(tracker.tracked(poses[max(frame - 2, 0)], poses[-1], frame))
-        report((frame + 1) * settings.track_iterations, {"color": tracker.error(poses[-1], frame)})
-    return [_Unknowns.of(pose, fit.smoothing) for pose in poses]
+    report(settings.track_iterations, {"color": tracker.error(poses[0], 0)})
+    for order in tracking_orders(video, 0):
+        for number, frame in enumerate(order[1:], 1):
+            poses[frame] = tracker.tracked(poses, order[:number], frame)
+            report(len(poses) * settings.track_iterations, {"color": tracker.error(poses[frame], frame)})
+    return [_Unknowns.of(poses[frame], fit.smoothing) for frame in range(len(video))]
 
 
-def _descended(fit: "_Fit", frames: int, settings: AssetSettings, report: Report) -> list["_Unknowns"]:
+def _descended(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list["_Unknowns"]:
     """Track the frames one after the other along gradients; return their variables."""
     done = 0
     tracked: list[_Unknowns] = [_Unknowns.still(1, fit.graph)]
-    for frame in range(frames):
+    for frame in range(len(video)):
         start = tracked[-1] if frame < 2 else tracked[-2].continued(tracked[-1])
         unknowns, steps = start.copy(), settings.track_iterations
         descent = _Descent(unknowns)

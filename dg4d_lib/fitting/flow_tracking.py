@@ -3,23 +3,27 @@
 Every frame is found by rounds: render the model, follow the optical flow from the render to the frame, and solve for
 rigid transforms of the nodes by Gauss-Newton steps, with an as-rigid-as-possible energy (Sorkine and Alexa 2007) that
 is robust so that joints may bend. Where parts move farther than their size, flow fails; so each frame is also tried
-from a start that matches patches of the surface anywhere near, and the better of the two stays.
+from a start that matches patches of the surface anywhere near, and from the pose at the most similar known frame.
+Where a frame fits much worse than the one before, parts of the model are searched (`part_search`). The best stays.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import coo_array, csr_array, vstack
-from scipy.spatial.transform import Rotation
 from skimage.registration import optical_flow_tvl1
 from torch import Tensor
 from torch.nn import functional
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.fitting.node_pose import Pose, rotation, rotation_vector
+from dg4d_lib.fitting.part_search import PartSearch
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import quat_multiply
 from dg4d_lib.images import luminance
@@ -35,8 +39,8 @@ DEPTH_SLACK = 0.05  # world units by which a Gaussian may lie behind the visible
 STILL = 0.15  # weight of the last frame's place beside that of the extrapolated one
 DEPTH = 0.1  # of `asset.depth`, which suits the refinement
 WHOLE_DEPTH = 30.0  # weight of the mean displacement in depth, which a video hardly shows, times that of every node's
-CONTINUED = 0.5  # of the last motion, in the extrapolation
-GAIN = 0.02  # by which matched patches must lower the error
+GAIN = 0.02  # by which another start must lower the error
+LOST, JUMP = 0.1, 1.3  # error, and its growth since the last frame, from which parts are searched
 AGREEMENT = 0.9  # IoU of outlines at the first frame from which the model is at rest there
 WINDOW = 8  # search of patches, in pixels of a picture of half the size, at 64 pixels of `asset.size`
 ALPHA_WEIGHT = 0.5  # of alpha beside a color, in patches
@@ -44,39 +48,6 @@ LARGEST_COST = 0.3  # of a pixel, so that occluded ones do not decide
 NEIGHBORS, SPREAD = 2, 0.3  # rounds and weight of the neighbors' costs
 PULL = 0.003  # cost of the farthest places of a patch
 SHARP = 0.01  # cost above the best place from which another one is told apart
-
-Turns = Float[np.ndarray, "m 3 3"]
-Shifts = Float[np.ndarray, "m 3"]
-
-
-@dataclass(frozen=True)
-class Pose:
-    """Rigid transforms of the nodes at one frame.
-
-    Attributes:
-        turns: rotation matrices about the nodes at rest.
-        shifts: translations of the nodes, world units.
-    """
-
-    turns: Turns
-    shifts: Shifts
-
-    @classmethod
-    def rest(cls, count: int) -> "Pose":
-        """Return the pose of so many nodes at rest."""
-        return cls(np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)))
-
-    def quats(self) -> Float[Tensor, "m 4"]:
-        """Return the rotations as unit quaternions, wxyz, w not negative."""
-        found = Rotation.from_matrix(self.turns).as_quat(canonical=True)
-        return torch.from_numpy(np.roll(found, 1, -1)).float()
-
-    def continued(self, last: "Pose") -> "Pose":
-        """Continue from this pose over the last one, at part of the speed."""
-        return Pose(
-            _rotation(CONTINUED * _vector(last.turns @ self.turns.swapaxes(1, 2))) @ last.turns,
-            last.shifts + CONTINUED * (last.shifts - self.shifts),
-        )
 
 
 @dataclass(frozen=True)
@@ -92,7 +63,7 @@ class FlowTracker:
     """Tracks a model from frame to frame.
 
     Attributes:
-        cloud: the Gaussians that are rendered; others with the same means may take their place.
+        cloud: the Gaussians that are rendered; others with the same means may take their place before frame 1.
     """
 
     def __init__(
@@ -130,6 +101,7 @@ class FlowTracker:
         self._backdrop = 1.0 if dark else 0.0  # the one that contrasts with the subject
         self._pictures = self._over(colors, alphas)
         self._features = _features(self._pictures, alphas)
+        self._frames = torch.cat([colors, alphas], -1)
         self._lumas = luminance(self._pictures).cpu().numpy()
 
     def placed(self, rest: Pose) -> Pose:
@@ -138,16 +110,34 @@ class FlowTracker:
         agreement = float((inside & wanted).sum() / (inside | wanted).sum().clamp(min=1))
         return rest if agreement >= AGREEMENT else self._followed(rest, rest, rest, 0)
 
-    def tracked(self, before: Pose, last: Pose, frame: int) -> Pose:
-        """Return the pose at a frame from the poses at the two frames before it."""
-        start = before.continued(last)
+    def tracked(self, poses: Mapping[int, Pose], trail: Sequence[int], frame: int) -> Pose:
+        """Return the pose at a frame.
+
+        Args:
+            poses: at the frames that are known.
+            trail: those of them that lead to the frame, in order.
+            frame: number of the frame.
+        """
+        last = poses[trail[-1]]
+        start = poses[trail[max(len(trail) - 2, 0)]].continued(last)
         found = self._followed(start, start, last, frame)
-        matched = start
-        targets = self._patches(start, frame)
+        matched, targets = start, self._patches(start, frame)
         for _ in range(MATCH_STEPS):
             matched = self._solved(matched, targets, start, last)
-        matched = self._followed(matched, matched, last, frame)
-        return matched if self.error(matched, frame) < (1 - GAIN) * self.error(found, frame) else found
+        found = self._better(found, self._followed(matched, matched, last, frame), frame)
+        known = sorted(poses)
+        alike = known[int((self._frames[known] - self._frames[frame]).square().mean((1, 2, 3)).argmin())]
+        if alike != trail[-1]:  # the motion may come back
+            again = poses[alike]
+            found = self._better(found, self._followed(again, again, again, frame), frame)
+        if self.error(found, frame) > max(LOST, JUMP * self.error(last, trail[-1])):
+            posed = self._parts.posed(last, frame)
+            found = self._better(found, self._followed(posed, posed, last, frame), frame)
+        return found
+
+    def _better(self, found: Pose, other: Pose, frame: int) -> Pose:
+        """Return the first pose, or the other one if its error is smaller by `GAIN`."""
+        return other if self.error(other, frame) < (1 - GAIN) * self.error(found, frame) else found
 
     def error(self, pose: Pose, frame: int) -> float:
         """Return the root mean square difference of the render and a frame, over the subject."""
@@ -155,6 +145,11 @@ class FlowTracker:
         difference = torch.cat([drawn.color[0] - self._colors[frame], drawn.alpha[0] - self._alphas[frame]], -1)
         smooth = functional.avg_pool2d(difference.movedim(-1, 0)[None], 3, 1, 1)
         return float(smooth.square().mean().sqrt() / self._alphas[frame].mean().clamp(min=1e-3).sqrt())
+
+    @cached_property
+    def _parts(self) -> PartSearch:
+        arguments = self._pictures, self._alphas, self._backdrop, self._rasterize
+        return PartSearch(self.cloud, self._graph, *arguments)
 
     def _followed(self, pose: Pose, expected: Pose, last: Pose, frame: int) -> Pose:
         """Return the pose after rounds of optical flow."""
@@ -266,7 +261,7 @@ class FlowTracker:
         normal[np.diag_indices(6 * count)] += 1e-9
         step = cho_solve(cho_factor(normal), -(matrix.T @ np.concatenate([values for _, values in terms])))
         step = step.reshape(count, 6)
-        return Pose(_rotation(step[:, :3]) @ pose.turns, pose.shifts + step[:, 3:])
+        return Pose(rotation(step[:, :3]) @ pose.turns, pose.shifts + step[:, 3:])
 
     def _flow_terms(self, pose: Pose, targets: _Targets) -> list[tuple[csr_array, Float[np.ndarray, " r"]]]:
         if not len(targets.rows):
@@ -302,7 +297,7 @@ class FlowTracker:
             )
             terms.append((_rows(blocks, np.stack([first, second], 1), count), (stretch * scale[:, None]).ravel()))
         first, second = self._edges.T
-        bend = _vector(pose.turns[second] @ pose.turns[first].swapaxes(1, 2))
+        bend = rotation_vector(pose.turns[second] @ pose.turns[first].swapaxes(1, 2))
         scale = np.sqrt(weight * self._settings.bending / edges / _softened(bend))
         unit = scale[:, None, None] * eye
         blocks = np.stack([np.concatenate([-unit, none], -1), np.concatenate([unit, none], -1)], 1)
@@ -337,15 +332,3 @@ def _cross(vectors: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
     x, y, z = np.moveaxis(vectors, -1, 0)
     matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -z, y, -x
     return matrix - matrix.swapaxes(-1, -2)
-
-
-def _rotation(vectors: Shifts) -> Turns:
-    """Return rotations by vectors along the axis, of the length of the angle."""
-    found: Turns = Rotation.from_rotvec(vectors).as_matrix()
-    return found
-
-
-def _vector(turns: Turns) -> Shifts:
-    """Return the vectors of rotations; see `_rotation`."""
-    found: Shifts = Rotation.from_matrix(turns).as_rotvec()
-    return found

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.fitting.asset_motion import Report, fit_asset_motion
+from dg4d_lib.fitting.tracking_order import tracking_orders
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.mesh.extraction.topology import group_vertices
@@ -103,18 +104,3 @@ def track_vertices(
             for number, frame in enumerate(chosen[1:], 1):
                 moved[frame] = motion.at(slice(number, number + 1)).points(vertices, bound)[0]
     return moved
-
-
-def tracking_orders(video: DrivingVideo, reference_frame: int) -> tuple[list[int], list[int]]:
-    """Return the frames from the reference frame on, and back from it; half of a loop each, for errors add up.
-
-    A video is a loop if its last frame differs from the first no more than two successive frames do somewhere.
-    """
-    count = len(video)
-    pictures = video.over(video.frames.new_ones(3))
-    steps = (pictures - pictures.roll(-1, 0)).abs().flatten(1).mean(1)
-    if count > 2 and float(steps[-1]) <= float(steps[:-1].max()):
-        forward = count // 2
-        ahead = [(reference_frame + step) % count for step in range(forward + 1)]
-        return ahead, [(reference_frame - step) % count for step in range(count - forward)]
-    return list(range(reference_frame, count)), list(range(reference_frame, -1, -1))

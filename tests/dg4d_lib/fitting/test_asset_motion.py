@@ -1,5 +1,6 @@
 """Motion of users' models: recovers bends that the video shows, keeps lengths, and leaves depth alone."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,8 @@ import torch
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.asset_motion import NodeMotion, antialiased, fit_asset_motion
+from dg4d_lib.fitting.flow_tracking import FlowTracker
+from dg4d_lib.fitting.node_pose import Pose
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.models.control_graph import ControlGraph, build_control_graph
 from dg4d_lib.mesh.models.model import Model, ModelPart
@@ -139,3 +142,24 @@ def test_colors_of_the_video_are_taken_over(
     rest = scene[0].fine.vertices
     still = np.linalg.norm(moved(scene, motion)[-1] - rest, axis=1).mean()
     assert np.linalg.norm(moved(scene, other)[-1] - moved(scene, motion)[-1], axis=1).mean() < 0.1 * still
+
+
+def test_loops_are_tracked_from_both_ends(
+    scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    surface, graph, video = scene
+    there_and_back = [0, 1, 2, 3, 2, 1]
+    loop = DrivingVideo(video.frames[there_and_back], video.alpha[there_and_back], 5.0)
+    seen = []
+
+    def tracked(self: FlowTracker, poses: Mapping[int, Pose], trail: Sequence[int], frame: int) -> Pose:
+        seen.append((list(trail), frame))
+        return poses[trail[-1]]
+
+    monkeypatch.setattr(FlowTracker, "tracked", tracked)
+    quick = SETTINGS.model_copy(update={"joint_iterations": 0})
+    found = fit_asset_motion(
+        surface.cloud, graph.of(surface.nearest), loop, get_rasterizer("cpu"), quick, torch.Generator()
+    )
+    assert seen == [([0], 1), ([0, 1], 2), ([0, 1, 2], 3), ([0], 5), ([0, 5], 4)]
+    assert len(found.shifts) == len(there_and_back)

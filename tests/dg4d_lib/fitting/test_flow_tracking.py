@@ -8,7 +8,8 @@ import torch
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.fitting.flow_tracking import FlowTracker, Pose, _Targets
+from dg4d_lib.fitting.flow_tracking import FlowTracker, _Targets
+from dg4d_lib.fitting.node_pose import Pose
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.models.control_graph import graph_of_points, point_graph
 from dg4d_lib.rasterizer.interface import get_rasterizer
@@ -80,17 +81,19 @@ def test_a_part_that_jumps_farther_than_its_size_is_found() -> None:
         np.abs(np.median(steps[ball], 0) - np.median(expected[ball], 0)).max() <= 2
     )  # pixels: half the size is searched
     assert targets.weights[ball].min() > 0.25
-    after = tracker._points(tracker.tracked(rest, rest, 1), np.arange(len(points)))[0]
+    after = tracker._points(tracker.tracked({0: rest}, [0], 1), np.arange(len(points)))[0]
     error = np.linalg.norm(after - moved, axis=1)
-    assert np.median(error[800:]) < 0.2 and np.median(error[:800]) < 0.1  # of 0.4; the block hangs on it
+    assert "_parts" in vars(tracker)  # flow alone loses it
+    assert np.median(error[800:]) < 0.2 and np.median(error[:800]) < 0.12  # of 0.4; the block hangs on it
 
 
 def test_a_still_video_moves_nothing() -> None:
     points, _ = scene()
     tracker = tracker_of(points)
     rest = Pose.rest(len(tracker._nodes))
-    after = tracker._points(tracker.tracked(rest, rest, 1), np.arange(len(points)))[0]
+    after = tracker._points(tracker.tracked({0: rest}, [0], 1), np.arange(len(points)))[0]
     assert np.abs(after - points).max() < 0.01
+    assert "_parts" not in vars(tracker)  # a search takes seconds, and nothing is lost
 
 
 def test_depth_is_not_extrapolated() -> None:

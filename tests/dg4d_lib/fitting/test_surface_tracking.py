@@ -12,7 +12,8 @@ from creatures import creature, seen
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
-from dg4d_lib.fitting.surface_tracking import DESCENT, track_surface, tracking_orders
+from dg4d_lib.fitting.surface_tracking import DESCENT, track_surface
+from dg4d_lib.fitting.tracking_order import tracking_orders
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.known import KnownShapes
 from dg4d_lib.guidance.moved import MovedSurfaces
