@@ -23,6 +23,7 @@ from dg4d_lib.fitting.losses import WHITE, check_finite, resize_cutouts
 from dg4d_lib.fitting.node_pose import Pose
 from dg4d_lib.fitting.tracking_order import tracking_orders
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.transform import thinned
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
 from dg4d_lib.images import luminance
 from dg4d_lib.mesh.models.control_graph import ControlGraph
@@ -406,9 +407,7 @@ def antialiased(cloud: Gaussians, camera: OrbitCamera) -> Gaussians:
 def _thinned(cloud: Gaussians, graph: ControlGraph, count: int) -> tuple[Gaussians, ControlGraph]:
     """Return about `count` of the Gaussians, evenly chosen and larger to cover as much."""
     step = max(1, round(len(cloud) / count))
-    rows = torch.arange(0, len(cloud), step)
-    thin = Gaussians(**{name: value[rows] for name, value in vars(cloud).items()})
-    return replace(thin, log_scales=thin.log_scales + 0.5 * math.log(step)), graph.of(rows)
+    return thinned(cloud, step), graph.of(torch.arange(0, len(cloud), step))
 
 
 def _robust(values: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:

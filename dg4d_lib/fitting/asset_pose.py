@@ -20,6 +20,7 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.fitting.asset_motion import antialiased
 from dg4d_lib.fitting.losses import WHITE, resize_cutouts
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.transform import thinned
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
 from dg4d_lib.rasterizer.interface import Rasterizer
 
@@ -107,7 +108,7 @@ def find_placement(
         azimuth_deg: azimuth of the model, if the user says it.
         ups: axes that may point up.
     """
-    sparse = _thinned(cloud)
+    sparse = thinned(cloud, max(1, len(cloud) // SEARCHED))
     azimuths = [azimuth_deg] if azimuth_deg is not None else [360 * step / STEPS for step in range(STEPS)]
     candidates = [centered_placement(sparse, azimuth, up) for up in ups for azimuth in azimuths]
     for _ in range(2):
@@ -252,10 +253,3 @@ def _turn(azimuth_deg: float) -> Float[Tensor, " 4"]:
     """Return the rotation about the vertical that moves azimuth 0 to an azimuth."""
     half = math.radians(azimuth_deg) / 2
     return torch.tensor([math.cos(half), 0.0, math.sin(half), 0.0])
-
-
-def _thinned(cloud: Gaussians) -> Gaussians:
-    """Return evenly many of the Gaussians, larger to cover as much."""
-    step = max(1, len(cloud) // SEARCHED)
-    thin = Gaussians(**{name: value[::step] for name, value in vars(cloud).items()})
-    return replace(thin, log_scales=thin.log_scales + 0.5 * math.log(step))

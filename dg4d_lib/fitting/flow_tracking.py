@@ -27,7 +27,7 @@ from dg4d_lib.fitting.part_search import PartSearch
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import quat_multiply
 from dg4d_lib.images import luminance
-from dg4d_lib.mesh.models.control_graph import ControlGraph
+from dg4d_lib.mesh.models.control_graph import ControlGraph, symmetric_matrix
 from dg4d_lib.rasterizer.interface import Rasterizer, Rendering
 
 STEPS = 2  # Gauss-Newton steps per round
@@ -87,7 +87,7 @@ class FlowTracker:
         """
         self.cloud = cloud
         self._graph, self._rasterize, self._settings = graph, rasterize, settings
-        self._colors, self._alphas = colors, alphas
+        self._alphas, self._frames = alphas, torch.cat([colors, alphas], -1)
         self._camera = replace(OrbitCamera(), width=settings.size, height=settings.size)
         self._viewmat = self._camera.viewmat().double().numpy()
         self._rest = cloud.means.double().numpy()
@@ -101,7 +101,6 @@ class FlowTracker:
         self._backdrop = 1.0 if dark else 0.0  # the one that contrasts with the subject
         self._pictures = self._over(colors, alphas)
         self._features = _features(self._pictures, alphas)
-        self._frames = torch.cat([colors, alphas], -1)
         self._lumas = luminance(self._pictures).cpu().numpy()
 
     def placed(self, rest: Pose) -> Pose:
@@ -142,14 +141,13 @@ class FlowTracker:
     def error(self, pose: Pose, frame: int) -> float:
         """Return the root mean square difference of the render and a frame, over the subject."""
         drawn = self._draw(pose)[0]
-        difference = torch.cat([drawn.color[0] - self._colors[frame], drawn.alpha[0] - self._alphas[frame]], -1)
+        difference = torch.cat([drawn.color[0], drawn.alpha[0]], -1) - self._frames[frame]
         smooth = functional.avg_pool2d(difference.movedim(-1, 0)[None], 3, 1, 1)
         return float(smooth.square().mean().sqrt() / self._alphas[frame].mean().clamp(min=1e-3).sqrt())
 
     @cached_property
     def _parts(self) -> PartSearch:
-        arguments = self._pictures, self._alphas, self._backdrop, self._rasterize
-        return PartSearch(self.cloud, self._graph, *arguments)
+        return PartSearch(self.cloud, self._graph, self._pictures, self._alphas, self._backdrop, self._rasterize)
 
     def _followed(self, pose: Pose, expected: Pose, last: Pose, frame: int) -> Pose:
         """Return the pose after rounds of optical flow."""
@@ -180,8 +178,7 @@ class FlowTracker:
         cost = (places - ours[:, row, column][..., None]).square().sum(0).clamp(max=LARGEST_COST).double().numpy()
         nodes, count = self._indices[visible, 0], len(self._nodes)
         owned = csr_array((np.ones(len(visible)), (nodes, np.arange(len(visible)))), shape=(count, len(visible)))
-        ends = np.concatenate([self._edges, self._edges[:, ::-1]]).T
-        beside = csr_array((np.ones(ends.shape[1]), tuple(ends)), shape=(count, count))
+        beside = symmetric_matrix(self._edges, np.ones(len(self._edges)), count)
         total, pieces = owned @ cost, owned @ np.ones(len(visible))
         for _ in range(NEIGHBORS):
             total, pieces = total + SPREAD * (beside @ total), pieces + SPREAD * (beside @ pieces)
@@ -217,9 +214,8 @@ class FlowTracker:
         self, pose: Pose, rows: Int[np.ndarray, " k"]
     ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k n 3"]]:
         """Return some of the Gaussians' means, and their turned offsets from the nodes that move them."""
-        index, weights = self._indices[rows], self._weights[rows]
-        arms = np.einsum("nkij,nkj->nki", pose.turns[index], self._rest[rows, None] - self._nodes[index])
-        return (weights[..., None] * (arms + self._nodes[index] + pose.shifts[index])).sum(1), arms
+        shares, arms = pose.shares(self._rest[rows], self._nodes, self._indices[rows], self._weights[rows])
+        return shares.sum(1), arms
 
     def _projected(
         self, points: Float[np.ndarray, "k 3"]

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -35,6 +35,24 @@ class Pose:
         """Return the rotations as unit quaternions, wxyz, w not negative."""
         found = Rotation.from_matrix(self.turns).as_quat(canonical=True)
         return torch.from_numpy(np.roll(found, 1, -1)).float()
+
+    def shares(
+        self,
+        points: Float[np.ndarray, "n 3"],
+        nodes: Float[np.ndarray, "m 3"],
+        index: Int[np.ndarray, "n k"],
+        weights: Float[np.ndarray, "n k"],
+    ) -> tuple[Float[np.ndarray, "n k 3"], Float[np.ndarray, "n k 3"]]:
+        """Return what its nodes add to each moved point, the sum of which it is, and its turned offsets from them.
+
+        Args:
+            points: at rest.
+            nodes: at rest.
+            index: nodes that move every point.
+            weights: of these nodes.
+        """
+        arms = np.einsum("nkij,nkj->nki", self.turns[index], points[:, None] - nodes[index])
+        return weights[..., None] * (arms + nodes[index] + self.shifts[index]), arms
 
     def continued(self, last: "Pose") -> "Pose":
         """Continue from this pose over the last one, at part of the speed."""

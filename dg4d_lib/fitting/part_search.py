@@ -5,15 +5,15 @@ middle, and clusters by normalized cuts (Shi and Malik 2000), which end where th
 """
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.cluster.vq import kmeans2
-from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 from torch.nn import functional
@@ -21,7 +21,8 @@ from torch.nn import functional
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.node_pose import Pose, Turns, rotation
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.mesh.models.control_graph import ControlGraph
+from dg4d_lib.gaussians.transform import thinned
+from dg4d_lib.mesh.models.control_graph import ControlGraph, symmetric_matrix
 from dg4d_lib.rasterizer.interface import Rasterizer
 
 SIZE = 64  # pixels of the compared pictures, at most
@@ -99,11 +100,10 @@ class PartSearch:
             rasterize: rasterizer.
         """
         step = -(-len(cloud) // RENDERED)
-        rows = torch.arange(0, len(cloud), step)
-        thin = Gaussians(**{name: value[rows] for name, value in vars(cloud).items()})
-        sizes = thin.log_scales.mean(-1, keepdim=True).expand(-1, 3) + 0.5 * float(np.log(step))
+        thin = thinned(cloud, step)
+        sizes = thin.log_scales.mean(-1, keepdim=True).expand(-1, 3)
         self._cloud = replace(thin, log_scales=sizes)  # round, for they are not turned
-        self._graph, self._rasterize = graph.of(rows), rasterize
+        self._graph, self._rasterize = graph.of(torch.arange(0, len(cloud), step)), rasterize
         size = min(SIZE, pictures.shape[1])
         self._camera = replace(OrbitCamera(), width=size, height=size)
         self._backdrop = pictures.new_full((3,), backdrop)
@@ -117,15 +117,15 @@ class PartSearch:
         """Return the pose after up to `ROUNDS` parts were turned; the same object if no part lowers the error."""
         everything = np.ones(len(self._nodes), bool)
         still = _Hinge(everything, self._nodes.mean(0), np.eye(3))
-        first = best = float(self._errors(self._shares(pose), still, np.eye(3)[None], frame)[0])
+        first = best = float(self._errors(self._shares(pose), frame, still, np.eye(3)[None])[0])
         for _ in range(ROUNDS):
-            places, shares = self._nodes + pose.shifts, self._shares(pose)
+            places = self._nodes + pose.shifts
+            costs_of = partial(self._costs, self._shares(pose), frame, first)
             hinges = [replace(still, center=places.mean(0)), *(_hinge(part, places) for part in self._parts)]
-            costs = [self._costs(shares, hinge, self._turns, frame, first) for hinge in hinges]
+            costs = [costs_of(hinge, self._turns) for hinge in hinges]
             promising = np.argsort([cost.min() for cost in costs], kind="stable")[:REFINED]
             refined = [
-                (*self._refined(shares, hinges[k], self._turns[int(costs[k].argmin())], frame, first), k)
-                for k in promising
+                (*_refined(partial(costs_of, hinges[k]), self._turns[int(costs[k].argmin())]), k) for k in promising
             ]
             cost, turn, chosen = min(refined, key=lambda one: one[0])
             if cost > (1 - GAIN) * best:
@@ -142,45 +142,26 @@ class PartSearch:
         shifts[own] = arms @ turn.T + hinge.center - self._nodes[own]
         return Pose(turns, shifts)
 
-    def _refined(
-        self,
-        shares: Float[np.ndarray, "n k 3"],
-        hinge: _Hinge,
-        turn: Float[np.ndarray, "3 3"],
-        frame: int,
-        scale: float,
-    ) -> tuple[float, Float[np.ndarray, "3 3"]]:
-        """Return the cost and the best of the rotations near one."""
-        best = np.inf
-        for angle in FINER:
-            near = np.concatenate([turn[None], _around(angle) @ turn])
-            costs = self._costs(shares, hinge, near, frame, scale)
-            best, turn = float(costs.min()), near[int(costs.argmin())]
-        return best, turn
-
     def _costs(
         self,
         shares: Float[np.ndarray, "n k 3"],
-        hinge: _Hinge,
-        turns: Float[np.ndarray, "b 3 3"],
         frame: int,
         scale: float,
+        hinge: _Hinge,
+        turns: Float[np.ndarray, "b 3 3"],
     ) -> Float[np.ndarray, " b"]:
         """Return errors with a penalty on large rotations, which are in the hinge's directions."""
         angles = np.arccos(((np.trace(turns, axis1=1, axis2=2) - 1) / 2).clip(-1, 1))
-        return self._errors(shares, hinge, turns, frame) + PENALTY * scale * np.square(angles / np.pi)
+        return self._errors(shares, frame, hinge, turns) + PENALTY * scale * np.square(angles / np.pi)
 
     def _shares(self, pose: Pose) -> Float[np.ndarray, "n k 3"]:
         """Return what each of its nodes adds to the mean of every Gaussian."""
         index, weights = self._graph.indices.numpy(), self._graph.weights.double().numpy()
-        arms = self._cloud.means.double().numpy()[:, None] - self._nodes[index]
-        moved = np.einsum("nkij,nkj->nki", pose.turns[index], arms) + (self._nodes + pose.shifts)[index]
-        shares: Float[np.ndarray, "n k 3"] = weights[..., None] * moved
-        return shares
+        return pose.shares(self._cloud.means.double().numpy(), self._nodes, index, weights)[0]
 
     @torch.no_grad()
     def _errors(
-        self, shares: Float[np.ndarray, "n k 3"], hinge: _Hinge, turns: Float[np.ndarray, "b 3 3"], frame: int
+        self, shares: Float[np.ndarray, "n k 3"], frame: int, hinge: _Hinge, turns: Float[np.ndarray, "b 3 3"]
     ) -> Float[np.ndarray, " b"]:
         """Return the mean squared differences of renders and a frame over a pyramid, for rotations of a part."""
         own = hinge.nodes[self._graph.indices.numpy()]
@@ -199,6 +180,18 @@ class PartSearch:
             drawn = self._rasterize(states, [self._camera] * count, self._backdrop)
             errors.append(_pyramid(torch.cat([drawn.color, drawn.alpha], -1).movedim(-1, 1) - self._frames[frame]))
         return torch.cat(errors).double().numpy()
+
+
+def _refined(
+    costs_of: Callable[[Float[np.ndarray, "b 3 3"]], Float[np.ndarray, " b"]], turn: Float[np.ndarray, "3 3"]
+) -> tuple[float, Float[np.ndarray, "3 3"]]:
+    """Return the cost and the best of the rotations near one."""
+    best = np.inf
+    for angle in FINER:
+        near = np.concatenate([turn[None], _around(angle) @ turn])
+        costs = costs_of(near)
+        best, turn = float(costs.min()), near[int(costs.argmin())]
+    return best, turn
 
 
 def _hinge(part: Part, places: Float[np.ndarray, "m 3"]) -> _Hinge:
@@ -225,28 +218,23 @@ def _pyramid(difference: Float[Tensor, "b c h w"]) -> Float[Tensor, " b"]:
     return total / LEVELS
 
 
-def _matrix(edges: Int[np.ndarray, "e 2"], values: Float[np.ndarray, " e"], count: int) -> csr_array:
-    ends = np.concatenate([edges, edges[:, ::-1]]).T
-    return csr_array(coo_array((np.concatenate([values, values]), tuple(ends)), shape=(count, count)))
-
-
 def _branches(
     edges: Int[np.ndarray, "e 2"], lengths: Float[np.ndarray, " e"], count: int
 ) -> Iterable[Bool[np.ndarray, " m"]]:
-    distances = dijkstra(_matrix(edges, lengths, count), directed=False)
+    distances = dijkstra(symmetric_matrix(edges, lengths, count), directed=False)
     distances[np.isinf(distances)] = distances[np.isfinite(distances)].max()
     reach = distances[int(distances.sum(1).argmin())]
     for share in BRANCHES:
         far = reach > np.quantile(reach, share)
         inside = edges[far[edges].all(1)]
-        labels = connected_components(_matrix(inside, np.ones(len(inside)), count), directed=False)[1]
+        labels = connected_components(symmetric_matrix(inside, np.ones(len(inside)), count), directed=False)[1]
         yield from (far & (labels == label) for label in np.unique(labels[far]))
 
 
 def _clusters(
     edges: Int[np.ndarray, "e 2"], lengths: Float[np.ndarray, " e"], count: int
 ) -> Iterable[Bool[np.ndarray, " m"]]:
-    near = _matrix(edges, lengths.mean() / lengths, count).toarray()
+    near = symmetric_matrix(edges, lengths.mean() / lengths, count).toarray()
     scale = 1 / np.sqrt(near.sum(1).clip(1e-12))
     vectors = np.linalg.eigh(np.eye(count) - near * scale[:, None] * scale)[1]
     for number in CLUSTERS:

@@ -1,4 +1,4 @@
-"""Similarity transforms and concatenation of clouds."""
+"""Similarity transforms, concatenation and thinning of clouds."""
 
 import math
 from collections.abc import Sequence
@@ -51,3 +51,9 @@ def concatenate(clouds: Sequence[Gaussians]) -> Gaussians:
         torch.cat([cloud.opacity_logits for cloud in clouds]),
         torch.cat([cloud.harmonics for cloud in clouds]),
     )
+
+
+def thinned(cloud: Gaussians, step: int) -> Gaussians:
+    """Return every so many-th Gaussian of one state, larger to cover as much."""
+    thin = Gaussians(**{name: value[::step] for name, value in vars(cloud).items()})
+    return replace(thin, log_scales=thin.log_scales + 0.5 * math.log(step))

@@ -204,10 +204,15 @@ def _distances(
     return found
 
 
+def symmetric_matrix(pairs: Int[np.ndarray, "e 2"], values: Float[np.ndarray, " e"], count: int) -> csr_array:
+    """Return values of the edges between so many nodes as a symmetric matrix."""
+    ends = np.concatenate([pairs, pairs[:, ::-1]]).T
+    return csr_array(coo_array((np.concatenate([values, values]), tuple(ends)), shape=(count, count)))
+
+
 def _lengths(points: Float[np.ndarray, "v 3"], pairs: Int[np.ndarray, "e 2"]) -> csr_array:
     lengths = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1).clip(1e-6)  # 0 would be no edge
-    ends = np.concatenate([pairs, pairs[:, ::-1]]).T
-    return csr_array(coo_array((np.concatenate([lengths, lengths]), tuple(ends)), shape=(len(points),) * 2))
+    return symmetric_matrix(pairs, lengths, len(points))
 
 
 def _bridges(points: Float[np.ndarray, "v 3"], labels: Int[np.ndarray, " v"], parts: int) -> Int[np.ndarray, "e 2"]:
