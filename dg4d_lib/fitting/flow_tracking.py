@@ -27,7 +27,7 @@ from dg4d_lib.fitting.part_search import PartSearch
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import quat_multiply
 from dg4d_lib.images import luminance
-from dg4d_lib.mesh.models.control_graph import ControlGraph, symmetric_matrix
+from dg4d_lib.mesh.models.control_graph import SHORTEST, ControlGraph, symmetric_matrix
 from dg4d_lib.rasterizer.interface import Rasterizer, Rendering
 
 STEPS = 2  # Gauss-Newton steps per round
@@ -95,7 +95,7 @@ class FlowTracker:
         self._indices, self._weights = graph.indices.numpy(), graph.weights.double().numpy()
         self._edges = graph.edges.numpy()
         self._spans = self._nodes[self._edges[:, 1]] - self._nodes[self._edges[:, 0]]
-        self._lengths = np.linalg.norm(self._spans, axis=1)
+        self._lengths = np.linalg.norm(self._spans, axis=1).clip(SHORTEST)
         self._unit = float(np.linalg.norm(np.ptp(self._nodes, axis=0))) / 10
         dark = luminance(colors - (1 - alphas)).sum() < 0.5 * alphas.sum()
         self._backdrop = 1.0 if dark else 0.0  # the one that contrasts with the subject

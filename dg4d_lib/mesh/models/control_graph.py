@@ -26,6 +26,7 @@ BRACES = 4  # edges of a node through the inside
 BRACE_REACH = 0.35  # of the diagonal: the longest of them
 PLACES = 7  # on such an edge, evenly, that must lie inside
 INWARD = 0.5  # cosine between such an edge and the normals at its ends
+SHORTEST = 1e-6  # world units: length of an edge between points at one place
 REACH = 6.0  # spacings of the nodes: farther points are not told apart
 
 
@@ -38,7 +39,7 @@ class ControlGraph:
         indices: nodes that move every point.
         weights: of these nodes, sum 1.
         edges: pairs of neighboring nodes.
-        lengths: of the edges at rest, along the straight line.
+        lengths: of the edges at rest, along the straight line; never 0.
     """
 
     nodes: Float[Tensor, "m 3"]
@@ -104,7 +105,7 @@ def graph_of_points(points: Float[np.ndarray, "v 3"], graph: csr_array, count: i
     pairs = np.unique(np.sort(pairs, 1), axis=0)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     nodes = points[chosen]
-    lengths = np.linalg.norm(nodes[pairs[:, 0]] - nodes[pairs[:, 1]], axis=1)
+    lengths = np.linalg.norm(nodes[pairs[:, 0]] - nodes[pairs[:, 1]], axis=1).clip(SHORTEST)
     return ControlGraph(
         torch.from_numpy(nodes.astype(np.float32)),
         torch.from_numpy(order[:, :used].astype(np.int64)),
@@ -156,7 +157,7 @@ def _braced(
     pairs = torch.from_numpy(np.sort(near[kept], 1).astype(np.int64))
     edges = torch.unique(torch.cat([control.edges, pairs]), dim=0)
     ends = control.nodes[edges]
-    return replace(control, edges=edges, lengths=(ends[:, 1] - ends[:, 0]).norm(dim=-1))
+    return replace(control, edges=edges, lengths=(ends[:, 1] - ends[:, 0]).norm(dim=-1).clamp(min=SHORTEST))
 
 
 def surface_graph(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> csr_array:
@@ -211,7 +212,7 @@ def symmetric_matrix(pairs: Int[np.ndarray, "e 2"], values: Float[np.ndarray, " 
 
 
 def _lengths(points: Float[np.ndarray, "v 3"], pairs: Int[np.ndarray, "e 2"]) -> csr_array:
-    lengths = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1).clip(1e-6)  # 0 would be no edge
+    lengths = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1).clip(SHORTEST)  # 0 would be no edge
     return symmetric_matrix(pairs, lengths, len(points))
 
 

@@ -10,6 +10,7 @@ from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.flow_tracking import FlowTracker, _Targets
 from dg4d_lib.fitting.node_pose import Pose
+from dg4d_lib.fitting.part_search import find_parts
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.models.control_graph import graph_of_points, point_graph
 from dg4d_lib.rasterizer.interface import get_rasterizer
@@ -94,6 +95,19 @@ def test_a_still_video_moves_nothing() -> None:
     after = tracker._points(tracker.tracked({0: rest}, [0], 1), np.arange(len(points)))[0]
     assert np.abs(after - points).max() < 0.01
     assert "_parts" not in vars(tracker)  # a search takes seconds, and nothing is lost
+
+
+def test_splats_at_one_place_are_tracked() -> None:
+    points, colors = scene()
+    twice = np.concatenate([points[::50], points[::50]])
+    cloud = cloud_of(twice, np.concatenate([colors[::50], colors[::50]]))
+    camera = OrbitCamera(width=SIZE, height=SIZE)
+    drawn = get_rasterizer("cpu")(cloud, [camera, camera], torch.ones(3))
+    graph = graph_of_points(twice, point_graph(twice), len(twice))
+    tracker = FlowTracker(cloud, graph, drawn.color, drawn.alpha, get_rasterizer("cpu"), SETTINGS)
+    rest = Pose.rest(len(graph.nodes))
+    assert np.isfinite(tracker.tracked({0: rest}, [0], 1).shifts).all()
+    assert find_parts(graph)
 
 
 def test_depth_is_not_extrapolated() -> None:
