@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch import Tensor
-from torch.nn.functional import max_pool2d, normalize
+from torch.nn.functional import normalize, pad
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import baking_views
@@ -241,8 +241,13 @@ def _graded(
 
 def _min_filter(values: Float[Tensor, "b h w"], reach: int) -> Float[Tensor, "b h w"]:
     """Return the minimum within some pixels."""
-    rows = max_pool2d(-values, (2 * reach + 1, 1), stride=1, padding=(reach, 0))
-    return -max_pool2d(rows, (1, 2 * reach + 1), stride=1, padding=(0, reach))
+    for axis in (1, 2):
+        border = [0, 0, reach, reach] if axis == 1 else [reach, reach]
+        padded, length = pad(values, border, value=torch.inf), values.shape[axis]
+        values = padded.narrow(axis, 0, length)
+        for shift in range(1, 2 * reach + 1):
+            values = torch.minimum(values, padded.narrow(axis, shift, length))
+    return values
 
 
 def _fill_unseen(

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 FINEST = 512  # cells per side of the grid of places, at most
 GAP = 2  # texels between charts, at least
-TURNS = 16  # rotations of a chart that are tried
+TURNS = 8  # rotations of a chart that are tried
 MOST_SHAPES = 640  # charts times turns; more charts are turned less
-ORDERS = 12  # orders of the charts that are tried: the first by area, the others disturbed
+ORDERS = 8  # orders of the charts that are tried: the first by area, the others disturbed
 DISTURBANCE = 0.25  # standard deviation of the logarithm of the area in a disturbed order
-FIRST_COVERAGE, STEP = 0.62, 0.01  # share of the texture that is tried first, and its increments
+FIRST_COVERAGE, STEP = 0.66, 0.01  # share of the texture that is tried first, and its increments
 LEAST_COVERAGE = 0.03  # share of the texture below which charts count as too many
 GOLDEN = 0.618  # multiples of this share of a length are spread evenly
 
@@ -177,21 +177,34 @@ def _mark_cells(points, faces, marked):
 def _center_and_cells(marked, gap):
     """Return the mean row of the marked cells, and in scattered order the cells at most a gap away from one."""
     height, width = marked.shape
+    beside = np.zeros((height, width + 2 * gap), np.bool_)  # marked cells grown along rows, then along columns
     around = np.zeros((height + 2 * gap, width + 2 * gap), np.bool_)
-    rows, count = 0, 0
+    rows, count, size = 0, 0, 0
     for row in range(height):
+        reached = -1  # first column that no marked cell of the row has grown to
         for column in range(width):
             if marked[row, column]:
                 rows, count = rows + row, count + 1
-                around[row : row + 2 * gap + 1, column : column + 2 * gap + 1] = True
-    cells = np.argwhere(around).astype(np.int32)
-    scattered = np.empty_like(cells)  # a collision shows after few cells
-    stride = max(1, int(GOLDEN * len(cells)))
-    while math.gcd(stride, len(cells)) > 1:
+                for place in range(max(column, reached), column + 2 * gap + 1):
+                    beside[row, place] = True
+                reached = column + 2 * gap + 1
+    for row in range(height + 2 * gap):
+        for column in range(width + 2 * gap):
+            for other in range(max(0, row - 2 * gap), min(height, row + 1)):
+                if beside[other, column]:
+                    around[row, column] = True
+                    size += 1
+                    break
+    cells, found = np.empty((size, 2), np.int32), 0
+    stride = max(1, int(GOLDEN * size))  # scattered: a collision shows after few cells
+    while math.gcd(stride, size) > 1:
         stride += 1
-    for i in range(len(cells)):
-        scattered[i] = cells[i * stride % len(cells)]
-    return rows / count, scattered
+    for row in range(height + 2 * gap):
+        for column in range(width + 2 * gap):
+            if around[row, column]:
+                cells[found, 0], cells[found, 1] = row, column
+                found = (found + stride) % size
+    return rows / count, cells
 
 
 @njit(cache=True, nogil=True)

@@ -92,7 +92,7 @@ def level_seams(texture: Float[Tensor, "h w 3"], points: Float[np.ndarray, "s 2 
     scale = diags_array(1 / matrix.diagonal())
     corrected = colors.copy()
     for channel in range(3):
-        correction, _ = cg(matrix, -(across.T @ mismatch[:, channel]), rtol=1e-4, maxiter=ITERATIONS, M=scale)
+        correction, _ = cg(matrix, -(across.T @ mismatch[:, channel]), rtol=1e-2, maxiter=ITERATIONS, M=scale)
         corrected[near, channel] += correction
     return torch.from_numpy(corrected.clip(0, 1)).to(texture)
 
