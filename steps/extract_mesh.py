@@ -46,6 +46,7 @@ Frame = tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]  # color and alpha
 Footage = Callable[[Int[Tensor, " w"]], list[PosedSurface]]
 
 COLORED = 16  # frames of the driving video that are baked into the texture of a mesh that follows it
+LEAST_ERROR = 1e-4  # squared error below which frames weigh alike, 40 dB
 FOLLOWED = {"gaussians": "motion", "video": "driving video"}
 OUTLINES = {"gaussians": "the Gaussians'", "video": "those of video and Gaussians"}
 PICTURE_CAMERAS = [OrbitCamera(0, azimuth, width=256, height=256) for azimuth in (0.0, 75.0, 180.0, 285.0)]
@@ -160,7 +161,7 @@ def _guided(
     )
     refined = refine_tracking(mesh, sources, vertices, offsets, faces, states, video, level, rasterize, settings)
     moved = vertices + refined
-    normals, footage = vertex_normals(vertices, faces)[sources], _footage(moved, faces, sources, video)
+    normals, footage = vertex_normals(vertices, faces)[sources], _footage(moved, faces, sources, video, mesh)
     texture = bake_texture(mesh.vertices, normals, mesh.faces, mesh.uvs, rest, rasterize, settings, footage)
     silhouettes = render_silhouettes(states, range(len(moved)), rasterize, video.alpha[..., 0])
     tracked = TrackedMesh(replace(mesh, texture=texture), refined[:, sources], reference_frame=frame)
@@ -168,11 +169,30 @@ def _guided(
 
 
 def _footage(
-    moved: Float[Tensor, "t v 3"], faces: Int[Tensor, "f 3"], sources: Int[Tensor, " w"], video: DrivingVideo
+    moved: Float[Tensor, "t v 3"],
+    faces: Int[Tensor, "f 3"],
+    sources: Int[Tensor, " w"],
+    video: DrivingVideo,
+    textured: TexturedMesh | None = None,
 ) -> list[PosedSurface]:
-    """Return some frames of the video with the surface, split along seams, that they show."""
+    """Return some frames of the video with the surface, split along seams, that they show.
+
+    With a textured mesh, frames weigh by how well its renders agree with them: badly tracked ones blur the texture.
+    """
     frames = evenly_spaced(len(video), COLORED)
-    return [surface for frame in frames for surface in _shown(moved[frame], faces, _at(video, frame))(sources)]
+    surfaces = [surface for frame in frames for surface in _shown(moved[frame], faces, _at(video, frame))(sources)]
+    if textured is None:
+        return surfaces
+    errors = [_squared_error(replace(textured, vertices=surface.vertices), surface) for surface in surfaces]
+    least = max(min(errors), LEAST_ERROR)
+    return [replace(surface, weight=least / max(error, least)) for surface, error in zip(surfaces, errors, strict=True)]
+
+
+def _squared_error(mesh: TexturedMesh, surface: PosedSurface) -> float:
+    """Return the mean squared error of a render from the input camera against a frame, over white."""
+    camera = OrbitCamera(width=surface.color.shape[1], height=surface.color.shape[0])
+    rendered = color_over_white(*render_mesh(mesh, [camera]))[0]
+    return float((rendered - color_over_white(surface.color, surface.alpha)).square().mean())
 
 
 def _at(video: DrivingVideo | None, frame: int) -> Frame | None:

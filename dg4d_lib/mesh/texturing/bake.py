@@ -56,12 +56,14 @@ class PosedSurface:
         normals: of the unsplit surface, one per split vertex.
         color: straight color of the frame, in [0, 1].
         alpha: of the frame, in [0, 1].
+        weight: of its colors, relative to other frames.
     """
 
     vertices: Float[Tensor, "v 3"]
     normals: Float[Tensor, "v 3"]
     color: Float[Tensor, "h w 3"]
     alpha: Float[Tensor, "h w 1"]
+    weight: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -114,20 +116,21 @@ def bake_texture(
     if len(texels.rows) == 0:  # all triangles are smaller than a texel
         return torch.full((size, size, 3), 0.5)
     total = np.zeros((len(texels.rows), 4), np.float32)  # sums of weight * color and of weight
-    parts, input_rule = _parts(len(total)), (INPUT_FLATTER * MIN_COSINE, INPUT_WEIGHT)
+    parts, flattest = _parts(len(total)), INPUT_FLATTER * MIN_COSINE
     for posed in footage:
         camera = OrbitCamera(width=posed.color.shape[1], height=posed.color.shape[0])
         moved = _placed_texels(rows, columns, corners, shares, posed.vertices, posed.normals)
         reach = max(1, round(OUTLINE * camera.width / side))  # the footage may be coarser than the renders
         pictures = _graded(posed.color[None], posed.alpha[None, ..., 0], [camera], posed.vertices, faces, reach)
-        run_parallel([partial(_add, moved, [camera], pictures, [input_rule], part, total) for part in parts])
+        rule = flattest, INPUT_WEIGHT * posed.weight
+        run_parallel([partial(_add, moved, [camera], pictures, [rule], part, total) for part in parts])
     cameras = [OrbitCamera(width=side, height=side), *baking_views(side)]
     for start in range(0, len(cameras), VIEWS_AT_ONCE):
         batch = cameras[start : start + VIEWS_AT_ONCE]
         renders = _render_views(batch, vertices, faces, gaussians, rasterize)
         rules = [(MIN_COSINE, 1.0)] * len(batch)
         if start == 0 and not footage:
-            rules[0] = input_rule
+            rules[0] = flattest, INPUT_WEIGHT
         run_parallel([partial(_add, texels, batch, renders, rules, part, total) for part in parts])
     weight = torch.from_numpy(total[:, 3:])
     seen = weight[:, 0] > 0

@@ -112,6 +112,18 @@ def test_footage_colors_what_it_shows_where_the_surface_was(sphere: Mesh, sphere
     assert (colors[hidden, 1] < 0.2).all()
 
 
+def test_footage_is_averaged_by_weight(sphere: Mesh, sphere_of_gaussians: Cloud) -> None:
+    """Three parts of green and one part of black, with next to nothing of the Gaussians, where the frames look."""
+    mesh = flattened(*sphere)
+    green, alpha = green_frame(1.0)
+    footage = [PosedSurface(*mesh[:2], green, alpha, 3.0), PosedSurface(*mesh[:2], torch.zeros_like(green), alpha)]
+    texture = bake_texture(*mesh, sphere_of_gaussians(600), get_rasterizer("auto"), SETTINGS, footage)
+    texels = locate_texels(*mesh, SETTINGS.texture_size)
+    shown = texels.normals[:, 2] > 0.85
+    assert shown.sum() > 300
+    assert (texture[texels.rows, texels.columns][shown] - 0.75 * GREEN).abs().max() < 0.05
+
+
 def test_transparent_footage_changes_nothing(sphere: Mesh, sphere_of_gaussians: Cloud) -> None:
     mesh, gaussians = flattened(*sphere), sphere_of_gaussians(600, 0.5, red_and_blue)
     nothing = PosedSurface(*mesh[:2], *green_frame(0.0))
