@@ -15,7 +15,6 @@ from dg4d_lib.asset_settings import ScoreSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.motion import fit_motion
 from dg4d_lib.fitting.static import fit_gaussians
-from dg4d_lib.fitting.surface_tracking import DESCENT
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.images import over_white, resize
@@ -103,7 +102,7 @@ def fit(subject: Subject, settings: PipelineSettings, seed: int = 0, sides: Bank
     video, kind = DrivingVideo(cutouts[..., :3].contiguous(), cutouts[..., 3:].contiguous(), 10), settings.prior
     moved = None
     if sides and tracks_surface(settings.motion, kind, sides, len(video)):
-        moved = tracked_shapes(rest, video, sides, kind, hint, rasterize, DESCENT, generator)
+        moved = tracked_shapes(rest, video, sides, kind, hint, rasterize, generator)
     prior = make_prior(kind, list(cutouts), settings.motion, None, Path(), hint, sides, moved).prior
     deformation = new_deformation(settings.deformation, rest, len(video), generator)
     fitted = fit_motion(rest, deformation, video, prior, rasterize, settings.motion, generator)

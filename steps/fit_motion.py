@@ -6,7 +6,6 @@ import torch
 
 from dg4d_lib.fitting.asset_motion import iterations
 from dg4d_lib.fitting.motion import fit_motion
-from dg4d_lib.fitting.surface_tracking import DESCENT
 from dg4d_lib.gaussians.ply import read_ply, write_ply
 from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
 from dg4d_lib.settings import DeformationSettings, MotionSettings
@@ -14,7 +13,7 @@ from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.motions import new_deformation, write_motion
 from steps.fitting.priors import make_prior, read_known_views, subject_hint
 from steps.fitting.reporting import SHOWN_AZIMUTHS_DEG, LossCurves, picture_of_divergence, render_row, show_fit
-from steps.fitting.tracking import TRACKED_NOTE, tracked_shapes, tracks_surface
+from steps.fitting.tracking import TRACKED_NOTE, tracked_shapes, tracking_of, tracks_surface
 from steps.runtime.job import Job, StepReport
 
 FINE_TUNED = "The Gaussians at rest were fitted to the whole video together with their motion."
@@ -36,11 +35,11 @@ def run(job: Job) -> StepReport:
     cutouts = list(torch.cat([video.frames, video.alpha], -1))
     known = read_known_views(job.inputs.get("known_views"), job.pictures)
     tracks = tracks_surface(settings, prior, known, len(video))
-    before = iterations(DESCENT, len(video)) if tracks else 0
+    before = iterations(tracking_of(known), len(video)) if known and tracks else 0
     curves = LossCurves(before + settings.iterations, job.progress)
     with picture_of_divergence(job, rasterize):
         moved = (
-            tracked_shapes(gaussians, video, known, prior, hint, rasterize, DESCENT, generator, curves.add)
+            tracked_shapes(gaussians, video, known, prior, hint, rasterize, generator, curves.add)
             if known and tracks
             else None
         )

@@ -4,7 +4,7 @@ import torch
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.fitting.asset_motion import Report
-from dg4d_lib.fitting.surface_tracking import track_surface
+from dg4d_lib.fitting.surface_tracking import DESCENT, track_surface
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.moved import MovedSurfaces
 from dg4d_lib.guidance.oracle import Bank
@@ -15,6 +15,7 @@ from dg4d_lib.video.driving import DrivingVideo
 from steps.fitting.priors import subject_shapes
 
 TRACKED_NOTE = "motion of unseen sides: the surface of the known views, moved as the video shows it"
+ALL_AROUND = 12  # known views of one frame from which limbs of their hull are apart
 
 
 def tracks_surface(settings: MotionSettings, prior: PriorSettings, known: Bank | None, frames: int) -> bool:
@@ -30,6 +31,11 @@ def tracks_surface(settings: MotionSettings, prior: PriorSettings, known: Bank |
     return settings.track_surface and has_shapes and known is not None and known.frames == (0,) and frames > 1
 
 
+def tracking_of(known: Bank) -> AssetSettings:
+    """Return how the surface of known views is tracked: where limbs are apart, by optical flow as a user's model is."""
+    return AssetSettings() if len(known.cameras) >= ALL_AROUND else DESCENT
+
+
 def tracked_shapes(
     gaussians: Gaussians,
     video: DrivingVideo,
@@ -37,11 +43,10 @@ def tracked_shapes(
     prior: PriorSettings,
     hint: DepthHint,
     rasterize: Rasterizer,
-    settings: AssetSettings,
     generator: torch.Generator,
     report: Report = lambda iteration, values: None,
 ) -> MovedSurfaces:
     """Return the shapes of all frames; arguments as of `track_surface` and `subject_shapes`."""
     first = torch.cat([video.frames[0], video.alpha[0]], -1)
     surface = subject_shapes(prior, [first], hint, known).surface(0)
-    return MovedSurfaces(track_surface(surface, gaussians, video, rasterize, settings, generator, report))
+    return MovedSurfaces(track_surface(surface, gaussians, video, rasterize, tracking_of(known), generator, report))

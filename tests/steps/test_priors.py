@@ -40,6 +40,7 @@ from steps.fitting.priors import (
     subject_hint,
     subject_shapes,
 )
+from steps.fitting.tracking import tracking_of
 
 CUTOUTS = [torch.rand(64, 64, 4, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1)]
 
@@ -150,6 +151,13 @@ def test_known_views_of_the_first_frame_guide_all_frames(
     _, between = mixed.prior.clean([GuidanceView(camera, 1)])
     assert float((between[0] - cover[1]).abs().max()) > 0.1  # pulled towards the tracked shape, which stands still
     assert bool(mixed.report("cpu").weights) == learned
+
+
+@pytest.mark.parametrize(("count", "tracking"), [(3, "descent"), (16, "flow")])
+def test_a_turntable_follows_optical_flow_and_few_views_descend(count: int, tracking: str) -> None:
+    cameras = tuple(OrbitCamera(0, 360 * step / count, width=64, height=64) for step in range(count))
+    views = Bank(cameras, (0,), torch.zeros(count, 1, 64, 64, 4, dtype=torch.uint8))
+    assert tracking_of(views).tracking == tracking
 
 
 def test_known_views_of_a_later_frame_guide_that_frame_alone(tmp_path: Path) -> None:
