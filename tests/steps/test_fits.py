@@ -19,6 +19,7 @@ from steps import fit_gaussians, fit_motion
 from steps.artifacts.media import read_png, write_frames, write_png
 from steps.artifacts.motions import read_motion
 from steps.fit_gaussians import one_state
+from steps.fitting import tracking
 from steps.fitting.priors import read_bank
 from steps.fitting.tracking import TRACKED_NOTE
 from steps.profiles import PREVIEW, revise, step_settings
@@ -150,7 +151,7 @@ def test_the_tracked_surface_of_known_views_guides_later_frames(
 ):
     write_bank(tmp_path / "known.zip", [[known_view(disc(), 90.0)]], tmp_path)
     small = {"track_iterations": 2, "joint_iterations": 1, "nodes": 8, "size": 32}
-    monkeypatch.setattr(fit_motion, "DESCENT", fit_motion.DESCENT.model_copy(update=small))
+    monkeypatch.setattr(tracking, "DESCENT", tracking.DESCENT.model_copy(update=small))
     settings = revise(SMALL, {"motion.track_surface": True})
     statics = job(tmp_path, fit_settings(), {"subject": subject}, STATIC)
     fit_gaussians.run(statics)
