@@ -34,13 +34,13 @@ def run(job: Job) -> StepReport:
     rasterize = get_rasterizer(backend)
     cutouts = list(torch.cat([video.frames, video.alpha], -1))
     known = read_known_views(job.inputs.get("known_views"), job.pictures)
-    tracks = tracks_surface(settings, prior, known, len(video))
-    before = iterations(tracking_of(known), len(video)) if known and tracks else 0
+    tracked = known if tracks_surface(settings, prior, known, len(video)) else None
+    before = iterations(tracking_of(tracked), len(video)) if tracked else 0
     curves = LossCurves(before + settings.iterations, job.progress)
     with picture_of_divergence(job, rasterize):
         moved = (
-            tracked_shapes(gaussians, video, known, prior, hint, rasterize, generator, curves.add)
-            if known and tracks
+            tracked_shapes(gaussians, video, tracked, prior, hint, rasterize, generator, curves.add)
+            if tracked
             else None
         )
     chosen = make_prior(prior, cutouts, settings, job.inputs.get("bank"), job.pictures, hint, known, moved)
@@ -68,5 +68,5 @@ def run(job: Job) -> StepReport:
     rows = [render_row(states, [azimuth] * len(timestamps), rasterize) for azimuth in (FRONT_DEG, SIDE_DEG)]
     write_png(job.outputs["picture"], torch.cat(rows))
     report = chosen.report(f"{backend} rasterizer")
-    report = replace(report, notes=(*report.notes, TRACKED_NOTE)) if tracks else report
+    report = replace(report, notes=(*report.notes, TRACKED_NOTE)) if tracked else report
     return replace(report, notes=(*report.notes, FINE_TUNED)) if settings.fine_tune else report

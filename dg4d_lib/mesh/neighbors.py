@@ -1,7 +1,7 @@
 """Neighborhoods of vertices on a triangle mesh."""
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int, Int64
 from scipy.sparse import coo_array, csr_array, diags_array
 
 
@@ -12,10 +12,18 @@ def half_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
 
 def mesh_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
     """Return every edge once, its smaller index first, in ascending order."""
-    edges = half_edges(faces).astype(np.int64)
-    count = edges.max(initial=0) + 1
-    keys = np.unique(edges.min(1) * count + edges.max(1))  # numbers are sorted four times as fast as pairs
-    return np.stack(np.divmod(keys, count), 1).astype(faces.dtype)
+    edges = half_edges(faces)
+    _, first = np.unique(edge_keys(edges), return_index=True)
+    return np.sort(edges[first], 1)
+
+
+def edge_keys(edges: Int[np.ndarray, "e 2"]) -> Int64[np.ndarray, " e"]:
+    """Return a number for every edge, equal in both directions, in the order of smaller and then larger index.
+
+    Numbers are sorted four times as fast as pairs.
+    """
+    wide = edges.astype(np.int64)
+    return wide.min(1) * (wide.max(initial=0) + 1) + wide.max(1)
 
 
 def edge_graph(faces: Int[np.ndarray, "f 3"], count: int) -> csr_array:

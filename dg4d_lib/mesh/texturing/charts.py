@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from dg4d_lib.mesh.neighbors import half_edges
+from dg4d_lib.mesh.neighbors import edge_keys, half_edges
 from dg4d_lib.mesh.texturing.flatten import flat_areas, flatten, overlapping
 
 DENSITIES = (0.72, 1.35)  # bounds of the linear texel density in a chart, relative to its mean
@@ -121,7 +121,7 @@ class _Surface:
         self.areas = np.linalg.norm(areas, axis=1)
         self.normals = areas / np.maximum(self.areas, np.finfo(float).tiny)[:, None]
         edges = half_edges(faces)
-        keys = edges.min(1) * len(vertices) + edges.max(1)
+        keys = edge_keys(edges)
         order = np.argsort(keys, kind="stable")
         _, firsts, uses = np.unique(keys[order], return_index=True, return_counts=True)
         one, other = order[firsts[uses == 2]], order[firsts[uses == 2] + 1]

@@ -14,7 +14,7 @@ from scipy.sparse.linalg import cg
 from torch import Tensor
 
 from dg4d_lib.mesh.extraction.topology import join_seams
-from dg4d_lib.mesh.neighbors import half_edges
+from dg4d_lib.mesh.neighbors import edge_keys, half_edges
 
 SAMPLES = 2  # points on a seam per texel of its length
 REACH = 6  # texels around seams that are corrected
@@ -38,7 +38,7 @@ def seam_points(
     """
     _, joined = join_seams(vertices.detach().cpu().numpy(), faces.cpu().numpy())
     split, welded = half_edges(faces.cpu().numpy()), half_edges(joined).astype(np.int64)
-    keys = welded.min(1) * (joined.max() + 1) + welded.max(1)
+    keys = edge_keys(welded)
     order = np.argsort(keys, kind="stable")
     _, firsts, uses = np.unique(keys[order], return_index=True, return_counts=True)
     one, other = order[firsts[uses == 2]], order[firsts[uses == 2] + 1]
