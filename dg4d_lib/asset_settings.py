@@ -200,4 +200,12 @@ class AssetSettings(Settings):
     bending: NotNegative = Field(0.1, description="differences of neighboring rotations, times `rigidity`")
     inertia: NotNegative = Field(0.002, description="distance to the extrapolated motion while tracking")
     smoothness: NotNegative = Field(0.1, description="accelerations in the joint fit")
-    depth: NotNegative = Field(0.005, description="displacements along the viewing direction")
+    depth: NotNegative = Field(0.001, description="displacements along the viewing direction")
+    whole_depth: NotNegative = Field(
+        0.15, description="displacement of the whole along the viewing direction, which a video hardly shows"
+    )
+    across: NotNegative = Field(
+        0.15,
+        description="displacements across the upright mirror plane of the model: legs and lids swing in it, "
+        "which tells how far they move in depth; without such a plane, this is not used",
+    )

@@ -2,7 +2,7 @@
 
 The frames are tracked one after the other, by optical flow (`flow_tracking`) or by descent, then all are refined
 together. An as-rigid-as-possible energy (Sorkine and Alexa 2007), robust so that joints may bend, decides what the
-video leaves open; accelerations and displacements in depth are penalized.
+video leaves open; accelerations, and displacements in depth and out of the plane of symmetry, are penalized.
 """
 
 import math
@@ -18,12 +18,13 @@ from torch.nn import functional
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.fitting.flow_tracking import DEPTH_SLACK, FlowTracker
+from dg4d_lib.fitting.flow_tracking import DEPTH_SLACK, FlowTracker, across_weight
 from dg4d_lib.fitting.losses import WHITE, check_finite, resize_cutouts
 from dg4d_lib.fitting.node_pose import Pose
 from dg4d_lib.fitting.tracking_order import tracking_orders
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.transform import thinned
+from dg4d_lib.geometry.mirror import mirror_normal
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
 from dg4d_lib.images import luminance
 from dg4d_lib.mesh.models.control_graph import ControlGraph
@@ -37,7 +38,6 @@ FLOW_UNIT = 0.02  # of the picture's side: error of the flow up to which its los
 MATCH_ITERATIONS = 80  # of the colors at the first frame
 MATCH_LR = (0.05, 0.1, 0.01)  # of harmonics, opacities and sizes
 ROBUST = 0.05  # relative stretch up to which the rigidity is quadratic
-WHOLE_DEPTH = 30.0  # weight of the mean displacement in depth, which a video hardly shows, times that of every node's
 SMALLEST_REAL = 0.05  # part of a quaternion: turns by half a circle have no vector
 BETA1, BETA2 = 0.9, 0.99  # of Adam
 FACTORS = {"turns": 6.0, "shifts": 3.0, "whole_turns": 2.0, "whole_shifts": 1.0}  # of the learning rate, per variable
@@ -98,6 +98,7 @@ def fit_asset_motion(
     settings: AssetSettings,
     generator: torch.Generator,
     report: Report = lambda iteration, values: None,
+    surface: Float[np.ndarray, "p 3"] | None = None,
 ) -> NodeMotion:
     """Fit the motion of a placed model to a video of the camera at azimuth and elevation 0.
 
@@ -109,11 +110,14 @@ def fit_asset_motion(
         settings: of the fit.
         generator: draws the frames of joint iterations.
         report: called after every iteration with (iterations done, named losses).
+        surface: points of the model's surface at rest, whose mirror plane counts; None: the means of the Gaussians.
 
     Raises:
         FitDiverged: the loss became non-finite.
     """
-    fit = _Fit(*_thinned(cloud, graph, settings.fit_points), video, rasterize, settings)
+    surface = cloud.means.double().numpy(force=True) if surface is None else surface
+    normal = mirror_normal(surface) if settings.across else None
+    fit = _Fit(*_thinned(cloud, graph, settings.fit_points), video, rasterize, settings, normal)
     frames, done = len(video), settings.track_iterations * len(video)
     track = _followed if settings.tracking == "flow" else _descended
     unknowns = _Unknowns.joined(track(fit, video, settings, report))
@@ -140,7 +144,7 @@ def iterations(settings: AssetSettings, frames: int) -> int:
 
 def _followed(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list["_Unknowns"]:
     """Track the frames by optical flow, loops from both ends; return their variables."""
-    tracker = FlowTracker(fit.cloud, fit.graph, fit.colors, fit.alphas, fit.rasterize, settings)
+    tracker = FlowTracker(fit.cloud, fit.graph, fit.colors, fit.alphas, fit.rasterize, settings, fit.normal)
     poses = {0: tracker.placed(Pose.rest(len(fit.graph.nodes)))}
     fit.match_first_frame(poses[0])
     tracker.cloud = fit.cloud
@@ -188,7 +192,9 @@ class _Fit:
         video: DrivingVideo,
         rasterize: Rasterizer,
         settings: AssetSettings,
+        normal: Float[np.ndarray, " 3"] | None,
     ) -> None:
+        self.normal = normal  # of the mirror plane
         self.camera = replace(OrbitCamera(), width=settings.size, height=settings.size)
         self.plain, self.graph = cloud.detach(), graph
         self.cloud = antialiased(self.plain, self.camera)
@@ -242,13 +248,17 @@ class _Fit:
         rendering = self.rasterize(states, [self.camera] * count, means.new_tensor(WHITE))
         color = _pyramid_error(rendering.color, self.colors[frames]) / self.area
         alpha = _pyramid_error(rendering.alpha, self.alphas[frames]) / self.area
-        depth = self.relative(motion.nodes(self.graph)[..., 2] - self.graph.nodes[:, 2])
-        depth = depth.square().mean() + WHOLE_DEPTH * depth.mean(-1).square().mean()
+        shifts = self.relative(motion.nodes(self.graph) - self.graph.nodes)
+        depth = shifts[..., 2]
+        unseen = settings.depth * depth.square().mean() + settings.whole_depth * depth.mean(-1).square().mean()
+        if self.normal is not None:
+            across = (shifts @ torch.from_numpy(self.normal).to(shifts)).square().mean()
+            unseen = unseen + across_weight(settings, self.normal) * across
         return {
             "color": settings.color_weight * color,
             "alpha": settings.alpha_weight * alpha,
             "rigidity": settings.rigidity * self.rigidity(motion),
-            "depth": settings.depth * depth,
+            "unseen": unseen,
         }
 
     @torch.no_grad()

@@ -37,8 +37,7 @@ FLOW_UNIT = 0.01  # of the picture's side: error of the flow up to which its los
 ROBUST = 0.02  # relative stretch, or radians, up to which the rigidity is quadratic
 DEPTH_SLACK = 0.05  # world units by which a Gaussian may lie behind the visible surface
 STILL = 0.15  # weight of the last frame's place beside that of the extrapolated one
-DEPTH = 0.1  # of `asset.depth`, which suits the refinement
-WHOLE_DEPTH = 30.0  # weight of the mean displacement in depth, which a video hardly shows, times that of every node's
+UNSEEN = 0.1  # of the weights of displacements that a video hardly shows; they suit the refinement
 GAIN = 0.02  # by which another start must lower the error
 LOST, JUMP = 0.1, 1.3  # error, and its growth since the last frame, from which parts are searched
 AGREEMENT = 0.9  # IoU of outlines at the first frame from which the model is at rest there
@@ -74,6 +73,7 @@ class FlowTracker:
         alphas: Float[Tensor, "t s s 1"],
         rasterize: Rasterizer,
         settings: AssetSettings,
+        normal: Float[np.ndarray, " 3"] | None = None,
     ) -> None:
         """Store the model and the frames.
 
@@ -84,8 +84,9 @@ class FlowTracker:
             alphas: of the frames.
             rasterize: rasterizer.
             settings: of the fit.
+            normal: of the model's mirror plane, in which it moves; None if it has none.
         """
-        self.cloud = cloud
+        self.cloud, self._normal = cloud, normal
         self._graph, self._rasterize, self._settings = graph, rasterize, settings
         self._alphas, self._frames = alphas, torch.cat([colors, alphas], -1)
         self._camera = replace(OrbitCamera(), width=settings.size, height=settings.size)
@@ -247,11 +248,17 @@ class FlowTracker:
             blocks = np.zeros((count, 1, 3, 6))
             blocks[..., 3:] = scale * np.eye(3)
             terms.append((_rows(blocks, np.arange(count)[:, None], count), ((pose.shifts - target) * scale).ravel()))
-        depth = np.zeros((count, 1, 1, 6))
-        depth[..., 5] = scale = np.sqrt(DEPTH * settings.depth / count) / self._unit
-        terms.append((_rows(depth, np.arange(count)[:, None], count), pose.shifts[:, 2] * scale))
-        depth[..., 5] = scale = np.sqrt(WHOLE_DEPTH * DEPTH * settings.depth) / count / self._unit
-        terms.append((_rows(depth[None, :, 0], np.arange(count)[None], count), pose.shifts[:, 2:].sum(0) * scale))
+        unseen = [(np.array([0.0, 0.0, 1.0]), settings.depth)]
+        if self._normal is not None:
+            unseen.append((self._normal, across_weight(settings, self._normal)))
+        for direction, weight in unseen:
+            scale = np.sqrt(UNSEEN * weight / count) / self._unit
+            blocks = np.zeros((count, 1, 1, 6))
+            blocks[..., 3:] = scale * direction
+            terms.append((_rows(blocks, np.arange(count)[:, None], count), pose.shifts @ direction * scale))
+        depth = np.zeros((1, count, 1, 6))
+        depth[..., 5] = scale = np.sqrt(UNSEEN * settings.whole_depth) / count / self._unit
+        terms.append((_rows(depth, np.arange(count)[None], count), pose.shifts[:, 2:].sum(0) * scale))
         matrix = vstack([rows for rows, _ in terms], format="csr")
         normal = (matrix.T @ matrix).toarray()
         normal[np.diag_indices(6 * count)] += 1e-9
@@ -299,6 +306,14 @@ class FlowTracker:
         blocks = np.stack([np.concatenate([-unit, none], -1), np.concatenate([unit, none], -1)], 1)
         terms.append((_rows(blocks, self._edges, count), (bend * scale[:, None]).ravel()))
         return terms
+
+
+def across_weight(settings: AssetSettings, normal: Float[np.ndarray, " 3"]) -> float:
+    """Return the weight of displacements across the mirror plane: the less, the more it is seen edge-on.
+
+    The picture shows displacements across such a plane, and the plane does not tell their depth.
+    """
+    return float(settings.across * normal[2] ** 2)
 
 
 def _features(pictures: Float[Tensor, "t s s 3"], alphas: Float[Tensor, "t s s 1"]) -> Float[Tensor, "t 4 h w"]:

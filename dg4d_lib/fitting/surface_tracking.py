@@ -26,6 +26,8 @@ DESCENT = AssetSettings(  # for surfaces that are guesses: what flow takes for c
     rigidity=0.3,
     inertia=0.02,
     smoothness=0.02,
+    depth=0.005,
+    across=0.0,
 )
 CELL = 0.02  # world units: vertices in one cell move alike; distances along a finer surface take a minute
 
@@ -100,7 +102,9 @@ def track_vertices(
     for chosen in tracking_orders(video, reference_frame):
         if len(chosen) > 1:
             part = DrivingVideo(video.frames[chosen], video.alpha[chosen], video.fps)
-            motion = fit_asset_motion(gaussians, graph.of(nearest), part, rasterize, settings, generator, report)
+            motion = fit_asset_motion(
+                gaussians, graph.of(nearest), part, rasterize, settings, generator, report, points
+            )
             for number, frame in enumerate(chosen[1:], 1):
                 moved[frame] = motion.at(slice(number, number + 1)).points(vertices, bound)[0]
     return moved

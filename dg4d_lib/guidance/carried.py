@@ -1,20 +1,26 @@
 """Shapes of later frames: that of the first frame, carried along by the motion of the video, and the own guess.
 
-Every pixel of a later frame takes along what lies behind it at the first frame, at the same depths: exact for motions
-in the image plane. Where the video is followed badly, the frame's own guess is left.
+Every pixel of a later frame takes along what lies behind it at the first frame. Depths stay, which is exact for motions
+in the image plane, or change as motions in a known upright plane do. Where the video is followed badly, the frame's own
+guess is left.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dg4d_lib.cameras.orbit import RADIUS
 from dg4d_lib.shape_prior.field import Fields, ShapeField, bounded_logits, premultiplied
+from dg4d_lib.shape_prior.frustum import TAN_HALF_FOV
+from dg4d_lib.shape_prior.raymarch import CELL
 from dg4d_lib.video.first_frame import Correspondence, match_first_frame, strain
 
+EDGE_ON = 0.1  # damps depths of motions in planes that are seen edge-on
 MOST_STRAIN = 0.15  # of the picture, at which the share of a guessed first frame falls to 1/e
 
 
@@ -27,6 +33,7 @@ class CarriedFields:
         first: ShapeField,
         cutouts: Sequence[Float[Tensor, "h w 4"]],
         most_strain: float = math.inf,
+        normal: Float[np.ndarray, " 3"] | None = None,
     ) -> None:
         """Follow the video.
 
@@ -36,8 +43,9 @@ class CarriedFields:
             cutouts: one per frame: square, straight alpha, color and alpha in [0, 1].
             most_strain: of the picture, at which the share of the first frame falls to 1/e. Parts that turn in depth
                 are foreshortened; a first frame that is a guess too says no more of them than the own guess.
+            normal: horizontal unit vector across the plane in which parts move; None: that of the image.
         """
-        self._guess, self._first, self._most_strain = guess, first, most_strain
+        self._guess, self._first, self._most_strain, self._normal = guess, first, most_strain, normal
         self._matches = match_first_frame([premultiplied(cutout) for cutout in cutouts])
 
     def __len__(self) -> int:
@@ -50,7 +58,7 @@ class CarriedFields:
             BadInput: the frame shows no subject.
         """
         own, match = self._guess.predict(frame), self._matches[frame]
-        carried, share = carry(self._first, match), match.trust
+        carried, share = carry(self._first, match, self._normal), match.trust
         if math.isfinite(self._most_strain):
             share = share * torch.exp(-(strain(match, own.mask) / self._most_strain).square())
         logits = own.logits + share[..., None] * (carried.logits - own.logits)
@@ -59,8 +67,32 @@ class CarriedFields:
         return replace(own, logits=logits, hidden=hidden, generosity=self._first.generosity)
 
 
-def carry(field: ShapeField, match: Correspondence) -> ShapeField:
-    """Return the field of the first frame at another one; the picture and its mask stay."""
-    logits = match.warp(field.logits.permute(2, 0, 1)).permute(1, 2, 0)
-    hidden = match.warp(field.hidden.flatten(2).permute(2, 0, 1)).permute(1, 2, 0)
-    return replace(field, logits=logits, hidden=hidden.unflatten(2, field.hidden.shape[2:]))
+def carry(field: ShapeField, match: Correspondence, normal: Float[np.ndarray, " 3"] | None = None) -> ShapeField:
+    """Return the field of the first frame at another one; the picture and its mask stay.
+
+    Args:
+        field: of the first frame.
+        match: of the other one.
+        normal: horizontal unit vector across the plane in which parts move; None: they keep their depths.
+    """
+    planes = torch.cat([field.logits[..., None], field.hidden], -1).permute(2, 3, 0, 1)  # depth c h w
+    moved = match.warp(planes.flatten(0, 1)).unflatten(0, planes.shape[:2])
+    if normal is not None:
+        moved = _deepened(moved, match, normal)
+    logits, hidden = moved.permute(2, 3, 0, 1).split([1, 3], -1)
+    return replace(field, logits=logits[..., 0], hidden=hidden)
+
+
+def _deepened(
+    planes: Float[Tensor, "d c h w"], match: Correspondence, normal: Float[np.ndarray, " 3"]
+) -> Float[Tensor, "d c h w"]:
+    """Return planes by depth, moved in depth as far as a sideways motion in an upright plane does."""
+    depths, width = len(planes), planes.shape[-1]
+    across, _, along = normal
+    sideways = (torch.arange(width) - match.places[..., 1]) * (2 * RADIUS * TAN_HALF_FOV / width)
+    nearer = -float(across * along / (along**2 + EDGE_ON)) * sideways
+    cells = torch.arange(depths)[:, None, None] + nearer / CELL
+    low = cells.floor().clamp(0, depths - 2).long()
+    share = (cells - low).clamp(0, 1)[:, None]
+    low = low[:, None].expand_as(planes)
+    return planes.gather(0, low) * (1 - share) + planes.gather(0, low + 1) * share

@@ -11,22 +11,32 @@ from dg4d_lib.images import over_background
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.visual_hull.known import KnownView
-from dg4d_lib.visual_hull.shape import known_surface
+from dg4d_lib.visual_hull.probable import Predict
+from dg4d_lib.visual_hull.shape import known_volume
+from dg4d_lib.visual_hull.surface import colored_surface
 
 
 class KnownShapes:
     """Shapes per frame: from known views where a frame has some, else a guess."""
 
-    def __init__(self, guess: SubjectShapes, known: Mapping[int, Sequence[KnownView]]) -> None:
+    def __init__(
+        self,
+        guess: SubjectShapes,
+        known: Mapping[int, Sequence[KnownView]],
+        predict: Predict | None = None,
+        surfaces: Mapping[int, InflatedSurface] | None = None,
+    ) -> None:
         """Store the views.
 
         Args:
             guess: shapes of frames without known views.
             known: views by frame, the input view first.
+            predict: tells the shape behind each of their pictures; see `known_volume`.
+            surfaces: of some of these frames, where they are made already.
         """
-        self._guess = guess
+        self._guess, self._predict = guess, predict
         self._known = {frame: tuple(views) for frame, views in known.items()}
-        self._surfaces: dict[int, InflatedSurface] = {}
+        self._surfaces = dict(surfaces or {})
 
     @property
     def guess(self) -> SubjectShapes:
@@ -47,7 +57,8 @@ class KnownShapes:
         if frame not in self._known:
             return self._guess.surface(frame)
         if frame not in self._surfaces:
-            self._surfaces[frame] = known_surface(self._known[frame])
+            views = self._known[frame]
+            self._surfaces[frame] = colored_surface(known_volume(views, self._predict), views)
         return self._surfaces[frame]
 
     def clean(self, views: Sequence[GuidanceView]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:

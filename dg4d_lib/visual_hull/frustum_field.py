@@ -1,4 +1,4 @@
-"""Hull of known views on the rays of the input camera, as the shape prior describes a subject."""
+"""Shape of known views on the rays of the input camera, as the shape prior describes a subject."""
 
 from collections.abc import Sequence
 
@@ -22,20 +22,19 @@ from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV
 from dg4d_lib.shape_prior.raymarch import CELL
 from dg4d_lib.visual_hull.carve import Volume
 from dg4d_lib.visual_hull.known import KnownView
-from dg4d_lib.visual_hull.shape import known_volume
-from dg4d_lib.visual_hull.surface import colored_surface
 
 SOFTNESS = 0.01  # world units: distance to the surface at which the log-odds of matter are 1
 
 
-def known_field(views: Sequence[KnownView]) -> ShapeField:
-    """Return the hull of views of one moment on the rays of the input view, which is the first of them.
+def known_field(views: Sequence[KnownView], volume: Volume, surface: InflatedSurface) -> ShapeField:
+    """Return the shape of a subject on the rays of the input view.
 
-    Raises:
-        BadInput: the views have no common shape.
+    Args:
+        views: of one moment, the input view first.
+        volume: their shape; see `known_volume`.
+        surface: of the volume, colored.
     """
-    volume, picture = known_volume(views), premultiplied(views[0].cutout)
-    surface = colored_surface(volume, views)
+    picture = premultiplied(views[0].cutout)
     logits, mask = _sampled(volume, cell_centers()) / SOFTNESS, picture_mask(picture)
     color, hidden = straight_color(picture), _nearest_colors(surface)
     return ShapeField(bounded_logits(logits, mask), color, hidden, mask, 0.0, generosity=0.0)

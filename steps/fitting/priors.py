@@ -5,6 +5,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
@@ -17,6 +18,7 @@ from dg4d_lib.diffusion.depth import DepthEstimator
 from dg4d_lib.diffusion.pipelines import is_flow_matching
 from dg4d_lib.errors import BadInput
 from dg4d_lib.fitting.static import RADIUS_JITTER
+from dg4d_lib.geometry.mirror import mirror_normal
 from dg4d_lib.guidance.analytic import AnalyticPrior
 from dg4d_lib.guidance.carried import MOST_STRAIN, CarriedFields
 from dg4d_lib.guidance.distillation import TimestepSchedule
@@ -46,6 +48,8 @@ from dg4d_lib.shape_prior import packaged
 from dg4d_lib.shape_prior.field import Fields, InflatedFields, ShapeField, ShapeFields
 from dg4d_lib.visual_hull.frustum_field import known_field
 from dg4d_lib.visual_hull.known import KnownView, known_view
+from dg4d_lib.visual_hull.shape import known_volume
+from dg4d_lib.visual_hull.surface import colored_surface
 from dg4d_lib.weights.registry import lookup_weights
 from steps.artifacts.archives import unpack
 from steps.artifacts.depth_fields import read_depth_field
@@ -187,9 +191,14 @@ def subject_shapes(
     """
     frames = [frame for frame in sides.frames if frame < len(cutouts)] if sides else []
     known = {frame: [known_view(cutouts[frame]), *known_views(sides, frame)] for frame in frames if sides}
+    predict = _predicted_logits if isinstance(settings, LearnedPriorSettings) else None
     shapes: SubjectShapes
+    surfaces = {}
     if 0 in known and len(cutouts) > 1:
-        shapes = _carried_shapes(settings, cutouts, hint, known_field(known[0]))
+        volume = known_volume(known[0], predict)
+        surfaces[0] = colored_surface(volume, known[0])
+        first, normal = known_field(known[0], volume, surfaces[0]), mirror_normal(surfaces[0].vertices.double().numpy())
+        shapes = _carried_shapes(settings, cutouts, hint, first, normal)
         shapes = shapes if moved is None else MixedShapes(moved, shapes, CARRIED_SHARE)
     elif isinstance(settings, LearnedPriorSettings):
         shapes = LearnedShapes(learned_fields(cutouts, hint), settings)
@@ -199,17 +208,27 @@ def subject_shapes(
         if own.depth_weights and sides is None and not hint.sigma:
             depth = DepthEstimator.load(open_weights(own.depth_weights).folder, default_device())
         shapes = InflatedSurfaces(cutouts, own, hint, depth)
-    return KnownShapes(shapes, known) if sides else shapes
+    return KnownShapes(shapes, known, predict, surfaces) if sides else shapes
+
+
+def _predicted_logits(cutout: Float[Tensor, "h w 4"]) -> Float[Tensor, "128 128 64"]:
+    """Return the log-odds of matter that the shape network predicts behind one picture."""
+    return ShapeFields(packaged.packaged_network(), [cutout]).predict(0).logits
 
 
 def _carried_shapes(
-    settings: PriorSettings, cutouts: Sequence[Float[Tensor, "h w 4"]], hint: DepthHint, first: ShapeField
+    settings: PriorSettings,
+    cutouts: Sequence[Float[Tensor, "h w 4"]],
+    hint: DepthHint,
+    first: ShapeField,
+    normal: Float[np.ndarray, " 3"] | None,
 ) -> LearnedShapes:
-    """Return the shapes of later frames from the known one of the first frame and a guess per frame."""
+    """Return the shapes of later frames from that of the first one, the normal of its mirror plane and own guesses."""
     guess: Fields = InflatedFields(cutouts)
     if isinstance(settings, LearnedPriorSettings):
         guess = ShapeFields(packaged.packaged_network(), cutouts, hint)
-    return LearnedShapes(CarriedFields(guess, first, cutouts), LearnedPriorSettings(contrast=CARRIED_CONTRAST))
+    carried = CarriedFields(guess, first, cutouts, normal=normal)
+    return LearnedShapes(carried, LearnedPriorSettings(contrast=CARRIED_CONTRAST))
 
 
 def learned_fields(cutouts: Sequence[Float[Tensor, "h w 4"]], hint: DepthHint) -> Fields:

@@ -12,10 +12,11 @@ from dg4d_lib.inflation.hints import DepthHint
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import GeometricPriorSettings, LearnedPriorSettings, MotionSettings, PriorSettings
 from dg4d_lib.video.driving import DrivingVideo
+from dg4d_lib.visual_hull.shape import ALL_AROUND
 from steps.fitting.priors import subject_shapes
 
 TRACKED_NOTE = "motion of unseen sides: the surface of the known views, moved as the video shows it"
-ALL_AROUND = 12  # known views of one frame from which limbs of their hull are apart
+SOFT = DESCENT.model_copy(update={"across": AssetSettings().across})
 
 
 def tracks_surface(settings: MotionSettings, prior: PriorSettings, known: Bank | None, frames: int) -> bool:
@@ -33,7 +34,7 @@ def tracks_surface(settings: MotionSettings, prior: PriorSettings, known: Bank |
 
 def tracking_of(known: Bank) -> AssetSettings:
     """Return how the surface of known views is tracked: where limbs are apart, by optical flow as a user's model is."""
-    return AssetSettings() if len(known.cameras) >= ALL_AROUND else DESCENT
+    return AssetSettings() if len(known.cameras) >= ALL_AROUND else SOFT
 
 
 def tracked_shapes(

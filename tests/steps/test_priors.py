@@ -31,6 +31,7 @@ from dg4d_lib.shape_prior import packaged
 from steps.artifacts.depth_fields import read_depth_field, write_depth_field
 from steps.artifacts.media import write_png, write_zip
 from steps.artifacts.pose import Pose, write_pose
+from steps.fitting import priors
 from steps.fitting.priors import (
     LoadedPrior,
     make_oracle_prior,
@@ -151,6 +152,22 @@ def test_known_views_of_the_first_frame_guide_all_frames(
     _, between = mixed.prior.clean([GuidanceView(camera, 1)])
     assert float((between[0] - cover[1]).abs().max()) > 0.1  # pulled towards the tracked shape, which stands still
     assert bool(mixed.report("cpu").weights) == learned
+
+
+@pytest.mark.parametrize("settings", [GeometricPriorSettings(size=32), LearnedPriorSettings()])
+def test_the_shape_network_takes_away_what_few_views_allow(
+    settings: GeometricPriorSettings | LearnedPriorSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    near = torch.where(torch.arange(64) < 32, 5.0, -5.0).expand(128, 128, 64)  # matter lies in front, in both views
+    monkeypatch.setattr(priors, "_predicted_logits", lambda cutout: near)
+    alpha = torch.zeros(64, 64, 1)
+    alpha[20:44, 20:44] = 1
+    cutout = torch.cat([torch.full((64, 64, 3), 0.4), alpha], -1)
+    sides = Bank((OrbitCamera(0, 90, width=64, height=64),), (0,), (cutout * 255).to(torch.uint8)[None, None])
+    vertices = subject_shapes(settings, [cutout], sides=sides).surface(0).vertices
+    far, close = vertices[:, [0, 2]].sum(1).aminmax()
+    cut = isinstance(settings, LearnedPriorSettings)  # the corner far from both cameras
+    assert (float(-far) < 0.85 * float(close)) == cut
 
 
 @pytest.mark.parametrize(("count", "tracking"), [(3, "descent"), (16, "flow")])

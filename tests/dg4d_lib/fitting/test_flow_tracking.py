@@ -16,7 +16,7 @@ from dg4d_lib.mesh.models.control_graph import graph_of_points, point_graph
 from dg4d_lib.rasterizer.interface import get_rasterizer
 
 SIZE = 64
-SETTINGS = AssetSettings(size=SIZE, nodes=40, inertia=0.0, depth=0.0)
+SETTINGS = AssetSettings(size=SIZE, nodes=40, inertia=0.0, depth=0.0, whole_depth=0.0)
 
 
 def cloud_of(points: np.ndarray, colors: np.ndarray) -> Gaussians:
@@ -42,7 +42,7 @@ def scene() -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def tracker_of(moved: np.ndarray, settings: AssetSettings = SETTINGS) -> FlowTracker:
+def tracker_of(moved: np.ndarray, settings: AssetSettings = SETTINGS, normal: np.ndarray | None = None) -> FlowTracker:
     """Return a tracker of the scene whose second frame shows moved points."""
     points, colors = scene()
     drawn = [
@@ -51,7 +51,7 @@ def tracker_of(moved: np.ndarray, settings: AssetSettings = SETTINGS) -> FlowTra
     ]
     graph = graph_of_points(points, point_graph(points), settings.nodes)
     frames, alphas = (torch.cat([getattr(one, name) for one in drawn]) for name in ("color", "alpha"))
-    return FlowTracker(cloud_of(points, colors), graph, frames, alphas, get_rasterizer("cpu"), settings)
+    return FlowTracker(cloud_of(points, colors), graph, frames, alphas, get_rasterizer("cpu"), settings, normal)
 
 
 def test_gauss_newton_recovers_a_rigid_motion_from_exact_pixels() -> None:
@@ -120,6 +120,19 @@ def test_depth_is_not_extrapolated() -> None:
     for _ in range(5):
         pose = tracker._solved(pose, nothing, expected, rest)
     np.testing.assert_allclose(pose.shifts.mean(0), (0.1 / 1.15, 0, 0), atol=1e-4)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_mirror_plane_tells_depth(side: float) -> None:
+    points, _ = scene()
+    for normal, depth in ((None, 0.0), (np.array([1.0, 0, -side]) / 2**0.5, 0.08 * side)):
+        tracker = tracker_of(points, SETTINGS.model_copy(update={"across": 10.0}), normal)
+        pixels, _, slope = tracker._projected(points)
+        targets = _Targets(np.arange(len(points)), pixels + slope @ (0.08, 0.05, 0), np.ones(len(points)))
+        pose = rest = Pose.rest(len(tracker._nodes))
+        for _ in range(8):
+            pose = tracker._solved(pose, targets, rest, rest)
+        np.testing.assert_allclose(pose.shifts.mean(0), (0.08, 0.05, depth), atol=0.02)
 
 
 @pytest.mark.parametrize("agrees", [True, False])

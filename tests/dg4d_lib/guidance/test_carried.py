@@ -2,16 +2,19 @@
 
 import math
 
+import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.guidance.carried import CarriedFields
+from dg4d_lib.guidance.carried import EDGE_ON, CarriedFields, carry
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.learned import LearnedShapes
 from dg4d_lib.settings import LearnedPriorSettings
 from dg4d_lib.shape_prior.field import LARGEST_LOGIT, InflatedFields, ShapeField, bounded_logits
-from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE
+from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV
+from dg4d_lib.video.first_frame import Correspondence
 
 BLUE, YELLOW = torch.tensor([0.1, 0.1, 0.9]), torch.tensor([0.9, 0.8, 0.1])
 MIDDLE = (SIZE - 1) / 2
@@ -113,3 +116,21 @@ class _Known:
 
     def predict(self, frame: int) -> ShapeField:
         return self._field
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_sideways_motion_in_an_upright_plane_is_one_in_depth(side):
+    pixels = torch.stack(torch.meshgrid(*[torch.arange(SIZE).float()] * 2, indexing="ij"), -1)
+    shifted = 12
+    match = Correspondence(pixels - torch.tensor([0.0, shifted]), torch.ones(SIZE, SIZE))
+    normal = np.array([side, 0, 1.0]) / 2**0.5
+    still, moved = (carry(box(0), match, one) for one in (None, normal))
+    row, column = SIZE // 2, SIZE // 2 - 20 + shifted  # of the near half
+    away = side * shifted * 4 * TAN_HALF_FOV / SIZE * 0.5 / (0.5 + EDGE_ON)
+    before, after = (DEPTHS[field.logits[row, column] > 0] for field in (still, moved))
+    assert before.min() < 1.75 and before.max() > 2.35
+    cell = (FAR - NEAR) / BINS
+    assert (
+        abs(float(after.min() - before.min()) - away) <= cell and abs(float(after.max() - before.max()) - away) <= cell
+    )
+    assert (moved.hidden[row, column] - BLUE).abs().max() < 1e-5

@@ -8,6 +8,9 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.visual_hull.known import KnownView
+from dg4d_lib.visual_hull.probable import Predict
+from dg4d_lib.visual_hull.shape import known_volume
+from dg4d_lib.visual_hull.surface import colored_surface
 
 SIZE = 96
 PARTS = (  # center, radii, color
@@ -47,3 +50,8 @@ def ring(count: int, surface: InflatedSurface | None = None) -> list[KnownView]:
 def alpha_of(surface: InflatedSurface, azimuth: float) -> Tensor:
     """Return the alpha of a surface from an azimuth."""
     return seen(surface, azimuth).cutout[None, ..., 3:]
+
+
+def known_surface(views: list[KnownView], predict: Predict | None = None) -> InflatedSurface:
+    """Return the colored surface of views."""
+    return colored_surface(known_volume(views, predict), views)

@@ -1,11 +1,10 @@
 import pytest
 import torch
-from creatures import alpha_of, creature, ring, seen
+from creatures import alpha_of, creature, known_surface, ring, seen
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.metrics.image import iou
 from dg4d_lib.visual_hull.carve import hull, margins_of
-from dg4d_lib.visual_hull.shape import known_surface
 
 
 def test_the_surface_never_leaves_the_hull():
