@@ -36,6 +36,7 @@ FOLLOWED = 1500  # largest number of Gaussians that follow the flow
 FLOW_UNIT = 0.01  # of the picture's side: error of the flow up to which its loss is quadratic
 ROBUST = 0.02  # relative stretch, or radians, up to which the rigidity is quadratic
 DEPTH_SLACK = 0.05  # world units by which a Gaussian may lie behind the visible surface
+SLANTED = 0.5  # cosine of normal and line of sight from which a mirror plane counts fully
 STILL = 0.15  # weight of the last frame's place beside that of the extrapolated one
 UNSEEN = 0.1  # of the weights of displacements that a video hardly shows; they suit the refinement
 GAIN = 0.02  # by which another start must lower the error
@@ -309,11 +310,11 @@ class FlowTracker:
 
 
 def across_weight(settings: AssetSettings, normal: Float[np.ndarray, " 3"]) -> float:
-    """Return the weight of displacements across the mirror plane: the less, the more it is seen edge-on.
+    """Return the weight of displacements across the mirror plane, less where it is seen nearly edge-on.
 
-    The picture shows displacements across such a plane, and the plane does not tell their depth.
+    The picture shows displacements across such a plane, and the plane does not tell depth.
     """
-    return float(settings.across * normal[2] ** 2)
+    return float(settings.across * min(1.0, (normal[2] / SLANTED) ** 2))
 
 
 def _features(pictures: Float[Tensor, "t s s 3"], alphas: Float[Tensor, "t s s 1"]) -> Float[Tensor, "t 4 h w"]:

@@ -8,7 +8,7 @@ import torch
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.fitting.flow_tracking import FlowTracker, _Targets
+from dg4d_lib.fitting.flow_tracking import FlowTracker, _Targets, across_weight
 from dg4d_lib.fitting.node_pose import Pose
 from dg4d_lib.fitting.part_search import find_parts
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -152,3 +152,11 @@ def test_poses_continue_at_half_their_speed() -> None:
     found = rest.continued(Pose(pair[0], np.array([[0.2, 0, 0]])))
     np.testing.assert_allclose(found.turns, pair[1], atol=1e-4)
     np.testing.assert_allclose(found.shifts, [[0.3, 0, 0]])
+
+
+def test_a_mirror_plane_that_is_seen_edge_on_tells_nothing() -> None:
+    angles = np.deg2rad([0, 60, 75, 90])
+    weights = [across_weight(SETTINGS, np.array([np.sin(angle), 0, np.cos(angle)])) for angle in angles]
+    assert weights[:2] == pytest.approx([SETTINGS.across] * 2)
+    assert weights[2] == pytest.approx(SETTINGS.across * (np.cos(angles[2]) / 0.5) ** 2)
+    assert weights[3] == pytest.approx(0, abs=1e-9)
