@@ -151,7 +151,7 @@ def test_the_tracked_surface_of_known_views_guides_later_frames(
 ):
     write_bank(tmp_path / "known.zip", [[known_view(disc(), 90.0)]], tmp_path)
     small = {"track_iterations": 2, "joint_iterations": 1, "nodes": 8, "size": 32}
-    monkeypatch.setattr(tracking, "DESCENT", tracking.DESCENT.model_copy(update=small))
+    monkeypatch.setattr(tracking, "SOFT", tracking.SOFT.model_copy(update=small))
     settings = revise(SMALL, {"motion.track_surface": True})
     statics = job(tmp_path, fit_settings(), {"subject": subject}, STATIC)
     fit_gaussians.run(statics)
