@@ -12,7 +12,7 @@ from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.visual_hull.known import KnownView
 from dg4d_lib.visual_hull.probable import Predict
-from dg4d_lib.visual_hull.shape import known_volume
+from dg4d_lib.visual_hull.shape import known_volume, leaves_doubt
 from dg4d_lib.visual_hull.surface import colored_surface
 
 
@@ -42,6 +42,11 @@ class KnownShapes:
     def guess(self) -> SubjectShapes:
         """Shapes of the other frames."""
         return self._guess
+
+    @property
+    def has_predictions(self) -> bool:
+        """True if what is predicted behind the pictures counts at some frame."""
+        return self._predict is not None and any(leaves_doubt(views) for views in self._known.values())
 
     @property
     def frames(self) -> tuple[int, ...]:

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn.functional import grid_sample
@@ -67,7 +67,7 @@ def _seen(
     return found, row * SIZE + column
 
 
-def _smoothed(values: Float[Tensor, " n"], places: Tensor) -> Float[Tensor, " n"]:
+def _smoothed(values: Float[Tensor, " n"], places: Bool[Tensor, "x y z"]) -> Float[Tensor, " n"]:
     """Return values at some places of a grid, averaged with those of neighboring places."""
     inside = places.numpy()
     total, share = np.zeros(inside.shape, np.float32), inside.astype(np.float32)

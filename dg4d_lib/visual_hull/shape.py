@@ -22,8 +22,18 @@ def known_volume(views: Sequence[KnownView], predict: Predict | None = None) -> 
     Raises:
         BadInput: the views have no common shape.
     """
-    carving = [view for view in views if view.weight >= CARVES]
+    carving = _carving(views)
     volume = hull(carving, CELLS)
     if not shows_sides(carving, SIDE_DEG):
         return bounded(volume, carving, fitting_turn(carving))
-    return volume if predict is None or len(carving) > ALL_AROUND else probable(volume, views, predict)
+    return probable(volume, views, predict) if predict is not None and leaves_doubt(views) else volume
+
+
+def leaves_doubt(views: Sequence[KnownView]) -> bool:
+    """Return True if views bound the hull on all sides, but are few: a prediction then counts."""
+    carving = _carving(views)
+    return shows_sides(carving, SIDE_DEG) and len(carving) <= ALL_AROUND
+
+
+def _carving(views: Sequence[KnownView]) -> list[KnownView]:
+    return [view for view in views if view.weight >= CARVES]

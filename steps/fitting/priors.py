@@ -48,7 +48,7 @@ from dg4d_lib.shape_prior import packaged
 from dg4d_lib.shape_prior.field import Fields, InflatedFields, ShapeField, ShapeFields
 from dg4d_lib.visual_hull.frustum_field import known_field
 from dg4d_lib.visual_hull.known import KnownView, known_view
-from dg4d_lib.visual_hull.shape import ALL_AROUND, known_volume
+from dg4d_lib.visual_hull.shape import known_volume
 from dg4d_lib.visual_hull.surface import colored_surface
 from dg4d_lib.weights.registry import lookup_weights
 from steps.artifacts.archives import unpack
@@ -148,7 +148,7 @@ def make_prior(
                 weights = dict.fromkeys(shapes.frames, 1.0)
                 prior = AnalyticPrior(clean, noise, viewpoints, frames, 1.0 if moved else guided, weights)
                 network = _network(shapes.guess, settings)
-                return LoadedPrior(prior, known_note(sides, settings), shapes=shapes, network=network)
+                return LoadedPrior(prior, known_note(sides, shapes.has_predictions), shapes=shapes, network=network)
             if isinstance(settings, LearnedPriorSettings):
                 note, weight = LEARNED_NOTE, guided
             elif settings.depth_weights and not hint.sigma:
@@ -262,11 +262,10 @@ def known_views(bank: Bank, frame: int = 0) -> list[KnownView]:
     return [KnownView(camera, picture, weight=weight) for camera, picture, weight in known]
 
 
-def known_note(bank: Bank | None, settings: PriorSettings) -> str:
-    """Return the sentence about known views."""
+def known_note(bank: Bank | None, has_predictions: bool) -> str:
+    """Return the sentence about known views, and about the shape network if its predictions count."""
     count = len(bank.cameras) if bank is not None else 0
-    checked = isinstance(settings, LearnedPriorSettings) and count < ALL_AROUND
-    network = ", without what the shape network finds improbable" if checked else ""
+    network = ", without what the shape network finds improbable" if has_predictions else ""
     return f"prior: visual hull of {count + 1} views{network}; what none of them shows is a guess"
 
 

@@ -168,6 +168,10 @@ def test_the_shape_network_takes_away_what_few_views_allow(
     far, close = vertices[:, [0, 2]].sum(1).aminmax()
     cut = isinstance(settings, LearnedPriorSettings)  # the corner far from both cameras
     assert (float(-far) < 0.85 * float(close)) == cut
+    back = replace(sides, cameras=(OrbitCamera(0, 180, width=64, height=64),))
+    for known, noted in ((sides, cut), (back, False)):  # opposite views leave all depths open
+        note = make_prior(settings, [cutout], StaticSettings(), None, Path(), sides=known).note
+        assert "visual hull of 2 views" in note and ("shape network" in note) == noted
 
 
 @pytest.mark.parametrize(("count", "tracking"), [(3, "descent"), (16, "flow")])
