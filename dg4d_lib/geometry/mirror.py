@@ -1,4 +1,4 @@
-"""Vertical mirror plane of a subject, from points on its surface."""
+"""Upright mirror plane of a subject, from points on its surface."""
 
 import math
 

@@ -2,6 +2,10 @@
 
 import math
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
 from dg4d_lib.cameras.orbit import FOV_Y_DEG, RADIUS
 
 SIZE = 128  # pixels of a side, one ray each
@@ -11,3 +15,18 @@ NEAR = RADIUS - HALF_DEPTH  # distance from the camera's plane, world units
 FAR = RADIUS + HALF_DEPTH
 KNOTS = 8  # depths at which hidden colors are predicted; linear between them
 TAN_HALF_FOV = math.tan(math.radians(FOV_Y_DEG) / 2)
+
+
+def grid_places(
+    right: Float[Tensor, " n"], down: Float[Tensor, " n"], distance: Float[Tensor, " n"]
+) -> Float[Tensor, "n 3"]:
+    """Return where `grid_sample` finds points before the camera: depth, column and row, in [-1, 1] on the grid.
+
+    Args:
+        right: of the line of sight, world units.
+        down: of the line of sight, world units.
+        distance: from the camera's plane, world units.
+    """
+    away = distance.clamp(min=NEAR / 2)
+    deep = 2 * (away - NEAR) / (FAR - NEAR) - 1
+    return torch.stack([deep, right / away / TAN_HALF_FOV, down / away / TAN_HALF_FOV], -1)

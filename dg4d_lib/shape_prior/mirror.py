@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from dg4d_lib.cameras.orbit import RADIUS
-from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV
+from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV, grid_places
 
 LEAST_MATTER = 0.03  # probability below which a cell's color does not matter
 SHOWN, COVERED = 0.6, 0.1  # transmittance from the input camera: above the first a mirror image is fully visible
@@ -69,15 +69,11 @@ def mirrored_colors(
     y = (1 - 2 * (row + 0.5) / SIZE) * TAN_HALF_FOV * distance
     places = torch.stack([x, y, RADIUS - distance], -1)
     places = places - 2 * ((places - plane.point) @ plane.normal)[:, None] * plane.normal
-    away = (RADIUS - places[:, 2]).clamp(min=NEAR / 2)
-    across, down = places[:, 0] / away / TAN_HALF_FOV, -places[:, 1] / away / TAN_HALF_FOV
-    deep = 2 * (away - NEAR) / (FAR - NEAR) - 1
-    at = torch.stack([deep, across, down], -1)[None, None, None]
+    at = grid_places(places[:, 0], -places[:, 1], RADIUS - places[:, 2])
     volumes = torch.stack([transmittance, probability])[None]
-    left, matter = grid_sample(volumes, at, align_corners=False)[0, :, 0, 0]
-    pixels = torch.stack([across, down], -1)[None, None]
+    left, matter = grid_sample(volumes, at[None, None, None], align_corners=False)[0, :, 0, 0]
     planes = torch.cat([front * mask[..., None], mask[..., None].float()], -1).permute(2, 0, 1)[None]
-    *color, inside = grid_sample(planes, pixels, align_corners=False)[0, :, 0]
+    *color, inside = grid_sample(planes, at[None, None, :, 1:], align_corners=False)[0, :, 0]
     shown = (
         ((left - COVERED) / (SHOWN - COVERED)).clamp(0, 1) * inside * (matter / probability[tuple(cells.T)]).clamp(0, 1)
     )

@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from dg4d_lib.shape_prior.frustum import FAR, NEAR, SIZE, TAN_HALF_FOV
+from dg4d_lib.shape_prior.frustum import SIZE, grid_places
 from dg4d_lib.visual_hull.carve import TRUNCATION, Volume
 from dg4d_lib.visual_hull.known import KnownView
 
@@ -59,11 +59,11 @@ def _seen(
     """Return the log-odds of points before the camera of a view, and the pixels (row by row) that show them."""
     matrix = view.camera.viewmat().float()
     places = points @ matrix[:3, :3].T + matrix[:3, 3]
-    across = places[:, :2] / places[:, 2:].clamp(min=NEAR / 2) / TAN_HALF_FOV
-    depth = 2 * (places[:, 2:] - NEAR) / (FAR - NEAR) - 1
-    at = torch.cat([depth, across], 1)[None, None, None]
-    found = grid_sample(logits[None, None], at, align_corners=False, padding_mode="border")[0, 0, 0, 0]
-    column, row = ((across + 1) * SIZE / 2).long().clamp(0, SIZE - 1).T
+    at = grid_places(*places.T)
+    found = grid_sample(logits[None, None], at[None, None, None], align_corners=False, padding_mode="border")[
+        0, 0, 0, 0
+    ]
+    column, row = ((at[:, 1:] + 1) * SIZE / 2).long().clamp(0, SIZE - 1).T
     return found, row * SIZE + column
 
 
