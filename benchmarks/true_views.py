@@ -28,8 +28,8 @@ from steps.artifacts.ground_truth import GroundTruth, find_ground_truths
 from steps.artifacts.media import read_png
 from steps.artifacts.motions import new_deformation
 from steps.fit_gaussians import initial_gaussians
-from steps.fitting.priors import known_views, make_prior, subject_shapes
-from steps.fitting.tracking import tracked_shapes, tracks_surface
+from steps.fitting.priors import known_by_frame, known_views, make_prior, subject_shapes
+from steps.fitting.tracking import surface_tracker, tracks_surface
 from steps.profiles import PipelineSettings
 from steps.score_asset import MetricNetworks, ViewFrames, compare
 
@@ -100,12 +100,13 @@ def fit(subject: Subject, settings: PipelineSettings, seed: int = 0, sides: Bank
     known = known_views(sides) if sides is not None else []
     rest = fit_gaussians(start, cutouts[0], prior, rasterize, settings.static, generator, known=known)
     video, kind = DrivingVideo(cutouts[..., :3].contiguous(), cutouts[..., 3:].contiguous(), 10), settings.prior
-    moved = None
+    track = None
     if sides and tracks_surface(settings.motion, kind, sides, len(video)):
-        moved = tracked_shapes(rest, video, sides, kind, hint, rasterize, generator)
-    prior = make_prior(kind, list(cutouts), settings.motion, None, Path(), hint, sides, moved).prior
+        track = surface_tracker(rest, video, sides, rasterize, generator)
+    prior = make_prior(kind, list(cutouts), settings.motion, None, Path(), hint, sides, track).prior
     deformation = new_deformation(settings.deformation, rest, len(video), generator)
-    fitted = fit_motion(rest, deformation, video, prior, rasterize, settings.motion, generator)
+    others = known_by_frame(sides, len(video))
+    fitted = fit_motion(rest, deformation, video, prior, rasterize, settings.motion, generator, known=others)
     with torch.no_grad():
         return deformation.displace(fitted.means, torch.linspace(0, 1, len(video))).apply(fitted)
 

@@ -11,9 +11,9 @@ from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
 from dg4d_lib.settings import DeformationSettings, MotionSettings
 from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.motions import new_deformation, write_motion
-from steps.fitting.priors import make_prior, read_known_views, subject_hint
+from steps.fitting.priors import known_by_frame, make_prior, read_known_views, subject_hint
 from steps.fitting.reporting import SHOWN_AZIMUTHS_DEG, LossCurves, picture_of_divergence, render_row, show_fit
-from steps.fitting.tracking import TRACKED_NOTE, tracked_shapes, tracking_of, tracks_surface
+from steps.fitting.tracking import TRACKED_NOTE, surface_tracker, tracking_of, tracks_surface
 from steps.runtime.job import Job, StepReport
 
 FINE_TUNED = "The Gaussians at rest were fitted to the whole video together with their motion."
@@ -37,13 +37,9 @@ def run(job: Job) -> StepReport:
     tracked = known if tracks_surface(settings, prior, known, len(video)) else None
     before = iterations(tracking_of(tracked), len(video)) if tracked else 0
     curves = LossCurves(before + settings.iterations, job.progress)
+    track = surface_tracker(gaussians, video, tracked, rasterize, generator, curves.add) if tracked else None
     with picture_of_divergence(job, rasterize):
-        moved = (
-            tracked_shapes(gaussians, video, tracked, prior, hint, rasterize, generator, curves.add)
-            if tracked
-            else None
-        )
-    chosen = make_prior(prior, cutouts, settings, job.inputs.get("bank"), job.pictures, hint, known, moved)
+        chosen = make_prior(prior, cutouts, settings, job.inputs.get("bank"), job.pictures, hint, known, track)
     deformation = new_deformation(kind, gaussians, len(video), generator)
     device = preferred_device(backend)
     deformation.to(device)
@@ -55,7 +51,10 @@ def run(job: Job) -> StepReport:
         show_fit(job, lambda: deformation.displace(start.means, moments).apply(start), rasterize)
 
     with picture_of_divergence(job, rasterize), chosen.threads():
-        fitted = fit_motion(start, deformation, video, chosen.prior, rasterize, settings, generator, watch)
+        others = known_by_frame(known, len(video))
+        fitted = fit_motion(
+            start, deformation, video, chosen.prior, rasterize, settings, generator, watch, known=others
+        )
     deformation.cpu()
     gaussians = fitted.to(torch.device("cpu"))
     if settings.fine_tune:

@@ -1,6 +1,6 @@
 """Dynamic stage: optimization of the deformation on the driving video and a guidance prior (paper section 3.2)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -15,12 +15,13 @@ from dg4d_lib.deformation.rigidity_loss import neighborhoods, rigidity_loss
 from dg4d_lib.devices import to_device_async
 from dg4d_lib.fitting.losses import WHITE, check_finite, reference_loss, resize_cutouts
 from dg4d_lib.fitting.schedules import late_decay, log_linear, reference_size_at, resolution_at
-from dg4d_lib.fitting.static import learning_rates
+from dg4d_lib.fitting.static import draw_view, learning_rates
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.interface import GuidancePrior, GuidanceView, ring_size
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MotionSettings
 from dg4d_lib.video.driving import DrivingVideo
+from dg4d_lib.visual_hull.known import KnownView
 
 ADVICE = "lower the learning rates (motion.*_lr) or the weights"
 Report = Callable[[int, dict[str, float]], None]
@@ -36,6 +37,7 @@ def fit_motion(
     generator: torch.Generator,
     report: Report = lambda iteration, values: None,
     input_camera: OrbitCamera | None = None,
+    known: Mapping[int, Sequence[KnownView]] | None = None,
 ) -> Gaussians:
     """Fit `deformation` in place, and with `settings.fine_tune` the canonical Gaussians too.
 
@@ -49,6 +51,8 @@ def fit_motion(
         generator: source of all randomness.
         report: called after every iteration with (iterations done, named losses).
         input_camera: camera of the video; the default is azimuth and elevation 0.
+        known: further images by frame; an iteration compares one of them, drawn by their weights, with the weight of
+            the video.
 
     Returns:
         The canonical cloud of `deformation`: the given one, or with `settings.fine_tune` its optimized copy.
@@ -67,13 +71,8 @@ def fit_motion(
 
     times = video.times.to(device)
     white = torch.tensor(WHITE, device=device)
-    gaussians, groups = gaussians.detach(), parameter_groups(deformation, settings)
-    if settings.fine_tune:
-        gaussians = Gaussians(**{name: nn.Parameter(value.clone()) for name, value in vars(gaussians).items()})
-        cloud_groups = [
-            {"params": getattr(gaussians, name), "lr": rate} for name, rate in learning_rates(settings).items()
-        ]
-        groups = [*cloud_groups, *groups]
+    known_frames, known_images = known_pairs(known or {})
+    gaussians, groups = trained(gaussians.detach(), deformation, settings)
     adam = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15, fused=True)
     rates = [float(group["lr"]) for group in adam.param_groups]
     neighbors = neighborhoods(gaussians.means) if settings.rigidity_weight else None
@@ -88,7 +87,8 @@ def fit_motion(
         chosen = to_device_async(frames, device)
         moved = deformation.displace(gaussians.means, times[chosen]).apply(gaussians)
 
-        camera, color, alpha = references(reference_size_at(settings, progress))
+        side = reference_size_at(settings, progress)
+        camera, color, alpha = references(side)
         rendering = rasterize(moved, [camera] * len(frames), white)
         reference = reference_loss(
             rendering,
@@ -98,6 +98,10 @@ def fit_motion(
             settings.alpha_weight,
             settings.ssim_weight,
         )
+        if known_images:
+            row = draw_view(known_images, generator)
+            state = deformation.displace(gaussians.means, times[known_frames[row], None]).apply(gaussians)
+            reference = reference + known_loss(state, known_images[row], side, rasterize, settings)
         loss = progress * reference + deformation.regularization_loss()
         guidance = torch.zeros((), device=device)
         if settings.views and settings.guidance_weight:
@@ -120,6 +124,22 @@ def fit_motion(
         adam.step()
         report(step, numbers)
     return gaussians.detach()
+
+
+def known_pairs(known: Mapping[int, Sequence[KnownView]]) -> tuple[list[int], list[KnownView]]:
+    """Return frame and view of every known image."""
+    pairs = [(frame, view) for frame, views in known.items() for view in views]
+    return [frame for frame, _ in pairs], [view for _, view in pairs]
+
+
+def known_loss(
+    state: Gaussians, view: KnownView, size: int, rasterize: Rasterizer, settings: MotionSettings
+) -> Float[Tensor, ""]:
+    """Compare a batch of one state with a known image, as the reference view is compared, at `size` pixels."""
+    color, alpha = resize_cutouts(view.cutout[None].to(state.means.device), size)
+    camera = replace(view.camera, width=size, height=size)
+    rendering = rasterize(state, [camera], torch.tensor(WHITE, device=state.means.device))
+    return reference_loss(rendering, color, alpha, settings.color_weight, settings.alpha_weight, settings.ssim_weight)
 
 
 def sample_frames(total: int, count: int, generator: torch.Generator) -> Int[Tensor, " k"]:
@@ -153,6 +173,18 @@ def sample_views(
         cameras = [replace(prior.viewpoints[i], width=size, height=size) for i in choice]
     views = [GuidanceView(camera, int(frames[row])) for camera, row in zip(cameras, rows, strict=True)]
     return views, torch.tensor(rows, dtype=torch.long)
+
+
+def trained(
+    gaussians: Gaussians, deformation: Deformation, settings: MotionSettings
+) -> tuple[Gaussians, list[dict[str, object]]]:
+    """Return the canonical cloud, with `settings.fine_tune` a trainable copy of it, and Adam's parameter groups."""
+    groups = parameter_groups(deformation, settings)
+    if not settings.fine_tune:
+        return gaussians, groups
+    copy = Gaussians(**{name: nn.Parameter(value.clone()) for name, value in vars(gaussians).items()})
+    rates = learning_rates(settings).items()
+    return copy, [*({"params": getattr(copy, name), "lr": rate} for name, rate in rates), *groups]
 
 
 def bounds_of(gaussians: Gaussians, margin: float = 0.1) -> Float[Tensor, "2 3"]:

@@ -87,7 +87,8 @@ def blend(
     blended = (weights[..., None] * colors).sum(0) / total.clamp(min=FAINT)[:, None]
     if shown.any() and not shown.all():
         count = min(NEAREST, int(shown.sum()))
-        distances, indices = cKDTree(vertices[shown].numpy()).query(vertices[~shown].numpy(), k=count)
+        tree = cKDTree(vertices[shown].numpy(), compact_nodes=False, balanced_tree=False)  # faster far from points
+        distances, indices = tree.query(vertices[~shown].numpy(), k=count)
         share = torch.from_numpy(1 / (np.asarray(distances).reshape(-1, count) + 1e-4)).float()
         near = blended[shown][torch.from_numpy(np.asarray(indices).reshape(-1, count))]
         blended[~shown] = (share[..., None] * near).sum(1) / share.sum(1, keepdim=True)

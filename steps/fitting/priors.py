@@ -1,6 +1,6 @@
 """Guidance priors of the fits, from settings and files."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +33,7 @@ from dg4d_lib.guidance.oracle import Bank, perturb
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.images import over_white
 from dg4d_lib.inflation.hints import NO_HINT, DepthHint
+from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.kernels.workers import torch_on_one_thread
 from dg4d_lib.settings import (
     FitSettings,
@@ -68,6 +69,8 @@ GUESS_WEIGHT = 0.5  # of frames whose other sides are a guess, beside frames wit
 CARRIED_CONTRAST = 2.0  # of shapes that a known first frame has made sure already
 CARRIED_SHARE = 0.3  # of the carried shapes in their mean with tracked ones: more is foggy where limbs move
 ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
+
+Track = Callable[[InflatedSurface], SubjectShapes]  # the surface at all frames, from that of the first
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,7 @@ def make_prior(
     scratch: Path,
     hint: DepthHint = NO_HINT,
     sides: Bank | None = None,
-    moved: SubjectShapes | None = None,
+    track: Track | None = None,
 ) -> LoadedPrior:
     """Make the guidance prior of a stage.
 
@@ -126,7 +129,7 @@ def make_prior(
         scratch: folder for unpacking.
         hint: at the depth of the subject; see `subject_hint`.
         sides: views of other sides that the user gave; priors with shapes take them as their own.
-        moved: their surface, tracked through the video; see `subject_shapes`.
+        track: moves their surface through the video; see `subject_shapes`.
 
     Raises:
         BadInput: the oracle has no bank, or the weights are damaged or of another model.
@@ -137,7 +140,7 @@ def make_prior(
     )
     match settings:
         case GeometricPriorSettings() | LearnedPriorSettings():
-            shapes = subject_shapes(settings, cutouts, hint, sides, moved)
+            shapes = subject_shapes(settings, cutouts, hint, sides, track)
             note, weight, opened = GEOMETRIC_NOTE, 1.0, None
             clean, viewpoints = shapes.clean, None
             if stage.viewpoints:
@@ -146,7 +149,7 @@ def make_prior(
             if isinstance(shapes, KnownShapes):
                 frames = None if 0 in shapes.frames else shapes.frames
                 weights = dict.fromkeys(shapes.frames, 1.0)
-                prior = AnalyticPrior(clean, noise, viewpoints, frames, 1.0 if moved else guided, weights)
+                prior = AnalyticPrior(clean, noise, viewpoints, frames, 1.0 if track else guided, weights)
                 network = _network(shapes.guess, settings)
                 return LoadedPrior(prior, known_note(sides, shapes.has_predictions), shapes=shapes, network=network)
             if isinstance(settings, LearnedPriorSettings):
@@ -178,7 +181,7 @@ def subject_shapes(
     cutouts: Sequence[Float[Tensor, "h w 4"]],
     hint: DepthHint = NO_HINT,
     sides: Bank | None = None,
-    moved: SubjectShapes | None = None,
+    track: Track | None = None,
 ) -> SubjectShapes:
     """Return the shapes behind a prior, by default inflated ones.
 
@@ -187,10 +190,10 @@ def subject_shapes(
         cutouts: the subject at every frame.
         hint: at its depth; see `subject_hint`. A depth picture goes before an estimate by `prior.depth_weights`.
         sides: views of other sides; their hull replaces the shapes of their frames.
-        moved: the surface of known views of the first frame, tracked; averaged with the other guess at later frames.
+        track: moves the surface of known views of the first frame; its shapes are averaged with the other guess.
     """
-    frames = [frame for frame in sides.frames if frame < len(cutouts)] if sides else []
-    known = {frame: [known_view(cutouts[frame]), *known_views(sides, frame)] for frame in frames if sides}
+    others = known_by_frame(sides, len(cutouts))
+    known = {frame: [known_view(cutouts[frame]), *views] for frame, views in others.items()}
     predict = _predicted_logits if isinstance(settings, LearnedPriorSettings) else None
     shapes: SubjectShapes
     surfaces = {}
@@ -199,7 +202,7 @@ def subject_shapes(
         surfaces[0] = colored_surface(volume, known[0])
         first, normal = known_field(known[0], volume, surfaces[0]), mirror_normal(surfaces[0].vertices.double().numpy())
         shapes = _carried_shapes(settings, cutouts, hint, first, normal)
-        shapes = shapes if moved is None else MixedShapes(moved, shapes, CARRIED_SHARE)
+        shapes = shapes if track is None else MixedShapes(track(surfaces[0]), shapes, CARRIED_SHARE)
     elif isinstance(settings, LearnedPriorSettings):
         shapes = LearnedShapes(learned_fields(cutouts, hint), settings)
     else:
@@ -260,6 +263,11 @@ def known_views(bank: Bank, frame: int = 0) -> list[KnownView]:
     weights = bank.weights or (1.0,) * len(bank.cameras)
     known = zip(bank.cameras, pictures, weights, strict=True)
     return [KnownView(camera, picture, weight=weight) for camera, picture, weight in known]
+
+
+def known_by_frame(bank: Bank | None, frames: int) -> dict[int, list[KnownView]]:
+    """Return the views in a bank, if any, by frame of a video of some frames."""
+    return {frame: known_views(bank, frame) for frame in bank.frames if frame < frames} if bank is not None else {}
 
 
 def known_note(bank: Bank | None, has_predictions: bool) -> str:

@@ -8,12 +8,12 @@ from dg4d_lib.fitting.surface_tracking import DESCENT, track_surface
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.moved import MovedSurfaces
 from dg4d_lib.guidance.oracle import Bank
-from dg4d_lib.inflation.hints import DepthHint
+from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import GeometricPriorSettings, LearnedPriorSettings, MotionSettings, PriorSettings
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.visual_hull.shape import ALL_AROUND
-from steps.fitting.priors import subject_shapes
+from steps.fitting.priors import Track
 
 TRACKED_NOTE = "motion of unseen sides: the surface of the known views, moved as the video shows it"
 SOFT = DESCENT.model_copy(update={"across": AssetSettings().across})  # for hulls of few views, whose limbs may touch
@@ -37,17 +37,18 @@ def tracking_of(known: Bank) -> AssetSettings:
     return AssetSettings() if len(known.cameras) >= ALL_AROUND else SOFT
 
 
-def tracked_shapes(
+def surface_tracker(
     gaussians: Gaussians,
     video: DrivingVideo,
     known: Bank,
-    prior: PriorSettings,
-    hint: DepthHint,
     rasterize: Rasterizer,
     generator: torch.Generator,
     report: Report = lambda iteration, values: None,
-) -> MovedSurfaces:
-    """Return the shapes of all frames; arguments as of `track_surface` and `subject_shapes`."""
-    first = torch.cat([video.frames[0], video.alpha[0]], -1)
-    surface = subject_shapes(prior, [first], hint, known).surface(0)
-    return MovedSurfaces(track_surface(surface, gaussians, video, rasterize, tracking_of(known), generator, report))
+) -> Track:
+    """Return what moves the surface of known views of the first frame; arguments as of `track_surface`."""
+    settings = tracking_of(known)
+
+    def track(surface: InflatedSurface) -> MovedSurfaces:
+        return MovedSurfaces(track_surface(surface, gaussians, video, rasterize, settings, generator, report))
+
+    return track

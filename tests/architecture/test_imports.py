@@ -104,7 +104,7 @@ def test_only_the_process_that_cleans_meshes_imports_pymeshlab() -> None:
     places = [
         path for path in repository.modules(*repository.PACKAGES) for name, _ in imports_of(path) if name == "pymeshlab"
     ]
-    assert places == ["dg4d_lib/mesh/extraction/clean.py"]
+    assert places == ["dg4d_lib/mesh/extraction/pymeshlab_program.py"]
     assert "pymeshlab" not in imported_by("dg4d_lib.mesh.extraction.clean")
 
 

@@ -146,8 +146,9 @@ def test_known_views_of_the_first_frame_guide_all_frames(
         assert sign * float(middles[1] - middles[0]) > 2  # pixels; from behind it moves left
     learned = isinstance(settings, LearnedPriorSettings)
     assert bool(choice.report("cpu").weights) == learned  # the network has guessed frame 1
-    tracked = MovedSurfaces([choice.shapes.surface(0)] * 2)
-    mixed = make_prior(settings, cutouts, MotionSettings(), None, tmp_path, sides=sides, moved=tracked)
+    mixed = make_prior(
+        settings, cutouts, MotionSettings(), None, tmp_path, sides=sides, track=lambda first: MovedSurfaces([first] * 2)
+    )
     assert isinstance(mixed.prior, AnalyticPrior) and mixed.prior.weight == 1
     _, between = mixed.prior.clean([GuidanceView(camera, 1)])
     assert float((between[0] - cover[1]).abs().max()) > 0.1  # pulled towards the tracked shape, which stands still

@@ -4,6 +4,8 @@ The Gaussians of a fit leave gaps where parts of a body meet, such as a leg and 
 around every gap. Silhouettes hide these tunnels, light shows them.
 """
 
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -62,8 +64,27 @@ def fill_tunnels(field: DensityField, level: float, gaussians: Gaussians, raster
 
 
 def _closed(solid: Bool[np.ndarray, "i j k"], radius: int) -> Bool[np.ndarray, "i j k"]:
-    grown = ndimage.distance_transform_edt(~solid) <= radius
-    return ndimage.distance_transform_edt(grown) > radius
+    return ~dilated(~dilated(solid, radius), radius)
+
+
+def dilated(solid: Bool[np.ndarray, "i j k"], radius: int) -> Bool[np.ndarray, "i j k"]:
+    """Mark the samples within a distance, in cells, of solid ones: faster than scipy's distances for small radii."""
+    lines = {0: solid}  # by reach along the last axis
+    for reach in range(1, radius + 1):
+        lines[reach] = lines[reach - 1].copy()
+        for step in (-reach, reach):
+            _mark(lines[reach], solid, (0, 0, step))
+    ball, steps = np.zeros_like(solid), range(-radius, radius + 1)
+    for i, j in itertools.product(steps, steps):
+        if i * i + j * j <= radius * radius:
+            _mark(ball, lines[math.isqrt(radius * radius - i * i - j * j)], (i, j, 0))
+    return ball
+
+
+def _mark(target: Bool[np.ndarray, "i j k"], source: Bool[np.ndarray, "i j k"], shift: tuple[int, int, int]) -> None:
+    """Mark the samples of the source in the target, moved by a number of samples along each axis."""
+    onto = tuple(slice(max(step, 0), min(step, 0) or None) for step in shift)
+    target[onto] |= source[tuple(slice(max(-step, 0), -step if step > 0 else None) for step in shift)]
 
 
 def _silhouettes(gaussians: Gaussians, rasterize: Rasterizer) -> list[tuple[OrbitCamera, Bool[np.ndarray, "h w"]]]:

@@ -131,6 +131,7 @@ class _Surface:
         across = np.full(3 * len(faces), -1)
         across[self.pairs] = self.pairs[:, ::-1] // 3
         self.across = across.reshape(-1, 3)
+        self._latest: Charts | None = None  # of all faces: the final charts have been flattened for their last test
 
     def connected(self, labels: Labels) -> Labels:
         """Give every connected part of a chart a label of its own."""
@@ -191,10 +192,14 @@ class _Surface:
     def flattened(self, labels: Labels, chosen: Bool[np.ndarray, " f"] | None = None) -> Charts:
         """Flatten the charts of chosen faces, which must be disks."""
         chosen = np.ones(len(labels), bool) if chosen is None else chosen
+        if self._latest is not None and chosen.all() and np.array_equal(labels, self._latest.labels):
+            return self._latest
         sources, faces = self.cut(labels, chosen)
         names, disk = np.unique(labels[chosen], return_inverse=True)
         flat = flatten(self.vertices[sources], faces, disk.ravel(), len(names))
-        return Charts(labels[chosen], sources, faces, flat)
+        charts = Charts(labels[chosen], sources, faces, flat)
+        self._latest = charts if chosen.all() else self._latest
+        return charts
 
     def split(self, labels: Labels, chosen: Bool[np.ndarray, " f"]) -> Labels:
         """Split the charts of chosen faces in two by their normals."""

@@ -3,6 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.factory import new_deformation
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.deformation.hexplane import HexPlane
@@ -10,8 +11,10 @@ from dg4d_lib.deformation.mlp import Mlp
 from dg4d_lib.errors import FitDiverged
 from dg4d_lib.fitting.motion import bounds_of, fit_motion, parameter_groups, sample_frames, sample_views
 from dg4d_lib.settings import HexPlaneSettings, MlpSettings, ResolutionStage
+from dg4d_lib.video.driving import DrivingVideo
+from dg4d_lib.visual_hull.known import KnownView
 
-FRAMES, SLIDE = 4, 0.3
+SIZE, FRAMES, SLIDE = 32, 4, 0.3
 
 
 def seed(number: int = 0) -> torch.Generator:
@@ -39,6 +42,26 @@ def test_a_slide_along_x_is_recovered(kind: str, known, motion_settings):
     slid = deformation.displace(known.gaussians.means, video.times).means.median(1).values
     expected = torch.stack([SLIDE * video.times, torch.zeros(FRAMES), torch.zeros(FRAMES)], -1)
     assert (slid - expected).abs().max() < 0.03
+
+
+def test_a_known_view_of_a_later_frame_shows_motion_along_the_axis_of_the_camera(known, motion_settings):
+    settings = motion_settings.model_copy(update={"views": 0})
+    still, moments = known.at([0] * FRAMES), torch.linspace(0, 1, FRAMES)
+    truth = replace(still, means=still.means + torch.tensor([0.0, 0.0, SLIDE]) * moments[:, None, None])
+    front, side = (OrbitCamera(0, azimuth, width=SIZE, height=SIZE) for azimuth in (0, 90))
+    seen = known.rasterize(truth, [front] * FRAMES, torch.zeros(3))
+    video = DrivingVideo(seen.color / seen.alpha.clamp(min=1e-3), seen.alpha, 8.0)
+    aside = known.rasterize(truth.states([FRAMES - 1]), [side], torch.zeros(3))
+    cutout = torch.cat([aside.color / aside.alpha.clamp(min=1e-3), aside.alpha], -1)[0]
+    found = []
+    for views in ({}, {FRAMES - 1: [KnownView(side, cutout)]}):
+        deformation = make("hexplane", known)
+        fit_motion(
+            known.gaussians, deformation, video, known.prior(0.5), known.rasterize, settings, seed(), known=views
+        )
+        last = deformation.displace(known.gaussians.means, video.times[-1:]).means[0]
+        found.append((last.median(0).values - torch.tensor([0.0, 0.0, SLIDE])).abs().max().item())
+    assert found[1] < 0.03 and found[1] < 0.5 * found[0]
 
 
 @pytest.mark.slow

@@ -1,12 +1,14 @@
 import math
 
 import numpy as np
+import pytest
 import torch
+from scipy.ndimage import distance_transform_edt
 
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import DensityField, density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface
-from dg4d_lib.mesh.extraction.tunnels import fill_tunnels
+from dg4d_lib.mesh.extraction.tunnels import dilated, fill_tunnels
 from dg4d_lib.mesh.folds import genus
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
@@ -76,3 +78,10 @@ def test_gaps_between_two_bodies_are_not_tunnels():
 def test_an_empty_field_stays_empty():
     field = DensityField(torch.zeros(8, 8, 8), torch.zeros(3, dtype=torch.float64), 0.1, 1.0)
     assert torch.equal(fill_tunnels(field, LEVEL, ring(), RASTERIZE).values, field.values)
+
+
+@pytest.mark.parametrize("radius", [1, 2, 3, 4])
+def test_a_dilation_reaches_all_samples_within_a_distance(radius: int) -> None:
+    solid = np.random.default_rng(radius).random((11, 17, 23)) < 0.004
+    assert 0 < solid.sum() < 30
+    np.testing.assert_array_equal(dilated(solid, radius), distance_transform_edt(~solid) <= radius)
