@@ -31,11 +31,12 @@ from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.fitting.asset_motion import fit_asset_motion
 from dg4d_lib.fitting.asset_pose import find_placement
+from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.images import over_white, resize
 from dg4d_lib.mesh.models.control_graph import build_control_graph
 from dg4d_lib.mesh.models.model import Model, ModelPart
 from dg4d_lib.mesh.models.surface_cloud import cover_surface
-from dg4d_lib.mesh.texturing.bake import locate_texels, vertex_normals
+from dg4d_lib.mesh.texturing.bake import locate_texels
 from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.metrics.surface import chamfer_distance, sample_surface

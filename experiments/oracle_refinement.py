@@ -34,8 +34,9 @@ from benchmarks.objects.drawing import Painted
 from benchmarks.objects.specimens import FPS, OBJECTS, SCORED_AZIMUTHS_DEG
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.video_model import karras_sigmas, start_index
+from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.mesh.texturing.bake import Texels, locate_texels, vertex_normals
+from dg4d_lib.mesh.texturing.bake import Texels, locate_texels
 from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.mesh_rasterizer.texture import build_lookup, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh

@@ -15,6 +15,7 @@ from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.errors import BadInput
 from dg4d_lib.fitting.guided_mesh import follow_video, refine_tracking
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.images import color_over_white
 from dg4d_lib.mesh.extraction.clean import clean
 from dg4d_lib.mesh.extraction.density import density_field
@@ -25,7 +26,7 @@ from dg4d_lib.mesh.extraction.tunnels import fill_tunnels
 from dg4d_lib.mesh.extraction.unfold import unfold
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
-from dg4d_lib.mesh.texturing.bake import PosedSurface, bake_texture, vertex_normals
+from dg4d_lib.mesh.texturing.bake import PosedSurface, bake_texture
 from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.mesh.tracking.elastic import relax
 from dg4d_lib.mesh.tracking.isosurface_projection import project_to_isosurface

@@ -1,1 +1,1 @@
-"""Quaternions and spherical-harmonics colors."""
+"""Quaternions, spherical harmonics, normals and mirror planes."""

@@ -9,9 +9,9 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.mesh.extraction.topology import group_vertices
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.mesh.texturing.bake import vertex_normals
 from dg4d_lib.mesh_rasterizer.texture import build_lookup, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
 

@@ -20,9 +20,9 @@ from torch.nn.functional import normalize
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput, FitDiverged
+from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.images import resize
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.mesh.texturing.bake import vertex_normals
 from dg4d_lib.mesh_rasterizer.texture import TextureLookup, build_lookup, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import Fragments, interpolate, rasterize_mesh
 from dg4d_lib.settings import TextureSettings

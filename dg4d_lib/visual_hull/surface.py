@@ -10,6 +10,7 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
+from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.inflation.colors import front_colors
 from dg4d_lib.inflation.mask import subject_mask
 from dg4d_lib.inflation.surface import InflatedSurface
@@ -33,16 +34,6 @@ def extract(volume: Volume) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
     corners = vertices[triangles].double()
     inside = (corners[:, 0] * torch.linalg.cross(corners[:, 1], corners[:, 2])).sum() > 0
     return vertices, triangles if inside else triangles.flip(1)
-
-
-def vertex_normals(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "v 3"]:
-    """Return unit normals, weighted by area."""
-    corners = vertices[faces]
-    crosses = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = torch.zeros_like(vertices)
-    for corner in range(3):
-        normals.index_add_(0, faces[:, corner], crosses)
-    return normalize(normals, dim=-1)
 
 
 def observations(

@@ -97,7 +97,7 @@ def bake_texture(
 
     Args:
         vertices: world units, split along the seams.
-        normals: of the unsplit surface (`vertex_normals`), one per split vertex.
+        normals: of the unsplit surface (`dg4d_lib.geometry.normals.vertex_normals`), one per split vertex.
         faces: counter-clockwise seen from outside.
         uvs: texture coordinates in [0, 1], v down.
         gaussians: one state.
@@ -137,14 +137,6 @@ def bake_texture(
     colors = torch.where(seen[:, None], torch.from_numpy(total[:, :3]) / weight.clamp_min(1e-30), 0.5)
     colors = _fill_unseen(colors, seen, texels.positions)
     return level_seams(_fill_texture(colors, texels, size), seam_points(vertices, faces, uvs, size))
-
-
-def vertex_normals(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "v 3"]:
-    """Compute unit vertex normals, weighted by the areas of the adjacent faces."""
-    corners = vertices[faces.long()]
-    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = torch.zeros_like(vertices).index_add_(0, faces.long().flatten(), area.repeat_interleave(3, 0))
-    return normalize(total, dim=-1)
 
 
 def locate_texels(

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
+from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.mesh.extraction.topology import group_vertices
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.mesh.texturing.bake import Texels, locate_texels, vertex_normals
+from dg4d_lib.mesh.texturing.bake import Texels, locate_texels
 from dg4d_lib.mesh.texturing.unwrap import taubin_smooth
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear red, green and blue (Rec. 709)

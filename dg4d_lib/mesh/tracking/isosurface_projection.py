@@ -12,8 +12,8 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.mesh.extraction.density import DensityField, density_field
-from dg4d_lib.mesh.texturing.bake import vertex_normals
 from dg4d_lib.settings import MeshSettings
 
 LEVEL_FACTOR = 1.4  # factor of the level; a mesh that joins separating limbs is too thick over the whole motion

@@ -17,13 +17,13 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.clean import drop_small_components
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface, usable_level
 from dg4d_lib.mesh.extraction.silhouettes import silhouette_iou
 from dg4d_lib.mesh.neighbors import edge_graph, graph_laplacian
-from dg4d_lib.mesh.texturing.bake import vertex_normals
 from dg4d_lib.settings import MeshSettings
 
 MIN_IOU = 0.85  # silhouette IoU from which a frame is left unchanged

@@ -21,12 +21,12 @@ from torch.nn import functional
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.density import DensityField, density_field
 from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
 from dg4d_lib.mesh.extraction.unfold import unfold
 from dg4d_lib.mesh.neighbors import neighbor_means
-from dg4d_lib.mesh.texturing.bake import vertex_normals
 from dg4d_lib.mesh.tracking.elastic import ElasticBody
 from dg4d_lib.mesh.tracking.isosurface_projection import SMOOTHING, steps_to_isosurface
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh

@@ -7,7 +7,8 @@ from scipy import ndimage
 from torch.nn.functional import max_pool2d
 
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.mesh.texturing.bake import PosedSurface, bake_texture, locate_texels, vertex_normals
+from dg4d_lib.geometry.normals import vertex_normals
+from dg4d_lib.mesh.texturing.bake import PosedSurface, bake_texture, locate_texels
 from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings

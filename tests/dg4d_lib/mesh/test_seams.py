@@ -3,9 +3,10 @@ import pytest
 import torch
 import trimesh
 
+from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.atlas_quality import atlas_quality
-from dg4d_lib.mesh.texturing.bake import _fill_texture, locate_texels, vertex_normals
+from dg4d_lib.mesh.texturing.bake import _fill_texture, locate_texels
 from dg4d_lib.mesh.texturing.seams import level_seams, seam_differences, seam_points
 from dg4d_lib.mesh.texturing.unwrap import unwrap
 
