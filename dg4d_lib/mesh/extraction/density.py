@@ -93,22 +93,36 @@ def density_field(gaussians: Gaussians, settings: MeshSettings) -> DensityField:
 @njit(cache=True, nogil=True)
 @no_type_check
 def _splat(means, half_inverse, reach, opacities, values):
-    """Add every Gaussian to the samples inside its ellipsoid; lengths in cells."""
+    """Add every Gaussian to the samples inside its ellipsoid; lengths in cells.
+
+    Along z the logarithm is a quadratic function, so the ratio of successive values changes by a constant factor.
+    """
     size = values.shape[0]
-    first, last = np.zeros(3, np.int64), np.zeros(3, np.int64)
+    first, last = np.zeros(2, np.int64), np.zeros(2, np.int64)
     for i in range(means.shape[0]):
-        for a in range(3):
+        for a in range(2):
             first[a] = max(0, int(np.ceil(means[i, a] - reach[i, a])))
             last[a] = min(size - 1, int(np.floor(means[i, a] + reach[i, a])))
         h = half_inverse[i]
+        square = h[0, 2] * h[0, 2] + h[1, 2] * h[1, 2] + h[2, 2] * h[2, 2]
+        factor = np.exp(-square)
         for x in range(first[0], last[0] + 1):
             dx = x - means[i, 0]
             for y in range(first[1], last[1] + 1):
                 dy = y - means[i, 1]
                 u0, u1, u2 = h[0, 0] * dx + h[0, 1] * dy, h[1, 0] * dx + h[1, 1] * dy, h[2, 0] * dx + h[2, 1] * dy
-                for z in range(first[2], last[2] + 1):
-                    dz = z - means[i, 2]
-                    a0, a1, a2 = u0 + h[0, 2] * dz, u1 + h[1, 2] * dz, u2 + h[2, 2] * dz
-                    distance2 = a0 * a0 + a1 * a1 + a2 * a2
-                    if distance2 < REACH * REACH:
-                        values[x, y, z] += opacities[i] * np.exp(-0.5 * distance2)
+                constant, linear = u0 * u0 + u1 * u1 + u2 * u2, u0 * h[0, 2] + u1 * h[1, 2] + u2 * h[2, 2]
+                middle = -linear / square
+                inside = REACH * REACH - constant - linear * middle  # less the smallest squared distance of the line
+                if inside <= 0:
+                    continue
+                half = np.sqrt(inside / square)
+                start = max(0, int(np.ceil(means[i, 2] + middle - half)))
+                end = min(size - 1, int(np.floor(means[i, 2] + middle + half)))
+                dz = start - means[i, 2]
+                value = opacities[i] * np.exp(-0.5 * (constant + dz * (2 * linear + dz * square)))
+                ratio = np.exp(-linear - square * (dz + 0.5))
+                for z in range(start, end + 1):
+                    values[x, y, z] += value
+                    value *= ratio
+                    ratio *= factor
