@@ -20,6 +20,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import DensityField
 from dg4d_lib.mesh.extraction.extract import SILHOUETTE_SIZE, SILHOUETTE_VIEWS_DEG
 from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
+from dg4d_lib.mesh.shifts import shifted
 from dg4d_lib.rasterizer.interface import Rasterizer
 
 RADII = (1, 2, 3, 4)  # cells; tunnels narrower than twice the last are filled, the narrowest first
@@ -73,18 +74,14 @@ def dilated(solid: Bool[np.ndarray, "i j k"], radius: int) -> Bool[np.ndarray, "
     for reach in range(1, radius + 1):
         lines[reach] = lines[reach - 1].copy()
         for step in (-reach, reach):
-            _mark(lines[reach], solid, (0, 0, step))
+            onto, source = shifted((0, 0, step))
+            lines[reach][onto] |= solid[source]
     ball, steps = np.zeros_like(solid), range(-radius, radius + 1)
     for i, j in itertools.product(steps, steps):
         if i * i + j * j <= radius * radius:
-            _mark(ball, lines[math.isqrt(radius * radius - i * i - j * j)], (i, j, 0))
+            onto, source = shifted((i, j, 0))
+            ball[onto] |= lines[math.isqrt(radius * radius - i * i - j * j)][source]
     return ball
-
-
-def _mark(target: Bool[np.ndarray, "i j k"], source: Bool[np.ndarray, "i j k"], shift: tuple[int, int, int]) -> None:
-    """Mark the samples of the source in the target, moved by a number of samples along each axis."""
-    onto = tuple(slice(max(step, 0), min(step, 0) or None) for step in shift)
-    target[onto] |= source[tuple(slice(max(-step, 0), -step if step > 0 else None) for step in shift)]
 
 
 def _silhouettes(gaussians: Gaussians, rasterize: Rasterizer) -> list[tuple[OrbitCamera, Bool[np.ndarray, "h w"]]]:

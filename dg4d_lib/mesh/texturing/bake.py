@@ -6,6 +6,8 @@ where there are some. Colors are un-premultiplied and pixels along soft silhouet
 into the texture.
 """
 
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -17,7 +19,6 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from numba import njit
 from numpy.typing import NDArray
-from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize, pad
@@ -28,6 +29,7 @@ from dg4d_lib.errors import DG4DError
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
+from dg4d_lib.mesh.shifts import shifted
 from dg4d_lib.mesh.texturing.seams import level_seams, seam_points
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
@@ -43,6 +45,7 @@ FLATTEST = 0.05  # cosine below which a view is ignored
 DEPTH_SLACK = 1.5  # tolerance of the depth test, in pixels of a texel's projected position
 NEIGHBORS = 4  # colored texels that a texel without a view interpolates
 GUTTER = 2  # texels of chart border that are repeated outwards, for bilinear filtering and the next mip level
+GUTTER_SHIFTS = sorted(itertools.product(range(-GUTTER, GUTTER + 1), repeat=2), key=lambda shift: math.hypot(*shift))
 VIEWS_AT_ONCE = 9  # bounds memory
 TEXELS_AT_ONCE = 1 << 16  # texels per job of the thread pool
 
@@ -267,11 +270,17 @@ def _fill_texture(colors: Float[Tensor, "p 3"], texels: Texels, size: int) -> Fl
     Empty texels within the gutter of a chart repeat the nearest texel of the chart, so that nothing bleeds over a seam.
     The others are filled by push-pull (Gortler et al. 1996, section 3.4), because smooth images compress well.
     """
-    texture, empty = np.zeros((size, size, 4), np.float32), np.ones((size, size), bool)
+    texture, covered = np.zeros((size, size, 4), np.float32), np.zeros((size, size), bool)
     texture[texels.rows, texels.columns] = np.pad(colors.numpy(), ((0, 0), (0, 1)), constant_values=1)
-    empty[texels.rows, texels.columns] = False
-    distance, (rows, columns) = ndimage.distance_transform_edt(empty, return_indices=True)
-    texture = np.where((distance <= GUTTER)[..., None], texture[rows, columns], 0)
+    covered[texels.rows, texels.columns] = True
+    repeated = covered.copy()
+    for shift in GUTTER_SHIFTS:  # the nearest first
+        if math.hypot(*shift) > GUTTER:
+            break
+        onto, source = shifted(shift)
+        fresh = covered[source] & ~repeated[onto]
+        texture[onto][fresh] = texture[source][fresh]
+        repeated[onto] |= fresh
     filled = oiio.ImageBufAlgo.fillholes_pushpull(oiio.ImageBuf(texture))
     if filled.has_error:
         raise DG4DError(f"OpenImageIO could not fill the texture: {filled.geterror()}; lower mesh.texture_size")
