@@ -28,7 +28,7 @@ from steps.artifacts.ground_truth import GroundTruth, find_ground_truths
 from steps.artifacts.media import read_png
 from steps.artifacts.motions import new_deformation
 from steps.fit_gaussians import initial_gaussians
-from steps.fitting.priors import known_by_frame, known_views, make_prior, subject_shapes
+from steps.fitting.priors import known_views, make_prior, still_views, subject_shapes
 from steps.fitting.tracking import surface_tracker, tracks_surface
 from steps.profiles import PipelineSettings
 from steps.score_asset import MetricNetworks, ViewFrames, compare
@@ -105,7 +105,7 @@ def fit(subject: Subject, settings: PipelineSettings, seed: int = 0, sides: Bank
         track = surface_tracker(rest, video, sides, rasterize, generator)
     prior = make_prior(kind, list(cutouts), settings.motion, None, Path(), hint, sides, track).prior
     deformation = new_deformation(settings.deformation, rest, len(video), generator)
-    others = known_by_frame(sides, len(video))
+    others = still_views(sides, len(video))
     fitted = fit_motion(rest, deformation, video, prior, rasterize, settings.motion, generator, known=others)
     with torch.no_grad():
         return deformation.displace(fitted.means, torch.linspace(0, 1, len(video))).apply(fitted)

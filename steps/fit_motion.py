@@ -11,7 +11,7 @@ from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
 from dg4d_lib.settings import DeformationSettings, MotionSettings
 from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.motions import new_deformation, write_motion
-from steps.fitting.priors import known_by_frame, make_prior, read_known_views, subject_hint
+from steps.fitting.priors import make_prior, read_known_views, still_views, subject_hint
 from steps.fitting.reporting import SHOWN_AZIMUTHS_DEG, LossCurves, picture_of_divergence, render_row, show_fit
 from steps.fitting.tracking import TRACKED_NOTE, surface_tracker, tracking_of, tracks_surface
 from steps.runtime.job import Job, StepReport
@@ -51,7 +51,7 @@ def run(job: Job) -> StepReport:
         show_fit(job, lambda: deformation.displace(start.means, moments).apply(start), rasterize)
 
     with picture_of_divergence(job, rasterize), chosen.threads():
-        others = known_by_frame(known, len(video))
+        others = still_views(known, len(video))
         fitted = fit_motion(
             start, deformation, video, chosen.prior, rasterize, settings, generator, watch, known=others
         )

@@ -135,7 +135,8 @@ def known_pairs(known: Mapping[int, Sequence[KnownView]]) -> tuple[list[int], li
 def known_loss(
     state: Gaussians, view: KnownView, size: int, rasterize: Rasterizer, settings: MotionSettings
 ) -> Float[Tensor, ""]:
-    """Compare a batch of one state with a known image, as the reference view is compared, at `size` pixels."""
+    """Compare a batch of one state with a known image, at `size` pixels or its own if it is smaller."""
+    size = min(size, len(view.cutout))
     color, alpha = resize_cutouts(view.cutout[None].to(state.means.device), size)
     camera = replace(view.camera, width=size, height=size)
     rendering = rasterize(state, [camera], torch.tensor(WHITE, device=state.means.device))

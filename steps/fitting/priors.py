@@ -270,6 +270,14 @@ def known_by_frame(bank: Bank | None, frames: int) -> dict[int, list[KnownView]]
     return {frame: known_views(bank, frame) for frame in bank.frames if frame < frames} if bank is not None else {}
 
 
+def still_views(bank: Bank | None, frames: int) -> dict[int, list[KnownView]]:
+    """Return the views in a bank, by frame, if they show a single moment of a video of some frames.
+
+    Videos of other sides would draw the motion fit away from the input: one picture per iteration is a noisy sample.
+    """
+    return known_by_frame(bank, frames) if bank is not None and len(bank.frames) == 1 else {}
+
+
 def known_note(bank: Bank | None, has_predictions: bool) -> str:
     """Return the sentence about known views, and about the shape network if its predictions count."""
     count = len(bank.cameras) if bank is not None else 0

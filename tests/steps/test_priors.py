@@ -38,6 +38,7 @@ from steps.fitting.priors import (
     make_prior,
     read_bank,
     read_bank_folder,
+    still_views,
     subject_hint,
     subject_shapes,
 )
@@ -332,3 +333,13 @@ def test_a_prior_that_keeps_its_views_says_the_same(tmp_path: Path) -> None:
         for prior in (fresh.prior, keeping.prior, keeping.prior)
     ]
     assert losses[1] == losses[2] == pytest.approx(float(losses[0]), rel=1e-4)
+
+
+def test_only_pictures_of_a_single_moment_join_the_motion_fit() -> None:
+    side = OrbitCamera(0, 90, width=8, height=8)
+    pictures = torch.zeros(1, 2, 8, 8, 4, dtype=torch.uint8)
+    assert list(still_views(Bank((side,), (0,), pictures[:, :1]), 5)) == [0]
+    assert still_views(Bank((side,), (0,), pictures[:, :1]), 5)[0][0].camera == side
+    assert still_views(Bank((side,), (0, 1), pictures), 5) == {}  # a video of the other side
+    assert still_views(Bank((side,), (6,), pictures[:, :1]), 5) == {}
+    assert still_views(None, 5) == {}
