@@ -71,7 +71,7 @@ def fit_motion(
 
     times = video.times.to(device)
     white = torch.tensor(WHITE, device=device)
-    known_frames, known_images = known_pairs(known or {})
+    known_frames, known_images = known_pairs(known or {}, device)
     gaussians, groups = trained(gaussians.detach(), deformation, settings)
     adam = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15, fused=True)
     rates = [float(group["lr"]) for group in adam.param_groups]
@@ -101,7 +101,7 @@ def fit_motion(
         if known_images:
             row = draw_view(known_images, generator)
             state = deformation.displace(gaussians.means, times[known_frames[row], None]).apply(gaussians)
-            reference = reference + known_loss(state, known_images[row], side, rasterize, settings)
+            reference = reference + known_loss(state, known_images[row], side, rasterize, white, settings)
         loss = progress * reference + deformation.regularization_loss()
         guidance = torch.zeros((), device=device)
         if settings.views and settings.guidance_weight:
@@ -126,20 +126,24 @@ def fit_motion(
     return gaussians.detach()
 
 
-def known_pairs(known: Mapping[int, Sequence[KnownView]]) -> tuple[list[int], list[KnownView]]:
-    """Return frame and view of every known image."""
-    pairs = [(frame, view) for frame, views in known.items() for view in views]
+def known_pairs(known: Mapping[int, Sequence[KnownView]], device: torch.device) -> tuple[list[int], list[KnownView]]:
+    """Return frame and view of every known image, on the device of the fit."""
+    pairs = [(frame, replace(view, cutout=view.cutout.to(device))) for frame, views in known.items() for view in views]
     return [frame for frame, _ in pairs], [view for _, view in pairs]
 
 
 def known_loss(
-    state: Gaussians, view: KnownView, size: int, rasterize: Rasterizer, settings: MotionSettings
+    state: Gaussians,
+    view: KnownView,
+    size: int,
+    rasterize: Rasterizer,
+    white: Float[Tensor, " 3"],
+    settings: MotionSettings,
 ) -> Float[Tensor, ""]:
     """Compare a batch of one state with a known image, at `size` pixels or its own if it is smaller."""
     size = min(size, len(view.cutout))
-    color, alpha = resize_cutouts(view.cutout[None].to(state.means.device), size)
-    camera = replace(view.camera, width=size, height=size)
-    rendering = rasterize(state, [camera], torch.tensor(WHITE, device=state.means.device))
+    color, alpha = resize_cutouts(view.cutout[None], size)
+    rendering = rasterize(state, [replace(view.camera, width=size, height=size)], white)
     return reference_loss(rendering, color, alpha, settings.color_weight, settings.alpha_weight, settings.ssim_weight)
 
 

@@ -1,5 +1,7 @@
 """Isosurface extraction from a density field, and selection of its level."""
 
+import itertools
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -11,6 +13,7 @@ from dg4d_lib.errors import FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import DensityField
 from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
+from dg4d_lib.mesh.shifts import shifted
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 
@@ -117,9 +120,8 @@ def _dilate(solid: Bool[np.ndarray, "r r r"]) -> Bool[np.ndarray, "r r r"]:
     """Mark every sample within `LEAK` steps along the axes of a solid one."""
     for _ in range(LEAK):
         grown = solid.copy()
-        for axis in range(3):
-            target, source = np.moveaxis(grown, axis, 0), np.moveaxis(solid, axis, 0)
-            target[1:] |= source[:-1]
-            target[:-1] |= source[1:]
+        for axis, step in itertools.product(range(3), (-1, 1)):
+            onto, source = shifted([step * (axis == other) for other in range(3)])
+            grown[onto] |= solid[source]
         solid = grown
     return solid
