@@ -8,15 +8,17 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
-from skimage.measure import euler_number
+from numba import njit
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.kernels.compiling import configure_numba
 from dg4d_lib.mesh.extraction.density import DensityField
 from dg4d_lib.mesh.extraction.extract import SILHOUETTE_SIZE, SILHOUETTE_VIEWS_DEG
 from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
@@ -26,7 +28,8 @@ from dg4d_lib.rasterizer.interface import Rasterizer
 RADII = (1, 2, 3, 4)  # cells; tunnels narrower than twice the last are filled, the narrowest first
 INSIDE = 1.3  # density of filled samples, of the level: the surface over them lies between the samples
 COVERED = 0.75  # smallest share of a filled tunnel that every view sees covered
-CONNECTIVITY = 3  # samples that share a corner are connected
+
+configure_numba()
 
 
 def fill_tunnels(field: DensityField, level: float, gaussians: Gaussians, rasterize: Rasterizer) -> DensityField:
@@ -51,14 +54,11 @@ def fill_tunnels(field: DensityField, level: float, gaussians: Gaussians, raster
     for radius in RADII:
         candidates, _ = ndimage.label(_closed(filled, radius) & ~filled)
         for number, place in enumerate(ndimage.find_objects(candidates), 1):
-            box = tuple(slice(side.start - 1, side.stop + 1) for side in place)
-            here, part = filled[box], candidates[box] == number
-            if euler_number(here | part, CONNECTIVITY) <= euler_number(here, CONNECTIVITY):
+            samples = np.argwhere(candidates[place] == number) + [side.start for side in place]
+            if euler_gain(filled, candidates, samples) <= 0:
                 continue
-            corner = np.array([side.start for side in box])
-            positions = origin + (np.argwhere(part) + corner) * field.cell
-            if _least_covered(positions, views) >= COVERED:
-                here |= part
+            if _least_covered(origin + samples * field.cell, views) >= COVERED:
+                filled[tuple(samples.T)] = True
     values = field.values.clone()
     values[body][torch.from_numpy((filled & ~solid)[(slice(margin, -margin),) * 3])] = INSIDE * level
     return replace(field, values=values)
@@ -82,6 +82,43 @@ def dilated(solid: Bool[np.ndarray, "i j k"], radius: int) -> Bool[np.ndarray, "
             onto, source = shifted((i, j, 0))
             ball[onto] |= lines[math.isqrt(radius * radius - i * i - j * j)][source]
     return ball
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def euler_gain(solid, labels, samples):
+    """Return by how much the Euler characteristic grows when one part of the samples becomes solid.
+
+    Samples are closed cubes: those that share a corner are connected. New corners and faces count 1, edges and cubes -1.
+
+    Args:
+        solid: whether a sample is solid: "i j k"; its border is not.
+        labels: number of the part that a sample belongs to: "i j k".
+        samples: those of one part, in the order of the array: "p 3".
+    """
+    gain, part = 0, labels[samples[0, 0], samples[0, 1], samples[0, 2]]
+    for i, j, k in samples:
+        for a in range(-1, 2):
+            for b in range(-1, 2):
+                for c in range(-1, 2):
+                    if _is_new(solid, labels, part, i, j, k, a, b, c):
+                        gain += 1 - 2 * ((a == 0) ^ (b == 0) ^ (c == 0))
+    return gain
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _is_new(solid, labels, part, i, j, k, a, b, c):
+    """Tell whether the corner, edge, face or cube of a sample towards (a, b, c) is of no solid or earlier sample."""
+    for x in range(min(a, 0), max(a, 0) + 1):
+        for y in range(min(b, 0), max(b, 0) + 1):
+            for z in range(min(c, 0), max(c, 0) + 1):
+                if solid[i + x, j + y, k + z]:
+                    return False
+                earlier = x < 0 or (x == 0 and (y < 0 or (y == 0 and z < 0)))
+                if earlier and labels[i + x, j + y, k + z] == part:
+                    return False
+    return True
 
 
 def _silhouettes(gaussians: Gaussians, rasterize: Rasterizer) -> list[tuple[OrbitCamera, Bool[np.ndarray, "h w"]]]:

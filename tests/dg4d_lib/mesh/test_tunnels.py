@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import distance_transform_edt
+from skimage.measure import euler_number
 
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import DensityField, density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface
-from dg4d_lib.mesh.extraction.tunnels import dilated, fill_tunnels
+from dg4d_lib.mesh.extraction.tunnels import dilated, euler_gain, fill_tunnels
 from dg4d_lib.mesh.folds import genus
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
@@ -85,3 +86,14 @@ def test_a_dilation_reaches_all_samples_within_a_distance(radius: int) -> None:
     solid = np.random.default_rng(radius).random((11, 17, 23)) < 0.004
     assert 0 < solid.sum() < 30
     np.testing.assert_array_equal(dilated(solid, radius), distance_transform_edt(~solid) <= radius)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.6])
+def test_the_growth_of_the_euler_characteristic_equals_that_of_whole_pictures(share: float) -> None:
+    random = np.random.default_rng(round(10 * share))
+    solid = np.pad(random.random((6, 7, 8)) < share, 1)
+    labels = np.where(solid, 0, np.pad(random.integers(0, 4, (6, 7, 8)), 1))
+    gains = [euler_gain(solid, labels, np.argwhere(labels == part)) for part in (1, 2, 3)]
+    before = euler_number(solid, 3)
+    assert gains == [euler_number(solid | (labels == part), 3) - before for part in (1, 2, 3)]
+    assert len(set(gains)) > 1
