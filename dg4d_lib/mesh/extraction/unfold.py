@@ -30,6 +30,8 @@ def unfold(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) ->
         if fewest == 0:
             break
         around = grown(faces_to_vertices(defective, faces, len(smooth)), edges, 1 + number // WIDER)
+        here = np.flatnonzero(around)
+        means_here = mean_of_neighbors[here]
         for _ in range(SWEEPS):
-            smooth[around] += STEP * ((mean_of_neighbors @ smooth)[around] - smooth[around])
+            smooth[here] += STEP * (means_here @ smooth - smooth[here])
     return best.astype(vertices.dtype)
