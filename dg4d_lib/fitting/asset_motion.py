@@ -38,6 +38,7 @@ FLOW_UNIT = 0.02  # of the picture's side: error of the flow up to which its los
 MATCH_ITERATIONS = 80  # of the colors at the first frame
 MATCH_LR = (0.05, 0.1, 0.01)  # of harmonics, opacities and sizes
 ROBUST = 0.05  # relative stretch up to which the rigidity is quadratic
+EXPLAINED = 0.04  # error of the first frame up to which the model is at rest there
 SMALLEST_REAL = 0.05  # part of a quaternion: turns by half a circle have no vector
 BETA1, BETA2 = 0.9, 0.99  # of Adam
 FACTORS = {"turns": 6.0, "shifts": 3.0, "whole_turns": 2.0, "whole_shifts": 1.0}  # of the learning rate, per variable
@@ -145,15 +146,29 @@ def iterations(settings: AssetSettings, frames: int) -> int:
 def _followed(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list["_Unknowns"]:
     """Track the frames by optical flow, loops from both ends; return their variables."""
     tracker = FlowTracker(fit.cloud, fit.graph, fit.colors, fit.alphas, fit.rasterize, settings, fit.normal)
-    poses = {0: tracker.placed(Pose.rest(len(fit.graph.nodes)))}
-    fit.match_first_frame(poses[0])
-    tracker.cloud = fit.cloud
+    poses = {0: _first_pose(fit, tracker)}
     report(settings.track_iterations, {"color": tracker.error(poses[0], 0)})
     for order in tracking_orders(video, 0):
         for number, frame in enumerate(order[1:], 1):
             poses[frame] = tracker.tracked(poses, order[:number], frame)
             report(len(poses) * settings.track_iterations, {"color": tracker.error(poses[frame], frame)})
     return [_Unknowns.of(poses[frame], fit.smoothing) for frame in range(len(video))]
+
+
+def _first_pose(fit: "_Fit", tracker: FlowTracker) -> Pose:
+    """Return the pose at the first frame, with the colors of the Gaussians fitted to it.
+
+    It is that at rest if colors, opacities and sizes explain the frame: outlines that differ, as by a texture's holes or
+    by gaps between the Gaussians, are no motion, and would become motion in depth at all frames.
+    """
+    rest, unmatched = Pose.rest(len(fit.graph.nodes)), tracker.cloud
+    tracker.cloud = fit.match_first_frame(rest)
+    if tracker.error(rest, 0) <= EXPLAINED:
+        return rest
+    tracker.cloud = unmatched
+    followed = tracker.followed(rest, 0)
+    tracker.cloud = fit.match_first_frame(followed)
+    return followed
 
 
 def _descended(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list["_Unknowns"]:
@@ -207,8 +222,12 @@ class _Fit:
         self.smoothing = _smoothing(graph, settings.smoothing)
         self.spans = graph.nodes[second] - graph.nodes[first]
 
-    def match_first_frame(self, pose: Pose) -> None:
-        """Fit colors, opacities and sizes to the first frame: light, texture and gaps differ from the video's."""
+    def match_first_frame(self, pose: Pose) -> Gaussians:
+        """Fit colors, opacities and sizes to the first frame: light, texture and gaps differ from the video's.
+
+        Returns:
+            The Gaussians that the fit renders from now on.
+        """
         motion = _Unknowns.of(pose, self.smoothing).motion(self.smoothing)
         means, quats = motion.points(self.plain.means, self.graph)[0], motion.rotations(self.graph)[0]
         names = ("harmonics", "opacity_logits", "log_scales")
@@ -229,6 +248,7 @@ class _Fit:
             optimizer.step()
         found = replace(self.plain, **{name: value.detach() for name, value in values.items()})
         self.cloud = antialiased(found, self.camera)
+        return self.cloud
 
     def relative(self, values: Tensor) -> Tensor:
         """Return lengths in tenths of the model's size."""

@@ -41,7 +41,6 @@ STILL = 0.15  # weight of the last frame's place beside that of the extrapolated
 UNSEEN = 0.1  # of the weights of displacements that a video hardly shows; they suit the refinement
 GAIN = 0.02  # by which another start must lower the error
 LOST, JUMP = 0.1, 1.3  # error, and its growth since the last frame, from which parts are searched
-AGREEMENT = 0.9  # IoU of outlines at the first frame from which the model is at rest there
 WINDOW = 8  # search of patches, in pixels of a picture of half the size, at 64 pixels of `asset.size`
 ALPHA_WEIGHT = 0.5  # of alpha beside a color, in patches
 LARGEST_COST = 0.3  # of a pixel, so that occluded ones do not decide
@@ -105,11 +104,9 @@ class FlowTracker:
         self._features = _features(self._pictures, alphas)
         self._lumas = luminance(self._pictures).cpu().numpy()
 
-    def placed(self, rest: Pose) -> Pose:
-        """Return the pose at the first frame: at rest, or by optical flow where outlines differ."""
-        inside, wanted = self._draw(rest)[0].alpha[0] > 0.5, self._alphas[0] > 0.5
-        agreement = float((inside & wanted).sum() / (inside | wanted).sum().clamp(min=1))
-        return rest if agreement >= AGREEMENT else self._followed(rest, rest, rest, 0)
+    def followed(self, pose: Pose, frame: int) -> Pose:
+        """Return a pose that follows the optical flow to a frame, without regard to other frames."""
+        return self._followed(pose, pose, pose, frame)
 
     def tracked(self, poses: Mapping[int, Pose], trail: Sequence[int], frame: int) -> Pose:
         """Return the pose at a frame.

@@ -22,11 +22,13 @@ DESCENT = AssetSettings(  # for surfaces that are guesses: what flow takes for c
     tracking="descent",
     track_iterations=40,
     size=96,
+    lr=0.006,
     smoothing=4.0,
     rigidity=0.3,
     inertia=0.02,
     smoothness=0.02,
     depth=0.005,
+    whole_depth=0.15,
     across=0.0,
 )
 CELL = 0.02  # world units: vertices in one cell move alike; distances along a finer surface take a minute

@@ -135,16 +135,6 @@ def test_a_mirror_plane_tells_depth(side: float) -> None:
         np.testing.assert_allclose(pose.shifts.mean(0), (0.08, 0.05, depth), atol=0.02)
 
 
-@pytest.mark.parametrize("agrees", [True, False])
-def test_the_first_frame_is_tracked_only_where_outlines_differ(agrees: bool) -> None:
-    points, _ = scene()
-    tracker = tracker_of(points)
-    if not agrees:
-        tracker._alphas[0] = tracker._alphas[0].roll(9, 1)
-    rest = Pose.rest(len(tracker._nodes))
-    assert (tracker.placed(rest) is rest) == agrees
-
-
 def test_poses_continue_at_half_their_speed() -> None:
     angle = torch.tensor([[0.0, -0.4, 0], [0.4, 0, 0], [0, 0, 0]])
     pair = [torch.linalg.matrix_exp(scale * angle).double().numpy()[None] for scale in (1.0, 1.5)]
