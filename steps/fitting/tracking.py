@@ -16,7 +16,9 @@ from dg4d_lib.visual_hull.shape import ALL_AROUND
 from steps.fitting.priors import Track
 
 TRACKED_NOTE = "motion of unseen sides: the surface of the known views, moved as the video shows it"
-SOFT = DESCENT.model_copy(update={"across": AssetSettings().across})  # for hulls of few views, whose limbs may touch
+SOFT = DESCENT.model_copy(  # for hulls of few views, whose limbs may touch
+    update={"across": AssetSettings().across, "whole_depth": 0.02}
+)
 
 
 def tracks_surface(settings: MotionSettings, prior: PriorSettings, known: Bank | None, frames: int) -> bool:
