@@ -158,8 +158,8 @@ def _followed(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report:
 def _first_pose(fit: "_Fit", tracker: FlowTracker) -> Pose:
     """Return the pose at the first frame, with the colors of the Gaussians fitted to it.
 
-    It is that at rest if colors, opacities and sizes explain the frame: outlines that differ, as by a texture's holes or
-    by gaps between the Gaussians, are no motion, and would become motion in depth at all frames.
+    It is that at rest if colors, opacities and sizes explain the frame: outlines that differ, as by holes of a texture
+    or gaps between the Gaussians, are no motion, and would become motion in depth at all frames.
     """
     rest, unmatched = Pose.rest(len(fit.graph.nodes)), tracker.cloud
     tracker.cloud = fit.match_first_frame(rest)

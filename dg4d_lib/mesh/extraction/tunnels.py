@@ -12,9 +12,9 @@ from typing import no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
-from scipy import ndimage
+from jaxtyping import Bool, Float
 from numba import njit
+from scipy import ndimage
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -89,7 +89,8 @@ def dilated(solid: Bool[np.ndarray, "i j k"], radius: int) -> Bool[np.ndarray, "
 def euler_gain(solid, labels, samples):
     """Return by how much the Euler characteristic grows when one part of the samples becomes solid.
 
-    Samples are closed cubes: those that share a corner are connected. New corners and faces count 1, edges and cubes -1.
+    Samples are closed cubes, so those that share a corner are connected. New corners and faces count 1, new edges and
+    cubes -1.
 
     Args:
         solid: whether a sample is solid: "i j k"; its border is not.
