@@ -25,11 +25,11 @@ from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
 from dg4d_lib.mesh.shifts import shifted
 from dg4d_lib.rasterizer.interface import Rasterizer
 
+configure_numba()
+
 RADII = (1, 2, 3, 4)  # cells; tunnels narrower than twice the last are filled, the narrowest first
 INSIDE = 1.3  # density of filled samples, of the level: the surface over them lies between the samples
 COVERED = 0.75  # smallest share of a filled tunnel that every view sees covered
-
-configure_numba()
 
 
 def fill_tunnels(field: DensityField, level: float, gaussians: Gaussians, rasterize: Rasterizer) -> DensityField:
