@@ -6,8 +6,9 @@ from jaxtyping import Bool, Float, Int
 from dg4d_lib.mesh.folds import area_normals
 from dg4d_lib.mesh.neighbors import edge_graph, grown, neighbor_means
 
-ROUNDS = 40  # smoothing steps at most
-RINGS = 1  # rings of vertices by which the smoothed region grows in a step
+ROUNDS = 120  # of smoothing, at most
+SWEEPS = 3  # averagings with the neighbors per round
+WIDER = 2  # rounds after which the smoothed region grows by a ring of vertices
 
 
 def faces_against_rotations(
@@ -44,18 +45,19 @@ def unflip(
     if not wrong.any():
         return moved, 0
     edges = edge_graph(faces, len(rest))
-    mean = neighbor_means(edges)
-    turns = rotations.copy()
-    shifts = moved - np.einsum("vij,vj->vi", turns, rest)
-    moved = moved.copy()
-    region = np.zeros(len(rest), bool)
-    for _ in range(ROUNDS):
+    mean_of_neighbors = neighbor_means(edges)
+    affine = np.concatenate([rotations.reshape(-1, 9), moved - np.einsum("vij,vj->vi", rotations, rest)], 1)
+    moved, region = moved.copy(), np.zeros(len(rest), bool)
+    for number in range(ROUNDS):
         region[faces[wrong]] = True
-        region = grown(region, edges, RINGS)
-        affine = np.concatenate([turns.reshape(-1, 9), shifts], 1)
-        affine[region] = 0.5 * (affine[region] + (mean @ affine)[region])
+        if number % WIDER == 0:
+            region = grown(region, edges, 1)
+        here = np.flatnonzero(region)
+        means_here = mean_of_neighbors[here]
+        for _ in range(SWEEPS):
+            affine[here] = 0.5 * (affine[here] + means_here @ affine)
         turns, shifts = affine[:, :9].reshape(-1, 3, 3), affine[:, 9:]
-        moved[region] = (np.einsum("vij,vj->vi", turns, rest) + shifts)[region]
+        moved[here] = np.einsum("vij,vj->vi", turns[here], rest[here]) + shifts[here]
         wrong = faces_against_rotations(rest, moved, faces, turns)
         if not wrong.any():
             break

@@ -1,6 +1,7 @@
 """Faces that a motion turns inside out are found and turned back."""
 
 import numpy as np
+import pytest
 
 from dg4d_lib.mesh.models.flips import faces_against_rotations, unflip
 
@@ -33,6 +34,21 @@ def test_a_folded_vertex_is_unfolded_and_the_rest_stays():
     assert not faces_against_rotations(vertices, repaired, faces, identity(len(vertices))).any()
     np.testing.assert_array_equal(repaired[0], vertices[0])
     assert repaired[middle, 0] > vertices[middle, 0]
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 60.0, 120.0])
+def test_halves_that_overlap_far_are_joined_without_flips(angle_deg: float) -> None:
+    vertices, faces = sheet(40)
+    c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    half, turn = vertices[:, 0] >= 20, np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    moved, rotations = vertices.copy(), identity(len(vertices))
+    moved[half] = (vertices[half] - (20, 0, 0)) @ turn.T + (8, 0, 0)  # 12 cells back over the other half
+    rotations[half] = turn
+    assert faces_against_rotations(vertices, moved, faces, rotations).any()
+    repaired, left = unflip(vertices, moved, faces, rotations)
+    assert left == 0
+    ends = vertices[:, 0] == 0
+    np.testing.assert_allclose(repaired[ends], vertices[ends], atol=2.0)
 
 
 def test_a_sound_motion_is_returned_unchanged():
