@@ -191,7 +191,9 @@ class AssetSettings(Settings):
     )
     joint_iterations: int = Field(100, ge=0, le=10000, description="iterations over all frames after tracking")
     joint_frames: int = Field(8, ge=1, le=512, description="frames of a joint iteration")
-    lr: Positive = Field(0.003, description="learning rate of the position of the model, world units")
+    lr: Positive = Field(
+        0.003, description="learning rate of the position of the model, world units; `tracking=descent` needs 0.006"
+    )
     smoothing: NotNegative = Field(1.0, description="smoothing of the steps over the control graph")
     color_weight: NotNegative = Field(1.0, description="colors of the video, mean squared error over the subject")
     alpha_weight: NotNegative = Field(1.0, description="alpha of the video, mean squared error over the subject")
@@ -202,7 +204,9 @@ class AssetSettings(Settings):
     smoothness: NotNegative = Field(0.1, description="accelerations in the joint fit")
     depth: NotNegative = Field(0.001, description="displacements along the viewing direction")
     whole_depth: NotNegative = Field(
-        0.01, description="displacement of the whole along the viewing direction, which a video shows little"
+        0.01,
+        description="displacement of the whole along the viewing direction, which rigidity and perspective tell; "
+        "`tracking=descent` drifts below 0.1",
     )
     across: NotNegative = Field(
         0.15,
