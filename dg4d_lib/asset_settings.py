@@ -192,7 +192,7 @@ class AssetSettings(Settings):
     joint_iterations: int = Field(100, ge=0, le=10000, description="iterations over all frames after tracking")
     joint_frames: int = Field(8, ge=1, le=512, description="frames of a joint iteration")
     lr: Positive = Field(
-        0.003, description="learning rate of the position of the model, world units; `tracking=descent` needs 0.006"
+        0.003, description="learning rate of the position of the model, world units; for `tracking=descent`, 0.006"
     )
     smoothing: NotNegative = Field(1.0, description="smoothing of the steps over the control graph")
     color_weight: NotNegative = Field(1.0, description="colors of the video, mean squared error over the subject")
@@ -206,7 +206,7 @@ class AssetSettings(Settings):
     whole_depth: NotNegative = Field(
         0.01,
         description="displacement of the whole along the viewing direction, which rigidity and perspective tell; "
-        "`tracking=descent` drifts below 0.1",
+        "for `tracking=descent`, 0.15",
     )
     across: NotNegative = Field(
         0.15,
