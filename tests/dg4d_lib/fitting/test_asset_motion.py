@@ -20,9 +20,7 @@ from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 
 FRAMES, ANGLE = 4, 0.35  # radians at the last frame
-SETTINGS = AssetSettings(  # `across` is 0, for a round arm has many mirror planes
-    points=700, fit_points=700, nodes=16, size=48, track_iterations=3, joint_iterations=10, across=0.0
-)
+SETTINGS = AssetSettings(points=700, fit_points=700, nodes=16, size=48, track_iterations=3, joint_iterations=10)
 
 
 def arm() -> Model:
