@@ -189,7 +189,7 @@ class AssetSettings(Settings):
     track_iterations: int = Field(
         3, ge=1, le=1000, description="rounds of optical flow, or steps of the descent, per frame while tracking"
     )
-    joint_iterations: int = Field(100, ge=0, le=10000, description="iterations over all frames after tracking")
+    joint_iterations: int = Field(200, ge=0, le=10000, description="iterations over all frames after tracking")
     joint_frames: int = Field(8, ge=1, le=512, description="frames of a joint iteration")
     lr: Positive = Field(
         0.003, description="learning rate of the position of the model, world units; for `tracking=descent`, 0.006"
@@ -204,7 +204,7 @@ class AssetSettings(Settings):
     smoothness: NotNegative = Field(0.1, description="accelerations in the joint fit")
     depth: NotNegative = Field(0.001, description="displacements along the viewing direction")
     whole_depth: NotNegative = Field(
-        0.01,
+        0.001,
         description="displacement of the whole along the viewing direction, which rigidity and perspective tell; "
         "for `tracking=descent`, 0.15",
     )

@@ -255,7 +255,7 @@ class FlowTracker:
             blocks[..., 3:] = scale * direction
             terms.append((_rows(blocks, np.arange(count)[:, None], count), pose.shifts @ direction * scale))
         depth = np.zeros((1, count, 1, 6))
-        depth[..., 5] = scale = np.sqrt(UNSEEN * settings.whole_depth) / count / self._unit
+        depth[..., 5] = scale = np.sqrt(settings.whole_depth) / count / self._unit
         terms.append((_rows(depth, np.arange(count)[None], count), pose.shifts[:, 2:].sum(0) * scale))
         matrix = vstack([rows for rows, _ in terms], format="csr")
         normal = (matrix.T @ matrix).toarray()

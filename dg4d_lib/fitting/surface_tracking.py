@@ -21,6 +21,7 @@ from dg4d_lib.video.driving import DrivingVideo
 DESCENT = AssetSettings(  # for surfaces that are guesses: what flow takes for certain tears them
     tracking="descent",
     track_iterations=40,
+    joint_iterations=100,
     size=96,
     lr=0.006,
     smoothing=4.0,

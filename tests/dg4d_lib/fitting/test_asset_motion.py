@@ -103,17 +103,23 @@ def test_nothing_drifts_in_depth(scene: tuple[SurfaceCloud, ControlGraph, Drivin
     assert np.abs(depth.mean(1)).max() < 0.02
 
 
-def follow(scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo], video: DrivingVideo) -> np.ndarray:
+def follow(
+    scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo], video: DrivingVideo, settings: AssetSettings = SETTINGS
+) -> np.ndarray:
     """Return the vertices of the arm as it follows a video."""
     surface, graph, _ = scene
     bound, generator = graph.of(surface.nearest), torch.Generator().manual_seed(0)
-    return moved(scene, fit_asset_motion(surface.cloud, bound, video, get_rasterizer("cpu"), SETTINGS, generator))
+    return moved(scene, fit_asset_motion(surface.cloud, bound, video, get_rasterizer("cpu"), settings, generator))
 
 
-def test_a_motion_of_the_whole_in_depth_is_found(scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo]) -> None:
+@pytest.mark.parametrize("joint_iterations", [0, 60])
+def test_a_motion_of_the_whole_in_depth_is_found(
+    scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo], joint_iterations: int
+) -> None:
     truth = -0.1 * np.arange(FRAMES)
     video = video_of([arm().parts[0].vertices + np.array([0, 0, depth]) for depth in truth])
-    depth = (follow(scene, video) - scene[0].fine.vertices)[..., 2].mean(1)
+    settings = SETTINGS.model_copy(update={"joint_iterations": joint_iterations})
+    depth = (follow(scene, video, settings) - scene[0].fine.vertices)[..., 2].mean(1)
     np.testing.assert_allclose(depth[1:] / truth[1:], 0.8, atol=0.1)
 
 
