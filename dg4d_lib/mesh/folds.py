@@ -61,10 +61,17 @@ class DefectFinder:
             self._normals_at_rest = unit_normals(rest, faces)
             self._at_vertices = _sums_at_vertices(self._sides, len(rest))
 
-    def defective(self, vertices: Float[np.ndarray, "v 3"]) -> Bool[np.ndarray, " f"]:
-        """Mark faces that intersect others, are flipped or lie at a fold."""
+    def defective(
+        self, vertices: Float[np.ndarray, "v 3"], moved: Bool[np.ndarray, " v"] | None = None
+    ) -> Bool[np.ndarray, " f"]:
+        """Mark faces that intersect others, are flipped or lie at a fold.
+
+        Args:
+            vertices: of the pose.
+            moved: vertices outside of which faces are known not to intersect, which saves most of the time; None: all.
+        """
         normals = unit_normals(vertices, self._faces)
-        marked = self_intersecting(vertices, self._faces) | self._flipped(vertices, normals)
+        marked = self_intersecting(vertices, self._faces, moved) | self._flipped(vertices, normals)
         folded = self._cosines(normals) < np.cos(np.radians(FOLD_DEG))
         marked[self._first[folded]] = marked[self._second[folded]] = True
         return marked
@@ -145,10 +152,17 @@ def area_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3
     return np.cross(b - a, c - a)
 
 
-def self_intersecting(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
+def self_intersecting(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], moved: Bool[np.ndarray, " v"] | None = None
+) -> Bool[np.ndarray, " f"]:
     """Mark faces that an edge of another face crosses, or that cross another face with an edge of their own.
 
     Faces that only touch, at a corner or along an edge, do not count.
+
+    Args:
+        vertices: positions.
+        faces: indices into the vertices.
+        moved: pairs of faces without such a corner are known not to cross; None: no pair is.
     """
     points = np.ascontiguousarray(vertices, np.float64)
     corners = np.ascontiguousarray(faces, np.int64)
@@ -163,7 +177,8 @@ def self_intersecting(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray,
     last = ((high - low.min(0)) / cell).astype(np.int64)
     shape = last.max(0) + 1
     starts, members = _fill_grid(first, last, shape)
-    _cross_faces(points, corners, low, high, low.min(0), cell, shape, starts, members, marked)
+    tested = np.ones(len(corners), np.bool_) if moved is None else moved[corners].any(1)
+    _cross_faces(points, corners, low, high, low.min(0), cell, shape, starts, members, tested, marked)
     return marked
 
 
@@ -205,14 +220,14 @@ def _fill_grid(first, last, shape):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _cross_faces(points, faces, low, high, origin, size, shape, starts, members, marked):
-    """Mark the faces that cross another one; a pair is tested in the first cell that both boxes share."""
+def _cross_faces(points, faces, low, high, origin, size, shape, starts, members, tested, marked):
+    """Mark the faces that cross another one, pairs with a `tested` face, in the first cell that both boxes share."""
     for cell in range(len(starts) - 1):
         z, y, x = cell % shape[2], cell // shape[2] % shape[1], cell // (shape[1] * shape[2])
         for m in range(starts[cell], starts[cell + 1]):
             for n in range(starts[cell], m):
                 i, j = members[m], members[n]
-                if marked[i] and marked[j]:
+                if (marked[i] and marked[j]) or not (tested[i] or tested[j]):
                     continue
                 apart = False
                 for axis in range(3):

@@ -1,7 +1,7 @@
 """Removal of folds and self-intersections from a surface by smoothing around them."""
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from dg4d_lib.mesh.folds import DefectFinder
 from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, grown, neighbor_means
@@ -23,13 +23,15 @@ def unfold(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) ->
     mean_of_neighbors, finder = neighbor_means(edges), DefectFinder(faces)
     smooth = vertices.astype(np.float64)
     fewest, best = len(faces) + 1, smooth
+    moved: Bool[np.ndarray, " v"] | None = None
     for number in range(ROUNDS):
-        defective = finder.defective(smooth)
+        defective = finder.defective(smooth, moved)
         if defective.sum() < fewest:
             fewest, best = defective.sum(), smooth.copy()
         if fewest == 0:
             break
         around = grown(faces_to_vertices(defective, faces, len(smooth)), edges, 1 + number // WIDER)
+        moved = around if moved is None else moved | around
         here = np.flatnonzero(around)
         means_here = mean_of_neighbors[here]
         for _ in range(SWEEPS):

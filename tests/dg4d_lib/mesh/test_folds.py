@@ -99,6 +99,27 @@ def test_a_spike_through_the_other_side_is_smoothed_away() -> None:
     assert unfold(vertices, faces) is not vertices and np.array_equal(unfold(vertices, faces), vertices)
 
 
+def test_unfolding_tests_moved_faces_alone_and_misses_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    vertices, faces = tube()
+    noisy = vertices + 0.012 * np.random.default_rng(1).normal(size=vertices.shape) * (vertices[:, :1] > 0.85)
+    fast = unfold(noisy, faces)
+    assert DefectFinder(faces).defective(noisy).any() and (fast == noisy).all(1).mean() > 0.5
+    search = DefectFinder.defective
+    monkeypatch.setattr(DefectFinder, "defective", lambda self, vertices, moved=None: search(self, vertices))
+    assert np.array_equal(fast, unfold(noisy, faces))
+
+
+def test_faces_that_did_not_move_are_not_tested_again() -> None:
+    vertices, faces = sphere(2)
+    both, joined = (
+        np.concatenate([vertices, vertices + np.array([1.0, 0, 0])]),
+        np.concatenate([faces, faces + len(vertices)]),
+    )
+    everywhere = self_intersecting(both, joined)
+    assert not self_intersecting(both, joined, np.zeros(len(both), bool)).any()
+    assert np.array_equal(self_intersecting(both, joined, np.arange(len(both)) < len(vertices)), everywhere)
+
+
 def test_more_rounds_of_smoothing_never_leave_more_defects(monkeypatch: pytest.MonkeyPatch) -> None:
     """A thin and crumpled tube, which smoothing collapses in the end."""
     vertices, faces = tube(rings=41, around=4)
