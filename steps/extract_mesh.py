@@ -47,6 +47,7 @@ Frame = tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]  # color and alpha
 Footage = Callable[[Int[Tensor, " w"]], list[PosedSurface]]
 
 COLORED = 16  # frames of the driving video that are baked into the texture of a mesh that follows it
+SELECTIVITY = 2  # exponent of a frame's weight in the inverse of its squared error
 LEAST_ERROR = 1e-4  # squared error below which frames weigh alike, 40 dB
 FOLLOWED = {"gaussians": "motion", "video": "driving video"}
 OUTLINES = {"gaussians": "the Gaussians'", "video": "those of video and Gaussians"}
@@ -186,7 +187,8 @@ def _footage(
         return surfaces
     errors = [_squared_error(replace(textured, vertices=surface.vertices), surface) for surface in surfaces]
     least = max(min(errors), LEAST_ERROR)
-    return [replace(surface, weight=least / max(error, least)) for surface, error in zip(surfaces, errors, strict=True)]
+    weights = [(least / max(error, least)) ** SELECTIVITY for error in errors]
+    return [replace(surface, weight=weight) for surface, weight in zip(surfaces, weights, strict=True)]
 
 
 def _squared_error(mesh: TexturedMesh, surface: PosedSurface) -> float:

@@ -2,13 +2,15 @@
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import csc_array, csr_array, diags_array
+from scipy.sparse.linalg import splu
 
 from dg4d_lib.mesh.folds import area_normals
-from dg4d_lib.mesh.neighbors import edge_graph, grown, neighbor_means
+from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, graph_laplacian, grown
 
-ROUNDS = 120  # of smoothing, at most
-SWEEPS = 3  # averagings with the neighbors per round
-WIDER = 2  # rounds after which the smoothed region grows by a ring of vertices
+RINGS = (2, 4, 8, 16, 32, 64, 128)  # of vertices around flipped faces that give way, one attempt after the other
+SHORTEST = 1e-3  # of the median length: no edge is stiffer than one so short
+LEAST_OWN = 1e-6  # weight of the own motion of vertices at flipped faces, against 1 per edge
 
 
 def faces_against_rotations(
@@ -32,8 +34,8 @@ def unflip(
 ) -> tuple[Float[np.ndarray, "v 3"], int]:
     """Return the vertices without flipped faces, and the number of faces that stay flipped.
 
-    Around flipped faces, the displacements from the turned rest pose are averaged with those of the neighbors, until
-    the surface moves like a stiffer one there.
+    Around flipped faces, turn and displacement are those of a membrane that is drawn to the motion of the other
+    vertices, the less the wider it is; where it flips faces, too, a wider one is tried.
 
     Args:
         rest: vertices at rest.
@@ -45,20 +47,42 @@ def unflip(
     if not wrong.any():
         return moved, 0
     edges = edge_graph(faces, len(rest))
-    mean_of_neighbors = neighbor_means(edges)
+    laplacian = graph_laplacian(_stiff(edges, rest))
     affine = np.concatenate([rotations.reshape(-1, 9), moved - np.einsum("vij,vj->vi", rotations, rest)], 1)
-    moved, region = moved.copy(), np.zeros(len(rest), bool)
-    for number in range(ROUNDS):
-        region[faces[wrong]] = True
-        if number % WIDER == 0:
-            region = grown(region, edges, 1)
-        here = np.flatnonzero(region)
-        means_here = mean_of_neighbors[here]
-        for _ in range(SWEEPS):
-            affine[here] = 0.5 * (affine[here] + means_here @ affine)
-        turns, shifts = affine[:, :9].reshape(-1, 3, 3), affine[:, 9:]
-        moved[here] = np.einsum("vij,vj->vi", turns[here], rest[here]) + shifts[here]
-        wrong = faces_against_rotations(rest, moved, faces, turns)
-        if not wrong.any():
+    fewest, best, region = int(wrong.sum()), moved, np.zeros(len(rest), bool)
+    at_first = faces_to_vertices(wrong, faces, len(rest))
+    for rings in RINGS:
+        region |= grown(faces_to_vertices(wrong, faces, len(rest)), edges, rings)
+        spanned = _spanned(affine, laplacian, region, np.where(at_first, LEAST_OWN, 1 / rings**2))
+        turns, attempt = spanned[:, :9].reshape(-1, 3, 3), moved.copy()
+        attempt[region] = np.einsum("vij,vj->vi", turns[region], rest[region]) + spanned[region, 9:]
+        wrong = faces_against_rotations(rest, attempt, faces, turns)
+        if wrong.sum() < fewest:
+            fewest, best = int(wrong.sum()), attempt
+        if fewest == 0 or region.all():
             break
-    return moved, int(wrong.sum())
+    return best, fewest
+
+
+def _stiff(edges: csr_array, rest: Float[np.ndarray, "v 3"]) -> csr_array:
+    """Return the adjacency with a weight by the inverse square of the length, 1 for the median: slivers stay stiff."""
+    pairs = edges.tocoo()
+    lengths = np.linalg.norm(rest[pairs.row] - rest[pairs.col], axis=1)
+    lengths /= np.median(lengths)
+    return csr_array((lengths.clip(SHORTEST) ** -2, (pairs.row, pairs.col)), shape=edges.shape)
+
+
+def _spanned(
+    values: Float[np.ndarray, "v c"],
+    laplacian: csr_array,
+    region: Bool[np.ndarray, " v"],
+    own: Float[np.ndarray, " v"],
+) -> Float[np.ndarray, "v c"]:
+    """Return values that are smooth in a region and drawn to the given ones by `own`; those outside stay."""
+    here, outside = np.flatnonzero(region), np.flatnonzero(~region)
+    rows = laplacian[here]
+    matrix = csc_array(rows[:, here] + diags_array(own[here]))
+    solve = splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve
+    spanned = values.copy()
+    spanned[here] = solve(own[here, None] * values[here] - rows[:, outside] @ values[outside])
+    return spanned
