@@ -9,6 +9,7 @@ from dg4d_lib.mesh.folds import area_normals
 from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, graph_laplacian, grown
 
 RINGS = (2, 4, 8, 16, 32, 64, 128)  # of vertices around flipped faces that give way, one attempt after the other
+NEAR, SLIVER = 8, 0.1  # rings beyond which nothing gives way for flipped slivers, of less than so many median areas
 SHORTEST = 1e-3  # of the median length: no edge is stiffer than one so short
 LEAST_OWN = 1e-6  # weight of the own motion of vertices at flipped faces, against 1 per edge
 
@@ -35,7 +36,8 @@ def unflip(
     """Return the vertices without flipped faces, and the number of faces that stay flipped.
 
     Around flipped faces, turn and displacement are those of a membrane that is drawn to the motion of the other
-    vertices, the less the wider it is; where it flips faces, too, a wider one is tried.
+    vertices, the less the wider it is; where it flips faces, too, a wider one is tried. Slivers may stay flipped:
+    nobody sees them, and the surface should not stiffen far around for them.
 
     Args:
         rest: vertices at rest.
@@ -50,16 +52,19 @@ def unflip(
     laplacian = graph_laplacian(_stiff(edges, rest))
     affine = np.concatenate([rotations.reshape(-1, 9), moved - np.einsum("vij,vj->vi", rotations, rest)], 1)
     fewest, best, region = int(wrong.sum()), moved, np.zeros(len(rest), bool)
-    at_first = faces_to_vertices(wrong, faces, len(rest))
+    areas = np.linalg.norm(area_normals(rest, faces), axis=1)
+    broad = areas > SLIVER * np.median(areas)
+    at_first, own = faces_to_vertices(wrong, faces, len(rest)), np.ones(len(rest))
     for rings in RINGS:
-        region |= grown(faces_to_vertices(wrong, faces, len(rest)), edges, rings)
-        spanned = _spanned(affine, laplacian, region, np.where(at_first, LEAST_OWN, 1 / rings**2))
+        near = grown(faces_to_vertices(wrong, faces, len(rest)), edges, rings)
+        own[near], region = 1 / rings**2, region | near
+        spanned = _spanned(affine, laplacian, region, np.where(at_first, LEAST_OWN, own))
         turns, attempt = spanned[:, :9].reshape(-1, 3, 3), moved.copy()
         attempt[region] = np.einsum("vij,vj->vi", turns[region], rest[region]) + spanned[region, 9:]
         wrong = faces_against_rotations(rest, attempt, faces, turns)
         if wrong.sum() < fewest:
             fewest, best = int(wrong.sum()), attempt
-        if fewest == 0 or region.all():
+        if fewest == 0 or region.all() or (rings >= NEAR and not (wrong & broad).any()):
             break
     return best, fewest
 
@@ -68,7 +73,7 @@ def _stiff(edges: csr_array, rest: Float[np.ndarray, "v 3"]) -> csr_array:
     """Return the adjacency with a weight by the inverse square of the length, 1 for the median: slivers stay stiff."""
     pairs = edges.tocoo()
     lengths = np.linalg.norm(rest[pairs.row] - rest[pairs.col], axis=1)
-    lengths /= np.median(lengths)
+    lengths /= max(float(np.median(lengths)), 1e-30)
     return csr_array((lengths.clip(SHORTEST) ** -2, (pairs.row, pairs.col)), shape=edges.shape)
 
 

@@ -63,6 +63,17 @@ def test_slivers_are_turned_back_with_their_surroundings() -> None:
     np.testing.assert_array_equal(repaired[:24], moved[:24])
 
 
+def test_a_sliver_does_not_stiffen_what_is_far_from_it() -> None:
+    vertices, faces = sheet(40)
+    corner = 20 * 40 + 20
+    vertices[corner + 40] = vertices[corner] + (0.5, 1e-5, 0)  # almost on the line to its neighbor
+    moved = vertices + np.stack([0 * vertices[:, 0], 0.01 * np.square(vertices[:, 0] - 20), 0 * vertices[:, 0]], 1)
+    repaired, left = unflip(vertices, moved, faces, identity(len(vertices)))
+    assert left == 1
+    far = np.abs(vertices[:, :2] - vertices[corner, :2]).max(1) > 12
+    np.testing.assert_array_equal(repaired[far], moved[far])
+
+
 def test_a_sound_motion_is_returned_unchanged():
     vertices, faces = sheet()
     moved = vertices + np.array([0.5, 0, 0])
