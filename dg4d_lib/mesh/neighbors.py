@@ -1,8 +1,9 @@
 """Neighborhoods of vertices on a triangle mesh."""
 
 import numpy as np
-from jaxtyping import Bool, Int, Int64
-from scipy.sparse import coo_array, csr_array, diags_array
+from jaxtyping import Bool, Float, Int, Int64
+from scipy.sparse import coo_array, csc_array, csr_array, diags_array
+from scipy.sparse.linalg import SuperLU, splu
 
 
 def half_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
@@ -41,6 +42,11 @@ def neighbor_means(edges: csr_array) -> csr_array:
 def graph_laplacian(edges: csr_array) -> csr_array:
     """Return the number of neighbors on the diagonal minus the adjacency."""
     return csr_array(diags_array(edges.sum(axis=1)) - edges)
+
+
+def screened_factors(laplacian: csr_array, pull: Float[np.ndarray, " n"]) -> SuperLU:
+    """Return the factors of a Laplacian plus the weights by which vertices are pulled to given values."""
+    return splu(csc_array(laplacian + diags_array(pull)), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
 
 
 def faces_to_vertices(

@@ -2,11 +2,10 @@
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import csc_array, csr_array, diags_array
-from scipy.sparse.linalg import splu
+from scipy.sparse import csr_array
 
 from dg4d_lib.mesh.folds import area_normals
-from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, graph_laplacian, grown
+from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, graph_laplacian, grown, screened_factors
 
 RINGS = (2, 4, 8, 16, 32, 64, 128)  # of vertices around flipped faces that give way, one attempt after the other
 NEAR, SLIVER = 8, 0.1  # rings beyond which nothing gives way for flipped slivers, of less than so many median areas
@@ -86,8 +85,7 @@ def _spanned(
     """Return values that are smooth in a region and drawn to the given ones by `own`; those outside stay."""
     here, outside = np.flatnonzero(region), np.flatnonzero(~region)
     rows = laplacian[here]
-    matrix = csc_array(rows[:, here] + diags_array(own[here]))
-    solve = splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve
+    wanted = own[here, None] * values[here] - rows[:, outside] @ values[outside]
     spanned = values.copy()
-    spanned[here] = solve(own[here, None] * values[here] - rows[:, outside] @ values[outside])
+    spanned[here] = screened_factors(rows[:, here], own[here]).solve(wanted)
     return spanned

@@ -14,14 +14,12 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int
 from numba import njit
-from scipy.sparse import csc_array, csr_array, diags_array
-from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.silhouettes import silhouette_iou
 from dg4d_lib.mesh.folds import DefectFinder
-from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, graph_laplacian, grown
+from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, graph_laplacian, grown, screened_factors
 from dg4d_lib.mesh.tracking.skinning import nearest_rotation
 
 PULL = 1.0  # weight of the tracked position of a vertex, against 1 for each of its edges
@@ -94,7 +92,7 @@ class ElasticBody:
         self.rest, self.faces = rest, faces
         self.edges = edge_graph(faces, len(rest))
         self.laplacian = graph_laplacian(self.edges)
-        self._whole = _factors(self.laplacian, np.full(len(rest), PULL))
+        self._whole = screened_factors(self.laplacian, np.full(len(rest), PULL))
         self._finder = DefectFinder(faces, rest)
         self._sound_at_rest = ~DefectFinder(faces).defective(rest)
 
@@ -137,10 +135,10 @@ class ElasticBody:
         moved, rotations, forces = start.copy(), np.empty((len(start), 3, 3)), np.empty_like(start)
         rows: slice | Int[np.ndarray, " n"] = slice(None)
         if free is None:
-            solve = (self._whole if (pull == PULL).all() else _factors(self.laplacian, pull)).solve
+            solve = (self._whole if (pull == PULL).all() else screened_factors(self.laplacian, pull)).solve
         else:
             rows = np.flatnonzero(free)
-            solve = _factors(self.laplacian[rows][:, rows], pull[rows]).solve
+            solve = screened_factors(self.laplacian[rows][:, rows], pull[rows]).solve
             outside = self.laplacian[rows][:, ~free]
         for _ in range(passes):
             _rotations(self.edges.indptr, self.edges.indices, self.rest, moved, rotations)
@@ -148,10 +146,6 @@ class ElasticBody:
             wanted = (forces + pull[:, None] * tracked)[rows]
             moved[rows] = solve(wanted if free is None else wanted - outside @ moved[~free])
         return moved
-
-
-def _factors(laplacian: csr_array, pull: Float64[np.ndarray, " v"]) -> SuperLU:
-    return splu(csc_array(laplacian + diags_array(pull)), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
 
 
 @njit(cache=True, nogil=True)
