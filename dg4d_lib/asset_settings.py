@@ -200,6 +200,11 @@ class AssetSettings(Settings):
     flow: NotNegative = Field(0.1, description="optical flow between frames while tracking")
     rigidity: NotNegative = Field(1.0, description="as-rigid-as-possible energy of the surface")
     bending: NotNegative = Field(0.1, description="differences of neighboring rotations, times `rigidity`")
+    rigidity_loss: Literal["l1", "log", "best"] = Field(
+        "best",
+        description="loss of stretch and bend, quadratic near 0: `l1`: linear beyond; `log`: logarithmic, for few "
+        "joints that bend a lot; `best`: both, in twice the time, and the motion that shows the video better is kept",
+    )
     inertia: NotNegative = Field(0.002, description="distance to the extrapolated motion while tracking")
     smoothness: NotNegative = Field(0.1, description="accelerations in the joint fit")
     depth: NotNegative = Field(0.001, description="displacements along the viewing direction")

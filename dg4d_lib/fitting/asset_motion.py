@@ -8,6 +8,8 @@ video leaves open; accelerations, and displacements in depth and out of the plan
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Literal
 
 import numpy as np
 import torch
@@ -18,7 +20,7 @@ from torch.nn import functional
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.fitting.flow_tracking import DEPTH_SLACK, FlowTracker, across_weight
+from dg4d_lib.fitting.flow_tracking import DEPTH_SLACK, LOG_SCALE, FlowTracker, across_weight
 from dg4d_lib.fitting.losses import WHITE, check_finite, resize_cutouts
 from dg4d_lib.fitting.node_pose import Pose
 from dg4d_lib.fitting.tracking_order import tracking_orders
@@ -118,17 +120,42 @@ def fit_asset_motion(
     """
     surface = cloud.means.double().numpy(force=True) if surface is None else surface
     normal = mirror_normal(surface) if settings.across else None
-    fit = _Fit(*_thinned(cloud, graph, settings.fit_points), video, rasterize, settings, normal)
-    frames, done = len(video), settings.track_iterations * len(video)
+    thin, bound = _thinned(cloud, graph, settings.fit_points)
+    found: list[tuple[float, NodeMotion]] = []
+    for rigidity_loss in _rigidity_losses(settings):
+        one = settings.model_copy(update={"rigidity_loss": rigidity_loss})
+        fit, before = _Fit(thin, bound, video, rasterize, one, normal), len(found) * iterations(one, len(video))
+        motion = _fitted(fit, video, generator, partial(_report_after, report, before))
+        found.append((fit.difference(motion), motion))
+    return min(found, key=lambda one: one[0])[1]
+
+
+def iterations(settings: AssetSettings, frames: int) -> int:
+    """Return the number of iterations that a fit reports."""
+    return len(_rigidity_losses(settings)) * (settings.track_iterations * frames + settings.joint_iterations)
+
+
+def _report_after(report: Report, before: int, done: int, values: dict[str, float]) -> None:
+    report(before + done, values)
+
+
+def _rigidity_losses(settings: AssetSettings) -> list[Literal["l1", "log"]]:
+    return ["l1", "log"] if settings.rigidity_loss == "best" else [settings.rigidity_loss]
+
+
+def _fitted(fit: "_Fit", video: DrivingVideo, generator: torch.Generator, report: Report) -> NodeMotion:
+    """Track all frames, then refine them together."""
+    settings, frames = fit.settings, len(video)
+    done = settings.track_iterations * frames
     track = _followed if settings.tracking == "flow" else _descended
-    unknowns = _Unknowns.joined(track(fit, video, settings, report))
+    unknowns = _Unknowns.joined(track(fit, video, report))
     descent = _Descent(unknowns)
     for step in range(settings.joint_iterations):
         chosen = torch.randperm(frames, generator=generator)[: min(settings.joint_frames, frames)].sort().values
         moved = unknowns.motion(fit.smoothing)
         losses = fit.losses(moved.at(chosen), chosen.tolist())
         if frames > 2:
-            nodes = moved.nodes(graph)
+            nodes = moved.nodes(fit.graph)
             acceleration = fit.relative(nodes[2:] - 2 * nodes[1:-1] + nodes[:-2])
             losses["inertia"] = settings.smoothness * acceleration.square().sum(-1).mean()
         fit.step(losses, unknowns, f"joint iteration {step + 1}")
@@ -138,13 +165,9 @@ def fit_asset_motion(
     return unknowns.detach().motion(fit.smoothing)
 
 
-def iterations(settings: AssetSettings, frames: int) -> int:
-    """Return the number of iterations that a fit reports."""
-    return settings.track_iterations * frames + settings.joint_iterations
-
-
-def _followed(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list["_Unknowns"]:
+def _followed(fit: "_Fit", video: DrivingVideo, report: Report) -> list["_Unknowns"]:
     """Track the frames by optical flow, loops from both ends; return their variables."""
+    settings = fit.settings
     tracker = FlowTracker(fit.cloud, fit.graph, fit.colors, fit.alphas, fit.rasterize, settings, fit.normal)
     poses = {0: _first_pose(fit, tracker)}
     report(settings.track_iterations, {"color": tracker.error(poses[0], 0)})
@@ -171,9 +194,9 @@ def _first_pose(fit: "_Fit", tracker: FlowTracker) -> Pose:
     return followed
 
 
-def _descended(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list["_Unknowns"]:
+def _descended(fit: "_Fit", video: DrivingVideo, report: Report) -> list["_Unknowns"]:
     """Track the frames one after the other along gradients; return their variables."""
-    done = 0
+    settings, done = fit.settings, 0
     tracked: list[_Unknowns] = [_Unknowns.still(1, fit.graph)]
     for frame in range(len(video)):
         start = tracked[-1] if frame < 2 else tracked[-2].continued(tracked[-1])
@@ -254,9 +277,14 @@ class _Fit:
         """Return lengths in tenths of the model's size."""
         return values / self.unit
 
-    def losses(self, motion: NodeMotion, frames: list[int]) -> dict[str, Tensor]:
-        """Return the weighted losses of some frames."""
-        settings = self.settings
+    @torch.no_grad()
+    def difference(self, motion: NodeMotion) -> float:
+        """Return how much a motion and the video differ: their losses of color and alpha, over all frames."""
+        losses = self._picture_losses(motion, list(range(len(motion.shifts))))
+        return float(losses["color"] + losses["alpha"])
+
+    def _picture_losses(self, motion: NodeMotion, frames: list[int]) -> dict[str, Tensor]:
+        """Return the weighted losses of color and alpha of some frames."""
         means = motion.points(self.cloud.means, self.graph)
         count = len(frames)
         states = replace(
@@ -268,6 +296,11 @@ class _Fit:
         rendering = self.rasterize(states, [self.camera] * count, means.new_tensor(WHITE))
         color = _pyramid_error(rendering.color, self.colors[frames]) / self.area
         alpha = _pyramid_error(rendering.alpha, self.alphas[frames]) / self.area
+        return {"color": self.settings.color_weight * color, "alpha": self.settings.alpha_weight * alpha}
+
+    def losses(self, motion: NodeMotion, frames: list[int]) -> dict[str, Tensor]:
+        """Return the weighted losses of some frames."""
+        settings = self.settings
         shifts = self.relative(motion.nodes(self.graph) - self.graph.nodes)
         depth = shifts[..., 2]
         unseen = settings.depth * depth.square().mean() + settings.whole_depth * depth.mean(-1).square().mean()
@@ -275,8 +308,7 @@ class _Fit:
             across = (shifts @ torch.from_numpy(self.normal).to(shifts)).square().mean()
             unseen = unseen + across_weight(settings, self.normal) * across
         return {
-            "color": settings.color_weight * color,
-            "alpha": settings.alpha_weight * alpha,
+            **self._picture_losses(motion, frames),
             "rigidity": settings.rigidity * self.rigidity(motion),
             "unseen": unseen,
         }
@@ -322,7 +354,8 @@ class _Fit:
         turned = [(matrix.unflatten(-1, (3, 3)) @ self.spans[..., None])[..., 0] for matrix in matrices]
         stretch = torch.cat([(moved - span) / self.graph.lengths[:, None] for span in turned], 1)
         bend = matrices[0] - matrices[1]
-        return _robust(stretch).mean() + self.settings.bending * _robust(bend).mean()
+        log = self.settings.rigidity_loss == "log"
+        return _robust(stretch, log).mean() + self.settings.bending * _robust(bend, log).mean()
 
     def step(self, losses: dict[str, Tensor], unknowns: "_Unknowns", place: str) -> None:
         """Compute the gradients of the sum of the losses."""
@@ -440,9 +473,10 @@ def _thinned(cloud: Gaussians, graph: ControlGraph, count: int) -> tuple[Gaussia
     return thinned(cloud, step), graph.of(torch.arange(0, len(cloud), step))
 
 
-def _robust(values: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
-    """Return a loss that is quadratic for small and linear for large vectors."""
-    return (values.square().sum(-1) + ROBUST**2).sqrt() - ROBUST
+def _robust(values: Float[Tensor, "*b c"], log: bool) -> Float[Tensor, "*b"]:
+    """Return a loss that is quadratic for small and linear for large vectors, or logarithmic."""
+    linear = (values.square().sum(-1) + ROBUST**2).sqrt() - ROBUST
+    return LOG_SCALE * torch.log1p(linear / LOG_SCALE) if log else linear
 
 
 def _pyramid_error(ours: Float[Tensor, "b h w c"], theirs: Float[Tensor, "b h w c"]) -> Float[Tensor, ""]:

@@ -35,6 +35,7 @@ MATCH_STEPS = 4  # towards matched patches
 FOLLOWED = 1500  # largest number of Gaussians that follow the flow
 FLOW_UNIT = 0.01  # of the picture's side: error of the flow up to which its loss is quadratic
 ROBUST = 0.02  # relative stretch, or radians, up to which the rigidity is quadratic
+LOG_SCALE = 0.3  # relative stretch, or radians, above which a logarithmic rigidity stays well below a linear one
 DEPTH_SLACK = 0.05  # world units by which a Gaussian may lie behind the visible surface
 SLANTED = 0.5  # cosine of normal and line of sight from which a mirror plane counts fully
 STILL = 0.15  # weight of the last frame's place beside that of the extrapolated one
@@ -280,14 +281,15 @@ class FlowTracker:
         return [(_rows(blocks, index, len(self._nodes)), (error * scale[:, None]).ravel())]
 
     def _rigidity_terms(self, pose: Pose) -> list[tuple[csr_array, Float[np.ndarray, " r"]]]:
-        weight, count, edges = self._settings.rigidity, len(self._nodes), len(self._edges)
+        settings, count, edges = self._settings, len(self._nodes), len(self._edges)
+        weight, log = settings.rigidity, settings.rigidity_loss == "log"
         places, eye, none = self._nodes + pose.shifts, np.eye(3), np.zeros((edges, 3, 3))
         terms = []
         for start, end, sign in ((0, 1, 1.0), (1, 0, -1.0)):
             first, second = self._edges[:, start], self._edges[:, end]
             turned = np.einsum("eij,ej->ei", pose.turns[first], sign * self._spans)
             stretch = (places[second] - places[first] - turned) / self._lengths[:, None]
-            scale = np.sqrt(weight / (2 * edges) / _softened(stretch))
+            scale = np.sqrt(weight / (2 * edges) / _softened(stretch, log))
             unit = (scale / self._lengths)[:, None, None]
             blocks = np.stack(
                 [
@@ -299,7 +301,7 @@ class FlowTracker:
             terms.append((_rows(blocks, np.stack([first, second], 1), count), (stretch * scale[:, None]).ravel()))
         first, second = self._edges.T
         bend = rotation_vector(pose.turns[second] @ pose.turns[first].swapaxes(1, 2))
-        scale = np.sqrt(weight * self._settings.bending / edges / _softened(bend))
+        scale = np.sqrt(weight * settings.bending / edges / _softened(bend, log))
         unit = scale[:, None, None] * eye
         blocks = np.stack([np.concatenate([-unit, none], -1), np.concatenate([unit, none], -1)], 1)
         terms.append((_rows(blocks, self._edges, count), (bend * scale[:, None]).ravel()))
@@ -329,10 +331,10 @@ def _rows(blocks: Float[np.ndarray, "n k d 6"], nodes: Int[np.ndarray, "n k"], c
     return csr_array(coo_array((blocks.ravel(), places), shape=(items * height, 6 * count)))
 
 
-def _softened(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Return the divisor that makes a quadratic loss linear for large values."""
+def _softened(values: Float[np.ndarray, "n 3"], log: bool) -> Float[np.ndarray, " n"]:
+    """Return the divisor that makes a quadratic loss linear for large values, or logarithmic."""
     divisor: Float[np.ndarray, " n"] = np.sqrt(np.square(values).sum(1) + ROBUST**2)
-    return divisor
+    return divisor * (1 + divisor / LOG_SCALE) if log else divisor
 
 
 def _cross(vectors: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:

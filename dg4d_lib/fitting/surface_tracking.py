@@ -20,6 +20,7 @@ from dg4d_lib.video.driving import DrivingVideo
 
 DESCENT = AssetSettings(  # for surfaces that are guesses: what flow takes for certain tears them
     tracking="descent",
+    rigidity_loss="l1",
     track_iterations=40,
     joint_iterations=100,
     size=96,

@@ -9,7 +9,8 @@ import torch
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.fitting.asset_motion import NodeMotion, antialiased, fit_asset_motion
+from dg4d_lib.fitting import asset_motion, flow_tracking
+from dg4d_lib.fitting.asset_motion import NodeMotion, antialiased, fit_asset_motion, iterations
 from dg4d_lib.fitting.flow_tracking import FlowTracker
 from dg4d_lib.fitting.node_pose import Pose
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -20,7 +21,9 @@ from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 
 FRAMES, ANGLE = 4, 0.35  # radians at the last frame
-SETTINGS = AssetSettings(points=700, fit_points=700, nodes=16, size=48, track_iterations=3, joint_iterations=10)
+SETTINGS = AssetSettings(
+    points=700, fit_points=700, nodes=16, size=48, track_iterations=3, joint_iterations=10, rigidity_loss="l1"
+)
 
 
 def arm() -> Model:
@@ -204,3 +207,55 @@ def test_loops_are_tracked_from_both_ends(
     )
     assert seen == [([0], 1), ([0, 1], 2), ([0, 1, 2], 3), ([0], 5), ([0, 5], 4)]
     assert len(found.shifts) == len(there_and_back)
+
+
+@pytest.mark.parametrize("log", [False, True])
+def test_tracking_and_refinement_have_one_rigidity(log: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gauss-Newton steps solve least squares, reweighted by the derivative of the refinement's loss."""
+    monkeypatch.setattr(asset_motion, "ROBUST", flow_tracking.ROBUST)
+    stretch = torch.logspace(-3, 0.5, 20, dtype=torch.float64)[:, None] * torch.tensor([0.6, 0.0, 0.8])
+    stretch.requires_grad_()
+    asset_motion._robust(stretch, log).sum().backward()
+    divisor = torch.from_numpy(flow_tracking._softened(stretch.detach().numpy(), log))
+    torch.testing.assert_close(stretch.grad, stretch.detach() / divisor[:, None], rtol=0.07, atol=0)
+
+
+def test_of_two_rigidities_the_one_that_shows_the_video_better_is_kept(
+    scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    surface, graph, video = scene
+    quick = SETTINGS.model_copy(update={"track_iterations": 1, "joint_iterations": 4})
+    shown = {}
+
+    def fitted(rigidity_loss: str) -> NodeMotion:
+        settings = quick.model_copy(update={"rigidity_loss": rigidity_loss})
+        done = []
+        motion = fit_asset_motion(
+            surface.cloud,
+            graph.of(surface.nearest),
+            video,
+            get_rasterizer("cpu"),
+            settings,
+            torch.Generator().manual_seed(0),
+            lambda count, values: done.append(count),
+        )
+        assert done == sorted(done)
+        assert done[-1] == iterations(settings, FRAMES)
+        return motion
+
+    original = asset_motion._Fit.difference
+
+    def difference(fit: asset_motion._Fit, motion: NodeMotion) -> float:
+        shown[fit.settings.rigidity_loss] = original(fit, motion)
+        return -shown[fit.settings.rigidity_loss] if reverse else shown[fit.settings.rigidity_loss]
+
+    monkeypatch.setattr(asset_motion._Fit, "difference", difference)
+    reverse = False
+    better = fitted("best")
+    reverse = True
+    worse = fitted("best")
+    assert shown["l1"] != shown["log"]
+    names = sorted(shown, key=lambda name: shown[name])
+    assert not torch.equal(better.shifts, worse.shifts)
+    reverse = False
+    torch.testing.assert_close(fitted("l1").shifts, (better if names[0] == "l1" else worse).shifts)

@@ -16,7 +16,7 @@ from dg4d_lib.mesh.models.control_graph import graph_of_points, point_graph
 from dg4d_lib.rasterizer.interface import get_rasterizer
 
 SIZE = 64
-SETTINGS = AssetSettings(size=SIZE, nodes=40, inertia=0.0, depth=0.0, whole_depth=0.0)
+SETTINGS = AssetSettings(size=SIZE, nodes=40, inertia=0.0, depth=0.0, whole_depth=0.0, rigidity_loss="l1")
 
 
 def cloud_of(points: np.ndarray, colors: np.ndarray) -> Gaussians:
