@@ -10,6 +10,7 @@ from skimage.measure import perimeter
 from torch import Tensor
 
 from dg4d_lib.fitting.surface_tracking import DESCENT, track_vertices
+from dg4d_lib.fitting.tracking_order import is_loop, tracking_orders
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface, select_level
@@ -63,7 +64,16 @@ def follow_video(
     rest = states.at(reference_frame)
     moved = track_vertices(vertices, faces, rest, video, rasterize, TRACKING, generator, reference_frame)
     return register_to_outlines(
-        vertices, moved - vertices, faces, states, video.alpha[..., 0], level, rasterize, settings
+        vertices,
+        moved - vertices,
+        faces,
+        states,
+        video.alpha[..., 0],
+        level,
+        rasterize,
+        settings,
+        orders=tracking_orders(video, reference_frame),
+        loop=is_loop(video),
     )
 
 

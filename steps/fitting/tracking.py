@@ -16,6 +16,7 @@ from dg4d_lib.visual_hull.shape import ALL_AROUND
 from steps.fitting.priors import Track
 
 TRACKED_NOTE = "motion of unseen sides: the surface of the known views, moved as the video shows it"
+FLOW = AssetSettings(rigidity_loss="l1")  # for hulls of many views: both losses take twice the time and gain nothing
 SOFT = DESCENT.model_copy(  # for hulls of few views, whose limbs may touch
     update={"across": AssetSettings().across, "whole_depth": 0.02}
 )
@@ -36,7 +37,7 @@ def tracks_surface(settings: MotionSettings, prior: PriorSettings, known: Bank |
 
 def tracking_of(known: Bank) -> AssetSettings:
     """Return how the surface of known views is tracked: where limbs are apart, by optical flow as a user's model is."""
-    return AssetSettings() if len(known.cameras) >= ALL_AROUND else SOFT
+    return FLOW if len(known.cameras) >= ALL_AROUND else SOFT
 
 
 def surface_tracker(

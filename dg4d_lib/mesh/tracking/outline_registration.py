@@ -9,6 +9,7 @@ and crossings are smoothed away in between.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -40,6 +41,9 @@ LONGEST = 24.0  # pixels of a step
 BLUR = 2.0  # standard deviation of the mask whose gradient is the normal of an outline, pixels
 FIRST_ROUNDS = ((2, 6),)  # passes to the isosurface alone, and to outlines too; then folds and crossings are smoothed
 LAST_ROUNDS = ((0, 2), (0, 2))  # smoothing draws outlines in a little, so they are fitted again
+GOOD_OVERLAP = 0.97  # with the silhouette of the video, IoU, above which a frame needs no other start
+GAIN = 0.005  # of the overlap by which another start must be better
+SPEED = 0.5  # share of the last step that goes on beyond the middle of a loop
 ROTATIONS = 2  # alternations of rotations and positions per pass
 PULL, OUTLINE_PULL = 0.5, 3.0  # weights of the positions of vertices, on outlines and elsewhere, against 1 per edge
 
@@ -78,6 +82,8 @@ def register_to_outlines(
     rasterize: Rasterizer,
     settings: MeshSettings,
     rounds: Sequence[tuple[int, int]] = FIRST_ROUNDS,
+    orders: Sequence[Sequence[int]] = (),
+    loop: bool = False,
 ) -> Float[Tensor, "t v 3"]:
     """Return offsets by which the outlines of the mesh agree with those of the subject.
 
@@ -92,6 +98,9 @@ def register_to_outlines(
         settings: mesh settings.
         rounds: passes to the isosurface alone and passes to outlines too, after which folds and crossings are smoothed
             away.
+        orders: of the frames, each from the reference frame on. A frame that misses the outline of the video is tried
+            again from where the correction of the frame before puts it. None: every frame for itself.
+        loop: the two orders are the halves of a loop, and go on into each other as far as that is better.
     """
     cameras = [OrbitCamera(0, azimuth, width=SIZE, height=SIZE) for azimuth in AZIMUTHS_DEG]
     masks = [functional.interpolate(alpha[:, None], (SIZE, SIZE), mode="bicubic")[:, 0] > ALPHA_THRESHOLD]
@@ -101,15 +110,36 @@ def register_to_outlines(
             drawn = [rasterize(states.at(frame), [camera], black).alpha[0, ..., 0] for frame in range(len(offsets))]
         masks.append(torch.stack(drawn) > ALPHA_THRESHOLD)
     body = ElasticBody(vertices.double().numpy(), faces.numpy())
-    registered = torch.empty_like(offsets)
+    registered, overlaps = offsets.clone(), [-1.0] * len(offsets)
 
-    def register_frame(frame: int) -> None:
+    def improve(frame: int, start: Float[Tensor, "v 3"]) -> bool:
+        """Register a frame from a start; return True if its silhouette agrees better with the video's than before."""
         targets = [outline_of(mask[frame].numpy(force=True)).points for mask in masks]
         field = density_field(states.at(frame), settings)
-        moved = _registered(body, vertices + offsets[frame], faces, targets, cameras, field, level, rounds)
-        registered[frame] = moved.to(offsets) - vertices
+        moved = _registered(body, vertices + start, faces, targets, cameras, field, level, rounds).to(offsets)
+        overlap = _overlap(moved, faces, cameras[0], masks[0][frame])
+        better = overlap > overlaps[frame] + GAIN
+        if better:
+            registered[frame], overlaps[frame] = moved - vertices, overlap
+        return better
 
-    run_parallel([partial(register_frame, frame) for frame in range(len(offsets))])
+    def hand_on(order: Sequence[int]) -> None:
+        for before, frame in pairwise(order):
+            if overlaps[frame] < GOOD_OVERLAP:
+                improve(frame, offsets[frame] + registered[before] - offsets[before])
+
+    def go_on(order: Sequence[int], other: Sequence[int]) -> None:
+        before, last = order[-2:]
+        for frame in other[:0:-1]:
+            if not improve(frame, registered[last] + SPEED * (registered[last] - registered[before])):
+                return
+            before, last = last, frame
+
+    run_parallel([partial(improve, frame, offsets[frame]) for frame in range(len(offsets))])
+    run_parallel([partial(hand_on, order) for order in orders])
+    if loop:
+        go_on(*orders)
+        go_on(*orders[::-1])
     return registered
 
 
@@ -149,6 +179,14 @@ def outline_steps(
     for axis in range(3):
         total[:, axis] = np.bincount(corners.ravel(), (weights * in_world[:, axis, None]).ravel(), len(moved))
     return total / share.clip(1e-6)[:, None], share.clip(max=1)
+
+
+def _overlap(
+    moved: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], camera: OrbitCamera, mask: Bool[Tensor, "h w"]
+) -> float:
+    """Return the intersection over union of the silhouette of a mesh and a mask."""
+    shown = rasterize_mesh(moved, faces, [camera]).faces[0] >= 0
+    return float((shown & mask).sum() / (shown | mask).sum().clamp(min=1))
 
 
 def _registered(
