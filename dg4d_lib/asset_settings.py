@@ -15,7 +15,7 @@ class GltfSettings(Settings):
         description="texture format; png: lossless, larger; webp: smallest (EXT_texture_webp), with a 512-pixel jpeg "
         "as a fallback",
     )
-    quality: int = Field(85, ge=1, le=100, description="of jpeg and webp; from 95, jpeg does not subsample chroma")
+    quality: int = Field(85, ge=1, le=100, description="of jpeg and webp; from 85, jpeg does not subsample chroma")
     quantized: bool = Field(
         True, description="16 bits for positions and 8 for normals instead of 32 (KHR_mesh_quantization)"
     )
