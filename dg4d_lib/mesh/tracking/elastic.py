@@ -50,7 +50,6 @@ def relax(
     offsets: Float[Tensor, "t v 3"],
     faces: Int[Tensor, "f 3"],
     silhouettes: Bool[Tensor, "t k h w"] | None = None,
-    everywhere: bool = True,
 ) -> Float[Tensor, "t v 3"]:
     """Return offsets near the given ones by which the surface moves without folds and crossings.
 
@@ -60,17 +59,16 @@ def relax(
         faces: counter-clockwise seen from outside, of nearly equal size. Defects that the rest shape has stay.
         silhouettes: of the frames (`render_silhouettes`); with them, frames that keep defects are relaxed more
             strongly where that costs at most 0.003 of their IoU.
-        everywhere: relax all of the surface once; false: only around defects, for offsets that were fitted to outlines.
     """
     body = ElasticBody(vertices.double().numpy(), faces.numpy())
     relaxed = torch.empty_like(offsets)
 
     def relax_frame(frame: int) -> None:
         tracked = (vertices + offsets[frame]).double().numpy()
-        moved = body.relaxed(tracked, GENTLE, everywhere)
+        moved = body.relaxed(tracked, GENTLE)
         if silhouettes is not None and body.defective(moved).any():
             outline = silhouettes[frame, None]
-            strong = body.relaxed(tracked, STRONG, everywhere)
+            strong = body.relaxed(tracked, STRONG)
             if body.defective(strong).sum() < body.defective(moved).sum() and (
                 _iou(strong, faces, outline) >= _iou(moved, faces, outline) - MAX_LOSS
             ):
@@ -100,12 +98,10 @@ class ElasticBody:
         """Mark the faces with defects that the rest shape does not have."""
         return self._finder.defective(moved) & self._sound_at_rest
 
-    def relaxed(
-        self, tracked: Float64[np.ndarray, "v 3"], effort: Effort, everywhere: bool
-    ) -> Float64[np.ndarray, "v 3"]:
-        """Return the relaxed positions of one frame; unless `everywhere`, vertices far from defects stay."""
+    def relaxed(self, tracked: Float64[np.ndarray, "v 3"], effort: Effort) -> Float64[np.ndarray, "v 3"]:
+        """Return the relaxed positions of one frame."""
         pull = np.full(len(tracked), PULL)
-        moved = self.settle(tracked, tracked, pull) if everywhere else tracked.copy()
+        moved = self.settle(tracked, tracked, pull)
         for _ in range(effort.rounds - 1):
             defective = self.defective(moved)
             if not defective.any():
