@@ -21,6 +21,7 @@ from dg4d_lib.mesh.extraction.clean import clean
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface, usable_level
 from dg4d_lib.mesh.extraction.silhouettes import render_silhouettes, silhouette_iou
+from dg4d_lib.mesh.extraction.smoothing import smooth_bumps
 from dg4d_lib.mesh.extraction.topology import MeshTopology, check_topology, weld_vertices
 from dg4d_lib.mesh.extraction.tunnels import fill_tunnels
 from dg4d_lib.mesh.extraction.unfold import unfold
@@ -220,7 +221,8 @@ def _cleaned_surface(
     level = usable_level(field, level)
     field = fill_tunnels(field, level, gaussians, rasterize)
     vertices, faces = clean(*extract_surface(field, level), settings, field.unit)
-    return torch.from_numpy(unfold(vertices, faces)), torch.from_numpy(faces)
+    vertices = unfold(smooth_bumps(vertices, faces, settings.smoothing), faces)
+    return torch.from_numpy(vertices), torch.from_numpy(faces)
 
 
 def _colored(

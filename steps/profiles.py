@@ -279,6 +279,7 @@ PREVIEW = revise(
         "motion.guided_frames": 6,
         "mesh.mode": "auto",
         "mesh.max_faces": 20000,
+        "mesh.smoothing": 10,
     },
 )
 

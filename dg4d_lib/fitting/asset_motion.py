@@ -21,7 +21,7 @@ from torch.nn import functional
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.flow_tracking import DEPTH_SLACK, LOG_SCALE, FlowTracker, across_weight
-from dg4d_lib.fitting.losses import WHITE, check_finite, resize_cutouts
+from dg4d_lib.fitting.losses import WHITE, check_finite, pyramid_error, resize_cutouts
 from dg4d_lib.fitting.node_pose import Pose
 from dg4d_lib.fitting.tracking_order import tracking_orders
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -34,7 +34,6 @@ from dg4d_lib.rasterizer.interface import BLUR, Rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 
 ADVICE = "lower asset.lr"
-LEVELS = (1, 4, 8)  # widths of the filters over the compared pictures, pixels
 FLOW_SHARE = 0.6  # of the iterations of a descent that follow the optical flow; the rest follow the pictures alone
 FLOW_UNIT = 0.02  # of the picture's side: error of the flow up to which its loss is quadratic
 MATCH_ITERATIONS = 80  # of the colors at the first frame
@@ -125,7 +124,7 @@ def fit_asset_motion(
     for rigidity_loss in _rigidity_losses(settings):
         one = settings.model_copy(update={"rigidity_loss": rigidity_loss})
         fit, before = _Fit(thin, bound, video, rasterize, one, normal), len(found) * iterations(one, len(video))
-        motion = _fitted(fit, video, generator, partial(_report_after, report, before))
+        motion = _fitted(fit, video, one, generator, partial(_report_after, report, before))
         found.append((fit.difference(motion), motion))
     return min(found, key=lambda one: one[0])[1]
 
@@ -143,12 +142,13 @@ def _rigidity_losses(settings: AssetSettings) -> list[Literal["l1", "log"]]:
     return ["l1", "log"] if settings.rigidity_loss == "best" else [settings.rigidity_loss]
 
 
-def _fitted(fit: "_Fit", video: DrivingVideo, generator: torch.Generator, report: Report) -> NodeMotion:
+def _fitted(
+    fit: "_Fit", video: DrivingVideo, settings: AssetSettings, generator: torch.Generator, report: Report
+) -> NodeMotion:
     """Track all frames, then refine them together."""
-    settings, frames = fit.settings, len(video)
-    done = settings.track_iterations * frames
+    frames, done = len(video), settings.track_iterations * len(video)
     track = _followed if settings.tracking == "flow" else _descended
-    unknowns = _Unknowns.joined(track(fit, video, report))
+    unknowns = _Unknowns.joined(track(fit, video, settings, report))
     descent = _Descent(unknowns)
     for step in range(settings.joint_iterations):
         chosen = torch.randperm(frames, generator=generator)[: min(settings.joint_frames, frames)].sort().values
@@ -165,9 +165,8 @@ def _fitted(fit: "_Fit", video: DrivingVideo, generator: torch.Generator, report
     return unknowns.detach().motion(fit.smoothing)
 
 
-def _followed(fit: "_Fit", video: DrivingVideo, report: Report) -> list["_Unknowns"]:
+def _followed(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list["_Unknowns"]:
     """Track the frames by optical flow, loops from both ends; return their variables."""
-    settings = fit.settings
     tracker = FlowTracker(fit.cloud, fit.graph, fit.colors, fit.alphas, fit.rasterize, settings, fit.normal)
     poses = {0: _first_pose(fit, tracker)}
     report(settings.track_iterations, {"color": tracker.error(poses[0], 0)})
@@ -194,9 +193,9 @@ def _first_pose(fit: "_Fit", tracker: FlowTracker) -> Pose:
     return followed
 
 
-def _descended(fit: "_Fit", video: DrivingVideo, report: Report) -> list["_Unknowns"]:
+def _descended(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list["_Unknowns"]:
     """Track the frames one after the other along gradients; return their variables."""
-    settings, done = fit.settings, 0
+    done = 0
     tracked: list[_Unknowns] = [_Unknowns.still(1, fit.graph)]
     for frame in range(len(video)):
         start = tracked[-1] if frame < 2 else tracked[-2].continued(tracked[-1])
@@ -294,8 +293,8 @@ class _Fit:
             quats=self.cloud.quats.expand(count, -1, -1),
         )
         rendering = self.rasterize(states, [self.camera] * count, means.new_tensor(WHITE))
-        color = _pyramid_error(rendering.color, self.colors[frames]) / self.area
-        alpha = _pyramid_error(rendering.alpha, self.alphas[frames]) / self.area
+        color = pyramid_error(rendering.color, self.colors[frames]) / self.area
+        alpha = pyramid_error(rendering.alpha, self.alphas[frames]) / self.area
         return {"color": self.settings.color_weight * color, "alpha": self.settings.alpha_weight * alpha}
 
     def losses(self, motion: NodeMotion, frames: list[int]) -> dict[str, Tensor]:
@@ -477,18 +476,3 @@ def _robust(values: Float[Tensor, "*b c"], log: bool) -> Float[Tensor, "*b"]:
     """Return a loss that is quadratic for small and linear for large vectors, or logarithmic."""
     linear = (values.square().sum(-1) + ROBUST**2).sqrt() - ROBUST
     return LOG_SCALE * torch.log1p(linear / LOG_SCALE) if log else linear
-
-
-def _pyramid_error(ours: Float[Tensor, "b h w c"], theirs: Float[Tensor, "b h w c"]) -> Float[Tensor, ""]:
-    """Return the mean squared error, averaged over filters of several widths.
-
-    Each is a mean over squares of half the width and three of three by three of these, which is nearly a Gaussian.
-    """
-    difference = (ours - theirs).movedim(-1, 1)
-    errors = []
-    for width in LEVELS:
-        filtered = functional.avg_pool2d(difference, max(1, width // 2))
-        for _ in range(3 if width > 1 else 0):
-            filtered = functional.avg_pool2d(filtered, 3, 1, 1)
-        errors.append(filtered.square().mean())
-    return torch.stack(errors).mean()

@@ -1,4 +1,4 @@
-"""Reference-view loss of both stages, and the check for non-finite losses and gradients."""
+"""Reference-view loss of both stages, error over filters of several widths, and the check for non-finite values."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -16,6 +16,7 @@ from dg4d_lib.metrics.ssim import ssim
 from dg4d_lib.rasterizer.interface import Rendering
 
 WHITE = (1.0, 1.0, 1.0)
+LEVELS = (1, 4, 8)  # widths of the filters over pictures that a pyramid compares, pixels
 
 
 def resize_cutouts(
@@ -31,6 +32,21 @@ def resize_cutouts(
         both = resize_planes(both, (size, size))
     color, alpha = both[:, :3] + 1 - both[:, 3:], both[:, 3:].contiguous()
     return color.permute(0, 2, 3, 1), alpha.permute(0, 2, 3, 1)
+
+
+def pyramid_error(ours: Float[Tensor, "b h w c"], theirs: Float[Tensor, "b h w c"]) -> Float[Tensor, ""]:
+    """Return the mean squared error, averaged over filters of several widths.
+
+    Each is a mean over squares of half the width and three of three by three of these, which is nearly a Gaussian.
+    """
+    difference = (ours - theirs).movedim(-1, 1)
+    errors = []
+    for width in LEVELS:
+        filtered = functional.avg_pool2d(difference, max(1, width // 2))
+        for _ in range(3 if width > 1 else 0):
+            filtered = functional.avg_pool2d(filtered, 3, 1, 1)
+        errors.append(filtered.square().mean())
+    return torch.stack(errors).mean()
 
 
 def reference_loss(

@@ -1,0 +1,33 @@
+"""Smoothing of the bumps that the density of Gaussians leaves on a surface, outside the outlines of the input view."""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.geometry.normals import vertex_normals
+from dg4d_lib.mesh.neighbors import edge_graph, neighbor_means
+
+FACING = 0.5  # cosine of normal and line of sight of the input camera from which a vertex is smoothed fully
+INWARDS, OUTWARDS = 0.5, 0.53  # shares of the way to the mean of the neighbors, and back (Taubin 1995)
+
+
+def smooth_bumps(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], steps: int
+) -> Float[np.ndarray, "v 3"]:
+    """Return vertices without bumps; the surface neither shrinks nor moves where the input view shows its outline.
+
+    Args:
+        vertices: of a surface of nearly equal edges, world units.
+        faces: counter-clockwise seen from outside.
+        steps: Taubin steps.
+    """
+    means = neighbor_means(edge_graph(faces, len(vertices)))
+    normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces)).numpy()
+    sight = OrbitCamera().viewmat()[2, :3].numpy()
+    share = np.minimum(np.abs(normals @ sight) / FACING, 1)[:, None]
+    smooth = vertices.astype(np.float64)
+    for _ in range(steps):
+        for length in (INWARDS, -OUTWARDS):
+            smooth += share * length * (means @ smooth - smooth)
+    return smooth.astype(vertices.dtype)
