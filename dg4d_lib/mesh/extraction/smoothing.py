@@ -6,9 +6,11 @@ from jaxtyping import Float, Int
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.geometry.normals import vertex_normals
-from dg4d_lib.mesh.neighbors import edge_graph, neighbor_means
+from dg4d_lib.mesh.folds import DefectFinder
+from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, grown, neighbor_means
 
 FACING = 0.5  # cosine of normal and line of sight of the input camera from which a vertex is smoothed fully
+ATTEMPTS, RINGS = 4, 4  # thin sheets that smoothing folds or crosses stay as they are, with rings of vertices around
 INWARDS, OUTWARDS = 0.5, 0.53  # shares of the way to the mean of the neighbors, and back (Taubin 1995)
 
 
@@ -22,12 +24,20 @@ def smooth_bumps(
         faces: counter-clockwise seen from outside.
         steps: Taubin steps.
     """
-    means = neighbor_means(edge_graph(faces, len(vertices)))
+    if steps == 0:
+        return vertices
+    edges, finder = edge_graph(faces, len(vertices)), DefectFinder(faces)
+    means, sound = neighbor_means(edges), ~finder.defective(vertices)
     normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces)).numpy()
     sight = OrbitCamera().viewmat()[2, :3].numpy()
     share = np.minimum(np.abs(normals @ sight) / FACING, 1)[:, None]
-    smooth = vertices.astype(np.float64)
-    for _ in range(steps):
-        for length in (INWARDS, -OUTWARDS):
-            smooth += share * length * (means @ smooth - smooth)
+    for _ in range(ATTEMPTS):
+        smooth = vertices.astype(np.float64)
+        for _ in range(steps):
+            for length in (INWARDS, -OUTWARDS):
+                smooth += share * length * (means @ smooth - smooth)
+        damaged = finder.defective(smooth) & sound
+        if not damaged.any():
+            break
+        share[grown(faces_to_vertices(damaged, faces, len(vertices)), edges, RINGS)] = 0
     return smooth.astype(vertices.dtype)
