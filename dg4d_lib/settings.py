@@ -427,7 +427,7 @@ class MeshSettings(Settings):
     edge_length: Positive = Field(
         0.015, description="target edge length of isotropic remeshing, in units of the normalized box"
     )
-    smoothing: int = Field(0, ge=0, le=100, description="Taubin steps over bumps, not on outlines of the input view")
+    smoothing: int = Field(0, ge=0, le=100, description="pairs of Taubin steps, not on outlines of the input view")
     max_faces: int = Field(100000, ge=100, description="largest number of triangles of a mesh")
     min_component: Share = Field(
         0.02, description="connected components with a smaller fraction of the faces are removed"

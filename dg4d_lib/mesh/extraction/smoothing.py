@@ -1,8 +1,8 @@
-"""Smoothing of the bumps that the density of Gaussians leaves on a surface, outside the outlines of the input view."""
+"""Smoothing of surfaces, and of the bumps that the density of Gaussians leaves outside outlines of the input view."""
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float64, Int
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.geometry.normals import vertex_normals
@@ -14,6 +14,30 @@ ATTEMPTS, RINGS = 4, 4  # thin sheets that smoothing folds or crosses stay as th
 INWARDS, OUTWARDS = 0.5, 0.53  # shares of the way to the mean of the neighbors, and back (Taubin 1995)
 
 
+def taubin_smooth(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    steps: int,
+    share: float | Float[np.ndarray, "v 1"] = 1.0,
+) -> Float64[np.ndarray, "v 3"]:
+    """Smooth a mesh with alternating inward and outward steps, which keep its volume (Taubin 1995).
+
+    Args:
+        vertices: any units; those of no face stay.
+        faces: indices into the vertices.
+        steps: pairs of an inward and an outward step.
+        share: of a whole step that a vertex takes, in [0, 1].
+    """
+    edges = edge_graph(faces, len(vertices))
+    mean = neighbor_means(edges)
+    isolated = (edges.sum(axis=1) == 0)[:, None]
+    points = vertices.astype(np.float64)
+    for _ in range(steps):
+        for length in (INWARDS, -OUTWARDS):
+            points = np.where(isolated, points, points + share * length * (mean @ points - points))
+    return points
+
+
 def smooth_bumps(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], steps: int
 ) -> Float[np.ndarray, "v 3"]:
@@ -22,20 +46,17 @@ def smooth_bumps(
     Args:
         vertices: of a surface of nearly equal edges, world units.
         faces: counter-clockwise seen from outside.
-        steps: Taubin steps.
+        steps: pairs of Taubin steps.
     """
     if steps == 0:
         return vertices
     edges, finder = edge_graph(faces, len(vertices)), DefectFinder(faces)
-    means, sound = neighbor_means(edges), ~finder.defective(vertices)
+    sound = ~finder.defective(vertices)
     normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces)).numpy()
     sight = OrbitCamera().viewmat()[2, :3].numpy()
     share = np.minimum(np.abs(normals @ sight) / FACING, 1)[:, None]
     for _ in range(ATTEMPTS):
-        smooth = vertices.astype(np.float64)
-        for _ in range(steps):
-            for length in (INWARDS, -OUTWARDS):
-                smooth += share * length * (means @ smooth - smooth)
+        smooth = taubin_smooth(vertices, faces, steps, share)
         damaged = finder.defective(smooth) & sound
         if not damaged.any():
             break

@@ -15,10 +15,11 @@ from scipy import ndimage
 from torch import Tensor
 
 from dg4d_lib.geometry.normals import vertex_normals
+from dg4d_lib.mesh.extraction.smoothing import taubin_smooth
 from dg4d_lib.mesh.extraction.topology import group_vertices
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.bake import Texels, locate_texels
-from dg4d_lib.mesh.texturing.unwrap import taubin_smooth
+from dg4d_lib.mesh.texturing.unwrap import SMOOTHING
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear red, green and blue (Rec. 709)
 DARKEST = 0.005  # linear luminance; darker texels count as this bright
@@ -56,7 +57,7 @@ def _smooth_normals(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -
     """Return normals of a smoothed surface, so that bumps of the mesh do not become visible in the texture."""
     first, position = group_vertices(vertices.numpy())
     joined = position[faces.numpy()]
-    smooth = torch.from_numpy(taubin_smooth(vertices.numpy()[first], joined)).to(vertices)
+    smooth = torch.from_numpy(taubin_smooth(vertices.numpy()[first], joined, SMOOTHING)).to(vertices)
     return vertex_normals(smooth, torch.from_numpy(joined))[position]
 
 

@@ -4,13 +4,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dg4d_lib.errors import DG4DError
-from dg4d_lib.mesh.neighbors import edge_graph, neighbor_means
+from dg4d_lib.mesh.extraction.smoothing import taubin_smooth
 from dg4d_lib.mesh.texturing.chart_packing import pack_charts
 from dg4d_lib.mesh.texturing.charts import find_charts
 from dg4d_lib.mesh.texturing.xatlas_charts import unwrap_with_xatlas
 from dg4d_lib.settings import UnwrapMethod
 
-SMOOTHING = 20  # Taubin steps; charts follow the normals of a smoothed copy, so that noise does not divide them
+SMOOTHING = 10  # pairs of Taubin steps; charts follow normals of a smoothed copy, so that noise does not divide them
 
 
 def unwrap(
@@ -36,7 +36,7 @@ def unwrap(
         BackendUnavailable: xatlas is missing.
         DG4DError: the charts do not fit into the texture, or xatlas crashed.
     """
-    smooth = taubin_smooth(vertices, faces)
+    smooth = taubin_smooth(vertices, faces, SMOOTHING)
     if method == "xatlas":
         return unwrap_with_xatlas(smooth, faces, size)
     charts = find_charts(vertices, faces, smooth)
@@ -47,17 +47,3 @@ def unwrap(
             "raise mesh.texture_size or lower mesh.max_faces"
         )
     return charts.sources.astype(np.int32), charts.faces.astype(np.int32), np.clip(uvs, 0, 1).astype(np.float32)
-
-
-def taubin_smooth(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], steps: int = SMOOTHING
-) -> Float[np.ndarray, "v 3"]:
-    """Smooth a mesh with alternating inward and outward steps, which keep its volume (Taubin 1995)."""
-    edges = edge_graph(faces, len(vertices))
-    mean = neighbor_means(edges)
-    isolated = (edges.sum(axis=1) == 0)[:, None]
-    points = vertices.astype(np.float64)
-    for step in range(steps):
-        factor = 0.5 if step % 2 == 0 else -0.53
-        points = np.where(isolated, points, points + factor * (mean @ points - points))
-    return points

@@ -99,7 +99,7 @@ def register_to_outlines(
         rounds: passes to the isosurface alone and passes to outlines too, after which folds and crossings are smoothed
             away.
         orders: of the frames, each from the reference frame on. A frame that misses the outline of the video is tried
-            again from where the correction of the frame before puts it. None: every frame for itself.
+            again from where the correction of the frame before puts it. Empty: every frame for itself.
         loop: the two orders are the halves of a loop, and go on into each other as far as that is better.
     """
     cameras = [OrbitCamera(0, azimuth, width=SIZE, height=SIZE) for azimuth in AZIMUTHS_DEG]

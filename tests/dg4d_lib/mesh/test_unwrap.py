@@ -9,7 +9,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from dg4d_lib.errors import DG4DError
-from dg4d_lib.mesh.texturing.unwrap import taubin_smooth, unwrap
+from dg4d_lib.mesh.extraction.smoothing import taubin_smooth
+from dg4d_lib.mesh.texturing.unwrap import SMOOTHING, unwrap
 
 Mesh = tuple[np.ndarray, np.ndarray]
 SIZE = 256
@@ -120,7 +121,7 @@ def test_loose_and_degenerate_triangles_get_charts_too() -> None:
 def test_smoothing_takes_noise_away_and_keeps_the_size(sphere: Mesh) -> None:
     vertices, faces = sphere
     noise = 0.01 * torch.randn(vertices.shape, generator=torch.Generator().manual_seed(0)).numpy()
-    radii = np.linalg.norm(taubin_smooth(vertices + noise, faces), axis=1)
+    radii = np.linalg.norm(taubin_smooth(vertices + noise, faces, SMOOTHING), axis=1)
     assert radii.std() < 0.4 * np.linalg.norm(vertices + noise, axis=1).std()
     assert radii.mean() == pytest.approx(0.5, rel=0.01)
 
