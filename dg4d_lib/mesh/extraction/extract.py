@@ -1,11 +1,8 @@
 """Isosurface extraction from a density field, and selection of its level."""
 
-import itertools
-
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
-from scipy import ndimage
+from jaxtyping import Float, Int
 from skimage.measure import marching_cubes
 
 from dg4d_lib.cameras.orbit import OrbitCamera
@@ -13,12 +10,11 @@ from dg4d_lib.errors import FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import DensityField
 from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
-from dg4d_lib.mesh.shifts import shifted
+from dg4d_lib.mesh.extraction.solid import cavities
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 
 LOWEST_SHARE = 0.25  # of the field's peak; the level used when the given one lies above the peak
-LEAK = 2  # cells; a cavity that opens to the outside only through gaps narrower than twice this is filled
 
 STEP = 2**0.5  # ratio of successive trial levels
 MAX_STEPS = 4  # trial levels on either side of the given one
@@ -41,7 +37,7 @@ def extract_surface(field: DensityField, level: float) -> tuple[Float[np.ndarray
         raise FitDiverged(
             f"no surface: the largest density is {values.max():.3g}, below the level {level:.3g}; lower the level"
         )
-    filled = np.where(_cavities(values >= level), np.float32(2 * level), values)
+    filled = np.where(cavities(values >= level), np.float32(2 * level), values)
     vertices, faces, _, _ = marching_cubes(np.pad(filled, 1), level)
     world = (vertices.astype(np.float64) - 1) * field.cell + field.origin.double().numpy()
     return world.astype(np.float32), faces[:, ::-1].astype(np.int32)
@@ -98,30 +94,3 @@ def usable_level(field: DensityField, level: float) -> float:
     if peak <= 0:
         raise FitDiverged("no surface: the density is zero everywhere; the model is empty, fit it again")
     return level if peak > level else LOWEST_SHARE * peak
-
-
-def _cavities(solid: Bool[np.ndarray, "r r r"]) -> Bool[np.ndarray, "r r r"]:
-    """Mark empty samples that a ball of `LEAK` cells fits into but cannot reach from outside."""
-    padded = np.pad(solid, LEAK + 1)
-    thick = _dilate(padded)
-    room = ~_outside(thick) & ~thick
-    inside = ~_outside(padded | _dilate(room)) & ~padded
-    border = slice(LEAK + 1, -LEAK - 1)
-    return inside[border, border, border]
-
-
-def _outside(solid: Bool[np.ndarray, "r r r"]) -> Bool[np.ndarray, "r r r"]:
-    """Mark the empty samples connected to the first one."""
-    components, _ = ndimage.label(~solid)
-    return components == components[0, 0, 0]
-
-
-def _dilate(solid: Bool[np.ndarray, "r r r"]) -> Bool[np.ndarray, "r r r"]:
-    """Mark every sample within `LEAK` steps along the axes of a solid one."""
-    for _ in range(LEAK):
-        grown = solid.copy()
-        for axis, step in itertools.product(range(3), (-1, 1)):
-            onto, source = shifted([step * (axis == other) for other in range(3)])
-            grown[onto] |= solid[source]
-        solid = grown
-    return solid

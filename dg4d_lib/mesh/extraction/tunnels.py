@@ -22,6 +22,7 @@ from dg4d_lib.kernels.compiling import configure_numba
 from dg4d_lib.mesh.extraction.density import DensityField
 from dg4d_lib.mesh.extraction.extract import SILHOUETTE_SIZE, SILHOUETTE_VIEWS_DEG
 from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
+from dg4d_lib.mesh.extraction.solid import cavities, doubtful
 from dg4d_lib.mesh.shifts import shifted
 from dg4d_lib.rasterizer.interface import Rasterizer
 
@@ -31,12 +32,14 @@ RADII = (1, 2, 3, 4)  # cells; tunnels narrower than twice the last are filled, 
 INSIDE = 1.3  # density of filled samples, of the level: the surface over them lies between the samples
 COVERED = 0.75  # smallest share of a filled tunnel that every view sees covered
 
+View = tuple[OrbitCamera, Bool[np.ndarray, "h w"]]  # with the silhouette that it shows
+
 
 def fill_tunnels(field: DensityField, level: float, gaussians: Gaussians, rasterize: Rasterizer) -> DensityField:
     """Return the field with narrow tunnels filled, except those that some view looks through.
 
     A morphological closing (dilation by a ball, then erosion) gives the candidates; those that lower the genus are
-    filled.
+    filled. So are cavities, as these hide tunnels, and `doubtful` samples, as the interpolation makes handles of them.
 
     Args:
         field: the density of these Gaussians.
@@ -49,19 +52,38 @@ def fill_tunnels(field: DensityField, level: float, gaussians: Gaussians, raster
         return field
     (body,), margin = ndimage.find_objects(inside.astype(np.int8)), RADII[-1] + 2
     origin = field.origin.double().numpy() + (np.array([side.start for side in body]) - margin) * field.cell
-    solid = np.pad(inside[body], margin)
-    filled, views = solid.copy(), _silhouettes(gaussians, rasterize)
+    padded, views = np.pad(field.values.numpy()[body], margin), _silhouettes(gaussians, rasterize)
+    fillings = (
+        lambda: _hidden_tunnels(padded >= level, origin, field.cell, views),
+        lambda: cavities(padded >= level),
+        lambda: doubtful(padded, level),
+    )
+    changed = True
+    while changed:
+        changed = False
+        for find in fillings:
+            filled = find()
+            padded[filled] = INSIDE * level
+            changed |= bool(filled.any())
+    values = field.values.clone()
+    values[body] = torch.from_numpy(padded[(slice(margin, -margin),) * 3])
+    return replace(field, values=values)
+
+
+def _hidden_tunnels(
+    solid: Bool[np.ndarray, "i j k"], origin: Float[np.ndarray, " 3"], cell: float, views: Sequence[View]
+) -> Bool[np.ndarray, "i j k"]:
+    """Mark narrow tunnels that no view looks through."""
+    filled = solid.copy()
     for radius in RADII:
         candidates, _ = ndimage.label(_closed(filled, radius) & ~filled)
         for number, place in enumerate(ndimage.find_objects(candidates), 1):
             samples = np.argwhere(candidates[place] == number) + [side.start for side in place]
             if euler_gain(filled, candidates, samples) <= 0:
                 continue
-            if _least_covered(origin + samples * field.cell, views) >= COVERED:
+            if _least_covered(origin + samples * cell, views) >= COVERED:
                 filled[tuple(samples.T)] = True
-    values = field.values.clone()
-    values[body][torch.from_numpy((filled & ~solid)[(slice(margin, -margin),) * 3])] = INSIDE * level
-    return replace(field, values=values)
+    return filled & ~solid
 
 
 def _closed(solid: Bool[np.ndarray, "i j k"], radius: int) -> Bool[np.ndarray, "i j k"]:
@@ -122,7 +144,7 @@ def _is_new(solid, labels, part, i, j, k, a, b, c):
     return True
 
 
-def _silhouettes(gaussians: Gaussians, rasterize: Rasterizer) -> list[tuple[OrbitCamera, Bool[np.ndarray, "h w"]]]:
+def _silhouettes(gaussians: Gaussians, rasterize: Rasterizer) -> list[View]:
     """Return the silhouettes of the Gaussians with their cameras."""
     views = dict.fromkeys(SILHOUETTE_VIEWS_DEG)
     cameras = [OrbitCamera(e, a, width=SILHOUETTE_SIZE, height=SILHOUETTE_SIZE) for e, a in views]
@@ -131,9 +153,7 @@ def _silhouettes(gaussians: Gaussians, rasterize: Rasterizer) -> list[tuple[Orbi
     return list(zip(cameras, (alpha > ALPHA_THRESHOLD).numpy(force=True), strict=True))
 
 
-def _least_covered(
-    positions: Float[np.ndarray, "p 3"], views: Sequence[tuple[OrbitCamera, Bool[np.ndarray, "h w"]]]
-) -> float:
+def _least_covered(positions: Float[np.ndarray, "p 3"], views: Sequence[View]) -> float:
     """Return the share of the positions that lie within a silhouette, in the view where fewest do."""
     shares = []
     for camera, mask in views:
