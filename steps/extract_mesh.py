@@ -28,6 +28,7 @@ from dg4d_lib.mesh.extraction.unfold import unfold
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
 from dg4d_lib.mesh.texturing.bake import PosedSurface, bake_texture
+from dg4d_lib.mesh.texturing.footage import fit_texture
 from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.mesh.tracking.elastic import relax
 from dg4d_lib.mesh.tracking.isosurface_projection import project_to_isosurface
@@ -48,7 +49,8 @@ Frame = tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]  # color and alpha
 Footage = Callable[[Int[Tensor, " w"]], list[PosedSurface]]
 
 COLORED = 16  # frames of the driving video that are baked into the texture of a mesh that follows it
-SELECTIVITY = 2  # exponent of a frame's weight in the inverse of its squared error
+SELECTIVITY = 2  # exponent of such a frame's weight in the inverse of its squared error
+FITTED, FITTED_SELECTIVITY = 32, 1  # frames that the texture is then fitted to, and the exponent of their weights
 LEAST_ERROR = 1e-4  # squared error below which frames weigh alike, 40 dB
 FOLLOWED = {"gaussians": "motion", "video": "driving video"}
 OUTLINES = {"gaussians": "the Gaussians'", "video": "those of video and Gaussians"}
@@ -107,7 +109,9 @@ def textured_mesh(
 ) -> TexturedMesh:
     """Return the isosurface of one state of the Gaussians at a density, with a texture baked from it and the frame."""
     vertices, faces = _cleaned_surface(gaussians, level, rasterize, settings)
-    return _colored(vertices, faces, gaussians, rasterize, settings, _shown(vertices, faces, frame))[0]
+    shown = _shown(vertices, faces, frame)
+    mesh, sources = _colored(vertices, faces, gaussians, rasterize, settings, shown)
+    return replace(mesh, texture=fit_texture(mesh, shown(sources)))
 
 
 def _driving_video(job: Job, frames: int) -> DrivingVideo | None:
@@ -143,6 +147,8 @@ def _tracked(
         offsets = relax(vertices, registered, faces, silhouettes)
         ious = silhouette_iou(vertices + offsets, faces, silhouettes)
         mesh, sources = coloring.result()
+    if video is not None:
+        mesh = _fitted(mesh, vertices + offsets, faces, sources, video)
     return TrackedMesh(mesh, offsets[:, sources], reference_frame=frame), ious
 
 
@@ -166,9 +172,22 @@ def _guided(
     moved = vertices + refined
     normals, footage = vertex_normals(vertices, faces)[sources], _footage(moved, faces, sources, video, mesh)
     texture = bake_texture(mesh.vertices, normals, mesh.faces, mesh.uvs, rest, rasterize, settings, footage)
+    mesh = _fitted(replace(mesh, texture=texture), moved, faces, sources, video)
     silhouettes = render_silhouettes(states, range(len(moved)), rasterize, video.alpha[..., 0])
-    tracked = TrackedMesh(replace(mesh, texture=texture), refined[:, sources], reference_frame=frame)
+    tracked = TrackedMesh(mesh, refined[:, sources], reference_frame=frame)
     return tracked, silhouette_iou(moved, faces, silhouettes)
+
+
+def _fitted(
+    mesh: TexturedMesh,
+    moved: Float[Tensor, "t v 3"],
+    faces: Int[Tensor, "f 3"],
+    sources: Int[Tensor, " w"],
+    video: DrivingVideo,
+) -> TexturedMesh:
+    """Return the mesh with its texture fitted to the video."""
+    footage = _footage(moved, faces, sources, video, mesh, FITTED, FITTED_SELECTIVITY)
+    return replace(mesh, texture=fit_texture(mesh, footage))
 
 
 def _footage(
@@ -177,18 +196,20 @@ def _footage(
     sources: Int[Tensor, " w"],
     video: DrivingVideo,
     textured: TexturedMesh | None = None,
+    count: int = COLORED,
+    selectivity: float = SELECTIVITY,
 ) -> list[PosedSurface]:
     """Return some frames of the video with the surface, split along seams, that they show.
 
     With a textured mesh, frames weigh by how well its renders agree with them: badly tracked ones blur the texture.
     """
-    frames = evenly_spaced(len(video), COLORED)
+    frames = evenly_spaced(len(video), count)
     surfaces = [surface for frame in frames for surface in _shown(moved[frame], faces, _at(video, frame))(sources)]
     if textured is None:
         return surfaces
     errors = [_squared_error(replace(textured, vertices=surface.vertices), surface) for surface in surfaces]
     least = max(min(errors), LEAST_ERROR)
-    weights = [(least / max(error, least)) ** SELECTIVITY for error in errors]
+    weights = [(least / max(error, least)) ** selectivity for error in errors]
     return [replace(surface, weight=weight) for surface, weight in zip(surfaces, weights, strict=True)]
 
 

@@ -39,6 +39,7 @@ SHARPNESS = 2  # exponent of a view's weight in the cosine above the minimum; vi
 INPUT_WEIGHT = 200.0  # weight of the input view relative to others; only its colors come from a photograph
 MIN_COSINE = 0.5  # texels seen at a more oblique angle are not colored
 INPUT_FLATTER = 0.6  # factor of `MIN_COSINE` in the input view: a stretched true color beats a guessed one
+INSIDE = 2  # grade of a pixel inside a silhouette; 1 along it, 0 outside
 OUTLINE = 2  # width of the unreliable band along silhouettes and occluding edges, pixels
 LAST_RESORT = 1e-4  # weight of oblique views and of the unreliable band, used only where no better view exists
 FLATTEST = 0.05  # cosine below which a view is ignored
@@ -124,7 +125,7 @@ def bake_texture(
         camera = OrbitCamera(width=posed.color.shape[1], height=posed.color.shape[0])
         moved = _placed_texels(rows, columns, corners, shares, posed.vertices, posed.normals)
         reach = max(1, round(OUTLINE * camera.width / side))  # the footage may be coarser than the renders
-        pictures = _graded(posed.color[None], posed.alpha[None, ..., 0], [camera], posed.vertices, faces, reach)
+        pictures = graded(posed.color[None], posed.alpha[None, ..., 0], [camera], posed.vertices, faces, reach)
         rule = flattest, INPUT_WEIGHT * posed.weight
         run_parallel([partial(_add, moved, [camera], pictures, [rule], part, total) for part in parts])
     cameras = [OrbitCamera(width=side, height=side), *baking_views(side)]
@@ -218,10 +219,10 @@ def _render_views(
     with torch.no_grad():
         render = rasterize(gaussians, cameras, torch.zeros(3))
     color = (render.color / render.alpha.clamp_min(1e-6)).clamp(0, 1)
-    return _graded(color, render.alpha[..., 0], cameras, vertices, faces, OUTLINE)
+    return graded(color, render.alpha[..., 0], cameras, vertices, faces, OUTLINE)
 
 
-def _graded(
+def graded(
     color: Float[Tensor, "b h w 3"],
     alpha: Float[Tensor, "b h w"],
     cameras: Sequence[OrbitCamera],
