@@ -25,7 +25,7 @@ from dg4d_lib.mesh.texturing.seams import level_seams, seam_points
 from dg4d_lib.mesh_rasterizer.texture import Taps, TextureLookup, build_lookup, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
-ITERATIONS = 8  # of conjugate gradients
+ITERATIONS = 4  # of conjugate gradients
 KEPT = 0.1  # weight of a texel's squared change; that of a pixel's squared error is 1
 EVEN = 0.1  # weight of the squared difference between the changes of neighboring texels
 DOUBTFUL = 0.3  # weight of a pixel beside an outline or behind an occluding edge
@@ -57,10 +57,12 @@ def fit_texture(mesh: TexturedMesh, footage: Sequence[PosedSurface]) -> Texture:
 def _best_change(start: Texture, frames: "_Pixels") -> Texture:
     """Return what to add to a texture."""
 
+    variable = start.clone().requires_grad_()
+    seen = frames.render(variable)
+
     def spread(errors: Float[Tensor, "p 3"]) -> Texture:
-        """Return what every texel contributes to weighted errors: the transpose of the renders."""
-        texture = torch.zeros_like(start, requires_grad=True)
-        (gradient,) = torch.autograd.grad((frames.render(texture) * frames.weights * errors).sum(), texture)
+        """Return what every texel contributes to weighted errors: the transpose of the renders, which are linear."""
+        (gradient,) = torch.autograd.grad(seen, variable, frames.weights * errors, retain_graph=True)
         return gradient
 
     def normal(flat: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -69,11 +71,9 @@ def _best_change(start: Texture, frames: "_Pixels") -> Texture:
             rendered = frames.render(change)
         return _flat(spread(rendered) + KEPT * change + EVEN * _differences(change))
 
-    with torch.no_grad():
-        seen = frames.render(start)
     diagonal = _flat(spread(torch.ones_like(seen)) + KEPT + 4 * EVEN)
     matrix, scale = LinearOperator(2 * diagonal.shape, normal), diags_array(1 / diagonal)
-    change, _ = cg(matrix, _flat(spread(frames.colors - seen)), rtol=0, maxiter=ITERATIONS, M=scale)
+    change, _ = cg(matrix, _flat(spread(frames.colors - seen.detach())), rtol=0, maxiter=ITERATIONS, M=scale)
     return torch.from_numpy(change.reshape(start.shape)).to(start)
 
 
