@@ -63,9 +63,10 @@ def run(job: Job) -> StepReport:
     Raises:
         BadInput: the motion does not have these frames.
     """
-    settings: MeshSettings = job.settings.mesh
-    frames_of_task: FrameRange = job.settings
     plan = read_plan(job.inputs["plan"])
+    settings: MeshSettings = job.settings.mesh
+    settings = settings.model_copy(update={"grid": plan.grid or settings.grid})
+    frames_of_task: FrameRange = job.settings
     rasterize = get_rasterizer(job.settings.rasterizer)
     states, displacement = read_states(job.inputs["gaussians"], job.inputs["motion"])
     frames = len(states.means)

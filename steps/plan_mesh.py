@@ -15,6 +15,8 @@ from steps.artifacts.mesh_plan import MeshPlan, write_plan
 from steps.artifacts.motions import read_states
 from steps.runtime.job import Job, StepReport
 
+FINER, FINEST = 1.5, 512  # factor of `mesh.grid` that a mesh per frame tries, and the largest grid
+FINER_GAIN = 0.005  # intersection over union of outlines by which the finer grid must be better
 LIMITS = {"gaussians": "min_followed", "video": "min_guided"}
 
 
@@ -29,7 +31,7 @@ def run(job: Job) -> StepReport:
     settings: MeshSettings = job.settings.mesh
     rasterize = get_rasterizer(job.settings.rasterizer)
     states, displacement = read_states(job.inputs["gaussians"], job.inputs["motion"])
-    mode, frame, followed, notes = settings.mode, 0, 1.0, []
+    mode, frame, followed, notes, grid = settings.mode, 0, 1.0, [], None
     guide: Literal["gaussians", "video"] = "gaussians"
     if mode != "per_frame":
         trial = select_reference_frame(states, displacement, rasterize, settings)
@@ -53,8 +55,16 @@ def run(job: Job) -> StepReport:
     job.progress(1, 2, {})
     rest = states.at(frame)
     level, agreement = select_level(density_field(rest, settings), rest, rasterize, settings.density_threshold)
+    if settings.mode == "auto" and mode == "per_frame":
+        finer = settings.model_copy(update={"grid": min(round(FINER * settings.grid), FINEST)})
+        found = select_level(density_field(rest, finer), rest, rasterize, level)
+        if found[1] > agreement + FINER_GAIN:
+            (level, agreement), grid = found, finer.grid
+            notes.append(
+                f"thin parts: the density field has {grid} samples along every axis (mesh.grid={settings.grid})"
+            )
     notes.append(f"surface at density {level:.3g}; its outlines agree with the Gaussians' to {agreement:.1%} (IoU)")
-    plan = MeshPlan(mode=mode, reference_frame=frame, followed=followed, level=level, guide=guide)
+    plan = MeshPlan(mode=mode, reference_frame=frame, followed=followed, level=level, grid=grid, guide=guide)
     write_plan(job.outputs["plan"], plan)
     job.progress(2, 2, {})
     return StepReport(backend=f"{job.settings.rasterizer} rasterizer", notes=tuple(notes))

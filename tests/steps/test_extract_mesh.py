@@ -218,6 +218,23 @@ def test_what_no_trial_follows_gets_a_mesh_per_frame(
     assert any(limit in note for note in facts.notes)
 
 
+@pytest.mark.parametrize(("thickness", "finer"), [(0.0, True), (0.4, False)])
+def test_a_mesh_per_frame_gets_a_finer_grid_for_thin_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, thickness: float, finer: bool
+) -> None:
+    monkeypatch.setattr(plan_mesh, "select_reference_frame", lambda *given: Trial(1, 0.8, 0.0))
+    body = ball()
+    body = replace(body, means=body.means * torch.tensor([1, 1, max(thickness, 1e-3) / 0.4]))
+    if not thickness:
+        body = replace(body, log_scales=body.log_scales - torch.tensor([0, 0, 2.0]))
+    settings = MESH.model_copy(update={"mode": "auto"})
+    _, facts = extract(tmp_path, body, settings)
+    plan = read_plan(tmp_path / "plan")
+    assert plan.grid == (round(1.5 * settings.grid) if finer else None)
+    assert any(note.startswith("thin parts") for note in facts.notes) is finer
+    assert len(read_meshes(tmp_path / "meshes")) == FRAMES
+
+
 def test_a_stretched_mesh_that_the_video_guides_no_better_stays_with_its_gaussians(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
